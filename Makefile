@@ -1,0 +1,35 @@
+# Every target sets up what it needs in .venv: a fresh machine needs make and a Python 3.11 to 3.13 with venv, nothing more.
+
+SHELL := /bin/sh
+IS_USABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
+  $$p -c '$(IS_USABLE)' >/dev/null 2>&1 && { echo $$p; break; }; done)
+
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/ready
+DEMO_OUT := out/hanging_beam
+
+.PHONY: demo test lint clean
+
+demo: $(READY)
+	$(BIN)/taisoft run hanging_beam --headless --out $(DEMO_OUT) --overwrite
+	@echo "Written to $(DEMO_OUT): report.json (what happened), steps.csv (every step), frames/ (pictures), scene.usdc (USD)."
+
+test: $(READY)
+	$(BIN)/python -m pytest -q
+
+lint: $(READY)
+	$(BIN)/ruff check .
+
+# pip and venv build into $(VENV); the stamp is written last, so that an installation cut short is done again.
+$(READY): pyproject.toml
+	@[ -n "$(PYTHON)" ] || { echo "No Python 3.11 to 3.13 with venv was found: install one" \
+	  "(Debian: apt install python3-venv) or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $(READY)
+
+clean:
+	rm -rf $(VENV) out build dist .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

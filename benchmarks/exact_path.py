@@ -1,0 +1,193 @@
+"""The falling beam integrated exactly in time: what a solver on the same mesh is compared with.
+
+A beam 4 x 1 x 1 m of St. Venant-Kirchhoff material, psi = mu E:E + lam/2 tr(E)^2 with E = (F^T F - I)/2, is clamped at
+x = -2 and falls under gravity from rest, undamped. Mesh (five tets a cell) and lumped mass (each tet gives a quarter of
+its mass to each node) are fixed, so that the difference to a solver's path is its error in time alone. The ordinary
+differential equations are integrated by Runge-Kutta of order 8 (SciPy's DOP853) at two tolerances; the difference of
+the two paths is stored with the path as its uncertainty.
+
+The law has no barrier against inversion: from about t = 0.8 s on the beam folds at the clamp and tets invert there. The
+path stays well defined (see `convergence` in the data), but it is a model's path, no longer a beam's. Hence an error
+is also quoted up to t = 0.8 s.
+
+`python -m benchmarks.exact_path` integrates all meshes (about a minute) and writes data/falling_beam_svk.npz.
+"""
+
+import argparse
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.integrate import DOP853
+from scipy.sparse import csr_matrix
+
+from taisoft.errors import SimulationError
+from taisoft.mesh.shapes import box_mesh
+
+SIZE = (4.0, 1.0, 1.0)  # m, centred at the origin
+YOUNG, POISSON, DENSITY = 1e6, 0.3, 1000.0  # Pa, 1, kg/m^3
+GRAVITY = 9.8  # m/s^2, along -y
+MESHES = ((12, 3, 3), (24, 6, 6), (48, 12, 12))  # 540, 4,320, 34,560 tets
+SAMPLE = 0.01  # s between two stored points of the path
+SECONDS = 1.0
+FOLDING_STARTS = 0.8  # s
+DATA = Path(__file__).parent / "data" / "falling_beam_svk.npz"
+
+
+class FallingBeam:
+    """The semi-discrete beam: mesh, masses and acceleration, in float64 NumPy.
+
+    cells: (nx, ny, nz). Attributes: vertices (n,3) [m], tets (m,4), volumes (m,) [m^3], mass (n,) [kg], free (n,) bool,
+    tip (k,) ids of the nodes of the free end face x = 2.
+    """
+
+    def __init__(self, cells):
+        mesh = box_mesh(cells, SIZE)
+        self.cells, self.vertices, self.tets, self.volumes = tuple(cells), mesh.vertices, mesh.tets, mesh.volumes
+        n, m = len(self.vertices), len(self.tets)
+        self.mass = np.bincount(self.tets.ravel(), np.repeat(DENSITY * self.volumes / 4, 4), n)
+        self.free = self.vertices[:, 0] > -SIZE[0] / 2 + 1e-9
+        self.tip = np.flatnonzero(self.vertices[:, 0] > SIZE[0] / 2 - 1e-9)
+        self.lam = YOUNG * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
+        self.mu = YOUNG / (2 * (1 + POISSON))
+        # Row j m + e of the operator: the derivative along X_j in tet e of a nodal quantity.
+        edges = self.vertices[self.tets[:, 1:]] - self.vertices[self.tets[:, :1]]
+        gradients = np.linalg.inv(edges).transpose(0, 2, 1)
+        gradients = np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)  # (m, 4 corners, 3)
+        rows = np.broadcast_to(np.arange(3) * m + np.arange(m)[:, None, None], gradients.shape)
+        columns = np.broadcast_to(self.tets[:, :, None], gradients.shape)
+        self._gradient = csr_matrix((gradients.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * m, n))
+        self._divergence = self._gradient.T.tocsr()
+
+    def elastic_force(self, u):
+        """Force of the material on each node (3,n) [N] at the displacement u (3,n) [m]."""
+        m = len(self.tets)
+        grad_u = [(self._gradient @ u[i]).reshape(3, m) for i in range(3)]  # grad_u[i][j] = du_i / dX_j
+        stress = self._weighted_stress(grad_u)
+        force = np.empty_like(u)
+        weighted_pk1 = np.empty((3, m))
+        for i in range(3):
+            for j in range(3):  # P = F S with F = I + grad u
+                weighted_pk1[j] = stress[i][j] + sum(grad_u[i][k] * stress[k][j] for k in range(3))
+            force[i] = -(self._divergence @ weighted_pk1.ravel())
+        return force
+
+    def _weighted_stress(self, grad_u):
+        """Second Piola-Kirchhoff stress times the tet's volume, as a symmetric 3 x 3 list of (m,) [N m]."""
+        strain = [[None] * 3 for _ in range(3)]
+        for i in range(3):
+            for j in range(i, 3):
+                strain[i][j] = 0.5 * (grad_u[i][j] + grad_u[j][i] + sum(grad_u[k][i] * grad_u[k][j] for k in range(3)))
+        pressure = self.lam * (strain[0][0] + strain[1][1] + strain[2][2])
+        stress = [[None] * 3 for _ in range(3)]
+        for i in range(3):
+            for j in range(i, 3):
+                value = 2 * self.mu * strain[i][j] + (pressure if i == j else 0.0)
+                stress[i][j] = stress[j][i] = self.volumes * value
+        return stress
+
+    def acceleration(self, u):
+        """Acceleration (3,n) [m/s^2] at the displacement u (3,n) [m]; zero for the fixed nodes."""
+        a = self.elastic_force(u) / self.mass
+        a[1] -= GRAVITY
+        a[:, ~self.free] = 0.0
+        return a
+
+
+def integrate(beam: FallingBeam, tolerance: float, seconds: float = SECONDS, points=None):
+    """Times (k,) [s], every SAMPLE, and the positions (k,3) [m] of the mean of `points`, by default of the tip's nodes.
+
+    tolerance: relative, and absolute in m and m/s, of the error of one step.
+    """
+    points = beam.tip if points is None else points
+    n = len(beam.vertices)
+
+    def rate(_, y):
+        u, v = y.reshape(2, 3, n)
+        return np.concatenate([v.ravel(), beam.acceleration(u).ravel()])
+
+    times = np.arange(round(seconds / SAMPLE) + 1) * SAMPLE
+    start = beam.vertices[points].mean(axis=0)
+    path = np.tile(start, (len(times), 1))
+    solver = DOP853(rate, 0.0, np.zeros(6 * n), times[-1], rtol=tolerance, atol=tolerance)
+    done = 1
+    while solver.status == "running":
+        solver.step()
+        reached = np.searchsorted(times, solver.t + 1e-12, side="right")
+        if reached > done:
+            between = solver.dense_output()
+            for k in range(done, reached):
+                path[k] += between(min(times[k], solver.t)).reshape(2, 3, n)[0][:, points].mean(axis=1)
+            done = reached
+    if solver.status == "failed":
+        raise SimulationError(f"the exact path of the mesh {beam.cells} ends at t = {solver.t:.4f} s: too small a step")
+    return times, path
+
+
+@dataclass(frozen=True)
+class ExactPath:
+    """Path of the tip (mean of the end face's nodes): t (k,) [s], path (k,3) [m], and how far it is converged.
+
+    excursion: largest distance of the tip from its start [m]. convergence (k,): difference to the path at the looser
+    tolerance, over the excursion: an upper bound of the path's own error.
+    """
+
+    t: np.ndarray
+    path: np.ndarray
+    excursion: float
+    convergence: np.ndarray
+
+    def error(self, t, path, until: float = SECONDS) -> float:
+        """Largest distance of `path` (k,3) [m] to this path over the times t <= until, over the excursion.
+
+        t (k,) [s] must be multiples of SAMPLE within the stored second; ValueError otherwise.
+        """
+        t, path = np.asarray(t, float), np.asarray(path, float)
+        index = np.rint(t / SAMPLE).astype(int)
+        off = np.flatnonzero((np.abs(t - index * SAMPLE) > 1e-9) | (index < 0) | (index >= len(self.t)))
+        if len(off):
+            raise ValueError(
+                f"time {off[0]}, {t[off[0]]} s, is not a multiple of {SAMPLE} s between 0 and {self.t[-1]} s"
+            )
+        use = t <= until + 1e-9
+        return float(np.linalg.norm(path[use] - self.path[index[use]], axis=1).max() / self.excursion)
+
+
+def load_exact(cells) -> ExactPath:
+    """The stored exact path of the mesh `cells`. Raises ValueError for a mesh that is not stored."""
+    key = _key(cells)
+    with np.load(DATA) as data:
+        if f"path_{key}" not in data:
+            raise ValueError(f"no exact path is stored for the mesh {key}; stored are {', '.join(map(_key, MESHES))}")
+        path, convergence = data[f"path_{key}"], data[f"convergence_{key}"]
+    times = np.arange(len(path)) * SAMPLE
+    return ExactPath(times, path, float(np.linalg.norm(path - path[0], axis=1).max()), convergence)
+
+
+def _key(cells) -> str:
+    return "x".join(str(c) for c in cells)
+
+
+def main(arguments=None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--out", type=Path, default=DATA, help="file to write (default: %(default)s)")
+    parser.add_argument("--tolerances", type=float, nargs=2, default=(1e-7, 1e-9), metavar=("LOOSE", "TIGHT"))
+    options = parser.parse_args(arguments)
+    stored = {}
+    for cells in MESHES:
+        beam, start = FallingBeam(cells), time.perf_counter()
+        loose, path = (integrate(beam, tolerance)[1] for tolerance in options.tolerances)
+        excursion = np.linalg.norm(path - path[0], axis=1).max()
+        convergence = np.linalg.norm(path - loose, axis=1) / excursion
+        stored[f"path_{_key(cells)}"] = path
+        stored[f"convergence_{_key(cells)}"] = convergence.astype(np.float32)
+        print(f"{_key(cells):>9} {len(beam.tets):6d} tets: excursion {excursion:.9f} m, two tolerances differ by "
+              f"{convergence.max():.1e} of it, {time.perf_counter() - start:.0f} s", flush=True)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(options.out, **stored)
+    print(f"written: {options.out}, {options.out.stat().st_size / 1000:.1f} kB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""Timing on a shared machine: a number is a median with minimum and spread, beside what the machine was doing."""
+
+import os
+import platform
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What several repeats of one thing took [s]. `spread` is the distance between the quartiles over the median."""
+
+    median: float
+    minimum: float
+    maximum: float
+    spread: float
+    repeats: int
+
+
+def summarise(seconds: Iterable[float]) -> Timing:
+    """Timing of the repeats `seconds` (k,) [s]. Raises ValueError where there are none."""
+    seconds = np.asarray(list(seconds), float)
+    if len(seconds) == 0:
+        raise ValueError("a timing needs at least one repeat")
+    low, median, high = np.percentile(seconds, (25, 50, 75))
+    return Timing(float(median), float(seconds.min()), float(seconds.max()), float((high - low) / median), len(seconds))
+
+
+def time_repeats(call: Callable[[], object], repeats: int) -> Timing:
+    """Timing of `call()`, done `repeats` times; what should be warm must be warmed before."""
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - start)
+    return summarise(seconds)
+
+
+def load_average() -> float | None:
+    """Mean number of running processes over the last minute, None on a system that does not tell."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+
+
+def machine() -> dict:
+    """Name of the processor, number of cores this process may use, operating system, and the present load."""
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"processor": _processor(), "cores": allowed, "system": platform.platform(), "load": load_average()}
+
+
+def versions(*packages: str) -> dict[str, str | None]:
+    """Version of Python and of each package; None where a package is not installed."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for package in packages:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = None
+    return found
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")  # platform.processor() is empty on many Linux systems
+    if info.exists():
+        for line in info.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,44 @@
+"""Elastic soft bodies in Taichi. Importing this package starts no Taichi: a public name is loaded at its first use."""
+
+from importlib import import_module
+
+__version__ = "0.1.0"
+
+_HOME = {  # public name -> the module that defines it
+    "TetMesh": "taisoft.mesh.tet_mesh",
+    "box_mesh": "taisoft.mesh.shapes",
+    "sheet_mesh": "taisoft.mesh.shapes",
+    "ball_mesh": "taisoft.mesh.shapes",
+    "read_mesh": "taisoft.mesh.files",
+    "write_mesh": "taisoft.mesh.files",
+    "Material": "taisoft.scene.scene",
+    "Body": "taisoft.scene.scene",
+    "Scene": "taisoft.scene.scene",
+    "Simulator": "taisoft.simulator",
+    "solve_static": "taisoft.static",
+    "modes": "taisoft.stability",
+    "evaluate_law": "taisoft.materials.evaluate",
+    "Energies": "taisoft.records",
+    "StepReport": "taisoft.records",
+    "RunReport": "taisoft.records",
+    "TaisoftError": "taisoft.errors",
+    "MeshError": "taisoft.errors",
+    "SceneError": "taisoft.errors",
+    "OutputError": "taisoft.errors",
+    "SimulationError": "taisoft.errors",
+}
+
+__all__ = sorted(_HOME) + ["__version__"]
+
+
+def __getattr__(name: str):
+    """The public name `name`, imported from its module at the first use (PEP 562)."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'taisoft' has no attribute {name!r}")
+    value = getattr(import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME})

@@ -1,0 +1,96 @@
+"""The command `taisoft`: arguments in, an exit status out. Each command lives in its own file beside this one.
+
+Exit status: 0 the run is ok or degraded, 1 the run failed, 2 bad input (refused before any file is written), 3 output
+could not be written, 130 ended by SIGINT, 143 ended by SIGTERM.
+"""
+
+import argparse
+import os
+import sys
+from importlib import import_module
+
+from taisoft import __version__
+from taisoft.cli.signals import Left
+from taisoft.errors import OutputError, TaisoftError
+
+EXIT_FAILED = 1
+EXIT_BAD_INPUT = 2
+EXIT_OUTPUT = 3
+EXIT_SIGNAL = 128  # plus the signal's number: 130, 143
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs one command. argv: the arguments after the program's name, those of the process by default.
+
+    Returns the exit status; argparse itself leaves with status 2 where it cannot parse. A TaisoftError becomes one
+    sentence on stderr; any other exception is a fault of taisoft and keeps its traceback. A command's module is
+    imported only when it is asked for, so that `doctor` also works on a broken installation.
+    """
+    arguments = _parser().parse_args(argv)
+    try:
+        return import_module(f"taisoft.cli.{arguments.command}").command(arguments)
+    except TaisoftError as error:
+        print(f"taisoft: {error}", file=sys.stderr)
+        return EXIT_OUTPUT if isinstance(error, OutputError) else EXIT_BAD_INPUT
+    except Left as leave:
+        print("taisoft: ended by a signal; nothing was written", file=sys.stderr)
+        return EXIT_SIGNAL + leave.signal_number
+    except BrokenPipeError:
+        # The reader of our output has gone (`taisoft list | head -1`): stdout as it is would complain when closed.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_OUTPUT
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="taisoft", description="Elastic soft bodies in Taichi.", allow_abbrev=False)
+    parser.add_argument("--version", action="version", version=f"taisoft {__version__}")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    _add_run(commands)
+
+    listed = commands.add_parser("list", help="the demos, one line each")
+    listed.set_defaults(command="listing")
+
+    mesh_info = commands.add_parser("info", help="what a mesh file holds: counts, size, quality, problems")
+    mesh_info.add_argument("mesh", metavar="MESH", help="a mesh file with tetrahedra, in any format that meshio reads")
+    mesh_info.set_defaults(command="info")
+
+    doctor_parser = commands.add_parser("doctor", help="what this machine offers, and how to get what is missing")
+    doctor_parser.set_defaults(command="doctor")
+
+    bench_parser = commands.add_parser("bench", help="run a benchmark; without a name, list them", add_help=False)
+    bench_parser.add_argument("name", metavar="NAME", nargs="?", help="the benchmark's name")
+    bench_parser.add_argument("rest", nargs=argparse.REMAINDER, help="arguments of the benchmark itself")
+    bench_parser.set_defaults(command="bench")
+    return parser
+
+
+def _add_run(commands) -> None:
+    """The options of `taisoft run`; their defaults are None so that what was given can be told from what was not."""
+    parser = commands.add_parser(
+        "run",
+        help="run a scene: a demo's name or a .py file with build()",
+        description="Run a scene and, with --out, keep report.json, steps.csv, frames/ and scene.usdc.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("scene", metavar="SCENE", help="a demo's name (see `taisoft list`) or a .py file with build()")
+    parser.add_argument("--arch", choices=("cpu", "cuda"), help="where to compute (default cpu)")
+    parser.add_argument("--precision", choices=("f32", "f64"), help="of the arithmetic (default f32)")
+    parser.add_argument("--headless", action="store_true", help="open no window")
+    parser.add_argument("--seconds", type=float, metavar="T", help="simulated time [s] (default: the scene's, or 1)")
+    parser.add_argument(
+        "--fps", type=float, metavar="N", help="frames per simulated second (default: the scene's, or 60)"
+    )
+    parser.add_argument("--out", metavar="DIR", help="folder for the results; without it nothing is written")
+    parser.add_argument("--overwrite", action="store_true", help="replace results that DIR already holds")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="assignments",
+        metavar="solver.KEY=VALUE",
+        help="a Simulator argument, e.g. solver.dt=0.01; may be repeated",
+    )
+    parser.add_argument("--no-usd", action="store_true", help="write no scene.usdc")
+    parser.add_argument("--no-frames", action="store_true", help="write no pictures")
+    parser.set_defaults(command="run")

@@ -1,0 +1,84 @@
+"""`taisoft doctor`: what this machine offers and how to get what is missing. Nothing here can end the process: Taichi's
+Vulkan probe loads drivers and runs in a process of its own, CUDA is asked through its driver library."""
+
+import ctypes
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from argparse import Namespace
+from importlib import metadata
+
+from taisoft import __version__
+
+REQUIRED = ("taichi", "numpy", "scipy", "meshio", "usd-core", "networkx", "rich")
+OPTIONAL = {"mujoco": "peers"}  # package -> the extra that installs it; only benchmarks compare with MuJoCo
+VULKAN_PROBE = "from taichi._lib import core; print('vulkan', core.with_vulkan())"
+PROBE_SECONDS = 60.0  # loading Taichi from a cold disk takes several seconds
+
+
+def command(_: Namespace) -> int:
+    """Prints one line per finding and always returns 0: a missing part is news, not an error."""
+    lines = [
+        ("taisoft", f"{__version__}, Python {platform.python_version()}"),
+        ("machine", f"{platform.platform()}, {os.cpu_count()} cores"),
+        ("packages", ", ".join(f"{name} {_version(name)}" for name in REQUIRED)),
+        *(("optional", f"{name} {_version(name, extra)}") for name, extra in OPTIONAL.items()),
+        ("arch cpu", "yes"),
+        ("arch cuda", cuda()),
+        ("vulkan", vulkan()),
+        ("display", display()),
+    ]
+    for name, text in lines:
+        print(f"{name:<10} {text}")
+    return 0
+
+
+def _version(package: str, extra: str = "") -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "missing: pip install " + (f"'taisoft[{extra}]'" if extra else package)
+
+
+def cuda() -> str:
+    """Whether the NVIDIA driver offers a device, with its name and the driver's CUDA version."""
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return "no: there is no NVIDIA driver (libcuda.so.1); install it, or use --arch cpu"
+    status = driver.cuInit(0)
+    if status != 0:
+        return f"no: the NVIDIA driver does not start (cuInit gives {status}); see nvidia-smi, or use --arch cpu"
+    count, version, name = ctypes.c_int(), ctypes.c_int(), ctypes.create_string_buffer(100)
+    driver.cuDeviceGetCount(ctypes.byref(count))
+    if count.value == 0:
+        return "no: the NVIDIA driver finds no device; use --arch cpu"
+    driver.cuDriverGetVersion(ctypes.byref(version))
+    driver.cuDeviceGetName(name, len(name), 0)
+    return f"yes: {name.value.decode()}, CUDA {version.value // 1000}.{version.value % 1000 // 10}"
+
+
+def vulkan() -> str:
+    """Whether Taichi finds a Vulkan driver, which windows and pictures need."""
+    hint = "no pictures, no window; install a driver (Debian: apt install mesa-vulkan-drivers)"
+    try:
+        probe = subprocess.run(
+            [sys.executable, "-c", VULKAN_PROBE], capture_output=True, text=True, timeout=PROBE_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return f"no: the driver did not answer within {PROBE_SECONDS:.0f} s; {hint}"
+    if "vulkan True" in probe.stdout:
+        return "yes"
+    return f"no: {hint}" if "vulkan False" in probe.stdout else f"no: the probe ended with {probe.returncode}; {hint}"
+
+
+def display() -> str:
+    """Whether there is a display for the live window, or a way to a virtual one."""
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
+        if os.environ.get(variable):
+            return f"yes: {variable}={os.environ[variable]}"
+    if shutil.which("xvfb-run"):
+        return "no, but a virtual one can be had: xvfb-run -a taisoft run SCENE; or use --headless"
+    return "no: use --headless, or a virtual one (Debian: apt install xvfb)"

@@ -1,0 +1,94 @@
+"""What a run writes: the observers of `taisoft run` together, kept going or ended as one."""
+
+from pathlib import Path
+
+from taisoft.cli.settings import RunSettings
+from taisoft.errors import OutputError
+from taisoft.output.files import RESULT_FILES, OutputFolder
+from taisoft.output.frames import FRAMES_NAME, FrameWriter
+from taisoft.output.report import write_report
+from taisoft.output.usd import UsdWriter
+from taisoft.records import RunReport
+from taisoft.view.offscreen import Offscreen
+
+
+class Observers:
+    """Hands every frame to its members; the first that cannot write asks the run to end, and the sentence is kept.
+
+    error: the OutputError, or None. A member has frame(sim, index) and close().
+    """
+
+    def __init__(self) -> None:
+        self.members: list = []
+        self.error: OutputError | None = None
+
+    def on_frame(self, sim, index: int, _report) -> None:
+        """For Simulator.run. Never raises OutputError: what was computed must still be reported."""
+        for member in self.members:
+            if self.error is None:
+                self.guard(member.frame, sim, index)
+
+    def failed(self) -> bool:
+        """True once a member could not write."""
+        return self.error is not None
+
+    def close(self) -> None:
+        """Closes the members, last first, each of them whatever the others do."""
+        while self.members:
+            self.guard(self.members.pop().close)
+
+    def guard(self, write, *arguments) -> None:
+        """write(*arguments); its OutputError is kept, if it is the first, and not raised."""
+        try:
+            write(*arguments)
+        except OutputError as error:
+            self.error = self.error or error
+
+
+class Recording:
+    """The results of a run in one folder: report.json, steps.csv and, where wanted, frames/ and scene.usdc.
+
+    Raises OutputError if the folder cannot be written or holds results and overwrite is off.
+    """
+
+    def __init__(self, path: str, overwrite: bool):
+        self._folder = OutputFolder(path, overwrite)
+        self.path = Path(path)
+
+    def add_writers(self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool) -> None:
+        """Adds the writers of frames and USD to the observers."""
+        if with_usd:
+            observers.members.append(UsdWriter(self._folder.path, sim.scene, fps=fps or 1.0 / sim.dt))
+        if with_frames:
+            observers.members.append(FrameWriter(self._folder.path, Offscreen(sim.scene)))
+
+    def report(self, result: RunReport, sim, settings: RunSettings) -> None:
+        """Writes report.json and steps.csv, and removes what an earlier run left. Raises OutputError."""
+        record = settings.as_dict() | {"dt": sim.dt}
+        write_report(
+            self._folder.path,
+            result,
+            arch=record["arch"],
+            precision=record["precision"],
+            settings=record,
+            plan=sim.plan.entries,
+        )
+        self._folder.discard_stale()
+
+    def files(self) -> list[str]:
+        """What the folder holds now, one text for each file and one for all pictures."""
+        paths = [path for path in (self.path / name for name in RESULT_FILES) if path.is_file()]
+        found = [f"{path} ({_size(path.stat().st_size)})" for path in paths]
+        pictures = list((self.path / FRAMES_NAME).glob("*.png"))
+        if pictures:
+            size = _size(sum(path.stat().st_size for path in pictures))
+            found.append(f"{self.path / FRAMES_NAME}/ ({len(pictures)} pictures, {size})")
+        return found
+
+    def close(self) -> None:
+        """Gives the folder back."""
+        self._folder.close()
+
+
+def _size(n_bytes: int) -> str:
+    return f"{n_bytes / 1e6:.1f} MB" if n_bytes >= 1e5 else f"{n_bytes / 1e3:.1f} kB"

@@ -1,0 +1,127 @@
+"""Finding and loading what `taisoft run` and `taisoft bench` name: demos, benchmarks and a user's own .py files.
+
+A checkout keeps demos/ and benchmarks/ beside the package; an installed wheel carries them inside it. A scene file is
+Python and is run as such: only run files you trust.
+"""
+
+import ast
+import difflib
+import importlib
+import importlib.util
+import sys
+import traceback
+from pathlib import Path
+from types import ModuleType
+
+from taisoft.errors import MeshError, SceneError
+from taisoft.scene.scene import Scene
+
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def shipped_files(folder: str) -> dict[str, Path]:
+    """Name -> path of the .py files in the shipped folder `folder` ("demos" or "benchmarks"), sorted by name.
+
+    A file in a subfolder is called subfolder.name; files that start with _ are helpers and have no name.
+    """
+    place = shipped_folder(folder)
+    paths = sorted(place.rglob("[!_]*.py")) if place else []
+    return {".".join(path.relative_to(place).with_suffix("").parts): path for path in paths}
+
+
+def shipped_folder(folder: str) -> Path | None:
+    """Path of a shipped folder: inside the package (a wheel), else beside it (a checkout), else None."""
+    return next((place for place in (PACKAGE / folder, PACKAGE.parent / folder) if place.is_dir()), None)
+
+
+def load_shipped(folder: str, name: str) -> ModuleType:
+    """Imports the shipped file `name`; the folder is its package, so that it may import its neighbours relatively."""
+    package = ModuleType(f"taisoft_{folder}")
+    package.__path__ = [str(shipped_folder(folder))]
+    sys.modules[package.__name__] = package
+    return importlib.import_module(f"{package.__name__}.{name}")
+
+
+def first_line(path: Path) -> str:
+    """The first line of the docstring of a .py file, read without running it; empty if it has none."""
+    return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition("\n")[0]
+
+
+def nearest(name: str, known) -> str:
+    """ " (did you mean X?)" for the known name closest to `name`, or an empty string."""
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
+def find_scene(name: str) -> Path:
+    """Path of the .py file that SCENE names. Raises SceneError if there is none."""
+    if name.endswith(".toml"):
+        raise SceneError(f"{name}: scene files (.toml) are not supported; write a .py file with build()")
+    if name.endswith(".py"):
+        path = Path(name)
+        if not path.is_file():
+            raise SceneError(f"{name}: no such file")
+        return path
+    demos = shipped_files("demos")
+    if name not in demos:
+        raise SceneError(
+            f"{name!r} is neither a demo nor a .py file{nearest(name, demos)}; `taisoft list` names the demos"
+        )
+    return demos[name]
+
+
+def load_scene(name: str) -> tuple[Scene, dict]:
+    """The scene that SCENE names and its `solver` dict (empty if the file has none).
+
+    Raises SceneError, or MeshError for a mesh, naming the file and, where its code is at fault, the line.
+    """
+    path = find_scene(name)
+    module = load_module(path)
+    build = getattr(module, "build", None)
+    if not callable(build):
+        raise SceneError(f"{path}: no function build() that returns a Scene")
+    scene = _call(path, build)
+    if not isinstance(scene, Scene):
+        raise SceneError(f"{path}: build() returned {type(scene).__name__}, a Scene is needed")
+    solver = getattr(module, "solver", {})
+    if not isinstance(solver, dict) or not all(isinstance(key, str) for key in solver):
+        raise SceneError(f"{path}: solver must be a dict of Simulator arguments")
+    return scene, dict(solver)
+
+
+def load_module(path: Path) -> ModuleType:
+    """Runs a .py file as a module. Raises SceneError naming file and line if it cannot be run."""
+    spec = importlib.util.spec_from_file_location(f"taisoft_file_{path.stem}", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up by name
+    # A file split in two imports its neighbour by name; last on the path, so that it hides no other module.
+    folder = str(path.absolute().parent)
+    if folder not in sys.path:
+        sys.path.append(folder)
+    _call(path, spec.loader.exec_module, module)
+    return module
+
+
+def _call(path: Path, function, *arguments):
+    """function(*arguments), with an exception of the file's code turned into one sentence."""
+    try:
+        return function(*arguments)
+    except (Exception, SystemExit) as error:  # a file may raise anything
+        kind = MeshError if isinstance(error, MeshError) else SceneError
+        raise kind(f"{_place(path, error)}: {_sentence(error)}") from error
+
+
+def _place(path: Path, error: BaseException) -> str:
+    """ "file, line n": the innermost line of the file that led to the error, or the file alone."""
+    if isinstance(error, SyntaxError) and error.filename == str(path):
+        return f"{path}, line {error.lineno}"
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+    return f"{path}, line {frames[-1].lineno}" if frames else str(path)
+
+
+def _sentence(error: BaseException) -> str:
+    """The error's text in one line; taisoft's own sentences stand alone, others are led by their type."""
+    text = " ".join((error.msg if isinstance(error, SyntaxError) else str(error)).split())
+    if isinstance(error, (MeshError, SceneError)):
+        return text
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -1,0 +1,99 @@
+"""The settings of a run, resolved from the scene's `solver` dict, --set and the other options, in this order."""
+
+import inspect
+import math
+import re
+import tomllib
+from argparse import Namespace
+from dataclasses import dataclass, field
+
+from taisoft.cli.scene_file import nearest
+from taisoft.errors import SceneError
+
+RUN_KEYS = ("seconds", "fps")  # arguments of Simulator.run that a `solver` dict may hold too
+BARE_WORD = re.compile(r"[A-Za-z_]\w*")
+
+
+@dataclass
+class RunSettings:
+    """What a run starts with. simulator: arguments of Simulator; seconds [s]; fps [1/s], None for a frame a step."""
+
+    simulator: dict
+    seconds: float = 1.0
+    fps: float | None = 60.0
+    defaults: dict = field(default_factory=dict)  # Simulator's own, for the arguments that were not given
+
+    def as_dict(self) -> dict:
+        """Every setting of the run by name, given or by default."""
+        return self.defaults | self.simulator | {"seconds": self.seconds, "fps": self.fps}
+
+
+def resolve(solver: dict, arguments: Namespace, simulator_class: type) -> RunSettings:
+    """Merges the three sources; options win over --set, --set wins over the scene.
+
+    Raises SceneError for an unknown key, a value that is no TOML scalar, an option and a --set that disagree, or
+    seconds and fps that are not finite and positive. Simulator checks its own arguments.
+    """
+    defaults = _defaults(simulator_class)
+    keys = [*defaults, *RUN_KEYS]
+    _refuse_unknown(solver, keys, "the scene's solver dict: ")
+    given = parse_assignments(arguments.assignments, keys)
+    for key in ("arch", "precision", *RUN_KEYS):
+        option = getattr(arguments, key)
+        if option is None:
+            continue
+        if key in given and given[key] != option:
+            raise SceneError(f"--{key} {option} and --set solver.{key}={given[key]} disagree; give one of them")
+        given[key] = option
+    merged = {**solver, **given}
+    simulator = {key: value for key, value in merged.items() if key not in RUN_KEYS}
+    settings = RunSettings(simulator=simulator, defaults=defaults)
+    settings.seconds = _positive("seconds", merged.get("seconds", settings.seconds))
+    fps = merged.get("fps", settings.fps)
+    settings.fps = None if fps is None else _positive("fps", fps)
+    return settings
+
+
+def parse_assignments(assignments: list[str], keys: list[str]) -> dict:
+    """["solver.dt=0.01", ...] -> {"dt": 0.01, ...}; a value is a TOML scalar, a bare word or none."""
+    values = {}
+    for assignment in assignments:
+        name, equals, text = assignment.partition("=")
+        head, _, key = name.strip().partition(".")
+        if not equals or head != "solver":
+            raise SceneError(f"--set {assignment}: write solver.KEY=VALUE, e.g. solver.dt=0.01")
+        _refuse_unknown([key], keys, f"--set {assignment}: ")
+        values[key] = parse_scalar(text.strip(), assignment)
+    return values
+
+
+def parse_scalar(text: str, assignment: str) -> float | int | bool | str | None:
+    """A number, true, false or "text" as TOML writes them; a bare word is text, and none is Python's None."""
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        if not BARE_WORD.fullmatch(text):
+            raise SceneError(f"--set {assignment}: {text!r} is not a number, true, false, none or a word") from None
+        return None if text == "none" else text
+    if set(table) != {"value"} or not isinstance(table["value"], (float, int, bool, str)):
+        raise SceneError(f"--set {assignment}: {text!r} is not a single number, true, false, none or a word")
+    return table["value"]
+
+
+def _defaults(simulator_class: type) -> dict:
+    """Argument -> default value of Simulator, without the scene."""
+    parameters = inspect.signature(simulator_class).parameters.values()
+    return {parameter.name: parameter.default for parameter in parameters if parameter.name != "scene"}
+
+
+def _refuse_unknown(names, keys: list[str], where: str) -> None:
+    for name in names:
+        if name not in keys:
+            raise SceneError(f"{where}no setting is called {name!r}{nearest(name, keys)}; there are {', '.join(keys)}")
+
+
+def _positive(name: str, value) -> float:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not is_number or not math.isfinite(value) or value <= 0:
+        raise SceneError(f"{name} is {value!r}, it must be a finite number above 0")
+    return float(value)

@@ -1,0 +1,21 @@
+"""The errors a user can meet. Each message is one sentence: the thing, the index, the rule it breaks."""
+
+
+class TaisoftError(Exception):
+    """Base of every error that taisoft raises on purpose."""
+
+
+class MeshError(TaisoftError):
+    """A mesh, or a file that should hold one, breaks a rule."""
+
+
+class SceneError(TaisoftError):
+    """A scene, a material or a setting breaks a rule."""
+
+
+class OutputError(TaisoftError):
+    """A result could not be written."""
+
+
+class SimulationError(TaisoftError):
+    """A run cannot start, or a step failed; the state is the last good one."""

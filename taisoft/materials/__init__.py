@@ -1,0 +1,9 @@
+"""The material laws by name. Adding one: a file like the others here, and its line below.
+
+A law has NAME, `constants(mu, lam)` (host, four numbers kept per body) and the lane functions `psi`, `pk1`, `prepare`,
+`dpk1`, `hessian_eigen`; tests over the registry check each against the others by finite differences.
+"""
+
+from taisoft.materials import corotational, st_venant_kirchhoff, stable_neo_hookean
+
+LAWS = {law.NAME: law for law in (st_venant_kirchhoff, corotational, stable_neo_hookean)}

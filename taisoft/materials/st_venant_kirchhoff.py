@@ -1,0 +1,82 @@
+"""St. Venant-Kirchhoff solid.
+
+psi = mu E : E + lambda/2 tr(E)^2,   E = (F^T F - I)/2,   P = F (2 mu E + lambda tr(E) I).
+Source: Sifakis, Barbic, "FEM Simulation of 3D Deformable Solids", SIGGRAPH 2012 course, section 3.3.
+Weak: softens when compressed below a stretch of 1/sqrt(3) = 0.577 and does not see inversion (psi is blind to
+reflection): squeezed bodies collapse.
+"""
+
+import taichi as ti
+
+from taisoft.math3 import ddot, matmul, matmul_tn
+
+NAME = "st_venant_kirchhoff"
+
+
+def constants(mu: float, lam: float) -> tuple[float, float, float, float]:
+    """(mu, lambda, 0, 0) [Pa]."""
+    return mu, lam, 0.0, 0.0
+
+
+@ti.func
+def _green_strain(F):
+    """E = (F^T F - I)/2, formed from H = F - I so that small strains keep their digits."""
+    H = [F[k] - (1.0 if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
+    C = matmul_tn(H, H)
+    return [0.5 * (H[3 * i + j] + H[3 * j + i] + C[3 * i + j]) for i in ti.static(range(3)) for j in ti.static(range(3))]
+
+
+@ti.func
+def _second_pk(E, p):
+    """S = 2 mu E + lambda tr(E) I [Pa]."""
+    t = p[1] * (E[0] + E[4] + E[8])
+    return [2.0 * p[0] * E[k] + (t if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
+
+
+@ti.func
+def psi(F, p):
+    """Energy density [Pa], 0 at rest."""
+    E = _green_strain(F)
+    t = E[0] + E[4] + E[8]
+    return p[0] * ddot(E, E) + 0.5 * p[1] * t * t
+
+
+@ti.func
+def pk1(F, p):
+    """First Piola-Kirchhoff stress [Pa]; any F is valid."""
+    return matmul(F, _second_pk(_green_strain(F), p))
+
+
+@ti.func
+def prepare(F, p):
+    """What `dpk1` needs of F: the second Piola-Kirchhoff stress and the Lamé parameters."""
+    return _second_pk(_green_strain(F), p) + [p[0], p[1]]
+
+
+@ti.func
+def dpk1(F, S, D):
+    """Differential of the stress along D [Pa], with S = prepare(F, p): D S + F dS."""
+    B = matmul_tn(F, D)
+    t = S[10] * (B[0] + B[4] + B[8])
+    T = [
+        S[9] * (B[3 * i + j] + B[3 * j + i]) + (t if ti.static(i == j) else 0.0) for i in ti.static(range(3)) for j in ti.static(range(3))
+    ]
+    first, second = matmul(D, S), matmul(F, T)
+    return [first[k] + second[k] for k in ti.static(range(9))]
+
+
+@ti.func
+def hessian_eigen(s, p):
+    """Second derivatives in the SVD frame: the 3x3 block over the stretches s (nine entries), and the eigenvalues of
+    the symmetric and of the antisymmetric mode of the pairs (0,1), (0,2), (1,2). All [Pa]."""
+    h = 0.5 * p[1] * (s[0] * s[0] + s[1] * s[1] + s[2] * s[2] - 3.0)
+    A = [
+        p[1] * s[i] * s[j] + ((p[0] * (3.0 * s[i] * s[i] - 1.0) + h) if ti.static(i == j) else 0.0)
+        for i in ti.static(range(3))
+        for j in ti.static(range(3))
+    ]
+    square = [s[0] * s[0] + s[1] * s[1] - 1.0, s[0] * s[0] + s[2] * s[2] - 1.0, s[1] * s[1] + s[2] * s[2] - 1.0]
+    mixed = [s[0] * s[1], s[0] * s[2], s[1] * s[2]]
+    symmetric = [p[0] * (square[k] + mixed[k]) + h for k in ti.static(range(3))]
+    antisymmetric = [p[0] * (square[k] - mixed[k]) + h for k in ti.static(range(3))]
+    return A, symmetric, antisymmetric

@@ -1,0 +1,86 @@
+"""Stable neo-Hookean solid.
+
+psi = m/2 (Ic - 3) + l/2 (J - alpha)^2 - m/2 ln(Ic + 1) - psi_rest,   Ic = F : F, J = det F,
+m = 4/3 mu, l = lambda + 5/6 mu, alpha = 1 + m/l - m/(4 l): the Lamé parameters of Hooke's law are met at F = I.
+Source: Smith, de Goes, Kim, "Stable Neo-Hookean Flesh Simulation", ACM TOG 37(2), 2018, eqs 14 and 18.
+Strong: finite for every F, recovers from inversion. Weak: slightly softer in compression than it should be for
+rubber; stress-free states exist only where the log term is kept (as here).
+"""
+
+import taichi as ti
+
+from taisoft.math3 import cofactor, cofactor_differential, ddot
+
+NAME = "stable_neo_hookean"
+
+
+def constants(mu: float, lam: float) -> tuple[float, float, float, float]:
+    """(m, l, alpha, l (1 - alpha)) from the Lamé parameters [Pa]."""
+    m, l = 4.0 / 3.0 * mu, lam + 5.0 / 6.0 * mu
+    alpha = 1.0 + m / l - m / (4.0 * l)
+    return m, l, alpha, l * (1.0 - alpha)
+
+
+@ti.func
+def psi(F, p):
+    """Energy density [Pa], 0 at rest.
+
+    Written in d = Ic - 3 and e = J - 1, so that small strains lose no digits: with l (1 - alpha) = -3/4 m,
+    psi = m/2 (d - log1p(d/4)) + l/2 e^2 + l (1 - alpha) e.
+    """
+    H = [F[k] - (1.0 if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
+    trace = H[0] + H[4] + H[8]
+    norm2 = ddot(H, H)
+    d = 2.0 * trace + norm2
+    G = cofactor(H)
+    e = trace + (G[0] + G[4] + G[8]) + H[0] * G[0] + H[1] * G[1] + H[2] * G[2]
+    z = 0.25 * d
+    u = 1.0 + z  # log1p by the quotient that cancels the rounding of 1 + z
+    log1p = ti.select(u == 1.0, z, ti.log(u) * z / ti.select(u == 1.0, 1.0 + 0.0 * u, u - 1.0))
+    return 0.5 * p[0] * (d - log1p) + 0.5 * p[1] * e * e + p[3] * e
+
+
+@ti.func
+def pk1(F, p):
+    """First Piola-Kirchhoff stress [Pa]; any F is valid. Source: the paper's eq. 18."""
+    G = cofactor(F)
+    J = F[0] * G[0] + F[1] * G[1] + F[2] * G[2]
+    a = p[0] - p[0] / (ddot(F, F) + 1.0)
+    b = p[1] * (J - p[2])
+    return [a * F[k] + b * G[k] for k in ti.static(range(9))]
+
+
+@ti.func
+def prepare(F, p):
+    """What `dpk1` needs of F: its cofactor and the factors of the four terms."""
+    G = cofactor(F)
+    J = F[0] * G[0] + F[1] * G[1] + F[2] * G[2]
+    q = 1.0 / (ddot(F, F) + 1.0)
+    return G + [p[0] - p[0] * q, 2.0 * p[0] * q * q, p[1], p[1] * (J - p[2])]
+
+
+@ti.func
+def dpk1(F, S, D):
+    """Differential of the stress along D [Pa], with S = prepare(F, p)."""
+    FD = S[10] * ddot(F, D)
+    GD = S[11] * ddot(S, D)
+    C = cofactor_differential(F, D)
+    return [S[9] * D[k] + FD * F[k] + GD * S[k] + S[12] * C[k] for k in ti.static(range(9))]
+
+
+@ti.func
+def hessian_eigen(s, p):
+    """Second derivatives in the SVD frame: the 3x3 block over the stretches s (nine entries), and the eigenvalues of
+    the symmetric and of the antisymmetric mode of the pairs (0,1), (0,2), (1,2). All [Pa]."""
+    Ic = s[0] * s[0] + s[1] * s[1] + s[2] * s[2]
+    q = 1.0 / (Ic + 1.0)
+    a, f = p[0] - p[0] * q, 2.0 * p[0] * q * q
+    g = [s[1] * s[2], s[0] * s[2], s[0] * s[1]]
+    b = p[1] * (s[0] * g[0] - p[2])
+    A = [
+        (a if ti.static(i == j) else b * s[(3 - i - j) % 3]) + f * s[i] * s[j] + p[1] * g[i] * g[j]
+        for i in ti.static(range(3))
+        for j in ti.static(range(3))
+    ]
+    across = [s[2], s[1], s[0]]  # the stretch that is in neither pair
+    return A, [a - b * across[k] for k in ti.static(range(3))], [a + b * across[k] for k in ti.static(range(3))]

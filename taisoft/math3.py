@@ -1,0 +1,203 @@
+"""3x3 matrices over SIMD lanes.
+
+A matrix is a Python list of nine entries, row by row, each a `ti.Vector` with one value per lane (one tetrahedron each);
+a 3-vector is a list of three. Lists are resolved while Taichi traces a kernel, so nothing but lane arithmetic is left,
+which LLVM turns into SIMD instructions. A list is never assigned twice: each result gets a fresh name.
+"""
+
+import taichi as ti
+
+PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+@ti.func
+def matmul(A, B):
+    """A B."""
+    return [
+        A[3 * i] * B[j] + A[3 * i + 1] * B[3 + j] + A[3 * i + 2] * B[6 + j]
+        for i in ti.static(range(3))
+        for j in ti.static(range(3))
+    ]
+
+
+@ti.func
+def matmul_nt(A, B):
+    """A B^T."""
+    return [
+        A[3 * i] * B[3 * j] + A[3 * i + 1] * B[3 * j + 1] + A[3 * i + 2] * B[3 * j + 2]
+        for i in ti.static(range(3))
+        for j in ti.static(range(3))
+    ]
+
+
+@ti.func
+def matmul_tn(A, B):
+    """A^T B."""
+    return [A[i] * B[j] + A[3 + i] * B[3 + j] + A[6 + i] * B[6 + j] for i in ti.static(range(3)) for j in ti.static(range(3))]
+
+
+@ti.func
+def scaled_sum(a, A, b, B):
+    """a A + b B, with a and b one value per lane."""
+    return [a * A[k] + b * B[k] for k in ti.static(range(9))]
+
+
+@ti.func
+def cofactor(F):
+    """Cofactor matrix, dJ/dF."""
+    return [
+        F[4] * F[8] - F[5] * F[7],
+        F[5] * F[6] - F[3] * F[8],
+        F[3] * F[7] - F[4] * F[6],
+        F[2] * F[7] - F[1] * F[8],
+        F[0] * F[8] - F[2] * F[6],
+        F[1] * F[6] - F[0] * F[7],
+        F[1] * F[5] - F[2] * F[4],
+        F[2] * F[3] - F[0] * F[5],
+        F[0] * F[4] - F[1] * F[3],
+    ]
+
+
+@ti.func
+def cofactor_differential(F, D):
+    """Change of the cofactor matrix of F along D (the cofactor is quadratic in F)."""
+    return [
+        F[4] * D[8] + D[4] * F[8] - F[5] * D[7] - D[5] * F[7],
+        F[5] * D[6] + D[5] * F[6] - F[3] * D[8] - D[3] * F[8],
+        F[3] * D[7] + D[3] * F[7] - F[4] * D[6] - D[4] * F[6],
+        F[2] * D[7] + D[2] * F[7] - F[1] * D[8] - D[1] * F[8],
+        F[0] * D[8] + D[0] * F[8] - F[2] * D[6] - D[2] * F[6],
+        F[1] * D[6] + D[1] * F[6] - F[0] * D[7] - D[0] * F[7],
+        F[1] * D[5] + D[1] * F[5] - F[2] * D[4] - D[2] * F[4],
+        F[2] * D[3] + D[2] * F[3] - F[0] * D[5] - D[0] * F[5],
+        F[0] * D[4] + D[0] * F[4] - F[1] * D[3] - D[1] * F[3],
+    ]
+
+
+@ti.func
+def determinant(F):
+    """det F, by the same products as the cofactor so that both share their work."""
+    return (
+        F[0] * (F[4] * F[8] - F[5] * F[7]) + F[1] * (F[5] * F[6] - F[3] * F[8]) + F[2] * (F[3] * F[7] - F[4] * F[6])
+    )
+
+
+@ti.func
+def ddot(A, B):
+    """A : B, the sum of the products of the entries."""
+    return (
+        A[0] * B[0] + A[1] * B[1] + A[2] * B[2]
+        + A[3] * B[3] + A[4] * B[4] + A[5] * B[5]
+        + A[6] * B[6] + A[7] * B[7] + A[8] * B[8]
+    )  # fmt: skip
+
+
+@ti.func
+def _jacobi_angle(app, aqq, apq):
+    """(cosine, sine) of the rotation that makes the off-diagonal apq of a symmetric 2x2 vanish."""
+    small = abs(apq) <= 1e-30
+    tau = (aqq - app) / ti.select(small, 1.0 + 0.0 * apq, 2.0 * apq)
+    t = ti.select(tau >= 0.0, 1.0 + 0.0 * tau, -1.0 + 0.0 * tau) / (abs(tau) + ti.sqrt(1.0 + tau * tau))
+    t0 = ti.select(small, 0.0 * t, t)
+    c = 1.0 / ti.sqrt(1.0 + t0 * t0)
+    return c, t0 * c
+
+
+@ti.func
+def signed_svd(F, sweeps: ti.template()):
+    """F = U diag(s) V^T with U and V rotations, s0 >= s1 >= |s2|, and s2 < 0 exactly when F is inverted.
+
+    One-sided Jacobi on the columns of F / max|F|: columns are turned in pairs until they are orthogonal, then sorted by
+    length; U's third column is the cross product of the first two, so a rank-deficient F gets a full rotation too.
+    Returns (U, s, V), s a list of three. Any finite F is valid. Accuracy: a few units of rounding of |F| in s.
+    """
+    big = abs(F[0])
+    for k in ti.static(range(1, 9)):
+        big = ti.max(big, abs(F[k]))
+    unit = ti.select(big > 0.0, big, 1.0 + 0.0 * big)
+    A = [F[k] / unit for k in ti.static(range(9))]
+    one, zero = 1.0 + 0.0 * unit, 0.0 * unit
+    V = [one, zero, zero, zero, one, zero, zero, zero, one]
+    for _ in range(sweeps):
+        for p, q in ti.static(PAIRS):
+            _rotate_columns(A, V, p, q)
+    for p, q in ti.static(((0, 1), (1, 2), (0, 1))):  # a sorting network of three comparisons
+        _sort_columns(A, V, p, q)
+    U, s = _left_frame(A)
+    return U, [s[k] * unit for k in ti.static(range(3))], V
+
+
+@ti.func
+def _rotate_columns(A: ti.template(), V: ti.template(), p: ti.template(), q: ti.template()):
+    app = A[p] * A[p] + A[3 + p] * A[3 + p] + A[6 + p] * A[6 + p]
+    aqq = A[q] * A[q] + A[3 + q] * A[3 + q] + A[6 + q] * A[6 + q]
+    apq = A[p] * A[q] + A[3 + p] * A[3 + q] + A[6 + p] * A[6 + q]
+    c, s = _jacobi_angle(app, aqq, apq)
+    for r in ti.static(range(3)):
+        ap, aq = c * A[3 * r + p] - s * A[3 * r + q], s * A[3 * r + p] + c * A[3 * r + q]
+        vp, vq = c * V[3 * r + p] - s * V[3 * r + q], s * V[3 * r + p] + c * V[3 * r + q]
+        A[3 * r + p], A[3 * r + q] = ap, aq
+        V[3 * r + p], V[3 * r + q] = vp, vq
+
+
+@ti.func
+def _sort_columns(A: ti.template(), V: ti.template(), p: ti.template(), q: ti.template()):
+    """Exchange two columns of A and V where the later one is longer; one changes sign, so V stays a rotation."""
+    app = A[p] * A[p] + A[3 + p] * A[3 + p] + A[6 + p] * A[6 + p]
+    aqq = A[q] * A[q] + A[3 + q] * A[3 + q] + A[6 + q] * A[6 + q]
+    swap = aqq > app
+    for r in ti.static(range(3)):
+        ap, aq = ti.select(swap, A[3 * r + q], A[3 * r + p]), ti.select(swap, -A[3 * r + p], A[3 * r + q])
+        vp, vq = ti.select(swap, V[3 * r + q], V[3 * r + p]), ti.select(swap, -V[3 * r + p], V[3 * r + q])
+        A[3 * r + p], A[3 * r + q] = ap, aq
+        V[3 * r + p], V[3 * r + q] = vp, vq
+
+
+@ti.func
+def _left_frame(A):
+    """Orthonormal frame (as a rotation) of A's nearly orthogonal, sorted columns, and their signed lengths."""
+    s0 = ti.sqrt(A[0] * A[0] + A[3] * A[3] + A[6] * A[6])
+    none = s0 <= 0.0
+    d0 = ti.select(none, 1.0 + 0.0 * s0, s0)
+    u = [ti.select(none, 1.0 + 0.0 * s0, A[0] / d0), A[3] / d0, A[6] / d0]
+    along = u[0] * A[1] + u[1] * A[4] + u[2] * A[7]
+    w = [A[1] - along * u[0], A[4] - along * u[1], A[7] - along * u[2]]
+    s1 = ti.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    # below this the second column's direction is rounding noise, and any direction across u serves
+    flat = s1 <= 1e-30 + 0.0 * s1
+    ax = abs(u[0]) < 0.6
+    e = [ti.select(ax, 1.0 + 0.0 * s1, 0.0 * s1), ti.select(ax, 0.0 * s1, 1.0 + 0.0 * s1)]
+    n = [-e[1] * u[2], e[0] * u[2], e[1] * u[0] - e[0] * u[1]]  # (e0, e1, 0) cross-built across u
+    m = [u[1] * n[2] - u[2] * n[1], u[2] * n[0] - u[0] * n[2], u[0] * n[1] - u[1] * n[0]]
+    length = ti.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+    d1 = ti.select(flat, length, s1)
+    t = [ti.select(flat, m[k], w[k]) / d1 for k in ti.static(range(3))]
+    b = [u[1] * t[2] - u[2] * t[1], u[2] * t[0] - u[0] * t[2], u[0] * t[1] - u[1] * t[0]]
+    s2 = b[0] * A[2] + b[1] * A[5] + b[2] * A[8]
+    U = [u[0], t[0], b[0], u[1], t[1], b[1], u[2], t[2], b[2]]
+    return U, [s0, t[0] * A[1] + t[1] * A[4] + t[2] * A[7], s2]
+
+
+@ti.func
+def clamp_symmetric(A, sweeps: ti.template()):
+    """Nearest positive semi-definite matrix to a symmetric A (nine entries): negative eigenvalues become 0.
+
+    Two-sided Jacobi; A's eigenvectors Q are collected, then Q max(0, D) Q^T is formed.
+    """
+    D = [A[k] + 0.0 for k in ti.static(range(9))]
+    one, zero = 1.0 + 0.0 * A[0], 0.0 * A[0]
+    Q = [one, zero, zero, zero, one, zero, zero, zero, one]
+    for _ in range(sweeps):
+        for p, q in ti.static(PAIRS):
+            c, s = _jacobi_angle(D[4 * p], D[4 * q], D[3 * p + q])
+            for r in ti.static(range(3)):
+                dp, dq = c * D[3 * r + p] - s * D[3 * r + q], s * D[3 * r + p] + c * D[3 * r + q]
+                qp, qq = c * Q[3 * r + p] - s * Q[3 * r + q], s * Q[3 * r + p] + c * Q[3 * r + q]
+                D[3 * r + p], D[3 * r + q] = dp, dq
+                Q[3 * r + p], Q[3 * r + q] = qp, qq
+            for r in ti.static(range(3)):
+                dp, dq = c * D[3 * p + r] - s * D[3 * q + r], s * D[3 * p + r] + c * D[3 * q + r]
+                D[3 * p + r], D[3 * q + r] = dp, dq
+    d = [ti.max(D[4 * k], 0.0) for k in ti.static(range(3))]
+    QD = [Q[3 * i + j] * d[j] for i in ti.static(range(3)) for j in ti.static(range(3))]
+    return matmul_nt(QD, Q)

@@ -1,0 +1,275 @@
+"""Meshes from files and into files.
+
+Gmsh's and TetGen's files are read by `gmsh.py` and `tetgen.py`, which say where one is broken; every other format by
+meshio, behind a fence: on a broken file it may end the program, print, raise anything or wait for ever, and here that
+becomes one MeshError.
+"""
+
+import contextlib
+import io
+import os
+import re
+import tempfile
+from pathlib import Path
+
+import meshio
+import numpy as np
+
+from taisoft.errors import MeshError, OutputError
+from taisoft.mesh.gmsh import read_gmsh
+from taisoft.mesh.tet_mesh import TetMesh, merge_labels
+from taisoft.mesh.tetgen import read_tetgen
+
+BOUNDARY = ("vertex", "line", "triangle")  # elements that meshers add to mark boundaries; told and left out
+WRITERS = {".msh": "gmsh", ".vtk": "vtk", ".vtu": "vtu", ".mesh": "medit"}
+
+# How to count the faces in a file of a format that cannot hold tets.
+SURFACES = {
+    ".obj": rb"^[ \t]*f[ \t]",
+    ".stl": rb"^[ \t]*facet\b",
+    ".off": rb"\A\s*OFF\s+(?:#[^\n]*\s+)*\d+\s+(\d+)",
+    ".ply": rb"^[ \t]*element[ \t]+face[ \t]+(\d+)",
+}
+
+# Where a format announces a count: a file of n bytes cannot hold more than n of anything.
+_COUNTS = {
+    ".vtk": rb"(?:POINTS|CELLS|CELL_TYPES|OFFSETS|CONNECTIVITY)\s+(\d+)",
+    ".vtu": rb"NumberOf(?:Points|Cells)\s*=\s*\"(\d+)",
+    ".mesh": rb"(?:Vertices|Edges|Triangles|Quadrilaterals|Tetrahedra|Hexahedra|Prisms|Pyramids)\s+(\d+)",
+    ".vol": rb"(?:points|volumeelements|surfaceelements\w*|edgesegments\w*)\s+(\d+)",
+    ".su2": rb"N(?:POIN|ELEM)\s*=\s*(\d+)",
+    ".xml": rb"size\s*=\s*\"(\d+)",
+    ".dat": rb"\b(?:NODES|ELEMENTS|N|E)\s*=\s*(\d+)",
+    ".tec": rb"\b(?:NODES|ELEMENTS|N|E)\s*=\s*(\d+)",
+    ".msh": rb"\$(?:Nodes|Elements)\s+(\d+)[ \t\r]*\n",
+}
+
+_PLURAL = {"vertex": "vertices", "line": "lines", "triangle": "triangles", "quad": "quads", "hexahedron": "hexahedra"}
+
+_PATIENCE = 100  # times that a reader may ask past the end of a file
+
+
+class _Ending(io.BufferedReader):
+    """A file that raises where a reader asks again and again past its end; some of meshio's readers would for ever."""
+
+    asked = 0
+
+    def _told(self, found: bytes) -> bytes:
+        self.asked = 0 if found else self.asked + 1
+        if self.asked > _PATIENCE:
+            raise EOFError("the file ends too early")
+        return found
+
+    def readline(self, size: int | None = -1, /) -> bytes:
+        return self._told(super().readline(size))
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return self._told(super().read(size))
+
+
+class _EndingText(io.TextIOWrapper):
+    """The same for text."""
+
+    asked = 0
+
+    def readline(self, size: int = -1, /) -> str:
+        line = super().readline(size)
+        self.asked = 0 if line else self.asked + 1
+        if self.asked > _PATIENCE:
+            raise EOFError("the file ends too early")
+        return line
+
+
+def read_mesh(path, fix_orientation: bool = False, weld: float | None = None) -> TetMesh:
+    """Read a tetrahedral mesh from a file of any format that meshio knows.
+
+    path: the file; its ending tells the format. fix_orientation: as for `TetMesh`. weld: merge vertices at most this
+    far apart [m], 0 for equal ones only; None merges nothing. Points, lines and triangles next to the tets, and
+    vertices of no tet, are left out with a warning; any other element is refused by name and number. Raises MeshError.
+    """
+    try:
+        file = Path(path)
+    except TypeError as error:
+        raise MeshError(f"read_mesh: path must be a file's name, not {path!r}") from error
+    name = str(file)
+    data = _content(file, name)
+    ending = file.suffix.lower()
+    found = None
+    if ending in SURFACES:
+        raise MeshError(f"{name}: no tetrahedra; {_count_faces(ending, data)} found; make a volume mesh first")
+    if ending == ".msh" and data.lstrip()[:1] == b"$":
+        found = read_gmsh(name, data)
+    elif ending in (".node", ".ele"):
+        found = read_tetgen(file)
+    points, cells = found or _read_by_meshio(file, name, data)
+    tets, notes = _tets_among(name, cells)
+    return _clean_mesh(name, np.asarray(points), tets, notes, fix_orientation, weld)
+
+
+def write_mesh(path, mesh: TetMesh) -> None:
+    """Write a mesh as .msh (Gmsh 4.1, text), .vtk, .vtu or .mesh (Medit); the file appears complete or not at all.
+
+    Raises MeshError for another ending or no TetMesh, OutputError where the file cannot be written.
+    """
+    file = Path(path)
+    ending = file.suffix.lower()
+    if ending not in WRITERS:
+        raise MeshError(f"{file}: a mesh can be written as {', '.join(WRITERS)}, not with the ending {ending!r}")
+    if not isinstance(mesh, TetMesh):
+        raise MeshError(f"{file}: write_mesh needs a TetMesh, not {type(mesh).__name__}")
+    record = meshio.Mesh(mesh.vertices, [("tetra", mesh.tets)])
+    options = {"binary": False} if ending == ".msh" else {}
+    part = None
+    try:
+        handle, part = tempfile.mkstemp(suffix=f".part{ending}", prefix=f".{file.name}.", dir=file.parent)
+        os.close(handle)
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            meshio.write(part, record, file_format=WRITERS[ending], **options)
+        with open(part, "rb+") as written:
+            os.fsync(written.fileno())
+        os.chmod(part, 0o666 & ~_umask())  # mkstemp keeps the file to its owner
+        os.replace(part, file)
+        part = None
+    except OSError as error:
+        raise OutputError(f"{file}: the mesh could not be written: {error.strerror or error}") from error
+    finally:
+        if part is not None:
+            with contextlib.suppress(OSError):
+                os.remove(part)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _content(file: Path, name: str) -> bytes:
+    """The file's bytes, at least one that is not blank."""
+    try:
+        if not file.exists():
+            raise MeshError(f"{name}: there is no such file")
+        if not file.is_file():
+            raise MeshError(f"{name}: this is not a file")
+        data = file.read_bytes()
+    except (OSError, ValueError) as error:
+        raise MeshError(f"{name!r}: the file cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if not data.strip():
+        raise MeshError(f"{name}: the file is empty")
+    return data
+
+
+def _count_faces(ending: str, data: bytes) -> str:
+    """The faces in a surface file, as text."""
+    if ending == ".stl" and len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
+        return _counted({"triangle": int.from_bytes(data[80:84], "little")})
+    found = re.findall(SURFACES[ending], data, re.MULTILINE)
+    if ending in (".off", ".ply"):
+        return f"{found[0][:20].decode()} faces" if found else "no faces"
+    if ending == ".obj" and any(len(line.split()) != 4 for line in data.splitlines() if line.split()[:1] == [b"f"]):
+        return f"{len(found)} faces"
+    return _counted({"triangle": len(found)})
+
+
+def _read_by_meshio(file: Path, name: str, data: bytes):
+    """Points and blocks of elements as meshio gives them, whatever it does on a file that is broken."""
+    ending = file.suffix.lower()
+    known = meshio.extension_to_filetypes
+    if not any("".join(file.suffixes[-n:]).lower() in known for n in (1, 2)):
+        raise MeshError(f"{name}: not a supported mesh: the ending {ending!r} is not known")
+    for found in re.finditer(_COUNTS.get(ending, rb"(?!)"), data):
+        if int(found[1][:30]) > len(data):
+            line = data.count(b"\n", 0, found.start(1)) + 1
+            raise MeshError(
+                f"{name}: line {line} announces {found[1][:30].decode()} items, but the file has {len(data)} bytes"
+            )
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), np.errstate(all="ignore"):
+            mesh = _call_meshio(file, ending, data)
+        return mesh.points, [(block.type, np.asarray(block.data)) for block in mesh.cells]
+    except ImportError as error:
+        raise MeshError(f"{name}: files {ending!r} need the Python package {error.name or error}") from error
+    except MemoryError as error:
+        raise MeshError(f"{name}: not a supported mesh: it asks for more memory than there is") from error
+    except (Exception, SystemExit) as error:
+        # Before meshio ends the program it prints why.
+        said = f"{type(error).__name__}: {error}" if isinstance(error, Exception) else printed.getvalue()
+        raise MeshError(f"{name}: not a supported mesh ({_one_line(said)})") from error
+
+
+def _call_meshio(file: Path, ending: str, data: bytes) -> meshio.Mesh:
+    """meshio's mesh; the three readers that would wait for ever at the end of a broken file get one that stops them."""
+    if ending == ".msh" and data.lstrip()[:1] != b"(":
+        return meshio.read(file, file_format="gmsh")
+    if ending not in (".msh", ".mdpa", ".dat", ".tec"):
+        return meshio.read(file)
+    with _Ending(io.FileIO(file)) as stream:
+        if ending in (".dat", ".tec"):
+            return meshio.read(_EndingText(stream, encoding="utf-8"), file_format="tecplot")
+        return meshio.read(stream, file_format="ansys" if ending == ".msh" else "mdpa")
+
+
+def _one_line(text: str) -> str:
+    text = " ".join(text.split())
+    return text if len(text) <= 120 else text[:117] + "..."
+
+
+def _tets_among(name: str, cells: list[tuple[str, np.ndarray]]) -> tuple[np.ndarray, list[str]]:
+    """The tets (m,4), and what has to be told about other elements."""
+    counts: dict[str, int] = {}
+    for kind, nodes in cells:
+        if len(nodes):
+            counts[kind] = counts.get(kind, 0) + len(nodes)
+    foreign = {kind: count for kind, count in counts.items() if kind not in ("tetra", *BOUNDARY)}
+    if foreign:
+        raise MeshError(f"{name}: only tetrahedra with four nodes can be used, but the file holds {_counted(foreign)}")
+    boundary = {kind: count for kind, count in counts.items() if kind != "tetra"}
+    if "tetra" not in counts:
+        advice = "; make a volume mesh first" if boundary else ""
+        raise MeshError(f"{name}: no tetrahedra; {_counted(boundary) if boundary else 'no elements'} found{advice}")
+    tets = np.concatenate([nodes for kind, nodes in cells if kind == "tetra" and len(nodes)])
+    return tets, [f"{_counted(boundary)} next to the tets are not used"] if boundary else []
+
+
+def _counted(counts: dict[str, int]) -> str:
+    """Such as "3 quads, 1 line"."""
+    parts = []
+    for kind, count in counts.items():
+        several = _PLURAL.get(kind, f"{kind} elements")
+        parts.append(f"{count} {kind if count == 1 else several}")
+    return ", ".join(parts)
+
+
+def _clean_mesh(name, points, tets, notes, fix_orientation, weld) -> TetMesh:
+    """The TetMesh, after welding and without vertices of no tet; where the arrays are wrong, TetMesh says so first."""
+    sound = (
+        points.ndim == 2 and points.shape[1] == 3 and points.dtype.kind in "fiu" and np.isfinite(points).all()
+        and tets.dtype.kind in "iu" and tets.min() >= 0 and tets.max() < len(points)
+    )  # fmt: skip
+    if not sound:
+        return TetMesh(points, tets, fix_orientation, source=name, notes=tuple(notes))
+    if weld is not None:
+        points, tets, note = _welded(name, points.astype(np.float64), tets, weld)
+        notes += note
+    used = np.zeros(len(points), dtype=bool)
+    used[tets] = True
+    if not used.all():
+        count, first = int((~used).sum()), int(np.argmin(used))
+        notes.append(f"{count} vertices of no tet are left out, the first is vertex {first} of the file")
+        points, tets = points[used], (np.cumsum(used) - 1)[tets]
+    return TetMesh(points, tets, fix_orientation, source=name, notes=tuple(notes))
+
+
+def _welded(name: str, points: np.ndarray, tets: np.ndarray, weld) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Points and tets with vertices at most `weld` [m] apart merged into the first of each group, and what to tell."""
+    if isinstance(weld, bool) or not isinstance(weld, (int, float, np.number)) or not 0 <= weld < np.inf:
+        raise MeshError(f"{name}: weld must be a distance of at least 0 m, or None, not {weld!r}")
+    x = points[tets]
+    shortest = min(float(np.linalg.norm(x[:, a] - x[:, b], axis=1).min()) for a in range(3) for b in range(a + 1, 4))
+    if weld >= shortest > 0:
+        raise MeshError(f"{name}: weld = {float(weld):g} m must be less than the shortest edge, {shortest:g} m")
+    labels = merge_labels(points, float(weld))
+    first = np.unique(labels, return_index=True)[1]
+    merged = len(points) - len(first)
+    return points[first], labels[tets], [f"{merged} vertices were welded to another one"] if merged else []

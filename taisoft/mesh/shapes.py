@@ -1,0 +1,149 @@
+"""Meshes of simple bodies: a box, a thin sheet, a ball, made by array arithmetic without loops over cells.
+
+A grid cell is cut into five tets (one regular in the middle, four at the corners; neighbours must be mirrored, hence
+a checkerboard) or six (Kuhn's, all around one diagonal). Five are fewer and better shaped; six are the same in every
+cell, but that gives the whole mesh a preferred diagonal.
+"""
+
+import itertools
+from numbers import Integral
+
+import numpy as np
+
+from taisoft.errors import MeshError
+from taisoft.mesh.tet_mesh import TetMesh
+
+MAX_TETS = 50_000_000  # about 20 GB while a mesh is built and checked
+
+# Corners of a cell are numbered 4 dx + 2 dy + dz.
+_FIVE_EVEN = np.array([(0, 6, 3, 5), (4, 6, 0, 5), (2, 0, 6, 3), (1, 0, 3, 5), (7, 6, 5, 3)])
+
+
+def box_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five") -> TetMesh:
+    """A box of nx x ny x nz cells.
+
+    cells: three positive integers, the number of cells along x, y, z. size: (3,) edge lengths [m]. center: (3,) [m].
+    pattern: "five" tets a cell, cells mirrored by the parity of i+j+k, even ones with the middle tet 000,110,101,011;
+    or "six", Kuhn's tets around the diagonal 000-111. Vertex (i,j,k) has index (i*(ny+1)+j)*(nz+1)+k.
+    Raises MeshError for arguments outside these rules.
+    """
+    cells = _cells(cells, "box_mesh", (3,))
+    size, center = _vector(size, "box_mesh", "size", positive=True), _vector(center, "box_mesh", "center")
+    if pattern not in ("five", "six"):
+        raise MeshError(f"box_mesh: pattern must be 'five' or 'six', not {pattern!r}")
+    _check_count(cells, 5 if pattern == "five" else 6, "box_mesh")
+    vertices = center + size * _grid_points(cells)
+    corners = _cell_corners(cells)
+    if pattern == "six":
+        return TetMesh(vertices, corners[:, _kuhn()].reshape(-1, 4))
+    odd = _cell_indices(cells).sum(axis=1) % 2 == 1
+    # Mirroring x exchanges the corners c and c ^ 4 and turns every tet inside out; swapping two vertices turns it back.
+    table = np.stack([_FIVE_EVEN, (_FIVE_EVEN ^ 4)[:, [1, 0, 2, 3]]])[odd.astype(int)]
+    return TetMesh(vertices, np.take_along_axis(corners, table.reshape(len(corners), -1), axis=1).reshape(-1, 4))
+
+
+def sheet_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five") -> TetMesh:
+    """A flat sheet lying in the x-z plane: a box that is thin along y.
+
+    cells: (nx, nz) for one layer, or (nx, ny, nz). size: (length x, thickness y, length z) [m]; the thickness must not
+    exceed the lengths. center, pattern, vertex order and errors as for `box_mesh`.
+    """
+    cells = _cells(cells, "sheet_mesh", (2, 3))
+    if len(cells) == 2:
+        cells = np.array([cells[0], 1, cells[1]])
+    size = _vector(size, "sheet_mesh", "size", positive=True)
+    if size[1] > min(size[0], size[2]):
+        raise MeshError(f"sheet_mesh: size {size.tolist()} has a thickness size[1] above the lengths size[0], size[2]")
+    return box_mesh(cells, size, center, pattern)
+
+
+def ball_mesh(radius: float, cells: int, center=(0.0, 0.0, 0.0)) -> TetMesh:
+    """A ball, made from a cube of cells^3 cells whose shells are rounded towards the surface.
+
+    radius: [m]; all surface vertices lie on it, so the volume is a little below the ball's. cells: even number of cells
+    across, at least 2. center: (3,) [m]. Raises MeshError for arguments outside these rules.
+
+    The six tets of a cell stand around the diagonal that points away from the center, so that none has its four
+    vertices on the sphere; that would leave it flat.
+    """
+    if isinstance(cells, bool) or not isinstance(cells, Integral) or cells < 2 or cells % 2:
+        raise MeshError(f"ball_mesh: cells must be an even integer, at least 2, not {cells!r}")
+    radius = float(_vector([radius] * 3, "ball_mesh", "radius", positive=True)[0])
+    center = _vector(center, "ball_mesh", "center")
+    grid = np.array([cells] * 3)
+    _check_count(grid, 6, "ball_mesh")
+    inward = 2 * _cell_indices(grid) < cells  # cells below the middle along an axis are mirrored along it
+    mirror = inward @ np.array([4, 2, 1])
+    table = _kuhn()[None] ^ mirror[:, None, None]
+    flipped = inward.sum(axis=1) % 2 == 1
+    table[flipped] = table[flipped][:, :, [0, 1, 3, 2]]
+    tets = np.take_along_axis(_cell_corners(grid), table.reshape(len(table), -1), axis=1).reshape(-1, 4)
+    return TetMesh(center + radius * _rounded(2.0 * _grid_points(grid)), tets)
+
+
+def _rounded(p: np.ndarray) -> np.ndarray:
+    """Map the cube [-1,1]^3 onto the unit ball along rays: cubes in the middle, ever rounder outwards. p: (n,3)."""
+    shell = np.abs(p).max(axis=1, keepdims=True)
+    length = np.linalg.norm(p, axis=1, keepdims=True)
+    to_sphere = shell / np.where(length > 0, length, 1.0)
+    return p * (1.0 - shell + shell * to_sphere)
+
+
+def _kuhn() -> np.ndarray:
+    """(6,4) corner numbers: for every order of the axes the path 000 -> ... -> 111; positively oriented."""
+    tets = []
+    for axes in itertools.permutations(range(3)):
+        bits = [4 >> axis for axis in axes]
+        path = [0, bits[0], bits[0] + bits[1], 7]
+        even = axes in ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+        tets.append(path if even else [path[0], path[2], path[1], path[3]])
+    return np.array(tets)
+
+
+def _cell_indices(cells: np.ndarray) -> np.ndarray:
+    """(nx*ny*nz, 3) indices i, j, k of the cells, k fastest."""
+    return np.indices(cells).reshape(3, -1).T
+
+
+def _cell_corners(cells: np.ndarray) -> np.ndarray:
+    """(nx*ny*nz, 8) vertex indices of every cell's corners, numbered 4 dx + 2 dy + dz."""
+    corner = np.indices((2, 2, 2)).reshape(3, -1).T
+    at = _cell_indices(cells)[:, None, :] + corner[None]
+    return (at[..., 0] * (cells[1] + 1) + at[..., 1]) * (cells[2] + 1) + at[..., 2]
+
+
+def _grid_points(cells: np.ndarray) -> np.ndarray:
+    """((nx+1)(ny+1)(nz+1), 3) points of the grid in [-1/2, 1/2]^3."""
+    return np.indices(cells + 1).reshape(3, -1).T / cells - 0.5
+
+
+def _cells(cells, shape: str, lengths: tuple[int, ...]) -> np.ndarray:
+    values = list(cells) if isinstance(cells, (list, tuple, np.ndarray)) else [cells]
+    whole = all(isinstance(c, Integral) and not isinstance(c, bool) and c > 0 for c in values)
+    if len(values) not in lengths or not whole:
+        counts = " or ".join({2: "two", 3: "three"}[n] for n in lengths)
+        raise MeshError(f"{shape}: cells must be {counts} positive integers, not {cells!r}")
+    if max(values) > MAX_TETS:
+        raise MeshError(f"{shape}: {max(values)} cells along an axis give more than the {MAX_TETS} tets allowed")
+    return np.array([int(c) for c in values])
+
+
+def _check_count(cells: np.ndarray, tets_per_cell: int, shape: str) -> None:
+    n = tets_per_cell * int(np.prod([int(c) for c in cells], dtype=object))
+    if n > MAX_TETS:
+        raise MeshError(
+            f"{shape}: cells {tuple(cells.tolist())} give {n} tets, about {400 * n / 1e9:.3g} GB of memory; "
+            f"at most {MAX_TETS} tets are allowed"
+        )
+
+
+def _vector(values, shape: str, what: str, positive: bool = False) -> np.ndarray:
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise MeshError(f"{shape}: {what} must be three numbers, not {values!r}") from error
+    if array.shape != (3,) or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+        raise MeshError(f"{shape}: {what} must be three finite numbers, not {values!r}")
+    if positive and not (array > 0).all():
+        raise MeshError(f"{shape}: {what} must be positive, not {values!r}")
+    return array.astype(np.float64)

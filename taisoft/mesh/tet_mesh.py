@@ -1,0 +1,240 @@
+"""A tetrahedral mesh that has been checked: whoever holds a TetMesh can rely on it.
+
+Refused: coordinates that are not finite, indices that do not exist, tets without volume, some tets inverted, tets given
+twice, faces of three tets, vertices of no tet. Told as a warning: all tets inverted (they are flipped), coincident
+vertices, overlapping neighbours, parts joined at a vertex or an edge only. Tets that overlap without sharing a face are
+not looked for.
+"""
+
+import warnings
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from taisoft.errors import MeshError
+from taisoft.mesh.topology import Faces, count_components, first_repeated_tet, joint_edges, joint_vertices
+
+DEGENERATE = 1e-9  # a tet's volume below this times its longest edge cubed counts as none
+LARGEST_COORDINATE = float(np.finfo(np.float32).max)  # [m], forces may be computed in 32 bits
+COINCIDENT = 1e-9  # vertices nearer than this times the mesh's diagonal count as coincident
+LISTED = 20  # indices named in a message at most
+
+
+class TetMesh:
+    """Tetrahedra in space, checked and read-only.
+
+    vertices: (n,3) float64 [m]. tets: (m,4) int64, every det(x1-x0, x2-x0, x3-x0) > 0. volumes: (m,) [m^3].
+    surface: (t,3) int64, the faces that belong to one tet, normals outward; surface_tets: (t,) int64, the tet of each.
+    flipped: int64 indices of the tets whose orientation was changed. n_components: pieces, joined by shared vertices.
+    warnings: list of str, what was told but not refused; each is also issued as a UserWarning.
+    """
+
+    def __init__(
+        self, vertices, tets, fix_orientation: bool = False, *, source: str | None = None, notes: tuple[str, ...] = ()
+    ):
+        """Check and take a copy of the arrays.
+
+        vertices: (n,3) numbers [m]. tets: (m,4) integers, counted from 0. fix_orientation: flip inverted tets where
+        only some are, and list them in `warnings`, instead of refusing them. source: where the mesh comes from, such as
+        a file's name; messages start with it. notes: what a reader has to tell; it joins `warnings`. Raises MeshError.
+        """
+        self.source = source
+        self.warnings: list[str] = []
+        self.vertices = self._checked_vertices(vertices)
+        self.tets = self._checked_tets(tets)
+        self.volumes = self._oriented_volumes(fix_orientation)
+        faces = self._checked_faces()
+        rows = faces.surface()
+        self.surface = faces.triangles[rows]
+        self.surface_tets = rows // 4
+        self.n_components = count_components(self.tets, self.n_verts)
+        self._tell_joints(faces)
+        self._tell_coincident()
+        for note in notes:
+            self._tell(note)
+        for array in (self.vertices, self.tets, self.volumes, self.surface, self.surface_tets, self.flipped):
+            array.setflags(write=False)
+
+    @property
+    def n_verts(self) -> int:
+        """Number of vertices n."""
+        return len(self.vertices)
+
+    @property
+    def n_tets(self) -> int:
+        """Number of tetrahedra m."""
+        return len(self.tets)
+
+    def __repr__(self) -> str:
+        return f"TetMesh({self.n_verts} vertices, {self.n_tets} tets, {len(self.surface)} surface triangles)"
+
+    def _error(self, text: str) -> MeshError:
+        return MeshError(f"{self.source}: {text}" if self.source else text)
+
+    def _tell(self, text: str) -> None:
+        self.warnings.append(text)
+        warnings.warn(f"{self.source}: {text}" if self.source else text, UserWarning, stacklevel=4)
+
+    def _checked_vertices(self, vertices) -> np.ndarray:
+        """(n,3) float64 copy, every coordinate finite."""
+        array = self._as_array(vertices, "vertices", "fiu", "numbers")
+        if array.size == 0:
+            raise self._error("the mesh has no vertices")
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise self._error(f"vertices must have shape (n, 3), not {array.shape}")
+        array = np.array(array, dtype=np.float64, order="C")
+        bad = np.argwhere(~np.isfinite(array))
+        if len(bad):
+            raise self._error(f"vertex {bad[0, 0]} coordinate {bad[0, 1]} is not finite")
+        bad = np.argwhere(np.abs(array) > LARGEST_COORDINATE)
+        if len(bad):
+            value = array[tuple(bad[0])]
+            raise self._error(f"vertex {bad[0, 0]} coordinate {bad[0, 1]} is {value:g} m, too large for a 32-bit float")
+        return array
+
+    def _checked_tets(self, tets) -> np.ndarray:
+        """(m,4) int64 copy: indices exist, no tet names a vertex twice or is given twice, no vertex is left over."""
+        array = self._as_array(tets, "tets", "iu", "integers")
+        if array.size == 0:
+            raise self._error("the mesh has no tetrahedra")
+        if array.ndim != 2 or array.shape[1] != 4:
+            raise self._error(f"tets must have shape (m, 4), not {array.shape}")
+        self._check_indices(array)
+        array = np.array(array, dtype=np.int64, order="C")
+        corners = np.sort(array, axis=1)
+        twice = (corners[:, 1:] == corners[:, :-1]).any(axis=1)
+        if twice.any():
+            e = int(np.argmax(twice))
+            raise self._error(f"tet {e} names a vertex twice: {tuple(array[e].tolist())}")
+        pair = first_repeated_tet(array)
+        if pair:
+            corners = tuple(array[pair[0]].tolist())
+            raise self._error(f"tets {pair[0]} and {pair[1]} have the same four vertices {corners}")
+        used = np.zeros(self.n_verts, dtype=bool)
+        used[array] = True
+        if not used.all():
+            raise self._error(
+                f"vertex {int(np.argmin(used))} belongs to no tet and would have no mass "
+                f"({int((~used).sum())} such vertices)"
+            )
+        return array
+
+    def _as_array(self, values, what: str, kinds: str, kinds_said: str) -> np.ndarray:
+        try:
+            array = np.asarray(values)
+        except (ValueError, TypeError, OverflowError) as error:
+            raise self._error(f"{what} must be an array of {kinds_said} ({error})") from error
+        if array.size and array.dtype.kind not in kinds:
+            raise self._error(f"{what} must be {kinds_said}, not of type {array.dtype}")
+        return array
+
+    def _check_indices(self, tets: np.ndarray) -> None:
+        n = self.n_verts
+        bad = np.argwhere((tets < 0) | (tets >= n))
+        if not len(bad):
+            return
+        e, vertex = int(bad[0, 0]), int(tets[tuple(bad[0])])
+        hint = ""
+        if tets.min() == 1 and tets.max() == n:
+            hint = f"; all indices are 1 to {n}: they seem to count from 1, subtract 1"
+        raise self._error(f"tet {e}: vertex {vertex} does not exist ({n} vertices, counted from 0){hint}")
+
+    def _oriented_volumes(self, fix_orientation: bool) -> np.ndarray:
+        """(m,) volumes [m^3], all positive; sets `flipped` and turns those tets round."""
+        x = self.vertices[self.tets]
+        volumes = np.linalg.det(x[:, 1:] - x[:, :1]) / 6.0
+        longest = np.zeros(self.n_tets)
+        for a, b in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)):
+            longest = np.maximum(longest, np.linalg.norm(x[:, a] - x[:, b], axis=1))
+        flat = ~(np.abs(volumes) > DEGENERATE * longest**3)  # also true for lengths too small to cube
+        if flat.any():
+            e = int(np.argmax(flat))
+            raise self._error(
+                f"tet {e} has no volume: {abs(volumes[e]):.3g} m^3 with a longest edge of {longest[e]:.3g} m "
+                f"({int(flat.sum())} such tets; the volume must exceed {DEGENERATE:g} longest edge^3)"
+            )
+        inverted = np.flatnonzero(volumes < 0)
+        self.flipped = inverted
+        if len(inverted) == self.n_tets:
+            self._tell(f"all {self.n_tets} tets are inverted (a mirrored mesh?); all have been flipped")
+        elif len(inverted) and not fix_orientation:
+            raise self._error(
+                f"{len(inverted)} of {self.n_tets} tets are inverted, the first is tet {inverted[0]}; "
+                "fix_orientation=True flips and lists them"
+            )
+        elif len(inverted):
+            self._tell(f"{len(inverted)} of {self.n_tets} inverted tets have been flipped: {_listed(inverted)}")
+        self.tets[inverted] = self.tets[inverted][:, [0, 1, 3, 2]]
+        return np.abs(volumes)
+
+    def _checked_faces(self) -> Faces:
+        """The faces, none of which belongs to three tets."""
+        faces = Faces(self.tets)
+        crowded = np.flatnonzero(faces.counts > 2)
+        if len(crowded):
+            start = faces.starts[crowded[0]]
+            rows = faces.order[start : start + faces.counts[crowded[0]]]
+            owners = np.sort(rows // 4)
+            corners = tuple(np.sort(faces.triangles[rows[0]]).tolist())
+            raise self._error(
+                f"face {corners} is shared by {len(rows)} tets ({_listed(owners)}); a face may have two at most"
+            )
+        # Two outward faces of neighbours on opposite sides run in opposite senses; in the same sense, the tets overlap.
+        pairs = faces.pairs()
+        a, b = faces.triangles[pairs[:, 0]], faces.triangles[pairs[:, 1]]
+        overlap = (a == b).all(axis=1) | (a == b[:, [1, 2, 0]]).all(axis=1) | (a == b[:, [2, 0, 1]]).all(axis=1)
+        if overlap.any():
+            first = np.sort(pairs[int(np.argmax(overlap))] // 4)
+            self._tell(
+                f"{int(overlap.sum())} pairs of neighbouring tets overlap: they lie on the same side of their face; "
+                f"the first are tets {first[0]} and {first[1]}"
+            )
+        return faces
+
+    def _tell_joints(self, faces: Faces) -> None:
+        edges = joint_edges(self.surface)
+        if len(edges):
+            first = tuple(edges[0].tolist())
+            self._tell(f"parts are joined at an edge only at {len(edges)} edges, the first is {first}")
+        vertices = np.setdiff1d(joint_vertices(self.tets, faces), edges)
+        if len(vertices):
+            self._tell(f"parts are joined at a vertex only at {len(vertices)} vertices: {_listed(vertices)}")
+
+    def _tell_coincident(self) -> None:
+        """Count the vertices that lie on another one; such pieces are not connected."""
+        labels = merge_labels(self.vertices, COINCIDENT * float(np.linalg.norm(np.ptp(self.vertices, axis=0))))
+        first = np.unique(labels, return_index=True)[1]
+        extra = np.setdiff1d(np.arange(self.n_verts), first)
+        if len(extra):
+            twin = int(first[labels[extra[0]]])
+            self._tell(
+                f"{len(extra)} vertices coincide with another one, the first is vertex {extra[0]} on vertex {twin}; "
+                "they are not connected (read_mesh can weld them)"
+            )
+
+
+def merge_labels(points: np.ndarray, tolerance: float) -> np.ndarray:
+    """(n,) int: points at most `tolerance` [m] apart, directly or through others, get the same label from 0.
+
+    points: (n,3) [m]. Labels follow the order in which a group first appears.
+    """
+    # Equal points first: thousands in one place would make as many pairs as their number squared.
+    distinct, labels = np.unique(points + 0.0, axis=0, return_inverse=True)  # + 0.0 makes -0.0 equal to 0.0
+    labels = labels.ravel()
+    if tolerance > 0:
+        pairs = cKDTree(distinct).query_pairs(tolerance, output_type="ndarray")
+        n = len(distinct)
+        graph = coo_matrix((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+        labels = connected_components(graph, directed=False)[1][labels]
+    first, inverse = np.unique(labels, return_index=True, return_inverse=True)[1:]
+    rank = np.empty(len(first), dtype=np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[inverse.ravel()]
+
+
+def _listed(indices: np.ndarray) -> str:
+    """Indices as text, shortened where there are many."""
+    text = ", ".join(str(i) for i in indices[:LISTED].tolist())
+    return text if len(indices) <= LISTED else f"{text}, ... ({len(indices)} in all)"

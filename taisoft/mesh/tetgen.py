@@ -1,0 +1,62 @@
+"""TetGen's pair of text files: NAME.node holds the vertices, NAME.ele the tets.
+
+Source: the TetGen manual, "File formats". Each file is a head line of counts and then rows; # begins a comment.
+Vertices count from 0 or 1, as the first row of NAME.node says. Attributes and boundary marks are passed over.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from taisoft.errors import MeshError
+
+
+def read_tetgen(file: Path) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
+    """Points (n,3) and the one block of tets, indices from 0. file: either of the two. Raises MeshError."""
+    head, rows = _table(file.with_suffix(".node"), "vertices")
+    if head[1] != 3:
+        raise MeshError(f"{file.with_suffix('.node')}: vertices must have 3 coordinates, not {head[1]}")
+    first = _whole(rows[:, :1], file.with_suffix(".node"))[0, 0] if len(rows) else 0
+    if first not in (0, 1):
+        raise MeshError(f"{file.with_suffix('.node')}: vertices must count from 0 or 1, not from {first}")
+    head, tets = _table(file.with_suffix(".ele"), "tets")
+    kind = {4: "tetra", 10: "tetra10"}.get(head[1])
+    if kind is None:
+        raise MeshError(f"{file.with_suffix('.ele')}: tets must have 4 vertices, not {head[1]}")
+    return rows[:, 1:4], [(kind, _whole(tets[:, 1 : 1 + head[1]], file.with_suffix(".ele")) - first)]
+
+
+def _table(file: Path, what: str) -> tuple[list[int], np.ndarray]:
+    """The head line as integers, and the rows that it announces, at least 1 + head[1] numbers each."""
+    try:
+        text = file.read_bytes().decode("utf-8", "replace")
+    except OSError as error:
+        raise MeshError(f"{file}: the file cannot be read: {error.strerror}; TetGen's files come in pairs") from error
+    lines = [(i, words) for i, line in enumerate(text.splitlines(), 1) if (words := line.split("#")[0].split())]
+    if not lines:
+        raise MeshError(f"{file}: the file is empty")
+    number, words = lines[0]
+    try:
+        head = [int(word) for word in words]
+    except ValueError:
+        head = []
+    if len(head) < 2 or head[0] < 0 or head[1] < 0:
+        raise MeshError(f"{file}: line {number}: not a supported mesh: the counts of TetGen's format should stand here")
+    if head[0] > len(lines) - 1:
+        last, found = lines[-1][0], len(lines) - 1
+        raise MeshError(f"{file}: line {last}: {head[0]} {what} were announced, but the file ends after {found}")
+    least = 1 + head[1]
+    rows = np.empty((head[0], min(least, 1000)))
+    for k, (number, words) in enumerate(lines[1 : head[0] + 1]):
+        try:
+            rows[k] = [float(word) for word in words[:least]]
+        except ValueError:
+            raise MeshError(f"{file}: line {number}: {least} numbers should stand here") from None
+    return head, rows
+
+
+def _whole(values: np.ndarray, file: Path) -> np.ndarray:
+    bad = np.argwhere(~((np.floor(values) == values) & (np.abs(values) < 2.0**53)))
+    if len(bad):
+        raise MeshError(f"{file}: row {bad[0, 0]}: {values[tuple(bad[0])]:g} is not a whole number")
+    return values.astype(np.int64)

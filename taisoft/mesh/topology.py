@@ -1,0 +1,90 @@
+"""Connectivity of tetrahedra: faces, surface, pieces and joints. NumPy and SciPy graphs, no loops over elements."""
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+# Face k lies opposite corner k; in this order its normal points out of a positive tet, det(x1-x0, x2-x0, x3-x0) > 0.
+TET_FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
+
+
+class Faces:
+    """The 4m faces of m tets, those of equal vertices brought together.
+
+    triangles: (4m,3) outward, face k of tet e in row 4e+k. order: (4m,) rows sorted so that equal faces are neighbours.
+    starts, counts: (f,) where each of the f distinct faces begins in `order`, and how many tets own it.
+    """
+
+    def __init__(self, tets: np.ndarray):
+        """tets: (m,4) int, positively oriented."""
+        self.triangles = tets[:, TET_FACES].reshape(-1, 3)
+        corners = np.sort(self.triangles, axis=1)
+        self.order = np.lexsort((corners[:, 2], corners[:, 1], corners[:, 0]))
+        corners = corners[self.order]
+        new = np.ones(len(corners), dtype=bool)
+        new[1:] = (corners[1:] != corners[:-1]).any(axis=1)
+        self.starts = np.flatnonzero(new)
+        self.counts = np.diff(np.append(self.starts, len(corners)))
+
+    def surface(self) -> np.ndarray:
+        """Rows of `triangles` that one tet alone owns, in the order of the tets."""
+        return np.sort(self.order[self.starts[self.counts == 1]])
+
+    def pairs(self) -> np.ndarray:
+        """(p,2) rows of `triangles`: the two sides of every face that exactly two tets own."""
+        first = self.starts[self.counts == 2]
+        return np.stack([self.order[first], self.order[first + 1]], axis=1)
+
+
+def first_repeated_tet(tets: np.ndarray) -> tuple[int, int] | None:
+    """The first pair of tets with the same four vertices, or None. tets: (m,4) int."""
+    corners = np.sort(tets, axis=1)
+    order = np.lexsort(corners.T[::-1])
+    same = (corners[order[1:]] == corners[order[:-1]]).all(axis=1)
+    if not same.any():
+        return None
+    k = int(np.argmax(same))
+    a, b = sorted((int(order[k]), int(order[k + 1])))
+    return a, b
+
+
+def count_components(tets: np.ndarray, n_verts: int) -> int:
+    """Number of pieces; tets belong to one piece when they share a vertex. Every vertex must belong to a tet."""
+    rows = np.repeat(tets[:, 0], 3)
+    graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, tets[:, 1:].ravel())), shape=(n_verts, n_verts))
+    return int(connected_components(graph, directed=False)[0])
+
+
+def joint_edges(surface: np.ndarray) -> np.ndarray:
+    """(k,2) surface edges with more than two triangles: parts hang together by an edge alone. surface: (t,3) int."""
+    edges = np.sort(surface[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    distinct, counts = np.unique(edges, axis=0, return_counts=True)
+    return distinct[counts > 2]
+
+
+def joint_vertices(tets: np.ndarray, faces: Faces) -> np.ndarray:
+    """(k,) vertices whose tets do not all reach one another through faces that hold the vertex.
+
+    The graph has a node for every corner of every tet and joins the corners that two tets share through a face; a
+    vertex with more than one connected piece is a joint. Only surface vertices can be one, so only their corners count.
+    """
+    n_verts = int(tets.max()) + 1
+    on_surface = np.zeros(n_verts, dtype=bool)
+    on_surface[faces.triangles[faces.surface()]] = True
+    pairs = faces.pairs()
+    # The corner (0..3) of its tet that each vertex of a face is; both sides are sorted by vertex so that columns agree.
+    sides = []
+    for rows in pairs.T:
+        triangles = faces.triangles[rows]
+        corners = 4 * (rows // 4)[:, None] + TET_FACES[rows % 4]
+        by_vertex = np.argsort(triangles, axis=1)
+        sides.append(np.take_along_axis(corners, by_vertex, axis=1).ravel())
+    vertex_of = tets.ravel()
+    keep = on_surface[vertex_of[sides[0]]]
+    a, b = sides[0][keep], sides[1][keep]
+    n = len(vertex_of)
+    labels = connected_components(coo_matrix((np.ones(len(a), dtype=np.int8), (a, b)), shape=(n, n)), directed=False)[1]
+    used = on_surface[vertex_of]
+    fans = np.unique(np.stack([vertex_of[used], labels[used]], axis=1), axis=0)[:, 0]
+    vertices, counts = np.unique(fans, return_counts=True)
+    return vertices[counts > 1]

@@ -1,0 +1,38 @@
+"""What a body looks like: its colour, and its surface with only the vertices that are on it."""
+
+import numpy as np
+
+# sRGB, apart in hue and close in lightness, so that the shading carries the form
+BODY_COLOURS = np.array(
+    [
+        (0.33, 0.56, 0.80),
+        (0.90, 0.55, 0.27),
+        (0.42, 0.68, 0.44),
+        (0.80, 0.40, 0.42),
+        (0.58, 0.50, 0.76),
+        (0.85, 0.73, 0.36),
+        (0.36, 0.67, 0.68),
+        (0.72, 0.53, 0.42),
+    ]
+)
+
+
+def body_colour(index: int) -> np.ndarray:
+    """Colour (3,) of the body added as number index, sRGB in [0, 1]; the palette repeats."""
+    return BODY_COLOURS[index % len(BODY_COLOURS)]
+
+
+def linear_rgb(srgb: np.ndarray) -> np.ndarray:
+    """Linear Rec. 709 of sRGB colours (..., 3), both in [0, 1] (IEC 61966-2-1)."""
+    srgb = np.asarray(srgb, dtype=float)
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def compact_surface(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices that surface triangles use, and the triangles in terms of those.
+
+    triangles: int (t,3) of mesh vertices. Returns (nodes int (s,) ascending, local int (t,3)) with
+    nodes[local] == triangles.
+    """
+    nodes, local = np.unique(np.asarray(triangles), return_inverse=True)
+    return nodes, local.reshape(-1, 3)

@@ -1,0 +1,215 @@
+"""Files that are whole or absent, and a folder that has one writer.
+
+Every file is written under a temporary name in its own folder (`<name>.<pid>-<n>.part`), flushed, fsynced, renamed, and
+the folder fsynced: whatever stands under a final name is complete, whenever the process is killed. The folder's lock is
+an advisory kernel lock (flock) on a file that holds the writer's process id, so that a dead writer's lock is free.
+"""
+
+import errno
+import itertools
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from taisoft.errors import OutputError
+
+LOCK_NAME = "taisoft.lock"
+RESULT_FILES = ("report.json", "steps.csv", "scene.usdc", "checkpoint.npz")
+RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc"}  # folder -> the files in it that are ours
+
+_part_numbers = itertools.count()
+
+
+def write_error(path: Path, error: OSError, n_bytes: int | None = None) -> OutputError:
+    """The OutputError that tells of a failed write: path, bytes where known, and the system's reason."""
+    size = "" if n_bytes is None else f" ({n_bytes} bytes)"
+    return OutputError(f"cannot write {path}{size}: {error.strerror or error}")
+
+
+def part_path(path: Path) -> Path:
+    """A temporary name beside path that no other file of this process has; leftovers end in `.part`."""
+    return path.with_name(f"{path.name}.{os.getpid()}-{next(_part_numbers)}.part")
+
+
+def publish(part: Path, path: Path) -> None:
+    """Bring a finished temporary file to disk and to its final name. Raises OSError; then the part is still there."""
+    _fsync(part, os.O_RDWR)
+    os.replace(part, path)
+    if os.name == "posix":  # elsewhere a folder cannot be opened, nor needs to be
+        _fsync(path.parent, os.O_RDONLY)
+
+
+@contextmanager
+def replacing(path: str | Path, n_bytes: int | None = None) -> Iterator[Path]:
+    """Yield a temporary path to fill; at the end of the block it becomes `path`, or vanishes if the block failed.
+
+    n_bytes: size to name in the message, where known. Raises OutputError for any OSError, inside the block too.
+    """
+    path = Path(path)
+    part = part_path(path)
+    try:
+        yield part
+        publish(part, path)
+    except OSError as error:
+        raise write_error(path, error, n_bytes) from error
+    finally:
+        with suppress(OSError):  # gone after a rename; unreachable when the folder is
+            part.unlink()
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write data to path, whole or not at all. Raises OutputError naming path and size."""
+    with replacing(path, len(data)) as part, open(part, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def make_folder(path: str | Path) -> Path:
+    """Create a folder with its parents, or accept the one that is there. Raises OutputError."""
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise OutputError(f"cannot use {path} as a folder: a file has that name") from None
+    except OSError as error:
+        raise OutputError(f"cannot create the folder {path}: {error.strerror or error}") from error
+    return path
+
+
+class OutputFolder:
+    """A run's folder: created or taken over, checked, and locked until `close`.
+
+    path: created where absent; an empty folder, or one with files that are not a run's, is accepted. overwrite: take a
+    folder that holds results: frames and chunks go at once, each other file when its successor is complete. Raises
+    OutputError when the folder cannot be written, another process writes to it, or it holds results without overwrite.
+    """
+
+    def __init__(self, path: str | Path, overwrite: bool = False):
+        self.path = make_folder(path).absolute()  # a later change of the working directory must not move the output
+        self._lock: int | None = _lock_folder(self.path)
+        try:
+            self._old = _results(self.path)
+            if self._old and not overwrite:
+                raise OutputError(
+                    f"the output folder {path} already holds results ({', '.join(self._old)}): name another folder or "
+                    "ask to overwrite"
+                )
+            _clear(self.path)
+            _probe(self.path)
+        except OSError as error:
+            self.close()
+            raise OutputError(f"cannot write to the output folder {path}: {error.strerror or error}") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def discard_stale(self) -> None:
+        """Remove the earlier run's result files that this run did not replace, so that a folder tells of one run."""
+        for name, identity in self._old.items():
+            file = self.path / name
+            if identity is not None and file.exists() and _identity(file) == identity:
+                try:
+                    file.unlink()
+                except OSError as error:
+                    raise OutputError(f"cannot remove the earlier run's {file}: {error.strerror or error}") from error
+
+    def close(self) -> None:
+        """Release the lock. A second call does nothing."""
+        if self._lock is not None:
+            with suppress(OSError):  # the folder may be gone; the kernel frees the lock with the descriptor anyway
+                (self.path / LOCK_NAME).unlink()
+            os.close(self._lock)
+            self._lock = None
+
+    def __enter__(self) -> "OutputFolder":
+        return self
+
+    def __exit__(self, kind, value, traceback) -> None:
+        try:
+            if kind is None:
+                self.discard_stale()
+        finally:
+            self.close()
+
+
+def _fsync(path: Path, flags: int) -> None:
+    descriptor = os.open(path, flags)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # some file systems have no fsync for a folder
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def _lock_folder(folder: Path) -> int:
+    """Take the folder's lock and write our pid into it; returns the open descriptor that holds it."""
+    import fcntl  # POSIX only, like the rest of the lock
+
+    path = folder / LOCK_NAME
+    while True:
+        try:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise OutputError(f"cannot write to the output folder {folder}: {error.strerror or error}") from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # the last holder may have removed this file between our open and our lock: then it locks nothing
+            if path.exists() and os.fstat(descriptor).st_ino == path.stat().st_ino:
+                os.ftruncate(descriptor, 0)
+                os.write(descriptor, f"{os.getpid()}\n".encode())
+                return descriptor
+            os.close(descriptor)
+        except BlockingIOError:
+            holder = os.read(descriptor, 32).decode(errors="replace").strip() or "unknown"
+            os.close(descriptor)
+            raise OutputError(f"process {holder} is writing to the output folder {folder} (lock {path})") from None
+        except OSError as error:
+            os.close(descriptor)
+            raise OutputError(f"cannot lock the output folder {folder}: {error.strerror or error}") from error
+
+
+def _identity(file: Path) -> tuple[int, int]:
+    """Tells a file from its successor: inode and time of change (an inode alone is used again)."""
+    status = file.stat()
+    return status.st_ino, status.st_mtime_ns
+
+
+def _results(folder: Path) -> dict[str, tuple[int, int] | None]:
+    """Results of an earlier run: file name -> identity, and subfolder name -> None."""
+    found: dict[str, tuple[int, int] | None] = {}
+    for name in RESULT_FILES:
+        if (folder / name).exists():
+            found[name] = _identity(folder / name)
+    for name, pattern in RESULT_FOLDERS.items():
+        if any((folder / name).glob(pattern)):
+            found[f"{name}/"] = None
+    return found
+
+
+def _clear(folder: Path) -> None:
+    """Remove an earlier run's frames and chunks, and what a killed writer left under temporary names."""
+    for name, pattern in RESULT_FOLDERS.items():
+        for file in itertools.chain((folder / name).glob(pattern), (folder / name).glob(f"{pattern}.*.part")):
+            file.unlink()
+    for name in RESULT_FILES:
+        for file in folder.glob(f"{name}.*.part"):
+            file.unlink()
+
+
+def _probe(folder: Path) -> None:
+    """Prove by doing that files can be created, renamed and removed here, and that no result's name is a folder."""
+    for name in RESULT_FILES:
+        if (folder / name).is_dir():
+            raise OutputError(f"cannot write {folder / name}: a folder has that name")
+    for name in RESULT_FOLDERS:
+        if (folder / name).exists() and not (folder / name).is_dir():
+            raise OutputError(f"cannot use {folder / name} as a folder: a file has that name")
+    part = part_path(folder / "probe")
+    try:
+        part.write_bytes(b"taisoft\n")
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,0 +1,304 @@
+"""OpenUSD export: `chunks/points_<first frame>.usdc` while a run lasts, `scene.usdc` when it ends.
+
+Each chunk is a whole scene of its own (topology, materials, a few frames), published complete: a killed run leaves
+files that open, and loses the frames of the chunk in the making at most. The same frames are appended to a temporary
+`scene.usdc.*.part`, which becomes `scene.usdc` at the end, one file that needs no other; then the chunks go. Appending
+costs what the new frames cost (the crate format writes new values behind the old ones), and saved frames leave memory;
+it would ruin the file if the process died meanwhile, hence the separate chunks. Layers cannot share the work: USD takes
+an attribute's time samples from the strongest layer alone, and value clips are unknown to many readers.
+`join_chunks` makes a `scene.usdc` from the chunks of a run that was killed.
+
+Time codes are frame numbers; metres, y up. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose
+guide, so that the two are not drawn over each other) and `material`.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from taisoft.errors import OutputError
+from taisoft.output.appearance import body_colour, compact_surface, linear_rgb
+from taisoft.output.files import make_folder, part_path, publish, replacing, write_error
+
+SCENE_NAME = "scene.usdc"
+CHUNKS_NAME = "chunks"
+ROOT = "/World"
+MAX_NAME = 64  # characters of a prim name; the whole name of the body is kept beside it
+
+
+class UsdWriter:
+    """Observer that writes the scene's bodies over time to folder/scene.usdc.
+
+    folder: the run's folder; scene: its bodies' meshes and names are read now; fps: frames per second of simulated time
+    [1/s]; chunk_frames: frames per chunk, at most so many are lost when the process is killed. Raises OutputError.
+    """
+
+    def __init__(self, folder: str | Path, scene, fps: float = 60.0, chunk_frames: int = 10):
+        if not fps > 0:
+            raise OutputError(f"USD export: fps is {fps}, it must be positive")
+        if chunk_frames < 1:
+            raise OutputError(f"USD export: chunk_frames is {chunk_frames}, it must be at least 1")
+        self.path = Path(folder) / SCENE_NAME
+        self.chunks = make_folder(Path(folder) / CHUNKS_NAME)
+        self.chunk_frames = chunk_frames
+        self._tracks, self._template = _scene_layer(scene, fps)
+        self._joined = _Joined(self.path, self._template)
+        self._chunk = None
+        self._frames: list[int] = []  # in the chunk
+
+    def frame(self, sim, index: int) -> None:
+        """Record sim's positions as frame index; index must ascend. Raises OutputError."""
+        from pxr import Vt
+
+        if self._chunk is None:
+            self._chunk = _copy(self._template)
+        for name, tracks in self._tracks.items():
+            x = np.asarray(sim.positions(name), dtype=np.float32)
+            for prim_path, nodes in tracks:
+                points = x if nodes is None else x[nodes]
+                extent = np.array([points.min(axis=0), points.max(axis=0)])
+                self._chunk.SetTimeSample(f"{prim_path}.points", float(index), Vt.Vec3fArray.FromNumpy(points))
+                self._chunk.SetTimeSample(f"{prim_path}.extent", float(index), Vt.Vec3fArray.FromNumpy(extent))
+        self._frames.append(index)
+        if len(self._frames) >= self.chunk_frames:
+            self._publish_chunk()
+
+    def close(self) -> None:
+        """Complete scene.usdc and remove the chunks; without a frame no file is made. Raises OutputError.
+
+        After a failed write there is nothing to complete: the chunks stay as they are.
+        """
+        if self._frames:
+            self._publish_chunk()
+        if self._joined is not None:
+            joined, self._joined = self._joined, None
+            joined.publish()
+            _remove_chunks(self.chunks)
+
+    def _publish_chunk(self) -> None:
+        chunk, frames = self._chunk, self._frames
+        self._chunk, self._frames = None, []
+        if self._joined is None:
+            raise OutputError(f"cannot go on writing {self.path}: an earlier write failed")
+        try:
+            _set_range(chunk, frames[0], frames[-1])
+            _export(chunk, self.chunks / f"points_{frames[0]:05d}.usdc")
+            self._joined.append(chunk)
+        except Exception:
+            self._joined.discard()
+            self._joined = None
+            raise
+
+
+def join_chunks(folder: str | Path) -> Path:
+    """Make folder/scene.usdc from the chunks that a killed run left, then remove the chunks; returns the path.
+
+    Raises OutputError where there is no chunk, one cannot be read, or the scene cannot be written.
+    """
+    from pxr import Sdf
+
+    target, chunks = Path(folder) / SCENE_NAME, Path(folder) / CHUNKS_NAME
+    paths = sorted(chunks.glob("points_*.usdc"), key=lambda p: int(p.stem.removeprefix("points_")))
+    if not paths:
+        raise OutputError(f"{chunks} holds no chunk of a USD export")
+    joined = None
+    for path in paths:
+        try:
+            chunk = Sdf.Layer.OpenAsAnonymous(str(path))
+        except Exception as error:
+            raise OutputError(f"{path} cannot be read: {_last_line(error)}") from None
+        joined = joined or _Joined(target, _without_samples(chunk))
+        joined.append(chunk)
+    joined.publish()
+    _remove_chunks(chunks)
+    return target
+
+
+def prim_names(names: list[str]) -> list[str]:
+    """Legal, distinct USD prim names for body names, in order.
+
+    Anything but ASCII letters, digits and underscores becomes an underscore (UTF-8 identifiers are young in USD, and
+    many readers refuse them); a leading digit gets one before it; a name met before gets a number behind it.
+    """
+    used: set[str] = set()
+    legal = []
+    for name in names:
+        base = re.sub(r"[^A-Za-z0-9_]", "_", name)[:MAX_NAME] or "body"
+        base = f"_{base}" if base[0].isdigit() else base
+        candidate, count = base, 1
+        while candidate in used:
+            candidate, count = f"{base}_{count}", count + 1
+        used.add(candidate)
+        legal.append(candidate)
+    return legal
+
+
+class _Joined:
+    """The one-file scene in the making, under a temporary name until `publish`."""
+
+    def __init__(self, path: Path, template):
+        from pxr import Sdf
+
+        self.path, self.part = path, part_path(path)
+        self.first: float | None = None
+        self.layer = Sdf.Layer.New(Sdf.FileFormat.FindById("usdc"), str(self.part))
+        self.layer.TransferContent(template)
+
+    def append(self, chunk) -> None:
+        """Add the chunk's frames and save, which frees their memory. Raises OutputError."""
+        for path in _sampled(chunk):
+            for time in chunk.ListTimeSamplesForPath(path):
+                self.layer.SetTimeSample(path, time, chunk.QueryTimeSample(path, time))
+        self.first = chunk.startTimeCode if self.first is None else self.first
+        _set_range(self.layer, self.first, chunk.endTimeCode)
+        try:
+            _written(self.path, chunk, self.layer.Save)
+        except OutputError:
+            self.discard()
+            raise
+
+    def publish(self) -> None:
+        """Give the file its final name; without frames drop it. Raises OutputError."""
+        if self.first is None:
+            self.discard()
+            return
+        self.layer = None
+        try:
+            publish(self.part, self.path)
+        except OSError as error:
+            self.discard()
+            raise write_error(self.path, error) from error
+
+    def discard(self) -> None:
+        """Drop the layer and its temporary file."""
+        self.layer = None
+        self.part.unlink(missing_ok=True)
+
+
+def _scene_layer(scene, fps: float) -> tuple[dict[str, list], object]:
+    """A layer with everything but the frames, and per body the (prim path, nodes or None for all) that get points."""
+    from pxr import Sdf, Usd, UsdGeom
+
+    import taisoft
+
+    layer = Sdf.Layer.CreateAnonymous(".usdc")
+    layer.comment = f"taisoft {taisoft.__version__}"
+    stage = Usd.Stage.Open(layer)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    stage.SetTimeCodesPerSecond(fps)
+    stage.SetFramesPerSecond(fps)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())
+    legal = prim_names([body.name for body in scene.bodies])
+    tracks = {body.name: _define_body(stage, body, name, k) for k, (body, name) in enumerate(zip(scene.bodies, legal))}
+    return tracks, layer
+
+
+def _define_body(stage, body, legal_name: str, index: int) -> list[tuple[str, np.ndarray | None]]:
+    from pxr import Gf, UsdGeom, UsdShade, Vt
+
+    path = f"{ROOT}/{legal_name}"
+    prim = UsdGeom.Xform.Define(stage, path).GetPrim()
+    prim.SetDisplayName(body.name)
+    prim.SetCustomDataByKey("taisoft:name", body.name)
+    colour = Gf.Vec3f(*linear_rgb(body_colour(index)).tolist())
+    material = _define_material(stage, f"{path}/material", colour)
+
+    nodes, local = compact_surface(body.mesh.surface)
+    surface = UsdGeom.Mesh.Define(stage, f"{path}/surface")
+    surface.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(local), 3, dtype=np.int32)))
+    surface.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(local.ravel().astype(np.int32)))
+    surface.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+
+    tets = UsdGeom.TetMesh.Define(stage, f"{path}/tets")
+    tets.CreateTetVertexIndicesAttr(Vt.Vec4iArray.FromNumpy(np.ascontiguousarray(body.mesh.tets, dtype=np.int32)))
+    faces = np.ascontiguousarray(body.mesh.surface, dtype=np.int32)
+    tets.CreateSurfaceFaceVertexIndicesAttr(Vt.Vec3iArray.FromNumpy(faces))
+    tets.CreatePurposeAttr(UsdGeom.Tokens.guide)
+
+    for gprim in (surface, tets):
+        gprim.CreatePointsAttr()
+        gprim.CreateExtentAttr()
+        gprim.CreateDisplayColorAttr([colour])
+        UsdShade.MaterialBindingAPI.Apply(gprim.GetPrim()).Bind(material)
+    return [(f"{path}/surface", nodes), (f"{path}/tets", None)]
+
+
+def _define_material(stage, path: str, colour):
+    from pxr import Sdf, UsdShade
+
+    material = UsdShade.Material.Define(stage, path)
+    shader = UsdShade.Shader.Define(stage, f"{path}/shader")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(colour)
+    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.6)
+    material.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+    return material
+
+
+def _copy(layer):
+    from pxr import Sdf
+
+    copy = Sdf.Layer.CreateAnonymous(".usdc")
+    copy.TransferContent(layer)
+    return copy
+
+
+def _without_samples(layer):
+    """A copy of a chunk with its frames taken out: what the joined scene starts from."""
+    copy = _copy(layer)
+    for path in _sampled(copy):
+        for time in copy.ListTimeSamplesForPath(path):
+            copy.EraseTimeSample(path, time)
+    return copy
+
+
+def _sampled(layer) -> list[str]:
+    """Paths of the attributes that change over time in a layer of this module."""
+    return [
+        f"{ROOT}/{body.name}/{part}.{attribute}"
+        for body in layer.GetPrimAtPath(ROOT).nameChildren
+        for part in ("surface", "tets")
+        for attribute in ("points", "extent")
+    ]
+
+
+def _set_range(layer, first: float, last: float) -> None:
+    layer.startTimeCode, layer.endTimeCode = float(first), float(last)
+
+
+def _export(layer, path: Path) -> None:
+    """Write a layer under a temporary name, then publish it. Raises OutputError."""
+    with replacing(path) as part:
+        _written(path, layer, lambda: layer.Export(str(part), args={"format": "usdc"}))
+
+
+def _written(path: Path, layer, write) -> None:
+    """Run write(), and turn USD's failure, an exception or False, into an OutputError with the size of the frames."""
+    try:
+        if write():
+            return
+        reason = "USD does not say why"
+    except Exception as error:
+        reason = _last_line(error)
+    n_bytes = sum(
+        len(layer.QueryTimeSample(p, t)) * 12 for p in _sampled(layer) for t in layer.ListTimeSamplesForPath(p)
+    )  # three floats of 4 bytes a point
+    raise OutputError(f"cannot write {path} ({n_bytes} bytes of new frames): {reason}")
+
+
+def _remove_chunks(chunks: Path) -> None:
+    try:
+        for path in chunks.glob("points_*.usdc"):
+            path.unlink()
+        if not any(chunks.iterdir()):
+            chunks.rmdir()
+    except OSError as error:
+        raise OutputError(f"cannot remove the chunks in {chunks}: {error.strerror or error}") from error
+
+
+def _last_line(error: Exception) -> str:
+    """The gist of a USD error, whose text is a list of source locations."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__

@@ -1,0 +1,54 @@
+"""What a step and a run tell about themselves: plain records, no Taichi."""
+
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Energies:
+    """Energies of a state [J]; elastic is 0 at rest, gravity is -sum m g.x, 0 at the origin."""
+
+    kinetic: float
+    elastic: float
+    gravity: float
+
+    @property
+    def total(self) -> float:
+        """Kinetic + elastic + gravity [J]."""
+        return self.kinetic + self.elastic + self.gravity
+
+
+@dataclass
+class StepReport:
+    """What one step did. A batch of explicit sub-steps gives one report: extremes over its sub-steps, the rest at its end."""
+
+    time: float  # at the end of the step [s]
+    steps: int = 1  # sub-steps of size dt that this report covers
+    newton_iterations: int = 0
+    linear_iterations: int = 0
+    contact_iterations: int = 0
+    residual: float = 0.0  # relative residual of the implicit equations, 0 for explicit steps
+    contact_residual: float = 0.0
+    n_contacts: int = 0
+    dropped_contacts: int = 0
+    max_penetration: float = 0.0  # [m]
+    min_volume_ratio: float = 1.0  # smallest J = det F
+    n_inverted: int = 0  # tets with J <= 0
+    kinetic: float = 0.0  # [J]
+    elastic: float = 0.0  # [J]
+    gravity: float = 0.0  # [J]
+    converged: bool = True
+    problems: list[str] = field(default_factory=list)
+
+
+@dataclass
+class RunReport:
+    """What a run did. status: ok | degraded | failed; problems says why it is not ok."""
+
+    status: str = "ok"
+    problems: list[str] = field(default_factory=list)
+    steps: int = 0
+    sim_seconds: float = 0.0
+    wall_seconds: float = 0.0  # without compile time
+    compile_seconds: float = 0.0
+    interrupted: bool = False  # a signal ended the run early
+    step_reports: list[StepReport] = field(default_factory=list)

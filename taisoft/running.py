@@ -1,0 +1,133 @@
+"""A run: steps, frames, a status. Failures end it and are told; what was computed stays."""
+
+import math
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from taisoft.errors import SimulationError
+from taisoft.records import RunReport, StepReport
+
+if TYPE_CHECKING:
+    from taisoft.simulator import Simulator
+
+FrameCallback = Callable[["Simulator", int, StepReport | None], None]
+IMPLICIT_BATCH_SECONDS = 0.5  # of simulated steps between two questions to `stop`
+
+
+def run(
+    sim: "Simulator", seconds: float, on_frame: FrameCallback | None = None, fps: float | None = 60,
+    stop: Callable[[], bool] | None = None,
+) -> RunReport:  # fmt: skip
+    """Step until `seconds` [s] from now, to the nearest step; frames at fps, or after every step when fps is None.
+
+    on_frame(sim, index, report): called for frame 0 (the start, report None) and after every frame. stop: asked between
+    steps; True ends the run. dt is lowered once to the next divisor of 1/fps, and that is reported. Never raises for a
+    failed or interrupted run: status and problems say it. Raises SimulationError for bad arguments.
+    """
+    _check_arguments(seconds, fps)
+    report = RunReport()
+    compiled = sim.compile_seconds
+    clock = time.perf_counter()
+    steps_per_frame = _fit_dt(sim, seconds, fps, report)
+    total = max(1, round(seconds / sim.dt))
+    start_count, start_time = sim.step_count, sim.time
+    try:
+        if on_frame is not None:
+            on_frame(sim, 0, None)
+        frame = 0
+        while sim.step_count - start_count < total and not report.interrupted:
+            frame += 1
+            goal = min(total, frame * steps_per_frame)
+            merged = _advance_to(sim, start_count + goal, stop, report)
+            if merged is None:
+                break
+            if sim.settings.explicit:
+                report.step_reports.append(merged)
+            if on_frame is not None and sim.step_count - start_count == goal:
+                on_frame(sim, frame, merged)
+    except SimulationError as error:
+        report.status = "failed"
+        report.problems.append(str(error))
+    except KeyboardInterrupt:
+        _interrupt(report)
+    report.steps = sim.step_count - start_count
+    report.sim_seconds = sim.time - start_time
+    report.compile_seconds = sim.compile_seconds - compiled
+    report.wall_seconds = time.perf_counter() - clock - report.compile_seconds
+    _judge(report)
+    return report
+
+
+def _check_arguments(seconds, fps) -> None:
+    for name, value in (("seconds", seconds), ("fps", fps)):
+        if name == "fps" and value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value <= 0:
+            raise SimulationError(f"{name} = {value!r}: it must be a finite number above 0")
+
+
+def _fit_dt(sim: "Simulator", seconds: float, fps: float | None, report: RunReport) -> int:
+    """Steps per frame; lowers dt to a divisor of the frame time where it is none."""
+    if fps is None:
+        return 1
+    frame = 1.0 / fps
+    n = max(1, math.ceil(frame / sim.dt - 1e-9))
+    if abs(n * sim.dt - frame) > 1e-9 * frame:
+        old = sim.dt
+        sim.dt = frame / n
+        report.problems.append(f"note: dt lowered from {old:.6g} s to {sim.dt:.6g} s, so that {n} steps make a frame of 1/{fps:g} s")
+    return n
+
+
+def _advance_to(sim: "Simulator", goal: int, stop, report: RunReport) -> StepReport | None:
+    """Step up to a step count. Explicit batches are merged into one report; implicit steps are listed one by one.
+
+    Returns the merged report, or that of the last implicit step; None when nothing was done.
+    """
+    merged = None
+    while sim.step_count < goal:
+        if stop is not None and stop():
+            _interrupt(report)
+            break
+        one = sim.advance(goal - sim.step_count)
+        if sim.settings.explicit:
+            merged = one if merged is None else _merge(merged, one)
+        else:
+            report.step_reports.append(one)
+            merged = one
+    return merged
+
+
+def _merge(a: StepReport, b: StepReport) -> StepReport:
+    """Later report b of an explicit batch with the extremes of a."""
+    b.steps += a.steps
+    b.min_volume_ratio = min(a.min_volume_ratio, b.min_volume_ratio)
+    b.n_inverted = max(a.n_inverted, b.n_inverted)
+    b.problems = a.problems + b.problems
+    return b
+
+
+def _interrupt(report: RunReport) -> None:
+    report.interrupted = True
+    report.problems.append("the run was interrupted before its end")
+
+
+def _judge(report: RunReport) -> None:
+    """Status from what happened: anything dropped, inverted or not converged keeps a run from ok."""
+    steps = report.step_reports
+    unconverged = [s for s in steps if not s.converged]
+    inverted = [s for s in steps if s.n_inverted > 0]
+    if unconverged:
+        worst = max(unconverged, key=lambda s: s.residual)
+        report.problems.append(
+            f"{len(unconverged)} of {len(steps)} steps did not converge; the worst, at t = {worst.time:.4g} s, to a relative residual of "
+            f"{worst.residual:.2e}"
+        )
+    if inverted:
+        worst = max(inverted, key=lambda s: s.n_inverted)
+        report.problems.append(
+            f"tets were inverted in {len(inverted)} reported steps; at most {worst.n_inverted}, at t = {worst.time:.4g} s"
+        )
+    if report.status == "ok" and (unconverged or inverted or report.interrupted):
+        report.status = "degraded"

@@ -1,0 +1,160 @@
+"""The only place that starts Taichi: arch, precision, flags, field memory, launch counts.
+
+Taichi's state belongs to the process, so one (arch, precision) is open at a time. `cfg_optimization=False` works round a
+miscompilation of Taichi 1.7.4 (`A = f(A)` on a local matrix), and also compiles faster; `fast_math=False` keeps NaN
+comparisons and the order of sums (no speed lost). Fields live in one
+`FieldArena` per simulator and are released with it.
+"""
+
+import functools
+import os
+import time
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
+import taichi as ti  # noqa: E402
+
+from taisoft.errors import SimulationError  # noqa: E402
+
+PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
+ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
+
+launches: Counter[str] = Counter()  # kernel name -> launches so far in this process
+_open: list["Runtime"] = []  # simulators that hold the runtime now
+_kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
+_clock = {"compile": 0.0}
+
+
+class Runtime:
+    """A claim on the process's Taichi runtime; `close` gives it back.
+
+    arch: "cpu" | "cuda"; precision: "f32" | "f64"; real: the Taichi type of everything but positions; lanes: elements
+    handled side by side (SIMD lanes on the CPU, 1 on CUDA, where threads take that part).
+    """
+
+    def __init__(self, arch: str, precision: str):
+        self.arch, self.precision = arch, precision
+        self.real = PRECISIONS[precision]
+        self.np_real = np.float32 if precision == "f32" else np.float64
+        self.eps = float(np.finfo(self.np_real).eps)
+        self.lanes = 4 if arch == "cpu" else 1
+        self.owner = ""
+
+    def close(self) -> None:
+        """Release the claim; Taichi itself stays up until another kind is asked for."""
+        if self in _open:
+            _open.remove(self)
+
+
+def open_runtime(arch: str, precision: str, owner: str = "a simulator") -> Runtime:
+    """Claim Taichi with this arch and precision, initialising it where needed.
+
+    Raises SimulationError when the names are unknown, another kind is in use, or the arch cannot be had.
+    """
+    global _kind
+    if arch not in ARCHS:
+        raise SimulationError(f"arch '{arch}' is unknown: it must be one of {', '.join(ARCHS)}")
+    if precision not in PRECISIONS:
+        raise SimulationError(f"precision '{precision}' is unknown: it must be one of {', '.join(PRECISIONS)}")
+    kind = (arch, precision)
+    if _open and _kind != kind:
+        raise SimulationError(
+            f"{_open[0].owner} is open with arch '{_kind[0]}' and precision '{_kind[1]}', and one process holds one kind at "
+            f"a time: close it before asking for '{arch}' and '{precision}'"
+        )
+    # another initialisation in this process (a user's own ti.init) shows in the configuration and is replaced
+    if _kind != kind or ti.cfg.default_fp != PRECISIONS[precision] or ti.cfg.cfg_optimization:
+        _initialise(arch, precision)
+        _kind = kind
+    runtime = Runtime(arch, precision)
+    runtime.owner = owner
+    _open.append(runtime)
+    return runtime
+
+
+def _initialise(arch: str, precision: str) -> None:
+    ti.init(
+        arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
+        fast_math=False, offline_cache=True, log_level=ti.ERROR, random_seed=0,
+    )  # fmt: skip
+    obtained = "cuda" if ti.cfg.arch == ti.cuda else "cpu"
+    if obtained != arch:
+        raise SimulationError(f"arch '{arch}' is not to be had on this machine (Taichi fell back to '{obtained}')")
+
+
+def open_kind() -> tuple[str, str] | None:
+    """(arch, precision) in use by an open simulator, or None."""
+    return _kind if _open else None
+
+
+class FieldArena:
+    """Fields of one simulator: allocated together, counted by name, released together."""
+
+    def __init__(self) -> None:
+        self.bytes: dict[str, int] = {}
+        self._trees: list = []
+
+    def field(self, name: str, dtype, shape: tuple[int, ...] | int, data: np.ndarray | None = None):
+        """A scalar field, filled from data when given (else zero)."""
+        return self._place(name, ti.field(dtype), dtype, 1, shape, data)
+
+    def vectors(self, name: str, dtype, shape: int, data: np.ndarray | None = None, n: int = 3):
+        """A field of n-vectors, filled from data (shape, n) when given (else zero)."""
+        return self._place(name, ti.Vector.field(n, dtype), dtype, n, shape, data)
+
+    def _place(self, name, field, dtype, components, shape, data):
+        if name in self.bytes:
+            raise ValueError(f"field '{name}' is allocated twice")
+        shape = (shape,) if isinstance(shape, int) else tuple(shape)
+        count = int(np.prod(shape, dtype=np.int64))
+        if count * components >= 2**31:
+            raise SimulationError(f"field '{name}' needs {count * components} entries, more than 2^31 - 1")
+        builder = ti.FieldsBuilder()
+        if shape == ():
+            builder.place(field)
+        else:
+            builder.dense((ti.i, ti.ij, ti.ijk, ti.ijkl)[len(shape) - 1], shape).place(field)
+        try:
+            self._trees.append(builder.finalize())
+        except RuntimeError as error:
+            raise SimulationError(f"no memory for field '{name}' ({count * components * 8} bytes at most): {error}") from None
+        size = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.u8: 1}[dtype]
+        self.bytes[name] = count * components * size
+        if data is not None:
+            field.from_numpy(np.ascontiguousarray(data))
+        return field
+
+    def release(self) -> None:
+        """Give the memory back to Taichi."""
+        while self._trees:
+            self._trees.pop().destroy()
+        self.bytes.clear()
+
+
+def kernel(function: Callable) -> Callable:
+    """`ti.kernel` whose launches are counted by name, and whose first launch per set of templates counts as compile time."""
+    compiled = ti.kernel(function)
+    seen: set = set()
+
+    @functools.wraps(function)
+    def launch(*arguments):
+        launches[function.__name__] += 1
+        key = (_kind, *(id(a) for a in arguments if not isinstance(a, (int, float, np.ndarray))))
+        if key in seen:
+            return compiled(*arguments)
+        seen.add(key)
+        start = time.perf_counter()
+        result = compiled(*arguments)
+        ti.sync()
+        _clock["compile"] += time.perf_counter() - start
+        return result
+
+    return launch
+
+
+def compile_clock() -> float:
+    """Seconds spent so far in first launches (tracing, compiling, and that first run)."""
+    return _clock["compile"]

@@ -1,0 +1,131 @@
+"""Checks of what a scene is given. Each raises SceneError with one sentence, or returns the clean value."""
+
+import difflib
+from numbers import Real
+
+import numpy as np
+
+from taisoft.errors import SceneError
+
+
+def number(
+    value,
+    what: str,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    most: float | None = None,
+    unit: str = "",
+) -> float:
+    """A finite real number, > above, >= least, <= most where these are given. what: the start of the message."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
+        raise SceneError(f"{what} must be a number, not {value!r}")
+    try:
+        result = float(value)
+    except OverflowError:
+        result = float("inf")
+    if not np.isfinite(result):
+        raise SceneError(f"{what} must be finite, not {value!r}")
+    rules = []
+    if above is not None:
+        rules.append((result > above, f"greater than {above:g}"))
+    if least is not None:
+        rules.append((result >= least, f"at least {least:g}"))
+    if most is not None:
+        rules.append((result <= most, f"at most {most:g}"))
+    if not all(kept for kept, _ in rules):
+        rule = " and ".join(text for _, text in rules)
+        raise SceneError(f"{what} must be {rule}{unit and ' ' + unit}, not {value!r}")
+    return result
+
+
+def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
+    """A float64 copy of finite numbers in one of the shapes. what: the start of the message."""
+    said = " or ".join(str(shape) for shape in shapes)
+    try:
+        result = np.asarray(value)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise SceneError(f"{what} must be numbers of shape {said}, not {value!r}") from error
+    if result.dtype.kind not in "fiu":
+        raise SceneError(f"{what} must be numbers of shape {said}, not {value!r}")
+    if result.shape not in shapes:
+        raise SceneError(f"{what} must have shape {said}, not {result.shape}")
+    result = np.array(result, dtype=np.float64)
+    bad = np.argwhere(~np.isfinite(result))
+    if len(bad):
+        raise SceneError(f"{what}: entry {bad[0].tolist()} is {result[tuple(bad[0])]}, not finite")
+    return result
+
+
+def choice(value, what: str, allowed: tuple[str, ...]) -> str:
+    """One of the allowed words; the message names the nearest one."""
+    if isinstance(value, str) and value in allowed:
+        return value
+    near = difflib.get_close_matches(value.lower(), allowed, n=1) if isinstance(value, str) else []
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise SceneError(f"{what} must be one of {', '.join(allowed)}, not {value!r}{hint}")
+
+
+def name(value, what: str, taken: list[str]) -> str:
+    """A text with something in it that is not taken yet."""
+    if not isinstance(value, str) or not value.strip():
+        raise SceneError(f"{what} must be a text that is not empty, not {value!r}")
+    if value in taken:
+        raise SceneError(f"{what} {value!r} is taken; names must be unique")
+    return value
+
+
+def axes(value, what: str) -> np.ndarray:
+    """(3,) bool for a text such as "xz": some of x, y, z, none twice."""
+    if not isinstance(value, str) or not value or set(value) - set("xyz") or len(set(value)) != len(value):
+        raise SceneError(f"{what}: axes must name some of 'x', 'y', 'z', none of them twice, not {value!r}")
+    return np.array([axis in value for axis in "xyz"])
+
+
+def selection(where, points: np.ndarray, what: str, items: str, *, repeats: bool = True) -> np.ndarray:
+    """Ids (k,) int64 of the chosen items, at least one.
+
+    where: ids, a bool mask (n,), or a callable that gets a copy of points (n,3) and returns such a mask. what: the
+    start of the message. items: what is chosen, in the singular. repeats: True drops repeated ids, False refuses them.
+    """
+    n = len(points)
+    if callable(where):
+        try:
+            mask = np.asarray(where(points.copy()))
+        except Exception as error:
+            raise SceneError(f"{what}: the function that chooses failed: {type(error).__name__}: {error}") from error
+        if mask.dtype != bool or mask.shape != (n,):
+            raise SceneError(
+                f"{what}: the function that chooses must return a bool mask of shape ({n},), "
+                f"not {mask.dtype} of shape {mask.shape}"
+            )
+        ids = np.flatnonzero(mask)
+    else:
+        ids = _ids(where, n, what, items)
+    if not len(ids):
+        raise SceneError(f"{what}: no {items} is chosen")
+    distinct, first = np.unique(ids, return_index=True)
+    if len(distinct) < len(ids) and not repeats:
+        twice = np.setdiff1d(np.arange(len(ids)), first)[0]
+        raise SceneError(f"{what}: {items} {ids[twice]} is chosen twice")
+    return ids[np.sort(first)].astype(np.int64)
+
+
+def _ids(where, n: int, what: str, items: str) -> np.ndarray:
+    try:
+        ids = np.asarray(where)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise SceneError(f"{what}: choose by {items} ids, a bool mask or a function, not {where!r}") from error
+    if ids.size == 0:
+        return np.empty(0, dtype=np.int64)
+    if ids.dtype == bool:
+        if ids.shape != (n,):
+            raise SceneError(f"{what}: a mask must have shape ({n},), not {ids.shape}")
+        return np.flatnonzero(ids)
+    if ids.dtype.kind not in "iu" or ids.ndim > 1:
+        raise SceneError(f"{what}: {items} ids must be a list of integers, not {where!r}")
+    ids = np.atleast_1d(ids)
+    bad = np.flatnonzero((ids < 0) | (ids >= n))
+    if len(bad):
+        raise SceneError(f"{what}: {items} {ids[bad[0]]} does not exist (there are {n}, counted from 0)")
+    return ids

@@ -1,0 +1,63 @@
+"""What a body is made of: an elastic law and its numbers, all checked."""
+
+import warnings
+from dataclasses import dataclass
+
+from taisoft.errors import SceneError
+from taisoft.scene import checks
+
+LAWS = ("st_venant_kirchhoff", "corotational", "stable_neo_hookean")
+NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which first-order tets lock: they bend far too little
+
+
+@dataclass(frozen=True)
+class Material:
+    """An elastic material with damping and surface numbers. Raises SceneError for numbers outside the rules below.
+
+    Poisson's ratio above 0.49 is told with a UserWarning, because first-order tets are far too stiff there.
+    """
+
+    law: str = "stable_neo_hookean"  # one of LAWS
+    young: float = 1e6  # Young's modulus [Pa], > 0
+    poisson: float = 0.3  # Poisson's ratio, in the open interval (-1, 0.5)
+    density: float = 1000.0  # [kg/m^3], > 0
+    friction: float = 0.5  # Coulomb's coefficient, >= 0
+    restitution: float = 0.0  # share of the normal speed that comes back, 0 to 1
+    mass_damping: float = 0.0  # [1/s], >= 0
+    stiffness_damping: float = 0.0  # [s], >= 0
+
+    def __post_init__(self):
+        checks.choice(self.law, "material: law", LAWS)
+        limits = {
+            "young": {"above": 0.0, "unit": "Pa"},
+            "poisson": {},
+            "density": {"above": 0.0, "unit": "kg/m^3"},
+            "friction": {"least": 0.0},
+            "restitution": {"least": 0.0, "most": 1.0},
+            "mass_damping": {"least": 0.0, "unit": "1/s"},
+            "stiffness_damping": {"least": 0.0, "unit": "s"},
+        }
+        for field, limit in limits.items():
+            # The only way to store a clean float in a frozen record.
+            object.__setattr__(self, field, checks.number(getattr(self, field), f"material: {field}", **limit))
+        if not -1.0 < self.poisson < 0.5:
+            raise SceneError(f"material: poisson must lie in the open interval (-1, 0.5), not {self.poisson:g}")
+        for text in self.warnings:
+            warnings.warn(text, UserWarning, stacklevel=3)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is allowed but worth knowing."""
+        if self.poisson <= NEARLY_INCOMPRESSIBLE:
+            return []
+        return [f"material: poisson = {self.poisson:g} is above {NEARLY_INCOMPRESSIBLE}: first-order tets lock there"]
+
+    @property
+    def mu(self) -> float:
+        """Lamé's second parameter, the shear modulus [Pa]."""
+        return self.young / (2.0 * (1.0 + self.poisson))
+
+    @property
+    def lam(self) -> float:
+        """Lamé's first parameter [Pa]."""
+        return self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))

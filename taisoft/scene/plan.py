@@ -1,0 +1,54 @@
+"""The plan: which features a scene needs, and why. What is off allocates nothing and launches nothing."""
+
+from dataclasses import dataclass, field
+
+from taisoft.scene.scene import LAWS, Scene
+
+
+@dataclass
+class Plan:
+    """entries: dicts {"feature", "on", "why"}, in a fixed order; `on[feature]` looks one up."""
+
+    entries: list[dict] = field(default_factory=list)
+
+    @property
+    def on(self) -> dict[str, bool]:
+        """feature -> whether it is modelled."""
+        return {e["feature"]: e["on"] for e in self.entries}
+
+    def add(self, feature: str, on: bool, why: str, why_not: str) -> None:
+        """Decide one feature."""
+        self.entries.append({"feature": feature, "on": bool(on), "why": why if on else why_not})
+
+
+def _named(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def make_plan(scene: Scene, explicit: bool, multistep: bool) -> Plan:
+    """Decide from the scene and the kind of integrator."""
+    plan = Plan()
+    laws = {name: [b.name for b in scene.bodies if b.material.law == name] for name in LAWS}
+    for law, names in laws.items():
+        plan.add(f"law:{law}", bool(names), f"used by {_named(names)}", "no body uses it")
+
+    def bodies(test) -> list[str]:
+        return [b.name for b in scene.bodies if test(b)]
+
+    loaded = bodies(lambda b: b.tractions or b.forces)
+    plan.add("loads", bool(loaded), f"tractions or forces on {_named(loaded)}", "no traction and no force")
+    fixed = bodies(lambda b: any(c.path is None for c in b.constraints))
+    plan.add("fixed_nodes", bool(fixed), f"on {_named(fixed)}", "no node is fixed")
+    moved = bodies(lambda b: any(c.path is not None for c in b.constraints))
+    plan.add("moving_nodes", bool(moved), f"paths on {_named(moved)}", "no node follows a path")
+    dragged = bodies(lambda b: b.material.mass_damping > 0)
+    plan.add("mass_damping", bool(dragged), f"material of {_named(dragged)}", "every mass_damping is 0")
+    viscous = bodies(lambda b: b.material.stiffness_damping > 0)
+    plan.add("stiffness_damping", bool(viscous), f"material of {_named(viscous)}", "every stiffness_damping is 0")
+    plan.add("assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only")
+    plan.add("past_states", multistep, "the integrator looks back two steps", "a one-step integrator")
+    plan.add(
+        "inversion_handling", not explicit, "the stiffness of tets with negative curvature is projected when a solve meets it",
+        "explicit steps need forces only, which every law gives for inverted tets too",
+    )  # fmt: skip
+    return plan

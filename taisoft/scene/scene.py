@@ -1,0 +1,208 @@
+"""A scene as plain data: bodies of tetrahedra, what they are made of, what holds, moves and loads them.
+
+Everything is checked and turned into arrays at the call that adds it, so that a scene that exists can be simulated.
+"""
+
+import difflib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from taisoft.errors import SceneError
+from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.scene import checks
+from taisoft.scene.material import LAWS, Material
+
+__all__ = ["LAWS", "Body", "Constraint", "Material", "NodalForce", "Scene", "Traction"]
+
+_FREE, _FIXED, _MOVED = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class Constraint:
+    """Nodes held along some axes: at their start, or at their start plus a displacement that depends on time."""
+
+    nodes: np.ndarray  # (k,) int64 node ids
+    axes: np.ndarray  # (3,) bool
+    path: Callable | None = None  # t [s] -> displacement (3,) or (k,3) [m], None once released; no path: they stay
+
+
+@dataclass(frozen=True, eq=False)
+class Traction:
+    """A dead load on surface triangles."""
+
+    triangles: np.ndarray  # (k,) int64 rows of mesh.surface
+    value: np.ndarray  # (3,) force per reference area [Pa]
+
+
+@dataclass(frozen=True, eq=False)
+class NodalForce:
+    """A dead load spread over nodes by their lumped mass."""
+
+    nodes: np.ndarray  # (k,) int64 node ids
+    value: np.ndarray  # (3,) total force [N]
+
+
+class Body:
+    """One elastic body of a scene; made by `Scene.add_body`.
+
+    name, mesh, material. position: (3,) [m], where the body starts: its nodes begin at rest_positions + position.
+    velocity: (3,) or (n,3) [m/s], of the start. order: 1, the elements' order. constraints, tractions, forces: lists of
+    `Constraint`, `Traction`, `NodalForce`.
+    """
+
+    def __init__(self, name: str, mesh: TetMesh, material: Material, position, velocity, order: int):
+        what = f"body {name!r}"
+        if not isinstance(mesh, TetMesh):
+            raise SceneError(f"{what}: mesh must be a TetMesh, not {type(mesh).__name__}")
+        if not isinstance(material, Material):
+            raise SceneError(f"{what}: material must be a Material, not {type(material).__name__}")
+        if isinstance(order, bool) or order != 1:
+            raise SceneError(f"{what}: order must be 1, not {order!r}")
+        self.name = name
+        self.mesh = mesh
+        self.material = material
+        self.position = checks.array(position, f"{what}: position", ((3,),))
+        self.velocity = checks.array(velocity, f"{what}: velocity", ((3,), (mesh.n_verts, 3)))
+        self.order = 1
+        self.constraints: list[Constraint] = []
+        self.tractions: list[Traction] = []
+        self.forces: list[NodalForce] = []
+        self._held = np.full((mesh.n_verts, 3), _FREE, dtype=np.int8)  # what holds each node along each axis
+
+    @property
+    def rest_positions(self) -> np.ndarray:
+        """(n,3) [m], read-only: the mesh's vertices, where the body is free of stress."""
+        return self.mesh.vertices
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of nodes."""
+        return self.mesh.n_verts
+
+    def __repr__(self) -> str:
+        return f"Body({self.name!r}, {self.mesh.n_verts} nodes, {self.mesh.n_tets} tets, {self.material.law})"
+
+    def fix(self, where, axes: str = "xyz") -> Constraint:
+        """Hold nodes where they start.
+
+        where: node ids, a bool mask (n,), or a callable that gets the rest positions (n,3) and returns such a mask.
+        axes: the directions held, such as "y" or "xz". Raises SceneError when no node is chosen or one is moved.
+        """
+        what = f"body {self.name!r}: fix"
+        nodes = checks.selection(where, self.rest_positions, what, "node")
+        return self._hold(Constraint(nodes, checks.axes(axes, what)), _FIXED, what)
+
+    def move(self, where, path: Callable, axes: str = "xyz") -> Constraint:
+        """Lead nodes along a path.
+
+        where: as for `fix`, but no id twice. path: callable t [s] -> displacement from the start, (3,) or (k,3) in the
+        order of the chosen nodes [m], or None from the moment they are released; it is called once here, for t = 0.
+        axes: the directions led. Raises SceneError when no node is chosen, one is held already, or the path is not of
+        this kind.
+        """
+        what = f"body {self.name!r}: move"
+        nodes = checks.selection(where, self.rest_positions, what, "node", repeats=False)
+        mask = checks.axes(axes, what)
+        if not callable(path):
+            raise SceneError(f"{what}: path must be a function of time, not {path!r}")
+        try:
+            start = path(0.0)
+        except Exception as error:
+            raise SceneError(f"{what}: the path failed at t = 0: {type(error).__name__}: {error}") from error
+        if start is None:
+            raise SceneError(f"{what}: the path must give a displacement at t = 0, not None")
+        checks.array(start, f"{what}: the path's displacement at t = 0", ((3,), (len(nodes), 3)))
+        return self._hold(Constraint(nodes, mask, path), _MOVED, what)
+
+    def add_traction(self, where, traction) -> Traction:
+        """Load surface triangles with a dead force per reference area.
+
+        where: rows of mesh.surface, a bool mask (t,), or a callable that gets the triangles' centroids at rest (t,3)
+        and returns such a mask. traction: (3,) [Pa]. Raises SceneError when no triangle is chosen or a number is not
+        finite.
+        """
+        what = f"body {self.name!r}: add_traction"
+        centroids = self.rest_positions[self.mesh.surface].mean(axis=1)
+        triangles = checks.selection(where, centroids, what, "surface triangle")
+        load = Traction(triangles, checks.array(traction, f"{what}: traction", ((3,),)))
+        self.tractions.append(load)
+        return load
+
+    def add_force(self, where, force) -> NodalForce:
+        """Load nodes with a total dead force, spread over them by lumped mass.
+
+        where: as for `fix`. force: (3,) [N]. Raises SceneError when no node is chosen or numbers are not finite.
+        """
+        what = f"body {self.name!r}: add_force"
+        nodes = checks.selection(where, self.rest_positions, what, "node")
+        load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,),)))
+        self.forces.append(load)
+        return load
+
+    def _hold(self, constraint: Constraint, kind: int, what: str) -> Constraint:
+        """Add a constraint unless it contradicts an earlier one: only two fixes of one node and axis agree."""
+        at = np.ix_(constraint.nodes, np.flatnonzero(constraint.axes))
+        before = self._held[at]
+        clash = np.argwhere((before != _FREE) if kind == _MOVED else (before == _MOVED))
+        if len(clash):
+            row, column = clash[0]
+            axis = "xyz"[np.flatnonzero(constraint.axes)[column]]
+            done = "fixed" if before[row, column] == _FIXED else "moved"
+            raise SceneError(f"{what}: node {constraint.nodes[row]} is already {done} along {axis}")
+        self._held[at] = kind
+        self.constraints.append(constraint)
+        return constraint
+
+
+class Scene:
+    """What is simulated: gravity and bodies. SI units, y up."""
+
+    def __init__(self, gravity=(0.0, -9.81, 0.0)):
+        """gravity: (3,) [m/s^2]. Raises SceneError unless it is three finite numbers."""
+        self.gravity = gravity
+        self.bodies: list[Body] = []
+
+    @property
+    def gravity(self) -> np.ndarray:
+        """(3,) [m/s^2]."""
+        return self._gravity
+
+    @gravity.setter
+    def gravity(self, value) -> None:
+        self._gravity = checks.array(value, "scene: gravity", ((3,),))
+
+    def __repr__(self) -> str:
+        return f"Scene(gravity={tuple(self.gravity.tolist())}, bodies={[body.name for body in self.bodies]})"
+
+    def add_body(
+        self,
+        mesh: TetMesh,
+        material: Material,
+        name: str | None = None,
+        position=(0.0, 0.0, 0.0),
+        velocity=(0.0, 0.0, 0.0),
+        order: int = 1,
+    ) -> Body:
+        """Add a body and return it.
+
+        mesh: its shape at rest. name: unique, "body0" and so on where left out. position: (3,) [m], shift of the start.
+        velocity: (3,) for all nodes or (n,3) [m/s]. order: 1. Raises SceneError.
+        """
+        taken = [body.name for body in self.bodies]
+        if name is None:
+            name = next(free for free in (f"body{i}" for i in range(len(taken) + 1)) if free not in taken)
+        body = Body(checks.name(name, "scene: body name", taken), mesh, material, position, velocity, order)
+        self.bodies.append(body)
+        return body
+
+    def body(self, name: str) -> Body:
+        """The body of that name. Raises SceneError where there is none."""
+        for body in self.bodies:
+            if body.name == name:
+                return body
+        names = [body.name for body in self.bodies]
+        near = difflib.get_close_matches(name, names, n=1) if isinstance(name, str) else []
+        hint = f"; did you mean {near[0]!r}?" if near else f"; there are {names}" if names else "; the scene is empty"
+        raise SceneError(f"scene: no body is called {name!r}{hint}")

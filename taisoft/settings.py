@@ -1,0 +1,71 @@
+"""The settings of a simulation, checked before anything is allocated."""
+
+import difflib
+import math
+from dataclasses import dataclass
+
+from taisoft.errors import SceneError, SimulationError
+from taisoft.scene.scene import Scene
+from taisoft.stepping import EXPLICIT, INTEGRATORS
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a Simulator was asked for; tolerances are relative, None is adaptive."""
+
+    dt: float  # [s]
+    integrator: str
+    precision: str
+    arch: str
+    allow_unstable: bool
+    newton_tolerance: float | None
+    linear_tolerance: float | None
+
+    @property
+    def explicit(self) -> bool:
+        """Whether the integrator is explicit."""
+        return self.integrator in EXPLICIT
+
+
+def check_dt(dt) -> float:
+    """dt as a float, or SimulationError."""
+    if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not math.isfinite(dt) or dt <= 0.0:
+        raise SimulationError(f"dt = {dt!r}: it must be a finite number of seconds above 0")
+    return float(dt)
+
+
+def _check_tolerance(name: str, value) -> None:
+    if value is None:
+        return
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < 1.0:
+        raise SimulationError(f"{name} = {value!r}: it must lie between 0 and 1, or be None for the adaptive one")
+
+
+def check_settings(
+    scene: Scene, dt, integrator, contact_solver, self_collision, precision, arch, allow_unstable, newton_tolerance,
+    linear_tolerance, contact_tolerance,
+) -> Settings:  # fmt: skip
+    """Check every argument of a Simulator. Raises SceneError or SimulationError with one sentence."""
+    if not isinstance(scene, Scene):
+        raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
+    if not scene.bodies:
+        raise SceneError("the scene holds no body")
+    if integrator not in INTEGRATORS:
+        near = difflib.get_close_matches(str(integrator), INTEGRATORS, 1)
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        raise SimulationError(f"integrator {integrator!r} is unknown{hint}: it must be one of {', '.join(INTEGRATORS)}")
+    if contact_solver != "auto":
+        raise SimulationError(f"contact_solver = {contact_solver!r}: this version models no contact, so it must be 'auto'")
+    if self_collision is not False:
+        raise SimulationError("self_collision must be False: this version models no contact")
+    if contact_tolerance is not None:
+        raise SimulationError("contact_tolerance must be None: this version models no contact")
+    if not isinstance(allow_unstable, bool):
+        raise SimulationError(f"allow_unstable = {allow_unstable!r}: it must be True or False")
+    _check_tolerance("newton_tolerance", newton_tolerance)
+    _check_tolerance("linear_tolerance", linear_tolerance)
+    if precision not in ("f32", "f64"):
+        raise SimulationError(f"precision {precision!r} is unknown: it must be 'f32' or 'f64'")
+    if arch not in ("cpu", "cuda"):
+        raise SimulationError(f"arch {arch!r} is unknown: it must be 'cpu' or 'cuda'")
+    return Settings(check_dt(dt), integrator, precision, arch, allow_unstable, newton_tolerance, linear_tolerance)

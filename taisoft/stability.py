@@ -1,0 +1,183 @@
+"""Linear vibration about the rest shape: Hooke stiffness, highest frequency, stable steps, eigenmodes. NumPy and SciPy.
+
+All three laws have Hooke's law as tangent at F = I, so one stiffness serves them: sigma = 2 mu eps + lambda tr(eps) I.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spl
+
+from taisoft import elements
+from taisoft.errors import SceneError
+from taisoft.model import body_masses
+from taisoft.scene.scene import Body, Scene
+
+LANCZOS_MARGIN = 1.005  # Lanczos nears the highest frequency from below; its tolerance is half of this
+
+
+def hooke_differential(body: Body):
+    """Matrix-free K v of one body at rest: a function (n,3) -> (n,3) [N per unit of v]."""
+    tets = body.mesh.tets
+    Dm_inv, volume = elements.inverse_rest_edges(body.mesh.vertices, tets)
+    gradients = elements.shape_gradients(Dm_inv)
+    mu, lam, n = body.material.mu, body.material.lam, body.mesh.n_verts
+
+    def apply(v: np.ndarray) -> np.ndarray:
+        H = np.einsum("eai,eaj->eij", v[tets], gradients)
+        P = mu * (H + H.transpose(0, 2, 1)) + lam * np.einsum("eii->e", H)[:, None, None] * np.eye(3)
+        f = np.einsum("e,eij,eaj->eai", volume, P, gradients)
+        return np.stack([np.bincount(tets.reshape(-1), f[:, :, k].reshape(-1), n) for k in range(3)], axis=1)
+
+    return apply
+
+
+def hooke_stiffness(body: Body) -> sp.csr_matrix:
+    """Stiffness matrix (3n, 3n) of one body at rest [N/m]."""
+    tets, mu, lam = body.mesh.tets, body.material.mu, body.material.lam
+    Dm_inv, volume = elements.inverse_rest_edges(body.mesh.vertices, tets)
+    g = elements.shape_gradients(Dm_inv)
+    # K_ab = V (mu (ga.gb) I + mu gb ga^T + lambda ga gb^T)
+    inner = np.einsum("eai,ebi->eab", g, g)
+    K = mu * inner[..., None, None] * np.eye(3) + mu * np.einsum("ebi,eaj->eabij", g, g) + lam * np.einsum("eai,ebj->eabij", g, g)
+    K *= volume[:, None, None, None, None]
+    dof = 3 * tets[:, :, None] + np.arange(3)
+    rows = np.broadcast_to(dof[:, :, None, :, None], K.shape)
+    columns = np.broadcast_to(dof[:, None, :, None, :], K.shape)
+    size = 3 * body.mesh.n_verts
+    return sp.csr_matrix((K.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(size, size))
+
+
+def consistent_mass(body: Body) -> sp.csr_matrix:
+    """Consistent mass matrix (3n, 3n): rho V/20 (1 + delta_ab) per tet [kg]."""
+    tets = body.mesh.tets
+    share = (np.ones((4, 4)) + np.eye(4)) / 20.0
+    values = body.material.density * body.mesh.volumes[:, None, None] * share
+    rows, columns = np.broadcast_arrays(tets[:, :, None], tets[:, None, :])
+    n = body.mesh.n_verts
+    scalar = sp.csr_matrix((values.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(n, n))
+    return sp.kron(scalar, sp.identity(3), format="csr")
+
+
+def held_axes(body: Body) -> np.ndarray:
+    """(n, 3) bool: axes that are fixed or led at the start, and vertices of no tet."""
+    held = np.zeros((body.mesh.n_verts, 3), dtype=bool)
+    for c in body.constraints:
+        held[np.ix_(c.nodes, np.flatnonzero(c.axes))] = True
+    held[np.bincount(body.mesh.tets.reshape(-1), minlength=body.mesh.n_verts) == 0] = True
+    return held
+
+
+def highest_frequency(body: Body) -> float:
+    """omega_max [rad/s] of a body at rest with lumped mass, by Lanczos, a fraction of a percent on the high side."""
+    mass = elements.lumped_mass(body.mesh.tets, body.mesh.volumes, body.material.density, body.mesh.n_verts)
+    free = ~held_axes(body)
+    scale = np.where(free, 1.0 / np.sqrt(np.maximum(mass, 1e-300))[:, None], 0.0)
+    if not free.any():
+        return 0.0
+    apply = hooke_differential(body)
+    size = scale.size
+    operator = spl.LinearOperator(
+        (size, size), matvec=lambda y: (scale * apply(scale * y.reshape(-1, 3))).reshape(-1), dtype=np.float64
+    )
+    start = np.random.default_rng(0).normal(size=size) * free.reshape(-1)
+    if size <= 60:
+        dense = np.stack([operator.matvec(e) for e in np.eye(size)])
+        return LANCZOS_MARGIN * float(np.sqrt(np.linalg.eigvalsh(0.5 * (dense + dense.T))[-1]))
+    top = spl.eigsh(operator, k=1, which="LA", tol=0.5 * (LANCZOS_MARGIN - 1.0), v0=start, return_eigenvectors=False)
+    return LANCZOS_MARGIN * float(np.sqrt(top[0]))
+
+
+def _euler_matrix(z: float, drag: float, viscous: float) -> np.ndarray:
+    """One symplectic Euler step of (x, dt v): z = omega dt; drag, viscous = dt times mass and stiffness damping rate."""
+    v = np.array([-z * z, 1.0 - drag - viscous])
+    return np.array([[1.0, 0.0], [0.0, 0.0]]) + np.array([v, v])
+
+
+def _verlet_matrix(z: float, drag: float, viscous: float) -> np.ndarray:
+    """One velocity Verlet step of (x, dt v, dt^2 a), as in stepping/explicit.py."""
+    decay = np.exp(-0.5 * drag)
+    half = np.array([0.0, decay, 0.5])
+    x = np.array([1.0, 0.0, 0.0]) + half
+    a = -z * z * x - viscous * (half + np.array([0.0, 0.0, 0.5]))
+    v = decay * (half + 0.5 * a)
+    return np.stack([x, v, a])
+
+
+def stable_dt(scene: Scene, verlet: bool) -> float:
+    """Largest stable step [s] of an explicit integrator about the rest shape; infinite where nothing can vibrate.
+
+    Without damping 2/omega_max; damping changes it, so the limit is where an eigenvalue of one step leaves the unit disk.
+    """
+    limit = np.inf
+    for body in scene.bodies:
+        omega = highest_frequency(body)
+        if omega > 0.0:
+            limit = min(limit, _stable_dt_of(omega, body.material.mass_damping, body.material.stiffness_damping, verlet))
+    return float(limit)
+
+
+def _stable_dt_of(omega: float, mass_damping: float, stiffness_damping: float, verlet: bool) -> float:
+    if mass_damping == 0.0 and stiffness_damping == 0.0:
+        return 2.0 / omega
+    step = _verlet_matrix if verlet else _euler_matrix
+
+    def stable(dt: float) -> bool:
+        matrix = step(omega * dt, mass_damping * dt, stiffness_damping * omega**2 * dt)
+        return np.abs(np.linalg.eigvals(matrix)).max() <= 1.0 + 1e-9
+
+    low, high = 0.0, 2.0 / omega
+    while stable(high):  # mass damping can widen the limit
+        low, high = high, 2.0 * high
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return low
+
+
+@dataclass(frozen=True)
+class Modes:
+    """frequencies (k,) [Hz], ascending; shapes (k, n_nodes, 3), each with unit modal mass; names of the bodies in order."""
+
+    frequencies: np.ndarray
+    shapes: np.ndarray
+
+
+def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
+    """The lowest k eigenfrequencies [Hz] and shapes of a scene at rest, with its constraints; rigid motions count as 0 Hz.
+
+    mass: "lumped" or "consistent". Raises SceneError for a k or mass that cannot be.
+    """
+    if mass not in ("lumped", "consistent"):
+        raise SceneError(f"mass '{mass}' is unknown: it must be 'lumped' or 'consistent'")
+    if not scene.bodies:
+        raise SceneError("the scene holds no body")
+    free = np.concatenate([~held_axes(b) for b in scene.bodies]).reshape(-1)
+    n_free = int(free.sum())
+    if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 1 <= k <= n_free:
+        raise SceneError(f"k = {k!r}: it must be a whole number from 1 to the {n_free} free axes of the scene")
+    K = sp.block_diag([hooke_stiffness(b) for b in scene.bodies], format="csr")[free][:, free]
+    if mass == "lumped":
+        M = sp.diags(np.repeat(body_masses(scene), 3)[free], format="csc")
+    else:
+        M = sp.block_diag([consistent_mass(b) for b in scene.bodies], format="csr")[free][:, free]
+    if n_free <= max(200, 2 * k):
+        values, vectors = _dense_modes(K, M, k)
+    else:
+        # shifted slightly below 0, so that free bodies (K singular) can be factorised too
+        shift = -1e-6 * K.diagonal().max() / M.diagonal().max()
+        start = np.random.default_rng(0).normal(size=n_free)
+        values, vectors = spl.eigsh(K.tocsc(), k=int(k), M=M.tocsc(), sigma=shift, which="LM", v0=start)
+    order = np.argsort(values)
+    shapes = np.zeros((int(k), free.size))
+    shapes[:, free] = vectors[:, order].T
+    noise = 1e-9 * K.diagonal().max() / M.diagonal().max()  # rigid motions come out as rounding of either sign
+    clean = np.where(np.abs(values[order]) < noise, 0.0, values[order])
+    return Modes(np.sqrt(np.maximum(clean, 0.0)) / (2.0 * np.pi), shapes.reshape(int(k), -1, 3))
+
+
+def _dense_modes(K, M, k: int) -> tuple[np.ndarray, np.ndarray]:
+    from scipy.linalg import eigh
+
+    return eigh(K.toarray(), M.toarray(), subset_by_index=[0, int(k) - 1])

@@ -1,0 +1,150 @@
+"""Static equilibrium: Newton's method on the elastic forces, with load steps where the whole load at once fails."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taisoft.errors import SceneError, SimulationError
+from taisoft.elasticity import measure
+from taisoft.runtime import FieldArena, open_kind, open_runtime
+from taisoft.model import Layout, build_model
+from taisoft.scene.plan import make_plan
+from taisoft.scene.scene import Scene
+from taisoft.stepping.newton import StageResult, StageSolver
+from taisoft.stepping.motion import Motion
+from taisoft.stepping.world import World
+
+MAX_NEWTON = 100
+SMALLEST_LOAD_STEP = 1.0 / 256.0
+
+
+@dataclass(frozen=True)
+class StaticResult:
+    """A state of equilibrium, or the nearest that was found; residual: |force on free axes| / |applied load|.
+
+    load_steps: how many parts the load was applied in. n_inverted: tets with J <= 0.
+    """
+
+    converged: bool
+    residual: float
+    iterations: int  # Newton's, over all load steps
+    linear_iterations: int
+    load_steps: int
+    elastic: float  # stored energy [J]
+    n_inverted: int
+    _scene: Scene
+    _layout: Layout
+    _positions: np.ndarray
+    _reactions: np.ndarray
+
+    def positions(self, name: str | None = None) -> np.ndarray:
+        """(n_nodes, 3) [m] of a body, or of all bodies concatenated."""
+        return self._positions[self._rows(name)].copy()
+
+    def reactions(self, name: str | None = None) -> np.ndarray:
+        """(n_nodes, 3) force of the constraints [N]."""
+        return self._reactions[self._rows(name)].copy()
+
+    def _rows(self, name: str | None) -> slice:
+        if name is None:
+            return slice(None)
+        return self._layout.nodes(self._scene.bodies.index(self._scene.body(name)))
+
+
+def solve_static(
+    scene: Scene, tolerance: float = 1e-6, precision: str = "f64", arch: str = "cpu", time: float = 0.0
+) -> StaticResult:
+    """Find the rest state under gravity, loads and constraints; paths of moved nodes are taken at `time` [s].
+
+    tolerance: of |residual on free axes| / |applied load| (without any load: over the constraint forces). An open f64
+    runtime is reused, otherwise one is opened and closed. Raises SceneError where nothing holds a body, SimulationError
+    when the runtime is taken; a solve that does not converge returns converged=False.
+    """
+    _check(scene, tolerance)
+    kind = open_kind()
+    arch = kind[0] if kind is not None and kind[1] == precision else arch
+    runtime = open_runtime(arch, precision, "solve_static")
+    arena = FieldArena()
+    try:
+        return _Static(scene, runtime, arena, tolerance, time).solve()
+    finally:
+        arena.release()
+        runtime.close()
+
+
+def _check(scene: Scene, tolerance: float) -> None:
+    if not isinstance(scene, Scene) or not scene.bodies:
+        raise SceneError("solve_static needs a Scene that holds a body")
+    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 0.0 < tolerance < 1.0:
+        raise SceneError(f"tolerance = {tolerance!r}: it must lie between 0 and 1")
+    for body in scene.bodies:
+        held = np.zeros(3, dtype=bool)
+        for c in body.constraints:
+            held |= c.axes
+        if not held.all():
+            missing = "".join(a for a, h in zip("xyz", held, strict=True) if not h)
+            raise SceneError(f"body '{body.name}': nothing holds it along {missing}, so it has no static state")
+
+
+class _Static:
+    def __init__(self, scene, runtime, arena, tolerance, time):
+        plan = make_plan(scene, explicit=False, multistep=False)
+        model, layout = build_model(scene, runtime, arena, {**plan.on, "mass_damping": False, "stiffness_damping": False})
+        self.world = World(scene, runtime, arena, model, layout, Motion(scene, layout))
+        self.solver = StageSolver(model, arena, runtime.eps, self.world.motion.moved)
+        self.tolerance = tolerance
+        self.target = self.world.next_target(time)
+        self.world.upload_constraints()
+        self.gravity = np.array(scene.gravity, dtype=np.float64)
+        self.loads = model.loads.to_numpy() if model.loaded else None
+        self.newton = self.linear = 0
+
+    def solve(self) -> StaticResult:
+        """The whole load at once; failing that, in steps that halve on failure and grow on success."""
+        rest = self.world.layout.rest
+        result, steps = self._attempt(rest, 1.0, self.tolerance), 1
+        if not self._good(result):
+            done, share, x, steps = 0.0, 0.25, rest, 0
+            while done < 1.0 and share >= SMALLEST_LOAD_STEP:
+                goal = min(1.0, done + share)
+                result = self._attempt(x, goal, self.tolerance if goal == 1.0 else max(self.tolerance, 1e-3))
+                if self._good(result):
+                    done, share, steps, x = goal, 1.5 * share, steps + 1, self.world.model.x.to_numpy()
+                else:
+                    share *= 0.5
+        return self._answer(result, steps)
+
+    def _good(self, result: StageResult) -> bool:
+        measure(self.world.model)
+        return result.converged and self.world.model.scalars[2] == 0.0
+
+    def _attempt(self, x: np.ndarray, share: float, tolerance: float) -> StageResult:
+        """Solve with a share of the load, from x."""
+        m, w, npr = self.world.model, self.solver.work, self.world.runtime.np_real
+        m.gravity.from_numpy((share * self.gravity).astype(npr)[None])
+        if self.loads is not None:
+            m.loads.from_numpy((share * self.loads).astype(npr))
+        w.x_hat.from_numpy(x)
+        m.x.from_numpy(x)
+        m.v.fill(0.0)
+        if self.target is not None:
+            rest = self.world.layout.rest[self.world.motion.moved]
+            w.targets.from_numpy(rest + share * (self.target - rest))
+            w.moved_axes.from_numpy(self.world.motion.moved_axes())
+        result = self.solver.solve(0.0, 1.0, tolerance, MAX_NEWTON, by_energy=True)
+        self.newton += result.newton_iterations
+        self.linear += result.linear_iterations
+        return result
+
+    def _answer(self, result: StageResult, steps: int) -> StaticResult:
+        world = self.world
+        measure(world.model)
+        s = world.model.scalars.to_numpy()
+        held = 1.0 - world.model.free.to_numpy().astype(np.float64)
+        if not np.isfinite(result.residual):
+            raise SimulationError(f"solve_static: {world.find_unfinite() or 'the residual is not finite'}")
+        return StaticResult(
+            converged=result.converged, residual=result.residual, iterations=self.newton, linear_iterations=self.linear,
+            load_steps=steps, elastic=float(s[0]), n_inverted=int(s[2]), _scene=world.scene, _layout=world.layout,
+            _positions=world.model.x.to_numpy(), _reactions=held * self.solver.work.residual.to_numpy(),
+        )  # fmt: skip

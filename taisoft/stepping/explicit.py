@@ -1,0 +1,227 @@
+"""Explicit steps: symplectic Euler and velocity Verlet, many sub-steps in one kernel launch.
+
+Symplectic Euler (the report's semi-implicit): v += dt a(x, v); x += dt v. First order, stable for dt < 2/omega_max.
+Velocity Verlet: half a kick, drift, force, half a kick. The same cost, second order, the same limit.
+Damping: the stiffness part -c K(x) v enters the force (K projected positive; Verlet extrapolates v to the force's time,
+which keeps it second order); the mass part is a factor on v, exact in Verlet and `1 - dt a` in Euler.
+A small mesh runs all its sub-steps in one serial kernel; a large one takes two parallel loops a sub-step.
+"""
+
+import taichi as ti
+
+from taisoft.elasticity import HUGE, count_inverted, element_force
+from taisoft.elements import broadcast, gather
+from taisoft.runtime import kernel
+
+
+@ti.func
+def unfinite(value):
+    """Whether an f64 is NaN, infinite or past the range of f32, told from its bits after rounding to f32."""
+    bits = ti.bit_cast(ti.cast(value, ti.f32), ti.i32)
+    return (bits & 0x7F800000) == 0x7F800000
+
+
+@ti.func
+def acceleration(m: ti.template(), i):
+    """Elastic (and stiffness damping) force, loads and gravity on node i [m/s^2]; 0 on constrained axes."""
+    f = gather(m, i)
+    if ti.static(m.loaded):
+        f += m.loads[i]
+    return m.free[i] * (f / m.mass[i] + m.gravity[0])
+
+
+@ti.func
+def euler_node(m: ti.template(), i, dt):
+    a = acceleration(m, i)
+    v = m.v[i] + dt * a
+    if ti.static(m.damped):
+        v -= dt * m.damping[m.node_body[i], 0] * m.v[i]
+    m.v[i] = v
+    m.x[i] = m.x[i] + ti.cast(dt * v, ti.f64)
+    return v
+
+
+@ti.func
+def verlet_drift(m: ti.template(), s: ti.template(), i, dt):
+    """First half kick and drift; where stiffness damping is on, v is then extrapolated to the force's time."""
+    v = m.v[i]
+    if ti.static(m.damped):
+        v *= ti.exp(-0.5 * dt * m.damping[m.node_body[i], 0])
+    half = v + 0.5 * dt * s.acceleration[i]
+    m.x[i] = m.x[i] + ti.cast(dt * half, ti.f64)
+    if ti.static(m.stiffness_damping):
+        s.half_velocity[i] = half
+        m.v[i] = half + 0.5 * dt * s.acceleration[i]
+    else:
+        m.v[i] = half
+
+
+@ti.func
+def verlet_kick(m: ti.template(), s: ti.template(), i, dt):
+    """Second half kick."""
+    a = acceleration(m, i)
+    half = m.v[i]
+    if ti.static(m.stiffness_damping):
+        half = s.half_velocity[i]
+    v = half + 0.5 * dt * a
+    if ti.static(m.damped):
+        v *= ti.exp(-0.5 * dt * m.damping[m.node_body[i], 0])
+    s.acceleration[i] = a
+    m.v[i] = v
+    return v
+
+
+@ti.func
+def lead(m: ti.template(), s: ti.template(), row, dt):
+    """Put the moved nodes on their targets for this sub-step; their velocity is the way per time."""
+    for k in range(s.n_moved):
+        i = s.moved[k]
+        for a in ti.static(range(3)):
+            if s.moved_axes[k][a] != 0:
+                target = s.targets[row * s.n_moved + k][a]
+                m.v[i][a] = ti.cast((target - s.before[k][a]) / dt, m.real)
+                m.x[i][a] = target
+
+
+@ti.func
+def remember(m: ti.template(), s: ti.template()):
+    for k in range(s.n_moved):
+        s.before[k] = m.x[s.moved[k]]
+
+
+@ti.func
+def react(m: ti.template(), s: ti.template(), dt):
+    """Constraint force on held nodes: m (v_new - v_old)/dt - f, with v_old kept in `held_velocity` [N]."""
+    for k in range(s.n_held):
+        i = s.held[k]
+        f = gather(m, i)
+        if ti.static(m.loaded):
+            f += m.loads[i]
+        mass = m.mass[i]
+        s.reaction[k] = (1.0 - m.free[i]) * (mass * (m.v[i] - s.held_velocity[k]) / dt - f - mass * m.gravity[0])
+
+
+@ti.func
+def keep_held(m: ti.template(), s: ti.template()):
+    for k in range(s.n_held):
+        s.held_velocity[k] = m.v[s.held[k]]
+
+
+@kernel
+def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, restart: ti.i32):
+    """n sub-steps of dt on one thread. scalars 5..7: sub-steps done, smallest J, most inverted tets in a sub-step.
+
+    Stops after the sub-step in which a velocity stops being finite. restart: Verlet's acceleration is stale.
+    """
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        dt = ti.cast(dt64, m.real)
+        done, going = 0, True
+        lowest = broadcast(ti.cast(HUGE, m.real), m.lanes)
+        most = 0
+        if ti.static(s.verlet):
+            if restart != 0:
+                for law, first, last in ti.static(m.laws):
+                    for b in range(first, last):
+                        element_force(m, law, m.stiffness_damping, b)
+                for i in range(m.n_nodes):
+                    s.acceleration[i] = acceleration(m, i)
+        while done < n and going:
+            if ti.static(s.n_held > 0):
+                if done == n - 1:
+                    keep_held(m, s)
+            if ti.static(s.n_moved > 0):
+                remember(m, s)
+            if ti.static(s.verlet):
+                for i in range(m.n_nodes):
+                    verlet_drift(m, s, i, dt)
+                if ti.static(s.n_moved > 0):
+                    lead(m, s, done, dt64)
+            inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
+            for law, first, last in ti.static(m.laws):
+                for b in range(first, last):
+                    J = element_force(m, law, m.stiffness_damping, b)
+                    lowest = ti.min(lowest, J)
+                    inverted += count_inverted(m, b, J)
+            total = ti.Vector([0.0, 0.0, 0.0], m.real)
+            for i in range(m.n_nodes):
+                if ti.static(s.verlet):
+                    total += verlet_kick(m, s, i, dt)
+                else:
+                    total += euler_node(m, i, dt)
+            if ti.static(s.n_moved > 0):
+                lead(m, s, done, dt64)
+            if ti.static(s.n_held > 0):
+                if done == n - 1:
+                    react(m, s, dt)
+            count = 0
+            for q in ti.static(range(m.lanes)):
+                count += inverted[q]
+            most = ti.max(most, count)
+            going = not unfinite(ti.cast(total[0] + total[1] + total[2], ti.f64))
+            done += 1
+        low = lowest[0]
+        for q in ti.static(range(1, m.lanes)):
+            low = ti.min(low, lowest[q])
+        m.scalars[5], m.scalars[6], m.scalars[7] = done - (0 if going else 1), low, most
+
+
+@kernel
+def elements_parallel(m: ti.template()):
+    """One sub-step's element loop over threads; scalars 6, 7: smallest J, inverted tets of this sub-step."""
+    for law, first, last in ti.static(m.laws):
+        for b in range(first, last):
+            J = element_force(m, law, m.stiffness_damping, b)
+            bad = count_inverted(m, b, J)
+            low, count = J[0], bad[0]
+            for q in ti.static(range(1, m.lanes)):
+                low, count = ti.min(low, J[q]), count + bad[q]
+            ti.atomic_min(m.scalars[6], ti.cast(low, ti.f64))
+            ti.atomic_add(m.scalars[7], ti.cast(count, ti.f64))
+
+
+@kernel
+def restart_parallel(m: ti.template(), s: ti.template()):
+    """Verlet's acceleration from the corner buffer."""
+    for i in range(m.n_nodes):
+        s.acceleration[i] = acceleration(m, i)
+
+
+@kernel
+def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64):
+    """What comes before a sub-step's element loop."""
+    if ti.static(s.n_held > 0):
+        for k in range(s.n_held):
+            s.held_velocity[k] = m.v[s.held[k]]
+    if ti.static(s.n_moved > 0):
+        for k in range(s.n_moved):
+            s.before[k] = m.x[s.moved[k]]
+    if ti.static(s.verlet):
+        for i in range(m.n_nodes):
+            verlet_drift(m, s, i, ti.cast(dt64, m.real))
+        if ti.static(s.n_moved > 0):
+            ti.loop_config(serialize=True)
+            for _ in range(1):
+                lead(m, s, row, dt64)
+
+
+@kernel
+def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64):
+    """What comes after a sub-step's element loop; scalars 8: not 0 once a velocity is not finite."""
+    for i in range(m.n_nodes):
+        dt = ti.cast(dt64, m.real)
+        v = ti.Vector([0.0, 0.0, 0.0], m.real)
+        if ti.static(s.verlet):
+            v = verlet_kick(m, s, i, dt)
+        else:
+            v = euler_node(m, i, dt)
+        if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
+            m.scalars[8] = 1.0
+    if ti.static(s.n_moved > 0):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            lead(m, s, row, dt64)
+    if ti.static(s.n_held > 0):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            react(m, s, ti.cast(dt64, m.real))

@@ -1,0 +1,163 @@
+"""What the implicit integrators share: one stage x = x_hat + beta v, M (v - v_hat) = beta f(x, v), and its bookkeeping.
+
+An integrator is a `Scheme`: how x_hat, v_hat and beta come from the past, and whether the stage is the step's middle.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+from taisoft.errors import SimulationError
+from taisoft.runtime import kernel
+from taisoft.stepping.newton import StageResult, StageSolver
+from taisoft.stepping.world import World
+
+MAX_NEWTON = 50  # a step that needs more is reported as not converged
+DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """x_hat = now x_n - before x_(n-1), v_hat alike, beta = share dt; midpoint: the step ends at twice the stage minus x_n."""
+
+    share: float
+    now: float = 1.0
+    before: float = 0.0
+    midpoint: bool = False
+    one_iteration: bool = False  # linearised at x_n, one Newton step, no look back
+    start: "Scheme | None" = None  # what takes the first step, when there is no past
+
+
+@kernel
+def keep_state(m: ti.template(), h: ti.template(), shift: ti.template()):
+    """State n into the history; with shift, what was n becomes n - 1."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        if ti.static(shift):
+            h.x_before[i] = h.x_now[i]
+        h.v_before[i] = h.v_now[i]
+        h.x_now[i] = m.x[i]
+        h.v_now[i] = m.v[i]
+
+
+@kernel
+def set_hats(m: ti.template(), w: ti.template(), h: ti.template(), multistep: ti.template(), now: ti.f64, before: ti.f64):
+    """x_hat and v_hat of the stage."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        w.x_hat[i] = h.x_now[i]
+        w.v_hat[i] = h.v_now[i]
+        if ti.static(multistep):
+            w.x_hat[i] = now * h.x_now[i] - before * h.x_before[i]
+            w.v_hat[i] = ti.cast(now, m.real) * h.v_now[i] - ti.cast(before, m.real) * h.v_before[i]
+
+
+@kernel
+def guess(m: ti.template(), h: ti.template(), along: ti.f64):
+    """First iterate v_n + along (v_n - v_(n-1)) on the free axes, 0 elsewhere (led nodes are set with the targets)."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        m.v[i] = m.free[i] * (h.v_now[i] + ti.cast(along, m.real) * (h.v_now[i] - h.v_before[i]))
+
+
+@kernel
+def standstill(m: ti.template()):
+    """First iterate v = 0: the linearly implicit step is linearised at x_n."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        m.v[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
+
+
+@kernel
+def finish_midpoint(m: ti.template(), h: ti.template()):
+    """The stage was the middle: x = 2 x_m - x_n, v = 2 v_m - v_n."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        m.x[i] = 2.0 * m.x[i] - h.x_now[i]
+        m.v[i] = 2.0 * m.v[i] - h.v_now[i]
+
+
+@kernel
+def restore(m: ti.template(), h: ti.template()):
+    """Back to state n."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        m.x[i] = h.x_now[i]
+        m.v[i] = h.v_now[i]
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """States n and n - 1, (n_nodes) 3-vectors; x_before only for multistep schemes."""
+
+    x_now: object
+    v_now: object
+    v_before: object
+    x_before: object
+
+
+class ImplicitStepper:
+    """Takes steps of one scheme over a world."""
+
+    explicit = False
+
+    def __init__(self, world: World, scheme: Scheme):
+        self.world, self.scheme = world, scheme
+        m, arena = world.model, world.arena
+        self.solver = StageSolver(m, arena, world.runtime.eps, world.motion.moved)
+        self.history = History(
+            arena.vectors("x_now", ti.f64, m.n_nodes), arena.vectors("v_now", m.real, m.n_nodes),
+            arena.vectors("v_before", m.real, m.n_nodes),
+            arena.vectors("x_before", ti.f64, m.n_nodes) if scheme.before else None,
+        )  # fmt: skip
+        self.tolerance = DEFAULT_TOLERANCE[world.runtime.precision]
+        self.linear_tolerance: float | None = None
+        self.material_changed()
+        self.forget()
+
+    def forget(self) -> None:
+        """The past is void: the state, dt or a number changed."""
+        self._past = 0  # steps whose state is in the history
+        self._beta = 0.0
+
+    def material_changed(self) -> None:
+        """Material numbers changed."""
+        self.solver.update_material()
+
+    def step(self, dt: float) -> StageResult:
+        """One step of dt; on a non-finite result the state is put back and SimulationError raised."""
+        world, m, h, w = self.world, self.world.model, self.history, self.solver.work
+        scheme = self.scheme if self._past > 0 or self.scheme.start is None else self.scheme.start
+        target = world.next_target(world.time + dt)
+        keep_state(m, h, self.scheme.before > 0.0)
+        if target is not None:
+            w.moved_axes.from_numpy(world.motion.moved_axes())
+            if scheme.midpoint:
+                target = 0.5 * (target + h.x_now.to_numpy()[world.motion.moved])
+            w.targets.from_numpy(target)
+        self._beta = scheme.share * dt
+        self.solver.assemble_damper()
+        set_hats(m, w, h, self.scheme.before > 0.0, scheme.now, scheme.before)
+        if scheme.one_iteration:
+            standstill(m)
+        else:
+            guess(m, h, (0.5 if scheme.midpoint else 1.0) if self._past > 1 else 0.0)
+        result = self.solver.solve(
+            1.0, self._beta, self.tolerance, 1 if scheme.one_iteration else MAX_NEWTON, self.linear_tolerance
+        )
+        if scheme.midpoint:
+            finish_midpoint(m, h)
+        where = world.find_unfinite()
+        if where is not None:
+            restore(m, h)
+            raise SimulationError(f"step {world.step_count + 1}: {where}")
+        self._past += 1
+        return result
+
+    def reactions(self) -> np.ndarray:
+        """(n_nodes, 3) force of the constraints in the last step [N]."""
+        if self._beta == 0.0:
+            return np.zeros((self.world.model.n_nodes, 3))
+        held = 1.0 - self.world.model.free.to_numpy().astype(np.float64)
+        return held * self.solver.work.residual.to_numpy() / self._beta

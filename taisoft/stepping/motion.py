@@ -1,0 +1,104 @@
+"""Constraints as the steps see them: which axes are free, where moved nodes must be at a time, when they are released."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taisoft.errors import SimulationError
+from taisoft.model import Layout
+from taisoft.scene.scene import Constraint, Scene
+
+
+@dataclass
+class _Group:
+    name: str  # of the body
+    constraint: Constraint
+    nodes: np.ndarray  # (k,) rows of the model
+    rows: slice  # rows among the moved nodes
+    released: bool = False
+
+
+class Motion:
+    """Constraints of all bodies.
+
+    moved (n_moved,): model rows of led nodes, group by group; a node led by two groups on different axes has two rows.
+    held (n_held,): model rows with a constrained axis at the start.
+    """
+
+    def __init__(self, scene: Scene, layout: Layout):
+        self._rest = layout.rest
+        self._fixed = np.zeros((len(layout.rest), 3), dtype=bool)
+        self._groups: list[_Group] = []
+        n_moved = 0
+        for k, body in enumerate(scene.bodies):
+            for c in body.constraints:
+                rows = c.nodes + layout.node_start[k]
+                if c.path is None:
+                    self._fixed[np.ix_(rows, np.flatnonzero(c.axes))] = True
+                else:
+                    self._groups.append(_Group(body.name, c, rows, slice(n_moved, n_moved + len(rows))))
+                    n_moved += len(rows)
+        weightless = layout.mass <= 0  # vertices of no tet: nothing acts on them
+        self._fixed[weightless] = True
+        self.moved = np.concatenate([g.nodes for g in self._groups]) if self._groups else np.zeros(0, dtype=np.int64)
+        self.held = np.flatnonzero(self.constrained().any(axis=1) & ~weightless)
+
+    def reset(self) -> None:
+        """Take up every path again."""
+        for g in self._groups:
+            g.released = False
+
+    @property
+    def n_moved(self) -> int:
+        """Rows of led nodes, released ones included."""
+        return len(self.moved)
+
+    def constrained(self) -> np.ndarray:
+        """(n_nodes, 3) bool: axes that are fixed or led now."""
+        mask = self._fixed.copy()
+        for g in self._groups:
+            if not g.released:
+                mask[np.ix_(g.nodes, np.flatnonzero(g.constraint.axes))] = True
+        return mask
+
+    def moved_axes(self) -> np.ndarray:
+        """(n_moved, 3) int32: 1 where a row's axis is led now."""
+        axes = np.zeros((self.n_moved, 3), dtype=np.int32)
+        for g in self._groups:
+            if not g.released:
+                axes[g.rows] = g.constraint.axes
+        return axes
+
+    def targets(self, times: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Positions of the led nodes at the times (k,) [s], up to the first release.
+
+        Returns (r, n_moved, 3) [m] with r <= k, and whether a group lets go at times[r]. If that is times[0], the groups
+        that let go are released and the call is to be repeated.
+        """
+        rows = np.zeros((len(times), self.n_moved, 3))
+        for r, t in enumerate(times):
+            letting_go = []
+            for g in self._groups:
+                if g.released:
+                    continue
+                way = g.constraint.path(float(t))
+                if way is None:
+                    letting_go.append(g)
+                    continue
+                rows[r, g.rows] = self._rest[g.nodes] + self._checked(g, way, t)
+            if letting_go:
+                if r == 0:
+                    for g in letting_go:
+                        g.released = True
+                return rows[:r], True
+        return rows, False
+
+    @staticmethod
+    def _checked(group: _Group, way, t: float) -> np.ndarray:
+        way = np.asarray(way, dtype=np.float64)
+        if way.shape not in ((3,), (len(group.nodes), 3)) or not np.isfinite(way).all():
+            raise SimulationError(
+                f"body '{group.name}': the path of its moved nodes gave {way.tolist() if way.size < 10 else way.shape} at "
+                f"t = {t:g} s: it must be finite, of shape (3,) or ({len(group.nodes)}, 3)"
+            )
+        return way

@@ -1,0 +1,153 @@
+"""Runs explicit sub-steps in batches, checks them, and puts the last good state back when one fails."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from taisoft.errors import SimulationError
+from taisoft.stepping import explicit
+from taisoft.stepping.world import World
+
+LAUNCH_SECONDS = 0.1  # aim for one launch, so that Ctrl-C is heard
+SECONDS_PER_TET = 60e-9  # of one sub-step, the slowest seen (corotational with stiffness damping): sizes a launch
+MAX_BATCH = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class SubstepWork:
+    """Fields of the explicit steps; what a scene does not need is None."""
+
+    verlet: bool
+    n_moved: int
+    n_held: int
+    acceleration: Any  # (n_nodes) 3-vectors, Verlet
+    half_velocity: Any  # (n_nodes) 3-vectors, Verlet with stiffness damping
+    moved: Any  # (n_moved) i32
+    moved_axes: Any  # (n_moved) 3-vectors i32
+    targets: Any  # (rows * n_moved) 3-vectors f64
+    before: Any  # (n_moved) 3-vectors f64: position before the sub-step
+    held: Any  # (n_held) i32
+    held_velocity: Any  # (n_held) 3-vectors
+    reaction: Any  # (n_held) 3-vectors [N]
+
+
+@dataclass(frozen=True)
+class SubstepResult:
+    """Extremes over a batch."""
+
+    done: int
+    min_volume_ratio: float
+    n_inverted: int
+
+
+class ExplicitStepper:
+    """Takes sub-steps of symplectic Euler or velocity Verlet over a world."""
+
+    explicit = True
+
+    def __init__(self, world: World, verlet: bool):
+        self.world = world
+        m, arena, motion = world.model, world.arena, world.motion
+        n_tets = int(world.layout.n_tets.sum())
+        self.max_batch = max(1, min(MAX_BATCH, int(LAUNCH_SECONDS / (SECONDS_PER_TET * n_tets))))
+        n_moved, n_held = motion.n_moved, len(motion.held)
+        self.rows = max(1, min(self.max_batch, 1_000_000 // max(1, n_moved)))  # bounds the targets' memory
+
+        def vectors(name: str, count: int, dtype=m.real, wanted: bool = True, data=None):
+            return arena.vectors(name, dtype, count, data) if wanted and count > 0 else None
+
+        self.work = SubstepWork(
+            verlet=verlet, n_moved=n_moved, n_held=n_held,
+            acceleration=vectors("acceleration", m.n_nodes, wanted=verlet),
+            half_velocity=vectors("half_velocity", m.n_nodes, wanted=verlet and m.stiffness_damping),
+            moved=arena.field("moved", ti.i32, n_moved, motion.moved.astype(np.int32)) if n_moved else None,
+            moved_axes=vectors("moved_axes", n_moved, ti.i32, data=motion.moved_axes()),
+            targets=vectors("targets", self.rows * n_moved, ti.f64),
+            before=vectors("moved_before", n_moved, ti.f64),
+            held=arena.field("held", ti.i32, n_held, motion.held.astype(np.int32)) if n_held else None,
+            held_velocity=vectors("held_velocity", n_held), reaction=vectors("reaction", n_held),
+        )  # fmt: skip
+        self.stale = True  # Verlet's acceleration does not belong to the present state
+
+    def forget(self) -> None:
+        """The state or a number changed."""
+        self.stale = True
+
+    material_changed = forget
+
+    def advance(self, n: int, dt: float) -> SubstepResult:
+        """Take n sub-steps of dt, or fewer where led nodes let go or the launch would last too long; at least one.
+
+        A sub-step with a non-finite result raises SimulationError, and the state is the one before it.
+        """
+        n = min(n, self.max_batch)
+        world = self.world
+        if self.work.n_moved:
+            n = min(n, self.rows)
+            targets = world.next_targets(world.time + dt * np.arange(1, n + 1))
+            n = len(targets)
+            self._upload_targets(targets)
+        x, v = world.model.x.to_numpy(), world.model.v.to_numpy()
+        result = self._launch(n, dt)
+        if result.done < n:
+            self._put_back(x, v)
+            if result.done > 0:  # deterministic on the CPU: the same sub-steps again, up to the last good one
+                self._launch(result.done, dt)
+            good = world.model.x.to_numpy(), world.model.v.to_numpy()
+            self._put_back(*good)
+            self._launch(1, dt)
+            where = world.find_unfinite() or "a velocity is no longer finite"
+            self._put_back(*good)
+            world.step_count += result.done
+            world.time += result.done * dt
+            raise SimulationError(f"step {world.step_count + 1}: {where}")
+        return result
+
+    def _upload_targets(self, targets: np.ndarray) -> None:
+        padded = np.zeros((self.rows * self.work.n_moved, 3))
+        padded[: targets.size // 3] = targets.reshape(-1, 3)
+        self.work.targets.from_numpy(padded)
+        self.work.moved_axes.from_numpy(self.world.motion.moved_axes())
+
+    def _put_back(self, x: np.ndarray, v: np.ndarray) -> None:
+        self.world.model.x.from_numpy(x)
+        self.world.model.v.from_numpy(v)
+        self.stale = True
+
+    def _launch(self, n: int, dt: float) -> SubstepResult:
+        m, s = self.world.model, self.work
+        if m.serial:
+            explicit.advance_serial(m, s, n, dt, int(self.stale))
+        else:
+            self._launch_parallel(n, dt)
+        self.stale = False
+        values = m.scalars.to_numpy()
+        return SubstepResult(int(values[5]), float(values[6]), int(values[7]))
+
+    def _launch_parallel(self, n: int, dt: float) -> None:
+        m, s = self.world.model, self.work
+        low, most, done = explicit.HUGE, 0.0, 0
+        if s.verlet and self.stale:
+            explicit.elements_parallel(m)
+            explicit.restart_parallel(m, s)
+        for row in range(n):
+            m.scalars[6], m.scalars[7], m.scalars[8] = explicit.HUGE, 0.0, 0.0
+            if s.verlet or s.n_moved or s.n_held:
+                explicit.drift_parallel(m, s, row, dt)
+            explicit.elements_parallel(m)
+            explicit.nodes_parallel(m, s, row, dt)
+            values = m.scalars.to_numpy()
+            low, most = min(low, values[6]), max(most, values[7])
+            if values[8] != 0.0:
+                break
+            done += 1
+        m.scalars[5], m.scalars[6], m.scalars[7] = done, low, most
+
+    def reactions(self) -> np.ndarray:
+        """(n_nodes, 3) force of the constraints in the last sub-step [N]."""
+        out = np.zeros((self.world.model.n_nodes, 3))
+        if self.work.n_held:
+            out[self.world.motion.held] = self.work.reaction.to_numpy()
+        return out

@@ -1,0 +1,72 @@
+"""World: what every stepper works on: model, constraints, time; the one place that touches them together."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from taisoft.model import Layout, Model, body_masses, damping_table, material_table
+from taisoft.runtime import FieldArena, Runtime
+from taisoft.scene.scene import Scene
+from taisoft.stepping.motion import Motion
+
+
+@dataclass
+class World:
+    """A scene in the machine. time [s] is start + count * dt, so that it does not drift."""
+
+    scene: Scene
+    runtime: Runtime
+    arena: FieldArena
+    model: Model
+    layout: Layout
+    motion: Motion
+    time: float = 0.0
+    step_count: int = 0
+
+    def upload_constraints(self) -> None:
+        """Free axes to the device; velocities of fixed axes become 0."""
+        held = self.motion.constrained()
+        self.model.free.from_numpy((~held).astype(self.runtime.np_real))
+
+    def upload_material(self) -> None:
+        """Material numbers, masses and loads of the bodies to the device."""
+        m, npr = self.model, self.runtime.np_real
+        mass = body_masses(self.scene)
+        self.layout = replace(self.layout, mass=mass)
+        m.mass.from_numpy(mass.astype(npr))
+        m.law_constants.from_numpy(material_table([b.material for b in self.scene.bodies]))
+        if m.damping is not None:
+            m.damping.from_numpy(damping_table(self.scene).astype(npr))
+
+    def rest_velocities(self) -> np.ndarray:
+        """Initial velocities with 0 on constrained axes (n_nodes, 3)."""
+        start = [np.broadcast_to(b.velocity, b.rest_positions.shape) for b in self.scene.bodies]
+        return np.where(self.motion.constrained(), 0.0, np.concatenate(start))
+
+    def next_targets(self, times: np.ndarray) -> np.ndarray | None:
+        """Targets of led nodes (r, n_moved, 3), r >= 1, for the first r of the times; None when nothing is led.
+
+        Nodes that let go at the first time are released here.
+        """
+        if self.motion.n_moved == 0:
+            return None
+        rows, letting_go = self.motion.targets(times)
+        while letting_go and len(rows) == 0:
+            self.upload_constraints()
+            rows, letting_go = self.motion.targets(times)
+        return rows
+
+    def next_target(self, t: float) -> np.ndarray | None:
+        """Targets (n_moved, 3) at one time."""
+        rows = self.next_targets(np.array([t]))
+        return None if rows is None else rows[0]
+
+    def find_unfinite(self) -> str | None:
+        """Names the first node whose position or velocity is not finite, in a few words."""
+        x, v = self.model.x.to_numpy(), self.model.v.to_numpy()
+        bad = np.flatnonzero(~(np.isfinite(x).all(axis=1) & np.isfinite(v).all(axis=1)))
+        if len(bad) == 0:
+            return None
+        body = int(np.searchsorted(self.layout.node_start, bad[0], side="right")) - 1
+        name, vertex = self.scene.bodies[body].name, bad[0] - self.layout.node_start[body]
+        return f"body '{name}', vertex {vertex}: position or velocity is no longer finite ({len(bad)} vertices in all)"

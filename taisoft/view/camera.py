@@ -1,0 +1,97 @@
+"""A perspective camera that looks at a point from a direction: framing, orbiting, projecting."""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+UP = np.array([0.0, 1.0, 0.0])
+MAX_ELEVATION = 89.0  # [deg]; at 90 "up" is no longer defined
+BORDER = 0.06  # of the picture, both sides together, kept free when the camera moves back from moving bodies
+MAX_WIDENING = 4.0  # times the first distance: a body that flies away goes out of sight in the end
+NEAR, FAR = 0.02, 50.0  # clipping planes in units of the distance to the target
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Looks at target (3,) [m] from a distance [m].
+
+    azimuth [deg] about y: 0 looks along -z, 90 along -x; elevation [deg] above the horizon; fov [deg]: the vertical
+    opening angle.
+    """
+
+    target: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    distance: float = 5.0
+    azimuth: float = 32.0
+    elevation: float = 20.0
+    fov: float = 30.0
+
+    @classmethod
+    def framing(cls, points: np.ndarray, margin: float = 1.15, **angles) -> "Camera":
+        """A camera that shows the ball round the bounding box of points (n,3), times margin."""
+        low, high = np.min(points, axis=0), np.max(points, axis=0)
+        camera = cls(target=(low + high) / 2, **angles)
+        radius = max(float(np.linalg.norm(high - low)) / 2, 1e-9)  # of a single point: anything above 0
+        return replace(camera, distance=margin * radius / math.sin(math.radians(camera.fov) / 2))
+
+    @property
+    def position(self) -> np.ndarray:
+        """Where the eye is, (3,) [m]."""
+        return self.target - self.distance * self.forward
+
+    @property
+    def forward(self) -> np.ndarray:
+        """Unit vector (3,) from the eye to the target."""
+        azimuth, elevation = math.radians(self.azimuth), math.radians(self.elevation)
+        return -np.array(
+            [math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation)]
+        )
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Rows right, up, forward of the picture: (3,3), orthonormal."""
+        right = np.cross(self.forward, UP)
+        right /= np.linalg.norm(right)
+        return np.array([right, np.cross(right, self.forward), self.forward])
+
+    @property
+    def clipping(self) -> tuple[float, float]:
+        """Distances of the near and the far clipping plane [m]."""
+        return NEAR * self.distance, FAR * self.distance
+
+    def widened(self, points: np.ndarray, size: tuple[int, int], limit: float) -> "Camera":
+        """Moved back, to limit [m] at most, until points (n,3) lie within the picture less BORDER.
+
+        size: width and height of the picture. Never moves nearer; points that are not finite do not count.
+        """
+        right, up, forward = self.axes @ (np.asarray(points) - self.target).T
+        half = (1.0 - BORDER) * math.tan(math.radians(self.fov) / 2)  # height by distance
+        needed = np.maximum(np.abs(right) / (half * size[0] / size[1]), np.abs(up) / half) - forward
+        furthest = np.max(needed, initial=0.0, where=np.isfinite(needed))
+        return replace(self, distance=max(self.distance, min(furthest, limit)))
+
+    def orbit(self, azimuth: float, elevation: float) -> "Camera":
+        """Turned about the target by so many degrees; elevation stops short of the poles."""
+        raised = min(max(self.elevation + elevation, -MAX_ELEVATION), MAX_ELEVATION)
+        return replace(self, azimuth=(self.azimuth + azimuth) % 360.0, elevation=raised)
+
+    def zoom(self, factor: float) -> "Camera":
+        """Distance times factor."""
+        return replace(self, distance=self.distance * factor)
+
+    def pan(self, right: float, up: float) -> "Camera":
+        """Moved in the picture's plane, in units of the picture's height at the target."""
+        height = 2 * self.distance * math.tan(math.radians(self.fov) / 2)
+        return replace(self, target=self.target + height * (right * self.axes[0] + up * self.axes[1]))
+
+    def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Pixel coordinates (from the left, from the top) and depth along the view [m] of points (n,3): (n,3).
+
+        size: width and height in pixels. A point at or behind the eye has depth <= 0 and no meaningful pixel.
+        """
+        width, height = size
+        seen = (np.asarray(points) - self.position) @ self.axes.T
+        focal = height / 2 / math.tan(math.radians(self.fov) / 2)
+        depth = seen[:, 2]
+        scale = focal / np.where(depth > 0, depth, np.inf)
+        return np.column_stack([width / 2 + scale * seen[:, 0], height / 2 - scale * seen[:, 1], depth])

@@ -1,0 +1,138 @@
+"""Taichi's renderer behind one door: what it lacks on this machine, and a drawing of the scene's surfaces.
+
+Taichi ends the process, past any `except`, when it opens a window without a display, holds two windows, or is
+initialised anew while one lives. So what is missing is asked first, a process holds one window at a time, and an open
+window holds a claim on the runtime.
+"""
+
+import ctypes
+import functools
+import os
+import sys
+import warnings
+
+import numpy as np
+import taichi as ti
+from taichi._lib import core
+
+from taisoft.errors import OutputError
+from taisoft.runtime import FieldArena, open_kind, open_runtime
+from taisoft.view.camera import Camera
+from taisoft.view.shading import lit_colours
+from taisoft.view.surfaces import Surfaces
+
+_holder: list[str] = []  # what holds the process's one window
+
+
+@functools.cache  # asking loads drivers, and a refusal is printed by the loader each time
+def vulkan_missing() -> str:
+    """What to install for Taichi's renderer, as a sentence; empty when a Vulkan driver is there."""
+    if core.with_vulkan():
+        return ""
+    return "there is no Vulkan driver (Debian and Ubuntu: apt install mesa-vulkan-drivers)"
+
+
+def display_missing() -> str:
+    """Why no window can be shown, as a sentence; empty when a display answers. Windows need X11 (Wayland offers it)."""
+    if not sys.platform.startswith("linux"):
+        return ""
+    name = os.environ.get("DISPLAY", "")
+    if not name:
+        return "there is no display: the variable DISPLAY is not set (without a screen: xvfb-run, package xvfb)"
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError:
+        return "the library libX11.so.6 is missing (Debian and Ubuntu: apt install libx11-6)"
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    connection = x11.XOpenDisplay(None)
+    if not connection:
+        return f"the display '{name}' does not answer (variable DISPLAY)"
+    x11.XCloseDisplay(ctypes.c_void_p(connection))
+    return ""
+
+
+def window_holder() -> str:
+    """What holds the process's one window now; empty when it is free."""
+    return _holder[0] if _holder else ""
+
+
+class Canvas:
+    """The process's one Taichi window with the scene's surfaces in it; on the screen, or only in memory.
+
+    surfaces: what is drawn; size: (width, height) in pixels; visible: on the screen. Raises OutputError, before
+    anything is opened, when a Vulkan driver or a display is missing or a window is open already.
+    """
+
+    def __init__(self, surfaces: Surfaces, size: tuple[int, int], visible: bool, title: str = "taisoft"):
+        missing = (visible and display_missing()) or vulkan_missing()
+        if missing:
+            raise OutputError(f"cannot open a window: {missing}")
+        if _holder:
+            raise OutputError(f"cannot open a window: {_holder[0]} holds the one a process can have; close it first")
+        arch, precision = open_kind() or ("cpu", "f32")
+        if arch != "cpu":
+            raise OutputError(f"cannot open a window: arch is '{arch}', and windows are for arch cpu alone")
+        owner = "a window" if visible else "a picture renderer"
+        self._runtime = open_runtime(arch, precision, owner=owner)
+        _holder.append(owner)
+        self._fields = FieldArena()
+        self._surfaces = surfaces
+        n = len(surfaces.colours)
+        self._x = self._fields.vectors("picture positions", ti.f32, n)
+        self._normals = self._fields.vectors("picture normals", ti.f32, n, np.tile(np.float32([0, 1, 0]), (n, 1)))
+        self._colours = self._fields.vectors("picture colours", ti.f32, n)
+        triangles = surfaces.triangles.ravel()
+        self._indices = self._fields.field("picture triangles", ti.i32, len(triangles), triangles)
+        self.window = self._canvas = self._scene = None
+        try:
+            self.window = ti.ui.Window(title, size, show_window=visible)
+            self._canvas = self.window.get_canvas()
+            self._scene = self.window.get_scene()
+        except RuntimeError as error:
+            self.close()
+            raise OutputError(f"cannot open a window: Taichi says: {error}") from error
+
+    def draw(
+        self, x: np.ndarray, normals: np.ndarray, camera: Camera, background: tuple[float, float, float]
+    ) -> None:
+        """Draw the surfaces with vertices x [m] and unit normals, (n,3) each; background: RGB in [0, 1]."""
+        colours = lit_colours(x, normals, self._surfaces.colours, camera)
+        # relative to the target: single precision would blur a scene far from the origin
+        self._x.from_numpy((x - camera.target).astype(np.float32))
+        self._colours.from_numpy(colours.astype(np.float32))
+        eye = ti.ui.Camera()
+        eye.position(*(camera.position - camera.target))
+        eye.lookat(0.0, 0.0, 0.0)
+        eye.up(0.0, 1.0, 0.0)
+        eye.fov(camera.fov)
+        near, far = camera.clipping
+        eye.z_near(near)
+        eye.z_far(far)
+        self._canvas.set_background_color(background)
+        self._scene.set_camera(eye)
+        self._scene.ambient_light((1.0, 1.0, 1.0))  # the colours are lit already
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Taichi's own copy kernel warns of f64 literals where the runtime is f64
+            self._scene.mesh(
+                self._x, indices=self._indices, normals=self._normals, per_vertex_color=self._colours, two_sided=True
+            )
+            self._canvas.scene(self._scene)
+
+    def pixels(self, left: int, top: int, right: int, bottom: int) -> np.ndarray:
+        """That part of the drawn picture, uint8 (bottom - top, right - left, 3), first row on top."""
+        buffer = self.window.get_image_buffer_as_numpy()  # float32 (width, height, 4) in [0, 1], first row below
+        height = buffer.shape[1]
+        part = 255 * buffer[left:right, height - bottom : height - top, :3] + 0.5
+        return part.astype(np.uint8).transpose(1, 0, 2)[::-1]
+
+    def close(self) -> None:
+        """Destroy the window, free the fields, release the runtime; a second call does nothing."""
+        if self._runtime is None:
+            return
+        if self.window is not None:
+            self.window.destroy()
+        self.window = self._canvas = self._scene = None
+        self._fields.release()
+        self._runtime.close()
+        self._runtime = None
+        _holder.clear()

@@ -1,0 +1,114 @@
+"""Pictures of a simulation without a screen: by Taichi's renderer where a Vulkan driver is there, else in NumPy.
+
+Both draw the same triangles with the same colours at twice the size, and four pixels are averaged into one.
+"""
+
+import sys
+
+import numpy as np
+
+from taisoft.errors import OutputError
+from taisoft.runtime import open_kind
+from taisoft.view.camera import MAX_WIDENING, Camera
+from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
+from taisoft.view.raster import rasterise
+from taisoft.view.shading import background, lit_colours
+from taisoft.view.surfaces import Surfaces, start_positions
+
+SIZE = (1280, 720)
+SAMPLES = 2  # per pixel and axis
+KEY_COLOUR = (1.0, 0.0, 1.0)  # magenta, of what no triangle covers; no lit body has it
+RENDERERS = ("auto", "vulkan", "software")
+
+_told: set[str] = set()  # sentences printed in this process
+
+
+class Offscreen:
+    """Draws a scene's bodies as pictures.
+
+    scene: read once; size: (width, height) in pixels; camera: stays as given, else shows a ball round the start of all
+    bodies, and moves back, never nearer, when a body would leave the picture; renderer: "vulkan", "software" or "auto":
+    Vulkan where it can be had, else one line on stderr says why not. Raises OutputError.
+    """
+
+    def __init__(self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None, renderer: str = "auto"):
+        if renderer not in RENDERERS:
+            raise OutputError(f"renderer '{renderer}' is unknown: it must be one of {', '.join(RENDERERS)}")
+        if min(size) < 1:
+            raise OutputError(f"a picture of {size[0]} x {size[1]} pixels cannot be drawn: both must be at least 1")
+        self.size = (int(size[0]), int(size[1]))
+        self.camera = camera or Camera.framing(start_positions(scene))
+        self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # [m]
+        self.surfaces = Surfaces(scene)
+        self._large = (self.size[0] * SAMPLES, self.size[1] * SAMPLES)
+        self._background = background(self._large)
+        self._canvas = None
+        self.renderer = _choose() if renderer == "auto" else renderer
+        if self.renderer == "vulkan":
+            self._canvas = Canvas(self.surfaces, self._large, visible=False)
+
+    def image(self, sim) -> np.ndarray:
+        """Picture of sim's present state, uint8 (height, width, 3), first row on top."""
+        x, normals = self.surfaces.vertices(sim)
+        self.camera = self.camera.widened(x, self.size, self._widest)
+        projected = self.camera.project(x, self._large)
+        left, top, right, bottom = _box(projected, self._large)  # the rest is background, and stays as it is
+        picture = self._background[::SAMPLES, ::SAMPLES].copy()
+        if left == right or top == bottom:
+            return picture
+        part = self._background[top:bottom, left:right].copy()
+        if self._canvas is not None:
+            self._canvas.draw(x, normals, self.camera, KEY_COLOUR)
+            pixels = self._canvas.pixels(left, top, right, bottom)
+            red, green, blue = np.moveaxis(pixels, 2, 0)
+            empty = (red == 255) & (green == 0) & (blue == 255)
+            np.copyto(part, pixels, where=~empty[..., None])
+        else:
+            colours = lit_colours(x, normals, self.surfaces.colours, self.camera)
+            projected[:, :2] -= (left, top)
+            rasterise(projected, self.surfaces.triangles, colours, self.camera.clipping[0], part)
+        picture[top // SAMPLES : bottom // SAMPLES, left // SAMPLES : right // SAMPLES] = _averaged(part)
+        return picture
+
+    def close(self) -> None:
+        """Destroy the window in memory, if there is one; a second call does nothing."""
+        if self._canvas is not None:
+            self._canvas.close()
+            self._canvas = None
+
+
+def _box(projected: np.ndarray, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of what the vertices cover, in whole final pixels and within size.
+
+    All of size where a vertex is behind the eye or not finite.
+    """
+    if not (np.isfinite(projected).all() and (projected[:, 2] > 0).all()):
+        return 0, 0, *size
+    low = np.floor(projected[:, :2].min(axis=0) / SAMPLES) * SAMPLES
+    high = np.ceil(projected[:, :2].max(axis=0) / SAMPLES) * SAMPLES
+    (left, top), (right, bottom) = np.clip(low, 0, size).astype(int), np.clip(high, 0, size).astype(int)
+    return left, top, right, bottom
+
+
+def _averaged(image: np.ndarray) -> np.ndarray:
+    """Every block of SAMPLES x SAMPLES pixels as one."""
+    total = np.zeros((image.shape[0] // SAMPLES, image.shape[1] // SAMPLES, 3), dtype=np.uint16)
+    for i in range(SAMPLES):
+        for j in range(SAMPLES):
+            total += image[i::SAMPLES, j::SAMPLES]
+    return ((total + SAMPLES**2 // 2) // SAMPLES**2).astype(np.uint8)
+
+
+def _choose() -> str:
+    """The renderer that can be had now; a reason against Vulkan is printed once a process."""
+    reason = vulkan_missing()
+    if not reason and open_kind() is not None and open_kind()[0] != "cpu":
+        reason = "Taichi's renderer is used with arch cpu alone"
+    if not reason and window_holder():
+        reason = f"{window_holder()} holds the one window that a process can have"
+    if not reason:
+        return "vulkan"
+    if reason not in _told:
+        _told.add(reason)
+        print(f"taisoft: pictures are drawn in software: {reason}", file=sys.stderr)
+    return "software"

@@ -1,0 +1,139 @@
+"""The triangles that a picture shows: every body's surface, split at sharp edges, and markers of fixed nodes.
+
+A drawn vertex belongs to one mesh vertex and one smoothing group: the triangles round that vertex that are connected
+over edges bent by less than CREASE at rest. Its normal is the area-weighted mean over that group, so a ball looks round
+and a box keeps its edges, in every deformed state.
+"""
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from taisoft.output.appearance import body_colour
+
+CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
+MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
+MARKER_SIZE = 0.16  # radius in units of the mean edge length of the body's surface
+MAX_MARKERS = 500  # a picture with more fixed nodes shows an even selection of them
+
+
+class Surfaces:
+    """Everything drawn, as one triangle mesh whose topology and colours stay.
+
+    scene: its bodies are read once. triangles: int32 (t,3) of drawn vertices; colours: float (n,3), unshaded sRGB.
+    """
+
+    def __init__(self, scene):
+        self._bodies = [_BodySurface(body, body_colour(k)) for k, body in enumerate(scene.bodies)]
+        triangles, colours, n = [], [], 0
+        for body in self._bodies:
+            triangles.append(body.triangles + n)
+            colours.append(body.colours)
+            n += len(body.colours)
+        self.triangles = np.concatenate(triangles).astype(np.int32)
+        self.colours = np.concatenate(colours)
+
+    def vertices(self, sim) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [m] and unit normals of the drawn vertices in sim's present state, each float64 (n,3)."""
+        parts = [body.vertices(sim.positions(body.name)) for body in self._bodies]
+        return np.concatenate([x for x, _ in parts]), np.concatenate([n for _, n in parts])
+
+
+def start_positions(scene) -> np.ndarray:
+    """Nodes of all bodies where they start, (n,3) [m]."""
+    return np.concatenate([body.rest_positions + body.position for body in scene.bodies])
+
+
+class _BodySurface:
+    def __init__(self, body, colour: np.ndarray):
+        self.name = body.name
+        surface = np.asarray(body.mesh.surface)
+        rest = np.asarray(body.rest_positions)
+        self._nodes, corners = smoothing_groups(rest, surface)
+        edges = rest[surface] - rest[np.roll(surface, 1, axis=1)]
+        self._radius = MARKER_SIZE * float(np.linalg.norm(edges, axis=2).mean())
+        self._marked = _fixed_surface_nodes(body, surface)
+        ball, ball_triangles = _coarse_ball()
+        self._ball = ball
+        starts = len(self._nodes) + len(ball) * np.arange(len(self._marked))
+        markers = (starts[:, None, None] + ball_triangles).reshape(-1, 3)
+        self._corners = corners
+        self.triangles = np.concatenate([corners, markers])
+        counts = (len(self._nodes), len(ball) * len(self._marked))
+        self.colours = np.repeat([colour, MARKER_COLOUR], counts, axis=0)
+
+    def vertices(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        drawn = x[self._nodes]
+        markers = (x[self._marked][:, None] + self._radius * self._ball).reshape(-1, 3)
+        normals = np.tile(self._ball, (len(self._marked), 1))
+        return np.concatenate([drawn, markers]), np.concatenate([vertex_normals(drawn, self._corners), normals])
+
+
+def smoothing_groups(rest: np.ndarray, surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Split surface vertices at sharp edges.
+
+    rest: (n,3); surface: (t,3) vertex ids. Returns nodes (d,), the mesh vertex of each drawn vertex, and corners (t,3),
+    the drawn vertex at each triangle's corner: nodes[corners] == surface.
+    """
+    t = len(surface)
+    a, b, c = (rest[surface[:, k]] for k in range(3))
+    normals = _unit(np.cross(b - a, c - a))
+    # half-edges sorted by their vertex pair: neighbours in the list share an edge
+    ends = np.sort(np.stack([surface, np.roll(surface, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    same = np.flatnonzero((ends[order[1:]] == ends[order[:-1]]).all(axis=1))
+    first, second = order[same], order[same + 1]
+    smooth = np.einsum("ij,ij->i", normals[first // 3], normals[second // 3]) > np.cos(np.radians(CREASE))
+    first, second = first[smooth], second[smooth]
+    # corner 3*t+k is vertex k of triangle t; half-edge 3*t+k runs from corner k to the next one
+    corner_vertex = surface.ravel()
+    links = []
+    for end in (first, first // 3 * 3 + (first + 1) % 3):
+        for other in (second, second // 3 * 3 + (second + 1) % 3):
+            meet = corner_vertex[end] == corner_vertex[other]
+            links.append(np.stack([end[meet], other[meet]]))
+    i, j = np.concatenate(links, axis=1)
+    graph = coo_matrix((np.ones(len(i), dtype=bool), (i, j)), shape=(3 * t, 3 * t))
+    n_drawn, group = connected_components(graph, directed=False)
+    nodes = np.empty(n_drawn, dtype=np.int64)
+    nodes[group] = corner_vertex
+    return nodes, group.reshape(t, 3)
+
+
+def vertex_normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Unit normals (n,3): per vertex the area-weighted mean over its triangles (t,3); zero where they cancel."""
+    a, b, c = (x[triangles[:, k]] for k in range(3))
+    areas = np.cross(b - a, c - a)
+    total = np.empty_like(x)
+    for axis in range(3):
+        total[:, axis] = np.bincount(triangles.ravel(), np.repeat(areas[:, axis], 3), minlength=len(x))
+    return _unit(total)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1.0)
+
+
+def _fixed_surface_nodes(body, surface: np.ndarray) -> np.ndarray:
+    held = [constraint.nodes for constraint in body.constraints if constraint.path is None]
+    if not held:
+        return np.empty(0, dtype=np.int64)
+    nodes = np.intersect1d(np.concatenate(held), surface)
+    return nodes[:: -(-len(nodes) // MAX_MARKERS)] if len(nodes) else nodes
+
+
+def _coarse_ball() -> tuple[np.ndarray, np.ndarray]:
+    """A coarse unit ball: an octahedron with each face cut in four twice, 66 vertices (n,3) and 128 triangles (t,3)."""
+    points = np.concatenate([np.eye(3), -np.eye(3)])
+    faces = [(x, y, z) for x in (0, 3) for y in (1, 4) for z in (2, 5)]
+    # an odd number of negative axes turns the order x, y, z inward
+    triangles = np.array([f if sum(k > 2 for k in f) % 2 == 0 else f[::-1] for f in faces])
+    for _ in range(2):
+        corners = points[triangles]
+        middles = _unit((corners + np.roll(corners, -1, axis=1)).reshape(-1, 3)).reshape(-1, 3, 3)  # of ij, jk, ki
+        (i, j, k), (ij, jk, ki) = np.moveaxis(corners, 1, 0), np.moveaxis(middles, 1, 0)
+        cut = np.concatenate([np.stack(t, axis=1) for t in ((i, ij, ki), (j, jk, ij), (k, ki, jk), (ij, jk, ki))])
+        points, inverse = np.unique(np.round(cut.reshape(-1, 3), 12), axis=0, return_inverse=True)
+        triangles = inverse.reshape(-1, 3)
+    return points, triangles

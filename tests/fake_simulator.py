@@ -1,0 +1,53 @@
+"""A stand-in for Simulator whose motion is a formula: for tests of what reads a simulation, not of what computes it."""
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.records import Energies, RunReport, StepReport
+
+RUBBER = ts.Material(law="stable_neo_hookean", young=1e5, poisson=0.3, density=1000.0)
+
+
+def beam_scene(names=("beam",), cells=(8, 2, 2)):
+    """Beams of 4 x 1 x 1 m, 1.5 m above one another, fixed at their left end."""
+    scene = ts.Scene()
+    for k, name in enumerate(names):
+        body = scene.add_body(ts.box_mesh(cells, (4, 1, 1)), RUBBER, name=name, position=(0, 1.5 * k, 0))
+        body.fix(lambda x: x[:, 0] < -1.99)
+    return scene
+
+
+class FakeSimulator:
+    """Bends every body about its left end, more and more with time; announce prints each call for a parent process."""
+
+    def __init__(self, scene, dt=1 / 60, announce=False):
+        self.scene, self.dt, self.announce = scene, dt, announce
+        self.time, self.step_count = 0.0, 0
+
+    def positions(self, name):
+        body = self.scene.body(name)
+        x = body.rest_positions + body.position
+        bent = x.copy()
+        bent[:, 1] -= 0.1 * np.sin(self.time) * (x[:, 0] - x[:, 0].min()) ** 2
+        return bent
+
+    def energies(self):
+        return Energies(kinetic=1.0 + self.time, elastic=2.0, gravity=-3.0)
+
+    def step(self):
+        self._tell("step")
+        self.time, self.step_count = self.time + self.dt, self.step_count + 1
+        return StepReport(time=self.time)
+
+    def run(self, seconds, on_frame=None, fps=60, stop=None):
+        self._tell("run")
+        self.time, self.step_count = self.time + seconds, self.step_count + 1
+        return RunReport(steps=1)
+
+    def reset(self):
+        self._tell("reset")
+        self.time, self.step_count = 0.0, 0
+
+    def _tell(self, what):
+        if self.announce:
+            print(what, flush=True)

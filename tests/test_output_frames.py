@@ -1,0 +1,107 @@
+"""Pictures as files, and the progress of a run:
+
+* a PNG decodes to the picture that went in, and a frame is numbered with five digits;
+* on a terminal a bar, elsewhere lines, both with steps/s and the time left.
+"""
+
+import io
+import re
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from fake_simulator import FakeSimulator, beam_scene
+
+from taisoft.output import progress
+from taisoft.output.frames import FrameWriter, png_bytes
+from taisoft.output.progress import Progress
+
+
+def decode(png):
+    """The picture in a PNG file of 8-bit RGB rows with filter "up", by the format's own rules."""
+    assert png[:8] == b"\x89PNG\r\n\x1a\n"
+    parts, at = {}, 8
+    while at < len(png):
+        (length,) = struct.unpack(">I", png[at : at + 4])
+        kind, data = png[at + 4 : at + 8], png[at + 8 : at + 8 + length]
+        (checksum,) = struct.unpack(">I", png[at + 8 + length : at + 12 + length])
+        assert checksum == zlib.crc32(kind + data)
+        parts[kind], at = data, at + 12 + length
+    width, height, *rest = struct.unpack(">IIBBBBB", parts[b"IHDR"])
+    assert rest == [8, 2, 0, 0, 0] and list(parts)[-1] == b"IEND"
+    rows = np.frombuffer(zlib.decompress(parts[b"IDAT"]), dtype=np.uint8).reshape(height, 1 + 3 * width)
+    assert (rows[:, 0] == 2).all()
+    return np.cumsum(rows[:, 1:], axis=0, dtype=np.uint8).reshape(height, width, 3)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (7, 5, 3), (48, 64, 3)])
+def test_png_decodes_to_the_picture(shape):
+    image = np.random.default_rng(3).integers(0, 256, shape, dtype=np.uint8)
+    assert np.array_equal(decode(png_bytes(image)), image)
+
+
+@pytest.mark.parametrize("image", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)])
+def test_png_refuses_other_arrays(image):
+    with pytest.raises(ValueError, match="must be uint8"):
+        png_bytes(image)
+
+
+class GreyRenderer:
+    """Draws sim.step_count as a shade of grey."""
+
+    closed = False
+
+    def image(self, sim):
+        return np.full((6, 8, 3), sim.step_count, dtype=np.uint8)
+
+    def close(self):
+        self.closed = True
+
+
+def test_frames_are_numbered_files(tmp_path):
+    renderer = GreyRenderer()
+    writer, sim = FrameWriter(tmp_path, renderer), FakeSimulator(beam_scene())
+    for index in range(3):
+        writer.frame(sim, index)
+        sim.step()
+    writer.close()
+    assert renderer.closed
+    files = sorted((tmp_path / "frames").iterdir())
+    assert [path.name for path in files] == ["00000.png", "00001.png", "00002.png"]
+    assert [decode(path.read_bytes())[0, 0, 0] for path in files] == [0, 1, 2]
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Wall time that moves by 2 s a look."""
+    looks = iter(range(0, 1000, 2))
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: float(next(looks)))
+
+
+def advance(bar):
+    sim = FakeSimulator(beam_scene())
+    for index in range(6):
+        bar.frame(sim, index)
+        sim.time, sim.step_count = sim.time + 0.5, sim.step_count + 20
+    bar.close()
+    bar.close()
+
+
+def test_progress_in_lines(clock):
+    stream = io.StringIO()
+    advance(Progress(10.0, "beam", stream))
+    # looks at 0, 2, 4, 6, 8, 10 s; a line where 5 s have gone by; 20 steps and 0.5 s simulated in 2 s
+    assert stream.getvalue() == "beam: 1.500 of 10 s, 10 steps/s, 0:34 left\n"
+
+
+def test_progress_on_a_terminal(clock):
+    stream = Terminal()
+    advance(Progress(10.0, "beam", stream))
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue())
+    assert "10 steps/s" in text and "0:30 left" in text and "2.50 of 10 s" in text

@@ -1,0 +1,250 @@
+"""The USD export, read back with USD:
+
+* scene.usdc passes every validator of pxr.UsdValidation and holds the float32 positions of every frame, body and node;
+* metres, y up, default prim, frame rate, frame range, extents, materials, tetrahedra that USD itself finds upright;
+* body names become legal, distinct prim names, with the own name beside them;
+* killed at any time, every file under a final name opens, at most the chunk in the making is lost, an older scene.usdc
+  is whole; the chunks join to the file that the run would have written;
+* a full disk is an OutputError with the path, and leaves no partial file.
+"""
+
+import random
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_simulator import FakeSimulator, beam_scene
+from pxr import Tf, Usd, UsdGeom, UsdShade, UsdValidation
+
+from taisoft.errors import OutputError
+from taisoft.output.usd import UsdWriter, join_chunks, prim_names
+
+ROOT = Path(__file__).resolve().parents[1]
+NAMES = ("1 cube", "1_cube", "ü", "x" * 300, "material")
+
+
+def export(folder, scene, n_frames, chunk_frames=10, close=True):
+    """Write n_frames of a fake run; returns the positions given, per frame and body."""
+    sim, given = FakeSimulator(scene), []
+    writer = UsdWriter(folder, scene, fps=30.0, chunk_frames=chunk_frames)
+    for index in range(n_frames):
+        sim.time = index / 30
+        given.append({body.name: sim.positions(body.name) for body in scene.bodies})
+        writer.frame(sim, index)
+    if close:
+        writer.close()
+    return given
+
+
+def points_of(stage, path, index):
+    return np.array(stage.GetAttributeAtPath(f"{path}.points").Get(index))
+
+
+def check_frames(path, given, first=0):
+    """Every frame in the file equals the positions given, in float32; returns the number of frames."""
+    stage = Usd.Stage.Open(str(path))
+    start, end = int(stage.GetStartTimeCode()), int(stage.GetEndTimeCode())
+    assert start == first
+    for body, legal in zip(given[0], prim_names(list(given[0]))):
+        prim = f"/World/{legal}"
+        triangles = np.array(stage.GetAttributeAtPath(f"{prim}/tets.surfaceFaceVertexIndices").Get())
+        local = np.array(stage.GetAttributeAtPath(f"{prim}/surface.faceVertexIndices").Get())
+        samples = stage.GetAttributeAtPath(f"{prim}/surface.points").GetTimeSamples()
+        assert samples == list(range(start, end + 1))
+        for index in range(start, end + 1):
+            expected = given[index][body].astype(np.float32)
+            assert np.array_equal(points_of(stage, f"{prim}/tets", index), expected)
+            surface = points_of(stage, f"{prim}/surface", index)
+            assert np.array_equal(surface[local].reshape(-1, 3, 3), expected[triangles])
+            extent = np.array(stage.GetAttributeAtPath(f"{prim}/tets.extent").Get(index))
+            assert np.array_equal(extent, [expected.min(axis=0), expected.max(axis=0)])
+    return end - start + 1
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("usd")
+    scene = beam_scene(NAMES)
+    given = export(folder, scene, 23)
+    return folder, scene, given, Usd.Stage.Open(str(folder / "scene.usdc"))
+
+
+def test_no_validator_objects(exported):
+    registry = UsdValidation.ValidationRegistry()
+    validators = registry.GetOrLoadAllValidators()
+    assert len(validators) > 10
+    errors = UsdValidation.ValidationContext(validators).Validate(exported[3])
+    assert [error.GetMessage() for error in errors] == []
+
+
+def test_one_file_with_every_frame(exported):
+    folder, _, given, _ = exported
+    assert [path.name for path in folder.iterdir()] == ["scene.usdc"]
+    assert check_frames(folder / "scene.usdc", given) == 23
+
+
+def test_stage_units_and_range(exported):
+    stage = exported[3]
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
+    assert stage.GetDefaultPrim().GetPath() == "/World"
+    assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (30.0, 0.0, 22.0)
+
+
+def test_surface_has_no_inner_vertex_and_a_colour(exported):
+    _, scene, _, stage = exported
+    surface = UsdGeom.Mesh(stage.GetPrimAtPath("/World/_1_cube/surface"))
+    triangles = scene.bodies[0].mesh.surface
+    assert len(surface.GetPointsAttr().Get(0)) == len(np.unique(triangles)) < scene.bodies[0].mesh.n_verts
+    assert surface.GetSubdivisionSchemeAttr().Get() == UsdGeom.Tokens.none
+    assert set(surface.GetFaceVertexCountsAttr().Get()) == {3}
+    material = UsdShade.MaterialBindingAPI(surface.GetPrim()).ComputeBoundMaterial()[0]
+    shader = material.ComputeSurfaceSource()[0]
+    assert shader.GetShaderId() == "UsdPreviewSurface"
+    assert shader.GetInput("diffuseColor").Get() == surface.GetDisplayColorAttr().Get()[0]
+
+
+def test_tets_are_upright_and_not_drawn(exported):
+    _, scene, _, stage = exported
+    tets = UsdGeom.TetMesh(stage.GetPrimAtPath("/World/_1_cube/tets"))
+    assert np.array_equal(np.array(tets.GetTetVertexIndicesAttr().Get()), scene.bodies[0].mesh.tets)
+    assert len(UsdGeom.TetMesh.FindInvertedElements(tets, Usd.TimeCode(5))) == 0
+    faces = np.array(UsdGeom.TetMesh.ComputeSurfaceFaces(tets, Usd.TimeCode(5)))
+    assert sorted(map(canonical, faces)) == sorted(map(canonical, scene.bodies[0].mesh.surface))
+    assert tets.ComputePurpose() == UsdGeom.Tokens.guide
+
+
+def canonical(triangle):
+    """The triangle's indices from the smallest on: equal for equal orientation."""
+    k = int(np.argmin(triangle))
+    return tuple(int(i) for i in np.roll(triangle, -k))
+
+
+def test_body_names_are_kept_beside_legal_ones(exported):
+    stage = exported[3]
+    prims = stage.GetPrimAtPath("/World").GetChildren()
+    assert [prim.GetDisplayName() for prim in prims] == list(NAMES)
+    assert [prim.GetCustomDataByKey("taisoft:name") for prim in prims] == list(NAMES)
+
+
+def test_prim_names_are_legal_and_distinct():
+    names = ["a/b", "a b", "a_b", "a_b_1", "", "9", "ü", "é", "x" * 300, "x" * 299, "__", "body"]
+    legal = prim_names(names)
+    assert len(set(legal)) == len(names)
+    assert all(Tf.IsValidIdentifier(name) and name.isascii() and len(name) < 80 for name in legal)
+    assert prim_names(["beam", "cube"]) == ["beam", "cube"]
+
+
+def test_chunks_appear_while_the_run_lasts(tmp_path):
+    given = export(tmp_path, beam_scene(), 25, close=False)
+    chunks = sorted((tmp_path / "chunks").iterdir())
+    assert [path.name for path in chunks] == ["points_00000.usdc", "points_00010.usdc"]
+    assert not (tmp_path / "scene.usdc").exists()
+    assert [check_frames(path, given, first) for path, first in zip(chunks, (0, 10))] == [10, 10]
+
+
+def test_a_run_without_frames_leaves_nothing(tmp_path):
+    export(tmp_path, beam_scene(), 0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_joined_chunks_equal_the_finished_scene(tmp_path):
+    scene = beam_scene(("one", "two"))
+    export(tmp_path / "whole", scene, 20)
+    given = export(tmp_path / "killed", scene, 27, close=False)
+    assert join_chunks(tmp_path / "killed") == tmp_path / "killed" / "scene.usdc"
+    assert check_frames(tmp_path / "killed" / "scene.usdc", given) == 20
+    texts = [Usd.Stage.Open(str(tmp_path / name / "scene.usdc")).ExportToString() for name in ("whole", "killed")]
+    # the composed text starts with where it came from
+    assert texts[0].replace("whole", "killed") == texts[1]
+    assert not (tmp_path / "killed" / "chunks").exists()
+    with pytest.raises(OutputError, match="holds no chunk"):
+        join_chunks(tmp_path / "killed")
+
+
+CHILD = """
+import sys
+sys.path[:0] = ["tests", "."]
+from fake_simulator import FakeSimulator, beam_scene
+from taisoft.output.usd import UsdWriter
+scene = beam_scene(("one", "two"), cells=(16, 4, 4))
+sim = FakeSimulator(scene)
+writer = UsdWriter(sys.argv[1], scene, fps=30.0)
+for index in range(int(sys.argv[2])):
+    sim.time = index / 30
+    writer.frame(sim, index)
+    print(index, flush=True)
+print("closing", flush=True)
+writer.close()
+"""
+N_KILLED_FRAMES = 400  # some 0.3 s of writing
+
+
+def test_killed_at_any_time_leaves_files_that_open(tmp_path):
+    scene = beam_scene(("one", "two"), cells=(16, 4, 4))
+    sim, given = FakeSimulator(scene), []
+    for index in range(N_KILLED_FRAMES):
+        sim.time = index / 30
+        given.append({body.name: sim.positions(body.name) for body in scene.bodies})
+    export(tmp_path / "old", scene, 3)
+    old = (tmp_path / "old" / "scene.usdc").read_bytes()
+    dice = random.Random(1)
+    stopped = []
+    for attempt in range(6):
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        (folder / "scene.usdc").write_bytes(old)
+        done = run_and_kill(folder, dice.uniform(0.0, 0.4))
+        stopped.append(len(done))
+        chunks = sorted((folder / "chunks").glob("*.usdc"))
+        if (folder / "scene.usdc").read_bytes() != old:
+            assert check_frames(folder / "scene.usdc", given) == N_KILLED_FRAMES
+        else:
+            firsts = [int(path.stem[-5:]) for path in chunks]
+            kept = sum(check_frames(path, given, first) for path, first in zip(chunks, firsts))
+            assert kept >= len([line for line in done if line.isdigit()]) - 10
+    assert len(set(stopped)) > 2, "the kills all came at the same place"
+
+
+def run_and_kill(folder, delay):
+    """Lines that the child printed before it was killed, delay [s] after its first frame."""
+    child = subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(folder), str(N_KILLED_FRAMES)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    first = child.stdout.readline()
+    time.sleep(delay)
+    child.kill()
+    return [first.strip(), *child.communicate()[0].split()]
+
+
+def test_a_full_disk_is_told_and_leaves_no_part(tmp_path):
+    scene = beam_scene(cells=(16, 4, 4))
+    writer = UsdWriter(tmp_path, scene, chunk_frames=5)
+    sim = FakeSimulator(scene)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(OutputError, match=r"cannot write .*usdc \(\d+ bytes"):
+            for index in range(50):
+                writer.frame(sim, index)
+        n_chunks = len(list((tmp_path / "chunks").glob("*.usdc")))
+        writer.close()  # nothing to complete, nothing to complain of again
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not (tmp_path / "scene.usdc").exists()
+    assert not list(tmp_path.rglob("*.part"))
+    assert len(list((tmp_path / "chunks").iterdir())) == n_chunks >= 1
+    for path in (tmp_path / "chunks").iterdir():
+        assert Usd.Stage.Open(str(path))
+
+
+def test_settings_out_of_range_are_refused(tmp_path):
+    with pytest.raises(OutputError, match="fps is 0"):
+        UsdWriter(tmp_path, beam_scene(), fps=0)
+    with pytest.raises(OutputError, match="chunk_frames is 0"):
+        UsdWriter(tmp_path, beam_scene(), chunk_frames=0)
+    assert list(tmp_path.iterdir()) == []

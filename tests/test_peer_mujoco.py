@@ -1,0 +1,75 @@
+"""MuJoCo as a peer: the comparison is fair only if it solves the same equations.
+
+* Its masses, its elastic force on a deformed mesh and its fixed nodes are those of the exact path's beam;
+* its path is near the exact one, of first order (Euler, discrete) or better (staggered start, RK4);
+* step sizes and names outside the rules are refused, and a run that diverges is an error, not a result;
+* the table's step sizes are the largest stable ones (shown on the smallest mesh).
+"""
+
+import numpy as np
+import pytest
+
+from benchmarks.exact_path import FallingBeam
+from taisoft.errors import SceneError, SimulationError
+
+mujoco = pytest.importorskip("mujoco", minversion="4.0")
+
+from benchmarks.peers.mujoco_flex import STABLE_STEPS, build_model, run_mujoco, table_rows  # noqa: E402
+
+CELLS = (12, 3, 3)
+
+
+def test_masses_and_elastic_forces_are_those_of_the_beam():
+    beam = FallingBeam(CELLS)
+    model = build_model(mujoco, beam, "euler", 1e-3)
+    data = mujoco.MjData(model)
+    u = 0.02 * np.random.default_rng(2).standard_normal(beam.vertices.shape) * beam.free[:, None]
+    data.qpos[:] = u[beam.free].ravel()
+    mujoco.mj_forward(model, data)
+    assert model.nv == 3 * beam.free.sum()
+    assert np.allclose(model.body_mass[1:], beam.mass[beam.free], rtol=1e-14)
+    expected = beam.elastic_force(u.T).T[beam.free].ravel()
+    assert np.abs(expected).max() > 1e3  # N: something is active
+    assert np.abs(data.qfrc_passive - expected).max() < 1e-10 * np.abs(expected).max()
+    expected_acceleration = beam.acceleration(u.T).T[beam.free].ravel()
+    assert np.abs(data.qacc - expected_acceleration).max() < 1e-10 * np.abs(expected_acceleration).max()
+
+
+@pytest.mark.parametrize("integrator, dt, order, largest", [
+    ("euler", 2.5e-3, 1, 2e-3),
+    ("euler_staggered", 2.5e-3, 2, 5e-5),
+    ("discrete", 2.5e-3, 1, 5e-3),
+    ("rk4", 5e-3, 4, 1e-5),
+])  # fmt: skip
+def test_error_falls_with_the_order_of_the_integrator(integrator, dt, order, largest):
+    coarse, fine = (run_mujoco(CELLS, integrator, h, seconds=0.7)["error"] for h in (dt, dt / 2))
+    assert coarse < largest
+    assert np.log2(coarse / fine) == pytest.approx(order, abs=0.25)
+
+
+def test_result_holds_path_times_timing_and_settings():
+    r = run_mujoco(CELLS, "discrete", 0.01, seconds=0.2, repeats=2)
+    assert r["path"].shape == (21, 3) and np.allclose(r["t"], np.arange(21) * 0.01)
+    assert np.allclose(r["path"][0], [2, 0, 0])
+    assert r["step_timing"].repeats == 40 and r["seconds_per_step"] == r["step_timing"].median
+    assert r["seconds_per_simulated_second"] == pytest.approx(100 * r["seconds_per_step"], rel=1)
+    assert r["settings"]["integrator"] == "mjINT_DISCRETE" and r["settings"]["timestep"] == 0.01
+
+
+def test_what_breaks_the_rules_is_refused():
+    with pytest.raises(SceneError, match="dt must divide the 0.01 s between two samples, not 0.003 s"):
+        run_mujoco(CELLS, "euler", 0.003)
+    with pytest.raises(SceneError, match="integrator must be one of .*, not 'implicitfast'"):
+        run_mujoco(CELLS, "implicitfast", 0.001)
+    with pytest.raises(SceneError, match="seconds must be a multiple of 0.01 s up to 1.0 s, not 2 s"):
+        run_mujoco(CELLS, "euler", 0.001, seconds=2)
+
+
+@pytest.mark.parametrize("integrator, steps", list(zip(("euler", "rk4"), STABLE_STEPS[CELLS])))
+def test_the_tables_steps_are_the_largest_stable_ones(integrator, steps, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert (integrator, steps) in table_rows(CELLS)
+    assert run_mujoco(CELLS, integrator, 0.01 / steps)["error"] < 0.01
+    with pytest.raises(SimulationError, match=f"MuJoCo's {integrator} with dt = .* diverges on the mesh"):
+        run_mujoco(CELLS, integrator, 0.01 / (steps - 1))
+    assert list(tmp_path.iterdir()) == []  # MuJoCo's log of warnings is kept away

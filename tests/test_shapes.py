@@ -1,0 +1,155 @@
+"""What the shapes promise:
+
+* a box has its vertices in the agreed order and its size, fills its volume with positive tets and has its six sides as
+  surface, for both patterns and any numbers of cells; pattern five is the agreed checkerboard;
+* a ball has all its surface vertices on the sphere, converges to the ball's volume and has no bad tets;
+* arguments outside the rules are refused, and so is a mesh too large, before any memory is taken.
+"""
+
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from taisoft.errors import MeshError
+from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
+
+PATTERNS = {"five": 5, "six": 6}
+EVEN_MIDDLE = {(0, 0, 0), (1, 1, 0), (1, 0, 1), (0, 1, 1)}
+
+
+def mean_ratio(mesh) -> np.ndarray:
+    """12 (3 V)^(2/3) / sum of squared edge lengths of every tet: 1 if regular, 0 if flat."""
+    x = mesh.vertices[mesh.tets]
+    squares = sum(((x[:, a] - x[:, b]) ** 2).sum(axis=1) for a in range(4) for b in range(a))
+    return 12.0 * (3.0 * mesh.volumes) ** (2.0 / 3.0) / squares
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.tuples(*[st.integers(1, 4)] * 3), st.tuples(*[st.floats(0.1, 10.0)] * 3), st.sampled_from(sorted(PATTERNS)))
+def test_box_is_the_whole_box(cells, size, pattern):
+    center = np.array([0.5, -1.0, 2.0])
+    mesh = box_mesh(cells, size, center, pattern)
+    nx, ny, nz = cells
+    assert mesh.n_tets == PATTERNS[pattern] * nx * ny * nz
+    assert mesh.warnings == [] and mesh.n_components == 1 and len(mesh.flipped) == 0
+    assert mesh.volumes.sum() == pytest.approx(np.prod(size))
+    for i, j, k in ((0, 0, 0), (nx, 0, 0), (0, ny, nz), (nx, ny, nz), (nx // 2, ny - 1, 1)):
+        expected = center + np.array(size) * (np.array([i / nx, j / ny, k / nz]) - 0.5)
+        assert mesh.vertices[(i * (ny + 1) + j) * (nz + 1) + k] == pytest.approx(expected, abs=1e-12)
+    assert len(mesh.surface) == 4 * (nx * ny + ny * nz + nz * nx)
+    x = mesh.vertices[mesh.surface]
+    areas = 0.5 * np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1)
+    a, b, c = size
+    assert areas.sum() == pytest.approx(2 * (a * b + b * c + c * a))
+
+
+@pytest.mark.parametrize(
+    "cells, pattern, count", [((12, 3, 3), "five", 540), ((11, 2, 2), "five", 220), ((2, 3, 4), "six", 144)]
+)
+def test_known_counts(cells, pattern, count):
+    assert box_mesh(cells, (4, 1, 1), pattern=pattern).n_tets == count
+
+
+def cell_tets(mesh, cells):
+    """For every cell (i,j,k), its tets as sets of corners relative to the cell, e.g. (1,0,1)."""
+    found: dict[tuple, list] = {}
+    grid = np.stack(np.unravel_index(mesh.tets, np.array(cells) + 1), axis=-1)
+    for tet in grid:
+        low = tet.min(axis=0)
+        found.setdefault(tuple(low.tolist()), []).append({tuple(corner) for corner in (tet - low).tolist()})
+    return found
+
+
+def test_five_is_the_agreed_checkerboard():
+    cells = (3, 2, 2)
+    found = cell_tets(box_mesh(cells, (3, 2, 2)), cells)
+    assert len(found) == 12
+    for cell, tets in found.items():
+        odd = sum(cell) % 2
+        middle = {(x ^ odd, y, z) for x, y, z in EVEN_MIDDLE}
+        assert middle in tets and len(tets) == 5
+        for corner in {(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)} - middle:
+            near = {other for other in middle if sum(abs(a - b) for a, b in zip(corner, other)) == 1}
+            assert {corner} | near in tets
+
+
+def test_six_stands_around_the_diagonal():
+    cells = (2, 2, 1)
+    for tets in cell_tets(box_mesh(cells, (2, 2, 1), pattern="six"), cells).values():
+        assert len(tets) == 6 and all({(0, 0, 0), (1, 1, 1)} <= tet for tet in tets)
+
+
+def test_sheet_lies_flat():
+    mesh = sheet_mesh((4, 3), (2.0, 0.05, 1.5), pattern="six")
+    assert mesh.n_tets == 72
+    assert np.ptp(mesh.vertices, axis=0) == pytest.approx([2.0, 0.05, 1.5])
+    assert sheet_mesh((4, 2, 3), (2.0, 0.05, 1.5)).n_verts == 60
+    with pytest.raises(MeshError, match="thickness"):
+        sheet_mesh((4, 3), (2.0, 1.6, 1.5))
+
+
+@pytest.mark.parametrize("cells", [2, 4, 8, 16])
+def test_ball_is_round_and_well_shaped(cells):
+    center = np.array([1.0, 2.0, -3.0])
+    mesh = ball_mesh(0.7, cells, center)
+    assert mesh.n_tets == 6 * cells**3 and mesh.warnings == []
+    radii = np.linalg.norm(mesh.vertices - center, axis=1)
+    assert radii[np.unique(mesh.surface)] == pytest.approx(0.7)
+    assert radii.max() <= 0.7 * (1 + 1e-12)
+    missing = 1.0 - mesh.volumes.sum() / (4.0 / 3.0 * np.pi * 0.7**3)
+    assert 0 < missing < 1.2 / cells**2  # a surface of chords of length h loses volume as h^2
+    assert mean_ratio(mesh).min() > 0.68
+
+
+def test_ball_is_symmetric():
+    mesh = ball_mesh(1.0, 4)
+    points = {tuple(p) for p in np.round(mesh.vertices, 12) + 0.0}
+    for axis in range(3):
+        mirrored = mesh.vertices.copy()
+        mirrored[:, axis] *= -1
+        assert {tuple(p) for p in np.round(mirrored, 12) + 0.0} == points
+    assert (mesh.volumes[:, None] * mesh.vertices[mesh.tets].mean(axis=1)).sum(axis=0) == pytest.approx(
+        [0, 0, 0], abs=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    "cells", [(0, 1, 1), (1, -2, 1), (1, 1), (1.5, 1, 1), 3, "abc", (True, 1, 1), (1, 1, 1, 1), None]
+)
+def test_box_refuses_cells(cells):
+    with pytest.raises(MeshError, match="box_mesh: cells must be three positive integers"):
+        box_mesh(cells, (1, 1, 1))
+
+
+@pytest.mark.parametrize("size", [(0, 1, 1), (1, -1, 1), (1, 1), (1, np.nan, 1), (1, np.inf, 1), "abc", ((1, 2), 3)])
+def test_box_refuses_sizes(size):
+    with pytest.raises(MeshError, match="box_mesh: size must be"):
+        box_mesh((1, 1, 1), size)
+
+
+def test_box_refuses_other_arguments():
+    with pytest.raises(MeshError, match="pattern must be 'five' or 'six', not 'four'"):
+        box_mesh((1, 1, 1), (1, 1, 1), pattern="four")
+    with pytest.raises(MeshError, match="center must be three finite numbers"):
+        box_mesh((1, 1, 1), (1, 1, 1), center=(0, 0, np.nan))
+
+
+@pytest.mark.parametrize(
+    "radius, cells, rule", [(0, 4, "radius"), (-1, 4, "radius"), (1, 3, "even"), (1, 0, "even"), (1, 2.0, "even")]
+)
+def test_ball_refuses(radius, cells, rule):
+    with pytest.raises(MeshError, match=rule):
+        ball_mesh(radius, cells)
+
+
+@pytest.mark.parametrize("cells", [(1000, 1000, 1000), (10**9, 1, 1), (10**9, 10**9, 10**9), (10**30, 1, 1)])
+def test_a_mesh_too_large_is_refused_at_once(cells):
+    start = time.perf_counter()
+    with pytest.raises(MeshError, match="tets"):
+        box_mesh(cells, (1, 1, 1))
+    with pytest.raises(MeshError, match="ball_mesh.*tets"):
+        ball_mesh(1.0, 2 * cells[0])
+    assert time.perf_counter() - start < 1.0  # nothing of that size was built

@@ -1,0 +1,21 @@
+"""Timing: the median, minimum and spread are those of the repeats; machine and versions are named."""
+
+import numpy as np
+import pytest
+
+from benchmarks.timing import machine, summarise, time_repeats, versions
+
+
+def test_timing_of_repeats():
+    t = summarise([4.0, 1.0, 2.0, 3.0, 5.0])
+    assert (t.median, t.minimum, t.maximum, t.repeats) == (3.0, 1.0, 5.0, 5)
+    assert t.spread == pytest.approx(2 / 3)
+    with pytest.raises(ValueError, match="at least one repeat"):
+        summarise([])
+    assert time_repeats(lambda: sum(range(1000)), 3).minimum > 0
+
+
+def test_machine_and_versions_are_named():
+    assert machine()["processor"] and machine()["cores"] >= 1
+    found = versions("numpy", "no-such-package")
+    assert found["numpy"] == np.__version__ and found["no-such-package"] is None
