@@ -1,8 +1,14 @@
 """Elastic soft bodies in Taichi. Importing this package starts no Taichi: a public name is loaded at its first use."""
 
+import os
 from importlib import import_module
 
 __version__ = "0.1.0"
+
+if os.name == "posix" and "HOME" not in os.environ:
+    # Without HOME, importing Taichi ends the process. expanduser asks the user database, which may not know.
+    _home = os.path.expanduser("~")
+    os.environ["HOME"] = _home if os.path.isabs(_home) else "/tmp"
 
 _HOME = {  # public name -> the module that defines it
     "TetMesh": "taisoft.mesh.tet_mesh",

@@ -9,10 +9,13 @@ import taichi as ti
 
 
 def inverse_rest_edges(vertices: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Dm^-1 (m,3,3) [1/m], with Dm's columns X1-X0, X2-X0, X3-X0, and the rest volumes (m,) [m^3]."""
+    """Dm^-1 (m,3,3) [1/m], with Dm's columns X1-X0, X2-X0, X3-X0, and the rest volumes (m,) [m^3].
+
+    The order of a tet's vertices does not matter: F is the same for each, and the volume is taken as positive.
+    """
     corner = vertices[tets]
     Dm = (corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1)
-    return np.linalg.inv(Dm), np.linalg.det(Dm) / 6.0
+    return np.linalg.inv(Dm), np.abs(np.linalg.det(Dm)) / 6.0
 
 
 def shape_gradients(Dm_inv: np.ndarray) -> np.ndarray:

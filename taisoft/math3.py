@@ -33,13 +33,29 @@ def matmul_nt(A, B):
 @ti.func
 def matmul_tn(A, B):
     """A^T B."""
-    return [A[i] * B[j] + A[3 + i] * B[3 + j] + A[6 + i] * B[6 + j] for i in ti.static(range(3)) for j in ti.static(range(3))]
+    return [
+        A[i] * B[j] + A[3 + i] * B[3 + j] + A[6 + i] * B[6 + j]
+        for i in ti.static(range(3))
+        for j in ti.static(range(3))
+    ]
 
 
 @ti.func
-def scaled_sum(a, A, b, B):
-    """a A + b B, with a and b one value per lane."""
-    return [a * A[k] + b * B[k] for k in ti.static(range(9))]
+def transform(A, x):
+    """A x."""
+    return [A[3 * i] * x[0] + A[3 * i + 1] * x[1] + A[3 * i + 2] * x[2] for i in ti.static(range(3))]
+
+
+@ti.func
+def dot(a, b):
+    """a . b of two 3-vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@ti.func
+def cross(a, b):
+    """a x b of two 3-vectors."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 @ti.func
@@ -77,9 +93,7 @@ def cofactor_differential(F, D):
 @ti.func
 def determinant(F):
     """det F, by the same products as the cofactor so that both share their work."""
-    return (
-        F[0] * (F[4] * F[8] - F[5] * F[7]) + F[1] * (F[5] * F[6] - F[3] * F[8]) + F[2] * (F[3] * F[7] - F[4] * F[6])
-    )
+    return F[0] * (F[4] * F[8] - F[5] * F[7]) + F[1] * (F[5] * F[6] - F[3] * F[8]) + F[2] * (F[3] * F[7] - F[4] * F[6])
 
 
 @ti.func

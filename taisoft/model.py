@@ -115,11 +115,13 @@ def _packed_tets(scene: Scene, layout: Layout, n_blocks: int, lanes: int):
     Dm_inv, volume = np.zeros((n_blocks * lanes, 3, 3)), np.zeros(n_blocks * lanes)
     real = np.zeros(n_blocks * lanes, dtype=bool)
     for k, body in enumerate(scene.bodies):
-        inverse, v = elements.inverse_rest_edges(body.mesh.vertices, body.mesh.tets)
+        # ascending vertices: F and V do not mind, and every mesh edge then has one direction in all its tets
+        tets = np.sort(body.mesh.tets, axis=1)
+        inverse, v = elements.inverse_rest_edges(body.mesh.vertices, tets)
         first, m = layout.block_start[k] * lanes, body.mesh.n_tets
         last = first + -(-m // lanes) * lanes
         padded = np.minimum(np.arange(last - first), m - 1)
-        verts[first:last] = body.mesh.tets[padded] + layout.node_start[k]
+        verts[first:last] = tets[padded] + layout.node_start[k]
         Dm_inv[first:last], volume[first : first + m], real[first : first + m] = inverse[padded], v, True
     return verts, Dm_inv, volume, real
 
@@ -203,6 +205,7 @@ def changed_material(body: Body, numbers: dict[str, float], on: dict[str, bool])
             raise SceneError(f"body '{body.name}': {name} cannot change while it runs; {', '.join(CHANGEABLE)} can")
         if name in on and not on[name] and value != 0.0:
             raise SceneError(
-                f"body '{body.name}': {name} was 0 everywhere at the start and is not modelled; start with a small value to change it later"
+                f"body '{body.name}': {name} was 0 everywhere at the start and is not modelled; "
+                "start with a small value to change it later"
             )
     body.material = replace(body.material, **numbers)

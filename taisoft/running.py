@@ -76,7 +76,9 @@ def _fit_dt(sim: "Simulator", seconds: float, fps: float | None, report: RunRepo
     if abs(n * sim.dt - frame) > 1e-9 * frame:
         old = sim.dt
         sim.dt = frame / n
-        report.problems.append(f"note: dt lowered from {old:.6g} s to {sim.dt:.6g} s, so that {n} steps make a frame of 1/{fps:g} s")
+        report.problems.append(
+            f"note: dt lowered from {old:.6g} s to {sim.dt:.6g} s, so that {n} steps make a frame of 1/{fps:g} s"
+        )
     return n
 
 
@@ -121,8 +123,8 @@ def _judge(report: RunReport) -> None:
     if unconverged:
         worst = max(unconverged, key=lambda s: s.residual)
         report.problems.append(
-            f"{len(unconverged)} of {len(steps)} steps did not converge; the worst, at t = {worst.time:.4g} s, to a relative residual of "
-            f"{worst.residual:.2e}"
+            f"{len(unconverged)} of {len(steps)} steps did not converge; the worst, at t = {worst.time:.4g} s, "
+            f"to a relative residual of {worst.residual:.2e}"
         )
     if inverted:
         worst = max(inverted, key=lambda s: s.n_inverted)

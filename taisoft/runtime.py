@@ -8,16 +8,18 @@ comparisons and the order of sums (no speed lost). Fields live in one
 
 import functools
 import os
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read when taichi is imported
-import taichi as ti  # noqa: E402
+import taichi as ti
 
-from taisoft.errors import SimulationError  # noqa: E402
+from taisoft.errors import SimulationError
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
@@ -75,10 +77,27 @@ def open_runtime(arch: str, precision: str, owner: str = "a simulator") -> Runti
     return runtime
 
 
+def _cache_folder() -> str:
+    """A folder for compiled kernels that can be written: Taichi ends the process where its own cannot."""
+    for folder in (Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"), Path(tempfile.gettempdir())):
+        path = folder / "taisoft" / "kernels"
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(path, os.W_OK):
+            return str(path)
+    raise SimulationError("no folder for compiled kernels can be written: set XDG_CACHE_HOME to one that can")
+
+
 def _initialise(arch: str, precision: str) -> None:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise SimulationError("the working folder no longer exists: change to one that does") from None
     ti.init(
         arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
-        fast_math=False, offline_cache=True, log_level=ti.ERROR, random_seed=0,
+        fast_math=False, offline_cache=True, offline_cache_file_path=_cache_folder(), log_level=ti.ERROR, random_seed=0,
     )  # fmt: skip
     obtained = "cuda" if ti.cfg.arch == ti.cuda else "cpu"
     if obtained != arch:
@@ -120,7 +139,9 @@ class FieldArena:
         try:
             self._trees.append(builder.finalize())
         except RuntimeError as error:
-            raise SimulationError(f"no memory for field '{name}' ({count * components * 8} bytes at most): {error}") from None
+            raise SimulationError(
+                f"no memory for field '{name}' ({count * components * 8} bytes at most): {error}"
+            ) from None
         size = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.u8: 1}[dtype]
         self.bytes[name] = count * components * size
         if data is not None:

@@ -55,7 +55,9 @@ def check_settings(
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise SimulationError(f"integrator {integrator!r} is unknown{hint}: it must be one of {', '.join(INTEGRATORS)}")
     if contact_solver != "auto":
-        raise SimulationError(f"contact_solver = {contact_solver!r}: this version models no contact, so it must be 'auto'")
+        raise SimulationError(
+            f"contact_solver = {contact_solver!r}: this version models no contact, so it must be 'auto'"
+        )
     if self_collision is not False:
         raise SimulationError("self_collision must be False: this version models no contact")
     if contact_tolerance is not None:

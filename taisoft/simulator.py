@@ -1,25 +1,20 @@
 """Simulator: builds a scene into the machine, steps it, and tells about it."""
 
-import warnings
-
-import numpy as np
-
 from taisoft import runtime
-from taisoft.elasticity import cauchy_stress, measure
-from taisoft.errors import SceneError, SimulationError
-from taisoft.model import build_model, changed_material
-from taisoft.records import Energies, RunReport, StepReport
+from taisoft.access import StateAccess
+from taisoft.elasticity import measure
+from taisoft.model import build_model
+from taisoft.records import RunReport, StepReport
 from taisoft.running import run
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
-from taisoft.settings import check_dt, check_settings
-from taisoft.stability import stable_dt
+from taisoft.settings import check_settings
 from taisoft.stepping import SCHEMES, make_stepper
 from taisoft.stepping.motion import Motion
 from taisoft.stepping.world import World
 
 
-class Simulator:
+class Simulator(StateAccess):
     """A scene being simulated. SI units; positions are float64 in either precision.
 
     dt [s]; integrator: one of taisoft.stepping.INTEGRATORS; newton_tolerance, linear_tolerance: relative, None is adaptive.
@@ -40,6 +35,7 @@ class Simulator:
         self.scene = scene
         self._dt = self.settings.dt
         self._stable_dt: float | None = None
+        self._tangent = None  # fields of force_differential, once asked for
         if self.settings.explicit:
             self._check_stability(self._dt)
         scheme = SCHEMES.get(integrator)
@@ -83,8 +79,8 @@ class Simulator:
             report.residual, report.converged = result.residual, result.converged
             if not result.converged:
                 report.problems.append(
-                    f"step {world.step_count}: Newton stopped after {result.newton_iterations} iterations at a relative residual of "
-                    f"{result.residual:.2e}"
+                    f"step {world.step_count}: Newton stopped after {result.newton_iterations} iterations "
+                    f"at a relative residual of {result.residual:.2e}"
                 )
         report.steps = self.step_count - start
         if report.n_inverted:
@@ -113,109 +109,15 @@ class Simulator:
 
     def _report(self) -> StepReport:
         measure(self._world.model)
-        s = self._world.model.scalars.to_numpy()
+        elastic, lowest, inverted, kinetic, gravity = (self._world.model.scalars[k] for k in range(5))
         return StepReport(
-            time=self.time, min_volume_ratio=float(s[1]), n_inverted=int(s[2]), kinetic=float(s[3]), elastic=float(s[0]),
-            gravity=float(s[4]),
-        )  # fmt: skip
-
-    # --- state ----------------------------------------------------------------------------------------------------
-
-    @property
-    def time(self) -> float:
-        """Simulated time [s]."""
-        return self._world.time
-
-    @property
-    def step_count(self) -> int:
-        """Steps of dt taken."""
-        return self._world.step_count
-
-    def positions(self, body: str | None = None) -> np.ndarray:
-        """(n_nodes, 3) float64 copy [m]; of all bodies, concatenated in the order added, without a name."""
-        return self._rows(self._open_world().model.x, body)
-
-    def velocities(self, body: str | None = None) -> np.ndarray:
-        """(n_nodes, 3) float64 copy [m/s]."""
-        return self._rows(self._open_world().model.v, body)
-
-    def set_state(self, positions=None, velocities=None, body: str | None = None) -> None:
-        """Set positions [m] and velocities [m/s], (n_nodes, 3) each; velocities of constrained axes become 0."""
-        world, rows = self._open_world(), self._slice(body)
-        for name, field, value in (("positions", world.model.x, positions), ("velocities", world.model.v, velocities)):
-            if value is not None:
-                self._check_rows(name, value, rows)
-        for field, value in ((world.model.x, positions), (world.model.v, velocities)):
-            if value is not None:
-                whole = field.to_numpy()
-                whole[rows] = value
-                if field is world.model.v:
-                    whole[world.motion.constrained()] = 0.0
-                field.from_numpy(whole)
-        self._stepper.forget()
-
-    def energies(self) -> Energies:
-        """Energies of the present state [J]."""
-        self._open_world()
-        r = self._report()
-        return Energies(r.kinetic, r.elastic, r.gravity)
-
-    def reactions(self, body: str | None = None) -> np.ndarray:
-        """(n_nodes, 3) force of the constraint on each fixed or moved node in the last step [N], else 0."""
-        self._open_world()
-        return self._stepper.reactions()[self._slice(body)]
-
-    def stress(self, body: str) -> np.ndarray:
-        """Cauchy stress per tet (m,3,3) [Pa]; infinite in a flat one."""
-        world, k = self._open_world(), self._index(body)
-        m = world.model
-        sigma = np.zeros((m.n_blocks * m.lanes, 9))
-        cauchy_stress(m, sigma)
-        first = world.layout.block_start[k] * m.lanes
-        return sigma[first : first + world.layout.n_tets[k]].reshape(-1, 3, 3)
-
-    # --- run-time data ----------------------------------------------------------------------------------------------
-
-    @property
-    def dt(self) -> float:
-        """Step [s]; setting it takes effect with the next step."""
-        return self._dt
-
-    @dt.setter
-    def dt(self, value: float) -> None:
-        value = check_dt(value)
-        if value == self._dt:
-            return
-        if self.settings.explicit:
-            self._check_stability(value)
-        self._time_base = (self.time, self.step_count)
-        self._dt = value
-        self._stepper.forget()
-
-    @property
-    def stable_dt(self) -> float:
-        """Largest stable step [s] of an explicit integrator about the rest shape: 2/omega_max without damping."""
-        if self._stable_dt is None:
-            self._stable_dt = stable_dt(self.scene, self.settings.integrator == "velocity_verlet")
-        return self._stable_dt
-
-    def set_gravity(self, gravity) -> None:
-        """Change gravity (3,) [m/s^2]."""
-        world = self._open_world()
-        self.scene.gravity = gravity
-        world.model.gravity.from_numpy(np.asarray(self.scene.gravity, dtype=self._runtime.np_real)[None])
-        self._stepper.forget()
-
-    def set_material(self, body: str, **numbers) -> None:
-        """Change numbers of a body's material (young, poisson, density, mass_damping, stiffness_damping); law stays."""
-        world, k = self._open_world(), self._index(body)
-        changed_material(self.scene.bodies[k], numbers, self.plan.on)
-        self._stable_dt = None
-        world.upload_material()
-        if self.settings.explicit:
-            self._check_stability(self._dt)
-        self._stepper.material_changed()
-        self._stepper.forget()
+            time=self.time,
+            min_volume_ratio=lowest,
+            n_inverted=int(inverted),
+            kinetic=kinetic,
+            elastic=elastic,
+            gravity=gravity,
+        )
 
     # --- life ---------------------------------------------------------------------------------------------------------
 
@@ -241,40 +143,3 @@ class Simulator:
 
     def __exit__(self, *exception) -> None:
         self.close()
-
-    # --- helpers ------------------------------------------------------------------------------------------------------
-
-    def _open_world(self) -> World:
-        if self._world is None:
-            raise SimulationError("the simulator is closed")
-        return self._world
-
-    def _check_stability(self, dt: float) -> None:
-        limit = self.stable_dt
-        if dt <= limit:
-            return
-        text = f"dt = {dt:.3g} s is above the estimated stability limit of {limit:.3g} s of {self.settings.integrator}"
-        if not self.settings.allow_unstable:
-            raise SimulationError(f"{text}: take a smaller dt (0.9 of the limit is {0.9 * limit:.3g} s) or allow_unstable=True")
-        warnings.warn(text, stacklevel=3)
-
-    def _index(self, body: str) -> int:
-        for k, b in enumerate(self.scene.bodies):
-            if b.name == body:
-                return k
-        raise SceneError(f"the scene has no body {body!r}; it has {[b.name for b in self.scene.bodies]}")
-
-    def _slice(self, body: str | None) -> slice:
-        return slice(None) if body is None else self._world.layout.nodes(self._index(body))
-
-    def _rows(self, field, body: str | None) -> np.ndarray:
-        return field.to_numpy()[self._slice(body)].astype(np.float64)
-
-    def _check_rows(self, name: str, value, rows: slice) -> None:
-        value = np.asarray(value)
-        wanted = (len(range(*rows.indices(self._world.model.n_nodes))), 3)
-        if value.shape != wanted or value.dtype.kind not in "fiu":
-            raise SceneError(f"{name} have shape {value.shape} and type {value.dtype}: they must be {wanted} numbers")
-        bad = np.flatnonzero(~np.isfinite(value).all(axis=1))
-        if len(bad):
-            raise SceneError(f"{name}: vertex {bad[0]} is not finite")

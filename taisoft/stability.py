@@ -40,7 +40,11 @@ def hooke_stiffness(body: Body) -> sp.csr_matrix:
     g = elements.shape_gradients(Dm_inv)
     # K_ab = V (mu (ga.gb) I + mu gb ga^T + lambda ga gb^T)
     inner = np.einsum("eai,ebi->eab", g, g)
-    K = mu * inner[..., None, None] * np.eye(3) + mu * np.einsum("ebi,eaj->eabij", g, g) + lam * np.einsum("eai,ebj->eabij", g, g)
+    K = (
+        mu * inner[..., None, None] * np.eye(3)
+        + mu * np.einsum("ebi,eaj->eabij", g, g)
+        + lam * np.einsum("eai,ebj->eabij", g, g)
+    )
     K *= volume[:, None, None, None, None]
     dof = 3 * tets[:, :, None] + np.arange(3)
     rows = np.broadcast_to(dof[:, :, None, :, None], K.shape)
@@ -114,7 +118,9 @@ def stable_dt(scene: Scene, verlet: bool) -> float:
     for body in scene.bodies:
         omega = highest_frequency(body)
         if omega > 0.0:
-            limit = min(limit, _stable_dt_of(omega, body.material.mass_damping, body.material.stiffness_damping, verlet))
+            limit = min(
+                limit, _stable_dt_of(omega, body.material.mass_damping, body.material.stiffness_damping, verlet)
+            )
     return float(limit)
 
 

@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.errors import SceneError, SimulationError
 from taisoft.elasticity import measure
-from taisoft.runtime import FieldArena, open_kind, open_runtime
+from taisoft.errors import SceneError, SimulationError
 from taisoft.model import Layout, build_model
+from taisoft.runtime import FieldArena, open_kind, open_runtime
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
-from taisoft.stepping.newton import StageResult, StageSolver
 from taisoft.stepping.motion import Motion
+from taisoft.stepping.newton import StageResult, StageSolver
 from taisoft.stepping.world import World
 
 MAX_NEWTON = 100
@@ -22,10 +22,12 @@ SMALLEST_LOAD_STEP = 1.0 / 256.0
 class StaticResult:
     """A state of equilibrium, or the nearest that was found; residual: |force on free axes| / |applied load|.
 
+    at_rounding: the residual is down at the rounding of the forces, so no tolerance below it can be met.
     load_steps: how many parts the load was applied in. n_inverted: tets with J <= 0.
     """
 
     converged: bool
+    at_rounding: bool
     residual: float
     iterations: int  # Newton's, over all load steps
     linear_iterations: int
@@ -89,7 +91,9 @@ def _check(scene: Scene, tolerance: float) -> None:
 class _Static:
     def __init__(self, scene, runtime, arena, tolerance, time):
         plan = make_plan(scene, explicit=False, multistep=False)
-        model, layout = build_model(scene, runtime, arena, {**plan.on, "mass_damping": False, "stiffness_damping": False})
+        model, layout = build_model(
+            scene, runtime, arena, {**plan.on, "mass_damping": False, "stiffness_damping": False}
+        )
         self.world = World(scene, runtime, arena, model, layout, Motion(scene, layout))
         self.solver = StageSolver(model, arena, runtime.eps, self.world.motion.moved)
         self.tolerance = tolerance
@@ -103,7 +107,7 @@ class _Static:
         """The whole load at once; failing that, in steps that halve on failure and grow on success."""
         rest = self.world.layout.rest
         result, steps = self._attempt(rest, 1.0, self.tolerance), 1
-        if not self._good(result):
+        if not self._good(result) and not result.at_rounding:
             done, share, x, steps = 0.0, 0.25, rest, 0
             while done < 1.0 and share >= SMALLEST_LOAD_STEP:
                 goal = min(1.0, done + share)
@@ -144,7 +148,8 @@ class _Static:
         if not np.isfinite(result.residual):
             raise SimulationError(f"solve_static: {world.find_unfinite() or 'the residual is not finite'}")
         return StaticResult(
-            converged=result.converged, residual=result.residual, iterations=self.newton, linear_iterations=self.linear,
-            load_steps=steps, elastic=float(s[0]), n_inverted=int(s[2]), _scene=world.scene, _layout=world.layout,
-            _positions=world.model.x.to_numpy(), _reactions=held * self.solver.work.residual.to_numpy(),
+            converged=result.converged, at_rounding=result.at_rounding, residual=result.residual, iterations=self.newton,
+            linear_iterations=self.linear, load_steps=steps, elastic=float(s[0]), n_inverted=int(s[2]),
+            _scene=world.scene, _layout=world.layout, _positions=world.model.x.to_numpy(),
+            _reactions=held * self.solver.work.residual.to_numpy(),
         )  # fmt: skip

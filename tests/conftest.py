@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from command import BEAM, write
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
@@ -13,3 +14,9 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip("the folder of reference data beside the repository is absent")
     return SHARED
+
+
+@pytest.fixture
+def beam(tmp_path) -> Path:
+    """A scene file that runs in a moment."""
+    return write(tmp_path / "beam.py", BEAM)

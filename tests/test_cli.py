@@ -1,47 +1,21 @@
-"""The command line:
+"""The command line, apart from runs that begin (see test_cli_run.py):
 
 * bad input: exit status 2, one sentence that names the thing, no traceback, no output file;
-* a run: exit status 0, and a report with every setting as resolved; 1 where the run failed;
-* output that cannot be written: exit status 3, and what was computed is still reported;
-* signals: the first saves and leaves with 130 or 143, one before the run or a second one leaves at once;
 * settings: the options win over --set, --set over the scene's solver dict, and what contradicts itself is refused;
 * list, info, doctor and bench tell what there is, and need no Taichi for it.
 """
 
-import json
 import os
-import signal
 import subprocess
 import sys
 from argparse import Namespace
-from pathlib import Path
 
 import pytest
+from command import BEAM, ROOT, child, run, write
 
 import taisoft as ts
-from taisoft.cli import main, recording, scene_file, settings
-from taisoft.errors import OutputError, SceneError
-
-ROOT = Path(__file__).resolve().parents[1]
-
-BEAM = '''"""A beam."""
-import taisoft as ts
-
-solver = {"dt": 1 / 240, "integrator": "symplectic_euler", "seconds": 0.1, "fps": 30}
-
-
-def build():
-    scene = ts.Scene()
-    body = scene.add_body(ts.box_mesh((4, 1, 1), (4, 1, 1)), ts.Material(young=1e5), name="beam")
-    body.fix(lambda X: X[:, 0] < -1.99)
-    return scene
-'''
-# The path is called as the run goes on, which puts what it does inside the run.
-LED = BEAM.replace(
-    "    return scene",
-    "    body.move(lambda X: X[:, 0] > 1.99, path)\n    return scene\n\n\ndef path(t):\n    {body}\n",
-)
-SHORT_OUTPUT = ("--no-usd", "--no-frames")
+from taisoft.cli import main, scene_file, settings
+from taisoft.errors import SceneError
 
 
 class FakeSimulator:
@@ -49,34 +23,6 @@ class FakeSimulator:
 
     def __init__(self, scene, dt=1 / 60, arch="cpu", precision="f32", newton_tolerance=None):
         pass
-
-
-@pytest.fixture
-def beam(tmp_path) -> Path:
-    """A scene file that runs in a moment."""
-    return write(tmp_path / "beam.py", BEAM)
-
-
-def write(path: Path, text: str) -> Path:
-    path.write_text(text)
-    return path
-
-
-def run(*arguments) -> int:
-    return main(["run", "--headless", *map(str, arguments)])
-
-
-def report(folder: Path) -> dict:
-    return json.loads((folder / "report.json").read_text())
-
-
-def child(*arguments, **keywords) -> subprocess.Popen:
-    """The command in a process of its own."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "taisoft", *map(str, arguments)]
-    return subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **keywords
-    )
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
@@ -189,147 +135,6 @@ def test_options_win_over_set_and_set_over_the_scene():
     assert (resolved.seconds, resolved.fps) == (2.0, None)
     expected = {"dt": 0.5, "arch": "cpu", "precision": "f64", "newton_tolerance": None, "seconds": 2.0, "fps": None}
     assert resolved.as_dict() == expected
-
-
-# --- runs -------------------------------------------------------------------------------------------------------------
-
-
-def test_a_run_writes_its_results_and_tells_them(beam, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert run(beam, "--out", out, "--set", "solver.dt=0.004") == 0
-    record = report(out)
-    assert record["status"] == "ok" and record["sim_seconds"] == pytest.approx(0.1)
-    assert any("dt lowered from 0.004 s" in problem for problem in record["problems"])
-    expected = {"integrator": "symplectic_euler", "fps": 30, "seconds": 0.1, "allow_unstable": False}
-    assert expected.items() <= record["settings"].items()
-    assert record["settings"]["dt"] == pytest.approx(1 / 270)  # the dt that was used, not the one asked for
-    assert record["plan"]
-    assert sorted(path.name for path in (out / "frames").iterdir()) == [f"{i:05d}.png" for i in range(4)]
-    assert len((out / "steps.csv").read_text().splitlines()) == 4 and (out / "scene.usdc").stat().st_size > 0
-    shown = capsys.readouterr().out
-    for word in ("fixed_nodes", "status   ok", "min J", "kinetic", "report.json", "(4 pictures"):
-        assert word in shown
-    assert len(shown.splitlines()) < 40  # one screen
-
-
-def test_results_are_replaced_only_on_request(beam, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert run(beam, "--out", out) == 0
-    before = (out / "report.json").read_bytes()
-    assert run(beam, "--out", out) == 3
-    assert "already holds results" in capsys.readouterr().err
-    assert (out / "report.json").read_bytes() == before
-    assert run(beam, "--out", out, "--overwrite", *SHORT_OUTPUT) == 0
-    assert (out / "report.json").read_bytes() != before
-    assert not (out / "scene.usdc").exists()  # it told of the earlier run
-
-
-def test_without_out_nothing_is_written(beam, tmp_path, monkeypatch):
-    (tmp_path / "empty").mkdir()
-    monkeypatch.chdir(tmp_path / "empty")
-    assert run(beam) == 0
-    assert not list((tmp_path / "empty").iterdir())
-
-
-def test_a_failed_run_is_reported(tmp_path, capsys):
-    path = write(tmp_path / "led.py", LED.replace("{body}", "return (0, 0, 0) if t < 0.05 else (0, float('nan'), 0)"))
-    out = tmp_path / "out"
-    assert run(path, "--out", out, *SHORT_OUTPUT) == 1
-    record = report(out)
-    assert record["status"] == "failed" and 0.0 < record["sim_seconds"] < 0.1
-    assert record["problems"] and record["problems"][0] in capsys.readouterr().out.replace("\n         ", " ")
-
-
-def test_warnings_are_told_once_and_reported(tmp_path, capsys):
-    path = write(tmp_path / "stiff.py", BEAM.replace("young=1e5", "young=1e5, poisson=0.495"))
-    out = tmp_path / "out"
-    assert run(path, "--out", out, *SHORT_OUTPUT) == 0
-    error = capsys.readouterr().err
-    assert error.count("taisoft: warning: material: poisson = 0.495") == 1
-    assert report(out)["problems"][0].startswith("warning: material: poisson = 0.495")
-
-
-def test_a_scene_may_import_its_neighbour(tmp_path):
-    write(tmp_path / "beam_parts_of_this_test.py", BEAM)
-    path = write(tmp_path / "scene.py", "from beam_parts_of_this_test import build, solver\n")
-    assert run(path) == 0
-
-
-def test_a_picture_that_cannot_be_written_ends_the_run(beam, tmp_path, monkeypatch, capsys):
-    class FullDisk(recording.FrameWriter):
-        def frame(self, sim, index):
-            if index == 2:
-                raise OutputError("cannot write frames/00002.png (9 bytes): No space left on device")
-            super().frame(sim, index)
-
-    monkeypatch.setattr(recording, "FrameWriter", FullDisk)
-    out = tmp_path / "out"
-    assert run(beam, "--out", out) == 3
-    assert "taisoft: cannot write frames/00002.png" in capsys.readouterr().err
-    record = report(out)
-    assert record["status"] == "degraded" and not record["interrupted"]
-    assert record["sim_seconds"] == pytest.approx(2 / 30)
-    assert any("frames/00002.png" in problem for problem in record["problems"])
-    assert (out / "scene.usdc").exists() and len(list((out / "frames").iterdir())) == 2
-
-
-def test_a_report_that_cannot_be_written(beam, tmp_path, monkeypatch, capsys):
-    def refuse(*_, **__):
-        raise OutputError("cannot write report.json (9 bytes): No space left on device")
-
-    monkeypatch.setattr(recording, "write_report", refuse)
-    assert run(beam, "--out", tmp_path / "out", *SHORT_OUTPUT) == 3
-    captured = capsys.readouterr()
-    assert "taisoft: cannot write report.json" in captured.err and "status   ok" in captured.out
-
-
-def test_no_display_means_no_window(beam, monkeypatch, capsys):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    assert main(["run", str(beam)]) == 0
-    captured = capsys.readouterr()
-    assert "taisoft: running without a window: there is no display" in captured.err and "status   ok" in captured.out
-
-
-# --- signals ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_first_signal_saves_what_there_is(tmp_path, number, capfd):
-    raising = f"import signal; signal.raise_signal({int(number)}) if 0.05 < t < 0.0542 else None\n    return (0, 0, 0)"
-    path = write(tmp_path / "led.py", LED.replace("{body}", raising))
-    before = signal.getsignal(number)
-    assert run(path, "--out", tmp_path / "out", "--no-frames") == 128 + number
-    assert signal.getsignal(number) is before
-    record = report(tmp_path / "out")
-    assert record["interrupted"] and record["status"] == "degraded" and 0.0 < record["sim_seconds"] < 0.1
-    assert (tmp_path / "out" / "scene.usdc").exists()
-    captured = capfd.readouterr()
-    assert "ended early by a signal" in captured.out and "a second signal leaves at once" in captured.err
-
-
-def test_signal_before_the_run_writes_nothing(tmp_path, capsys):
-    text = BEAM.replace("    scene = ts.Scene()", "    import signal; signal.raise_signal(15)\n    scene = ts.Scene()")
-    assert run(write(tmp_path / "scene.py", text), "--out", tmp_path / "out") == 143
-    assert "nothing was written" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_second_signal_leaves_at_once(tmp_path):
-    """The scene hangs inside a step after the first signal, so that only the second can end the process."""
-    hanging = "import signal, time; t > 0.05 and (signal.raise_signal(2), time.sleep(60))\n    return (0, 0, 0)"
-    path = write(tmp_path / "led.py", LED.replace("{body}", hanging))
-    process = child("run", path, "--headless", "--out", tmp_path / "out", *SHORT_OUTPUT)
-    try:
-        for line in process.stderr:
-            if "a second signal leaves at once" in line:
-                break
-        process.send_signal(signal.SIGTERM)
-        process.communicate(timeout=10)
-    finally:
-        process.kill()
-    assert process.returncode == 143
-    assert not (tmp_path / "out" / "report.json").exists()
 
 
 # --- the other commands -----------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """What a run writes: the observers of `taisoft run` together, kept going or ended as one."""
 
+import time
 from pathlib import Path
 
 from taisoft.cli.settings import RunSettings
@@ -15,18 +16,22 @@ from taisoft.view.offscreen import Offscreen
 class Observers:
     """Hands every frame to its members; the first that cannot write asks the run to end, and the sentence is kept.
 
-    error: the OutputError, or None. A member has frame(sim, index) and close().
+    error: the OutputError, or None; seconds: wall time spent in the members [s]. A member has frame(sim, index) and
+    close().
     """
 
     def __init__(self) -> None:
         self.members: list = []
         self.error: OutputError | None = None
+        self.seconds = 0.0
 
     def on_frame(self, sim, index: int, _report) -> None:
         """For Simulator.run. Never raises OutputError: what was computed must still be reported."""
+        start = time.perf_counter()
         for member in self.members:
             if self.error is None:
                 self.guard(member.frame, sim, index)
+        self.seconds += time.perf_counter() - start
 
     def failed(self) -> bool:
         """True once a member could not write."""

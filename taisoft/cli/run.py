@@ -1,5 +1,6 @@
 """`taisoft run SCENE`: load, check, build, run, save, tell."""
 
+import os
 import sys
 import warnings
 from argparse import Namespace
@@ -13,6 +14,7 @@ from taisoft.cli.scene_file import load_scene
 from taisoft.cli.settings import RunSettings, resolve
 from taisoft.cli.signals import Signals
 from taisoft.cli.summary import print_plan, print_state, print_summary
+from taisoft.errors import SceneError
 from taisoft.output.progress import Progress
 from taisoft.records import RunReport
 from taisoft.simulator import Simulator
@@ -21,6 +23,7 @@ from taisoft.view.ggui import display_missing, vulkan_missing
 
 def command(arguments: Namespace) -> int:
     """Runs the scene and returns the exit status. What can be refused is refused before a file is written."""
+    _check_working_folder()
     with Signals() as signals, _told_warnings() as told:
         scene, solver = load_scene(arguments.scene)
         settings = resolve(solver, arguments, Simulator)
@@ -30,6 +33,14 @@ def command(arguments: Namespace) -> int:
             if has_window and arguments.out is None and arguments.seconds is None:
                 return _watch(sim, settings)
             return _run(sim, settings, arguments, signals, told, has_window)
+
+
+def _check_working_folder() -> None:
+    """Raises SceneError if the working folder is gone: Taichi asks for it when it starts."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise SceneError(f"the working folder cannot be used ({error.strerror}): change to another one") from None
 
 
 def _window_is_possible() -> bool:
@@ -77,7 +88,7 @@ def _run(
             _tell_failed_output(result, observers, signals)
         if recording is not None:
             observers.guard(recording.report, result, sim, settings)
-        print_summary(result, sim, recording)
+        print_summary(result, sim, observers, recording)
     if observers.error is not None:
         print(f"taisoft: {observers.error}", file=sys.stderr)
         return EXIT_OUTPUT

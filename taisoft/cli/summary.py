@@ -2,7 +2,7 @@
 
 import textwrap
 
-from taisoft.cli.recording import Recording
+from taisoft.cli.recording import Observers, Recording
 from taisoft.records import RunReport
 
 WIDTH = 118
@@ -26,7 +26,7 @@ def print_state(sim) -> None:
     _line("energy", f"kinetic {e.kinetic:.6g} J, elastic {e.elastic:.6g} J, gravity {e.gravity:.6g} J")
 
 
-def print_summary(result: RunReport, sim, recording: Recording | None) -> None:
+def print_summary(result: RunReport, sim, observers: Observers, recording: Recording | None) -> None:
     """Status, problems, time, smallest volume ratio, energies, files."""
     print()
     _line("status", result.status + (", ended early by a signal" if result.interrupted else ""))
@@ -35,7 +35,8 @@ def print_summary(result: RunReport, sim, recording: Recording | None) -> None:
     if len(result.problems) > PROBLEMS_SHOWN:
         _line("", f"and {len(result.problems) - PROBLEMS_SHOWN} more problems")
     print_state(sim)
-    _line("wall", f"{result.wall_seconds:.2f} s, and {result.compile_seconds:.2f} s to compile")
+    wall, output = result.wall_seconds, observers.seconds
+    _line("wall", f"{wall:.2f} s, {output:.2f} s of them for output; and {result.compile_seconds:.2f} s to compile")
     if result.step_reports:
         worst = min(result.step_reports, key=lambda report: report.min_volume_ratio)
         _line("min J", f"{worst.min_volume_ratio:.4g} at {worst.time:.4g} s, {worst.n_inverted} tets inverted")

@@ -27,12 +27,13 @@ class BlockCsr:
 
     n_edges: int
     row_start: Any  # (n_nodes + 1) i32
+    row_upper: Any  # (n_nodes) i32: where a row's columns pass the diagonal
     column: Any  # (2 n_edges) i32, ascending in each row, no diagonal
     value: Any  # (2 n_edges * 9), blocks row by row
     diagonal: Any  # (n_nodes * 9)
     element: Any  # (n_blocks * 54 * lanes): K_ab of each tet, per block (pair, entry, lane)
     edge_start: Any  # (n_edges + 1) i32: rows of edge_entry
-    edge_entry: Any  # (6 n_tets) i32: base index into element, or -1 - base where K_ab is the transposed block
+    edge_entry: Any  # (6 n_tets) i32: base index into element
     edge_upper: Any  # (n_edges) i32: where K_ij lies in value / 9
     edge_lower: Any  # (n_edges) i32: where K_ji lies
 
@@ -44,9 +45,7 @@ def build_block_csr(model: Model, arena: FieldArena, real, prefix: str = "stiffn
     lane = np.flatnonzero(model.volume.to_numpy().reshape(-1) > 0)
     ends = np.stack([verts[lane][:, PAIRS[k]] for k in range(6)], axis=1).reshape(-1, 2)
     base = (((lane // lanes)[:, None] * 6 + np.arange(6)) * 9 * lanes + (lane % lanes)[:, None]).reshape(-1)
-    turned = ends[:, 0] > ends[:, 1]
-    low, high = ends.min(axis=1), ends.max(axis=1)
-    key, edge = np.unique(low * n + high, return_inverse=True)
+    key, edge = np.unique(ends[:, 0] * n + ends[:, 1], return_inverse=True)  # a tet's vertices ascend
     order = np.argsort(edge, kind="stable")
     edge_start = np.concatenate([[0], np.cumsum(np.bincount(edge, minlength=len(key)))])
     i, j = key // n, key % n
@@ -60,10 +59,11 @@ def build_block_csr(model: Model, arena: FieldArena, real, prefix: str = "stiffn
         return arena.field(f"{prefix}_{name}", ti.i32, len(data), data.astype(np.int32))
 
     return BlockCsr(
-        n_edges=len(key), row_start=ints("row_start", row_start), column=ints("column", columns[sort]),
+        n_edges=len(key), row_start=ints("row_start", row_start),
+        row_upper=ints("row_upper", row_start[:-1] + np.bincount(j, minlength=n)), column=ints("column", columns[sort]),
         value=arena.field(f"{prefix}_value", real, 18 * len(key)), diagonal=arena.field(f"{prefix}_diagonal", real, 9 * n),
         element=arena.field(f"{prefix}_element", real, model.n_blocks * 54 * lanes),
-        edge_start=ints("edge_start", edge_start), edge_entry=ints("edge_entry", np.where(turned, -1 - base, base)[order]),
+        edge_start=ints("edge_start", edge_start), edge_entry=ints("edge_entry", base[order]),
         edge_upper=ints("edge_upper", place[: len(key)]), edge_lower=ints("edge_lower", place[len(key) :]),
     )  # fmt: skip
 
@@ -91,10 +91,10 @@ def assemble(m: ti.template(), A: ti.template(), projected: ti.template()):
             V = volumes(m, b, m.real)
             if ti.static(projected):
                 S = prepare_projected(law, F, p)
-                element_blocks(m, A, law, True, b, F, S, M, V)
+                projected_blocks(m, A, b, S, M, V)
             else:
                 S = law.prepare(F, p)
-                element_blocks(m, A, law, False, b, F, S, M, V)
+                exact_blocks(m, A, law, b, F, S, M, V)
     ti.loop_config(serialize=m.serial)
     for e in range(A.n_edges):
         gather_edge(m, A, e)
@@ -108,31 +108,53 @@ def assemble(m: ti.template(), A: ti.template(), projected: ti.template()):
 
 
 @ti.func
-def element_blocks(m: ti.template(), A: ti.template(), law: ti.template(), projected: ti.template(), b, F, S, M, V):
-    """K_ab = V (dP along e_k (x) g_a) g_b for the corner pairs of block b.
+def exact_blocks(m: ti.template(), A: ti.template(), law: ti.template(), b, F, S, M, V):
+    """K_ab of the corner pairs of block b by the law's closed form.
 
-    Corners 1, 2, 3 have the gradients g of M's rows; K_0b is minus the sum over a of K_ab, corner 0 being what moves
-    when all the others do. One (a, k) at a time, in a loop that stays a loop: unrolled it takes seconds to compile.
+    Corners 1, 2, 3 have the gradients g of M's rows; K_0b is minus the sum over a of K_ab.
     """
+    g = [[M[3 * a], M[3 * a + 1], M[3 * a + 2]] for a in ti.static(range(3))]
+    K11, K22, K33 = law.block(F, S, g[0], g[0]), law.block(F, S, g[1], g[1]), law.block(F, S, g[2], g[2])
+    # law.block(ga, gb) has the force at b as rows: its transpose is K_ab
+    K21, K31, K32 = law.block(F, S, g[0], g[1]), law.block(F, S, g[0], g[2]), law.block(F, S, g[1], g[2])
+    base = b * (54 * m.lanes)
+    for i in ti.static(range(3)):
+        for k in ti.static(range(3)):
+            store(m, A, base, 0, 3 * i + k, -V * (K11[3 * i + k] + K21[3 * i + k] + K31[3 * i + k]))
+            store(m, A, base, 1, 3 * i + k, -V * (K21[3 * k + i] + K22[3 * i + k] + K32[3 * i + k]))
+            store(m, A, base, 2, 3 * i + k, -V * (K31[3 * k + i] + K32[3 * k + i] + K33[3 * i + k]))
+            store(m, A, base, 3, 3 * i + k, V * K21[3 * k + i])
+            store(m, A, base, 4, 3 * i + k, V * K31[3 * k + i])
+            store(m, A, base, 5, 3 * i + k, V * K32[3 * k + i])
+
+
+@ti.func
+def store(m: ti.template(), A: ti.template(), base, pair: ti.template(), entry: ti.template(), value):
+    for q in ti.static(range(m.lanes)):
+        A.element[base + ((pair * 9 + entry) * m.lanes + q)] = value[q]
+
+
+@ti.func
+def projected_blocks(m: ti.template(), A: ti.template(), b, S, M, V):
+    """The same of the projected second derivative, a column at a time: unrolled it takes seconds to compile."""
     base = b * (54 * m.lanes)
     for a in ti.static(range(3)):
         for k in range(3):
             # unit displacement of corner a + 1 along axis k
             on = [ti.select(k == r, ti.cast(1.0, m.real), ti.cast(0.0, m.real)) for r in ti.static(range(3))]
             D = [on[r] * M[3 * a + c] for r in ti.static(range(3)) for c in ti.static(range(3))]
-            if ti.static(projected):
-                T = dpk1_projected(S, D)
-                store_column(m, A, base, a, k, T, M, V)
-            else:
-                T = law.dpk1(F, S, D)
-                store_column(m, A, base, a, k, T, M, V)
+            T = dpk1_projected(S, D)
+            store_column(m, A, base, a, k, T, M, V)
 
 
 @ti.func
 def store_column(m: ti.template(), A: ti.template(), base, a: ti.template(), k, T, M, V):
     """Column k of the blocks between corner a + 1 and the others: rows r of K_(c+1)(a+1) as row k of K_(a+1)(c+1)."""
     for r in ti.static(range(3)):
-        g = [V * (T[3 * r] * M[3 * c] + T[3 * r + 1] * M[3 * c + 1] + T[3 * r + 2] * M[3 * c + 2]) for c in ti.static(range(3))]
+        g = [
+            V * (T[3 * r] * M[3 * c] + T[3 * r + 1] * M[3 * c + 1] + T[3 * r + 2] * M[3 * c + 2])
+            for c in ti.static(range(3))
+        ]
         g0 = -(g[0] + g[1] + g[2])
         # pair (0, a + 1) is number a: entry (r, k) of K_0a
         at0 = base + (a * 9 + 3 * r + k) * m.lanes
@@ -152,11 +174,9 @@ def gather_edge(m: ti.template(), A: ti.template(), e):
     s = ti.Matrix.zero(m.real, 3, 3)
     for k in range(A.edge_start[e], A.edge_start[e + 1]):
         at = A.edge_entry[k]
-        turned = at < 0
-        at = ti.select(turned, -1 - at, at)
         for r in ti.static(range(3)):
             for c in ti.static(range(3)):
-                s[r, c] += A.element[at + ti.select(turned, 3 * c + r, 3 * r + c) * m.lanes]
+                s[r, c] += A.element[at + (3 * r + c) * m.lanes]
     upper, lower = 9 * A.edge_upper[e], 9 * A.edge_lower[e]
     for r in ti.static(range(3)):
         for c in ti.static(range(3)):
@@ -164,18 +184,55 @@ def gather_edge(m: ti.template(), A: ti.template(), e):
             A.value[lower + 3 * c + r] = s[r, c]
 
 
+@kernel
+def to_system(m: ti.template(), A: ti.template(), damper: ti.template(), shift: ti.template(), k: ti.f64, c: ti.f64):
+    """A = diag(shift) + k A + c b K_d in place; b is the stiffness damping of the row's body, K_d the damper's values."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        kr, drag = ti.cast(k, m.real), ti.cast(0.0, m.real)
+        if ti.static(m.stiffness_damping):
+            drag = ti.cast(c, m.real) * m.damping[m.node_body[i], 1]
+        for at in range(9 * A.row_start[i], 9 * A.row_start[i + 1]):
+            A.value[at] = kr * A.value[at]
+            if ti.static(m.stiffness_damping):
+                A.value[at] = A.value[at] + drag * damper.value[at]
+        for e in ti.static(range(9)):
+            d = kr * A.diagonal[9 * i + e]
+            if ti.static(m.stiffness_damping):
+                d += drag * damper.diagonal[9 * i + e]
+            if ti.static(e % 4 == 0):
+                d += shift[i]
+            A.diagonal[9 * i + e] = d
+
+
 @ti.func
-def row_times(m: ti.template(), A: ti.template(), i, x: ti.template()):
-    """(A x)_i."""
+def diagonal_times(m: ti.template(), A: ti.template(), i, x):
+    """The diagonal block of row i times a 3-vector."""
     y = ti.Vector([0.0, 0.0, 0.0], m.real)
-    d, xi = 9 * i, x[i]
     for r in ti.static(range(3)):
-        y[r] = A.diagonal[d + 3 * r] * xi[0] + A.diagonal[d + 3 * r + 1] * xi[1] + A.diagonal[d + 3 * r + 2] * xi[2]
-    for k in range(A.row_start[i], A.row_start[i + 1]):
+        y[r] = (
+            A.diagonal[9 * i + 3 * r] * x[0]
+            + A.diagonal[9 * i + 3 * r + 1] * x[1]
+            + A.diagonal[9 * i + 3 * r + 2] * x[2]
+        )
+    return y
+
+
+@ti.func
+def part_times(m: ti.template(), A: ti.template(), first, last, x: ti.template()):
+    """Sum of the blocks first..last (of one row) times x at their columns."""
+    y = ti.Vector([0.0, 0.0, 0.0], m.real)
+    for k in range(first, last):
         xj, at = x[A.column[k]], 9 * k
         for r in ti.static(range(3)):
             y[r] += A.value[at + 3 * r] * xj[0] + A.value[at + 3 * r + 1] * xj[1] + A.value[at + 3 * r + 2] * xj[2]
     return y
+
+
+@ti.func
+def row_times(m: ti.template(), A: ti.template(), i, x: ti.template()):
+    """(A x)_i."""
+    return diagonal_times(m, A, i, x[i]) + part_times(m, A, A.row_start[i], A.row_start[i + 1], x)
 
 
 @kernel
@@ -193,4 +250,7 @@ def to_scipy(m: Model, A: BlockCsr) -> sp.csr_matrix:
     diagonal = A.diagonal.to_numpy().astype(np.float64).reshape(-1, 3, 3)
     shape = (3 * m.n_nodes, 3 * m.n_nodes)
     own = np.arange(m.n_nodes)
-    return (sp.bsr_matrix((off, column, start), shape=shape) + sp.bsr_matrix((diagonal, own, np.arange(m.n_nodes + 1)), shape=shape)).tocsr()
+    return (
+        sp.bsr_matrix((off, column, start), shape=shape)
+        + sp.bsr_matrix((diagonal, own, np.arange(m.n_nodes + 1)), shape=shape)
+    ).tocsr()

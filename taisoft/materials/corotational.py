@@ -10,10 +10,11 @@ rotation is taken from the signed SVD instead. Weak: R is not unique there, so t
 
 import taichi as ti
 
-from taisoft.math3 import cofactor, ddot, determinant, matmul, matmul_nt, matmul_tn, signed_svd
+from taisoft.math3 import cofactor, cross, ddot, determinant, dot, matmul, matmul_nt, matmul_tn, signed_svd, transform
 
 NAME = "corotational"
-NEWTON_STEPS = 7  # from sqrt(3 Ic) down to the largest root: enough for stretch ratios up to about 10; others take the SVD
+EXTRA_STEPS = 8  # of Halley beyond the two that moderate strain needs
+SETTLED = 1e-5  # relative change whose cube is below rounding: the next step would change nothing
 SVD_BELOW = 0.04  # relative size of the denominator under which the closed form loses more than about a digit
 
 
@@ -29,33 +30,48 @@ def _svd_rotation(F):
 
 
 @ti.func
+def _halley(f, Ic, J, c0):
+    """Change of f by one Halley step (third order, and from above the largest root never past it)."""
+    value = f * (f * (f * f - 2.0 * Ic) - 8.0 * J) + c0
+    slope = 4.0 * f * (f * f - Ic) - 8.0 * J
+    bend = 6.0 * f * f - 2.0 * Ic  # half the second derivative
+    return value * slope / ti.max(slope * slope - value * bend, 1e-30)
+
+
+@ti.func
+def _any(flags):
+    some = flags[0] != 0
+    for q in ti.static(range(1, flags.n)):
+        some = some or flags[q] != 0
+    return some
+
+
+@ti.func
 def rotation(F):
     """R of the polar decomposition, det R = +1; any finite F is valid."""
     C = matmul_tn(F, F)
     G = cofactor(F)
     J = F[0] * G[0] + F[1] * G[1] + F[2] * G[2]
     Ic = C[0] + C[4] + C[8]
-    IIc = ddot(C, C)
-    c0 = 2.0 * IIc - Ic * Ic
-    f = ti.sqrt(3.0 * Ic)
-    change = 0.0 * f
-    for _ in ti.static(range(NEWTON_STEPS)):
-        slope = 4.0 * f * (f * f - Ic) - 8.0 * J
-        value = f * (f * (f * f - 2.0 * Ic) - 8.0 * J) + c0
-        change = value / ti.max(slope, 1e-30)
-        f = f - change
+    c0 = 2.0 * ddot(C, C) - Ic * Ic
+    f = ti.sqrt(3.0 * Ic)  # above the root, and near it where the stretches are nearly equal
+    f -= _halley(f, Ic, J, c0)
+    change = _halley(f, Ic, J, c0)
+    f -= change
+    more = 0
+    while more < EXTRA_STEPS and _any(abs(change) > SETTLED * f):
+        change = _halley(f, Ic, J, c0)
+        f -= change
+        more += 1
     denominator = f * (f * f - Ic) - 2.0 * J
-    unsure = (denominator <= SVD_BELOW * f * f * f) | (abs(change) > 1e-5 * f) | ~(f > 0.0)
+    unsure = (denominator <= SVD_BELOW * f * f * f) | (abs(change) > SETTLED * f) | ~(f > 1e-4)
     FC = matmul(F, C)
     a = f * f + Ic
     N = [a * F[k] + 2.0 * f * G[k] - 2.0 * FC[k] for k in ti.static(range(9))]
     # |R|^2 = 3 takes the rounding of f out of R's length
     scale = ti.sqrt(3.0 / ti.max(ddot(N, N), 1e-30))
     R = [scale * N[k] for k in ti.static(range(9))]
-    some = unsure[0] != 0
-    for q in ti.static(range(1, F[0].n)):
-        some = some or unsure[q] != 0
-    if some:
+    if _any(unsure):
         Q = _svd_rotation(F)
         for k in ti.static(range(9)):
             R[k] = ti.select(unsure, Q[k], R[k])
@@ -82,16 +98,13 @@ def pk1(F, p):
 
 @ti.func
 def prepare(F, p):
-    """What `dpk1` needs of F: R, the inverse of tr(S) I - S (six entries), and the factors."""
+    """What `dpk1` and `block` need of F: R, the inverse of tr(S) I - S in the turned frame (R K R^T), and the factors."""
     R = rotation(F)
-    S = matmul_tn(R, F)
-    t = S[0] + S[4] + S[8]
-    K = [
-        t - S[0], -0.5 * (S[1] + S[3]), -0.5 * (S[2] + S[6]), -0.5 * (S[1] + S[3]), t - S[4], -0.5 * (S[5] + S[7]),
-        -0.5 * (S[2] + S[6]), -0.5 * (S[5] + S[7]), t - S[8],
-    ]  # fmt: skip
-    det = determinant(K)
-    # (s0+s1)(s0+s2)(s1+s2): 0 only where the rotation itself is not unique
+    T = matmul_nt(F, R)  # R S R^T, symmetric
+    t = T[0] + T[4] + T[8]
+    a, b, c = -0.5 * (T[1] + T[3]), -0.5 * (T[2] + T[6]), -0.5 * (T[5] + T[7])
+    K = [t - T[0], a, b, a, t - T[4], c, b, c, t - T[8]]
+    det = determinant(K)  # (s0+s1)(s0+s2)(s1+s2): 0 only where the rotation itself is not unique
     tiny = 1e-12 * abs(t * t * t) + 1e-30
     inverse = 1.0 / ti.select(abs(det) > tiny, det, tiny)
     C = cofactor(K)
@@ -102,27 +115,53 @@ def prepare(F, p):
 def dpk1(F, S, D):
     """Differential of the stress along D [Pa], with S = prepare(F, p).
 
-    dR = R [w]x with (tr(S) I - S) w = axial(R^T dF - dF^T R); tr S changes by R : dF.
+    dR = [w]x R with R (tr(S) I - S) R^T w = axial(dF R^T - R dF^T); tr S changes by R : dF.
     """
     R = [S[k] for k in ti.static(range(9))]
     K = [S[9 + k] for k in ti.static(range(9))]
-    B = matmul_tn(R, D)
-    a = [B[7] - B[5], B[2] - B[6], B[3] - B[1]]
-    w = [K[3 * i] * a[0] + K[3 * i + 1] * a[1] + K[3 * i + 2] * a[2] for i in ti.static(range(3))]
+    B = matmul_nt(D, R)
+    w = transform(K, [B[7] - B[5], B[2] - B[6], B[3] - B[1]])
     t = S[19] * (B[0] + B[4] + B[8])
+    c = [S[20] * w[k] for k in ti.static(range(3))]
     dR = [
-        [R[3 * i + 1] * w[2] - R[3 * i + 2] * w[1], R[3 * i + 2] * w[0] - R[3 * i] * w[2], R[3 * i] * w[1] - R[3 * i + 1] * w[0]][j]
+        c[(i + 1) % 3] * R[3 * ((i + 2) % 3) + j] - c[(i + 2) % 3] * R[3 * ((i + 1) % 3) + j]
         for i in ti.static(range(3))
         for j in ti.static(range(3))
     ]
-    return [2.0 * S[18] * D[k] + t * R[k] + S[20] * dR[k] for k in ti.static(range(9))]
+    return [2.0 * S[18] * D[k] + t * R[k] + dR[k] for k in ti.static(range(9))]
+
+
+@ti.func
+def block(F, S, ga, gb):
+    """(d/dx_k of) (P g_b)_i for a displacement field with gradient e_k (x) g_a: the nine entries (i, k) [Pa/m^2]."""
+    R = [S[k] for k in ti.static(range(9))]
+    Ra, Rb = transform(R, ga), transform(R, gb)
+    d = 2.0 * S[18] * dot(ga, gb)
+    l = [S[19] * Rb[k] for k in ti.static(range(3))]
+    # dR g_b = w x R g_b with w = K (R g_a x e_k), so the matrix over k is -[R g_b]x K [R g_a]x
+    N = [cross([S[9 + 3 * i], S[10 + 3 * i], S[11 + 3 * i]], Ra) for i in ti.static(range(3))]
+    c = [S[20] * Rb[k] for k in ti.static(range(3))]
+    turn = [
+        c[(i + 2) % 3] * N[(i + 1) % 3][k] - c[(i + 1) % 3] * N[(i + 2) % 3][k]
+        for i in ti.static(range(3))
+        for k in ti.static(range(3))
+    ]
+    return [
+        turn[3 * i + k] + l[i] * Ra[k] + (d if ti.static(i == k) else 0.0)
+        for i in ti.static(range(3))
+        for k in ti.static(range(3))
+    ]
 
 
 @ti.func
 def hessian_eigen(s, p):
     """Second derivatives in the SVD frame: the 3x3 block over the stretches s (nine entries), and the eigenvalues of
     the symmetric and of the antisymmetric mode of the pairs (0,1), (0,2), (1,2). All [Pa]."""
-    A = [(2.0 * p[0] if ti.static(i == j) else 0.0) + p[1] + 0.0 * s[0] for i in ti.static(range(3)) for j in ti.static(range(3))]
+    A = [
+        (2.0 * p[0] if ti.static(i == j) else 0.0) + p[1] + 0.0 * s[0]
+        for i in ti.static(range(3))
+        for j in ti.static(range(3))
+    ]
     symmetric = [2.0 * p[0] + 0.0 * s[0], 2.0 * p[0] + 0.0 * s[0], 2.0 * p[0] + 0.0 * s[0]]
     factor = 2.0 * p[1] * (s[0] + s[1] + s[2] - 3.0) - 4.0 * p[0]
     pair = [s[0] + s[1], s[0] + s[2], s[1] + s[2]]

@@ -8,7 +8,7 @@ reflection): squeezed bodies collapse.
 
 import taichi as ti
 
-from taisoft.math3 import ddot, matmul, matmul_tn
+from taisoft.math3 import ddot, dot, matmul, matmul_nt, matmul_tn, transform
 
 NAME = "st_venant_kirchhoff"
 
@@ -23,7 +23,9 @@ def _green_strain(F):
     """E = (F^T F - I)/2, formed from H = F - I so that small strains keep their digits."""
     H = [F[k] - (1.0 if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
     C = matmul_tn(H, H)
-    return [0.5 * (H[3 * i + j] + H[3 * j + i] + C[3 * i + j]) for i in ti.static(range(3)) for j in ti.static(range(3))]
+    return [
+        0.5 * (H[3 * i + j] + H[3 * j + i] + C[3 * i + j]) for i in ti.static(range(3)) for j in ti.static(range(3))
+    ]
 
 
 @ti.func
@@ -49,8 +51,9 @@ def pk1(F, p):
 
 @ti.func
 def prepare(F, p):
-    """What `dpk1` needs of F: the second Piola-Kirchhoff stress and the Lamé parameters."""
-    return _second_pk(_green_strain(F), p) + [p[0], p[1]]
+    """What `dpk1` and `block` need of F: the second Piola-Kirchhoff stress, the Lamé parameters, mu F F^T."""
+    B = matmul_nt(F, F)
+    return _second_pk(_green_strain(F), p) + [p[0], p[1]] + [p[0] * B[k] for k in ti.static(range(9))]
 
 
 @ti.func
@@ -59,10 +62,26 @@ def dpk1(F, S, D):
     B = matmul_tn(F, D)
     t = S[10] * (B[0] + B[4] + B[8])
     T = [
-        S[9] * (B[3 * i + j] + B[3 * j + i]) + (t if ti.static(i == j) else 0.0) for i in ti.static(range(3)) for j in ti.static(range(3))
+        S[9] * (B[3 * i + j] + B[3 * j + i]) + (t if ti.static(i == j) else 0.0)
+        for i in ti.static(range(3))
+        for j in ti.static(range(3))
     ]
     first, second = matmul(D, S), matmul(F, T)
     return [first[k] + second[k] for k in ti.static(range(9))]
+
+
+@ti.func
+def block(F, S, ga, gb):
+    """(d/dx_k of) (P g_b)_i for a displacement field with gradient e_k (x) g_a: the nine entries (i, k) [Pa/m^2]."""
+    Fa, Fb = transform(F, ga), transform(F, gb)
+    c, d = dot(ga, gb), dot(ga, transform(S, gb))
+    m = [S[9] * Fa[k] for k in ti.static(range(3))]
+    l = [S[10] * Fb[k] for k in ti.static(range(3))]
+    return [
+        c * S[11 + 3 * i + k] + m[i] * Fb[k] + l[i] * Fa[k] + (d if ti.static(i == k) else 0.0)
+        for i in ti.static(range(3))
+        for k in ti.static(range(3))
+    ]
 
 
 @ti.func

@@ -9,7 +9,7 @@ rubber; stress-free states exist only where the log term is kept (as here).
 
 import taichi as ti
 
-from taisoft.math3 import cofactor, cofactor_differential, ddot
+from taisoft.math3 import cofactor, cofactor_differential, cross, ddot, dot, transform
 
 NAME = "stable_neo_hookean"
 
@@ -66,6 +66,22 @@ def dpk1(F, S, D):
     GD = S[11] * ddot(S, D)
     C = cofactor_differential(F, D)
     return [S[9] * D[k] + FD * F[k] + GD * S[k] + S[12] * C[k] for k in ti.static(range(9))]
+
+
+@ti.func
+def block(F, S, ga, gb):
+    """(d/dx_k of) (P g_b)_i for a displacement field with gradient e_k (x) g_a: the nine entries (i, k) [Pa/m^2]."""
+    Fa, Fb, Ga, Gb = transform(F, ga), transform(F, gb), transform(S, ga), transform(S, gb)
+    d = S[9] * dot(ga, gb)
+    t = transform(F, cross(ga, gb))
+    w = [S[12] * t[k] for k in ti.static(range(3))]
+    f = [S[10] * Fb[k] for k in ti.static(range(3))]
+    g = [S[11] * Gb[k] for k in ti.static(range(3))]
+    return [
+        d + f[0] * Fa[0] + g[0] * Ga[0], f[0] * Fa[1] + g[0] * Ga[1] - w[2], f[0] * Fa[2] + g[0] * Ga[2] + w[1],
+        f[1] * Fa[0] + g[1] * Ga[0] + w[2], d + f[1] * Fa[1] + g[1] * Ga[1], f[1] * Fa[2] + g[1] * Ga[2] - w[0],
+        f[2] * Fa[0] + g[2] * Ga[0] - w[1], f[2] * Fa[1] + g[2] * Ga[1] + w[0], d + f[2] * Fa[2] + g[2] * Ga[2],
+    ]  # fmt: skip
 
 
 @ti.func

@@ -45,7 +45,9 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool) -> Plan:
     plan.add("mass_damping", bool(dragged), f"material of {_named(dragged)}", "every mass_damping is 0")
     viscous = bodies(lambda b: b.material.stiffness_damping > 0)
     plan.add("stiffness_damping", bool(viscous), f"material of {_named(viscous)}", "every stiffness_damping is 0")
-    plan.add("assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only")
+    plan.add(
+        "assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only"
+    )
     plan.add("past_states", multistep, "the integrator looks back two steps", "a one-step integrator")
     plan.add(
         "inversion_handling", not explicit, "the stiffness of tets with negative curvature is projected when a solve meets it",

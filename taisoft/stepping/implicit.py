@@ -42,7 +42,9 @@ def keep_state(m: ti.template(), h: ti.template(), shift: ti.template()):
 
 
 @kernel
-def set_hats(m: ti.template(), w: ti.template(), h: ti.template(), multistep: ti.template(), now: ti.f64, before: ti.f64):
+def set_hats(
+    m: ti.template(), w: ti.template(), h: ti.template(), multistep: ti.template(), now: ti.f64, before: ti.f64
+):
     """x_hat and v_hat of the stage."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -113,7 +115,6 @@ class ImplicitStepper:
         )  # fmt: skip
         self.tolerance = DEFAULT_TOLERANCE[world.runtime.precision]
         self.linear_tolerance: float | None = None
-        self.material_changed()
         self.forget()
 
     def forget(self) -> None:
@@ -148,9 +149,10 @@ class ImplicitStepper:
         )
         if scheme.midpoint:
             finish_midpoint(m, h)
-        where = world.find_unfinite()
-        if where is not None:
+        if not np.isfinite(result.residual):  # a NaN anywhere in x or v reaches the residual
+            where = world.find_unfinite() or "the residual is not finite"
             restore(m, h)
+            self.forget()
             raise SimulationError(f"step {world.step_count + 1}: {where}")
         self._past += 1
         return result

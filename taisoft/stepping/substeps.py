@@ -123,8 +123,7 @@ class ExplicitStepper:
         else:
             self._launch_parallel(n, dt)
         self.stale = False
-        values = m.scalars.to_numpy()
-        return SubstepResult(int(values[5]), float(values[6]), int(values[7]))
+        return SubstepResult(int(m.scalars[5]), m.scalars[6], int(m.scalars[7]))
 
     def _launch_parallel(self, n: int, dt: float) -> None:
         m, s = self.world.model, self.work

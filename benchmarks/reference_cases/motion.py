@@ -1,0 +1,247 @@
+"""Motion in time on a fixed mesh, against paths that were integrated exactly: order of accuracy, energies, momenta.
+
+Orders come from the largest error over the whole path, at two steps, the second half the first. The last problem leaves
+the fixed mesh: it tells how far finer and finer ones are from the beam itself.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.errors import SimulationError
+from taisoft.model import body_masses
+from taisoft.stepping import EXPLICIT, INTEGRATORS
+
+from .record import GRAVITY, Case, Check, face, label, material, near, nearest, order, scene, small
+
+ORDER = {
+    "symplectic_euler": 1, "velocity_verlet": 2, "linearly_implicit_euler": 1, "implicit_euler": 1, "bdf2": 2,
+    "implicit_midpoint": 2,
+}  # fmt: skip
+ORDER_LIMIT = 0.12  # of an observed order; the next term of the error is a few percent at these steps
+
+
+@dataclass
+class Path:
+    """A body at the frames of a run, the start left out: x, v (k,n,3) [m, m/s]; kinetic, elastic, gravity (k,) [J]."""
+
+    x: np.ndarray
+    v: np.ndarray
+    kinetic: np.ndarray
+    elastic: np.ndarray
+    gravity: np.ndarray
+
+
+def simulator(s: ts.Scene, integrator: str, arch: str, tolerance: float = 1e-10) -> ts.Simulator:
+    """A simulator in f64; implicit steps are solved to `tolerance`."""
+    tight = {} if integrator in EXPLICIT else {"newton_tolerance": tolerance}
+    return ts.Simulator(s, dt=1e-4, integrator=integrator, precision="f64", arch=arch, **tight)
+
+
+def follow(sim: ts.Simulator, steps: int, seconds: float, fps: int) -> Path:
+    """Run from the start with `steps` steps a second. Raises SimulationError unless every step converged."""
+    sim.reset()
+    sim.dt = 1.0 / steps
+    frames = []
+
+    def keep(s: ts.Simulator, index: int, report) -> None:
+        if index > 0:
+            energies = s.energies()
+            frames.append((s.positions(), s.velocities(), energies.kinetic, energies.elastic, energies.gravity))
+
+    report = sim.run(seconds, keep, fps)
+    if report.status == "failed" or not all(step.converged for step in report.step_reports):
+        raise SimulationError("; ".join(report.problems))
+    return Path(*(np.array(column) for column in zip(*frames)))
+
+
+def _distance(path: np.ndarray, exact: np.ndarray) -> float:
+    """Largest distance of two paths (k,3) [m]."""
+    return float(np.linalg.norm(path - exact, axis=1).max())
+
+
+@dataclass(frozen=True)
+class Exact:
+    """A problem whose exact path on its own mesh is tabulated; the probe is the node nearest to a point."""
+
+    name: str
+    build: Callable[[dict, str], ts.Scene]  # (reference, law) -> scene of one body
+    table: Callable[[dict, str], dict]  # (reference, law) -> t, probe_x, probe_v, kinetic, elastic, perhaps gravity
+    probe: tuple[float, float, float]
+    fps: int
+    steps: dict[bool, int]  # steps a second of the coarser run for the order, by whether the integrator is explicit
+
+    def orders(self, law: str, integrator: str, seconds: float, reference: dict, arch: str) -> Iterable[Check]:
+        """Observed order of an integrator over the first `seconds`."""
+        table, s = self.table(reference, law), self.build(reference, law)
+        node, errors = nearest(s.bodies[0], self.probe)[0], []
+        steps = self.steps[integrator in EXPLICIT]
+        with simulator(s, integrator, arch) as sim:
+            for n in (steps, 2 * steps):
+                x = follow(sim, n, seconds, self.fps).x[:, node]
+                errors.append(_distance(x, np.array(table["probe_x"])[: len(x)]))
+                yield small(f"{integrator}, dt = 1/{n} s: largest error of the probe [m]", errors[-1], 0.05)
+        yield order(f"{integrator}: order in dt", *errors, ORDER[integrator], ORDER_LIMIT)
+
+    def exact_path(self, law: str, seconds: float, limit: float, reference: dict, arch: str) -> Iterable[Check]:
+        """Verlet with steps so fine (10 us) that its error is below the table's: probe, velocity, energies at all times."""
+        table, s = self.table(reference, law), self.build(reference, law)
+        node = nearest(s.bodies[0], self.probe)[0]
+        with simulator(s, "velocity_verlet", arch) as sim:
+            path = follow(sim, 100_000, seconds, self.fps)
+        k = len(path.x)
+        for name, measured in (("probe_x", path.x[:, node]), ("probe_v", path.v[:, node])):
+            exact = np.array(table[name])[:k]
+            size = np.linalg.norm(exact - exact[0], axis=1).max()
+            yield small(f"{name}: largest error / excursion", _distance(measured, exact) / size, limit)
+        for name in ("kinetic", "elastic", "gravity"):
+            if name in table:
+                exact = np.array(table[name])[:k]
+                error = np.abs(getattr(path, name) - exact).max()
+                yield small(f"{name} energy: largest error / largest value", error / np.abs(exact).max(), limit)
+
+
+def _falling_beam(cells, reference: dict, law: str) -> ts.Scene:
+    s = scene(gravity=True)
+    beam = s.add_body(ts.box_mesh(cells, reference["geometry"]["box"]), material(reference, law))
+    beam.fix(face(0, -2.0))
+    return s
+
+
+def _breathing_bar(reference: dict, law: str) -> ts.Scene:
+    size = reference["geometry"]["box"]
+    mesh = ts.box_mesh(reference["geometry"]["cells"], size, (size[0] / 2, 0.0, 0.0))
+    s = scene()
+    s.add_body(mesh, material(reference, law), velocity=mesh.vertices * (2.0, 0.0, 0.0)).fix(face(0, 0.0))
+    return s
+
+
+BEAM = Exact(
+    "beam_fall_semidiscrete", lambda reference, law: _falling_beam(reference["geometry"]["cells"], reference, law),
+    lambda reference, law: reference["value"][f"{law}_lumped"], (2, 0, 0), 10, {True: 800, False: 400},
+)  # fmt: skip
+BAR = Exact(
+    "breathing_bar", _breathing_bar, lambda reference, law: reference["value"], (1, 0.25, 0.25), 20, {True: 800, False: 800}
+)
+
+
+# --- spinning block -------------------------------------------------------------------------------------------------
+
+
+def _spinning_block(reference: dict, law: str) -> ts.Scene:
+    mesh = ts.box_mesh(reference["geometry"]["cells"], reference["geometry"]["box"])
+    s = scene()
+    s.add_body(mesh, material(reference, law), velocity=np.cross((1.0, 2.0, 6.0), mesh.vertices) + (0.5, 1.0, 0.0))
+    return s
+
+
+@dataclass
+class Drift:
+    """Largest departures of a run from the constants, relative: momentum, angular momentum, energy; probe's error [m]."""
+
+    P: float
+    L: float
+    energy: float
+    probe: float
+
+
+def _drift(sim: ts.Simulator, steps: int, law: str, reference: dict) -> Drift:
+    path, value = follow(sim, steps, 1.0, 10), reference["value"]
+    mass = body_masses(sim.scene)[None, :, None]
+    node = nearest(sim.scene.bodies[0], (0.5, 0.375, 0.25))[0]
+    P, L = (mass * path.v).sum(axis=1), (mass * np.cross(path.x, path.v)).sum(axis=1)
+    return Drift(
+        float(np.linalg.norm(P - value["P"], axis=1).max() / np.linalg.norm(value["P"])),
+        float(np.linalg.norm(L - value["L"], axis=1).max() / np.linalg.norm(value["L"])),
+        float(np.abs(path.kinetic + path.elastic - value["energy"]).max() / value["energy"]),
+        _distance(path.x[:, node], np.array(value["probe_x"][f"{law}_lumped"])),
+    )
+
+
+def spin_block_exact(law: str, reference: dict, arch: str):
+    """Fine Verlet steps: constants and path."""
+    with simulator(_spinning_block(reference, law), "velocity_verlet", arch) as sim:
+        drift = _drift(sim, 100_000, law, reference)
+        elastic = follow(sim, 100_000, 1.0, 10).elastic
+    table = np.array(reference["value"]["elastic"][f"{law}_lumped"])
+    yield small("momentum P, relative drift", drift.P, 1e-10)
+    yield small("angular momentum L, relative drift", drift.L, 1e-10)
+    yield small("energy, relative drift", drift.energy, 1e-6)
+    yield small("largest error of the probe [m]", drift.probe, 1e-6)
+    yield small("elastic energy: largest error / largest value", np.abs(elastic - table).max() / table.max(), 1e-6)
+
+
+CONSERVES = {"symplectic_euler", "velocity_verlet", "implicit_midpoint"}  # angular momentum
+
+
+def spin_block(integrator: str, reference: dict, arch: str):
+    """Orders of an integrator, and which constants it keeps."""
+    with simulator(_spinning_block(reference, "SNH"), integrator, arch, tolerance=1e-12) as sim:
+        coarse, fine = (_drift(sim, n, "SNH", reference) for n in (400, 800))
+    explicit = integrator in EXPLICIT
+    yield small(f"{integrator}: momentum P, relative drift", fine.P, 1e-10)
+    if integrator in CONSERVES:
+        yield small(f"{integrator}: angular momentum L, relative drift", fine.L, 1e-10)
+    else:
+        yield small(f"{integrator}, dt = 1/800 s: L, relative drift", fine.L, 0.05)
+        yield order(f"{integrator}: order of the drift of L", coarse.L, fine.L, ORDER[integrator], None if integrator == "bdf2" else 0.15)
+    yield small(f"{integrator}, dt = 1/800 s: energy, relative drift", fine.energy, 0.05)
+    yield order(f"{integrator}: order of the energy's drift", coarse.energy, fine.energy, ORDER[integrator], None if explicit else 0.3)
+    yield order(f"{integrator}: order of the probe's path", coarse.probe, fine.probe, ORDER[integrator], ORDER_LIMIT)
+
+
+# --- the beam itself, converged in space ----------------------------------------------------------------------------
+
+
+def beam_fall_converged(law: str, meshes, reference: dict, arch: str):
+    """Lowest point of the first swing on finer and finer meshes: how far each is from the converged one."""
+    best, errors = reference["value"]["best_estimate"][law], []
+    for cells in meshes:
+        s = _falling_beam(cells, reference, law)
+        node = nearest(s.bodies[0], (2, 0, 0))[0]
+        with simulator(s, "velocity_verlet", arch) as sim:
+            y = follow(sim, 8000, 1.3, 400).x[:, node, 1]
+        k = int(np.argmin(y[:-1]))
+        low = near(f"lowest uy of the tip, {label(cells)} [m]", y[k], best["y_min"])
+        errors.append(low.error)
+        yield low
+        yield near(f"its time, {label(cells)} [s]", (k + 1) / 400, best["t_min"])
+    for coarse, fine, cells in zip(errors, errors[1:], meshes[1:]):
+        yield order(f"order in h of the lowest point, at {label(cells)}", coarse, fine, 2.0, 0.5)
+
+
+def _beam_cases():
+    for law, seconds, limit in (("SNH", 2.0, 1e-7), ("COR", 2.0, 1e-7), ("SVK", 0.8, 1e-5)):
+        yield Case(BEAM.name, law, "11x2x2 exact path", partial(BEAM.exact_path, law, seconds, limit))
+        for integrator in INTEGRATORS:
+            run = partial(BEAM.orders, law, integrator, min(seconds, 1.0))
+            yield Case(BEAM.name, law, f"11x2x2 {integrator}", run, law != "SNH")
+
+
+def _bar_cases():
+    yield Case(BAR.name, "SNH", "4x2x2 exact path", partial(BAR.exact_path, "SNH", 0.5, 1e-6), True)
+    for integrator in INTEGRATORS:
+        fine = integrator not in ("velocity_verlet", "bdf2")
+        yield Case(BAR.name, "SNH", f"4x2x2 {integrator}", partial(BAR.orders, "SNH", integrator, 0.5), fine)
+
+
+def _spin_cases():
+    for law in ("SNH", "COR", "SVK"):
+        yield Case("spin_block", law, "4x3x2 exact path", partial(spin_block_exact, law), law == "SVK")
+    for integrator in INTEGRATORS:
+        fine = integrator not in ("implicit_midpoint", "implicit_euler")
+        yield Case("spin_block", "SNH", f"4x3x2 {integrator}", partial(spin_block, integrator), fine)
+
+
+CASES = (
+    *_beam_cases(),
+    *_bar_cases(),
+    *_spin_cases(),
+    *(
+        Case("beam_fall_converged", law, "11x2x2 to 44x8x8", partial(beam_fall_converged, law, ((11, 2, 2), (22, 4, 4), (44, 8, 8))), True)
+        for law in ("SNH", "COR")
+    ),
+)

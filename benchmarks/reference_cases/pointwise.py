@@ -1,0 +1,157 @@
+"""Problems whose exact answer any mesh must give to rounding: laws at a point, affine fields, rigid motion, free fall."""
+
+from functools import partial
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.model import body_masses
+from taisoft.stepping import EXPLICIT, INTEGRATORS
+
+from .record import GRAVITY, LAWS, Case, deformation_gradients, face, label, material, near, scene, small, worst
+
+SEED = 7  # of the patch test's mesh
+
+
+def stress_table(law: str, reference: dict, arch: str):
+    """P and psi at the tabulated F, over max(|P|, E) and max(|psi|, E)."""
+    rows, young = reference["value"], reference["material"]["E"]
+    F = np.array([row["F"] for row in rows])
+    psi, P = ts.evaluate_law(LAWS[law], F, young, reference["material"]["nu"])
+    stresses, energies = [], []
+    for k, row in enumerate(rows):
+        exact = np.array(row[law]["P"])
+        i = np.unravel_index(np.argmax(np.abs(P[k] - exact)), (3, 3))
+        scale = max(np.linalg.norm(exact), young)
+        stresses.append(near(f"{row['case']} P{i[0] + 1}{i[1] + 1}", P[k][i], exact[i], 1e-10, scale))
+        energies.append(near(row["case"], psi[k], row[law]["psi"], 1e-10, max(abs(row[law]["psi"]), young)))
+    return worst(stresses, "stress"), worst(energies, "energy density")
+
+
+def uniaxial_stress(law: str, reference: dict, arch: str):
+    """Lateral stretch and nominal stress of unit cubes, one for each stretch, all in one scene."""
+    s = scene()
+    for row in reference["value"]:
+        cube = s.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1), (0.5, 0.5, 0.5)), material(reference, law, density=1.0))
+        for axis in range(3):
+            cube.fix(face(axis, 0.0), axes="xyz"[axis])
+        cube.move(face(0, 1.0), lambda t, by=row["stretch"] - 1.0: (by, 0.0, 0.0), axes="x")
+    result = ts.solve_static(s, tolerance=1e-12, arch=arch)
+    lateral, stress = [], []
+    for cube, row in zip(s.bodies, reference["value"]):
+        x, pull, exact = result.positions(cube.name), result.reactions(cube.name)[:, 0], row[law]
+        for axis in (1, 2):
+            for node in np.flatnonzero(face(axis, 1.0)(cube.rest_positions)):
+                lateral.append(near(f"stretch {row['stretch']}", x[node, axis], exact["lateral_stretch"], 1e-10))
+        p11 = pull[face(0, 1.0)(cube.rest_positions)].sum()
+        stress.append(near(f"stretch {row['stretch']}", p11, exact["P11"], 1e-10))
+    return worst(lateral, "lateral stretch"), worst(stress, "P11 [Pa]")
+
+
+def irregular_cube() -> ts.TetMesh:
+    """The unit cube in 3x3x3 cells, its eight interior nodes moved at random by up to a quarter of a cell."""
+    regular = ts.box_mesh((3, 3, 3), (1, 1, 1), (0.5, 0.5, 0.5))
+    moved = regular.vertices + np.random.default_rng(SEED).uniform(-1 / 12, 1 / 12, regular.vertices.shape)
+    return ts.TetMesh(np.where(_boundary(regular.vertices)[:, None], regular.vertices, moved), regular.tets)
+
+
+def _boundary(X: np.ndarray) -> np.ndarray:
+    return ((X < 1e-9) | (X > 1 - 1e-9)).any(axis=1)
+
+
+def patch_test(law: str, reference: dict, arch: str):
+    """Boundary nodes on the affine map x = A X + b, interior ones where the static solve puts them."""
+    A, b = np.array([[1.2, 0.3, -0.1], [0.05, 0.9, 0.2], [0.15, -0.25, 1.1]]), np.array([0.3, -0.2, 0.1])
+    s = scene()
+    cube = s.add_body(irregular_cube(), material(reference, law))
+    X = cube.rest_positions
+    exact, held = X @ A.T + b, _boundary(X)
+    cube.move(held, lambda t: (exact - X)[held])
+    result = ts.solve_static(s, tolerance=1e-14, arch=arch)
+    x, young, h = result.positions(), reference["material"]["E"], 1 / 3
+    force = result.residual * np.linalg.norm(result.reactions())  # N, of all interior nodes together
+    return (
+        small("largest position error of an interior node [m]", np.abs(x - exact)[~held].max(), 1e-12),
+        small("largest |F - A|", np.abs(deformation_gradients(cube, x) - A).max(), 1e-12 / h),
+        small("interior nodal forces / (E h^2)", force / (young * h * h), 1e-12),
+        # the reference has 12 digits
+        near("energy [J]", result.elastic, reference["value"]["energy_density"][law] * cube.mesh.volumes.sum(), 1e-11),
+    )
+
+
+def _rotation(axis, angle: float) -> np.ndarray:
+    """Rodrigues' rotation matrix about `axis` by `angle` [rad]."""
+    k = np.asarray(axis, float) / np.linalg.norm(axis)
+    K = np.cross(np.eye(3), k)
+    return np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
+
+
+def rigid_motion(reference: dict, arch: str):
+    """Energy and forces of rigidly moved and of rigidly moving bodies, read from one explicit step without gravity."""
+    s = scene()
+    for law in LAWS:
+        s.add_body(ts.box_mesh((3, 2, 2), (1.0, 0.7, 0.6)), material(reference, law), name=law)
+    young, dt, shift = reference["material"]["E"], 1e-4, np.array([10.0, -5.0, 3.0])
+    motions = {"0.7 rad about z": _rotation((0, 0, 1), 0.7), "180 deg about (1,1,1)": _rotation((1, 1, 1), np.pi)}
+    mass = body_masses(s)[:, None]
+    rest = np.concatenate([body.rest_positions for body in s.bodies])
+    laws = np.repeat(list(LAWS), [body.n_nodes for body in s.bodies])
+    checks = []
+    with ts.Simulator(s, dt=dt, integrator="symplectic_euler", precision="f64", arch=arch) as sim:
+
+        def forces(x, v):
+            sim.set_state(x, v)
+            sim.step()
+            return np.abs(mass * (sim.velocities() - v) / dt)
+
+        for name, R in motions.items():
+            for law in LAWS:  # the others stay at rest, so that the energy is this one's
+                x = np.where((laws == law)[:, None], rest @ R.T + shift, rest)
+                sim.set_state(x, np.zeros_like(x))
+                checks.append(small(f"{law}, {name}: energy / (E L^3)", sim.energies().elastic / young, 1e-13))
+            f = forces(rest @ R.T + shift, np.zeros_like(rest))
+            checks += [small(f"{law}, {name}: force / (E L^2)", f[laws == law].max() / young, 1e-13) for law in LAWS]
+        f = forces(rest, np.cross((1.0, 2.0, 6.0), rest) + (3.0, -1.0, 2.0))
+        checks += [small(f"{law}, spinning at t = 0: force / (E L^2)", f[laws == law].max() / young, 1e-13) for law in LAWS]
+    return checks
+
+
+def free_fall(laws, integrator: str, reference: dict, arch: str):
+    """Fall of n steps against the discrete formula, and the strain that must not appear."""
+    example = reference["value"]["example"]
+    dt, n = example["dt"], example["n"]
+    s = scene(gravity=True)
+    for law in laws:
+        s.add_body(ts.box_mesh((2, 1, 1), (2, 1, 1)), material(reference, law), name=law)
+    tight = {} if integrator in EXPLICIT else {"newton_tolerance": 1e-13, "linear_tolerance": 1e-13}
+    with ts.Simulator(s, dt=dt, integrator=integrator, precision="f64", arch=arch, **tight) as sim:
+        while sim.step_count < n:
+            sim.advance(n - sim.step_count)
+        x = {law: sim.positions(law) for law in laws}
+        elastic = sim.energies().elastic
+    first_order = integrator in ("symplectic_euler", "implicit_euler", "linearly_implicit_euler")
+    fall = -GRAVITY * dt * dt * n * (n + 1) / 2 if first_order else -GRAVITY * (n * dt) ** 2 / 2
+    checks = []
+    for body in s.bodies:
+        way = (x[body.name] - body.rest_positions)[:, 1]
+        strain = np.abs(deformation_gradients(body, x[body.name]) - np.eye(3)).max()
+        checks.append(near(f"{integrator}: {body.name} fall [m]", way[np.argmax(np.abs(way - fall))], fall, 1e-12))
+        checks.append(small(f"{integrator}: {body.name} largest |F - I|", strain, 1e-12))
+    checks.append(small(f"{integrator}: elastic / gravity energy", elastic / (reference["material"]["rho"] * 2 * GRAVITY * -fall), 1e-12))
+    return checks
+
+
+def _free_fall_cases():
+    for integrator in INTEGRATORS:
+        laws = tuple(LAWS) if integrator == "symplectic_euler" else ("SNH",)
+        fine = integrator not in ("symplectic_euler", "bdf2")
+        yield Case("free_fall", "+".join(laws), integrator, partial(free_fall, laws, integrator), fine)
+
+
+CASES = (
+    *(Case("stress_table", law, "", partial(stress_table, law)) for law in LAWS),
+    *(Case("uniaxial_stress", law, label((1, 1, 1)), partial(uniaxial_stress, law)) for law in LAWS),
+    *(Case("patch_test", law, "3x3x3 irregular", partial(patch_test, law)) for law in LAWS),
+    Case("rigid_motion", "+".join(LAWS), label((3, 2, 2)), rigid_motion),
+    *_free_fall_cases(),
+)

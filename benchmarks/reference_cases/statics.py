@@ -1,0 +1,211 @@
+"""Static problems: on the tabulated meshes the linear tets must give the tabulated value; the converged one is told.
+
+`linear_tet_error_curve` of a problem's file holds what a correct code gives on the same mesh. The error against the
+converged value is the mesh's own (linear tets lock in bending), so it has no limit here.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.scene.scene import Body
+from taisoft.static import StaticResult
+
+from .record import SAME_MESH, Case, face, label, material, near, nearest, order, scene, small
+
+TOLERANCE = 1e-9  # of |residual| / |load|: far below what the reference is good to
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A static problem that is compared on its tabulated meshes."""
+
+    name: str
+    build: Callable[[dict, str, tuple], ts.Scene]  # (reference, law, cells) -> scene of one body
+    read: Callable[[Body, StaticResult], float]
+    quantity: str
+    converged: str  # key of the value converged in space
+    meshes: dict[str, int]  # law -> how many of its tabulated meshes are run
+    quick: tuple[str, ...]  # laws whose coarsest mesh the tests run
+    tolerance: float = TOLERANCE
+
+    def cases(self):
+        """Cases in the order of laws and meshes."""
+        for law, count in self.meshes.items():
+            for k in range(count):
+                yield Case(self.name, law, MESHES[self.name][k], partial(self.solve, law, k), k > 0 or law not in self.quick)
+
+    def solve(self, law: str, k: int, reference: dict, arch: str):
+        """Solve on the k-th tabulated mesh."""
+        curve = reference["notes"]["linear_tet_error_curve"]
+        row = (curve if isinstance(curve, list) else curve[law])[k]
+        if label(row["cells"]) != MESHES[self.name][k]:
+            raise ValueError(f"{self.name}: mesh {k} of the reference is {row['cells']}, not {MESHES[self.name][k]}")
+        s = self.build(reference, law, tuple(row["cells"]))
+        result = ts.solve_static(s, tolerance=self.tolerance, arch=arch)
+        measured = self.read(s.bodies[0], result)
+        yield small("residual / load", result.residual, self.tolerance)
+        yield near(f"{self.quantity}, same mesh", measured, row["value"], SAME_MESH)
+        value = reference["value"].get(law, reference["value"])
+        if value.get(self.converged) is not None:
+            yield near(f"{self.quantity}, converged in space", measured, value[self.converged])
+
+
+MESHES = {  # as tabulated
+    "hanging_beam_E1e6": ("11x2x2", "22x4x4", "44x8x8"),
+    "hanging_beam_E2e6": ("11x2x2", "22x4x4", "44x8x8"),
+    "mid_traction_beam": ("80x2x2", "160x4x4"),
+    "cook_membrane_3d": ("8x8x2", "16x16x4", "32x32x8"),
+    "cantilever_small": ("20x2x2", "40x4x4", "80x8x8"),
+    "soft_sheet_self_weight": ("19x1x9", "38x2x18"),
+    "twist_bar_90deg": ("8x2x2", "16x4x4"),
+}
+
+
+def _box(reference: dict, cells) -> ts.TetMesh:
+    """The problem's box, centred at the origin or starting at x = 0."""
+    size = reference["geometry"]["box"]
+    center = (size[0] / 2, 0.0, 0.0) if "x_from" in reference["geometry"] else (0.0, 0.0, 0.0)
+    return ts.box_mesh(cells, size, center)
+
+
+def _displacement(body: Body, result: StaticResult, nodes: np.ndarray) -> float:
+    """Mean vertical displacement of some nodes [m]."""
+    return float((result.positions(body.name) - body.rest_positions)[nodes, 1].mean())
+
+
+def _at(point) -> Callable[[Body, StaticResult], float]:
+    """Reads the vertical displacement of the nodes nearest to a point."""
+    return lambda body, result: _displacement(body, result, nearest(body, point))
+
+
+def hanging_beam(reference: dict, law: str, cells) -> ts.Scene:
+    """Cantilever under its own weight."""
+    s = scene(gravity=True)
+    s.add_body(_box(reference, cells), material(reference, law)).fix(face(0, -2.0))
+    return s
+
+
+def mid_traction_beam(reference: dict, law: str, cells) -> ts.Scene:
+    """Beam clamped at both ends, a patch of its bottom pushed up."""
+    s = scene()
+    beam = s.add_body(_box(reference, cells), material(reference, law))
+    beam.fix(lambda X: np.abs(np.abs(X[:, 0]) - 2.0) < 1e-9)
+    beam.add_traction(lambda C: (np.abs(C[:, 1] + 0.05) < 1e-9) & (np.abs(C[:, 0]) < 0.05), (0.0, 2000.0, 0.0))
+    return s
+
+
+def cook_panel(cells, reference: dict) -> ts.TetMesh:
+    """Unit square grid mapped bilinearly to the tapered panel."""
+    flat = ts.box_mesh(cells, (1, 1, reference["geometry"]["thickness_z"]), (0.5, 0.5, 0.0))
+    u, v, z = flat.vertices.T
+    corners = np.array(reference["geometry"]["corner_points_xy"], float)
+    weights = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v])
+    return ts.TetMesh(np.column_stack([weights.T @ corners, z]), flat.tets)
+
+
+def cook_membrane(reference: dict, law: str, cells) -> ts.Scene:
+    """Tapered panel, clamped on the left, pulled up on the right."""
+    s = scene()
+    panel = s.add_body(cook_panel(cells, reference), material(reference, law, density=1.0))
+    panel.fix(face(0, 0.0))
+    panel.add_traction(face(0, 48.0), (0.0, 6.25, 0.0))
+    return s
+
+
+def cantilever(reference: dict, law: str, cells) -> ts.Scene:
+    """Slender cantilever, 0.01 N of shear spread over its end face."""
+    s = scene()
+    beam = s.add_body(_box(reference, cells), material(reference, law))
+    beam.fix(face(0, 0.0))
+    _, height, width = reference["geometry"]["box"]
+    beam.add_traction(face(0, 1.0), (0.0, 0.01 / (height * width), 0.0))
+    return s
+
+
+def soft_sheet(reference: dict, law: str, cells) -> ts.Scene:
+    """Thin sheet held along two opposite sides."""
+    s = scene(gravity=True)
+    half = reference["geometry"]["box"][0] / 2
+    s.add_body(_box(reference, cells), material(reference, law)).fix(lambda X: np.abs(np.abs(X[:, 0]) - half) < 1e-9)
+    return s
+
+
+def twisted_bar(reference: dict, law: str, cells) -> ts.Scene:
+    """Thick bar, one end face clamped, the other turned by 90 degrees about x."""
+    s = scene()
+    bar = s.add_body(_box(reference, cells), material(reference, law, density=1.0))
+    bar.fix(face(0, -2.0))
+    end = face(0, 2.0)(bar.rest_positions)
+    _, y, z = bar.rest_positions[end].T
+    way = np.column_stack([np.zeros_like(y), -z - y, y - z])
+    bar.move(end, lambda t: way)
+    return s
+
+
+def _torque(body: Body, result: StaticResult) -> float:
+    """Torque of the turned face's reactions about x [N m]."""
+    end = face(0, 2.0)(body.rest_positions)
+    x, force = result.positions(body.name)[end], result.reactions(body.name)[end]
+    return float(np.cross(x, force)[:, 0].sum())
+
+
+PROBLEMS = (
+    Problem(
+        "hanging_beam_E1e6", hanging_beam, _at((2, 0, 0)), "uy of the tip [m]", "uy_tip",
+        {"SNH": 3, "COR": 3, "SVK": 2}, ("SNH", "COR", "SVK"),
+    ),
+    Problem(
+        "hanging_beam_E2e6", hanging_beam, _at((2, 0, 0)), "uy of the tip [m]", "uy_tip", {"SNH": 3, "SVK": 2}, ("SVK",)
+    ),
+    Problem(
+        "mid_traction_beam", mid_traction_beam, _at((0, 0, 0)), "uy of the centre [m]", "uy_centre",
+        {"SNH": 2, "COR": 1, "SVK": 1}, ("SNH",),
+    ),
+    Problem(
+        "cook_membrane_3d", cook_membrane, _at((48, 52, 0)), "uy of the middle of the right face", "uy_mid",
+        {"SNH": 3, "COR": 2, "SVK": 2}, ("SNH",),
+    ),
+    Problem(  # its load is tiny: a smaller residual than 1e-7 of it lies below the rounding of the stress
+        "cantilever_small", cantilever, lambda body, result: _displacement(body, result, face(0, 1.0)(body.rest_positions)),
+        "mean uy of the end face [m]", "fe3d", {"SVK": 3, "SNH": 1, "COR": 1}, ("SVK",), tolerance=1e-7,
+    ),
+    Problem(
+        "soft_sheet_self_weight", soft_sheet, _at((0, 0, 0)), "uy of the centre [m]", "uy_centre", {"SNH": 2, "SVK": 2}, ("SNH",)
+    ),
+    Problem(
+        "twist_bar_90deg", twisted_bar, _torque, "torque [N m]", "torque", {"SNH": 2, "COR": 2, "SVK": 2}, ("SVK",)
+    ),
+)  # fmt: skip
+
+
+def column(law: str, reference: dict, arch: str):
+    """Columns of three mesh widths in one scene: exact base force, second-order displacement of the top."""
+    s = scene(gravity=True)
+    width, height, depth = reference["geometry"]["box"]
+    for n in (2, 4, 8):
+        mesh = ts.box_mesh((n // 2, n, n // 2), (width, height, depth), (0.0, height / 2, 0.0))
+        s.add_body(mesh, material(reference, law), name=f"h = 1/{n}").fix(face(1, 0.0))
+    result = ts.solve_static(s, tolerance=1e-12, arch=arch)
+    exact, errors = reference["value"]["uy_top"][law], []
+    for body in s.bodies:
+        top = near(f"uy of the top, {body.name} [m]", _displacement(body, result, face(1, height)(body.rest_positions)), exact)
+        errors.append(top.error)
+        yield top
+        yield near(f"base force, {body.name} [N]", result.reactions(body.name)[:, 1].sum(), reference["value"]["base_force"], 1e-10)
+    for k in range(2):
+        yield order(f"order in h of uy, {s.bodies[k].name} halved", errors[k], errors[k + 1], 2.0, 0.2)
+    yield small("largest sideways displacement / height", _sideways(s, result) / height, 0.02)
+
+
+def _sideways(s: ts.Scene, result: StaticResult) -> float:
+    return max(np.abs((result.positions(b.name) - b.rest_positions)[:, [0, 2]]).max() for b in s.bodies)
+
+
+CASES = (
+    *(case for problem in PROBLEMS for case in problem.cases()),
+    *(Case("column_self_weight", law, "1x2x1 2x4x2 4x8x4", partial(column, law)) for law in ("SVK", "COR")),
+)

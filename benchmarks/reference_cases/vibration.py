@@ -1,0 +1,136 @@
+"""Small vibration: eigenfrequencies of clamped beams, and what each integrator makes of one linear oscillator."""
+
+import warnings
+from functools import partial
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.errors import SimulationError
+from taisoft.stepping import EXPLICIT, INTEGRATORS
+
+from .record import SAME_MESH, Case, face, label, material, near, order, scene, worst
+
+# --- eigenfrequencies ---------------------------------------------------------------------------------------------
+
+
+def half_beam(reference: dict, cells) -> ts.Scene:
+    """The half z <= 0 of the beam, its cut face sliding: its modes are exactly those of the whole that are symmetric in z.
+
+    The five-tet pattern of an even number of cells is its own mirror image, and the half has the same tets as the whole.
+    """
+    length, height, width = reference["geometry"]["box"]
+    half = (cells[0], cells[1], cells[2] // 2)
+    s = scene()
+    mesh = ts.box_mesh(half, (length, height, width / 2), (length / 2, 0.0, -width / 4))
+    beam = s.add_body(mesh, material(reference, "SVK"))  # every law has Hooke's tangent at rest
+    beam.fix(face(0, 0.0))
+    beam.fix(face(2, 0.0), axes="z")
+    return s
+
+
+def modal(meshes, reference: dict, arch: str):
+    """Three lowest symmetric frequencies on a chain of meshes, each with half the width of the one before."""
+    rows = reference["value"]["linear_tet_consistent_mass"]
+    exact, errors = reference["value"]["f"], []
+    for cells in meshes:
+        f = ts.modes(half_beam(reference, cells), 3, mass="consistent").frequencies
+        row = next(r for r in rows if tuple(r["cells"]) == cells)
+        yield near(f"f1, same mesh {label(cells)} [Hz]", f[0], row["f1"], SAME_MESH)
+        told = [near(f"f{k + 1}, converged in space, {label(cells)} [Hz]", f[k], exact[k]) for k in range(3)]
+        errors.append([check.error for check in told])
+        yield from told
+    for coarse, fine, cells in zip(errors, errors[1:], meshes[1:]):
+        for k in range(3):  # the third is axial, and the edge of the clamp, where the stress is singular, lowers its order
+            yield order(f"order in h of f{k + 1}, at {label(cells)}", coarse[k], fine[k], 2.0, 0.35 if k < 2 else None)
+
+
+# --- one oscillator -------------------------------------------------------------------------------------------------
+
+# Energy of the shear of one tet is even in the displacement, so that its force is linear up to the third order: 1e-10
+# of relative error here. Rounding of the positions is 1e-11 of the amplitude.
+AMPLITUDE = 1e-5  # m, of a tet of 1 m
+LARGEST = 5e-5  # m: a growing motion is followed no further, so that it stays linear
+STEPS = 24  # per start
+LIMIT = 1e-7  # relative, of |lambda| and of the frequency
+
+
+def oscillator(integrator: str, reference: dict, arch: str):
+    """Amplification |lambda| and frequency of the update matrix, read off the motion of a body with one free axis."""
+    key = next(k for k in reference["value"] if k.startswith(_tabulated_as(integrator)))
+    s, apex = sheared_tet()
+    omega = 2 * np.pi * ts.modes(s, 1).frequencies[0]
+    settings = {"allow_unstable": True} if integrator in EXPLICIT else {"newton_tolerance": 1e-13, "linear_tolerance": 1e-13}
+    sizes, frequencies = [], []
+    with warnings.catch_warnings(), ts.Simulator(
+        s, dt=1.0 / omega, integrator=integrator, precision="f64", arch=arch, **settings
+    ) as sim:
+        warnings.simplefilter("ignore", UserWarning)  # that steps of z > 2 are unstable is what is measured
+        for text, (amplification, frequency) in reference["value"][key].items():
+            z = float(text)
+            sim.dt = z / omega
+            root = _root(integrator, [_motion(sim, apex, omega, start) for start in ((1.0, 0.0), (0.0, 1.0))], z)
+            sizes.append(near(f"z = {z:g}", abs(root), amplification, LIMIT))
+            # both signs belong to a real motion; the table gives one
+            frequencies.append(near(f"z = {z:g}", np.copysign(np.angle(root) / z, frequency), frequency, LIMIT))
+    return worst(sizes, "|lambda| per step"), worst(frequencies, "frequency / exact one")
+
+
+def _tabulated_as(integrator: str) -> str:
+    """Name in the table: Verlet's positions obey the recurrence of symplectic Euler, and a linear force is its own linearisation."""
+    return {"velocity_verlet": "symplectic_euler", "linearly_implicit_euler": "implicit_euler"}.get(integrator, integrator)
+
+
+def sheared_tet() -> tuple[ts.Scene, int]:
+    """One tet on a fixed base whose apex may only move sideways, along y: one free axis."""
+    s = scene()
+    mesh = ts.TetMesh(np.array([(0, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 0)], float), np.array([(0, 1, 2, 3)]))
+    if not np.array_equal(mesh.vertices[3], (1, 0, 0)):
+        raise SimulationError("the oscillator's apex is not its last vertex")
+    body = s.add_body(mesh, ts.Material(law="st_venant_kirchhoff", young=1e4, poisson=0.3, density=1000.0))
+    body.fix([0, 1, 2])
+    body.fix([3], axes="xz")
+    return s, 3
+
+
+def _motion(sim: ts.Simulator, apex: int, omega: float, start) -> np.ndarray:
+    """(k, 2): displacement and velocity / omega of the apex at the start and after each step, over the amplitude."""
+    x, rest = sim.scene.bodies[0].rest_positions.copy(), sim.scene.bodies[0].rest_positions
+    v = np.zeros_like(x)
+    x[apex, 1] += AMPLITUDE * start[0]
+    v[apex, 1] = AMPLITUDE * start[1] * omega
+    sim.set_state(x, v)
+    rows = [tuple(start)]
+    while len(rows) <= STEPS and np.abs(rows[-1]).max() * AMPLITUDE < LARGEST:
+        sim.step()
+        way = sim.positions()[apex, 1] - rest[apex, 1]
+        rows.append((way / AMPLITUDE, sim.velocities()[apex, 1] / (omega * AMPLITUDE)))
+    return np.array(rows)
+
+
+def _root(integrator: str, motions: list[np.ndarray], z: float) -> complex:
+    """The eigenvalue of the update matrix that is tabulated.
+
+    BDF2 has two, and the table holds the one nearest to exp(iz), the exact factor. At z = 10 that is the smaller one: a
+    motion that goes on there decays as the other, by 0.3007 a step.
+    """
+    if integrator != "bdf2":
+        before, after = (np.concatenate([m[a:b] for m in motions]) for a, b in ((0, -1), (1, None)))
+        step = np.linalg.lstsq(before, after, rcond=None)[0]
+        return max(np.linalg.eigvals(step), key=abs)
+    # w = x - i v/omega obeys w2 = a w1 + b w0 with complex a, b; the start-up step only chooses the initial values
+    past, after = [], []
+    for m in motions:
+        w = m[:, 0] - 1j * m[:, 1]
+        past.append(np.column_stack([w[1:-1], w[:-2]]))
+        after.append(w[2:])
+    a, b = np.linalg.lstsq(np.concatenate(past), np.concatenate(after), rcond=None)[0]
+    return min(np.roots([1.0, -a, -b]), key=lambda root: abs(root - np.exp(1j * z)))
+
+
+CASES = (
+    Case("modal_thick", "all", "11x2x2 22x4x4", partial(modal, ((11, 2, 2), (22, 4, 4)))),
+    Case("modal_thick", "all", "22x4x4 44x8x8", partial(modal, ((22, 4, 4), (44, 8, 8))), fine=True),
+    Case("modal_slender", "all", "20x2x2 40x4x4", partial(modal, ((20, 2, 2), (40, 4, 4)))),
+    *(Case("oscillator_amplification", "SVK", f"one tet {name}", partial(oscillator, name)) for name in INTEGRATORS),
+)

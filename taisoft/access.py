@@ -1,0 +1,168 @@
+"""What a simulator shows of its state and lets a user change while it runs."""
+
+import warnings
+
+import numpy as np
+
+from taisoft.elasticity import cauchy_stress, force_differential, measure
+from taisoft.errors import SceneError, SimulationError
+from taisoft.model import changed_material
+from taisoft.records import Energies
+from taisoft.settings import Settings, check_dt
+from taisoft.stability import stable_dt
+from taisoft.stepping.world import World
+
+
+class StateAccess:
+    """State, results and run-time data of a world; `Simulator` adds building and stepping."""
+
+    settings: Settings
+    _world: World | None = None
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self._open_world().time
+
+    @property
+    def step_count(self) -> int:
+        """Steps of dt taken."""
+        return self._open_world().step_count
+
+    def positions(self, body: str | None = None) -> np.ndarray:
+        """(n_nodes, 3) float64 copy [m]; of all bodies, concatenated in the order added, without a name."""
+        return self._rows(self._open_world().model.x, body)
+
+    def velocities(self, body: str | None = None) -> np.ndarray:
+        """(n_nodes, 3) float64 copy [m/s]."""
+        return self._rows(self._open_world().model.v, body)
+
+    def set_state(self, positions=None, velocities=None, body: str | None = None) -> None:
+        """Set positions [m] and velocities [m/s], (n_nodes, 3) each; velocities of constrained axes become 0."""
+        world, rows = self._open_world(), self._slice(body)
+        for name, value in (("positions", positions), ("velocities", velocities)):
+            if value is not None:
+                self._check_rows(name, value, rows)
+        for field, value in ((world.model.x, positions), (world.model.v, velocities)):
+            if value is not None:
+                whole = field.to_numpy()
+                whole[rows] = value
+                if field is world.model.v:
+                    whole[world.motion.constrained()] = 0.0
+                field.from_numpy(whole)
+        self._stepper.forget()
+
+    def energies(self) -> Energies:
+        """Energies of the present state [J]."""
+        model = self._open_world().model
+        measure(model)
+        return Energies(kinetic=model.scalars[3], elastic=model.scalars[0], gravity=model.scalars[4])
+
+    def reactions(self, body: str | None = None) -> np.ndarray:
+        """(n_nodes, 3) force of the constraint on each fixed or moved node in the last step [N], else 0."""
+        self._open_world()
+        return self._stepper.reactions()[self._slice(body)]
+
+    def stress(self, body: str) -> np.ndarray:
+        """Cauchy stress per tet (m,3,3) [Pa]; infinite in a flat one."""
+        world, k = self._open_world(), self._index(body)
+        m = world.model
+        sigma = np.zeros((m.n_blocks * m.lanes, 9))
+        cauchy_stress(m, sigma)
+        first = world.layout.block_start[k] * m.lanes
+        return sigma[first : first + world.layout.n_tets[k]].reshape(-1, 3, 3)
+
+    def force_differential(self, displacement: np.ndarray) -> np.ndarray:
+        """Change of the elastic forces (n_nodes, 3) [N] along a displacement (n_nodes, 3) [m] of all bodies: (df/dx) dx."""
+        world = self._open_world()
+        self._check_rows("displacement", displacement, slice(None))
+        if self._tangent is None:
+            make, n, real = self._arena.vectors, world.model.n_nodes, self._runtime.real
+            self._tangent = make("tangent_dx", real, n), make("tangent_df", real, n)
+        dx, df = self._tangent
+        dx.from_numpy(np.asarray(displacement, dtype=self._runtime.np_real))
+        force_differential(world.model, dx, df)
+        return df.to_numpy().astype(np.float64)
+
+    @property
+    def dt(self) -> float:
+        """Step [s]; setting it takes effect with the next step."""
+        return self._dt
+
+    @dt.setter
+    def dt(self, value: float) -> None:
+        value = check_dt(value)
+        if value == self._dt:
+            return
+        if self.settings.explicit:
+            self._check_stability(value)
+        self._time_base = (self.time, self.step_count)
+        self._dt = value
+        self._stepper.forget()
+
+    @property
+    def stable_dt(self) -> float:
+        """Largest stable step [s] of an explicit integrator about the rest shape: 2/omega_max without damping."""
+        if self._stable_dt is None:
+            self._stable_dt = stable_dt(self.scene, self.settings.integrator == "velocity_verlet")
+        return self._stable_dt
+
+    def set_gravity(self, gravity) -> None:
+        """Change gravity (3,) [m/s^2]."""
+        world = self._open_world()
+        self.scene.gravity = gravity
+        world.model.gravity.from_numpy(np.asarray(self.scene.gravity, dtype=self._runtime.np_real)[None])
+        self._stepper.forget()
+
+    def set_material(self, body: str, **numbers) -> None:
+        """Change numbers of a body's material (young, poisson, density, mass_damping, stiffness_damping); law stays."""
+        world, k = self._open_world(), self._index(body)
+        old, old_limit = self.scene.bodies[k].material, self._stable_dt
+        changed_material(self.scene.bodies[k], numbers, self.plan.on)
+        self._stable_dt = None
+        try:
+            if self.settings.explicit:
+                self._check_stability(self._dt)
+        except SimulationError:
+            self.scene.bodies[k].material, self._stable_dt = old, old_limit
+            raise
+        world.upload_material()
+        self._stepper.material_changed()
+        self._stepper.forget()
+
+    def _open_world(self) -> World:
+        if self._world is None:
+            raise SimulationError("the simulator is closed")
+        return self._world
+
+    def _check_stability(self, dt: float) -> None:
+        limit = self.stable_dt
+        if dt <= limit:
+            return
+        text = f"dt = {dt:.3g} s is above the estimated stability limit of {limit:.3g} s of {self.settings.integrator}"
+        if not self.settings.allow_unstable:
+            raise SimulationError(
+                f"{text}: take a smaller dt (0.9 of the limit is {0.9 * limit:.3g} s) or allow_unstable=True"
+            )
+        warnings.warn(text, stacklevel=3)
+
+    def _index(self, body: str) -> int:
+        for k, b in enumerate(self.scene.bodies):
+            if b.name == body:
+                return k
+        raise SceneError(f"the scene has no body {body!r}; it has {[b.name for b in self.scene.bodies]}")
+
+    def _slice(self, body: str | None) -> slice:
+        return slice(None) if body is None else self._world.layout.nodes(self._index(body))
+
+    def _rows(self, field, body: str | None) -> np.ndarray:
+        return field.to_numpy()[self._slice(body)].astype(np.float64)
+
+    def _check_rows(self, name: str, value, rows: slice) -> None:
+        value = np.asarray(value)
+        wanted = (len(range(*rows.indices(self._world.model.n_nodes))), 3)
+        if value.shape != wanted or value.dtype.kind not in "fiu":
+            raise SceneError(f"{name} have shape {value.shape} and type {value.dtype}: they must be {wanted} numbers")
+        bad = np.flatnonzero(~np.isfinite(value).all(axis=1))
+        if len(bad):
+            raise SceneError(f"{name}: vertex {bad[0]} is not finite")

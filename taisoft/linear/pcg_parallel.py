@@ -1,0 +1,90 @@
+"""CG with block-Jacobi in parallel loops; dot products are sums over chunks, added in order, so that threads do not matter."""
+
+import taichi as ti
+
+from taisoft.linear.block_csr import row_times
+from taisoft.linear.pcg import (
+    CONVERGED,
+    COUNT,
+    NEGATIVE,
+    RUNNING,
+    RZ,
+    RZ_START,
+    STEP,
+    STOP,
+    dot64,
+    inverse_times,
+    total,
+)  # fmt: skip
+from taisoft.runtime import kernel
+
+
+@kernel
+def start(m: ti.template(), A: ti.template(), w: ti.template()):
+    """y = 0, r = rhs, z = p = B r."""
+    for c in range(m.chunks):
+        size = (m.n_nodes + m.chunks - 1) // m.chunks
+        s = ti.cast(0.0, ti.f64)
+        for i in range(c * size, ti.min(m.n_nodes, (c + 1) * size)):
+            r = m.free[i] * w.rhs[i]
+            z = inverse_times(m, w, i, r)
+            w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
+            w.r[i], w.z[i], w.p[i] = r, z, z
+            s += dot64(r, z)
+        m.partial[c, 6] = s
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        rz = total(m, 6)
+        w.state[RZ], w.state[RZ_START], w.state[COUNT], w.state[STOP] = rz, rz, 0.0, RUNNING
+
+
+def iterate(m, A, w, n: int, tolerance: float) -> None:
+    """Up to n iterations, without reading the residual."""
+    for _ in range(n + 1):  # convergence is noticed at the start of the next one
+        iterate_once(m, A, w, tolerance)
+
+
+@kernel
+def iterate_once(m: ti.template(), A: ti.template(), w: ti.template(), tolerance: ti.f64):
+    """One iteration; does nothing once stopped."""
+    for c in range(m.chunks):
+        size = (m.n_nodes + m.chunks - 1) // m.chunks
+        s = ti.cast(0.0, ti.f64)
+        if w.state[STOP] == RUNNING:
+            for i in range(c * size, ti.min(m.n_nodes, (c + 1) * size)):
+                q = m.free[i] * row_times(m, A, i, w.p)
+                w.q[i] = q
+                s += dot64(w.p[i], q)
+        m.partial[c, 6] = s
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        if w.state[STOP] == RUNNING:
+            curvature = total(m, 6)
+            if w.state[RZ] <= tolerance * tolerance * w.state[RZ_START]:
+                w.state[STOP] = CONVERGED
+            elif not curvature > 0.0:
+                w.state[STOP] = NEGATIVE
+            else:
+                w.state[STEP] = w.state[RZ] / curvature
+    for c in range(m.chunks):
+        size = (m.n_nodes + m.chunks - 1) // m.chunks
+        s = ti.cast(0.0, ti.f64)
+        if w.state[STOP] == RUNNING:
+            a = ti.cast(w.state[STEP], m.real)
+            for i in range(c * size, ti.min(m.n_nodes, (c + 1) * size)):
+                w.y[i] = w.y[i] + a * w.p[i]
+                r = w.r[i] - a * w.q[i]
+                z = inverse_times(m, w, i, r)
+                w.r[i], w.z[i] = r, z
+                s += dot64(r, z)
+        m.partial[c, 7] = s
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        if w.state[STOP] == RUNNING:
+            rz = total(m, 7)
+            w.state[STEP] = rz / w.state[RZ]
+            w.state[RZ] = rz
+            w.state[COUNT] = w.state[COUNT] + 1.0
+    for i in range(m.n_nodes):
+        if w.state[STOP] == RUNNING:
+            w.p[i] = w.z[i] + ti.cast(w.state[STEP], m.real) * w.p[i]

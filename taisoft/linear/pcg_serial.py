@@ -1,0 +1,77 @@
+"""CG with symmetric Gauss-Seidel on one thread, all iterations in one launch.
+
+With A = L + D + L^T and the preconditioner M = (D + L) D^-1 (D + L)^T, the vectors kept are s = (D + L)^-1 r and
+t = (D + L)^T p. Since A p = (D + L) p + t - D p, one backward and one forward sweep make an iteration:
+    p = (D + L)^-T t,   q = (D + L)^-1 A p = p + (D + L)^-1 (t - D p),   p.Ap = t.q,   r.z = s.D s.
+Source: Eisenstat, "Efficient Implementation of a Class of Preconditioned Conjugate Gradient Methods", SIAM J. Sci. Stat.
+Comput. 2(1), 1981. D^-1 holds the inverse of the blocks that could be inverted, so M stays symmetric in any case.
+"""
+
+import taichi as ti
+
+from taisoft.linear.block_csr import diagonal_times, part_times
+from taisoft.linear.pcg import CONVERGED, COUNT, NEGATIVE, RUNNING, RZ, RZ_START, STOP, dot64, inverse_times
+from taisoft.runtime import kernel
+
+
+@kernel
+def start(m: ti.template(), A: ti.template(), w: ti.template()):
+    """y = 0, s = (D + L)^-1 rhs, t = D s."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        rz = ti.cast(0.0, ti.f64)
+        for i in range(m.n_nodes):
+            below = part_times(m, A, A.row_start[i], A.row_upper[i], w.r)
+            s = inverse_times(m, w, i, w.rhs[i] - below)
+            t = diagonal_times(m, A, i, s)
+            w.r[i], w.z[i] = s, t
+            w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
+            rz += dot64(s, t)
+        w.state[RZ], w.state[RZ_START], w.state[COUNT], w.state[STOP] = rz, rz, 0.0, RUNNING
+
+
+@kernel
+def iterate(m: ti.template(), A: ti.template(), w: ti.template(), n: ti.i32, tolerance: ti.f64):
+    """Up to n iterations."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        rz, stop, k = w.state[RZ], ti.cast(RUNNING, ti.i32), 0
+        limit = tolerance * tolerance * w.state[RZ_START]
+        if rz < 0.0:
+            stop = NEGATIVE
+        elif rz <= limit:
+            stop = CONVERGED
+        while k < n and stop == RUNNING:
+            for back in range(m.n_nodes):
+                i = m.n_nodes - 1 - back
+                above = part_times(m, A, A.row_upper[i], A.row_start[i + 1], w.p)
+                w.p[i] = inverse_times(m, w, i, w.z[i] - above)
+            curvature = ti.cast(0.0, ti.f64)
+            for i in range(m.n_nodes):
+                # w.q holds (D + L)^-1 (t - D p) during the sweep, as its lower rows need it
+                p, t = w.p[i], w.z[i]
+                below = part_times(m, A, A.row_start[i], A.row_upper[i], w.q)
+                s = inverse_times(m, w, i, t - diagonal_times(m, A, i, p) - below)
+                w.q[i] = s
+                curvature += dot64(t, p + s)
+            if not curvature > 0.0:
+                stop = NEGATIVE
+            else:
+                step, next_rz = ti.cast(rz / curvature, m.real), ti.cast(0.0, ti.f64)
+                for i in range(m.n_nodes):
+                    p = w.p[i]
+                    w.y[i] = w.y[i] + step * p
+                    s = w.r[i] - step * (p + w.q[i])
+                    w.r[i] = s
+                    next_rz += dot64(s, diagonal_times(m, A, i, s))
+                along = ti.cast(next_rz / rz, m.real)
+                for i in range(m.n_nodes):
+                    w.z[i] = diagonal_times(m, A, i, w.r[i]) + along * w.z[i]
+                rz = next_rz
+                k += 1
+                if rz < 0.0:
+                    stop = NEGATIVE
+                elif rz <= limit:
+                    stop = CONVERGED
+        w.state[RZ], w.state[STOP] = rz, stop
+        w.state[COUNT] = w.state[COUNT] + k

@@ -1,0 +1,154 @@
+"""Fields and kernels of one implicit stage; `newton` drives them. The formulas stand there."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import taichi as ti
+
+from taisoft.elements import gather
+from taisoft.linear.block_csr import row_times
+from taisoft.linear.pcg import dot64, total
+from taisoft.runtime import kernel
+
+
+@dataclass(frozen=True, eq=False)
+class StageWork:
+    """Fields of a stage; (n_nodes) 3-vectors."""
+
+    x_hat: Any  # f64
+    v_hat: Any
+    base: Any  # v before the step that is being tried
+    residual: Any  # on all axes: constraint impulses where not free
+    moved: Any  # (n_moved) i32
+    moved_axes: Any  # (n_moved, 3) i32
+    targets: Any  # (n_moved) f64 3-vectors
+    n_moved: int
+    shift: Any  # (n_nodes) inertia of the system
+    damper: Any  # BlockCsr or None
+
+
+@ti.func
+def lead_rows(m: ti.template(), w: ti.template()):
+    for k in range(w.n_moved):
+        for a in ti.static(range(3)):
+            if w.moved_axes[k][a] != 0:
+                m.x[w.moved[k]][a] = w.targets[k][a]
+
+
+@kernel
+def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64):
+    """Constrained velocities from the targets (0 on fixed axes is v's own state), then x from v."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        m.x[i] = w.x_hat[i] + beta * ti.cast(m.v[i], ti.f64)
+    ti.loop_config(serialize=True)
+    for k in range(w.n_moved):
+        i = w.moved[k]
+        for a in ti.static(range(3)):
+            if w.moved_axes[k][a] != 0:
+                m.v[i][a] = ti.cast((w.targets[k][a] - w.x_hat[i][a]) / beta, m.real)
+                m.x[i][a] = w.targets[k][a]
+
+
+@kernel
+def form_residual(m: ti.template(), w: ti.template(), p: ti.template(), c: ti.f64, beta: ti.f64):
+    """Residual from the corner buffer, -r as CG's right side, inertia of the system.
+
+    partial 0..4: |r|^2, |c M dv|^2, |f_el|^2, |f_ext|^2 on the free axes, |r|^2 on the others; scalars 8..12 their sums.
+    """
+    ti.loop_config(serialize=m.serial)
+    for k in range(m.chunks):
+        size = (m.n_nodes + m.chunks - 1) // m.chunks
+        s = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64)
+        for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
+            b, mass, free = ti.cast(beta, m.real), m.mass[i], m.free[i]
+            inertia = ti.cast(c, m.real) * mass
+            f = gather(m, i)
+            external = mass * m.gravity[0]
+            if ti.static(m.loaded):
+                external += m.loads[i]
+            drag = ti.Vector([0.0, 0.0, 0.0], m.real)
+            if ti.static(m.damped):
+                a = m.damping[m.node_body[i], 0]
+                drag += a * mass * m.v[i]
+                inertia += b * a * mass
+            if ti.static(m.stiffness_damping):
+                drag += m.damping[m.node_body[i], 1] * row_times(m, w.damper, i, m.v)
+            change = ti.cast(c, m.real) * mass * (m.v[i] - w.v_hat[i])
+            r = change - b * (f + external - drag)
+            w.residual[i] = r
+            p.rhs[i] = -free * r
+            w.shift[i] = inertia
+            s += ti.Vector(
+                [
+                    norm2(free * r),
+                    norm2(free * change),
+                    norm2(free * f),
+                    norm2(free * external),
+                    norm2((1.0 - free) * r),
+                ]
+            )
+        for j in ti.static(range(5)):
+            m.partial[k, j] = s[j]
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for j in ti.static(range(5)):
+            m.scalars[8 + j] = total(m, j)
+
+
+@ti.func
+def norm2(a):
+    b = ti.cast(a, ti.f64)
+    return b.dot(b)
+
+
+@kernel
+def try_step(m: ti.template(), w: ti.template(), y: ti.template(), share: ti.f64, beta: ti.f64):
+    """v = base + share y, x accordingly."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        v = w.base[i] + ti.cast(share, m.real) * y[i]
+        m.v[i] = v
+        m.x[i] = w.x_hat[i] + beta * ti.cast(v, ti.f64)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        lead_rows(m, w)
+
+
+@kernel
+def keep_base(m: ti.template(), w: ti.template(), y: ti.template()):
+    """base = v; scalars 13: slope r.y of the step y (its sign: negative is downhill)."""
+    ti.loop_config(serialize=m.serial)
+    for k in range(m.chunks):
+        size = (m.n_nodes + m.chunks - 1) // m.chunks
+        s = ti.cast(0.0, ti.f64)
+        for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
+            w.base[i] = m.v[i]
+            s += dot64(m.free[i] * w.residual[i], y[i])
+        m.partial[k, 5] = s
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        m.scalars[13] = total(m, 5)
+
+
+@kernel
+def stage_terms(m: ti.template(), w: ti.template(), c: ti.f64, beta: ti.f64):
+    """Inertia, loads and damping terms of Phi, in f64: scalars 14."""
+    ti.loop_config(serialize=m.serial)
+    for k in range(m.chunks):
+        size = (m.n_nodes + m.chunks - 1) // m.chunks
+        s = ti.cast(0.0, ti.f64)
+        for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
+            mass, v = ti.cast(m.mass[i], ti.f64), ti.cast(m.v[i], ti.f64)
+            d = v - ti.cast(w.v_hat[i], ti.f64)
+            s += 0.5 * c * mass * d.dot(d)
+            if ti.static(m.loaded):
+                s -= ti.cast(m.loads[i], ti.f64).dot(m.x[i])
+            if ti.static(m.damped):
+                s += 0.5 * beta * m.damping[m.node_body[i], 0] * mass * v.dot(v)
+            if ti.static(m.stiffness_damping):
+                s += 0.5 * beta * m.damping[m.node_body[i], 1] * dot64(m.v[i], row_times(m, w.damper, i, m.v))
+        m.partial[k, 5] = s
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        m.scalars[14] = total(m, 5)

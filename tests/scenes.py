@@ -1,0 +1,85 @@
+"""Small scenes for tests of the core, and the machine's arrays of a scene without a simulator around them."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+import taichi as ti
+from lanes import opened
+from oracle import Oracle
+
+import taisoft as ts
+from taisoft.model import Layout, Model, build_model
+from taisoft.runtime import FieldArena, Runtime
+from taisoft.scene.plan import make_plan
+
+SVK, COR, SNH = "st_venant_kirchhoff", "corotational", "stable_neo_hookean"
+
+
+def rubber(law: str = SNH, **numbers) -> ts.Material:
+    """A soft material: 1e5 Pa, waves of about 12 m/s, so that steps of a millisecond are small for meshes of 1 m."""
+    return ts.Material(law=law, **{"young": 1e5, "poisson": 0.3, "density": 1000.0, **numbers})
+
+
+def cube(center=(0.0, 0.0, 0.0), cells=(1, 1, 1), size=(1.0, 0.9, 1.1), pattern="five") -> ts.TetMesh:
+    """A box that is no cube, of 5 or 6 tets a cell."""
+    return ts.box_mesh(cells, size, center, pattern)
+
+
+def mixed_scene(mass_damping: float = 0.0, stiffness_damping: float = 0.0) -> ts.Scene:
+    """Four bodies of three laws whose order is not that of the laws, of 10, 5, 6 and 5 tets: none fills its last lanes.
+
+    Each is held, led and loaded in another way, where it can be.
+    """
+    scene = ts.Scene(gravity=(0.3, -9.81, 0.7))
+    damping = {"mass_damping": mass_damping, "stiffness_damping": stiffness_damping}
+    beam = scene.add_body(cube(cells=(2, 1, 1)), rubber(SNH, **damping), name="beam", position=(0.5, 0, 0))
+    beam.fix(lambda X: X[:, 0] < -0.49)
+    beam.add_traction(lambda X: X[:, 0] > 0.49, (300.0, 2000.0, -500.0))
+    block = scene.add_body(cube((3, 0, 0)), rubber(SVK, young=7e4, poisson=0.2), name="block", velocity=(0.5, 0, -0.3))
+    block.fix([0, 1], axes="x")
+    block.fix([1, 2], axes="yz")
+    block.add_force([5, 6, 7], (30.0, -10.0, 20.0))
+    tower = scene.add_body(cube((6, 0, 0), pattern="six"), rubber(COR, density=800.0, **damping), name="tower")
+    tower.fix(lambda X: X[:, 1] < -0.44)
+    spin = np.random.default_rng(8).standard_normal((8, 3))
+    scene.add_body(cube((9, 0, 0)), rubber(SVK, density=1500.0), name="flyer", velocity=spin)
+    return scene
+
+
+@dataclass
+class Rig:
+    """A scene in the machine, and what it should do. parallel: the model whose loops run on several threads."""
+
+    scene: ts.Scene
+    machine: Runtime
+    arena: FieldArena
+    model: Model
+    parallel: Model
+    layout: Layout
+    oracle: Oracle
+
+    def vectors(self, name: str, data=None):
+        """A field of 3-vectors at the nodes."""
+        return self.arena.vectors(name, self.model.real, self.model.n_nodes, data)
+
+    @property
+    def eps(self) -> float:
+        """Rounding of everything but positions."""
+        return self.machine.eps
+
+
+@contextmanager
+def built(scene: ts.Scene, precision: str, chunks: int = 7) -> Iterator[Rig]:
+    """The arrays of a scene; the parallel model adds its sums up in `chunks` parts."""
+    with opened(precision) as machine:
+        arena = FieldArena()
+        try:
+            on = make_plan(scene, explicit=False, multistep=False).on
+            model, layout = build_model(scene, machine, arena, on)
+            partial = arena.field("partial_parallel", ti.f64, (chunks, model.partial.shape[1]))
+            parallel = replace(model, serial=False, chunks=chunks, partial=partial)
+            yield Rig(scene, machine, arena, model, parallel, layout, Oracle(scene))
+        finally:
+            arena.release()
