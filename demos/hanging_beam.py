@@ -11,7 +11,7 @@ import numpy as np
 
 import taisoft as ts
 
-solver = {"integrator": "velocity_verlet", "dt": 1 / 960, "seconds": 2.0, "fps": 60.0}
+solver = {"integrator": "velocity_verlet", "dt": 1 / 960, "seconds": 2.0, "fps": 30.0}
 
 TIP = (2.0, 0.0, 0.0)  # [m] at rest
 TIP_END = (1.68729062555, -1.53957261726, 0.0)  # [m] at 2 s

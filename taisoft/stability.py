@@ -3,7 +3,7 @@
 All three laws have Hooke's law as tangent at F = I, so one stiffness serves them: sigma = 2 mu eps + lambda tr(eps) I.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -142,9 +142,8 @@ def _stable_dt_of(omega: float, mass_damping: float, stiffness_damping: float, v
     return low
 
 
-@dataclass(frozen=True)
-class Modes:
-    """frequencies (k,) [Hz], ascending; shapes (k, n_nodes, 3), each with unit modal mass; names of the bodies in order."""
+class Modes(NamedTuple):
+    """frequencies (k,) [Hz], ascending; shapes (k, n_nodes, 3), each with unit modal mass, bodies in the order added."""
 
     frequencies: np.ndarray
     shapes: np.ndarray

@@ -27,24 +27,24 @@ def cube(center=(0.0, 0.0, 0.0), cells=(1, 1, 1), size=(1.0, 0.9, 1.1), pattern=
     return ts.box_mesh(cells, size, center, pattern)
 
 
-def mixed_scene(mass_damping: float = 0.0, stiffness_damping: float = 0.0) -> ts.Scene:
-    """Four bodies of three laws whose order is not that of the laws, of 10, 5, 6 and 5 tets: none fills its last lanes.
+def mixed_scene(laws=(SNH, SVK, COR, SVK), mass_damping: float = 0.0, stiffness_damping: float = 0.0) -> ts.Scene:
+    """Four bodies whose order is not that of the laws, of 10, 5, 6 and 5 tets: none fills its last lanes.
 
-    Each is held, led and loaded in another way, where it can be.
+    Each has another material, and is held and loaded in another way; the first and the third are damped.
     """
     scene = ts.Scene(gravity=(0.3, -9.81, 0.7))
     damping = {"mass_damping": mass_damping, "stiffness_damping": stiffness_damping}
-    beam = scene.add_body(cube(cells=(2, 1, 1)), rubber(SNH, **damping), name="beam", position=(0.5, 0, 0))
+    beam = scene.add_body(cube(cells=(2, 1, 1)), rubber(laws[0], **damping), name="beam", position=(0.5, 0, 0))
     beam.fix(lambda X: X[:, 0] < -0.49)
     beam.add_traction(lambda X: X[:, 0] > 0.49, (300.0, 2000.0, -500.0))
-    block = scene.add_body(cube((3, 0, 0)), rubber(SVK, young=7e4, poisson=0.2), name="block", velocity=(0.5, 0, -0.3))
+    block = scene.add_body(cube((3, 0, 0)), rubber(laws[1], young=7e4, poisson=0.2), name="block", velocity=(0.5, 0, -0.3))
     block.fix([0, 1], axes="x")
     block.fix([1, 2], axes="yz")
     block.add_force([5, 6, 7], (30.0, -10.0, 20.0))
-    tower = scene.add_body(cube((6, 0, 0), pattern="six"), rubber(COR, density=800.0, **damping), name="tower")
+    tower = scene.add_body(cube((6, 0, 0), pattern="six"), rubber(laws[2], density=800.0, **damping), name="tower")
     tower.fix(lambda X: X[:, 1] < -0.44)
     spin = np.random.default_rng(8).standard_normal((8, 3))
-    scene.add_body(cube((9, 0, 0)), rubber(SVK, density=1500.0), name="flyer", velocity=spin)
+    scene.add_body(cube((9, 0, 0)), rubber(laws[3], density=1500.0), name="flyer", velocity=spin)
     return scene
 
 

@@ -1,4 +1,4 @@
-"""The elastic operator of four bodies with three laws, none of whose tets fill the last lanes, in f32 and f64:
+"""The elastic operator of four bodies, none of whose tets fill the last lanes: three laws in f64, one in f32.
 
 * energies, volume ratios, forces and their differential are the oracle's, in the serial and in the parallel kernels;
 * a body at rest has no force, wherever it stands and however it is turned;
@@ -11,7 +11,7 @@
 import numpy as np
 import oracle as exact
 import pytest
-from scenes import built, mixed_scene
+from scenes import SNH, built, mixed_scene
 
 from taisoft import elasticity
 from taisoft.linear import block_csr
@@ -21,7 +21,10 @@ SQUEEZE = np.array([[0.6, 0.1, 0.0], [-0.15, 1.2, 0.05], [0.0, 0.1, 0.7]])
 
 @pytest.fixture(scope="module", params=["f64", "f32"])
 def rig(request):
-    with built(mixed_scene(mass_damping=0.4, stiffness_damping=3e-3), request.param) as made:
+    # compiling an assembly takes seconds a law, so one law has to do where the rest of the code is what is looked at
+    laws = {} if request.param == "f64" else {"laws": (SNH,) * 4}
+    with built(mixed_scene(mass_damping=0.4, stiffness_damping=3e-3, **laws), request.param) as made:
+        made.heavy = (made.model,) if request.param == "f64" else (made.model, made.parallel)
         made.force, made.way, made.product = made.vectors("force"), made.vectors("way"), made.vectors("product")
         made.matrix = block_csr.build_block_csr(made.model, made.arena, made.model.real)
         made.damper = block_csr.sibling(made.matrix, made.model, made.arena, made.model.real, "damper")
@@ -39,10 +42,6 @@ def squeezed(rig):
     return x
 
 
-def both(rig):
-    return rig.model, rig.parallel
-
-
 def close(rig, value, expected, roundings: float) -> None:
     """Equal up to so many roundings of the largest expected number."""
     assert np.abs(expected).max() > 0.0
@@ -51,7 +50,7 @@ def close(rig, value, expected, roundings: float) -> None:
 
 def test_the_squeezed_state_is_a_hard_one(rig, squeezed):
     J = np.concatenate([np.linalg.det(rig.oracle.gradients(squeezed, part)) for part in rig.oracle.parts])
-    assert (J <= 0).sum() in range(1, 6) and J.max() > 1.0
+    assert (J <= 0).sum() in range(1, 6)
     assert np.linalg.eigvalsh(rig.oracle.stiffness(squeezed)).min() < -1e3  # N/m
     F = rig.oracle.gradients(squeezed, rig.oracle.parts[2])
     s = exact.signed_svd(F)[1]
@@ -63,7 +62,7 @@ def test_energies_and_volume_ratios(rig, squeezed):
     v = rig.model.v.to_numpy().astype(np.float64)
     gravity = -np.sum(rig.oracle.mass * squeezed * rig.oracle.gravity)
     expected = (rig.oracle.energy(squeezed), J.min(), (J <= 0).sum(), np.sum(rig.oracle.mass * v**2) / 2, gravity)
-    for model in both(rig):
+    for model in (rig.model, rig.parallel):
         model.scalars.fill(-1.0)
         elasticity.measure(model)
         # sums are in f64, but the rest shape, masses and gravity are stored in the model's precision
@@ -72,7 +71,7 @@ def test_energies_and_volume_ratios(rig, squeezed):
 
 def test_forces(rig, squeezed):
     expected = rig.oracle.force(squeezed)
-    for model in both(rig):
+    for model in (rig.model, rig.parallel):
         model.corner.fill(np.nan)  # what is read must have been written
         elasticity.elastic_forces(model)
         elasticity.gather_forces(model, rig.force)
@@ -99,7 +98,7 @@ def test_force_differential(rig, squeezed):
     way = np.random.default_rng(5).standard_normal(squeezed.shape).astype(rig.machine.np_real)
     expected = -(rig.oracle.stiffness(squeezed) @ way.astype(np.float64).reshape(-1)).reshape(-1, 3)
     rig.way.from_numpy(way)
-    for model in both(rig):
+    for model in rig.heavy:
         elasticity.force_differential(model, rig.way, rig.product)
         close(rig, rig.product.to_numpy(), expected, 100)
 
@@ -110,7 +109,7 @@ def test_assembled_stiffness(rig, squeezed):
     elasticity.force_differential(rig.model, rig.way, rig.product)
     free = rig.product.to_numpy()
     exactly = rig.oracle.stiffness(squeezed)
-    for model in both(rig):
+    for model in rig.heavy:
         rig.matrix.value.fill(np.nan)
         rig.matrix.diagonal.fill(np.nan)
         block_csr.assemble(model, rig.matrix, False)
@@ -151,36 +150,37 @@ def test_pattern_is_the_node_graph(rig):
     assert all(row == sorted(set(row)) for row in rows) and 2 * rig.matrix.n_edges == len(edges)
 
 
+@pytest.mark.parametrize("rig", ["f32"], indirect=True)  # each law's own projection is tested in f64 with the laws
 def test_projected_stiffness(rig, squeezed):
     expected = rig.oracle.stiffness(squeezed, projected=True)
     assert np.abs(expected - rig.oracle.stiffness(squeezed)).max() > 1e4  # [N/m] there is something to project
-    for model in both(rig):
-        block_csr.assemble(model, rig.matrix, True)
-        K = block_csr.to_scipy(model, rig.matrix).toarray()
-        close(rig, K, expected, 100)
-        assert np.linalg.eigvalsh((K + K.T) / 2).min() > -20 * rig.eps * np.abs(K).max()
+    block_csr.assemble(rig.model, rig.matrix, True)
+    K = block_csr.to_scipy(rig.model, rig.matrix).toarray()
+    close(rig, K, expected, 100)
+    assert np.linalg.eigvalsh((K + K.T) / 2).min() > -20 * rig.eps * np.abs(K).max()
 
 
-def test_system(rig, squeezed):
+def test_system(rig):
     """diag(shift) + k K + c b K_d with each row's own stiffness damping b, which is 0 in two of the bodies."""
-    k, c = 0.04, 0.3
-    K, K_d = rig.oracle.stiffness(squeezed), rig.oracle.stiffness(squeezed, projected=True)
-    shift = np.random.default_rng(9).uniform(1e3, 2e3, rig.model.n_nodes).astype(rig.machine.np_real)
+    k, c, rng = 0.04, 0.3, np.random.default_rng(9)
+    fields = (rig.matrix.value, rig.matrix.diagonal, rig.damper.value, rig.damper.diagonal)
+    numbers = [rng.standard_normal(field.shape).astype(rig.machine.np_real) for field in fields]
+    shift = rng.uniform(1, 2, rig.model.n_nodes).astype(rig.machine.np_real)
     damping = np.repeat(rig.oracle.stiffness_damping, 3)[:, None]
     assert {float(b) for b in np.unique(damping)} == {0.0, 3e-3}
-    expected = np.diag(np.repeat(shift.astype(np.float64), 3)) + k * K + c * damping * K_d
     rig.shift.from_numpy(shift)
-    for model in both(rig):
-        block_csr.assemble(model, rig.matrix, False)
-        block_csr.assemble(model, rig.damper, True)
+    for model in (rig.model, rig.parallel):
+        for field, values in zip(fields, numbers):
+            field.from_numpy(values)
+        K, K_d = (block_csr.to_scipy(model, A).toarray() for A in (rig.matrix, rig.damper))
         block_csr.to_system(model, rig.matrix, rig.damper, rig.shift, k, c)
-        close(rig, block_csr.to_scipy(model, rig.matrix).toarray(), expected, 100)
+        expected = np.diag(np.repeat(shift.astype(np.float64), 3)) + k * K + c * damping * K_d
+        close(rig, block_csr.to_scipy(model, rig.matrix).toarray(), expected, 10)
 
 
 def test_parallel_kernels_are_reproducible(rig, squeezed):
     def numbers():
-        rig.matrix.value.fill(0.0)
-        block_csr.assemble(rig.parallel, rig.matrix, False)
+        block_csr.assemble(rig.heavy[-1], rig.matrix, False)
         elasticity.elastic_forces(rig.parallel)
         elasticity.gather_forces(rig.parallel, rig.force)
         elasticity.measure(rig.parallel)

@@ -31,14 +31,15 @@ def law_numbers(
     law: ti.template(), lanes: ti.template(), A: ti.types.ndarray(), B: ti.types.ndarray(), p: ti.types.ndarray(),
     out: ti.types.ndarray(),
 ):  # fmt: skip
-    """psi, P and dP of F in A along D in B."""
+    """psi, P and dP of F in A along D in B, and the block of the gradients that are D's first two rows."""
     for b in range(A.shape[0]):
         F, D = load(A, b, lanes, 9), load(B, b, lanes, 9)
         c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(4))]
         energy, P, S = law.psi(F, c), law.pk1(F, c), law.prepare(F, c)
         dP = law.dpk1(F, S, D)
+        K = law.block(F, S, [D[0], D[1], D[2]], [D[3], D[4], D[5]])
         store(out, b, 0, [energy], lanes)
-        store(out, b, 1, P + dP, lanes)
+        store(out, b, 1, P + dP + K, lanes)
 
 
 @kernel
@@ -195,14 +196,14 @@ def test_bad_arguments_are_refused(change, words):
 
 
 def numbers_in_f32(law, F, D, lanes):
-    """psi, P, dP of the law's lane functions, run in f32."""
+    """psi, P, dP and the block of the law's lane functions, run in f32."""
     with opened("f32"):
         constants = np.array(LAWS[law].constants(*oracle.lame(YOUNG, POISSON)), dtype=np.float32)
         A, B = packed(F, lanes, np.float32), packed(D, lanes, np.float32)
-        out = np.zeros((len(A), 19, lanes), np.float32)
+        out = np.zeros((len(A), 28, lanes), np.float32)
         law_numbers(LAWS[law], lanes, A, B, constants, out)
     flat = unpacked(out, len(F))
-    return flat[:, 0], flat[:, 1:10].reshape(-1, 3, 3), flat[:, 10:].reshape(-1, 3, 3)
+    return flat[:, 0], *(flat[:, k : k + 9].reshape(-1, 3, 3) for k in (1, 10, 19))
 
 
 @each_law
@@ -215,11 +216,15 @@ def test_single_precision(law):
     eps = np.finfo(np.float32).eps
     size = (1.0 + np.abs(F).max(axis=(1, 2)))[:, None, None]
     loss = (1 + 0.05 / gap(F) ** 2)[:, None, None] if law == "corotational" else 1.0
-    psi, P, dP = numbers_in_f32(law, F, D, 4)
+    psi, P, dP, block = numbers_in_f32(law, F, D, 4)
     assert (np.abs(psi - oracle.psi(law, F, YOUNG, POISSON)) / size[:, 0, 0] ** 6).max() < 20 * eps * YOUNG
     assert (np.abs(P - oracle.pk1(law, F, YOUNG, POISSON)) / size**5 / loss).max() < 20 * eps * YOUNG
     expected = oracle.dpk1(law, F, D, YOUNG, POISSON)
     assert (np.abs(dP - expected) / size**4 / loss**2).max() < 100 * eps * YOUNG
+    # block (i, k): the change of P gb along e_k (x) ga
+    H = oracle.hessian(law, F, YOUNG, POISSON).reshape(-1, 3, 3, 3, 3)
+    expected = np.einsum("nijkl,nl,nj->nik", H, D[:, 0], D[:, 1])
+    assert (np.abs(block - expected) / size**4 / loss**2).max() < 300 * eps * YOUNG
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])

@@ -24,7 +24,7 @@ from fake_simulator import RUBBER, FakeSimulator, beam_scene
 import taisoft as ts
 from taisoft.errors import OutputError, SimulationError
 from taisoft.runtime import open_kind, open_runtime
-from taisoft.view.camera import BORDER, Camera
+from taisoft.view.camera import BORDER, FILL, Camera
 from taisoft.view.ggui import vulkan_missing, window_holder
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.raster import rasterise
@@ -44,7 +44,8 @@ def test_framing_shows_everything(azimuth, elevation):
     camera = Camera.framing(points, azimuth=azimuth, elevation=elevation)
     seen = camera.project(points, SIZE)
     assert (seen[:, 2] > 0).all()
-    assert (seen[:, :2] > 0).all() and (seen[:, 0] < SIZE[0]).all() and (seen[:, 1] < SIZE[1]).all()
+    shares = np.abs(2 * seen[:, :2] / SIZE - 1).max(axis=0)  # of the picture's width and height
+    assert shares.max() == pytest.approx(FILL)
     assert np.allclose(camera.project(camera.target[None], SIZE), [[160, 90, camera.distance]])
 
 

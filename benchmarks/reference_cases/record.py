@@ -62,7 +62,12 @@ def small(quantity: str, measured: float, limit: float) -> Check:
     return Check(quantity, float(measured), 0.0, abs(float(measured)), limit)
 
 
-def order(quantity: str, coarse: float, fine: float, expected: float, limit: float) -> Check:
+def told(quantity: str, error: float) -> Check:
+    """An error that is told without a limit."""
+    return Check(quantity, float(error), 0.0, abs(float(error)))
+
+
+def order(quantity: str, coarse: float, fine: float, expected: float, limit: float | None) -> Check:
     """A check of the observed order log2(coarse/fine) of two errors, the step or the mesh width being halved."""
     observed = math.log2(coarse / fine) if coarse > 0.0 and fine > 0.0 else math.nan
     return Check(quantity, observed, expected, abs(observed - expected), limit)

@@ -45,8 +45,11 @@ def psi(F, p):
 
 @ti.func
 def pk1(F, p):
-    """First Piola-Kirchhoff stress [Pa]; any F is valid."""
-    return matmul(F, _second_pk(_green_strain(F), p))
+    """First Piola-Kirchhoff stress [Pa]; any F is valid. Written as mu F C + (lambda/2 (tr C - 3) - mu) F, C = F^T F."""
+    C = matmul_tn(F, F)
+    FC = matmul(F, C)
+    t = 0.5 * p[1] * (C[0] + C[4] + C[8] - 3.0) - p[0]
+    return [p[0] * FC[k] + t * F[k] for k in ti.static(range(9))]
 
 
 @ti.func

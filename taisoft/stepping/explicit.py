@@ -168,7 +168,7 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
 
 @kernel
 def elements_parallel(m: ti.template()):
-    """One sub-step's element loop over threads; scalars 6, 7: smallest J, inverted tets of this sub-step."""
+    """One sub-step's element loop over threads; scalars 6, 9: smallest J so far, inverted tets of this sub-step."""
     for law, first, last in ti.static(m.laws):
         for b in range(first, last):
             J = element_force(m, law, m.stiffness_damping, b)
@@ -177,7 +177,7 @@ def elements_parallel(m: ti.template()):
             for q in ti.static(range(1, m.lanes)):
                 low, count = ti.min(low, J[q]), count + bad[q]
             ti.atomic_min(m.scalars[6], ti.cast(low, ti.f64))
-            ti.atomic_add(m.scalars[7], ti.cast(count, ti.f64))
+            ti.atomic_add(m.scalars[9], ti.cast(count, ti.f64))
 
 
 @kernel
@@ -207,7 +207,7 @@ def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
 
 @kernel
 def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64):
-    """What comes after a sub-step's element loop; scalars 8: not 0 once a velocity is not finite."""
+    """What comes after a sub-step's element loop; scalars 5, 7, 8: good sub-steps, most inverted tets, whether one failed."""
     for i in range(m.n_nodes):
         dt = ti.cast(dt64, m.real)
         v = ti.Vector([0.0, 0.0, 0.0], m.real)
@@ -225,3 +225,17 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
         ti.loop_config(serialize=True)
         for _ in range(1):
             react(m, s, ti.cast(dt64, m.real))
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        m.scalars[7] = ti.max(m.scalars[7], m.scalars[9])
+        m.scalars[9] = 0.0
+        if m.scalars[8] == 0.0:
+            m.scalars[5] = m.scalars[5] + 1.0
+
+
+@kernel
+def begin_parallel(m: ti.template()):
+    """Counters of a batch of parallel sub-steps."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        m.scalars[5], m.scalars[6], m.scalars[7], m.scalars[8], m.scalars[9] = 0.0, HUGE, 0.0, 0.0, 0.0

@@ -150,7 +150,7 @@ class ImplicitStepper:
         if scheme.midpoint:
             finish_midpoint(m, h)
         if not np.isfinite(result.residual):  # a NaN anywhere in x or v reaches the residual
-            where = world.find_unfinite() or "the residual is not finite"
+            where = world.find_unfinite(self.solver.work.residual.to_numpy()) or "the residual is not finite"
             restore(m, h)
             self.forget()
             raise SimulationError(f"step {world.step_count + 1}: {where}")

@@ -127,22 +127,15 @@ class ExplicitStepper:
 
     def _launch_parallel(self, n: int, dt: float) -> None:
         m, s = self.world.model, self.work
-        low, most, done = explicit.HUGE, 0.0, 0
         if s.verlet and self.stale:
             explicit.elements_parallel(m)
             explicit.restart_parallel(m, s)
+        explicit.begin_parallel(m)
         for row in range(n):
-            m.scalars[6], m.scalars[7], m.scalars[8] = explicit.HUGE, 0.0, 0.0
             if s.verlet or s.n_moved or s.n_held:
                 explicit.drift_parallel(m, s, row, dt)
             explicit.elements_parallel(m)
             explicit.nodes_parallel(m, s, row, dt)
-            values = m.scalars.to_numpy()
-            low, most = min(low, values[6]), max(most, values[7])
-            if values[8] != 0.0:
-                break
-            done += 1
-        m.scalars[5], m.scalars[6], m.scalars[7] = done, low, most
 
     def reactions(self) -> np.ndarray:
         """(n_nodes, 3) force of the constraints in the last sub-step [N]."""

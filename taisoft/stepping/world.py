@@ -61,12 +61,16 @@ class World:
         rows = self.next_targets(np.array([t]))
         return None if rows is None else rows[0]
 
-    def find_unfinite(self) -> str | None:
-        """Names the first node whose position or velocity is not finite, in a few words."""
+    def find_unfinite(self, force: np.ndarray | None = None) -> str | None:
+        """Names the first node whose position, velocity or force (n_nodes, 3) is not finite, in a few words."""
         x, v = self.model.x.to_numpy(), self.model.v.to_numpy()
-        bad = np.flatnonzero(~(np.isfinite(x).all(axis=1) & np.isfinite(v).all(axis=1)))
+        good = np.isfinite(x).all(axis=1) & np.isfinite(v).all(axis=1)
+        if force is not None:
+            with np.errstate(over="ignore"):  # a force whose square overflows is as bad as an infinite one
+                good &= np.isfinite((force.astype(np.float64) ** 2).sum(axis=1))
+        bad = np.flatnonzero(~good)
         if len(bad) == 0:
             return None
         body = int(np.searchsorted(self.layout.node_start, bad[0], side="right")) - 1
         name, vertex = self.scene.bodies[body].name, bad[0] - self.layout.node_start[body]
-        return f"body '{name}', vertex {vertex}: position or velocity is no longer finite ({len(bad)} vertices in all)"
+        return f"body '{name}', vertex {vertex}: position, velocity or force is no longer finite ({len(bad)} vertices in all)"

@@ -7,6 +7,7 @@ import numpy as np
 
 UP = np.array([0.0, 1.0, 0.0])
 MAX_ELEVATION = 89.0  # [deg]; at 90 "up" is no longer defined
+FILL = 0.62  # of the picture's width or height, whichever is reached first, that the bodies take at the start
 BORDER = 0.06  # of the picture, both sides together, kept free when the camera moves back from moving bodies
 MAX_WIDENING = 4.0  # times the first distance: a body that flies away goes out of sight in the end
 NEAR, FAR = 0.02, 50.0  # clipping planes in units of the distance to the target
@@ -27,12 +28,13 @@ class Camera:
     fov: float = 30.0
 
     @classmethod
-    def framing(cls, points: np.ndarray, margin: float = 1.15, **angles) -> "Camera":
-        """A camera that shows the ball round the bounding box of points (n,3), times margin."""
-        low, high = np.min(points, axis=0), np.max(points, axis=0)
-        camera = cls(target=(low + high) / 2, **angles)
-        radius = max(float(np.linalg.norm(high - low)) / 2, 1e-9)  # of a single point: anything above 0
-        return replace(camera, distance=margin * radius / math.sin(math.radians(camera.fov) / 2))
+    def framing(cls, points: np.ndarray, size: tuple[int, int] = (16, 9), **angles) -> "Camera":
+        """A camera at the middle of the bounding box of points (n,3), which fill FILL of a picture.
+
+        size: width and height of the picture, in any unit.
+        """
+        camera = cls(target=(np.min(points, axis=0) + np.max(points, axis=0)) / 2, **angles)
+        return replace(camera, distance=max(camera._distance(points, size, FILL), 1e-9))  # of a single point: above 0
 
     @property
     def position(self) -> np.ndarray:
@@ -64,11 +66,14 @@ class Camera:
 
         size: width and height of the picture. Never moves nearer; points that are not finite do not count.
         """
+        return replace(self, distance=max(self.distance, min(self._distance(points, size, 1.0 - BORDER), limit)))
+
+    def _distance(self, points: np.ndarray, size: tuple[int, int], share: float) -> float:
+        """Distance [m] from the target at which points (n,3) fill that share of the picture's width or height."""
         right, up, forward = self.axes @ (np.asarray(points) - self.target).T
-        half = (1.0 - BORDER) * math.tan(math.radians(self.fov) / 2)  # height by distance
+        half = share * math.tan(math.radians(self.fov) / 2)  # height by distance
         needed = np.maximum(np.abs(right) / (half * size[0] / size[1]), np.abs(up) / half) - forward
-        furthest = np.max(needed, initial=0.0, where=np.isfinite(needed))
-        return replace(self, distance=max(self.distance, min(furthest, limit)))
+        return float(np.max(needed, initial=0.0, where=np.isfinite(needed)))
 
     def orbit(self, azimuth: float, elevation: float) -> "Camera":
         """Turned about the target by so many degrees; elevation stops short of the poles."""

@@ -26,9 +26,9 @@ _told: set[str] = set()  # sentences printed in this process
 class Offscreen:
     """Draws a scene's bodies as pictures.
 
-    scene: read once; size: (width, height) in pixels; camera: stays as given, else shows a ball round the start of all
-    bodies, and moves back, never nearer, when a body would leave the picture; renderer: "vulkan", "software" or "auto":
-    Vulkan where it can be had, else one line on stderr says why not. Raises OutputError.
+    scene: read once; size: (width, height) in pixels; camera: stays as given, else shows all bodies as they start,
+    and moves back, never nearer, when a body would leave the picture; renderer: "vulkan", "software" or "auto": Vulkan
+    where it can be had, else one line on stderr says why not. Raises OutputError.
     """
 
     def __init__(self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None, renderer: str = "auto"):
@@ -37,7 +37,7 @@ class Offscreen:
         if min(size) < 1:
             raise OutputError(f"a picture of {size[0]} x {size[1]} pixels cannot be drawn: both must be at least 1")
         self.size = (int(size[0]), int(size[1]))
-        self.camera = camera or Camera.framing(start_positions(scene))
+        self.camera = camera or Camera.framing(start_positions(scene), size)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # [m]
         self.surfaces = Surfaces(scene)
         self._large = (self.size[0] * SAMPLES, self.size[1] * SAMPLES)

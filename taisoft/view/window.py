@@ -34,7 +34,7 @@ class LiveWindow:
     """
 
     def __init__(self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None):
-        self.camera = camera or Camera.framing(start_positions(scene))
+        self.camera = camera or Camera.framing(start_positions(scene), size)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # [m]; 0 once the user moves the camera
         self._surfaces = Surfaces(scene)
         self._canvas = Canvas(self._surfaces, size, visible=True)

@@ -1,0 +1,135 @@
+"""Conjugate gradients, serial and parallel, in f32 and f64, on the stiffness of a squeezed scene plus inertia:
+
+* the solution is SciPy's on the free axes and exactly 0 on the others, whatever stands on the right side there;
+* a looser tolerance stops earlier, the limit of iterations is kept, no right side needs no iteration;
+* negative curvature is reported, and the iterate before it is finite and goes downhill;
+* diagonal blocks that are nearly singular do not spoil the solution;
+* the parallel solver's result does not depend on the run.
+"""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import scipy.sparse.linalg as spl
+from scenes import built, mixed_scene
+
+from taisoft.linear import block_csr, pcg
+
+METHODS = ("serial", "parallel")
+
+
+@pytest.fixture(scope="module", params=["f64", "f32"])
+def rig(request):
+    with built(mixed_scene(), request.param) as made:
+        made.matrix = block_csr.build_block_csr(made.model, made.arena, made.model.real)
+        made.work = pcg.build_pcg(made.model, made.arena)
+        rng = np.random.default_rng(1)
+        x = made.oracle.rest * [0.8, 1.1, 0.9] + 0.05 * rng.standard_normal(made.oracle.rest.shape)
+        made.stiffness = made.oracle.stiffness(x, projected=True)
+        made.free = rng.random(x.shape) < 0.8
+        made.free[3] = False
+        made.model.free.from_numpy(made.free.astype(made.machine.np_real))
+        made.rhs = rng.standard_normal(x.shape).astype(made.machine.np_real)
+        made.work.rhs.from_numpy(made.rhs)
+        yield made
+
+
+def fill(rig, dense: np.ndarray) -> sp.csr_matrix:
+    """Put a matrix with the node graph's pattern into the machine; returns what is there, rounded."""
+    blocks = dense.reshape(rig.model.n_nodes, 3, rig.model.n_nodes, 3).transpose(0, 2, 1, 3)
+    start, column = rig.matrix.row_start.to_numpy(), rig.matrix.column.to_numpy()
+    row = np.repeat(np.arange(rig.model.n_nodes), np.diff(start))
+    own = np.arange(rig.model.n_nodes)
+    rig.matrix.value.from_numpy(blocks[row, column].reshape(-1).astype(rig.machine.np_real))
+    rig.matrix.diagonal.from_numpy(blocks[own, own].reshape(-1).astype(rig.machine.np_real))
+    return block_csr.to_scipy(rig.model, rig.matrix)
+
+
+def solved(rig, method: str, tolerance: float, limit: int = 1000):
+    rig.work.y.fill(np.nan)
+    result = pcg.solve(rig.model if method == "serial" else rig.parallel, rig.matrix, rig.work, tolerance, limit)
+    return result, rig.work.y.to_numpy().astype(np.float64)
+
+
+@pytest.fixture
+def system(rig):
+    """K plus an inertia of about a hundredth of it, and its exact solution (n,3)."""
+    shift = np.repeat(np.random.default_rng(2).uniform(200.0, 2000.0, rig.model.n_nodes), 3)  # [N/m], a number a node
+    A = fill(rig, rig.stiffness + np.diag(shift))
+    free = rig.free.reshape(-1)
+    y = np.zeros(free.size)
+    y[free] = spl.spsolve(A[free][:, free].tocsc(), rig.rhs.reshape(-1)[free].astype(np.float64))
+    return y.reshape(-1, 3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_solution_is_scipys(rig, system, method):
+    tolerance = {"f64": 1e-12, "f32": 1e-6}[rig.machine.precision]
+    result, y = solved(rig, method, tolerance)
+    assert result.converged and not result.negative and 5 < result.iterations < rig.free.sum()
+    # the error is at most the tolerance times the root of the condition of the preconditioned matrix, about 30
+    assert np.abs(y - system).max() < 100 * tolerance * np.abs(system).max()
+    assert np.abs(system).max() > 0.0 and np.all(y[~rig.free] == 0.0) and np.abs(rig.rhs[~rig.free]).max() > 1.0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_tolerance_and_limit(rig, system, method):
+    counts = [solved(rig, method, tolerance)[0].iterations for tolerance in (0.3, 1e-2, 1e-5)]
+    assert counts == sorted(set(counts))
+    loose = solved(rig, method, 0.3)[1]
+    assert 1e-3 < np.abs(loose - system).max() / np.abs(system).max() < 1.0
+    result, y = solved(rig, method, 1e-5, limit=3)
+    assert result.iterations == 3 and not result.converged and not result.negative and np.isfinite(y).all()
+
+
+def test_gauss_seidel_needs_fewer_iterations(rig, system):
+    serial, parallel = (solved(rig, method, 1e-5)[0].iterations for method in METHODS)
+    assert serial < 0.8 * parallel
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_nothing_to_do(rig, system, method):
+    rig.work.rhs.from_numpy(np.where(rig.free, 0.0, 1.0).astype(rig.machine.np_real))
+    result, y = solved(rig, method, 1e-6)
+    rig.work.rhs.from_numpy(rig.rhs)
+    assert result.converged and result.iterations == 0 and not y.any()
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("shift", [-1e3, -1e5])
+def test_negative_curvature_is_reported(rig, method, shift):
+    """A little indefinite, and negative altogether, which the diagonal blocks already show."""
+    A = fill(rig, rig.stiffness + shift * np.eye(len(rig.stiffness)))
+    free = rig.free.reshape(-1)
+    assert np.linalg.eigvalsh(A[free][:, free].toarray()).min() < -500
+    result, y = solved(rig, method, 1e-6)
+    assert result.negative and not result.converged
+    assert np.isfinite(y).all() and np.sum(y * rig.rhs) >= 0.0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_blocks_that_are_nearly_singular(rig, method):
+    """Nodes ten thousand times as stiff along one oblique axis: their blocks have a determinant of nearly 0."""
+    u = np.array([1.0, 2.0, -2.0]) / 3.0
+    blocks = {i: 3e6 * np.outer(u, u) for i in range(4, 20, 3)}
+    A = rig.stiffness + 300.0 * np.eye(len(rig.stiffness))
+    for i, block in blocks.items():
+        A[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = block + 300.0 * np.eye(3)
+        others = np.r_[0 : 3 * i, 3 * i + 3 : len(A)]
+        A[3 * i : 3 * i + 3, others] = 0.01 * A[3 * i : 3 * i + 3, others]
+        A[others, 3 * i : 3 * i + 3] = A[3 * i : 3 * i + 3, others].T
+    A = fill(rig, A)
+    free = rig.free.reshape(-1)
+    assert np.linalg.eigvalsh(A[free][:, free].toarray()).min() > 10.0
+    exact = np.zeros(free.size)
+    exact[free] = spl.spsolve(A[free][:, free].tocsc(), rig.rhs.reshape(-1)[free].astype(np.float64))
+    result, y = solved(rig, method, 1e-6)
+    assert result.converged and not result.negative
+    assert np.abs(y.reshape(-1) - exact).max() < 1e-2 * np.abs(exact).max()
+
+
+def test_the_parallel_solver_is_reproducible(rig, system):
+    first = solved(rig, "parallel", 1e-5)
+    for _ in range(5):
+        again = solved(rig, "parallel", 1e-5)
+        assert again[0] == first[0] and np.array_equal(again[1], first[1])
