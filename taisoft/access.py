@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 
-from taisoft.elasticity import cauchy_stress, force_differential, measure
+from taisoft.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
 from taisoft.errors import SceneError, SimulationError
 from taisoft.model import changed_material
 from taisoft.records import Energies
@@ -72,17 +72,29 @@ class StateAccess:
         first = world.layout.block_start[k] * m.lanes
         return sigma[first : first + world.layout.n_tets[k]].reshape(-1, 3, 3)
 
+    def elastic_forces(self) -> np.ndarray:
+        """(n_nodes, 3) elastic forces of the present state on all nodes [N]."""
+        world = self._open_world()
+        _, force = self._tangent_fields()
+        elastic_forces(world.model)
+        gather_forces(world.model, force)
+        return force.to_numpy().astype(np.float64)
+
     def force_differential(self, displacement: np.ndarray) -> np.ndarray:
         """Change of the elastic forces (n_nodes, 3) [N] along a displacement (n_nodes, 3) [m] of all bodies: (df/dx) dx."""
         world = self._open_world()
         self._check_rows("displacement", displacement, slice(None))
-        if self._tangent is None:
-            make, n, real = self._arena.vectors, world.model.n_nodes, self._runtime.real
-            self._tangent = make("tangent_dx", real, n), make("tangent_df", real, n)
-        dx, df = self._tangent
+        dx, df = self._tangent_fields()
         dx.from_numpy(np.asarray(displacement, dtype=self._runtime.np_real))
         force_differential(world.model, dx, df)
         return df.to_numpy().astype(np.float64)
+
+    def _tangent_fields(self) -> tuple:
+        """Two fields of (n_nodes) 3-vectors, allocated when first asked for."""
+        if self._tangent is None:
+            make, n, real = self._arena.vectors, self._world.model.n_nodes, self._runtime.real
+            self._tangent = make("tangent_dx", real, n), make("tangent_df", real, n)
+        return self._tangent
 
     @property
     def dt(self) -> float:

@@ -6,7 +6,9 @@ comparisons and the order of sums (no speed lost). Fields live in one
 `FieldArena` per simulator and are released with it.
 """
 
+import contextlib
 import functools
+import io
 import os
 import tempfile
 import time
@@ -69,6 +71,7 @@ def open_runtime(arch: str, precision: str, owner: str = "a simulator") -> Runti
         )
     # another initialisation in this process (a user's own ti.init) shows in the configuration and is replaced
     if _kind != kind or ti.cfg.default_fp != PRECISIONS[precision] or ti.cfg.cfg_optimization:
+        _kind = None  # a failed initialisation leaves no kind
         _initialise(arch, precision)
         _kind = kind
     runtime = Runtime(arch, precision)
@@ -95,10 +98,11 @@ def _initialise(arch: str, precision: str) -> None:
         os.getcwd()
     except FileNotFoundError:
         raise SimulationError("the working folder no longer exists: change to one that does") from None
-    ti.init(
-        arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
-        fast_math=False, offline_cache=True, offline_cache_file_path=_cache_folder(), log_level=ti.ERROR, random_seed=0,
-    )  # fmt: skip
+    with contextlib.redirect_stdout(io.StringIO()):  # its greeting
+        ti.init(
+            arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
+            fast_math=False, offline_cache=True, offline_cache_file_path=_cache_folder(), log_level=ti.ERROR, random_seed=0,
+        )  # fmt: skip
     obtained = "cuda" if ti.cfg.arch == ti.cuda else "cpu"
     if obtained != arch:
         raise SimulationError(f"arch '{arch}' is not to be had on this machine (Taichi fell back to '{obtained}')")
@@ -139,9 +143,7 @@ class FieldArena:
         try:
             self._trees.append(builder.finalize())
         except RuntimeError as error:
-            raise SimulationError(
-                f"no memory for field '{name}' ({count * components * 8} bytes at most): {error}"
-            ) from None
+            raise SimulationError(f"no memory for field '{name}' ({count * components * 8} bytes at most): {error}") from None
         size = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.u8: 1}[dtype]
         self.bytes[name] = count * components * size
         if data is not None:

@@ -264,9 +264,9 @@ class Oracle:
         self._end(x, v, dt)
 
     def bdf2(self, dt: float) -> None:
-        """x1 = 4/3 x0 - 1/3 x_(-1) + 2/3 dt v1, v1 alike; the first step is the midpoint rule's."""
+        """x1 = 4/3 x0 - 1/3 x_(-1) + 2/3 dt v1, v1 alike; the first step is implicit Euler's."""
         if not self.past:
-            return self.implicit_midpoint(dt)
+            return self.implicit_euler(dt)
         (older_x, older_v), x, v = self.past[-1], self.x, self.v
         goal, led = self.targets(self.time + dt)
         self.x, self.v = self._stage((4 * x - older_x) / 3, (4 * v - older_v) / 3, 2 * dt / 3, goal, led)

@@ -48,6 +48,31 @@ def mixed_scene(laws=(SNH, SVK, COR, SVK), mass_damping: float = 0.0, stiffness_
     return scene
 
 
+RELEASE = 0.0095  # [s] when the driven scene's first led nodes let go
+
+
+def driven_scene(law: str = SNH, mass_damping: float = 0.0, stiffness_damping: float = 0.0) -> ts.Scene:
+    """A beam that is held, led and loaded in every way there is, and a flyer; nodes 8..11 are the beam's right end.
+
+    Two nodes are led along x and y until they are released, one along z by a path of its own, and their other axes are
+    free. damping: of the beam; the flyer has a third of its mass damping.
+    """
+    scene = ts.Scene(gravity=(0.3, -9.81, 0.7))
+    damping = {"mass_damping": mass_damping, "stiffness_damping": stiffness_damping}
+    beam = scene.add_body(cube(cells=(2, 1, 1)), rubber(law, **damping), name="beam", velocity=(0.4, 0.1, -0.2))
+    beam.fix([0, 1])
+    beam.fix([2, 3], axes="x")
+    beam.move([9, 8], lambda t: None if t > RELEASE else (0.05 * np.sin(60 * t), -2 * t, 0.0), axes="xy")
+    beam.move([11], lambda t: np.array([[9.0, 9.0, 40 * t**2]]), axes="z")
+    beam.add_traction(lambda X: X[:, 1] > 0.44, (300.0, 2000.0, -500.0))
+    beam.add_force([4, 6, 10], (30.0, -10.0, 60.0))
+    spin = np.random.default_rng(8).standard_normal((8, 3))
+    scene.add_body(
+        cube((3, 0, 0)), rubber(law, young=7e4, mass_damping=mass_damping / 3), name="flyer", velocity=spin
+    )
+    return scene
+
+
 @dataclass
 class Rig:
     """A scene in the machine, and what it should do. parallel: the model whose loops run on several threads."""

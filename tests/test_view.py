@@ -6,6 +6,7 @@
 * Taichi's renderer and the NumPy one draw the same picture, upright; a body that moves, moves in the picture;
 * without a Vulkan driver pictures are drawn in software, and one line says which package is missing;
 * without a display or a driver a window is refused with a sentence, and the process lives on;
+* a window leaves no file behind, and a file of the name it would have used stays as it is;
 * a process holds one window, and an open one keeps the runtime from being initialised anew;
 * the window answers keys and mouse (on a virtual display).
 """
@@ -299,6 +300,23 @@ def test_without_a_display_a_window_is_refused(display, reason):
     out, _ = run_child(TRY_WINDOW, DISPLAY=display)
     assert "refused: cannot open a window" in out and reason in out
     assert "(36, 64, 3)" in out
+
+
+@needs_vulkan
+def test_a_window_leaves_no_file_behind(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene = beam_scene()
+
+    def draw():
+        drawing = Offscreen(scene, SIZE, renderer="vulkan")
+        drawing.image(FakeSimulator(scene))
+        drawing.close()
+        return list(tmp_path.iterdir())
+
+    assert draw() == []
+    own = tmp_path / "imgui.ini"
+    own.write_text("[Window][mine]\n")
+    assert draw() == [own]
 
 
 @needs_vulkan

@@ -47,10 +47,10 @@ def modal(meshes, reference: dict, arch: str):
 
 # --- one oscillator -------------------------------------------------------------------------------------------------
 
-# Energy of the shear of one tet is even in the displacement, so that its force is linear up to the third order: 1e-10
-# of relative error here. Rounding of the positions is 1e-11 of the amplitude.
-AMPLITUDE = 1e-5  # m, of a tet of 1 m
-LARGEST = 5e-5  # m: a growing motion is followed no further, so that it stays linear
+# The energy of one tet's shear is even in the displacement, so that its force is linear up to the third order: 1e-11 of
+# relative error here. Rounding of the positions is 1e-10 of the amplitude.
+AMPLITUDE = 1e-6  # m, of a tet of 1 m
+LARGEST = 5e-6  # m: a growing motion is followed no further, so that it stays linear
 STEPS = 24  # per start
 LIMIT = 1e-7  # relative, of |lambda| and of the frequency
 

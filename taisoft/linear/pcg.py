@@ -60,12 +60,10 @@ def solve(m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: i
 
     invert_diagonal(m, A, w)
     method = pcg_serial if m.serial else pcg_parallel
-    method.start(m, A, w)
     batch = max(1, SERIAL_WORK // (2 * A.n_edges + m.n_nodes)) if m.serial else PARALLEL_BATCH
     done = 0
     while True:
-        method.iterate(m, A, w, min(batch, max_iterations - done), tolerance)
-        done, stop = int(w.state[COUNT]), int(w.state[STOP])
+        done, stop = method.iterate(m, A, w, min(batch, max_iterations - done), tolerance, done == 0)
         if stop != RUNNING or done >= max_iterations:
             return LinearResult(done, stop == CONVERGED, stop == NEGATIVE)
 
@@ -75,26 +73,26 @@ def invert_diagonal(m: ti.template(), A: ti.template(), w: ti.template()):
     """Inverse diagonal blocks over the free axes."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        B = ti.Matrix.zero(m.real, 3, 3)
+        B = ti.Matrix.zero(ti.f64, 3, 3)  # in f64, so that blocks much stiffer one way than another are inverted too
         free = m.free[i]
         for r in ti.static(range(3)):
             for c in ti.static(range(3)):
                 both = free[r] * free[c]
                 B[r, c] = both * A.diagonal[9 * i + 3 * r + c] + (1.0 - both if ti.static(r == c) else 0.0)
         det = B.determinant()
-        solid = B[0, 0] > 0.0 and B[1, 1] > 0.0 and B[2, 2] > 0.0 and det > 1e-6 * B[0, 0] * B[1, 1] * B[2, 2]
+        solid = B[0, 0] > 0.0 and B[1, 1] > 0.0 and B[2, 2] > 0.0 and det > 1e-12 * B[0, 0] * B[1, 1] * B[2, 2]
         if solid:
             C = B.inverse()
             for r in ti.static(range(3)):
                 for c in ti.static(range(3)):
-                    w.inverse[9 * i + 3 * r + c] = free[r] * free[c] * C[r, c]
+                    w.inverse[9 * i + 3 * r + c] = free[r] * free[c] * ti.cast(C[r, c], m.real)
         else:
             # a nearly singular or indefinite block (unprojected, compressed): its diagonal still preconditions
             for r in ti.static(range(3)):
                 for c in ti.static(range(3)):
                     w.inverse[9 * i + 3 * r + c] = 0.0
                 d = abs(B[r, r])
-                w.inverse[9 * i + 4 * r] = free[r] * ti.select(d > 0.0, 1.0 / ti.max(d, 1e-30), 1.0)
+                w.inverse[9 * i + 4 * r] = free[r] * ti.cast(ti.select(d > 0.0, 1.0 / ti.max(d, 1e-30), 1.0), m.real)
 
 
 @ti.func

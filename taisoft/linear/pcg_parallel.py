@@ -38,10 +38,13 @@ def start(m: ti.template(), A: ti.template(), w: ti.template()):
         w.state[RZ], w.state[RZ_START], w.state[COUNT], w.state[STOP] = rz, rz, 0.0, RUNNING
 
 
-def iterate(m, A, w, n: int, tolerance: float) -> None:
-    """Up to n iterations, without reading the residual."""
-    for _ in range(n + 1):  # convergence is noticed at the start of the next one
+def iterate(m, A, w, n: int, tolerance: float, begin: bool) -> tuple[int, int]:
+    """Up to n iterations, from y = 0 where the solve begins; returns the iterations so far and how it stands."""
+    if begin:
+        start(m, A, w)
+    for _ in range(n):
         iterate_once(m, A, w, tolerance)
+    return int(w.state[COUNT]), int(w.state[STOP])
 
 
 @kernel
@@ -85,6 +88,8 @@ def iterate_once(m: ti.template(), A: ti.template(), w: ti.template(), tolerance
             w.state[STEP] = rz / w.state[RZ]
             w.state[RZ] = rz
             w.state[COUNT] = w.state[COUNT] + 1.0
+            if rz <= tolerance * tolerance * w.state[RZ_START]:
+                w.state[STOP] = CONVERGED
     for i in range(m.n_nodes):
         if w.state[STOP] == RUNNING:
             w.p[i] = w.z[i] + ti.cast(w.state[STEP], m.real) * w.p[i]

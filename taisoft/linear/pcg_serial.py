@@ -14,27 +14,35 @@ from taisoft.linear.pcg import CONVERGED, COUNT, NEGATIVE, RUNNING, RZ, RZ_START
 from taisoft.runtime import kernel
 
 
-@kernel
+@ti.func
 def start(m: ti.template(), A: ti.template(), w: ti.template()):
     """y = 0, s = (D + L)^-1 rhs, t = D s."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        rz = ti.cast(0.0, ti.f64)
-        for i in range(m.n_nodes):
-            below = part_times(m, A, A.row_start[i], A.row_upper[i], w.r)
-            s = inverse_times(m, w, i, w.rhs[i] - below)
-            t = diagonal_times(m, A, i, s)
-            w.r[i], w.z[i] = s, t
-            w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
-            rz += dot64(s, t)
-        w.state[RZ], w.state[RZ_START], w.state[COUNT], w.state[STOP] = rz, rz, 0.0, RUNNING
+    rz = ti.cast(0.0, ti.f64)
+    for i in range(m.n_nodes):
+        below = part_times(m, A, A.row_start[i], A.row_upper[i], w.r)
+        s = inverse_times(m, w, i, w.rhs[i] - below)
+        t = diagonal_times(m, A, i, s)
+        w.r[i], w.z[i] = s, t
+        w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
+        rz += dot64(s, t)
+    w.state[RZ], w.state[RZ_START], w.state[COUNT], w.state[STOP] = rz, rz, 0.0, RUNNING
+
+
+def iterate(m, A, w, n: int, tolerance: float, begin: bool) -> tuple[int, int]:
+    """Up to n iterations, from y = 0 where the solve begins; returns the iterations so far and how it stands."""
+    count, stop = iterate_kernel(m, A, w, n, tolerance, int(begin))
+    return int(count), int(stop)
 
 
 @kernel
-def iterate(m: ti.template(), A: ti.template(), w: ti.template(), n: ti.i32, tolerance: ti.f64):
-    """Up to n iterations."""
+def iterate_kernel(
+    m: ti.template(), A: ti.template(), w: ti.template(), n: ti.i32, tolerance: ti.f64, begin: ti.i32
+) -> ti.types.vector(2, ti.f64):
+    """The iterations in one launch: (count, stop)."""
     ti.loop_config(serialize=True)
     for _ in range(1):
+        if begin != 0:
+            start(m, A, w)
         rz, stop, k = w.state[RZ], ti.cast(RUNNING, ti.i32), 0
         limit = tolerance * tolerance * w.state[RZ_START]
         if rz < 0.0:
@@ -75,3 +83,4 @@ def iterate(m: ti.template(), A: ti.template(), w: ti.template(), n: ti.i32, tol
                     stop = CONVERGED
         w.state[RZ], w.state[STOP] = rz, stop
         w.state[COUNT] = w.state[COUNT] + k
+    return ti.Vector([w.state[COUNT], w.state[STOP]])

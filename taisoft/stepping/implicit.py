@@ -30,45 +30,29 @@ class Scheme:
 
 
 @kernel
-def keep_state(m: ti.template(), h: ti.template(), shift: ti.template()):
-    """State n into the history; with shift, what was n becomes n - 1."""
+def begin_step(
+    m: ti.template(), w: ti.template(), h: ti.template(), multistep: ti.template(), now: ti.f64, before: ti.f64,
+    still: ti.f64, along: ti.f64,
+):  # fmt: skip
+    """State n into the history, x_hat and v_hat of the stage, and the first iterate of v on the free axes.
+
+    The iterate is (1 - still) v_n + along (v_n - v_(n-1)): still is 1 for the linearly implicit step, which is linearised
+    at x_n. Fixed axes keep 0; led nodes are set with the targets.
+    """
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        if ti.static(shift):
+        if ti.static(multistep):
             h.x_before[i] = h.x_now[i]
         h.v_before[i] = h.v_now[i]
         h.x_now[i] = m.x[i]
         h.v_now[i] = m.v[i]
-
-
-@kernel
-def set_hats(
-    m: ti.template(), w: ti.template(), h: ti.template(), multistep: ti.template(), now: ti.f64, before: ti.f64
-):
-    """x_hat and v_hat of the stage."""
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
         w.x_hat[i] = h.x_now[i]
         w.v_hat[i] = h.v_now[i]
         if ti.static(multistep):
             w.x_hat[i] = now * h.x_now[i] - before * h.x_before[i]
             w.v_hat[i] = ti.cast(now, m.real) * h.v_now[i] - ti.cast(before, m.real) * h.v_before[i]
-
-
-@kernel
-def guess(m: ti.template(), h: ti.template(), along: ti.f64):
-    """First iterate v_n + along (v_n - v_(n-1)) on the free axes, 0 elsewhere (led nodes are set with the targets)."""
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        m.v[i] = m.free[i] * (h.v_now[i] + ti.cast(along, m.real) * (h.v_now[i] - h.v_before[i]))
-
-
-@kernel
-def standstill(m: ti.template()):
-    """First iterate v = 0: the linearly implicit step is linearised at x_n."""
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        m.v[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
+        v = ti.cast(1.0 - still, m.real) * h.v_now[i] + ti.cast(along, m.real) * (h.v_now[i] - h.v_before[i])
+        m.v[i] = m.free[i] * v
 
 
 @kernel
@@ -131,19 +115,16 @@ class ImplicitStepper:
         world, m, h, w = self.world, self.world.model, self.history, self.solver.work
         scheme = self.scheme if self._past > 0 or self.scheme.start is None else self.scheme.start
         target = world.next_target(world.time + dt)
-        keep_state(m, h, self.scheme.before > 0.0)
         if target is not None:
             w.moved_axes.from_numpy(world.motion.moved_axes())
             if scheme.midpoint:
-                target = 0.5 * (target + h.x_now.to_numpy()[world.motion.moved])
+                target = 0.5 * (target + m.x.to_numpy()[world.motion.moved])
             w.targets.from_numpy(target)
         self._beta = scheme.share * dt
         self.solver.assemble_damper()
-        set_hats(m, w, h, self.scheme.before > 0.0, scheme.now, scheme.before)
-        if scheme.one_iteration:
-            standstill(m)
-        else:
-            guess(m, h, (0.5 if scheme.midpoint else 1.0) if self._past > 1 else 0.0)
+        along = (0.5 if scheme.midpoint else 1.0) if self._past > 1 and not scheme.one_iteration else 0.0
+        multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)
+        begin_step(m, w, h, multistep, scheme.now, scheme.before, still, along)
         result = self.solver.solve(
             1.0, self._beta, self.tolerance, 1 if scheme.one_iteration else MAX_NEWTON, self.linear_tolerance
         )

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
-from taisoft.elasticity import elastic_forces, measure
+from taisoft.elasticity import measure
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.model import Model
@@ -88,9 +88,8 @@ class StageSolver:
 
     def _evaluate(self, c: float, beta: float) -> tuple[float, float]:
         """(|r|, scale) at the present v and x."""
-        elastic_forces(self.model)
-        form_residual(self.model, self.work, self.pcg, c, beta)
-        r, inertia, elastic, external, held = (math.sqrt(self.model.scalars[8 + k]) for k in range(5))
+        norms = form_residual(self.model, self.work, self.pcg, c, beta)
+        r, inertia, elastic, external, held = (math.sqrt(norms[k]) for k in range(5))
         if c == 0.0:
             return r, beta * external if external > 0.0 else held
         return r, inertia + beta * (elastic + external)
@@ -160,7 +159,6 @@ class StageSolver:
         """Take the step in pcg.y as far as it helps; returns (|r|, scale, moved)."""
         m, w, y = self.model, self.work, self.pcg.y
         keep_base(m, w, y)
-        slope = float(m.scalars[13])
         start = self._objective(c, beta) if by_energy else None
         try_step(m, w, y, 1.0, beta)
         if not by_energy:
@@ -170,7 +168,7 @@ class StageSolver:
             try_step(m, w, y, 0.0, beta)
             start = self._objective(c, beta)
             try_step(m, w, y, 1.0, beta)
-        share = 1.0
+        share, slope = 1.0, m.scalars[13]
         # Phi's own rounding: the elastic terms of f32 forces are only good to eps, so tiny rises are not rises
         slack = 10.0 * np.finfo(np.float64).eps * abs(start)
         for _ in range(MAX_BACKTRACKS):

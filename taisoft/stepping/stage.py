@@ -5,6 +5,7 @@ from typing import Any
 
 import taichi as ti
 
+from taisoft.elasticity import element_force
 from taisoft.elements import gather
 from taisoft.linear.block_csr import row_times
 from taisoft.linear.pcg import dot64, total
@@ -51,11 +52,17 @@ def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64):
 
 
 @kernel
-def form_residual(m: ti.template(), w: ti.template(), p: ti.template(), c: ti.f64, beta: ti.f64):
-    """Residual from the corner buffer, -r as CG's right side, inertia of the system.
+def form_residual(
+    m: ti.template(), w: ti.template(), p: ti.template(), c: ti.f64, beta: ti.f64
+) -> ti.types.vector(5, ti.f64):
+    """Elastic forces and residual at the present x and v, -r as CG's right side, inertia of the system.
 
-    partial 0..4: |r|^2, |c M dv|^2, |f_el|^2, |f_ext|^2 on the free axes, |r|^2 on the others; scalars 8..12 their sums.
+    Returns |r|^2, |c M dv|^2, |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on the others.
     """
+    for law, first, last in ti.static(m.laws):
+        ti.loop_config(serialize=m.serial)
+        for b in range(first, last):
+            element_force(m, law, False, b)
     ti.loop_config(serialize=m.serial)
     for k in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
@@ -90,10 +97,7 @@ def form_residual(m: ti.template(), w: ti.template(), p: ti.template(), c: ti.f6
             )
         for j in ti.static(range(5)):
             m.partial[k, j] = s[j]
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        for j in ti.static(range(5)):
-            m.scalars[8 + j] = total(m, j)
+    return ti.Vector([total(m, j) for j in ti.static(range(5))])
 
 
 @ti.func

@@ -2,14 +2,17 @@
 
 Taichi ends the process, past any `except`, when it opens a window without a display, holds two windows, or is
 initialised anew while one lives. So what is missing is asked first, a process holds one window at a time, and an open
-window holds a claim on the runtime.
+window holds a claim on the runtime. A window also leaves `imgui.ini`, the place of its panel, in the working folder when
+it goes; that is removed again unless it was there before.
 """
 
+import contextlib
 import ctypes
 import functools
 import os
 import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import taichi as ti
@@ -56,6 +59,15 @@ def window_holder() -> str:
     return _holder[0] if _holder else ""
 
 
+def _panel_file_to_come() -> Path | None:
+    """The file that a window leaves when it goes; None if it is there already or cannot come about."""
+    try:
+        path = Path.cwd() / "imgui.ini"
+    except FileNotFoundError:  # the working folder is gone
+        return None
+    return None if path.exists() else path
+
+
 class Canvas:
     """The process's one Taichi window with the scene's surfaces in it; on the screen, or only in memory.
 
@@ -84,6 +96,7 @@ class Canvas:
         triangles = surfaces.triangles.ravel()
         self._indices = self._fields.field("picture triangles", ti.i32, len(triangles), triangles)
         self.window = self._canvas = self._scene = None
+        self._litter = _panel_file_to_come()
         try:
             self.window = ti.ui.Window(title, size, show_window=visible)
             self._canvas = self.window.get_canvas()
@@ -131,6 +144,9 @@ class Canvas:
             return
         if self.window is not None:
             self.window.destroy()
+        if self._litter is not None:
+            with contextlib.suppress(OSError):  # a folder that has become read-only keeps it, and no harm is done
+                self._litter.unlink(missing_ok=True)
         self.window = self._canvas = self._scene = None
         self._fields.release()
         self._runtime.close()
