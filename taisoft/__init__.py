@@ -10,6 +10,8 @@ if os.name == "posix" and "HOME" not in os.environ:
     _home = os.path.expanduser("~")
     os.environ["HOME"] = _home if os.path.isabs(_home) else "/tmp"
 
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # Taichi greets on standard output when imported, else
+
 _HOME = {  # public name -> the module that defines it
     "TetMesh": "taisoft.mesh.tet_mesh",
     "box_mesh": "taisoft.mesh.shapes",

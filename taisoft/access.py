@@ -175,6 +175,7 @@ class StateAccess:
         wanted = (len(range(*rows.indices(self._world.model.n_nodes))), 3)
         if value.shape != wanted or value.dtype.kind not in "fiu":
             raise SceneError(f"{name} have shape {value.shape} and type {value.dtype}: they must be {wanted} numbers")
-        bad = np.flatnonzero(~np.isfinite(value).all(axis=1))
+        with np.errstate(over="ignore"):
+            bad = np.flatnonzero(~np.isfinite(value.astype(self._runtime.np_real)).all(axis=1))
         if len(bad):
-            raise SceneError(f"{name}: vertex {bad[0]} is not finite")
+            raise SceneError(f"{name}: vertex {bad[0]} is not finite or too large for {self._runtime.precision}")

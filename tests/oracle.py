@@ -273,32 +273,34 @@ class Oracle:
         self._end(x, v, dt)
 
     def linearly_implicit_euler(self, dt: float) -> None:
-        """(M + dt a M + dt^2 K + dt b K_d) v1 = M v0 + dt f(x0), f linearised at x0; no led nodes."""
-        free = ~self.fixed.reshape(-1)
-        K, damper = self.stiffness(self.x), self.stiffness(self.x, projected=True)
+        """(M + dt a M + dt^2 K + dt b K_d) v1 = M v0 + dt f(x), f linearised where led nodes have gone and others stay."""
+        goal, led = self.targets(self.time + dt)
+        free = ~(self.fixed | led).reshape(-1)
+        x, v, damper = self.x, self.v, self.stiffness(self.x, projected=True)
+        start, way = np.where(led, goal, x), np.where(led, (goal - x) / dt, 0.0)
+        rhs = (self.mass * v + dt * self.total_force(start, way, damper)).reshape(-1)
+        self.v = way.copy()
+        self.v[free.reshape(-1, 3)] = np.linalg.solve(self._system(dt, start, damper)[np.ix_(free, free)], rhs[free])
+        self.x = np.where(led, goal, x + dt * self.v)
+        self._residual = self.mass * (self.v - v) / dt - self.total_force(self.x, self.v, damper)
+        self._end(x, v, dt)
+
+    def _system(self, beta: float, x, damper):
+        """M + beta a M + beta^2 K(x) + beta b K_d."""
+        inertia = np.repeat(self.mass * (1 + beta * self.mass_damping), 3, axis=1).reshape(-1)
         b = np.repeat(self.stiffness_damping, 3, axis=1).reshape(-1, 1)
-        inertia = np.diag(np.repeat(self.mass * (1 + dt * self.mass_damping), 3, axis=1).reshape(-1))
-        A = inertia + dt**2 * K + dt * b * damper
-        rhs = (self.mass * self.v + dt * self.total_force(self.x, np.zeros_like(self.v), damper)).reshape(-1)
-        v = np.zeros(3 * self.n)
-        v[free] = np.linalg.solve(A[np.ix_(free, free)], rhs[free])
-        x, before = self.x, self.v
-        self.v = v.reshape(-1, 3)
-        self.x = x + dt * self.v
-        self._end(x, before, dt)
+        return np.diag(inertia) + beta**2 * self.stiffness(x) + beta * b * damper
 
     def _stage(self, x_hat, v_hat, beta: float, goal, led):
         """Solve M (v - v_hat) = beta f(x_hat + beta v, v) on the free axes by dense Newton."""
         held = self.fixed | led
         free = ~held.reshape(-1)
         damper = self.stiffness(self.x, projected=True)
-        b = np.repeat(self.stiffness_damping, 3, axis=1).reshape(-1, 1)
-        inertia = np.diag(np.repeat(self.mass * (1 + beta * self.mass_damping), 3, axis=1).reshape(-1))
         v = np.where(led, (goal - x_hat) / beta, np.where(held, 0.0, v_hat))
         for _ in range(50):
             x = x_hat + beta * v
             self._residual = self.mass * (v - v_hat) / beta - self.total_force(x, v, damper)
-            A = inertia + beta**2 * self.stiffness(x) + beta * b * damper
+            A = self._system(beta, x, damper)
             step = np.linalg.solve(A[np.ix_(free, free)], -beta * self._residual.reshape(-1)[free])
             v = v.reshape(-1).copy()
             v[free] += step
@@ -310,8 +312,7 @@ class Oracle:
     def _end(self, x, v, dt: float) -> None:
         self.past.append((x, v))
         self.time += dt
-        if hasattr(self, "_residual"):
-            self.reactions = np.where(self._masks(), self._residual, 0.0)
+        self.reactions = np.where(self._masks(), self._residual, 0.0)
 
 
 def _loads(body, mass):

@@ -6,16 +6,17 @@
 * the bunny of examples/ runs where its mesh is there, and says what is missing where it is not.
 """
 
+from pathlib import Path
 from types import ModuleType
 
 import pytest
 
-from taisoft.cli.scene_file import first_line, load_module, shipped_files, shipped_folder
+from taisoft.cli.scene_file import first_line, load_module, shipped_files
 from taisoft.errors import MeshError
 from taisoft.simulator import Simulator
 
 DEMOS = shipped_files("demos")
-BUNNY = shipped_folder("demos").parent / "examples" / "bunny_pull.py"
+BUNNY = Path(__file__).resolve().parents[1] / "examples" / "bunny_pull.py"
 LINE = 100  # characters that `taisoft list` has for a demo's sentence
 
 

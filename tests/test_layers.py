@@ -29,7 +29,7 @@ ORDER = (
     ("linear",),
     ("collision", "contact"),
     ("stepping",),
-    ("simulator", "settings", "running", "static"),
+    ("simulator", "access", "settings", "running", "static"),
     ("output", "view"),
     ("cli",),
     ("__main__",),

@@ -87,7 +87,7 @@ def scene(gravity: bool = False) -> ts.Scene:
 
 
 def label(cells) -> str:
-    """"11x2x2" for the cells (11, 2, 2)."""
+    """11x2x2 for the cells (11, 2, 2)."""
     return "x".join(str(c) for c in cells)
 
 
@@ -96,10 +96,10 @@ def face(axis: int, value: float) -> Callable[[np.ndarray], np.ndarray]:
     return lambda X: np.abs(X[:, axis] - value) < 1e-9 * max(1.0, np.abs(X).max())
 
 
-def nearest(body: Body, point) -> np.ndarray:
-    """Ids of the nodes of a body that lie nearest to a point [m]; all of them where several are equally near."""
-    distance = np.linalg.norm(body.rest_positions - np.asarray(point, float), axis=1)
-    return np.flatnonzero(distance <= distance.min() + 1e-9 * np.ptp(body.rest_positions))
+def nearest(points: np.ndarray, point) -> np.ndarray:
+    """Indices of the points (n,d) nearest to a point (d,) [m]; all of them where several are equally near."""
+    distance = np.linalg.norm(points - np.asarray(point, float), axis=1)
+    return np.flatnonzero(distance <= distance.min() + 1e-9 * np.ptp(points))
 
 
 def deformation_gradients(body: Body, x: np.ndarray) -> np.ndarray:

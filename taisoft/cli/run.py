@@ -15,6 +15,7 @@ from taisoft.cli.settings import RunSettings, resolve
 from taisoft.cli.signals import Signals
 from taisoft.cli.summary import print_plan, print_state, print_summary
 from taisoft.errors import SceneError
+from taisoft.output.files import check_free
 from taisoft.output.progress import Progress
 from taisoft.records import RunReport
 from taisoft.simulator import Simulator
@@ -27,6 +28,8 @@ def command(arguments: Namespace) -> int:
     with Signals() as signals, _told_warnings() as told:
         scene, solver = load_scene(arguments.scene)
         settings = resolve(solver, arguments, Simulator)
+        if arguments.out is not None:
+            check_free(arguments.out, arguments.overwrite)
         with Simulator(scene, **settings.simulator) as sim:
             print_plan(sim)
             has_window = not arguments.headless and _window_is_possible()

@@ -78,6 +78,16 @@ def make_folder(path: str | Path) -> Path:
     return path
 
 
+def check_free(path: str | Path, overwrite: bool) -> dict:
+    """The results that a folder holds already, by name; OutputError when there are any and overwrite is off. Only looks."""
+    found = _results(Path(path)) if Path(path).is_dir() else {}
+    if found and not overwrite:
+        raise OutputError(
+            f"the output folder {path} already holds results ({', '.join(found)}): name another folder or ask to overwrite"
+        )
+    return found
+
+
 class OutputFolder:
     """A run's folder: created or taken over, checked, and locked until `close`.
 
@@ -90,12 +100,7 @@ class OutputFolder:
         self.path = make_folder(path).absolute()  # a later change of the working directory must not move the output
         self._lock: int | None = _lock_folder(self.path)
         try:
-            self._old = _results(self.path)
-            if self._old and not overwrite:
-                raise OutputError(
-                    f"the output folder {path} already holds results ({', '.join(self._old)}): name another folder or "
-                    "ask to overwrite"
-                )
+            self._old = check_free(path, overwrite)
             _clear(self.path)
             _probe(self.path)
         except OSError as error:

@@ -98,6 +98,11 @@ def react(m: ti.template(), s: ti.template(), dt):
         if ti.static(m.loaded):
             f += m.loads[i]
         mass = m.mass[i]
+        if ti.static(m.damped):
+            v = m.v[i]
+            if ti.static(not s.verlet):
+                v = s.held_velocity[k]
+            f -= m.damping[m.node_body[i], 0] * mass * v
         s.reaction[k] = (1.0 - m.free[i]) * (mass * (m.v[i] - s.held_velocity[k]) / dt - f - mass * m.gravity[0])
 
 

@@ -61,7 +61,7 @@ def finish_midpoint(m: ti.template(), h: ti.template()):
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         m.x[i] = 2.0 * m.x[i] - h.x_now[i]
-        m.v[i] = 2.0 * m.v[i] - h.v_now[i]
+        m.v[i] = m.v[i] + m.free[i] * (m.v[i] - h.v_now[i])
 
 
 @kernel
@@ -125,9 +125,14 @@ class ImplicitStepper:
         along = (0.5 if scheme.midpoint else 1.0) if self._past > 1 and not scheme.one_iteration else 0.0
         multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)
         begin_step(m, w, h, multistep, scheme.now, scheme.before, still, along)
-        result = self.solver.solve(
-            1.0, self._beta, self.tolerance, 1 if scheme.one_iteration else MAX_NEWTON, self.linear_tolerance
-        )
+        try:
+            result = self.solver.solve(
+                1.0, self._beta, self.tolerance, 1 if scheme.one_iteration else MAX_NEWTON, self.linear_tolerance
+            )
+        except BaseException:  # Ctrl-C: the step is abandoned
+            restore(m, h)
+            self.forget()
+            raise
         if scheme.midpoint:
             finish_midpoint(m, h)
         if not np.isfinite(result.residual):  # a NaN anywhere in x or v reaches the residual

@@ -119,7 +119,7 @@ class StageSolver:
         begin_stage(self.model, self.work, beta)
         r, scale = self._evaluate(c, beta)
         floor = beta * self.rounding_force
-        limit = floor if c > 0.0 else 0.0
+        limit = floor if c > 0.0 or scale <= floor else 0.0  # statics without any load: nothing to compare with
         newton = linear = 0
         needs_projection, forcing, previous = False, MAX_FORCING, 0.0
         fresh = False
@@ -150,7 +150,7 @@ class StageSolver:
                     break
                 needs_projection, fresh = True, False  # the unprojected direction did not go downhill
         converged = bool(r <= tolerance * scale + limit) or max_newton == 1
-        relative = r / scale if scale != 0.0 else 0.0
+        relative = r / scale if scale > floor or not r <= floor else 0.0
         return StageResult(
             newton, linear, relative, converged and bool(np.isfinite(r)), needs_projection, bool(r <= floor)
         )

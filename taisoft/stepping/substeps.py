@@ -80,7 +80,8 @@ class ExplicitStepper:
     def advance(self, n: int, dt: float) -> SubstepResult:
         """Take n sub-steps of dt, or fewer where led nodes let go or the launch would last too long; at least one.
 
-        A sub-step with a non-finite result raises SimulationError, and the state is the one before it.
+        A sub-step with a non-finite result raises SimulationError, and the state is the one before it; any other
+        exception leaves the state as it was.
         """
         n = min(n, self.max_batch)
         world = self.world
@@ -90,7 +91,11 @@ class ExplicitStepper:
             n = len(targets)
             self._upload_targets(targets)
         x, v = world.model.x.to_numpy(), world.model.v.to_numpy()
-        result = self._launch(n, dt)
+        try:
+            result = self._launch(n, dt)
+        except BaseException:  # Ctrl-C, heard when the launch has ended: the batch is abandoned
+            self._put_back(x, v)
+            raise
         if result.done < n:
             self._put_back(x, v)
             if result.done > 0:  # deterministic on the CPU: the same sub-steps again, up to the last good one

@@ -1,0 +1,129 @@
+"""Every reference problem without contact: measured beside reference, one row a check, pass or fail.
+
+taisoft bench references [--problem NAME] [--arch cpu|cuda] [--out FILE.json]
+
+Computed in f64. The reference values lie beside the repository, in shared/references; without them there is nothing to
+compare with. Rows without a limit only tell how far a mesh or a step is off. Seconds include compiling the kernels; a
+case with several rows shows them in its first. Exit status: 0 all passed, 1 some failed, 2 nothing to compare with.
+"""
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from taisoft.errors import OutputError, TaisoftError
+from taisoft.runtime import open_runtime
+
+from .reference_cases import CASES, PROBLEMS
+from .reference_cases.record import Case, Check
+from .timing import machine, versions
+
+REFERENCES = Path(__file__).resolve().parents[1].parent / "shared" / "references"
+HEADINGS = ("problem", "law", "mesh", "quantity", "measured", "reference", "error", "limit", "", "seconds")
+FORMAT = "{:24} {:11} {:30} {:64} {:>16} {:>16} {:>8} {:>8} {:4} {:>7}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table; verdict: pass, FAIL, or - where there is no limit."""
+
+    problem: str
+    law: str
+    mesh: str
+    quantity: str
+    measured: float
+    reference: float
+    error: float
+    limit: float | None
+    verdict: str
+    seconds: float
+
+    def __str__(self) -> str:
+        limit = "-" if self.limit is None else f"{self.limit:.1e}"
+        seconds = f"{self.seconds:.1f}" if self.seconds else ""
+        numbers = f"{self.measured:.9g}", f"{self.reference:.9g}", f"{self.error:.1e}", limit
+        return FORMAT.format(self.problem, self.law, self.mesh, self.quantity, *numbers, self.verdict, seconds)
+
+
+def run(case: Case, reference: dict, arch: str) -> list[Row]:
+    """The rows of a case; one that could not be computed is a failed row that says why."""
+    start = time.perf_counter()
+    try:
+        checks = list(case.compute(reference, arch))
+    except TaisoftError as error:
+        checks = [Check(f"failed: {error}", math.nan, math.nan, math.nan, 0.0)]
+    seconds = [time.perf_counter() - start] + [0.0] * (len(checks) - 1)
+    return [_row(case, check, s) for check, s in zip(checks, seconds)]
+
+
+def _row(case: Case, check: Check, seconds: float) -> Row:
+    verdict = "FAIL" if not check.passed else "-" if check.limit is None else "pass"
+    return Row(case.problem, case.law, case.mesh, **asdict(check), verdict=verdict, seconds=seconds)
+
+
+def _missing(problems) -> str | None:
+    """Why the problems cannot be compared, or None."""
+    absent = [name for name in problems if not (REFERENCES / f"{name}.json").is_file()]
+    if not REFERENCES.is_dir():
+        return f"the folder of reference values is absent: {REFERENCES}"
+    return f"reference values are absent from {REFERENCES}: {', '.join(absent)}" if absent else None
+
+
+def _rows(problems, arch: str) -> Iterator[Row]:
+    for case in CASES:
+        if case.problem in problems:
+            reference = json.loads((REFERENCES / f"{case.problem}.json").read_text(encoding="utf-8"))
+            yield from run(case, reference, arch)
+
+
+def _write(path: Path, arch: str, rows: list[Row]) -> None:
+    # JSON knows no NaN: a row that could not be computed has null there
+    plain = [{k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(r).items()} for r in rows]
+    content = {
+        "arch": arch, "precision": "f64", "machine": machine(), "versions": versions("taisoft", "taichi", "numpy", "scipy"),
+        "rows": plain,
+    }  # fmt: skip
+    try:
+        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path} could not be written: {error.strerror}") from error
+
+
+def main(argv=None) -> int:
+    """Run the cases and print their table. Raises OutputError, or SimulationError where the arch cannot be had."""
+    parser = argparse.ArgumentParser(prog="taisoft bench references", description=__doc__.partition("\n")[0])
+    parser.add_argument("--problem", choices=PROBLEMS, metavar="NAME", help=f"only this one of {', '.join(PROBLEMS)}")
+    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
+    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write the rows to this file too")
+    options = parser.parse_args(argv)
+    problems = (options.problem,) if options.problem else PROBLEMS
+    missing = _missing(problems)
+    if missing:
+        print(f"taisoft bench references: {missing}", file=sys.stderr)
+        return 2
+    if options.out and not options.out.parent.is_dir():
+        raise OutputError(f"{options.out} cannot be written: its folder does not exist")
+    start, rows = time.perf_counter(), []
+    print(FORMAT.format(*HEADINGS))
+    runtime = open_runtime(options.arch, "f64", "the benchmark of the reference problems")
+    try:
+        for row in _rows(problems, options.arch):
+            rows.append(row)
+            print(row, flush=True)
+    finally:
+        runtime.close()
+    count = {verdict: sum(row.verdict == verdict for row in rows) for verdict in ("pass", "FAIL", "-")}
+    print(f"{count['pass']} checks passed, {count['FAIL']} failed, {count['-']} without a limit; "
+          f"{time.perf_counter() - start:.0f} s on {options.arch} in f64")  # fmt: skip
+    if options.out:
+        _write(options.out, options.arch, rows)
+    return 1 if count["FAIL"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

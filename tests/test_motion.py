@@ -1,0 +1,90 @@
+"""Constraints as the steps see them:
+
+* fixed and led axes are constrained, a released group's are not, a reset takes it up again;
+* targets are the placed rest positions plus the path's displacement, one for all nodes or one for each;
+* targets end before the first release; asked again at that time, they let go and go on;
+* a path that gives anything else is refused with the body's name and the time.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scenes import cube, rubber
+
+import taisoft as ts
+from taisoft.stepping.motion import Motion
+
+
+def made(*paths):
+    """Two cubes; the second, a metre up, is led by the paths (nodes, axes, path) and fixed at node 7 along x, y."""
+    scene = ts.Scene()
+    scene.add_body(cube(), rubber(), name="still").fix([2], axes="z")
+    second = scene.add_body(cube(), rubber(), name="led", position=(0, 1, 0))
+    second.fix([7], axes="xy")
+    for nodes, axes, path in paths:
+        second.move(nodes, path, axes=axes)
+    rest = np.concatenate([body.rest_positions + body.position for body in scene.bodies])
+    layout = SimpleNamespace(rest=rest, node_start=np.array([0, 8, 16]), mass=np.ones(16))
+    return Motion(scene, layout), rest
+
+
+def until(end, way):
+    return lambda t: None if t > end else way(t)
+
+
+def test_masks():
+    motion, _ = made(([0, 1], "xz", lambda t: (t, 0, 0)), ([1, 3], "y", lambda t: (0, t, 0)))
+    expected = np.zeros((16, 3), dtype=bool)
+    expected[2, 2] = expected[15, :2] = True
+    expected[[8, 9], 0] = expected[[8, 9], 2] = expected[[9, 11], 1] = True
+    assert np.array_equal(motion.constrained(), expected)
+    assert list(motion.moved) == [8, 9, 9, 11] and motion.n_moved == 4
+    assert list(motion.held) == [2, 8, 9, 11, 15]
+    assert motion.moved_axes().tolist() == [[1, 0, 1], [1, 0, 1], [0, 1, 0], [0, 1, 0]]
+
+
+def test_vertices_of_no_tet_are_held_but_have_no_reaction():
+    scene = ts.Scene()
+    scene.add_body(cube(), rubber())
+    layout = SimpleNamespace(rest=np.zeros((8, 3)), node_start=np.array([0, 8]), mass=np.r_[0.0, np.ones(7)])
+    motion = Motion(scene, layout)
+    assert motion.constrained()[0].all() and not motion.constrained()[1:].any() and len(motion.held) == 0
+
+
+def test_targets():
+    way = np.array([[1.0, 2, 3], [4, 5, 6]])
+    motion, rest = made(([5, 2], "xyz", lambda t: t * way), ([3], "y", lambda t: (0, -t, 0)))
+    rows, letting_go = motion.targets(np.array([0.5, 2.0]))
+    assert rows.shape == (2, 3, 3) and not letting_go
+    for row, t in zip(rows, (0.5, 2.0)):
+        assert row == pytest.approx(np.concatenate([rest[[13, 10]] + t * way, rest[[11]] + [[0, -t, 0]]]))
+
+
+def test_release():
+    motion, rest = made(
+        ([0, 1], "xyz", until(1.0, lambda t: (t, 0, 0))), ([3], "y", until(2.0, lambda t: (0, t, 0)))
+    )
+    times = np.array([0.5, 1.0, 1.5, 1.75, 2.5])
+    rows, letting_go = motion.targets(times)
+    assert len(rows) == 2 and letting_go and motion.constrained()[8].all()  # not before its time has come
+    rows, letting_go = motion.targets(times[2:])
+    assert len(rows) == 0 and letting_go and not motion.constrained()[[8, 9]].any() and motion.constrained()[11, 1]
+    assert motion.moved_axes().tolist() == [[0, 0, 0], [0, 0, 0], [0, 1, 0]]
+    rows, letting_go = motion.targets(times[2:])
+    assert len(rows) == 2 and letting_go and rows[1, 2] == pytest.approx(rest[11] + [0, 1.75, 0])
+    assert motion.targets(times[4:])[1]
+    rows, letting_go = motion.targets(times[4:])
+    assert len(rows) == 1 and not letting_go
+    motion.reset()
+    assert motion.constrained()[8].all() and len(motion.targets(times)[0]) == 2
+
+
+@pytest.mark.parametrize(
+    "way", [(1, 2), np.zeros((3, 3)), np.zeros((2, 2)), (0, np.nan, 0), np.full((2, 3), np.inf), 1.0]
+)
+def test_what_a_path_may_give(way):
+    motion, _ = made(([0, 1], "xyz", lambda t: (0, 0, 0) if t < 1 else way))
+    motion.targets(np.array([0.5]))
+    with pytest.raises(ts.SimulationError, match=r"body 'led': the path of its moved nodes gave .* at t = 1.5 s"):
+        motion.targets(np.array([1.5]))

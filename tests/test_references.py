@@ -1,0 +1,116 @@
+"""The reference problems, by the cases of `benchmarks/references.py` on their cheap meshes:
+
+* every check with a limit passes, and every case has one;
+* a wrong number, or one that is not a number, fails its check;
+* the benchmark tells in its table, its file and its exit status what failed, what could not be computed and what is absent.
+"""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from benchmarks import references
+from benchmarks.reference_cases import CASES, PROBLEMS
+from benchmarks.reference_cases.record import Check, near, order, small, worst
+from taisoft.errors import OutputError, SimulationError
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if not c.fine], ids=lambda case: case.name)
+def test_reference(case, shared):
+    path = shared / "references" / f"{case.problem}.json"
+    if not path.is_file():
+        pytest.skip(f"{path.name} is absent")
+    checks = list(case.compute(json.loads(path.read_text(encoding="utf-8")), "cpu"))
+    assert any(check.limit is not None for check in checks)
+    assert not [check for check in checks if not check.passed]
+
+
+def test_every_problem_has_a_cheap_case_or_is_told_apart():
+    cheap = {case.problem for case in CASES if not case.fine}
+    assert set(PROBLEMS) - cheap == {"beam_fall_converged"}
+    assert len({case.name for case in CASES}) == len(CASES)
+
+
+def test_checks_tell_right_from_wrong():
+    assert near("a", 1.001, 1.0, 0.01).passed and not near("a", 1.02, 1.0, 0.01).passed
+    assert near("a", 5.0, 0.0, 0.1, scale=100.0).passed
+    assert not small("a", -2.0, 1.0).passed and not small("a", math.nan, 1.0).passed
+    assert not near("a", math.nan, 1.0).passed and near("a", 3.0, 1.0).passed
+    assert order("a", 4.1, 1.0, 2, 0.1).passed and not order("a", 2.0, 1.0, 2, 0.1).passed
+    assert not order("a", 0.0, 0.0, 2, 0.1).passed
+
+
+def test_worst_finds_the_largest_error_and_what_is_no_number():
+    checks = [Check("a", 1, 1, 0.1, 1.0), Check("b", 2, 1, 0.7, 1.0)]
+    assert worst(checks, "what").error == 0.7 and "b" in worst(checks, "what").quantity
+    assert not worst([*checks, Check("c", 0, 1, math.nan, 1.0)], "what").passed
+
+
+@pytest.fixture
+def tables(shared, tmp_path, monkeypatch):
+    """A folder with a copy of the law table, which the benchmark takes for the references."""
+    text = (shared / "references" / "stress_table.json").read_text(encoding="utf-8")
+    monkeypatch.setattr(references, "REFERENCES", tmp_path)
+    (tmp_path / "stress_table.json").write_text(text, encoding="utf-8")
+    return tmp_path
+
+
+def test_benchmark_prints_and_writes_what_it_found(tables, capsys):
+    out = tables / "rows.json"
+    assert references.main(["--problem", "stress_table", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    rows = json.loads(out.read_text(encoding="utf-8"))["rows"]
+    assert printed[0].split()[:4] == ["problem", "law", "mesh", "quantity"]
+    assert len(rows) == len(printed) - 2 == 6 and {row["law"] for row in rows} == {"SNH", "COR", "SVK"}
+    assert all(row["verdict"] == "pass" and row["error"] <= row["limit"] for row in rows)
+    assert printed[-1].startswith("6 checks passed, 0 failed")
+
+
+def test_benchmark_fails_where_a_value_is_off(tables, capsys):
+    path = tables / "stress_table.json"
+    table = json.loads(path.read_text(encoding="utf-8"))
+    table["value"][2]["SVK"]["P"][0][0] *= 1 + 1e-8
+    path.write_text(json.dumps(table), encoding="utf-8")
+    assert references.main(["--problem", "stress_table"]) == 1
+    failed = [line for line in capsys.readouterr().out.splitlines() if " FAIL " in line]
+    assert len(failed) == 1 and "SVK" in failed[0] and "P11" in failed[0]
+
+
+def test_benchmark_says_what_is_absent(tables, capsys, monkeypatch):
+    assert references.main([]) == 2
+    assert "uniaxial_stress" in capsys.readouterr().err
+    monkeypatch.setattr(references, "REFERENCES", tables / "nowhere")
+    assert references.main(["--problem", "stress_table"]) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and told.err.count("\n") == 1 and "absent" in told.err
+
+
+def test_a_case_that_cannot_be_computed_is_a_failed_row(tables):
+    def broken(reference, arch):
+        raise SimulationError("no such luck")
+        yield
+
+    rows = references.run(replace(CASES[0], compute=broken), {}, "cpu")
+    assert [row.verdict for row in rows] == ["FAIL"] and "no such luck" in rows[0].quantity
+    references._write(tables / "rows.json", "cpu", rows)
+    assert json.loads((tables / "rows.json").read_text(encoding="utf-8"))["rows"][0]["measured"] is None
+
+
+def test_a_file_that_cannot_be_written_is_told_before_the_run(tables, capsys):
+    with pytest.raises(OutputError, match="folder does not exist"):
+        references.main(["--problem", "stress_table", "--out", str(tables / "no" / "rows.json")])
+    assert capsys.readouterr().out == ""
+
+
+def test_benchmark_runs_from_the_command_line(shared):
+    root = Path(references.__file__).resolve().parents[1]
+    command = [sys.executable, "-m", "taisoft", "bench", "references", "--problem", "stress_table"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=root, env={**os.environ, "PYTHONPATH": str(root)}, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "6 checks passed, 0 failed" in done.stdout
