@@ -3,7 +3,7 @@
 * demos are found in the folder, so a new one is tested without a line here;
 * the check fails where the material is 1 % stiffer than the demo says, so it would notice wrong physics;
 * a demo says what it is in one line;
-* the bunny of examples/ runs where its mesh is there, and says what is missing where it is not.
+* the bunny of benchmarks/scenes/ runs where its mesh is there, and says what is missing where it is not.
 """
 
 from pathlib import Path
@@ -16,7 +16,7 @@ from taisoft.errors import MeshError
 from taisoft.simulator import Simulator
 
 DEMOS = shipped_files("demos")
-BUNNY = Path(__file__).resolve().parents[1] / "examples" / "bunny_pull.py"
+BUNNY = Path(__file__).resolve().parents[1] / "benchmarks" / "scenes" / "bunny_pull.py"
 LINE = 100  # characters that `taisoft list` has for a demo's sentence
 
 

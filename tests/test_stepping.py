@@ -3,7 +3,8 @@
 * every integrator's positions, velocities and reactions, step by step, in f64; the explicit ones also of three laws;
 * f32 follows to its rounding, and so do the parallel kernels, whose result does not depend on the run;
 * a batch of explicit steps is bitwise so many single steps, and two runs from the start are bitwise alike;
-* loads, weight and reactions make the rate of momentum; a release lets go of the led velocity;
+* loads, weight and reactions make the rate of momentum;
+* the implicit residual is the gradient of the objective that decides how far to go;
 * the integrators' names mean the schemes they should.
 """
 
@@ -164,6 +165,33 @@ def test_parallel_kernels(integrator, monkeypatch):
             with pytest.raises(ts.SimulationError, match=f"step {failed + 1}: "):
                 sim.step()
             assert np.array_equal(sim.positions(), x)
+
+
+def test_the_residual_is_the_gradient_of_the_objective(implicit, monkeypatch):
+    """Of the function that backtracking lowers, inertia, loads and both kinds of damping included."""
+    monkeypatch.setattr(implicit._stepper, "scheme", SCHEMES["implicit_euler"])
+    implicit.reset()
+    implicit.step()
+    model, solver, beta = implicit._world.model, implicit._stepper.solver, implicit._stepper._beta
+    free, x_hat = model.free.to_numpy(), solver.work.x_hat.to_numpy()
+    rng = np.random.default_rng(4)
+    base = model.v.to_numpy() + 5.0 * free * rng.standard_normal(x_hat.shape)
+    way = free * rng.standard_normal(x_hat.shape)
+    fixed_x = model.x.to_numpy()
+
+    def put(v):
+        model.v.from_numpy(v)
+        model.x.from_numpy(np.where(free > 0, x_hat + beta * v, fixed_x))
+
+    values, h = [], 1e-3  # [m/s]
+    for step in (h, -h):
+        put(base + step * way)
+        values.append(solver._objective(1.0, beta))
+    put(base)
+    solver._evaluate(1.0, beta)
+    slope = np.sum(solver.work.residual.to_numpy() * way)
+    assert abs(slope) > 100.0  # [J s/m]
+    assert (values[0] - values[1]) / (2 * h) == pytest.approx(slope, rel=1e-6)
 
 
 def check_momentum(sim, drag_at: int) -> None:

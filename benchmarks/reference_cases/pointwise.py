@@ -116,42 +116,44 @@ def rigid_motion(reference: dict, arch: str):
     return checks
 
 
-def free_fall(laws, integrator: str, reference: dict, arch: str):
+def _fallen(integrator: str, n: int) -> float:
+    """Fall after n steps from rest, in units of g dt^2."""
+    if integrator in ("symplectic_euler", "implicit_euler", "linearly_implicit_euler"):
+        return n * (n + 1) / 2
+    if integrator == "bdf2":  # exact but for its first step, implicit Euler's; that error follows e2 = 4/3 e1 - 1/3 e0
+        return n * n / 2 + 0.75 * (1.0 - 3.0**-n)
+    return n * n / 2
+
+
+def free_fall(law: str, integrator: str, reference: dict, arch: str):
     """Fall of n steps against the discrete formula, and the strain that must not appear."""
     example = reference["value"]["example"]
     dt, n = example["dt"], example["n"]
     s = scene(gravity=True)
-    for law in laws:
-        s.add_body(ts.box_mesh((2, 1, 1), (2, 1, 1)), material(reference, law), name=law)
+    body = s.add_body(ts.box_mesh((2, 1, 1), (2, 1, 1)), material(reference, law))
     tight = {} if integrator in EXPLICIT else {"newton_tolerance": 1e-13, "linear_tolerance": 1e-13}
     with ts.Simulator(s, dt=dt, integrator=integrator, precision="f64", arch=arch, **tight) as sim:
         while sim.step_count < n:
             sim.advance(n - sim.step_count)
-        x = {law: sim.positions(law) for law in laws}
-        elastic = sim.energies().elastic
-    first_order = integrator in ("symplectic_euler", "implicit_euler", "linearly_implicit_euler")
-    fall = -GRAVITY * dt * dt * n * (n + 1) / 2 if first_order else -GRAVITY * (n * dt) ** 2 / 2
-    checks = []
-    for body in s.bodies:
-        way = (x[body.name] - body.rest_positions)[:, 1]
-        strain = np.abs(deformation_gradients(body, x[body.name]) - np.eye(3)).max()
-        checks.append(near(f"{integrator}: {body.name} fall [m]", way[np.argmax(np.abs(way - fall))], fall, 1e-12))
-        checks.append(small(f"{integrator}: {body.name} largest |F - I|", strain, 1e-12))
-    checks.append(small(f"{integrator}: elastic / gravity energy", elastic / (reference["material"]["rho"] * 2 * GRAVITY * -fall), 1e-12))
-    return checks
-
-
-def _free_fall_cases():
-    for integrator in INTEGRATORS:
-        laws = tuple(LAWS) if integrator == "symplectic_euler" else ("SNH",)
-        fine = integrator not in ("symplectic_euler", "bdf2")
-        yield Case("free_fall", "+".join(laws), integrator, partial(free_fall, laws, integrator), fine)
+        x, energies = sim.positions(), sim.energies()
+    fall = -GRAVITY * dt * dt * _fallen(integrator, n)
+    way = (x - body.rest_positions)[:, 1]
+    strain = np.abs(deformation_gradients(body, x) - np.eye(3)).max()
+    return (
+        near("fall [m]", way[np.argmax(np.abs(way - fall))], fall, 1e-12),
+        small("largest |F - I|", strain, 1e-12),
+        small("elastic / gravity energy", energies.elastic / abs(energies.gravity), 1e-12),
+    )
 
 
 CASES = (
     *(Case("stress_table", law, "", partial(stress_table, law)) for law in LAWS),
-    *(Case("uniaxial_stress", law, label((1, 1, 1)), partial(uniaxial_stress, law)) for law in LAWS),
+    *(Case("uniaxial_stress", law, label((1, 1, 1)), partial(uniaxial_stress, law), law != "SNH") for law in LAWS),
     *(Case("patch_test", law, "3x3x3 irregular", partial(patch_test, law)) for law in LAWS),
     Case("rigid_motion", "+".join(LAWS), label((3, 2, 2)), rigid_motion),
-    *_free_fall_cases(),
+    *(
+        Case("free_fall", law, f"2x1x1 {name}", partial(free_fall, law, name), (law, name) != ("SNH", "symplectic_euler"))
+        for name in INTEGRATORS
+        for law in (LAWS if name == "symplectic_euler" else ("SNH",))
+    ),
 )

@@ -167,7 +167,7 @@ _TIP = (("uy of the tip [m]", "uy_tip", _at((2, 0, 0))), ("ux of the tip [m]", "
 PROBLEMS = (
     Problem(
         "hanging_beam_E1e6", hanging_beam, _TIP, ("11x2x2", "22x4x4", "44x8x8"), {"SNH": 3, "COR": 3, "SVK": 2},
-        quick=("SNH", "COR"),
+        quick=("SNH",),
     ),
     Problem(
         "hanging_beam_E2e6", hanging_beam, _TIP, ("11x2x2", "22x4x4", "44x8x8"), {"SNH": 3, "SVK": 2}, quick=("SVK",)
@@ -182,7 +182,7 @@ PROBLEMS = (
     ),
     Problem(
         "cook_membrane_3d", cook_membrane, (("uy of the right face's middle", "uy_mid", _at((48, 52, 0))),),
-        ("8x8x2", "16x16x4", "32x32x8"), {"SVK": 2, "COR": 2, "SNH": 3}, quick=("SNH",),
+        ("8x8x2", "16x16x4", "32x32x8"), {"SVK": 2, "COR": 2, "SNH": 3}, quick=("SVK",),
     ),
     Problem(  # its load is tiny: less than 1e-7 of it lies below the rounding of the stress
         "cantilever_small", cantilever, (("mean uy of the end face [m]", "fe3d", _end_face),),
@@ -239,5 +239,5 @@ def column(law: str, reference: dict, arch: str):
 
 CASES = (
     *(case for problem in PROBLEMS for case in problem.cases()),
-    *(Case("column_self_weight", law, "1x2x1 2x4x2 4x8x4", partial(column, law)) for law in ("SVK", "COR")),
+    *(Case("column_self_weight", law, "1x2x1 2x4x2 4x8x4", partial(column, law), law == "SVK") for law in ("SVK", "COR")),
 )

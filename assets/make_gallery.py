@@ -1,7 +1,8 @@
-"""Draws the README's pictures: `python docs/make_gallery.py` (under a minute) writes docs/*.png, one strip a scene.
+"""Draws the README's pictures: `python assets/make_gallery.py` (under a minute) writes assets/gallery/*.png, one strip a
+scene.
 
 A strip shows a scene at a few moments, from the same place, side by side. The bunny needs its mesh; see
-examples/bunny_pull.py.
+benchmarks/scenes/bunny_pull.py.
 """
 
 from pathlib import Path
@@ -15,7 +16,7 @@ from taisoft.output.frames import png_bytes
 from taisoft.view.camera import Camera
 from taisoft.view.offscreen import Offscreen
 
-DOCS = Path(__file__).resolve().parent
+ASSETS = Path(__file__).resolve().parent
 GAP = 4  # white pixels between two moments
 MAX_BYTES = 200_000  # of a picture; the repository keeps them
 
@@ -24,7 +25,7 @@ STRIPS = {
     "demos/hanging_beam.py": ((0.0, 0.5, 1.0, 1.5, 2.0), (300, 300), ((-0.2, -1.4, 0.0), 11.0, 28.0, 14.0)),
     "demos/midpoint_traction.py": ((0.0, 0.5, 6.0), (504, 160), ((0.0, 0.05, 0.0), 3.2, 12.0, 8.0)),
     "demos/twisting_bar.py": ((0.0, 0.75, 1.5, 4.0), (377, 220), ((0.0, 0.0, 0.0), 6.6, 32.0, 20.0)),
-    "examples/bunny_pull.py": ((0.0, 1.0, 1.1, 1.3, 1.7), (260, 330), ((-0.3, 1.85, 0.0), 9.6, 32.0, 8.0)),
+    "benchmarks/scenes/bunny_pull.py": ((0.0, 1.0, 1.1, 1.3, 1.7), (260, 330), ((-0.3, 1.85, 0.0), 9.6, 32.0, 8.0)),
 }
 
 
@@ -52,14 +53,14 @@ def strip(scene_file: Path, moments: tuple, size: tuple[int, int], view: tuple) 
 
 
 def main() -> None:
-    """Writes docs/<scene>.png for every strip."""
+    """Writes gallery/<scene>.png for every strip."""
     for name, (moments, size, view) in STRIPS.items():
-        data = png_bytes(strip(DOCS.parent / name, moments, size, view))
-        path = DOCS / f"{Path(name).stem}.png"
+        data = png_bytes(strip(ASSETS.parent / name, moments, size, view))
+        path = ASSETS / "gallery" / f"{Path(name).stem}.png"
         if len(data) > MAX_BYTES:
             raise SystemExit(f"{path}: {len(data)} bytes, at most {MAX_BYTES} are meant to be kept")
         write_bytes(path, data)
-        print(f"{path.relative_to(DOCS.parent)}: {len(data) / 1e3:.0f} kB")
+        print(f"{path.relative_to(ASSETS.parent)}: {len(data) / 1e3:.0f} kB")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import taisoft as ts
 
 solver = {"integrator": "bdf2", "dt": 1 / 120, "seconds": 2.0, "fps": 60.0}
 
-BESIDE = Path(__file__).resolve().parents[2] / "shared" / "meshes" / "bunny.msh"
+BESIDE = Path(__file__).resolve().parents[3] / "shared" / "meshes" / "bunny.msh"
 BASE_BELOW, TIPS_ABOVE = -0.25, 2.45  # [m]: heights in the file's coordinates, which run from -0.34 to 2.74
 RISE, RELEASE = 1.4, 1.0  # [m], [s]
 

@@ -1,0 +1,127 @@
+"""Newton's method of the implicit steps, on a beam of ten tets:
+
+* it converges in a few iterations, to the tolerance that was asked for, and the linear one decides how much CG does;
+* a step that stops early returns converged=False and says so; the linearly implicit step is one iteration;
+* wild states (inverted, crushed, flat) are met by projection and backtracking: Phi falls, the step converges;
+* nothing to do needs no iteration, in f32 too, whose rounding is no reason to go on.
+"""
+
+import numpy as np
+import pytest
+from scenes import cube, rubber
+
+import taisoft as ts
+from taisoft.stepping import SCHEMES, implicit
+
+
+def beam(**settings) -> ts.Simulator:
+    scene = ts.Scene()
+    body = scene.add_body(cube(cells=(2, 1, 1)), rubber(), name="beam")
+    body.fix(lambda X: X[:, 0] < -0.49)
+    return ts.Simulator(scene, integrator="implicit_euler", precision="f64", **settings)
+
+
+@pytest.fixture(scope="module")
+def shared_sim():
+    with beam() as made:
+        yield made
+
+
+@pytest.fixture
+def sim(shared_sim, monkeypatch):
+    """The beam at its start, with tolerances that a test may change."""
+    shared_sim.reset()
+    for name in ("tolerance", "linear_tolerance", "scheme"):
+        monkeypatch.setattr(shared_sim._stepper, name, getattr(shared_sim._stepper, name))
+    return shared_sim
+
+
+def stage(sim, dt: float):
+    """The result of one step, with what only the solver tells."""
+    return sim._stepper.step(dt)
+
+
+def test_it_converges_as_newton_does(sim):
+    sim._stepper.tolerance = 1e-12
+    report = sim.step()
+    assert report.converged and report.residual < 1e-12 and 2 <= report.newton_iterations <= 6
+    assert report.linear_iterations >= report.newton_iterations and not report.problems
+
+
+def test_tolerances(sim):
+    counts = []
+    for tolerance in (1e-1, 1e-4, 1e-12):
+        sim.reset()
+        sim._stepper.tolerance = tolerance
+        report = sim.step()
+        assert report.converged and report.residual <= tolerance
+        counts.append(report.newton_iterations)
+    assert counts == sorted(set(counts))
+    sim.reset()
+    sim._stepper.linear_tolerance = 1e-12
+    exact = sim.step()
+    assert exact.newton_iterations < counts[-1] and exact.linear_iterations > 4 * exact.newton_iterations
+
+
+def test_tolerances_are_taken_from_the_simulators_arguments():
+    with beam(newton_tolerance=1e-3, linear_tolerance=1e-2) as sim:
+        assert (sim._stepper.tolerance, sim._stepper.linear_tolerance) == (1e-3, 1e-2)
+    with beam() as sim:
+        assert (sim._stepper.tolerance, sim._stepper.linear_tolerance) == (1e-8, None)
+
+
+def test_stopping_early_is_told(sim, monkeypatch):
+    monkeypatch.setattr(implicit, "MAX_NEWTON", 1)
+    sim._stepper.tolerance = 1e-12
+    report = sim.step()
+    assert not report.converged and report.newton_iterations == 1 and report.residual > 1e-12
+    assert report.problems == [
+        f"step 1: Newton stopped after 1 iterations at a relative residual of {report.residual:.2e}"
+    ]
+    result = sim.run(2 / 60, fps=None)
+    assert result.status == "degraded" and "2 of 2 steps did not converge" in result.problems[-1]
+
+
+def test_linearly_implicit_steps_are_one_iteration(sim):
+    sim._stepper.scheme = SCHEMES["linearly_implicit_euler"]
+    sim.set_state(velocities=np.random.default_rng(0).standard_normal((12, 3)))
+    report = sim.step()
+    assert report.newton_iterations == 1 and report.converged and report.residual > 1e-6
+
+
+@pytest.mark.parametrize("kind", ["crushed", "inside out", "flat", "random"])
+def test_wild_states(sim, kind):
+    rest, rng = sim.positions(), np.random.default_rng(1)
+    x = {
+        "crushed": rest * [0.2, 1.0, 0.3],
+        "inside out": rest * [-1.0, 1.0, 1.0],
+        "flat": rest * [1.0, 0.0, 1.0],
+        "random": rest + 0.7 * rng.standard_normal(rest.shape),
+    }[kind]
+    sim.set_state(positions=np.where(sim._world.motion.constrained(), rest, x))
+    start = sim.energies()
+    projected = 0
+    for _ in range(40):
+        result = stage(sim, 0.02)
+        assert result.converged and result.newton_iterations < 30
+        projected += result.projected
+    assert projected > 0  # there was something to project
+    now = sim.energies()
+    assert now.total < start.total and now.elastic < 0.02 * start.elastic
+    sim._report()
+    assert sim._world.model.scalars[1] > 0.0  # no tet is left inverted
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_nothing_to_do(shared_sim, precision):
+    """At rest and without weight, even where positions and velocities are large."""
+    shared_sim.close()
+    scene = ts.Scene(gravity=(0, 0, 0))
+    scene.add_body(cube(), rubber(young=1e7), position=(300.0, -200.0, 100.0), velocity=(20.0, 3.0, -7.0))
+    with ts.Simulator(scene, integrator="implicit_euler", precision=precision) as sim:
+        start = sim.positions()
+        for _ in range(20):
+            report = sim.step()
+            assert report.converged and report.newton_iterations == 0
+        flown = start + sim.time * np.array([20.0, 3.0, -7.0])
+        assert np.abs(sim.positions() - flown).max() < 1e-5 and report.elastic < 1e-3
