@@ -82,12 +82,16 @@ def _rows(problems, arch: str) -> Iterator[Row]:
 
 
 def _write(path: Path, arch: str, rows: list[Row]) -> None:
-    # JSON knows no NaN: a row that could not be computed has null there
-    plain = [{k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(r).items()} for r in rows]
+    def plain(value):  # JSON knows no NaN: what could not be computed is null there
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
     content = {
-        "arch": arch, "precision": "f64", "machine": machine(), "versions": versions("taisoft", "taichi", "numpy", "scipy"),
-        "rows": plain,
-    }  # fmt: skip
+        "arch": arch,
+        "precision": "f64",
+        "machine": machine(),
+        "versions": versions("taisoft", "taichi", "numpy", "scipy"),
+        "rows": [{key: plain(value) for key, value in asdict(row).items()} for row in rows],
+    }
     try:
         path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     except OSError as error:

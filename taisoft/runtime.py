@@ -120,20 +120,20 @@ class FieldArena:
 
     def field(self, name: str, dtype, shape: tuple[int, ...] | int, data: np.ndarray | None = None):
         """A scalar field, filled from data when given (else zero)."""
-        return self._place(name, ti.field(dtype), dtype, 1, shape, data)
+        return self._place(name, lambda: ti.field(dtype), dtype, 1, shape, data)
 
     def vectors(self, name: str, dtype, shape: int, data: np.ndarray | None = None, n: int = 3):
         """A field of n-vectors, filled from data (shape, n) when given (else zero)."""
-        return self._place(name, ti.Vector.field(n, dtype), dtype, n, shape, data)
+        return self._place(name, lambda: ti.Vector.field(n, dtype), dtype, n, shape, data)
 
-    def _place(self, name, field, dtype, components, shape, data):
+    def _place(self, name, make, dtype, components, shape, data):
         if name in self.bytes:
             raise ValueError(f"field '{name}' is allocated twice")
         shape = (shape,) if isinstance(shape, int) else tuple(shape)
         count = int(np.prod(shape, dtype=np.int64))
         if count * components >= 2**31:
             raise SimulationError(f"field '{name}' needs {count * components} entries, more than 2^31 - 1")
-        builder = ti.FieldsBuilder()
+        field, builder = make(), ti.FieldsBuilder()  # not before: a field that is never placed stops every later kernel
         if shape == ():
             builder.place(field)
         else:

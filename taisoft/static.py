@@ -116,13 +116,15 @@ class _Static:
                     done, share, steps, x = goal, 1.5 * share, steps + 1, self.world.model.x.to_numpy()
                 else:
                     share *= 0.5
+            if done < 1.0:  # the state of the last good share, judged by all of the load
+                result = self._attempt(x, 1.0, self.tolerance, max_newton=0)
         return self._answer(result, steps)
 
     def _good(self, result: StageResult) -> bool:
         measure(self.world.model)
         return result.converged and self.world.model.scalars[2] == 0.0
 
-    def _attempt(self, x: np.ndarray, share: float, tolerance: float) -> StageResult:
+    def _attempt(self, x: np.ndarray, share: float, tolerance: float, max_newton: int = MAX_NEWTON) -> StageResult:
         """Solve with a share of the load, from x."""
         m, w, npr = self.world.model, self.solver.work, self.world.runtime.np_real
         m.gravity.from_numpy((share * self.gravity).astype(npr)[None])
@@ -135,7 +137,7 @@ class _Static:
             rest = self.world.layout.rest[self.world.motion.moved]
             w.targets.from_numpy(rest + share * (self.target - rest))
             w.moved_axes.from_numpy(self.world.motion.moved_axes())
-        result = self.solver.solve(0.0, 1.0, tolerance, MAX_NEWTON, by_energy=True)
+        result = self.solver.solve(0.0, 1.0, tolerance, max_newton, by_energy=True)
         self.newton += result.newton_iterations
         self.linear += result.linear_iterations
         return result

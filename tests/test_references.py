@@ -2,7 +2,7 @@
 
 * every check with a limit passes, and every case has one;
 * a wrong number, or one that is not a number, fails its check;
-* the benchmark tells in its table, its file and its exit status what failed, what could not be computed and what is absent.
+* the benchmark's table, file and exit status tell what failed, what could not be computed and what is absent.
 """
 
 import json
@@ -82,24 +82,25 @@ def test_benchmark_fails_where_a_value_is_off(tables, capsys):
     assert len(failed) == 1 and "SVK" in failed[0] and "P11" in failed[0]
 
 
-def test_benchmark_says_what_is_absent(tables, capsys, monkeypatch):
-    assert references.main([]) == 2
-    assert "uniaxial_stress" in capsys.readouterr().err
-    monkeypatch.setattr(references, "REFERENCES", tables / "nowhere")
-    assert references.main(["--problem", "stress_table"]) == 2
-    told = capsys.readouterr()
-    assert told.out == "" and told.err.count("\n") == 1 and "absent" in told.err
+def test_benchmark_says_what_is_absent(tmp_path, capsys, monkeypatch):
+    (tmp_path / "stress_table.json").write_text("{}", encoding="utf-8")
+    for folder, name in ((tmp_path, "uniaxial_stress"), (tmp_path / "nowhere", "nowhere")):
+        monkeypatch.setattr(references, "REFERENCES", folder)
+        assert references.main([]) == 2
+        told = capsys.readouterr()
+        assert told.out == "" and told.err.count("\n") == 1 and "absent" in told.err
+        assert name in told.err and "stress_table" not in told.err
 
 
-def test_a_case_that_cannot_be_computed_is_a_failed_row(tables):
+def test_a_case_that_cannot_be_computed_is_a_failed_row(tmp_path):
     def broken(reference, arch):
         raise SimulationError("no such luck")
         yield
 
     rows = references.run(replace(CASES[0], compute=broken), {}, "cpu")
     assert [row.verdict for row in rows] == ["FAIL"] and "no such luck" in rows[0].quantity
-    references._write(tables / "rows.json", "cpu", rows)
-    assert json.loads((tables / "rows.json").read_text(encoding="utf-8"))["rows"][0]["measured"] is None
+    references._write(tmp_path / "rows.json", "cpu", rows)
+    assert json.loads((tmp_path / "rows.json").read_text(encoding="utf-8"))["rows"][0]["measured"] is None
 
 
 def test_a_file_that_cannot_be_written_is_told_before_the_run(tables, capsys):
@@ -111,6 +112,7 @@ def test_a_file_that_cannot_be_written_is_told_before_the_run(tables, capsys):
 def test_benchmark_runs_from_the_command_line(shared):
     root = Path(references.__file__).resolve().parents[1]
     command = [sys.executable, "-m", "taisoft", "bench", "references", "--problem", "stress_table"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=root, env={**os.environ, "PYTHONPATH": str(root)}, timeout=120)
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=root, env=environment, timeout=120)
     assert done.returncode == 0, done.stderr
     assert "6 checks passed, 0 failed" in done.stdout

@@ -97,7 +97,7 @@ class Exact:
             yield order("order in dt of the velocity", coarse_v, fine_v, ORDER[integrator], 0.12)
 
     def exact_path(self, law: str, seconds: float, limit: float, reference: dict, arch: str) -> Iterable[Check]:
-        """Verlet with steps so fine (10 us) that its error is below the table's: probe, velocity, energies at all times."""
+        """Verlet with steps of 10 us, whose error is below the table's: probe, velocity, energies at all times."""
         table, s = self.table(reference, law), self.build(reference, law)
         node = nearest(s.bodies[0].rest_positions, self.probe)[0]
         with simulator(s, "velocity_verlet", arch) as sim:
@@ -131,7 +131,8 @@ def _breathing_bar(reference: dict, law: str) -> ts.Scene:
 
 BEAM = Exact(
     "beam_fall_semidiscrete", lambda reference, law: _falling_beam(reference["geometry"]["cells"], reference, law),
-    lambda reference, law: reference["value"][f"{law}_lumped"], (2, 0, 0), 10, {True: 3200, False: 400}, starts_free=False,
+    lambda reference, law: reference["value"][f"{law}_lumped"], (2, 0, 0), 10,
+    {True: 3200, False: 400}, starts_free=False,
 )  # fmt: skip
 BAR = Exact(
     "breathing_bar", _breathing_bar, lambda reference, law: reference["value"], (1, 0.25, 0.25), 20,
@@ -151,7 +152,7 @@ def _spinning_block(reference: dict, law: str) -> ts.Scene:
 
 @dataclass
 class Drift:
-    """Largest departures of a run from the constants, relative: momentum, angular momentum, energy; probe's error [m]."""
+    """Largest relative changes of momentum, angular momentum and energy in a run; largest error of the probe [m]."""
 
     P: float
     L: float
@@ -181,17 +182,19 @@ def spin_block_exact(law: str, reference: dict, arch: str):
     yield small("angular momentum L, relative drift", drift.L, 1e-10)
     yield small("energy, relative drift", drift.energy, 1e-7)
     yield small("largest error of the probe [m]", drift.probe, 1e-7)
-    yield small("elastic energy: largest error / largest value", np.abs(path.elastic - elastic).max() / elastic.max(), 1e-6)
+    error = np.abs(path.elastic - elastic).max() / elastic.max()
+    yield small("elastic energy: largest error / largest value", error, 1e-6)
 
 
-CONSERVES = {"symplectic_euler", "velocity_verlet", "implicit_midpoint"}  # angular momentum, and energy but for a wobble
+CONSERVES = {"symplectic_euler", "velocity_verlet", "implicit_midpoint"}  # L, and the energy but for a wobble
 
 
 def spin_block(integrator: str, reference: dict, arch: str):
     """Order of an integrator's path, and which constants it keeps; what drifts, drifts with the integrator's order."""
     s, expected = _spinning_block(reference, "SNH"), ORDER[integrator]
     steps = 3200 if integrator in EXPLICIT else 800
-    with simulator(s, integrator, arch, linear_tolerance=1e-12) as sim:  # what the linear solve leaves over moves P and L
+    # what a linear solve leaves over would change P and L
+    with simulator(s, integrator, arch, linear_tolerance=1e-12) as sim:
         coarse, fine = (_drift(follow(sim, n, 1.0, 10), s, "SNH", reference) for n in (steps, 2 * steps))
     yield small("momentum P, relative drift", fine.P, 1e-9)
     if integrator in CONSERVES:
@@ -201,7 +204,8 @@ def spin_block(integrator: str, reference: dict, arch: str):
         yield order("order in dt of the drift of L", coarse.L, fine.L, expected, 0.12)
     yield told(f"energy, relative drift, dt = 1/{2 * steps} s", fine.energy)
     # BDF2's dissipation is of third order and mixes with the second-order wobble
-    yield order("order in dt of the energy's drift", coarse.energy, fine.energy, expected, None if integrator == "bdf2" else 0.2)
+    limit = None if integrator == "bdf2" else 0.2
+    yield order("order in dt of the energy's drift", coarse.energy, fine.energy, expected, limit)
     yield order("order in dt of the position", coarse.probe, fine.probe, _path_order(integrator, True), 0.12)
 
 
@@ -237,13 +241,16 @@ def _vertex(y: np.ndarray, spacing: float) -> tuple[float, float]:
     return (k + 1 + shift) * spacing, b - 0.25 * (a - c) * shift
 
 
-QUICK_ORDERS = ("symplectic_euler", "velocity_verlet", "implicit_euler", "bdf2")  # the midpoint's is in the spinning block
+# the tests measure the midpoint rule in the spinning block
+QUICK_ORDERS = ("symplectic_euler", "velocity_verlet", "implicit_euler", "bdf2")
 
 
 def _beam_cases():
     for law, seconds, limit in (("SNH", 2.0, 1e-7), ("COR", 2.0, 1e-7), ("SVK", 0.8, 1e-5)):
         yield Case(BEAM.name, law, "11x2x2 exact path", partial(BEAM.exact_path, law, seconds, limit))
         for name in INTEGRATORS:
+            if law != "SNH" and name == "linearly_implicit_euler":
+                continue  # its one Newton step is implicit Euler's first
             run = partial(BEAM.orders, law, name, min(seconds, 1.0))
             yield Case(BEAM.name, law, f"11x2x2 {name}", run, law != "SNH" or name not in QUICK_ORDERS)
 

@@ -7,7 +7,7 @@ against a value converged in space the error is the mesh's own, and the check ha
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ SAME_MESH = 1e-6  # relative: what the values computed on the same mesh are good
 
 @dataclass(frozen=True)
 class Check:
-    """A measured number beside its reference. error: as the problem defines it, mostly relative; limit None: only told."""
+    """A measured number beside its reference. error: relative unless the quantity says else; limit None: only told."""
 
     quantity: str
     measured: float
@@ -51,7 +51,9 @@ class Case:
         return "-".join(part.replace(" ", "_") for part in (self.problem, self.law, self.mesh) if part)
 
 
-def near(quantity: str, measured: float, reference: float, limit: float | None = None, scale: float | None = None) -> Check:
+def near(
+    quantity: str, measured: float, reference: float, limit: float | None = None, scale: float | None = None
+) -> Check:
     """A check of |measured - reference| over `scale`, by default |reference|."""
     scale = abs(reference) if scale is None else scale
     return Check(quantity, float(measured), float(reference), float(abs(measured - reference) / scale), limit)
@@ -113,4 +115,4 @@ def worst(checks: Iterable[Check], what: str) -> Check:
     """The check with the largest error of several alike, called `what`; one that is not a number counts as largest."""
     checks = list(checks)
     found = max(checks, key=lambda check: math.inf if math.isnan(check.error) else check.error)
-    return Check(f"{what}, worst of {len(checks)}: {found.quantity}", found.measured, found.reference, found.error, found.limit)
+    return replace(found, quantity=f"{what}, worst of {len(checks)}: {found.quantity}")

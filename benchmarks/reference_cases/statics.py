@@ -184,9 +184,9 @@ PROBLEMS = (
         "cook_membrane_3d", cook_membrane, (("uy of the right face's middle", "uy_mid", _at((48, 52, 0))),),
         ("8x8x2", "16x16x4", "32x32x8"), {"SVK": 2, "COR": 2, "SNH": 3}, quick=("SVK",),
     ),
-    Problem(  # its load is tiny: less than 1e-7 of it lies below the rounding of the stress
+    Problem(  # its load is tiny: 1e-7 of it is the rounding of the stress on the finest mesh
         "cantilever_small", cantilever, (("mean uy of the end face [m]", "fe3d", _end_face),),
-        ("20x2x2", "40x4x4", "80x8x8"), {"SVK": 3, "COR": 1, "SNH": 1}, quick=("SVK",), tolerance=1e-7,
+        ("20x2x2", "40x4x4", "80x8x8"), {"SVK": 3, "COR": 1, "SNH": 1}, quick=("SVK",), tolerance=3e-7,
     ),
     Problem(
         "soft_sheet_self_weight", soft_sheet,
@@ -229,7 +229,8 @@ def column(law: str, reference: dict, arch: str):
     value, errors = reference["value"], []
     for body in s.bodies:
         pushed = result.reactions(body.name)[:, 1].sum()
-        top = near(f"uy of the top, {body.name} [m]", _mean_by_area(body, result, face(1, height)), value["uy_top"][law])
+        way = _mean_by_area(body, result, face(1, height))
+        top = near(f"uy of the top, {body.name} [m]", way, value["uy_top"][law])
         errors.append(top.error)
         yield top
         yield near(f"base force, {body.name} [N]", pushed, value["base_force"], 1e-10)
@@ -239,5 +240,6 @@ def column(law: str, reference: dict, arch: str):
 
 CASES = (
     *(case for problem in PROBLEMS for case in problem.cases()),
-    *(Case("column_self_weight", law, "1x2x1 2x4x2 4x8x4", partial(column, law), law == "SVK") for law in ("SVK", "COR")),
+    Case("column_self_weight", "SVK", "1x2x1 2x4x2 4x8x4", partial(column, "SVK"), fine=True),
+    Case("column_self_weight", "COR", "1x2x1 2x4x2 4x8x4", partial(column, "COR")),
 )

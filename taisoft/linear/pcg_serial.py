@@ -10,7 +10,7 @@ Comput. 2(1), 1981. D^-1 holds the inverse of the blocks that could be inverted,
 import taichi as ti
 
 from taisoft.linear.block_csr import diagonal_times, part_times
-from taisoft.linear.pcg import CONVERGED, COUNT, NEGATIVE, RUNNING, RZ, RZ_START, STOP, dot64, inverse_times
+from taisoft.linear.pcg import CONVERGED, COUNT, NEGATIVE, RUNNING, RZ, RZ_START, STEP, STOP, dot64, inverse_times
 from taisoft.runtime import kernel
 
 
@@ -22,10 +22,12 @@ def start(m: ti.template(), A: ti.template(), w: ti.template()):
         below = part_times(m, A, A.row_start[i], A.row_upper[i], w.r)
         s = inverse_times(m, w, i, w.rhs[i] - below)
         t = diagonal_times(m, A, i, s)
-        w.r[i], w.z[i] = s, t
+        w.r[i], w.q[i] = s, t
+        w.z[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
         w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
         rz += dot64(s, t)
-    w.state[RZ], w.state[RZ_START], w.state[COUNT], w.state[STOP] = rz, rz, 0.0, RUNNING
+    w.state[RZ], w.state[RZ_START], w.state[STEP] = rz, rz, 0.0
+    w.state[COUNT], w.state[STOP] = 0.0, RUNNING
 
 
 def iterate(m, A, w, n: int, tolerance: float, begin: bool) -> tuple[int, int]:
@@ -43,7 +45,7 @@ def iterate_kernel(
     for _ in range(1):
         if begin != 0:
             start(m, A, w)
-        rz, stop, k = w.state[RZ], ti.cast(RUNNING, ti.i32), 0
+        rz, along, stop, k = w.state[RZ], w.state[STEP], ti.cast(RUNNING, ti.i32), 0
         limit = tolerance * tolerance * w.state[RZ_START]
         if rz < 0.0:
             stop = NEGATIVE
@@ -52,11 +54,13 @@ def iterate_kernel(
         while k < n and stop == RUNNING:
             for back in range(m.n_nodes):
                 i = m.n_nodes - 1 - back
+                t = w.q[i] + ti.cast(along, m.real) * w.z[i]  # w.q holds D s of the last update
+                w.z[i] = t
                 above = part_times(m, A, A.row_upper[i], A.row_start[i + 1], w.p)
-                w.p[i] = inverse_times(m, w, i, w.z[i] - above)
+                w.p[i] = inverse_times(m, w, i, t - above)
             curvature = ti.cast(0.0, ti.f64)
             for i in range(m.n_nodes):
-                # w.q holds (D + L)^-1 (t - D p) during the sweep, as its lower rows need it
+                # now w.q holds (D + L)^-1 (t - D p), as the rows below need it
                 p, t = w.p[i], w.z[i]
                 below = part_times(m, A, A.row_start[i], A.row_upper[i], w.q)
                 s = inverse_times(m, w, i, t - diagonal_times(m, A, i, p) - below)
@@ -71,16 +75,16 @@ def iterate_kernel(
                     w.y[i] = w.y[i] + step * p
                     s = w.r[i] - step * (p + w.q[i])
                     w.r[i] = s
-                    next_rz += dot64(s, diagonal_times(m, A, i, s))
-                along = ti.cast(next_rz / rz, m.real)
-                for i in range(m.n_nodes):
-                    w.z[i] = diagonal_times(m, A, i, w.r[i]) + along * w.z[i]
+                    t = diagonal_times(m, A, i, s)
+                    w.q[i] = t
+                    next_rz += dot64(s, t)
+                along = next_rz / rz
                 rz = next_rz
                 k += 1
                 if rz < 0.0:
                     stop = NEGATIVE
                 elif rz <= limit:
                     stop = CONVERGED
-        w.state[RZ], w.state[STOP] = rz, stop
+        w.state[RZ], w.state[STEP], w.state[STOP] = rz, along, stop
         w.state[COUNT] = w.state[COUNT] + k
     return ti.Vector([w.state[COUNT], w.state[STOP]])

@@ -1,0 +1,106 @@
+"""The falling beam of exact_path.py in taisoft: its scene, its steps, its tip's path, its memory.
+
+Below model.PARALLEL_FROM tets taisoft steps on one thread of the CPU, and so does MuJoCo: one core against one.
+"""
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.output.report import peak_memory
+from taisoft.scene.scene import Scene
+from taisoft.stability import stable_dt
+
+from .exact_path import DENSITY, GRAVITY, POISSON, SAMPLE, SIZE, YOUNG
+
+LAWS = {"SNH": "stable_neo_hookean", "SVK": "st_venant_kirchhoff", "COR": "corotational"}
+MARGIN = 0.9  # of the largest stable step about the rest shape
+WARM_STEPS = 3  # a multistep integrator has met all its kernels by then
+
+
+@dataclass
+class Stretch:
+    """What some steps did. seconds: wall time without compiling [s]; inverted: the most tets in one report."""
+
+    steps: int = 0
+    seconds: float = 0.0
+    unconverged: int = 0
+    inverted: int = 0
+    newton_iterations: int = 0
+    linear_iterations: int = 0
+
+    def __add__(self, other: "Stretch") -> "Stretch":
+        sums = {k: a + b for (k, a), b in zip(vars(self).items(), vars(other).values())}
+        return Stretch(**sums | {"inverted": max(self.inverted, other.inverted)})
+
+
+def n_tets(cells) -> int:
+    """Number of tets, five a cell."""
+    return 5 * math.prod(cells)
+
+
+def beam_scene(cells, law: str = "SVK") -> Scene:
+    """The beam, clamped at its left end face, straight and at rest. law: one of LAWS."""
+    scene = ts.Scene(gravity=(0.0, -GRAVITY, 0.0))
+    rubber = ts.Material(law=LAWS[law], young=YOUNG, poisson=POISSON, density=DENSITY)
+    beam = scene.add_body(ts.box_mesh(cells, SIZE), rubber, name="beam")
+    beam.fix(lambda X: X[:, 0] < -SIZE[0] / 2 + 1e-9)
+    return scene
+
+
+def steps_within_limit(cells) -> int:
+    """Smallest number of explicit steps in 10 ms whose dt is at most MARGIN of the limit; one limit for all laws."""
+    return math.ceil(SAMPLE / (MARGIN * stable_dt(beam_scene(cells), verlet=True)))
+
+
+def advance(sim: ts.Simulator, steps: int) -> Stretch:
+    """Take `steps` steps in the largest batches that sim.advance takes, as sim.run does between two frames."""
+    stretch = Stretch(steps)
+    compiled, start = sim.compile_seconds, time.perf_counter()
+    done = 0
+    while done < steps:
+        report = sim.advance(steps - done)
+        done += report.steps
+        stretch.unconverged += not report.converged
+        stretch.inverted = max(stretch.inverted, report.n_inverted)
+        stretch.newton_iterations += report.newton_iterations
+        stretch.linear_iterations += report.linear_iterations
+    stretch.seconds = time.perf_counter() - start - (sim.compile_seconds - compiled)
+    return stretch
+
+
+def warm_up(sim: ts.Simulator) -> None:
+    """Compile what steps need, and go back to the start."""
+    for _ in range(WARM_STEPS):
+        sim.step()
+    sim.reset()
+
+
+def follow_tip(sim: ts.Simulator, steps: int, samples: int) -> tuple[np.ndarray, Stretch]:
+    """Path (samples + 1, 3) [m] of the mean of the end face's nodes, every `steps` steps from the start, and the stretch."""
+    sim.reset()
+    tip = np.flatnonzero(sim.scene.body("beam").rest_positions[:, 0] > SIZE[0] / 2 - 1e-9)
+    path, whole = [sim.positions("beam")[tip].mean(axis=0)], Stretch()
+    for _ in range(samples):
+        whole += advance(sim, steps)
+        path.append(sim.positions("beam")[tip].mean(axis=0))
+    return np.array(path), whole
+
+
+def measure_memory(meshes, arch: str, integrators=("velocity_verlet", "bdf2")) -> list[dict]:
+    """Bytes of the fields per tet in f32, by default of an explicit and an implicit simulator, and the peak of the process."""
+    rows = [{"tets": 0, "integrator": "before", "field_bytes": 0, "bytes_per_tet": None, "peak_bytes": peak_memory()}]
+    for cells in meshes:
+        for integrator in integrators:
+            dt = SAMPLE / steps_within_limit(cells)
+            with ts.Simulator(beam_scene(cells), dt=dt, integrator=integrator, precision="f32", arch=arch) as sim:
+                warm_up(sim)
+                total = sum(sim.field_bytes.values())
+            rows.append({
+                "tets": n_tets(cells), "integrator": integrator, "field_bytes": total,
+                "bytes_per_tet": total / n_tets(cells), "peak_bytes": peak_memory(),
+            })  # fmt: skip
+    return rows

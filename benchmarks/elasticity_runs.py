@@ -1,0 +1,159 @@
+"""Whole runs of the falling beam over a second: time and error, taisoft and MuJoCo in turn so that noise hits both.
+
+A round opens, runs and closes each program's each integrator once, so that a slow minute of the machine falls on all;
+ratios are taken round by round. A time is that of a whole run: MuJoCo's steps in pieces of 10 ms, taisoft's through
+sim.advance in the largest batches it takes, without compiling. The first round also follows the tip.
+"""
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from time import perf_counter
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.errors import SimulationError
+from taisoft.stepping import EXPLICIT
+
+from .elasticity_beam import MARGIN, Stretch, advance, beam_scene, follow_tip, n_tets, steps_within_limit, warm_up
+from .exact_path import FOLDING_STARTS, SAMPLE, load_exact
+from .peers.mujoco_flex import STABLE_STEPS, run_mujoco
+from .timing import Timing, summarise
+
+IMPLICIT = ("bdf2", "implicit_midpoint", "implicit_euler", "linearly_implicit_euler")
+TAISOFT, MUJOCO = "taisoft", "MuJoCo"
+ROUND_SECONDS, ROUND_RUNS = 0.3, 10  # a round repeats a run until this wall time or this number is reached
+
+
+@dataclass
+class Row:
+    """One program's integrator at one step size on one mesh. rounds: wall seconds per simulated second of every run."""
+
+    tets: int
+    program: str
+    integrator: str
+    steps: int  # within 10 ms
+    rounds: list[list[float]] = field(default_factory=list)
+    build_seconds: list[float] = field(default_factory=list)  # to a simulator that steps, compiling included
+    compile_seconds: list[float] = field(default_factory=list)
+    error: float | None = None
+    error_unfolded: float | None = None
+    first_run: Stretch | None = None  # taisoft: what the steps did
+    note: str = ""
+    failure: str = ""
+
+    @property
+    def dt(self) -> float:
+        """Step [s]."""
+        return SAMPLE / self.steps
+
+    @property
+    def timing(self) -> Timing | None:
+        """Of a simulated second [s], over all runs of all rounds; None where no run ended."""
+        runs = [seconds for one in self.rounds for seconds in one]
+        return summarise(runs) if runs else None
+
+    def judge(self, cells, path: np.ndarray) -> None:
+        """Errors of the path (k,3) [m], a point every 10 ms."""
+        exact, t = load_exact(cells), np.arange(len(path)) * SAMPLE
+        self.error, self.error_unfolded = exact.error(t, path), exact.error(t, path, until=FOLDING_STARTS)
+
+    def record(self) -> dict:
+        """As plain data."""
+        return asdict(self) | {"dt": self.dt, "seconds_per_simulated_second": self.timing and asdict(self.timing)}
+
+
+def lasting_steps(cells, integrator: str, arch: str, seconds: float) -> tuple[int, str]:
+    """Smallest number of explicit steps in 10 ms, from MARGIN of the limit on, that lasts `seconds`; and what did not.
+
+    The limit is that of small vibrations about the rest shape; the law stiffens where the beam is squeezed.
+    """
+    least, failures = steps_within_limit(cells), []
+    samples = round(seconds / SAMPLE)
+    with ts.Simulator(beam_scene(cells), dt=SAMPLE / least, integrator=integrator, precision="f32", arch=arch) as sim:
+        for steps in range(least, 4 * least):
+            sim.dt = SAMPLE / steps
+            sim.reset()
+            try:
+                advance(sim, steps * samples)
+            except SimulationError:
+                failures.append(f"{1e3 * sim.dt:.3f} ms (at t = {sim.time:.2f} s)")
+                continue
+            told = f"from {MARGIN} of the limit at rest on, dt = {', '.join(failures)} diverged" if failures else ""
+            return steps, told
+    raise SimulationError(f"{integrator} on the mesh {cells}: even dt = {1e3 * sim.dt:.3f} ms does not last {seconds} s")
+
+
+def make_rows(cells, arch: str, peers: bool, seconds: float, implicit=IMPLICIT) -> list[Row]:
+    """The rows of a mesh, in the order of their measurement: each of taisoft beside one of MuJoCo."""
+    verlet, euler = (lasting_steps(cells, name, arch, seconds) for name in reversed(EXPLICIT))
+    stable = STABLE_STEPS[tuple(cells)][0]
+    own = [
+        ("velocity_verlet", *verlet), ("velocity_verlet", 2 * verlet[0], ""), ("symplectic_euler", *euler),
+        *((name, 1, "") for name in implicit),
+    ]  # fmt: skip
+    theirs = [("euler_staggered", stable), ("euler_staggered", 2 * stable), ("euler", stable), ("discrete", 1), ("discrete", 4)]
+    rows = []
+    for k, (integrator, steps, note) in enumerate(own):
+        rows.append(Row(n_tets(cells), TAISOFT, integrator, steps, note=note))
+        if peers and k < len(theirs):
+            rows.append(Row(n_tets(cells), MUJOCO, *theirs[k]))
+    return rows
+
+
+def measure_rows(rows: list[Row], cells, arch: str, rounds: int, seconds: float) -> None:
+    """Fill the rows in `rounds` rounds; a row that diverges says so and is left out of what follows."""
+    for number in range(rounds):
+        for row in rows:
+            if row.failure:
+                continue
+            print(f"{row.tets:,} tets, round {number + 1} of {rounds}: {row.program} {row.integrator}", file=sys.stderr)
+            try:
+                (_taisoft_round if row.program == TAISOFT else _mujoco_round)(row, cells, arch, seconds, number == 0)
+            except SimulationError as error:
+                row.failure = str(error)
+
+
+def _taisoft_round(row: Row, cells, arch: str, seconds: float, first: bool) -> None:
+    scene, samples = beam_scene(cells), round(seconds / SAMPLE)
+    start = perf_counter()
+    with ts.Simulator(scene, dt=row.dt, integrator=row.integrator, precision="f32", arch=arch) as sim:
+        made, compiled = perf_counter() - start, sim.compile_seconds
+        warm_up(sim)
+        if first:
+            path, row.first_run = follow_tip(sim, row.steps, samples)
+            row.judge(cells, path)
+
+        def run() -> float:
+            sim.reset()
+            return advance(sim, row.steps * samples).seconds / seconds
+
+        row.rounds.append(list(_repeat(run)))
+        row.build_seconds.append(made + sim.compile_seconds - compiled)
+        row.compile_seconds.append(sim.compile_seconds)
+
+
+def _mujoco_round(row: Row, cells, arch: str, seconds: float, first: bool) -> None:
+    def run() -> float:
+        result = run_mujoco(cells, row.integrator, row.dt, seconds)
+        row.build_seconds.append(result["compile_seconds"])
+        row.error, row.error_unfolded = result["error"], result["error_unfolded"]
+        return result["seconds_per_simulated_second"]
+
+    row.rounds.append(list(_repeat(run)))
+
+
+def _repeat(run: Callable[[], float]) -> Iterator[float]:
+    """Results of run(), seconds, until their sum or number is enough for a round; at least one."""
+    total, count = 0.0, 0
+    while count == 0 or (total < ROUND_SECONDS and count < ROUND_RUNS):
+        seconds = run()
+        total, count = total + seconds, count + 1
+        yield seconds
+
+
+def time_ratio(slow: Row, fast: Row) -> Timing | None:
+    """Time of `slow` over that of `fast`, from the medians of each round; None where one of them has no run."""
+    pairs = list(zip(slow.rounds, fast.rounds))
+    return summarise(np.median(a) / np.median(b) for a, b in pairs) if pairs else None

@@ -1,0 +1,113 @@
+"""What a scene does not need is not there:
+
+* the plan names each feature, whether it is on and why, with the bodies that ask for it;
+* what is off allocates no field and launches no kernel, counted by name; what is on does;
+* a simulator takes less than 1 kB a tet.
+"""
+
+import pytest
+from scenes import cube, driven_scene, mixed_scene, rubber
+
+import taisoft as ts
+from taisoft import runtime
+from taisoft.scene.plan import make_plan
+from taisoft.stepping import EXPLICIT
+
+LOADS, DAMPING, LED = {"loads"}, {"damping", "node_body"}, {"moved", "moved_axes", "targets", "moved_before"}
+HELD, VERLET, BOTH = {"held", "held_velocity", "reaction"}, {"acceleration"}, {"half_velocity"}
+
+
+def bare() -> ts.Scene:
+    scene = ts.Scene()
+    scene.add_body(cube(), rubber(), name="block")
+    return scene
+
+
+def test_reasons():
+    plan = make_plan(mixed_scene(mass_damping=1.0), explicit=True, multistep=False)
+    entries = {e["feature"]: (e["on"], e["why"]) for e in plan.entries}
+    assert entries == {
+        "law:st_venant_kirchhoff": (True, "used by block, flyer"),
+        "law:corotational": (True, "used by tower"),
+        "law:stable_neo_hookean": (True, "used by beam"),
+        "loads": (True, "tractions or forces on beam, block"),
+        "fixed_nodes": (True, "on beam, block, tower"),
+        "moving_nodes": (False, "no node follows a path"),
+        "mass_damping": (True, "material of beam, tower"),
+        "stiffness_damping": (False, "every stiffness_damping is 0"),
+        "assembled_stiffness": (False, "explicit steps need forces only"),
+        "past_states": (False, "a one-step integrator"),
+        "inversion_handling": (False, entries["inversion_handling"][1]),
+    }
+    assert plan.on["loads"] is True and plan.on["moving_nodes"] is False
+
+
+def test_every_feature_can_be_on_and_off():
+    off = make_plan(bare(), explicit=True, multistep=False).on
+    on = make_plan(driven_scene(mass_damping=1.0, stiffness_damping=1.0), explicit=False, multistep=True).on
+    laws = {name for name in on if name.startswith("law:")}
+    assert {name for name in on if not on[name]} < laws and {name for name in off if off[name]} < laws
+
+
+def test_many_names_are_cut_short():
+    scene = ts.Scene()
+    for _ in range(6):
+        scene.add_body(cube(), rubber())
+    entries = {e["feature"]: e["why"] for e in make_plan(scene, explicit=True, multistep=False).entries}
+    assert entries["law:stable_neo_hookean"] == "used by body0, body1, body2 and 3 more"
+
+
+@pytest.mark.parametrize("integrator", [*EXPLICIT, "implicit_euler", "bdf2"])
+def test_what_is_off_allocates_nothing(integrator):
+    with ts.Simulator(bare(), dt=1e-3, integrator=integrator) as sim:
+        fields = set(sim.field_bytes)
+        assert all(size > 0 for size in sim.field_bytes.values())
+    assert not fields & (LOADS | DAMPING | LED | HELD | BOTH) and not any(f.startswith("damping") for f in fields)
+    assert bool(fields & VERLET) == (integrator == "velocity_verlet")
+    assert any(f.startswith("stiffness") for f in fields) == any(f.startswith("pcg") for f in fields)
+    assert any(f.startswith("stiffness") for f in fields) == (integrator not in EXPLICIT)
+    assert ("x_before" in fields) == (integrator == "bdf2")
+
+
+def test_what_is_on_is_allocated():
+    scene = driven_scene(mass_damping=1.0, stiffness_damping=1e-3)
+    with ts.Simulator(scene, dt=1e-4, integrator="velocity_verlet") as sim:
+        assert LOADS | DAMPING | LED | HELD | VERLET | BOTH <= set(sim.field_bytes)
+
+
+def launched(sim, steps: int) -> dict[str, int]:
+    """kernel -> launches of so many steps."""
+    before = dict(runtime.launches)
+    for _ in range(steps):
+        sim.step()
+    return {k: n - before.get(k, 0) for k, n in runtime.launches.items() if n > before.get(k, 0)}
+
+
+def test_an_explicit_step_is_one_launch():
+    """Beside the report's own."""
+    with ts.Simulator(bare(), dt=1e-3, integrator="symplectic_euler") as sim:
+        assert launched(sim, 3) == {"advance_serial": 3, "measure": 3}
+
+
+def test_an_implicit_step_assembles_what_it_needs():
+    with ts.Simulator(bare(), dt=1e-3, integrator="implicit_euler") as sim:
+        sim.set_gravity((0, 0, 0))
+        still = launched(sim, 2)
+        # at rest there is nothing to solve: a residual says so
+        assert still.keys() == {"begin_step", "begin_stage", "form_residual", "measure"} and set(still.values()) == {2}
+        sim.set_gravity((0, -9.81, 0))
+        sim.set_state(velocities=0.1 * sim.positions())
+        falling = launched(sim, 2)
+        assert falling["assemble"] >= 1 and falling["iterate_kernel"] >= 1
+        # no damping: no second matrix; no negative curvature: no projection; a lower residual: no backtracking
+        assert falling["assemble"] <= falling["form_residual"] and "stage_terms" not in falling
+        assert falling["measure"] == 2 and "finish_midpoint" not in falling and "elastic_forces" not in falling
+
+
+def test_memory():
+    scene = ts.Scene()
+    body = scene.add_body(ts.box_mesh((24, 6, 6), (4, 1, 1)), rubber())
+    body.fix(lambda X: X[:, 0] < -1.99)
+    with ts.Simulator(scene, integrator="implicit_euler", precision="f32") as sim:
+        size = sum(sim.field_bytes.values()) / body.mesh.n_tets
+    assert 300 < size < 1000  # [bytes a tet]

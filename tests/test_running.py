@@ -1,0 +1,246 @@
+"""A run, told by a stand-in whose steps cost nothing, and by two real simulators:
+
+* frames come at fps or after every step, frame 0 first, and the run ends at `seconds` to the nearest step;
+* dt is lowered once, to the next divisor of the frame time, and that is reported; a dt that divides it stays;
+* explicit batches give a report a frame with the extremes of their sub-steps, implicit steps a report each;
+* stop and Ctrl-C end it as interrupted, at the last whole step; a failure ends it as failed; neither raises;
+* status: inverted tets and steps that did not converge make it degraded, and the problems say how many and when.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scenes import cube, rubber
+
+import taisoft as ts
+from taisoft.records import StepReport
+from taisoft.running import run
+
+
+class StandIn:
+    """Counts steps; `events` maps a step to what happens in it: an exception, or fields of its report."""
+
+    def __init__(self, explicit: bool, dt: float = 0.01, events=None, largest_batch: int = 4):
+        self.settings = SimpleNamespace(explicit=explicit)
+        self.dt, self.step_count, self.time, self.compile_seconds = dt, 0, 0.0, 0.0
+        self.events, self.largest_batch = events or {}, largest_batch
+
+    def advance(self, n: int) -> StepReport:
+        n = min(n, self.largest_batch) if self.settings.explicit else 1
+        report = StepReport(time=0.0, steps=0)
+        for _ in range(n):
+            event = self.events.get(self.step_count + 1, {})
+            if isinstance(event, BaseException):
+                raise event
+            self.step_count += 1
+            self.time += self.dt
+            report.steps += 1
+            report.time = self.time
+            report.n_inverted = max(report.n_inverted, event.get("n_inverted", 0))
+            report.min_volume_ratio = min(report.min_volume_ratio, event.get("min_volume_ratio", 1.0))
+            report.converged = event.get("converged", True)
+            report.residual = event.get("residual", 0.0)
+        return report
+
+
+def frames(sim, seconds, fps=60, **arguments):
+    """The run's report, and (index, time, steps of the report) of every frame."""
+    seen = []
+
+    def on_frame(s, index, report):
+        assert s is sim
+        seen.append((index, round(s.time, 9), None if report is None else report.steps))
+
+    return run(sim, seconds, on_frame, fps, **arguments), seen
+
+
+@pytest.mark.parametrize("explicit", [True, False])
+def test_frames_at_fps(explicit):
+    result, seen = frames(StandIn(explicit, dt=0.01), 0.3, fps=10)
+    steps = 10 if explicit else 1  # an explicit frame is one report, an implicit one that of its last step
+    assert seen == [(0, 0.0, None), (1, 0.1, steps), (2, 0.2, steps), (3, 0.3, steps)]
+    assert result.status == "ok" and result.problems == [] and not result.interrupted
+    assert result.steps == 30 and result.sim_seconds == pytest.approx(0.3)
+    assert len(result.step_reports) == (3 if explicit else 30) and result.wall_seconds >= 0.0
+
+
+@pytest.mark.parametrize("explicit", [True, False])
+def test_a_frame_a_step(explicit):
+    sim = StandIn(explicit, dt=0.03)
+    result, seen = frames(sim, 0.1, fps=None)
+    assert sim.dt == 0.03 and [time for _, time, _ in seen] == [0.0, 0.03, 0.06, 0.09]
+    assert result.steps == 3 and len(result.step_reports) == 3 and result.problems == []
+
+
+@pytest.mark.parametrize("seconds, steps", [(0.104, 10), (0.106, 11), (0.001, 1)])
+def test_the_end_is_the_nearest_step(seconds, steps):
+    result, seen = frames(StandIn(True, dt=0.01), seconds, fps=20)
+    assert result.steps == steps and seen[-1][1] == pytest.approx(steps * 0.01)
+
+
+@pytest.mark.parametrize(
+    "dt, lowered, per_frame", [(0.03, 1 / 60, 1), (0.01, 1 / 120, 2), (1 / 60, 1 / 60, 1), (1 / 180, 1 / 180, 3)]
+)
+def test_dt_is_lowered_to_a_divisor_of_the_frame(dt, lowered, per_frame):
+    sim = StandIn(True, dt=dt)
+    result, seen = frames(sim, 0.1)
+    assert sim.dt == pytest.approx(lowered, rel=1e-12) and (sim.dt == dt) == (dt == lowered)
+    assert [steps for *_, steps in seen[1:]] == [per_frame] * 6
+    expected = [] if dt == lowered else [f"note: dt lowered from {dt:g} s to {lowered:.6g} s, so that "]
+    assert len(result.problems) == len(expected) and result.status == "ok"
+    assert all(problem.startswith(words) for problem, words in zip(result.problems, expected))
+
+
+def test_a_second_run_goes_on():
+    sim = StandIn(True, dt=0.01)
+    frames(sim, 0.2, fps=10)
+    result, seen = frames(sim, 0.1, fps=10)
+    assert seen == [(0, 0.2, None), (1, 0.3, 10)] and result.steps == 10 and result.sim_seconds == pytest.approx(0.1)
+
+
+def test_batches_are_merged():
+    """Ten sub-steps in batches of four: the extremes of the first batch are in the frame's report."""
+    events = {2: {"n_inverted": 3, "min_volume_ratio": -0.5}, 6: {"n_inverted": 1, "min_volume_ratio": 0.1}}
+    result, _ = frames(StandIn(True, events=events), 0.2, fps=10)
+    first, second = result.step_reports
+    assert (first.steps, first.n_inverted, first.min_volume_ratio) == (10, 3, -0.5)
+    assert (second.steps, second.n_inverted, second.min_volume_ratio) == (10, 0, 1.0)
+    assert first.time == pytest.approx(0.1)
+    assert result.status == "degraded"
+    assert result.problems == ["tets were inverted in 1 reported steps; at most 3, at t = 0.1 s"]
+
+
+def test_steps_that_did_not_converge():
+    events = {3: {"converged": False, "residual": 1e-3}, 5: {"converged": False, "residual": 2e-2}}
+    result, _ = frames(StandIn(False, events=events), 0.1, fps=None)
+    assert result.status == "degraded"
+    assert result.problems == [
+        "2 of 10 steps did not converge; the worst, at t = 0.05 s, to a relative residual of 2.00e-02"
+    ]
+
+
+@pytest.mark.parametrize("explicit", [True, False])
+def test_stop(explicit):
+    sim = StandIn(explicit)
+    result, seen = frames(sim, 1.0, fps=10, stop=lambda: sim.step_count >= 23)
+    assert (result.status, result.interrupted) == ("degraded", True)
+    assert 23 <= result.steps < 28 and [index for index, *_ in seen] == [0, 1, 2]
+    assert result.problems == ["the run was interrupted before its end"]
+    assert sum(report.steps for report in result.step_reports) == result.steps
+
+
+def test_stop_before_the_first_step():
+    result, seen = frames(StandIn(True), 1.0, stop=lambda: True)
+    assert result.interrupted and result.steps == 0 and result.step_reports == [] and len(seen) == 1
+
+
+@pytest.mark.parametrize("where", ["step", "frame"])
+def test_ctrl_c(where):
+    sim = StandIn(False, events={8: KeyboardInterrupt()} if where == "step" else {})
+
+    def on_frame(s, index, report):
+        if where == "frame" and s.step_count == 7:
+            raise KeyboardInterrupt
+
+    result = run(sim, 1.0, on_frame, None)
+    assert (result.status, result.interrupted, result.steps) == ("degraded", True, 7)
+    assert len(result.step_reports) == 7
+
+
+@pytest.mark.parametrize("explicit", [True, False])
+def test_failure(explicit):
+    sim = StandIn(explicit, events={8: ts.SimulationError("step 8: body 'beam', vertex 3: gone")}, largest_batch=1)
+    result, seen = frames(sim, 1.0, fps=20)
+    assert result.status == "failed" and result.problems == ["step 8: body 'beam', vertex 3: gone"]
+    assert result.steps == 7 and [index for index, *_ in seen] == [0, 1]
+
+
+def test_other_errors_are_not_swallowed():
+    """An observer that cannot write is no failure of the run."""
+
+    def on_frame(s, index, report):
+        if index == 1:
+            raise ts.OutputError("the disk is full")
+
+    with pytest.raises(ts.OutputError, match="the disk is full"):
+        run(StandIn(True), 1.0, on_frame, 10)
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        ((0.0,), "seconds = 0.0: it must be a finite number above 0"),
+        ((-1,), "seconds = -1"),
+        ((np.inf,), "seconds = inf"),
+        (("1",), "seconds = '1'"),
+        ((1.0, None, 0), "fps = 0: it must be a finite number above 0"),
+        ((1.0, None, np.nan), "fps = nan"),
+    ],
+)
+def test_bad_arguments(arguments, words):
+    sim = StandIn(True)
+    with pytest.raises(ts.SimulationError, match=words):
+        run(sim, *arguments)
+    assert sim.step_count == 0
+
+
+@pytest.fixture(scope="module", params=["symplectic_euler", "implicit_euler"])
+def block(request):
+    scene = ts.Scene()
+    scene.add_body(cube(), rubber(), name="block", velocity=(1.0, 0.0, 0.0)).fix([0, 1, 2])
+    with ts.Simulator(scene, 0.004, request.param, precision="f64") as sim:
+        yield sim
+
+
+def test_a_real_run(block):
+    block.reset()
+    block.dt = 0.004
+    result, seen = frames(block, 0.1, fps=20)
+    assert result.status == "ok" and block.dt == pytest.approx(0.05 / 13) and result.steps == 26
+    assert seen[-1][0] == 2 and block.time == pytest.approx(0.1)
+    x = block.positions()
+    block.reset()
+    for _ in range(26):
+        block.step()
+    assert np.array_equal(block.positions(), x)
+
+
+def test_a_real_failure(block):
+    block.reset()
+    block.dt = 0.004
+    block.set_gravity((0.0, 1e36 if block.settings.explicit else 1e200, 0.0))  # [m/s^2]
+    try:
+        result = block.run(0.4, fps=None)
+    finally:
+        block.set_gravity((0.0, -9.81, 0.0))
+    assert result.status == "failed"
+    assert f"step {result.steps + 1}: body 'block', vertex" in result.problems[0]
+    assert np.isfinite(block.positions()).all() and np.isfinite(block.velocities()).all()
+    assert result.sim_seconds == pytest.approx(0.004 * result.steps) and block.step_count == result.steps
+
+
+def test_real_ctrl_c(block, monkeypatch):
+    """In the middle of a step: the step is abandoned, and the next one starts from the last good state."""
+    block.reset()
+    block.dt = 0.004
+    block.advance(1)
+    before = block.positions(), block.velocities()
+    worker, name = (block._stepper, "_launch") if block.settings.explicit else (block._stepper.solver, "_advance")
+    working = getattr(worker, name)
+
+    def interrupted(*arguments):
+        working(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(worker, name, interrupted)
+    result = block.run(0.4, fps=None)
+    assert (result.status, result.interrupted, result.steps, block.step_count) == ("degraded", True, 0, 1)
+    assert np.array_equal(block.positions(), before[0]) and np.array_equal(block.velocities(), before[1])
+    monkeypatch.undo()
+    block.step()
+    after = block.positions()
+    block.reset()
+    for _ in range(2):
+        block.step()
+    assert np.abs(after - block.positions()).max() < 1e-9  # [m]

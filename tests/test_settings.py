@@ -1,0 +1,56 @@
+"""Every argument of a Simulator is checked before anything is opened: one sentence that names the argument and the rule."""
+
+import numpy as np
+import pytest
+from scenes import cube, rubber
+
+import taisoft as ts
+from taisoft import runtime
+from taisoft.settings import check_dt
+
+
+def scene() -> ts.Scene:
+    made = ts.Scene()
+    made.add_body(cube(), rubber(), name="block")
+    return made
+
+
+@pytest.mark.parametrize(
+    "settings, words",
+    [
+        ({"dt": 0}, r"^dt = 0: it must be a finite number of seconds above 0$"),
+        ({"dt": -0.01}, "dt = -0.01"),
+        ({"dt": np.nan}, "dt = nan"),
+        ({"dt": np.inf}, "dt = inf"),
+        ({"dt": "0.01"}, "dt = '0.01'"),
+        ({"dt": True}, "dt = True"),
+        ({"integrator": "simplectic_euler"}, "integrator 'simplectic_euler' is unknown .*did you mean 'symplectic_euler'"),
+        ({"integrator": None}, "integrator None is unknown: it must be one of symplectic_euler, "),
+        ({"precision": "f16"}, "precision 'f16' is unknown: it must be 'f32' or 'f64'"),
+        ({"arch": "gpu"}, "arch 'gpu' is unknown: it must be 'cpu' or 'cuda'"),
+        ({"newton_tolerance": 0}, "newton_tolerance = 0: it must lie between 0 and 1"),
+        ({"newton_tolerance": 2.0}, "newton_tolerance = 2.0"),
+        ({"linear_tolerance": -1e-3}, "linear_tolerance = -0.001"),
+        ({"linear_tolerance": np.nan}, "linear_tolerance = nan"),
+        ({"linear_tolerance": True}, "linear_tolerance = True"),
+        ({"allow_unstable": 1}, "allow_unstable = 1: it must be True or False"),
+        ({"contact_solver": "gauss_seidel"}, "contact_solver = 'gauss_seidel': this version models no contact"),
+        ({"self_collision": True}, "self_collision must be False: this version models no contact"),
+        ({"contact_tolerance": 1e-3}, "contact_tolerance must be None: this version models no contact"),
+    ],
+)
+def test_bad_settings(settings, words):
+    with pytest.raises(ts.SimulationError, match=words):
+        ts.Simulator(scene(), **settings)
+    assert runtime.open_kind() is None
+
+
+@pytest.mark.parametrize("what, words", [(ts.Scene(), "the scene holds no body"), ("beam.py", "scene must be a Scene, not str")])
+def test_bad_scenes(what, words):
+    with pytest.raises(ts.SceneError, match=words):
+        ts.Simulator(what)
+    assert runtime.open_kind() is None
+
+
+def test_dt_becomes_a_float():
+    assert type(check_dt(1)) is float and check_dt(np.float64(0.25)) == 0.25

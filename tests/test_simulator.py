@@ -1,0 +1,321 @@
+"""A simulator as its user sees it, explicit and implicit:
+
+* state is given as copies, in the order of the bodies, and taken only where it is right; reports and stresses are the
+  oracle's; a reset and a second simulator repeat every bit;
+* gravity, dt and material numbers take effect at once and compile nothing;
+* a step that fails names body and vertex and leaves the last good state, from which it can go on;
+* a closed simulator says so, and so does one that is asked for a body it does not have;
+* turning, shifting and enlarging a scene does the same to its result, and the order of the bodies does not matter.
+"""
+
+import numpy as np
+import oracle as exact
+import pytest
+from oracle import Oracle
+from scenes import SNH, SVK, cube, rubber
+
+import taisoft as ts
+
+DT = 0.002  # [s]
+INTEGRATORS = ("symplectic_euler", "implicit_euler")
+
+
+def pair(**numbers) -> ts.Scene:
+    """Two bodies of another law each; the first is fixed at one end, the second flies. Damping is there to be changed."""
+    scene = ts.Scene()
+    beam = scene.add_body(cube(cells=(2, 1, 1)), rubber(SNH, mass_damping=0.5, **numbers), name="beam", position=(1, 2, 0))
+    beam.fix(lambda X: X[:, 0] < -0.49)
+    spin = np.random.default_rng(4).standard_normal((8, 3))
+    scene.add_body(cube((4, 0, 0)), rubber(SVK, density=1200.0), name="flyer", velocity=spin)
+    return scene
+
+
+def test_what_f32_cannot_hold_is_refused():
+    with ts.Simulator(pair(), DT, "symplectic_euler", precision="f32") as sim:
+        v = np.zeros((20, 3))
+        v[17, 1] = 1e39
+        with pytest.raises(ts.SceneError, match="velocities: vertex 17 is not finite or too large for f32"):
+            sim.set_state(velocities=v)
+
+
+@pytest.fixture(scope="module", params=INTEGRATORS)
+def shared_sim(request):
+    tolerances = {} if request.param == "symplectic_euler" else {"newton_tolerance": 1e-12, "linear_tolerance": 1e-12}
+    with ts.Simulator(pair(), DT, request.param, precision="f64", **tolerances) as made:
+        made.advance(3)
+        yield made
+
+
+once = pytest.mark.parametrize("shared_sim", INTEGRATORS[:1], indirect=True)  # where the integrator plays no part
+
+
+@pytest.fixture
+def sim(shared_sim):
+    """At the start, and at the start again afterwards, whatever a test has changed."""
+
+    def restore():
+        shared_sim.set_gravity((0.0, -9.81, 0.0))
+        shared_sim.set_material("beam", young=1e5, poisson=0.3, density=1000.0, mass_damping=0.5)
+        shared_sim.dt = DT
+        shared_sim.reset()
+
+    restore()
+    yield shared_sim
+    restore()
+
+
+def stepped(sim, oracle, steps: int = 3, dt: float = DT) -> None:
+    """Step both and compare."""
+    for _ in range(steps):
+        sim.step()
+        getattr(oracle, sim.settings.integrator)(dt)
+    assert np.abs(sim.positions() - oracle.x).max() < 1e-11  # [m]
+    assert np.abs(sim.velocities() - oracle.v).max() < 1e-9  # [m/s]
+
+
+def test_the_start(sim):
+    oracle = Oracle(sim.scene)
+    assert (sim.time, sim.step_count, sim.dt) == (0.0, 0, DT)
+    assert np.array_equal(sim.positions(), oracle.rest) and np.array_equal(sim.velocities(), oracle.v)
+    assert np.array_equal(sim.positions("flyer"), oracle.rest[12:]) and sim.positions("beam").shape == (12, 3)
+    assert np.array_equal(sim.velocities("flyer"), oracle.v[12:]) and sim.velocities().dtype == np.float64
+    energies = sim.energies()
+    assert energies.elastic == pytest.approx(0.0, abs=1e-9)
+    assert energies.kinetic == pytest.approx(np.sum(oracle.mass * oracle.v**2) / 2)
+    assert energies.gravity == pytest.approx(9.81 * np.sum(oracle.mass[:, 0] * oracle.rest[:, 1]))
+    assert not sim.reactions().any() or sim.settings.explicit
+
+
+@once
+def test_state_is_given_as_copies(sim):
+    x, v = sim.positions(), sim.velocities("flyer")
+    x += 1.0
+    v += 1.0
+    assert np.abs(sim.positions() - x).min() > 0.9 and np.abs(sim.velocities("flyer") - v).min() > 0.9
+
+
+def test_set_state(sim):
+    before, rng = sim.positions(), np.random.default_rng(0)
+    x, v = before[12:] + 0.01, rng.standard_normal((20, 3))
+    sim.set_state(positions=x, body="flyer")
+    assert np.array_equal(sim.positions("flyer"), x) and np.array_equal(sim.positions("beam"), before[:12])
+    sim.set_state(velocities=v)
+    fixed = sim._world.motion.constrained()
+    assert fixed.sum() == 12 and np.array_equal(sim.velocities(), np.where(fixed, 0.0, v))
+    oracle = Oracle(sim.scene)
+    oracle.x, oracle.v = sim.positions(), sim.velocities()
+    stepped(sim, oracle)
+
+
+@once
+@pytest.mark.parametrize(
+    "state, words",
+    [
+        ({"positions": np.zeros((12, 3)), "body": "flyer"}, r"positions have shape \(12, 3\) .*: they must be \(8, 3\) numbers"),
+        ({"positions": np.zeros(60)}, r"positions have shape \(60,\)"),
+        ({"velocities": [["a"] * 3] * 20}, "velocities have shape .* type <U1: they must be"),
+        ({"positions": np.zeros((20, 3)), "velocities": np.eye(20, 3) * np.nan}, "velocities: vertex 0 is not finite"),
+        ({"positions": np.r_[np.zeros((7, 3)), [[0, np.inf, 0]]], "body": "flyer"}, "positions: vertex 7 is not finite"),
+        ({"positions": np.zeros((20, 3)), "body": "flier"}, r"no body 'flier'; it has \['beam', 'flyer'\]"),
+    ],
+)
+def test_states_that_are_refused(sim, state, words):
+    x, v = sim.positions(), sim.velocities()
+    with pytest.raises(ts.SceneError, match=words):
+        sim.set_state(**state)
+    assert np.array_equal(sim.positions(), x) and np.array_equal(sim.velocities(), v)
+
+
+def test_reports(sim):
+    x = sim.positions()
+    x[12:] = x[12:] * [-0.9, 1.0, 1.0]  # the flyer inside out
+    sim.set_state(positions=x)
+    report = sim.step()
+    oracle = Oracle(sim.scene)
+    J = np.concatenate([np.linalg.det(oracle.gradients(sim.positions(), part)) for part in oracle.parts])
+    J_start = np.concatenate([np.linalg.det(oracle.gradients(x, part)) for part in oracle.parts])
+    assert report.time == sim.time == pytest.approx(DT) and report.steps == sim.step_count == 1
+    # an explicit step knows the state that it started from too
+    lowest = min(J.min(), J_start.min()) if sim.settings.explicit else J.min()
+    assert report.min_volume_ratio == pytest.approx(lowest) and report.n_inverted == 5
+    assert report.problems == ["step 1: 5 tets are inverted"]
+    assert report.elastic == pytest.approx(oracle.energy(sim.positions()))
+    assert report.kinetic == pytest.approx(np.sum(oracle.mass * sim.velocities() ** 2) / 2)
+    assert report.gravity == pytest.approx(-np.sum(oracle.mass * sim.positions() * oracle.gravity))
+    energies = sim.energies()
+    assert energies.total == pytest.approx(report.elastic + report.kinetic + report.gravity)
+
+
+@once
+def test_a_batch_reports_the_extremes(sim):
+    x = sim.positions()
+    x[12:] = x[12:] * [0.5, 1.0, 1.0]
+    sim.set_state(positions=x)
+    single = [sim.step().min_volume_ratio for _ in range(60)]
+    sim.reset()
+    sim.set_state(positions=x)
+    report = sim.advance(60)
+    assert report.steps == 60 and report.min_volume_ratio == min(single) < single[-1] - 0.1
+
+
+@once
+def test_stress(sim):
+    rng = np.random.default_rng(1)
+    x = sim.positions() + 0.05 * rng.standard_normal((20, 3))
+    sim.set_state(positions=x)
+    oracle = Oracle(sim.scene)
+    for part, name in zip(oracle.parts, ("beam", "flyer")):
+        F, m = oracle.gradients(x, part), part[3]
+        P = exact.pk1(m.law, F, m.young, m.poisson)
+        sigma = P @ exact.transposed(F) / np.linalg.det(F)[:, None, None]
+        assert np.abs(sim.stress(name) - sigma).max() < 1e-11 * np.abs(sigma).max()
+        assert np.abs(sim.stress(name) - exact.transposed(sim.stress(name))).max() < 1e-11 * np.abs(sigma).max()
+
+
+@once
+def test_force_differential(sim):
+    rng = np.random.default_rng(1)
+    x, way = sim.positions() + 0.05 * rng.standard_normal((20, 3)), rng.standard_normal((20, 3))
+    sim.set_state(positions=x)
+    expected = -(Oracle(sim.scene).stiffness(x) @ way.reshape(-1)).reshape(-1, 3)
+    assert np.abs(sim.force_differential(way) - expected).max() < 1e-11 * np.abs(expected).max()
+    with pytest.raises(ts.SceneError, match="displacement have shape"):
+        sim.force_differential(way[:5])
+
+
+def test_repetition_is_bitwise(sim):
+    def run():
+        sim.reset()
+        for _ in range(5):
+            sim.step()
+        return sim.positions(), sim.velocities(), sim.reactions()
+
+    assert all(np.array_equal(a, b) for a, b in zip(run(), run()))
+
+
+@pytest.mark.parametrize("change", ["gravity", "dt", "young", "poisson", "density", "mass_damping"])
+def test_changes_take_effect_without_compiling(sim, change):
+    """Compared with an oracle whose scene has the new number from the start."""
+    for _ in range(2):
+        sim.step()
+    unchanged = sim.positions() + sim.velocities() * DT
+    compiled, numbers, dt = sim.compile_seconds, {}, DT
+    if change == "gravity":
+        sim.set_gravity((5.0, 0.0, -20.0))
+    elif change == "dt":
+        sim.dt = dt = 0.6 * DT
+    else:
+        numbers = {change: {"young": 2e5, "poisson": 0.1, "density": 1500.0, "mass_damping": 40.0}[change]}
+        sim.set_material("beam", **numbers)
+        assert getattr(sim.scene.body("beam").material, change) == numbers[change]
+    oracle = Oracle(sim.scene)  # whose record has the new numbers
+    oracle.x, oracle.v = sim.positions(), sim.velocities()
+    stepped(sim, oracle, 3, dt)
+    assert sim.compile_seconds == compiled and sim.time == pytest.approx(2 * DT + 3 * dt)
+    assert np.abs(sim.positions() - unchanged).max() > 1e-4
+
+
+@once
+def test_changes_that_are_refused(sim):
+    for bad, words in ((0.0, "dt = 0.0"), (np.nan, "dt = nan")):
+        with pytest.raises(ts.SimulationError, match=words):
+            sim.dt = bad
+    with pytest.raises(ts.SceneError, match="gravity must have shape"):
+        sim.set_gravity((0, 1))
+    with pytest.raises(ts.SceneError, match="body 'flyer': stiffness_damping was 0 everywhere"):
+        sim.set_material("flyer", stiffness_damping=0.1)
+    with pytest.raises(ts.SceneError, match="no body 'wing'"):
+        sim.set_material("wing", young=1.0)
+    stepped(sim, Oracle(pair()))
+
+
+def test_a_failing_step(sim):
+    sim.advance(1)
+    x, v = sim.positions(), sim.velocities()
+    wild = v.copy()
+    wild[15] = 1e200  # vertex 3 of the flyer
+    sim.set_state(velocities=wild)
+    named = "body 'flyer', vertex 3" if sim.settings.explicit else "body '"
+    with pytest.raises(ts.SimulationError, match=f"^step 2: {named}.* no longer finite"):
+        sim.step()
+    assert sim.step_count == 1 and sim.time == pytest.approx(DT)
+    assert np.array_equal(sim.positions(), x) and np.array_equal(sim.velocities(), wild)
+    sim.set_state(velocities=v)
+    oracle = Oracle(sim.scene)
+    oracle.x, oracle.v = x, v
+    stepped(sim, oracle)
+
+
+def test_a_closed_simulator():
+    sim = ts.Simulator(pair(), DT, "symplectic_euler", precision="f64")
+    sim.close()
+    sim.close()
+    calls = (
+        sim.step, sim.reset, sim.positions, sim.velocities, sim.energies, sim.reactions, lambda: sim.advance(3),
+        lambda: sim.run(1.0), lambda: sim.stress("beam"), lambda: sim.set_state(velocities=np.zeros((20, 3))),
+        lambda: sim.set_gravity((0, 0, 0)), lambda: sim.set_material("beam", young=1e4), lambda: sim.time,
+        lambda: sim.step_count, lambda: sim.force_differential(np.zeros((20, 3))), lambda: setattr(sim, "dt", 1e-4),
+    )  # fmt: skip
+    for call in calls:
+        with pytest.raises(ts.SimulationError, match="^the simulator is closed$"):
+            call()
+
+
+def flown(scene, dt: float = DT, order=("beam", "flyer")) -> np.ndarray:
+    """(20, 6) positions and velocities of the bodies after 30 explicit steps."""
+    with ts.Simulator(scene, dt, "symplectic_euler", precision="f64") as sim:
+        sim.advance(30)
+        return np.concatenate([np.c_[sim.positions(name), sim.velocities(name)] for name in order])
+
+
+def copied(vertices=lambda X: X, vectors=lambda u: u, reverse: bool = False) -> ts.Scene:
+    """A loaded pair with other vertices, and other vectors for velocities, loads and gravity."""
+    source, scene = pair(), ts.Scene(gravity=vectors(np.array([0.0, -9.81, 0.0])))
+    for body in source.bodies[:: -1 if reverse else 1]:
+        mesh = ts.TetMesh(vertices(body.mesh.vertices + body.position), body.mesh.tets)
+        material = rubber(SNH, density=body.material.density)  # one law, and no damping, which would set a time
+        made = scene.add_body(mesh, material, name=body.name, velocity=vectors(body.velocity))
+        if body.name == "beam":
+            made.fix([0, 1, 2, 3])
+            end = body.mesh.vertices[body.mesh.surface].mean(axis=1)[:, 0] > 0.49
+            made.add_traction(end, vectors(np.array([0.0, 900.0, 500.0])))
+            made.add_force([5, 6], vectors(np.array([40.0, 0.0, 0.0])))
+    return scene
+
+
+def test_invariances():
+    start = np.concatenate([b.mesh.vertices for b in copied().bodies])
+    plain = flown(copied())
+    assert np.abs(plain[:12, :3] - start[:12]).max() > 0.01  # [m] the beam bends
+    assert np.array_equal(flown(copied(reverse=True)), plain)
+    Q = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
+    Q = Q * np.linalg.det(Q)
+    turned = flown(copied(lambda X: X @ Q.T, lambda u: u @ Q.T))
+    assert np.abs(turned - np.c_[plain[:, :3] @ Q.T, plain[:, 3:] @ Q.T]).max() < 1e-11
+    shift = np.array([30.0, -20.0, 10.0])
+    assert np.abs(flown(copied(lambda X: X + shift)) - plain - np.r_[shift, 0, 0, 0]).max() < 1e-11
+    # twice as large of the same material: stresses and velocities stay, everything takes twice the time, so gravity is
+    # halved; tractions stay and forces grow as areas do
+    scene = copied(lambda X: 2 * X)
+    scene.gravity = scene.gravity / 2
+    for force in scene.body("beam").forces:
+        force.value[:] *= 4
+    assert np.abs(flown(scene, 2 * DT) - plain * [2, 2, 2, 1, 1, 1]).max() < 1e-11
+
+
+def test_turning_the_state_turns_the_result(sim):
+    """Objectivity: the rest shape stays, and position, velocity and gravity are turned about the origin."""
+    Q = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0]
+    Q = Q * np.linalg.det(Q)
+    x, v = sim.positions(), sim.velocities()
+    for _ in range(5):
+        sim.step()
+    expected = sim.positions() @ Q.T, sim.velocities() @ Q.T, sim.reactions() @ Q.T
+    sim.reset()
+    sim.set_gravity(Q @ [0.0, -9.81, 0.0])
+    sim.set_state(x @ Q.T, v @ Q.T)
+    for _ in range(5):
+        sim.step()
+    assert np.abs(sim.positions() - expected[0]).max() < 1e-10  # [m]
+    assert np.abs(sim.velocities() - expected[1]).max() < 1e-8  # [m/s]
+    assert np.abs(sim.reactions() - expected[2]).max() < 1e-6 * np.abs(expected[2]).max()

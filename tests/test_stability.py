@@ -1,0 +1,178 @@
+"""Linear vibration about the rest shape:
+
+* Hooke's stiffness is the oracle's at rest for every law; the highest frequency and the modes are those of dense algebra;
+* a free body has six rigid motions, shapes have unit modal mass, held axes stay;
+* a step below `stable_dt` keeps a small vibration small and 1.1 times it explodes, for both explicit integrators, without
+  damping and with either kind; the damped limit is the least of all frequencies'; a constraint can raise it;
+* above the limit the simulator refuses, or warns where that is allowed; a stiffer material is refused while it runs.
+"""
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+from oracle import Oracle
+from scenes import COR, SNH, SVK, cube, rubber
+
+import taisoft as ts
+from taisoft import runtime
+from taisoft.stability import consistent_mass, highest_frequency, hooke_differential, hooke_stiffness, stable_dt
+
+
+def one_body(material=None, cells=(2, 1, 1), held: bool = False) -> ts.Scene:
+    scene = ts.Scene(gravity=(0, 0, 0))
+    body = scene.add_body(cube(cells=cells), material or rubber(), name="block")
+    if held:
+        body.fix(lambda X: X[:, 0] < -0.49)
+        body.fix([10], axes="y")
+    return scene
+
+
+def dense(scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stiffness, lumped mass (3n,3n) and free axes (3n,)."""
+    oracle = Oracle(scene)
+    mass = np.diag(np.repeat(oracle.mass, 3, axis=1).reshape(-1))
+    return oracle.stiffness(oracle.rest), mass, ~oracle.fixed.reshape(-1)
+
+
+@pytest.mark.parametrize("law", [SVK, COR, SNH])
+def test_stiffness_at_rest(law):
+    scene = one_body(rubber(law, poisson=0.4))
+    K = dense(scene)[0]
+    body = scene.bodies[0]
+    assert np.abs(hooke_stiffness(body).toarray() - K).max() < 1e-12 * np.abs(K).max()
+    v = np.random.default_rng(0).standard_normal((12, 3))
+    assert np.abs(hooke_differential(body)(v) - (K @ v.reshape(-1)).reshape(-1, 3)).max() < 1e-11 * np.abs(K).max()
+
+
+@pytest.mark.parametrize("cells", [(2, 1, 1), (4, 3, 3)])
+@pytest.mark.parametrize("held", [False, True])
+def test_highest_frequency(cells, held):
+    """By dense algebra for a small body, by Lanczos for a larger one; on the high side, by a percent at most."""
+    scene = one_body(cells=cells)
+    if held:
+        scene.bodies[0].fix(lambda X: X[:, 0] < -0.49)
+        scene.bodies[0].fix([10], axes="y")
+    K, M, free = dense(scene)
+    exact = np.sqrt(la.eigh(K[np.ix_(free, free)], M[np.ix_(free, free)], eigvals_only=True)[-1])
+    assert exact < highest_frequency(scene.bodies[0]) < 1.01 * exact
+    assert stable_dt(scene, verlet=False) == pytest.approx(2 / exact, rel=0.01)
+    assert stable_dt(scene, verlet=True) == stable_dt(scene, verlet=False)
+
+
+@pytest.mark.parametrize("mass", ["lumped", "consistent"])
+@pytest.mark.parametrize("cells", [(2, 1, 1), (6, 3, 3)])
+def test_modes(mass, cells):
+    """Dense for a small body, by shift and invert for a larger one."""
+    scene = one_body(rubber(density=700.0), cells, held=True)
+    K, M, free = dense(scene)
+    if mass == "consistent":
+        M = consistent_mass(scene.bodies[0]).toarray()
+        assert M.sum() == pytest.approx(3 * 700 * 0.99)
+    expected = np.sqrt(la.eigh(K[np.ix_(free, free)], M[np.ix_(free, free)], eigvals_only=True)[:5]) / (2 * np.pi)
+    found = ts.modes(scene, 5, mass=mass)
+    assert found.frequencies == pytest.approx(expected, rel=1e-6)
+    shapes = found.shapes.reshape(5, -1)
+    assert np.abs(shapes @ M @ shapes.T - np.eye(5)).max() < 1e-6
+    assert not shapes[:, ~free].any() and found.shapes.shape == (5, len(free) // 3, 3)
+
+
+@pytest.mark.parametrize("cells", [(1, 1, 1), (5, 4, 4)])
+def test_a_free_body_has_six_rigid_motions(cells):
+    scene = one_body(cells=cells)
+    scene.add_body(cube(), rubber(), position=(0, 5, 0))
+    frequencies = ts.modes(scene, 13).frequencies
+    assert np.abs(frequencies[:12]).max() < 1e-2 * frequencies[12]
+
+
+@pytest.mark.parametrize(
+    "k, mass, words",
+    [
+        (0, "lumped", "k = 0: it must be a whole number from 1 to the 23 free axes"),
+        (24, "lumped", "k = 24"),
+        (2.0, "lumped", "k = 2.0"),
+        (True, "lumped", "k = True"),
+        (3, "none", "mass 'none' is unknown: it must be 'lumped' or 'consistent'"),
+    ],
+)
+def test_modes_that_are_refused(k, mass, words):
+    with pytest.raises(ts.SceneError, match=words):
+        ts.modes(one_body(held=True), k, mass=mass)
+    with pytest.raises(ts.SceneError, match="the scene holds no body"):
+        ts.modes(ts.Scene(), 1)
+
+
+def test_a_step_above_the_limit():
+    scene = one_body(cells=(1, 1, 1))
+    limit = stable_dt(scene, False)
+    words = rf"dt = {2 * limit:.3g} s is above the estimated stability limit of {limit:.3g} s of symplectic_euler"
+    with pytest.raises(ts.SimulationError, match=rf"^{words}: take a smaller dt \(0.9 of the limit is .* allow_unstable=True$"):
+        ts.Simulator(scene, 2 * limit, "symplectic_euler")
+    assert runtime.open_kind() is None
+    with pytest.warns(UserWarning, match=words), ts.Simulator(scene, 2 * limit, "symplectic_euler", allow_unstable=True):
+        pass
+    with ts.Simulator(scene, 0.9 * limit, "symplectic_euler") as sim:
+        with pytest.raises(ts.SimulationError, match=words):
+            sim.dt = 2 * limit
+        assert sim.dt == 0.9 * limit and sim.stable_dt == limit
+        with pytest.raises(ts.SimulationError, match="is above the estimated stability limit"):
+            sim.set_material("block", young=1e7)
+        assert scene.bodies[0].material.young == 1e5 and sim.stable_dt == limit
+        assert sim._world.model.law_constants[0, 0] == pytest.approx(4 / 3 * scene.bodies[0].material.mu)
+        sim.set_material("block", density=2000.0)
+        assert sim.stable_dt == pytest.approx(np.sqrt(2) * limit, rel=1e-3)
+
+
+def growth(sim, share: float, steps: int = 200) -> float:
+    """Energy after so many steps of a share of the limit over that of the start: the highest mode, 1e-6 m high."""
+    K, M, _ = dense(sim.scene)
+    shape = la.eigh(K, M)[1][:, -1].reshape(-1, 3)
+    sim.reset()
+    sim.dt = share * sim.stable_dt
+    sim.set_state(sim.positions() + 1e-6 * shape / np.abs(shape).max())
+    start = sim.energies().total
+    assert start > 0.0
+    for _ in range(steps // 10):
+        sim.advance(10)
+        total = sim.energies().total
+        if not total < 1e6 * start:
+            break
+    return total / start
+
+
+@pytest.fixture(scope="module", params=["symplectic_euler", "velocity_verlet"])
+def sim(request):
+    """Both kinds of damping are compiled in, so that the tests can change them."""
+    scene = one_body(rubber(mass_damping=1.0, stiffness_damping=1e-3), cells=(1, 1, 1))
+    with ts.Simulator(scene, 1e-4, request.param, precision="f64", allow_unstable=True) as made:
+        yield made
+
+
+@pytest.mark.filterwarnings("ignore:dt = .* is above the estimated stability limit")
+@pytest.mark.parametrize(
+    "damping",
+    [(0.0, 0.0), (30.0, 0.0), (0.0, 2e-3), (0.0, 0.1), (30.0, 0.02)],
+    ids=["none", "mass", "stiffness", "much stiffness", "both"],
+)
+def test_the_limit_is_where_steps_explode(sim, damping):
+    sim.set_material("block", mass_damping=damping[0], stiffness_damping=damping[1])
+    undamped = 2 / highest_frequency(sim.scene.bodies[0])
+    limit = sim.stable_dt
+    verlet = sim.settings.integrator == "velocity_verlet"
+    if damping == (0.0, 0.0):
+        assert limit == undamped
+    elif damping[1] > 0.0:
+        assert limit < 0.999 * undamped
+    else:
+        assert (limit > undamped) == verlet  # the exact decay helps Verlet, the explicit one costs Euler
+    assert growth(sim, 0.98) < (100.0 if damping == (0.0, 0.0) else 1.0)
+    assert growth(sim, 1.1) > 1e6
+
+
+def test_the_limit_is_the_least_of_all_bodies():
+    scene = one_body(cells=(1, 1, 1))
+    alone = stable_dt(scene, False)
+    scene.add_body(cube((9, 0, 0)), rubber(young=4e5))
+    assert stable_dt(scene, False) == pytest.approx(alone / 2, rel=1e-3)
+    held = one_body(cells=(1, 1, 1))
+    held.bodies[0].fix(lambda X: X[:, 0] < 9)
+    assert stable_dt(held, False) == np.inf

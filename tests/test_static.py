@@ -1,0 +1,154 @@
+"""Statics:
+
+* the state has no force on its free axes, by the oracle's account, and is the oracle's own; reactions carry the weight and
+  the loads; what fails at once is loaded in steps; f32 tells where its rounding ends it;
+* led nodes stand where their path is at the time asked for, with the reactions that takes;
+* what cannot be reached is told: converged is False, and the residual is that of the whole load;
+* a body that nothing holds is refused, and so is what is no scene and no tolerance, with nothing left open.
+"""
+
+import numpy as np
+import pytest
+from lanes import opened
+from oracle import Oracle
+from scenes import SNH, SVK, cube, rubber
+
+import taisoft as ts
+from taisoft import runtime
+
+
+def hanging(young: float = 2e3, law: str = SNH) -> ts.Scene:
+    """A beam fixed at one end, pulled and pushed, so soft that it hangs down and fails under the whole load at once."""
+    scene = ts.Scene(gravity=(0.0, -9.81, 1.0))
+    beam = scene.add_body(cube(cells=(3, 1, 1), size=(2.0, 0.5, 0.5)), rubber(law, young=young), name="beam", position=(5, 0, 0))
+    beam.fix(lambda X: X[:, 0] < -0.99)
+    beam.add_traction(lambda X: X[:, 0] > 0.99, (500.0, 0.0, 0.0))
+    beam.add_force([12, 13], (0.0, -50.0, 0.0))
+    return scene
+
+
+def unbalanced(scene, result) -> float:
+    """|force on the free axes| / |load on the free axes|, by the oracle."""
+    oracle = Oracle(scene)
+    load = oracle.loads + oracle.mass * oracle.gravity
+    left = oracle.force(result.positions()) + load
+    return np.linalg.norm(left[~oracle.fixed]) / np.linalg.norm(load[~oracle.fixed])
+
+
+@pytest.fixture(scope="module")
+def solved():
+    scene = hanging()
+    return scene, ts.solve_static(scene, tolerance=1e-9)
+
+
+def test_equilibrium(solved):
+    scene, result = solved
+    oracle = Oracle(scene)
+    x = result.positions("beam")
+    assert result.converged and result.residual <= 1e-9 and result.load_steps > 1 and result.n_inverted == 0
+    assert 30 < result.iterations < 500 and result.linear_iterations > result.iterations
+    assert unbalanced(scene, result) <= 2e-9
+    assert result.elastic == pytest.approx(oracle.energy(x)) and result.elastic > 1.0
+    assert oracle.rest[:, 1].min() - x[:, 1].min() > 2.0  # [m] it does hang down
+    assert np.array_equal(x[oracle.fixed], oracle.rest[oracle.fixed])
+
+
+def test_it_is_the_oracles_state(solved):
+    """Where dense Newton steps lead from nearby."""
+    scene, result = solved
+    oracle = Oracle(scene)
+    free, load = ~oracle.fixed.reshape(-1), oracle.loads + oracle.mass * oracle.gravity
+    x = result.positions() + 0.003 * np.random.default_rng(0).standard_normal((16, 3)) * ~oracle.fixed
+    assert np.abs(x - result.positions()).max() > 0.005  # [m]
+    for _ in range(10):
+        step = np.linalg.solve(
+            oracle.stiffness(x)[np.ix_(free, free)], (oracle.force(x) + load).reshape(-1)[free]
+        )
+        x = x.reshape(-1)
+        x[free] += step
+        x = x.reshape(-1, 3)
+    assert np.abs(result.positions() - x).max() < 1e-7  # [m]
+
+
+def test_reactions_carry_the_loads(solved):
+    scene, result = solved
+    oracle = Oracle(scene)
+    load = oracle.loads + oracle.mass * oracle.gravity
+    assert np.abs(load.sum(axis=0)).min() > 100.0  # [N]
+    assert result.reactions().sum(axis=0) == pytest.approx(-load.sum(axis=0), abs=1e-5)
+    # the moment about the origin too: there is no other way to stand still
+    x = result.positions()
+    moment = np.cross(x, load + result.reactions()).sum(axis=0)
+    assert np.abs(moment).max() < 1e-4 * np.abs(np.cross(x, load)).max()
+    assert not result.reactions("beam")[~oracle.fixed.any(axis=1)].any()
+
+
+def test_single_precision():
+    """f32 cannot meet a tolerance below its rounding, and says that this is why it stopped."""
+    scene = hanging(young=1e5)
+    result = ts.solve_static(scene, tolerance=1e-9, precision="f32")
+    assert not result.converged and result.at_rounding and 1e-9 < result.residual < 1e-4
+    assert unbalanced(scene, result) < 1e-4
+    assert runtime.open_kind() is None
+
+
+def test_led_nodes():
+    """A block is pulled to 1.3 of its length, sideways free: uniform tension, the same force at both ends."""
+    scene = ts.Scene(gravity=(0, 0, 0))
+    block = scene.add_body(cube(size=(1.0, 1.0, 1.0)), rubber(SVK, poisson=0.0), name="block")
+    block.fix(lambda X: X[:, 0] < 0)
+    block.move(lambda X: X[:, 0] > 0, lambda t: (0.1 * t, 0.0, 0.0))
+    scene.add_body(cube((4, 0, 0)), rubber(SVK), name="idle").fix([0, 1, 2])
+    with opened("f64"):  # an open f64 runtime is used
+        result = ts.solve_static(scene, tolerance=1e-10, time=3.0)
+        assert runtime.open_kind() == ("cpu", "f64")
+    assert result.converged
+    x = result.positions("block")
+    assert x == pytest.approx(block.rest_positions * [1.3, 1.0, 1.0] + [0.15, 0, 0], abs=1e-9)
+    stress = 1e5 * 1.3 * (1.3**2 - 1) / 2  # P of St. Venant-Kirchhoff without lateral strain: F E young [Pa]
+    pull = result.reactions("block")[x[:, 0] > 0].sum(axis=0)
+    assert pull == pytest.approx([stress, 0, 0], rel=1e-8, abs=1e-6)
+    assert result.reactions("block").sum(axis=0) == pytest.approx([0, 0, 0], abs=1e-6)
+    assert result.positions("idle") == pytest.approx(scene.body("idle").rest_positions)
+    assert len(result.positions()) == 16
+    with pytest.raises(ts.SceneError, match="no body is called 'blok'"):
+        result.positions("blok")
+
+
+def test_what_cannot_be_reached_is_told():
+    """St. Venant-Kirchhoff collapses under this load; a share of it that was reached is not passed off as the whole."""
+    scene = hanging(young=2e4, law=SVK)
+    result = ts.solve_static(scene)
+    assert not result.converged and result.residual > 0.1
+    assert result.residual == pytest.approx(unbalanced(scene, result), rel=1e-6)
+
+
+def unheld(axes: str):
+    scene = ts.Scene()
+    scene.add_body(cube(), rubber(), name="held").fix([0])
+    body = scene.add_body(cube((5, 0, 0)), rubber(), name="loose")
+    for axis in axes:
+        body.fix([0], axes=axis)
+    return scene
+
+
+@pytest.mark.parametrize(
+    "scene, settings, words",
+    [
+        (unheld(""), {}, "body 'loose': nothing holds it along xyz, so it has no static state"),
+        (unheld("y"), {}, "body 'loose': nothing holds it along xz"),
+        (ts.Scene(), {}, "solve_static needs a Scene that holds a body"),
+        ("beam", {}, "solve_static needs a Scene that holds a body"),
+        (hanging(), {"tolerance": 0.0}, "tolerance = 0.0: it must lie between 0 and 1"),
+        (hanging(), {"tolerance": "1e-6"}, "tolerance = '1e-6'"),
+    ],
+)
+def test_what_is_refused(scene, settings, words):
+    with pytest.raises(ts.SceneError, match=words):
+        ts.solve_static(scene, **settings)
+    assert runtime.open_kind() is None
+
+
+def test_another_precision_while_a_simulator_is_open():
+    with opened("f32"), pytest.raises(ts.SimulationError, match=r"a test is open with arch 'cpu' and precision 'f32'"):
+        ts.solve_static(hanging())
