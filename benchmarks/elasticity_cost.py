@@ -57,8 +57,9 @@ def measure_costs(cells, precision: str, arch: str, repeats: int, laws=tuple(LAW
         pairs = []
         for integrator in integrators:
             for law in laws:
-                sim = ts.Simulator(beam_scene(cells, law), dt=dt, integrator=integrator, precision=precision, arch=arch)
-                stack.enter_context(sim)
+                beam = beam_scene(cells, law)
+                made = ts.Simulator(beam, dt=dt, integrator=integrator, precision=precision, arch=arch)
+                sim = stack.enter_context(made)
                 warm_up(sim)
                 pairs.append((sim, Cost(tets, law, integrator, precision, sim.compile_seconds)))
         for _ in range(repeats):

@@ -169,7 +169,7 @@ def _key(cells) -> str:
     return "x".join(str(c) for c in cells)
 
 
-def main(arguments=None) -> None:
+def regenerate(arguments=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, default=DATA, help="file to write (default: %(default)s)")
     parser.add_argument("--tolerances", type=float, nargs=2, default=(1e-7, 1e-9), metavar=("LOOSE", "TIGHT"))
@@ -190,4 +190,4 @@ def main(arguments=None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    regenerate()

@@ -64,7 +64,7 @@ class StateAccess:
         return self._stepper.reactions()[self._slice(body)]
 
     def stress(self, body: str) -> np.ndarray:
-        """Cauchy stress per tet (m,3,3) [Pa]; infinite in a flat one."""
+        """Cauchy stress per tet (m,3,3) [Pa]; not finite in a flat one."""
         world, k = self._open_world(), self._index(body)
         m = world.model
         sigma = np.zeros((m.n_blocks * m.lanes, 9))
@@ -110,7 +110,6 @@ class StateAccess:
             self._check_stability(value)
         self._time_base = (self.time, self.step_count)
         self._dt = value
-        self._stepper.forget()
 
     @property
     def stable_dt(self) -> float:
@@ -124,7 +123,7 @@ class StateAccess:
         world = self._open_world()
         self.scene.gravity = gravity
         world.model.gravity.from_numpy(np.asarray(self.scene.gravity, dtype=self._runtime.np_real)[None])
-        self._stepper.forget()
+        self._stepper.numbers_changed()
 
     def set_material(self, body: str, **numbers) -> None:
         """Change numbers of a body's material (young, poisson, density, mass_damping, stiffness_damping); law stays."""
@@ -139,8 +138,7 @@ class StateAccess:
             self.scene.bodies[k].material, self._stable_dt = old, old_limit
             raise
         world.upload_material()
-        self._stepper.material_changed()
-        self._stepper.forget()
+        self._stepper.numbers_changed()
 
     def _open_world(self) -> World:
         if self._world is None:
@@ -159,10 +157,7 @@ class StateAccess:
         warnings.warn(text, stacklevel=3)
 
     def _index(self, body: str) -> int:
-        for k, b in enumerate(self.scene.bodies):
-            if b.name == body:
-                return k
-        raise SceneError(f"the scene has no body {body!r}; it has {[b.name for b in self.scene.bodies]}")
+        return self.scene.bodies.index(self.scene.body(body))
 
     def _slice(self, body: str | None) -> slice:
         return slice(None) if body is None else self._world.layout.nodes(self._index(body))

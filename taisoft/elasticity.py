@@ -136,7 +136,7 @@ def measure(m: ti.template()):
 
 @kernel
 def cauchy_stress(m: ti.template(), sigma: ti.types.ndarray()):
-    """sigma = P F^T / J per tet, (n_blocks * lanes, 9) [Pa]; infinite where a tet is flat."""
+    """sigma = P F^T / J per tet, (n_blocks * lanes, 9) [Pa]; not finite where a tet is flat."""
     for law, first, last in ti.static(m.laws):
         ti.loop_config(serialize=m.serial)
         for b in range(first, last):

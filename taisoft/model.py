@@ -5,6 +5,7 @@ constraint masks are run-time data. Nodes keep the order of the bodies and of th
 (a kernel runs one law's blocks in one loop), and a body's last block is padded with copies of its last tet of volume 0.
 """
 
+import difflib
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -202,10 +203,15 @@ def changed_material(body: Body, numbers: dict[str, float], on: dict[str, bool])
     """Give a body a material with new numbers; the law, and damping that is compiled out, cannot change while it runs."""
     for name, value in numbers.items():
         if name not in CHANGEABLE:
-            raise SceneError(f"body '{body.name}': {name} cannot change while it runs; {', '.join(CHANGEABLE)} can")
+            near = difflib.get_close_matches(name, CHANGEABLE, 1)
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            raise SceneError(f"body '{body.name}': {name} cannot change while it runs{hint}; {', '.join(CHANGEABLE)} can")
         if name in on and not on[name] and value != 0.0:
             raise SceneError(
                 f"body '{body.name}': {name} was 0 everywhere at the start and is not modelled; "
                 "start with a small value to change it later"
             )
-    body.material = replace(body.material, **numbers)
+    try:
+        body.material = replace(body.material, **numbers)
+    except SceneError as error:
+        raise SceneError(f"body '{body.name}': {error}") from None

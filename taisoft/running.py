@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from taisoft.errors import SimulationError
 from taisoft.records import RunReport, StepReport
+from taisoft.settings import check_positive
 
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
@@ -25,7 +26,8 @@ def run(
     steps; True ends the run. dt is lowered once to the next divisor of 1/fps, and that is reported. Never raises for a
     failed or interrupted run: status and problems say it. Raises SimulationError for bad arguments.
     """
-    _check_arguments(seconds, fps)
+    seconds = check_positive("seconds", seconds, "s")
+    fps = None if fps is None else check_positive("fps", fps, "1/s")
     report = RunReport()
     compiled = sim.compile_seconds
     clock = time.perf_counter()
@@ -57,14 +59,6 @@ def run(
     report.wall_seconds = time.perf_counter() - clock - report.compile_seconds
     _judge(report)
     return report
-
-
-def _check_arguments(seconds, fps) -> None:
-    for name, value in (("seconds", seconds), ("fps", fps)):
-        if name == "fps" and value is None:
-            continue
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value <= 0:
-            raise SimulationError(f"{name} = {value!r}: it must be a finite number above 0")
 
 
 def _fit_dt(sim: "Simulator", seconds: float, fps: float | None, report: RunReport) -> int:

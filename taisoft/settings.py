@@ -1,10 +1,10 @@
 """The settings of a simulation, checked before anything is allocated."""
 
 import difflib
-import math
 from dataclasses import dataclass
 
 from taisoft.errors import SceneError, SimulationError
+from taisoft.scene import checks
 from taisoft.scene.scene import Scene
 from taisoft.stepping import EXPLICIT, INTEGRATORS
 
@@ -29,9 +29,15 @@ class Settings:
 
 def check_dt(dt) -> float:
     """dt as a float, or SimulationError."""
-    if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not math.isfinite(dt) or dt <= 0.0:
-        raise SimulationError(f"dt = {dt!r}: it must be a finite number of seconds above 0")
-    return float(dt)
+    return check_positive("dt", dt, "s")
+
+
+def check_positive(name: str, value, unit: str) -> float:
+    """value as a float; SimulationError unless it is a finite number above 0."""
+    try:
+        return checks.number(value, name, above=0.0, unit=unit)
+    except SceneError as error:
+        raise SimulationError(str(error)) from None
 
 
 def _check_tolerance(name: str, value) -> None:

@@ -1,5 +1,7 @@
 """Simulator: builds a scene into the machine, steps it, and tells about it."""
 
+import weakref
+
 from taisoft import runtime
 from taisoft.access import StateAccess
 from taisoft.elasticity import measure
@@ -14,8 +16,14 @@ from taisoft.stepping.motion import Motion
 from taisoft.stepping.world import World
 
 
+def _release(arena: runtime.FieldArena, claim: runtime.Runtime) -> None:
+    """Give memory and runtime back; also when a simulator is dropped without `close`."""
+    arena.release()
+    claim.close()
+
+
 class Simulator(StateAccess):
-    """A scene being simulated. SI units; positions are float64 in either precision.
+    """A scene being simulated, as it was when this was made. SI units; positions are float64 in either precision.
 
     dt [s]; integrator: one of taisoft.stepping.INTEGRATORS; newton_tolerance, linear_tolerance: relative, None is adaptive.
     An explicit integrator refuses a dt above `stable_dt` unless allow_unstable, which only warns.
@@ -32,7 +40,8 @@ class Simulator(StateAccess):
             scene, dt, integrator, contact_solver, self_collision, precision, arch, allow_unstable, newton_tolerance,
             linear_tolerance, contact_tolerance,
         )  # fmt: skip
-        self.scene = scene
+        self.scene = scene.snapshot()  # what a user changes later, here or there, stays there
+        scene = self.scene
         self._dt = self.settings.dt
         self._stable_dt: float | None = None
         self._tangent = None  # fields of force_differential, once asked for
@@ -47,14 +56,14 @@ class Simulator(StateAccess):
             model, layout = build_model(scene, self._runtime, self._arena, self.plan.on)
             self._world = World(scene, self._runtime, self._arena, model, layout, Motion(scene, layout))
             self._stepper = make_stepper(self._world, integrator)
+            self.reset()
         except BaseException:
-            self._arena.release()
-            self._runtime.close()
+            _release(self._arena, self._runtime)
             raise
         if not self.settings.explicit:
             self._stepper.tolerance = newton_tolerance or self._stepper.tolerance
             self._stepper.linear_tolerance = linear_tolerance
-        self.reset()
+        self._release = weakref.finalize(self, _release, self._arena, self._runtime)
 
     # --- stepping -------------------------------------------------------------------------------------------------
 
@@ -92,7 +101,7 @@ class Simulator(StateAccess):
         return run(self, seconds, on_frame, fps, stop)
 
     def reset(self) -> None:
-        """Back to the scene's start."""
+        """Back to the scene's start; numbers changed while it ran (dt, gravity, materials) stay."""
         world = self._open_world()
         world.motion.reset()
         world.upload_constraints()
@@ -134,8 +143,7 @@ class Simulator(StateAccess):
     def close(self) -> None:
         """Release the fields and the runtime; a closed simulator cannot be used."""
         if self._world is not None:
-            self._arena.release()
-            self._runtime.close()
+            self._release()
             self._world = None
 
     def __enter__(self) -> "Simulator":

@@ -64,20 +64,20 @@ def consistent_mass(body: Body) -> sp.csr_matrix:
     return sp.kron(scalar, sp.identity(3), format="csr")
 
 
-def held_axes(body: Body) -> np.ndarray:
-    """(n, 3) bool: axes that are fixed or led at the start, and vertices of no tet."""
+def held_axes(body: Body, led: bool) -> np.ndarray:
+    """(n, 3) bool: axes that are fixed; those that follow a path too, if led."""
     held = np.zeros((body.mesh.n_verts, 3), dtype=bool)
     for c in body.constraints:
-        held[np.ix_(c.nodes, np.flatnonzero(c.axes))] = True
-    held[np.bincount(body.mesh.tets.reshape(-1), minlength=body.mesh.n_verts) == 0] = True
+        if led or c.path is None:
+            held[np.ix_(c.nodes, np.flatnonzero(c.axes))] = True
     return held
 
 
 def highest_frequency(body: Body) -> float:
     """omega_max [rad/s] of a body at rest with lumped mass, by Lanczos, a fraction of a percent on the high side."""
     mass = elements.lumped_mass(body.mesh.tets, body.mesh.volumes, body.material.density, body.mesh.n_verts)
-    free = ~held_axes(body)
-    scale = np.where(free, 1.0 / np.sqrt(np.maximum(mass, 1e-300))[:, None], 0.0)
+    free = ~held_axes(body, led=False)  # a path may let go
+    scale = np.where(free, 1.0 / np.sqrt(mass)[:, None], 0.0)
     if not free.any():
         return 0.0
     apply = hooke_differential(body)
@@ -158,7 +158,7 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
         raise SceneError(f"mass '{mass}' is unknown: it must be 'lumped' or 'consistent'")
     if not scene.bodies:
         raise SceneError("the scene holds no body")
-    free = np.concatenate([~held_axes(b) for b in scene.bodies]).reshape(-1)
+    free = np.concatenate([~held_axes(b, led=True) for b in scene.bodies]).reshape(-1)
     n_free = int(free.sum())
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 1 <= k <= n_free:
         raise SceneError(f"k = {k!r}: it must be a whole number from 1 to the {n_free} free axes of the scene")

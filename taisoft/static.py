@@ -22,11 +22,13 @@ SMALLEST_LOAD_STEP = 1.0 / 256.0
 class StaticResult:
     """A state of equilibrium, or the nearest that was found; residual: |force on free axes| / |applied load|.
 
+    load: share of the whole load that equilibrium was found for; below 1 the state is that of the last, failed attempt.
     at_rounding: the residual is down at the rounding of the forces, so no tolerance below it can be met.
     load_steps: how many parts the load was applied in. n_inverted: tets with J <= 0.
     """
 
     converged: bool
+    load: float
     at_rounding: bool
     residual: float
     iterations: int  # Newton's, over all load steps
@@ -106,7 +108,7 @@ class _Static:
     def solve(self) -> StaticResult:
         """The whole load at once; failing that, in steps that halve on failure and grow on success."""
         rest = self.world.layout.rest
-        result, steps = self._attempt(rest, 1.0, self.tolerance), 1
+        result, steps, done = self._attempt(rest, 1.0, self.tolerance), 1, 1.0
         if not self._good(result) and not result.at_rounding:
             done, share, x, steps = 0.0, 0.25, rest, 0
             while done < 1.0 and share >= SMALLEST_LOAD_STEP:
@@ -118,7 +120,7 @@ class _Static:
                     share *= 0.5
             if done < 1.0:  # the state of the last good share, judged by all of the load
                 result = self._attempt(x, 1.0, self.tolerance, max_newton=0)
-        return self._answer(result, steps)
+        return self._answer(result, steps, done)
 
     def _good(self, result: StageResult) -> bool:
         measure(self.world.model)
@@ -142,7 +144,7 @@ class _Static:
         self.linear += result.linear_iterations
         return result
 
-    def _answer(self, result: StageResult, steps: int) -> StaticResult:
+    def _answer(self, result: StageResult, steps: int, load: float) -> StaticResult:
         world = self.world
         measure(world.model)
         s = world.model.scalars.to_numpy()
@@ -150,8 +152,8 @@ class _Static:
         if not np.isfinite(result.residual):
             raise SimulationError(f"solve_static: {world.find_unfinite() or 'the residual is not finite'}")
         return StaticResult(
-            converged=result.converged, at_rounding=result.at_rounding, residual=result.residual, iterations=self.newton,
-            linear_iterations=self.linear, load_steps=steps, elastic=float(s[0]), n_inverted=int(s[2]),
-            _scene=world.scene, _layout=world.layout, _positions=world.model.x.to_numpy(),
-            _reactions=held * self.solver.work.residual.to_numpy(),
+            converged=result.converged and load == 1.0, load=load, at_rounding=result.at_rounding,
+            residual=result.residual, iterations=self.newton, linear_iterations=self.linear, load_steps=steps,
+            elastic=float(s[0]), n_inverted=int(s[2]), _scene=world.scene, _layout=world.layout,
+            _positions=world.model.x.to_numpy(), _reactions=held * self.solver.work.residual.to_numpy(),
         )  # fmt: skip

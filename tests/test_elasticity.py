@@ -1,4 +1,4 @@
-"""The elastic operator of four bodies, none of whose tets fill the last lanes: three laws in f64, one in f32.
+"""The elastic operator of four bodies, none of whose tets fill the last lanes: two laws in f64, one in f32.
 
 * energies, volume ratios, forces and their differential are the oracle's, in the serial and in the parallel kernels;
 * a body at rest has no force, wherever it stands and however it is turned;
@@ -9,9 +9,8 @@
 """
 
 import numpy as np
-import oracle as exact
 import pytest
-from scenes import SNH, built, mixed_scene
+from scenes import SNH, SVK, built, mixed_scene
 
 from taisoft import elasticity
 from taisoft.linear import block_csr
@@ -21,9 +20,9 @@ SQUEEZE = np.array([[0.6, 0.1, 0.0], [-0.15, 1.2, 0.05], [0.0, 0.1, 0.7]])
 
 @pytest.fixture(scope="module", params=["f64", "f32"])
 def rig(request):
-    # compiling an assembly takes seconds a law, so one law has to do where the rest of the code is what is looked at
-    laws = {} if request.param == "f64" else {"laws": (SNH,) * 4}
-    with built(mixed_scene(mass_damping=0.4, stiffness_damping=3e-3, **laws), request.param) as made:
+    # compiling an assembly takes seconds a law; the laws have tests of their own
+    laws = (SNH, SVK, SNH, SVK) if request.param == "f64" else (SNH,) * 4
+    with built(mixed_scene(laws, mass_damping=0.4, stiffness_damping=3e-3), request.param) as made:
         made.heavy = (made.model,) if request.param == "f64" else (made.model, made.parallel)
         made.force, made.way, made.product = made.vectors("force"), made.vectors("way"), made.vectors("product")
         made.matrix = block_csr.build_block_csr(made.model, made.arena, made.model.real)
@@ -52,9 +51,6 @@ def test_the_squeezed_state_is_a_hard_one(rig, squeezed):
     J = np.concatenate([np.linalg.det(rig.oracle.gradients(squeezed, part)) for part in rig.oracle.parts])
     assert (J <= 0).sum() in range(1, 6)
     assert np.linalg.eigvalsh(rig.oracle.stiffness(squeezed)).min() < -1e3  # N/m
-    F = rig.oracle.gradients(squeezed, rig.oracle.parts[2])
-    s = exact.signed_svd(F)[1]
-    assert ((s[:, 1] + s[:, 2]) / s[:, 0]).min() > 0.2  # the corotational body's rotations are unique
 
 
 def test_energies_and_volume_ratios(rig, squeezed):

@@ -102,14 +102,13 @@ def test_wild_states(sim, kind):
     assert sim._world.model.scalars[1] > 0.0  # no tet is left inverted
 
 
-@pytest.mark.parametrize("precision", ["f64", "f32"])
-def test_nothing_to_do(shared_sim, precision):
-    """At rest and without weight, even where positions and velocities are large."""
+def test_nothing_to_do(shared_sim):
+    """At rest and without weight in f32, where positions and velocities are large: rounding is no reason to go on."""
     shared_sim.close()
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.add_body(cube(), rubber(young=1e7), position=(300.0, -200.0, 100.0), velocity=(20.0, 3.0, -7.0))
-    with ts.Simulator(scene, integrator="implicit_euler", precision=precision) as sim:
-        assert sim._stepper.tolerance == {"f64": 1e-8, "f32": 1e-4}[precision] and sim._stepper.linear_tolerance is None
+    with ts.Simulator(scene, integrator="implicit_euler", precision="f32") as sim:
+        assert sim._stepper.tolerance == 1e-4 and sim._stepper.linear_tolerance is None
         start = sim.positions()
         for _ in range(20):
             report = sim.step()

@@ -11,7 +11,7 @@
 import numpy as np
 import pytest
 from oracle import Oracle
-from scenes import driven_scene, mixed_scene
+from scenes import COR, SNH, SVK, driven_scene, mixed_scene
 
 import taisoft as ts
 from taisoft import stepping
@@ -66,7 +66,9 @@ def explicit(request):
 
 @pytest.fixture(scope="module", params=EXPLICIT)
 def mixture(request):
-    with simulator(mixed_scene(mass_damping=3.0), request.param) as sim:
+    """Three laws for one integrator, one for the other: a kernel of three takes long to compile."""
+    laws = (SNH, SVK, COR, SVK) if request.param == "symplectic_euler" else (SNH,) * 4
+    with simulator(mixed_scene(laws, mass_damping=3.0), request.param) as sim:
         yield sim
 
 
@@ -82,7 +84,7 @@ def test_explicit_steps_are_the_oracles(explicit):
     assert len(oracle.led) == 1  # two of the three led nodes have been released
 
 
-def test_explicit_steps_of_three_laws_are_the_oracles(mixture):
+def test_explicit_steps_of_a_mixture_are_the_oracles(mixture):
     follow(mixture, mixture.settings.integrator, 9, 1e-10)
 
 

@@ -91,6 +91,7 @@ def _add_run(commands) -> None:
         metavar="solver.KEY=VALUE",
         help="a Simulator argument, e.g. solver.dt=0.01; may be repeated",
     )
+    parser.add_argument("--resume", metavar="CHECKPOINT", help="not in this version: it writes no checkpoints")
     parser.add_argument("--no-usd", action="store_true", help="write no scene.usdc")
     parser.add_argument("--no-frames", action="store_true", help="write no pictures")
     parser.set_defaults(command="run")

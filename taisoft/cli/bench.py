@@ -9,7 +9,9 @@ from taisoft.errors import SceneError
 
 def command(arguments: Namespace) -> int:
     """Runs the benchmark, or lists all of them if none is named. Raises SceneError for an unknown name."""
-    benchmarks = {name: path for name, path in shipped_files("benchmarks").items() if "def main(" in path.read_text()}
+    # a part of a benchmark, or a peer in a folder below, is no benchmark of its own
+    files = {name: path for name, path in shipped_files("benchmarks").items() if "." not in name}
+    benchmarks = {name: path for name, path in files.items() if "def main(" in path.read_text()}
     if arguments.name in (None, "-h", "--help"):
         print("usage: taisoft bench NAME [arguments of the benchmark]")
         print_table(benchmarks)

@@ -26,6 +26,8 @@ def command(arguments: Namespace) -> int:
     """Runs the scene and returns the exit status. What can be refused is refused before a file is written."""
     _check_working_folder()
     with Signals() as signals, _told_warnings() as told:
+        if arguments.resume is not None:
+            raise SceneError(f"--resume {arguments.resume}: this version writes and reads no checkpoints")
         scene, solver = load_scene(arguments.scene)
         settings = resolve(solver, arguments, Simulator)
         if arguments.out is not None:

@@ -1,7 +1,6 @@
 """The settings of a run, resolved from the scene's `solver` dict, --set and the other options, in this order."""
 
 import inspect
-import math
 import re
 import tomllib
 from argparse import Namespace
@@ -9,6 +8,7 @@ from dataclasses import dataclass, field
 
 from taisoft.cli.scene_file import nearest
 from taisoft.errors import SceneError
+from taisoft.scene import checks
 
 RUN_KEYS = ("seconds", "fps")  # arguments of Simulator.run that a `solver` dict may hold too
 BARE_WORD = re.compile(r"[A-Za-z_]\w*")
@@ -93,7 +93,4 @@ def _refuse_unknown(names, keys: list[str], where: str) -> None:
 
 
 def _positive(name: str, value) -> float:
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not is_number or not math.isfinite(value) or value <= 0:
-        raise SceneError(f"{name} is {value!r}, it must be a finite number above 0")
-    return float(value)
+    return checks.number(value, name, above=0.0)

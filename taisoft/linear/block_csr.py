@@ -6,7 +6,7 @@ K is the second derivative of the energy (positive at rest), so df/dx = -K. Proj
 positive semi-definite first.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -70,8 +70,6 @@ def build_block_csr(model: Model, arena: FieldArena, real, prefix: str = "stiffn
 
 def sibling(matrix: BlockCsr, model: Model, arena: FieldArena, real, prefix: str) -> BlockCsr:
     """A second matrix with the same pattern and element buffer, its own values."""
-    from dataclasses import replace
-
     return replace(
         matrix,
         value=arena.field(f"{prefix}_value", real, 18 * matrix.n_edges),

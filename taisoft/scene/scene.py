@@ -3,6 +3,7 @@
 Everything is checked and turned into arrays at the call that adds it, so that a scene that exists can be simulated.
 """
 
+import copy
 import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -175,6 +176,16 @@ class Scene:
 
     def __repr__(self) -> str:
         return f"Scene(gravity={tuple(self.gravity.tolist())}, bodies={[body.name for body in self.bodies]})"
+
+    def snapshot(self) -> "Scene":
+        """A copy whose bodies, materials, constraints and loads can change apart from this one's; meshes are shared."""
+        twin = Scene(self.gravity)
+        for body in self.bodies:
+            other = copy.copy(body)
+            other.constraints, other.tractions, other.forces = list(body.constraints), list(body.tractions), list(body.forces)
+            other._held = body._held.copy()
+            twin.bodies.append(other)
+        return twin
 
     def add_body(
         self,

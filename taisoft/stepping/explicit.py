@@ -172,6 +172,14 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
 
 
 @kernel
+def set_targets(s: ti.template(), rows: ti.types.ndarray()):
+    """Targets of a batch, (sub-steps * n_moved, 3) [m]."""
+    for k in range(rows.shape[0]):
+        for a in ti.static(range(3)):
+            s.targets[k][a] = rows[k, a]
+
+
+@kernel
 def elements_parallel(m: ti.template()):
     """One sub-step's element loop over threads; scalars 6, 9: smallest J so far, inverted tets of this sub-step."""
     for law, first, last in ti.static(m.laws):

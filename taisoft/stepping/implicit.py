@@ -86,8 +86,6 @@ class History:
 class ImplicitStepper:
     """Takes steps of one scheme over a world."""
 
-    explicit = False
-
     def __init__(self, world: World, scheme: Scheme):
         self.world, self.scheme = world, scheme
         m, arena = world.model, world.arena
@@ -102,19 +100,23 @@ class ImplicitStepper:
         self.forget()
 
     def forget(self) -> None:
-        """The past is void: the state, dt or a number changed."""
+        """The past is void: the state was set."""
         self._past = 0  # steps whose state is in the history
-        self._beta = 0.0
+        self._beta = self._dt = 0.0  # of the last step
 
-    def material_changed(self) -> None:
-        """Material numbers changed."""
+    def numbers_changed(self) -> None:
+        """Gravity or material numbers changed."""
         self.solver.update_material()
 
     def step(self, dt: float) -> StageResult:
         """One step of dt; on a non-finite result the state is put back and SimulationError raised."""
         world, m, h, w = self.world, self.world.model, self.history, self.solver.work
-        scheme = self.scheme if self._past > 0 or self.scheme.start is None else self.scheme.start
+        releases = world.releases
         target = world.next_target(world.time + dt)
+        if world.releases != releases or dt != self._dt:
+            self._past = 0
+        self._dt = dt
+        scheme = self.scheme if self._past > 0 or self.scheme.start is None else self.scheme.start
         if target is not None:
             w.moved_axes.from_numpy(world.motion.moved_axes())
             if scheme.midpoint:

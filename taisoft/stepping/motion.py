@@ -38,10 +38,8 @@ class Motion:
                 else:
                     self._groups.append(_Group(body.name, c, rows, slice(n_moved, n_moved + len(rows))))
                     n_moved += len(rows)
-        weightless = layout.mass <= 0  # vertices of no tet: nothing acts on them
-        self._fixed[weightless] = True
         self.moved = np.concatenate([g.nodes for g in self._groups]) if self._groups else np.zeros(0, dtype=np.int64)
-        self.held = np.flatnonzero(self.constrained().any(axis=1) & ~weightless)
+        self.held = np.flatnonzero(self.constrained().any(axis=1))
 
     def reset(self) -> None:
         """Take up every path again."""
@@ -81,11 +79,11 @@ class Motion:
             for g in self._groups:
                 if g.released:
                     continue
-                way = g.constraint.path(float(t))
+                way = self._ask(g, float(t))
                 if way is None:
                     letting_go.append(g)
                     continue
-                rows[r, g.rows] = self._rest[g.nodes] + self._checked(g, way, t)
+                rows[r, g.rows] = self._rest[g.nodes] + way
             if letting_go:
                 if r == 0:
                     for g in letting_go:
@@ -94,11 +92,19 @@ class Motion:
         return rows, False
 
     @staticmethod
-    def _checked(group: _Group, way, t: float) -> np.ndarray:
-        way = np.asarray(way, dtype=np.float64)
+    def _ask(group: _Group, t: float) -> np.ndarray | None:
+        """A path's displacement at t, checked; SimulationError names the body, the time and the rule."""
+        what = f"body '{group.name}': the path of its moved nodes"
+        try:
+            way = group.constraint.path(t)
+            if way is None:
+                return None
+            way = np.asarray(way, dtype=np.float64)
+        except Exception as error:  # a user's function may raise anything
+            raise SimulationError(f"{what} failed at t = {t:g} s: {type(error).__name__}: {error}") from error
         if way.shape not in ((3,), (len(group.nodes), 3)) or not np.isfinite(way).all():
             raise SimulationError(
-                f"body '{group.name}': the path of its moved nodes gave {way.tolist() if way.size < 10 else way.shape} at "
-                f"t = {t:g} s: it must be finite, of shape (3,) or ({len(group.nodes)}, 3)"
+                f"{what} gave {way.tolist() if way.size < 10 else way.shape} at t = {t:g} s: "
+                f"it must be finite, of shape (3,) or ({len(group.nodes)}, 3)"
             )
         return way

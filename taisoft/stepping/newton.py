@@ -7,9 +7,10 @@ system (c + beta a) M + beta^2 K(x) + beta b K_d, the gradient and second deriva
 c = 1 for a time step, 0 for statics (v is then a displacement). A full step that lowers |r| is taken; otherwise Phi
 decides by backtracking. K is unprojected; negative curvature in CG asks for the projected one. CG's tolerance follows
 Newton's progress (Eisenstat and Walker 1996, choice 2).
-Convergence: |r| <= tolerance * scale + floor, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes; floor is
-what the rounding of F makes of the forces: below it lies only noise. In statics the scale is the applied load (without any:
-the constraint forces), and a residual under the floor that misses the tolerance ends the solve unconverged.
+Convergence: |r| <= tolerance * scale, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes. The rounding of F
+makes forces of its own; a residual below those (the floor) that a Newton step no longer halves is rounding, which moves
+nothing by more than the rounding of a strain, and ends the stage as converged, its residual told as it is. In statics the
+scale is the applied load (without any: the constraint forces), and rounding above the tolerance is not convergence.
 """
 
 import math
@@ -27,6 +28,7 @@ from taisoft.stepping.stage import StageWork, begin_stage, form_residual, keep_b
 
 MAX_BACKTRACKS = 30  # halvings: below 1e-9 of a step nothing but rounding is left
 SLOW = 0.2  # a step that leaves more of |r| than this asks for a new matrix
+LINEAR_LIMIT = 0.01  # true relative residual of a linearly implicit step above which it has failed
 MAX_FORCING = 0.1  # CG's loosest tolerance
 SUFFICIENT = 1e-4  # Armijo's share of the predicted decrease
 
@@ -39,7 +41,6 @@ class StageResult:
     linear_iterations: int
     residual: float  # relative
     converged: bool
-    projected: bool  # a projected matrix was needed
     at_rounding: bool  # the residual is at the rounding of the forces
 
 
@@ -61,13 +62,14 @@ class StageSolver:
             block_csr.sibling(self.matrix, model, arena, model.real, "damping") if model.stiffness_damping else None
         )
         self.pcg = pcg.build_pcg(model, arena)
-        n, k = model.n_nodes, max(1, len(moved))
+        n, k = model.n_nodes, len(moved)
         self.work = StageWork(
             x_hat=arena.vectors("x_hat", ti.f64, n), v_hat=arena.vectors("v_hat", model.real, n),
-            base=arena.vectors("v_base", model.real, n), residual=arena.vectors("residual", model.real, n),
-            moved=arena.field("stage_moved", ti.i32, k, moved.astype(np.int32) if len(moved) else None),
-            moved_axes=arena.vectors("stage_moved_axes", ti.i32, k), targets=arena.vectors("stage_targets", ti.f64, k),
-            n_moved=len(moved), shift=arena.field("shift", model.real, n), damper=self.damper,
+            base=arena.vectors("x_base", ti.f64, n), residual=arena.vectors("residual", model.real, n),
+            moved=arena.field("stage_moved", ti.i32, k, moved.astype(np.int32)) if k else None,
+            moved_axes=arena.vectors("stage_moved_axes", ti.i32, k) if k else None,
+            targets=arena.vectors("stage_targets", ti.f64, k) if k else None,
+            n_moved=k, shift=arena.field("shift", model.real, n), damper=self.damper,
         )  # fmt: skip
         self.update_material()
 
@@ -114,21 +116,24 @@ class StageSolver:
         """Solve the stage from the present v. x_hat, v_hat and the targets are set by the caller.
 
         by_energy: every step must lower Phi (statics); otherwise a lower |r| is enough. max_newton = 1 takes one full
-        step without looking back (linearly implicit).
+        step without looking back (linearly implicit); it has converged when its linear solve has.
         """
         begin_stage(self.model, self.work, beta)
         r, scale = self._evaluate(c, beta)
         floor = beta * self.rounding_force
-        limit = floor if c > 0.0 or scale <= floor else 0.0  # statics without any load: nothing to compare with
         newton = linear = 0
-        needs_projection, forcing, previous = False, MAX_FORCING, 0.0
-        fresh = False
-        while not r <= tolerance * scale + limit and newton < max_newton:
+        needs_projection, forcing, previous, fresh = False, MAX_FORCING, 0.0, False
+        solved, rounding = True, False
+        while not r <= tolerance * scale and newton < max_newton:
             wanted = linear_tolerance
             if wanted is None:
                 forcing = _forcing(forcing, r, previous)
-                # the last solve need not go far below what Newton asks for; a single one has nobody to correct it
-                wanted = tolerance if max_newton == 1 else max(forcing, 0.1 * (tolerance * scale + limit) / r, 1e-12)
+                # the last solve need not go far below what Newton asks for
+                wanted = max(forcing, 0.1 * tolerance * scale / r, 1e-12)
+                if max_newton == 1 or floor > tolerance * scale:
+                    # nobody corrects a single solve; and where the rounding of stiff stress hides the motion of the
+                    # whole body in |r|, only a tight solve gets that motion right
+                    wanted = min(wanted, tolerance)
             # the matrix is kept while it still serves: assembling costs as much as some ten CG iterations
             if not fresh or by_energy or r > SLOW * previous:
                 self._form_system(beta, needs_projection)
@@ -140,22 +145,32 @@ class StageSolver:
                 self._form_system(beta, True)
                 answer = self._direction(wanted)
                 linear += answer.iterations
+            solved = answer.converged and (max_newton > 1 or self._linear_residual() <= LINEAR_LIMIT)
             previous = r
-            r, scale, moved = self._advance(c, beta, r, scale, max_newton == 1, by_energy)
+            r, scale, moved = self._advance(c, beta, r, scale, max_newton == 1, by_energy, floor)
             newton += 1
             if r <= floor and r > 0.5 * previous:
-                break  # nothing but rounding is left
+                rounding = True  # nothing but rounding is left
+                break
             if not moved:
                 if needs_projection:
                     break
                 needs_projection, fresh = True, False  # the unprojected direction did not go downhill
-        converged = bool(r <= tolerance * scale + limit) or max_newton == 1
-        relative = r / scale if scale > floor or not r <= floor else 0.0
-        return StageResult(
-            newton, linear, relative, converged and bool(np.isfinite(r)), needs_projection, bool(r <= floor)
-        )
+        if max_newton == 1:
+            converged = solved
+        else:  # statics without any load have nothing to compare the rounding with
+            converged = r <= tolerance * scale or (rounding and (c > 0.0 or scale <= floor))
+        relative = r / scale if scale > 0.0 else r
+        return StageResult(newton, linear, relative, bool(converged and np.isfinite(r)), bool(rounding or r <= floor))
 
-    def _advance(self, c: float, beta: float, r: float, scale: float, blind: bool, by_energy: bool):
+    def _linear_residual(self) -> float:
+        """|rhs - A y| / |rhs| as it really is: in f32 CG's own residual can fall while the true one stays."""
+        block_csr.multiply(self.model, self.matrix, self.pcg.y, self.pcg.q)
+        rhs, free = self.pcg.rhs.to_numpy().astype(np.float64), self.model.free.to_numpy()
+        size = float(np.linalg.norm(rhs))
+        return float(np.linalg.norm(rhs - free * self.pcg.q.to_numpy())) / size if size > 0.0 else 0.0
+
+    def _advance(self, c: float, beta: float, r: float, scale: float, blind: bool, by_energy: bool, floor: float):
         """Take the step in pcg.y as far as it helps; returns (|r|, scale, moved)."""
         m, w, y = self.model, self.work, self.pcg.y
         keep_base(m, w, y)
@@ -163,7 +178,7 @@ class StageSolver:
         try_step(m, w, y, 1.0, beta)
         if not by_energy:
             new_r, new_scale = self._evaluate(c, beta)
-            if blind or new_r < r:
+            if blind or new_r < r or new_r <= floor:
                 return new_r, new_scale, True
             try_step(m, w, y, 0.0, beta)
             start = self._objective(c, beta)

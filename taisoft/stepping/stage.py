@@ -18,8 +18,8 @@ class StageWork:
 
     x_hat: Any  # f64
     v_hat: Any
-    base: Any  # v before the step that is being tried
-    residual: Any  # on all axes: constraint impulses where not free
+    base: Any  # f64: x before the step that is being tried
+    residual: Any  # on all axes; where not free, beta times the constraint force
     moved: Any  # (n_moved) i32
     moved_axes: Any  # (n_moved, 3) i32
     targets: Any  # (n_moved) f64 3-vectors
@@ -29,26 +29,25 @@ class StageWork:
 
 
 @ti.func
-def lead_rows(m: ti.template(), w: ti.template()):
-    for k in range(w.n_moved):
-        for a in ti.static(range(3)):
-            if w.moved_axes[k][a] != 0:
-                m.x[w.moved[k]][a] = w.targets[k][a]
+def stage_velocity(m: ti.template(), w: ti.template(), i, beta):
+    """(x - x_hat) / beta of node i in f64: an f32 velocity would make neighbours' positions differ by its rounding."""
+    return (m.x[i] - w.x_hat[i]) / beta
 
 
 @kernel
 def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64):
-    """Constrained velocities from the targets (0 on fixed axes is v's own state), then x from v."""
+    """x from the first iterate v; led nodes go to their targets, which gives their v."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         m.x[i] = w.x_hat[i] + beta * ti.cast(m.v[i], ti.f64)
-    ti.loop_config(serialize=True)
-    for k in range(w.n_moved):
-        i = w.moved[k]
-        for a in ti.static(range(3)):
-            if w.moved_axes[k][a] != 0:
-                m.v[i][a] = ti.cast((w.targets[k][a] - w.x_hat[i][a]) / beta, m.real)
-                m.x[i][a] = w.targets[k][a]
+    if ti.static(w.n_moved > 0):
+        ti.loop_config(serialize=True)
+        for k in range(w.n_moved):
+            i = w.moved[k]
+            for a in ti.static(range(3)):
+                if w.moved_axes[k][a] != 0:
+                    m.v[i][a] = ti.cast((w.targets[k][a] - w.x_hat[i][a]) / beta, m.real)
+                    m.x[i][a] = w.targets[k][a]
 
 
 @kernel
@@ -81,7 +80,7 @@ def form_residual(
                 inertia += b * a * mass
             if ti.static(m.stiffness_damping):
                 drag += m.damping[m.node_body[i], 1] * row_times(m, w.damper, i, m.v)
-            change = ti.cast(c, m.real) * mass * (m.v[i] - w.v_hat[i])
+            change = ti.cast(c * (stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64)), m.real) * mass
             r = change - b * (f + external - drag)
             w.residual[i] = r
             p.rhs[i] = -free * r
@@ -108,26 +107,22 @@ def norm2(a):
 
 @kernel
 def try_step(m: ti.template(), w: ti.template(), y: ti.template(), share: ti.f64, beta: ti.f64):
-    """v = base + share y, x accordingly."""
+    """x = base + share beta y, v accordingly; y is 0 on constrained axes."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        v = w.base[i] + ti.cast(share, m.real) * y[i]
-        m.v[i] = v
-        m.x[i] = w.x_hat[i] + beta * ti.cast(v, ti.f64)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        lead_rows(m, w)
+        m.x[i] = w.base[i] + share * beta * ti.cast(y[i], ti.f64)
+        m.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
 
 
 @kernel
 def keep_base(m: ti.template(), w: ti.template(), y: ti.template()):
-    """base = v; scalars 13: slope r.y of the step y (its sign: negative is downhill)."""
+    """base = x; scalars 13: slope r.y of the step y (its sign: negative is downhill)."""
     ti.loop_config(serialize=m.serial)
     for k in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         s = ti.cast(0.0, ti.f64)
         for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
-            w.base[i] = m.v[i]
+            w.base[i] = m.x[i]
             s += dot64(m.free[i] * w.residual[i], y[i])
         m.partial[k, 5] = s
     ti.loop_config(serialize=True)
@@ -143,7 +138,7 @@ def stage_terms(m: ti.template(), w: ti.template(), c: ti.f64, beta: ti.f64):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         s = ti.cast(0.0, ti.f64)
         for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
-            mass, v = ti.cast(m.mass[i], ti.f64), ti.cast(m.v[i], ti.f64)
+            mass, v = ti.cast(m.mass[i], ti.f64), stage_velocity(m, w, i, beta)
             d = v - ti.cast(w.v_hat[i], ti.f64)
             s += 0.5 * c * mass * d.dot(d)
             if ti.static(m.loaded):

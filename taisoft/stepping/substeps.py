@@ -13,6 +13,7 @@ from taisoft.stepping.world import World
 LAUNCH_SECONDS = 0.1  # aim for one launch, so that Ctrl-C is heard
 SECONDS_PER_TET = 60e-9  # of one sub-step, the slowest seen (corotational with stiffness damping): sizes a launch
 MAX_BATCH = 4096
+TARGET_BYTES_PER_TET = 200  # memory that the targets of a batch may take
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +46,13 @@ class SubstepResult:
 class ExplicitStepper:
     """Takes sub-steps of symplectic Euler or velocity Verlet over a world."""
 
-    explicit = True
-
     def __init__(self, world: World, verlet: bool):
         self.world = world
         m, arena, motion = world.model, world.arena, world.motion
         n_tets = int(world.layout.n_tets.sum())
         self.max_batch = max(1, min(MAX_BATCH, int(LAUNCH_SECONDS / (SECONDS_PER_TET * n_tets))))
         n_moved, n_held = motion.n_moved, len(motion.held)
-        self.rows = max(1, min(self.max_batch, 1_000_000 // max(1, n_moved)))  # bounds the targets' memory
+        self.rows = max(1, min(self.max_batch, TARGET_BYTES_PER_TET * n_tets // (24 * max(1, n_moved))))
 
         def vectors(name: str, count: int, dtype=m.real, wanted: bool = True, data=None):
             return arena.vectors(name, dtype, count, data) if wanted and count > 0 else None
@@ -72,10 +71,14 @@ class ExplicitStepper:
         self.stale = True  # Verlet's acceleration does not belong to the present state
 
     def forget(self) -> None:
-        """The state or a number changed."""
+        """The state was set."""
         self.stale = True
+        if self.work.n_held:
+            self.work.reaction.fill(0.0)
 
-    material_changed = forget
+    def numbers_changed(self) -> None:
+        """Gravity or material numbers changed."""
+        self.stale = True
 
     def advance(self, n: int, dt: float) -> SubstepResult:
         """Take n sub-steps of dt, or fewer where led nodes let go or the launch would last too long; at least one.
@@ -87,7 +90,9 @@ class ExplicitStepper:
         world = self.world
         if self.work.n_moved:
             n = min(n, self.rows)
+            releases = world.releases
             targets = world.next_targets(world.time + dt * np.arange(1, n + 1))
+            self.stale = self.stale or world.releases != releases
             n = len(targets)
             self._upload_targets(targets)
         x, v = world.model.x.to_numpy(), world.model.v.to_numpy()
@@ -111,9 +116,7 @@ class ExplicitStepper:
         return result
 
     def _upload_targets(self, targets: np.ndarray) -> None:
-        padded = np.zeros((self.rows * self.work.n_moved, 3))
-        padded[: targets.size // 3] = targets.reshape(-1, 3)
-        self.work.targets.from_numpy(padded)
+        explicit.set_targets(self.work, targets.reshape(-1, 3))
         self.work.moved_axes.from_numpy(self.world.motion.moved_axes())
 
     def _put_back(self, x: np.ndarray, v: np.ndarray) -> None:

@@ -22,14 +22,15 @@ class World:
     motion: Motion
     time: float = 0.0
     step_count: int = 0
+    releases: int = 0  # times that led nodes were let go: what steppers know of the past then no longer holds
 
     def upload_constraints(self) -> None:
-        """Free axes to the device; velocities of fixed axes become 0."""
+        """Free axes to the device."""
         held = self.motion.constrained()
         self.model.free.from_numpy((~held).astype(self.runtime.np_real))
 
     def upload_material(self) -> None:
-        """Material numbers, masses and loads of the bodies to the device."""
+        """Material numbers and masses of the bodies to the device."""
         m, npr = self.model, self.runtime.np_real
         mass = body_masses(self.scene)
         self.layout = replace(self.layout, mass=mass)
@@ -52,6 +53,7 @@ class World:
             return None
         rows, letting_go = self.motion.targets(times)
         while letting_go and len(rows) == 0:
+            self.releases += 1
             self.upload_constraints()
             rows, letting_go = self.motion.targets(times)
         return rows
