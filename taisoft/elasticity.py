@@ -1,8 +1,9 @@
 """The elastic operator: forces, their differential, energy, and what a state tells about itself.
 
 f_a = -sum_e V P(F) grad N_a; each tet writes its corner forces to a buffer, each node gathers them in a fixed order, so
-the result does not depend on threads. The differential is the report's Algorithm 8 with its last factor corrected:
-dH = -V dP(F; dF) M^T with M = Dm^-1 (M^-T there), and the fourth corner's force belongs to vertex 0.
+the result does not depend on threads. The differential is Algorithm 8 of She, "Soft Body Simulation" (University of
+Copenhagen), with its last factor corrected: dH = -V dP(F; dF) M^T with M = Dm^-1 (M^-T there), and the fourth corner's
+force belongs to vertex 0.
 """
 
 import taichi as ti

@@ -1,5 +1,6 @@
 """Simulator: builds a scene into the machine, steps it, and tells about it."""
 
+import warnings
 import weakref
 
 from taisoft import runtime
@@ -11,6 +12,7 @@ from taisoft.running import run
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
 from taisoft.settings import check_settings
+from taisoft.stability import scale_warnings
 from taisoft.stepping import SCHEMES, make_stepper
 from taisoft.stepping.motion import Motion
 from taisoft.stepping.world import World
@@ -47,6 +49,8 @@ class Simulator(StateAccess):
         self._tangent = None  # fields of force_differential, once asked for
         if self.settings.explicit:
             self._check_stability(self._dt)
+        for text in scale_warnings(scene):
+            warnings.warn(text, UserWarning, stacklevel=2)
         scheme = SCHEMES.get(integrator)
         self.plan = make_plan(scene, self.settings.explicit, scheme is not None and scheme.before > 0.0)
         self._runtime = runtime.open_runtime(arch, precision, f"the simulator of {[b.name for b in scene.bodies]}")

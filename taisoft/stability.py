@@ -14,6 +14,7 @@ from taisoft.errors import SceneError
 from taisoft.model import body_masses
 from taisoft.scene.scene import Body, Scene
 
+CRUSHING = 0.5  # strain under its own weight above which a body's scale is questioned
 LANCZOS_MARGIN = 1.005  # Lanczos nears the highest frequency from below; its tolerance is half of this
 
 
@@ -91,6 +92,24 @@ def highest_frequency(body: Body) -> float:
         return LANCZOS_MARGIN * float(np.sqrt(np.linalg.eigvalsh(0.5 * (dense + dense.T))[-1]))
     top = spl.eigsh(operator, k=1, which="LA", tol=0.5 * (LANCZOS_MARGIN - 1.0), v0=start, return_eigenvectors=False)
     return LANCZOS_MARGIN * float(np.sqrt(top[0]))
+
+
+def scale_warnings(scene: Scene) -> list[str]:
+    """One sentence for each body whose own weight would crush it, as a mesh in millimetres read as metres does."""
+    told = []
+    for body in scene.bodies:
+        size = float(np.ptp(body.rest_positions, axis=0).max())
+        material, pull = body.material, float(np.linalg.norm(scene.gravity))
+        strain = material.density * pull * size / material.young
+        if strain > CRUSHING:
+            mass = material.density * float(body.mesh.volumes.sum())
+            crossing = size / np.sqrt(material.young / material.density)
+            told.append(
+                f"body '{body.name}': {size:.4g} m long and {mass:.3g} kg, its own weight strains it by about {strain:.2g}; "
+                f"a wave crosses it in {crossing:.2g} s, explicit steps must stay below "
+                f"{2.0 / highest_frequency(body):.2g} s: is the mesh in metres and young in pascals?"
+            )
+    return told
 
 
 def _euler_matrix(z: float, drag: float, viscous: float) -> np.ndarray:

@@ -3,7 +3,7 @@
 * it converges in a few iterations, to the tolerance that was asked for, and the linear one decides how much CG does;
 * a step that stops early returns converged=False and says so; the linearly implicit step is one iteration;
 * wild states (inverted, crushed, flat) are met by projection and backtracking: Phi falls, the step converges;
-* nothing to do needs no iteration, in f32 too, whose rounding is no reason to go on.
+* nothing to do needs no iteration, and rounding, of which f32 has much, is no reason to go on.
 """
 
 import numpy as np
@@ -100,6 +100,16 @@ def test_wild_states(sim, kind):
     assert now.total < start.total and now.elastic < 0.03 * start.elastic
     sim._report()
     assert sim._world.model.scalars[1] > 0.0  # no tet is left inverted
+
+
+def test_statics_end_at_the_rounding_of_the_forces(sim):
+    """A tolerance that no arithmetic can meet: not converged, and the reason is told."""
+    solver, model = sim._stepper.solver, sim._world.model
+    solver.work.x_hat.copy_from(model.x)
+    model.v.fill(0.0)
+    result = solver.solve(0.0, 1.0, 1e-18, 100, by_energy=True)
+    assert not result.converged and result.at_rounding and 1e-18 < result.residual < 1e-11
+    assert result.newton_iterations < 20
 
 
 def test_nothing_to_do(shared_sim):

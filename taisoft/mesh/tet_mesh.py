@@ -18,6 +18,7 @@ from taisoft.mesh.topology import Faces, count_components, first_repeated_tet, j
 
 DEGENERATE = 1e-9  # a tet's volume below this times its longest edge cubed counts as none
 LARGEST_COORDINATE = float(np.finfo(np.float32).max)  # [m], forces may be computed in 32 bits
+FAR = 1e5  # distance from the origin over size, above which a mesh is told to lie far away
 COINCIDENT = 1e-9  # vertices nearer than this times the mesh's diagonal count as coincident
 LISTED = 20  # indices named in a message at most
 
@@ -52,6 +53,7 @@ class TetMesh:
         self.n_components = count_components(self.tets, self.n_verts)
         self._tell_joints(faces)
         self._tell_coincident()
+        self._tell_distance()
         for note in notes:
             self._tell(note)
         for array in (self.vertices, self.tets, self.volumes, self.surface, self.surface_tets, self.flipped):
@@ -69,6 +71,15 @@ class TetMesh:
 
     def __repr__(self) -> str:
         return f"TetMesh({self.n_verts} vertices, {self.n_tets} tets, {len(self.surface)} surface triangles)"
+
+    def _tell_distance(self) -> None:
+        """Warn of a mesh far from the origin: positions keep 16 digits, and the distance takes some of them."""
+        size, distance = float(np.ptp(self.vertices, axis=0).max()), float(np.abs(self.vertices).max())
+        if distance > FAR * size:
+            self._tell(
+                f"the mesh lies {distance:.3g} m from the origin, {distance / size:.1g} times its size of {size:.3g} m: "
+                f"its strains are good to {np.finfo(np.float64).eps * distance / size:.0e} at best; centre it for more"
+            )
 
     def _error(self, text: str) -> MeshError:
         return MeshError(f"{self.source}: {text}" if self.source else text)

@@ -1,6 +1,6 @@
 """Explicit steps: symplectic Euler and velocity Verlet, many sub-steps in one kernel launch.
 
-Symplectic Euler (the report's semi-implicit): v += dt a(x, v); x += dt v. First order, stable for dt < 2/omega_max.
+Symplectic Euler (semi-implicit Euler): v += dt a(x, v); x += dt v. First order, stable for dt < 2/omega_max.
 Velocity Verlet: half a kick, drift, force, half a kick. The same cost, second order, the same limit.
 Damping: the stiffness part -c K(x) v enters the force (K projected positive; Verlet extrapolates v to the force's time,
 which keeps it second order); the mass part is a factor on v, exact in Verlet and `1 - dt a` in Euler.
