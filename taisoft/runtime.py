@@ -163,7 +163,9 @@ def kernel(function: Callable) -> Callable:
     @functools.wraps(function)
     def launch(*arguments):
         launches[function.__name__] += 1
-        key = (_kind, *(id(a) for a in arguments if not isinstance(a, (int, float, np.ndarray))))
+        # numbers and arrays are run-time data; True and False, which are ints too, choose a template's code
+        templates = (a for a in arguments if isinstance(a, bool) or not isinstance(a, (int, float, np.ndarray)))
+        key = (_kind, *map(id, templates))
         if key in seen:
             return compiled(*arguments)
         seen.add(key)

@@ -158,9 +158,11 @@ class Oracle:
         return mask
 
     def targets(self, t: float):
-        """(positions, mask) of the led axes at a time; groups that let go are dropped."""
+        """(positions, mask) of the led axes at a time; groups that let go are dropped, and the past with them."""
         where, mask = self.rest.copy(), np.zeros((self.n, 3), dtype=bool)
-        self.led = [group for group in self.led if group[2](t) is not None]
+        still = [group for group in self.led if group[2](t) is not None]
+        if len(still) < len(self.led):
+            self.led, self.past, self.acceleration = still, [], None
         for nodes, led, path in self.led:
             way = np.zeros((self.n, 3))
             way[nodes] = path(t)
@@ -265,10 +267,10 @@ class Oracle:
 
     def bdf2(self, dt: float) -> None:
         """x1 = 4/3 x0 - 1/3 x_(-1) + 2/3 dt v1, v1 alike; the first step is implicit Euler's."""
+        goal, led = self.targets(self.time + dt)
         if not self.past:
             return self.implicit_euler(dt)
         (older_x, older_v), x, v = self.past[-1], self.x, self.v
-        goal, led = self.targets(self.time + dt)
         self.x, self.v = self._stage((4 * x - older_x) / 3, (4 * v - older_v) / 3, 2 * dt / 3, goal, led)
         self._end(x, v, dt)
 

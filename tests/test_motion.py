@@ -3,7 +3,7 @@
 * fixed and led axes are constrained, a released group's are not, a reset takes it up again;
 * targets are the placed rest positions plus the path's displacement, one for all nodes or one for each;
 * targets end before the first release; asked again at that time, they let go and go on;
-* a path that gives anything else is refused with the body's name and the time.
+* a path that fails or gives anything else is refused with the body's name and the time.
 """
 
 from types import SimpleNamespace
@@ -44,14 +44,6 @@ def test_masks():
     assert motion.moved_axes().tolist() == [[1, 0, 1], [1, 0, 1], [0, 1, 0], [0, 1, 0]]
 
 
-def test_vertices_of_no_tet_are_held_but_have_no_reaction():
-    scene = ts.Scene()
-    scene.add_body(cube(), rubber())
-    layout = SimpleNamespace(rest=np.zeros((8, 3)), node_start=np.array([0, 8]), mass=np.r_[0.0, np.ones(7)])
-    motion = Motion(scene, layout)
-    assert motion.constrained()[0].all() and not motion.constrained()[1:].any() and len(motion.held) == 0
-
-
 def test_targets():
     way = np.array([[1.0, 2, 3], [4, 5, 6]])
     motion, rest = made(([5, 2], "xyz", lambda t: t * way), ([3], "y", lambda t: (0, -t, 0)))
@@ -87,4 +79,11 @@ def test_what_a_path_may_give(way):
     motion, _ = made(([0, 1], "xyz", lambda t: (0, 0, 0) if t < 1 else way))
     motion.targets(np.array([0.5]))
     with pytest.raises(ts.SimulationError, match=r"body 'led': the path of its moved nodes gave .* at t = 1.5 s"):
+        motion.targets(np.array([1.5]))
+
+
+@pytest.mark.parametrize("late, words", [(lambda t: 1 / 0, "ZeroDivisionError: "), (lambda t: "up", "ValueError: ")])
+def test_a_path_that_fails(late, words):
+    motion, _ = made(([0, 1], "xyz", lambda t: (0, 0, 0) if t < 1 else late(t)))
+    with pytest.raises(ts.SimulationError, match=f"body 'led': the path of its moved nodes failed at t = 1.5 s: {words}"):
         motion.targets(np.array([1.5]))

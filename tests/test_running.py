@@ -170,12 +170,12 @@ def test_other_errors_are_not_swallowed():
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        ((0.0,), "seconds = 0.0: it must be a finite number above 0"),
-        ((-1,), "seconds = -1"),
-        ((np.inf,), "seconds = inf"),
-        (("1",), "seconds = '1'"),
-        ((1.0, None, 0), "fps = 0: it must be a finite number above 0"),
-        ((1.0, None, np.nan), "fps = nan"),
+        ((0.0,), "seconds must be greater than 0 s, not 0.0"),
+        ((-1,), "seconds must be greater than 0 s, not -1"),
+        ((np.inf,), "seconds must be finite, not inf"),
+        (("1",), "seconds must be a number, not '1'"),
+        ((1.0, None, 0), "fps must be greater than 0 1/s, not 0"),
+        ((1.0, None, np.nan), "fps must be finite, not nan"),
     ],
 )
 def test_bad_arguments(arguments, words):

@@ -119,7 +119,7 @@ def test_implicit_steps_are_the_oracles(implicit, method, monkeypatch):
 
 @pytest.mark.parametrize("change", ["dt", "state", "gravity"])
 def test_a_change_makes_bdf2_start_anew(implicit, change):
-    """The past does not fit any more: the next step is one of implicit Euler."""
+    """Where the past does not fit any more, the next step is one of implicit Euler; another gravity leaves it as it is."""
     oracle = follow(implicit, "bdf2", 2, 1e-8)
     dt = DT
     try:
@@ -131,7 +131,8 @@ def test_a_change_makes_bdf2_start_anew(implicit, change):
         else:
             oracle.gravity = np.array([0.0, 5.0, 0.0])
             implicit.set_gravity(oracle.gravity)
-        oracle.past = []
+        if change != "gravity":
+            oracle.past = []
         for _ in range(2):
             implicit.step()
             oracle.bdf2(dt)

@@ -74,7 +74,7 @@ class StageSolver:
         self.update_material()
 
     def update_material(self) -> None:
-        """Recompute the rounding floor: the nodal forces of a strain as large as its rounding."""
+        """Recompute the rounding floor: the nodal forces of a strain as large as its rounding, the momenta of that of x."""
         m = self.model
         volume, Dm_inv = m.volume.to_numpy().astype(np.float64), m.Dm_inv.to_numpy().astype(np.float64)
         stiff = np.abs(m.law_constants.to_numpy()[:, :2]).sum(axis=1)[m.block_body.to_numpy()]
@@ -82,6 +82,9 @@ class StageSolver:
         largest = float(np.abs(m.x.to_numpy()).max())
         strain = self.eps + np.finfo(np.float64).eps * largest * g  # of F, and of the f64 positions it is formed from
         self.rounding_force = float(np.sqrt(((stiff[:, None] * volume * g * strain) ** 2).sum()))
+        # and of v = (x - x_hat) / beta: |M| times the rounding of x, to be divided by beta
+        mass = m.mass.to_numpy().astype(np.float64)
+        self.rounding_mass = float(np.linalg.norm(mass) * 4.0 * np.finfo(np.float64).eps * largest)
 
     def assemble_damper(self) -> None:
         """K_d = projected K at the present x, for the step that begins."""
@@ -120,7 +123,7 @@ class StageSolver:
         """
         begin_stage(self.model, self.work, beta)
         r, scale = self._evaluate(c, beta)
-        floor = beta * self.rounding_force
+        floor = beta * self.rounding_force + c * self.rounding_mass / beta
         newton = linear = 0
         needs_projection, forcing, previous, fresh = False, MAX_FORCING, 0.0, False
         solved, rounding = True, False
