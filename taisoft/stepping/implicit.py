@@ -149,5 +149,10 @@ class ImplicitStepper:
         """(n_nodes, 3) force of the constraints in the last step [N]."""
         if self._beta == 0.0:
             return np.zeros((self.world.model.n_nodes, 3))
-        held = 1.0 - self.world.model.free.to_numpy().astype(np.float64)
-        return held * self.solver.work.residual.to_numpy() / self._beta
+        m = self.world.model
+        held = 1.0 - m.free.to_numpy().astype(np.float64)
+        force = held * self.solver.work.residual.to_numpy() / self._beta
+        if self.scheme.midpoint:  # led nodes change their velocity once a step, which the stage takes for half of one
+            change = m.v.to_numpy().astype(np.float64) - self.history.v_now.to_numpy()
+            force -= held * self.world.layout.mass[:, None] * change / (2.0 * self._beta)
+        return force
