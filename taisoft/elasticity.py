@@ -1,37 +1,65 @@
 """The elastic operator: forces, their differential, energy, and what a state tells about itself.
 
-f_a = -sum_e V P(F) grad N_a; each tet writes its corner forces to a buffer, each node gathers them in a fixed order, so
-the result does not depend on threads. The differential is Algorithm 8 of She, "Soft Body Simulation" (University of
-Copenhagen), with its last factor corrected: dH = -V dP(F; dF) M^T with M = Dm^-1 (M^-T there), and the fourth corner's
-force belongs to vertex 0.
+f_a = -sum_e V sum_q w_q P(F_q) grad N_a; each tet writes the forces on its nodes to a buffer, each node gathers them in a
+fixed order, so the result does not depend on threads. The differential is Algorithm 8 of She, "Soft Body Simulation"
+(University of Copenhagen), at every quadrature point, with its last factor corrected: dH = -V dP(F; dF) M^T with
+M = Dm^-1 (M^-T there), and the fourth corner's force belongs to vertex 0.
 """
 
 import taichi as ti
 
-from taisoft.elements import broadcast, edge_gradient, gather, law_constants, store_corner_forces, volumes
+from taisoft.elements.lanes import (
+    add_forces,
+    broadcast,
+    differences,
+    gather,
+    gradient_at,
+    law_constants,
+    no_forces,
+    rest_gradients,
+    store_forces,
+    volumes,
+    weight_at,
+)
+from taisoft.mass import mass_times
 from taisoft.materials.projection import dpk1_projected, prepare_projected
-from taisoft.math3 import determinant
+from taisoft.math3 import determinant, matmul_nt
 from taisoft.runtime import kernel
 
 HUGE = 1e30  # above any volume ratio
 
 
 @ti.func
-def element_force(m: ti.template(), law: ti.template(), damped: ti.template(), b):
-    """Corner forces of block b from x (and from v, where the stiffness damping -c K(x) v is on); returns J = det F."""
-    F = edge_gradient(m, m.x, b, m.real)
+def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
+    """Corner forces of block b of group g from x (and from v, where the stiffness damping -c K(x) v is on).
+
+    Returns the least J = det F over each tet's quadrature points.
+    """
+    X = differences(m, g, m.x, b, m.real)
+    M = rest_gradients(m, b, m.real)
     p = law_constants(m, b, m.real)
-    P = law.pk1(F, p)
+    S = no_forces(m, g)
+    lowest = broadcast(ti.cast(HUGE, m.real), m.lanes)
     if ti.static(damped):
-        S = prepare_projected(law, F, p)
-        dF = edge_gradient(m, m.v, b, m.real)
-        D = dpk1_projected(S, dF)
+        V = differences(m, g, m.v, b, m.real)
         c = broadcast(m.damping[m.block_body[b], 1], m.lanes)
-        Q = [P[k] + c * D[k] for k in ti.static(range(9))]
-        store_corner_forces(m, b, Q)
+        for q in range(g.n_points):
+            F = gradient_at(m, g, X, M, q, m.real)
+            dF = gradient_at(m, g, V, M, q, m.real)
+            K = prepare_projected(g.law, F, p)
+            D = dpk1_projected(K, dF)
+            P = g.law.pk1(F, p)
+            Q = [P[k] + c * D[k] for k in ti.static(range(9))]
+            add_forces(m, g, S, Q, M, q)
+            lowest = ti.min(lowest, determinant(F))
     else:
-        store_corner_forces(m, b, P)
-    return determinant(F)
+        for q in range(g.n_points):
+            F = gradient_at(m, g, X, M, q, m.real)
+            P = g.law.pk1(F, p)
+            add_forces(m, g, S, P, M, q)
+            lowest = ti.min(lowest, determinant(F))
+    store_forces(m, g, b, S)
+    return lowest
 
 
 @ti.func
@@ -45,24 +73,30 @@ def count_inverted(m: ti.template(), b, J):
 @kernel
 def elastic_forces(m: ti.template()):
     """Fill the corner buffer from x; returns nothing, nodes gather."""
-    for law, first, last in ti.static(m.laws):
+    for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for b in range(first, last):
-            element_force(m, law, False, b)
+        for b in range(g.first, g.last):
+            element_force(m, g, False, b)
 
 
 @kernel
 def force_differential(m: ti.template(), dx: ti.template(), df: ti.template()):
     """df = (df/dx)(x) dx, matrix-free: (n_nodes) 3-vectors [m] to [N]."""
-    for law, first, last in ti.static(m.laws):
+    for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for b in range(first, last):
-            F = edge_gradient(m, m.x, b, m.real)
-            dF = edge_gradient(m, dx, b, m.real)
+        for b in range(g.first, g.last):
+            X = differences(m, g, m.x, b, m.real)
+            dX = differences(m, g, dx, b, m.real)
+            M = rest_gradients(m, b, m.real)
             p = law_constants(m, b, m.real)
-            S = law.prepare(F, p)
-            dP = law.dpk1(F, S, dF)
-            store_corner_forces(m, b, dP)
+            S = no_forces(m, g)
+            for q in range(g.n_points):
+                F = gradient_at(m, g, X, M, q, m.real)
+                dF = gradient_at(m, g, dX, M, q, m.real)
+                K = g.law.prepare(F, p)
+                dP = g.law.dpk1(F, K, dF)
+                add_forces(m, g, S, dP, M, q)
+            store_forces(m, g, b, S)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         df[i] = gather(m, i)
@@ -104,12 +138,16 @@ def measure(m: ti.template()):
         lowest = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
         inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
         size = (m.n_blocks + m.chunks - 1) // m.chunks
-        for law, first, last in ti.static(m.laws):
-            for b in range(ti.max(first, c * size), ti.min(last, (c + 1) * size)):
-                F = edge_gradient(m, m.x, b, ti.f64)
+        for g in ti.static(m.groups):
+            for b in range(ti.max(g.first, c * size), ti.min(g.last, (c + 1) * size)):
+                X = differences(m, g, m.x, b, ti.f64)
+                M = rest_gradients(m, b, ti.f64)
                 p = law_constants(m, b, ti.f64)
-                energy += volumes(m, b, ti.f64) * law.psi(F, p)
-                J = determinant(F)
+                J = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
+                for q in range(g.n_points):
+                    F = gradient_at(m, g, X, M, q, ti.f64)
+                    energy += weight_at(m, g, q, ti.f64) * volumes(m, b, ti.f64) * g.law.psi(F, p)
+                    J = ti.min(J, determinant(F))
                 lowest = ti.min(lowest, J)
                 inverted += count_inverted(m, b, J)
         m.partial[c, 0] = _lane_sum(energy)
@@ -118,9 +156,8 @@ def measure(m: ti.template()):
         kinetic, gravity = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         size_n = (m.n_nodes + m.chunks - 1) // m.chunks
         for i in range(c * size_n, ti.min(m.n_nodes, (c + 1) * size_n)):
-            mass, v = ti.cast(m.mass[i], ti.f64), ti.cast(m.v[i], ti.f64)
-            kinetic += 0.5 * mass * v.dot(v)
-            gravity -= mass * ti.cast(m.gravity[0], ti.f64).dot(m.x[i])
+            kinetic += 0.5 * ti.cast(m.v[i], ti.f64).dot(mass_times(m, i, m.v))
+            gravity -= ti.cast(m.weight[i], ti.f64) * ti.cast(m.gravity[0], ti.f64).dot(m.x[i])
         m.partial[c, 3], m.partial[c, 4] = kinetic, gravity
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -137,15 +174,26 @@ def measure(m: ti.template()):
 
 @kernel
 def cauchy_stress(m: ti.template(), sigma: ti.types.ndarray()):
-    """sigma = P F^T / J per tet, (n_blocks * lanes, 9) [Pa]; not finite where a tet is flat."""
-    for law, first, last in ti.static(m.laws):
+    """Mean of sigma = P F^T / J over the deformed tet, (n_blocks * lanes, 9) [Pa]; not finite where a tet is flat."""
+    for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for b in range(first, last):
-            F = edge_gradient(m, m.x, b, ti.f64)
-            P = law.pk1(F, law_constants(m, b, ti.f64))
-            J = determinant(F)
-            for i in ti.static(range(3)):
-                for j in ti.static(range(3)):
-                    s = (P[3 * i] * F[3 * j] + P[3 * i + 1] * F[3 * j + 1] + P[3 * i + 2] * F[3 * j + 2]) / J
-                    for q in ti.static(range(m.lanes)):
-                        sigma[b * m.lanes + q, 3 * i + j] = s[q]
+        for b in range(g.first, g.last):
+            X = differences(m, g, m.x, b, ti.f64)
+            M = rest_gradients(m, b, ti.f64)
+            p = law_constants(m, b, ti.f64)
+            size = broadcast(ti.cast(0.0, ti.f64), m.lanes)  # sum of w_q J_q: the deformed volume over the rest volume
+            for k in range(9):
+                for q in ti.static(range(m.lanes)):
+                    sigma[b * m.lanes + q, k] = 0.0
+            for q in range(g.n_points):
+                F = gradient_at(m, g, X, M, q, ti.f64)
+                w = weight_at(m, g, q, ti.f64)
+                P = g.law.pk1(F, p)
+                T = matmul_nt(P, F)
+                size += w * determinant(F)
+                for k in ti.static(range(9)):
+                    for l in ti.static(range(m.lanes)):
+                        sigma[b * m.lanes + l, k] += w * T[k][l]
+            for k in range(9):
+                for q in ti.static(range(m.lanes)):
+                    sigma[b * m.lanes + q, k] /= size[q]

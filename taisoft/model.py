@@ -1,8 +1,9 @@
 """Model: the arrays of a scene. One structure of arrays over all bodies, elements in blocks of SIMD lanes.
 
 Topology, rest shape and law are constant (a kernel is compiled for them); gravity, material numbers, loads and
-constraint masks are run-time data. Nodes keep the order of the bodies and of their meshes. Tets are grouped by law
-(a kernel runs one law's blocks in one loop), and a body's last block is padded with copies of its last tet of volume 0.
+constraint masks are run-time data. Nodes keep the order of the bodies and of their meshes. Tets are grouped by order,
+quadrature and law (a kernel runs one group's blocks in one loop), and a body's last block is padded with copies of its
+last tet of volume 0.
 """
 
 import difflib
@@ -12,13 +13,32 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft import elements
+from taisoft.elements import reference
 from taisoft.errors import SceneError
+from taisoft.mass import MassMatrix, lumped_masses, upload_mass_matrix, weight_masses
 from taisoft.materials import LAWS
+from taisoft.node_graph import PAIRS, NodeGraph, node_graph
 from taisoft.runtime import FieldArena, Runtime
 from taisoft.scene.scene import Body, Material, Scene
 
-PARALLEL_FROM = 100_000  # tets from which parallel loops beat one serial kernel on the CPU (50 us to wake the threads)
+PARALLEL_FROM = 100_000  # points from which parallel loops beat one serial kernel on the CPU (50 us to wake the threads)
+MATRIX_BLOCKS = {1: 6, 2: 45 + 6}  # 3x3 blocks per tet in the buffer of an assembly: node pairs, and what they come from
+
+
+@dataclass(frozen=True)
+class Group:
+    """Blocks of one kind of element and law, and where their parts of the flat arrays begin; all known to the compiler."""
+
+    law: Any  # module of taisoft.materials
+    order: int
+    n_nodes: int  # of an element
+    n_points: int
+    first: int  # block
+    last: int  # one past its last block
+    nodes_at: int  # in Model.nodes
+    corner_at: int  # in Model.corner
+    matrix_at: int  # in the buffer of an assembly
+    points_at: int  # row of Model.points
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,24 +50,29 @@ class Model:
     serial: bool  # loops run on one thread
     n_nodes: int
     n_blocks: int
-    laws: tuple  # (law module, first block, one past its last block)
+    groups: tuple  # of Group
     x: Any  # (n_nodes) 3-vectors f64: positions [m]
     v: Any  # (n_nodes) 3-vectors: velocities [m/s]
-    verts: Any  # (n_blocks, 4, lanes) i32: nodes of each tet
+    nodes: Any  # i32: nodes of each tet, per block (node, lane); they ascend, corners before middles
+    rules: tuple  # reference.Quadrature of the groups of order 2, one after the other
+    points: Any  # (points, 28), or None: of these rules, the weight and dN_a/d(l_1, l_2, l_3) of nodes 1 to 9
     Dm_inv: Any  # (n_blocks, 9, lanes) [1/m]
     volume: Any  # (n_blocks, lanes) [m^3]
     block_body: Any  # (n_blocks) i32
     law_constants: Any  # (n_bodies, 4)
-    corner: Any  # (n_blocks * 12 * lanes): corner forces [N], per block (corner, axis, lane)
+    corner: Any  # forces of each tet on its nodes [N], per block (node, axis, lane)
     gather_start: Any  # (n_nodes + 1) i32: rows of gather_entry
-    gather_entry: Any  # (4 n_tets) i32: base index into corner
+    gather_entry: Any  # i32: base index into corner of each node of each tet
     mass: Any  # (n_nodes) lumped mass [kg]
+    weight: Any  # (n_nodes) what gravity pulls at [kg]: the lumped mass, or int rho N_a dV
+    mass_matrix: Any  # MassMatrix, or None: consistent mass
     free: Any  # (n_nodes) 3-vectors: 1 on free axes, 0 on constrained ones
     gravity: Any  # () 3-vector [m/s^2]
     loads: Any  # (n_nodes) 3-vectors [N], or None: tractions and forces
     node_body: Any  # (n_nodes) i32, or None: only where damping needs it
     damping: Any  # (n_bodies, 2), or None: mass damping [1/s], stiffness damping [s]
-    loaded: bool  # which of the above are on
+    consistent: bool  # which of the above are on
+    loaded: bool
     damped: bool
     stiffness_damping: bool
     scalars: Any  # (16) f64: what a kernel tells the host
@@ -62,7 +87,6 @@ class Layout:
     node_start: np.ndarray  # (n_bodies + 1)
     block_start: np.ndarray  # (n_bodies,) first block of each body
     n_tets: np.ndarray  # (n_bodies,)
-    mass: np.ndarray  # (n_nodes,) [kg]
     rest: np.ndarray  # (n_nodes, 3) rest positions, placed
 
     def nodes(self, body: int) -> slice:
@@ -70,71 +94,107 @@ class Layout:
         return slice(self.node_start[body], self.node_start[body + 1])
 
 
-def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple]:
-    counts = [len(b.rest_positions) for b in scene.bodies]
-    n_tets = np.array([b.mesh.n_tets for b in scene.bodies])
+def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
+    bodies = scene.bodies
+    n_tets = np.array([b.mesh.n_tets for b in bodies])
     blocks = -(-n_tets // lanes)
-    block_start = np.zeros(len(counts), dtype=np.int64)
-    laws, next_block = [], 0
-    for name, law in LAWS.items():
-        first = next_block
-        for k, body in enumerate(scene.bodies):
-            if body.material.law == name:
-                block_start[k] = next_block
-                next_block += int(blocks[k])
-        if next_block > first:
-            laws.append((law, first, next_block))
-    rest = np.concatenate([b.rest_positions + b.position for b in scene.bodies])
-    node_start = np.concatenate([[0], np.cumsum(counts)])
-    return Layout(node_start, block_start, n_tets, body_masses(scene), rest), tuple(laws)
+    block_start = np.zeros(len(bodies), dtype=np.int64)
+    kinds = sorted({(b.order, b.quadrature_degree, list(LAWS).index(b.material.law)) for b in bodies})
+    rules = sorted({degree for order, degree, _ in kinds if order == 2})
+    groups, block, nodes_at, corner_at, matrix_at = [], 0, 0, 0, 0
+    for order, degree, law in kinds:
+        first = block
+        for k, body in enumerate(bodies):
+            if (body.order, body.quadrature_degree, list(LAWS).index(body.material.law)) == (order, degree, law):
+                block_start[k] = block
+                block += int(blocks[k])
+        n_nodes, count = len(reference.unit_mass(order)), (block - first) * lanes
+        points_at = sum(len(reference.quadrature(r).weights) for r in rules if r < degree) if order == 2 else 0
+        groups.append(
+            Group(
+                list(LAWS.values())[law], order, n_nodes, len(reference.quadrature(degree).weights), first, block,
+                nodes_at, corner_at, matrix_at, points_at,
+            )
+        )  # fmt: skip
+        nodes_at += count * n_nodes
+        corner_at += count * n_nodes * 3
+        matrix_at += (block - first) * MATRIX_BLOCKS[order] * 9
+    rest = np.concatenate([b.rest_positions + b.position for b in bodies])
+    node_start = np.concatenate([[0], np.cumsum([b.n_nodes for b in bodies])])
+    return Layout(node_start, block_start, n_tets, rest), tuple(groups)
 
 
-def body_masses(scene: Scene) -> np.ndarray:
-    """Lumped masses of all nodes, bodies in order [kg]."""
-    return np.concatenate(
-        [elements.lumped_mass(b.mesh.tets, b.mesh.volumes, b.material.density, b.mesh.n_verts) for b in scene.bodies]
-    )
+def _rule_table(rules: tuple[reference.Quadrature, ...]) -> np.ndarray:
+    """(points, 28) of `Model.points`."""
+    points, weights = np.concatenate([r.points for r in rules]), np.concatenate([r.weights for r in rules])
+    # of the four barycentric derivatives; l_0 = 1 - l_1 - l_2 - l_3
+    s = reference.shape_derivatives(2, points)[:, 1:]
+    return np.column_stack([weights, (s[:, :, 1:] - s[:, :, :1]).reshape(len(points), 27)])
 
 
 def body_loads(scene: Scene) -> np.ndarray:
-    """Nodal forces of tractions and forces (n_nodes, 3) [N]; forces are spread over their nodes by lumped mass."""
+    """Nodal forces of tractions and forces (n_nodes, 3) [N]; total forces are spread over their nodes by lumped mass."""
     parts = []
     for body in scene.bodies:
-        total = np.zeros((body.mesh.n_verts, 3))
+        total = np.zeros((body.n_nodes, 3))
         for t in body.tractions:
-            total += elements.traction_forces(body.mesh.vertices, body.mesh.surface[t.triangles], t.value)
-        mass = elements.lumped_mass(body.mesh.tets, body.mesh.volumes, 1.0, body.mesh.n_verts)
+            total += reference.traction_forces(body, t.triangles, t.value)
+        mass = reference.lumped_mass(body)
         for f in body.forces:
-            total[f.nodes] += np.outer(mass[f.nodes] / mass[f.nodes].sum(), f.value)
+            shares = mass[f.nodes] / mass[f.nodes].sum()
+            total[f.nodes] += f.value if f.value.ndim == 2 else np.outer(shares, f.value)
         parts.append(total)
     return np.concatenate(parts)
 
 
-def _packed_tets(scene: Scene, layout: Layout, n_blocks: int, lanes: int):
-    """Node ids (n_blocks*lanes, 4), Dm^-1 and volumes of every lane, and which lanes hold a real tet."""
-    verts = np.zeros((n_blocks * lanes, 4), dtype=np.int64)
-    Dm_inv, volume = np.zeros((n_blocks * lanes, 3, 3)), np.zeros(n_blocks * lanes)
-    real = np.zeros(n_blocks * lanes, dtype=bool)
+def _packed_tets(scene: Scene, layout: Layout, groups: tuple[Group, ...], lanes: int):
+    """Node ids of every lane, a list with (lanes, n_nodes) for each group; Dm^-1, volumes (0 in padding) of every lane."""
+    count = groups[-1].last * lanes
+    nodes = [np.zeros(((g.last - g.first) * lanes, g.n_nodes), dtype=np.int64) for g in groups]
+    Dm_inv, volume = np.zeros((count, 3, 3)), np.zeros(count)
     for k, body in enumerate(scene.bodies):
-        # ascending vertices: F and V do not mind, and every mesh edge then has one direction in all its tets
-        tets = np.sort(body.mesh.tets, axis=1)
-        inverse, v = elements.inverse_rest_edges(body.mesh.vertices, tets)
+        # ascending nodes: F and V do not mind, and every node pair then has one direction in all its tets; the middles
+        # of edges are numbered like their ends, so they can be sorted apart
+        own = body.nodes.elements
+        own = np.concatenate([np.sort(own[:, :4], axis=1), np.sort(own[:, 4:], axis=1)], axis=1)
+        inverse, v = reference.inverse_rest_edges(body.mesh.vertices, own[:, :4])
         first, m = layout.block_start[k] * lanes, body.mesh.n_tets
         last = first + -(-m // lanes) * lanes
         padded = np.minimum(np.arange(last - first), m - 1)
-        verts[first:last] = tets[padded] + layout.node_start[k]
-        Dm_inv[first:last], volume[first : first + m], real[first : first + m] = inverse[padded], v, True
-    return verts, Dm_inv, volume, real
+        j = next(j for j, g in enumerate(groups) if g.first <= layout.block_start[k] < g.last)
+        at = first - groups[j].first * lanes
+        nodes[j][at : at + len(padded)] = own[padded] + layout.node_start[k]
+        Dm_inv[first:last], volume[first : first + m] = inverse[padded], v
+    return nodes, Dm_inv, volume
 
 
-def _gather_table(verts: np.ndarray, real: np.ndarray, n_nodes: int, lanes: int) -> tuple[np.ndarray, np.ndarray]:
+def _gather_table(nodes, groups: tuple[Group, ...], real: np.ndarray, n_nodes: int, lanes: int):
     """CSR from node to the corner-buffer entries of its tets, in block order."""
-    lane = np.flatnonzero(real)
-    node = verts[lane].reshape(-1)
-    entry = ((lane // lanes)[:, None] * 12 + np.arange(4) * 3) * lanes + (lane % lanes)[:, None]
+    ids, entries = [], []
+    for own, g in zip(nodes, groups):
+        lane = np.flatnonzero(real[g.first * lanes : g.last * lanes])
+        base = (lane // lanes)[:, None] * (3 * g.n_nodes * lanes) + (lane % lanes)[:, None]
+        ids.append(own[lane].reshape(-1))
+        entries.append((g.corner_at + base + 3 * lanes * np.arange(g.n_nodes)).reshape(-1))
+    node, entry = np.concatenate(ids), np.concatenate(entries)
     order = np.argsort(node, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=n_nodes))])
-    return start.astype(np.int32), entry.reshape(-1)[order].astype(np.int32)
+    return start.astype(np.int32), entry[order].astype(np.int32)
+
+
+def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray]:
+    """The node pairs that share a tet, and for each pair of each tet lanes times its place in an assembly plus its lane."""
+    lanes, flat = model.lanes, model.nodes.to_numpy().astype(np.int64)
+    real = model.volume.to_numpy().reshape(-1) > 0
+    ends, entries = [], []
+    for g in model.groups:
+        pairs, lane = np.array(PAIRS[g.order]), np.flatnonzero(real[g.first * lanes : g.last * lanes])
+        block = flat[g.nodes_at :][: (g.last - g.first) * g.n_nodes * lanes].reshape(-1, g.n_nodes, lanes)
+        own = block.transpose(0, 2, 1).reshape(-1, g.n_nodes)[lane]
+        ends.append(own[:, pairs].reshape(-1, 2))
+        base = g.matrix_at + (lane // lanes)[:, None] * (MATRIX_BLOCKS[g.order] * 9) + 9 * np.arange(len(pairs))
+        entries.append((base * lanes + (lane % lanes)[:, None]).reshape(-1))
+    return node_graph(np.concatenate(ends), model.n_nodes), np.concatenate(entries)
 
 
 def lane_layout(values: np.ndarray, lanes: int) -> np.ndarray:
@@ -150,45 +210,67 @@ def material_table(materials: list[Material]) -> np.ndarray:
 def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str, bool]) -> tuple[Model, Layout]:
     """Allocate and fill the model of a scene. on: the plan's switches; what is off allocates nothing."""
     lanes, real, npr = runtime.lanes, runtime.real, runtime.np_real
-    layout, laws = _layout(scene, lanes)
-    n_nodes, n_blocks = len(layout.rest), laws[-1][2]
-    verts, Dm_inv, volume, present = _packed_tets(scene, layout, n_blocks, lanes)
-    start, entry = _gather_table(verts, present, n_nodes, lanes)
+    layout, groups = _layout(scene, lanes)
+    n_nodes, n_blocks = len(layout.rest), groups[-1].last
+    nodes, Dm_inv, volume = _packed_tets(scene, layout, groups, lanes)
+    start, entry = _gather_table(nodes, groups, volume > 0, n_nodes, lanes)
     block_body = np.zeros(n_blocks, dtype=np.int32)
     for k in range(len(scene.bodies)):
         block_body[layout.block_start[k] : layout.block_start[k] + -(-layout.n_tets[k] // lanes)] = k
-    serial = runtime.arch == "cpu" and int(layout.n_tets.sum()) < PARALLEL_FROM
+    work = sum((g.last - g.first) * lanes * g.n_points for g in groups)
+    serial = runtime.arch == "cpu" and work < PARALLEL_FROM
     chunks = 1 if serial else (64 if runtime.arch == "cpu" else 4096)
     damped = on["mass_damping"] or on["stiffness_damping"]
     n_bodies = len(scene.bodies)
     node_body = np.repeat(np.arange(n_bodies, dtype=np.int32), np.diff(layout.node_start))
     velocity = np.concatenate([np.broadcast_to(b.velocity, b.rest_positions.shape) for b in scene.bodies])
+    flat_nodes = np.concatenate([lane_layout(own, lanes).reshape(-1) for own in nodes])
+    rules = tuple(reference.quadrature(d) for d in sorted({b.quadrature_degree for b in scene.bodies if b.order == 2}))
+    table = _rule_table(rules) if rules else None
+    mass = arena.field("mass", real, n_nodes, lumped_masses(scene).astype(npr))
     model = Model(
-        real=real, lanes=lanes, serial=serial, n_nodes=n_nodes, n_blocks=n_blocks, laws=laws,
+        real=real, lanes=lanes, serial=serial, n_nodes=n_nodes, n_blocks=n_blocks, groups=groups,
         x=arena.vectors("x", ti.f64, n_nodes, layout.rest),
         v=arena.vectors("v", real, n_nodes, velocity.astype(npr)),
-        verts=arena.field("verts", ti.i32, (n_blocks, 4, lanes), lane_layout(verts, lanes).astype(np.int32)),
+        nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
+        rules=rules, points=arena.field("points", ti.f64, (len(table), 28), table) if rules else None,
         Dm_inv=arena.field("Dm_inv", real, (n_blocks, 9, lanes), lane_layout(Dm_inv.reshape(-1, 9), lanes).astype(npr)),
         volume=arena.field("volume", real, (n_blocks, lanes), volume.reshape(n_blocks, lanes).astype(npr)),
         block_body=arena.field("block_body", ti.i32, n_blocks, block_body),
         law_constants=arena.field(
             "law_constants", ti.f64, (n_bodies, 4), material_table([b.material for b in scene.bodies])
         ),
-        corner=arena.field("corner", real, n_blocks * 12 * lanes),
+        corner=arena.field("corner", real, 3 * len(flat_nodes)),
         gather_start=arena.field("gather_start", ti.i32, n_nodes + 1, start),
         gather_entry=arena.field("gather_entry", ti.i32, len(entry), entry),
-        mass=arena.field("mass", real, n_nodes, layout.mass.astype(npr)),
+        mass=mass,
+        weight=arena.field("weight", real, n_nodes, weight_masses(scene).astype(npr)) if on["consistent_weight"] else mass,
+        mass_matrix=None,
         free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
         gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),
         loads=arena.vectors("loads", real, n_nodes, body_loads(scene).astype(npr)) if on["loads"] else None,
         node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
         damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
-        loaded=on["loads"], damped=damped, stiffness_damping=on["stiffness_damping"],
+        consistent=on["consistent_mass"], loaded=on["loads"], damped=damped, stiffness_damping=on["stiffness_damping"],
         scalars=arena.field("scalars", ti.f64, 16),
         partial=arena.field("partial", ti.f64, (chunks, 8)),
         chunks=chunks,
     )  # fmt: skip
+    if on["consistent_mass"]:
+        model = replace(model, mass_matrix=_build_mass_matrix(scene, model, arena, npr))
     return model, layout
+
+
+def _build_mass_matrix(scene: Scene, model: Model, arena: FieldArena, npr: type) -> MassMatrix:
+    graph, _ = model_graph(model)
+    mass = MassMatrix(
+        row_start=arena.field("mass_row_start", ti.i32, model.n_nodes + 1, graph.row_start.astype(np.int32)),
+        column=arena.field("mass_column", ti.i32, len(graph.column), graph.column.astype(np.int32)),
+        value=arena.field("mass_value", model.real, len(graph.column)),
+        diagonal=arena.field("mass_diagonal", model.real, model.n_nodes),
+    )
+    upload_mass_matrix(scene, mass, npr)
+    return mass
 
 
 def damping_table(scene: Scene) -> np.ndarray:

@@ -9,9 +9,9 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 
-from taisoft import elements
+from taisoft.elements import reference
 from taisoft.errors import SceneError
-from taisoft.model import body_masses
+from taisoft.mass import lumped_masses
 from taisoft.scene.scene import Body, Scene
 
 CRUSHING = 0.5  # strain under its own weight above which a body's scale is questioned
@@ -20,54 +20,39 @@ LANCZOS_MARGIN = 1.005  # Lanczos nears the highest frequency from below; its to
 
 def hooke_differential(body: Body):
     """Matrix-free K v of one body at rest: a function (n,3) -> (n,3) [N per unit of v]."""
-    tets = body.mesh.tets
-    Dm_inv, volume = elements.inverse_rest_edges(body.mesh.vertices, tets)
-    gradients = elements.shape_gradients(Dm_inv)
-    mu, lam, n = body.material.mu, body.material.lam, body.mesh.n_verts
+    nodes = body.nodes.elements
+    gradients, volumes = reference.shape_gradients(body)
+    mu, lam, n = body.material.mu, body.material.lam, body.n_nodes
 
     def apply(v: np.ndarray) -> np.ndarray:
-        H = np.einsum("eai,eaj->eij", v[tets], gradients)
-        P = mu * (H + H.transpose(0, 2, 1)) + lam * np.einsum("eii->e", H)[:, None, None] * np.eye(3)
-        f = np.einsum("e,eij,eaj->eai", volume, P, gradients)
-        return np.stack([np.bincount(tets.reshape(-1), f[:, :, k].reshape(-1), n) for k in range(3)], axis=1)
+        f = np.zeros((*nodes.shape, 3))
+        for q in range(volumes.shape[1]):
+            g = gradients[:, q]
+            H = np.einsum("eai,eaj->eij", v[nodes], g)
+            P = mu * (H + H.transpose(0, 2, 1)) + lam * np.einsum("eii->e", H)[:, None, None] * np.eye(3)
+            f += np.einsum("e,eij,eaj->eai", volumes[:, q], P, g)
+        return np.stack([np.bincount(nodes.reshape(-1), f[:, :, k].reshape(-1), n) for k in range(3)], axis=1)
 
     return apply
 
 
 def hooke_stiffness(body: Body) -> sp.csr_matrix:
     """Stiffness matrix (3n, 3n) of one body at rest [N/m]."""
-    tets, mu, lam = body.mesh.tets, body.material.mu, body.material.lam
-    Dm_inv, volume = elements.inverse_rest_edges(body.mesh.vertices, tets)
-    g = elements.shape_gradients(Dm_inv)
-    # K_ab = V (mu (ga.gb) I + mu gb ga^T + lambda ga gb^T)
-    inner = np.einsum("eai,ebi->eab", g, g)
-    K = (
-        mu * inner[..., None, None] * np.eye(3)
-        + mu * np.einsum("ebi,eaj->eabij", g, g)
-        + lam * np.einsum("eai,ebj->eabij", g, g)
-    )
-    K *= volume[:, None, None, None, None]
-    dof = 3 * tets[:, :, None] + np.arange(3)
+    nodes, mu, lam = body.nodes.elements, body.material.mu, body.material.lam
+    gradients, volumes = reference.shape_gradients(body)
+    # G_ab = sum_q V_q ga gb^T, and K_ab = mu (tr(G_ab) I + G_ab^T) + lambda G_ab
+    G = np.einsum("eq,eqai,eqbj->eabij", volumes, gradients, gradients, optimize=True)
+    K = mu * (np.einsum("eabii->eab", G)[..., None, None] * np.eye(3) + G.swapaxes(3, 4)) + lam * G
+    dof = 3 * nodes[:, :, None] + np.arange(3)
     rows = np.broadcast_to(dof[:, :, None, :, None], K.shape)
     columns = np.broadcast_to(dof[:, None, :, None, :], K.shape)
-    size = 3 * body.mesh.n_verts
+    size = 3 * body.n_nodes
     return sp.csr_matrix((K.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(size, size))
-
-
-def consistent_mass(body: Body) -> sp.csr_matrix:
-    """Consistent mass matrix (3n, 3n): rho V/20 (1 + delta_ab) per tet [kg]."""
-    tets = body.mesh.tets
-    share = (np.ones((4, 4)) + np.eye(4)) / 20.0
-    values = body.material.density * body.mesh.volumes[:, None, None] * share
-    rows, columns = np.broadcast_arrays(tets[:, :, None], tets[:, None, :])
-    n = body.mesh.n_verts
-    scalar = sp.csr_matrix((values.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(n, n))
-    return sp.kron(scalar, sp.identity(3), format="csr")
 
 
 def held_axes(body: Body, led: bool) -> np.ndarray:
     """(n, 3) bool: axes that are fixed; those that follow a path too, if led."""
-    held = np.zeros((body.mesh.n_verts, 3), dtype=bool)
+    held = np.zeros((body.n_nodes, 3), dtype=bool)
     for c in body.constraints:
         if led or c.path is None:
             held[np.ix_(c.nodes, np.flatnonzero(c.axes))] = True
@@ -76,7 +61,7 @@ def held_axes(body: Body, led: bool) -> np.ndarray:
 
 def highest_frequency(body: Body) -> float:
     """omega_max [rad/s] of a body at rest with lumped mass, by Lanczos, a fraction of a percent on the high side."""
-    mass = elements.lumped_mass(body.mesh.tets, body.mesh.volumes, body.material.density, body.mesh.n_verts)
+    mass = reference.lumped_mass(body)
     free = ~held_axes(body, led=False)  # a path may let go
     scale = np.where(free, 1.0 / np.sqrt(mass)[:, None], 0.0)
     if not free.any():
@@ -183,9 +168,10 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
         raise SceneError(f"k = {k!r}: it must be a whole number from 1 to the {n_free} free axes of the scene")
     K = sp.block_diag([hooke_stiffness(b) for b in scene.bodies], format="csr")[free][:, free]
     if mass == "lumped":
-        M = sp.diags(np.repeat(body_masses(scene), 3)[free], format="csc")
+        M = sp.diags(np.repeat(lumped_masses(scene), 3)[free], format="csc")
     else:
-        M = sp.block_diag([consistent_mass(b) for b in scene.bodies], format="csr")[free][:, free]
+        scalar = sp.block_diag([reference.consistent_mass(b) for b in scene.bodies])
+        M = sp.kron(scalar, sp.identity(3), format="csr")[free][:, free]
     if n_free <= max(200, 2 * k):
         values, vectors = _dense_modes(K, M, k)
     else:

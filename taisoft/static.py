@@ -7,7 +7,7 @@ import numpy as np
 from taisoft.elasticity import measure
 from taisoft.errors import SceneError, SimulationError
 from taisoft.model import Layout, build_model
-from taisoft.runtime import FieldArena, open_kind, open_runtime
+from taisoft.runtime import FieldArena, Runtime, open_kind, open_runtime
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
 from taisoft.stepping.motion import Motion
@@ -70,7 +70,7 @@ def solve_static(
     runtime = open_runtime(arch, precision, "solve_static")
     arena = FieldArena()
     try:
-        return _Static(scene, runtime, arena, tolerance, time).solve()
+        return StaticSolver(scene, runtime, arena, tolerance, time).solve()
     finally:
         arena.release()
         runtime.close()
@@ -90,12 +90,15 @@ def _check(scene: Scene, tolerance: float) -> None:
             raise SceneError(f"body '{body.name}': nothing holds it along {missing}, so it has no static state")
 
 
-class _Static:
-    def __init__(self, scene, runtime, arena, tolerance, time):
+class StaticSolver:
+    """The rest state of a scene in an open runtime; `solve` starts from rest each time it is called."""
+
+    def __init__(self, scene: Scene, runtime: Runtime, arena: FieldArena, tolerance: float, time: float):
         plan = make_plan(scene, explicit=False, multistep=False)
         model, layout = build_model(
-            scene, runtime, arena, {**plan.on, "mass_damping": False, "stiffness_damping": False}
-        )
+            scene, runtime, arena,
+            {**plan.on, "mass_damping": False, "stiffness_damping": False, "consistent_mass": False},
+        )  # fmt: skip
         self.world = World(scene, runtime, arena, model, layout, Motion(scene, layout))
         self.solver = StageSolver(model, arena, runtime.eps, self.world.motion.moved)
         self.tolerance = tolerance

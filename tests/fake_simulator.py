@@ -8,11 +8,11 @@ from taisoft.records import Energies, RunReport, StepReport
 RUBBER = ts.Material(law="stable_neo_hookean", young=1e5, poisson=0.3, density=1000.0)
 
 
-def beam_scene(names=("beam",), cells=(8, 2, 2)):
+def beam_scene(names=("beam",), cells=(8, 2, 2), order=1):
     """Beams of 4 x 1 x 1 m, 1.5 m above one another, fixed at their left end."""
     scene = ts.Scene()
     for k, name in enumerate(names):
-        body = scene.add_body(ts.box_mesh(cells, (4, 1, 1)), RUBBER, name=name, position=(0, 1.5 * k, 0))
+        body = scene.add_body(ts.box_mesh(cells, (4, 1, 1)), RUBBER, name=name, position=(0, 1.5 * k, 0), order=order)
         body.fix(lambda x: x[:, 0] < -1.99)
     return scene
 

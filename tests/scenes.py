@@ -8,6 +8,7 @@ import numpy as np
 import taichi as ti
 from lanes import opened
 from oracle import Oracle
+from oracle_elements import mesh_nodes
 
 import taisoft as ts
 from taisoft.model import Layout, Model, build_model
@@ -27,49 +28,74 @@ def cube(center=(0.0, 0.0, 0.0), cells=(1, 1, 1), size=(1.0, 0.9, 1.1), pattern=
     return ts.box_mesh(cells, size, center, pattern)
 
 
-def mixed_scene(laws=(SNH, SVK, COR, SVK), mass_damping: float = 0.0, stiffness_damping: float = 0.0) -> ts.Scene:
+def element(order: int, quadrature_degree: int | None = None) -> dict:
+    """Arguments of `add_body`; the degree counts for order 2 only."""
+    return {"order": order, "quadrature_degree": quadrature_degree if order == 2 else None}
+
+
+def spin(mesh: ts.TetMesh, order: int) -> np.ndarray:
+    """Random velocities (n,3) of a body's nodes [m/s]."""
+    return np.random.default_rng(8).standard_normal(mesh_nodes(mesh, order)[0].shape)
+
+
+def mixed_scene(
+    laws=(SNH, SVK, COR, SVK), mass_damping: float = 0.0, stiffness_damping: float = 0.0, order: int | str = 1,
+    degrees: tuple[int, int] = (2, 4),
+) -> ts.Scene:  # fmt: skip
     """Four bodies whose order is not that of the laws, of 10, 5, 6 and 5 tets: none fills its last lanes.
 
     Each has another material, and is held and loaded in another way; the first and the third are damped.
+    order: 1, 2, or "both": 2, 1, 2, 1. degrees: of the quadrature of the first and the third body, if they are quadratic.
     """
+    orders = (2, 1, 2, 1) if order == "both" else (order,) * 4
     scene = ts.Scene(gravity=(0.3, -9.81, 0.7))
     damping = {"mass_damping": mass_damping, "stiffness_damping": stiffness_damping}
-    beam = scene.add_body(cube(cells=(2, 1, 1)), rubber(laws[0], **damping), name="beam", position=(0.5, 0, 0))
+    beam = scene.add_body(
+        cube(cells=(2, 1, 1)), rubber(laws[0], **damping), name="beam", position=(0.5, 0, 0),
+        **element(orders[0], degrees[0]),
+    )  # fmt: skip
     beam.fix(lambda X: X[:, 0] < -0.49)
     beam.add_traction(lambda X: X[:, 0] > 0.49, (300.0, 2000.0, -500.0))
-    block = scene.add_body(cube((3, 0, 0)), rubber(laws[1], young=7e4, poisson=0.2), name="block", velocity=(0.5, 0, -0.3))
+    softer = rubber(laws[1], young=7e4, poisson=0.2)
+    block = scene.add_body(cube((3, 0, 0)), softer, name="block", velocity=(0.5, 0, -0.3), **element(orders[1]))
     block.fix([0, 1], axes="x")
     block.fix([1, 2], axes="yz")
     block.add_force([5, 6, 7], (30.0, -10.0, 20.0))
-    tower = scene.add_body(cube((6, 0, 0), pattern="six"), rubber(laws[2], density=800.0, **damping), name="tower")
+    lighter, mesh = rubber(laws[2], density=800.0, **damping), cube((6, 0, 0), pattern="six")
+    tower = scene.add_body(mesh, lighter, name="tower", **element(orders[2], degrees[1]))
     tower.fix(lambda X: X[:, 1] < -0.44)
-    spin = np.random.default_rng(8).standard_normal((8, 3))
-    scene.add_body(cube((9, 0, 0)), rubber(laws[3], density=1500.0), name="flyer", velocity=spin)
+    mesh = cube((9, 0, 0))
+    flying = {"velocity": spin(mesh, orders[3]), **element(orders[3])}
+    scene.add_body(mesh, rubber(laws[3], density=1500.0), name="flyer", **flying)
     return scene
 
 
 RELEASE = 0.0095  # [s] when the driven scene's first led nodes let go
 
 
-def driven_scene(law: str = SNH, mass_damping: float = 0.0, stiffness_damping: float = 0.0) -> ts.Scene:
-    """A beam that is held, led and loaded in every way there is, and a flyer; nodes 8..11 are the beam's right end.
+def driven_scene(
+    law: str = SNH, mass_damping: float = 0.0, stiffness_damping: float = 0.0, order: int | str = 1
+) -> ts.Scene:
+    """A beam that is held, led and loaded in every way there is, and a flyer; vertices 8..11 are the beam's right end.
 
     Two nodes are led along x and y until they are released, one along z by a path of its own, and their other axes are
-    free. damping: of the beam; the flyer has a third of its mass damping.
+    free. damping: of the beam; the flyer has a third of its mass damping. order: 1, 2, or "both": 2 for the beam.
     """
+    orders = (2, 1) if order == "both" else (order,) * 2
     scene = ts.Scene(gravity=(0.3, -9.81, 0.7))
     damping = {"mass_damping": mass_damping, "stiffness_damping": stiffness_damping}
-    beam = scene.add_body(cube(cells=(2, 1, 1)), rubber(law, **damping), name="beam", velocity=(0.4, 0.1, -0.2))
+    beam = scene.add_body(
+        cube(cells=(2, 1, 1)), rubber(law, **damping), name="beam", velocity=(0.4, 0.1, -0.2), **element(orders[0])
+    )
     beam.fix([0, 1])
     beam.fix([2, 3], axes="x")
     beam.move([9, 8], lambda t: None if t > RELEASE else (0.05 * np.sin(60 * t), -2 * t, 0.0), axes="xy")
     beam.move([11], lambda t: np.array([[9.0, 9.0, 40 * t**2]]), axes="z")
     beam.add_traction(lambda X: X[:, 1] > 0.44, (300.0, 2000.0, -500.0))
     beam.add_force([4, 6, 10], (30.0, -10.0, 60.0))
-    spin = np.random.default_rng(8).standard_normal((8, 3))
-    scene.add_body(
-        cube((3, 0, 0)), rubber(law, young=7e4, mass_damping=mass_damping / 3), name="flyer", velocity=spin
-    )
+    mesh = cube((3, 0, 0))
+    flying = {"velocity": spin(mesh, orders[1]), **element(orders[1])}
+    scene.add_body(mesh, rubber(law, young=7e4, mass_damping=mass_damping / 3), name="flyer", **flying)
     return scene
 
 

@@ -186,11 +186,12 @@ def test_info_suspects_millimetres(tmp_path, capsys):
     assert "probably millimetres" in capsys.readouterr().out
 
 
-def test_mean_ratio_is_one_for_a_regular_tet():
-    from taisoft.cli.info import mean_ratio
-
-    mesh = ts.TetMesh([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], [(0, 2, 1, 3)])
-    assert mean_ratio(mesh) == pytest.approx([1.0])
+def test_info_tells_of_nearly_flat_tets(tmp_path, capsys):
+    path = tmp_path / "thin.msh"
+    with pytest.warns(UserWarning, match="nearly flat"):
+        ts.write_mesh(path, ts.box_mesh((1, 1, 1), (1, 1, 1e-3)))
+    assert main(["info", str(path)]) == 0
+    assert "problems   5 tets are nearly flat or needles" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("content", [b"", b"\x00\x01random", None])

@@ -73,8 +73,8 @@ def test_warnings_are_told_once_and_reported(tmp_path, capsys):
     out = tmp_path / "out"
     assert run(path, "--out", out, *SHORT_OUTPUT) == 0
     error = capsys.readouterr().err
-    assert error.count("taisoft: warning: material: poisson = 0.495") == 1
-    assert report(out)["problems"][0].startswith("warning: material: poisson = 0.495")
+    assert error.count("taisoft: warning: body 'beam': poisson = 0.495") == 1
+    assert report(out)["problems"][0].startswith("warning: body 'beam': poisson = 0.495")
 
 
 def test_a_scene_may_import_its_neighbour(tmp_path):

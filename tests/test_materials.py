@@ -10,7 +10,7 @@
 """
 
 import numpy as np
-import oracle
+import oracle_laws as oracle
 import pytest
 import taichi as ti
 from lanes import load, opened, packed, store, unpacked

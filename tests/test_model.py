@@ -1,7 +1,7 @@
-"""The arrays of a scene:
+"""The arrays of a scene, of linear bodies alone and of linear and quadratic ones:
 
-* nodes keep the order of the bodies, tets are grouped by law, no block holds two bodies, padding has no volume;
-* every corner of every tet is gathered once, at its node;
+* nodes keep the order of the bodies, tets are grouped by kind, no block holds two bodies, padding has no volume;
+* every node of every tet is gathered once;
 * loads are those of the oracle and add up to what was asked for;
 * one lane, as on CUDA, gives the same forces as four;
 * what cannot change while it runs is refused, and nothing is changed then.
@@ -14,60 +14,104 @@ from scenes import COR, SNH, SVK, built, driven_scene, mixed_scene
 
 import taisoft as ts
 from taisoft import elasticity
-from taisoft.materials import LAWS
-from taisoft.model import body_loads, body_masses, build_model, changed_material
+from taisoft.mass import lumped_masses, mass_matrix, weight_masses
+from taisoft.model import body_loads, build_model, changed_material
 from taisoft.runtime import FieldArena
 from taisoft.scene.plan import make_plan
 
 
-@pytest.fixture(scope="module")
-def rig():
-    with built(mixed_scene(), "f64") as made:
+@pytest.fixture(scope="module", params=[1, "both"])
+def rig(request):
+    with built(mixed_scene(order=request.param), "f64") as made:
         yield made
 
 
+def quadratic(rig) -> bool:
+    return rig.scene.bodies[0].order == 2
+
+
+def elements(rig, group) -> np.ndarray:
+    """(blocks, lanes, nodes of an element) of a group, from the model's flat array."""
+    count = (group.last - group.first) * group.n_nodes * rig.model.lanes
+    flat = rig.model.nodes.to_numpy()[group.nodes_at : group.nodes_at + count]
+    return flat.reshape(-1, group.n_nodes, rig.model.lanes).transpose(0, 2, 1)
+
+
 def test_nodes_and_masses(rig):
-    assert list(rig.layout.node_start) == [0, 12, 20, 28, 36] and rig.model.n_nodes == 36
-    assert [len(rig.layout.rest[rig.layout.nodes(k)]) for k in range(4)] == [12, 8, 8, 8]
+    counts = [43, 8, 27, 8] if quadratic(rig) else [12, 8, 8, 8]
+    assert list(rig.layout.node_start) == list(np.cumsum([0, *counts])) and rig.model.n_nodes == sum(counts)
+    assert [len(rig.layout.rest[rig.layout.nodes(k)]) for k in range(4)] == counts
     assert np.array_equal(rig.layout.rest, rig.oracle.rest) and rig.layout.rest[0, 0] == 0.0  # placed half a metre on
-    assert rig.model.mass.to_numpy() == pytest.approx(rig.oracle.mass[:, 0])
-    assert body_masses(rig.scene).sum() == pytest.approx(0.99 * (1000 + 1000 + 800 + 1500))
+    lumped, M = rig.oracle.lumped[:, 0], rig.oracle.mass
+    assert rig.model.mass.to_numpy() == pytest.approx(lumped) and lumped_masses(rig.scene) == pytest.approx(lumped)
+    assert np.abs(mass_matrix(rig.scene).toarray() - M).max() < 1e-13 * M.max()
+    assert weight_masses(rig.scene) == pytest.approx(M.sum(axis=1))
+    assert rig.model.weight.to_numpy() == pytest.approx(M.sum(axis=1))
+    assert [lumped.sum(), M.sum()] == pytest.approx([0.99 * (1000 + 1000 + 800 + 1500)] * 2)
+    assert (rig.model.mass_matrix is not None) == rig.model.consistent == quadratic(rig)
+
+
+def test_the_mass_matrix_on_the_device(rig):
+    if not quadratic(rig):
+        assert rig.model.mass_matrix is None
+        return
+    mass, n = rig.model.mass_matrix, rig.model.n_nodes
+    start, column = mass.row_start.to_numpy(), mass.column.to_numpy()
+    M = np.diag(mass.diagonal.to_numpy())
+    M[np.repeat(np.arange(n), np.diff(start)), column] = mass.value.to_numpy()
+    assert np.abs(M - rig.oracle.mass).max() < 1e-13 * M.max()
 
 
 def test_blocks(rig):
-    """Tets of one law are neighbours; a body's last lanes are copies of its last tet without volume."""
+    """Tets of one kind are neighbours; a body's last lanes are copies of its last tet without volume."""
     lanes, volume = rig.model.lanes, rig.model.volume.to_numpy()
-    body, verts = rig.model.block_body.to_numpy(), rig.model.verts.to_numpy()
+    body = rig.model.block_body.to_numpy()
     assert lanes == 4 and list(rig.layout.n_tets) == [10, 5, 6, 5] and rig.model.n_blocks == 9
-    ranges = {law.NAME: (first, last) for law, first, last in rig.model.laws}
-    assert ranges == {SVK: (0, 4), COR: (4, 6), SNH: (6, 9)} and list(ranges) == list(LAWS)
-    assert list(body) == [1, 1, 3, 3, 2, 2, 0, 0, 0]
-    for k, made in enumerate(rig.scene.bodies):
-        blocks = body == k
-        inside = verts[blocks].transpose(0, 2, 1).reshape(-1, 4) - rig.layout.node_start[k]
-        here = {tuple(tet) for tet in np.sort(made.mesh.tets, axis=1)}
-        assert {tuple(tet) for tet in np.sort(inside, axis=1)} == here
-        assert (volume[blocks] > 0).sum() == made.mesh.n_tets
-        assert volume[blocks].sum() == pytest.approx(made.mesh.volumes.sum())
+    found = [(g.order, g.n_points, g.law.NAME, g.first, g.last) for g in rig.model.groups]
+    if quadratic(rig):
+        assert found == [(1, 1, SVK, 0, 4), (2, 4, SNH, 4, 7), (2, 14, COR, 7, 9)]
+        assert list(body) == [1, 1, 3, 3, 0, 0, 0, 2, 2]
+    else:
+        assert found == [(1, 1, SVK, 0, 4), (1, 1, COR, 4, 6), (1, 1, SNH, 6, 9)]
+        assert list(body) == [1, 1, 3, 3, 2, 2, 0, 0, 0]
+    for g in rig.model.groups:
+        for k in set(body[g.first : g.last]):
+            made, blocks = rig.scene.bodies[k], body[g.first : g.last] == k
+            inside = elements(rig, g)[blocks].reshape(-1, g.n_nodes) - rig.layout.node_start[k]
+            here = {tuple(tet) for tet in np.sort(made.nodes.elements, axis=1)}
+            assert {tuple(tet) for tet in np.sort(inside, axis=1)} == here
+            assert (volume[body == k] > 0).sum() == made.mesh.n_tets
+            assert volume[body == k].sum() == pytest.approx(made.mesh.volumes.sum())
 
 
-def test_every_corner_is_gathered_once(rig):
+def test_every_node_of_a_tet_is_gathered_once(rig):
     start, entry = rig.model.gather_start.to_numpy(), rig.model.gather_entry.to_numpy()
-    verts, volume, lanes = rig.model.verts.to_numpy(), rig.model.volume.to_numpy(), rig.model.lanes
-    assert len(entry) == 4 * rig.layout.n_tets.sum() == len(set(entry))
-    for node in range(rig.model.n_nodes):
-        for at in entry[start[node] : start[node + 1]]:
-            block, rest = divmod(at, 12 * lanes)
-            corner, lane = divmod(rest, 3 * lanes)
-            assert lane < lanes and verts[block, corner, lane] == node and volume[block, lane] > 0
+    volume, lanes, expected = rig.model.volume.to_numpy(), rig.model.lanes, {}
+    for g in rig.model.groups:
+        for at in np.ndindex(elements(rig, g).shape):
+            block, lane, node = at
+            if volume[g.first + block, lane] > 0:
+                place = g.corner_at + ((block * g.n_nodes + node) * 3) * lanes + lane
+                expected[place] = elements(rig, g)[at]
+    found = {e: node for node in range(rig.model.n_nodes) for e in entry[start[node] : start[node + 1]]}
+    assert found == expected and len(entry) == len(expected)
 
 
 def test_loads(rig):
-    total = body_loads(rig.scene)
+    total, start = body_loads(rig.scene), rig.layout.node_start
     assert total == pytest.approx(rig.oracle.loads)
-    assert total[:12].sum(axis=0) == pytest.approx(0.9 * 1.1 * np.array([300, 2000, -500]))
-    assert total[12:20].sum(axis=0) == pytest.approx([30, -10, 20])
-    assert not total[20:].any() and body_loads(driven_scene()) == pytest.approx(Oracle(driven_scene()).loads)
+    assert total[: start[1]].sum(axis=0) == pytest.approx(0.9 * 1.1 * np.array([300, 2000, -500]))
+    assert total[start[1] : start[2]].sum(axis=0) == pytest.approx([30, -10, 20])
+    driven = driven_scene(order="both" if quadratic(rig) else 1)
+    assert not total[start[2] :].any() and body_loads(driven) == pytest.approx(Oracle(driven).loads)
+
+
+def test_a_force_for_each_node(rig):
+    scene, forces = rig.scene.snapshot(), np.random.default_rng(0).standard_normal((3, 3))
+    scene.body("tower").add_force([4, 2, 7], forces)
+    added = body_loads(scene) - body_loads(rig.scene)
+    nodes = rig.layout.node_start[2] + np.array([4, 2, 7])
+    assert np.abs(added[nodes] - forces).max() < 1e-12 and np.count_nonzero(added) == 9
 
 
 def test_one_lane_gives_the_same_forces(rig):

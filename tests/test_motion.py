@@ -1,4 +1,4 @@
-"""Constraints as the steps see them:
+"""Constraints as the steps see them, of linear and quadratic bodies:
 
 * fixed and led axes are constrained, a released group's are not, a reset takes it up again;
 * targets are the placed rest positions plus the path's displacement, one for all nodes or one for each;
@@ -10,22 +10,24 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scenes import cube, rubber
+from scenes import cube, element, rubber
 
 import taisoft as ts
 from taisoft.stepping.motion import Motion
 
+both_orders = pytest.mark.parametrize("order, n", [(1, 8), (2, 26)])  # of the second body, and its number of nodes
 
-def made(*paths):
+
+def made(*paths, order: int = 1):
     """Two cubes; the second, a metre up, is led by the paths (nodes, axes, path) and fixed at node 7 along x, y."""
     scene = ts.Scene()
     scene.add_body(cube(), rubber(), name="still").fix([2], axes="z")
-    second = scene.add_body(cube(), rubber(), name="led", position=(0, 1, 0))
+    second = scene.add_body(cube(), rubber(), name="led", position=(0, 1, 0), **element(order))
     second.fix([7], axes="xy")
     for nodes, axes, path in paths:
         second.move(nodes, path, axes=axes)
     rest = np.concatenate([body.rest_positions + body.position for body in scene.bodies])
-    layout = SimpleNamespace(rest=rest, node_start=np.array([0, 8, 16]), mass=np.ones(16))
+    layout = SimpleNamespace(rest=rest, node_start=np.array([0, 8, len(rest)]))
     return Motion(scene, layout), rest
 
 
@@ -33,24 +35,27 @@ def until(end, way):
     return lambda t: None if t > end else way(t)
 
 
-def test_masks():
-    motion, _ = made(([0, 1], "xz", lambda t: (t, 0, 0)), ([1, 3], "y", lambda t: (0, t, 0)))
-    expected = np.zeros((16, 3), dtype=bool)
+@both_orders
+def test_masks(order, n):
+    """The last led node is the middle of an edge if the body is quadratic."""
+    motion, _ = made(([0, 1], "xz", lambda t: (t, 0, 0)), ([1, n - 2], "y", lambda t: (0, t, 0)), order=order)
+    expected = np.zeros((8 + n, 3), dtype=bool)
     expected[2, 2] = expected[15, :2] = True
-    expected[[8, 9], 0] = expected[[8, 9], 2] = expected[[9, 11], 1] = True
+    expected[[8, 9], 0] = expected[[8, 9], 2] = expected[[9, 6 + n], 1] = True
     assert np.array_equal(motion.constrained(), expected)
-    assert list(motion.moved) == [8, 9, 9, 11] and motion.n_moved == 4
-    assert list(motion.held) == [2, 8, 9, 11, 15]
+    assert list(motion.moved) == [8, 9, 9, 6 + n] and motion.n_moved == 4
+    assert list(motion.held) == sorted([2, 8, 9, 6 + n, 15])
     assert motion.moved_axes().tolist() == [[1, 0, 1], [1, 0, 1], [0, 1, 0], [0, 1, 0]]
 
 
-def test_targets():
+@both_orders
+def test_targets(order, n):
     way = np.array([[1.0, 2, 3], [4, 5, 6]])
-    motion, rest = made(([5, 2], "xyz", lambda t: t * way), ([3], "y", lambda t: (0, -t, 0)))
+    motion, rest = made(([n - 3, 2], "xyz", lambda t: t * way), ([3], "y", lambda t: (0, -t, 0)), order=order)
     rows, letting_go = motion.targets(np.array([0.5, 2.0]))
     assert rows.shape == (2, 3, 3) and not letting_go
     for row, t in zip(rows, (0.5, 2.0)):
-        assert row == pytest.approx(np.concatenate([rest[[13, 10]] + t * way, rest[[11]] + [[0, -t, 0]]]))
+        assert row == pytest.approx(np.concatenate([rest[[5 + n, 10]] + t * way, rest[[11]] + [[0, -t, 0]]]))
 
 
 def test_release():

@@ -1,6 +1,7 @@
 """The USD export, read back with USD:
 
-* scene.usdc passes every validator of pxr.UsdValidation and holds the float32 positions of every frame, body and node;
+* scene.usdc passes every validator of pxr.UsdValidation and holds the float32 positions of every frame, body and node,
+  for elements of first and second order;
 * metres, y up, default prim, frame rate, frame range, extents, materials, tetrahedra that USD itself finds upright;
 * body names become legal, distinct prim names, with the own name beside them;
 * killed at any time, every file under a final name opens, at most the chunk in the making is lost, an older scene.usdc
@@ -65,10 +66,10 @@ def check_frames(path, given, first=0):
     return end - start + 1
 
 
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory):
+@pytest.fixture(scope="module", params=[1, 2], ids=["order1", "order2"])
+def exported(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("usd")
-    scene = beam_scene(NAMES)
+    scene = beam_scene(NAMES, order=request.param)
     given = export(folder, scene, 23)
     return folder, scene, given, Usd.Stage.Open(str(folder / "scene.usdc"))
 
@@ -98,8 +99,8 @@ def test_stage_units_and_range(exported):
 def test_surface_has_no_inner_vertex_and_a_colour(exported):
     _, scene, _, stage = exported
     surface = UsdGeom.Mesh(stage.GetPrimAtPath("/World/_1_cube/surface"))
-    triangles = scene.bodies[0].mesh.surface
-    assert len(surface.GetPointsAttr().Get(0)) == len(np.unique(triangles)) < scene.bodies[0].mesh.n_verts
+    triangles = scene.bodies[0].nodes.surface
+    assert len(surface.GetPointsAttr().Get(0)) == len(np.unique(triangles)) < scene.bodies[0].n_nodes
     assert surface.GetSubdivisionSchemeAttr().Get() == UsdGeom.Tokens.none
     assert set(surface.GetFaceVertexCountsAttr().Get()) == {3}
     material = UsdShade.MaterialBindingAPI(surface.GetPrim()).ComputeBoundMaterial()[0]
@@ -111,10 +112,10 @@ def test_surface_has_no_inner_vertex_and_a_colour(exported):
 def test_tets_are_upright_and_not_drawn(exported):
     _, scene, _, stage = exported
     tets = UsdGeom.TetMesh(stage.GetPrimAtPath("/World/_1_cube/tets"))
-    assert np.array_equal(np.array(tets.GetTetVertexIndicesAttr().Get()), scene.bodies[0].mesh.tets)
+    assert np.array_equal(np.array(tets.GetTetVertexIndicesAttr().Get()), scene.bodies[0].nodes.tets)
     assert len(UsdGeom.TetMesh.FindInvertedElements(tets, Usd.TimeCode(5))) == 0
     faces = np.array(UsdGeom.TetMesh.ComputeSurfaceFaces(tets, Usd.TimeCode(5)))
-    assert sorted(map(canonical, faces)) == sorted(map(canonical, scene.bodies[0].mesh.surface))
+    assert sorted(map(canonical, faces)) == sorted(map(canonical, scene.bodies[0].nodes.surface))
     assert tets.ComputePurpose() == UsdGeom.Tokens.guide
 
 
@@ -154,6 +155,7 @@ def test_a_run_without_frames_leaves_nothing(tmp_path):
 
 def test_joined_chunks_equal_the_finished_scene(tmp_path):
     scene = beam_scene(("one", "two"))
+    scene.add_body(scene.bodies[0].mesh, scene.bodies[0].material, name="three", position=(0, -1.5, 0), order=2)
     export(tmp_path / "whole", scene, 20)
     given = export(tmp_path / "killed", scene, 27, close=False)
     assert join_chunks(tmp_path / "killed") == tmp_path / "killed" / "scene.usdc"

@@ -1,4 +1,5 @@
-"""Conjugate gradients, serial and parallel, in f32 and f64, on the stiffness of a squeezed scene plus inertia:
+"""Conjugate gradients, serial and parallel, in f32 and f64, on the stiffness of squeezed linear and quadratic
+bodies plus inertia:
 
 * the solution is SciPy's on the free axes and exactly 0 on the others, whatever stands on the right side there;
 * a looser tolerance stops earlier, the limit of iterations is kept, no right side needs no iteration;
@@ -20,7 +21,7 @@ METHODS = ("serial", "parallel")
 
 @pytest.fixture(scope="module", params=["f64", "f32"])
 def rig(request):
-    with built(mixed_scene(), request.param) as made:
+    with built(mixed_scene(order="both"), request.param) as made:
         made.matrix = block_csr.build_block_csr(made.model, made.arena, made.model.real)
         made.work = pcg.build_pcg(made.model, made.arena)
         rng = np.random.default_rng(1)

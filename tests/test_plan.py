@@ -30,6 +30,9 @@ def test_reasons():
         "law:st_venant_kirchhoff": (True, "used by block, flyer"),
         "law:corotational": (True, "used by tower"),
         "law:stable_neo_hookean": (True, "used by beam"),
+        "quadratic_tets": (False, "every body is of order 1"),
+        "consistent_weight": (False, "on linear tets it is the lumped mass"),
+        "consistent_mass": (False, "the mass of linear tets is lumped"),
         "loads": (True, "tractions or forces on beam, block"),
         "fixed_nodes": (True, "on beam, block, tower"),
         "moving_nodes": (False, "no node follows a path"),
@@ -44,9 +47,20 @@ def test_reasons():
 
 def test_every_feature_can_be_on_and_off():
     off = make_plan(bare(), explicit=True, multistep=False).on
-    on = make_plan(driven_scene(mass_damping=1.0, stiffness_damping=1.0), explicit=False, multistep=True).on
+    on = make_plan(driven_scene(order=2, mass_damping=1.0, stiffness_damping=1.0), explicit=False, multistep=True).on
     laws = {name for name in on if name.startswith("law:")}
     assert {name for name in on if not on[name]} < laws and {name for name in off if off[name]} < laws
+
+
+def test_quadratic_bodies_get_a_consistent_mass_in_implicit_steps_only():
+    scene = mixed_scene(order="both")
+    names = [b.name for b in scene.bodies if b.order == 2]
+    for explicit in (True, False):
+        plan = make_plan(scene, explicit=explicit, multistep=False)
+        entries = {e["feature"]: (e["on"], e["why"]) for e in plan.entries}
+        assert entries["quadratic_tets"] == (True, f"order 2 of {', '.join(names)}")
+        assert entries["consistent_mass"][0] is entries["consistent_weight"][0] is (not explicit)
+    assert entries["consistent_mass"][1] == f"quadratic tets of {', '.join(names)} in implicit steps"
 
 
 def test_many_names_are_cut_short():

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scenes import cube, rubber
+from scenes import cube, element, rubber
 
 import taisoft as ts
 from taisoft.records import StepReport
@@ -185,11 +185,12 @@ def test_bad_arguments(arguments, words):
     assert sim.step_count == 0
 
 
-@pytest.fixture(scope="module", params=["symplectic_euler", "implicit_euler"])
+@pytest.fixture(scope="module", params=["symplectic_euler-1", "implicit_euler-2"])
 def block(request):
+    integrator, order = request.param.split("-")
     scene = ts.Scene()
-    scene.add_body(cube(), rubber(), name="block", velocity=(1.0, 0.0, 0.0)).fix([0, 1, 2])
-    with ts.Simulator(scene, 0.004, request.param, precision="f64") as sim:
+    scene.add_body(cube(), rubber(), name="block", velocity=(1.0, 0.0, 0.0), **element(int(order))).fix([0, 1, 2])
+    with ts.Simulator(scene, 0.004, integrator, precision="f64") as sim:
         yield sim
 
 

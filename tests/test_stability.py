@@ -1,4 +1,4 @@
-"""Linear vibration about the rest shape:
+"""Linear vibration about the rest shape, with elements of both orders:
 
 * Hooke's stiffness is the oracle's at rest for every law; the highest frequency and the modes are those of dense algebra;
 * a free body has six rigid motions, shapes have unit modal mass, held axes stay;
@@ -11,44 +11,48 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 from oracle import Oracle
-from scenes import COR, SNH, SVK, cube, rubber
+from scenes import COR, SNH, SVK, cube, element, rubber
 
 import taisoft as ts
 from taisoft import runtime
-from taisoft.stability import consistent_mass, highest_frequency, hooke_differential, hooke_stiffness, stable_dt
+from taisoft.stability import highest_frequency, hooke_differential, hooke_stiffness, stable_dt
+
+KINDS = ((1, None), (2, 2), (2, 4))  # order, degree of the quadrature
+both_orders = pytest.mark.parametrize("order", [1, 2])
 
 
-def one_body(material=None, cells=(2, 1, 1), held: bool = False) -> ts.Scene:
+def one_body(material=None, cells=(2, 1, 1), held: bool = False, order: int = 1, degree: int | None = None) -> ts.Scene:
     scene = ts.Scene(gravity=(0, 0, 0))
-    body = scene.add_body(cube(cells=cells), material or rubber(), name="block")
+    body = scene.add_body(cube(cells=cells), material or rubber(), name="block", **element(order, degree))
     if held:
         body.fix(lambda X: X[:, 0] < -0.49)
         body.fix([10], axes="y")
     return scene
 
 
-def dense(scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stiffness, lumped mass (3n,3n) and free axes (3n,)."""
+def dense(scene, mass: str = "lumped") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stiffness, mass (3n,3n) and free axes (3n,)."""
     oracle = Oracle(scene)
-    mass = np.diag(np.repeat(oracle.mass, 3, axis=1).reshape(-1))
-    return oracle.stiffness(oracle.rest), mass, ~oracle.fixed.reshape(-1)
+    M = oracle.consistent if mass == "consistent" else oracle.inertia(explicit=True)
+    return oracle.stiffness(oracle.rest), np.kron(M, np.eye(3)), ~oracle.fixed.reshape(-1)
 
 
+@pytest.mark.parametrize("order, degree", KINDS)
 @pytest.mark.parametrize("law", [SVK, COR, SNH])
-def test_stiffness_at_rest(law):
-    scene = one_body(rubber(law, poisson=0.4))
+def test_stiffness_at_rest(law, order, degree):
+    scene = one_body(rubber(law, poisson=0.4), order=order, degree=degree)
     K = dense(scene)[0]
     body = scene.bodies[0]
     assert np.abs(hooke_stiffness(body).toarray() - K).max() < 1e-12 * np.abs(K).max()
-    v = np.random.default_rng(0).standard_normal((12, 3))
+    v = np.random.default_rng(0).standard_normal((body.n_nodes, 3))
     assert np.abs(hooke_differential(body)(v) - (K @ v.reshape(-1)).reshape(-1, 3)).max() < 1e-11 * np.abs(K).max()
 
 
-@pytest.mark.parametrize("cells", [(2, 1, 1), (4, 3, 3)])
+@pytest.mark.parametrize("order, cells", [(1, (2, 1, 1)), (1, (4, 3, 3)), (2, (1, 1, 1)), (2, (3, 2, 2))])
 @pytest.mark.parametrize("held", [False, True])
-def test_highest_frequency(cells, held):
+def test_highest_frequency(order, cells, held):
     """By dense algebra for a small body, by Lanczos for a larger one; on the high side, by a percent at most."""
-    scene = one_body(cells=cells)
+    scene = one_body(cells=cells, order=order)
     if held:
         scene.bodies[0].fix(lambda X: X[:, 0] < -0.49)
         scene.bodies[0].fix([10], axes="y")
@@ -60,14 +64,14 @@ def test_highest_frequency(cells, held):
 
 
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])
-@pytest.mark.parametrize("cells", [(2, 1, 1), (6, 3, 3)])
-def test_modes(mass, cells):
+@pytest.mark.parametrize(
+    "order, degree, cells", [(1, None, (2, 1, 1)), (1, None, (6, 3, 3)), (2, 4, (2, 1, 1)), (2, 2, (4, 2, 2))]
+)
+def test_modes(mass, order, degree, cells):
     """Dense for a small body, by shift and invert for a larger one."""
-    scene = one_body(rubber(density=700.0), cells, held=True)
-    K, M, free = dense(scene)
-    if mass == "consistent":
-        M = consistent_mass(scene.bodies[0]).toarray()
-        assert M.sum() == pytest.approx(3 * 700 * 0.99)
+    scene = one_body(rubber(density=700.0), cells, held=True, order=order, degree=degree)
+    K, M, free = dense(scene, mass)
+    assert M.sum() == pytest.approx(3 * 700 * 0.99)
     expected = np.sqrt(la.eigh(K[np.ix_(free, free)], M[np.ix_(free, free)], eigvals_only=True)[:5]) / (2 * np.pi)
     found = ts.modes(scene, 5, mass=mass)
     assert found.frequencies == pytest.approx(expected, rel=1e-6)
@@ -76,9 +80,11 @@ def test_modes(mass, cells):
     assert not shapes[:, ~free].any() and found.shapes.shape == (5, len(free) // 3, 3)
 
 
-@pytest.mark.parametrize("cells", [(1, 1, 1), (5, 4, 4)])
-def test_a_free_body_has_six_rigid_motions(cells):
-    scene = one_body(cells=cells)
+@pytest.mark.parametrize(
+    "order, degree, cells", [(1, None, (1, 1, 1)), (1, None, (5, 4, 4)), (2, 2, (1, 1, 1)), (2, 4, (3, 2, 2))]
+)
+def test_a_free_body_has_six_rigid_motions(order, degree, cells):
+    scene = one_body(cells=cells, order=order, degree=degree)
     scene.add_body(cube(), rubber(), position=(0, 5, 0))
     frequencies = ts.modes(scene, 13).frequencies
     assert np.abs(frequencies[:12]).max() < 1e-2 * frequencies[12]
@@ -101,8 +107,9 @@ def test_modes_that_are_refused(k, mass, words):
         ts.modes(ts.Scene(), 1)
 
 
-def test_a_step_above_the_limit():
-    scene = one_body(cells=(1, 1, 1))
+@both_orders
+def test_a_step_above_the_limit(order):
+    scene = one_body(cells=(1, 1, 1), order=order)
     limit = stable_dt(scene, False)
     words = rf"dt = {2 * limit:.3g} s is above the estimated stability limit of {limit:.3g} s of symplectic_euler"
     with pytest.raises(ts.SimulationError, match=rf"^{words}: take a smaller dt \(0.9 of the limit is .* allow_unstable=True$"):
@@ -139,11 +146,12 @@ def growth(sim, share: float, steps: int = 200) -> float:
     return total / start
 
 
-@pytest.fixture(scope="module", params=["symplectic_euler", "velocity_verlet"])
+@pytest.fixture(scope="module", params=["symplectic_euler-1", "symplectic_euler-2", "velocity_verlet-1", "velocity_verlet-2"])
 def sim(request):
     """Both kinds of damping are compiled in, so that the tests can change them."""
-    scene = one_body(rubber(mass_damping=1.0, stiffness_damping=1e-3), cells=(1, 1, 1))
-    with ts.Simulator(scene, 1e-4, request.param, precision="f64", allow_unstable=True) as made:
+    integrator, order = request.param.split("-")
+    scene = one_body(rubber(mass_damping=1.0, stiffness_damping=1e-3), cells=(1, 1, 1), order=int(order))
+    with ts.Simulator(scene, 1e-4, integrator, precision="f64", allow_unstable=True) as made:
         yield made
 
 
@@ -173,6 +181,10 @@ def test_the_limit_is_the_least_of_all_bodies():
     alone = stable_dt(scene, False)
     scene.add_body(cube((9, 0, 0)), rubber(young=4e5))
     assert stable_dt(scene, False) == pytest.approx(alone / 2, rel=1e-3)
+    quadratic = stable_dt(one_body(cells=(1, 1, 1), order=2), False)
+    assert quadratic < alone
+    scene.add_body(cube((18, 0, 0)), rubber(young=4e5), **element(2))
+    assert stable_dt(scene, False) == pytest.approx(quadratic / 2, rel=1e-3)
     held = one_body(cells=(1, 1, 1))
     held.bodies[0].fix(lambda X: X[:, 0] < 9)
     assert stable_dt(held, False) == np.inf

@@ -1,7 +1,7 @@
 """Pictures and the live window:
 
 * the camera frames a scene whichever way it turns, and projects as a pinhole does;
-* surfaces are split at sharp edges only, and their normals point outward;
+* surfaces are split at sharp edges only, their normals point outward, and nodes in the middle of edges are drawn;
 * the NumPy renderer covers, orders and colours pixels as a plain loop over pixels does;
 * Taichi's renderer and the NumPy one draw the same picture, upright; a body that moves, moves in the picture;
 * without a Vulkan driver pictures are drawn in software, and one line says which package is missing;
@@ -29,7 +29,7 @@ from taisoft.view.camera import BORDER, FILL, Camera
 from taisoft.view.ggui import vulkan_missing, window_holder
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.raster import rasterise
-from taisoft.view.surfaces import Surfaces, smoothing_groups, vertex_normals
+from taisoft.view.surfaces import MARKER_COLOUR, Surfaces, smoothing_groups, vertex_normals
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZE = (320, 180)
@@ -98,8 +98,9 @@ def test_a_ball_is_smooth():
     assert (np.einsum("ij,ij->i", normals, mesh.vertices[nodes]) > 2.0 * np.cos(np.radians(12))).all()
 
 
-def test_drawn_vertices_follow_the_body_and_mark_fixed_nodes():
-    scene = beam_scene(("one", "two"))
+@pytest.mark.parametrize("order", [1, 2])
+def test_drawn_vertices_follow_the_body_and_mark_fixed_nodes(order):
+    scene = beam_scene(("one", "two"), order=order)
     surfaces, sim = Surfaces(scene), FakeSimulator(scene)
     x, normals = surfaces.vertices(sim)
     sim.time = 1.0
@@ -110,10 +111,28 @@ def test_drawn_vertices_follow_the_body_and_mark_fixed_nodes():
     assert (moved[:, 1] <= x[:, 1] + 1e-12).all() and (x[:, 1] - moved[:, 1]).max() > 1.0
     drawn_colours = np.unique(surfaces.colours, axis=0)
     assert len(drawn_colours) == 3  # two bodies and the markers
+    held = len(np.intersect1d(scene.bodies[0].constraints[0].nodes, scene.bodies[0].nodes.surface))
+    assert held == (2 * order + 1) ** 2  # all of the left end
+    assert (surfaces.colours == MARKER_COLOUR).all(axis=1).sum() == 2 * held * 66  # vertices of a ball
     # every triangle's normals point the way it is wound: outward
     a, b, c = (x[surfaces.triangles[:, k]] for k in range(3))
     winding = np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[surfaces.triangles].sum(axis=1))
     assert (winding > 0).all()
+
+
+def test_a_second_order_body_is_drawn_as_finely_as_a_first_order_one_of_half_the_size():
+    drawn = []
+    for cells, order in (((4, 2, 2), 2), ((8, 4, 4), 1)):  # every vertex of the fine grid's surface is a node of the coarse
+        scene = beam_scene(cells=cells, order=order)
+        surfaces, sim = Surfaces(scene), FakeSimulator(scene)
+        sim.time = 1.0
+        x, normals = surfaces.vertices(sim)
+        body = (surfaces.colours != MARKER_COLOUR).any(axis=1)
+        drawn.append((x[body], normals[body]))
+    (coarse, coarse_normals), (fine, fine_normals) = drawn
+    nearest = np.linalg.norm(coarse[:, None] - fine[None], axis=2) + (coarse_normals @ fine_normals.T < 0.9)
+    assert len(coarse) == len(fine)
+    assert nearest.min(axis=1).max() < 1e-12 and nearest.min(axis=0).max() < 1e-12
 
 
 # --- the NumPy renderer ---
@@ -201,7 +220,7 @@ def test_picture_of_a_beam(renderer):
 @needs_vulkan
 def test_both_renderers_draw_the_same_picture():
     scene = beam_scene(("one", "two"))
-    scene.add_body(ts.ball_mesh(0.7, 6), RUBBER, name="ball", position=(0.5, -1.3, 0.6))
+    scene.add_body(ts.ball_mesh(0.7, 6), RUBBER, name="ball", position=(0.5, -1.3, 0.6), order=2)
     sim, images = FakeSimulator(scene), {}
     sim.time = 0.5
     camera = Camera.framing(np.array([[-2.0, -2, -1], [2, 2, 1]]), azimuth=-50.0, elevation=35.0)

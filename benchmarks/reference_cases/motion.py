@@ -12,7 +12,7 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.errors import SimulationError
-from taisoft.model import body_masses
+from taisoft.mass import lumped_masses
 from taisoft.stepping import EXPLICIT, INTEGRATORS
 
 from .record import LAWS, Case, Check, face, label, material, near, nearest, order, scene, small, told
@@ -161,7 +161,7 @@ class Drift:
 
 
 def _drift(path: Path, s: ts.Scene, law: str, reference: dict) -> Drift:
-    value, mass = reference["value"], body_masses(s)[None, :, None]
+    value, mass = reference["value"], lumped_masses(s)[None, :, None]
     node = nearest(s.bodies[0].rest_positions, (0.5, 0.375, 0.25))[0]
     P, L = (mass * path.v).sum(axis=1), (mass * np.cross(path.x, path.v)).sum(axis=1)
     return Drift(

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 import taisoft as ts
-from taisoft.model import body_masses
+from taisoft.mass import lumped_masses
 from taisoft.stepping import EXPLICIT, INTEGRATORS
 
 from .record import GRAVITY, LAWS, Case, deformation_gradients, face, label, material, near, scene, small, worst
@@ -93,7 +93,7 @@ def rigid_motion(reference: dict, arch: str):
         s.add_body(ts.box_mesh((3, 2, 2), (1.0, 0.7, 0.6)), material(reference, law), name=law)
     young, dt, shift = reference["material"]["E"], 1e-4, np.array([10.0, -5.0, 3.0])
     motions = {"0.7 rad about z": _rotation((0, 0, 1), 0.7), "180 deg about (1,1,1)": _rotation((1, 1, 1), np.pi)}
-    mass = body_masses(s)[:, None]
+    mass = lumped_masses(s)[:, None]
     rest = np.concatenate([body.rest_positions for body in s.bodies])
     laws = np.repeat(list(LAWS), [body.n_nodes for body in s.bodies])
     checks = []

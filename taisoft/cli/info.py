@@ -6,9 +6,9 @@ from argparse import Namespace
 import numpy as np
 
 from taisoft.mesh.files import read_mesh
+from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.tet_mesh import TetMesh
 
-EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 SHARP = 0.1  # mean ratio below which a tet stiffens its surroundings and slows the solver noticeably
 MILLIMETRES_ABOVE = 20.0  # longest side in file units: soft bodies of more than 20 m are rare, parts of 20 mm are not
 TINY_BELOW = 1e-3  # soft bodies under 1 mm are rare
@@ -28,8 +28,8 @@ def command(arguments: Namespace) -> int:
 def describe(mesh: TetMesh) -> list[tuple[str, str]]:
     """(name, text) lines about a mesh; lengths in the file's own unit."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    lengths = edge_lengths(mesh)
-    quality = mean_ratio(mesh)
+    lengths = edge_lengths(mesh.vertices, mesh.tets)
+    quality = mean_ratio(lengths, mesh.volumes)
     pieces = "1 piece" if mesh.n_components == 1 else f"{mesh.n_components} pieces"
     lines = [
         ("counts", f"{mesh.n_verts} vertices, {mesh.n_tets} tets, {len(mesh.surface)} surface triangles, {pieces}"),
@@ -45,20 +45,6 @@ def describe(mesh: TetMesh) -> list[tuple[str, str]]:
     ]
     problems = mesh.warnings or ["none"]
     return lines + [("problems" if i == 0 else "", problem) for i, problem in enumerate(problems)]
-
-
-def edge_lengths(mesh: TetMesh) -> np.ndarray:
-    """Lengths (m, 6) of the edges of every tet."""
-    corners = mesh.vertices[mesh.tets]
-    return np.stack([np.linalg.norm(corners[:, a] - corners[:, b], axis=1) for a, b in EDGES], axis=1)
-
-
-def mean_ratio(mesh: TetMesh) -> np.ndarray:
-    """Mean ratio (m,) of every tet, 12 (3 V)^(2/3) / sum of squared edge lengths: 1 if regular, 0 if flat.
-
-    Source: Liu, Joe 1994, Relationship between tetrahedron shape measures, BIT 34.
-    """
-    return 12.0 * np.cbrt(3.0 * mesh.volumes) ** 2 / (edge_lengths(mesh) ** 2).sum(axis=1)
 
 
 def unit_guess(longest: float) -> str:

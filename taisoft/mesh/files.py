@@ -17,10 +17,13 @@ import numpy as np
 
 from taisoft.errors import MeshError, OutputError
 from taisoft.mesh.gmsh import read_gmsh
-from taisoft.mesh.tet_mesh import TetMesh, merge_labels
+from taisoft.mesh.quality import edge_lengths
+from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh, merge_labels
 from taisoft.mesh.tetgen import read_tetgen
+from taisoft.mesh.tetra10 import straightened
 
-BOUNDARY = ("vertex", "line", "triangle")  # elements that meshers add to mark boundaries; told and left out
+TETS = ("tetra", "tetra10")
+BOUNDARY = ("vertex", "line", "line3", "triangle", "triangle6")  # elements that meshers add to mark boundaries; told and left out
 WRITERS = {".msh": "gmsh", ".vtk": "vtk", ".vtu": "vtu", ".mesh": "medit"}
 
 # How to count the faces in a file of a format that cannot hold tets.
@@ -85,7 +88,8 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None) ->
 
     path: the file; its ending tells the format. fix_orientation: as for `TetMesh`. weld: merge vertices at most this
     far apart [m], 0 for equal ones only; None merges nothing. Points, lines and triangles next to the tets, and
-    vertices of no tet, are left out with a warning; any other element is refused by name and number. Raises MeshError.
+    vertices of no tet, are left out with a warning; any other element is refused by name and number. Of second-order
+    tets the corners are taken; a warning tells how many curved edges are straightened. Raises MeshError.
     """
     try:
         file = Path(path)
@@ -102,8 +106,8 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None) ->
     elif ending in (".node", ".ele"):
         found = read_tetgen(file)
     points, cells = found or _read_by_meshio(file, name, data)
-    tets, notes = _tets_among(name, cells)
-    return _clean_mesh(name, np.asarray(points), tets, notes, fix_orientation, weld)
+    blocks, notes = _tets_among(name, cells)
+    return _clean_mesh(name, np.asarray(points), blocks, notes, fix_orientation, weld)
 
 
 def write_mesh(path, mesh: TetMesh) -> None:
@@ -215,21 +219,21 @@ def _one_line(text: str) -> str:
     return text if len(text) <= 120 else text[:117] + "..."
 
 
-def _tets_among(name: str, cells: list[tuple[str, np.ndarray]]) -> tuple[np.ndarray, list[str]]:
-    """The tets (m,4), and what has to be told about other elements."""
+def _tets_among(name: str, cells: list[tuple[str, np.ndarray]]) -> tuple[list[np.ndarray], list[str]]:
+    """The blocks of tets, (m,4) or (m,10), and what has to be told about other elements."""
     counts: dict[str, int] = {}
     for kind, nodes in cells:
         if len(nodes):
             counts[kind] = counts.get(kind, 0) + len(nodes)
-    foreign = {kind: count for kind, count in counts.items() if kind not in ("tetra", *BOUNDARY)}
+    foreign = {kind: count for kind, count in counts.items() if kind not in (*TETS, *BOUNDARY)}
     if foreign:
-        raise MeshError(f"{name}: only tetrahedra with four nodes can be used, but the file holds {_counted(foreign)}")
-    boundary = {kind: count for kind, count in counts.items() if kind != "tetra"}
-    if "tetra" not in counts:
+        raise MeshError(f"{name}: only tetrahedra with four or ten nodes can be used, but the file holds {_counted(foreign)}")
+    boundary = {kind: count for kind, count in counts.items() if kind in BOUNDARY}
+    if len(boundary) == len(counts):
         advice = "; make a volume mesh first" if boundary else ""
         raise MeshError(f"{name}: no tetrahedra; {_counted(boundary) if boundary else 'no elements'} found{advice}")
-    tets = np.concatenate([nodes for kind, nodes in cells if kind == "tetra" and len(nodes)])
-    return tets, [f"{_counted(boundary)} next to the tets are not used"] if boundary else []
+    blocks = [nodes for kind, nodes in cells if kind in TETS and len(nodes)]
+    return blocks, [f"{_counted(boundary)} next to the tets are not used"] if boundary else []
 
 
 def _counted(counts: dict[str, int]) -> str:
@@ -241,23 +245,34 @@ def _counted(counts: dict[str, int]) -> str:
     return ", ".join(parts)
 
 
-def _clean_mesh(name, points, tets, notes, fix_orientation, weld) -> TetMesh:
-    """The TetMesh, after welding and without vertices of no tet; where the arrays are wrong, TetMesh says so first."""
+def _clean_mesh(name, points, blocks, notes, fix_orientation, weld) -> TetMesh:
+    """The TetMesh of the corners, without other vertices and welded; where the arrays are wrong, TetMesh says so first."""
+    tets = np.concatenate([nodes[..., :4] for nodes in blocks])
     sound = (
-        points.ndim == 2 and points.shape[1] == 3 and points.dtype.kind in "fiu" and np.isfinite(points).all()
-        and tets.dtype.kind in "iu" and tets.min() >= 0 and tets.max() < len(points)
+        points.ndim == 2 and points.shape[1] == 3 and points.dtype.kind in "fiu"
+        and (np.abs(points) <= LARGEST_COORDINATE).all() and tets.ndim == 2 and tets.min() >= 0 and tets.max() < len(points)
+        and all(nodes.dtype.kind in "iu" for nodes in blocks)
     )  # fmt: skip
     if not sound:
         return TetMesh(points, tets, fix_orientation, source=name, notes=tuple(notes))
+    points = points.astype(np.float64)
+    loose = np.ones(len(points), dtype=bool)
+    loose[tets] = False
+    kept = ~loose
+    second = [nodes for nodes in blocks if nodes.shape[1] == 10]
+    if second:
+        cells = np.concatenate(second)
+        bad = np.argwhere((cells < 0) | (cells >= len(points)))
+        if len(bad):
+            raise MeshError(f"{name}: second-order tet {bad[0, 0]}: node {cells[tuple(bad[0])]} does not exist")
+        notes += straightened(name, points, cells)
+        loose[cells] = False
+    if loose.any():
+        notes.append(f"{loose.sum()} vertices of no tet are left out, the first is vertex {loose.argmax()} of the file")
+    points, tets = points[kept], (np.cumsum(kept) - 1)[tets]
     if weld is not None:
-        points, tets, note = _welded(name, points.astype(np.float64), tets, weld)
+        points, tets, note = _welded(name, points, tets, weld)
         notes += note
-    used = np.zeros(len(points), dtype=bool)
-    used[tets] = True
-    if not used.all():
-        count, first = int((~used).sum()), int(np.argmin(used))
-        notes.append(f"{count} vertices of no tet are left out, the first is vertex {first} of the file")
-        points, tets = points[used], (np.cumsum(used) - 1)[tets]
     return TetMesh(points, tets, fix_orientation, source=name, notes=tuple(notes))
 
 
@@ -265,8 +280,7 @@ def _welded(name: str, points: np.ndarray, tets: np.ndarray, weld) -> tuple[np.n
     """Points and tets with vertices at most `weld` [m] apart merged into the first of each group, and what to tell."""
     if isinstance(weld, bool) or not isinstance(weld, (int, float, np.number)) or not 0 <= weld < np.inf:
         raise MeshError(f"{name}: weld must be a distance of at least 0 m, or None, not {weld!r}")
-    x = points[tets]
-    shortest = min(float(np.linalg.norm(x[:, a] - x[:, b], axis=1).min()) for a in range(3) for b in range(a + 1, 4))
+    shortest = float(edge_lengths(points, tets).min())
     if weld >= shortest > 0:
         raise MeshError(f"{name}: weld = {float(weld):g} m must be less than the shortest edge, {shortest:g} m")
     labels = merge_labels(points, float(weld))

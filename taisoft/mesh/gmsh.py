@@ -257,7 +257,7 @@ def _to_indices(name: str, tags: np.ndarray, blocks: list[tuple[str, np.ndarray]
         unknown = np.argwhere(ordered[at] != nodes)
         if len(unknown):
             e = int(unknown[0, 0])
-            label = "tet" if kind == "tetra" else kind
+            label = "tet" if kind in ("tetra", "tetra10") else kind
             raise MeshError(f"{name}: {label} {e}: node {nodes[tuple(unknown[0])]} does not exist ({len(tags)} nodes)")
         result.append((kind, order[at]))
     return result

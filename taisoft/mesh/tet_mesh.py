@@ -1,9 +1,9 @@
 """A tetrahedral mesh that has been checked: whoever holds a TetMesh can rely on it.
 
 Refused: coordinates that are not finite, indices that do not exist, tets without volume, some tets inverted, tets given
-twice, faces of three tets, vertices of no tet. Told as a warning: all tets inverted (they are flipped), coincident
-vertices, overlapping neighbours, parts joined at a vertex or an edge only. Tets that overlap without sharing a face are
-not looked for.
+twice, faces of three tets, vertices of no tet. Told as a warning: all tets inverted (they are flipped), tets that
+are nearly flat, coincident vertices, overlapping neighbours, parts joined at a vertex or an edge only. Tets that overlap without
+sharing a face are not looked for.
 """
 
 import warnings
@@ -14,9 +14,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from taisoft.errors import MeshError
+from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.topology import Faces, count_components, first_repeated_tet, joint_edges, joint_vertices
 
 DEGENERATE = 1e-9  # a tet's volume below this times its longest edge cubed counts as none
+NEARLY_FLAT = 0.02  # mean ratio below which a tet is told; grids and common meshers stay above
 LARGEST_COORDINATE = float(np.finfo(np.float32).max)  # [m], forces may be computed in 32 bits
 FAR = 1e5  # distance from the origin over size, above which a mesh is told to lie far away
 COINCIDENT = 1e-9  # vertices nearer than this times the mesh's diagonal count as coincident
@@ -51,6 +53,7 @@ class TetMesh:
         self.surface = faces.triangles[rows]
         self.surface_tets = rows // 4
         self.n_components = count_components(self.tets, self.n_verts)
+        self._tell_flat()
         self._tell_joints(faces)
         self._tell_coincident()
         self._tell_distance()
@@ -156,9 +159,7 @@ class TetMesh:
         """(m,) volumes [m^3], all positive; sets `flipped` and turns those tets round."""
         x = self.vertices[self.tets]
         volumes = np.linalg.det(x[:, 1:] - x[:, :1]) / 6.0
-        longest = np.zeros(self.n_tets)
-        for a, b in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)):
-            longest = np.maximum(longest, np.linalg.norm(x[:, a] - x[:, b], axis=1))
+        longest = edge_lengths(self.vertices, self.tets).max(axis=1)
         flat = ~(np.abs(volumes) > DEGENERATE * longest**3)  # also true for lengths too small to cube
         if flat.any():
             e = int(np.argmax(flat))
@@ -203,6 +204,18 @@ class TetMesh:
                 f"the first are tets {first[0]} and {first[1]}"
             )
         return faces
+
+    def _tell_flat(self) -> None:
+        """Warn of badly shaped tets: a wave crosses their least height at once, and that sets the explicit step."""
+        quality = mean_ratio(edge_lengths(self.vertices, self.tets), self.volumes)
+        count = int((quality < NEARLY_FLAT).sum())
+        if count:
+            worst = int(np.argmin(quality))
+            self._tell(
+                f"{count} tets are nearly flat or needles (mean ratio below {NEARLY_FLAT}, a regular tet has 1), the worst is "
+                f"tet {worst} with {quality[worst]:.2g}: explicit integrators need very small steps, and the body may be too "
+                "stiff there"
+            )
 
     def _tell_joints(self, faces: Faces) -> None:
         edges = joint_edges(self.surface)

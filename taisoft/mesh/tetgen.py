@@ -12,7 +12,10 @@ from taisoft.errors import MeshError
 
 
 def read_tetgen(file: Path) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
-    """Points (n,3) and the one block of tets, indices from 0. file: either of the two. Raises MeshError."""
+    """Points (n,3) and the one block of tets with 4 or 10 nodes, indices from 0. file: either of the two.
+
+    Raises MeshError.
+    """
     head, rows = _table(file.with_suffix(".node"), "vertices")
     if head[1] != 3:
         raise MeshError(f"{file.with_suffix('.node')}: vertices must have 3 coordinates, not {head[1]}")
@@ -22,7 +25,7 @@ def read_tetgen(file: Path) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
     head, tets = _table(file.with_suffix(".ele"), "tets")
     kind = {4: "tetra", 10: "tetra10"}.get(head[1])
     if kind is None:
-        raise MeshError(f"{file.with_suffix('.ele')}: tets must have 4 vertices, not {head[1]}")
+        raise MeshError(f"{file.with_suffix('.ele')}: tets must have 4 or 10 nodes, not {head[1]}")
     return rows[:, 1:4], [(kind, _whole(tets[:, 1 : 1 + head[1]], file.with_suffix(".ele")) - first)]
 
 

@@ -1,4 +1,4 @@
-"""Connectivity of tetrahedra: faces, surface, pieces and joints. NumPy and SciPy graphs, no loops over elements."""
+"""Connectivity of tetrahedra: edges, faces, surface, pieces and joints. NumPy and SciPy graphs, no loops over elements."""
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -6,6 +6,8 @@ from scipy.sparse.csgraph import connected_components
 
 # Face k lies opposite corner k; in this order its normal points out of a positive tet, det(x1-x0, x2-x0, x3-x0) > 0.
 TET_FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
+
+EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners of a tet's six edges; edges k and 5-k do not meet
 
 
 class Faces:
@@ -34,6 +36,17 @@ class Faces:
         """(p,2) rows of `triangles`: the two sides of every face that exactly two tets own."""
         first = self.starts[self.counts == 2]
         return np.stack([self.order[first], self.order[first + 1]], axis=1)
+
+
+def distinct_edges(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The edges (k,2), ascending pairs in lexicographic order, and (m,6) the edge of each of a tet's EDGES.
+
+    tets: (m,4) int, indices from 0.
+    """
+    ends = np.sort(tets[:, EDGES], axis=2)
+    n = int(tets.max()) + 1
+    keys, of_tet = np.unique(ends[..., 0] * n + ends[..., 1], return_inverse=True)
+    return np.stack(np.divmod(keys, n), axis=1), of_tet.reshape(-1, 6)
 
 
 def first_repeated_tet(tets: np.ndarray) -> tuple[int, int] | None:

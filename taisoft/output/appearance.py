@@ -1,4 +1,4 @@
-"""What a body looks like: its colour, and its surface with only the vertices that are on it."""
+"""What a body looks like: its colour, and its surface with only the nodes that are on it."""
 
 import numpy as np
 
@@ -29,9 +29,9 @@ def linear_rgb(srgb: np.ndarray) -> np.ndarray:
 
 
 def compact_surface(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices that surface triangles use, and the triangles in terms of those.
+    """The nodes that surface triangles use, and the triangles in terms of those.
 
-    triangles: int (t,3) of mesh vertices. Returns (nodes int (s,) ascending, local int (t,3)) with
+    triangles: int (t,3) of nodes. Returns (nodes int (s,) ascending, local int (t,3)) with
     nodes[local] == triangles.
     """
     nodes, local = np.unique(np.asarray(triangles), return_inverse=True)

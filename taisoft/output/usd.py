@@ -9,7 +9,8 @@ an attribute's time samples from the strongest layer alone, and value clips are 
 `join_chunks` makes a `scene.usdc` from the chunks of a run that was killed.
 
 Time codes are frame numbers; metres, y up. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose
-guide, so that the two are not drawn over each other) and `material`.
+guide, so that the two are not drawn over each other) and `material`. Both are flat: a second-order body is written as
+the linear triangles and tets that its elements are cut into, all its nodes as points (`taisoft/mesh/nodes.py`).
 """
 
 import re
@@ -205,15 +206,15 @@ def _define_body(stage, body, legal_name: str, index: int) -> list[tuple[str, np
     colour = Gf.Vec3f(*linear_rgb(body_colour(index)).tolist())
     material = _define_material(stage, f"{path}/material", colour)
 
-    nodes, local = compact_surface(body.mesh.surface)
+    nodes, local = compact_surface(body.nodes.surface)
     surface = UsdGeom.Mesh.Define(stage, f"{path}/surface")
     surface.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(local), 3, dtype=np.int32)))
     surface.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(local.ravel().astype(np.int32)))
     surface.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
 
     tets = UsdGeom.TetMesh.Define(stage, f"{path}/tets")
-    tets.CreateTetVertexIndicesAttr(Vt.Vec4iArray.FromNumpy(np.ascontiguousarray(body.mesh.tets, dtype=np.int32)))
-    faces = np.ascontiguousarray(body.mesh.surface, dtype=np.int32)
+    tets.CreateTetVertexIndicesAttr(Vt.Vec4iArray.FromNumpy(np.ascontiguousarray(body.nodes.tets, dtype=np.int32)))
+    faces = np.ascontiguousarray(body.nodes.surface, dtype=np.int32)
     tets.CreateSurfaceFaceVertexIndicesAttr(Vt.Vec3iArray.FromNumpy(faces))
     tets.CreatePurposeAttr(UsdGeom.Tokens.guide)
 

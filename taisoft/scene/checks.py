@@ -66,6 +66,13 @@ def choice(value, what: str, allowed: tuple[str, ...]) -> str:
     raise SceneError(f"{what} must be one of {', '.join(allowed)}, not {value!r}{hint}")
 
 
+def whole(value, what: str, allowed: tuple[int, ...]) -> int:
+    """One of the allowed whole numbers."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value not in allowed:
+        raise SceneError(f"{what} must be {' or '.join(map(str, allowed))}, not {value!r}")
+    return int(value)
+
+
 def name(value, what: str, taken: list[str]) -> str:
     """A text with something in it that is not taken yet."""
     if not isinstance(value, str) or not value.strip():

@@ -1,21 +1,16 @@
 """What a body is made of: an elastic law and its numbers, all checked."""
 
-import warnings
 from dataclasses import dataclass
 
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 
 LAWS = ("st_venant_kirchhoff", "corotational", "stable_neo_hookean")
-NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which first-order tets lock: they bend far too little
 
 
 @dataclass(frozen=True)
 class Material:
-    """An elastic material with damping and surface numbers. Raises SceneError for numbers outside the rules below.
-
-    Poisson's ratio above 0.49 is told with a UserWarning, because first-order tets are far too stiff there.
-    """
+    """An elastic material with damping and surface numbers. Raises SceneError for numbers outside the rules below."""
 
     law: str = "stable_neo_hookean"  # one of LAWS
     young: float = 1e6  # Young's modulus [Pa], > 0
@@ -42,15 +37,6 @@ class Material:
             object.__setattr__(self, field, checks.number(getattr(self, field), f"material: {field}", **limit))
         if not -1.0 < self.poisson < 0.5:
             raise SceneError(f"material: poisson must lie in the open interval (-1, 0.5), not {self.poisson:g}")
-        for text in self.warnings:
-            warnings.warn(text, UserWarning, stacklevel=3)
-
-    @property
-    def warnings(self) -> list[str]:
-        """What is allowed but worth knowing."""
-        if self.poisson <= NEARLY_INCOMPRESSIBLE:
-            return []
-        return [f"material: poisson = {self.poisson:g} is above {NEARLY_INCOMPRESSIBLE}: first-order tets lock there"]
 
     @property
     def mu(self) -> float:

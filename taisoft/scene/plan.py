@@ -35,6 +35,16 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool) -> Plan:
     def bodies(test) -> list[str]:
         return [b.name for b in scene.bodies if test(b)]
 
+    quadratic = bodies(lambda b: b.order == 2)
+    plan.add("quadratic_tets", bool(quadratic), f"order 2 of {_named(quadratic)}", "every body is of order 1")
+    plan.add(
+        "consistent_weight", bool(quadratic) and not explicit, "gravity on quadratic tets acts as int rho N g dV",
+        "explicit steps take gravity as an acceleration" if quadratic else "on linear tets it is the lumped mass",
+    )  # fmt: skip
+    plan.add(
+        "consistent_mass", bool(quadratic) and not explicit, f"quadratic tets of {_named(quadratic)} in implicit steps",
+        "explicit steps need a diagonal mass" if quadratic else "the mass of linear tets is lumped",
+    )  # fmt: skip
     loaded = bodies(lambda b: b.tractions or b.forces)
     plan.add("loads", bool(loaded), f"tractions or forces on {_named(loaded)}", "no traction and no force")
     fixed = bodies(lambda b: any(c.path is None for c in b.constraints))

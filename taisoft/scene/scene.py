@@ -5,18 +5,22 @@ Everything is checked and turned into arrays at the call that adds it, so that a
 
 import copy
 import difflib
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from taisoft.errors import SceneError
+from taisoft.mesh.nodes import Nodes, make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.material import LAWS, Material
 
 __all__ = ["LAWS", "Body", "Constraint", "Material", "NodalForce", "Scene", "Traction"]
 
+NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock: they bend far too little
+QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # of polynomials integrated exactly, by order; the first is the default
 _FREE, _FIXED, _MOVED = 0, 1, 2
 
 
@@ -39,51 +43,64 @@ class Traction:
 
 @dataclass(frozen=True, eq=False)
 class NodalForce:
-    """A dead load spread over nodes by their lumped mass."""
+    """A dead load on nodes: a total spread over them by their lumped mass, or one force for each."""
 
     nodes: np.ndarray  # (k,) int64 node ids
-    value: np.ndarray  # (3,) total force [N]
+    value: np.ndarray  # (3,) total force, or (k,3) one a node [N]
 
 
 class Body:
     """One elastic body of a scene; made by `Scene.add_body`.
 
     name, mesh, material. position: (3,) [m], where the body starts: its nodes begin at rest_positions + position.
-    velocity: (3,) or (n,3) [m/s], of the start. order: 1, the elements' order. constraints, tractions, forces: lists of
-    `Constraint`, `Traction`, `NodalForce`.
+    velocity: (3,) or (n,3) [m/s], of the start. order: 1 or 2, of the elements' shape functions; quadrature_degree: of
+    polynomials that their quadrature integrates exactly. nodes: `Nodes`, the mesh's vertices and for order 2 the middles
+    of its edges. constraints, tractions, forces: lists of `Constraint`, `Traction`, `NodalForce`. A Poisson's ratio above
+    0.49 is told with a UserWarning for order 1, whose tets are far too stiff there.
     """
 
-    def __init__(self, name: str, mesh: TetMesh, material: Material, position, velocity, order: int):
+    def __init__(
+        self, name: str, mesh: TetMesh, material: Material, position, velocity, order: int, quadrature_degree: int | None
+    ):  # fmt: skip
         what = f"body {name!r}"
         if not isinstance(mesh, TetMesh):
             raise SceneError(f"{what}: mesh must be a TetMesh, not {type(mesh).__name__}")
         if not isinstance(material, Material):
             raise SceneError(f"{what}: material must be a Material, not {type(material).__name__}")
-        if isinstance(order, bool) or order != 1:
-            raise SceneError(f"{what}: order must be 1, not {order!r}")
         self.name = name
         self.mesh = mesh
         self.material = material
+        self.order = checks.whole(order, f"{what}: order", tuple(QUADRATURE_DEGREES))
+        degrees = QUADRATURE_DEGREES[self.order]
+        degree = degrees[0] if quadrature_degree is None else quadrature_degree
+        self.quadrature_degree = checks.whole(degree, f"{what}: quadrature_degree of order {self.order}", degrees)
+        if self.order == 1 and material.poisson > NEARLY_INCOMPRESSIBLE:
+            warnings.warn(
+                f"{what}: poisson = {material.poisson:g} is above {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend "
+                "far too little: order=2 does not",
+                UserWarning, stacklevel=4,
+            )  # fmt: skip
+        self.nodes: Nodes = make_nodes(mesh, self.order)
         self.position = checks.array(position, f"{what}: position", ((3,),))
-        self.velocity = checks.array(velocity, f"{what}: velocity", ((3,), (mesh.n_verts, 3)))
-        self.order = 1
+        self.velocity = checks.array(velocity, f"{what}: velocity", ((3,), (self.n_nodes, 3)))
         self.constraints: list[Constraint] = []
         self.tractions: list[Traction] = []
         self.forces: list[NodalForce] = []
-        self._held = np.full((mesh.n_verts, 3), _FREE, dtype=np.int8)  # what holds each node along each axis
+        self._held = np.full((self.n_nodes, 3), _FREE, dtype=np.int8)  # what holds each node along each axis
 
     @property
     def rest_positions(self) -> np.ndarray:
-        """(n,3) [m], read-only: the mesh's vertices, where the body is free of stress."""
-        return self.mesh.vertices
+        """(n,3) [m], read-only: the nodes where the body is free of stress; the mesh's vertices come first."""
+        return self.nodes.positions
 
     @property
     def n_nodes(self) -> int:
         """Number of nodes."""
-        return self.mesh.n_verts
+        return len(self.nodes.positions)
 
     def __repr__(self) -> str:
-        return f"Body({self.name!r}, {self.mesh.n_verts} nodes, {self.mesh.n_tets} tets, {self.material.law})"
+        kind = f"{self.mesh.n_tets} tets of order {self.order}"
+        return f"Body({self.name!r}, {self.n_nodes} nodes, {kind}, {self.material.law})"
 
     def fix(self, where, axes: str = "xyz") -> Constraint:
         """Hold nodes where they start.
@@ -125,20 +142,21 @@ class Body:
         finite.
         """
         what = f"body {self.name!r}: add_traction"
-        centroids = self.rest_positions[self.mesh.surface].mean(axis=1)
+        centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
         triangles = checks.selection(where, centroids, what, "surface triangle")
         load = Traction(triangles, checks.array(traction, f"{what}: traction", ((3,),)))
         self.tractions.append(load)
         return load
 
     def add_force(self, where, force) -> NodalForce:
-        """Load nodes with a total dead force, spread over them by lumped mass.
+        """Load nodes with a total dead force, spread over them by lumped mass, or with one force for each node.
 
-        where: as for `fix`. force: (3,) [N]. Raises SceneError when no node is chosen or numbers are not finite.
+        where: as for `fix`. force: (3,) the total, or (k,3) in the order of the chosen nodes [N].
+        Raises SceneError when no node is chosen or numbers are not finite.
         """
         what = f"body {self.name!r}: add_force"
         nodes = checks.selection(where, self.rest_positions, what, "node")
-        load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,),)))
+        load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,), (len(nodes), 3))))
         self.forces.append(load)
         return load
 
@@ -195,16 +213,19 @@ class Scene:
         position=(0.0, 0.0, 0.0),
         velocity=(0.0, 0.0, 0.0),
         order: int = 1,
+        quadrature_degree: int | None = None,
     ) -> Body:
         """Add a body and return it.
 
         mesh: its shape at rest. name: unique, "body0" and so on where left out. position: (3,) [m], shift of the start.
-        velocity: (3,) for all nodes or (n,3) [m/s]. order: 1. Raises SceneError.
+        velocity: (3,) for all nodes or (n,3) [m/s]. order: 1, linear tets, or 2, quadratic ones with nodes in the middle of
+        every edge. quadrature_degree, for order 2: 2 (four points, the default) or 4 (fourteen). Raises SceneError.
         """
         taken = [body.name for body in self.bodies]
         if name is None:
             name = next(free for free in (f"body{i}" for i in range(len(taken) + 1)) if free not in taken)
-        body = Body(checks.name(name, "scene: body name", taken), mesh, material, position, velocity, order)
+        name = checks.name(name, "scene: body name", taken)
+        body = Body(name, mesh, material, position, velocity, order, quadrature_degree)
         self.bodies.append(body)
         return body
 

@@ -10,7 +10,7 @@ A small mesh runs all its sub-steps in one serial kernel; a large one takes two 
 import taichi as ti
 
 from taisoft.elasticity import HUGE, count_inverted, element_force
-from taisoft.elements import broadcast, gather
+from taisoft.elements.lanes import broadcast, gather
 from taisoft.runtime import kernel
 
 
@@ -126,9 +126,9 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
         most = 0
         if ti.static(s.verlet):
             if restart != 0:
-                for law, first, last in ti.static(m.laws):
-                    for b in range(first, last):
-                        element_force(m, law, m.stiffness_damping, b)
+                for g in ti.static(m.groups):
+                    for b in range(g.first, g.last):
+                        element_force(m, g, m.stiffness_damping, b)
                 for i in range(m.n_nodes):
                     s.acceleration[i] = acceleration(m, i)
         while done < n and going:
@@ -143,9 +143,9 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
                 if ti.static(s.n_moved > 0):
                     lead(m, s, done, dt64)
             inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
-            for law, first, last in ti.static(m.laws):
-                for b in range(first, last):
-                    J = element_force(m, law, m.stiffness_damping, b)
+            for g in ti.static(m.groups):
+                for b in range(g.first, g.last):
+                    J = element_force(m, g, m.stiffness_damping, b)
                     lowest = ti.min(lowest, J)
                     inverted += count_inverted(m, b, J)
             total = ti.Vector([0.0, 0.0, 0.0], m.real)
@@ -182,9 +182,9 @@ def set_targets(s: ti.template(), rows: ti.types.ndarray()):
 @kernel
 def elements_parallel(m: ti.template()):
     """One sub-step's element loop over threads; scalars 6, 9: smallest J so far, inverted tets of this sub-step."""
-    for law, first, last in ti.static(m.laws):
-        for b in range(first, last):
-            J = element_force(m, law, m.stiffness_damping, b)
+    for g in ti.static(m.groups):
+        for b in range(g.first, g.last):
+            J = element_force(m, g, m.stiffness_damping, b)
             bad = count_inverted(m, b, J)
             low, count = J[0], bad[0]
             for q in ti.static(range(1, m.lanes)):

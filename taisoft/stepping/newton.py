@@ -69,7 +69,7 @@ class StageSolver:
             moved=arena.field("stage_moved", ti.i32, k, moved.astype(np.int32)) if k else None,
             moved_axes=arena.vectors("stage_moved_axes", ti.i32, k) if k else None,
             targets=arena.vectors("stage_targets", ti.f64, k) if k else None,
-            n_moved=k, shift=arena.field("shift", model.real, n), damper=self.damper,
+            n_moved=k, change=arena.vectors("change", ti.f64, n), damper=self.damper,
         )  # fmt: skip
         self.update_material()
 
@@ -79,6 +79,8 @@ class StageSolver:
         volume, Dm_inv = m.volume.to_numpy().astype(np.float64), m.Dm_inv.to_numpy().astype(np.float64)
         stiff = np.abs(m.law_constants.to_numpy()[:, :2]).sum(axis=1)[m.block_body.to_numpy()]
         g = np.sqrt((Dm_inv**2).sum(axis=1))
+        for group in m.groups:  # the gradients of quadratic shape functions are up to four times as large
+            g[group.first : group.last] *= 1.0 if group.order == 1 else 4.0
         largest = float(np.abs(m.x.to_numpy()).max())
         strain = self.eps + np.finfo(np.float64).eps * largest * g  # of F, and of the f64 positions it is formed from
         self.rounding_force = float(np.sqrt(((stiff[:, None] * volume * g * strain) ** 2).sum()))
@@ -105,23 +107,23 @@ class StageSolver:
         s = self.model.scalars
         return s[0] + s[4] + s[14]
 
-    def _form_system(self, beta: float, projected: bool) -> None:
+    def _form_system(self, c: float, beta: float, projected: bool) -> None:
         block_csr.assemble(self.model, self.matrix, projected)
-        block_csr.to_system(self.model, self.matrix, self.damper or self.matrix, self.work.shift, beta * beta, beta)
+        block_csr.to_system(self.model, self.matrix, self.damper or self.matrix, c, beta)
 
     def _direction(self, tolerance: float) -> pcg.LinearResult:
         return pcg.solve(self.model, self.matrix, self.pcg, tolerance, max(200, 3 * self.model.n_nodes))
 
     def solve(
         self, c: float, beta: float, tolerance: float, max_newton: int, linear_tolerance: float | None = None,
-        by_energy: bool = False,
+        by_energy: bool = False, led_share: float = 1.0,
     ) -> StageResult:  # fmt: skip
-        """Solve the stage from the present v. x_hat, v_hat and the targets are set by the caller.
+        """Solve the stage from the present v. x_hat, v_hat and the targets are set by the caller; led_share: `begin_stage`.
 
         by_energy: every step must lower Phi (statics); otherwise a lower |r| is enough. max_newton = 1 takes one full
         step without looking back (linearly implicit); it has converged when its linear solve has.
         """
-        begin_stage(self.model, self.work, beta)
+        begin_stage(self.model, self.work, beta, led_share)
         r, scale = self._evaluate(c, beta)
         floor = beta * self.rounding_force + c * self.rounding_mass / beta
         newton = linear = 0
@@ -139,13 +141,13 @@ class StageSolver:
                     wanted = min(wanted, tolerance)
             # the matrix is kept while it still serves: assembling costs as much as some ten CG iterations
             if not fresh or by_energy or r > SLOW * previous:
-                self._form_system(beta, needs_projection)
+                self._form_system(c, beta, needs_projection)
                 fresh = True
             answer = self._direction(wanted)
             linear += answer.iterations
             if answer.negative and not needs_projection:
                 needs_projection = True
-                self._form_system(beta, True)
+                self._form_system(c, beta, True)
                 answer = self._direction(wanted)
                 linear += answer.iterations
             solved = answer.converged and (max_newton > 1 or self._linear_residual() <= LINEAR_LIMIT)

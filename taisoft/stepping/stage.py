@@ -6,9 +6,10 @@ from typing import Any
 import taichi as ti
 
 from taisoft.elasticity import element_force
-from taisoft.elements import gather
+from taisoft.elements.lanes import gather
 from taisoft.linear.block_csr import row_times
 from taisoft.linear.pcg import dot64, total
+from taisoft.mass import mass_times
 from taisoft.runtime import kernel
 
 
@@ -24,7 +25,7 @@ class StageWork:
     moved_axes: Any  # (n_moved, 3) i32
     targets: Any  # (n_moved) f64 3-vectors
     n_moved: int
-    shift: Any  # (n_nodes) inertia of the system
+    change: Any  # f64: what the mass is multiplied by
     damper: Any  # BlockCsr or None
 
 
@@ -35,8 +36,11 @@ def stage_velocity(m: ti.template(), w: ti.template(), i, beta):
 
 
 @kernel
-def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64):
-    """x from the first iterate v; led nodes go to their targets, which gives their v."""
+def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, led_share: ti.f64):
+    """x from the first iterate v; led nodes go to their targets, which gives their v.
+
+    led_share: of a led node's change of velocity that happens within the stage; v_hat is moved by the rest.
+    """
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         m.x[i] = w.x_hat[i] + beta * ti.cast(m.v[i], ti.f64)
@@ -46,7 +50,9 @@ def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64):
             i = w.moved[k]
             for a in ti.static(range(3)):
                 if w.moved_axes[k][a] != 0:
-                    m.v[i][a] = ti.cast((w.targets[k][a] - w.x_hat[i][a]) / beta, m.real)
+                    v = (w.targets[k][a] - w.x_hat[i][a]) / beta
+                    w.v_hat[i][a] = ti.cast(v - led_share * (v - ti.cast(w.v_hat[i][a], ti.f64)), m.real)
+                    m.v[i][a] = ti.cast(v, m.real)
                     m.x[i][a] = w.targets[k][a]
 
 
@@ -54,41 +60,41 @@ def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64):
 def form_residual(
     m: ti.template(), w: ti.template(), p: ti.template(), c: ti.f64, beta: ti.f64
 ) -> ti.types.vector(5, ti.f64):
-    """Elastic forces and residual at the present x and v, -r as CG's right side, inertia of the system.
+    """Elastic forces and residual at the present x and v, -r as CG's right side.
 
-    Returns |r|^2, |c M dv|^2, |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on the others.
+    Returns |r|^2, |inertia and mass damping|^2, |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on the others.
     """
-    for law, first, last in ti.static(m.laws):
+    for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for b in range(first, last):
-            element_force(m, law, False, b)
+        for b in range(g.first, g.last):
+            element_force(m, g, False, b)
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        change = c * (stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64))
+        if ti.static(m.damped):
+            change += beta * ti.cast(m.damping[m.node_body[i], 0], ti.f64) * ti.cast(m.v[i], ti.f64)
+        w.change[i] = change
     ti.loop_config(serialize=m.serial)
     for k in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         s = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64)
         for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
-            b, mass, free = ti.cast(beta, m.real), m.mass[i], m.free[i]
-            inertia = ti.cast(c, m.real) * mass
+            b, free = ti.cast(beta, m.real), m.free[i]
             f = gather(m, i)
-            external = mass * m.gravity[0]
+            external = m.weight[i] * m.gravity[0]
             if ti.static(m.loaded):
                 external += m.loads[i]
             drag = ti.Vector([0.0, 0.0, 0.0], m.real)
-            if ti.static(m.damped):
-                a = m.damping[m.node_body[i], 0]
-                drag += a * mass * m.v[i]
-                inertia += b * a * mass
             if ti.static(m.stiffness_damping):
                 drag += m.damping[m.node_body[i], 1] * row_times(m, w.damper, i, m.v)
-            change = ti.cast(c * (stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64)), m.real) * mass
-            r = change - b * (f + external - drag)
+            inertia = ti.cast(mass_times(m, i, w.change), m.real)
+            r = inertia - b * (f + external - drag)
             w.residual[i] = r
             p.rhs[i] = -free * r
-            w.shift[i] = inertia
             s += ti.Vector(
                 [
                     norm2(free * r),
-                    norm2(free * change),
+                    norm2(free * inertia),
                     norm2(free * f),
                     norm2(free * external),
                     norm2((1.0 - free) * r),
@@ -133,18 +139,30 @@ def keep_base(m: ti.template(), w: ti.template(), y: ti.template()):
 @kernel
 def stage_terms(m: ti.template(), w: ti.template(), c: ti.f64, beta: ti.f64):
     """Inertia, loads and damping terms of Phi, in f64: scalars 14."""
+    if ti.static(m.damped):
+        ti.loop_config(serialize=m.serial)
+        for i in range(m.n_nodes):
+            w.change[i] = stage_velocity(m, w, i, beta)
+        ti.loop_config(serialize=m.serial)
+        for k in range(m.chunks):
+            m.partial[k, 6] = 0.0
+            size = (m.n_nodes + m.chunks - 1) // m.chunks
+            for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
+                a = ti.cast(m.damping[m.node_body[i], 0], ti.f64)
+                m.partial[k, 6] += 0.5 * beta * a * w.change[i].dot(mass_times(m, i, w.change))
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        w.change[i] = stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64)
     ti.loop_config(serialize=m.serial)
     for k in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         s = ti.cast(0.0, ti.f64)
+        if ti.static(m.damped):
+            s += m.partial[k, 6]
         for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
-            mass, v = ti.cast(m.mass[i], ti.f64), stage_velocity(m, w, i, beta)
-            d = v - ti.cast(w.v_hat[i], ti.f64)
-            s += 0.5 * c * mass * d.dot(d)
+            s += 0.5 * c * w.change[i].dot(mass_times(m, i, w.change))
             if ti.static(m.loaded):
                 s -= ti.cast(m.loads[i], ti.f64).dot(m.x[i])
-            if ti.static(m.damped):
-                s += 0.5 * beta * m.damping[m.node_body[i], 0] * mass * v.dot(v)
             if ti.static(m.stiffness_damping):
                 s += 0.5 * beta * m.damping[m.node_body[i], 1] * dot64(m.v[i], row_times(m, w.damper, i, m.v))
         m.partial[k, 5] = s

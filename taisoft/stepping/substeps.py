@@ -11,7 +11,7 @@ from taisoft.stepping import explicit
 from taisoft.stepping.world import World
 
 LAUNCH_SECONDS = 0.1  # aim for one launch, so that Ctrl-C is heard
-SECONDS_PER_TET = 60e-9  # of one sub-step, the slowest seen (corotational with stiffness damping): sizes a launch
+SECONDS_PER_POINT = 60e-9  # of one sub-step, the slowest seen (corotational with stiffness damping): sizes a launch
 MAX_BATCH = 4096
 TARGET_BYTES_PER_TET = 200  # memory that the targets of a batch may take
 
@@ -50,7 +50,8 @@ class ExplicitStepper:
         self.world = world
         m, arena, motion = world.model, world.arena, world.motion
         n_tets = int(world.layout.n_tets.sum())
-        self.max_batch = max(1, min(MAX_BATCH, int(LAUNCH_SECONDS / (SECONDS_PER_TET * n_tets))))
+        n_points = sum((g.last - g.first) * m.lanes * g.n_points for g in m.groups)
+        self.max_batch = max(1, min(MAX_BATCH, int(LAUNCH_SECONDS / (SECONDS_PER_POINT * n_points))))
         n_moved, n_held = motion.n_moved, len(motion.held)
         self.rows = max(1, min(self.max_batch, TARGET_BYTES_PER_TET * n_tets // (24 * max(1, n_moved))))
 

@@ -1,10 +1,11 @@
 """World: what every stepper works on: model, constraints, time; the one place that touches them together."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.model import Layout, Model, body_masses, damping_table, material_table
+from taisoft.mass import lumped_masses, upload_mass_matrix, weight_masses
+from taisoft.model import Layout, Model, damping_table, material_table
 from taisoft.runtime import FieldArena, Runtime
 from taisoft.scene.scene import Scene
 from taisoft.stepping.motion import Motion
@@ -32,9 +33,11 @@ class World:
     def upload_material(self) -> None:
         """Material numbers and masses of the bodies to the device."""
         m, npr = self.model, self.runtime.np_real
-        mass = body_masses(self.scene)
-        self.layout = replace(self.layout, mass=mass)
-        m.mass.from_numpy(mass.astype(npr))
+        m.mass.from_numpy(lumped_masses(self.scene).astype(npr))
+        if m.weight is not m.mass:
+            m.weight.from_numpy(weight_masses(self.scene).astype(npr))
+        if m.consistent:
+            upload_mass_matrix(self.scene, m.mass_matrix, npr)
         m.law_constants.from_numpy(material_table([b.material for b in self.scene.bodies]))
         if m.damping is not None:
             m.damping.from_numpy(damping_table(self.scene).astype(npr))

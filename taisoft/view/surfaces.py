@@ -1,8 +1,8 @@
 """The triangles that a picture shows: every body's surface, split at sharp edges, and markers of fixed nodes.
 
-A drawn vertex belongs to one mesh vertex and one smoothing group: the triangles round that vertex that are connected
-over edges bent by less than CREASE at rest. Its normal is the area-weighted mean over that group, so a ball looks round
-and a box keeps its edges, in every deformed state.
+A drawn vertex belongs to one node and one smoothing group: the triangles round that node that are connected over edges
+bent by less than CREASE at rest. Its normal is the area-weighted mean over that group, so a ball looks round and a box
+keeps its edges, in every deformed state. A second-order face is drawn as four flat triangles between its six nodes.
 """
 
 import numpy as np
@@ -47,7 +47,7 @@ def start_positions(scene) -> np.ndarray:
 class _BodySurface:
     def __init__(self, body, colour: np.ndarray):
         self.name = body.name
-        surface = np.asarray(body.mesh.surface)
+        surface = np.asarray(body.nodes.surface)
         rest = np.asarray(body.rest_positions)
         self._nodes, corners = smoothing_groups(rest, surface)
         edges = rest[surface] - rest[np.roll(surface, 1, axis=1)]
@@ -70,10 +70,10 @@ class _BodySurface:
 
 
 def smoothing_groups(rest: np.ndarray, surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split surface vertices at sharp edges.
+    """Split surface nodes at sharp edges.
 
-    rest: (n,3); surface: (t,3) vertex ids. Returns nodes (d,), the mesh vertex of each drawn vertex, and corners (t,3),
-    the drawn vertex at each triangle's corner: nodes[corners] == surface.
+    rest: (n,3); surface: (t,3) node ids. Returns nodes (d,), the node of each drawn vertex, and corners (t,3), the drawn
+    vertex at each triangle's corner: nodes[corners] == surface.
     """
     t = len(surface)
     a, b, c = (rest[surface[:, k]] for k in range(3))

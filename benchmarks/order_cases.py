@@ -1,0 +1,236 @@
+"""What `order.py` measures: static problems and one motion, each a scene for any cells and element, a reading, a reference.
+
+The references are numbers of other programs or closed forms, so that nothing beside this file is needed; `uncertainty` is
+what they are good to, and no error below it is claimed. Two problems have no such number: there the order-2 meshes of the
+same run stand in, see `Case.reference`. All scenes are in SI units but Cook's panel, which has units of its own.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.scene.scene import Body
+
+from .reference_cases.record import GRAVITY, LAWS, face, label, nearest, scene
+from .reference_cases.statics import cook_panel
+
+
+@dataclass(frozen=True)
+class Element:
+    """Order of a body's shape functions and, for order 2, the degree of its quadrature rule."""
+
+    order: int
+    degree: int | None = None
+
+    @property
+    def keywords(self) -> dict:
+        """Arguments of `Scene.add_body`."""
+        return {"order": self.order} | ({} if self.degree is None else {"quadrature_degree": self.degree})
+
+    @property
+    def points(self) -> int:
+        """Quadrature points in a tet."""
+        return {None: 1, 2: 4, 4: 14}[self.degree]
+
+
+LINEAR, QUADRATIC, QUADRATIC_14 = Element(1), Element(2, 2), Element(2, 4)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a case is judged by. values: of its first numbers; those beyond are only told. source: where they are from.
+
+    uncertainty: relative, of the least sure value.
+    """
+
+    values: tuple[float, ...]
+    uncertainty: float
+    source: str
+
+
+@dataclass(frozen=True)
+class Case:
+    """One problem with one law, and the cells of its meshes, coarse to fine, for each element.
+
+    reference None: the finest order-2 mesh that has a solution stands in; with `extrapolated` the limit of its last three
+    meshes, each of which halves the cells of the one before. dt: step of a motion [s]; None for an equilibrium.
+    """
+
+    name: str
+    title: str
+    law: str
+    quantity: str
+    mesh: Callable[[tuple], ts.TetMesh]
+    material: dict  # young, poisson, density
+    clamped: Callable[[np.ndarray], np.ndarray]  # choice of nodes
+    read: Callable[[Body, object], np.ndarray]  # (body, state) -> numbers; state: StaticResult or a motion's path
+    meshes: dict[Element, tuple]
+    reference: Reference | None = None
+    gravity: bool = True
+    load: Callable[[Body], object] | None = None  # more than gravity
+    extrapolated: bool = False
+    dt: float | None = None
+    note: str = ""
+
+    def build(self, cells, element: Element) -> ts.Scene:
+        """The scene with its one body."""
+        s = scene(self.gravity)
+        body = s.add_body(self.mesh(cells), ts.Material(law=LAWS[self.law], **self.material), **element.keywords)
+        body.fix(self.clamped)
+        if self.load is not None:
+            self.load(body)
+        return s
+
+
+def displacement(point, *axes: int) -> Callable[[Body, object], np.ndarray]:
+    """Reads the displacement of the node nearest to a point along axes [m]; the mean of several equally near."""
+
+    def read(body: Body, state) -> np.ndarray:
+        nodes = nearest(body.rest_positions, point)
+        return (state.positions(body.name) - body.rest_positions)[nodes].mean(axis=0)[list(axes)]
+
+    return read
+
+
+def _box(size, starts_at_zero: bool = False) -> Callable[[tuple], ts.TetMesh]:
+    """Boxes (3,) [m] of any cells, centred, or with their left end at x = 0."""
+    return lambda cells: ts.box_mesh(cells, size, (size[0] / 2 if starts_at_zero else 0.0, 0.0, 0.0))
+
+
+def _pulled(x: float, force: float, area: float) -> Callable[[Body], object]:
+    """A dead force [N] along y, spread evenly over the face at x [m] of an area [m^2]."""
+    return lambda body: body.add_traction(face(0, x), (0.0, force / area, 0.0))
+
+
+def _turned(body: Body) -> None:
+    """The face at x = 2 m turned by 90 degrees about x."""
+    end = face(0, 2.0)(body.rest_positions)
+    _, y, z = body.rest_positions[end].T
+    way = np.column_stack([np.zeros_like(y), -z - y, y - z])
+    body.move(end, lambda t: way)
+
+
+def _torque(body: Body, state) -> np.ndarray:
+    """Torque about x on the face at x = 2 m (1,) [N m]."""
+    end = face(0, 2.0)(body.rest_positions)
+    return np.cross(state.positions(body.name)[end], state.reactions(body.name)[end])[:, :1].sum(axis=0)
+
+
+def _lowest(body: Body, path) -> np.ndarray:
+    """Lowest displacement of the tip [m] and its time [s]."""
+    return np.array(path.lowest)
+
+
+# --- meshes -----------------------------------------------------------------------------------------------------------
+
+
+def _cubes(*across: int, length: float) -> tuple:
+    """Cells of boxes as wide as high, `length` times as long, nearly cubes; across: cells over the height."""
+    return tuple((round(length * n), n, n) for n in across)
+
+
+BEAM_MESHES = {
+    LINEAR: ((11, 2, 2), (22, 4, 4), (44, 8, 8), (66, 12, 12)),
+    QUADRATIC: ((6, 1, 1), (11, 2, 2), (16, 3, 3), (22, 4, 4)),
+}
+FINER_MESHES = {LINEAR: BEAM_MESHES[LINEAR][1:], QUADRATIC: BEAM_MESHES[QUADRATIC][:3]}
+MOTION_MESHES = {LINEAR: BEAM_MESHES[LINEAR][:3], QUADRATIC: BEAM_MESHES[QUADRATIC][:3]}
+NESTED_MESHES = {LINEAR: _cubes(2, 4, 8, length=3), QUADRATIC: _cubes(1, 2, 4, 8, length=3)}
+
+# --- references -------------------------------------------------------------------------------------------------------
+
+BRICKS = "27-node bricks of scikit-fem 12.0.2 on nested meshes, full Newton, Richardson extrapolation"
+ELASTICA = "elastica: elliptic integrals (Bisshopp and Drucker 1945); thickness and shear move a 3D bar by less than 0.1 %"
+HEAVY_ELASTICA = "elastica under its own weight: boundary value problem solved to 1e-11; thickness, stretch and shear as above"
+FALL = "27-node bricks of scikit-fem 12.0.2 with Newmark's rule, two meshes, estimated limit"
+
+# --- cases ------------------------------------------------------------------------------------------------------------
+
+RUBBER = {"young": 1e6, "poisson": 0.3, "density": 1000.0}
+BEAM, BAR, STRIP, SHEET = (4.0, 1.0, 1.0), (1.0, 0.1, 0.1), (10.0, 0.1, 1.0), (4.0, 0.05, 4.0)
+PANEL = {"geometry": {"thickness_z": 10.0, "corner_points_xy": ((0, 0), (48, 44), (48, 60), (0, 44))}}
+# weight over bending stiffness w L^3 / (E I) = 8, with w = rho g and I = h^2/12 for one unit of the section's area
+HEAVY = 8.0 * 1.2e6 * STRIP[1] ** 2 / (12.0 * GRAVITY * STRIP[0] ** 3)
+
+
+def _hanging(name: str, title: str, law: str, reference: Reference | None, young: float = 1e6, **more) -> Case:
+    """The beam 4 x 1 x 1 m, clamped at its left end, bends under its own weight."""
+    more = {"meshes": FINER_MESHES, "material": RUBBER | {"young": young}} | more
+    return Case(
+        name, title, law, "uy of the tip [m]", _box(BEAM), clamped=face(0, -2.0), read=displacement((2, 0, 0), 1),
+        reference=reference, **more,
+    )  # fmt: skip
+
+
+HANGING = "hanging_beam"  # the case with a wanted ratio
+CASES = (
+    _hanging(
+        HANGING, "hanging beam", "SNH", Reference((-2.70947892267,), 4.3e-4, BRICKS),
+        meshes=BEAM_MESHES | {QUADRATIC_14: ((6, 1, 1), (11, 2, 2))},
+    ),
+    _hanging("hanging_beam_cor", "hanging beam", "COR", Reference((-2.6807151797,), 3e-4, BRICKS)),
+    _hanging(
+        "hanging_beam_svk", "hanging beam, E = 2 MPa", "SVK",
+        Reference((-1.73061189475,), 5.8e-3, BRICKS + ", two meshes only: not converged"), young=2e6,
+    ),
+    _hanging(
+        "hanging_beam_svk_1MPa", "hanging beam, E = 1 MPa", "SVK", None,
+        meshes={LINEAR: BEAM_MESHES[LINEAR][:2], QUADRATIC: BEAM_MESHES[QUADRATIC][:2]},
+        note="no value converged in space exists: this law softens where the clamp squeezes it, and fine meshes of any element "
+        "lose the equilibrium below the whole load; errors are distances to the finest order-2 mesh that has one",
+    ),
+    _hanging(
+        "hanging_beam_nu0.499", "hanging beam, nu = 0.499", "SNH", None, material=RUBBER | {"poisson": 0.499},
+        meshes=NESTED_MESHES | {QUADRATIC_14: ((6, 2, 2),)}, extrapolated=True,
+    ),
+    Case(
+        "cook", "Cook's panel", "SNH", "uy of the right side's middle", lambda cells: cook_panel(cells, PANEL),
+        {"young": 240.565, "poisson": 0.3, "density": 1.0}, face(0, 0.0), displacement((48, 52, 0), 1),
+        {LINEAR: ((8, 8, 2), (16, 16, 4), (32, 32, 8)), QUADRATIC: ((2, 2, 1), (4, 4, 1), (8, 8, 2))},
+        Reference((8.39990723254,), 5e-4, BRICKS), gravity=False,
+        load=lambda panel: panel.add_traction(face(0, 48.0), (0.0, 6.25, 0.0)),
+    ),
+    Case(
+        "twist", "bar twisted by 90 degrees", "SNH", "torque [N m]", _box(BEAM), RUBBER, face(0, -2.0), _torque,
+        {LINEAR: ((8, 2, 2), (16, 4, 4), (32, 8, 8)), QUADRATIC: ((4, 1, 1), (8, 2, 2), (16, 4, 4))},
+        Reference((21464.5387028,), 2.4e-3, BRICKS), gravity=False, load=_turned,
+    ),
+    Case(
+        "cantilever", "slender cantilever, tiny end shear", "SVK", "uy of the tip [m]", _box(BAR, True), RUBBER,
+        face(0, 0.0), displacement((1, 0, 0), 1),
+        {LINEAR: ((20, 2, 2), (40, 4, 4), (80, 8, 8)), QUADRATIC: ((5, 1, 1), (10, 1, 1), (20, 2, 2))},
+        Reference((0.000400391367029,), 5e-4, BRICKS), gravity=False, load=_pulled(1.0, 0.01, BAR[1] * BAR[2]),
+    ),
+    Case(
+        "elastica_shear", "elastica, end shear", "SVK", "ux, uy of the tip [m]", _box(STRIP, True),
+        {"young": 1.2e6, "poisson": 0.0, "density": 1.0}, face(0, 0.0), displacement((10, 0, 0), 0, 1),
+        {LINEAR: ((50, 1, 5), (100, 1, 10)), QUADRATIC: ((10, 1, 1), (20, 1, 2), (40, 1, 4))},
+        Reference((-3.28941242247, 6.69964181278), 1e-3, ELASTICA), gravity=False,
+        load=_pulled(10.0, 4.0, STRIP[1] * STRIP[2]),
+    ),
+    Case(
+        "elastica_weight", "elastica, own weight", "SVK", "ux, uy of the tip [m]", _box(STRIP, True),
+        {"young": 1.2e6, "poisson": 0.0, "density": HEAVY}, face(0, 0.0), displacement((10, 0, 0), 0, 1),
+        {LINEAR: ((50, 1, 5), (100, 1, 10)), QUADRATIC: ((10, 1, 1), (20, 1, 2), (40, 1, 4))},
+        Reference((-2.75575265862, -6.40630717422), 1e-3, HEAVY_ELASTICA),
+    ),
+    Case(
+        "soft_sheet", "soft sheet", "SNH", "uy of the centre [m]", _box(SHEET), RUBBER,
+        lambda X: np.abs(np.abs(X[:, 0]) - 2.0) < 1e-9, displacement((0, 0, 0), 1),
+        {LINEAR: ((18, 1, 8), (38, 2, 18), (76, 4, 36)), QUADRATIC: ((6, 1, 2), (10, 1, 4), (18, 1, 8))},
+        Reference((-0.484115899582,), 3e-4, BRICKS),
+    ),
+    Case(
+        "beam_fall", "falling beam, first swing", "SNH", "lowest uy of the tip [m], its time [s]", _box(BEAM), RUBBER,
+        face(0, -2.0), _lowest, MOTION_MESHES, Reference((-3.774,), 3.2e-3, FALL), dt=0.01,
+        note="BDF2 with steps of 10 ms up to 1.2 s; the time is that of all steps; when the tip is lowest is only told, and to "
+        "be compared with 1.100 s, good to 0.7 %",
+    ),
+)  # fmt: skip
+
+
+def mesh_name(element: Element, cells) -> str:
+    """How rows and messages call a mesh."""
+    return f"order {element.order}, {element.points} points, {label(cells)}"

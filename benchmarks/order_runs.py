@@ -1,0 +1,203 @@
+"""Runs of one case on its meshes: each is built and solved once, which compiles it, then all are timed in turn.
+
+A round times every mesh of a case one after another, so that a slow minute of the machine falls on all; ratios are taken
+round by round. A time is that of the whole solution from the rest shape, Newton, matrices and linear solves together,
+without the building of the scene and the compiling of its kernels.
+"""
+
+import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.errors import SimulationError, TaisoftError
+from taisoft.runtime import FieldArena, Runtime, compile_clock
+from taisoft.static import StaticSolver
+
+from .elasticity_beam import Stretch, advance
+from .order_cases import Case, Element, Reference, mesh_name
+from .reference_cases.motion import _vertex
+from .reference_cases.record import nearest
+from .timing import Timing, summarise, time_repeats
+
+TOLERANCE = 1e-6  # of |residual| / |load|
+FALL_SECONDS = 1.2  # the first swing is over
+INTEGRATOR = "bdf2"
+ROUND_SECONDS, ROUND_RUNS = 0.1, 5  # a quick solution is repeated within a round until this wall time or this number
+CASE_SECONDS = 4.0  # a slow one is left out of later rounds when its runs have taken this long
+
+
+@dataclass
+class Row:
+    """One element on one mesh. rounds: median wall seconds of each round; error: relative, the largest of the numbers read."""
+
+    case: str
+    law: str
+    order: int
+    degree: int | None
+    points: int
+    cells: tuple
+    tets: int = 0
+    nodes: int = 0
+    measured: list[float] = field(default_factory=list)
+    error: float | None = None
+    newton: int = 0
+    linear: int = 0
+    rounds: list[float] = field(default_factory=list)
+    compile_seconds: float = 0.0  # first launches: tracing, compiling and that first run
+    field_bytes: int = 0
+    failure: str = ""
+
+    @property
+    def timing(self) -> Timing | None:
+        """Of a solution [s]; None where it was never timed."""
+        return summarise(self.rounds) if self.rounds else None
+
+    def record(self) -> dict:
+        """As plain data."""
+        return asdict(self) | {"seconds": self.timing and asdict(self.timing)}
+
+
+class Statics:
+    """An equilibrium that can be solved again and again."""
+
+    def __init__(self, case: Case, scene: ts.Scene, runtime: Runtime):
+        self._case, self._scene, self._arena = case, scene, FieldArena()
+        self._static = StaticSolver(scene, runtime, self._arena, TOLERANCE, 0.0)
+
+    def first(self, row: Row) -> None:
+        """Solve, and write down what was found. Raises SimulationError where no equilibrium is."""
+        result = self._static.solve()
+        row.newton, row.linear = result.iterations, result.linear_iterations
+        row.field_bytes = sum(self._arena.bytes.values())
+        if not result.converged:
+            why = f"; residual {result.residual:.1e} of the load" if result.load == 1.0 else ""
+            raise SimulationError(f"no equilibrium beyond {result.load:.0%} of the load{why}")
+        row.measured = self._case.read(self._scene.bodies[0], result).tolist()
+
+    def again(self) -> None:
+        """Solve from the rest shape."""
+        self._static.solve()
+
+    def close(self) -> None:
+        """Give the memory back."""
+        self._arena.release()
+
+
+@dataclass(frozen=True)
+class Path:
+    """What a motion left; lowest: uy of the tip [m] and its time [s]."""
+
+    lowest: tuple[float, float]
+
+
+class Motion:
+    """A fall that can be run again and again."""
+
+    def __init__(self, case: Case, scene: ts.Scene, runtime: Runtime):
+        self._case, self._body = case, scene.bodies[0]
+        self._steps = round(FALL_SECONDS / case.dt)
+        self._sim = ts.Simulator(scene, dt=case.dt, integrator=INTEGRATOR, precision="f64", arch=runtime.arch)
+
+    def first(self, row: Row) -> None:
+        """Run, and write down what was found. Raises SimulationError where a step fails or does not converge."""
+        tip, heights, whole = nearest(self._body.rest_positions, (2, 0, 0)), [], Stretch()
+        for _ in range(self._steps):
+            whole += advance(self._sim, 1)
+            heights.append(float(self._sim.positions()[tip, 1].mean()))
+        row.newton, row.linear = whole.newton_iterations, whole.linear_iterations
+        row.field_bytes = sum(self._sim.field_bytes.values())
+        if whole.unconverged:
+            raise SimulationError(f"{whole.unconverged} of {whole.steps} steps did not converge")
+        when, low = _vertex(np.array(heights), self._case.dt)
+        row.measured = self._case.read(self._body, Path((low, when))).tolist()
+
+    def again(self) -> None:
+        """Run from the start."""
+        self._sim.reset()
+        advance(self._sim, self._steps)
+
+    def close(self) -> None:
+        """Give the memory back."""
+        self._sim.close()
+
+
+def measure_case(case: Case, meshes: dict[Element, tuple], rounds: int, runtime: Runtime) -> tuple[list[Row], Reference]:
+    """All rows of a case and what they are judged by. A mesh that fails is a row that says so."""
+    rows: list[Row] = []
+    runs: list[tuple] = []  # (Statics or Motion, row)
+    try:
+        for element, chain in meshes.items():
+            for cells in chain:
+                row = Row(case.name, case.law, element.order, element.degree, element.points, tuple(cells))
+                rows.append(row)
+                print(f"{case.name}: {mesh_name(element, cells)}", file=sys.stderr, flush=True)
+                _prepare(case, element, row, runs, runtime)
+        reference = case.reference or own_reference(case, rows)
+        for row in rows:
+            judge(row, reference)
+        _time(runs, rounds)
+    finally:
+        for run, _ in runs:
+            run.close()
+    return rows, reference
+
+
+def _prepare(case: Case, element: Element, row: Row, runs: list[tuple], runtime: Runtime) -> None:
+    """Build, solve once and write down what was found; the run joins `runs`."""
+    compiled = compile_clock()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # order 1 locks where nu is near 1/2: this is what is measured
+            scene = case.build(row.cells, element)
+        row.tets, row.nodes = scene.bodies[0].mesh.n_tets, len(scene.bodies[0].rest_positions)
+        run = (Statics if case.dt is None else Motion)(case, scene, runtime)
+        runs.append((run, row))  # from here on it is closed at the end
+        run.first(row)
+    except TaisoftError as error:
+        row.failure = str(error)
+    row.compile_seconds = compile_clock() - compiled
+
+
+def _time(runs: list[tuple], rounds: int) -> None:
+    """Time every run that ended well, in rounds."""
+    spent = [0.0] * len(runs)
+    for _ in range(rounds):
+        for k, (run, row) in enumerate(runs):
+            if row.failure or spent[k] > CASE_SECONDS:
+                continue
+            seconds = _repeat(run.again)
+            spent[k] += sum(seconds)
+            row.rounds.append(float(np.median(seconds)))
+
+
+def _repeat(call: Callable[[], None]) -> list[float]:
+    """Seconds of one call after another, until their sum or number is enough for a round; at least one."""
+    seconds: list[float] = []
+    while not seconds or (sum(seconds) < ROUND_SECONDS and len(seconds) < ROUND_RUNS):
+        seconds.append(time_repeats(call, 1).median)
+    return seconds
+
+
+def own_reference(case: Case, rows: list[Row]) -> Reference:
+    """The finest order-2 mesh with a solution or, where the case asks for it, the limit of the last three."""
+    solved = [np.array(row.measured) for row in rows if row.degree == 2 and row.measured]
+    if not solved:
+        return Reference((), 0.0, "none, since no order-2 mesh has a solution")
+    finest = solved[-1]
+    if not case.extrapolated or len(solved) < 3:
+        return Reference(tuple(finest.tolist()), 0.0, "the finest order-2 mesh of this run that has a solution")
+    before, last = solved[-2] - solved[-3], finest - solved[-2]
+    limit = finest + last * last / (before - last)  # of a geometric sequence
+    uncertainty = float(np.abs((limit - finest) / limit).max())
+    return Reference(tuple(limit.tolist()), uncertainty, "the three finest order-2 meshes of this run, extrapolated")
+
+
+def judge(row: Row, reference: Reference) -> None:
+    """Set the error of a row that has numbers, where there are others to compare them with."""
+    if row.measured and reference.values:
+        exact = np.array(reference.values)
+        row.error = float(np.abs(np.array(row.measured)[: len(exact)] / exact - 1.0).max())

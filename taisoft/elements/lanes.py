@@ -1,0 +1,145 @@
+"""Tetrahedra in kernels, four at a time in SIMD lanes: gradients of nodal fields, forces from stresses, node sums.
+
+With d_a = x_a - x_0 and c_a(q) = dN_a/d(l_1, l_2, l_3) at a quadrature point,
+    F_q = D_q Dm^-1,  D_q = sum_a d_a c_a(q)^T,     f_a = -V sum_q w_q (P_q Dm^-T) c_a(q),  f_0 = -sum_a f_a.
+For order 1 c_a are the unit vectors, one point is enough, and nothing but Ds Dm^-1 is left.
+"""
+
+import taichi as ti
+
+
+@ti.func
+def broadcast(value, lanes: ti.template()):
+    """The same number in every lane."""
+    return ti.Vector([value for q in ti.static(range(lanes))])
+
+
+@ti.func
+def rest_gradients(m: ti.template(), b, real: ti.template()):
+    """Dm^-1 of the tets of block b (nine lane entries) [1/m]."""
+    return [
+        ti.Vector([ti.cast(m.Dm_inv[b, c, q], real) for q in ti.static(range(m.lanes))]) for c in ti.static(range(9))
+    ]
+
+
+@ti.func
+def volumes(m: ti.template(), b, real: ti.template()):
+    """Rest volumes of the tets of block b [m^3]; 0 in padding lanes."""
+    return ti.Vector([ti.cast(m.volume[b, q], real) for q in ti.static(range(m.lanes))])
+
+
+@ti.func
+def law_constants(m: ti.template(), b, real: ti.template()):
+    """The four law constants of block b's body [Pa and pure numbers], in every lane."""
+    body = m.block_body[b]
+    return [broadcast(ti.cast(m.law_constants[body, k], real), m.lanes) for k in ti.static(range(4))]
+
+
+@ti.func
+def differences(m: ti.template(), g: ti.template(), field: ti.template(), b, real: ti.template()):
+    """Nodal values of block b of group g relative to node 0: entry 3 (a - 1) + r is component r of node a.
+
+    They are formed in the field's own precision (f64 for positions), then rounded to `real`.
+    """
+    at = g.nodes_at + (b - g.first) * (g.n_nodes * m.lanes)
+    p = [
+        [field[m.nodes[at + (a * m.lanes + q)]] for q in ti.static(range(m.lanes))] for a in ti.static(range(g.n_nodes))
+    ]
+    return [
+        ti.Vector([ti.cast(p[a][q][r] - p[0][q][r], real) for q in ti.static(range(m.lanes))])
+        for a in ti.static(range(1, g.n_nodes))
+        for r in ti.static(range(3))
+    ]
+
+
+@ti.func
+def weight_at(m: ti.template(), g: ti.template(), q, real: ti.template()):
+    """Share of the volume that quadrature point q of group g stands for."""
+    w = ti.cast(1.0, real)
+    if ti.static(g.order == 2):
+        w = ti.cast(m.points[g.points_at + q, 0], real)
+    return w
+
+
+@ti.func
+def derivatives_at(m: ti.template(), g: ti.template(), q, real: ti.template()):
+    """c_a at quadrature point q of an order 2 group: entry 3 (a - 1) + c, 27 numbers."""
+    return [ti.cast(m.points[g.points_at + q, 1 + k], real) for k in ti.static(range(27))]
+
+
+@ti.func
+def gradient_at(m: ti.template(), g: ti.template(), E, M, q, real: ti.template()):
+    """Gradient over the rest shape at quadrature point q: F when E holds the differences of x. M: `rest_gradients`."""
+    if ti.static(g.order == 1):
+        return edges_times(E, M)
+    else:
+        C = derivatives_at(m, g, q, real)
+        D = [
+            E[r] * C[c] + E[3 + r] * C[3 + c] + E[6 + r] * C[6 + c]
+            + E[9 + r] * C[9 + c] + E[12 + r] * C[12 + c] + E[15 + r] * C[15 + c]
+            + E[18 + r] * C[18 + c] + E[21 + r] * C[21 + c] + E[24 + r] * C[24 + c]
+            for c in ti.static(range(3))
+            for r in ti.static(range(3))
+        ]  # fmt: skip
+        return edges_times(D, M)
+
+
+@ti.func
+def edges_times(D, M):
+    """D M with D by columns: entry 3 c + r."""
+    return [
+        D[i] * M[j] + D[3 + i] * M[3 + j] + D[6 + i] * M[6 + j]
+        for i in ti.static(range(3))
+        for j in ti.static(range(3))
+    ]
+
+
+@ti.func
+def no_forces(m: ti.template(), g: ti.template()):
+    """What `add_forces` adds to, at its start."""
+    return [broadcast(ti.cast(0.0, m.real), m.lanes) for k in ti.static(range(3 * (g.n_nodes - 1)))]
+
+
+@ti.func
+def add_forces(m: ti.template(), g: ti.template(), S: ti.template(), P, M, q):
+    """Add what the stress P at quadrature point q gives to S: entry 3 (a - 1) + i, forces per volume of nodes 1 and on."""
+    w = weight_at(m, g, q, m.real)
+    H = [
+        w * (P[3 * i] * M[3 * c] + P[3 * i + 1] * M[3 * c + 1] + P[3 * i + 2] * M[3 * c + 2])
+        for c in ti.static(range(3))
+        for i in ti.static(range(3))
+    ]
+    if ti.static(g.order == 1):
+        for k in ti.static(range(9)):
+            S[k] += H[k]
+    else:
+        C = derivatives_at(m, g, q, m.real)
+        for a in ti.static(range(9)):
+            for i in ti.static(range(3)):
+                S[3 * a + i] += H[i] * C[3 * a] + H[3 + i] * C[3 * a + 1] + H[6 + i] * C[3 * a + 2]
+
+
+@ti.func
+def store_forces(m: ti.template(), g: ti.template(), b, S):
+    """Write the nodal forces -V S [N] of block b to the corner buffer, lane by lane (which keeps it SIMD)."""
+    V = -volumes(m, b, m.real)
+    base = g.corner_at + (b - g.first) * (3 * g.n_nodes * m.lanes)
+    for i in ti.static(range(3)):
+        total = broadcast(ti.cast(0.0, m.real), m.lanes)
+        for a in ti.static(range(1, g.n_nodes)):
+            f = V * S[3 * a - 3 + i]
+            total += f
+            for q in ti.static(range(m.lanes)):
+                m.corner[base + ((3 * a + i) * m.lanes + q)] = f[q]
+        for q in ti.static(range(m.lanes)):
+            m.corner[base + (i * m.lanes + q)] = -total[q]
+
+
+@ti.func
+def gather(m: ti.template(), i):
+    """Sum of the corner forces at node i, in a fixed order."""
+    f = ti.Vector([0.0, 0.0, 0.0], m.real)
+    for k in range(m.gather_start[i], m.gather_start[i + 1]):
+        e = m.gather_entry[k]
+        f += ti.Vector([m.corner[e], m.corner[e + m.lanes], m.corner[e + 2 * m.lanes]])
+    return f

@@ -1,0 +1,143 @@
+"""Shape functions, quadrature and masses of linear and quadratic tetrahedra, in barycentric coordinates l_0..l_3. NumPy.
+
+Order 1: N_a = l_a. Order 2: N_a = l_a (2 l_a - 1) at the corners, N_ab = 4 l_a l_b in the middle of the edge ab. Edges are
+straight at rest, so that grad l_k is constant over a tet, and so is the rest volume's density.
+Integrals over a tet are V times a weighted sum over points: for order 1 its centre, where F is what it is everywhere; for
+order 2 four points, exact for degree 2 (Hammer, Stroud 1956), or fourteen, exact for degree 5 (Walkington 2000).
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import permutations
+
+import numpy as np
+import scipy.sparse as sp
+
+from taisoft.mesh.topology import EDGES
+from taisoft.scene.scene import Body
+
+HRZ_SHARES = {1: (1 / 4, 0.0), 2: (1 / 36, 4 / 27)}  # of a tet's mass: at a corner, in the middle of an edge
+# symmetric rules as (weight of each point, one point of the orbit); a degree met by a better rule takes that
+RULES = {
+    1: ((1.0, (1 / 4, 1 / 4, 1 / 4, 1 / 4)),),
+    2: ((1 / 4, (0.58541019662496845446, *3 * (0.13819660112501051518,))),),
+    4: (
+        (0.11268792571801585080, (1 - 3 * 0.31088591926330060980, *3 * (0.31088591926330060980,))),
+        (0.07349304311636194955, (1 - 3 * 0.09273525031089122640, *3 * (0.09273525031089122640,))),
+        (0.04254602077708146644, (*2 * (0.04550370412564964949,), *2 * (0.5 - 0.04550370412564964949,))),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Quadrature:
+    """points (p,4): barycentric coordinates; weights (p,): shares of the volume, all positive, sum 1."""
+
+    points: np.ndarray
+    weights: np.ndarray
+
+
+@cache
+def quadrature(degree: int) -> Quadrature:
+    """The rule that integrates polynomials of that degree (1, 2 or 4) exactly."""
+    points, weights = [], []
+    for weight, point in RULES[degree]:
+        orbit = sorted(set(permutations(point)), reverse=True)
+        points += orbit
+        weights += [weight] * len(orbit)
+    return Quadrature(np.array(points), np.array(weights) / np.sum(weights))
+
+
+def shape_functions(order: int, points: np.ndarray) -> np.ndarray:
+    """N_a at barycentric points (p,4): (p, 4 or 10)."""
+    if order == 1:
+        return points.copy()
+    middles = [4.0 * points[:, a] * points[:, b] for a, b in EDGES]
+    return np.concatenate([points * (2.0 * points - 1.0), np.stack(middles, axis=1)], axis=1)
+
+
+def shape_derivatives(order: int, points: np.ndarray) -> np.ndarray:
+    """s (p, 4 or 10, 4) with grad N_a = sum_k s_ak grad l_k at barycentric points (p,4)."""
+    corner = np.eye(4) * (np.ones((len(points), 1)) if order == 1 else 4.0 * points - 1.0)[:, :, None]
+    if order == 1:
+        return corner
+    middle = np.zeros((len(points), 6, 4))
+    for e, (a, b) in enumerate(EDGES):
+        middle[:, e, a], middle[:, e, b] = 4.0 * points[:, b], 4.0 * points[:, a]
+    return np.concatenate([corner, middle], axis=1)
+
+
+def inverse_rest_edges(vertices: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Dm^-1 (m,3,3) [1/m], with Dm's columns X1-X0, X2-X0, X3-X0, and the rest volumes (m,) [m^3].
+
+    The order of a tet's vertices does not matter: F is the same for each, and the volume is taken as positive.
+    """
+    corner = vertices[tets]
+    Dm = (corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1)
+    return np.linalg.inv(Dm), np.abs(np.linalg.det(Dm)) / 6.0
+
+
+def shape_gradients(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    """Rest gradients of the shape functions (m, p, 4 or 10, 3) [1/m] at the body's quadrature points, and the volume that
+    each point stands for (m, p) [m^3]."""
+    Dm_inv, volumes = inverse_rest_edges(body.mesh.vertices, body.mesh.tets)
+    barycentric = np.concatenate([-Dm_inv.sum(axis=1, keepdims=True), Dm_inv], axis=1)
+    rule = quadrature(body.quadrature_degree)
+    return shape_derivatives(body.order, rule.points) @ barycentric[:, None], np.outer(volumes, rule.weights)
+
+
+def lumped_mass(body: Body) -> np.ndarray:
+    """Mass at each node (n,) [kg], positive: the diagonal of the consistent mass scaled to the mass of each tet.
+
+    Source for order 2: Hinton, Rock, Zienkiewicz 1976 (for order 1 a quarter to each vertex, as row sums would).
+    """
+    corner, middle = HRZ_SHARES[body.order]
+    shares = np.repeat([corner, middle], [4, body.nodes.elements.shape[1] - 4])
+    return _to_nodes(body, shares)
+
+
+def weight_mass(body: Body) -> np.ndarray:
+    """int rho N_a dV at each node (n,) [kg]: what gravity pulls at; for order 2 negative at the corners."""
+    shares = np.full(4, 0.25) if body.order == 1 else np.repeat([-0.05, 0.2], [4, 6])
+    return _to_nodes(body, shares)
+
+
+def _to_nodes(body: Body, shares: np.ndarray) -> np.ndarray:
+    values = body.material.density * np.outer(body.mesh.volumes, shares)
+    return np.bincount(body.nodes.elements.reshape(-1), values.reshape(-1), body.n_nodes)
+
+
+@cache
+def unit_mass(order: int) -> np.ndarray:
+    """int N_a N_b dV / V over a tet: (4,4) or (10,10)."""
+    if order == 1:
+        return (np.ones((4, 4)) + np.eye(4)) / 20.0
+    touches = np.array([[k in edge for k in range(4)] for edge in EDGES])
+    corners = 5.0 * np.eye(4) + 1.0
+    mixed = np.where(touches, -4.0, -6.0)
+    middles = 8.0 * (touches.astype(float) @ touches.T + 1.0) + 8.0 * np.eye(6)
+    return np.block([[corners, mixed.T], [mixed, middles]]) / 420.0
+
+
+def consistent_mass(body: Body) -> sp.csr_matrix:
+    """Consistent mass matrix (n,n), the same for each axis: int rho N_a N_b dV [kg]."""
+    elements = body.nodes.elements
+    values = body.material.density * body.mesh.volumes[:, None, None] * unit_mass(body.order)
+    rows, columns = np.broadcast_arrays(elements[:, :, None], elements[:, None, :])
+    return sp.csr_matrix((values.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(body.n_nodes,) * 2)
+
+
+def traction_forces(body: Body, triangles: np.ndarray, traction: np.ndarray) -> np.ndarray:
+    """Nodal forces (n,3) [N] of a uniform dead traction (3,) [Pa] per reference area on rows (k,) of mesh.surface.
+
+    A third of a triangle's force goes to each corner of a linear tet's face, to the middle of each edge of a quadratic's.
+    """
+    corners = body.mesh.surface[triangles]
+    a, b, c = (body.mesh.vertices[corners[:, k]] for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    if body.order == 1:
+        nodes = corners
+    else:  # the last of a face's four triangles joins the middles
+        nodes = body.nodes.surface.reshape(-1, 4, 3)[triangles, 3]
+    share = np.bincount(nodes.reshape(-1), np.repeat(area / 3.0, 3), body.n_nodes)
+    return share[:, None] * np.asarray(traction, dtype=np.float64)

@@ -1,0 +1,66 @@
+"""The mass of a scene's nodes: lumped for explicit steps, consistent in implicit ones where elements are quadratic.
+
+A lumped mass moves the poles of quadratic tets little but places their weight wrongly (gravity on them is not
+int rho N_a g dV), so implicit steps, which solve systems anyway, take the consistent matrix there. Linear bodies stay lumped,
+as rows with a diagonal alone.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import taichi as ti
+
+from taisoft.elements import reference
+from taisoft.scene.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class MassMatrix:
+    """A symmetric matrix with one number a node pair, the same for each axis, over the pattern of the stiffness [kg]."""
+
+    row_start: Any  # (n_nodes + 1) i32
+    column: Any  # (2 n_pairs) i32, ascending in each row, no diagonal
+    value: Any  # (2 n_pairs)
+    diagonal: Any  # (n_nodes)
+
+
+def lumped_masses(scene: Scene) -> np.ndarray:
+    """Lumped masses of all nodes, bodies in order [kg]."""
+    return np.concatenate([reference.lumped_mass(b) for b in scene.bodies])
+
+
+def weight_masses(scene: Scene) -> np.ndarray:
+    """What gravity pulls at, int rho N_a dV, of all nodes [kg]."""
+    return np.concatenate([reference.weight_mass(b) for b in scene.bodies])
+
+
+def mass_matrix(scene: Scene) -> sp.csr_matrix:
+    """Mass of implicit steps (n_nodes, n_nodes) [kg]: consistent for bodies of order 2, else lumped."""
+    parts = [
+        reference.consistent_mass(b) if b.order == 2 else sp.diags(reference.lumped_mass(b)) for b in scene.bodies
+    ]
+    return sp.block_diag(parts, format="csr")
+
+
+def upload_mass_matrix(scene: Scene, mass: MassMatrix, real: type) -> None:
+    """Fill the matrix on the device from the bodies' densities."""
+    M = mass_matrix(scene)
+    start, column = mass.row_start.to_numpy(), mass.column.to_numpy()
+    rows = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    mass.value.from_numpy(np.asarray(M[rows, column]).reshape(-1).astype(real))
+    mass.diagonal.from_numpy(M.diagonal().astype(real))
+
+
+@ti.func
+def mass_times(m: ti.template(), i, u: ti.template()):
+    """(M u)_i in f64, u a field of nodal 3-vectors."""
+    s = ti.Vector([0.0, 0.0, 0.0], ti.f64)
+    if ti.static(m.consistent):
+        s = ti.cast(m.mass_matrix.diagonal[i], ti.f64) * ti.cast(u[i], ti.f64)
+        for k in range(m.mass_matrix.row_start[i], m.mass_matrix.row_start[i + 1]):
+            s += ti.cast(m.mass_matrix.value[k], ti.f64) * ti.cast(u[m.mass_matrix.column[k]], ti.f64)
+    else:
+        s = ti.cast(m.mass[i], ti.f64) * ti.cast(u[i], ti.f64)
+    return s

@@ -1,0 +1,45 @@
+"""Which nodes share an element: the pattern of every matrix over nodes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taisoft.mesh.topology import EDGES
+
+# Pairs of an element's nodes, the lower first. Order 2: corners (as order 1), corner and middle, middles.
+PAIRS = {
+    1: EDGES,
+    2: (
+        *EDGES,
+        *((a, b) for a in range(4) for b in range(4, 10)),
+        *((a, b) for a in range(4, 10) for b in range(a + 1, 10)),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class NodeGraph:
+    """Node pairs i < j, and the same as rows: the columns of a row ascend and leave out the diagonal."""
+
+    ends: np.ndarray  # (n_pairs, 2)
+    row_start: np.ndarray  # (n_nodes + 1)
+    row_upper: np.ndarray  # (n_nodes) where a row's columns pass the diagonal
+    column: np.ndarray  # (2 n_pairs)
+    upper: np.ndarray  # (n_pairs) place of (i, j) among the columns
+    lower: np.ndarray  # (n_pairs) place of (j, i)
+    pair: np.ndarray  # (k,) which of the pairs each of those given is
+
+
+def node_graph(pairs: np.ndarray, n_nodes: int) -> NodeGraph:
+    """The graph of node pairs (k, 2), i < j, that may repeat."""
+    key, pair = np.unique(pairs[:, 0] * np.int64(n_nodes) + pairs[:, 1], return_inverse=True)
+    i, j = key // n_nodes, key % n_nodes
+    rows, columns = np.concatenate([i, j]), np.concatenate([j, i])
+    order = np.lexsort((columns, rows))
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n_nodes))])
+    return NodeGraph(
+        ends=np.stack([i, j], axis=1), row_start=start, row_upper=start[:-1] + np.bincount(j, minlength=n_nodes),
+        column=columns[order], upper=place[: len(key)], lower=place[len(key) :], pair=pair.reshape(-1),
+    )  # fmt: skip

@@ -1,0 +1,166 @@
+"""What the nodes of a body promise:
+
+* first order is the mesh itself;
+* second order: vertices first, then the middle of every edge once, by sorted pairs; elements name them in order;
+* the linear tets fill each element, all upright, the octahedron cut along its shortest diagonal;
+* the linear triangles are the boundary of the linear tets, outward, each a face of the tet behind it, at its place;
+* the cut does not depend on the order in which a tet lists its corners;
+* arrays are read-only, other orders are refused.
+"""
+
+import itertools
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import Delaunay
+
+from taisoft.errors import MeshError
+from taisoft.mesh.nodes import Nodes, make_nodes
+from taisoft.mesh.shapes import ball_mesh, box_mesh
+from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.mesh.topology import EDGES, TET_FACES, Faces
+
+EVEN = [p for p in itertools.permutations(range(4)) if np.linalg.det(np.eye(4)[list(p)]) > 0]
+
+
+def random_mesh(seed: int, n: int = 30) -> TetMesh:
+    """Delaunay tets of random points without the flattest, each with its corners in a random positive order."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (n, 3))
+    tets = Delaunay(points).simplices
+    x = points[tets]
+    volumes = np.linalg.det(x[:, 1:] - x[:, :1])
+    tets = np.where((volumes < 0)[:, None], tets[:, [0, 1, 3, 2]], tets)[np.abs(volumes) > 1e-2]
+    tets = np.array([tet[list(EVEN[k])] for tet, k in zip(tets, rng.integers(0, 12, len(tets)))])
+    used, local = np.unique(tets, return_inverse=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # parts that touch at an edge only
+        return TetMesh(points[used], local.reshape(-1, 4))
+
+
+def volumes(positions: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    x = positions[tets]
+    return np.linalg.det(x[:, 1:] - x[:, :1]) / 6.0
+
+
+MESHES = [box_mesh((2, 3, 2), (1, 2, 1)), box_mesh((2, 2, 2), (3, 1, 1), pattern="six"), ball_mesh(1.0, 4)]
+MESHES += [random_mesh(seed) for seed in range(4)]
+each_mesh = pytest.mark.parametrize("mesh", MESHES, ids=repr)
+
+
+@each_mesh
+def test_first_order_is_the_mesh(mesh):
+    nodes = make_nodes(mesh, 1)
+    assert nodes.positions is mesh.vertices and nodes.surface is mesh.surface
+    assert nodes.elements is mesh.tets and nodes.tets is mesh.tets
+    assert np.array_equal(nodes.surface_tets, mesh.tets[mesh.surface_tets])
+
+
+@each_mesh
+def test_middles_are_numbered_by_sorted_vertex_pairs(mesh):
+    pairs = sorted({tuple(sorted((int(tet[a]), int(tet[b])))) for tet in mesh.tets for a, b in EDGES})
+    number = {pair: mesh.n_verts + k for k, pair in enumerate(pairs)}
+    nodes = make_nodes(mesh, 2)
+    assert np.array_equal(nodes.positions[: mesh.n_verts], mesh.vertices)
+    assert len(nodes.positions) == mesh.n_verts + len(pairs)
+    for (a, b), k in number.items():
+        assert np.array_equal(nodes.positions[k], (mesh.vertices[a] + mesh.vertices[b]) / 2)
+    for tet, element in zip(mesh.tets, nodes.elements):
+        assert element.tolist() == [*tet, *(number[tuple(sorted((int(tet[a]), int(tet[b]))))] for a, b in EDGES)]
+
+
+@each_mesh
+def test_linear_tets_fill_their_element(mesh):
+    nodes = make_nodes(mesh, 2)
+    parts = volumes(nodes.positions, nodes.tets).reshape(-1, 8)
+    assert (parts > 0).all()
+    assert np.allclose(parts, mesh.volumes[:, None] / 8, rtol=1e-9)  # each an eighth, so they fill it
+    inside = (nodes.tets.reshape(-1, 32)[:, :, None] == nodes.elements[:, None, :]).any(axis=2)
+    assert inside.all()
+
+
+@each_mesh
+def test_the_octahedron_is_cut_along_its_shortest_diagonal(mesh):
+    nodes = make_nodes(mesh, 2)
+    x = nodes.positions
+    for element, tets in zip(nodes.elements, nodes.tets.reshape(-1, 8, 4)):
+        diagonals = [(element[4 + k], element[9 - k]) for k in range(3)]
+        lengths = [np.linalg.norm(x[a] - x[b]) for a, b in diagonals]
+        (cut,) = [k for k in range(3) if all({*diagonals[k]} <= {*tet} for tet in tets[4:])]
+        assert lengths[cut] <= min(lengths) * (1 + 1e-9)
+
+
+@each_mesh
+def test_linear_triangles_bound_the_linear_tets_at_their_place(mesh):
+    nodes = make_nodes(mesh, 2)
+    faces = Faces(nodes.tets)
+    assert faces.counts.max() <= 2  # neighbours agree on the four triangles between them
+    boundary = faces.triangles[faces.surface()]
+    assert sorted(map(canonical, boundary)) == sorted(map(canonical, nodes.surface))
+    middle = {tuple(sorted((int(tet[a]), int(tet[b])))): int(e[4 + k]) for tet, e in zip(mesh.tets, nodes.elements)
+              for k, (a, b) in enumerate(EDGES)}  # fmt: skip
+    for (a, b, c), four in zip(mesh.surface.tolist(), nodes.surface.reshape(-1, 4, 3).tolist()):
+        ab, bc, ca = (middle[tuple(sorted(pair))] for pair in ((a, b), (b, c), (c, a)))
+        assert four == [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@each_mesh
+def test_each_triangle_is_an_outward_face_of_the_tet_behind_it(mesh, order):
+    nodes = make_nodes(mesh, order)
+    assert (volumes(nodes.positions, nodes.surface_tets) > 0).all()
+    all_tets = {tuple(sorted(tet)) for tet in nodes.tets.tolist()}
+    for triangle, tet in zip(nodes.surface, nodes.surface_tets):
+        assert canonical(triangle) in [canonical(tet[face]) for face in TET_FACES]
+        assert tuple(sorted(tet.tolist())) in all_tets
+        (top,) = set(tet.tolist()) - set(triangle.tolist())
+        a, b, c, d = nodes.positions[[*triangle, top]]
+        assert np.dot(np.cross(b - a, c - a), d - a) < 0
+    owner = mesh.tets[mesh.surface_tets] if order == 1 else np.repeat(nodes.elements[mesh.surface_tets], 4, axis=0)
+    assert (nodes.surface_tets[:, :, None] == owner[:, None, :]).any(axis=2).all()
+
+
+def canonical(triangle) -> tuple[int, ...]:
+    """The triangle's indices from the smallest on: equal for equal orientation."""
+    return tuple(np.roll(triangle, -int(np.argmin(triangle))).tolist())
+
+
+def as_sets(nodes: Nodes) -> set[tuple[int, ...]]:
+    return {tuple(sorted(tet)) for tet in nodes.tets.tolist()}
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32), st.sampled_from([0, 1, 2, 4]))
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_the_cut_does_not_depend_on_the_order_of_corners(seed, which):
+    """Grids too, whose octahedra have equal diagonals."""
+    mesh, rng = MESHES[which], np.random.default_rng(seed)
+    order = np.array(EVEN)[rng.integers(0, 12, mesh.n_tets)]
+    turned = TetMesh(mesh.vertices, np.take_along_axis(mesh.tets, order, axis=1))
+    a, b = make_nodes(mesh, 2), make_nodes(turned, 2)
+    assert np.array_equal(a.positions, b.positions) and as_sets(a) == as_sets(b)
+    key = lambda n: {(canonical(f), tuple(sorted(t))) for f, t in zip(n.surface, n.surface_tets.tolist())}  # noqa: E731
+    assert key(a) == key(b)
+
+
+def test_rounding_does_not_choose_among_equal_diagonals():
+    mesh = box_mesh((3, 3, 3), (1, 1, 1))
+    moved = TetMesh(mesh.vertices + (1e3, -7.7, 0.1), mesh.tets)
+    assert as_sets(make_nodes(mesh, 2)) == as_sets(make_nodes(moved, 2))
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_arrays_are_read_only(order):
+    nodes = make_nodes(MESHES[0], order)
+    for array in (nodes.positions, nodes.elements, nodes.surface, nodes.surface_tets, nodes.tets):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+
+
+@pytest.mark.parametrize("order", [0, 3, True, "2", 1.5])
+def test_other_orders_are_refused(order):
+    with pytest.raises(MeshError, match="order must be 1 or 2"):
+        make_nodes(MESHES[0], order)
