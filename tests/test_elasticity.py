@@ -87,9 +87,11 @@ def test_no_force_at_rest(rig, where):
         Q = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
         x = x @ (Q * np.linalg.det(Q)).T
     force = elastic_force(rig, x)
+    elasticity.measure(rig.model)
     largest = max(part.material.young for part in rig.oracle.parts)  # times about 1 m^2: the force of a strain of 1
     rounding = rig.eps + (1e-11 if where == "far" else 0.0)
     assert np.abs(force).max() < 10 * rounding * largest
+    assert rig.model.scalars[0] < 10 * rounding * largest and rig.model.scalars[2] == 0  # [J], inverted tets
 
 
 def test_forces_are_minus_the_gradient_of_the_energy(rig, squeezed):
@@ -181,7 +183,7 @@ def test_system(rig):
     """(c + beta a) M + beta^2 K + beta b K_d with each row's own damping a and b, which are 0 in two of the bodies."""
     c, beta, rng = 0.7, 30.0, np.random.default_rng(9)
     fields = (rig.matrix.value, rig.matrix.diagonal, rig.damper.value, rig.damper.diagonal)
-    numbers = [rng.standard_normal(field.shape).astype(rig.machine.np_real) for field in fields]
+    numbers = [block_csr.packed(rng.standard_normal((*field.shape, 3, 3))).astype(rig.machine.np_real) for field in fields]
     a, b = (np.repeat(rates, 3)[:, None] for rates in (rig.oracle.mass_damping, rig.oracle.stiffness_damping))
     assert set(a.flat) == {0.0, 0.4} and set(b.flat) == {0.0, 3e-3}
     M = np.kron(rig.oracle.mass, np.eye(3))

@@ -120,7 +120,7 @@ def test_wild_states(sim, kind, monkeypatch):
     start = sim.energies()
     for _ in range(20):
         result = sim._stepper.step(0.2)
-        assert result.converged and result.newton_iterations < 30
+        assert result.converged and result.newton_iterations < 40
     assert projections.count(True) > 0 and projections.count(False) > 10  # where there is something to project, and only there
     now = sim.energies()
     assert now.total < start.total and now.elastic < 0.03 * start.elastic

@@ -41,8 +41,8 @@ def fill(rig, dense: np.ndarray) -> sp.csr_matrix:
     start, column = rig.matrix.row_start.to_numpy(), rig.matrix.column.to_numpy()
     row = np.repeat(np.arange(rig.model.n_nodes), np.diff(start))
     own = np.arange(rig.model.n_nodes)
-    rig.matrix.value.from_numpy(blocks[row, column].reshape(-1).astype(rig.machine.np_real))
-    rig.matrix.diagonal.from_numpy(blocks[own, own].reshape(-1).astype(rig.machine.np_real))
+    rig.matrix.value.from_numpy(block_csr.packed(blocks[row, column]).astype(rig.machine.np_real))
+    rig.matrix.diagonal.from_numpy(block_csr.packed(blocks[own, own]).astype(rig.machine.np_real))
     return block_csr.to_scipy(rig.model, rig.matrix)
 
 

@@ -18,7 +18,6 @@ from taisoft import runtime
 from taisoft.stability import highest_frequency, hooke_differential, hooke_stiffness, stable_dt
 
 KINDS = ((1, None), (2, 2), (2, 4))  # order, degree of the quadrature
-both_orders = pytest.mark.parametrize("order", [1, 2])
 
 
 def one_body(material=None, cells=(2, 1, 1), held: bool = False, order: int = 1, degree: int | None = None) -> ts.Scene:
@@ -107,9 +106,8 @@ def test_modes_that_are_refused(k, mass, words):
         ts.modes(ts.Scene(), 1)
 
 
-@both_orders
-def test_a_step_above_the_limit(order):
-    scene = one_body(cells=(1, 1, 1), order=order)
+def test_a_step_above_the_limit():
+    scene = one_body(cells=(1, 1, 1), order=2)
     limit = stable_dt(scene, False)
     words = rf"dt = {2 * limit:.3g} s is above the estimated stability limit of {limit:.3g} s of symplectic_euler"
     with pytest.raises(ts.SimulationError, match=rf"^{words}: take a smaller dt \(0.9 of the limit is .* allow_unstable=True$"):
@@ -146,7 +144,7 @@ def growth(sim, share: float, steps: int = 200) -> float:
     return total / start
 
 
-@pytest.fixture(scope="module", params=["symplectic_euler-1", "symplectic_euler-2", "velocity_verlet-1", "velocity_verlet-2"])
+@pytest.fixture(scope="module", params=["symplectic_euler-2", "velocity_verlet-1"])
 def sim(request):
     """Both kinds of damping are compiled in, so that the tests can change them."""
     integrator, order = request.param.split("-")

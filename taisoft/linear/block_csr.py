@@ -17,6 +17,10 @@ from taisoft.linear.element_blocks import element_blocks, pair_terms
 from taisoft.model import MATRIX_BLOCKS, Model, model_graph
 from taisoft.runtime import FieldArena, kernel
 
+# A block is a 12-vector, column by column with a zero below each, entry (r, c) in place 4 c + r: one address serves for all,
+# and a column times a number is one SIMD instruction.
+BLOCK = 12
+
 
 @dataclass(frozen=True, eq=False)
 class BlockCsr:
@@ -26,8 +30,8 @@ class BlockCsr:
     row_start: Any  # (n_nodes + 1) i32
     row_upper: Any  # (n_nodes) i32: where a row's columns pass the diagonal
     column: Any  # (2 n_edges) i32, ascending in each row, no diagonal
-    value: Any  # (2 n_edges * 9), blocks row by row
-    diagonal: Any  # (n_nodes * 9)
+    value: Any  # (2 n_edges) 12-vectors: blocks as below
+    diagonal: Any  # (n_nodes) 12-vectors
     element: Any  # K_ab of each tet, per block of tets (pair, entry), vectors of lanes
     edge_start: Any  # (n_edges + 1) i32: rows of edge_entry
     edge_entry: Any  # i32: lanes times the first entry in element, plus the lane
@@ -58,8 +62,8 @@ def build_block_csr(model: Model, arena: FieldArena, real, prefix: str = "stiffn
         terms = {"term_start": ints("term_start", start), "term_pair": ints("term_pair", pairs), "term_factor": factors}
     return BlockCsr(
         n_edges=n_edges, row_start=ints("row_start", graph.row_start), row_upper=ints("row_upper", graph.row_upper),
-        column=ints("column", graph.column), value=arena.field(f"{prefix}_value", real, 18 * n_edges),
-        diagonal=arena.field(f"{prefix}_diagonal", real, 9 * model.n_nodes),
+        column=ints("column", graph.column), value=arena.vectors(f"{prefix}_value", real, 2 * n_edges, n=BLOCK),
+        diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
         element=arena.vectors(f"{prefix}_element", real, size, n=model.lanes),
         edge_start=ints("edge_start", edge_start), edge_entry=ints("edge_entry", base[order]),
         edge_upper=ints("edge_upper", graph.upper), edge_lower=ints("edge_lower", graph.lower),
@@ -71,8 +75,8 @@ def sibling(matrix: BlockCsr, model: Model, arena: FieldArena, real, prefix: str
     """A second matrix with the same pattern and element buffer, its own values."""
     return replace(
         matrix,
-        value=arena.field(f"{prefix}_value", real, 18 * matrix.n_edges),
-        diagonal=arena.field(f"{prefix}_diagonal", real, 9 * model.n_nodes),
+        value=arena.vectors(f"{prefix}_value", real, 2 * matrix.n_edges, n=BLOCK),
+        diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
     )
 
 
@@ -88,28 +92,26 @@ def assemble(m: ti.template(), A: ti.template(), projected: ti.template()):
         gather_edge(m, A, e)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        for c in ti.static(range(9)):
-            s = ti.cast(0.0, m.real)
-            for k in range(A.row_start[i], A.row_start[i + 1]):
-                s -= A.value[9 * k + c]
-            A.diagonal[9 * i + c] = s
+        s = ti.Vector([0.0 for _ in ti.static(range(BLOCK))], m.real)
+        for k in range(A.row_start[i], A.row_start[i + 1]):
+            s -= A.value[k]
+        A.diagonal[i] = s
 
 
 @ti.func
 def gather_edge(m: ti.template(), A: ti.template(), e):
     """Sum the element blocks of one edge and write K_ij and K_ji."""
-    s = ti.Matrix.zero(m.real, 3, 3)
+    s = ti.Vector([0.0 for _ in ti.static(range(BLOCK))], m.real)
     for k in range(A.edge_start[e], A.edge_start[e + 1]):
         # lanes are a power of two; signed division would have to mind the sign
         at, lane = A.edge_entry[k] >> ti.static(m.lanes.bit_length() - 1), A.edge_entry[k] & (m.lanes - 1)
         for r in ti.static(range(3)):
             for c in ti.static(range(3)):
-                s[r, c] += A.element[at + (3 * r + c)][lane]
-    upper, lower = 9 * A.edge_upper[e], 9 * A.edge_lower[e]
+                s[4 * c + r] += A.element[at + (3 * r + c)][lane]
+    A.value[A.edge_upper[e]] = s
     for r in ti.static(range(3)):
         for c in ti.static(range(3)):
-            A.value[upper + 3 * r + c] = s[r, c]
-            A.value[lower + 3 * c + r] = s[r, c]
+            A.value[A.edge_lower[e]][4 * r + c] = s[4 * c + r]
 
 
 @kernel
@@ -121,53 +123,60 @@ def to_system(m: ti.template(), A: ti.template(), damper: ti.template(), c: ti.f
         if ti.static(m.damped):
             inertia += ti.cast(beta, m.real) * m.damping[m.node_body[i], 0]
             drag = ti.cast(beta, m.real) * m.damping[m.node_body[i], 1]
-        for at in range(9 * A.row_start[i], 9 * A.row_start[i + 1]):
-            A.value[at] = k * A.value[at]
-            if ti.static(m.stiffness_damping):
-                A.value[at] = A.value[at] + drag * damper.value[at]
         mass = m.mass[i]
         if ti.static(m.consistent):
             mass = m.mass_matrix.diagonal[i]
-            for at in range(A.row_start[i], A.row_start[i + 1]):
-                for r in ti.static(range(3)):
-                    A.value[9 * at + 4 * r] = A.value[9 * at + 4 * r] + inertia * m.mass_matrix.value[at]
-        for e in ti.static(range(9)):
-            d = k * A.diagonal[9 * i + e]
+        for at in range(A.row_start[i], A.row_start[i + 1]):
+            A.value[at] = k * A.value[at]
             if ti.static(m.stiffness_damping):
-                d += drag * damper.diagonal[9 * i + e]
-            if ti.static(e % 4 == 0):
-                d += inertia * mass
-            A.diagonal[9 * i + e] = d
+                A.value[at] += drag * damper.value[at]
+            if ti.static(m.consistent):
+                for r in ti.static(range(3)):
+                    A.value[at][5 * r] += inertia * m.mass_matrix.value[at]
+        d = k * A.diagonal[i]
+        if ti.static(m.stiffness_damping):
+            d += drag * damper.diagonal[i]
+        for r in ti.static(range(3)):
+            d[5 * r] += inertia * mass
+        A.diagonal[i] = d
 
 
 @ti.func
-def diagonal_times(m: ti.template(), A: ti.template(), i, x):
-    """The diagonal block of row i times a 3-vector."""
-    y = ti.Vector([0.0, 0.0, 0.0], m.real)
-    for r in ti.static(range(3)):
-        y[r] = (
-            A.diagonal[9 * i + 3 * r] * x[0]
-            + A.diagonal[9 * i + 3 * r + 1] * x[1]
-            + A.diagonal[9 * i + 3 * r + 2] * x[2]
-        )
-    return y
+def padded_times(B, x):
+    """A block times a 3-vector, as a 4-vector whose last entry is 0."""
+    return ti.Vector([B[r] * x[0] + B[4 + r] * x[1] + B[8 + r] * x[2] for r in ti.static(range(4))])
+
+
+@ti.func
+def block_times(B, x):
+    """A block times a 3-vector."""
+    y = padded_times(B, x)
+    return ti.Vector([y[0], y[1], y[2]])
 
 
 @ti.func
 def part_times(m: ti.template(), A: ti.template(), first, last, x: ti.template()):
     """Sum of the blocks first..last (of one row) times x at their columns."""
-    y = ti.Vector([0.0, 0.0, 0.0], m.real)
+    y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
     for k in range(first, last):
-        xj, at = x[A.column[k]], 9 * k
-        for r in ti.static(range(3)):
-            y[r] += A.value[at + 3 * r] * xj[0] + A.value[at + 3 * r + 1] * xj[1] + A.value[at + 3 * r + 2] * xj[2]
-    return y
+        y += padded_times(A.value[k], x[A.column[k]])
+    return ti.Vector([y[0], y[1], y[2]])
+
+
+@ti.func
+def part_times_backward(m: ti.template(), A: ti.template(), first, last, x: ti.template()):
+    """The same sum from its end: in a sweep from the last row up, the entries of x that were computed last come last."""
+    y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
+    for n in range(last - first):
+        k = last - 1 - n
+        y += padded_times(A.value[k], x[A.column[k]])
+    return ti.Vector([y[0], y[1], y[2]])
 
 
 @ti.func
 def row_times(m: ti.template(), A: ti.template(), i, x: ti.template()):
     """(A x)_i."""
-    return diagonal_times(m, A, i, x[i]) + part_times(m, A, A.row_start[i], A.row_start[i + 1], x)
+    return block_times(A.diagonal[i], x[i]) + part_times(m, A, A.row_start[i], A.row_start[i + 1], x)
 
 
 @kernel
@@ -178,11 +187,22 @@ def multiply(m: ti.template(), A: ti.template(), x: ti.template(), y: ti.templat
         y[i] = row_times(m, A, i, x)
 
 
+def packed(blocks: np.ndarray) -> np.ndarray:
+    """(k, 3, 3) as blocks are kept, (k, 12)."""
+    padded = np.zeros((len(blocks), 3, 4), dtype=blocks.dtype)
+    padded[:, :, :3] = blocks.swapaxes(1, 2)
+    return padded.reshape(-1, BLOCK)
+
+
+def unpacked(kept: np.ndarray) -> np.ndarray:
+    """(k, 12) as (k, 3, 3) float64."""
+    return kept.reshape(-1, 3, 4)[:, :, :3].swapaxes(1, 2).astype(np.float64)
+
+
 def to_scipy(m: Model, A: BlockCsr) -> sp.csr_matrix:
     """A copy on the host, (3 n_nodes, 3 n_nodes) float64."""
     start, column = A.row_start.to_numpy().astype(np.int64), A.column.to_numpy()
-    off = A.value.to_numpy().astype(np.float64).reshape(-1, 3, 3)
-    diagonal = A.diagonal.to_numpy().astype(np.float64).reshape(-1, 3, 3)
+    off, diagonal = unpacked(A.value.to_numpy()), unpacked(A.diagonal.to_numpy())
     shape = (3 * m.n_nodes, 3 * m.n_nodes)
     own = np.arange(m.n_nodes)
     return (

@@ -13,7 +13,7 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.linear.block_csr import BlockCsr
+from taisoft.linear.block_csr import BLOCK, BlockCsr
 from taisoft.model import Model
 from taisoft.runtime import FieldArena, kernel
 
@@ -33,7 +33,7 @@ class PcgWork:
     z: Any  # preconditioned residual; serial: (D + L)^T p
     p: Any  # direction
     q: Any  # A p; serial: (D + L)^-1 of it
-    inverse: Any  # (n_nodes * 9): inverse diagonal blocks, 0 on constrained axes
+    inverse: Any  # (n_nodes) 12-vectors: inverse diagonal blocks, 0 on constrained axes
     state: Any  # (5) f64
 
 
@@ -50,7 +50,7 @@ def build_pcg(model: Model, arena: FieldArena) -> PcgWork:
     """Allocate the vectors of a solve."""
     names = ("rhs", "y", "r", "z", "p", "q")
     vectors = {name: arena.vectors(f"pcg_{name}", model.real, model.n_nodes) for name in names}
-    inverse = arena.field("pcg_inverse", model.real, 9 * model.n_nodes)
+    inverse = arena.vectors("pcg_inverse", model.real, model.n_nodes, n=BLOCK)
     return PcgWork(**vectors, inverse=inverse, state=arena.field("pcg_state", ti.f64, 5))
 
 
@@ -78,32 +78,21 @@ def invert_diagonal(m: ti.template(), A: ti.template(), w: ti.template()):
         for r in ti.static(range(3)):
             for c in ti.static(range(3)):
                 both = free[r] * free[c]
-                B[r, c] = both * A.diagonal[9 * i + 3 * r + c] + (1.0 - both if ti.static(r == c) else 0.0)
+                B[r, c] = both * A.diagonal[i][4 * c + r] + (1.0 - both if ti.static(r == c) else 0.0)
         det = B.determinant()
         solid = B[0, 0] > 0.0 and B[1, 1] > 0.0 and B[2, 2] > 0.0 and det > 1e-12 * B[0, 0] * B[1, 1] * B[2, 2]
         if solid:
             C = B.inverse()
             for r in ti.static(range(3)):
                 for c in ti.static(range(3)):
-                    w.inverse[9 * i + 3 * r + c] = free[r] * free[c] * ti.cast(C[r, c], m.real)
+                    w.inverse[i][4 * c + r] = free[r] * free[c] * ti.cast(C[r, c], m.real)
         else:
             # a nearly singular or indefinite block (unprojected, compressed): its diagonal still preconditions
             for r in ti.static(range(3)):
                 for c in ti.static(range(3)):
-                    w.inverse[9 * i + 3 * r + c] = 0.0
+                    w.inverse[i][4 * c + r] = 0.0
                 d = abs(B[r, r])
-                w.inverse[9 * i + 4 * r] = free[r] * ti.cast(ti.select(d > 0.0, 1.0 / ti.max(d, 1e-30), 1.0), m.real)
-
-
-@ti.func
-def inverse_times(m: ti.template(), w: ti.template(), i, x):
-    """The inverse diagonal block of row i times a 3-vector."""
-    y = ti.Vector([0.0, 0.0, 0.0], m.real)
-    for r in ti.static(range(3)):
-        y[r] = (
-            w.inverse[9 * i + 3 * r] * x[0] + w.inverse[9 * i + 3 * r + 1] * x[1] + w.inverse[9 * i + 3 * r + 2] * x[2]
-        )
-    return y
+                w.inverse[i][5 * r] = free[r] * ti.cast(ti.select(d > 0.0, 1.0 / ti.max(d, 1e-30), 1.0), m.real)
 
 
 @ti.func

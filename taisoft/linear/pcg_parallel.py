@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from taisoft.linear.block_csr import row_times
+from taisoft.linear.block_csr import block_times, row_times
 from taisoft.linear.pcg import (
     CONVERGED,
     COUNT,
@@ -13,7 +13,6 @@ from taisoft.linear.pcg import (
     STEP,
     STOP,
     dot64,
-    inverse_times,
     total,
 )  # fmt: skip
 from taisoft.runtime import kernel
@@ -27,7 +26,7 @@ def start(m: ti.template(), A: ti.template(), w: ti.template()):
         s = ti.cast(0.0, ti.f64)
         for i in range(c * size, ti.min(m.n_nodes, (c + 1) * size)):
             r = m.free[i] * w.rhs[i]
-            z = inverse_times(m, w, i, r)
+            z = block_times(w.inverse[i], r)
             w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
             w.r[i], w.z[i], w.p[i] = r, z, z
             s += dot64(r, z)
@@ -77,7 +76,7 @@ def iterate_once(m: ti.template(), A: ti.template(), w: ti.template(), tolerance
             for i in range(c * size, ti.min(m.n_nodes, (c + 1) * size)):
                 w.y[i] = w.y[i] + a * w.p[i]
                 r = w.r[i] - a * w.q[i]
-                z = inverse_times(m, w, i, r)
+                z = block_times(w.inverse[i], r)
                 w.r[i], w.z[i] = r, z
                 s += dot64(r, z)
         m.partial[c, 7] = s

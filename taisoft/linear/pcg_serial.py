@@ -9,8 +9,8 @@ Comput. 2(1), 1981. D^-1 holds the inverse of the blocks that could be inverted,
 
 import taichi as ti
 
-from taisoft.linear.block_csr import diagonal_times, part_times
-from taisoft.linear.pcg import CONVERGED, COUNT, NEGATIVE, RUNNING, RZ, RZ_START, STEP, STOP, dot64, inverse_times
+from taisoft.linear.block_csr import block_times, part_times, part_times_backward
+from taisoft.linear.pcg import CONVERGED, COUNT, NEGATIVE, RUNNING, RZ, RZ_START, STEP, STOP, dot64
 from taisoft.runtime import kernel
 
 
@@ -20,8 +20,8 @@ def start(m: ti.template(), A: ti.template(), w: ti.template()):
     rz = ti.cast(0.0, ti.f64)
     for i in range(m.n_nodes):
         below = part_times(m, A, A.row_start[i], A.row_upper[i], w.r)
-        s = inverse_times(m, w, i, w.rhs[i] - below)
-        t = diagonal_times(m, A, i, s)
+        s = block_times(w.inverse[i], w.rhs[i] - below)
+        t = block_times(A.diagonal[i], s)
         w.r[i], w.q[i] = s, t
         w.z[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
         w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
@@ -56,14 +56,14 @@ def iterate_kernel(
                 i = m.n_nodes - 1 - back
                 t = w.q[i] + ti.cast(along, m.real) * w.z[i]  # w.q holds D s of the last update
                 w.z[i] = t
-                above = part_times(m, A, A.row_upper[i], A.row_start[i + 1], w.p)
-                w.p[i] = inverse_times(m, w, i, t - above)
+                above = part_times_backward(m, A, A.row_upper[i], A.row_start[i + 1], w.p)
+                w.p[i] = block_times(w.inverse[i], t - above)
             curvature = ti.cast(0.0, ti.f64)
             for i in range(m.n_nodes):
                 # now w.q holds (D + L)^-1 (t - D p), as the rows below need it
                 p, t = w.p[i], w.z[i]
                 below = part_times(m, A, A.row_start[i], A.row_upper[i], w.q)
-                s = inverse_times(m, w, i, t - diagonal_times(m, A, i, p) - below)
+                s = block_times(w.inverse[i], t - block_times(A.diagonal[i], p) - below)
                 w.q[i] = s
                 curvature += dot64(t, p + s)
             if not curvature > 0.0:
@@ -75,7 +75,7 @@ def iterate_kernel(
                     w.y[i] = w.y[i] + step * p
                     s = w.r[i] - step * (p + w.q[i])
                     w.r[i] = s
-                    t = diagonal_times(m, A, i, s)
+                    t = block_times(A.diagonal[i], s)
                     w.q[i] = t
                     next_rz += dot64(s, t)
                 along = next_rz / rz

@@ -24,7 +24,7 @@ from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.model import Model
 from taisoft.runtime import FieldArena
-from taisoft.stepping.stage import StageWork, begin_stage, form_residual, keep_base, stage_terms, try_step
+from taisoft.stepping.stage import StageWork, begin_stage, form_residual, stage_terms, start_step, try_step
 
 MAX_BACKTRACKS = 30  # halvings: below 1e-9 of a step nothing but rounding is left
 SLOW = 0.2  # a step that leaves more of |r| than this asks for a new matrix
@@ -123,6 +123,7 @@ class StageSolver:
         by_energy: every step must lower Phi (statics); otherwise a lower |r| is enough. max_newton = 1 takes one full
         step without looking back (linearly implicit); it has converged when its linear solve has.
         """
+        self._phi: float | None = None  # Phi at the present state, where it is known
         begin_stage(self.model, self.work, beta, led_share)
         r, scale = self._evaluate(c, beta)
         floor = beta * self.rounding_force + c * self.rounding_mass / beta
@@ -178,9 +179,10 @@ class StageSolver:
     def _advance(self, c: float, beta: float, r: float, scale: float, blind: bool, by_energy: bool, floor: float):
         """Take the step in pcg.y as far as it helps; returns (|r|, scale, moved)."""
         m, w, y = self.model, self.work, self.pcg.y
-        keep_base(m, w, y)
-        start = self._objective(c, beta) if by_energy else None
-        try_step(m, w, y, 1.0, beta)
+        if by_energy and self._phi is None:
+            self._phi = self._objective(c, beta)
+        start_step(m, w, y, beta)
+        start = self._phi
         if not by_energy:
             new_r, new_scale = self._evaluate(c, beta)
             if blind or new_r < r or new_r <= floor:
@@ -194,6 +196,7 @@ class StageSolver:
         for _ in range(MAX_BACKTRACKS):
             value = self._objective(c, beta)
             if np.isfinite(value) and value <= start + SUFFICIENT * share * slope + slack and slope < 0.0:
+                self._phi = value
                 new_r, new_scale = self._evaluate(c, beta)
                 return new_r, new_scale, True
             share *= 0.5

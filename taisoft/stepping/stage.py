@@ -102,7 +102,11 @@ def form_residual(
             )
         for j in ti.static(range(5)):
             m.partial[k, j] = s[j]
-    return ti.Vector([total(m, j) for j in ti.static(range(5))])
+    ti.loop_config(serialize=True)  # a sum outside of any loop would be a loop of its own over threads, 50 us and more
+    for _ in range(1):
+        for j in ti.static(range(5)):
+            m.partial[0, j] = total(m, j)
+    return ti.Vector([m.partial[0, j] for j in ti.static(range(5))])
 
 
 @ti.func
@@ -121,15 +125,17 @@ def try_step(m: ti.template(), w: ti.template(), y: ti.template(), share: ti.f64
 
 
 @kernel
-def keep_base(m: ti.template(), w: ti.template(), y: ti.template()):
-    """base = x; scalars 13: slope r.y of the step y (its sign: negative is downhill)."""
+def start_step(m: ti.template(), w: ti.template(), y: ti.template(), beta: ti.f64):
+    """base = x, then the whole step y; scalars 13: slope r.y (its sign: negative is downhill)."""
     ti.loop_config(serialize=m.serial)
     for k in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         s = ti.cast(0.0, ti.f64)
         for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
-            w.base[i] = m.x[i]
             s += dot64(m.free[i] * w.residual[i], y[i])
+            w.base[i] = m.x[i]
+            m.x[i] = w.base[i] + beta * ti.cast(y[i], ti.f64)
+            m.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
         m.partial[k, 5] = s
     ti.loop_config(serialize=True)
     for _ in range(1):
