@@ -30,7 +30,7 @@ from .elasticity_table import limit_table
 from .order_cases import CASES, HANGING, LINEAR, QUADRATIC, Case, Reference
 from .order_plot import draw, require_matplotlib
 from .order_runs import Row, measure_case
-from .order_table import GOAL, Comparison, compare, compare_table, find_limits, row_table
+from .order_table import GOAL, GOALS, compare, compare_table, find_limits, row_table
 from .timing import load_average, machine, versions
 
 ROUNDS, QUICK_ROUNDS, QUICK_MESHES = 5, 1, 2
@@ -51,9 +51,9 @@ def header() -> tuple[str, dict]:
 
 def case_text(case: Case, rows: list[Row], reference: Reference) -> str:
     """A section: what the case is judged by, and its rows."""
-    values = ", ".join(f"{x:.7g}" for x in reference.values)
+    values = ", ".join(f"{x:.7g}" for x in reference.values) or "none"
     good = f", good to {reference.uncertainty:.2%}" if reference.uncertainty else ""
-    told = f"{case.quantity}; reference {values}{good}: {reference.source}."
+    told = f"{case.quantity}; reference: {values}{good}; {reference.source}."
     note = f"\nNote: {case.note}." if case.note else ""
     return f"## {case.name}: {case.title}, {case.law}\n\n{told}{note}\n\n{row_table(rows, reference)}"
 
@@ -75,13 +75,13 @@ def measure(cases: list[Case], quick: bool, arch: str, document: Document) -> tu
         for case in cases:
             rows, reference = measure_case(case, chosen_meshes(case, quick), QUICK_ROUNDS if quick else ROUNDS, runtime)
             found.append((case, rows, reference))
-            comparisons.append(compare(case, rows, reference))
+            comparisons += [compare(case, rows, reference, goal) for goal in GOALS]
             document.add(case_text(case, rows, reference))
-            document.add(f"Time to {GOAL:.0%} error: {_told(comparisons[-1])}")
+            document.add("Time to an error:\n\n" + compare_table(comparisons[-len(GOALS) :]))
     finally:
         runtime.close()
     document.add(f"## Time to {GOAL:.0%} error")
-    document.add(compare_table(comparisons))
+    document.add(compare_table([c for c in comparisons if c.goal == GOAL]))
     limits = [] if quick else find_limits(comparisons, [row for _, rows, _ in found for row in rows])
     if limits:
         document.add("## Limits")
@@ -93,13 +93,6 @@ def measure(cases: list[Case], quick: bool, arch: str, document: Document) -> tu
         "comparisons": [c.record() for c in comparisons], "limits": [x.record() for x in limits],
     }  # fmt: skip
     return numbers, found
-
-
-def _told(c: Comparison) -> str:
-    """The comparison as a line."""
-    times = ", ".join(f"order {order} {reach or 'unknown'}" for order, reach in c.reach.items())
-    sign = "" if c.bound == "=" else f"{c.bound} "
-    return times + (f", ratio {sign}{c.ratio.median:.3g}" if c.ratio else "; no ratio can be told from these meshes")
 
 
 def _check_out(path: Path | None, suffix: str) -> None:

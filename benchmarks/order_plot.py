@@ -35,6 +35,9 @@ def draw(cases: list[tuple[Case, list[Row], Reference]], path: Path) -> None:
     require_matplotlib()
     from matplotlib import pyplot
 
+    cases = [found for found in cases if any(r.error is not None and r.rounds for r in found[1])]
+    if not cases:
+        raise OutputError(f"{path}: there is nothing to draw, since no mesh has an error")
     columns = min(COLUMNS, len(cases))
     lines = math.ceil(len(cases) / columns)
     figure, grid = pyplot.subplots(
@@ -56,8 +59,6 @@ def draw(cases: list[tuple[Case, list[Row], Reference]], path: Path) -> None:
 
 def _panel(panel, case: Case, rows: list[Row], reference: Reference) -> dict:
     """One case; returns label -> handle of its lines."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
     handles = {}
     for (order, degree), (name, colour, marker, line) in STYLES.items():
         own = [r for r in rows if (r.order, r.degree) == (order, degree) and r.error is not None and r.rounds]
@@ -70,12 +71,22 @@ def _panel(panel, case: Case, rows: list[Row], reference: Reference) -> dict:
         floor = 100 * reference.uncertainty
         handles["below what the reference is good to"] = panel.axhspan(floor / 1e3, floor, color="#dddddd", lw=0)
     panel.set(xscale="log", yscale="log", title=f"{case.title}, {case.law}")
-    errors = [100 * max(claimed(r, reference), SURE) for r in rows if r.error is not None and r.rounds]
-    panel.set_ylim(min([*errors, 100 * GOAL]) / 2, max([*errors, 100 * GOAL]) * 2)
-    for axis in (panel.xaxis, panel.yaxis):
-        axis.set_major_locator(LogLocator(numticks=12))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(NullFormatter())
+    shown = [r for r in rows if r.error is not None and r.rounds]
+    errors = [100 * max(claimed(r, reference), SURE) for r in shown] + [100 * GOAL]
+    panel.set_ylim(min(errors) / 1.6, max(errors) * 1.6)
+    _ticks(panel.yaxis, max(errors) / min(errors))
+    seconds = [r.timing.median for r in shown]
+    panel.set_xlim(min(seconds) / 1.6, max(seconds) * 1.6)
+    _ticks(panel.xaxis, max(seconds) / min(seconds))
     panel.grid(True, which="major", color="#eeeeee")
     panel.set_axisbelow(True)
     return handles
+
+
+def _ticks(axis, ratio: float) -> None:
+    """Plain numbers at powers of ten, and between them too where the axis spans few."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1.0,) if ratio > 300.0 else (1.0, 3.0) if ratio > 30.0 else (1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())

@@ -56,14 +56,14 @@ def test_time_to_an_error_is_exact_for_a_power_law():
 
 
 def test_nothing_is_extrapolated():
-    assert time_to([0.5, 0.02], [1.0, 9.0]) == Reach(9.0, ">")
-    assert time_to([0.01, 0.002], [1.0, 9.0]) == Reach(1.0, "<=")
-    assert time_to([], []) is None
+    assert time_to([0.5, 0.02], [1.0, 9.0], 0.01) == Reach(9.0, ">")
+    assert time_to([0.01, 0.002], [1.0, 9.0], 0.01) == Reach(1.0, "<=")
+    assert time_to([], [], 0.01) is None
 
 
 def test_an_error_must_stay_below():
     """One that changes its sign passes through 0 on its way to a worse mesh."""
-    reach = time_to([0.5, 0.001, 0.04, 0.0025], [1.0, 2.0, 3.0, 6.0])
+    reach = time_to([0.5, 0.001, 0.04, 0.0025], [1.0, 2.0, 3.0, 6.0], 0.01)
     assert reach.bound == "=" and reach.seconds == pytest.approx(3.0 * 2 ** (math.log(4) / math.log(16)))
 
 
@@ -88,6 +88,8 @@ def test_no_error_counts_below_what_the_reference_is_good_to():
     good = compare(BEAM, rows, replace(REFERENCE, uncertainty=0.0025))
     assert exact.reach[1].seconds < good.reach[1].seconds == pytest.approx(2.0)
     assert good.bound == ">"  # order 2 takes at most the time of its only mesh
+    blind = compare(BEAM, rows, replace(REFERENCE, uncertainty=0.01))
+    assert blind.reach == {1: None, 2: None} and blind.texts() == ("-", "-", "-", "")
 
 
 @pytest.mark.parametrize(
@@ -137,14 +139,14 @@ def test_rows_tell_what_they_hold():
 # --- references -------------------------------------------------------------------------------------------------------
 
 
-def test_own_reference_is_the_limit_of_a_geometric_sequence_or_the_finest_mesh():
+def test_own_reference_is_the_limit_of_a_geometric_sequence_or_nothing():
     values = [-2.0 + 0.3 * 0.25**k for k in range(4)]
     rows = [row(QUADRATIC, measured=[x]) for x in values] + [row(measured=[7.0]), row(QUADRATIC_14, measured=[8.0])]
     limit = own_reference(replace(BEAM, extrapolated=True), rows)
     assert limit.values == pytest.approx((-2.0,), rel=1e-12) and "extrapolated" in limit.source
     assert limit.uncertainty == pytest.approx(0.3 * 0.25**3 / 2)
-    assert own_reference(replace(BEAM, extrapolated=False), rows).values == (values[-1],)
-    assert own_reference(BEAM, [row()]).values == ()
+    assert own_reference(replace(BEAM, extrapolated=False), rows).values == ()
+    assert own_reference(replace(BEAM, extrapolated=True), rows[:2]).values == ()
 
 
 def test_errors_are_the_largest_of_the_numbers_that_have_a_reference():
@@ -289,13 +291,14 @@ def test_the_whole_writes_and_draws_what_it_prints(faked, tmp_path, capsys, monk
         ("hanging_beam", 1, [2, 2, 2]), ("hanging_beam", 1, [8, 8, 8]), ("hanging_beam", 2, [1, 1, 1]),
     ]  # fmt: skip
     assert [r["error"] for r in numbers["rows"][:4]] == pytest.approx([0.08, 0.005, 0.02, 0.005])
-    first, fall = numbers["comparisons"]
-    assert (first["bound"], fall["bound"], first["goal"]) == ("=", ">", 0.01)
-    assert first["reach"]["1"]["bound"] == "=" and numbers["rows"][0]["seconds"]["repeats"] == order.ROUNDS
+    told = {(c["case"], c["goal"]): c for c in numbers["comparisons"]}
+    assert len(told) == 6 and [told[name, 0.01]["bound"] for name in ("hanging_beam", "beam_fall")] == ["=", ">"]
+    assert told["hanging_beam", 0.1]["reach"]["1"]["bound"] == "<=" and told["hanging_beam", 0.03]["bound"] == ">"
+    assert numbers["rows"][0]["seconds"]["repeats"] == order.ROUNDS
     assert numbers["precision"] == "f64" and numbers["references"]["beam_fall"]["values"] == [-3.774]
     kept = (tmp_path / "new" / "order.md").read_text()
     assert kept.strip() in shown and "* order 2, 3x3x3: no equilibrium beyond 90% of the load" in kept
-    for part in ("## hanging_beam: hanging beam, SNH", "Time to 1% error: order 1", "## Limits", "good to 0.04%"):
+    for part in ("## hanging_beam: hanging beam, SNH", "## Time to 1% error", "## Limits", "good to 0.04%"):
         assert part in kept
     assert plot.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and len(plot.read_bytes()) > 10_000
 

@@ -30,6 +30,7 @@ MAX_BACKTRACKS = 30  # halvings: below 1e-9 of a step nothing but rounding is le
 SLOW = 0.2  # a step that leaves more of |r| than this asks for a new matrix
 LINEAR_LIMIT = 0.01  # true relative residual of a linearly implicit step above which it has failed
 MAX_FORCING = 0.1  # CG's loosest tolerance
+RISEN_FORCING = 1e-2  # CG's tolerance after a step that lowered Phi but raised |r|
 SUFFICIENT = 1e-4  # Armijo's share of the predicted decrease
 
 
@@ -45,9 +46,14 @@ class StageResult:
 
 
 def _forcing(last: float, r: float, previous: float) -> float:
-    """CG's tolerance from Newton's progress: Eisenstat and Walker's choice 2, with their safeguard."""
+    """CG's tolerance from Newton's progress: Eisenstat and Walker's choice 2, with their safeguard.
+
+    A step that bends a slender body raises |r| by stretching it; a loose solve would then only undo that stretch.
+    """
     if previous == 0.0:
         return MAX_FORCING
+    if r > previous:
+        return RISEN_FORCING
     wanted, guard = 0.9 * (r / previous) ** 2, 0.9 * last**2
     return min(MAX_FORCING, max(wanted, guard if guard > 0.1 else 0.0))
 
@@ -112,7 +118,7 @@ class StageSolver:
         block_csr.to_system(self.model, self.matrix, self.damper or self.matrix, c, beta)
 
     def _direction(self, tolerance: float) -> pcg.LinearResult:
-        return pcg.solve(self.model, self.matrix, self.pcg, tolerance, max(200, 3 * self.model.n_nodes))
+        return pcg.solve(self.model, self.matrix, self.pcg, tolerance, max(1000, 30 * self.model.n_nodes))
 
     def solve(
         self, c: float, beta: float, tolerance: float, max_newton: int, linear_tolerance: float | None = None,
