@@ -21,7 +21,7 @@ from benchmarks.elasticity_runs import Row, lasting_steps, make_rows, measure_ro
 from benchmarks.elasticity_table import Limit, markdown, slug
 from benchmarks.exact_path import SAMPLE, FallingBeam, load_exact
 from taisoft.errors import OutputError, SimulationError
-from taisoft.model import body_masses
+from taisoft.mass import lumped_masses
 
 CELLS = (12, 3, 3)
 TINY = elasticity.Extent(meshes=(CELLS,), precisions=("f32",), repeats=2, rounds=(2,), seconds=0.02)
@@ -51,7 +51,7 @@ def test_the_scene_is_the_exact_paths_beam(verlet):
     beam = FallingBeam(CELLS)
     body = verlet.scene.body("beam")
     assert np.array_equal(body.mesh.vertices, beam.vertices)
-    assert np.allclose(body_masses(verlet.scene), beam.mass, rtol=1e-14)
+    assert np.allclose(lumped_masses(verlet.scene), beam.mass, rtol=1e-14)
     assert np.array_equal(body.constraints[0].nodes, np.flatnonzero(~beam.free))
     assert (body.material.mu, body.material.lam) == pytest.approx((beam.mu, beam.lam))
     assert tuple(verlet.scene.gravity) == (0.0, -9.8, 0.0)

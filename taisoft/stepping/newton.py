@@ -30,7 +30,7 @@ MAX_BACKTRACKS = 30  # halvings: below 1e-9 of a step nothing but rounding is le
 SLOW = 0.2  # a step that leaves more of |r| than this asks for a new matrix
 LINEAR_LIMIT = 0.01  # true relative residual of a linearly implicit step above which it has failed
 MAX_FORCING = 0.1  # CG's loosest tolerance
-RISEN_FORCING = 1e-2  # CG's tolerance after a step that lowered Phi but raised |r|
+RISEN_FORCING = 3e-2  # CG's tolerance after a step that lowered Phi but raised |r|
 SUFFICIENT = 1e-4  # Armijo's share of the predicted decrease
 
 
