@@ -75,9 +75,10 @@ def measure(cases: list[Case], quick: bool, arch: str, document: Document) -> tu
         for case in cases:
             rows, reference = measure_case(case, chosen_meshes(case, quick), QUICK_ROUNDS if quick else ROUNDS, runtime)
             found.append((case, rows, reference))
-            comparisons += [compare(case, rows, reference, goal) for goal in GOALS]
             document.add(case_text(case, rows, reference))
-            document.add("Time to an error:\n\n" + compare_table(comparisons[-len(GOALS) :]))
+            if reference.values:
+                comparisons += [compare(case, rows, reference, goal) for goal in GOALS]
+                document.add("Time to an error:\n\n" + compare_table(comparisons[-len(GOALS) :]))
     finally:
         runtime.close()
     document.add(f"## Time to {GOAL:.0%} error")

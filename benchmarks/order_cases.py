@@ -174,8 +174,8 @@ CASES = (
     _hanging(
         "hanging_beam_svk_1MPa", "hanging beam, E = 1 MPa", "SVK", None,
         meshes={LINEAR: BEAM_MESHES[LINEAR][:2], QUADRATIC: BEAM_MESHES[QUADRATIC][:2]},
-        note="no value converged in space exists: this law softens where the clamp squeezes it, and fine meshes of any element "
-        "lose the equilibrium below the whole load. Coarse ones have one because they are too stiff",
+        note="no value converged in space exists: this law softens where the clamp squeezes it, and fine meshes lose the "
+        "equilibrium below the whole load; coarse ones have one because they are too stiff",
     ),
     _hanging(
         "hanging_beam_nu0.499", "hanging beam, nu = 0.499", "SNH", None, material=RUBBER | {"poisson": 0.499},

@@ -48,7 +48,7 @@ def draw(cases: list[tuple[Case, list[Row], Reference]], path: Path) -> None:
     drawn: dict = {}
     for panel, (case, rows, reference) in zip(grid.flat, cases):
         drawn |= _panel(panel, case, rows, reference)
-    figure.legend(drawn.values(), drawn.keys(), loc="outside upper center", ncols=len(drawn), frameon=False)
+    figure.legend(drawn.values(), drawn.keys(), loc="outside upper center", ncols=min(len(drawn), 2 * columns), frameon=False)
     figure.supxlabel("time of a solution [s], median of the rounds")
     figure.supylabel("error [%]")
     picture = io.BytesIO()
@@ -69,7 +69,7 @@ def _panel(panel, case: Case, rows: list[Row], reference: Reference) -> dict:
     handles[f"{GOAL:.0%} error"] = panel.axhline(100 * GOAL, color="#555555", lw=0.9, ls="--")
     if reference.uncertainty > 0.0:
         floor = 100 * reference.uncertainty
-        handles["below what the reference is good to"] = panel.axhspan(floor / 1e3, floor, color="#dddddd", lw=0)
+        handles["below the reference's own error"] = panel.axhspan(floor / 1e3, floor, color="#dddddd", lw=0)
     panel.set(xscale="log", yscale="log", title=f"{case.title}, {case.law}")
     shown = [r for r in rows if r.error is not None and r.rounds]
     errors = [100 * max(claimed(r, reference), SURE) for r in shown] + [100 * GOAL]

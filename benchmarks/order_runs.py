@@ -76,8 +76,9 @@ class Statics:
         row.newton, row.linear = result.iterations, result.linear_iterations
         row.field_bytes = sum(self._arena.bytes.values())
         if not result.converged:
-            why = f"; residual {result.residual:.1e} of the load" if result.load == 1.0 else ""
-            raise SimulationError(f"no equilibrium beyond {result.load:.0%} of the load{why}")
+            if result.load == 1.0:
+                raise SimulationError(f"not converged: the residual is {result.residual:.1e} of the load")
+            raise SimulationError(f"no equilibrium beyond {result.load:.0%} of the load")
         row.measured = self._case.read(self._scene.bodies[0], result).tolist()
 
     def again(self) -> None:

@@ -137,7 +137,7 @@ class StateAccess:
         except SimulationError:
             self.scene.bodies[k].material, self._stable_dt = old, old_limit
             raise
-        world.upload_material()
+        world.upload_material("density" in numbers)
         self._stepper.numbers_changed()
 
     def _open_world(self) -> World:
@@ -173,4 +173,4 @@ class StateAccess:
         with np.errstate(over="ignore"):
             bad = np.flatnonzero(~np.isfinite(value.astype(self._runtime.np_real)).all(axis=1))
         if len(bad):
-            raise SceneError(f"{name}: vertex {bad[0]} is not finite or too large for {self._runtime.precision}")
+            raise SceneError(f"{name}: node {bad[0]} is not finite or too large for {self._runtime.precision}")

@@ -1,8 +1,8 @@
 """The mass of a scene's nodes: lumped for explicit steps, consistent in implicit ones where elements are quadratic.
 
 A lumped mass moves the poles of quadratic tets little but places their weight wrongly (gravity on them is not
-int rho N_a g dV), so implicit steps, which solve systems anyway, take the consistent matrix there. Linear bodies stay lumped,
-as rows with a diagonal alone.
+int rho N_a g dV), so implicit steps, which solve systems anyway, take the consistent matrix there. Linear bodies stay lumped:
+beside a quadratic one their rows hold zeros off the diagonal.
 """
 
 from dataclasses import dataclass

@@ -297,3 +297,5 @@ def changed_material(body: Body, numbers: dict[str, float], on: dict[str, bool])
         body.material = replace(body.material, **numbers)
     except SceneError as error:
         raise SceneError(f"body '{body.name}': {error}") from None
+    if "poisson" in numbers:
+        body.tell_locking()

@@ -172,18 +172,36 @@ class Oracle:
 
     # --- implicit steps ---------------------------------------------------------------------------------------------
 
-    def implicit_euler(self, dt: float) -> None:
+    def led_acceleration(self, dt: float, shares, weights):
+        """Second difference (n,3) of the led nodes' ways at shares of the step, over dt^2."""
+        total = np.zeros((self.n, 3))
+        for nodes, led, path in self.led:
+            way = np.zeros((self.n, 3))
+            way[nodes] = sum(w * np.asarray(path(self.time + share * dt)) for share, w in zip(shares, weights)) / dt**2
+            total += np.where(led, way, 0.0)
+        return total
+
+    def led_v_hat(self, v_hat, way, led, beta: float, dt: float, at_end: bool = False):
+        """v_hat with that of led axes such that (way - v_hat) / beta is their acceleration, where the mass couples nodes."""
+        if np.count_nonzero(self.mass - np.diag(np.diag(self.mass))) == 0:
+            return v_hat
+        rule = ((0, 1 / 3, 2 / 3, 1), (-9, 36, -45, 18)) if at_end else ((0, 0.5, 1), (4, -8, 4))
+        return np.where(led, way - beta * self.led_acceleration(dt, *rule), v_hat)
+
+    def implicit_euler(self, dt: float, at_end: bool = False) -> None:
         """M (v1 - v0) = dt f(x0 + dt v1, v1)."""
         goal, led = self.targets(self.time + dt)
         x, v = self.x, self.v
-        self.x, self.v = self._stage(x, v, dt, goal, led)
+        v_hat = self.led_v_hat(v, (goal - x) / dt, led, dt, dt, at_end)
+        self.x, self.v = self._stage(x, v_hat, dt, goal, led)
         self._end(x, v, dt)
 
     def implicit_midpoint(self, dt: float) -> None:
         """A stage of half the step, then as much again; led nodes change their velocity once a step, by half in the stage."""
         goal, led = self.targets(self.time + dt)
         x, v, way = self.x, self.v, (goal - self.x) / dt
-        xm, vm = self._stage(x, np.where(led, (way + v) / 2, v), dt / 2, (goal + x) / 2, led)
+        v_hat = self.led_v_hat(np.where(led, (way + v) / 2, v), way, led, dt / 2, dt)
+        xm, vm = self._stage(x, v_hat, dt / 2, (goal + x) / 2, led)
         self.x, self.v = 2 * xm - x, np.where(led, way, 2 * vm - v)
         self._end(x, v, dt)
 
@@ -191,9 +209,11 @@ class Oracle:
         """x1 = 4/3 x0 - 1/3 x_(-1) + 2/3 dt v1, v1 alike; the first step is implicit Euler's."""
         goal, led = self.targets(self.time + dt)
         if not self.past:
-            return self.implicit_euler(dt)
-        (older_x, older_v), x, v = self.past[-1], self.x, self.v
-        self.x, self.v = self._stage((4 * x - older_x) / 3, (4 * v - older_v) / 3, 2 * dt / 3, goal, led)
+            return self.implicit_euler(dt, at_end=True)
+        (older_x, older_v), x, v, beta = self.past[-1], self.x, self.v, 2 * dt / 3
+        x_hat = (4 * x - older_x) / 3
+        v_hat = self.led_v_hat((4 * v - older_v) / 3, (goal - x_hat) / beta, led, beta, dt, at_end=True)
+        self.x, self.v = self._stage(x_hat, v_hat, beta, goal, led)
         self._end(x, v, dt)
 
     def linearly_implicit_euler(self, dt: float) -> None:
@@ -202,12 +222,13 @@ class Oracle:
         free = ~(self.fixed | led).reshape(-1)
         x, v, damper = self.x, self.v, self.stiffness(self.x, projected=True)
         start, way = np.where(led, goal, x), np.where(led, (goal - x) / dt, 0.0)
+        old, v = v, self.led_v_hat(v, way, led, dt, dt)
         rhs = (self.mass @ (v - way) + dt * self.total_force(start, way, damper)).reshape(-1)
         self.v = way.copy()
         self.v[free.reshape(-1, 3)] = np.linalg.solve(self._system(dt, start, damper)[np.ix_(free, free)], rhs[free])
         self.x = np.where(led, goal, x + dt * self.v)
         self._residual = self.mass @ (self.v - v) / dt - self.total_force(self.x, self.v, damper)
-        self._end(x, v, dt)
+        self._end(x, old, dt)
 
     def _system(self, beta: float, x, damper):
         """M + beta a M + beta^2 K(x) + beta b K_d."""

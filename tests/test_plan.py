@@ -58,7 +58,7 @@ def test_quadratic_bodies_get_a_consistent_mass_in_implicit_steps_only():
     for explicit in (True, False):
         plan = make_plan(scene, explicit=explicit, multistep=False)
         entries = {e["feature"]: (e["on"], e["why"]) for e in plan.entries}
-        assert entries["quadratic_tets"] == (True, f"order 2 of {', '.join(names)}")
+        assert entries["quadratic_tets"] == (True, f"bodies of order 2: {', '.join(names)}")
         assert entries["consistent_mass"][0] is entries["consistent_weight"][0] is (not explicit)
     assert entries["consistent_mass"][1] == f"quadratic tets of {', '.join(names)} in implicit steps"
 

@@ -216,7 +216,7 @@ def test_a_real_failure(block):
     finally:
         block.set_gravity((0.0, -9.81, 0.0))
     assert result.status == "failed"
-    assert f"step {result.steps + 1}: body 'block', vertex" in result.problems[0]
+    assert f"step {result.steps + 1}: body 'block', node" in result.problems[0]
     assert np.isfinite(block.positions()).all() and np.isfinite(block.velocities()).all()
     assert result.sim_seconds == pytest.approx(0.004 * result.steps) and block.step_count == result.steps
 

@@ -4,7 +4,7 @@
 * after the last one closed any kind may follow, and the same kind is not initialised again;
 * a machine without CUDA refuses it with a sentence and goes on with the CPU;
 * fields are counted in bytes, named once, released together, and too large ones refused before they are made;
-* kernels are counted by name, and their first launch is compile time.
+* kernels are counted by name, and their first launch is compile time; a faulty one is told with its file and line.
 """
 
 import numpy as np
@@ -110,4 +110,20 @@ def test_launches_and_compile_time_are_counted():
         add_one(y)  # compiled for another field
         assert runtime.compile_clock() > first
         assert x.to_numpy().tolist() == [4.0, 4.0] and y.to_numpy().tolist() == [1.0, 1.0]
+        arena.release()
+
+
+@kernel
+def faulty(x: ti.template()):
+    for i in x:
+        x[i] = unknown_name  # noqa: F821
+
+
+def test_a_faulty_kernel_is_told_with_file_and_line():
+    """Taichi's excerpt of the source is left out, the place is not."""
+    with opened("f64"):
+        arena = FieldArena()
+        x = arena.field("x", ti.f64, 2)
+        with pytest.raises(ti.TaichiNameError, match=r'File ".*test_runtime.py", line \d+, in faulty:(.|\n)*unknown_name'):
+            faulty(x)
         arena.release()

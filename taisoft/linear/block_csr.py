@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
+from taisoft.errors import SimulationError
 from taisoft.linear.element_blocks import element_blocks, pair_terms
 from taisoft.model import MATRIX_BLOCKS, Model, model_graph
 from taisoft.runtime import FieldArena, kernel
@@ -46,6 +47,8 @@ def build_block_csr(model: Model, arena: FieldArena, real, prefix: str = "stiffn
     """Pattern and gather table from the model's tets; values are filled by `assemble`."""
     graph, base = model_graph(model)
     n_edges = len(graph.ends)
+    if base.max(initial=0) > np.iinfo(np.int32).max - 9 * model.lanes:
+        raise SimulationError(f"{int(model.volume.shape[0]) * model.lanes} tets are too many to assemble a stiffness of")
     order = np.argsort(graph.pair, kind="stable")
     edge_start = np.concatenate([[0], np.cumsum(np.bincount(graph.pair, minlength=n_edges))])
     size = sum((g.last - g.first) * MATRIX_BLOCKS[g.order] * 9 for g in model.groups)

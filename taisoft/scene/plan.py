@@ -36,7 +36,7 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool) -> Plan:
         return [b.name for b in scene.bodies if test(b)]
 
     quadratic = bodies(lambda b: b.order == 2)
-    plan.add("quadratic_tets", bool(quadratic), f"order 2 of {_named(quadratic)}", "every body is of order 1")
+    plan.add("quadratic_tets", bool(quadratic), f"bodies of order 2: {_named(quadratic)}", "every body is of order 1")
     plan.add(
         "consistent_weight", bool(quadratic) and not explicit, "gravity on quadratic tets acts as int rho N g dV",
         "explicit steps take gravity as an acceleration" if quadratic else "on linear tets it is the lumped mass",

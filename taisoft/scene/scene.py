@@ -74,12 +74,7 @@ class Body:
         degrees = QUADRATURE_DEGREES[self.order]
         degree = degrees[0] if quadrature_degree is None else quadrature_degree
         self.quadrature_degree = checks.whole(degree, f"{what}: quadrature_degree of order {self.order}", degrees)
-        if self.order == 1 and material.poisson > NEARLY_INCOMPRESSIBLE:
-            warnings.warn(
-                f"{what}: poisson = {material.poisson:g} is above {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend "
-                "far too little: order=2 does not",
-                UserWarning, stacklevel=4,
-            )  # fmt: skip
+        self.tell_locking()
         self.nodes: Nodes = make_nodes(mesh, self.order)
         self.position = checks.array(position, f"{what}: position", ((3,),))
         self.velocity = checks.array(velocity, f"{what}: velocity", ((3,), (self.n_nodes, 3)))
@@ -101,6 +96,16 @@ class Body:
     def __repr__(self) -> str:
         kind = f"{self.mesh.n_tets} tets of order {self.order}"
         return f"Body({self.name!r}, {self.n_nodes} nodes, {kind}, {self.material.law})"
+
+    def tell_locking(self) -> None:
+        """Warn of linear tets where they lock."""
+        poisson = self.material.poisson
+        if self.order == 1 and poisson > NEARLY_INCOMPRESSIBLE:
+            warnings.warn(
+                f"body {self.name!r}: poisson = {poisson:g} is above {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend "
+                "far too little: order=2 does not",
+                UserWarning, stacklevel=5,
+            )  # fmt: skip
 
     def fix(self, where, axes: str = "xyz") -> Constraint:
         """Hold nodes where they start.
@@ -151,8 +156,8 @@ class Body:
     def add_force(self, where, force) -> NodalForce:
         """Load nodes with a total dead force, spread over them by lumped mass, or with one force for each node.
 
-        where: as for `fix`. force: (3,) the total, or (k,3) in the order of the chosen nodes [N].
-        Raises SceneError when no node is chosen or numbers are not finite.
+        where: as for `fix`; a node chosen twice counts once. force: (3,) the total, or (k,3) in the order of the chosen
+        nodes [N]. Raises SceneError when no node is chosen or numbers are not finite.
         """
         what = f"body {self.name!r}: add_force"
         nodes = checks.selection(where, self.rest_positions, what, "node")
@@ -219,7 +224,7 @@ class Scene:
 
         mesh: its shape at rest. name: unique, "body0" and so on where left out. position: (3,) [m], shift of the start.
         velocity: (3,) for all nodes or (n,3) [m/s]. order: 1, linear tets, or 2, quadratic ones with nodes in the middle of
-        every edge. quadrature_degree, for order 2: 2 (four points, the default) or 4 (fourteen). Raises SceneError.
+        every edge. quadrature_degree: None for the default, for order 2 four points (2) or fourteen (4). Raises SceneError.
         """
         taken = [body.name for body in self.bodies]
         if name is None:

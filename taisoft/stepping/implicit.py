@@ -122,6 +122,8 @@ class ImplicitStepper:
             if scheme.midpoint:
                 target = 0.5 * (target + m.x.to_numpy()[world.motion.moved])
             w.targets.from_numpy(target)
+            if m.consistent:
+                w.led_acceleration.from_numpy(world.motion.accelerations(world.time, dt, self.scheme.before == 0.0))
         self._beta = scheme.share * dt
         self.solver.assemble_damper()
         along = (0.5 if scheme.midpoint else 1.0) if self._past > 1 and not scheme.one_iteration else 0.0

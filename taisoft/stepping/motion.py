@@ -91,6 +91,26 @@ class Motion:
                 return rows[:r], True
         return rows, False
 
+    def accelerations(self, start: float, dt: float, middle: bool) -> np.ndarray:
+        """Accelerations (n_moved, 3) [m/s^2] of the led nodes over the step from start [s]: at its middle, or at its end.
+
+        Second order in dt, from places within the step alone: a jump of the velocity between two steps is no force.
+        """
+        shares, weights = ((0, 1 / 2, 1), (4, -8, 4)) if middle else ((0, 1 / 3, 2 / 3, 1), (-9, 36, -45, 18))
+        total = np.zeros((self.n_moved, 3))
+        for g in self._groups:
+            if g.released:
+                continue
+            for share, weight in zip(shares, weights):
+                way = self._ask(g, start + share * dt)
+                if way is None:
+                    raise SimulationError(
+                        f"body '{g.name}': the path of its moved nodes gave None at t = {start + share * dt:g} s, "
+                        "but a displacement later: released nodes stay free"
+                    )
+                total[g.rows] += weight / dt**2 * way
+        return total
+
     @staticmethod
     def _ask(group: _Group, t: float) -> np.ndarray | None:
         """A path's displacement at t, checked; SimulationError names the body, the time and the rule."""

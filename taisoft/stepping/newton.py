@@ -75,6 +75,7 @@ class StageSolver:
             moved=arena.field("stage_moved", ti.i32, k, moved.astype(np.int32)) if k else None,
             moved_axes=arena.vectors("stage_moved_axes", ti.i32, k) if k else None,
             targets=arena.vectors("stage_targets", ti.f64, k) if k else None,
+            led_acceleration=arena.vectors("led_acceleration", ti.f64, k) if k and model.consistent else None,
             n_moved=k, change=arena.vectors("change", ti.f64, n), damper=self.damper,
         )  # fmt: skip
         self.update_material()
@@ -85,8 +86,10 @@ class StageSolver:
         volume, Dm_inv = m.volume.to_numpy().astype(np.float64), m.Dm_inv.to_numpy().astype(np.float64)
         stiff = np.abs(m.law_constants.to_numpy()[:, :2]).sum(axis=1)[m.block_body.to_numpy()]
         g = np.sqrt((Dm_inv**2).sum(axis=1))
-        for group in m.groups:  # the gradients of quadratic shape functions are up to four times as large
-            g[group.first : group.last] *= 1.0 if group.order == 1 else 4.0
+        if m.points is not None:  # the gradients of quadratic shape functions are larger
+            steepest = float(np.abs(m.points.to_numpy()[:, 1:]).max())
+            for group in m.groups:
+                g[group.first : group.last] *= steepest if group.order == 2 else 1.0
         largest = float(np.abs(m.x.to_numpy()).max())
         strain = self.eps + np.finfo(np.float64).eps * largest * g  # of F, and of the f64 positions it is formed from
         self.rounding_force = float(np.sqrt(((stiff[:, None] * volume * g * strain) ** 2).sum()))

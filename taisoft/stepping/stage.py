@@ -24,6 +24,7 @@ class StageWork:
     moved: Any  # (n_moved) i32
     moved_axes: Any  # (n_moved, 3) i32
     targets: Any  # (n_moved) f64 3-vectors
+    led_acceleration: Any  # (n_moved) f64 3-vectors, only with a consistent mass
     n_moved: int
     change: Any  # f64: what the mass is multiplied by
     damper: Any  # BlockCsr or None
@@ -39,7 +40,9 @@ def stage_velocity(m: ti.template(), w: ti.template(), i, beta):
 def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, led_share: ti.f64):
     """x from the first iterate v; led nodes go to their targets, which gives their v.
 
-    led_share: of a led node's change of velocity that happens within the stage; v_hat is moved by the rest.
+    v_hat of a led node is set so that (v - v_hat) / beta is its acceleration. With a lumped mass, which shows in nothing but
+    the reactions, that is its change of velocity in a step, of which led_share happens in the stage. A consistent mass
+    drags the neighbours along, so there the path itself says it.
     """
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -51,7 +54,10 @@ def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, led_share: ti.
             for a in ti.static(range(3)):
                 if w.moved_axes[k][a] != 0:
                     v = (w.targets[k][a] - w.x_hat[i][a]) / beta
-                    w.v_hat[i][a] = ti.cast(v - led_share * (v - ti.cast(w.v_hat[i][a], ti.f64)), m.real)
+                    if ti.static(m.consistent):
+                        w.v_hat[i][a] = ti.cast(v - beta * w.led_acceleration[k][a], m.real)
+                    else:
+                        w.v_hat[i][a] = ti.cast(v - led_share * (v - ti.cast(w.v_hat[i][a], ti.f64)), m.real)
                     m.v[i][a] = ti.cast(v, m.real)
                     m.x[i][a] = w.targets[k][a]
 

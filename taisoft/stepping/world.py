@@ -30,17 +30,19 @@ class World:
         held = self.motion.constrained()
         self.model.free.from_numpy((~held).astype(self.runtime.np_real))
 
-    def upload_material(self) -> None:
-        """Material numbers and masses of the bodies to the device."""
+    def upload_material(self, density: bool) -> None:
+        """Material numbers of the bodies to the device, and masses if a density changed."""
         m, npr = self.model, self.runtime.np_real
+        m.law_constants.from_numpy(material_table([b.material for b in self.scene.bodies]))
+        if m.damping is not None:
+            m.damping.from_numpy(damping_table(self.scene).astype(npr))
+        if not density:
+            return
         m.mass.from_numpy(lumped_masses(self.scene).astype(npr))
         if m.weight is not m.mass:
             m.weight.from_numpy(weight_masses(self.scene).astype(npr))
         if m.consistent:
             upload_mass_matrix(self.scene, m.mass_matrix, npr)
-        m.law_constants.from_numpy(material_table([b.material for b in self.scene.bodies]))
-        if m.damping is not None:
-            m.damping.from_numpy(damping_table(self.scene).astype(npr))
 
     def rest_velocities(self) -> np.ndarray:
         """Initial velocities with 0 on constrained axes (n_nodes, 3)."""
@@ -78,5 +80,5 @@ class World:
         if len(bad) == 0:
             return None
         body = int(np.searchsorted(self.layout.node_start, bad[0], side="right")) - 1
-        name, vertex = self.scene.bodies[body].name, bad[0] - self.layout.node_start[body]
-        return f"body '{name}', vertex {vertex}: position, velocity or force is no longer finite ({len(bad)} vertices in all)"
+        name, node = self.scene.bodies[body].name, bad[0] - self.layout.node_start[body]
+        return f"body '{name}', node {node}: position, velocity or force is no longer finite ({len(bad)} nodes in all)"
