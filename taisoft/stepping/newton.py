@@ -78,6 +78,7 @@ class StageSolver:
             led_acceleration=arena.vectors("led_acceleration", ti.f64, k) if k and model.consistent else None,
             n_moved=k, change=arena.vectors("change", ti.f64, n), damper=self.damper,
         )  # fmt: skip
+        self._norms = np.zeros(5)
         self.update_material()
 
     def update_material(self) -> None:
@@ -104,17 +105,20 @@ class StageSolver:
 
     def _evaluate(self, c: float, beta: float) -> tuple[float, float]:
         """(|r|, scale) at the present v and x."""
-        norms = form_residual(self.model, self.work, self.pcg, c, beta)
-        r, inertia, elastic, external, held = (math.sqrt(norms[k]) for k in range(5))
+        form_residual(self.model, self.work, self.pcg, c, beta, self._norms)
+        r, inertia, elastic, external, held = (math.sqrt(square) for square in self._norms)
         if c == 0.0:
             return r, beta * external if external > 0.0 else held
         return r, inertia + beta * (elastic + external)
 
     def _objective(self, c: float, beta: float) -> float:
-        measure(self.model)
-        stage_terms(self.model, self.work, c, beta)
-        s = self.model.scalars
-        return s[0] + s[4] + s[14]
+        m = self.model
+        measure(m)
+        energy = m.scalars[0] + m.scalars[4]
+        if c == 0.0 and not m.loaded and not m.damped:  # no other terms
+            return energy
+        stage_terms(m, self.work, c, beta)
+        return energy + m.scalars[14]
 
     def _form_system(self, c: float, beta: float, projected: bool) -> None:
         block_csr.assemble(self.model, self.matrix, projected)

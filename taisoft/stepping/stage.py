@@ -64,11 +64,11 @@ def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, led_share: ti.
 
 @kernel
 def form_residual(
-    m: ti.template(), w: ti.template(), p: ti.template(), c: ti.f64, beta: ti.f64
-) -> ti.types.vector(5, ti.f64):
+    m: ti.template(), w: ti.template(), p: ti.template(), c: ti.f64, beta: ti.f64, norms: ti.types.ndarray()
+):
     """Elastic forces and residual at the present x and v, -r as CG's right side.
 
-    Returns |r|^2, |inertia and mass damping|^2, |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on the others.
+    norms (5,), an array of the host (which is told sooner than by a returned vector): |r|^2, |inertia and mass damping|^2, |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on the others.
     """
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
@@ -111,8 +111,7 @@ def form_residual(
     ti.loop_config(serialize=True)  # a sum outside of any loop would be a loop of its own over threads, 50 us and more
     for _ in range(1):
         for j in ti.static(range(5)):
-            m.partial[0, j] = total(m, j)
-    return ti.Vector([m.partial[0, j] for j in ti.static(range(5))])
+            norms[j] = total(m, j)
 
 
 @ti.func
