@@ -103,7 +103,7 @@ class Body:
         if self.order == 1 and poisson > NEARLY_INCOMPRESSIBLE:
             warnings.warn(
                 f"body {self.name!r}: poisson = {poisson:g} is above {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend "
-                "far too little: order=2 does not",
+                "far too little: order=2 locks less",
                 UserWarning, stacklevel=5,
             )  # fmt: skip
 
