@@ -68,7 +68,8 @@ def form_residual(
 ):
     """Elastic forces and residual at the present x and v, -r as CG's right side.
 
-    norms (5,), an array of the host (which is told sooner than by a returned vector): |r|^2, |inertia and mass damping|^2, |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on the others.
+    norms (5,), an array of the host (it is told sooner than by a returned vector): |r|^2, |inertia and mass damping|^2,
+    |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on the others.
     """
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
