@@ -21,7 +21,7 @@ from taisoft.static import StaticSolver
 
 from .elasticity_beam import Stretch, advance
 from .order_cases import Case, Element, Reference, mesh_name
-from .reference_cases.motion import _vertex
+from .reference_cases.motion import parabola_vertex
 from .reference_cases.record import nearest
 from .timing import Timing, summarise, time_repeats
 
@@ -91,13 +91,13 @@ class Statics:
 
 
 @dataclass(frozen=True)
-class Path:
+class Swing:
     """What a motion left; lowest: uy of the tip [m] and its time [s]."""
 
     lowest: tuple[float, float]
 
 
-class Motion:
+class Fall:
     """A fall that can be run again and again."""
 
     def __init__(self, case: Case, scene: ts.Scene, runtime: Runtime):
@@ -115,8 +115,8 @@ class Motion:
         row.field_bytes = sum(self._sim.field_bytes.values())
         if whole.unconverged:
             raise SimulationError(f"{whole.unconverged} of {whole.steps} steps did not converge")
-        when, low = _vertex(np.array(heights), self._case.dt)
-        row.measured = self._case.read(self._body, Path((low, when))).tolist()
+        when, low = parabola_vertex(np.array(heights), self._case.dt)
+        row.measured = self._case.read(self._body, Swing((low, when))).tolist()
 
     def again(self) -> None:
         """Run from the start."""
@@ -131,7 +131,7 @@ class Motion:
 def measure_case(case: Case, meshes: dict[Element, tuple], rounds: int, runtime: Runtime) -> tuple[list[Row], Reference]:
     """All rows of a case and what they are judged by. A mesh that fails is a row that says so."""
     rows: list[Row] = []
-    runs: list[tuple] = []  # (Statics or Motion, row)
+    runs: list[tuple] = []  # (Statics or Fall, row)
     try:
         for element, chain in meshes.items():
             for cells in chain:
@@ -157,7 +157,7 @@ def _prepare(case: Case, element: Element, row: Row, runs: list[tuple], runtime:
             warnings.simplefilter("ignore", UserWarning)  # order 1 locks where nu is near 1/2: this is what is measured
             scene = case.build(row.cells, element)
         row.tets, row.nodes = scene.bodies[0].mesh.n_tets, len(scene.bodies[0].rest_positions)
-        run = (Statics if case.dt is None else Motion)(case, scene, runtime)
+        run = (Statics if case.dt is None else Fall)(case, scene, runtime)
         runs.append((run, row))  # from here on it is closed at the end
         start, before = perf_counter(), compile_clock()
         run.first(row)

@@ -255,7 +255,7 @@ def faked(monkeypatch):
     """The benchmark without a solver."""
     made.clear()
     monkeypatch.setattr(order_runs, "Statics", Fake)
-    monkeypatch.setattr(order_runs, "Motion", Fake)
+    monkeypatch.setattr(order_runs, "Fall", Fake)
     monkeypatch.setattr(order, "open_runtime", lambda *a: Nothing())
     return made
 

@@ -223,7 +223,7 @@ def beam_fall_converged(law: str, meshes, reference: dict, arch: str):
         node = nearest(s.bodies[0].rest_positions, (2, 0, 0))[0]
         with simulator(s, "velocity_verlet", arch) as sim:
             y = follow(sim, 1200, 1.2, 200).x[:, node, 1]
-        t, low = _vertex(y, 1 / 200)
+        t, low = parabola_vertex(y, 1 / 200)
         lowest.append(low)
         yield near(f"lowest uy of the tip, {label(cells)} [m]", low, best["y_min"])
         yield near(f"time of the lowest point, {label(cells)} [s]", t, best["t_min"])
@@ -233,7 +233,7 @@ def beam_fall_converged(law: str, meshes, reference: dict, arch: str):
     yield near("lowest uy of the tip, extrapolated [m]", limit, best["y_min"], uncertainty)
 
 
-def _vertex(y: np.ndarray, spacing: float) -> tuple[float, float]:
+def parabola_vertex(y: np.ndarray, spacing: float) -> tuple[float, float]:
     """Time and value of the lowest point of y, sampled at spacing, 2 spacing, ...: a parabola through three samples."""
     k = int(np.argmin(y[:-1]))
     a, b, c = y[k - 1 : k + 2]
