@@ -136,8 +136,8 @@ def test_set_state(sim, beam):
         ({"positions": np.zeros((12, 3)), "body": "flyer"}, r"positions have shape \(12, 3\) .*: they must be \(8, 3\) numbers"),
         ({"positions": np.zeros(60)}, r"positions have shape \(60,\)"),
         ({"velocities": [["a"] * 3] * 51}, "velocities have shape .* type <U1: they must be"),
-        ({"positions": np.zeros((51, 3)), "velocities": np.eye(51, 3) * np.nan}, "velocities: vertex 0 is not finite"),
-        ({"positions": np.r_[np.zeros((7, 3)), [[0, np.inf, 0]]], "body": "flyer"}, "positions: vertex 7 is not finite"),
+        ({"positions": np.zeros((51, 3)), "velocities": np.eye(51, 3) * np.nan}, "velocities: node 0 is not finite"),
+        ({"positions": np.r_[np.zeros((7, 3)), [[0, np.inf, 0]]], "body": "flyer"}, "positions: node 7 is not finite"),
         ({"positions": np.zeros((51, 3)), "body": "flier"}, "no body is called 'flier'; did you mean 'flyer'"),
     ],
 )
@@ -275,7 +275,7 @@ def test_a_failing_step(sim, beam):
     wild = v.copy()
     wild[beam + 3] = 1e200
     sim.set_state(velocities=wild)
-    named = "body 'flyer', vertex 3" if sim.settings.explicit else "body '"
+    named = "body 'flyer', node 3" if sim.settings.explicit else "body '"
     with pytest.raises(ts.SimulationError, match=f"^step 2: {named}.* no longer finite"):
         sim.step()
     assert sim.step_count == 1 and sim.time == pytest.approx(DT)

@@ -30,6 +30,7 @@ MAX_BACKTRACKS = 30  # halvings: below 1e-9 of a step nothing but rounding is le
 SLOW = 0.2  # a step that leaves more of |r| than this asks for a new matrix
 LINEAR_LIMIT = 0.01  # true relative residual of a linearly implicit step above which it has failed
 MAX_FORCING = 0.1  # CG's loosest tolerance
+UNSEEN = 1e-10  # share of Phi below which small strains round it: F - I cancels
 RISEN_FORCING = 3e-2  # CG's tolerance after a step that lowered Phi but raised |r|
 SUFFICIENT = 1e-4  # Armijo's share of the predicted decrease
 
@@ -206,6 +207,13 @@ class StageSolver:
         share, slope = 1.0, m.scalars[13]
         # Phi's own rounding: the elastic terms of f32 forces are only good to eps, so tiny rises are not rises
         slack = 10.0 * np.finfo(np.float64).eps * abs(start)
+        unseen = UNSEEN * abs(start)
+        if by_energy and -unseen < slope < 0.0:  # Phi cannot show so small a decrease: |r| decides
+            new_r, new_scale = self._evaluate(c, beta)
+            value = self._objective(c, beta)
+            if new_r < r and value <= start + unseen:
+                self._phi = value
+                return new_r, new_scale, True
         for _ in range(MAX_BACKTRACKS):
             value = self._objective(c, beta)
             if np.isfinite(value) and value <= start + SUFFICIENT * share * slope + slack and slope < 0.0:
