@@ -10,18 +10,17 @@ import pytest
 from scenes import SNH, cube, rubber
 
 import taisoft as ts
-from taisoft.stepping import INTEGRATORS
 
 SPEED = np.array([2.0, 0.0, -1.0])  # [m/s]
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["velocity_verlet", "linearly_implicit_euler", "implicit_midpoint", "bdf2"])
 def test_rigid_flight(integrator):
     scene = ts.Scene(gravity=(0, 0, 0))
     for order in (1, 2):
         body = scene.add_body(cube(cells=(2, 1, 1)), rubber(), velocity=SPEED, order=order, position=(0, 0, 3 * order))
         body.move(lambda X: X[:, 0] < -0.49, lambda t: SPEED * t)
-    settings = {} if integrator in ("symplectic_euler", "velocity_verlet") else {"linear_tolerance": 1e-12}
+    settings = {} if integrator == "velocity_verlet" else {"linear_tolerance": 1e-12}
     with ts.Simulator(scene, dt=1e-4, integrator=integrator, precision="f64", **settings) as sim:
         for _ in range(3):
             sim.step()
