@@ -17,7 +17,7 @@ demo: $(READY)
 	@echo "Written to $(DEMO_OUT): report.json (what happened), steps.csv (every step), frames/ (pictures), scene.usdc (USD)."
 
 test: $(READY)
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 lint: $(READY)
 	$(BIN)/ruff check .

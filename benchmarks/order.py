@@ -36,13 +36,13 @@ from .timing import load_average, machine, versions
 ROUNDS, QUICK_ROUNDS, QUICK_MESHES = 5, 1, 2
 
 
-def header() -> tuple[str, dict]:
-    """What is measured where, as text and as data."""
+def header(title: str, *how: str) -> tuple[str, dict]:
+    """What is measured where and how, as text and as data."""
     found = machine() | {"date": datetime.now().isoformat(timespec="minutes")}
     packages = {"taisoft": ts.__version__, **versions("taichi", "numpy", "scipy")}
     load = "unknown" if found["load"] is None else f"{found['load']:.1f}"
     text = (
-        f"# First- and second-order tets: error against time\n\n{found['processor']}, {found['cores']} cores, "
+        f"# {title}\n\n{', '.join([found['processor'], str(found['cores']) + ' cores', *how])}, "
         f"load {load} at the start; {found['date']}\n"
         + ", ".join(f"{name} {version or 'absent'}" for name, version in packages.items())
     )
@@ -67,7 +67,7 @@ def chosen_meshes(case: Case, quick: bool) -> dict:
 
 def measure(cases: list[Case], quick: bool, arch: str, document: Document) -> tuple[dict, list]:
     """Everything, printed as it comes. Returns the numbers, and (case, rows, reference) of each case."""
-    text, numbers = header()
+    text, numbers = header("First- and second-order tets: error against time")
     document.add(text)
     found, comparisons = [], []
     runtime = open_runtime(arch, "f64", "the benchmark of orders")
@@ -96,7 +96,7 @@ def measure(cases: list[Case], quick: bool, arch: str, document: Document) -> tu
     return numbers, found
 
 
-def _check_out(path: Path | None, suffix: str) -> None:
+def check_out(path: Path | None, suffix: str) -> None:
     """Raises OutputError, before minutes of measuring, where a file could not be written."""
     if path is None:
         return
@@ -117,8 +117,8 @@ def main(argv=None) -> int:
     parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw error against time, a panel a case")
     options = parser.parse_args(argv)
-    _check_out(options.out, ".json")
-    _check_out(options.plot, ".png")
+    check_out(options.out, ".json")
+    check_out(options.plot, ".png")
     if options.plot:
         require_matplotlib()
     name = options.case or (HANGING if options.quick else None)

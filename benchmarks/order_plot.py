@@ -74,16 +74,16 @@ def _panel(panel, case: Case, rows: list[Row], reference: Reference) -> dict:
     shown = [r for r in rows if r.error is not None and r.rounds]
     errors = [100 * max(claimed(r, reference), SURE) for r in shown] + [100 * GOAL]
     panel.set_ylim(min(errors) / 1.6, max(errors) * 1.6)
-    _ticks(panel.yaxis, max(errors) / min(errors))
+    ticks(panel.yaxis, max(errors) / min(errors))
     seconds = [r.timing.median for r in shown]
     panel.set_xlim(min(seconds) / 1.6, max(seconds) * 1.6)
-    _ticks(panel.xaxis, max(seconds) / min(seconds))
+    ticks(panel.xaxis, max(seconds) / min(seconds))
     panel.grid(True, which="major", color="#eeeeee")
     panel.set_axisbelow(True)
     return handles
 
 
-def _ticks(axis, ratio: float) -> None:
+def ticks(axis, ratio: float) -> None:
     """Plain numbers at powers of ten, and between them too where the axis spans few."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 

@@ -4,6 +4,8 @@ import warnings
 
 import numpy as np
 
+from taisoft.collision.contacts import Contacts
+from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
 from taisoft.errors import SceneError, SimulationError
 from taisoft.model import changed_material
@@ -18,6 +20,7 @@ class StateAccess:
 
     settings: Settings
     _world: World | None = None
+    _detections: list[Detection]  # one, once it was asked for
 
     @property
     def time(self) -> float:
@@ -62,6 +65,42 @@ class StateAccess:
         """(n_nodes, 3) force of the constraint on each fixed or moved node in the last step [N], else 0."""
         self._open_world()
         return self._stepper.reactions()[self._slice(body)]
+
+    def detect_contacts(self) -> Contacts:
+        """The contacts of the present state swept by dt v, impulses 0; no step.
+
+        What is looked for and how is the scene's (`Scene.collision`, each body's `collision`) and told in the plan. Memory and
+        kernels for it are made at the first call. Raises SimulationError where positions or velocities are not finite, or a
+        buffer would grow beyond `max_capacity`.
+        """
+        detection = self._find_contacts()
+        return detection.contacts()
+
+    def intersecting_triangles(self) -> list[tuple[str, int, str, int]]:
+        """Surface triangles that intersect in the present state, each pair once: name and triangle of each.
+
+        Triangles are rows of `body.nodes.surface`, or of an obstacle's surface. Of one body only where self_collision is on;
+        triangles that share a vertex are left out.
+        """
+        detection = self._find_contacts()
+        first, colliders = detection.topology.first, self._world.scene.colliders
+        pairs = detection.intersections()
+        owner = np.searchsorted(first, pairs, side="right") - 1
+        return [
+            (colliders[a].name, int(t - first[a]), colliders[b].name, int(u - first[b])) for (t, u), (a, b) in zip(pairs, owner)
+        ]
+
+    def _find_contacts(self) -> Detection:
+        world = self._open_world()
+        if not self._detections:
+            self_collision = self.settings.self_collision
+            self._detections.append(Detection(world.scene, world.model, world.layout, self._runtime, self_collision))
+        moved = world.motion.moved
+        led = None
+        if len(moved):
+            led = moved, world.motion.places(world.time + self._dt) - world.model.x.to_numpy()[moved]
+        self._detections[0].find(world.time, self._dt, led)
+        return self._detections[0]
 
     def stress(self, body: str) -> np.ndarray:
         """Cauchy stress per tet (m,3,3) [Pa]; not finite in a flat one."""

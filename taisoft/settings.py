@@ -18,6 +18,7 @@ class Settings:
     precision: str
     arch: str
     allow_unstable: bool
+    self_collision: bool
     newton_tolerance: float | None
     linear_tolerance: float | None
 
@@ -62,12 +63,12 @@ def check_settings(
         raise SimulationError(f"integrator {integrator!r} is unknown{hint}: it must be one of {', '.join(INTEGRATORS)}")
     if contact_solver != "auto":
         raise SimulationError(
-            f"contact_solver = {contact_solver!r}: this version models no contact, so it must be 'auto'"
+            f"contact_solver = {contact_solver!r}: this version computes no contact forces, so it must be 'auto'"
         )
-    if self_collision is not False:
-        raise SimulationError("self_collision must be False: this version models no contact")
+    if not isinstance(self_collision, bool):
+        raise SimulationError(f"self_collision = {self_collision!r}: it must be True or False")
     if contact_tolerance is not None:
-        raise SimulationError("contact_tolerance must be None: this version models no contact")
+        raise SimulationError("contact_tolerance must be None: this version computes no contact forces")
     if not isinstance(allow_unstable, bool):
         raise SimulationError(f"allow_unstable = {allow_unstable!r}: it must be True or False")
     _check_tolerance("newton_tolerance", newton_tolerance)
@@ -76,4 +77,4 @@ def check_settings(
         raise SimulationError(f"precision {precision!r} is unknown: it must be 'f32' or 'f64'")
     if arch not in ("cpu", "cuda"):
         raise SimulationError(f"arch {arch!r} is unknown: it must be 'cpu' or 'cuda'")
-    return Settings(check_dt(dt), integrator, precision, arch, allow_unstable, newton_tolerance, linear_tolerance)
+    return Settings(check_dt(dt), integrator, precision, arch, allow_unstable, self_collision, newton_tolerance, linear_tolerance)

@@ -5,7 +5,9 @@ import weakref
 
 from taisoft import runtime
 from taisoft.access import StateAccess
+from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import measure
+from taisoft.errors import SimulationError
 from taisoft.model import build_model
 from taisoft.records import RunReport, StepReport
 from taisoft.running import run
@@ -18,8 +20,10 @@ from taisoft.stepping.motion import Motion
 from taisoft.stepping.world import World
 
 
-def _release(arena: runtime.FieldArena, claim: runtime.Runtime) -> None:
+def _release(arena: runtime.FieldArena, claim: runtime.Runtime, detections: list[Detection]) -> None:
     """Give memory and runtime back; also when a simulator is dropped without `close`."""
+    while detections:
+        detections.pop().release()
     arena.release()
     claim.close()
 
@@ -46,13 +50,14 @@ class Simulator(StateAccess):
         scene = self.scene
         self._dt = self.settings.dt
         self._stable_dt: float | None = None
+        self._detections = []
         self._tangent = None  # fields of force_differential, once asked for
         if self.settings.explicit:
             self._check_stability(self._dt)
         for text in scale_warnings(scene):
             warnings.warn(text, UserWarning, stacklevel=2)
         scheme = SCHEMES.get(integrator)
-        self.plan = make_plan(scene, self.settings.explicit, scheme is not None and scheme.before > 0.0)
+        self.plan = make_plan(scene, self.settings.explicit, scheme is not None and scheme.before > 0.0, self_collision)
         self._runtime = runtime.open_runtime(arch, precision, f"the simulator of {[b.name for b in scene.bodies]}")
         self._compiled_before = runtime.compile_clock()
         self._arena = runtime.FieldArena()
@@ -62,12 +67,12 @@ class Simulator(StateAccess):
             self._stepper = make_stepper(self._world, integrator)
             self.reset()
         except BaseException:
-            _release(self._arena, self._runtime)
+            _release(self._arena, self._runtime, self._detections)
             raise
         if not self.settings.explicit:
             self._stepper.tolerance = newton_tolerance or self._stepper.tolerance
             self._stepper.linear_tolerance = linear_tolerance
-        self._release = weakref.finalize(self, _release, self._arena, self._runtime)
+        self._release = weakref.finalize(self, _release, self._arena, self._runtime, self._detections)
 
     # --- stepping -------------------------------------------------------------------------------------------------
 
@@ -78,6 +83,7 @@ class Simulator(StateAccess):
     def advance(self, n: int) -> StepReport:
         """Up to n steps of dt, at least one: explicit ones in one launch, implicit ones one at a time."""
         world, start = self._open_world(), self.step_count
+        self._refuse_contact_forces()
         if self.settings.explicit:
             result = self._stepper.advance(n, self._dt)
             self._count(result.done)
@@ -99,6 +105,15 @@ class Simulator(StateAccess):
         if report.n_inverted:
             report.problems.append(f"step {world.step_count}: {report.n_inverted} tets are inverted")
         return report
+
+    def _refuse_contact_forces(self) -> None:
+        scene = self._world.scene
+        why = f"obstacle '{scene.obstacles[0].name}'" if scene.obstacles else "self_collision=True"
+        if scene.obstacles or self.settings.self_collision:
+            raise SimulationError(
+                f"this version finds contacts but computes no contact forces, so it cannot step a scene with {why}; "
+                "detect_contacts() gives the contacts of the present state"
+            )
 
     def run(self, seconds: float, on_frame=None, fps: float | None = 60, stop=None) -> RunReport:
         """Run for some seconds; see `taisoft.running.run`."""

@@ -52,7 +52,8 @@ def test_result_holds_path_times_timing_and_settings():
     assert r["path"].shape == (21, 3) and np.allclose(r["t"], np.arange(21) * 0.01)
     assert np.allclose(r["path"][0], [2, 0, 0])
     assert r["step_timing"].repeats == 40 and r["seconds_per_step"] == r["step_timing"].median
-    assert r["seconds_per_simulated_second"] == pytest.approx(100 * r["seconds_per_step"], rel=1)
+    step = r["step_timing"]  # of 10 ms; a mean lies between the extremes, whatever else the machine does
+    assert 99 * step.minimum < r["seconds_per_simulated_second"] < 101 * step.maximum
     assert r["settings"]["integrator"] == "mjINT_DISCRETE" and r["settings"]["timestep"] == 0.01
 
 

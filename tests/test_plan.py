@@ -41,13 +41,20 @@ def test_reasons():
         "assembled_stiffness": (False, "explicit steps need forces only"),
         "past_states": (False, "a one-step integrator"),
         "inversion_handling": (False, entries["inversion_handling"][1]),
+        "obstacles": (False, "the scene has none"),
+        "distance_fields": (False, "every body is hit by proximity"),
+        "proximity": (True, "hits beam (sharp edges), block (sharp edges), tower (sharp edges) and 1 more"),
+        "self_collision": (False, "not asked for"),
     }
     assert plan.on["loads"] is True and plan.on["moving_nodes"] is False
 
 
 def test_every_feature_can_be_on_and_off():
     off = make_plan(bare(), explicit=True, multistep=False).on
-    on = make_plan(driven_scene(order=2, mass_damping=1.0, stiffness_damping=1.0), explicit=False, multistep=True).on
+    full = driven_scene(order=2, mass_damping=1.0, stiffness_damping=1.0)
+    full.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
+    full.body("beam").collision = "distance_field"
+    on = make_plan(full, explicit=False, multistep=True, self_collision=True).on
     laws = {name for name in on if name.startswith("law:")}
     assert {name for name in on if not on[name]} < laws and {name for name in off if off[name]} < laws
 
@@ -69,6 +76,44 @@ def test_many_names_are_cut_short():
         scene.add_body(cube(), rubber())
     entries = {e["feature"]: e["why"] for e in make_plan(scene, explicit=True, multistep=False).entries}
     assert entries["law:stable_neo_hookean"] == "used by body0, body1, body2 and 3 more"
+
+
+def contact_plan(bodies=(), obstacles=(), self_collision=False) -> dict[str, tuple[bool, str]]:
+    """feature -> (on, why) of what finds contacts; bodies: pairs of a name and what they ask to be hit by."""
+    scene = ts.Scene()
+    for name, collision in bodies:
+        scene.add_body(ts.ball_mesh(1.0, 8), rubber(), name=name, collision=collision)
+    for shape in obstacles:
+        scene.add_obstacle(shape)
+    entries = make_plan(scene, explicit=True, multistep=False, self_collision=self_collision).entries
+    return {e["feature"]: (e["on"], e["why"]) for e in entries[-4:]}
+
+
+def test_contact_geometry_is_there_where_something_can_touch():
+    plane, box = ts.HalfSpace((0, 0, 0), (0, 1, 0)), ts.Box((0, 0, 0), (1, 1, 1))
+    ball = ("ball", "auto")
+    alone = contact_plan([ball])
+    assert not any(on for on, _ in alone.values())
+    assert alone["distance_fields"] == alone["proximity"] == (False, "no triangles can hit a body")
+    # a half-space has no triangles: the body's triangles hit the half-space, nothing hits the body
+    grounded = contact_plan([ball], [plane, ts.Sphere((0, 0, 0), 1), ts.Capsule((0, 0, 0), (1, 0, 0), 1)])
+    assert grounded["obstacles"] == (True, "obstacle0, obstacle1, obstacle2")
+    assert not grounded["distance_fields"][0] and not grounded["proximity"][0]
+    boxed = contact_plan([ball], [plane, box])
+    assert boxed["distance_fields"] == (True, "hits ball (smooth and not thin)")
+    assert boxed["proximity"] == (False, "every body is hit by its distance field")
+    two = contact_plan([ball, ("told", "proximity")])
+    assert two["distance_fields"] == (True, "hits ball (smooth and not thin)")
+    assert two["proximity"] == (True, "hits told (asked for)")
+
+
+def test_meshes_and_bodies_themselves_are_hit_by_proximity():
+    vertices, triangles = ts.Box((0, 0, 0), (1, 1, 1)).surface()
+    meshed = contact_plan([("ball", "auto")], [ts.MeshObstacle(vertices, triangles)])
+    assert meshed["proximity"] == (True, "hits obstacle0 (triangles)") and meshed["distance_fields"][0]
+    itself = contact_plan([("ball", "auto")], self_collision=True)
+    assert itself["proximity"] == (True, "hits every body (itself)") and itself["self_collision"] == (True, "asked for")
+    assert itself["distance_fields"] == (False, "no triangles can hit a body")
 
 
 @pytest.mark.parametrize("integrator", [*EXPLICIT, "implicit_euler", "bdf2"])

@@ -146,6 +146,8 @@ def test_a_free_default_name_is_found(scene):
         ({"velocity": "fast"}, "velocity must be numbers"),
         ({"mesh": MESH.vertices}, "mesh must be a TetMesh, not ndarray"),
         ({"material": {"young": 1e6}}, "material must be a Material, not dict"),
+        ({"collision": "distance"}, "'b': collision must be one of auto, distance_field, proximity, not 'distance'; did you"),
+        ({"collision": None}, "'b': collision must be one of"),
     ],
 )
 def test_bodies_outside_the_rules(scene, body, options, rule):

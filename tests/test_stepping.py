@@ -3,7 +3,7 @@ driven bodies are quadratic, for Verlet linear, for implicit steps both, since t
 both kinds:
 
 * every integrator's positions, velocities and reactions, step by step, in f64; symplectic Euler also of the mixture;
-* f32 follows to its rounding, and so do the parallel kernels, whose result does not depend on the run;
+* so do those of the parallel kernels, whose result does not depend on the run;
 * a batch of explicit steps is bitwise so many single steps, and two runs from the start are bitwise alike;
 * loads, weight and reactions make the rate of momentum; a free body falls exactly, and keeps its momentum without gravity;
 * the implicit residual is the gradient of the objective that decides how far to go;
@@ -14,6 +14,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from following import DT, follow, simulator
 from oracle import Oracle
 from scenes import driven_scene, mixed_scene
 
@@ -21,7 +22,6 @@ import taisoft as ts
 from taisoft import stepping
 from taisoft.stepping import SCHEMES
 
-DT = 0.002  # [s]; the release falls between the fourth step and the fifth
 DAMPED = {"mass_damping": 3.0, "stiffness_damping": 0.004}
 EXPLICIT = ("symplectic_euler", "velocity_verlet")
 FALL = {  # after n steps from rest, in units of g dt^2; BDF2's first step is one of implicit Euler, whose error goes on
@@ -33,38 +33,6 @@ FALL = {  # after n steps from rest, in units of g dt^2; BDF2's first step is on
     "bdf2": lambda n: n * n / 2 + 0.75 * (1 - 3.0**-n),
 }
 ANGULAR = ("symplectic_euler", "velocity_verlet", "implicit_midpoint")  # conserve the angular momentum
-
-
-def simulator(scene, integrator, precision="f64", **settings):
-    return ts.Simulator(scene, dt=DT, integrator=integrator, precision=precision, **settings)
-
-
-def follow(sim, method: str, steps: int, relative: float) -> Oracle:
-    """Step sim and the oracle side by side from the start; compare them after every step. Returns the oracle."""
-    sim.reset()
-    oracle = Oracle(sim.scene)
-    for _ in range(steps):
-        sim.step()
-        getattr(oracle, method)(DT)
-        assert sim.time == pytest.approx(oracle.time, rel=1e-14)
-        assert np.abs(sim.positions() - oracle.x).max() < relative * 1e-2  # [m] a hundredth is about how far things move
-        assert np.abs(sim.velocities() - oracle.v).max() < relative * np.abs(oracle.v).max()
-        assert np.abs(oracle.reactions).max() > 100.0  # [N]
-        assert np.abs(sim.reactions() - oracle.reactions).max() < relative * np.abs(oracle.reactions).max()
-    return oracle
-
-
-@pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_euler"])
-def test_single_precision_follows(integrator):
-    """First of all, since the simulators below keep the process in f64.
-
-    Positions are f64; velocities and forces are rounded to 6e-8, and a strain's rounding makes forces of 0.01 N.
-    """
-    scene, settings = driven_scene(mass_damping=3.0, order=2), {}
-    if integrator == "implicit_euler":
-        settings = {"newton_tolerance": 1e-7, "linear_tolerance": 1e-6}
-    with simulator(scene, integrator, "f32", **settings) as sim:
-        follow(sim, integrator, 9, 2e-5)
 
 
 @pytest.fixture(scope="module", params=EXPLICIT)

@@ -18,3 +18,9 @@ def mean_ratio(lengths: np.ndarray, volumes: np.ndarray) -> np.ndarray:
     Source: Liu, Joe 1994, Relationship between tetrahedron shape measures, BIT 34.
     """
     return 12.0 * np.cbrt(3.0 * volumes) ** 2 / (lengths**2).sum(axis=1)
+
+
+def mean_surface_edge(surfaces: list[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Mean length [m] of the edges of all triangles of the surfaces, each vertices (n,3) [m] and triangles (t,3)."""
+    lengths = [np.linalg.norm(x[t] - x[np.roll(t, -1, axis=1)], axis=2).reshape(-1) for x, t in surfaces]
+    return float(np.concatenate(lengths).mean())

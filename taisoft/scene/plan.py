@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from taisoft.scene.obstacles import MeshObstacle
 from taisoft.scene.scene import LAWS, Scene
 
 
@@ -25,8 +26,8 @@ def _named(names: list[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def make_plan(scene: Scene, explicit: bool, multistep: bool) -> Plan:
-    """Decide from the scene and the kind of integrator."""
+def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: bool = False) -> Plan:
+    """Decide from the scene, the kind of integrator, and whether bodies may touch themselves."""
     plan = Plan()
     laws = {name: [b.name for b in scene.bodies if b.material.law == name] for name in LAWS}
     for law, names in laws.items():
@@ -63,4 +64,25 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool) -> Plan:
         "inversion_handling", not explicit, "the stiffness of tets with negative curvature is projected when a solve meets it",
         "explicit steps need forces only, which every law gives for inverted tets too",
     )  # fmt: skip
+    _add_collision(plan, scene, self_collision)
     return plan
+
+
+def _add_collision(plan: Plan, scene: Scene, self_collision: bool) -> None:
+    """Decide how contacts are found: a body counts only where another collider has triangles that could hit it."""
+    obstacles = scene.obstacles
+    plan.add("obstacles", bool(obstacles), _named([o.name for o in obstacles]), "the scene has none")
+    with_triangles = len(scene.bodies) + sum(o.shape.surface() is not None for o in obstacles)
+    hit = scene.bodies if with_triangles > 1 else []
+    modes: dict[str, list[str]] = {"distance_field": [], "proximity": []}
+    for body in hit:
+        mode, why = body.collision_choice
+        modes[mode].append(f"{body.name} ({why})")
+    modes["proximity"] += [f"{o.name} (triangles)" for o in obstacles if isinstance(o.shape, MeshObstacle) and scene.bodies]
+    if self_collision:
+        modes["proximity"].append("every body (itself)")
+    idle = "no triangles can hit a body" if not hit else "every body is hit by "
+    fields, near = modes["distance_field"], modes["proximity"]
+    plan.add("distance_fields", bool(fields), f"hits {_named(fields)}", idle + ("proximity" if hit else ""))
+    plan.add("proximity", bool(near), f"hits {_named(near)}", idle + ("its distance field" if hit else ""))
+    plan.add("self_collision", self_collision, "asked for", "not asked for")

@@ -1,192 +1,41 @@
-"""A scene as plain data: bodies of tetrahedra, what they are made of, what holds, moves and loads them.
+"""A scene as plain data: elastic bodies, obstacles, gravity, and what counts where two surfaces meet.
 
 Everything is checked and turned into arrays at the call that adds it, so that a scene that exists can be simulated.
 """
 
 import copy
 import difflib
-import warnings
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from taisoft.errors import SceneError
-from taisoft.mesh.nodes import Nodes, make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
+from taisoft.scene.body import Body, Constraint, NodalForce, Traction
+from taisoft.scene.collision import CollisionSettings
 from taisoft.scene.material import LAWS, Material
+from taisoft.scene.obstacles import Obstacle, Shape, surface_numbers
 
 __all__ = ["LAWS", "Body", "Constraint", "Material", "NodalForce", "Scene", "Traction"]
 
-NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock: they bend far too little
-QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # of polynomials integrated exactly, by order; the first is the default
-_FREE, _FIXED, _MOVED = 0, 1, 2
-
-
-@dataclass(frozen=True, eq=False)
-class Constraint:
-    """Nodes held along some axes: at their start, or at their start plus a displacement that depends on time."""
-
-    nodes: np.ndarray  # (k,) int64 node ids
-    axes: np.ndarray  # (3,) bool
-    path: Callable | None = None  # t [s] -> displacement (3,) or (k,3) [m], None once released; no path: they stay
-
-
-@dataclass(frozen=True, eq=False)
-class Traction:
-    """A dead load on surface triangles."""
-
-    triangles: np.ndarray  # (k,) int64 rows of mesh.surface
-    value: np.ndarray  # (3,) force per reference area [Pa]
-
-
-@dataclass(frozen=True, eq=False)
-class NodalForce:
-    """A dead load on nodes: a total spread over them by their lumped mass, or one force for each."""
-
-    nodes: np.ndarray  # (k,) int64 node ids
-    value: np.ndarray  # (3,) total force, or (k,3) one a node [N]
-
-
-class Body:
-    """One elastic body of a scene; made by `Scene.add_body`.
-
-    name, mesh, material. position: (3,) [m], where the body starts: its nodes begin at rest_positions + position.
-    velocity: (3,) or (n,3) [m/s], of the start. order: 1 or 2, of the elements' shape functions; quadrature_degree: of
-    polynomials that their quadrature integrates exactly. nodes: `Nodes`, the mesh's vertices and for order 2 the middles
-    of its edges. constraints, tractions, forces: lists of `Constraint`, `Traction`, `NodalForce`. A Poisson's ratio above
-    0.49 is told with a UserWarning for order 1, whose tets are far too stiff there.
-    """
-
-    def __init__(
-        self, name: str, mesh: TetMesh, material: Material, position, velocity, order: int, quadrature_degree: int | None
-    ):  # fmt: skip
-        what = f"body {name!r}"
-        if not isinstance(mesh, TetMesh):
-            raise SceneError(f"{what}: mesh must be a TetMesh, not {type(mesh).__name__}")
-        if not isinstance(material, Material):
-            raise SceneError(f"{what}: material must be a Material, not {type(material).__name__}")
-        self.name = name
-        self.mesh = mesh
-        self.material = material
-        self.order = checks.whole(order, f"{what}: order", tuple(QUADRATURE_DEGREES))
-        degrees = QUADRATURE_DEGREES[self.order]
-        degree = degrees[0] if quadrature_degree is None else quadrature_degree
-        self.quadrature_degree = checks.whole(degree, f"{what}: quadrature_degree of order {self.order}", degrees)
-        self.tell_locking()
-        self.nodes: Nodes = make_nodes(mesh, self.order)
-        self.position = checks.array(position, f"{what}: position", ((3,),))
-        self.velocity = checks.array(velocity, f"{what}: velocity", ((3,), (self.n_nodes, 3)))
-        self.constraints: list[Constraint] = []
-        self.tractions: list[Traction] = []
-        self.forces: list[NodalForce] = []
-        self._held = np.full((self.n_nodes, 3), _FREE, dtype=np.int8)  # what holds each node along each axis
-
-    @property
-    def rest_positions(self) -> np.ndarray:
-        """(n,3) [m], read-only: the nodes where the body is free of stress; the mesh's vertices come first."""
-        return self.nodes.positions
-
-    @property
-    def n_nodes(self) -> int:
-        """Number of nodes."""
-        return len(self.nodes.positions)
-
-    def __repr__(self) -> str:
-        kind = f"{self.mesh.n_tets} tets of order {self.order}"
-        return f"Body({self.name!r}, {self.n_nodes} nodes, {kind}, {self.material.law})"
-
-    def tell_locking(self) -> None:
-        """Warn of linear tets where they lock."""
-        poisson = self.material.poisson
-        if self.order == 1 and poisson > NEARLY_INCOMPRESSIBLE:
-            warnings.warn(
-                f"body {self.name!r}: poisson = {poisson:g} is above {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend "
-                "far too little: order=2 locks less",
-                UserWarning, stacklevel=5,
-            )  # fmt: skip
-
-    def fix(self, where, axes: str = "xyz") -> Constraint:
-        """Hold nodes where they start.
-
-        where: node ids, a bool mask (n,), or a callable that gets the rest positions (n,3) and returns such a mask.
-        axes: the directions held, such as "y" or "xz". Raises SceneError when no node is chosen or one is moved.
-        """
-        what = f"body {self.name!r}: fix"
-        nodes = checks.selection(where, self.rest_positions, what, "node")
-        return self._hold(Constraint(nodes, checks.axes(axes, what)), _FIXED, what)
-
-    def move(self, where, path: Callable, axes: str = "xyz") -> Constraint:
-        """Lead nodes along a path.
-
-        where: as for `fix`, but no id twice. path: callable t [s] -> displacement from the start, (3,) or (k,3) in the
-        order of the chosen nodes [m], or None from the moment they are released; it is called once here, for t = 0.
-        axes: the directions led. Raises SceneError when no node is chosen, one is held already, or the path is not of
-        this kind.
-        """
-        what = f"body {self.name!r}: move"
-        nodes = checks.selection(where, self.rest_positions, what, "node", repeats=False)
-        mask = checks.axes(axes, what)
-        if not callable(path):
-            raise SceneError(f"{what}: path must be a function of time, not {path!r}")
-        try:
-            start = path(0.0)
-        except Exception as error:
-            raise SceneError(f"{what}: the path failed at t = 0: {type(error).__name__}: {error}") from error
-        if start is None:
-            raise SceneError(f"{what}: the path must give a displacement at t = 0, not None")
-        checks.array(start, f"{what}: the path's displacement at t = 0", ((3,), (len(nodes), 3)))
-        return self._hold(Constraint(nodes, mask, path), _MOVED, what)
-
-    def add_traction(self, where, traction) -> Traction:
-        """Load surface triangles with a dead force per reference area.
-
-        where: rows of mesh.surface, a bool mask (t,), or a callable that gets the triangles' centroids at rest (t,3)
-        and returns such a mask. traction: (3,) [Pa]. Raises SceneError when no triangle is chosen or a number is not
-        finite.
-        """
-        what = f"body {self.name!r}: add_traction"
-        centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
-        triangles = checks.selection(where, centroids, what, "surface triangle")
-        load = Traction(triangles, checks.array(traction, f"{what}: traction", ((3,),)))
-        self.tractions.append(load)
-        return load
-
-    def add_force(self, where, force) -> NodalForce:
-        """Load nodes with a total dead force, spread over them by lumped mass, or with one force for each node.
-
-        where: as for `fix`; a node chosen twice counts once. force: (3,) the total, or (k,3) in the order of the chosen
-        nodes [N]. Raises SceneError when no node is chosen or numbers are not finite.
-        """
-        what = f"body {self.name!r}: add_force"
-        nodes = checks.selection(where, self.rest_positions, what, "node")
-        load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,), (len(nodes), 3))))
-        self.forces.append(load)
-        return load
-
-    def _hold(self, constraint: Constraint, kind: int, what: str) -> Constraint:
-        """Add a constraint unless it contradicts an earlier one: only two fixes of one node and axis agree."""
-        at = np.ix_(constraint.nodes, np.flatnonzero(constraint.axes))
-        before = self._held[at]
-        clash = np.argwhere((before != _FREE) if kind == _MOVED else (before == _MOVED))
-        if len(clash):
-            row, column = clash[0]
-            axis = "xyz"[np.flatnonzero(constraint.axes)[column]]
-            done = "fixed" if before[row, column] == _FIXED else "moved"
-            raise SceneError(f"{what}: node {constraint.nodes[row]} is already {done} along {axis}")
-        self._held[at] = kind
-        self.constraints.append(constraint)
-        return constraint
-
 
 class Scene:
-    """What is simulated: gravity and bodies. SI units, y up."""
+    """What is simulated: gravity, bodies and obstacles. SI units, y up.
+
+    contact_pairs: {frozenset of two names, or of one for a body with itself: (friction, restitution)}, each a number or
+    None where the default of `contact_numbers` holds.
+    """
 
     def __init__(self, gravity=(0.0, -9.81, 0.0)):
         """gravity: (3,) [m/s^2]. Raises SceneError unless it is three finite numbers."""
         self.gravity = gravity
         self.bodies: list[Body] = []
+        self.obstacles: list[Obstacle] = []
+        self.contact_pairs: dict[frozenset[str], tuple[float | None, float | None]] = {}
+        self.collision = CollisionSettings()
+        self.allow_initial_overlap = False
 
     @property
     def gravity(self) -> np.ndarray:
@@ -197,17 +46,49 @@ class Scene:
     def gravity(self, value) -> None:
         self._gravity = checks.array(value, "scene: gravity", ((3,),))
 
+    @property
+    def collision(self) -> CollisionSettings:
+        """How contacts are looked for."""
+        return self._collision
+
+    @collision.setter
+    def collision(self, value: CollisionSettings) -> None:
+        if not isinstance(value, CollisionSettings):
+            raise SceneError(f"scene: collision must be CollisionSettings, not {type(value).__name__}")
+        self._collision = value
+
+    @property
+    def allow_initial_overlap(self) -> bool:
+        """Whether a start with bodies inside one another is simulated instead of refused."""
+        return self._allow_initial_overlap
+
+    @allow_initial_overlap.setter
+    def allow_initial_overlap(self, value: bool) -> None:
+        if not isinstance(value, (bool, np.bool_)):
+            raise SceneError(f"scene: allow_initial_overlap must be True or False, not {value!r}")
+        self._allow_initial_overlap = bool(value)
+
+    @property
+    def colliders(self) -> list[Body | Obstacle]:
+        """Bodies, then obstacles, each in the order added: what numbers in contacts count."""
+        return [*self.bodies, *self.obstacles]
+
     def __repr__(self) -> str:
-        return f"Scene(gravity={tuple(self.gravity.tolist())}, bodies={[body.name for body in self.bodies]})"
+        names = f"bodies={[body.name for body in self.bodies]}"
+        if self.obstacles:
+            names += f", obstacles={[obstacle.name for obstacle in self.obstacles]}"
+        return f"Scene(gravity={tuple(self.gravity.tolist())}, {names})"
 
     def snapshot(self) -> "Scene":
-        """A copy whose bodies, materials, constraints and loads can change apart from this one's; meshes are shared."""
+        """A copy whose bodies, materials, constraints, loads and pairs can change apart from this one's; meshes are shared."""
         twin = Scene(self.gravity)
         for body in self.bodies:
             other = copy.copy(body)
             other.constraints, other.tractions, other.forces = list(body.constraints), list(body.tractions), list(body.forces)
             other._held = body._held.copy()
             twin.bodies.append(other)
+        twin.obstacles, twin.contact_pairs = list(self.obstacles), dict(self.contact_pairs)
+        twin.collision, twin.allow_initial_overlap = self.collision, self.allow_initial_overlap
         return twin
 
     def add_body(
@@ -219,27 +100,95 @@ class Scene:
         velocity=(0.0, 0.0, 0.0),
         order: int = 1,
         quadrature_degree: int | None = None,
+        collision: str = "auto",
     ) -> Body:
         """Add a body and return it.
 
         mesh: its shape at rest. name: unique, "body0" and so on where left out. position: (3,) [m], shift of the start.
         velocity: (3,) for all nodes or (n,3) [m/s]. order: 1, linear tets, or 2, quadratic ones with nodes in the middle of
-        every edge. quadrature_degree: None for the default, for order 2 four points (2) or fourteen (4). Raises SceneError.
+        every edge. quadrature_degree: None for the default, for order 2 four points (2) or fourteen (4). collision: by what
+        others hit it, "distance_field", "proximity", or "auto" for what fits its shape. Raises SceneError.
         """
-        taken = [body.name for body in self.bodies]
-        if name is None:
-            name = next(free for free in (f"body{i}" for i in range(len(taken) + 1)) if free not in taken)
-        name = checks.name(name, "scene: body name", taken)
-        body = Body(name, mesh, material, position, velocity, order, quadrature_degree)
+        name = self._free_name(name, "body")
+        body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision)
         self.bodies.append(body)
         return body
 
+    def add_obstacle(
+        self, shape: Shape, name: str | None = None, friction: float = 0.5, restitution: float = 0.0, path: Callable | None = None
+    ) -> Obstacle:
+        """Add an obstacle and return it.
+
+        shape: HalfSpace, Sphere, Box, Capsule or MeshObstacle. name: unique, "obstacle0" and so on where left out. path:
+        callable t [s] -> (translation (3,) [m], rotation (3,3) about the shape's pivot); it is called once here, for t = 0.
+        Raises SceneError.
+        """
+        obstacle = Obstacle(shape, self._free_name(name, "obstacle"), friction, restitution, path)
+        self.obstacles.append(obstacle)
+        return obstacle
+
     def body(self, name: str) -> Body:
         """The body of that name. Raises SceneError where there is none."""
-        for body in self.bodies:
-            if body.name == name:
-                return body
-        names = [body.name for body in self.bodies]
-        near = difflib.get_close_matches(name, names, n=1) if isinstance(name, str) else []
-        hint = f"; did you mean {near[0]!r}?" if near else f"; there are {names}" if names else "; the scene is empty"
-        raise SceneError(f"scene: no body is called {name!r}{hint}")
+        return _found(self.bodies, name, "body")
+
+    def obstacle(self, name: str) -> Obstacle:
+        """The obstacle of that name. Raises SceneError where there is none."""
+        return _found(self.obstacles, name, "obstacle")
+
+    def set_contact(
+        self, name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None
+    ) -> None:
+        """Set what counts between two bodies, a body and an obstacle, or a body and itself (its name twice).
+
+        A number left out stays as it was. Raises SceneError for names that do not exist, two obstacles, numbers outside
+        the rules, or no number at all.
+        """
+        pair = self._pair(name_a, name_b)
+        what = f"scene: contact of {name_a!r} and {name_b!r}"
+        if friction is None and restitution is None:
+            raise SceneError(f"{what}: give friction or restitution")
+        before = self.contact_pairs.get(pair, (None, None))
+        given = surface_numbers(
+            0.0 if friction is None else friction, 0.0 if restitution is None else restitution, what
+        )
+        asked = (friction is not None, restitution is not None)
+        self.contact_pairs[pair] = tuple(new if use else old for new, use, old in zip(given, asked, before))
+
+    def contact_numbers(self, name_a: str, name_b: str) -> tuple[float, float]:
+        """(friction, restitution) between two: as set, else the frictions' geometric mean and the larger restitution."""
+        friction, restitution = self.contact_pairs.get(self._pair(name_a, name_b), (None, None))
+        a, b = self._surface(name_a), self._surface(name_b)
+        return (
+            math.sqrt(a.friction * b.friction) if friction is None else friction,
+            max(a.restitution, b.restitution) if restitution is None else restitution,
+        )
+
+    def _pair(self, name_a: str, name_b: str) -> frozenset[str]:
+        """The key of a pair that can touch, or SceneError."""
+        found = [_found(self.colliders, name, "body or obstacle") for name in (name_a, name_b)]
+        if not any(isinstance(one, Body) for one in found):
+            raise SceneError(f"scene: contact of {name_a!r} and {name_b!r}: one of the two must be a body")
+        return frozenset((name_a, name_b))
+
+    def _surface(self, name: str) -> Material | Obstacle:
+        """The record that holds a collider's own friction and restitution."""
+        one = _found(self.colliders, name, "body or obstacle")
+        return one.material if isinstance(one, Body) else one
+
+    def _free_name(self, name: str | None, kind: str) -> str:
+        """The name, or where it is None the first free one of its kind; SceneError where it is taken."""
+        taken = [one.name for one in self.colliders]
+        if name is None:
+            name = next(free for free in (f"{kind}{i}" for i in range(len(taken) + 1)) if free not in taken)
+        return checks.name(name, f"scene: {kind} name", taken)
+
+
+def _found(items: list, name: str, kind: str) -> Body | Obstacle:
+    """The item of that name. Raises SceneError, with the nearest name, where there is none."""
+    for item in items:
+        if item.name == name:
+            return item
+    names = [item.name for item in items]
+    near = difflib.get_close_matches(name, names, n=1) if isinstance(name, str) else []
+    hint = f"; did you mean {near[0]!r}?" if near else f"; there are {names}" if names else "; the scene has none"
+    raise SceneError(f"scene: no {kind} is called {name!r}{hint}")

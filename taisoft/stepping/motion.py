@@ -91,6 +91,15 @@ class Motion:
                 return rows[:r], True
         return rows, False
 
+    def places(self, t: float) -> np.ndarray:
+        """Positions (n_moved, 3) of the led nodes at a time [m], nan on axes that are free or let go by then."""
+        places = np.full((self.n_moved, 3), np.nan)
+        for g in self._groups:
+            way = None if g.released else self._ask(g, t)
+            if way is not None:
+                places[g.rows] = np.where(g.constraint.axes, self._rest[g.nodes] + way, np.nan)
+        return places
+
     def accelerations(self, start: float, dt: float, middle: bool) -> np.ndarray:
         """Accelerations (n_moved, 3) [m/s^2] of the led nodes over the step from start [s]: at its middle, or at its end.
 

@@ -1,0 +1,275 @@
+"""What `collision.py` measures: searches for contacts phase by phase, frame by frame, broad phases and reductions beside others.
+
+A search's phases are timed between synchronisations, in one round after another; the first search of a configuration, which
+compiles the kernels and lets the buffers grow, is told apart.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+import taichi as ti
+
+import taisoft as ts
+from taisoft.collision.bvh import Bvh
+from taisoft.collision.pipeline import Detection
+from taisoft.collision.spatial_hash import SpatialHash
+from taisoft.collision.surface import find_active, move_soft, update_boxes
+from taisoft.model import build_model
+from taisoft.runtime import FieldArena, Runtime, compile_clock
+from taisoft.scene.plan import make_plan
+
+from .collision_cases import FPS, FRAMES, Setup, start
+from .collision_quadratic import Quadratic
+from .timing import Timing, summarise
+
+PHASES = ("boxes", "candidates", "contacts", "reduction")
+GEOMETRIES = ("proximity", "distance_field")
+HASH, TREES = "spatial_hash", ("bvh 6", "bvh 14", "bvh 18")
+DT = 1 / FPS
+ROUNDS, QUICK_ROUNDS = 15, 2
+ENOUGH_SECONDS = 3.0  # of rounds: slow searches are repeated less often
+FRAME_ROUNDS = 3
+
+
+@dataclass
+class Row:
+    """A configuration's search. phases, whole, quadratic: wall seconds of each round; first: of the first search, compiling
+    included. same: whether the quadratic reduction kept the same contacts."""
+
+    setup: str
+    geometry: str
+    tets: int
+    triangles: int = 0
+    active: int = 0
+    pairs: int = 0
+    found: int = 0
+    contacts: int = 0
+    phases: dict[str, list[float]] = field(default_factory=dict)
+    whole: list[float] = field(default_factory=list)
+    quadratic: list[float] = field(default_factory=list)
+    same: bool | None = None
+    first: float = 0.0
+    compile_seconds: float = 0.0
+    field_bytes: int = 0
+    failure: str = ""
+
+    @property
+    def timing(self) -> Timing | None:
+        """Of a whole search [s]; None where it failed."""
+        return summarise(self.whole) if self.whole else None
+
+    def phase(self, name: str) -> float:
+        """Median of a phase [s]."""
+        return float(np.median(self.phases[name]))
+
+    def record(self) -> dict:
+        """As plain data."""
+        return asdict(self) | {"seconds": self.timing and asdict(self.timing)}
+
+
+@dataclass
+class Film:
+    """A configuration in motion: a list over frames of each number; times are medians over FRAME_ROUNDS [s].
+
+    same: whether the quadratic reduction kept the same contacts in every frame.
+    """
+
+    setup: str
+    geometry: str
+    tets: int
+    same: bool = True
+    numbers: dict[str, list] = field(default_factory=dict)
+
+    def add(self, **numbers) -> None:
+        """A frame."""
+        for name, value in numbers.items():
+            self.numbers.setdefault(name, []).append(value)
+
+    def record(self) -> dict:
+        """As plain data."""
+        return asdict(self)
+
+
+@dataclass
+class Sweep:
+    """Times [s] of broad phases, rounds for each; `at` is what is swept: tets, or the cell's edge over the mean edge."""
+
+    what: str
+    setup: str
+    at: float
+    tets: int
+    triangles: int
+    pairs: dict[str, int] = field(default_factory=dict)
+    rounds: dict[str, list[float]] = field(default_factory=dict)
+
+    def median(self, name: str) -> float:
+        """Of one broad phase [s]."""
+        return float(np.median(self.rounds[name]))
+
+    def record(self) -> dict:
+        """As plain data."""
+        return asdict(self)
+
+
+def clock() -> float:
+    """Now [s], when the machine has done all it was told."""
+    ti.sync()
+    return time.perf_counter()
+
+
+def repeated(call: Callable[[], object], rounds: int) -> list[float]:
+    """Wall seconds of calls, fewer of slow ones; what should be warm must be warmed before."""
+    seconds: list[float] = []
+    while len(seconds) < rounds and (len(seconds) < 2 or sum(seconds) < ENOUGH_SECONDS):
+        begin = clock()
+        call()
+        seconds.append(clock() - begin)
+    return seconds
+
+
+class Rig:
+    """A configuration's model and detection, with the phases of a search apart; closed by `with`."""
+
+    def __init__(self, setup: Setup, geometry: str, runtime: Runtime):
+        self.setup, self.geometry, self.runtime = setup, geometry, runtime
+        self.scene = setup.build(geometry)
+        self._arena, self._others, self._quadratic = FieldArena(), [], None
+        self.model, layout = build_model(
+            self.scene, runtime, self._arena, make_plan(self.scene, explicit=True, multistep=False).on
+        )
+        self.detection = Detection(self.scene, self.model, layout, runtime)
+        self.tets = sum(body.mesh.n_tets for body in self.scene.bodies)
+
+    def __enter__(self) -> "Rig":
+        return self
+
+    def __exit__(self, *error) -> None:
+        for part in self._others:
+            part.release()
+        self.detection.release()
+        self._arena.release()
+
+    def place(self, share: float) -> None:
+        """Put the nodes where the motion has them, `share` of the film done."""
+        x = start(self.scene) if self.setup.motion is None else self.setup.motion(self.scene, share)
+        self.model.x.from_numpy(x)
+
+    def search(self) -> None:
+        """A whole search."""
+        self.detection.find(0.0, DT)
+
+    def phases(self) -> dict[str, float]:
+        """The same search in its phases: wall seconds of each. The buffers must have grown before."""
+        d, times = self.detection, [clock()]
+        move_soft(d.surface, self.model.x, self.model.v, DT)
+        update_boxes(d.surface, d.margin)
+        times.append(clock())
+        rows = d._candidates()
+        times.append(clock())
+        d._search(rows)
+        times.append(clock())
+        d._reduce()
+        times.append(clock())
+        return dict(zip(PHASES, np.diff(times).tolist()))
+
+    def n_pairs(self, broad=None) -> int:
+        """Pairs that a broad phase finds, that of the detection by default."""
+        find_active(self.detection.surface)
+        rows = (broad or self.detection.broad).find()
+        return int((rows.end.to_numpy() - rows.start.to_numpy())[: self.detection.surface.n_triangles].sum()) // 2
+
+    def broad_phase(self, name: str, ratio: float | None = None) -> SpatialHash | Bvh:
+        """A broad phase of this surface: HASH with that ratio of cell to mean edge, or one of TREES."""
+        d, arena = self.detection, FieldArena()
+        x = start(self.scene)[d.topology.node]
+        if name == HASH:
+            ratio = self.scene.collision.cell_ratio if ratio is None else ratio
+            made = SpatialHash(d.surface, arena, ratio * d.edge, np.ptp(x, axis=0))
+        else:
+            made = Bvh(d.surface, d.topology, x, d.margin, self.runtime, arena, int(name.split()[1]))
+        self._others += [made, arena]
+        return made
+
+    def quadratic(self) -> Quadratic:
+        """The quadratic reduction of the last search; the same as before, unless the buffer of contacts has grown."""
+        if self._quadratic is None or not self._quadratic.fits():
+            self._quadratic = Quadratic(self.detection)
+            self._others.append(self._quadratic)
+        return self._quadratic
+
+
+def measure_row(setup: Setup, geometry: str, runtime: Runtime, rounds: int) -> Row:
+    """A configuration's search: what it goes through, and its phases. What fails is told in the row."""
+    row = Row(setup.name, geometry, 0)
+    try:
+        with Rig(setup, geometry, runtime) as rig:
+            row.tets, row.triangles = rig.tets, rig.detection.surface.n_triangles
+            before, begin = compile_clock(), clock()
+            rig.search()
+            row.first, row.compile_seconds = clock() - begin, compile_clock() - before
+            rig.search()
+            counts = rig.detection.counts
+            row.active, row.found, row.contacts, row.pairs = counts.active, counts.found, counts.contacts, rig.n_pairs()
+            row.field_bytes = sum(rig.detection._arena.bytes.values())
+            row.whole = repeated(rig.search, rounds)
+            taken = [rig.phases() for _ in range(len(row.whole))]
+            row.phases = {name: [t[name] for t in taken] for name in PHASES}
+            quadratic = rig.quadratic()
+            quadratic.reduce()
+            row.same, row.quadratic = quadratic.same(), repeated(quadratic.reduce, rounds)
+    except ts.TaisoftError as error:
+        row.failure = str(error)
+    return row
+
+
+def measure_film(setup: Setup, geometry: str, runtime: Runtime, frames: int = FRAMES, broad: bool = False) -> Film:
+    """Every frame's phases, and the quadratic reduction. broad: the broad phases beside each other too."""
+    with Rig(setup, geometry, runtime) as rig:
+        film, others = Film(setup.name, geometry, rig.tets), {}
+        if broad:
+            others = {name: rig.broad_phase(name) for name in (HASH, *TREES)}
+        for k in range(-1, frames):  # the last frame first: it compiles, and buffers grow
+            rig.place(1.0 if k < 0 else k / max(frames - 1, 1))
+            rig.search()
+            quadratic = rig.quadratic()
+            quadratic.reduce()
+            film.same &= quadratic.same()
+            rounds = [rig.phases() for _ in range(FRAME_ROUNDS)]
+            numbers = {name: float(np.median([r[name] for r in rounds])) for name in PHASES}
+            numbers["quadratic"] = float(np.median(repeated(quadratic.reduce, FRAME_ROUNDS)))
+            for name, other in others.items():
+                rig.n_pairs(other)
+                numbers[name] = float(np.median(repeated(lambda other=other: _find(rig, other), FRAME_ROUNDS)))
+            if k >= 0:
+                counts = rig.detection.counts
+                film.add(active=counts.active, found=counts.found, kept=counts.contacts, **numbers)
+    return film
+
+
+def _find(rig: Rig, broad: SpatialHash | Bvh) -> None:
+    find_active(rig.detection.surface)
+    broad.find()
+
+
+def measure_broad(setup: Setup, runtime: Runtime, rounds: int, ratios=None) -> list[Sweep]:
+    """Broad phases of a configuration in the middle of its motion: all of them, or the hash over ratios of cell to edge."""
+    with Rig(setup, "proximity", runtime) as rig:
+        rig.place(0.5)
+        rig.search()
+        size = rig.tets, rig.detection.surface.n_triangles
+        if ratios is None:
+            sweeps = [Sweep("tets", setup.name, rig.tets, *size)]
+            jobs = [(sweeps[0], name, rig.broad_phase(name)) for name in (HASH, *TREES)]
+        else:
+            sweeps = [Sweep("ratio", setup.name, ratio, *size) for ratio in ratios]
+            jobs = [(sweep, HASH, rig.broad_phase(HASH, sweep.at)) for sweep in sweeps]
+        for sweep, name, broad in jobs:
+            sweep.pairs[name] = rig.n_pairs(broad)  # compiles, and lets the buffers grow
+            rig.n_pairs(broad)
+        for _ in range(3):  # in turn, so that a slow moment of the machine falls on all
+            for sweep, name, broad in jobs:
+                some = repeated(lambda broad=broad: _find(rig, broad), max(rounds // 3, 1))
+                sweep.rounds.setdefault(name, []).extend(some)
+    return sweeps

@@ -1,0 +1,253 @@
+"""Candidates by a chunked bounding volume hierarchy of k-DOPs: what the report compares the spatial hash with.
+
+Each collider has a tree over its triangles, built once (`trees.py`). A chunk is a subtree of at most `leaves` triangles. Every
+search refits the slabs (chunks in parallel, then what stands above them) and walks tree against tree from every chunk; of two
+nodes the larger is opened, so a stack needs no more entries than both trees have levels.
+
+Slabs hold each triangle at the start and at the end of the step, grown by half the margin. k = 6 gives the boxes of the spatial
+hash and so its candidates; 14 (and the space diagonals) and 18 (and the face diagonals) fewer. Weak: the trees keep
+the order of the first positions, and each chunk is tested against the root of every collider that may follow its own.
+
+Source: report, section 2.3.2, algorithm 1 and figure 7; Schmidtke and Erleben, Chunked bounding volume hierarchies for fast
+digital prototyping using volumetric meshes, 2018.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from taisoft.collision.candidates import TOTAL, Buffer, Candidates, PairRows, pairs, sum_parts
+from taisoft.collision.surface import Surface, Topology, dvec, may_touch
+from taisoft.collision.trees import TreeTables, build_trees
+from taisoft.runtime import FieldArena, Runtime, kernel
+
+LEAVES = {"cpu": 64, "cuda": 8}  # triangles of a chunk: on the CPU the fastest of 4 to 256, on CUDA for enough threads
+PAIRS_PER_TRIANGLE = 12  # at first
+
+AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+DIRECTIONS = {  # k -> normals of the slabs
+    6: AXES,
+    14: (*AXES, (1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)),
+    18: (*AXES, (1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1), (0, 1, 1), (0, 1, -1)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Trees:
+    """Fields of the trees, for kernels; `TreeTables` says what the tables hold."""
+
+    slabs: int  # k / 2
+    directions: tuple[tuple[int, int, int], ...]
+    n_chunks: int
+    levels: int  # entries of a stack
+    parts: int
+    link: Any  # i32
+    root: Any  # i32
+    chunk: Any  # i32
+    chunk_body: Any  # i32
+    top: Any  # i32
+    lo: Any  # (nodes) vectors f64, one entry for each slab [m], times the length of its direction
+    hi: Any
+    stack: Any  # (parts * levels) 2-vectors i32
+
+
+def place_trees(t: TreeTables, k: int, parts: int, arena: FieldArena) -> Trees:
+    """Allocate and fill the fields of the trees."""
+    levels = t.chunk_depth + t.depth + 1
+
+    def ints(name: str, data: np.ndarray):
+        return arena.field(f"bvh_{name}", ti.i32, max(len(data), 1), (data if len(data) else np.zeros(1)).astype(np.int32))
+
+    def slabs(name: str):
+        return arena.vectors(f"bvh_{name}", ti.f64, max(len(t.link), 1), n=k // 2)
+
+    return Trees(
+        k // 2, DIRECTIONS[k], len(t.chunk), levels, parts, ints("link", t.link), ints("root", t.root),
+        ints("chunk", t.chunk), ints("chunk_body", t.chunk_body), ints("top", t.top), slabs("lo"), slabs("hi"),
+        arena.vectors("bvh_stack", ti.i32, parts * levels, n=2),
+    )  # fmt: skip
+
+
+@ti.func
+def _diagonals(b: ti.template(), x):
+    """A vector's components along the directions of the slabs beyond the three axes."""
+    return ti.Vector([x.dot(dvec(b.directions[q])) for q in ti.static(range(3, b.slabs))], ti.f64)
+
+
+@ti.func
+def _refit_leaf(s: ti.template(), b: ti.template(), node, margin):
+    """Slabs of a triangle at both ends of the step."""
+    t = -1 - b.link[node]
+    for q in ti.static(range(3)):
+        b.lo[node][q] = s.lo[t][q]
+        b.hi[node][q] = s.hi[t][q]
+    if ti.static(b.slabs > 3):
+        lo = ti.Vector([ti.math.inf] * (b.slabs - 3), ti.f64)
+        hi = ti.Vector([-ti.math.inf] * (b.slabs - 3), ti.f64)
+        if s.lo[t][0] <= s.hi[t][0]:  # finite
+            for k in range(3):
+                i = s.triangle[t, k]
+                begin = _diagonals(b, s.x[i])
+                end = begin + _diagonals(b, s.move[i])
+                lo = ti.min(lo, ti.min(begin, end))
+                hi = ti.max(hi, ti.max(begin, end))
+        for q in ti.static(range(3, b.slabs)):
+            grown = ti.cast(0.5, ti.f64) * margin * dvec(b.directions[q]).norm()
+            b.lo[node][q] = lo[q - 3] - grown
+            b.hi[node][q] = hi[q - 3] + grown
+
+
+@ti.func
+def _right(b: ti.template(), node):
+    """The second child; the first one follows its parent."""
+    return node + (b.link[node] + 3) // 4 * 2
+
+
+@ti.func
+def _refit_inner(b: ti.template(), node):
+    """Slabs of a node from those of its children."""
+    other = _right(b, node)
+    b.lo[node] = ti.min(b.lo[node + 1], b.lo[other])
+    b.hi[node] = ti.max(b.hi[node + 1], b.hi[other])
+
+
+@ti.func
+def _nodes(b: ti.template(), node):
+    """Nodes of a subtree."""
+    return ti.max(b.link[node], 1)
+
+
+@kernel
+def refit_chunks(s: ti.template(), b: ti.template(), margin: ti.f64):
+    """Slabs of all nodes in the chunks."""
+    ti.loop_config(serialize=s.serial)
+    for c in range(b.n_chunks):
+        first = b.chunk[c]
+        n = _nodes(b, first)
+        for k in range(n):
+            node = first + n - 1 - k
+            if b.link[node] < 0:
+                _refit_leaf(s, b, node, margin)
+            else:
+                _refit_inner(b, node)
+
+
+@kernel
+def refit_tops(b: ti.template(), first: ti.i32, last: ti.i32, serial: ti.template()):
+    """Slabs of the nodes top[first:last] above the chunks; of one level, unless serial."""
+    ti.loop_config(serialize=serial)
+    for k in range(first, last):
+        _refit_inner(b, b.top[k])
+
+
+@ti.func
+def _walk(s: ti.template(), b: ti.template(), part, root_a, root_b, pair: ti.template(), begin, last):
+    """Append the pairs of leaves below two nodes; returns where the next one goes, beyond `last` where they did not fit.
+
+    Of a tree against itself, the second leaf of a pair comes after the first, so that each pair is found once; trees of
+    colliders follow each other, so this holds for all.
+    """
+    i, j, at = root_a, root_b, begin
+    bottom = part * b.levels
+    depth = 0
+    going = 1
+    while going == 1:
+        split = 0
+        if j + _nodes(b, j) > i and (b.lo[i] <= b.hi[j]).all() and (b.lo[j] <= b.hi[i]).all():
+            if b.link[i] < 0 and b.link[j] < 0:
+                t, u = -1 - b.link[i], -1 - b.link[j]
+                if j > i and may_touch(s, t, u) == 1:
+                    if at < last:
+                        pair[at] = ti.Vector([t, u], ti.i32)
+                    at += 1
+            else:
+                split = 1
+        if split == 1:  # one child goes on, the other waits
+            if b.link[i] >= b.link[j]:
+                b.stack[bottom + depth] = ti.Vector([_right(b, i), j], ti.i32)
+                i += 1
+            else:
+                b.stack[bottom + depth] = ti.Vector([i, _right(b, j)], ti.i32)
+                j += 1
+            depth += 1
+        elif depth > 0:
+            depth -= 1
+            i, j = b.stack[bottom + depth][0], b.stack[bottom + depth][1]
+        else:
+            going = 0
+    return at
+
+
+@kernel
+def walk_trees(
+    s: ti.template(), b: ti.template(), pair: ti.template(), used: ti.template(), total: ti.template(), part: ti.i32
+):  # fmt: skip
+    """Pairs of triangles whose slabs overlap, each once. Neighbouring chunks go to different parts, which evens the load."""
+    ti.loop_config(serialize=s.serial)
+    for c in range(b.parts):
+        at = c * part
+        for k in range((b.n_chunks - c + b.parts - 1) // b.parts):
+            chunk = c + k * b.parts
+            own = b.chunk_body[chunk]
+            for other in range(own, s.n_bodies):
+                together = s.self_on[own]
+                if other != own:
+                    together = s.soft[own] | s.soft[other]
+                if together == 1 and b.root[other] >= 0:
+                    at = _walk(s, b, c, b.chunk[chunk], b.root[other], pair, at, (c + 1) * part)
+        used[c] = at - c * part
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        sum_parts(used, total, b.parts)
+
+
+class Bvh:
+    """The broad phase by trees. margin [m] must be that of the surface's boxes; it may be changed at any time."""
+
+    def __init__(
+        self, surface: Surface, topology: Topology, x: np.ndarray, margin: float, runtime: Runtime, arena: FieldArena,
+        k_dop: int = 6, leaves: int | None = None, capacity: int | None = None, most: int | None = None,
+    ):  # fmt: skip
+        """x: (n_verts, 3) [m], the positions that the trees are built for. k_dop: 6, 14 or 18. leaves: triangles of a chunk, at
+        most. capacity: pairs at first; most: pairs, and entries of rows, at most. None for the default."""
+        n = surface.n_triangles
+        self.surface, self.margin = surface, margin
+        self.tables = build_trees(x[topology.triangle].mean(axis=1), topology.first, leaves or LEAVES[runtime.arch])
+        self.trees = place_trees(self.tables, k_dop, surface.chunks, arena)
+        self.by_levels = runtime.arch != "cpu"  # else one thread refits what stands above the chunks, in one launch
+        self.pairs = Buffer("bvh_pairs", pairs, capacity or PAIRS_PER_TRIANGLE * n + 64, most, surface.chunks, arena)
+        self.rows = PairRows(surface, arena, capacity or 2 * PAIRS_PER_TRIANGLE * n + 64, most)
+
+    def find(self) -> Candidates:
+        """The candidates of the present boxes. Raises SimulationError where a buffer may not grow as far as it must."""
+        self._refit()
+        while True:
+            found = self.pairs
+            walk_trees(self.surface, self.trees, found.data, found.used, found.count, found.part)
+            if found.fits():
+                return self.rows.from_pairs(found)
+
+    def _refit(self) -> None:
+        refit_chunks(self.surface, self.trees, self.margin)
+        first = self.tables.top_first
+        if not self.by_levels:
+            first = first[[0, -1]]
+        for begin, end in zip(first[:-1], first[1:]):
+            refit_tops(self.trees, int(begin), int(end), not self.by_levels)
+
+    @property
+    def buffers(self) -> tuple[Buffer, ...]:
+        """What grows."""
+        return self.pairs, self.rows.rows
+
+    @property
+    def n_pairs(self) -> int:
+        """Pairs that the last search found."""
+        return self.pairs.count[TOTAL]
+
+    def release(self) -> None:
+        """Give the memory of the buffers back."""
+        self.pairs.release()
+        self.rows.release()

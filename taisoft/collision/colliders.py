@@ -1,0 +1,28 @@
+"""The scene's colliders, bodies and then obstacles, as the search sees them: surfaces and frames. On the host."""
+
+import numpy as np
+
+from taisoft.collision.surface import Topology, make_topology
+from taisoft.model import Layout
+from taisoft.scene.obstacles import Obstacle
+from taisoft.scene.scene import Scene
+
+
+def collider_surfaces(scene: Scene, layout: Layout) -> tuple[Topology, np.ndarray]:
+    """Triangles of all colliders, and (v,3) their vertices at rest [m]: of obstacles where they were given."""
+    parts, rest = [], []
+    for k, body in enumerate(scene.bodies):
+        nodes, triangles = np.unique(body.nodes.surface, return_inverse=True)
+        parts.append((triangles.reshape(-1, 3), nodes + layout.node_start[k]))
+        rest.append(body.nodes.positions[nodes])
+    for obstacle in scene.obstacles:
+        vertices, triangles = obstacle.shape.surface() or (np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+        parts.append((triangles, np.full(len(vertices), -1)))
+        rest.append(vertices)
+    return make_topology(parts), np.concatenate(rest)
+
+
+def obstacle_frame(obstacle: Obstacle, t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Origin (3,) [m] and rotation (3,3) of an obstacle's own frame at a time."""
+    translation, rotation = obstacle.pose(t)
+    return obstacle.shape.pivot + translation, rotation @ obstacle.shape.frame()

@@ -1,0 +1,98 @@
+"""Contacts: where two surfaces touch or will touch within the step, as fields for kernels and as a record for the host.
+
+A contact has a side a and a side b, each a point on up to three nodes with weights that sum to 1; an obstacle is always b and
+has no nodes. The normal is a unit vector that points from b to a; the gap is the distance of the two points along it,
+negative where they penetrate. A feature names what meets what, and stays while that lasts.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from taisoft.runtime import FieldArena
+
+# kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + its number there); vertex and collider;
+# triangle and collider
+VERTEX_FACE, EDGE_EDGE, VERTEX_FIELD, FACE_FIELD = 0, 1, 2, 3
+KINDS = ("vertex_face", "edge_edge", "vertex_field", "face_field")
+
+
+@dataclass(frozen=True, eq=False)
+class ContactFields:
+    """A buffer of contacts, for kernels."""
+
+    point: Any  # 3-vectors f64: midway between the two surface points [m]
+    normal: Any  # 3-vectors f64
+    gap: Any  # f64 [m]
+    body: Any  # 2-vectors i32: colliders
+    feature: Any  # 3-vectors i32: kind and two ids
+    nodes_a: Any  # 3-vectors i32: vertices of the surface, -1 where there is none
+    nodes_b: Any
+    weights_a: Any  # 3-vectors f64
+    weights_b: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Contacts on the host, all arrays (k, ...) and in an order that does not depend on threads.
+
+    point (k,3) [m], normal (k,3), gap (k,) [m], impulse (k,3) [N s] on a; body_a, body_b: names, an obstacle is always b;
+    nodes, weights (k,6): three of each side, numbers of the model's nodes over all bodies, -1 and 0 where there is none;
+    kind: of "vertex_face", "edge_edge", "vertex_field", "face_field"; feature (k,2): ids that stay while two features meet.
+    friction, restitution (k,): of the pair, from the scene. found: contacts before the reduction; unmapped: triangles whose tet
+    is inverted, so that a distance field could not be used.
+    """
+
+    point: np.ndarray
+    normal: np.ndarray
+    gap: np.ndarray
+    impulse: np.ndarray
+    body_a: np.ndarray
+    body_b: np.ndarray
+    nodes: np.ndarray
+    weights: np.ndarray
+    kind: np.ndarray
+    feature: np.ndarray
+    friction: np.ndarray
+    restitution: np.ndarray
+    found: int
+    unmapped: int
+
+    def __len__(self) -> int:
+        return len(self.gap)
+
+
+def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:
+    """Room for that many contacts."""
+
+    def vectors(name: str, dtype, n: int = 3):
+        return arena.vectors(f"contact_{name}", dtype, capacity, n=n)
+
+    return ContactFields(
+        vectors("point", ti.f64), vectors("normal", ti.f64), arena.field("contact_gap", ti.f64, capacity),
+        vectors("body", ti.i32, 2), vectors("feature", ti.i32), vectors("nodes_a", ti.i32), vectors("nodes_b", ti.i32),
+        vectors("weights_a", ti.f64), vectors("weights_b", ti.f64),
+    )  # fmt: skip
+
+
+@ti.func
+def write_contact(
+    out: ti.template(), at, last, body_a, body_b, feature, point_a, n, gap, nodes_a, weights_a, nodes_b, weights_b
+):
+    """Write a contact where it still fits. n points from b to a; sides are swapped so that a is the collider of least number."""
+    if at < last:
+        out.point[at] = point_a - 0.5 * gap * n
+        out.gap[at] = gap
+        out.feature[at] = feature
+        sign = ti.cast(1.0, ti.f64)
+        if body_a > body_b:
+            sign = -1.0
+        out.normal[at] = sign * n
+        out.body[at] = ti.Vector([ti.min(body_a, body_b), ti.max(body_a, body_b)])
+        for q in ti.static(range(3)):  # entry by entry: the compiler fails on a vector stored as it was handed in
+            out.nodes_a[at][q] = ti.select(sign > 0.0, nodes_a[q], nodes_b[q])
+            out.nodes_b[at][q] = ti.select(sign > 0.0, nodes_b[q], nodes_a[q])
+            out.weights_a[at][q] = ti.select(sign > 0.0, weights_a[q], weights_b[q])
+            out.weights_b[at][q] = ti.select(sign > 0.0, weights_b[q], weights_a[q])

@@ -1,0 +1,86 @@
+"""Contacts of two edges that cross: where their lines are nearest, along the normal that is across both.
+
+Both edges must stick out along it. Edges that penetrate have shifted along each other, so they may cross a little beyond an end.
+Where an end lies inside the other body and makes a contact of its own, that tells already.
+"""
+
+import taichi as ti
+
+from taisoft.collision.contacts import EDGE_EDGE, write_contact
+from taisoft.collision.features import area_normal, corner, edge_normal, edge_sticks_out, sticks_out, unit
+from taisoft.collision.surface import dvec, ivec
+from taisoft.collision.triangles import closest_lines
+
+MISS = 2.0  # how far beyond the ends of edges that penetrate, in depths, they may cross: they have shifted along each other
+CROSSING = 0.02  # sine below which two edges count as parallel
+END = 10.0  # depths from an end within which it tells of a crossing
+TINY = 1e-9  # of lengths: rounding
+
+
+@ti.func
+def _end_tells(s: ti.template(), t, k, place, length, over, u, m, n):
+    """1 where edge k of triangle t crosses so near an end that the end's own contact tells of it: it lies inside, behind both
+    faces at edge m of triangle u, and sticks out along n."""
+    told = 0
+    for e in range(2):
+        near = place <= over
+        if e == 1:
+            near = length - place <= over
+        if near and over > 0.0:
+            i = s.triangle[t, (k + e) % 3]
+            d = s.x[i] - corner(s, u, m)
+            slack = ti.cast(TINY, ti.f64) * (length + d.norm())
+            behind = d.dot(unit(area_normal(s, u))) <= slack
+            v = s.neighbour[u, m]
+            if v >= 0:
+                behind = behind and d.dot(unit(area_normal(s, v))) <= slack
+            if behind:
+                told = told | sticks_out(s, i, n)
+    return told
+
+
+@ti.func
+def edge_contact(s: ti.template(), t, k, u, m, margin, out: ti.template(), start, end):
+    """The contact of edge k of triangle t with edge m of triangle u, if they cross. Returns the new count."""
+    at = start
+    a0, a1, b0, b1 = corner(s, t, k), corner(s, t, k + 1), corner(s, u, m), corner(s, u, m + 1)
+    da, db = a1 - a0, b1 - b0
+    c = da.cross(db)
+    la, lb = da.norm(), db.norm()
+    if c.norm() > ti.cast(CROSSING, ti.f64) * la * lb:
+        n = unit(c)
+        if n.dot(edge_normal(s, u, m) - edge_normal(s, t, k)) < 0.0:
+            n = -n
+        f, g, _ = closest_lines(a0, a1, b0, b1)
+        gap = (a0 - b0).dot(n)
+        over = ti.cast(MISS, ti.f64) * ti.max(-gap, 0.0)  # what penetrates has shifted along the edges
+        move = (1.0 - f) * s.move[s.triangle[t, k]] + f * s.move[s.triangle[t, (k + 1) % 3]]
+        move -= (1.0 - g) * s.move[s.triangle[u, m]] + g * s.move[s.triangle[u, (m + 1) % 3]]
+        deepest = ti.cast(0.5, ti.f64) * ti.min(la, lb)
+        if s.body[t] == s.body[u]:  # no deeper than half of what the body's own thickness can be
+            rest = (1.0 - f) * s.rest[s.triangle[t, k]] + f * s.rest[s.triangle[t, (k + 1) % 3]]
+            rest -= (1.0 - g) * s.rest[s.triangle[u, m]] + g * s.rest[s.triangle[u, (m + 1) % 3]]
+            deepest = ti.min(deepest, ti.cast(0.5, ti.f64) * rest.norm())
+        near = gap - ti.max(-move.dot(n), 0.0) <= margin and gap >= -deepest
+        crossing = -over <= f * la <= la + over and -over <= g * lb <= lb + over
+        good = int(near) & int(crossing)
+        if good == 1:
+            good = edge_sticks_out(s, u, m, n) & edge_sticks_out(s, t, k, -n)
+        if good == 1:
+            good = 1 - _end_tells(s, t, k, f * la, la, -END * gap, u, m, n)
+        if good == 1:
+            good = 1 - _end_tells(s, u, m, g * lb, lb, -END * gap, t, k, -n)
+        if good == 1:
+            # where it was clamped to an end, the contact is at that end
+            middle = a0 + f * da - 0.5 * gap * n
+            g_clamped = ti.min(ti.max(g, 0.0), 1.0)
+            if g_clamped != g:
+                middle = b0 + g_clamped * db + 0.5 * gap * n
+            f, g = ti.min(ti.max(f, 0.0), 1.0), g_clamped
+            write_contact(
+                out, at, end, s.body[t], s.body[u], ivec(EDGE_EDGE, 3 * t + k, 3 * u + m), middle + 0.5 * gap * n, n, gap,
+                ivec(s.triangle[t, k], s.triangle[t, (k + 1) % 3], -1), dvec(1.0 - f, f, 0.0),
+                ivec(s.triangle[u, m], s.triangle[u, (m + 1) % 3], -1), dvec(1.0 - g, g, 0.0),
+            )  # fmt: skip
+            at += 1
+    return at

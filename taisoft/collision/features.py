@@ -1,0 +1,162 @@
+"""Corners and edges of the deformed surface: which are features at all, and towards which side they stick out.
+
+A contact is a local minimum of the distance, and that can be seen from one side at a time: along the normal n, which points from
+b to a, no neighbour of a's feature may lie further towards b, and none of b's further towards a (Gauss map test). SLACK is the
+sine of the angle by which it may be missed: surfaces at rest on each other are never quite flat.
+"""
+
+import taichi as ti
+
+from taisoft.collision.surface import ACTIVE, dvec, ivec
+from taisoft.runtime import kernel
+
+CORNER_SLACK, EDGE_SLACK = 0.25, 0.05  # sines
+FLAT = 0.985  # cosine of 10 degrees: edges that turn by less are left to their ends
+SMOOTH = 0.5  # cosine of 60 degrees: the same for bodies hit by a distance field, which sees blunt edges itself
+
+
+@ti.func
+def corner(s: ti.template(), t, k):
+    """Position of corner k of triangle t, k from 0 to 3 (3 is 0 again)."""
+    return s.x[s.triangle[t, k % 3]]
+
+
+@ti.func
+def vertices_of(s: ti.template(), t):
+    """Vertices (3,) i32 of triangle t."""
+    return ivec(s.triangle[t, 0], s.triangle[t, 1], s.triangle[t, 2])
+
+
+@ti.func
+def moved(s: ti.template(), t, w):
+    """How far the point with weights w (3,) of triangle t goes in the step (3,) [m]."""
+    return w[0] * s.move[s.triangle[t, 0]] + w[1] * s.move[s.triangle[t, 1]] + w[2] * s.move[s.triangle[t, 2]]
+
+
+@ti.func
+def area_normal(s: ti.template(), t):
+    """Normal of triangle t, twice its area long [m^2]."""
+    a = corner(s, t, 0)
+    return (corner(s, t, 1) - a).cross(corner(s, t, 2) - a)
+
+
+@ti.func
+def unit(v):
+    """v over its length, 0 where it has none."""
+    length = v.norm()
+    result = dvec(0.0)
+    if length > 0.0:
+        result = v / length
+    return result
+
+
+@ti.func
+def opposite(s: ti.template(), t, i, j):
+    """The corner of triangle t that is neither vertex i nor j."""
+    found = s.triangle[t, 0]
+    for k in range(1, 3):
+        if found == i or found == j:
+            found = s.triangle[t, k]
+    return found
+
+
+@ti.func
+def sticks_out(s: ti.template(), i, n):
+    """1 where vertex i is its surface's furthest point against n near by, and some face there looks against n."""
+    x = s.x[i]
+    facing = 0
+    good = 1
+    r = s.ring_start[i]
+    while good == 1 and r < s.ring_start[i + 1]:
+        t = s.ring[r]
+        if area_normal(s, t).dot(n) < 0.0:
+            facing = 1
+        for k in range(3):
+            e = s.x[s.triangle[t, k]] - x
+            h = e.dot(n)
+            if h < 0.0 and h * h > ti.cast(CORNER_SLACK**2, ti.f64) * e.dot(e):
+                good = 0
+        r += 1
+    return good & facing
+
+
+@ti.func
+def nearest_of_ring(s: ti.template(), i, d):
+    """1 where vertex i is the nearest point of its surface, near by, to the point d away from it."""
+    x = s.x[i]
+    good = 1
+    r = s.ring_start[i]
+    while good == 1 and r < s.ring_start[i + 1]:
+        for k in range(3):
+            if (s.x[s.triangle[s.ring[r], k]] - x).dot(d) > 0.0:
+                good = 0
+        r += 1
+    return good
+
+
+@ti.func
+def ring_normal(s: ti.template(), i):
+    """Unit normal of the surface at vertex i: the mean of its triangles by their angles."""
+    total = dvec(0.0)
+    for r in range(s.ring_start[i], s.ring_start[i + 1]):
+        t = s.ring[r]
+        for k in range(3):
+            if s.triangle[t, k] == i:
+                e, f = unit(corner(s, t, k + 1) - s.x[i]), unit(corner(s, t, k + 2) - s.x[i])
+                total += ti.acos(ti.min(ti.max(e.dot(f), -1.0), 1.0)) * unit(area_normal(s, t))
+    return unit(total)
+
+
+@ti.func
+def edge_normal(s: ti.template(), t, k):
+    """Sum of the unit normals at edge k of triangle t."""
+    total = unit(area_normal(s, t))
+    if s.neighbour[t, k] >= 0:
+        total += unit(area_normal(s, s.neighbour[t, k]))
+    return total
+
+
+@ti.func
+def edge_sticks_out(s: ti.template(), t, k, n):
+    """1 where the surface near edge k of triangle t lies against n: towards -n of it, within EDGE_SLACK."""
+    i, j = s.triangle[t, k], s.triangle[t, (k + 1) % 3]
+    d = unit(s.x[j] - s.x[i])
+    good = 1
+    for side in range(2):
+        w = t
+        if side == 1:
+            w = s.neighbour[t, k]
+        if w >= 0:
+            e = s.x[opposite(s, w, i, j)] - s.x[i]
+            e -= e.dot(d) * d
+            h = e.dot(n)
+            if h > 0.0 and h * h > ti.cast(EDGE_SLACK**2, ti.f64) * e.dot(e):
+                good = 0
+    return good
+
+
+@kernel
+def find_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template()):
+    """Bits 0-2 of each active triangle: edges that it owns and that stick out, open ones too.
+
+    way: (n_bodies) i32, 0 for bodies hit by a distance field.
+    """
+    ti.loop_config(serialize=s.serial)
+    for c in range(s.count[ACTIVE]):
+        t = s.active[c]
+        bits = 0
+        flat = ti.cast(FLAT, ti.f64)
+        if way[s.body[t]] == 0:
+            flat = SMOOTH
+        for k in range(3):
+            if (s.owns[t] >> (3 + k)) & 1:
+                w = s.neighbour[t, k]
+                if w < 0:
+                    bits |= 1 << k
+                else:
+                    i, j = s.triangle[t, k], s.triangle[t, (k + 1) % 3]
+                    n = unit(area_normal(s, t))
+                    turned = n.dot(unit(area_normal(s, w))) < flat
+                    if turned and (s.x[opposite(s, w, i, j)] - s.x[i]).dot(n) < 0.0:
+                        bits |= 1 << k
+        sharp[t] = bits

@@ -1,0 +1,288 @@
+"""Detection: from a state to a list of contacts. Boxes, candidates, the three kinds of geometry, reduction.
+
+What a scene does not need is neither allocated nor launched: without two surfaces there are no candidates, without a smooth body
+no distance fields, without an analytic obstacle no analytic distances.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import taichi as ti
+
+from taisoft.collision.analytic import AnalyticObstacles, find_analytic
+from taisoft.collision.bvh import Bvh
+from taisoft.collision.candidates import Buffer, Candidates
+from taisoft.collision.colliders import collider_surfaces, obstacle_frame
+from taisoft.collision.contacts import KINDS, Contacts, contact_fields
+from taisoft.collision.features import find_sharp_edges
+from taisoft.collision.proximity import BY_EDGES, BY_FACES, BY_FIELD, find_proximity
+from taisoft.collision.reduction import FOUND, LEFT, ReductionFields, reduce_contacts, reduction_fields
+from taisoft.collision.sdf import DistanceFields, build_fields, find_in_fields
+from taisoft.collision.self_collision import Intersections
+from taisoft.collision.spatial_hash import SpatialHash
+from taisoft.collision.surface import (
+    ACTIVE,
+    UNFINITE,
+    Surface,
+    build_surface,
+    find_active,
+    move_obstacles,
+    move_soft,
+    update_boxes,
+)  # fmt: skip
+from taisoft.errors import SimulationError
+from taisoft.mesh.quality import mean_surface_edge
+from taisoft.mesh.sdf_grid import cached_sdf_grid
+from taisoft.model import Layout, Model
+from taisoft.runtime import FieldArena, Runtime
+from taisoft.scene.collision import has_sharp_edges
+from taisoft.scene.obstacles import Box, MeshObstacle
+from taisoft.scene.scene import Scene
+
+MARGIN = 0.1  # of the mean surface edge: distance within which contacts are found, where the scene names none
+DEPTH = 0.1  # of the mean surface edge: flat faces that have passed each other by less are still found
+MERGED = 1e-3  # of the mean surface edge: contacts nearer than this are one
+REDUCTION_CELL = 0.25  # of the mean surface edge: cells of the reduction
+CONTACTS_PER_TRIANGLE = 1  # room at first
+
+
+@dataclass
+class Counts:
+    """What the last search went through."""
+
+    triangles: int = 0
+    active: int = 0  # triangles whose box meets another collider's
+    pairs: int = 0  # of triangles with overlapping boxes
+    found: int = 0  # contacts before the reduction
+    contacts: int = 0  # after it
+    unmapped: int = 0  # (triangle, body) whose tet is inverted, so that the body's field could not be used
+    growths: dict[str, int] = field(default_factory=dict)  # times that each buffer grew since the start
+
+
+class Detection:
+    """Finds the contacts of a scene. edge: mean surface edge of the soft bodies at rest [m]; margin [m]; cell [m]."""
+
+    def __init__(
+        self, scene: Scene, model: Model, layout: Layout, runtime: Runtime, self_collision: bool = False,
+        serial: bool | None = None,
+    ):  # fmt: skip
+        """Allocate what the scene needs. serial: None decides by size. Raises MeshError where a field cannot be made."""
+        self.scene, self.model, self.layout = scene, model, layout
+        self._arena = arena = FieldArena()
+        settings = scene.collision
+        bodies, obstacles = scene.bodies, scene.obstacles
+        self.topology, self._rest = collider_surfaces(scene, layout)
+        soft = np.arange(len(scene.colliders)) < len(bodies)
+        self.surface: Surface = build_surface(
+            self.topology, self._rest, soft, soft & self_collision, runtime, arena, serial
+        )
+        s = self.surface
+        self.edge = mean_surface_edge([(b.nodes.positions, b.nodes.surface) for b in bodies])
+        self.margin = MARGIN * self.edge if settings.margin is None else settings.margin
+        faced = int((np.diff(self.topology.first) > 0).sum())
+        self.reach = self.margin + DEPTH * self.edge  # by half of it boxes grow
+        self._rows = self_collision or faced > 1
+        self.broad = self._make_broad(runtime) if self._rows else None
+        ways = [BY_FACES if b.hit_by == "proximity" else BY_FIELD for b in bodies]
+        ways += [BY_FACES if isinstance(o.shape, MeshObstacle) else BY_EDGES for o in obstacles]
+        sharp = any(isinstance(o.shape, Box) for o in obstacles) or any(has_sharp_edges(b.nodes) for b in bodies)
+        self._proximity = self._rows and (self_collision or BY_FACES in ways or sharp)
+        self._way = arena.field("contact_way", ti.i32, len(ways), np.array(ways, dtype=np.int32))
+        self._sharp = arena.field("surface_sharp", ti.i32, max(s.n_triangles, 1))
+        self._unmapped = arena.field("unmapped", ti.i32, 1)
+        self._fields = self._make_fields(runtime) if self._rows else None
+        self._analytic = [(len(bodies) + k, o) for k, o in enumerate(obstacles) if not isinstance(o.shape, MeshObstacle)]
+        self._shapes = self._make_shapes() if self._analytic else None
+        capacity = settings.initial_capacity or CONTACTS_PER_TRIANGLE * s.n_triangles + 64
+        self.buffer = Buffer("contacts", contact_fields, capacity, settings.max_capacity, s.chunks, arena)
+        self._reduction_arena = FieldArena()
+        self._reduction: ReductionFields | None = None
+        self._intersections: Intersections | None = None
+        self._placed: float | None = None  # time for which the obstacles were placed last
+        self.counts = Counts(triangles=s.n_triangles)
+
+    def _make_broad(self, runtime: Runtime) -> SpatialHash | Bvh:
+        settings, s = self.scene.collision, self.surface
+        limits = (settings.initial_capacity, settings.max_capacity)
+        if settings.broad_phase == "bvh":
+            x = self._rest + self._start_shift()
+            return Bvh(s, self.topology, x, self.reach, runtime, self._arena, settings.k_dop, capacity=limits[0], most=limits[1])
+        extent = np.ptp((self._rest + self._start_shift())[self.topology.triangle].reshape(-1, 3), axis=0)
+        return SpatialHash(s, self._arena, settings.cell_ratio * self.edge, extent, *limits)
+
+    def _start_shift(self) -> np.ndarray:
+        """(v,3) [m]: from rest to where the bodies start."""
+        shift = [b.position for b in self.scene.bodies] + [np.zeros(3)] * len(self.scene.obstacles)
+        return np.repeat(shift, np.diff(self.topology.vertex_first), axis=0)
+
+    def _make_fields(self, runtime: Runtime) -> DistanceFields | None:
+        bodies, settings = self.scene.bodies, self.scene.collision
+        grids = [
+            cached_sdf_grid(b.nodes.positions, b.nodes.surface, settings.field_cells, margin=2.0 * self.margin)
+            if b.hit_by == "distance_field" else None
+            for b in bodies
+        ]  # fmt: skip
+        if not any(grids):
+            return None
+        grids += [None] * len(self.scene.obstacles)
+        return build_fields(
+            bodies, grids, self.model.x, self.topology.first, self.layout.node_start, runtime.real, runtime.np_real, self._arena
+        )
+
+    def _make_shapes(self) -> AnalyticObstacles:
+        arena, n = self._arena, len(self._analytic)
+
+        def vectors(name: str, count: int, data: np.ndarray | None = None):
+            return arena.vectors(f"obstacle_{name}", ti.f64, count, data)
+
+        shapes = [o.shape for _, o in self._analytic]
+        return AnalyticObstacles(
+            n, arena.field("obstacle_body", ti.i32, n, np.array([k for k, _ in self._analytic], dtype=np.int32)),
+            arena.field("obstacle_kind", ti.i32, n, np.array([x.kind for x in shapes], dtype=np.int32)),
+            vectors("size", n, np.array([x.size() for x in shapes])), vectors("origin", n), vectors("rotation", 3 * n),
+            vectors("next_origin", n), vectors("next_rotation", 3 * n),
+        )  # fmt: skip
+
+    # --- a search -------------------------------------------------------------------------------------------------
+
+    def find(self, time: float, dt: float, led: tuple[np.ndarray, np.ndarray] | None = None) -> None:
+        """Find the contacts of the model's present state swept by dt [s].
+
+        time [s]: of the obstacles. led: (k,) nodes and (k,3) how far they are led during the step [m], nan where they are not.
+        Raises SimulationError where positions are not finite, or a buffer may not grow as far as it must.
+        """
+        s, count = self.surface, self.counts
+        move_soft(s, self.model.x, self.model.v, dt)
+        self._place_obstacles(time, dt)
+        if led is not None and len(led[0]):
+            self._lead(*led)
+        update_boxes(s, self.reach)
+        if s.count[UNFINITE]:
+            raise SimulationError(self._unfinite())
+        candidates = self._candidates()
+        self._unmapped[0] = 0
+        while True:
+            self._search(candidates)
+            if self.buffer.fits():
+                break
+            self._unmapped[0] = 0
+        self._reduce()
+        count.unmapped = self._unmapped[0]
+        count.found, count.contacts = self._reduction.count[FOUND], self._reduction.count[LEFT]
+        buffers = [self.buffer, *(self.broad.buffers if self.broad is not None else ())]
+        count.growths = {b.name: b.growths for b in buffers}
+
+    def _candidates(self) -> Candidates | None:
+        """Rows of near triangles; None where no two surfaces can touch."""
+        if not self._rows:
+            return None
+        find_active(self.surface)
+        self.counts.active = self.surface.count[ACTIVE]
+        rows = self.broad.find()
+        self.counts.pairs = self.broad.n_pairs
+        return rows
+
+    def _search(self, rows: Candidates | None) -> None:
+        """Fill the buffer of contacts, as far as it goes."""
+        s, b = self.surface, self.buffer
+        b.clear()
+        if rows is not None:
+            if self._proximity:
+                find_sharp_edges(s, self._way, self._sharp)
+                find_proximity(
+                    s, rows.start, rows.end, rows.entry, self._sharp, self._way, self.margin, 0.5 * self.reach, b.data, b.used,
+                    b.part,
+                )  # fmt: skip
+            if self._fields is not None:
+                find_in_fields(
+                    s, self._fields, rows.start, rows.end, rows.entry, self.margin, b.data, b.used, b.part, self._unmapped
+                )
+        if self._shapes is not None:
+            find_analytic(s, self._shapes, self.margin, b.data, b.used, b.part)
+        b.sum_up()
+
+    def _reduce(self) -> None:
+        b = self.buffer
+        if self._reduction is None or self._reduction.place.shape[0] != b.capacity:
+            self._reduction_arena.release()
+            self._reduction = reduction_fields(self._reduction_arena, b.capacity, b.chunks, self.surface.serial)
+        reduce_contacts(self._reduction, b.data, b.used, b.part, MERGED * self.edge, REDUCTION_CELL * self.edge)
+
+    def _place_obstacles(self, time: float, dt: float) -> None:
+        """Obstacles where they are at a time and at the end of the step; those that stand still are placed once."""
+        first = self._placed is None
+        start = len(self.scene.bodies)
+        for k, o in enumerate(self.scene.obstacles):
+            vertices = slice(self.topology.vertex_first[start + k], self.topology.vertex_first[start + k + 1])
+            if vertices.stop > vertices.start and (first or o.path is not None):
+                now, then = o.points_at(time, self._rest[vertices]), o.points_at(time + dt, self._rest[vertices])
+                move_obstacles(self.surface, vertices.start, now, then - now)
+        if self._analytic and (first or any(o.path is not None for _, o in self._analytic)):
+            for fields, t in (
+                ((self._shapes.origin, self._shapes.rotation), time),
+                ((self._shapes.next_origin, self._shapes.next_rotation), time + dt),
+            ):
+                frames = [obstacle_frame(o, t) for _, o in self._analytic]
+                fields[0].from_numpy(np.array([x for x, _ in frames]))
+                fields[1].from_numpy(np.concatenate([r for _, r in frames]))
+        self._placed = time
+
+    def _lead(self, nodes: np.ndarray, moves: np.ndarray) -> None:
+        """Led nodes go where their path leads them."""
+        where = np.full(self.model.n_nodes, -1)
+        on = self.topology.node >= 0
+        where[self.topology.node[on]] = np.flatnonzero(on)
+        whole = self.surface.move.to_numpy()
+        rows, axes = np.nonzero(np.isfinite(moves) & (where[nodes] >= 0)[:, None])
+        whole[where[nodes[rows]], axes] = moves[rows, axes]
+        self.surface.move.from_numpy(whole)
+
+    def _unfinite(self) -> str:
+        x, move = self.surface.x.to_numpy(), self.surface.move.to_numpy()
+        bad = int(np.argmin((np.isfinite(x) & np.isfinite(move)).all(axis=1)))
+        k = int(np.searchsorted(self.topology.vertex_first, bad, side="right")) - 1
+        node = self.topology.node[bad] - self.layout.node_start[k] if k < len(self.scene.bodies) else bad
+        name = self.scene.colliders[k].name
+        return f"body '{name}', node {node}: position or velocity is not finite, so no contact can be found"
+
+    # --- what was found -------------------------------------------------------------------------------------------
+
+    def contacts(self) -> Contacts:
+        """The last search's contacts, impulses 0."""
+        r, b = self._reduction, self.buffer.data
+        rows = r.kept.to_numpy()[: r.count[LEFT]]
+
+        def taken(f) -> np.ndarray:
+            return f.to_numpy()[rows]
+
+        body, feature = taken(b.body), taken(b.feature)
+        nodes = np.concatenate([taken(b.nodes_a), taken(b.nodes_b)], axis=1)
+        weights = np.concatenate([taken(b.weights_a), taken(b.weights_b)], axis=1)
+        nodes = np.where(nodes >= 0, np.append(self.topology.node, -1)[nodes], -1)
+        names = np.array([c.name for c in self.scene.colliders], dtype=object)
+        pairs, pair = np.unique(body, axis=0, return_inverse=True)
+        numbers = np.array([self.scene.contact_numbers(names[a], names[b]) for a, b in pairs]).reshape(-1, 2)[pair.reshape(-1)]
+        return Contacts(
+            taken(b.point), taken(b.normal), taken(b.gap), np.zeros((len(rows), 3)), names[body[:, 0]], names[body[:, 1]],
+            nodes, np.where(nodes >= 0, weights, 0.0), np.array(KINDS, dtype=object)[feature[:, 0]], feature[:, 1:],
+            numbers[:, 0], numbers[:, 1], self.counts.found, self.counts.unmapped,
+        )  # fmt: skip
+
+    def intersections(self) -> np.ndarray:
+        """(k,2) pairs of the surface's triangles that intersect where the last search found them, without a common vertex."""
+        rows = self._candidates()
+        if rows is None:
+            return np.zeros((0, 2), dtype=np.int64)
+        if self._intersections is None:
+            limits = (self.scene.collision.initial_capacity, self.scene.collision.max_capacity)
+            self._intersections = Intersections(self.surface, self._arena, *limits)
+        return self._intersections.find(rows)
+
+    def release(self) -> None:
+        """Give all memory back."""
+        for part in (self.broad, self._intersections):
+            if part is not None:
+                part.release()
+        self.buffer.release()
+        self._reduction_arena.release()
+        self._arena.release()

@@ -1,0 +1,181 @@
+"""Reduction: contacts of one pair, nearer than a tolerance and with one normal, are one (report, section 3.1.3).
+
+In the order of the list a contact is kept unless an earlier kept one is that near: what two nested loops over the list give.
+Here each looks only at the contacts in the cells round it, so the cost grows with their number. Cells hash into buckets;
+a cell is wider than twice the tolerance, and those that the tolerance reaches into are looked
+through too, so the result does not depend on where the cells lie. Rounds, until all are decided: a contact whose earlier
+neighbours are all dropped is kept, one with a kept earlier neighbour is dropped.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import taichi as ti
+
+from taisoft.collision.contacts import ContactFields
+from taisoft.collision.surface import ivec
+from taisoft.runtime import FieldArena, kernel
+
+SAME_NORMAL = 0.996  # cosine of 5 degrees
+UNKNOWN, KEPT, DROPPED = 0, 1, 2
+FOUND, LEFT, UNDECIDED = 0, 1, 2  # places in the count
+
+
+@dataclass(frozen=True, eq=False)
+class ReductionFields:
+    """Work space. The first count[LEFT] of `kept` are the contacts' places in the buffer, in its order."""
+
+    buckets: int  # a power of two
+    chunks: int
+    serial: bool
+    place: Any  # (capacity) i32: of the i-th contact found
+    bucket: Any  # (capacity) i32: of each contact
+    bucket_start: Any  # (buckets) i32: where its members begin and end
+    bucket_end: Any
+    member: Any  # (capacity) i32
+    state: Any  # (capacity) i32
+    kept: Any  # (capacity) i32
+    count: Any  # (3) i32
+    first: Any  # (chunks) i32: number of the first contact of each part
+
+
+def reduction_fields(arena: FieldArena, capacity: int, chunks: int, serial: bool) -> ReductionFields:
+    """Room for that many contacts in `chunks` parts."""
+    buckets = 1 << max(capacity - 1, 63).bit_length()
+
+    def ints(name: str, n: int):
+        return arena.field(f"reduction_{name}", ti.i32, n)
+
+    return ReductionFields(
+        buckets, chunks, serial, ints("place", capacity), ints("bucket", capacity), ints("bucket_start", buckets),
+        ints("bucket_end", buckets), ints("member", capacity),
+        ints("state", capacity), ints("kept", capacity), ints("count", 3), ints("first", chunks),
+    )  # fmt: skip
+
+
+@ti.func
+def _cell(p, inverse):
+    """Cell of a point, wrapped so that it is a small number."""
+    cell = ivec(0)
+    for q in ti.static(range(3)):
+        k = ti.floor(p[q] * inverse)
+        cell[q] = ti.cast(k - 1048576.0 * ti.floor(k / 1048576.0), ti.i32)
+    return cell
+
+
+@ti.func
+def _bucket(r: ti.template(), cell):
+    h = (cell[0] * 73856093) ^ (cell[1] * 19349663) ^ (cell[2] * 83492791)  # Teschner et al. 2003
+    return (h ^ (h >> 15)) & (r.buckets - 1)
+
+
+@kernel
+def list_contacts(
+    r: ti.template(), out: ti.template(), used: ti.template(), part: ti.i32, inverse: ti.f64
+):  # fmt: skip
+    """Number the contacts of all parts through and put them into the cells."""
+    ti.loop_config(serialize=r.serial)
+    for b in range(r.buckets):
+        r.bucket_end[b] = 0
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        total = 0
+        for k in range(r.chunks):
+            r.first[k] = total
+            total += used[k]
+        r.count[FOUND] = total
+    ti.loop_config(serialize=r.serial)
+    for c in range(r.chunks):
+        for k in range(used[c]):
+            i, at = r.first[c] + k, c * part + k
+            r.place[i] = at
+            r.state[i] = UNKNOWN
+            b = _bucket(r, _cell(out.point[at], inverse))
+            r.bucket[i] = b
+            ti.atomic_add(r.bucket_end[b], 1)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        total = 0
+        for b in range(r.buckets):
+            r.bucket_start[b] = total
+            total += r.bucket_end[b]
+            r.bucket_end[b] = r.bucket_start[b]
+    ti.loop_config(serialize=r.serial)
+    for i in range(r.count[FOUND]):
+        r.member[ti.atomic_add(r.bucket_end[r.bucket[i]], 1)] = i
+
+
+@ti.func
+def _same(out: ti.template(), a, b, tolerance):
+    """Whether the contacts at a and b are one."""
+    result = False
+    if (out.body[a] == out.body[b]).all():
+        d = out.point[a] - out.point[b]
+        result = d.dot(d) <= tolerance * tolerance and out.normal[a].dot(out.normal[b]) >= ti.cast(SAME_NORMAL, ti.f64)
+    return result
+
+
+@ti.func
+def _decide(r: ti.template(), out: ti.template(), i, inverse, tolerance):
+    """State of contact i by the states of the earlier ones near it."""
+    at = r.place[i]
+    lo, hi = _cell(out.point[at] - tolerance, inverse), _cell(out.point[at] + tolerance, inverse)
+    n = ti.select(lo == hi, 1, 2)
+    state = KEPT
+    k = 0
+    while state != DROPPED and k < n[0] * n[1] * n[2]:
+        z, y, x = k % n[2], (k // n[2]) % n[1], k // (n[2] * n[1])
+        cell = ivec(ti.select(x == 0, lo[0], hi[0]), ti.select(y == 0, lo[1], hi[1]), ti.select(z == 0, lo[2], hi[2]))
+        b = _bucket(r, cell)
+        for m in range(r.bucket_start[b], r.bucket_end[b]):
+            j = r.member[m]
+            if j < i and r.state[j] != DROPPED:
+                if _same(out, at, r.place[j], tolerance):
+                    if r.state[j] == KEPT:
+                        state = DROPPED
+                    elif state == KEPT:
+                        state = UNKNOWN
+        k += 1
+    return state
+
+
+@kernel
+def decide(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64):
+    """A round: decide what can be decided."""
+    r.count[UNDECIDED] = 0
+    ti.loop_config(serialize=r.serial)
+    for i in range(r.count[FOUND]):
+        if r.state[i] == UNKNOWN:
+            state = _decide(r, out, i, inverse, tolerance)
+            if state == UNKNOWN:
+                ti.atomic_add(r.count[UNDECIDED], 1)
+            else:
+                r.state[i] = state
+
+
+@kernel
+def list_kept(r: ti.template()):
+    """List the kept contacts in order."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        n = 0
+        for i in range(r.count[FOUND]):
+            if r.state[i] == KEPT:
+                r.kept[n] = r.place[i]
+                n += 1
+        r.count[LEFT] = n
+
+
+def reduce_contacts(
+    r: ReductionFields, out: ContactFields, used: Any, part: int, tolerance: float, cell: float
+) -> None:  # fmt: skip
+    """Fill r.kept and r.count. tolerance [m]; cell: edge of the cells [m], widened to 2.5 times the tolerance."""
+    inverse = 1.0 / max(cell, 2.5 * tolerance)
+    list_contacts(r, out, used, part, inverse)
+    while True:
+        decide(r, out, inverse, tolerance)
+        if r.count[UNDECIDED] == 0:
+            break
+    list_kept(r)
+
+

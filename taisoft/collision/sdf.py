@@ -1,0 +1,248 @@
+"""Contacts with soft bodies by their signed distance at rest, mapped by the deformation (report, section 2.3.2).
+
+A point near body B goes to B's material space through the tet behind the nearest of B's surface triangles in its row:
+X = X0 + F^-1 (x - x0). There phi is read from a grid. Back in the world the normal is F^-T grad phi, normalised (a covector), and
+the gap phi / |F^-T grad phi|. Vertices of A are contacts where its surface sticks out towards B; a triangle adds its deepest
+point where that lies deeper than its corners: one Frank-Wolfe solve for each (triangle, body), and none where phi at the
+corners excludes it. Weak: a grid rounds edges (sharp ones that cross are left to `proximity`), and far from rest phi is no
+distance any more.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from taisoft.collision.analytic import DEEPER, deeper_inside
+from taisoft.collision.contacts import FACE_FIELD, VERTEX_FIELD, write_contact
+from taisoft.collision.features import corner, moved, sticks_out, unit, vertices_of
+from taisoft.collision.frank_wolfe import deepest_point
+from taisoft.collision.surface import ACTIVE, dvec, ivec, part_first
+from taisoft.collision.triangles import closest_on_triangle
+from taisoft.mesh.sdf_grid import SdfGrid
+from taisoft.runtime import FieldArena, kernel
+from taisoft.scene.body import Body
+
+FLATTEST = 1e-3  # det F below which a tet maps nothing
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceFields:
+    """The grids of all bodies that have one, and the tets behind all triangles."""
+
+    of_body: Any  # (n_bodies) i32: field of each collider, -1 where it has none
+    origin: Any  # (fields) 3-vectors f64 [m]
+    spacing: Any  # (fields) 3-vectors f64 [m]
+    points: Any  # (fields) 3-vectors i32: grid points along each axis
+    first: Any  # (fields) i32: in phi
+    phi: Any  # [m]
+    x: Any  # the model's nodes
+    behind: Any  # (n_triangles) 4-vectors i32: nodes of the tet behind each triangle
+    corner: Any  # (n_triangles) 3-vectors f64: its first node at rest [m]
+    inverse: Any  # (n_triangles, 3) 3-vectors f64 by rows: inverse of its rest edges [1/m]
+
+    @ti.func
+    def sample(self, k, p):
+        """phi [m] and its gradient at the material point p (3,) of field k: trilinear, and beyond the grid farther by the way."""
+        cell, share = ivec(0), dvec(0.0)  # indexed by static numbers only
+        away = ti.cast(0.0, ti.f64)
+        for q in ti.static(range(3)):
+            last = ti.cast(self.points[k][q] - 1, ti.f64)
+            at = (p[q] - self.origin[k][q]) / self.spacing[k][q]
+            inside = ti.min(ti.max(at, 0.0), last)
+            away += ((at - inside) * self.spacing[k][q]) ** 2
+            cell[q] = ti.min(ti.cast(inside, ti.i32), self.points[k][q] - 2)
+            share[q] = inside - ti.cast(cell[q], ti.f64)
+        n = self.points[k]
+        base = self.first[k] + (cell[0] * n[1] + cell[1]) * n[2] + cell[2]
+        value, g = ti.cast(0.0, ti.f64), dvec(0.0)
+        for c in range(8):
+            i, j, m = c >> 2, (c >> 1) & 1, c & 1
+            f = ti.cast(self.phi[base + (i * n[1] + j) * n[2] + m], ti.f64)
+            a, da = 1.0 - share[0], ti.cast(-1.0, ti.f64)
+            if i == 1:
+                a, da = share[0], ti.cast(1.0, ti.f64)
+            b, db = 1.0 - share[1], ti.cast(-1.0, ti.f64)
+            if j == 1:
+                b, db = share[1], ti.cast(1.0, ti.f64)
+            d, dd = 1.0 - share[2], ti.cast(-1.0, ti.f64)
+            if m == 1:
+                d, dd = share[2], ti.cast(1.0, ti.f64)
+            value += a * b * d * f
+            g += dvec(da * b * d, a * db * d, a * b * dd) * f
+        return value + ti.sqrt(away), g / self.spacing[k]
+
+    @ti.func
+    def gradient(self, k, p):
+        """Gradient at p by differences over one cell: it does not jump between cells, and is exact where phi is linear."""
+        g = dvec(0.0)
+        for q in range(3):
+            e = dvec(ti.cast(q == 0, ti.f64), ti.cast(q == 1, ti.f64), ti.cast(q == 2, ti.f64))
+            step = 0.5 * self.spacing[k][q]
+            above, _ = self.sample(k, p + step * e)
+            below, _ = self.sample(k, p - step * e)
+            g += (above - below) / (2.0 * step) * e
+        return g
+
+
+def build_fields(
+    bodies: list[Body], grids: list[SdfGrid | None], x: Any, first: np.ndarray, node_start: np.ndarray, real: Any, npr: type,
+    arena: FieldArena,
+) -> DistanceFields:  # fmt: skip
+    """Upload the grids (one or None for each collider; obstacles have none) and the tets behind the bodies' triangles."""
+    used = [g for g in grids if g is not None]
+    of_body = np.cumsum([g is not None for g in grids]) - 1
+    of_body = np.where([g is not None for g in grids], of_body, -1)
+    n = max(int(first[-1]), 1)
+    behind, place, inverse = np.zeros((n, 4)), np.zeros((n, 3)), np.zeros((n, 3, 3))
+    for k, body in enumerate(bodies):
+        rows, tets = slice(first[k], first[k + 1]), body.nodes.surface_tets
+        rest = body.nodes.positions[tets]
+        behind[rows], place[rows] = tets + node_start[k], rest[:, 0]
+        inverse[rows] = np.linalg.inv((rest[:, 1:] - rest[:, :1]).transpose(0, 2, 1))
+    count = max(len(used), 1)
+    blank = np.zeros((1, 3))
+    return DistanceFields(
+        arena.field("field_of_body", ti.i32, len(grids), of_body.astype(np.int32)),
+        arena.vectors("field_origin", ti.f64, count, np.array([g.origin for g in used]) if used else blank),
+        arena.vectors("field_spacing", ti.f64, count, np.array([g.spacing for g in used]) if used else blank),
+        arena.vectors("field_points", ti.i32, count, np.array([g.phi.shape for g in used] if used else blank).astype(np.int32)),
+        arena.field("field_first", ti.i32, count, np.cumsum([0, *(g.phi.size for g in used)])[:count].astype(np.int32)),
+        arena.field("field_phi", real, max(sum(g.phi.size for g in used), 1),
+                    np.concatenate([g.phi.reshape(-1) for g in used]).astype(npr) if used else None),
+        x,
+        arena.vectors("field_behind", ti.i32, n, behind.astype(np.int32), n=4),
+        arena.vectors("field_corner", ti.f64, n, place),
+        arena.vectors("field_inverse", ti.f64, 3 * n, inverse.reshape(-1, 3)),
+    )  # fmt: skip
+
+
+@ti.func
+def _nearest(s: ti.template(), f: ti.template(), entry: ti.template(), first, last, p):
+    """The triangle of entry[first:last] nearest to p whose tet is not inverted, -1 where there is none."""
+    found, least = -1, ti.cast(ti.math.inf, ti.f64)
+    for e in range(first, last):
+        u = entry[e]
+        outside = ti.max(s.lo[u] - p, p - s.hi[u], 0.0)  # of its box, which is no nearer than the triangle
+        if outside.dot(outside) < least:
+            a, b, c = corner(s, u, 0), corner(s, u, 1), corner(s, u, 2)
+            w, _ = closest_on_triangle(p, a, b, c)
+            d = p - (w[0] * a + w[1] * b + w[2] * c)
+            if d.dot(d) < least:
+                if _gradient_of(f, u).determinant() > ti.cast(FLATTEST, ti.f64):
+                    least = d.dot(d)
+                    found = u
+    return found
+
+
+@ti.func
+def _gradient_of(f: ti.template(), u):
+    """Deformation gradient of the tet behind triangle u."""
+    x = f.x[f.behind[u][0]]
+    D = ti.Matrix.cols([f.x[f.behind[u][1]] - x, f.x[f.behind[u][2]] - x, f.x[f.behind[u][3]] - x])
+    return D @ ti.Matrix.rows([f.inverse[3 * u], f.inverse[3 * u + 1], f.inverse[3 * u + 2]])
+
+
+@ti.func
+def _material(f: ti.template(), u, p):
+    """Material point of p through the tet behind triangle u, and the inverse of its deformation gradient."""
+    G = _gradient_of(f, u).inverse()
+    return f.corner[u] + G @ (p - f.x[f.behind[u][0]]), G
+
+
+@ti.func
+def _field_contacts(
+    s: ti.template(), f: ti.template(), entry: ti.template(), first, last, t, margin, out: ti.template(), start, end
+):
+    """Contacts of triangle t with the field of the body of entry[first:last]. Returns the new count, and 1 where no tet maps."""
+    at, unmapped = start, 0
+    own, other = s.body[t], s.body[entry[first]]
+    k = f.of_body[other]
+    A, B, C = dvec(0.0), dvec(0.0), dvec(0.0)  # corners in material space
+    phi = dvec(0.0)
+    reach = ti.cast(0.0, ti.f64)
+    j = 0
+    while j < 4 and unmapped == 0:  # the corners, then the deepest point between them
+        w = dvec(ti.cast(j == 0, ti.f64), ti.cast(j == 1, ti.f64), ti.cast(j == 2, ti.f64))
+        wanted = True
+        if j == 3:
+            reach = ti.max((A - B).norm(), (B - C).norm(), (C - A).norm())
+            # phi at most 1 per metre: between two corners it is no deeper than this
+            wanted = phi.min() - reach <= 2.0 * margin
+            if wanted:
+                v, value = deepest_point(f, k, A, B, C, phi)
+                for i in ti.static(range(3)):
+                    w[i] = v[i]
+                wanted = value < phi.min() - ti.cast(DEEPER, ti.f64) * reach and w.max() < 1.0 - 1e-6
+        if wanted:
+            x = w[0] * corner(s, t, 0) + w[1] * corner(s, t, 1) + w[2] * corner(s, t, 2)
+            u = _nearest(s, f, entry, first, last, x)
+            if u < 0:
+                unmapped = 1
+            else:
+                X, G = _material(f, u, x)
+                value, _ = f.sample(k, X)
+                for i in ti.static(range(3)):
+                    if i == j:
+                        phi[i] = value
+                        wanted = (s.owns[t] >> i) & 1 == 1
+                for i in ti.static(range(3)):
+                    A[i] = ti.select(j == 0, X[i], A[i])
+                    B[i] = ti.select(j == 1, X[i], B[i])
+                    C[i] = ti.select(j == 2, X[i], C[i])
+                if wanted:
+                    n = G.transpose() @ f.gradient(k, X)
+                    length = n.norm()
+                    gap = value / ti.max(length, 1e-30)
+                    n = unit(n)
+                    a, b, c = corner(s, u, 0), corner(s, u, 1), corner(s, u, 2)
+                    v, _ = closest_on_triangle(x - gap * n, a, b, c)
+                    tu, tt = vertices_of(s, u), vertices_of(s, t)
+                    nearer = (moved(s, t, w) - moved(s, u, v)).dot(n)
+                    if length > 0.0 and gap + ti.min(nearer, 0.0) <= margin:
+                        i = s.triangle[t, ti.min(j, 2)]
+                        good = 0
+                        if j < 3:
+                            good = sticks_out(s, i, n)
+                        else:
+                            good = deeper_inside(s, t, w, n, x)
+                        if good == 1 and j < 3:
+                            write_contact(
+                                out, at, end, own, other, ivec(VERTEX_FIELD, i, other), x, n, gap,
+                                ivec(i, -1, -1), dvec(1.0, 0.0, 0.0), tu, v,
+                            )  # fmt: skip
+                            at += 1
+                        elif good == 1:
+                            write_contact(
+                                out, at, end, own, other, ivec(FACE_FIELD, t, other), x, n, gap, tt, w, tu, v
+                            )  # fmt: skip
+                            at += 1
+        j += 1
+    return at, unmapped
+
+
+@kernel
+def find_in_fields(
+    s: ti.template(), f: ti.template(), start: ti.template(), row_end: ti.template(), entry: ti.template(), margin: ti.f64,
+    out: ti.template(), used: ti.template(), part: ti.i32, unmapped: ti.template(),
+):  # fmt: skip
+    """Add the contacts with distance fields; unmapped[0] counts the (triangle, body) that no tet maps."""
+    ti.loop_config(serialize=s.serial)
+    for c in range(s.chunks):
+        at, end = c * part + used[c], (c + 1) * part
+        lost = 0
+        for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
+            t = s.active[i]
+            first = start[t]
+            while first < row_end[t]:
+                other = s.body[entry[first]]
+                last = first + 1
+                while last < row_end[t] and s.body[entry[last]] == other:
+                    last += 1
+                if f.of_body[other] >= 0 and other != s.body[t]:
+                    at, miss = _field_contacts(s, f, entry, first, last, t, margin, out, at, end)
+                    lost += miss
+                first = last
+        used[c] = at - c * part
+        ti.atomic_add(unmapped[0], lost)

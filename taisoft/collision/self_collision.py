@@ -1,0 +1,72 @@
+"""Which triangles intersect: of a body with itself, and of bodies with each other.
+
+Candidates leave out triangles that share a vertex, by number: those touch always. A fold is still found, by their
+neighbours. Positions are those of now, without the motion during the step.
+"""
+
+import numpy as np
+import taichi as ti
+
+from taisoft.collision.candidates import Buffer, Candidates, pairs, sum_parts
+from taisoft.collision.features import corner
+from taisoft.collision.surface import Surface, part_first
+from taisoft.collision.triangles import triangles_intersect
+from taisoft.runtime import FieldArena, kernel
+
+
+@ti.func
+def intersect(s: ti.template(), t, u):
+    """1 where triangles t and u of the surface intersect or touch, else 0."""
+    return triangles_intersect(
+        corner(s, t, 0), corner(s, t, 1), corner(s, t, 2), corner(s, u, 0), corner(s, u, 1), corner(s, u, 2)
+    )
+
+
+@kernel
+def find_intersections(
+    s: ti.template(), start: ti.template(), end: ti.template(), entry: ti.template(), pair: ti.template(), used: ti.template(),
+    total: ti.template(), part: ti.i32,
+):  # fmt: skip
+    """Pairs t < u of the rows that intersect; rows ascend, and so do the pairs of a part and the parts."""
+    ti.loop_config(serialize=s.serial)
+    for c in range(s.chunks):
+        last = (c + 1) * part
+        at = c * part
+        for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):
+            for e in range(start[t], end[t]):
+                u = entry[e]
+                if t < u and intersect(s, t, u) == 1:
+                    if at < last:
+                        pair[at] = ti.Vector([t, u], ti.i32)
+                    at += 1
+        used[c] = at - c * part
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        sum_parts(used, total, s.chunks)
+
+
+class Intersections:
+    """Finds the intersecting triangles among candidates."""
+
+    def __init__(self, surface: Surface, arena: FieldArena, capacity: int | None = None, most: int | None = None):
+        """capacity: pairs at first; most: pairs at most; None for the default."""
+        self.surface = surface
+        self.pairs = Buffer("intersections", pairs, capacity or surface.n_triangles + 64, most, surface.chunks, arena)
+
+    def find(self, candidates: Candidates) -> np.ndarray:
+        """(k,2) triangles t < u that intersect or touch, in ascending order, of the present positions.
+
+        Raises SimulationError where the buffer may not grow as far as it must.
+        """
+        found, c = self.pairs, candidates
+        while True:
+            find_intersections(self.surface, c.start, c.end, c.entry, found.data, found.used, found.count, found.part)
+            if found.fits():
+                break
+        data, used = found.data.to_numpy(), found.used.to_numpy()
+        places = np.arange(found.capacity)
+        return data[: found.capacity][places % found.part < np.repeat(used, found.part)]
+
+    def release(self) -> None:
+        """Give the memory of the buffer back."""
+        self.pairs.release()

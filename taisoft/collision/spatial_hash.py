@@ -1,0 +1,288 @@
+"""Candidates by spatial hashing over a dense grid (report, section 3.1.4; Teschner et al. 2003, Vision, Modeling, Visualization).
+
+Count, prefix scan, scatter: each triangle is put into the cells that its swept box covers; then each looks through its cells.
+A pair is accepted in the one cell that holds the least corner of the boxes' overlap, so it is found once. The grid is
+periodic: indices wrap round its size, which puts far things into cells of near ones but never outside the memory; the
+box test keeps the answer exact. A triangle that covers more than LARGE cells, or lies so far out that cells can no longer be
+counted, is not put into the grid but compared with every other one.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from taisoft.collision.candidates import TOTAL, Buffer, Candidates, entries, sort_row, sum_parts
+from taisoft.collision.surface import ACTIVE, Surface, boxes_overlap, ivec, may_touch, part_first
+from taisoft.runtime import FieldArena, kernel
+
+LARGE = 512  # cells
+COUNTABLE = 2.0**50  # cells from the origin: beyond, neighbouring cells have the same number in f64
+MOST_CELLS = 2**22
+CELLS_PER_TRIANGLE = 2
+ENTRIES_PER_TRIANGLE = 24  # of a row, at first
+SCAN = 256  # parts of the prefix scan
+N_LARGE, N_ENTRIES = 0, 1  # places in the grid's count
+
+
+def grid_size(extent: np.ndarray, cell: float, n_triangles: int) -> tuple[int, int, int]:
+    """Cells along each axis, powers of two: enough for the extent (3,) [m], but not many more than triangles."""
+    most = min(MOST_CELLS, max(512, CELLS_PER_TRIANGLE * n_triangles))
+    bits = [max(0, math.ceil(math.log2(min(max(e / cell, 1.0), 2.0**20)))) for e in extent]
+    while sum(bits) > math.log2(most):
+        bits[bits.index(max(bits))] -= 1
+    return tuple(2**b for b in bits)
+
+
+@ti.func
+def _cell_of(g: ti.template(), x, inverse):
+    """Wrapped cell of a point that can be counted."""
+    cell = ivec(0)
+    for q in ti.static(range(3)):
+        n = ti.cast(g.size[q], ti.f64)
+        k = ti.floor(x[q] * inverse)
+        cell[q] = ti.cast(k - n * ti.floor(k / n), ti.i32)
+    return cell
+
+
+@ti.func
+def _cells_of(s: ti.template(), g: ti.template(), t, inverse):
+    """First wrapped cell of a triangle's box, and how many it covers along each axis; (0, 0, 0) for a large one."""
+    lo, hi = s.lo[t], s.hi[t]
+    count = ivec(0)
+    far = ti.cast(0.0, ti.f64)
+    cells = ti.cast(1.0, ti.f64)
+    for q in ti.static(range(3)):
+        far = ti.max(far, ti.max(ti.abs(lo[q]), ti.abs(hi[q])) * inverse)
+        # the same floors as for the corner of an overlap, so that no cell is missed
+        cells *= ti.min(ti.floor(hi[q] * inverse) - ti.floor(lo[q] * inverse) + 1.0, ti.cast(g.size[q], ti.f64))
+    first = ivec(0)
+    if far < COUNTABLE and cells <= LARGE:
+        first = _cell_of(g, lo, inverse)
+        for q in ti.static(range(3)):
+            span = ti.floor(hi[q] * inverse) - ti.floor(lo[q] * inverse) + 1.0
+            count[q] = ti.cast(ti.min(span, ti.cast(g.size[q], ti.f64)), ti.i32)
+    return first, count
+
+
+@ti.func
+def _bucket(g: ti.template(), first, count, k):
+    """Number in memory of the k-th cell of a box."""
+    z = k % count[2]
+    y = (k // count[2]) % count[1]
+    x = k // (count[2] * count[1])
+    # sizes are powers of two
+    return _index(g, (first + ivec(x, y, z)) & ivec(g.size[0] - 1, g.size[1] - 1, g.size[2] - 1))
+
+
+@ti.func
+def _index(g: ti.template(), cell):
+    return (cell[0] * g.size[1] + cell[1]) * g.size[2] + cell[2]
+
+
+@kernel
+def count_cells(s: ti.template(), g: ti.template(), inverse: ti.f64):
+    """Cells of each active triangle, entries of each cell, the list of large triangles."""
+    ti.loop_config(serialize=s.serial)
+    for c in range(g.n_cells):
+        g.cell_end[c] = 0
+    ti.loop_config(serialize=s.serial)
+    for i in range(s.count[ACTIVE]):
+        t = s.active[i]
+        first, count = _cells_of(s, g, t, inverse)
+        g.first_cell[t] = first
+        g.cell_count[t] = count
+        for k in range(count[0] * count[1] * count[2]):
+            ti.atomic_add(g.cell_end[_bucket(g, first, count, k)], 1)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        n = 0
+        for j in range(s.count[ACTIVE]):
+            t = s.active[j]
+            if g.cell_count[t][0] == 0:
+                g.large[n] = t
+                n += 1
+        g.count[N_LARGE] = n
+
+
+@kernel
+def scan_cells(s: ti.template(), g: ti.template()):
+    """Prefix sums: cell_start from the counts in cell_end, which then points there too."""
+    ti.loop_config(serialize=s.serial)
+    for c in range(SCAN):
+        total = 0
+        for k in range(part_first(c, g.n_cells, SCAN), part_first(c + 1, g.n_cells, SCAN)):
+            total += g.cell_end[k]
+        g.scan[c] = total
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        total = 0
+        for k in range(SCAN):
+            n = g.scan[k]
+            g.scan[k] = total
+            total += n
+        g.count[N_ENTRIES] = total
+    ti.loop_config(serialize=s.serial)
+    for c in range(SCAN):
+        total = g.scan[c]
+        for k in range(part_first(c, g.n_cells, SCAN), part_first(c + 1, g.n_cells, SCAN)):
+            n = g.cell_end[k]
+            g.cell_start[k] = total
+            g.cell_end[k] = total
+            total += n
+
+
+@kernel
+def scatter_cells(s: ti.template(), g: ti.template(), member: ti.template()):
+    """Write the active triangles into their cells; the order in a cell is that of the threads."""
+    ti.loop_config(serialize=s.serial)
+    for i in range(s.count[ACTIVE]):
+        t = s.active[i]
+        first, count = g.first_cell[t], g.cell_count[t]
+        for k in range(count[0] * count[1] * count[2]):
+            member[ti.atomic_add(g.cell_end[_bucket(g, first, count, k)], 1)] = t
+
+
+@ti.func
+def _append(entry: ti.template(), at, last, u):
+    """Write an entry where it still fits; the count goes on."""
+    if at < last:
+        entry[at] = u
+
+
+@ti.func
+def _is_pair(s: ti.template(), t, u):
+    """1 where two triangles' boxes overlap and they may touch."""
+    found = 0
+    if u != t:
+        if boxes_overlap(s, t, u):
+            found = may_touch(s, t, u)
+    return found
+
+
+@kernel
+def find_rows(
+    s: ti.template(), g: ti.template(), member: ti.template(), entry: ti.template(), used: ti.template(),
+    total: ti.template(), part: ti.i32, inverse: ti.f64,
+):  # fmt: skip
+    """Each active triangle's row, sorted; a part of the list fills its own part of the entries."""
+    ti.loop_config(serialize=s.serial)
+    for t in range(s.n_triangles):
+        g.start[t] = 0
+        g.end[t] = 0
+    ti.loop_config(serialize=s.serial)
+    for c in range(s.chunks):
+        last = (c + 1) * part
+        at = c * part
+        for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
+            t = s.active[i]
+            begin = at
+            own = s.body[t]
+            self_on = s.self_on[own]
+            first, count = g.first_cell[t], g.cell_count[t]
+            for k in range(count[0] * count[1] * count[2]):
+                bucket = _bucket(g, first, count, k)
+                for e in range(g.cell_start[bucket], g.cell_end[bucket]):
+                    u = member[e]
+                    if s.body[u] != own or self_on == 1:
+                        if _is_pair(s, t, u) == 1:
+                            if _index(g, ti.select(s.lo[t] >= s.lo[u], first, g.first_cell[u])) == bucket:
+                                _append(entry, at, last, u)
+                                at += 1
+            if count[0] == 0:
+                for j in range(s.count[ACTIVE]):
+                    u = s.active[j]
+                    if _is_pair(s, t, u) == 1:
+                        _append(entry, at, last, u)
+                        at += 1
+            else:
+                for j in range(g.count[N_LARGE]):
+                    u = g.large[j]
+                    if _is_pair(s, t, u) == 1:
+                        _append(entry, at, last, u)
+                        at += 1
+            if at <= last:
+                g.start[t] = begin
+                g.end[t] = at
+                sort_row(entry, begin, at)
+        used[c] = at - c * part
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        sum_parts(used, total, s.chunks)
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Fields of the grid."""
+
+    size: tuple[int, int, int]  # cells along each axis
+    n_cells: int
+    cell_start: Any  # (n_cells) i32: members of each cell
+    cell_end: Any
+    scan: Any  # (SCAN) i32: sums of the parts of the scan
+    first_cell: Any  # (n_triangles) 3-vectors i32: of the cells that a box covers
+    cell_count: Any  # (n_triangles) 3-vectors i32: along each axis, 0 for large ones
+    large: Any  # i32: the first count[N_LARGE] are the large triangles
+    count: Any  # (2) i32
+    start: Any  # (n_triangles) i32: rows
+    end: Any
+
+
+def _make_grid(size: tuple[int, int, int], n: int, arena: FieldArena) -> Grid:
+    """Allocate the grid for n triangles."""
+    cells = size[0] * size[1] * size[2]
+
+    def ints(name: str, count: int):
+        return arena.field(f"hash_{name}", ti.i32, count)
+
+    return Grid(
+        size, cells, ints("cell_start", cells), ints("cell_end", cells), ints("scan", SCAN),
+        arena.vectors("hash_first_cell", ti.i32, n), arena.vectors("hash_cell_count", ti.i32, n), ints("large", n),
+        ints("count", 2), ints("start", n), ints("end", n),
+    )  # fmt: skip
+
+
+class SpatialHash:
+    """The broad phase by a dense grid. cell: edge of the cells [m]; may be changed at any time."""
+
+    def __init__(
+        self, surface: Surface, arena: FieldArena, cell: float, extent: np.ndarray, capacity: int | None = None,
+        most: int | None = None,
+    ):  # fmt: skip
+        """extent: (3,) [m], of what is usually there. capacity: entries at first, most: at most; None for the default."""
+        n = surface.n_triangles
+        self.surface, self.cell = surface, cell
+        self.grid = _make_grid(grid_size(extent, cell, n), max(n, 1), arena)
+        self.members = Buffer("hash_cells", entries, capacity or 8 * n + 64, most, 1, arena)
+        self.rows = Buffer("hash_rows", entries, capacity or ENTRIES_PER_TRIANGLE * n + 64, most, surface.chunks, arena)
+
+    def find(self) -> Candidates:
+        """The candidates of the present boxes. Raises SimulationError where a buffer may not grow as far as it must."""
+        s, g, inverse = self.surface, self.grid, 1.0 / self.cell
+        count_cells(s, g, inverse)
+        scan_cells(s, g)
+        self.members.count[0] = g.count[N_ENTRIES]
+        self.members.fits()
+        scatter_cells(s, g, self.members.data)
+        while True:
+            rows = self.rows
+            find_rows(s, g, self.members.data, rows.data, rows.used, rows.count, rows.part, inverse)
+            if rows.fits():
+                return Candidates(g.start, g.end, rows.data)
+
+    @property
+    def buffers(self) -> tuple[Buffer, ...]:
+        """What grows."""
+        return self.members, self.rows
+
+    @property
+    def n_pairs(self) -> int:
+        """Pairs that the last search found."""
+        return self.rows.count[TOTAL] // 2
+
+    def release(self) -> None:
+        """Give the memory of the buffers back."""
+        for buffer in self.buffers:
+            buffer.release()

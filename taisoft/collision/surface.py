@@ -1,0 +1,286 @@
+"""Surface: the triangles of everything that can be touched, in one list: soft bodies first, then obstacles that have faces.
+
+Positions and boxes are f64 in either precision: a gap is a small difference of large numbers. A triangle's box holds it at
+the start and at the end of the step and is grown by half the margin, so that two triangles whose distance falls below the
+margin have overlapping boxes. A triangle with a coordinate that is not finite has an empty box, which overlaps nothing.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from taisoft.runtime import FieldArena, Runtime, kernel
+
+SERIAL_BELOW = 1500  # triangles below which one thread is faster than waking the others (about 50 us a loop)
+CHUNKS = {"cpu": 64, "cuda": 4096}  # parts of a list that are worked on side by side, each with its own part of a buffer
+UNFINITE, ACTIVE = 0, 1  # places in Surface.count
+
+dvec = ti.types.vector(3, ti.f64)
+ivec = ti.types.vector(3, ti.i32)
+
+
+@dataclass(frozen=True)
+class Topology:
+    """Triangles on the host. Vertices are numbered over all colliders, without those inside the bodies.
+
+    triangle: (t,3) vertices; body: (t,) collider, ascending; first: (n_bodies + 1,) first triangle of each collider;
+    vertex_first: (n_bodies + 1,) first vertex; node: (v,) the model's node, -1 for obstacles; neighbour: (t,3) triangle across
+    the edge from corner k to k + 1, -1 where there is none; owns: (t,) bits 0-2 corners, 3-5 edges that this triangle
+    handles for all that share them; ring_start, ring: triangles round each vertex; behind: (t,4) nodes of the linear tet.
+    """
+
+    triangle: np.ndarray
+    body: np.ndarray
+    first: np.ndarray
+    vertex_first: np.ndarray
+    node: np.ndarray
+    neighbour: np.ndarray
+    owns: np.ndarray
+    ring_start: np.ndarray
+    ring: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Fields of the triangles, for kernels; `Topology` says what the tables hold."""
+
+    n_triangles: int
+    n_verts: int
+    n_bodies: int  # colliders, with those that have no faces
+    serial: bool
+    chunks: int
+    triangle: Any  # (n_triangles, 3) i32
+    body: Any  # i32
+    node: Any  # i32
+    neighbour: Any  # (n_triangles, 3) i32
+    owns: Any  # i32
+    ring_start: Any  # i32
+    ring: Any  # i32
+    soft: Any  # (n_bodies) i32: 1 for soft bodies
+    self_on: Any  # (n_bodies) i32: 1 where a body is tested against itself
+    first_of: Any  # (n_bodies + 1) i32
+    rest: Any  # (n_verts) 3-vectors f64: at rest [m]
+    x: Any  # (n_verts) 3-vectors f64: where they are [m]
+    move: Any  # (n_verts) 3-vectors f64: how far they go in the step [m]
+    lo: Any  # 3-vectors f64: boxes of the triangles [m]
+    hi: Any
+    body_lo: Any  # (n_bodies) 3-vectors f64
+    body_hi: Any
+    active: Any  # i32: triangles whose box meets another collider's, ascending; the first count[ACTIVE] hold
+    count: Any  # (4) i32
+    part: Any  # (chunks) i32: counts of the parts of a list
+
+
+def make_topology(parts: list[tuple[np.ndarray, np.ndarray]]) -> Topology:
+    """Number the surfaces of all colliders through. parts: of each, (t,3) triangles and (v,) the nodes they name."""
+    triangle, body, node, first, vertex_first = [], [], [], [0], [0]
+    for k, (triangles, nodes) in enumerate(parts):
+        triangle.append(triangles + vertex_first[-1])
+        body.append(np.full(len(triangles), k))
+        node.append(nodes)
+        first.append(first[-1] + len(triangles))
+        vertex_first.append(vertex_first[-1] + len(nodes))
+    t = np.concatenate(triangle).reshape(-1, 3)
+    neighbour, edge_owned = _edges(t)
+    corners = t.reshape(-1)
+    order = np.argsort(corners, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=vertex_first[-1]))])
+    ring = order // 3
+    owner = np.full(vertex_first[-1], -1)
+    used = start[1:] > start[:-1]
+    owner[used] = ring[start[:-1][used]]  # the first triangle round a vertex
+    corner_owned = owner[t] == np.arange(len(t))[:, None]
+    bits = np.concatenate([corner_owned, edge_owned], axis=1) @ (1 << np.arange(6))
+    return Topology(
+        t, np.concatenate(body), np.array(first), np.array(vertex_first), np.concatenate(node), neighbour, bits, start, ring
+    )
+
+
+def _edges(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Neighbours (t,3) across each triangle's edges, -1 at open and at crowded edges; (t,3) bool: it owns the edge."""
+    ends = np.sort(np.stack([t, np.roll(t, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = (ends[order[1:]] != ends[order[:-1]]).any(axis=1)
+    starts = np.flatnonzero(new)
+    counts = np.diff(np.append(starts, len(order)))
+    neighbour = np.full(len(order), -1)
+    a, b = order[starts[counts == 2]], order[starts[counts == 2] + 1]
+    neighbour[a], neighbour[b] = b // 3, a // 3
+    owned = np.zeros(len(order), dtype=bool)
+    owned[order[starts]] = True  # the sort is stable: the triangle of least number
+    return neighbour.reshape(-1, 3), owned.reshape(-1, 3)
+
+
+def build_surface(
+    topology: Topology, rest: np.ndarray, soft: np.ndarray, self_on: np.ndarray, runtime: Runtime, arena: FieldArena,
+    serial: bool | None = None,
+) -> Surface:  # fmt: skip
+    """Allocate and fill the fields. rest: (v,3) [m]; soft, self_on: (n_bodies,) bool. serial: None decides by size."""
+    t, i = topology, ti.i32
+    n, v, bodies = len(t.triangle), len(t.node), len(soft)
+    if serial is None:
+        serial = runtime.arch == "cpu" and n < SERIAL_BELOW
+    chunks = 1 if serial else CHUNKS[runtime.arch]
+
+    def ints(name: str, data: np.ndarray):
+        return arena.field(f"surface_{name}", i, max(len(data), 1), _filled(data))
+
+    def rows(name: str, data: np.ndarray):
+        # not a field of vectors: in one kernel with both run-time and fixed numbers of components, the compiler mixes these up
+        return arena.field(f"surface_{name}", i, (max(len(data), 1), 3), _filled(data))
+
+    def vectors(name: str, count: int):
+        return arena.vectors(f"surface_{name}", ti.f64, max(count, 1))
+
+    return Surface(
+        n, v, bodies, serial, chunks, rows("triangle", t.triangle), ints("body", t.body), ints("node", t.node),
+        rows("neighbour", t.neighbour), ints("owns", t.owns), ints("ring_start", t.ring_start), ints("ring", t.ring),
+        ints("soft", soft), ints("self_on", self_on), ints("first_of", t.first),
+        arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None), vectors("x", v), vectors("move", v),
+        vectors("lo", n), vectors("hi", n), vectors("body_lo", bodies), vectors("body_hi", bodies),
+        arena.field("surface_active", i, max(n, 1)), arena.field("surface_count", i, 4), arena.field("surface_part", i, chunks),
+    )  # fmt: skip
+
+
+def _filled(data: np.ndarray) -> np.ndarray:
+    """As i32, with one row at least: no field is empty."""
+    data = np.asarray(data)
+    return (data if len(data) else np.zeros((1, *data.shape[1:]))).astype(np.int32)
+
+
+@ti.func
+def part_first(c, n, parts: ti.template()):
+    """Where part c of a list of n begins, when it is cut into equal parts."""
+    return c * (n // parts) + ti.min(c, n % parts)
+
+
+@ti.func
+def boxes_overlap(s: ti.template(), t, u):
+    """Whether the boxes of two triangles share a point."""
+    found = False  # axis by axis: most boxes are told apart by the first
+    if s.lo[t][0] <= s.hi[u][0] and s.lo[u][0] <= s.hi[t][0]:
+        if s.lo[t][1] <= s.hi[u][1] and s.lo[u][1] <= s.hi[t][1]:
+            found = s.lo[t][2] <= s.hi[u][2] and s.lo[u][2] <= s.hi[t][2]
+    return found
+
+
+@ti.func
+def share_vertex(s: ti.template(), t, u):
+    """Whether two triangles have a vertex in common."""
+    found = 0
+    for k in range(3):
+        i = s.triangle[t, k]
+        if i == s.triangle[u, 0] or i == s.triangle[u, 1] or i == s.triangle[u, 2]:
+            found = 1
+    return found
+
+
+@ti.func
+def may_touch(s: ti.template(), t, u):
+    """Whether two triangles are a pair that counts: of different colliders, one of them soft; or of one body that is
+    tested against itself, without a common vertex."""
+    a, b = s.body[t], s.body[u]
+    result = 0
+    if a != b:
+        result = s.soft[a] | s.soft[b]
+    elif s.self_on[a] == 1:
+        result = 1 - share_vertex(s, t, u)
+    return result
+
+
+@kernel
+def move_soft(s: ti.template(), x: ti.template(), v: ti.template(), dt: ti.f64):
+    """Take the soft bodies' positions x (n_nodes) [m] and the way v dt of a step from the model."""
+    ti.loop_config(serialize=s.serial)
+    for i in range(s.n_verts):
+        if s.node[i] >= 0:
+            s.x[i] = x[s.node[i]]
+            s.move[i] = dt * ti.cast(v[s.node[i]], ti.f64)
+
+
+@kernel
+def move_obstacles(s: ti.template(), first: ti.i32, x: ti.types.ndarray(), move: ti.types.ndarray()):
+    """Place the vertices of an obstacle, the first of which is `first`: x, move (n,3) f64 [m]."""
+    ti.loop_config(serialize=s.serial)
+    for i in range(x.shape[0]):
+        for q in ti.static(range(3)):
+            s.x[first + i][q] = x[i, q]
+            s.move[first + i][q] = move[i, q]
+
+
+@kernel
+def update_boxes(s: ti.template(), margin: ti.f64):
+    """Boxes of triangles and colliders from x and move; counts the triangles that are not finite."""
+    s.count[UNFINITE] = 0
+    ti.loop_config(serialize=s.serial)
+    for t in range(s.n_triangles):
+        lo = dvec(ti.math.inf)
+        hi = dvec(-ti.math.inf)
+        finite = 1
+        for k in range(3):
+            i = s.triangle[t, k]
+            a, d = s.x[i], s.move[i]
+            b = a + d
+            lo = ti.min(lo, ti.min(a, b))
+            hi = ti.max(hi, ti.max(a, b))
+            for q in ti.static(range(3)):
+                if not (ti.abs(a[q]) < ti.math.inf and ti.abs(b[q]) < ti.math.inf):
+                    finite = 0
+        if finite == 1:
+            s.lo[t] = lo - ti.cast(0.5, ti.f64) * margin
+            s.hi[t] = hi + ti.cast(0.5, ti.f64) * margin
+        else:
+            s.lo[t] = dvec(ti.math.inf)
+            s.hi[t] = dvec(-ti.math.inf)
+            ti.atomic_add(s.count[UNFINITE], 1)
+    ti.loop_config(serialize=s.serial)
+    for b in range(s.n_bodies):
+        lo = dvec(ti.math.inf)
+        hi = dvec(-ti.math.inf)
+        for t in range(s.first_of[b], s.first_of[b + 1]):
+            lo = ti.min(lo, s.lo[t])
+            hi = ti.max(hi, s.hi[t])
+        s.body_lo[b] = lo
+        s.body_hi[b] = hi
+
+
+@ti.func
+def _meets_another(s: ti.template(), t):
+    """Whether a triangle's box meets the box of a collider that it may touch."""
+    own, lo, hi = s.body[t], s.lo[t], s.hi[t]
+    found = 0
+    if (lo <= hi).all():
+        found = s.self_on[own]
+        b = 0
+        while found == 0 and b < s.n_bodies:
+            if b != own and (s.soft[own] | s.soft[b]) == 1 and (lo <= s.body_hi[b]).all() and (s.body_lo[b] <= hi).all():
+                found = 1
+            b += 1
+    return found
+
+
+@kernel
+def find_active(s: ti.template()):
+    """List the triangles that can have a partner, in ascending order."""
+    ti.loop_config(serialize=s.serial)
+    for c in range(s.chunks):
+        first = part_first(c, s.n_triangles, s.chunks)
+        n = 0
+        for t in range(first, part_first(c + 1, s.n_triangles, s.chunks)):
+            if _meets_another(s, t):
+                s.active[first + n] = t
+                n += 1
+        s.part[c] = n
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        total = 0
+        for k in range(s.chunks):
+            base = part_first(k, s.n_triangles, s.chunks)
+            n = s.part[k]
+            for j in range(n):  # moves left only, so nothing is overwritten before it is read
+                s.active[total + j] = s.active[base + j]
+            total += n
+        s.count[ACTIVE] = total

@@ -1,0 +1,200 @@
+"""An elastic body as plain data: its mesh, what it is made of, what holds, moves and loads it, by what it is hit."""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from taisoft.errors import SceneError
+from taisoft.mesh.nodes import Nodes, make_nodes
+from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.scene import checks
+from taisoft.scene.collision import HIT_BY, choose_hit_by
+from taisoft.scene.material import Material
+
+NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock: they bend far too little
+QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # of polynomials integrated exactly, by order; the first is the default
+_FREE, _FIXED, _MOVED = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class Constraint:
+    """Nodes held along some axes: at their start, or at their start plus a displacement that depends on time."""
+
+    nodes: np.ndarray  # (k,) int64 node ids
+    axes: np.ndarray  # (3,) bool
+    path: Callable | None = None  # t [s] -> displacement (3,) or (k,3) [m], None once released; no path: they stay
+
+
+@dataclass(frozen=True, eq=False)
+class Traction:
+    """A dead load on surface triangles."""
+
+    triangles: np.ndarray  # (k,) int64 rows of mesh.surface
+    value: np.ndarray  # (3,) force per reference area [Pa]
+
+
+@dataclass(frozen=True, eq=False)
+class NodalForce:
+    """A dead load on nodes: a total spread over them by their lumped mass, or one force for each."""
+
+    nodes: np.ndarray  # (k,) int64 node ids
+    value: np.ndarray  # (3,) total force, or (k,3) one a node [N]
+
+
+class Body:
+    """One elastic body of a scene; made by `Scene.add_body`.
+
+    name, mesh, material. position: (3,) [m], where the body starts: its nodes begin at rest_positions + position.
+    velocity: (3,) or (n,3) [m/s], of the start. order: 1 or 2, of the elements' shape functions; quadrature_degree: of
+    polynomials that their quadrature integrates exactly. nodes: `Nodes`, the mesh's vertices and for order 2 the middles
+    of its edges. constraints, tractions, forces: lists of `Constraint`, `Traction`, `NodalForce`. collision: one of HIT_BY.
+    A Poisson's ratio above 0.49 is told with a UserWarning for order 1, whose tets are far too stiff there.
+    """
+
+    def __init__(
+        self, name: str, mesh: TetMesh, material: Material, position, velocity, order: int, quadrature_degree: int | None,
+        collision: str = "auto",
+    ):  # fmt: skip
+        what = f"body {name!r}"
+        if not isinstance(mesh, TetMesh):
+            raise SceneError(f"{what}: mesh must be a TetMesh, not {type(mesh).__name__}")
+        if not isinstance(material, Material):
+            raise SceneError(f"{what}: material must be a Material, not {type(material).__name__}")
+        self.name = name
+        self.mesh = mesh
+        self.material = material
+        self.order = checks.whole(order, f"{what}: order", tuple(QUADRATURE_DEGREES))
+        degrees = QUADRATURE_DEGREES[self.order]
+        degree = degrees[0] if quadrature_degree is None else quadrature_degree
+        self.quadrature_degree = checks.whole(degree, f"{what}: quadrature_degree of order {self.order}", degrees)
+        self.tell_locking()
+        self.nodes: Nodes = make_nodes(mesh, self.order)
+        self.position = checks.array(position, f"{what}: position", ((3,),))
+        self.velocity = checks.array(velocity, f"{what}: velocity", ((3,), (self.n_nodes, 3)))
+        self.collision = collision
+        self._fitting: tuple[str, str] | None = None  # what "auto" gives, once asked for
+        self.constraints: list[Constraint] = []
+        self.tractions: list[Traction] = []
+        self.forces: list[NodalForce] = []
+        self._held = np.full((self.n_nodes, 3), _FREE, dtype=np.int8)  # what holds each node along each axis
+
+    @property
+    def rest_positions(self) -> np.ndarray:
+        """(n,3) [m], read-only: the nodes where the body is free of stress; the mesh's vertices come first."""
+        return self.nodes.positions
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of nodes."""
+        return len(self.nodes.positions)
+
+    @property
+    def collision(self) -> str:
+        """By what the body is to be hit, one of HIT_BY; setting it raises SceneError for anything else."""
+        return self._collision
+
+    @collision.setter
+    def collision(self, value: str) -> None:
+        self._collision = checks.choice(value, f"body {self.name!r}: collision", HIT_BY)
+
+    @property
+    def collision_choice(self) -> tuple[str, str]:
+        """By what the body is hit, "distance_field" or "proximity", and why; for "auto" decided once, when first asked."""
+        if self.collision != "auto":
+            return self.collision, "asked for"
+        if self._fitting is None:
+            self._fitting = choose_hit_by(self.rest_positions, self.nodes.surface)
+        return self._fitting
+
+    @property
+    def hit_by(self) -> str:
+        """ "distance_field" or "proximity"."""
+        return self.collision_choice[0]
+
+    def __repr__(self) -> str:
+        kind = f"{self.mesh.n_tets} tets of order {self.order}"
+        return f"Body({self.name!r}, {self.n_nodes} nodes, {kind}, {self.material.law})"
+
+    def tell_locking(self) -> None:
+        """Warn of linear tets where they lock."""
+        poisson = self.material.poisson
+        if self.order == 1 and poisson > NEARLY_INCOMPRESSIBLE:
+            warnings.warn(
+                f"body {self.name!r}: poisson = {poisson:g} is above {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend "
+                "far too little: order=2 locks less",
+                UserWarning, stacklevel=5,
+            )  # fmt: skip
+
+    def fix(self, where, axes: str = "xyz") -> Constraint:
+        """Hold nodes where they start.
+
+        where: node ids, a bool mask (n,), or a callable that gets the rest positions (n,3) and returns such a mask.
+        axes: the directions held, such as "y" or "xz". Raises SceneError when no node is chosen or one is moved.
+        """
+        what = f"body {self.name!r}: fix"
+        nodes = checks.selection(where, self.rest_positions, what, "node")
+        return self._hold(Constraint(nodes, checks.axes(axes, what)), _FIXED, what)
+
+    def move(self, where, path: Callable, axes: str = "xyz") -> Constraint:
+        """Lead nodes along a path.
+
+        where: as for `fix`, but no id twice. path: callable t [s] -> displacement from the start, (3,) or (k,3) in the
+        order of the chosen nodes [m], or None from the moment they are released; it is called once here, for t = 0.
+        axes: the directions led. Raises SceneError when no node is chosen, one is held already, or the path is not of
+        this kind.
+        """
+        what = f"body {self.name!r}: move"
+        nodes = checks.selection(where, self.rest_positions, what, "node", repeats=False)
+        mask = checks.axes(axes, what)
+        if not callable(path):
+            raise SceneError(f"{what}: path must be a function of time, not {path!r}")
+        try:
+            start = path(0.0)
+        except Exception as error:
+            raise SceneError(f"{what}: the path failed at t = 0: {type(error).__name__}: {error}") from error
+        if start is None:
+            raise SceneError(f"{what}: the path must give a displacement at t = 0, not None")
+        checks.array(start, f"{what}: the path's displacement at t = 0", ((3,), (len(nodes), 3)))
+        return self._hold(Constraint(nodes, mask, path), _MOVED, what)
+
+    def add_traction(self, where, traction) -> Traction:
+        """Load surface triangles with a dead force per reference area.
+
+        where: rows of mesh.surface, a bool mask (t,), or a callable that gets the triangles' centroids at rest (t,3)
+        and returns such a mask. traction: (3,) [Pa]. Raises SceneError when no triangle is chosen or a number is not
+        finite.
+        """
+        what = f"body {self.name!r}: add_traction"
+        centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
+        triangles = checks.selection(where, centroids, what, "surface triangle")
+        load = Traction(triangles, checks.array(traction, f"{what}: traction", ((3,),)))
+        self.tractions.append(load)
+        return load
+
+    def add_force(self, where, force) -> NodalForce:
+        """Load nodes with a total dead force, spread over them by lumped mass, or with one force for each node.
+
+        where: as for `fix`; a node chosen twice counts once. force: (3,) the total, or (k,3) in the order of the chosen
+        nodes [N]. Raises SceneError when no node is chosen or numbers are not finite.
+        """
+        what = f"body {self.name!r}: add_force"
+        nodes = checks.selection(where, self.rest_positions, what, "node")
+        load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,), (len(nodes), 3))))
+        self.forces.append(load)
+        return load
+
+    def _hold(self, constraint: Constraint, kind: int, what: str) -> Constraint:
+        """Add a constraint unless it contradicts an earlier one: only two fixes of one node and axis agree."""
+        at = np.ix_(constraint.nodes, np.flatnonzero(constraint.axes))
+        before = self._held[at]
+        clash = np.argwhere((before != _FREE) if kind == _MOVED else (before == _MOVED))
+        if len(clash):
+            row, column = clash[0]
+            axis = "xyz"[np.flatnonzero(constraint.axes)[column]]
+            done = "fixed" if before[row, column] == _FIXED else "moved"
+            raise SceneError(f"{what}: node {constraint.nodes[row]} is already {done} along {axis}")
+        self._held[at] = kind
+        self.constraints.append(constraint)
+        return constraint

@@ -1,0 +1,107 @@
+"""How contacts are looked for: the settings of a scene, and by which geometry a body is hit.
+
+A body is hit either through its signed distance grid at rest, mapped by its deformation, or by vertex-face and edge-edge
+proximity of its deformed surface. A grid is cheap and smooth, but rounds edges off and has cells thicker than a sheet.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taisoft.errors import MeshError, SceneError
+from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
+from taisoft.mesh.nodes import Nodes
+from taisoft.scene import checks
+
+BROAD_PHASES = ("auto", "spatial_hash", "bvh")
+HIT_BY = ("auto", "distance_field", "proximity")
+THIN = 1.0 / 8.0  # least over largest extent below which a body is thin
+SHARP = 60.0  # [degrees] between the normals of neighbours above which a convex edge is sharp
+
+
+@dataclass(frozen=True)
+class CollisionSettings:
+    """Numbers of the search for contacts. Raises SceneError for those outside the rules below."""
+
+    broad_phase: str = "auto"  # one of BROAD_PHASES
+    cell_ratio: float = 2.2  # edge of a hash cell over the mean surface edge, > 0
+    margin: float | None = None  # [m] within which contacts are reported, >= 0; None: 0.1 of the mean surface edge
+    k_dop: int = 6  # planes of a hierarchy's boxes: 6, 14 or 18
+    field_cells: int = 32  # cells of a distance field along a body's longest side, 8 to 256
+    initial_capacity: int | None = None  # of the buffers of pairs and contacts, at least 64; None: from the surface
+    max_capacity: int | None = None  # to which they may grow; None: to what the memory holds
+
+    def __post_init__(self):
+        what = "collision settings"
+        checks.choice(self.broad_phase, f"{what}: broad_phase", BROAD_PHASES)
+        clean = {
+            "cell_ratio": checks.number(self.cell_ratio, f"{what}: cell_ratio", above=0.0),
+            "k_dop": checks.whole(self.k_dop, f"{what}: k_dop", (6, 14, 18)),
+            "field_cells": _count(self.field_cells, f"{what}: field_cells", 8, 256),
+        }
+        if self.margin is not None:
+            clean["margin"] = checks.number(self.margin, f"{what}: margin", least=0.0, unit="m")
+        for field in ("initial_capacity", "max_capacity"):
+            if getattr(self, field) is not None:
+                clean[field] = _count(getattr(self, field), f"{what}: {field}", 64, 2**31 - 1)
+        if clean.get("initial_capacity", 0) > clean.get("max_capacity", 2**31):
+            raise SceneError(
+                f"{what}: initial_capacity {self.initial_capacity} must not exceed max_capacity {self.max_capacity}"
+            )
+        for field, value in clean.items():
+            # The only way to store a clean value in a frozen record.
+            object.__setattr__(self, field, value)
+
+
+def _count(value, what: str, least: int, most: int) -> int:
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or not least <= value <= most:
+        raise SceneError(f"{what} must be a whole number from {least} to {most}, not {value!r}")
+    return int(value)
+
+
+def choose_hit_by(positions: np.ndarray, surface: np.ndarray) -> tuple[str, str]:
+    """By what a body should be hit, "distance_field" or "proximity", and why.
+
+    positions: (n,3) [m]. surface: (t,3) int, closed and outward.
+    """
+    try:
+        opposite = opposite_half_edges(surface)
+    except MeshError:
+        return "proximity", "parts joined at an edge"
+    extents = _extents(positions, surface)
+    if extents.min() < THIN * extents.max():
+        return "proximity", "thin"
+    if _sharpest_turn(positions, surface, opposite) > SHARP:
+        return "proximity", "sharp edges"
+    return "distance_field", "smooth and not thin"
+
+
+def has_sharp_edges(nodes: Nodes) -> bool:
+    """Whether some convex edge of a surface turns by more than SHARP at rest."""
+    return _sharpest_turn(nodes.positions, nodes.surface, opposite_half_edges(nodes.surface)) > SHARP
+
+
+def _extents(positions: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """(3,) [m]: sides of the box along the principal axes of the surface's area.
+
+    With s the sum of a triangle's corners v about the centroid, the integral of x x^T is area/12 (sum v v^T + s s^T).
+    """
+    x = positions[surface]
+    area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1)
+    x = x - (area @ x.mean(axis=1)) / area.sum()
+    total = x.sum(axis=1)
+    moment = np.einsum("t,tki,tkj->ij", area, x, x) + np.einsum("t,ti,tj->ij", area, total, total)
+    return np.ptp(x.reshape(-1, 3) @ np.linalg.eigh(moment)[1], axis=0)
+
+
+def _sharpest_turn(positions: np.ndarray, surface: np.ndarray, opposite: np.ndarray) -> float:
+    """The largest angle [degrees] by which the normal turns at a convex edge, rounded to 1e-6."""
+    normals, _ = normals_and_heights(positions, surface)
+    t, k = np.nonzero(opposite >= 0)
+    other, at = np.divmod(opposite[t, k], 3)
+    apex = positions[surface[other, (at + 2) % 3]]  # the neighbour's corner beyond the edge
+    convex = np.einsum("ex,ex->e", apex - positions[surface[t, k]], normals[t]) < 0
+    a, b = normals[t[convex]], normals[other[convex]]
+    # From sine and cosine: the arc cosine alone is poor near 0 and 180 degrees.
+    turn = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ex,ex->e", a, b))
+    return round(float(np.degrees(turn.max(initial=0.0))), 6)

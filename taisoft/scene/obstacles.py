@@ -1,0 +1,299 @@
+"""Obstacles: rigid things that bodies touch and that nothing moves but their own path.
+
+A shape is a checked, frozen record. It lives in a frame of its own: x = frame() @ x_local + pivot. Half-space: the local y
+axis is the normal, the solid lies at y <= 0. Capsule: the local x axis runs from a to b. Box and sphere: the world's axes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import ClassVar
+
+import numpy as np
+
+from taisoft.errors import MeshError, SceneError
+from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
+from taisoft.mesh.shapes import box_mesh
+from taisoft.scene import checks
+
+DEGENERATE = 1e-9  # a triangle's least height below this times its longest edge counts as none
+RIGID = 1e-6  # largest entry of R^T R - I that a path's rotation may have
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """What all shapes offer; `kind` tells them apart where branching on a class is impossible. Arrays are read-only."""
+
+    kind: ClassVar[int]
+    word: ClassVar[str]
+
+    @property
+    def pivot(self) -> np.ndarray:
+        """(3,) [m]: about which a path's rotation turns the shape, and the origin of its frame; the center where it has one."""
+        return self.center
+
+    def frame(self) -> np.ndarray:
+        """(3,3) rotation whose columns are the local axes."""
+        return np.eye(3)
+
+    def size(self) -> np.ndarray:
+        """(3,) [m]: (radius, 0, 0) of a sphere, half extents of a box, (half length, radius, 0) of a capsule, else 0."""
+        return np.zeros(3)
+
+    def surface(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Vertices (n,3) [m] and triangles (t,3) int64 with normals out of the solid; None for a shape without."""
+        return None
+
+    def _vector(self, field: str) -> np.ndarray:
+        return self._store(field, checks.array(getattr(self, field), f"{self.word}: {field}", ((3,),)))
+
+    def _radius(self) -> None:
+        # The only way to store a clean value in a frozen record.
+        object.__setattr__(self, "radius", checks.number(self.radius, f"{self.word}: radius", above=0.0, unit="m"))
+
+    def _store(self, field: str, value: np.ndarray) -> np.ndarray:
+        value.setflags(write=False)
+        object.__setattr__(self, field, value)
+        return value
+
+
+@dataclass(frozen=True, eq=False)
+class HalfSpace(Shape):
+    """All points x with (x - point) . normal <= 0. Raises SceneError for a normal without length."""
+
+    point: np.ndarray  # (3,) [m] of its boundary
+    normal: np.ndarray  # (3,), any length; kept as a unit vector
+    kind: ClassVar[int] = 0
+    word: ClassVar[str] = "half-space"
+
+    def __post_init__(self):
+        self._vector("point")
+        self._store("normal", _unit(self._vector("normal"), "half-space: normal must not be zero"))
+
+    @property
+    def pivot(self) -> np.ndarray:
+        """(3,) [m]: the given point."""
+        return self.point
+
+    def frame(self) -> np.ndarray:
+        """(3,3): y along the normal."""
+        return _axes(self.normal, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere(Shape):
+    """A ball. Raises SceneError unless its radius is above 0."""
+
+    center: np.ndarray  # (3,) [m]
+    radius: float  # [m]
+    kind: ClassVar[int] = 1
+    word: ClassVar[str] = "sphere"
+
+    def __post_init__(self):
+        self._vector("center")
+        self._radius()
+
+    def size(self) -> np.ndarray:
+        """(radius, 0, 0) [m]."""
+        return np.array([self.radius, 0.0, 0.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Box(Shape):
+    """A box along the axes. Raises SceneError unless its half extents are above 0."""
+
+    center: np.ndarray  # (3,) [m]
+    half_extents: np.ndarray  # (3,) [m]
+    kind: ClassVar[int] = 2
+    word: ClassVar[str] = "box"
+
+    def __post_init__(self):
+        self._vector("center")
+        if not (self._vector("half_extents") > 0).all():
+            raise SceneError(f"box: half_extents must be greater than 0 m, not {self.half_extents.tolist()}")
+
+    def size(self) -> np.ndarray:
+        """Half extents (3,) [m]."""
+        return self.half_extents.copy()
+
+    def surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """8 vertices, 12 triangles; corner (i,j,k) has index 4 i + 2 j + k."""
+        corners, triangles = _unit_box()
+        return self.center + self.half_extents * corners, triangles.copy()
+
+
+@dataclass(frozen=True, eq=False)
+class Capsule(Shape):
+    """All points within a radius of the segment from a to b. Raises SceneError unless the radius is above 0 and a is not b."""
+
+    a: np.ndarray  # (3,) [m]
+    b: np.ndarray  # (3,) [m]
+    radius: float  # [m]
+    kind: ClassVar[int] = 3
+    word: ClassVar[str] = "capsule"
+
+    def __post_init__(self):
+        axis = self._vector("b") - self._vector("a")
+        _unit(axis, "capsule: a and b must not be the same point (that is a sphere)")
+        self._radius()
+
+    @property
+    def pivot(self) -> np.ndarray:
+        """(3,) [m]: the middle of a and b."""
+        return self.a + 0.5 * (self.b - self.a)
+
+    def frame(self) -> np.ndarray:
+        """(3,3): x from a to b."""
+        return _axes(_unit(self.b - self.a, "capsule"), 0)
+
+    def size(self) -> np.ndarray:
+        """(half length of the segment, radius, 0) [m]."""
+        return np.array([0.5 * float(np.linalg.norm(self.b - self.a)), self.radius, 0.0])
+
+
+@dataclass(frozen=True, eq=False)
+class MeshObstacle(Shape):
+    """Triangles whose normals point out of the solid; they need not close, and normals inward make a hollow.
+
+    Raises SceneError for indices that do not exist, triangles without area, an edge of more than two triangles, and
+    neighbours that are not oriented alike.
+    """
+
+    vertices: np.ndarray  # (n,3) [m]
+    triangles: np.ndarray  # (t,3) int64
+    kind: ClassVar[int] = 4
+    word: ClassVar[str] = "mesh obstacle"
+
+    def __post_init__(self):
+        try:
+            n = len(self.vertices)
+        except TypeError:
+            n = 0
+        vertices = checks.array(self.vertices, "mesh obstacle: vertices", ((max(n, 3), 3),))
+        rule = "mesh obstacle: triangles must be integers of shape (t, 3) with t > 0"
+        try:
+            triangles = np.asarray(self.triangles)
+        except (ValueError, TypeError, OverflowError) as error:
+            raise SceneError(f"{rule} ({error})") from error
+        if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles) or triangles.dtype.kind not in "iu":
+            raise SceneError(f"{rule}, not {triangles.dtype} of shape {triangles.shape}")
+        bad = np.argwhere((triangles < 0) | (triangles >= len(vertices)))
+        if len(bad):
+            t, vertex = bad[0, 0], triangles[tuple(bad[0])]
+            raise SceneError(
+                f"mesh obstacle: triangle {t}: vertex {vertex} does not exist ({len(vertices)} vertices, counted from 0)"
+            )
+        triangles = np.array(triangles, dtype=np.int64)
+        flat = np.flatnonzero(~(normals_and_heights(vertices, triangles)[1] > DEGENERATE))
+        if len(flat):
+            raise SceneError(
+                f"mesh obstacle: triangle {flat[0]} {tuple(triangles[flat[0]].tolist())} has no area "
+                f"({len(flat)} such triangles; the least height must exceed {DEGENERATE:g} of the longest edge)"
+            )
+        try:
+            opposite_half_edges(triangles)
+        except MeshError as error:
+            raise SceneError(f"mesh obstacle: {error}") from None
+        self._store("vertices", vertices)
+        self._store("triangles", triangles)
+
+    @property
+    def pivot(self) -> np.ndarray:
+        """(3,) [m]: the mean vertex."""
+        return self.vertices.mean(axis=0)
+
+    def surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """Copies of the given arrays."""
+        return self.vertices.copy(), self.triangles.copy()
+
+
+def _unit(vector: np.ndarray, rule: str) -> np.ndarray:
+    """(3,) of length 1; SceneError with the rule where there is no direction."""
+    largest = float(np.abs(vector).max())
+    if largest == 0.0 or not np.isfinite(largest):
+        raise SceneError(rule)
+    scaled = vector / largest
+    return scaled / np.linalg.norm(scaled)
+
+
+def _axes(direction: np.ndarray, axis: int) -> np.ndarray:
+    """(3,3) rotation whose column `axis` is the unit direction; the identity where that is the axis already."""
+    second = np.zeros(3)
+    second[np.argmin(np.abs(direction))] = 1.0
+    second = second - (second @ direction) * direction
+    second /= np.linalg.norm(second)
+    if axis == 0:
+        return np.stack([direction, second, np.cross(direction, second)], axis=1)
+    return np.stack([second, direction, np.cross(second, direction)], axis=1)
+
+
+@cache
+def _unit_box() -> tuple[np.ndarray, np.ndarray]:
+    """Corners (8,3) at -1 and 1, triangles (12,3). Of a cube, since the mesh of a flat box would be warned of."""
+    mesh = box_mesh((1, 1, 1), (2.0, 2.0, 2.0), pattern="six")
+    return mesh.vertices, mesh.surface
+
+
+def surface_numbers(friction, restitution, what: str) -> tuple[float, float]:
+    """Coulomb's coefficient and the restitution as clean floats. what: the start of the message. Raises SceneError."""
+    return (
+        checks.number(friction, f"{what}: friction", least=0.0),
+        checks.number(restitution, f"{what}: restitution", least=0.0, most=1.0),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacle:
+    """A shape in a scene; made by `Scene.add_obstacle`.
+
+    path: None, or callable t [s] -> (translation (3,) [m], rotation (3,3)); it is called once here, for t = 0. Raises
+    SceneError for another shape, numbers outside the rules, and a path that gives anything else.
+    """
+
+    shape: Shape
+    name: str
+    friction: float = 0.5  # Coulomb's coefficient, >= 0
+    restitution: float = 0.0  # 0 to 1
+    path: Callable | None = None
+
+    def __post_init__(self):
+        what = f"obstacle {self.name!r}"
+        if not isinstance(self.shape, Shape) or type(self.shape) is Shape:
+            raise SceneError(
+                f"{what}: shape must be a HalfSpace, Sphere, Box, Capsule or MeshObstacle, not {type(self.shape).__name__}"
+            )
+        for field, value in zip(("friction", "restitution"), surface_numbers(self.friction, self.restitution, what)):
+            object.__setattr__(self, field, value)
+        if self.path is not None and not callable(self.path):
+            raise SceneError(f"{what}: path must be a function of time, not {self.path!r}")
+        self.pose(0.0)
+
+    def pose(self, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Translation (3,) [m] and rotation (3,3) at time t [s]: x -> rotation @ (x - pivot) + pivot + translation.
+
+        Raises SceneError, naming the obstacle and the time, for a path that fails or gives no rigid motion.
+        """
+        if self.path is None:
+            return np.zeros(3), np.eye(3)
+        what = f"obstacle {self.name!r}: the path"
+        try:
+            translation, rotation = self.path(t)
+        except Exception as error:
+            raise SceneError(
+                f"{what} must give (translation, rotation) and failed at t = {t:g}: {type(error).__name__}: {error}"
+            ) from error
+        translation = checks.array(translation, f"{what}'s translation at t = {t:g}", ((3,),))
+        rotation = checks.array(rotation, f"{what}'s rotation at t = {t:g}", ((3, 3),))
+        with np.errstate(over="ignore", invalid="ignore"):
+            rigid = np.abs(rotation.T @ rotation - np.eye(3)).max() <= RIGID and np.linalg.det(rotation) > 0
+        if not rigid:
+            raise SceneError(
+                f"{what}'s rotation at t = {t:g} must be orthonormal to {RIGID:g} with determinant 1, not {rotation.tolist()}"
+            )
+        return translation, rotation
+
+    def points_at(self, t: float, points: np.ndarray) -> np.ndarray:
+        """(n,3) [m]: where points (n,3) of the shape as it was given are at time t [s]."""
+        translation, rotation = self.pose(t)
+        pivot = self.shape.pivot
+        return (points - pivot) @ rotation.T + pivot + translation

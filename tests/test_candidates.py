@@ -1,0 +1,138 @@
+"""What broad phases share, serial and parallel, f32 and f64 as the precision of the rest:
+
+* the list of active triangles is that of those whose box meets the box of another collider that they may touch, in order;
+* rows made of pairs hold both directions, ascending, whatever the order of the pairs and the parts they lie in;
+* a buffer counts what its largest part and all parts need; one that was too small has grown to hold it, and never beyond its
+  limit; where it may not grow so far it says what is needed, in how many parts, and what is allowed.
+"""
+
+import numpy as np
+import pytest
+import taichi as ti
+from surfaces import brute_pairs, pairs_of, place, surface_of
+from test_bvh import colliders, scatter
+
+from taisoft.collision.candidates import NEEDED, SLACK, TOTAL, Buffer, PairRows, entries, pairs
+from taisoft.collision.surface import ACTIVE
+from taisoft.errors import SimulationError
+from taisoft.runtime import FieldArena
+
+
+@pytest.fixture(scope="module", params=[("f64", True), ("f32", False)], ids=str)
+def rig(request):
+    precision, serial = request.param
+    with surface_of(**colliders(np.random.default_rng(1)), precision=precision, serial=serial) as made:
+        made.x0 = made.x
+        yield made
+
+
+@pytest.fixture
+def arena(rig):
+    fields = FieldArena()
+    yield fields
+    fields.release()
+
+
+def used_buffer(arena, needs: list[int], capacity: int, most: int | None) -> Buffer:
+    """A buffer of a part for each need."""
+    buffer = Buffer("things", entries, capacity, most, len(needs), arena)
+    buffer.used.from_numpy(np.array(needs, dtype=np.int32))
+    buffer.sum_up()
+    return buffer
+
+
+def test_active_triangles(rig):
+    rng = np.random.default_rng(2)
+    parts = 0
+    for kind in range(20):
+        scatter(rng, rig, kind)
+        apart = np.repeat(0.6 * rng.standard_normal((rig.surface.n_bodies, 3)), np.diff(rig.topology.vertex_first), axis=0)
+        place(rig, rig.x + apart, rig.move)
+        lo, hi = rig.surface.lo.to_numpy(), rig.surface.hi.to_numpy()
+        body, soft, n = rig.topology.body, rig.soft, rig.surface.n_bodies
+        own = body[:, None] == np.arange(n)
+        body_lo = np.array([lo[of].min(axis=0, initial=np.inf) for of in own.T])
+        body_hi = np.array([hi[of].max(axis=0, initial=-np.inf) for of in own.T])
+        meets = (lo[:, None] <= body_hi).all(axis=2) & (body_lo <= hi[:, None]).all(axis=2) & (lo <= hi).all(axis=1)[:, None]
+        counts = ~own & (soft[body][:, None] | soft)
+        expected = np.flatnonzero((meets & counts).any(axis=1) | (meets & own & rig.self_on[body][:, None]).any(axis=1))
+        active = rig.surface.active.to_numpy()[: rig.surface.count[ACTIVE]]
+        assert np.array_equal(active, expected)
+        assert np.isin(brute_pairs(rig), active).all()
+        parts += 0 < len(active) < rig.surface.n_triangles
+    assert parts > 10
+
+
+@pytest.mark.parametrize("chunks", [1, 7])
+def test_rows_of_pairs(rig, arena, chunks):
+    rng = np.random.default_rng(3)
+    n = rig.surface.n_triangles
+    rows = PairRows(rig.surface, arena, 64, None)
+    found = Buffer("found", pairs, 4000, None, chunks, arena)
+    for density in (0.0, 1e-3, 0.05):
+        expected = np.argwhere(np.triu(rng.random((n, n)) < density, 1))
+        some = rng.permutation(expected)
+        some = np.where(rng.random((len(some), 1)) < 0.5, some, some[:, ::-1])
+        part_of = rng.integers(0, chunks, len(some))
+        data = np.full((found.capacity, 2), 10**9, dtype=np.int32)  # beyond the ends of the parts is nothing to be read
+        for c in range(chunks):
+            data[c * found.part : c * found.part + (part_of == c).sum()] = some[part_of == c]
+        found.data.from_numpy(data)
+        found.used.from_numpy(np.bincount(part_of, minlength=chunks).astype(np.int32))
+        assert np.array_equal(pairs_of(rows.from_pairs(found)), expected)
+    assert rows.rows.growths == 1 and rows.rows.count[NEEDED] == 2 * len(expected)
+    rows.release()
+    rows = PairRows(rig.surface, FieldArena(), 64, 100)
+    with pytest.raises(SimulationError, match=f"candidate_rows: {2 * len(expected)} entries are needed .* allows 100$"):
+        rows.from_pairs(found)
+    for buffer in (rows, found):
+        buffer.release()
+
+
+def test_a_buffer_that_is_large_enough_stays(rig, arena):
+    buffer = used_buffer(arena, [3, 0, 5], 15, None)
+    data = buffer.data
+    assert (buffer.count[NEEDED], buffer.count[TOTAL]) == (5, 8)
+    assert buffer.fits() and buffer.data is data and buffer.growths == 0
+    assert buffer.capacity == 15 and buffer.bytes == 60
+    buffer.clear()
+    buffer.sum_up()
+    assert (buffer.count[NEEDED], buffer.count[TOTAL]) == (0, 0) and buffer.fits()
+    buffer.release()
+
+
+def test_a_buffer_grows_to_what_was_needed(rig, arena):
+    buffer = used_buffer(arena, [6, 0, 40], 15, None)
+    assert not buffer.fits()
+    assert (buffer.part, buffer.capacity, buffer.growths) == (60, 180, 1) and SLACK == 1.5
+    assert buffer.data.shape == (180,) and buffer.bytes == 720
+    assert buffer.fits() and buffer.growths == 1
+    buffer.release()
+
+
+def test_a_buffer_stops_at_its_limit(rig, arena):
+    buffer = used_buffer(arena, [1, 0, 40], 15, 119)
+    with pytest.raises(SimulationError, match=r"^things: 120 entries are needed \(3 parts of 40\), and max_capacity allows 119$"):
+        buffer.fits()
+    assert (buffer.capacity, buffer.growths) == (15, 0)
+    buffer.most = 120
+    assert not buffer.fits() and buffer.capacity == 120
+    assert buffer.fits()
+    buffer.release()
+
+
+@pytest.mark.parametrize("capacity, need, most", [(15, 40, 130), (16, 5, 16), (100, 1, 100)])
+def test_a_buffer_is_never_larger_than_its_limit(rig, arena, capacity, need, most):
+    """Parts of equal length: what is left over is not used."""
+    buffer = used_buffer(arena, [need, 0, 1], capacity, most)
+    buffer.fits()
+    assert buffer.part >= need and buffer.capacity <= most
+    buffer.release()
+
+
+def test_what_is_asked_for_at_first_holds(rig, arena):
+    for capacity, chunks in ((0, 1), (64, 64), (64, 4096), (100, 64)):
+        buffer = Buffer(f"things_{capacity}_{chunks}", pairs, capacity, None, chunks, arena)
+        assert buffer.capacity >= max(capacity, chunks) and buffer.data.dtype == ti.i32 and buffer.data.n == 2
+        assert buffer.capacity < capacity + chunks or capacity < chunks == buffer.capacity
+        buffer.release()

@@ -1,0 +1,98 @@
+"""A cube on a thin sheet that sags under it, flat and tilted, apart and pushed into it by less than the sheet is thick:
+
+* every vertex of the cube near the sheet's upper side has its contact there, and no contact is with the lower side;
+* gaps are those of the two surfaces to a millimetre (to rounding by proximity), normals the sheet's to a few degrees.
+"""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from rotations import rotation
+
+import taisoft as ts
+
+THICKNESS, MARGIN = 0.05, 0.02  # [m]
+COLUMNS = np.linspace(-2.0, 2.0, 21)  # x of the sheet's vertices [m]
+TILTS = {"flat": np.eye(3), "tilted": rotation((0.4, 0.1, 1.0), np.radians(8.0))}
+GAPS = (0.002, -0.001, -0.005)  # [m] of the cube's lowest vertices
+
+
+def top(x: np.ndarray, sag: float) -> np.ndarray:
+    """Height of the sheet's upper side [m]."""
+    return np.interp(x, COLUMNS, 0.5 * THICKNESS - sag * (1 - (COLUMNS / 2) ** 2))
+
+
+def from_sheet(p: np.ndarray, sag: float) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distances (k,) [m] of points (k,3) to the upper side, and its normals there (k,3)."""
+    a = np.stack([COLUMNS, top(COLUMNS, sag)], axis=1)
+    way = np.diff(a, axis=0)
+    length = np.linalg.norm(way, axis=1)
+    share = np.clip(np.einsum("ksx,sx->ks", p[:, None, :2] - a[:-1], way) / length**2, 0, 1)
+    off = p[:, None, :2] - a[:-1] - share[:, :, None] * way
+    k = np.argmin(np.linalg.norm(off, axis=2), axis=1)
+    normal = np.stack([-way[:, 1], way[:, 0], 0 * length], axis=1)[k] / length[k, None]
+    distance = np.linalg.norm(off, axis=2).min(axis=1)
+    return np.where(p[:, 1] > top(p[:, 0], sag), distance, -distance), normal
+
+
+class Pair:
+    """The two in a simulator, the sheet first, so that it is side a."""
+
+    def __init__(self, collision: str):
+        scene = ts.Scene(gravity=(0, 0, 0))
+        scene.collision = ts.CollisionSettings(margin=MARGIN)
+        sheet = ts.sheet_mesh((20, 2, 10), (4.0, THICKNESS, 4.0))
+        self.cube = ts.box_mesh((4, 4, 4), (1.0, 1.0, 1.0))
+        soft = ts.Material(young=1e3)
+        scene.add_body(sheet, soft, name="sheet", collision=collision)
+        scene.add_body(self.cube, soft, name="cube", position=(0, 3, 0), collision=collision)
+        assert collision != "auto" or [b.hit_by for b in scene.bodies] == ["proximity", "proximity"]
+        self.sheet = sheet.vertices
+        self.sim = ts.Simulator(scene, dt=1e-4, integrator="symplectic_euler", precision="f64")
+
+    def place(self, sag: float, tilt: np.ndarray, gap: float) -> np.ndarray:
+        """Put the cube's lowest vertices at a gap [m] over the sheet; returns its vertices (n,3) [m]."""
+        self.sim.set_state(positions=self.sheet - sag * (1 - (self.sheet[:, :1] / 2) ** 2) * (0, 1, 0), body="sheet")
+        x = self.cube.vertices @ tilt.T + (0.03, 0.0, 0.04)
+        low, high = -3.0, 3.0
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            if from_sheet(x + (0, middle, 0), sag)[0].min() < gap:
+                low = middle
+            else:
+                high = middle
+        x = x + (0, high, 0)
+        self.sim.set_state(positions=x, body="cube")
+        return x
+
+
+@pytest.fixture(scope="module", params=["auto", "distance_field"])
+def pair(request):
+    made = Pair(request.param)
+    yield made, 1e-9 if request.param == "auto" else 1e-3
+    made.sim.close()
+
+
+@pytest.mark.parametrize("sag, tilt, gap", list(product((0.0, 0.3), TILTS, GAPS)))
+def test_the_cube_stands_on_the_upper_side(pair, sag, tilt, gap):
+    made, close = pair
+    x = made.place(sag, TILTS[tilt], gap)
+    c = made.sim.detect_contacts()
+    assert set(c.body_a) == {"sheet"} and set(c.body_b) == {"cube"}
+    assert c.unmapped == 0
+    of_sheet, normal = from_sheet(c.point, sag)
+    local = (c.point - x.mean(axis=0)) @ TILTS[tilt]
+    of_cube = -local[:, 1] - 0.5  # from its lower side
+    assert np.abs(of_sheet + of_cube - c.gap).max() < 1e-3
+    # of the sheet, or of the cube's lower side or edge
+    turned = np.degrees(np.arccos(np.clip(-np.einsum("kx,kx->k", c.normal, normal), -1, 1)))
+    assert turned.max() < (5.0 if tilt == "flat" else 15.0)
+    assert c.gap.min() == pytest.approx(gap, abs=close) and c.gap.max() <= MARGIN + 1e-9
+    # the contact of each vertex of the cube near the sheet
+    distance, normal = from_sheet(x, sag)
+    near = np.flatnonzero(distance < 0.9 * MARGIN)
+    for i in near:
+        mine = np.linalg.norm(c.point - (x[i] - 0.5 * distance[i] * normal[i]), axis=1) < 2e-3
+        assert mine.any(), f"vertex at {x[i]}, {distance[i]} m from the sheet, has no contact"
+        assert np.abs(c.gap[mine] - distance[i]).min() < close

@@ -1,0 +1,46 @@
+"""Steps in f32, in a file of their own, since a process holds one precision at a time:
+
+* explicit and implicit ones follow the oracle to the rounding;
+* with nothing to do, rounding is no reason for Newton to go on;
+* a state that f32 cannot hold is refused.
+"""
+
+import numpy as np
+import pytest
+from following import follow, simulator
+from scenes import cube, driven_scene, element, rubber
+
+import taisoft as ts
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_euler"])
+def test_single_precision_follows(integrator):
+    """Positions are f64; velocities and forces are rounded to 6e-8, and a strain's rounding makes forces of 0.01 N."""
+    scene, settings = driven_scene(mass_damping=3.0, order=2), {}
+    if integrator == "implicit_euler":
+        settings = {"newton_tolerance": 1e-7, "linear_tolerance": 1e-6}
+    with simulator(scene, integrator, "f32", **settings) as sim:
+        follow(sim, integrator, 9, 2e-5)
+
+
+def test_nothing_to_do():
+    """At rest and without weight, where positions and velocities are large: rounding is no reason to go on."""
+    scene = ts.Scene(gravity=(0, 0, 0))
+    flight = {"position": (300.0, -200.0, 100.0), "velocity": (20.0, 3.0, -7.0)}
+    scene.add_body(cube(), rubber(young=1e7), **flight, **element(2))
+    with ts.Simulator(scene, integrator="implicit_euler", precision="f32") as sim:
+        assert sim._stepper.tolerance == 1e-4 and sim._stepper.linear_tolerance is None
+        start = sim.positions()
+        for _ in range(20):
+            report = sim.step()
+            assert report.converged and report.newton_iterations <= 3
+        flown = start + sim.time * np.array([20.0, 3.0, -7.0])
+        assert np.abs(sim.positions() - flown).max() < 1e-5 and report.elastic < 1e-3
+
+
+def test_what_f32_cannot_hold_is_refused():
+    with simulator(driven_scene(), "symplectic_euler", "f32") as sim:
+        v = np.zeros((20, 3))
+        v[17, 1] = 1e39
+        with pytest.raises(ts.SceneError, match="velocities: node 17 is not finite or too large for f32"):
+            sim.set_state(velocities=v)
