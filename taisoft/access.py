@@ -76,6 +76,10 @@ class StateAccess:
         detection = self._find_contacts()
         return detection.contacts()
 
+    def set_contact(self, a: str, b: str, friction: float | None = None, restitution: float | None = None) -> None:
+        """Change the friction or restitution of a pair of bodies, or of a body and an obstacle; as `Scene.set_contact`."""
+        self._open_world().scene.set_contact(a, b, friction=friction, restitution=restitution)
+
     def intersecting_triangles(self) -> list[tuple[str, int, str, int]]:
         """Surface triangles that intersect in the present state, each pair once: name and triangle of each.
 

@@ -157,7 +157,7 @@ class Simulator(StateAccess):
     @property
     def field_bytes(self) -> dict[str, int]:
         """Bytes of every allocated field by name."""
-        return dict(self._arena.bytes)
+        return self._arena.bytes | (self._detections[0].field_bytes if self._detections else {})
 
     def close(self) -> None:
         """Release the fields and the runtime; a closed simulator cannot be used."""

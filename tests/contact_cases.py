@@ -23,7 +23,7 @@ SPIKE = ((0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1), (4, 3, 2, 1))  # its tip, t
 
 @dataclass(frozen=True)
 class Line:
-    """Where contacts of one direction are: between two points, of which each must have one; normal (3,) from B to A, depth [m]."""
+    """Where contacts of one direction are: between two points, each of which must have one; normal (3,), depth [m]."""
 
     normal: tuple[float, float, float]
     depth: float
@@ -51,7 +51,6 @@ class Case:
         """A scene of the two, "a" and "b"; both bodies are hit by `collision`, and gaps above P / 2 are of no interest."""
         scene = ts.Scene(gravity=(0, 0, 0))
         scene.collision = ts.CollisionSettings(margin=P / 2)
-        scene.allow_initial_overlap = True
         scene.add_body(self.a, ts.Material(), name="a", position=place, collision=collision)
         if isinstance(self.b, ts.TetMesh):
             scene.add_body(self.b, ts.Material(), name="b", collision=collision)

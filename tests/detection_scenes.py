@@ -8,8 +8,19 @@ from rotations import rotation
 import taisoft as ts
 from taisoft.collision.contacts import Contacts
 
-SOFT = {"young": 1e3, "density": 1000.0}
+SOFT = {"young": 1e3}
 S = np.sqrt(0.5)
+DT = 1e-3  # [s]
+
+
+def simulator(scene: ts.Scene, precision: str = "f64", **settings) -> ts.Simulator:
+    """A simulator for looking at a scene: hardly a step is taken, and the explicit integrator is built fastest."""
+    return ts.Simulator(scene, dt=DT, integrator="symplectic_euler", precision=precision, allow_unstable=True, **settings)
+
+
+def pairs_of(c: Contacts) -> set[frozenset[str]]:
+    """The pairs of bodies that touch."""
+    return {frozenset(pair) for pair in zip(c.body_a, c.body_b)}
 
 
 @dataclass
@@ -32,14 +43,13 @@ def jittered(mesh: ts.TetMesh, rng: np.random.Generator, by: float) -> ts.TetMes
 def zoo(scale: float = 1.0, swapped: bool = False) -> tuple[ts.Scene, Place]:
     """Four bodies and five obstacles about 1 m in size, times scale, with contacts of every kind between them.
 
-    block (hit by proximity) on a half-space; ball (by its field) and brick (order 2, edge across the block's edge) on it; egg (by its
-    field) on the ball; a sphere in a face of the block, a capsule in one of the brick, a box and an open mesh at balls.
+    block (hit by proximity) on a half-space; ball (by its field) and brick (order 2, an edge across one of the block's) on it;
+    egg (by its field) on the ball; a sphere in a face of the block, a capsule in one of the brick, a box and a mesh at balls.
     """
     rng = np.random.default_rng(4)
     place = Place(np.eye(3), np.zeros(3))
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.collision = ts.CollisionSettings(margin=0.02 * scale)
-    scene.allow_initial_overlap = True
     axes = np.array([[S, -S, 0.0], [0.5, 0.5, -S], [0.5, 0.5, S]]).T @ rotation((1, 2, 3), 0.05)
     half = np.array([0.25, 0.2, 0.3])
     brick = np.array([0.5, 0.3, 0.2]) - 0.008 * np.array([S, S, 0]) - axes @ (0.05, -half[1], -half[2])
@@ -55,7 +65,7 @@ def zoo(scale: float = 1.0, swapped: bool = False) -> tuple[ts.Scene, Place]:
     for name, mesh, turn, at, order, collision in bodies:
         mesh = jittered(mesh, rng, 0.004)
         mesh = ts.TetMesh(scale * (mesh.vertices @ turn.T + at), mesh.tets)
-        made.append((mesh, ts.Material(**SOFT), name, order, collision))
+        made.append((mesh, ts.Material(young=SOFT["young"] * scale**2), name, order, collision))
     for mesh, material, name, order, collision in made[::-1] if swapped else made:
         scene.add_body(mesh, material, name=name, order=order, collision=collision)
     side = brick + axes @ (0.1, 0.05, half[2] + 0.1 - 0.012)
@@ -79,15 +89,16 @@ def keys(c: Contacts) -> list[tuple]:
     return [(a, b, kind, *ids) for a, b, kind, ids in zip(c.body_a, c.body_b, c.kind, c.feature.tolist())]
 
 
-def compare(c: Contacts, other: Contacts, Q=np.eye(3), T=0.0, scale: float = 1.0, close: float = 1e-9) -> None:
-    """Check that `other` is the list c, turned, scaled and shifted: features alike, numbers to `close` of a size of 1 m."""
+def compare(c: Contacts, other: Contacts, Q=None, T=0.0, scale: float = 1.0, size: float = 1.0, close: float = 1e-9) -> None:
+    """Check that `other` is the list c, turned, scaled and shifted: features alike, numbers to `close` of a size [m]."""
+    Q = np.eye(3) if Q is None else Q
     mine, theirs = keys(c), keys(other)
     assert set(mine) == set(theirs), f"lost {set(mine) - set(theirs)}, new {set(theirs) - set(mine)}"
     assert len(mine) == len(set(mine)) == len(theirs)
     order = [theirs.index(key) for key in mine]
-    assert np.abs(other.point[order] - (scale * c.point @ Q.T + T)).max() <= close * scale
+    assert np.abs(other.point[order] - (scale * c.point @ Q.T + T)).max() <= close * size
     assert np.abs(other.normal[order] - c.normal @ Q.T).max() <= close
-    assert np.abs(other.gap[order] - scale * c.gap).max() <= close * scale
+    assert np.abs(other.gap[order] - scale * c.gap).max() <= close * size
     assert np.array_equal(other.nodes[order], c.nodes) and np.abs(other.weights[order] - c.weights).max() <= close
 
 

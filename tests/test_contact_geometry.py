@@ -37,7 +37,6 @@ def simulated(collision: str, chosen: dict[str, Case]) -> Iterator[dict[str, lis
     """Problems of every case, hit by `collision`, at all places of its body A."""
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.collision = ts.CollisionSettings(margin=P / 2)
-    scene.allow_initial_overlap = True
     places = {name: offset(k, case) for k, (name, case) in enumerate(chosen.items())}
     for name, case in chosen.items():
         scene.add_body(case.a, ts.Material(), name=f"{name} a", position=places[name], collision=collision)

@@ -52,24 +52,33 @@ def on_corner(shape, foot, normal, gap: float, kind: str = "vertex_field") -> St
 
 
 def under_face(shape, depth: float, where, kind: str = "face_field", turned=None) -> Station:
-    """A slab whose lower face, y = 0, is two triangles with the diagonal from (-1,0,-1) to (1,0,1) or across, pierced at (3,) [m]."""
+    """A slab whose lower face, y = 0, is two triangles that meet in a diagonal of the square; it is pierced at (3,) [m]."""
     mesh = ts.box_mesh((1, 1, 1), (2.0, 0.5, 2.0), (0.0, 0.25, 0.0), "six")
     return Station(shape, mesh, np.array(where, dtype=float), UP, -depth, kind, turned)
+
+
+def octahedron(below: float) -> ts.MeshObstacle:
+    """A closed mesh whose upper corner is at (0.2, -below, -0.5) [m]."""
+    vertices = 0.3 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
+    faces = [(0, 2, 4), (2, 1, 4), (1, 3, 4), (3, 0, 4), (2, 0, 5), (1, 2, 5), (3, 1, 5), (0, 3, 5)]
+    return ts.MeshObstacle(vertices + (0.2, -0.3 - below, -0.5), faces)
+
+
+def pole(height: float) -> ts.Box:
+    """A cube of 0.4 m whose corner is at (0.2, height, -0.4) [m] once it stands upright."""
+    return ts.Box((0.2, height - 0.2 * np.sqrt(3), -0.4), (0.2, 0.2, 0.2))
 
 
 def stations() -> dict[str, Station]:
     """By name; a half-space fills one side of the world, so that it comes first."""
     tilted, slope = np.array([1.0, 0.2, -0.1]), np.array([0.2, 1.0, 0.1])
     square = [(-1, 0, -1), (-1, 0, 1), (1, 0, 1), (1, 0, -1)]
-    octahedron = 0.3 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
-    faces = [(0, 2, 4), (2, 1, 4), (1, 3, 4), (3, 0, 4), (2, 0, 5), (1, 2, 5), (3, 1, 5), (0, 3, 5)]
     slope = slope / np.linalg.norm(slope)
     below = np.array([0.3, -0.4 + 0.02, -0.5])
     on_diagonal = np.array([0.3, -0.4 + 0.02, 0.3])
     across = np.array([0.3, -0.4 + 0.02, -0.3])
     end = np.array([0.4, -0.1, 0.2])
     upright = standing(UP)  # a box's corner (1,1,1) to the top
-    pole = np.array([0.2, 0.03 - np.sqrt(0.12), -0.4])
     flat = np.cross([0.3, 0.0, 1.0], [1.0, -0.4, 0.0])  # of an open mesh through the origin
     flat /= np.linalg.norm(flat)
     sheet = np.array(square) @ np.stack([[1.0, -0.4, 0.0], flat, [0.3, 0.0, 1.0]])
@@ -89,10 +98,10 @@ def stations() -> dict[str, Station]:
         "ball_on_diagonal": under_face(ts.Sphere(on_diagonal, 0.4), 0.02, (0.3, 0, 0.3)),
         "ball_across_diagonal": under_face(ts.Sphere(across, 0.4), 0.02, (0.3, 0, -0.3)),
         "capsule_in_triangle": under_face(ts.Capsule(end - (1, 0.3, 0.1), end, 0.105), 0.005, (0.4, 0, 0.2)),
-        "mesh_corner": under_face(ts.MeshObstacle(octahedron + (0.2, -0.304, -0.5), faces), -0.004, (0.2, 0, -0.5), "vertex_face"),
-        "mesh_corner_inside": under_face(ts.MeshObstacle(octahedron + (0.2, -0.29, -0.5), faces), 0.01, (0.2, 0, -0.5), "vertex_face"),
-        "box_corner": under_face(ts.Box(pole, (0.2, 0.2, 0.2)), 0.03, (0.2, 0, -0.4), "vertex_face", upright),
-        "box_corner_near": under_face(ts.Box(pole - (0, 0.035, 0), (0.2, 0.2, 0.2)), -0.005, (0.2, 0, -0.4), "vertex_face", upright),
+        "mesh_corner": under_face(octahedron(0.004), -0.004, (0.2, 0, -0.5), "vertex_face"),
+        "mesh_corner_inside": under_face(octahedron(-0.01), 0.01, (0.2, 0, -0.5), "vertex_face"),
+        "box_corner": under_face(pole(0.03), 0.03, (0.2, 0, -0.4), "vertex_face", upright),
+        "box_corner_near": under_face(pole(-0.005), -0.005, (0.2, 0, -0.4), "vertex_face", upright),
     }
 
 
@@ -107,7 +116,6 @@ class World:
         self.Q, self.T, self.back, self.speed = np.eye(3), np.zeros(3), 0.0, 0.0
         scene = ts.Scene(gravity=(0, 0, 0))
         scene.collision = ts.CollisionSettings(margin=MARGIN)
-        scene.allow_initial_overlap = True
         for k, (name, station) in enumerate(ALL.items()):
             place = np.array([10.0 * k, 0.0, 0.0])
             scene.add_body(station.mesh, ts.Material(young=1e3), name=name, position=place, collision="proximity")

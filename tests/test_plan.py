@@ -101,7 +101,7 @@ def test_contact_geometry_is_there_where_something_can_touch():
     assert not grounded["distance_fields"][0] and not grounded["proximity"][0]
     boxed = contact_plan([ball], [plane, box])
     assert boxed["distance_fields"] == (True, "hits ball (smooth and not thin)")
-    assert boxed["proximity"] == (False, "every body is hit by its distance field")
+    assert boxed["proximity"] == (True, "hits obstacle1 (edges)")
     two = contact_plan([ball, ("told", "proximity")])
     assert two["distance_fields"] == (True, "hits ball (smooth and not thin)")
     assert two["proximity"] == (True, "hits told (asked for)")

@@ -123,21 +123,14 @@ def test_pairs_outside_the_rules(names, numbers, rule):
 def test_a_snapshot_keeps_what_was_there():
     scene = touching()
     scene.set_contact("a", "b", friction=0.7)
-    scene.collision, scene.allow_initial_overlap = CollisionSettings(k_dop=14), True
+    scene.collision = CollisionSettings(k_dop=14)
     twin = scene.snapshot()
     scene.set_contact("a", "b", friction=0.1)
     scene.add_obstacle(Box((0, 0, 0), (1, 1, 1)))
-    scene.collision, scene.allow_initial_overlap = CollisionSettings(), False
+    scene.collision = CollisionSettings()
     assert twin.contact_numbers("a", "b") == (0.7, 0.3) and len(twin.obstacles) == 2
-    assert twin.collision.k_dop == 14 and twin.allow_initial_overlap is True
+    assert twin.collision.k_dop == 14
     assert twin.body("a").collision == "auto" and twin.body("a").hit_by == "proximity"
-
-
-@pytest.mark.parametrize("value", [0, None, "no", 1.0])
-def test_overlap_is_allowed_or_not(scene, value):
-    assert scene.allow_initial_overlap is False
-    with pytest.raises(SceneError, match="^scene: allow_initial_overlap must be True or False, not"):
-        scene.allow_initial_overlap = value
 
 
 @pytest.mark.parametrize(

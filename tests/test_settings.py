@@ -34,9 +34,9 @@ def scene() -> ts.Scene:
         ({"linear_tolerance": np.nan}, "linear_tolerance = nan"),
         ({"linear_tolerance": True}, "linear_tolerance = True"),
         ({"allow_unstable": 1}, "allow_unstable = 1: it must be True or False"),
-        ({"contact_solver": "gauss_seidel"}, "contact_solver = 'gauss_seidel': this version models no contact"),
-        ({"self_collision": True}, "self_collision must be False: this version models no contact"),
-        ({"contact_tolerance": 1e-3}, "contact_tolerance must be None: this version models no contact"),
+        ({"contact_solver": "gauss_seidel"}, "contact_solver = 'gauss_seidel': this version computes no contact forces"),
+        ({"self_collision": 1}, "self_collision = 1: it must be True or False"),
+        ({"contact_tolerance": 1e-3}, "contact_tolerance must be None: this version computes no contact forces"),
     ],
 )
 def test_bad_settings(settings, words):

@@ -45,13 +45,14 @@ class Buffer:
         self._allocate(capacity)
 
     def _allocate(self, capacity: int) -> None:
-        self.part = max(-(-capacity // self.chunks), 1)
+        part = max(-(-capacity // self.chunks), 1)
         if self.most is not None:
-            self.part = max(min(self.part, self.most // self.chunks), 1)
+            part = max(min(part, self.most // self.chunks), 1)
+        arena = FieldArena()
+        data = self._make(arena, part * self.chunks)  # may fail for want of memory: what was there then stays
         if self._arena is not None:
             self._arena.release()
-        self._arena = FieldArena()
-        self.data = self._make(self._arena, self.part * self.chunks)
+        self._arena, self.data, self.part = arena, data, part
 
     @property
     def capacity(self) -> int:
@@ -124,14 +125,26 @@ def sum_used(used: ti.template(), count: ti.template(), chunks: ti.template()):
 
 @ti.func
 def sort_row(entry: ti.template(), first, last):
-    """Sort entry[first:last] in place; rows are short, and long ones are nearly in order."""
-    for i in range(first + 1, last):
-        value = entry[i]
-        j = i - 1
-        while j >= first and entry[j] > value:
-            entry[j + 1] = entry[j]
-            j -= 1
-        entry[j + 1] = value
+    """Sort entry[first:last] in place (Shell's sort: rows are short mostly, but not always)."""
+    step = 1
+    while step < (last - first) // 9:
+        step = 3 * step + 1
+    while step > 0:
+        for i in range(first + step, last):
+            value = entry[i]
+            j = i - step
+            going = 1
+            while going == 1:
+                if j >= first:
+                    if entry[j] > value:
+                        entry[j + step] = entry[j]
+                        j -= step
+                    else:
+                        going = 0
+                else:
+                    going = 0
+            entry[j + step] = value
+        step //= 3
 
 
 @kernel

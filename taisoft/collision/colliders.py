@@ -3,9 +3,24 @@
 import numpy as np
 
 from taisoft.collision.surface import Topology, make_topology
+from taisoft.errors import MeshError
+from taisoft.mesh.sdf_grid import SdfGrid, cached_sdf_grid
 from taisoft.model import Layout
+from taisoft.scene.body import Body
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.scene import Scene
+
+
+def body_grid(body: Body, cells: int, margin: float) -> SdfGrid:
+    """A body's signed distances at rest, to `margin` [m] beyond its surface but no farther than a quarter of its size.
+
+    Farther out a sample adds the way to the grid. Raises MeshError, naming the body, where the grid cannot be made.
+    """
+    size = float(np.ptp(body.nodes.positions, axis=0).max())
+    try:
+        return cached_sdf_grid(body.nodes.positions, body.nodes.surface, cells, margin=min(margin, 0.25 * size))
+    except MeshError as error:
+        raise MeshError(f"body {body.name!r}: its distance field cannot be made: {error}") from None
 
 
 def collider_surfaces(scene: Scene, layout: Layout) -> tuple[Topology, np.ndarray]:

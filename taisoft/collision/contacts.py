@@ -78,16 +78,31 @@ def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:
 
 
 @ti.func
+def _least_vertex(nodes):
+    """The least that is not -1."""
+    least = nodes[0]
+    for k in ti.static(range(1, 3)):
+        if nodes[k] >= 0 and nodes[k] < least:
+            least = nodes[k]
+    return least
+
+
+@ti.func
 def write_contact(
     out: ti.template(), at, last, body_a, body_b, feature, point_a, n, gap, nodes_a, weights_a, nodes_b, weights_b
 ):
-    """Write a contact where it still fits. n points from b to a; sides are swapped so that a is the collider of least number."""
+    """Write a contact where it still fits. n points from b to a.
+
+    Sides are swapped so that a is the collider of least number, and in one body the side of the least vertex: what is found from
+    both sides then looks alike.
+    """
     if at < last:
         out.point[at] = point_a - 0.5 * gap * n
         out.gap[at] = gap
         out.feature[at] = feature
         sign = ti.cast(1.0, ti.f64)
-        if body_a > body_b:
+        least_a, least_b = _least_vertex(nodes_a), _least_vertex(nodes_b)
+        if body_a > body_b or (body_a == body_b and least_a > least_b):
             sign = -1.0
         out.normal[at] = sign * n
         out.body[at] = ti.Vector([ti.min(body_a, body_b), ti.max(body_a, body_b)])

@@ -12,7 +12,7 @@ import taichi as ti
 from taisoft.collision.analytic import AnalyticObstacles, find_analytic
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.candidates import Buffer, Candidates
-from taisoft.collision.colliders import collider_surfaces, obstacle_frame
+from taisoft.collision.colliders import body_grid, collider_surfaces, obstacle_frame
 from taisoft.collision.contacts import KINDS, Contacts, contact_fields
 from taisoft.collision.features import find_sharp_edges
 from taisoft.collision.proximity import BY_EDGES, BY_FACES, BY_FIELD, find_proximity
@@ -32,17 +32,18 @@ from taisoft.collision.surface import (
 )  # fmt: skip
 from taisoft.errors import SimulationError
 from taisoft.mesh.quality import mean_surface_edge
-from taisoft.mesh.sdf_grid import cached_sdf_grid
+from taisoft.mesh.sdf_grid import SdfGrid
 from taisoft.model import Layout, Model
 from taisoft.runtime import FieldArena, Runtime
-from taisoft.scene.collision import has_sharp_edges
-from taisoft.scene.obstacles import Box, MeshObstacle
+from taisoft.scene.obstacles import MeshObstacle
+from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
 
 MARGIN = 0.1  # of the mean surface edge: distance within which contacts are found, where the scene names none
 DEPTH = 0.1  # of the mean surface edge: flat faces that have passed each other by less are still found
 MERGED = 1e-3  # of the mean surface edge: contacts nearer than this are one
 REDUCTION_CELL = 0.25  # of the mean surface edge: cells of the reduction
+MANY = 200  # colliders above which the spatial hash finds candidates
 CONTACTS_PER_TRIANGLE = 1  # room at first
 
 
@@ -68,29 +69,27 @@ class Detection:
     ):  # fmt: skip
         """Allocate what the scene needs. serial: None decides by size. Raises MeshError where a field cannot be made."""
         self.scene, self.model, self.layout = scene, model, layout
-        self._arena = arena = FieldArena()
-        settings = scene.collision
-        bodies, obstacles = scene.bodies, scene.obstacles
+        settings, bodies, obstacles = scene.collision, scene.bodies, scene.obstacles
+        self.edge = mean_surface_edge([(b.nodes.positions, b.nodes.surface) for b in bodies])
+        self.margin = MARGIN * self.edge if settings.margin is None else settings.margin
+        self.reach = self.margin + DEPTH * self.edge  # by half of it boxes grow
         self.topology, self._rest = collider_surfaces(scene, layout)
+        self._rows = self_collision or int((np.diff(self.topology.first) > 0).sum()) > 1
+        self._proximity = self._rows and make_plan(scene, False, False, self_collision).on["proximity"]
+        grids = self._grids() if self._rows else []  # before anything is allocated: they may be impossible
+        self._arena = arena = FieldArena()
         soft = np.arange(len(scene.colliders)) < len(bodies)
         self.surface: Surface = build_surface(
             self.topology, self._rest, soft, soft & self_collision, runtime, arena, serial
         )
         s = self.surface
-        self.edge = mean_surface_edge([(b.nodes.positions, b.nodes.surface) for b in bodies])
-        self.margin = MARGIN * self.edge if settings.margin is None else settings.margin
-        faced = int((np.diff(self.topology.first) > 0).sum())
-        self.reach = self.margin + DEPTH * self.edge  # by half of it boxes grow
-        self._rows = self_collision or faced > 1
         self.broad = self._make_broad(runtime) if self._rows else None
         ways = [BY_FACES if b.hit_by == "proximity" else BY_FIELD for b in bodies]
         ways += [BY_FACES if isinstance(o.shape, MeshObstacle) else BY_EDGES for o in obstacles]
-        sharp = any(isinstance(o.shape, Box) for o in obstacles) or any(has_sharp_edges(b.nodes) for b in bodies)
-        self._proximity = self._rows and (self_collision or BY_FACES in ways or sharp)
         self._way = arena.field("contact_way", ti.i32, len(ways), np.array(ways, dtype=np.int32))
         self._sharp = arena.field("surface_sharp", ti.i32, max(s.n_triangles, 1))
         self._unmapped = arena.field("unmapped", ti.i32, 1)
-        self._fields = self._make_fields(runtime) if self._rows else None
+        self._fields = self._make_fields(grids, runtime) if any(grids) else None
         self._analytic = [(len(bodies) + k, o) for k, o in enumerate(obstacles) if not isinstance(o.shape, MeshObstacle)]
         self._shapes = self._make_shapes() if self._analytic else None
         capacity = settings.initial_capacity or CONTACTS_PER_TRIANGLE * s.n_triangles + 64
@@ -104,7 +103,11 @@ class Detection:
     def _make_broad(self, runtime: Runtime) -> SpatialHash | Bvh:
         settings, s = self.scene.collision, self.surface
         limits = (settings.initial_capacity, settings.max_capacity)
-        if settings.broad_phase == "bvh":
+        wanted = settings.broad_phase
+        if wanted == "auto":  # on the CPU trees were faster at every size measured; their roots are compared one by one
+            few = len(self.scene.colliders) <= MANY
+            wanted = "bvh" if runtime.arch == "cpu" and few else "spatial_hash"
+        if wanted == "bvh":
             x = self._rest + self._start_shift()
             return Bvh(s, self.topology, x, self.reach, runtime, self._arena, settings.k_dop, capacity=limits[0], most=limits[1])
         extent = np.ptp((self._rest + self._start_shift())[self.topology.triangle].reshape(-1, 3), axis=0)
@@ -115,19 +118,17 @@ class Detection:
         shift = [b.position for b in self.scene.bodies] + [np.zeros(3)] * len(self.scene.obstacles)
         return np.repeat(shift, np.diff(self.topology.vertex_first), axis=0)
 
-    def _make_fields(self, runtime: Runtime) -> DistanceFields | None:
-        bodies, settings = self.scene.bodies, self.scene.collision
-        grids = [
-            cached_sdf_grid(b.nodes.positions, b.nodes.surface, settings.field_cells, margin=2.0 * self.margin)
-            if b.hit_by == "distance_field" else None
-            for b in bodies
-        ]  # fmt: skip
-        if not any(grids):
-            return None
-        grids += [None] * len(self.scene.obstacles)
+    def _grids(self) -> list[SdfGrid | None]:
+        """Of each collider, None where it has none."""
+        cells, margin = self.scene.collision.field_cells, 2.0 * self.margin
+        grids = [body_grid(b, cells, margin) if b.hit_by == "distance_field" else None for b in self.scene.bodies]
+        return grids + [None] * len(self.scene.obstacles)
+
+    def _make_fields(self, grids: list[SdfGrid | None], runtime: Runtime) -> DistanceFields:
         return build_fields(
-            bodies, grids, self.model.x, self.topology.first, self.layout.node_start, runtime.real, runtime.np_real, self._arena
-        )
+            self.scene.bodies, grids, self.model.x, self.topology.first, self.layout.node_start, runtime.real,
+            runtime.np_real, self._arena,
+        )  # fmt: skip
 
     def _make_shapes(self) -> AnalyticObstacles:
         arena, n = self._arena, len(self._analytic)
@@ -169,8 +170,7 @@ class Detection:
         self._reduce()
         count.unmapped = self._unmapped[0]
         count.found, count.contacts = self._reduction.count[FOUND], self._reduction.count[LEFT]
-        buffers = [self.buffer, *(self.broad.buffers if self.broad is not None else ())]
-        count.growths = {b.name: b.growths for b in buffers}
+        count.growths = {b.name: b.growths for b in self._buffers()}
 
     def _candidates(self) -> Candidates | None:
         """Rows of near triangles; None where no two surfaces can touch."""
@@ -204,8 +204,10 @@ class Detection:
     def _reduce(self) -> None:
         b = self.buffer
         if self._reduction is None or self._reduction.place.shape[0] != b.capacity:
+            arena = FieldArena()
+            self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.serial)
             self._reduction_arena.release()
-            self._reduction = reduction_fields(self._reduction_arena, b.capacity, b.chunks, self.surface.serial)
+            self._reduction_arena = arena
         reduce_contacts(self._reduction, b.data, b.used, b.part, MERGED * self.edge, REDUCTION_CELL * self.edge)
 
     def _place_obstacles(self, time: float, dt: float) -> None:
@@ -277,6 +279,14 @@ class Detection:
             limits = (self.scene.collision.initial_capacity, self.scene.collision.max_capacity)
             self._intersections = Intersections(self.surface, self._arena, *limits)
         return self._intersections.find(rows)
+
+    def _buffers(self) -> list[Buffer]:
+        return [self.buffer, *(self.broad.buffers if self.broad is not None else ())]
+
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """Bytes of every allocated field by name."""
+        return self._arena.bytes | self._reduction_arena.bytes | {b.name: b.bytes for b in self._buffers()}
 
     def release(self) -> None:
         """Give all memory back."""

@@ -29,6 +29,7 @@ from taisoft.runtime import kernel
 
 TOGETHER = 2.0  # depths behind two faces of a ridge that differ by less are left together
 SAME = 0.999  # cosine above which two faces count as one plane
+KEPT = 16  # faces near a vertex that are remembered between passes
 FACES = 8  # of a tip that are told apart
 TINY = 1e-9  # of a triangle's size: nearer, a direction comes from normals
 
@@ -38,10 +39,11 @@ BY_FIELD, BY_FACES, BY_EDGES = 0, 1, 2  # how a collider is hit; a box by its ed
 
 @ti.func
 def relate(s: ti.template(), i, u):
-    """How vertex i lies to triangle u: (state, normal, height over its plane, distance, weights of the nearest point).
+    """How vertex i lies to triangle u: (state, normal, height over its plane, distance, weights of the nearest point, own).
 
     OUTSIDE: at the nearest point of the surface near by; the normal then leads from it. INSIDE: behind it; BESIDE: behind its
     plane, the foot beside it, as of the walls of a groove that is pierced at its bottom. NONE: anything else.
+    own: 1 where it is part of the vertex's own body that is near by at rest too; behind such a face no vertex is inside.
     """
     p = s.x[i]
     n_u = area_normal(s, u)
@@ -81,12 +83,14 @@ def relate(s: ti.template(), i, u):
         state = INSIDE
         if distance * distance - h * h > ti.cast(TINY, ti.f64) * n_u.norm():
             state = BESIDE
-        if s.body[u] == s.body[s.ring[s.ring_start[i]]]:  # no deeper than half of what the body's own thickness can be
-            c0, c1, c2 = s.rest[s.triangle[u, 0]], s.rest[s.triangle[u, 1]], s.rest[s.triangle[u, 2]]
-            apart = s.rest[i] - (w[0] * c0 + w[1] * c1 + w[2] * c2)
-            if -2.0 * h > apart.norm():
-                state = NONE
-    return state, n, h, distance, w
+    own = 0
+    if s.body[u] == s.body[s.ring[s.ring_start[i]]]:
+        c0, c1, c2 = s.rest[s.triangle[u, 0]], s.rest[s.triangle[u, 1]], s.rest[s.triangle[u, 2]]
+        apart = s.rest[i] - (w[0] * c0 + w[1] * c1 + w[2] * c2)
+        own = int(2.0 * distance > apart.norm())
+        if state == BESIDE or (own == 1 and state == INSIDE):
+            state = NONE
+    return state, n, h, distance, w, own
 
 
 @ti.func
@@ -105,9 +109,13 @@ def closing(s: ti.template(), i, u, w, n):
 
 @ti.func
 def _far(s: ti.template(), i, u, half):
-    """Whether the way of vertex i, grown by half the reach [m], misses the box of triangle u."""
+    """1 where the way of vertex i, grown by half the reach [m], misses the box of triangle u."""
     a, b = s.x[i], s.x[i] + s.move[i]
-    return (ti.min(a, b) > s.hi[u] + half).any() or (ti.max(a, b) < s.lo[u] - half).any()
+    far = 0
+    for q in ti.static(range(3)):
+        if ti.min(a[q], b[q]) > s.hi[u][q] + half or ti.max(a[q], b[q]) < s.lo[u][q] - half:
+            far = 1
+    return far
 
 
 @ti.func
@@ -130,46 +138,59 @@ def vertex_contacts(
     slack, n_best, total, way, depth = inf, dvec(0.0), dvec(0.0), dvec(0.0), inf
     normals = ti.Matrix.zero(ti.f64, FACES, 3)
     count = 0
-    rows = last - first
-    q = 0
-    while q <= 3 * rows:
-        phase = q // rows
-        u = entry[first + q % rows]
-        if q == 3 * rows:
-            u = best
-        if phase == 1 and count == 0:  # the passes that follow rest on what the first found
-            if clear == 1 and state == INSIDE:
-                state = NONE
-            if clear == 0 and nearest_beside < nearest:
-                state = INSIDE
-            if clear == 0 and least_beside < least:
-                least, best = least_beside, best_beside
-            if state == INSIDE:
-                n_best = unit(area_normal(s, best))
-                slack = ti.cast(1e-6, ti.f64) * least
-                for c in ti.static(range(3)):
-                    normals[0, c] = n_best[c]
-                total += n_best
-                count = 1
-            elif state == NONE:
-                q = 3 * rows
-            else:
-                q = 2 * rows
-                phase = 2
-                u = entry[first]
-                count = 1
-        if phase == 2 and state == INSIDE and way.norm() == 0.0:
-            way, depth = n_best, least
-            if count > 1 and total.norm() > 0.05:
-                way, depth = unit(total), inf  # along it the vertex leaves through the first face that it comes to
-        if q < 3 * rows and _far(s, i, u, half):
-            pass
-        elif q < 3 * rows or state == INSIDE:
-            a, n, h, distance, w = relate(s, i, u)
+    # faces that the later passes look at again; where they are too many, those go through the whole row
+    kept = ti.Vector.zero(ti.i32, KEPT)
+    n_kept = 0
+    phase, q, size = 0, 0, last - first
+    while phase <= 3:
+        if q == size:  # the passes that follow rest on what the first found
+            if phase == 0:
+                if clear == 1 and state == INSIDE:
+                    state = NONE
+                if clear == 0 and nearest_beside < nearest:
+                    state = INSIDE
+                if clear == 0 and least_beside < least:
+                    least, best = least_beside, best_beside
+                if state == INSIDE:
+                    n_best = unit(area_normal(s, best))
+                    slack = ti.cast(1e-6, ti.f64) * least
+                    for c in ti.static(range(3)):
+                        normals[0, c] = n_best[c]
+                    total += n_best
+                    count = 1
+                elif state == OUTSIDE:
+                    phase = 1
+                else:
+                    phase = 3
+                if n_kept <= KEPT:
+                    size = n_kept
+            elif phase == 1:
+                way, depth = n_best, least
+                if count > 1 and total.norm() > 0.05:
+                    way, depth = unit(total), inf  # along it the vertex leaves through the first face that it comes to
+            elif phase == 2:
+                size = 1
+                if state == OUTSIDE:
+                    phase = 3
+            phase += 1
+            q = 0
+            if phase == 4 or size == 0:
+                break
+        u = best
+        if phase < 3:
+            u = entry[first + q]
+            if phase > 0 and n_kept <= KEPT:
+                u = kept[q]
+        q += 1
+        look = 1
+        if phase == 0 or (phase < 3 and n_kept > KEPT):
+            look = 1 - _far(s, i, u, half)
+        if look == 1:
+            a, n, h, distance, w, own_near = relate(s, i, u)
             near = distance - closing(s, i, u, w, n) <= margin
             wanted = 0
             if phase == 0:
-                if distance <= any_nearest * one:
+                if own_near == 0 and distance <= any_nearest * one:
                     if distance * one < any_nearest:
                         clear, nearest_beside, best_beside, least_beside = 0, inf, -1, inf
                     any_nearest = ti.min(any_nearest, distance)
@@ -177,6 +198,10 @@ def vertex_contacts(
                         clear = 1
                 pierced = a == BESIDE and distance <= any_nearest * one
                 wanted = int(a == INSIDE or pierced or (a == OUTSIDE and near))
+                if wanted == 1:
+                    if n_kept < KEPT:
+                        kept[n_kept] = u
+                    n_kept += 1
             elif state == OUTSIDE:
                 wanted = int(a == OUTSIDE and near)
             elif phase < 3 and (a == INSIDE or (a == BESIDE and clear == 0 and distance <= any_nearest * one)):
@@ -223,7 +248,6 @@ def vertex_contacts(
                     ivec(i, -1, -1), dvec(1.0, 0.0, 0.0), vertices_of(s, u), w,
                 )  # fmt: skip
                 at += 1
-        q += 1
     return at
 
 

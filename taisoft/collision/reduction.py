@@ -65,8 +65,9 @@ def _cell(p, inverse):
 
 @ti.func
 def _bucket(r: ti.template(), cell):
-    h = (cell[0] * 73856093) ^ (cell[1] * 19349663) ^ (cell[2] * 83492791)  # Teschner et al. 2003
-    return (h ^ (h >> 15)) & (r.buckets - 1)
+    x, y, z = ti.cast(cell[0], ti.i64), ti.cast(cell[1], ti.i64), ti.cast(cell[2], ti.i64)
+    h = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)  # Teschner et al. 2003
+    return ti.cast((h ^ (h >> 15)) & (r.buckets - 1), ti.i32)
 
 
 @kernel

@@ -19,7 +19,7 @@ from taisoft.collision.contacts import FACE_FIELD, VERTEX_FIELD, write_contact
 from taisoft.collision.features import corner, moved, sticks_out, unit, vertices_of
 from taisoft.collision.frank_wolfe import deepest_point
 from taisoft.collision.surface import ACTIVE, dvec, ivec, part_first
-from taisoft.collision.triangles import closest_on_triangle
+from taisoft.collision.triangles import choose, closest_on_triangle
 from taisoft.mesh.sdf_grid import SdfGrid
 from taisoft.runtime import FieldArena, kernel
 from taisoft.scene.body import Body
@@ -79,7 +79,7 @@ class DistanceFields:
         g = dvec(0.0)
         for q in range(3):
             e = dvec(ti.cast(q == 0, ti.f64), ti.cast(q == 1, ti.f64), ti.cast(q == 2, ti.f64))
-            step = 0.5 * self.spacing[k][q]
+            step = 0.5 * choose(q, self.spacing[k][0], self.spacing[k][1], self.spacing[k][2])
             above, _ = self.sample(k, p + step * e)
             below, _ = self.sample(k, p - step * e)
             g += (above - below) / (2.0 * step) * e

@@ -23,7 +23,7 @@ SHARP = 60.0  # [degrees] between the normals of neighbours above which a convex
 class CollisionSettings:
     """Numbers of the search for contacts. Raises SceneError for those outside the rules below."""
 
-    broad_phase: str = "auto"  # one of BROAD_PHASES
+    broad_phase: str = "auto"  # one of BROAD_PHASES; auto: a hierarchy on the CPU unless colliders are many, else the hash
     cell_ratio: float = 2.2  # edge of a hash cell over the mean surface edge, > 0
     margin: float | None = None  # [m] within which contacts are reported, >= 0; None: 0.1 of the mean surface edge
     k_dop: int = 6  # planes of a hierarchy's boxes: 6, 14 or 18
@@ -77,8 +77,12 @@ def choose_hit_by(positions: np.ndarray, surface: np.ndarray) -> tuple[str, str]
 
 
 def has_sharp_edges(nodes: Nodes) -> bool:
-    """Whether some convex edge of a surface turns by more than SHARP at rest."""
-    return _sharpest_turn(nodes.positions, nodes.surface, opposite_half_edges(nodes.surface)) > SHARP
+    """Whether some convex edge of a surface turns by more than SHARP at rest, or parts join at an edge."""
+    try:
+        opposite = opposite_half_edges(nodes.surface)
+    except MeshError:
+        return True
+    return _sharpest_turn(nodes.positions, nodes.surface, opposite) > SHARP
 
 
 def _extents(positions: np.ndarray, surface: np.ndarray) -> np.ndarray:

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass, field
 
-from taisoft.scene.obstacles import MeshObstacle
+from taisoft.scene.collision import has_sharp_edges
+from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.scene import LAWS, Scene
 
 
@@ -79,6 +80,8 @@ def _add_collision(plan: Plan, scene: Scene, self_collision: bool) -> None:
         mode, why = body.collision_choice
         modes[mode].append(f"{body.name} ({why})")
     modes["proximity"] += [f"{o.name} (triangles)" for o in obstacles if isinstance(o.shape, MeshObstacle) and scene.bodies]
+    modes["proximity"] += [f"{o.name} (edges)" for o in obstacles if isinstance(o.shape, Box) and scene.bodies]
+    modes["proximity"] += [f"{b.name} (sharp edges)" for b in hit if b.hit_by == "distance_field" and has_sharp_edges(b.nodes)]
     if self_collision:
         modes["proximity"].append("every body (itself)")
     idle = "no triangles can hit a body" if not hit else "every body is hit by "
