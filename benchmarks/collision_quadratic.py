@@ -4,22 +4,25 @@ import numpy as np
 import taichi as ti
 
 from taisoft.collision.pipeline import MERGED, Detection
-from taisoft.collision.reduction import FOUND, KEPT, LEFT, UNKNOWN, _same
+from taisoft.collision.reduction import FOUND, KEPT, LEFT, UNKNOWN, is_same
 from taisoft.runtime import FieldArena, kernel
 
 
 @kernel
-def reduce_by_pairs(r: ti.template(), out: ti.template(), state: ti.template(), kept: ti.template(), tolerance: ti.f64):
+def reduce_by_pairs(
+    r: ti.template(), out: ti.template(), order: ti.types.ndarray(), state: ti.template(), kept: ti.template(),
+    tolerance: ti.f64,
+):  # fmt: skip
     """Two nested loops over the list that a search has left: a contact is kept unless an earlier kept one is the same."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         n = 0
         for i in range(r.count[FOUND]):
-            at = r.place[i]
+            at = order[i]
             state[i] = KEPT
             j = 0
             while j < n and state[i] == KEPT:
-                if _same(out, at, kept[j], tolerance):
+                if is_same(out, at, kept[j], tolerance):
                     state[i] = UNKNOWN
                 j += 1
             if state[i] == KEPT:
@@ -34,6 +37,7 @@ class Quadratic:
     def __init__(self, detection: Detection):
         self._detection, self._arena = detection, FieldArena()
         self._capacity = n = detection.buffer.capacity
+        self._known: tuple[np.ndarray, np.ndarray] | None = None
         self._state, self._kept = (self._arena.field(name, ti.i32, n + 1) for name in ("state", "kept"))
 
     def fits(self) -> bool:
@@ -43,7 +47,17 @@ class Quadratic:
     def reduce(self) -> None:
         """Decide every contact anew."""
         d = self._detection
-        reduce_by_pairs(d._reduction, d.buffer.data, self._state, self._kept, MERGED * d.edge)
+        reduce_by_pairs(d._reduction, d.buffer.data, self._order(), self._state, self._kept, MERGED * d.edge)
+
+    def _order(self) -> np.ndarray:
+        """Places of the contacts in the order in which they are kept: by kind and feature, then by place. Made once a search."""
+        d = self._detection
+        place = d._reduction.place.to_numpy()[: d._reduction.count[FOUND]]
+        if self._known is None or not np.array_equal(self._known[0], place):
+            feature = d.buffer.data.feature.to_numpy()[place]
+            order = place[np.lexsort((place, feature[:, 2], feature[:, 1], feature[:, 0]))]
+            self._known = (place, order.astype(np.int32))
+        return self._known[1]
 
     def same(self) -> bool:
         """Whether it kept what the detection's own reduction kept."""
@@ -51,7 +65,7 @@ class Quadratic:
         found, left = r.count[FOUND], r.count[LEFT]
         if self._state.to_numpy()[found] != left:
             return False
-        return np.array_equal(self._kept.to_numpy()[:left], r.kept.to_numpy()[:left])
+        return np.array_equal(np.sort(self._kept.to_numpy()[:left]), np.sort(r.kept.to_numpy()[:left]))
 
     def release(self) -> None:
         """Give the memory back."""

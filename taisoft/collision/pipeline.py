@@ -253,11 +253,14 @@ class Detection:
         """The last search's contacts, impulses 0."""
         r, b = self._reduction, self.buffer.data
         rows = r.kept.to_numpy()[: r.count[LEFT]]
+        body, feature = b.body.to_numpy()[rows], b.feature.to_numpy()[rows]
+        # an order that neither threads nor parts of the work change, so that a solver sees it again in the next step
+        order = np.lexsort((feature[:, 2], feature[:, 1], feature[:, 0], body[:, 1], body[:, 0]))
+        rows, body, feature = rows[order], body[order], feature[order]
 
         def taken(f) -> np.ndarray:
             return f.to_numpy()[rows]
 
-        body, feature = taken(b.body), taken(b.feature)
         nodes = np.concatenate([taken(b.nodes_a), taken(b.nodes_b)], axis=1)
         weights = np.concatenate([taken(b.weights_a), taken(b.weights_b)], axis=1)
         nodes = np.where(nodes >= 0, np.append(self.topology.node, -1)[nodes], -1)

@@ -31,6 +31,7 @@ TOGETHER = 2.0  # depths behind two faces of a ridge that differ by less are lef
 SAME = 0.999  # cosine above which two faces count as one plane
 KEPT = 16  # faces near a vertex that are remembered between passes
 FACES = 8  # of a tip that are told apart
+SLIGHT = 1e-6  # of a triangle's size: a vertex so little outside a side is not yet outside; wider than what `edge_edge` allows
 TINY = 1e-9  # of a triangle's size: nearer, a direction comes from normals
 
 NONE, OUTSIDE, INSIDE, BESIDE = 0, 1, 2, 3
@@ -194,7 +195,7 @@ def vertex_contacts(
                     if distance * one < any_nearest:
                         clear, nearest_beside, best_beside, least_beside = 0, inf, -1, inf
                     any_nearest = ti.min(any_nearest, distance)
-                    if h > ti.cast(TINY, ti.f64) * distance:
+                    if h > ti.cast(SLIGHT, ti.f64) * ti.sqrt(area_normal(s, u).norm()):
                         clear = 1
                 pierced = a == BESIDE and distance <= any_nearest * one
                 wanted = int(a == INSIDE or pierced or (a == OUTSIDE and near))

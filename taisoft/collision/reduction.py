@@ -1,6 +1,6 @@
 """Reduction: contacts of one pair, nearer than a tolerance and with one normal, are one (report, section 3.1.3).
 
-In the order of the list a contact is kept unless an earlier kept one is that near: what two nested loops over the list give.
+By kind, feature and place in the list, a contact is kept unless an earlier kept one is that near: what two nested loops give.
 Here each looks only at the contacts in the cells round it, so the cost grows with their number. Cells hash into buckets;
 a cell is wider than twice the tolerance, and those that the tolerance reaches into are looked
 through too, so the result does not depend on where the cells lie. Rounds, until all are decided: a contact whose earlier
@@ -107,12 +107,22 @@ def list_contacts(
 
 
 @ti.func
-def _same(out: ti.template(), a, b, tolerance):
+def is_same(out: ti.template(), a, b, tolerance):
     """Whether the contacts at a and b are one."""
     result = False
     if (out.body[a] == out.body[b]).all():
         d = out.point[a] - out.point[b]
         result = d.dot(d) <= tolerance * tolerance and out.normal[a].dot(out.normal[b]) >= ti.cast(SAME_NORMAL, ti.f64)
+    return result
+
+
+@ti.func
+def is_earlier(out: ti.template(), a, b):
+    """1 where the contact at a comes before that at b: by kind, the exact ones first, then by feature, then by place."""
+    result = int(a < b)
+    for q in ti.static((2, 1, 0)):
+        if out.feature[a][q] != out.feature[b][q]:
+            result = int(out.feature[a][q] < out.feature[b][q])
     return result
 
 
@@ -130,8 +140,11 @@ def _decide(r: ti.template(), out: ti.template(), i, inverse, tolerance):
         b = _bucket(r, cell)
         for m in range(r.bucket_start[b], r.bucket_end[b]):
             j = r.member[m]
-            if j < i and r.state[j] != DROPPED:
-                if _same(out, at, r.place[j], tolerance):
+            if r.state[j] != DROPPED:
+                found = 0
+                if is_earlier(out, r.place[j], at) == 1:
+                    found = int(is_same(out, at, r.place[j], tolerance))
+                if found == 1:
                     if r.state[j] == KEPT:
                         state = DROPPED
                     elif state == KEPT:
