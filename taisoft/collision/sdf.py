@@ -161,15 +161,15 @@ def _field_contacts(
     k = f.of_body[other]
     A, B, C = dvec(0.0), dvec(0.0), dvec(0.0)  # corners in material space
     phi = dvec(0.0)
-    reach = ti.cast(0.0, ti.f64)
+    reach, way = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     j = 0
     while j < 4 and unmapped == 0:  # the corners, then the deepest point between them
         w = dvec(ti.cast(j == 0, ti.f64), ti.cast(j == 1, ti.f64), ti.cast(j == 2, ti.f64))
         wanted = True
         if j == 3:
             reach = ti.max((A - B).norm(), (B - C).norm(), (C - A).norm())
-            # phi at most 1 per metre: between two corners it is no deeper than this
-            wanted = phi.min() - reach <= 2.0 * margin
+            # phi grows by at most 1 per metre at rest; the world's margin and way count double there, for bodies squeezed to half
+            wanted = phi.min() - reach <= 2.0 * (margin + way)
             if wanted:
                 v, value = deepest_point(f, k, A, B, C, phi)
                 for i in ti.static(range(3)):
@@ -183,6 +183,8 @@ def _field_contacts(
             else:
                 X, G = _material(f, u, x)
                 value, _ = f.sample(k, X)
+                if j < 3:
+                    way = ti.max(way, (s.move[s.triangle[t, j]] - moved(s, u, dvec(1.0 / 3.0))).norm())
                 for i in ti.static(range(3)):
                     if i == j:
                         phi[i] = value

@@ -29,7 +29,7 @@ class CollisionSettings:
     k_dop: int = 6  # planes of a hierarchy's boxes: 6, 14 or 18
     field_cells: int = 32  # cells of a distance field along a body's longest side, 8 to 256
     initial_capacity: int | None = None  # of the buffers of pairs and contacts, at least 64; None: from the surface
-    max_capacity: int | None = None  # to which they may grow; None: to what the memory holds
+    max_capacity: int | None = None  # of any buffer: parts of the work times the largest one; None: what the memory holds
 
     def __post_init__(self):
         what = "collision settings"
