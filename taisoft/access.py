@@ -69,16 +69,18 @@ class StateAccess:
     def detect_contacts(self) -> Contacts:
         """The contacts of the present state swept by dt v, impulses 0; no step.
 
-        What is looked for and how is the scene's (`Scene.collision`, each body's `collision`) and told in the plan. Memory and
-        kernels for it are made at the first call. Raises SimulationError where positions or velocities are not finite, or a
-        buffer would grow beyond `max_capacity`.
+        How it is done is the scene's (`Scene.collision`, each body's `collision`), and by what each is hit the plan tells. Memory
+        and kernels for it are made at the first call. Raises MeshError where a distance field cannot be made, SimulationError
+        where positions or velocities are not finite, or a buffer would grow beyond `max_capacity`.
         """
         detection = self._find_contacts()
         return detection.contacts()
 
-    def set_contact(self, a: str, b: str, friction: float | None = None, restitution: float | None = None) -> None:
+    def set_contact(
+        self, name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None
+    ) -> None:
         """Change the friction or restitution of a pair of bodies, or of a body and an obstacle; as `Scene.set_contact`."""
-        self._open_world().scene.set_contact(a, b, friction=friction, restitution=restitution)
+        self._open_world().scene.set_contact(name_a, name_b, friction=friction, restitution=restitution)
 
     def intersecting_triangles(self) -> list[tuple[str, int, str, int]]:
         """Surface triangles that intersect in the present state, each pair once: name and triangle of each.

@@ -43,7 +43,7 @@ def test_reasons():
         "inversion_handling": (False, entries["inversion_handling"][1]),
         "obstacles": (False, "the scene has none"),
         "distance_fields": (False, "every body is hit by proximity"),
-        "proximity": (True, "hits beam (sharp edges), block (sharp edges), tower (sharp edges) and 1 more"),
+        "proximity": (True, "hits beam (sharp edges), block (sharp edges), tower (sharp edges), flyer (sharp edges)"),
         "self_collision": (False, "not asked for"),
     }
     assert plan.on["loads"] is True and plan.on["moving_nodes"] is False

@@ -24,7 +24,7 @@ from taisoft.collision.trees import TreeTables, build_trees
 from taisoft.runtime import FieldArena, Runtime, kernel
 
 LEAVES = {"cpu": 64, "cuda": 8}  # triangles of a chunk: on the CPU the fastest of 4 to 256, on CUDA for enough threads
-PAIRS_PER_TRIANGLE = 12  # at first
+PAIRS_PER_TRIANGLE = 24  # at first
 
 AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 DIRECTIONS = {  # k -> normals of the slabs

@@ -71,12 +71,12 @@ def edge_contact(s: ti.template(), t, k, u, m, margin, out: ti.template(), start
         if good == 1:
             good = 1 - _end_tells(s, u, m, g * lb, lb, -END * gap, t, k, -n)
         if good == 1:
-            # where it was clamped to an end, the contact is at that end
-            middle = a0 + f * da - 0.5 * gap * n
-            g_clamped = ti.min(ti.max(g, 0.0), 1.0)
-            if g_clamped != g:
-                middle = b0 + g_clamped * db + 0.5 * gap * n
-            f, g = ti.min(ti.max(f, 0.0), 1.0), g_clamped
+            # where one was clamped to an end, the contact is at that end
+            f_in, g_in = ti.min(ti.max(f, 0.0), 1.0), ti.min(ti.max(g, 0.0), 1.0)
+            middle = a0 + f_in * da - 0.5 * gap * n
+            if g_in != g:
+                middle = b0 + g_in * db + 0.5 * gap * n
+            f, g = f_in, g_in
             write_contact(
                 out, at, end, s.body[t], s.body[u], ivec(EDGE_EDGE, 3 * t + k, 3 * u + m), middle + 0.5 * gap * n, n, gap,
                 ivec(s.triangle[t, k], s.triangle[t, (k + 1) % 3], -1), dvec(1.0 - f, f, 0.0),

@@ -61,7 +61,7 @@ class Counts:
 
 
 class Detection:
-    """Finds the contacts of a scene. edge: mean surface edge of the soft bodies at rest [m]; margin [m]; cell [m]."""
+    """Finds the contacts of a scene. edge: mean surface edge of the soft bodies at rest; margin, reach: as in `find` [m]."""
 
     def __init__(
         self, scene: Scene, model: Model, layout: Layout, runtime: Runtime, self_collision: bool = False,
@@ -97,7 +97,7 @@ class Detection:
         self._reduction_arena = FieldArena()
         self._reduction: ReductionFields | None = None
         self._intersections: Intersections | None = None
-        self._placed: float | None = None  # time for which the obstacles were placed last
+        self._placed = False  # whether obstacles have been placed
         self.counts = Counts(triangles=s.n_triangles)
 
     def _make_broad(self, runtime: Runtime) -> SpatialHash | Bvh:
@@ -147,7 +147,9 @@ class Detection:
     # --- a search -------------------------------------------------------------------------------------------------
 
     def find(self, time: float, dt: float, led: tuple[np.ndarray, np.ndarray] | None = None) -> None:
-        """Find the contacts of the model's present state swept by dt [s].
+        """Find the contacts of the model's present state swept by dt [s]: those nearer than the margin at some moment.
+
+        Faces that have passed each other are found to a depth of `reach`, the margin and a tenth of the mean edge.
 
         time [s]: of the obstacles. led: (k,) nodes and (k,3) how far they are led during the step [m], nan where they are not.
         Raises SimulationError where positions are not finite, or a buffer may not grow as far as it must.
@@ -177,9 +179,8 @@ class Detection:
         if not self._rows:
             return None
         find_active(self.surface)
-        self.counts.active = self.surface.count[ACTIVE]
         rows = self.broad.find()
-        self.counts.pairs = self.broad.n_pairs
+        self.counts.active, self.counts.pairs = self.surface.count[ACTIVE], self.broad.n_pairs
         return rows
 
     def _search(self, rows: Candidates | None) -> None:
@@ -212,7 +213,7 @@ class Detection:
 
     def _place_obstacles(self, time: float, dt: float) -> None:
         """Obstacles where they are at a time and at the end of the step; those that stand still are placed once."""
-        first = self._placed is None
+        first = not self._placed
         start = len(self.scene.bodies)
         for k, o in enumerate(self.scene.obstacles):
             vertices = slice(self.topology.vertex_first[start + k], self.topology.vertex_first[start + k + 1])
@@ -227,7 +228,7 @@ class Detection:
                 frames = [obstacle_frame(o, t) for _, o in self._analytic]
                 fields[0].from_numpy(np.array([x for x, _ in frames]))
                 fields[1].from_numpy(np.concatenate([r for _, r in frames]))
-        self._placed = time
+        self._placed = True
 
     def _lead(self, nodes: np.ndarray, moves: np.ndarray) -> None:
         """Led nodes go where their path leads them."""
@@ -241,7 +242,7 @@ class Detection:
 
     def _unfinite(self) -> str:
         x, move = self.surface.x.to_numpy(), self.surface.move.to_numpy()
-        bad = int(np.argmin((np.isfinite(x) & np.isfinite(move)).all(axis=1)))
+        bad = int(np.argmin((np.isfinite(x) & np.isfinite(x + move)).all(axis=1)))
         k = int(np.searchsorted(self.topology.vertex_first, bad, side="right")) - 1
         node = self.topology.node[bad] - self.layout.node_start[k] if k < len(self.scene.bodies) else bad
         name = self.scene.colliders[k].name

@@ -28,7 +28,7 @@ class Topology:
     triangle: (t,3) vertices; body: (t,) collider, ascending; first: (n_bodies + 1,) first triangle of each collider;
     vertex_first: (n_bodies + 1,) first vertex; node: (v,) the model's node, -1 for obstacles; neighbour: (t,3) triangle across
     the edge from corner k to k + 1, -1 where there is none; owns: (t,) bits 0-2 corners, 3-5 edges that this triangle
-    handles for all that share them; ring_start, ring: triangles round each vertex; behind: (t,4) nodes of the linear tet.
+    handles for all that share them; ring_start, ring: triangles round each vertex.
     """
 
     triangle: np.ndarray
@@ -69,7 +69,7 @@ class Surface:
     body_lo: Any  # (n_bodies) 3-vectors f64
     body_hi: Any
     active: Any  # i32: triangles whose box meets another collider's, ascending; the first count[ACTIVE] hold
-    count: Any  # (4) i32
+    count: Any  # (4) i32, of UNFINITE and ACTIVE
     part: Any  # (chunks) i32: counts of the parts of a list
 
 

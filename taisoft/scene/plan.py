@@ -86,6 +86,6 @@ def _add_collision(plan: Plan, scene: Scene, self_collision: bool) -> None:
         modes["proximity"].append("every body (itself)")
     idle = "no triangles can hit a body" if not hit else "every body is hit by "
     fields, near = modes["distance_field"], modes["proximity"]
-    plan.add("distance_fields", bool(fields), f"hits {_named(fields)}", idle + ("proximity" if hit else ""))
-    plan.add("proximity", bool(near), f"hits {_named(near)}", idle + ("its distance field" if hit else ""))
+    plan.add("distance_fields", bool(fields), "hits " + ", ".join(fields), idle + ("proximity" if hit else ""))
+    plan.add("proximity", bool(near), "hits " + ", ".join(near), idle + ("its distance field" if hit else ""))
     plan.add("self_collision", self_collision, "asked for", "not asked for")
