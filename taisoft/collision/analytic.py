@@ -148,10 +148,12 @@ def find_analytic(
 ):
     """Add the contacts of the soft bodies' triangles with all analytic obstacles."""
     ti.loop_config(serialize=s.serial)
-    for c in range(s.chunks):
-        at, end = c * part + used[c], (c + 1) * part
-        for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):
-            if s.soft[s.body[t]] == 1 and (s.lo[t] <= s.hi[t]).all():
-                for k in range(o.count):
-                    at = _touch(s, o, t, k, margin, out, at, end)
-        used[c] = at - c * part
+    for wide in range(s.chunks * s.spread):
+        if wide % s.spread == 0:
+            c = wide // s.spread
+            at, end = c * part + used[c], (c + 1) * part
+            for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):
+                if s.soft[s.body[t]] == 1 and (s.lo[t] <= s.hi[t]).all():
+                    for k in range(o.count):
+                        at = _touch(s, o, t, k, margin, out, at, end)
+            used[c] = at - c * part

@@ -123,15 +123,17 @@ def _nodes(b: ti.template(), node):
 def refit_chunks(s: ti.template(), b: ti.template(), margin: ti.f64):
     """Slabs of all nodes in the chunks."""
     ti.loop_config(serialize=s.serial)
-    for c in range(b.n_chunks):
-        first = b.chunk[c]
-        n = _nodes(b, first)
-        for k in range(n):
-            node = first + n - 1 - k
-            if b.link[node] < 0:
-                _refit_leaf(s, b, node, margin)
-            else:
-                _refit_inner(b, node)
+    for wide in range(b.n_chunks * s.spread):
+        if wide % s.spread == 0:
+            c = wide // s.spread
+            first = b.chunk[c]
+            n = _nodes(b, first)
+            for k in range(n):
+                node = first + n - 1 - k
+                if b.link[node] < 0:
+                    _refit_leaf(s, b, node, margin)
+                else:
+                    _refit_inner(b, node)
 
 
 @kernel
@@ -186,18 +188,20 @@ def walk_trees(
 ):  # fmt: skip
     """Pairs of triangles whose slabs overlap, each once. Neighbouring chunks go to different parts, which evens the load."""
     ti.loop_config(serialize=s.serial)
-    for c in range(b.parts):
-        at = c * part
-        for k in range((b.n_chunks - c + b.parts - 1) // b.parts):
-            chunk = c + k * b.parts
-            own = b.chunk_body[chunk]
-            for other in range(own, s.n_bodies):
-                together = s.self_on[own]
-                if other != own:
-                    together = s.soft[own] | s.soft[other]
-                if together == 1 and b.root[other] >= 0:
-                    at = _walk(s, b, c, b.chunk[chunk], b.root[other], pair, at, (c + 1) * part)
-        used[c] = at - c * part
+    for wide in range(b.parts * s.spread):
+        if wide % s.spread == 0:
+            c = wide // s.spread
+            at = c * part
+            for k in range((b.n_chunks - c + b.parts - 1) // b.parts):
+                chunk = c + k * b.parts
+                own = b.chunk_body[chunk]
+                for other in range(own, s.n_bodies):
+                    together = s.self_on[own]
+                    if other != own:
+                        together = s.soft[own] | s.soft[other]
+                    if together == 1 and b.root[other] >= 0:
+                        at = _walk(s, b, c, b.chunk[chunk], b.root[other], pair, at, (c + 1) * part)
+            used[c] = at - c * part
     ti.loop_config(serialize=True)
     for _ in range(1):
         sum_parts(used, total, b.parts)

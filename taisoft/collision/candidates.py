@@ -157,10 +157,12 @@ def pair_rows(
     for t in range(s.n_triangles):
         end[t] = 0
     ti.loop_config(serialize=serial)
-    for c in range(chunks):
-        for k in range(c * part, c * part + used[c]):
-            ti.atomic_add(end[pair[k][0]], 1)
-            ti.atomic_add(end[pair[k][1]], 1)
+    for wide in range(chunks * s.spread):
+        if wide % s.spread == 0:
+            c = wide // s.spread
+            for k in range(c * part, c * part + used[c]):
+                ti.atomic_add(end[pair[k][0]], 1)
+                ti.atomic_add(end[pair[k][1]], 1)
     ti.loop_config(serialize=True)
     for _ in range(1):
         total = 0
@@ -179,11 +181,13 @@ def fill_rows(
 ):  # fmt: skip
     """Write both directions of every pair into its rows and sort them."""
     ti.loop_config(serialize=serial)
-    for c in range(chunks):
-        for k in range(c * part, c * part + used[c]):
-            a, b = pair[k][0], pair[k][1]
-            entry[ti.atomic_add(end[a], 1)] = b
-            entry[ti.atomic_add(end[b], 1)] = a
+    for wide in range(chunks * s.spread):
+        if wide % s.spread == 0:
+            c = wide // s.spread
+            for k in range(c * part, c * part + used[c]):
+                a, b = pair[k][0], pair[k][1]
+                entry[ti.atomic_add(end[a], 1)] = b
+                entry[ti.atomic_add(end[b], 1)] = a
     ti.loop_config(serialize=serial)
     for t in range(s.n_triangles):
         sort_row(entry, start[t], end[t])

@@ -263,28 +263,30 @@ def find_proximity(
     half: of the reach by which boxes are grown [m].
     """
     ti.loop_config(serialize=s.serial)
-    for c in range(s.chunks):
-        at, end = c * part, (c + 1) * part
-        for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
-            t = s.active[j]
-            own = s.body[t]
-            first = start[t]
-            while first < row_end[t]:  # the triangles of one other collider after another
-                other = s.body[entry[first]]
-                last = first + 1
-                while last < row_end[t] and s.body[entry[last]] == other:
-                    last += 1
-                if way[other] == BY_FACES or other == own:
-                    for k in range(3):
-                        if (s.owns[t] >> k) & 1:
-                            at = vertex_contacts(s, entry, first, last, s.triangle[t, k], own, margin, half, out, at, end)
-                if sharp[t] != 0:
-                    for e in range(first, last):
-                        u = entry[e]
-                        if u > t and sharp[u] != 0:
-                            for km in range(9):
-                                k, m = km // 3, km % 3
-                                if (sharp[t] >> k) & 1 and (sharp[u] >> m) & 1:
-                                    at = edge_contact(s, t, k, u, m, margin, out, at, end)
-                first = last
-        used[c] = at - c * part
+    for wide in range(s.chunks * s.spread):
+        if wide % s.spread == 0:
+            c = wide // s.spread
+            at, end = c * part, (c + 1) * part
+            for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
+                t = s.active[j]
+                own = s.body[t]
+                first = start[t]
+                while first < row_end[t]:  # the triangles of one other collider after another
+                    other = s.body[entry[first]]
+                    last = first + 1
+                    while last < row_end[t] and s.body[entry[last]] == other:
+                        last += 1
+                    if way[other] == BY_FACES or other == own:
+                        for k in range(3):
+                            if (s.owns[t] >> k) & 1:
+                                at = vertex_contacts(s, entry, first, last, s.triangle[t, k], own, margin, half, out, at, end)
+                    if sharp[t] != 0:
+                        for e in range(first, last):
+                            u = entry[e]
+                            if u > t and sharp[u] != 0:
+                                for km in range(9):
+                                    k, m = km // 3, km % 3
+                                    if (sharp[t] >> k) & 1 and (sharp[u] >> m) & 1:
+                                        at = edge_contact(s, t, k, u, m, margin, out, at, end)
+                    first = last
+            used[c] = at - c * part

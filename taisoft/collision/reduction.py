@@ -28,6 +28,7 @@ class ReductionFields:
     buckets: int  # a power of two
     chunks: int
     serial: bool
+    spread: int  # as of the surface
     place: Any  # (capacity) i32: of the i-th contact found
     bucket: Any  # (capacity) i32: of each contact
     bucket_start: Any  # (buckets) i32: where its members begin and end
@@ -39,7 +40,7 @@ class ReductionFields:
     first: Any  # (chunks) i32: number of the first contact of each part
 
 
-def reduction_fields(arena: FieldArena, capacity: int, chunks: int, serial: bool) -> ReductionFields:
+def reduction_fields(arena: FieldArena, capacity: int, chunks: int, serial: bool, spread: int = 1) -> ReductionFields:
     """Room for that many contacts in `chunks` parts."""
     buckets = 1 << max(capacity - 1, 63).bit_length()
 
@@ -47,7 +48,7 @@ def reduction_fields(arena: FieldArena, capacity: int, chunks: int, serial: bool
         return arena.field(f"reduction_{name}", ti.i32, n)
 
     return ReductionFields(
-        buckets, chunks, serial, ints("place", capacity), ints("bucket", capacity), ints("bucket_start", buckets),
+        buckets, chunks, serial, spread, ints("place", capacity), ints("bucket", capacity), ints("bucket_start", buckets),
         ints("bucket_end", buckets), ints("member", capacity),
         ints("state", capacity), ints("kept", capacity), ints("count", 3), ints("first", chunks),
     )  # fmt: skip
@@ -86,14 +87,16 @@ def list_contacts(
             total += used[k]
         r.count[FOUND] = total
     ti.loop_config(serialize=r.serial)
-    for c in range(r.chunks):
-        for k in range(used[c]):
-            i, at = r.first[c] + k, c * part + k
-            r.place[i] = at
-            r.state[i] = UNKNOWN
-            b = _bucket(r, _cell(out.point[at], inverse))
-            r.bucket[i] = b
-            ti.atomic_add(r.bucket_end[b], 1)
+    for wide in range(r.chunks * r.spread):
+        if wide % r.spread == 0:
+            c = wide // r.spread
+            for k in range(used[c]):
+                i, at = r.first[c] + k, c * part + k
+                r.place[i] = at
+                r.state[i] = UNKNOWN
+                b = _bucket(r, _cell(out.point[at], inverse))
+                r.bucket[i] = b
+                ti.atomic_add(r.bucket_end[b], 1)
     ti.loop_config(serialize=True)
     for _ in range(1):
         total = 0

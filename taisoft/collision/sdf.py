@@ -231,20 +231,22 @@ def find_in_fields(
 ):  # fmt: skip
     """Add the contacts with distance fields; unmapped[0] counts the (triangle, body) that no tet maps."""
     ti.loop_config(serialize=s.serial)
-    for c in range(s.chunks):
-        at, end = c * part + used[c], (c + 1) * part
-        lost = 0
-        for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
-            t = s.active[i]
-            first = start[t]
-            while first < row_end[t]:
-                other = s.body[entry[first]]
-                last = first + 1
-                while last < row_end[t] and s.body[entry[last]] == other:
-                    last += 1
-                if f.of_body[other] >= 0 and other != s.body[t]:
-                    at, miss = _field_contacts(s, f, entry, first, last, t, margin, out, at, end)
-                    lost += miss
-                first = last
-        used[c] = at - c * part
-        ti.atomic_add(unmapped[0], lost)
+    for wide in range(s.chunks * s.spread):
+        if wide % s.spread == 0:
+            c = wide // s.spread
+            at, end = c * part + used[c], (c + 1) * part
+            lost = 0
+            for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
+                t = s.active[i]
+                first = start[t]
+                while first < row_end[t]:
+                    other = s.body[entry[first]]
+                    last = first + 1
+                    while last < row_end[t] and s.body[entry[last]] == other:
+                        last += 1
+                    if f.of_body[other] >= 0 and other != s.body[t]:
+                        at, miss = _field_contacts(s, f, entry, first, last, t, margin, out, at, end)
+                        lost += miss
+                    first = last
+            used[c] = at - c * part
+            ti.atomic_add(unmapped[0], lost)

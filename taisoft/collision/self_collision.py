@@ -29,17 +29,19 @@ def find_intersections(
 ):  # fmt: skip
     """Pairs t < u of the rows that intersect; rows ascend, and so do the pairs of a part and the parts."""
     ti.loop_config(serialize=s.serial)
-    for c in range(s.chunks):
-        last = (c + 1) * part
-        at = c * part
-        for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):
-            for e in range(start[t], end[t]):
-                u = entry[e]
-                if t < u and intersect(s, t, u) == 1:
-                    if at < last:
-                        pair[at] = ti.Vector([t, u], ti.i32)
-                    at += 1
-        used[c] = at - c * part
+    for wide in range(s.chunks * s.spread):
+        if wide % s.spread == 0:
+            c = wide // s.spread
+            last = (c + 1) * part
+            at = c * part
+            for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):
+                for e in range(start[t], end[t]):
+                    u = entry[e]
+                    if t < u and intersect(s, t, u) == 1:
+                        if at < last:
+                            pair[at] = ti.Vector([t, u], ti.i32)
+                        at += 1
+            used[c] = at - c * part
     ti.loop_config(serialize=True)
     for _ in range(1):
         sum_parts(used, total, s.chunks)

@@ -111,11 +111,13 @@ def count_cells(s: ti.template(), g: ti.template(), inverse: ti.f64):
 def scan_cells(s: ti.template(), g: ti.template()):
     """Prefix sums: cell_start from the counts in cell_end, which then points there too."""
     ti.loop_config(serialize=s.serial)
-    for c in range(SCAN):
-        total = 0
-        for k in range(part_first(c, g.n_cells, SCAN), part_first(c + 1, g.n_cells, SCAN)):
-            total += g.cell_end[k]
-        g.scan[c] = total
+    for wide in range(SCAN * s.spread):
+        if wide % s.spread == 0:
+            c = wide // s.spread
+            total = 0
+            for k in range(part_first(c, g.n_cells, SCAN), part_first(c + 1, g.n_cells, SCAN)):
+                total += g.cell_end[k]
+            g.scan[c] = total
     ti.loop_config(serialize=True)
     for _ in range(1):
         total = 0
@@ -125,13 +127,15 @@ def scan_cells(s: ti.template(), g: ti.template()):
             total += n
         g.count[N_ENTRIES] = total
     ti.loop_config(serialize=s.serial)
-    for c in range(SCAN):
-        total = g.scan[c]
-        for k in range(part_first(c, g.n_cells, SCAN), part_first(c + 1, g.n_cells, SCAN)):
-            n = g.cell_end[k]
-            g.cell_start[k] = total
-            g.cell_end[k] = total
-            total += n
+    for wide in range(SCAN * s.spread):
+        if wide % s.spread == 0:
+            c = wide // s.spread
+            total = g.scan[c]
+            for k in range(part_first(c, g.n_cells, SCAN), part_first(c + 1, g.n_cells, SCAN)):
+                n = g.cell_end[k]
+                g.cell_start[k] = total
+                g.cell_end[k] = total
+                total += n
 
 
 @kernel
@@ -173,41 +177,43 @@ def find_rows(
         g.start[t] = 0
         g.end[t] = 0
     ti.loop_config(serialize=s.serial)
-    for c in range(s.chunks):
-        last = (c + 1) * part
-        at = c * part
-        for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
-            t = s.active[i]
-            begin = at
-            own = s.body[t]
-            self_on = s.self_on[own]
-            first, count = g.first_cell[t], g.cell_count[t]
-            for k in range(count[0] * count[1] * count[2]):
-                bucket = _bucket(g, first, count, k)
-                for e in range(g.cell_start[bucket], g.cell_end[bucket]):
-                    u = member[e]
-                    if s.body[u] != own or self_on == 1:
+    for wide in range(s.chunks * s.spread):
+        if wide % s.spread == 0:
+            c = wide // s.spread
+            last = (c + 1) * part
+            at = c * part
+            for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
+                t = s.active[i]
+                begin = at
+                own = s.body[t]
+                self_on = s.self_on[own]
+                first, count = g.first_cell[t], g.cell_count[t]
+                for k in range(count[0] * count[1] * count[2]):
+                    bucket = _bucket(g, first, count, k)
+                    for e in range(g.cell_start[bucket], g.cell_end[bucket]):
+                        u = member[e]
+                        if s.body[u] != own or self_on == 1:
+                            if _is_pair(s, t, u) == 1:
+                                if _index(g, ti.select(s.lo[t] >= s.lo[u], first, g.first_cell[u])) == bucket:
+                                    _append(entry, at, last, u)
+                                    at += 1
+                if count[0] == 0:
+                    for j in range(s.count[ACTIVE]):
+                        u = s.active[j]
                         if _is_pair(s, t, u) == 1:
-                            if _index(g, ti.select(s.lo[t] >= s.lo[u], first, g.first_cell[u])) == bucket:
-                                _append(entry, at, last, u)
-                                at += 1
-            if count[0] == 0:
-                for j in range(s.count[ACTIVE]):
-                    u = s.active[j]
-                    if _is_pair(s, t, u) == 1:
-                        _append(entry, at, last, u)
-                        at += 1
-            else:
-                for j in range(g.count[N_LARGE]):
-                    u = g.large[j]
-                    if _is_pair(s, t, u) == 1:
-                        _append(entry, at, last, u)
-                        at += 1
-            if at <= last:
-                g.start[t] = begin
-                g.end[t] = at
-                sort_row(entry, begin, at)
-        used[c] = at - c * part
+                            _append(entry, at, last, u)
+                            at += 1
+                else:
+                    for j in range(g.count[N_LARGE]):
+                        u = g.large[j]
+                        if _is_pair(s, t, u) == 1:
+                            _append(entry, at, last, u)
+                            at += 1
+                if at <= last:
+                    g.start[t] = begin
+                    g.end[t] = at
+                    sort_row(entry, begin, at)
+            used[c] = at - c * part
     ti.loop_config(serialize=True)
     for _ in range(1):
         sum_parts(used, total, s.chunks)

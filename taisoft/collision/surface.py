@@ -14,6 +14,8 @@ import taichi as ti
 from taisoft.runtime import FieldArena, Runtime, kernel
 
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than waking the others (about 50 us a loop)
+# Taichi gives each CPU thread at least 512 turns of a loop: so many turns belong to one part, and one of them does the work
+SPREAD = {"cpu": 512, "cuda": 1}
 CHUNKS = {"cpu": 64, "cuda": 4096}  # parts of a list that are worked on side by side, each with its own part of a buffer
 UNFINITE, ACTIVE = 0, 1  # places in Surface.count
 
@@ -51,6 +53,7 @@ class Surface:
     n_bodies: int  # colliders, with those that have no faces
     serial: bool
     chunks: int
+    spread: int  # turns of a loop for each part, see SPREAD
     triangle: Any  # (n_triangles, 3) i32
     body: Any  # i32
     node: Any  # i32
@@ -136,7 +139,8 @@ def build_surface(
         return arena.vectors(f"surface_{name}", ti.f64, max(count, 1))
 
     return Surface(
-        n, v, bodies, serial, chunks, rows("triangle", t.triangle), ints("body", t.body), ints("node", t.node),
+        n, v, bodies, serial, chunks, 1 if serial else SPREAD[runtime.arch], rows("triangle", t.triangle),
+        ints("body", t.body), ints("node", t.node),
         rows("neighbour", t.neighbour), ints("owns", t.owns), ints("ring_start", t.ring_start), ints("ring", t.ring),
         ints("soft", soft), ints("self_on", self_on), ints("first_of", t.first),
         arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None), vectors("x", v), vectors("move", v),
@@ -266,14 +270,16 @@ def _meets_another(s: ti.template(), t):
 def find_active(s: ti.template()):
     """List the triangles that can have a partner, in ascending order."""
     ti.loop_config(serialize=s.serial)
-    for c in range(s.chunks):
-        first = part_first(c, s.n_triangles, s.chunks)
-        n = 0
-        for t in range(first, part_first(c + 1, s.n_triangles, s.chunks)):
-            if _meets_another(s, t):
-                s.active[first + n] = t
-                n += 1
-        s.part[c] = n
+    for wide in range(s.chunks * s.spread):
+        if wide % s.spread == 0:
+            c = wide // s.spread
+            first = part_first(c, s.n_triangles, s.chunks)
+            n = 0
+            for t in range(first, part_first(c + 1, s.n_triangles, s.chunks)):
+                if _meets_another(s, t):
+                    s.active[first + n] = t
+                    n += 1
+            s.part[c] = n
     ti.loop_config(serialize=True)
     for _ in range(1):
         total = 0
