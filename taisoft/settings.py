@@ -61,14 +61,9 @@ def check_settings(
         near = difflib.get_close_matches(str(integrator), INTEGRATORS, 1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise SimulationError(f"integrator {integrator!r} is unknown{hint}: it must be one of {', '.join(INTEGRATORS)}")
-    if contact_solver != "auto":
-        raise SimulationError(
-            f"contact_solver = {contact_solver!r}: this version computes no contact forces, so it must be 'auto'"
-        )
     if not isinstance(self_collision, bool):
         raise SimulationError(f"self_collision = {self_collision!r}: it must be True or False")
-    if contact_tolerance is not None:
-        raise SimulationError("contact_tolerance must be None: this version computes no contact forces")
+    _check_tolerance("contact_tolerance", contact_tolerance)
     if not isinstance(allow_unstable, bool):
         raise SimulationError(f"allow_unstable = {allow_unstable!r}: it must be True or False")
     _check_tolerance("newton_tolerance", newton_tolerance)

@@ -16,6 +16,7 @@ from taisoft.scene.scene import Scene
 from taisoft.settings import check_settings
 from taisoft.stability import scale_warnings
 from taisoft.stepping import SCHEMES, make_stepper
+from taisoft.stepping.contact import ContactStep
 from taisoft.stepping.motion import Motion
 from taisoft.stepping.world import World
 
@@ -64,7 +65,9 @@ class Simulator(StateAccess):
         try:
             model, layout = build_model(scene, self._runtime, self._arena, self.plan.on)
             self._world = World(scene, self._runtime, self._arena, model, layout, Motion(scene, layout))
-            self._stepper = make_stepper(self._world, integrator)
+            touching = self.plan.on["contact_forces"]
+            self._contact = ContactStep(self._world, self_collision, self.settings.explicit) if touching else None
+            self._stepper = make_stepper(self._world, integrator, self._contact)
             self.reset()
         except BaseException:
             _release(self._arena, self._runtime, self._detections)
@@ -72,6 +75,7 @@ class Simulator(StateAccess):
         if not self.settings.explicit:
             self._stepper.tolerance = newton_tolerance or self._stepper.tolerance
             self._stepper.linear_tolerance = linear_tolerance
+            self._stepper.contact_tolerance = contact_tolerance or self._stepper.contact_tolerance
         self._release = weakref.finalize(self, _release, self._arena, self._runtime, self._detections)
 
     # --- stepping -------------------------------------------------------------------------------------------------
@@ -83,7 +87,6 @@ class Simulator(StateAccess):
     def advance(self, n: int) -> StepReport:
         """Up to n steps of dt, at least one: explicit ones in one launch, implicit ones one at a time."""
         world, start = self._open_world(), self.step_count
-        self._refuse_contact_forces()
         if self.settings.explicit:
             result = self._stepper.advance(n, self._dt)
             self._count(result.done)
@@ -101,19 +104,16 @@ class Simulator(StateAccess):
                     f"step {world.step_count}: Newton stopped after {result.newton_iterations} iterations "
                     f"at a relative residual of {result.residual:.2e}"
                 )
+        if self._contact is not None:
+            self._tell_contacts(report, result)
         report.steps = self.step_count - start
         if report.n_inverted:
             report.problems.append(f"step {world.step_count}: {report.n_inverted} tets are inverted")
         return report
 
-    def _refuse_contact_forces(self) -> None:
-        scene = self._world.scene
-        why = f"obstacle '{scene.obstacles[0].name}'" if scene.obstacles else "self_collision=True"
-        if scene.obstacles or self.settings.self_collision:
-            raise SimulationError(
-                f"this version finds contacts but computes no contact forces, so it cannot step a scene with {why}; "
-                "detect_contacts() gives the contacts of the present state"
-            )
+    def _tell_contacts(self, report: StepReport, result) -> None:
+        report.contact_iterations, report.contact_residual = result.contact_iterations, result.contact_residual
+        report.n_contacts, report.max_penetration = self._contact.n_contacts, self._contact.penetration
 
     def run(self, seconds: float, on_frame=None, fps: float | None = 60, stop=None) -> RunReport:
         """Run for some seconds; see `taisoft.running.run`."""

@@ -40,6 +40,9 @@ class AnalyticObstacles:
         return shapes.distance(self.kind[k], self.size[k], p)
 
 
+NO_SHAPES = AnalyticObstacles(0, *[None] * 7)
+
+
 @ti.func
 def _rows(f: ti.template(), k):
     return ti.Matrix.rows([f[3 * k], f[3 * k + 1], f[3 * k + 2]])

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import taichi as ti
 
-from taisoft.collision.analytic import AnalyticObstacles, find_analytic
+from taisoft.collision.analytic import NO_SHAPES, AnalyticObstacles, find_analytic
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.candidates import Buffer, Candidates
 from taisoft.collision.colliders import body_grid, collider_surfaces, obstacle_frame
@@ -91,7 +91,7 @@ class Detection:
         self._unmapped = arena.field("unmapped", ti.i32, 1)
         self._fields = self._make_fields(grids, runtime) if any(grids) else None
         self._analytic = [(len(bodies) + k, o) for k, o in enumerate(obstacles) if not isinstance(o.shape, MeshObstacle)]
-        self._shapes = self._make_shapes() if self._analytic else None
+        self.shapes = self._make_shapes() if self._analytic else NO_SHAPES
         capacity = settings.initial_capacity or CONTACTS_PER_TRIANGLE * s.n_triangles + 64
         self.buffer = Buffer("contacts", contact_fields, capacity, settings.max_capacity, s.chunks, arena)
         self._reduction_arena = FieldArena()
@@ -198,8 +198,8 @@ class Detection:
                 find_in_fields(
                     s, self._fields, rows.start, rows.end, rows.entry, self.margin, b.data, b.used, b.part, self._unmapped
                 )
-        if self._shapes is not None:
-            find_analytic(s, self._shapes, self.margin, b.data, b.used, b.part)
+        if self.shapes.count:
+            find_analytic(s, self.shapes, self.margin, b.data, b.used, b.part)
         b.sum_up()
 
     def _reduce(self) -> None:
@@ -222,8 +222,8 @@ class Detection:
                 move_obstacles(self.surface, vertices.start, now, then - now)
         if self._analytic and (first or any(o.path is not None for _, o in self._analytic)):
             for fields, t in (
-                ((self._shapes.origin, self._shapes.rotation), time),
-                ((self._shapes.next_origin, self._shapes.next_rotation), time + dt),
+                ((self.shapes.origin, self.shapes.rotation), time),
+                ((self.shapes.next_origin, self.shapes.next_rotation), time + dt),
             ):
                 frames = [obstacle_frame(o, t) for _, o in self._analytic]
                 fields[0].from_numpy(np.array([x for x, _ in frames]))
@@ -265,14 +265,26 @@ class Detection:
         nodes = np.concatenate([taken(b.nodes_a), taken(b.nodes_b)], axis=1)
         weights = np.concatenate([taken(b.weights_a), taken(b.weights_b)], axis=1)
         nodes = np.where(nodes >= 0, np.append(self.topology.node, -1)[nodes], -1)
+        return self.record(
+            taken(b.point), taken(b.normal), taken(b.gap), np.zeros((len(rows), 3)), body, feature, nodes,
+            np.where(nodes >= 0, weights, 0.0),
+        )  # fmt: skip
+
+    def record(self, point, normal, gap, impulse, body, feature, nodes, weights) -> Contacts:
+        """Arrays of contacts (k, ...) with the names of the colliders and the numbers of their pairs. body: (k,2) colliders."""
         names = np.array([c.name for c in self.scene.colliders], dtype=object)
         pairs, pair = np.unique(body, axis=0, return_inverse=True)
         numbers = np.array([self.scene.contact_numbers(names[a], names[b]) for a, b in pairs]).reshape(-1, 2)[pair.reshape(-1)]
         return Contacts(
-            taken(b.point), taken(b.normal), taken(b.gap), np.zeros((len(rows), 3)), names[body[:, 0]], names[body[:, 1]],
-            nodes, np.where(nodes >= 0, weights, 0.0), np.array(KINDS, dtype=object)[feature[:, 0]], feature[:, 1:],
-            numbers[:, 0], numbers[:, 1], self.counts.found, self.counts.unmapped,
+            point, normal, gap, impulse, names[body[:, 0]], names[body[:, 1]], nodes, weights,
+            np.array(KINDS, dtype=object)[feature[:, 0]], feature[:, 1:], numbers[:, 0], numbers[:, 1], self.counts.found,
+            self.counts.unmapped,
         )  # fmt: skip
+
+    @property
+    def kept(self):
+        """The field of the kept contacts' places in the buffer, the first counts.contacts of it."""
+        return self._reduction.kept
 
     def intersections(self) -> np.ndarray:
         """(k,2) pairs of the surface's triangles that intersect where the last search found them, without a common vertex."""

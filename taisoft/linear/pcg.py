@@ -14,6 +14,7 @@ from typing import Any
 import taichi as ti
 
 from taisoft.linear.block_csr import BLOCK, BlockCsr
+from taisoft.linear.coupling import NO_COUPLING, Coupling
 from taisoft.model import Model
 from taisoft.runtime import FieldArena, kernel
 
@@ -54,8 +55,10 @@ def build_pcg(model: Model, arena: FieldArena) -> PcgWork:
     return PcgWork(**vectors, inverse=inverse, state=arena.field("pcg_state", ti.f64, 5))
 
 
-def solve(m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int) -> LinearResult:
-    """Fill w.y from w.rhs. tolerance: sqrt(r.z) relative to the start."""
+def solve(
+    m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int, coupling: Coupling = NO_COUPLING
+) -> LinearResult:
+    """Fill w.y from w.rhs. tolerance: sqrt(r.z) relative to the start. coupling: off-diagonal terms beside those of A."""
     from taisoft.linear import pcg_parallel, pcg_serial
 
     invert_diagonal(m, A, w)
@@ -63,7 +66,7 @@ def solve(m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: i
     batch = max(1, SERIAL_WORK // (2 * A.n_edges + m.n_nodes)) if m.serial else PARALLEL_BATCH
     done = 0
     while True:
-        done, stop = method.iterate(m, A, w, min(batch, max_iterations - done), tolerance, done == 0)
+        done, stop = method.iterate(m, A, coupling, w, min(batch, max_iterations - done), tolerance, done == 0)
         if stop != RUNNING or done >= max_iterations:
             return LinearResult(done, stop == CONVERGED, stop == NEGATIVE)
 

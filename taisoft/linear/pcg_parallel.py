@@ -3,6 +3,7 @@
 import taichi as ti
 
 from taisoft.linear.block_csr import block_times, row_times
+from taisoft.linear.coupling import coupling_times
 from taisoft.linear.pcg import (
     CONVERGED,
     COUNT,
@@ -37,24 +38,27 @@ def start(m: ti.template(), A: ti.template(), w: ti.template()):
         w.state[RZ], w.state[RZ_START], w.state[COUNT], w.state[STOP] = rz, rz, 0.0, RUNNING
 
 
-def iterate(m, A, w, n: int, tolerance: float, begin: bool) -> tuple[int, int]:
+def iterate(m, A, coupling, w, n: int, tolerance: float, begin: bool) -> tuple[int, int]:
     """Up to n iterations, from y = 0 where the solve begins; returns the iterations so far and how it stands."""
     if begin:
         start(m, A, w)
     for _ in range(n):
-        iterate_once(m, A, w, tolerance)
+        iterate_once(m, A, coupling, w, tolerance)
     return int(w.state[COUNT]), int(w.state[STOP])
 
 
 @kernel
-def iterate_once(m: ti.template(), A: ti.template(), w: ti.template(), tolerance: ti.f64):
+def iterate_once(m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), tolerance: ti.f64):
     """One iteration; does nothing once stopped."""
     for c in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         s = ti.cast(0.0, ti.f64)
         if w.state[STOP] == RUNNING:
             for i in range(c * size, ti.min(m.n_nodes, (c + 1) * size)):
-                q = m.free[i] * row_times(m, A, i, w.p)
+                product = row_times(m, A, i, w.p)
+                if ti.static(coupling.width > 0):
+                    product += coupling_times(m, coupling, i, w.p, True, True)
+                q = m.free[i] * product
                 w.q[i] = q
                 s += dot64(w.p[i], q)
         m.partial[c, 6] = s

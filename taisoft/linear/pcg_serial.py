@@ -10,16 +10,19 @@ Comput. 2(1), 1981. D^-1 holds the inverse of the blocks that could be inverted,
 import taichi as ti
 
 from taisoft.linear.block_csr import block_times, part_times, part_times_backward
+from taisoft.linear.coupling import coupling_times
 from taisoft.linear.pcg import CONVERGED, COUNT, NEGATIVE, RUNNING, RZ, RZ_START, STEP, STOP, dot64
 from taisoft.runtime import kernel
 
 
 @ti.func
-def start(m: ti.template(), A: ti.template(), w: ti.template()):
+def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()):
     """y = 0, s = (D + L)^-1 rhs, t = D s."""
     rz = ti.cast(0.0, ti.f64)
     for i in range(m.n_nodes):
         below = part_times(m, A, A.row_start[i], A.row_upper[i], w.r)
+        if ti.static(k.width > 0):
+            below += coupling_times(m, k, i, w.r, False, True)
         s = block_times(w.inverse[i], w.rhs[i] - below)
         t = block_times(A.diagonal[i], s)
         w.r[i], w.q[i] = s, t
@@ -30,21 +33,22 @@ def start(m: ti.template(), A: ti.template(), w: ti.template()):
     w.state[COUNT], w.state[STOP] = 0.0, RUNNING
 
 
-def iterate(m, A, w, n: int, tolerance: float, begin: bool) -> tuple[int, int]:
+def iterate(m, A, k, w, n: int, tolerance: float, begin: bool) -> tuple[int, int]:
     """Up to n iterations, from y = 0 where the solve begins; returns the iterations so far and how it stands."""
-    count, stop = iterate_kernel(m, A, w, n, tolerance, int(begin))
+    count, stop = iterate_kernel(m, A, k, w, n, tolerance, int(begin))
     return int(count), int(stop)
 
 
 @kernel
 def iterate_kernel(
-    m: ti.template(), A: ti.template(), w: ti.template(), n: ti.i32, tolerance: ti.f64, begin: ti.i32
+    m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), n: ti.i32, tolerance: ti.f64,
+    begin: ti.i32,
 ) -> ti.types.vector(2, ti.f64):
     """The iterations in one launch: (count, stop)."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         if begin != 0:
-            start(m, A, w)
+            start(m, A, coupling, w)
         rz, along, stop, k = w.state[RZ], w.state[STEP], ti.cast(RUNNING, ti.i32), 0
         limit = tolerance * tolerance * w.state[RZ_START]
         if rz < 0.0:
@@ -57,12 +61,16 @@ def iterate_kernel(
                 t = w.q[i] + ti.cast(along, m.real) * w.z[i]  # w.q holds D s of the last update
                 w.z[i] = t
                 above = part_times_backward(m, A, A.row_upper[i], A.row_start[i + 1], w.p)
+                if ti.static(coupling.width > 0):
+                    above += coupling_times(m, coupling, i, w.p, True, False)
                 w.p[i] = block_times(w.inverse[i], t - above)
             curvature = ti.cast(0.0, ti.f64)
             for i in range(m.n_nodes):
                 # now w.q holds (D + L)^-1 (t - D p), as the rows below need it
                 p, t = w.p[i], w.z[i]
                 below = part_times(m, A, A.row_start[i], A.row_upper[i], w.q)
+                if ti.static(coupling.width > 0):
+                    below += coupling_times(m, coupling, i, w.q, False, True)
                 s = block_times(w.inverse[i], t - block_times(A.diagonal[i], p) - below)
                 w.q[i] = s
                 curvature += dot64(t, p + s)

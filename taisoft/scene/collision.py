@@ -68,7 +68,7 @@ def choose_hit_by(positions: np.ndarray, surface: np.ndarray) -> tuple[str, str]
         opposite = opposite_half_edges(surface)
     except MeshError:
         return "proximity", "parts joined at an edge"
-    extents = _extents(positions, surface)
+    extents = principal_extents(positions, surface)
     if extents.min() < THIN * extents.max():
         return "proximity", "thin"
     if _sharpest_turn(positions, surface, opposite) > SHARP:
@@ -85,7 +85,7 @@ def has_sharp_edges(nodes: Nodes) -> bool:
     return _sharpest_turn(nodes.positions, nodes.surface, opposite) > SHARP
 
 
-def _extents(positions: np.ndarray, surface: np.ndarray) -> np.ndarray:
+def principal_extents(positions: np.ndarray, surface: np.ndarray) -> np.ndarray:
     """(3,) [m]: sides of the box along the principal axes of the surface's area.
 
     With s the sum of a triangle's corners v about the centroid, the integral of x x^T is area/12 (sum v v^T + s s^T).

@@ -145,7 +145,7 @@ class Scene:
     def contact_numbers(self, name_a: str, name_b: str) -> tuple[float, float]:
         """(friction, restitution) between two: as set, else the frictions' geometric mean and the larger restitution."""
         friction, restitution = self.contact_pairs.get(self._pair(name_a, name_b), (None, None))
-        a, b = self._surface(name_a), self._surface(name_b)
+        a, b = self.surface_of(name_a), self.surface_of(name_b)
         return (
             math.sqrt(a.friction * b.friction) if friction is None else friction,
             max(a.restitution, b.restitution) if restitution is None else restitution,
@@ -158,7 +158,7 @@ class Scene:
             raise SceneError(f"scene: contact of {name_a!r} and {name_b!r}: one of the two must be a body")
         return frozenset((name_a, name_b))
 
-    def _surface(self, name: str) -> Material | Obstacle:
+    def surface_of(self, name: str) -> Material | Obstacle:
         """The record that holds a collider's own friction and restitution."""
         one = _found(self.colliders, name, "body or obstacle")
         return one.material if isinstance(one, Body) else one

@@ -3,6 +3,7 @@
 An integrator is a `Scheme`: how x_hat, v_hat and beta come from the past, and whether the stage is the step's middle.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +11,17 @@ import taichi as ti
 
 from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
+from taisoft.stepping.contact import ContactStep
+from taisoft.stepping.contact_newton import ContactResult, ContactStageSolver, merge
 from taisoft.stepping.newton import StageResult, StageSolver
 from taisoft.stepping.world import World
 
 MAX_NEWTON = 50  # a step that needs more is reported as not converged
+MAX_CONTACT_NEWTON = 400  # with contacts, over all multipliers
+MAX_PARTS = 16  # of a step in which bodies close fast
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
+
+CONTACT_TOLERANCE = {"f32": 1e-4, "f64": 1e-6}  # residual of the contact laws
 
 
 @dataclass(frozen=True)
@@ -84,18 +91,20 @@ class History:
 
 
 class ImplicitStepper:
-    """Takes steps of one scheme over a world."""
+    """Takes steps of one scheme over a world; contact: its contacts, where it can have any."""
 
-    def __init__(self, world: World, scheme: Scheme):
-        self.world, self.scheme = world, scheme
+    def __init__(self, world: World, scheme: Scheme, contact: ContactStep | None = None):
+        self.world, self.scheme, self.contact = world, scheme, contact
         m, arena = world.model, world.arena
-        self.solver = StageSolver(m, arena, world.runtime.eps, world.motion.moved)
         self.history = History(
             arena.vectors("x_now", ti.f64, m.n_nodes), arena.vectors("v_now", m.real, m.n_nodes),
             arena.vectors("v_before", m.real, m.n_nodes),
             arena.vectors("x_before", ti.f64, m.n_nodes) if scheme.before else None,
         )  # fmt: skip
+        common = m, arena, world.runtime.eps, world.motion.moved
+        self.solver = StageSolver(*common) if contact is None else ContactStageSolver(*common, contact, self.history.x_now)
         self.tolerance = DEFAULT_TOLERANCE[world.runtime.precision]
+        self.contact_tolerance = CONTACT_TOLERANCE[world.runtime.precision]
         self.linear_tolerance: float | None = None
         self.forget()
 
@@ -103,16 +112,52 @@ class ImplicitStepper:
         """The past is void: the state was set."""
         self._past = 0  # steps whose state is in the history
         self._beta = self._dt = 0.0  # of the last step
+        if self.contact is not None:
+            self.contact.forget()
 
     def numbers_changed(self) -> None:
         """Gravity or material numbers changed."""
         self.solver.update_material()
 
     def step(self, dt: float) -> StageResult:
-        """One step of dt; on a non-finite result the state is put back and SimulationError raised."""
+        """One step of dt; on a non-finite result the state is put back and SimulationError raised.
+
+        With contacts it is cut into parts where bodies close so fast that they could pass each other unseen.
+        """
+        if self.contact is None:
+            return self._part(self.world.time, dt)
+        return self._with_contacts(dt)
+
+    def _with_contacts(self, dt: float) -> ContactResult:
+        contact, m, start = self.contact, self.world.model, self.world.time
+        parts = max(1, math.ceil(contact.haste(start, dt) - 1e-9))
+        if parts > MAX_PARTS:
+            raise SimulationError(f"step {self.world.step_count + 1}: {contact.too_fast(start, dt)}")
+        if parts == 1:
+            result = self._part(start, dt)
+        else:
+            x, v = m.x.to_numpy(), m.v.to_numpy()
+            part, results = dt / parts, []
+            try:
+                for k in range(parts):
+                    contact.search(start + k * part, part)
+                    results.append(self._part(start + k * part, part))
+                    if k + 1 < parts:
+                        contact.end(start + (k + 1) * part, part)
+            except BaseException:
+                m.x.from_numpy(x)
+                m.v.from_numpy(v)
+                self.forget()
+                raise
+            result = merge(results)
+        contact.penetration = contact.end(start + dt, dt)
+        return result
+
+    def _part(self, time: float, dt: float) -> StageResult:
+        """A step of dt from a time, in one piece."""
         world, m, h, w = self.world, self.world.model, self.history, self.solver.work
         releases = world.releases
-        target = world.next_target(world.time + dt)
+        target = world.next_target(time + dt)
         if world.releases != releases or dt != self._dt:
             self._past = 0
         self._dt = dt
@@ -123,18 +168,16 @@ class ImplicitStepper:
                 target = 0.5 * (target + m.x.to_numpy()[world.motion.moved])
             w.targets.from_numpy(target)
             if m.consistent:
-                w.led_acceleration.from_numpy(world.motion.accelerations(world.time, dt, self.scheme.before == 0.0))
+                w.led_acceleration.from_numpy(world.motion.accelerations(time, dt, self.scheme.before == 0.0))
         self._beta = scheme.share * dt
+        if self.contact is not None:
+            self.contact.begin(time, dt)
         self.solver.assemble_damper()
         along = (0.5 if scheme.midpoint else 1.0) if self._past > 1 and not scheme.one_iteration else 0.0
         multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)
         begin_step(m, w, h, multistep, scheme.now, scheme.before, still, along)
         try:
-            result = self.solver.solve(
-                1.0, self._beta, self.tolerance, 1 if scheme.one_iteration else MAX_NEWTON, self.linear_tolerance,
-                # led nodes change their velocity once a step, not twice within the midpoint's half step
-                led_share=0.5 if scheme.midpoint else 1.0,
-            )  # fmt: skip
+            result = self._solve(scheme, dt)
         except BaseException:  # Ctrl-C: the step is abandoned
             restore(m, h)
             self.forget()
@@ -149,6 +192,18 @@ class ImplicitStepper:
         self._past += 1
         return result
 
+    def _solve(self, scheme: Scheme, dt: float) -> StageResult:
+        """The stage, with contacts or without."""
+        most = 1 if scheme.one_iteration else MAX_NEWTON
+        if self.contact is None:
+            # led nodes change their velocity once a step, not twice within the midpoint's half step
+            share = 0.5 if scheme.midpoint else 1.0
+            return self.solver.solve(1.0, self._beta, self.tolerance, most, self.linear_tolerance, led_share=share)
+        return self.solver.solve_stage(
+            1.0, self._beta, dt, self.tolerance, self.contact_tolerance, MAX_CONTACT_NEWTON, self.linear_tolerance,
+            scheme.one_iteration,
+        )  # fmt: skip
+
     def reactions(self) -> np.ndarray:
         """(n_nodes, 3) force of the constraints in the last step [N]."""
         if self._beta == 0.0:
@@ -156,3 +211,9 @@ class ImplicitStepper:
         m = self.world.model
         held = 1.0 - m.free.to_numpy().astype(np.float64)
         return held * self.solver.work.residual.to_numpy() / self._beta
+
+    def release(self) -> None:
+        """Give the memory of contacts back."""
+        if self.contact is not None:
+            self.contact.release()
+            self.solver.release()

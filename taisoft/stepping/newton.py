@@ -107,6 +107,10 @@ class StageSolver:
     def _evaluate(self, c: float, beta: float) -> tuple[float, float]:
         """(|r|, scale) at the present v and x."""
         form_residual(self.model, self.work, self.pcg, c, beta, self._norms)
+        return self._sizes(c, beta)
+
+    def _sizes(self, c: float, beta: float) -> tuple[float, float]:
+        """(|r|, scale) from the norms that the residual's kernel told."""
         r, inertia, elastic, external, held = (math.sqrt(square) for square in self._norms)
         if c == 0.0:
             return r, beta * external if external > 0.0 else held

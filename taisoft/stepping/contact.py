@@ -1,0 +1,223 @@
+"""Contacts of a step: found, turned into a problem, watched. What explicit and implicit steps share.
+
+The search for the next step is made at the end of each one: it tells how deep bodies are in each other then, and whether a
+motion was too fast for what the search had seen.
+"""
+
+import numpy as np
+import taichi as ti
+
+from taisoft.collision.contacts import Contacts
+from taisoft.collision.pipeline import Detection
+from taisoft.collision.surface import dvec
+from taisoft.contact.assemble import (
+    build_found,
+    build_pair_numbers,
+    carried,
+    fill,
+    keep_impulses,
+    upload_pair_numbers,
+)  # fmt: skip
+from taisoft.contact.problem import NODES, build_node_problem, index_nodes
+from taisoft.runtime import FieldArena, kernel
+from taisoft.scene.body import Body
+from taisoft.scene.collision import principal_extents
+from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle, Obstacle
+from taisoft.stepping.world import World
+
+STANDOFF = 2e-3  # of the mean surface edge: gap that contacts keep, so that surfaces do not cross where motion is curved
+FAST = {True: 0.05, False: 1.0}  # share of a penetration that an explicit, an implicit step mends
+SLOW = {True: 0.005, False: 0.02}  # share of a missing standoff
+SPARE = 1024  # contacts beyond two a triangle that there is room for at first
+CLOSEST = 0.5  # of the thinner side's thickness: how far a contact may close in one step
+THINNEST = 0.25  # of the mean surface edge: least thickness of a collider, since open meshes have none
+DEPTH, HASTE, SPEED, WHICH = range(4)  # places in what `survey` tells
+
+
+@kernel
+def survey(
+    s: ti.template(), o: ti.template(), found: ti.template(), kept: ti.template(), thickness: ti.template(), n: ti.i32,
+    dt: ti.f64, told: ti.types.ndarray(),
+):  # fmt: skip
+    """told (4,): deepest penetration [m]; the most that a contact closes in the coming step, over what it may; the speed of
+    that [m/s]; its number among the kept."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        depth, haste, speed, which = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), -1
+        for c in range(n):
+            at = kept[c]
+            depth = ti.max(depth, -found.gap[at])
+            a, b = found.body[at][0], found.body[at][1]
+            way = dvec(0.0)
+            if ti.static(o.count > 0):
+                if found.nodes_b[at][0] < 0:
+                    way -= carried(o, b, found.point[at])
+            for j in ti.static(range(3)):
+                if found.nodes_a[at][j] >= 0:
+                    way += found.weights_a[at][j] * s.move[found.nodes_a[at][j]]
+                if found.nodes_b[at][j] >= 0:
+                    way -= found.weights_b[at][j] * s.move[found.nodes_b[at][j]]
+            closing = -way.dot(found.normal[at])
+            allowed = CLOSEST * ti.min(thickness[a], thickness[b])
+            if thickness[b] < ti.math.inf and closing > haste * allowed:
+                haste, speed, which = closing / allowed, closing / dt, c
+        told[0], told[1], told[2], told[3] = depth, haste, speed, which
+
+
+def collider_thickness(collider: Body | Obstacle, edge: float) -> float:
+    """How thick a body or an obstacle is [m]: a half space without end, others their smallest extent."""
+    if isinstance(collider, Body):
+        least = float(principal_extents(collider.nodes.positions, collider.nodes.surface).min())
+    elif isinstance(collider.shape, HalfSpace):
+        return np.inf
+    elif isinstance(collider.shape, MeshObstacle):
+        least = float(principal_extents(collider.shape.vertices, collider.shape.triangles).min())
+    elif isinstance(collider.shape, Box):
+        least = 2.0 * float(np.min(collider.shape.half_extents))
+    else:
+        least = 2.0 * float(collider.shape.radius)
+    return max(least, THINNEST * edge)
+
+
+class ContactStep:
+    """Finds the contacts of each step and keeps their problem. explicit: the kind of steps."""
+
+    def __init__(self, world: World, self_collision: bool, explicit: bool):
+        self.world = world
+        m, scene = world.model, world.scene
+        self.detection = Detection(scene, m, world.layout, world.runtime, self_collision)
+        d = self.detection
+        self.standoff = STANDOFF * d.edge
+        self.fast, self.slow = FAST[explicit], SLOW[explicit]
+        self._arena = FieldArena()
+        self._make_room(2 * d.surface.n_triangles + SPARE)
+        self._thick = np.array([collider_thickness(c, d.edge) for c in scene.colliders])
+        self._own_arena = FieldArena()
+        self._thickness = self._own_arena.field("collider_thickness", ti.f64, len(self._thick), self._thick)
+        self._numbers_arena = FieldArena()
+        self.numbers = build_pair_numbers(self._numbers_arena, scene)
+        self._told = np.zeros(4)
+        self._searched: tuple[float, float] | None = None  # time and dt of the search that is at hand
+        self._last_dt = 0.0
+        self.penetration = 0.0  # [m] at the end of the last step
+
+    def _make_room(self, capacity: int) -> None:
+        arena, m = FieldArena(), self.world.model
+        problem = build_node_problem(arena, capacity, m.n_nodes, m.serial)
+        self.found = build_found(arena, problem)
+        self._arena.release()
+        self._arena, self._last_dt = arena, 0.0
+
+    @property
+    def problem(self):
+        """The `ContactProblem` of the last step that began."""
+        return self.found.problem
+
+    @property
+    def n_contacts(self) -> int:
+        """Contacts of the last step, those that bear nothing included."""
+        return int(self.problem.count[0])
+
+    def forget(self) -> None:
+        """The state was set: the search at hand and the impulses of the last step do not belong to it."""
+        self._searched = None
+        self.problem.count[0] = 0
+        self._last_dt = self.penetration = 0.0
+
+    def numbers_changed(self) -> None:
+        """Friction or restitution changed."""
+        if not upload_pair_numbers(self.numbers, self.world.scene):
+            arena = FieldArena()
+            self.numbers = build_pair_numbers(arena, self.world.scene)
+            self._numbers_arena.release()
+            self._numbers_arena = arena
+
+    def search(self, time: float, dt: float) -> int:
+        """Find the contacts of the present state, at a time [s], swept by dt, unless they are at hand. Returns their number."""
+        world, d, known = self.world, self.detection, self._searched
+        if known is None or known[1] != dt or abs(known[0] - time) > 1e-6 * dt:
+            self._searched = None
+            moved = world.motion.moved
+            led = (moved, world.motion.places(time + dt) - world.model.x.to_numpy()[moved]) if len(moved) else None
+            d.find(time, dt, led)
+            self._searched = (time, dt)
+        return d.counts.contacts
+
+    def begin(self, time: float, dt: float) -> int:
+        """Fill the problem for a step of dt [s] from the state at a time; impulses are those of the last step. Returns its size."""
+        n, d, m = self.search(time, dt), self.detection, self.world.model
+        if n > self.problem.capacity:
+            self._make_room(2 * n)
+        f = self.found
+        keep_impulses(f)
+        warm = dt / self._last_dt if self._last_dt > 0.0 else 0.0
+        fill(f, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
+        if n:
+            index_nodes(f.problem)
+        self._last_dt = dt
+        return n
+
+    def end(self, time: float, dt: float) -> float:
+        """Search at the end of a step, at a time, for one of dt; the deepest penetration [m] that is left."""
+        self._searched = None
+        self.search(time, dt)
+        return float(self._survey(dt)[DEPTH])
+
+    def haste(self, time: float, dt: float) -> float:
+        """How far the contacts of a step of dt close at most, over what they may."""
+        self.search(time, dt)
+        return float(self._survey(dt)[HASTE])
+
+    def _survey(self, dt: float) -> np.ndarray:
+        d = self.detection
+        survey(d.surface, d.shapes, d.buffer.data, d.kept, self._thickness, d.counts.contacts, dt, self._told)
+        return self._told
+
+    def too_fast(self, time: float, dt: float) -> str:
+        """A sentence that names who closes too fast, how fast, how thick the thinner one is, and a dt that would do."""
+        self.search(time, dt)
+        told, d = self._survey(dt), self.detection
+        a, b = d.buffer.data.body[d.kept[int(told[WHICH])]]
+        names = [d.scene.colliders[k].name for k in (a, b)]
+        thin = float(min(self._thick[a], self._thick[b]))
+        return (
+            f"'{names[0]}' and '{names[1]}' close at {told[SPEED]:.3g} m/s, {told[SPEED] * dt:.3g} m in a step of {dt:.3g} s, and the "
+            f"thinner of them is {thin:.3g} m thick, so they could pass each other unseen: take dt <= {dt / told[HASTE]:.3g} s"
+        )
+
+    def contacts(self) -> Contacts:
+        """The contacts of the last step with their impulses."""
+        f, p = self.found, self.problem
+        n = p.count[0]
+        normal, tangent, r = (field.to_numpy()[:n] for field in (p.normal, p.tangent, p.r))
+        impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
+        nodes, weights = self._sides(n)
+        return self.detection.record(
+            f.point.to_numpy()[:n], normal, f.gap.to_numpy()[:n], impulse, f.body.to_numpy()[:n], f.feature.to_numpy()[:n],
+            nodes, weights,
+        )  # fmt: skip
+
+    def _sides(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes and weights (n,6) of the problem, three of each side."""
+        p = self.problem
+        node, weight = p.node.to_numpy()[:n], p.weight.to_numpy()[:n]
+        used = np.arange(NODES) < p.arity.to_numpy()[:n, None]
+        side_b = used & (weight < 0.0)
+        n_a = (used & ~side_b).sum(axis=1)  # side a comes first
+        row, column = np.nonzero(used)
+        place = np.where(side_b[row, column], NODES // 2 + column - n_a[row], column)
+        nodes, weights = np.full((n, NODES), -1), np.zeros((n, NODES))
+        nodes[row, place], weights[row, place] = node[row, column], np.abs(weight[row, column])
+        return nodes, weights
+
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """Bytes of every allocated field by name."""
+        return self.detection.field_bytes | self._arena.bytes | self._numbers_arena.bytes | self._own_arena.bytes
+
+    def release(self) -> None:
+        """Give all memory back."""
+        self.detection.release()
+        for arena in (self._arena, self._numbers_arena, self._own_arena):
+            arena.release()
+

@@ -1,0 +1,205 @@
+"""Newton's method for an implicit stage with contacts: an augmented Lagrangian round the elastic iterations.
+
+Per multiplier: minimise Phi(v) + sum_c psi_c(lambda - R (J v + b)) by the same Newton steps as without contacts, the friction
+disks frozen; then lambda = prox(lambda - R (J v + b)), and the disks open as far as its normal parts say. The minimisation
+need not go far: to a share of what the multiplier left. The stage has converged when the elastic residual, with the impulses in
+it, is within its tolerance and the residual of the contact laws,
+    |p - prox(p - f u)| / |p|,   f = 1 / (J diag(A)^-1 J^T),
+is within that of the contacts. Both are told as they are.
+Linearly implicit steps do the same with elastic forces linearised at x_n: a quadratic problem with contacts.
+Source: Alart and Curnier 1991 for the laws as a prox; the loop is that of the method of multipliers.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taisoft.contact.problem import RESIDUAL, find_factors
+from taisoft.linear import pcg
+from taisoft.model import Model
+from taisoft.runtime import FieldArena
+from taisoft.stepping.contact import ContactStep
+from taisoft.stepping.contact_stage import (
+    StageContacts,
+    add_impulses,
+    build_stage_contacts,
+    keep_diagonal,
+    keep_linear,
+    linear_residual,
+    press,
+    set_multipliers,
+    stiffen,
+)
+from taisoft.stepping.newton import MAX_FORCING, SLOW, StageResult, StageSolver, _forcing
+from taisoft.stepping.stage import begin_stage, form_residual
+
+PROGRESS = 0.1  # share of what a new multiplier left of |r| that the Newton steps bring it down to
+MAX_MULTIPLIERS = 200
+
+
+@dataclass(frozen=True)
+class ContactResult(StageResult):
+    """What a solve with contacts did."""
+
+    contact_iterations: int = 0
+    contact_residual: float = 0.0
+
+
+def merge(results: list[ContactResult]) -> ContactResult:
+    """The parts of one step: iterations in all, the worst residuals."""
+    return ContactResult(
+        sum(r.newton_iterations for r in results), sum(r.linear_iterations for r in results),
+        max(r.residual for r in results), all(r.converged for r in results), all(r.at_rounding for r in results),
+        sum(r.contact_iterations for r in results), max(r.contact_residual for r in results),
+    )  # fmt: skip
+
+
+class ContactStageSolver(StageSolver):
+    """Implicit stages of a scene with contacts."""
+
+    def __init__(self, model: Model, arena: FieldArena, eps: float, moved: np.ndarray, contact: ContactStep, x_start):
+        """x_start: (n_nodes) 3-vectors f64, positions at the start of the step."""
+        super().__init__(model, arena, eps, moved)
+        self.contact = contact
+        self._x_start = x_start
+        self._arena = FieldArena()
+        self._k: StageContacts | None = None
+        self._weighed: tuple[float, float] | None = None  # c and beta of the matrix that the r-factors rest on
+
+    def release(self) -> None:
+        """Give the memory of the contacts back."""
+        self._arena.release()
+
+    def _fit(self) -> None:
+        """Room for the contacts of this step."""
+        if self._k is None or self._k.found is not self.contact.found:
+            arena = FieldArena()
+            self._k = build_stage_contacts(arena, self.model, self.contact.found, self._x_start)
+            self._arena.release()
+            self._arena, self._weighed = arena, None
+
+    # --- what contacts add to the parts of a Newton step ----------------------------------------------------------
+
+    def _press(self, beta: float) -> None:
+        contact = self.contact
+        press(self.model, self.work, self._k, beta, self._dt, contact.standoff, contact.fast, contact.slow)
+
+    def _evaluate(self, c: float, beta: float) -> tuple[float, float]:
+        if not self._on:
+            return super()._evaluate(c, beta)
+        m, w, k = self.model, self.work, self._k
+        if self._linear:
+            linear_residual(m, w, self.matrix, k, beta)
+        else:
+            form_residual(m, w, self.pcg, c, beta, self._norms)
+        self._press(beta)
+        add_impulses(m, w, k, self.pcg, self._norms)
+        return self._sizes(c, beta)
+
+    def _objective(self, c: float, beta: float) -> float:
+        value = super()._objective(c, beta)
+        if self._on:
+            self._press(beta)
+            value += self._k.work.totals[0]
+        return value
+
+    def _form_system(self, c: float, beta: float, projected: bool) -> None:
+        super()._form_system(c, beta, projected)
+        if self._on:
+            keep_diagonal(self.model, self.matrix, self._k)
+
+    def _direction(self, tolerance: float) -> pcg.LinearResult:
+        if not self._on:
+            return super()._direction(tolerance)
+        m = self.model
+        stiffen(m, self.matrix, self._k)
+        most = max(1000, 30 * m.n_nodes)
+        return pcg.solve(m, self.matrix, self.pcg, tolerance, most, self._k.coupling)
+
+    # --- the loop -------------------------------------------------------------------------------------------------
+
+    def solve_stage(
+        self, c: float, beta: float, dt: float, tolerance: float, contact_tolerance: float, max_newton: int,
+        linear_tolerance: float | None, linear: bool, led_share: float = 1.0,
+    ) -> ContactResult:  # fmt: skip
+        """Solve the stage of a step of dt from the present v, contacts as `ContactStep.begin` left them.
+
+        linear: elastic forces linearised at the present x. Without contacts this is `StageSolver.solve`.
+        """
+        self._linear, self._on, self._dt = False, False, dt
+        p = self.contact.problem
+        if p.count[0] == 0:
+            self._weighed = None
+            r = self.solve(c, beta, tolerance, 1 if linear else max_newton, linear_tolerance, led_share=led_share)
+            return ContactResult(r.newton_iterations, r.linear_iterations, r.residual, r.converged, r.at_rounding)
+        self._fit()
+        self._on, self._phi = True, None
+        begin_stage(self.model, self.work, beta, led_share)
+        fresh = False
+        if self._weighed != (c, beta) or linear:
+            if linear:
+                form_residual(self.model, self.work, self.pcg, c, beta, self._norms)
+                keep_linear(self.model, self.work, self._k)
+            self._form_system(c, beta, False)
+            self._weighed, fresh = (c, beta), True
+        find_factors(p)
+        set_multipliers(self._k)
+        self._linear = linear
+        return self._iterate(c, beta, tolerance, contact_tolerance, max_newton, linear_tolerance, fresh)
+
+    def _iterate(self, c, beta, tolerance, contact_tolerance, max_newton, linear_tolerance, fresh) -> ContactResult:
+        state = self.contact.problem.state
+        r, scale = self._evaluate(c, beta)
+        floor = beta * self.rounding_force + c * self.rounding_mass / beta
+        newton = linear = multipliers = 0
+        needs_projection, forcing, previous, goal = False, MAX_FORCING, 0.0, PROGRESS * r
+        converged = rounding = False
+        while True:
+            near = r <= max(tolerance * scale, goal) or rounding
+            if near:  # the multiplier has done what it can
+                contact_residual = state[RESIDUAL]
+                enough = r <= tolerance * scale or rounding or r <= floor
+                if enough and contact_residual <= contact_tolerance:
+                    converged = True
+                    break
+                if multipliers >= MAX_MULTIPLIERS:
+                    break
+                set_multipliers(self._k)
+                multipliers += 1
+                r, scale = self._evaluate(c, beta)
+                goal, previous, rounding, self._phi = PROGRESS * r, 0.0, False, None
+                continue
+            if newton >= max_newton:
+                break
+            wanted = linear_tolerance
+            if wanted is None:
+                forcing = _forcing(forcing, r, previous)
+                wanted = max(forcing, 0.1 * tolerance * scale / r, 1e-12)
+                if floor > tolerance * scale:
+                    wanted = min(wanted, tolerance)
+            if not self._linear and (not fresh or r > SLOW * previous):
+                self._form_system(c, beta, needs_projection)
+                fresh = True
+            answer = self._direction(wanted)
+            linear += answer.iterations
+            if answer.negative and not needs_projection:
+                needs_projection = True
+                self._form_system(c, beta, True)
+                answer = self._direction(wanted)
+                linear += answer.iterations
+            previous = r
+            r, scale, moved = self._advance(c, beta, r, scale, False, False, floor)
+            newton += 1
+            if not np.isfinite(r):
+                break
+            if r <= floor and r > 0.5 * previous:
+                rounding = True  # nothing but rounding is left
+            if not moved:
+                if needs_projection or self._linear:
+                    break
+                needs_projection, fresh = True, False
+        relative = r / scale if scale > 0.0 else r
+        return ContactResult(
+            newton, linear, relative, bool(converged and np.isfinite(r)), bool(rounding or r <= floor), multipliers,
+            float(state[RESIDUAL]),
+        )  # fmt: skip
