@@ -12,6 +12,7 @@ from taisoft.model import changed_material
 from taisoft.records import Energies
 from taisoft.settings import Settings, check_dt
 from taisoft.stability import stable_dt
+from taisoft.stepping.contact import ContactStep
 from taisoft.stepping.world import World
 
 
@@ -20,7 +21,8 @@ class StateAccess:
 
     settings: Settings
     _world: World | None = None
-    _detections: list[Detection]  # one, once it was asked for
+    _contact: ContactStep | None
+    _detection: Detection | None
 
     @property
     def time(self) -> float:
@@ -81,6 +83,24 @@ class StateAccess:
     ) -> None:
         """Change the friction or restitution of a pair of bodies, or of a body and an obstacle; as `Scene.set_contact`."""
         self._open_world().scene.set_contact(name_a, name_b, friction=friction, restitution=restitution)
+        if self._contact is not None:
+            self._contact.numbers_changed()
+
+    def contacts(self) -> Contacts:
+        """The contacts that the last step began with, gaps those of its start, and the impulses that it gave them [N s].
+
+        Where a step was cut into parts, of its last part. Empty before the first step, and where nothing can touch.
+        """
+        self._open_world()
+        return self._contact.contacts() if self._contact is not None else self._find_contacts().contacts()
+
+    def contact_force(self, name: str) -> np.ndarray:
+        """Sum (3,) of the contact forces on a body or an obstacle over the last step [N]."""
+        scene = self._open_world().scene
+        scene.surface_of(name)
+        c = self.contacts()
+        on = (c.body_a == name).astype(float) - (c.body_b == name)
+        return on @ c.impulse / self._dt
 
     def intersecting_triangles(self) -> list[tuple[str, int, str, int]]:
         """Surface triangles that intersect in the present state, each pair once: name and triangle of each.
@@ -98,15 +118,14 @@ class StateAccess:
 
     def _find_contacts(self) -> Detection:
         world = self._open_world()
-        if not self._detections:
-            self_collision = self.settings.self_collision
-            self._detections.append(Detection(world.scene, world.model, world.layout, self._runtime, self_collision))
-        moved = world.motion.moved
-        led = None
-        if len(moved):
-            led = moved, world.motion.places(world.time + self._dt) - world.model.x.to_numpy()[moved]
-        self._detections[0].find(world.time, self._dt, led)
-        return self._detections[0]
+        if self._contact is not None:
+            self._contact.search(world.time, self._dt)
+            return self._contact.detection
+        if self._detection is None:
+            self._detection = Detection(world.scene, world.model, world.layout, self._runtime)
+            self._owned.append(self._detection)
+        self._detection.find(world.time, self._dt)
+        return self._detection
 
     def stress(self, body: str) -> np.ndarray:
         """Cauchy stress per tet (m,3,3) [Pa]; not finite in a flat one."""

@@ -9,6 +9,10 @@ from taisoft.scene.scene import Scene
 from taisoft.stepping import EXPLICIT, INTEGRATORS
 
 
+EXPLICIT_CONTACT = ("gauss_seidel", "jacobi", "hybrid", "coloured_gauss_seidel")
+IMPLICIT_CONTACT = ("augmented_lagrangian",)
+
+
 @dataclass(frozen=True)
 class Settings:
     """What a Simulator was asked for; tolerances are relative, None is adaptive."""
@@ -21,6 +25,8 @@ class Settings:
     self_collision: bool
     newton_tolerance: float | None
     linear_tolerance: float | None
+    contact_solver: str
+    contact_tolerance: float | None
 
     @property
     def explicit(self) -> bool:
@@ -48,6 +54,26 @@ def _check_tolerance(name: str, value) -> None:
         raise SimulationError(f"{name} = {value!r}: it must lie between 0 and 1, or be None for the adaptive one")
 
 
+def _check_contact_solver(integrator: str, solver: str, touching: bool) -> None:
+    """Which integrator takes which contact solver; touching: whether anything can touch."""
+    explicit = integrator in EXPLICIT
+    fitting = EXPLICIT_CONTACT if explicit else () if integrator == "implicit_midpoint" else IMPLICIT_CONTACT
+    known = ("auto", *EXPLICIT_CONTACT, *IMPLICIT_CONTACT)
+    if solver not in known:
+        near = difflib.get_close_matches(str(solver), known, 1)
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        raise SimulationError(f"contact_solver {solver!r} is unknown{hint}: it must be one of {', '.join(known)}")
+    if touching and not fitting:
+        raise SimulationError(
+            f"{integrator} takes no contacts: its stage lies in the middle of the step, where a contact that holds at the end "
+            "need not hold; take bdf2, which is of second order too, or implicit_euler"
+        )
+    if solver != "auto" and solver not in fitting:
+        raise SimulationError(
+            f"contact_solver {solver!r} does not fit {integrator}: " + (f"take 'auto' or one of {', '.join(fitting)}" if fitting else "take 'auto'")
+        )
+
+
 def check_settings(
     scene: Scene, dt, integrator, contact_solver, self_collision, precision, arch, allow_unstable, newton_tolerance,
     linear_tolerance, contact_tolerance,
@@ -64,6 +90,7 @@ def check_settings(
     if not isinstance(self_collision, bool):
         raise SimulationError(f"self_collision = {self_collision!r}: it must be True or False")
     _check_tolerance("contact_tolerance", contact_tolerance)
+    _check_contact_solver(integrator, contact_solver, len(scene.colliders) > 1 or self_collision)
     if not isinstance(allow_unstable, bool):
         raise SimulationError(f"allow_unstable = {allow_unstable!r}: it must be True or False")
     _check_tolerance("newton_tolerance", newton_tolerance)
@@ -72,4 +99,7 @@ def check_settings(
         raise SimulationError(f"precision {precision!r} is unknown: it must be 'f32' or 'f64'")
     if arch not in ("cpu", "cuda"):
         raise SimulationError(f"arch {arch!r} is unknown: it must be 'cpu' or 'cuda'")
-    return Settings(check_dt(dt), integrator, precision, arch, allow_unstable, self_collision, newton_tolerance, linear_tolerance)
+    return Settings(
+        check_dt(dt), integrator, precision, arch, allow_unstable, self_collision, newton_tolerance, linear_tolerance,
+        contact_solver, contact_tolerance,
+    )  # fmt: skip

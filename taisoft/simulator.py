@@ -21,10 +21,10 @@ from taisoft.stepping.motion import Motion
 from taisoft.stepping.world import World
 
 
-def _release(arena: runtime.FieldArena, claim: runtime.Runtime, detections: list[Detection]) -> None:
+def _release(arena: runtime.FieldArena, claim: runtime.Runtime, owned: list) -> None:
     """Give memory and runtime back; also when a simulator is dropped without `close`."""
-    while detections:
-        detections.pop().release()
+    while owned:
+        owned.pop().release()
     arena.release()
     claim.close()
 
@@ -51,7 +51,9 @@ class Simulator(StateAccess):
         scene = self.scene
         self._dt = self.settings.dt
         self._stable_dt: float | None = None
-        self._detections = []
+        self._owned = []  # what has memory of its own to give back
+        self._contact: ContactStep | None = None
+        self._detection: Detection | None = None  # of a scene without contact forces, once asked for
         self._tangent = None  # fields of force_differential, once asked for
         if self.settings.explicit:
             self._check_stability(self._dt)
@@ -66,17 +68,20 @@ class Simulator(StateAccess):
             model, layout = build_model(scene, self._runtime, self._arena, self.plan.on)
             self._world = World(scene, self._runtime, self._arena, model, layout, Motion(scene, layout))
             touching = self.plan.on["contact_forces"]
-            self._contact = ContactStep(self._world, self_collision, self.settings.explicit) if touching else None
+            if touching:
+                self._contact = ContactStep(self._world, self_collision, self.settings.explicit)
+                self._owned.append(self._contact)
             self._stepper = make_stepper(self._world, integrator, self._contact)
+            self._owned.append(self._stepper)
             self.reset()
         except BaseException:
-            _release(self._arena, self._runtime, self._detections)
+            _release(self._arena, self._runtime, self._owned)
             raise
         if not self.settings.explicit:
             self._stepper.tolerance = newton_tolerance or self._stepper.tolerance
             self._stepper.linear_tolerance = linear_tolerance
             self._stepper.contact_tolerance = contact_tolerance or self._stepper.contact_tolerance
-        self._release = weakref.finalize(self, _release, self._arena, self._runtime, self._detections)
+        self._release = weakref.finalize(self, _release, self._arena, self._runtime, self._owned)
 
     # --- stepping -------------------------------------------------------------------------------------------------
 
@@ -157,7 +162,8 @@ class Simulator(StateAccess):
     @property
     def field_bytes(self) -> dict[str, int]:
         """Bytes of every allocated field by name."""
-        return self._arena.bytes | (self._detections[0].field_bytes if self._detections else {})
+        searched = self._contact or self._detection
+        return self._arena.bytes | (searched.field_bytes if searched else {}) | self._stepper.field_bytes
 
     def close(self) -> None:
         """Release the fields and the runtime; a closed simulator cannot be used."""

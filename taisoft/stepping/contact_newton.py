@@ -66,8 +66,13 @@ class ContactStageSolver(StageSolver):
         self._k: StageContacts | None = None
         self._weighed: tuple[float, float] | None = None  # c and beta of the matrix that the r-factors rest on
 
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """Bytes by name of the fields that grow with the contacts."""
+        return self._arena.bytes
+
     def release(self) -> None:
-        """Give the memory of the contacts back."""
+        """Give their memory back."""
         self._arena.release()
 
     def _fit(self) -> None:

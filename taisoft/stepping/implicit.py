@@ -212,8 +212,11 @@ class ImplicitStepper:
         held = 1.0 - m.free.to_numpy().astype(np.float64)
         return held * self.solver.work.residual.to_numpy() / self._beta
 
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """Bytes by name of the fields that grow with the contacts."""
+        return self.solver.field_bytes
+
     def release(self) -> None:
-        """Give the memory of contacts back."""
-        if self.contact is not None:
-            self.contact.release()
-            self.solver.release()
+        """Give the memory of these fields back."""
+        self.solver.release()

@@ -82,6 +82,14 @@ class StageSolver:
         self._norms = np.zeros(5)
         self.update_material()
 
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """Bytes by name of fields outside of the simulator's own memory: none without contacts."""
+        return {}
+
+    def release(self) -> None:
+        """Give such memory back."""
+
     def update_material(self) -> None:
         """Recompute the rounding floor: the nodal forces of a strain as large as its rounding, the momenta of that of x."""
         m = self.model

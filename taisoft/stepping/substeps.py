@@ -146,6 +146,14 @@ class ExplicitStepper:
             explicit.elements_parallel(m)
             explicit.nodes_parallel(m, s, row, dt)
 
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """Bytes by name of fields outside of the simulator's own memory: none."""
+        return {}
+
+    def release(self) -> None:
+        """Nothing to give back."""
+
     def reactions(self) -> np.ndarray:
         """(n_nodes, 3) force of the constraints in the last sub-step [N]."""
         out = np.zeros((self.world.model.n_nodes, 3))
