@@ -34,6 +34,7 @@ from taisoft.stepping.newton import MAX_FORCING, SLOW, StageResult, StageSolver,
 from taisoft.stepping.stage import begin_stage, form_residual
 
 PROGRESS = 0.1  # share of what a new multiplier left of |r| that the Newton steps bring it down to
+FALL = 0.9  # share of the least |r| so far that a step must reach to be taken without a look at the objective
 MAX_MULTIPLIERS = 200
 
 
@@ -157,7 +158,7 @@ class ContactStageSolver(StageSolver):
         r, scale = self._evaluate(c, beta)
         floor = beta * self.rounding_force + c * self.rounding_mass / beta
         newton = linear = multipliers = 0
-        needs_projection, forcing, previous, goal = False, MAX_FORCING, 0.0, PROGRESS * r
+        needs_projection, forcing, previous, goal, least = False, MAX_FORCING, 0.0, PROGRESS * r, r
         converged = rounding = False
         while True:
             near = r <= max(tolerance * scale, goal) or rounding
@@ -172,7 +173,7 @@ class ContactStageSolver(StageSolver):
                 set_multipliers(self._k)
                 multipliers += 1
                 r, scale = self._evaluate(c, beta)
-                goal, previous, rounding, self._phi = PROGRESS * r, 0.0, False, None
+                goal, least, previous, rounding, self._phi = PROGRESS * r, r, 0.0, False, None
                 continue
             if newton >= max_newton:
                 break
@@ -193,7 +194,10 @@ class ContactStageSolver(StageSolver):
                 answer = self._direction(wanted)
                 linear += answer.iterations
             previous = r
-            r, scale, moved = self._advance(c, beta, r, scale, False, False, floor)
+            # contacts that open and close can raise |r| in one step and lower it in the next, round and round: a step counts as
+            # progress where |r| falls below all before it, and else where the objective falls
+            r, scale, moved = self._advance(c, beta, r, scale, False, False, floor, FALL * least)
+            least = min(least, r)
             newton += 1
             if not np.isfinite(r):
                 break
