@@ -71,7 +71,7 @@ class Simulator(StateAccess):
             if touching:
                 self._contact = ContactStep(self._world, self_collision, self.settings.explicit)
                 self._owned.append(self._contact)
-            self._stepper = make_stepper(self._world, integrator, self._contact)
+            self._stepper = make_stepper(self._world, integrator, self._contact, contact_solver)
             self._owned.append(self._stepper)
             self.reset()
         except BaseException:
@@ -80,6 +80,7 @@ class Simulator(StateAccess):
         if not self.settings.explicit:
             self._stepper.tolerance = newton_tolerance or self._stepper.tolerance
             self._stepper.linear_tolerance = linear_tolerance
+        if self._contact is not None:
             self._stepper.contact_tolerance = contact_tolerance or self._stepper.contact_tolerance
         self._release = weakref.finalize(self, _release, self._arena, self._runtime, self._owned)
 
@@ -104,21 +105,27 @@ class Simulator(StateAccess):
             report = self._report()
             report.newton_iterations, report.linear_iterations = result.newton_iterations, result.linear_iterations
             report.residual, report.converged = result.residual, result.converged
-            if not result.converged:
-                report.problems.append(
-                    f"step {world.step_count}: Newton stopped after {result.newton_iterations} iterations "
-                    f"at a relative residual of {result.residual:.2e}"
-                )
         if self._contact is not None:
-            self._tell_contacts(report, result)
+            report.contact_iterations, report.contact_residual = result.contact_iterations, result.contact_residual
+            report.n_contacts, report.max_penetration = self._contact.n_contacts, self._contact.penetration
+            report.converged &= result.contacts_converged
         report.steps = self.step_count - start
-        if report.n_inverted:
-            report.problems.append(f"step {world.step_count}: {report.n_inverted} tets are inverted")
+        report.problems = [f"step {world.step_count}: {what}" for what in self._problems(report)]
         return report
 
-    def _tell_contacts(self, report: StepReport, result) -> None:
-        report.contact_iterations, report.contact_residual = result.contact_iterations, result.contact_residual
-        report.n_contacts, report.max_penetration = self._contact.n_contacts, self._contact.penetration
+    def _problems(self, report: StepReport) -> list[str]:
+        """What was not as it should be, in sentences."""
+        found = []
+        if not report.converged and not self.settings.explicit:
+            found.append(
+                f"Newton stopped after {report.newton_iterations} iterations at a relative residual of {report.residual:.2e}"
+                + (f", that of the contacts {report.contact_residual:.2e}" if report.n_contacts else "")
+            )
+        elif not report.converged:
+            found.append(f"the contact solver stopped at a residual of {report.contact_residual:.2e}")
+        if report.n_inverted:
+            found.append(f"{report.n_inverted} tets are inverted")
+        return found
 
     def run(self, seconds: float, on_frame=None, fps: float | None = 60, stop=None) -> RunReport:
         """Run for some seconds; see `taisoft.running.run`."""

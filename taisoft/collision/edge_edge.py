@@ -18,6 +18,18 @@ TINY = 1e-9  # of lengths: rounding
 
 
 @ti.func
+def _is_behind(s: ti.template(), i, length, u, m):
+    """1 where vertex i, of an edge of that length, lies behind both faces at edge m of triangle u."""
+    d = s.x[i] - corner(s, u, m)
+    slack = ti.cast(TINY, ti.f64) * (length + d.norm())
+    behind = int(d.dot(unit(area_normal(s, u))) <= slack)
+    v = s.neighbour[u, m]
+    if v >= 0:
+        behind &= int(d.dot(unit(area_normal(s, v))) <= slack)
+    return behind
+
+
+@ti.func
 def _end_tells(s: ti.template(), t, k, place, length, over, u, m, n):
     """1 where edge k of triangle t crosses so near an end that the end's own contact tells of it: it lies inside, behind both
     faces at edge m of triangle u, and sticks out along n."""
@@ -28,15 +40,20 @@ def _end_tells(s: ti.template(), t, k, place, length, over, u, m, n):
             near = length - place <= over
         if near and over > 0.0:
             i = s.triangle[t, (k + e) % 3]
-            d = s.x[i] - corner(s, u, m)
-            slack = ti.cast(TINY, ti.f64) * (length + d.norm())
-            behind = d.dot(unit(area_normal(s, u))) <= slack
-            v = s.neighbour[u, m]
-            if v >= 0:
-                behind = behind and d.dot(unit(area_normal(s, v))) <= slack
-            if behind:
+            if _is_behind(s, i, length, u, m) == 1:
                 told = told | sticks_out(s, i, n)
     return told
+
+
+@ti.func
+def _within(s: ti.template(), t, k, place, length, over, u, m):
+    """1 where edge k of triangle t is crossed between its ends, or so little beyond one as `over`, if that end lies inside: of two
+    bodies side by side the edges cross beyond their ends, too, one below the other, and nothing penetrates."""
+    good = int(-over <= place <= length + over)
+    if good == 1 and (place < 0.0 or place > length):
+        e = int(place > length)
+        good = _is_behind(s, s.triangle[t, (k + e) % 3], length, u, m)
+    return good
 
 
 @ti.func
@@ -62,8 +79,11 @@ def edge_contact(s: ti.template(), t, k, u, m, margin, out: ti.template(), start
             rest -= (1.0 - g) * s.rest[s.triangle[u, m]] + g * s.rest[s.triangle[u, (m + 1) % 3]]
             deepest = ti.min(deepest, ti.cast(0.5, ti.f64) * rest.norm())
         near = gap - ti.max(-move.dot(n), 0.0) <= margin and gap >= -deepest
-        crossing = -over <= f * la <= la + over and -over <= g * lb <= lb + over
-        good = int(near) & int(crossing)
+        good = int(near)
+        if good == 1:
+            good = _within(s, t, k, f * la, la, over, u, m)
+        if good == 1:
+            good = _within(s, u, m, g * lb, lb, over, t, k)
         if good == 1:
             good = edge_sticks_out(s, u, m, n) & edge_sticks_out(s, t, k, -n)
         if good == 1:

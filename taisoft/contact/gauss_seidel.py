@@ -5,65 +5,32 @@ All sweeps run in one kernel on one thread, in the order of `ContactProblem.orde
 
 import taichi as ti
 
-from taisoft.contact import r_factor
-from taisoft.contact.problem import (
-    RESIDUAL,
-    STEP,
-    SWEEPS,
-    ContactProblem,
-    gather_velocity,
-    push,
-    residual,
-    velocity,
-)
+from taisoft.contact import share as shares
+from taisoft.contact.problem import STEP, push, velocity
 from taisoft.contact.prox import prox, scaled
-from taisoft.runtime import kernel
 
 
 @ti.func
-def relax(p: ti.template(), c, step):
-    """One prox of contact c with a share of its r-factors, told to its nodes."""
+def share(p: ti.template(), c, beyond):
+    """Share of its r-factors that contact c takes: all of them without momentum, which forgives no overshooting."""
+    result = ti.cast(1.0, ti.f64)
+    if beyond == 1:
+        result = shares.alone(p, c)
+    return result
+
+
+@ti.func
+def relax(p: ti.template(), c):
+    """One prox of contact c with its share of the r-factors, told to its nodes."""
     r = p.r[c]
-    new = prox(r - scaled(step * p.factor[c], velocity(p, c)), p.friction[c])
+    p.guess[c] = r
+    new = prox(r - scaled(p.state[STEP] * p.share[c] * p.factor[c], velocity(p, c)), p.friction[c])
     push(p, c, new - r)
     p.r[c] = new
 
 
 @ti.func
-def refresh(p: ti.template()):
-    """w from the impulses, on this thread."""
-    if ti.static(not p.matrix):
-        for i in range(p.n_nodes):
-            p.w[i] = gather_velocity(p, i)
-
-
-@kernel
-def sweep(p: ti.template(), first: ti.i32, sweeps: ti.i32, every: ti.i32, tolerance: ti.f64):
-    """Up to that many sweeps, a look at the residual after `every`; state[RESIDUAL] and state[SWEEPS] tell the end.
-
-    first: 1 where the solve begins.
-    """
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        if first == 1:
-            refresh(p)
-            p.state[RESIDUAL] = residual(p)
-            r_factor.begin(p)
-        done = 0
-        while done < sweeps and not p.state[RESIDUAL] <= tolerance:
-            step = p.state[STEP]
-            n = ti.min(every, sweeps - done)
-            for _k in range(n):
-                for k in range(p.count[0]):
-                    relax(p, p.order[k], step)
-            done += n
-            refresh(p)  # rounding gathers where changes are added
-            p.state[RESIDUAL] = residual(p)
-            if r_factor.look(p) == 1:
-                refresh(p)
-        p.state[SWEEPS] += ti.cast(done, ti.f64)
-
-
-def run(p: ContactProblem, sweeps: int, every: int, tolerance: float, first: bool) -> None:
-    """Sweep on; see `sweep`."""
-    sweep(p, int(first), sweeps, every, tolerance)
+def sweep(p: ti.template()):
+    """Every contact once, on this thread."""
+    for k in range(p.count[0]):
+        relax(p, p.order[k])

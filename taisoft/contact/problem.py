@@ -5,7 +5,8 @@ their weights, and `w` = M^-1 J^T r is kept up to date; nothing is assembled. As
 only `velocity` and `push`, so each is written once.
 The r-factors are 1 / W_nn and 1 / max(W_t1t1, W_t2t2), the same for every solver, since the residual
     |r - prox(r - f u)| / |r|
-rests on them: a change of r between two sweeps shrinks with the step that a solver dares, and tells nothing.
+rests on them: a change of r between two sweeps shrinks with the step that a solver dares, and tells nothing. What a solver
+dares is its own `share` of them.
 All is f64: impulses are small differences of large ones.
 """
 
@@ -19,8 +20,9 @@ from taisoft.contact.prox import prox, scaled
 from taisoft.runtime import FieldArena, kernel
 
 NODES = 6  # of a contact at most, three on each side
-CHANGED, SIZE, RESIDUAL, GOOD, STEP, SWEEPS, LOOKS = range(7)  # places in `state`
-HISTORY = 1024  # residuals kept
+CHANGED, SIZE, RESIDUAL, GOOD, STEP, SWEEPS, LOOKS, AGE, MOMENTUM, VERDICT = range(10)  # places in `state`
+HISTORY = 1024  # residuals kept of a launch
+PARTS = 256  # of a sum over the contacts, so that it does not depend on threads
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,16 +33,22 @@ class ContactProblem:
     serial: bool  # loops run on one thread
     matrix: bool  # the form of W
     n_nodes: int
-    count: Any  # (1) i32
+    count: Any  # (2) i32: contacts, colours
     friction: Any  # f64
     b: Any  # 3-vectors [m/s]: u without impulses; (normal, t1, t2)
     factor: Any  # 2-vectors: r-factors of normal and tangents [kg]; 0 where nothing can move
     r: Any  # 3-vectors: impulses [N s]
-    good: Any  # 3-vectors: impulses of the last good iterate
-    trial: Any  # 3-vectors: impulses of a sweep that uses those of the last one only
+    share: Any  # f64: of the r-factors, that a sweep takes at most; its solver's own
+    good: Any  # 3-vectors: the best impulses so far
+    guess: Any  # 3-vectors: impulses that a sweep started from
+    trial: Any  # 3-vectors: impulses after the last sweep but one
+    term: Any  # 2-vectors: what each contact adds to two sums
+    part: Any  # (PARTS) 2-vectors: sums over parts of the contacts
     order: Any  # i32: contacts in the order of a sweep
-    state: Any  # (7) f64: sums and value of the residual, that of the last good iterate, share of the r-factors, counts
-    history: Any  # (HISTORY) f64: residuals of the first looks
+    colour: Any  # i32: of each contact, see `graph`
+    colour_start: Any  # (capacity + 1) i32: where each colour starts in `order`
+    state: Any  # (10) f64: two sums, residual, that of `good`, share of the r-factors, counts; see `r_factor`, `momentum`
+    history: Any  # (HISTORY) f64: residuals of the looks of a launch
     # over nodes
     node: Any  # (capacity, NODES) i32, the first arity[c] hold
     arity: Any  # i32
@@ -91,11 +99,14 @@ def _common(arena: FieldArena, capacity: int, serial: bool) -> dict[str, Any]:
         return arena.vectors(f"problem_{name}", ti.f64, capacity, n=n)
 
     return {
-        "capacity": capacity, "serial": serial, "count": arena.field("problem_count", ti.i32, 1),
+        "capacity": capacity, "serial": serial, "count": arena.field("problem_count", ti.i32, 2),
         "friction": arena.field("problem_friction", ti.f64, capacity), "b": vectors("b"), "factor": vectors("factor", 2),
-        "r": vectors("r"), "good": vectors("good"), "trial": vectors("trial"),
-        "order": arena.field("problem_order", ti.i32, capacity), "state": arena.field("problem_state", ti.f64, 7),
-        "history": arena.field("problem_history", ti.f64, HISTORY),
+        "r": vectors("r"), "share": arena.field("problem_share", ti.f64, capacity), "good": vectors("good"),
+        "guess": vectors("guess"), "trial": vectors("trial"), "term": vectors("term", 2),
+        "part": arena.vectors("problem_part", ti.f64, PARTS, n=2), "order": arena.field("problem_order", ti.i32, capacity),
+        "colour": arena.field("problem_colour", ti.i32, capacity),
+        "colour_start": arena.field("problem_colour_start", ti.i32, capacity + 1),
+        "state": arena.field("problem_state", ti.f64, 10), "history": arena.field("problem_history", ti.f64, HISTORY),
     }  # fmt: skip
 
 
@@ -163,11 +174,11 @@ def natural_map(p: ti.template(), c):
 
 @ti.func
 def residual_of(changed, size):
-    """The relative residual from the two sums; 1 where impulses are wanted and there are none."""
+    """The relative residual from the two sums; 1 where impulses are wanted and there are none, or are not a number."""
     result = ti.cast(0.0, ti.f64)
     if size > 0.0:
         result = ti.sqrt(changed / size)
-    elif changed > 0.0:
+    elif not changed == 0.0:
         result = 1.0
     return result
 
@@ -192,26 +203,37 @@ def residual(p: ti.template()):
     return residual_of(changed, size)
 
 
+@ti.func
+def own_block(p: ti.template(), c):
+    """The 3x3 block of W between contact c and itself."""
+    B = ti.Matrix.zero(ti.f64, 3, 3)
+    if ti.static(p.matrix):
+        for k in range(p.row_start[c], p.row_start[c + 1]):
+            if p.column[k] == c:
+                for i, j in ti.static(ti.ndrange(3, 3)):
+                    B[i, j] += p.block[k, 3 * i + j]
+    else:
+        n, t = p.normal[c], p.tangent[c]
+        E = ti.Matrix.rows([n, t, n.cross(t)])
+        h = dvec(0.0)
+        for k in range(p.arity[c]):
+            h += p.weight[c, k] * p.weight[c, k] * p.inverse_mass[p.node[c, k]]
+        for i, j in ti.static(ti.ndrange(3, 3)):
+            for q in ti.static(range(3)):
+                B[i, j] += E[i, q] * h[q] * E[j, q]
+    return B
+
+
 @kernel
 def find_factors(p: ti.template()):
     """r-factors from the diagonal of W."""
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        d = dvec(0.0)
-        if ti.static(p.matrix):
-            for k in range(p.row_start[c], p.row_start[c + 1]):
-                if p.column[k] == c:
-                    d = dvec(p.block[k, 0], p.block[k, 4], p.block[k, 8])
-        else:
-            n, t = p.normal[c], p.tangent[c]
-            s = n.cross(t)
-            for k in range(p.arity[c]):
-                h = p.weight[c, k] * p.weight[c, k] * p.inverse_mass[p.node[c, k]]
-                d += dvec((h * n).dot(n), (h * t).dot(t), (h * s).dot(s))
-        across = ti.max(d[1], d[2])
-        p.factor[c][0] = ti.select(d[0] > 0.0, 1.0 / d[0], 0.0)
+        B = own_block(p, c)
+        across = ti.max(B[1, 1], B[2, 2])
+        p.factor[c][0] = ti.select(B[0, 0] > 0.0, 1.0 / B[0, 0], 0.0)
         p.factor[c][1] = ti.select(across > 0.0, 1.0 / across, 0.0)
-        if d[0] <= 0.0:  # nothing can move it
+        if B[0, 0] <= 0.0:  # nothing can move it
             p.r[c] = dvec(0.0)
 
 

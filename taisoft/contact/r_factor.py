@@ -1,48 +1,65 @@
 """The r-factor strategy: how large a share of the r-factors a sweep dares, and what is done when it was too much.
 
-The share starts at 1. A look at the residual after some sweeps either keeps the impulses as the last good ones, and lets the share
-recover, or, where the residual has grown, brings the last good ones back and lowers the share, but never below LEAST: a share
-that goes to zero would look like convergence (report, algorithm 2, lines 12 to 16).
+The share starts at 1. A look at the residual after some sweeps keeps the best impulses so far and lets the share recover, or,
+where the residual has risen RISE times above theirs or has found nothing better for PATIENCE sweeps, brings them back and lowers
+the share, but never below LEAST: a share that goes to zero would look like convergence (report, algorithm 2, lines 12 to
+16). A smaller rise is let pass: neither Gauss-Seidel nor momentum is monotone, and going back costs more than waiting.
 """
 
 import taichi as ti
 
-from taisoft.contact.problem import GOOD, HISTORY, LOOKS, RESIDUAL, STEP, SWEEPS
+from taisoft.contact.problem import AGE, GOOD, HISTORY, LOOKS, MOMENTUM, RESIDUAL, STEP, SWEEPS, VERDICT
 
-SHRINK = 0.6  # of the share after a rise
-RECOVER = 1.05  # of the share after a fall
-LEAST = 1e-2
-GROWTH = 1.2  # a rise of the residual by less is no divergence: Gauss-Seidel is not monotone
+# Sums of powers of two, so that they are the same numbers in f32 and f64 runs
+SHRINK = 0.75  # of the share after a rise
+RECOVER = 1.125  # of the share after a fall
+LEAST = 0.0078125
+RISE = 10.0
+PATIENCE = 200.0  # sweeps
+KEEP, PASS, BACK = range(3)  # verdicts
+
+
+@ti.func
+def record(p: ti.template()):
+    """state[RESIDUAL] into the history of this launch."""
+    k = ti.cast(p.state[LOOKS], ti.i32)
+    if k < HISTORY:
+        p.history[k] = p.state[RESIDUAL]
+    p.state[LOOKS] += 1.0
 
 
 @ti.func
 def begin(p: ti.template()):
-    """The impulses that a solve starts from are its first good ones; state[RESIDUAL] is theirs."""
-    for c in range(p.count[0]):
-        p.good[c] = p.r[c]
+    """A solve begins; state[RESIDUAL] is that of the impulses it starts from, its first good ones."""
     p.state[GOOD], p.state[STEP], p.state[SWEEPS] = p.state[RESIDUAL], 1.0, 0.0
-    p.history[0] = p.state[RESIDUAL]
-    p.state[LOOKS] = 1.0
+    p.state[AGE], p.state[MOMENTUM], p.state[VERDICT] = 0.0, 1.0, KEEP
+    record(p)
 
 
 @ti.func
-def look(p: ti.template()):
-    """Judge the impulses by state[RESIDUAL]. Returns 1 where the good ones came back, so that w must be found anew."""
+def judge(p: ti.template(), sweeps):
+    """After so many sweeps: state[VERDICT] on the impulses, by state[RESIDUAL]."""
     found, good = p.state[RESIDUAL], p.state[GOOD]
-    k = ti.cast(p.state[LOOKS], ti.i32)
-    if k < HISTORY:
-        p.history[k] = found
-    p.state[LOOKS] += 1.0
-    back = 0
-    if found <= GROWTH * good or good == 0.0:
-        for c in range(p.count[0]):
-            p.good[c] = p.r[c]
-        p.state[GOOD] = found
+    record(p)
+    p.state[SWEEPS] += sweeps
+    p.state[AGE] += sweeps
+    verdict = PASS
+    if found < good:
+        verdict = KEEP
+        p.state[GOOD], p.state[AGE] = found, 0.0
         p.state[STEP] = ti.min(1.0, RECOVER * p.state[STEP])
-    else:  # a residual that is not a number comes here too
-        back = 1
-        for c in range(p.count[0]):
-            p.r[c] = p.good[c]
-        p.state[RESIDUAL] = good
+    elif not (found <= RISE * good and p.state[AGE] <= PATIENCE):  # a residual that is not a number comes here too
+        verdict = BACK
+        p.state[RESIDUAL], p.state[AGE], p.state[MOMENTUM] = good, 0.0, 1.0
         p.state[STEP] = ti.max(LEAST, SHRINK * p.state[STEP])
-    return back
+    p.state[VERDICT] = verdict
+
+
+@ti.func
+def obey(p: ti.template(), c):
+    """What the verdict asks of contact c."""
+    if p.state[VERDICT] == KEEP:
+        p.good[c] = p.r[c]
+    elif p.state[VERDICT] == BACK:
+        p.r[c] = p.good[c]
+        p.trial[c] = p.good[c]

@@ -2,19 +2,21 @@
 
 from dataclasses import dataclass, field
 
-import numpy as np
+import taichi as ti
 
-from taisoft.contact import gauss_seidel
-from taisoft.contact.problem import HISTORY, LOOKS, RESIDUAL, SWEEPS, ContactProblem
+from taisoft.contact import coloured_gauss_seidel, gauss_seidel, hybrid, jacobi
+from taisoft.contact.problem import GOOD, HISTORY, LOOKS, RESIDUAL, SWEEPS, ContactProblem, find_velocities
+from taisoft.contact.sweeps import run_parallel, run_serial
+from taisoft.runtime import kernel
 
 VISITS = 1_000_000  # contacts visited in a launch: about 0.1 s, so that Ctrl-C is heard
 EVERY = 5  # sweeps between two looks at the residual, which costs as much as a sweep
-SOLVERS = {"gauss_seidel": gauss_seidel}
+SOLVERS = {"gauss_seidel": gauss_seidel, "jacobi": jacobi, "hybrid": hybrid, "coloured_gauss_seidel": coloured_gauss_seidel}
 
 
 @dataclass(frozen=True)
 class SolveResult:
-    """What a contact solve did. residual: see `problem`; history: that of each look, the start's first."""
+    """What a contact solve did. residual: of the impulses it left; history: that of each look, the start's first."""
 
     iterations: int
     residual: float
@@ -22,25 +24,41 @@ class SolveResult:
     history: list[float] = field(default_factory=list)
 
 
+@kernel
+def _bring_back(p: ti.template()):
+    """The best impulses become the present ones."""
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        p.r[c] = p.good[c]
+
+
 def solve(
-    p: ContactProblem, method: str, tolerance: float, max_iterations: int, every: int = EVERY, history: bool = False
-) -> SolveResult:
+    p: ContactProblem, method: str, tolerance: float, max_iterations: int, every: int = EVERY, history: bool = False,
+    momentum: bool = True,
+) -> SolveResult:  # fmt: skip
     """Solve the problem from the impulses that it holds; the best ones found are left in it.
 
-    method: one of SOLVERS. tolerance: of the residual. max_iterations: sweeps. every: sweeps between looks.
+    method: one of SOLVERS; the coloured one wants the contacts grouped, see `colouring`. tolerance: of the residual.
+    max_iterations: sweeps. every: sweeps between looks. history: whether the result tells the residual of each look. momentum:
+    False for the plain method.
     """
-    solver = SOLVERS[method]
-    batch = max(every, VISITS // max(1, int(p.count[0])) // every * every)
-    left, first = max_iterations, True
+    rule = SOLVERS[method]
+    # Gauss-Seidel has no parallel form: on a problem with parallel loops it runs on one thread all the same
+    run = run_serial if p.serial or rule is gauss_seidel else run_parallel
+    batch = max(1, min(HISTORY - 1, VISITS // max(1, int(p.count[0])) // every)) * every
+    left, first, told = max_iterations, 1, []
     while True:
         n = min(batch, left)
-        solver.run(p, n, every, tolerance, first)
-        left, first = left - n, False
+        run(p, rule, first, n, every, tolerance, int(momentum))
+        left, first = left - n, 0
         found = p.state.to_numpy()
+        if history:
+            told += p.history.to_numpy()[: int(found[LOOKS])].tolist()
         if left == 0 or found[RESIDUAL] <= tolerance:
             break
-    looks = min(int(found[LOOKS]), HISTORY)
-    return SolveResult(
-        int(found[SWEEPS]), float(found[RESIDUAL]), bool(found[RESIDUAL] <= tolerance),
-        p.history.to_numpy()[:looks].tolist() if history else [],
-    )  # fmt: skip
+    residual = float(found[RESIDUAL])
+    if found[GOOD] < residual or residual != residual:
+        _bring_back(p)
+        find_velocities(p)
+        residual = float(found[GOOD])
+    return SolveResult(int(found[SWEEPS]), residual, residual <= tolerance, told)

@@ -42,8 +42,13 @@ MAX_MULTIPLIERS = 200
 class ContactResult(StageResult):
     """What a solve with contacts did."""
 
-    contact_iterations: int = 0
+    contact_iterations: int = 0  # multipliers
     contact_residual: float = 0.0
+
+    @property
+    def contacts_converged(self) -> bool:
+        """As `converged`, which speaks for the contacts too."""
+        return self.converged
 
 
 def merge(results: list[ContactResult]) -> ContactResult:

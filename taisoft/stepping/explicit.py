@@ -31,23 +31,35 @@ def acceleration(m: ti.template(), i):
 
 
 @ti.func
-def euler_node(m: ti.template(), i, dt):
+def euler_velocity(m: ti.template(), i, dt):
+    """The velocity that Euler's step reaches."""
     a = acceleration(m, i)
     v = m.v[i] + dt * a
     if ti.static(m.damped):
         v -= dt * m.damping[m.node_body[i], 0] * m.v[i]
+    return v
+
+
+@ti.func
+def euler_node(m: ti.template(), i, dt):
+    v = euler_velocity(m, i, dt)
     m.v[i] = v
     m.x[i] = m.x[i] + ti.cast(dt * v, ti.f64)
     return v
 
 
 @ti.func
-def verlet_drift(m: ti.template(), s: ti.template(), i, dt):
-    """First half kick and drift; where stiffness damping is on, v is then extrapolated to the force's time."""
+def verlet_half(m: ti.template(), s: ti.template(), i, dt):
+    """The velocity after the first half kick."""
     v = m.v[i]
     if ti.static(m.damped):
         v *= ti.exp(-0.5 * dt * m.damping[m.node_body[i], 0])
-    half = v + 0.5 * dt * s.acceleration[i]
+    return v + 0.5 * dt * s.acceleration[i]
+
+
+@ti.func
+def verlet_move(m: ti.template(), s: ti.template(), i, dt, half):
+    """Drift by the velocity of the middle; where stiffness damping is on, v is then extrapolated to the force's time."""
     m.x[i] = m.x[i] + ti.cast(dt * half, ti.f64)
     if ti.static(m.stiffness_damping):
         s.half_velocity[i] = half
@@ -74,13 +86,28 @@ def verlet_kick(m: ti.template(), s: ti.template(), i, dt):
 @ti.func
 def lead(m: ti.template(), s: ti.template(), row, dt):
     """Put the moved nodes on their targets for this sub-step; their velocity is the way per time."""
+    lead_velocities(m, s, row, dt)
+    lead_positions(m, s, row)
+
+
+@ti.func
+def lead_velocities(m: ti.template(), s: ti.template(), row, dt):
+    """The velocity of the moved nodes: their way per time."""
     for k in range(s.n_moved):
         i = s.moved[k]
         for a in ti.static(range(3)):
             if s.moved_axes[k][a] != 0:
-                target = s.targets[row * s.n_moved + k][a]
-                m.v[i][a] = ti.cast((target - s.before[k][a]) / dt, m.real)
-                m.x[i][a] = target
+                m.v[i][a] = ti.cast((s.targets[row * s.n_moved + k][a] - s.before[k][a]) / dt, m.real)
+
+
+@ti.func
+def lead_positions(m: ti.template(), s: ti.template(), row):
+    """The moved nodes on their targets."""
+    for k in range(s.n_moved):
+        i = s.moved[k]
+        for a in ti.static(range(3)):
+            if s.moved_axes[k][a] != 0:
+                m.x[i][a] = s.targets[row * s.n_moved + k][a]
 
 
 @ti.func
@@ -139,7 +166,7 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
                 remember(m, s)
             if ti.static(s.verlet):
                 for i in range(m.n_nodes):
-                    verlet_drift(m, s, i, dt)
+                    verlet_move(m, s, i, dt, verlet_half(m, s, i, dt))
                 if ti.static(s.n_moved > 0):
                     lead(m, s, done, dt64)
             inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
@@ -211,7 +238,8 @@ def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
             s.before[k] = m.x[s.moved[k]]
     if ti.static(s.verlet):
         for i in range(m.n_nodes):
-            verlet_drift(m, s, i, ti.cast(dt64, m.real))
+            dt = ti.cast(dt64, m.real)
+            verlet_move(m, s, i, dt, verlet_half(m, s, i, dt))
         if ti.static(s.n_moved > 0):
             ti.loop_config(serialize=True)
             for _ in range(1):

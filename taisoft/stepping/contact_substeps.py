@@ -1,0 +1,112 @@
+"""Runs explicit sub-steps with contacts: a search, a contact problem and a solve in each."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from taisoft.contact.colouring import colour_contacts
+from taisoft.contact.problem import find_factors
+from taisoft.contact.solve import solve
+from taisoft.errors import SimulationError
+from taisoft.stepping import explicit
+from taisoft.stepping.contact import ContactStep
+from taisoft.stepping.explicit_contact import find_acceleration, finish_verlet, move, predict, set_free_velocities
+from taisoft.stepping.substeps import ExplicitStepper, SubstepResult
+from taisoft.stepping.world import World
+
+MAX_SWEEPS = 1000  # of a contact solve; one that needs more is reported as not converged
+LAUNCHES = 200  # sub-steps between two looks at whether the run is to stop
+
+
+@dataclass(frozen=True, eq=False)
+class GoodState:
+    """The state before the sub-step, (n_nodes) 3-vectors."""
+
+    x: Any  # f64
+    v: Any
+
+
+@dataclass(frozen=True)
+class ContactSubstepResult(SubstepResult):
+    """Extremes over a batch."""
+
+    contact_iterations: int = 0  # in all
+    contact_residual: float = 0.0  # the worst
+    contacts_converged: bool = True  # whether those of every sub-step were solved to the tolerance
+
+
+class ContactExplicitStepper(ExplicitStepper):
+    """Takes sub-steps of symplectic Euler or velocity Verlet over a world in which things can touch."""
+
+    def __init__(self, world: World, verlet: bool, contact: ContactStep, method: str):
+        super().__init__(world, verlet)
+        self.contact, self.method = contact, method
+        self.max_batch = min(self.max_batch, LAUNCHES)
+        m, arena = world.model, world.arena
+        self._good = GoodState(arena.vectors("x_good", ti.f64, m.n_nodes), arena.vectors("v_good", m.real, m.n_nodes))
+        self.contact_tolerance = 1e-4 if world.runtime.precision == "f32" else 1e-6
+
+    def forget(self) -> None:
+        """The state was set."""
+        super().forget()
+        self.contact.forget()
+
+    def advance(self, n: int, dt: float) -> ContactSubstepResult:
+        """Take n sub-steps of dt, or as many as a batch holds; as `ExplicitStepper.advance`."""
+        m, results, depth = self.world.model, [], 0.0
+        explicit.begin_parallel(m)
+        n = min(n, self.max_batch)
+        start = self.world.time
+        for done in range(n):
+            try:
+                results.append(self._substep(start + done * dt, dt))
+            except BaseException:  # what was done before stays
+                if done:
+                    self._restore()
+                    self.world.step_count += done
+                    self.world.time = start + done * dt
+                raise
+            depth = max(depth, self.contact.end(start + (done + 1) * dt, dt))
+        self.contact.penetration = depth
+        return ContactSubstepResult(
+            n, m.scalars[6], int(m.scalars[7]), sum(r.iterations for r in results if r),
+            max((r.residual for r in results if r), default=0.0), all(r.converged for r in results if r),
+        )  # fmt: skip
+
+    def _restore(self) -> None:
+        self._put_back(self._good.x.to_numpy(), self._good.v.to_numpy())
+        self.contact.forget()
+
+    def _substep(self, time: float, dt: float):
+        """One sub-step from a time; returns the contacts' SolveResult, None where there are none."""
+        world, m, s, contact = self.world, self.world.model, self.work, self.contact
+        if s.n_moved:
+            releases = world.releases
+            target = world.next_targets(np.array([time + dt]))
+            self.stale = self.stale or world.releases != releases
+            self._upload_targets(target)
+        if contact.haste(time, dt) > 1.0:
+            raise SimulationError(f"step {world.step_count + 1}: {contact.too_fast(time, dt)}")
+        if s.verlet and self.stale:
+            find_acceleration(m, s)
+        self.stale = False
+        n = contact.begin(time, dt)
+        predict(m, s, self._good, dt)
+        result = None
+        if n:
+            p = contact.problem
+            set_free_velocities(m, contact.found, dt, contact.standoff, contact.fast, contact.slow)
+            find_factors(p)
+            if self.method == "coloured_gauss_seidel":
+                colour_contacts(p)
+            result = solve(p, self.method, self.contact_tolerance, MAX_SWEEPS)
+        move(m, s, contact.problem, dt, int(n > 0))
+        if s.verlet:
+            finish_verlet(m, s, contact.problem, dt, int(n > 0))
+        if m.scalars[8] != 0.0:
+            where = world.find_unfinite() or "a velocity is no longer finite"
+            self._restore()
+            raise SimulationError(f"step {world.step_count + 1}: {where}")
+        return result

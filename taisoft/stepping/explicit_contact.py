@@ -1,0 +1,179 @@
+"""One explicit sub-step with contacts: the velocity that it would reach without them, the impulses, and where it gets with them.
+
+Symplectic Euler: v* = v_n + dt a(x_n), v = v* + M^-1 J^T r, x = x_n + dt v. Velocity Verlet: the impulses act on the velocity in
+the middle of the step, which is what moves the nodes. M is lumped, so M^-1 is known (report, section 2.4, corrected).
+"""
+
+import taichi as ti
+
+from taisoft.collision.surface import dvec
+from taisoft.contact.assemble import short_of_goal
+from taisoft.contact.problem import NODES, to_frame, to_world
+from taisoft.elasticity import count_inverted, element_force
+from taisoft.runtime import kernel
+from taisoft.stepping.explicit import (
+    acceleration,
+    euler_velocity,
+    keep_held,
+    lead_positions,
+    lead_velocities,
+    react,
+    remember,
+    unfinite,
+    verlet_half,
+    verlet_kick,
+    verlet_move,
+)  # fmt: skip
+
+
+@ti.func
+def tell_volumes(m: ti.template(), b, J):
+    """Smallest J and inverted tets of block b into scalars 6 and 9."""
+    bad = count_inverted(m, b, J)
+    low, count = J[0], bad[0]
+    for q in ti.static(range(1, m.lanes)):
+        low, count = ti.min(low, J[q]), count + bad[q]
+    ti.atomic_min(m.scalars[6], ti.cast(low, ti.f64))
+    ti.atomic_add(m.scalars[9], ti.cast(count, ti.f64))
+
+
+@kernel
+def predict(m: ti.template(), s: ti.template(), g: ti.template(), dt64: ti.f64):
+    """v* of every node, and the state kept in case the sub-step fails. scalars 6, 9: smallest J so far, inverted tets.
+
+    Verlet rests on the acceleration of the state, Euler finds the forces here.
+    """
+    if ti.static(not s.verlet):
+        for k in ti.static(m.groups):
+            ti.loop_config(serialize=m.serial)
+            for b in range(k.first, k.last):
+                J = element_force(m, k, m.stiffness_damping, b)
+                tell_volumes(m, b, J)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        if ti.static(s.n_held > 0):
+            keep_held(m, s)
+        if ti.static(s.n_moved > 0):
+            remember(m, s)
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        dt = ti.cast(dt64, m.real)
+        g.x[i], g.v[i] = m.x[i], m.v[i]
+        if ti.static(s.verlet):
+            m.v[i] = verlet_half(m, s, i, dt)
+        else:
+            m.v[i] = euler_velocity(m, i, dt)
+    if ti.static(s.n_moved > 0):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            lead_velocities(m, s, 0, dt64)
+
+
+@kernel
+def set_free_velocities(
+    m: ti.template(), f: ti.template(), dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64
+):  # fmt: skip
+    """b of every contact from v*, and the inverse masses."""
+    (p,) = ti.static((f.problem,))
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        p.inverse_mass[i] = ti.cast(m.free[i], ti.f64) / ti.cast(m.mass[i], ti.f64)
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        v = -f.carry[c] / dt
+        for j in range(p.arity[c]):
+            v += p.weight[c, j] * ti.cast(m.v[p.node[c, j]], ti.f64)
+        b = to_frame(p, c, v)
+        p.b[c] = dvec(b[0] + short_of_goal(f, c, dt, standoff, fast, slow) / dt, b[1], b[2])
+
+
+@ti.func
+def pushed(p: ti.template(), i):
+    """Impulse of all contacts on node i [N s]."""
+    d = dvec(0.0)
+    for e in range(p.entry_start[i], p.entry_start[i + 1]):
+        c, j = p.entry[e] // NODES, p.entry[e] % NODES
+        d += p.weight[c, j] * to_world(p, c, p.r[c])
+    return d
+
+
+@ti.func
+def close(m: ti.template(), s: ti.template(), p: ti.template(), dt64, touched):
+    """Reactions, and the counters of the sub-step: scalars 7, most inverted tets."""
+    if ti.static(s.n_held > 0):
+        react(m, s, ti.cast(dt64, m.real))
+        release_contacts(m, s, p, dt64, touched)
+    m.scalars[7] = ti.max(m.scalars[7], m.scalars[9])
+    m.scalars[9] = 0.0
+
+
+@ti.func
+def release_contacts(m: ti.template(), s: ti.template(), p: ti.template(), dt64, touched):
+    """A held node's reaction is what neither inertia, nor elasticity, nor loads, nor contacts bear."""
+    if touched == 1:
+        for k in range(s.n_held):
+            i = s.held[k]
+            s.reaction[k] -= (1.0 - m.free[i]) * ti.cast(pushed(p, i) / dt64, m.real)
+
+
+@kernel
+def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, touched: ti.i32):
+    """Impulses onto v, then x. touched: 1 where there are contacts. scalars 8: 1 where a velocity is no longer finite.
+
+    With Verlet `finish_verlet` follows.
+    """
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        dt = ti.cast(dt64, m.real)
+        v = m.v[i]
+        if touched == 1:
+            v += ti.cast(p.inverse_mass[i] * pushed(p, i), m.real)
+        if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
+            m.scalars[8] = 1.0
+        if ti.static(s.verlet):
+            verlet_move(m, s, i, dt, v)
+        else:
+            m.v[i] = v
+            m.x[i] = m.x[i] + ti.cast(dt * v, ti.f64)
+    if ti.static(s.n_moved > 0):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            lead_positions(m, s, 0)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        if ti.static(not s.verlet):
+            close(m, s, p, dt64, touched)
+
+
+@kernel
+def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, touched: ti.i32):
+    """Forces at the new positions and the second half kick; scalars as in `predict` and `move`."""
+    for k in ti.static(m.groups):
+        ti.loop_config(serialize=m.serial)
+        for b in range(k.first, k.last):
+            J = element_force(m, k, m.stiffness_damping, b)
+            tell_volumes(m, b, J)
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        v = verlet_kick(m, s, i, ti.cast(dt64, m.real))
+        if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
+            m.scalars[8] = 1.0
+    if ti.static(s.n_moved > 0):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            lead_velocities(m, s, 0, dt64)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        close(m, s, p, dt64, touched)
+
+
+@kernel
+def find_acceleration(m: ti.template(), s: ti.template()):
+    """Verlet's acceleration of the present state."""
+    for k in ti.static(m.groups):
+        ti.loop_config(serialize=m.serial)
+        for b in range(k.first, k.last):
+            element_force(m, k, m.stiffness_damping, b)
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        s.acceleration[i] = acceleration(m, i)
