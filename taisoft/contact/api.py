@@ -20,7 +20,6 @@ from taisoft.scene.checks import array, choice, number
 
 METHODS = (*SOLVERS, "augmented_lagrangian", "auto")
 SWEEPS = 100  # of Gauss-Seidel, before "auto" goes on with an augmented Lagrangian
-OUTER = 30  # of its outer iterates, before "auto" goes back to sweeps
 BELOW = 0.999  # of the tolerance, which the kernels are asked for: their sums round otherwise than NumPy's
 # Kernels are compiled for the fields they are given: one problem serves all calls that fit in. Fields end with the runtime.
 _held: list[tuple[Any, ContactProblem]] = []
@@ -114,15 +113,13 @@ def _run(
 def _auto(
     W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray, tolerance: float, most: int
 ) -> tuple[np.ndarray, list[float]]:
-    """Sweeps, outer iterates, and sweeps again with what is left of the iterations."""
-    told: list[float] = []
-    for method, limit in (("gauss_seidel", SWEEPS), ("augmented_lagrangian", OUTER), ("gauss_seidel", most)):
-        left = most - max(0, len(told) - 1)
-        if told and (told[-1] <= tolerance or not left):
-            break
-        r, history = _run(method, W, b, mu, r, tolerance, min(limit, left))
-        told += history[1:] if told else history
-    return r, told
+    """Sweeps, then outer iterates with what is left of the iterations."""
+    r, told = _run("gauss_seidel", W, b, mu, r, tolerance, min(SWEEPS, most))
+    left = most - len(told) + 1
+    if told[-1] <= tolerance or not left:
+        return r, told
+    r, more = _run("augmented_lagrangian", W, b, mu, r, tolerance, left)
+    return r, told + more[1:]
 
 
 @contextmanager

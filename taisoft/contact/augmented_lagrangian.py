@@ -20,7 +20,7 @@ from scipy.sparse.linalg import splu
 from taisoft.contact.graph import matrix_graph
 from taisoft.contact.host import find_factors, natural_map, prox, relative
 
-DENSE = 600  # rows of an island below which its matrix is kept dense
+DENSE = 90  # rows of an island up to which its equations are solved as a dense matrix; a larger one may be spread over threads
 START, MOST, LEAST = 1e4, 1e7, 1e-2  # rho
 STEPS = 10  # Newton steps of an outer iterate
 GOAL = 1e-2  # share of |G| that they bring it down to
@@ -32,7 +32,9 @@ class _Island:
     """Contacts that W joins with one another, and with no others."""
 
     contact: np.ndarray  # (k,)
-    W: np.ndarray | sp.csr_matrix  # (3k,3k)
+    W: sp.bsr_matrix  # (3k,3k)
+    row: np.ndarray  # (blocks,) contact of each block of W
+    diagonal: np.ndarray  # (k,) blocks of W on its diagonal
     b: np.ndarray  # (3k,)
     friction: np.ndarray  # (k,)
     factor: np.ndarray  # (k,2)
@@ -87,9 +89,10 @@ def _islands(W: sp.csr_matrix, b: np.ndarray, friction: np.ndarray, r: np.ndarra
     islands = []
     for contact in np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else []:
         rows = (3 * contact[:, None] + np.arange(3)).ravel()
-        part = W[rows][:, rows]
-        part = part.toarray() if len(rows) <= DENSE else part.tocsr()
-        islands.append(_Island(contact, part, b[rows], friction[contact], factor[contact], r[contact]))
+        part = W[rows][:, rows].tobsr((3, 3))
+        row = np.repeat(np.arange(len(contact)), np.diff(part.indptr))
+        diagonal = np.flatnonzero(part.indices == row)
+        islands.append(_Island(contact, part, row, diagonal, b[rows], friction[contact], factor[contact], r[contact]))
         islands[-1].measure()
     return islands
 
@@ -127,7 +130,7 @@ def _newton(i: _Island, damped: bool) -> tuple[np.ndarray, bool]:
     for _ in range(STEPS):
         if not size > goal:
             break
-        step = _step(i.W, soft, f, G, D)
+        step = _step(i, soft, f, G, D)
         if step is None or not np.all(np.isfinite(step)):
             return q.reshape(-1, 3), False
         share = 1.0
@@ -145,7 +148,7 @@ def _newton(i: _Island, damped: bool) -> tuple[np.ndarray, bool]:
 
 
 def _linearise(q: np.ndarray, change: np.ndarray, friction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """G (3k,) = q - prox(z), z = q - change, and the derivative (k,3,3) of prox at z, 0 for contacts that part."""
+    """G (3k,) = q - prox(z), z = q - change, and the derivative (k,3,3) of prox at z."""
     z = (q - change).reshape(-1, 3)
     p = prox(z, friction)
     pressed = z[:, 0] > 0.0
@@ -162,30 +165,18 @@ def _linearise(q: np.ndarray, change: np.ndarray, friction: np.ndarray) -> tuple
     return q - p.ravel(), D
 
 
-def _step(W, soft: np.ndarray, f: np.ndarray, G: np.ndarray, D: np.ndarray) -> np.ndarray | None:
-    """Newton's step (3k,): (1 - D (1 - F W')) step = -G, solved for the contacts that do not part; None where it cannot be."""
-    on = D[:, 0, 0] > 0.0
-    rows = np.flatnonzero(np.repeat(on, 3))
-    step = -G
-    if not len(rows):
-        return step
-    parted = step.copy()
-    parted[rows] = 0.0
-    D, k = D[on], int(on.sum())
-    DF = D * f[rows].reshape(-1, 1, 3)
-    rhs = step[rows] - (DF @ (W @ parted)[rows].reshape(-1, 3, 1)).ravel()
+def _step(i: _Island, soft: np.ndarray, f: np.ndarray, G: np.ndarray, D: np.ndarray) -> np.ndarray | None:
+    """Newton's step (3k,): (1 - D (1 - F W')) step = -G; None where it cannot be found."""
+    k = len(D)
+    blocks = i.W.data.copy()
+    blocks[i.diagonal] += soft.reshape(k, 3, 1) * np.eye(3)
+    blocks = (D * f.reshape(k, 1, 3))[i.row] @ blocks
+    blocks[i.diagonal] += np.eye(3) - D
     try:
-        if sp.issparse(W):
-            blocks, at = np.arange(k + 1), np.arange(k)
-            part = W[rows][:, rows] + sp.diags(soft[rows])
-            J = sp.bsr_matrix((np.eye(3) - D, at, blocks)) + sp.bsr_matrix((DF, at, blocks)) @ part
-            step[rows] = splu(J.tocsc()).solve(rhs)
-        else:
-            part = W[np.ix_(rows, rows)]
-            part[np.diag_indices(3 * k)] += soft[rows]
-            J = np.matmul(DF, part.reshape(k, 3, 3 * k))
-            J.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k), :] += np.eye(3) - D
-            step[rows] = np.linalg.solve(J.reshape(3 * k, 3 * k), rhs)
+        if 3 * k > DENSE:
+            return splu(sp.bsr_matrix((blocks, i.W.indices, i.W.indptr)).tocsc()).solve(-G)
+        J = np.zeros((k, k, 3, 3))
+        J[i.row, i.W.indices] = blocks
+        return np.linalg.solve(J.transpose(0, 2, 1, 3).reshape(3 * k, 3 * k), -G)
     except (np.linalg.LinAlgError, RuntimeError):  # RuntimeError: splu says "exactly singular"
         return None
-    return step

@@ -30,8 +30,14 @@ def record(p: ti.template()):
 
 @ti.func
 def begin(p: ti.template()):
-    """A solve begins; state[RESIDUAL] is that of the impulses it starts from, its first good ones."""
+    """A solve begins; state[RESIDUAL] is that of the impulses it starts from, its first good ones.
+
+    With a residual of 1 they are no better than none, and there is nothing to go back to: small impulses, with which a sweep
+    from none begins, can have a residual far above 1, which is relative to them.
+    """
     p.state[GOOD], p.state[STEP], p.state[SWEEPS] = p.state[RESIDUAL], 1.0, 0.0
+    if not p.state[RESIDUAL] < 1.0:
+        p.state[GOOD] = ti.cast(ti.math.inf, ti.f64)
     p.state[AGE], p.state[MOMENTUM], p.state[VERDICT] = 0.0, 1.0, KEEP
     record(p)
 

@@ -10,6 +10,7 @@ Linearly implicit steps do the same with elastic forces linearised at x_n: a qua
 Source: Alart and Curnier 1991 for the laws as a prox; the loop is that of the method of multipliers.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,10 +32,16 @@ from taisoft.stepping.contact_stage import (
     stiffen,
 )
 from taisoft.stepping.newton import MAX_FORCING, SLOW, StageResult, StageSolver, _forcing
-from taisoft.stepping.stage import begin_stage, form_residual
+from taisoft.stepping.stage import begin_stage, form_residual, start_step, try_step
 
-PROGRESS = 0.1  # share of what a new multiplier left of |r| that the Newton steps bring it down to
-FALL = 0.9  # share of the least |r| so far that a step must reach to be taken without a look at the objective
+# R over the r-factors at the start of a stage, at least and at most. A larger one means fewer multipliers but more and harder
+# Newton steps: it doubles after a multiplier that took one, and is halved after one that took many.
+STIFFNESS, SOFTEST, STIFFEST, MANY = 5.0, 3.0, 100.0, 5
+PROGRESS = 0.3  # share of what a new multiplier left of |r| that the Newton steps bring it down to
+FALL = 0.9  # share of the least |r| so far below which a step needs no look at its slope
+FLAT = 0.5  # of the slope at its start: a step that ends on a steeper rise has gone too far
+TRIES = 12  # of a step's length
+KEPT = 3  # Newton steps that a matrix serves at least: most of what changes is what touches
 MAX_MULTIPLIERS = 200
 
 
@@ -93,7 +100,7 @@ class ContactStageSolver(StageSolver):
 
     def _press(self, beta: float) -> None:
         contact = self.contact
-        press(self.model, self.work, self._k, beta, self._dt, contact.standoff, contact.fast, contact.slow)
+        press(self.model, self.work, self._k, beta, self._dt, contact.standoff, contact.fast, contact.slow, self._stiffness)
 
     def _evaluate(self, c: float, beta: float) -> tuple[float, float]:
         if not self._on:
@@ -107,13 +114,6 @@ class ContactStageSolver(StageSolver):
         add_impulses(m, w, k, self.pcg, self._norms)
         return self._sizes(c, beta)
 
-    def _objective(self, c: float, beta: float) -> float:
-        value = super()._objective(c, beta)
-        if self._on:
-            self._press(beta)
-            value += self._k.work.totals[0]
-        return value
-
     def _form_system(self, c: float, beta: float, projected: bool) -> None:
         super()._form_system(c, beta, projected)
         if self._on:
@@ -126,6 +126,34 @@ class ContactStageSolver(StageSolver):
         stiffen(m, self.matrix, self._k)
         most = max(1000, 30 * m.n_nodes)
         return pcg.solve(m, self.matrix, self.pcg, tolerance, most, self._k.coupling)
+
+    def _go(self, c: float, beta: float, enough: float) -> tuple[float, float, bool]:
+        """Take the step in pcg.y as far as it helps; returns (|r|, scale, moved). enough: |r| that needs no further look.
+
+        Contacts that open and close can raise |r| in one step and lower it in the next, round and round. The objective is convex
+        along a step but for the elastic part, so its slope tells: a step that ends on a steep rise is cut back by secants.
+        """
+        m, w, y = self.model, self.work, self.pcg.y
+        start_step(m, w, y, beta)
+        slope = m.scalars[13]
+        share, low, at_low, high, at_high = 1.0, 0.0, slope, 1.0, math.inf
+        for _ in range(TRIES):
+            r, scale = self._evaluate(c, beta)
+            rise = m.scalars[12]
+            too_far = not rise <= -FLAT * slope  # also where it is not a number
+            far_enough = share >= 0.4 * high or rise >= FLAT * slope
+            if r < enough or (slope < 0.0 and not too_far and far_enough):
+                return r, scale, True
+            if too_far:
+                high, at_high = share, rise
+            else:
+                low, at_low = share, rise
+            secant = at_low / (at_low - at_high) if math.isfinite(at_high) else 0.5
+            share = low + (high - low) * min(max(secant, 0.1 if low == 0.0 else 0.4), 0.9)
+            try_step(m, w, y, share, beta)
+        try_step(m, w, y, 0.0, beta)
+        r, scale = self._evaluate(c, beta)
+        return r, scale, False
 
     # --- the loop -------------------------------------------------------------------------------------------------
 
@@ -144,7 +172,7 @@ class ContactStageSolver(StageSolver):
             r = self.solve(c, beta, tolerance, 1 if linear else max_newton, linear_tolerance, led_share=led_share)
             return ContactResult(r.newton_iterations, r.linear_iterations, r.residual, r.converged, r.at_rounding)
         self._fit()
-        self._on, self._phi = True, None
+        self._on = True
         begin_stage(self.model, self.work, beta, led_share)
         fresh = False
         if self._weighed != (c, beta) or linear:
@@ -155,14 +183,14 @@ class ContactStageSolver(StageSolver):
             self._weighed, fresh = (c, beta), True
         find_factors(p)
         set_multipliers(self._k)
-        self._linear = linear
+        self._linear, self._stiffness = linear, STIFFNESS
         return self._iterate(c, beta, tolerance, contact_tolerance, max_newton, linear_tolerance, fresh)
 
     def _iterate(self, c, beta, tolerance, contact_tolerance, max_newton, linear_tolerance, fresh) -> ContactResult:
         state = self.contact.problem.state
         r, scale = self._evaluate(c, beta)
         floor = beta * self.rounding_force + c * self.rounding_mass / beta
-        newton = linear = multipliers = 0
+        newton = linear = multipliers = served = taken = 0
         needs_projection, forcing, previous, goal, least = False, MAX_FORCING, 0.0, PROGRESS * r, r
         converged = rounding = False
         while True:
@@ -177,8 +205,13 @@ class ContactStageSolver(StageSolver):
                     break
                 set_multipliers(self._k)
                 multipliers += 1
+                if taken <= 1:
+                    self._stiffness = min(STIFFEST, 2.0 * self._stiffness)
+                elif taken >= MANY:
+                    self._stiffness = max(SOFTEST, 0.5 * self._stiffness)
+                taken = 0
                 r, scale = self._evaluate(c, beta)
-                goal, least, previous, rounding, self._phi = PROGRESS * r, r, 0.0, False, None
+                goal, least, previous, rounding = PROGRESS * r, r, 0.0, False
                 continue
             if newton >= max_newton:
                 break
@@ -188,9 +221,10 @@ class ContactStageSolver(StageSolver):
                 wanted = max(forcing, 0.1 * tolerance * scale / r, 1e-12)
                 if floor > tolerance * scale:
                     wanted = min(wanted, tolerance)
-            if not self._linear and (not fresh or r > SLOW * previous):
+            if not self._linear and (not fresh or (served >= KEPT and r > SLOW * previous)):
                 self._form_system(c, beta, needs_projection)
-                fresh = True
+                fresh, served = True, 0
+            served += 1
             answer = self._direction(wanted)
             linear += answer.iterations
             if answer.negative and not needs_projection:
@@ -199,11 +233,10 @@ class ContactStageSolver(StageSolver):
                 answer = self._direction(wanted)
                 linear += answer.iterations
             previous = r
-            # contacts that open and close can raise |r| in one step and lower it in the next, round and round: a step counts as
-            # progress where |r| falls below all before it, and else where the objective falls
-            r, scale, moved = self._advance(c, beta, r, scale, False, False, floor, FALL * least)
+            r, scale, moved = self._go(c, beta, FALL * least)
             least = min(least, r)
             newton += 1
+            taken += 1
             if not np.isfinite(r):
                 break
             if r <= floor and r > 0.5 * previous:

@@ -18,13 +18,10 @@ from taisoft.contact.problem import CHANGED, NODES, RESIDUAL, SIZE, residual_of,
 from taisoft.contact.prox import into_disk, prox, scaled
 from taisoft.linear.block_csr import BLOCK, block_times, part_times
 from taisoft.linear.coupling import Coupling, coupling_diagonal
-from taisoft.linear.pcg import total
+from taisoft.linear.pcg import dot64, total
 from taisoft.model import Model
 from taisoft.runtime import FieldArena, kernel
 from taisoft.stepping.stage import norm2
-
-STIFFNESS = 10.0  # R over the r-factors; from 1 to 100 works: more means fewer multipliers and harder linear systems
-
 
 @dataclass(frozen=True, eq=False)
 class ContactStageWork:
@@ -79,14 +76,18 @@ def _stage_velocity_of(m: ti.template(), s: ti.template(), k: ti.template(), c, 
 
 @kernel
 def press(
-    m: ti.template(), s: ti.template(), k: ti.template(), beta: ti.f64, dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64
+    m: ti.template(), s: ti.template(), k: ti.template(), beta: ti.f64, dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64,
+    stiffness: ti.f64,
 ):  # fmt: skip
-    """Impulses p.r, energy and matrix blocks of the contacts at the present x, and the residual of their laws."""
+    """Impulses p.r, energy and matrix blocks of the contacts at the present x, and the residual of their laws.
+
+    stiffness: R over the r-factors.
+    """
     p, w = ti.static((k.problem, k.work))
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         u = _stage_velocity_of(m, s, k, c, beta, dt, standoff, fast, slow)
-        Rn, Rt = STIFFNESS * p.factor[c][0], STIFFNESS * p.factor[c][1]
+        Rn, Rt = stiffness * p.factor[c][0], stiffness * p.factor[c][1]
         z = w.multiplier[c] - dvec(Rn * u[0], Rt * u[1], Rt * u[2])
         rho = w.radius[c]
         size = ti.sqrt(z[1] * z[1] + z[2] * z[2])
@@ -131,12 +132,13 @@ def press(
 
 @kernel
 def add_impulses(m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.template(), norms: ti.types.ndarray()):
-    """Take J^T p from the residual, and find its norms anew: norms[0] on the free axes, norms[4] on the others."""
+    """Take J^T p from the residual, and find its norms anew: norms[0] on the free axes, norms[4] on the others; scalars 12:
+    its slope along the last direction, pcg.y."""
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for chunk in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
-        on, off = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        on, off, slope = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
             d = dvec(0.0)
             for e in range(p.entry_start[i], p.entry_start[i + 1]):
@@ -147,10 +149,12 @@ def add_impulses(m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.t
             pcg.rhs[i] = -free * r
             on += norm2(free * r)
             off += norm2((1.0 - free) * r)
-        m.partial[chunk, 0], m.partial[chunk, 4] = on, off
+            slope += dot64(free * r, pcg.y[i])
+        m.partial[chunk, 0], m.partial[chunk, 4], m.partial[chunk, 5] = on, off, slope
     ti.loop_config(serialize=True)
     for _ in range(1):
         norms[0], norms[4] = total(m, 0), total(m, 4)
+        m.scalars[12] = total(m, 5)
 
 
 @kernel

@@ -202,12 +202,8 @@ class StageSolver:
         size = float(np.linalg.norm(rhs))
         return float(np.linalg.norm(rhs - free * self.pcg.q.to_numpy())) / size if size > 0.0 else 0.0
 
-    def _advance(
-        self, c: float, beta: float, r: float, scale: float, blind: bool, by_energy: bool, floor: float,
-        enough: float | None = None,
-    ):  # fmt: skip
-        """Take the step in pcg.y as far as it helps; returns (|r|, scale, moved). enough: |r| below which a full step helps."""
-        enough = r if enough is None else enough
+    def _advance(self, c: float, beta: float, r: float, scale: float, blind: bool, by_energy: bool, floor: float):
+        """Take the step in pcg.y as far as it helps; returns (|r|, scale, moved)."""
         m, w, y = self.model, self.work, self.pcg.y
         if by_energy and self._phi is None:
             self._phi = self._objective(c, beta)
@@ -215,7 +211,7 @@ class StageSolver:
         start = self._phi
         if not by_energy:
             new_r, new_scale = self._evaluate(c, beta)
-            if blind or new_r < enough or new_r <= floor:
+            if blind or new_r < r or new_r <= floor:
                 return new_r, new_scale, True
             try_step(m, w, y, 0.0, beta)
             start = self._objective(c, beta)
