@@ -22,7 +22,7 @@ class StateAccess:
     settings: Settings
     _world: World | None = None
     _contact: ContactStep | None
-    _detection: Detection | None
+    _idle_detection: Detection | None
 
     @property
     def time(self) -> float:
@@ -121,11 +121,16 @@ class StateAccess:
         if self._contact is not None:
             self._contact.search(world.time, self._dt)
             return self._contact.detection
-        if self._detection is None:
-            self._detection = Detection(world.scene, world.model, world.layout, self._runtime)
-            self._owned.append(self._detection)
-        self._detection.find(world.time, self._dt)
-        return self._detection
+        if self._idle_detection is None:
+            self._idle_detection = Detection(world.scene, world.model, world.layout, self._runtime)
+            self._owned.append(self._idle_detection)
+        self._idle_detection.find(world.time, self._dt)
+        return self._idle_detection
+
+    @property
+    def _detection(self) -> Detection | None:
+        """What finds the contacts; None where it was not needed yet."""
+        return self._contact.detection if self._contact is not None else self._idle_detection
 
     def stress(self, body: str) -> np.ndarray:
         """Cauchy stress per tet (m,3,3) [Pa]; not finite in a flat one."""

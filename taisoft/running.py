@@ -100,6 +100,11 @@ def _merge(a: StepReport, b: StepReport) -> StepReport:
     b.steps += a.steps
     b.min_volume_ratio = min(a.min_volume_ratio, b.min_volume_ratio)
     b.n_inverted = max(a.n_inverted, b.n_inverted)
+    b.contact_iterations += a.contact_iterations
+    b.contact_residual = max(a.contact_residual, b.contact_residual)
+    b.max_penetration = max(a.max_penetration, b.max_penetration)
+    b.dropped_contacts += a.dropped_contacts
+    b.converged = a.converged and b.converged
     b.problems = a.problems + b.problems
     return b
 
@@ -115,10 +120,11 @@ def _judge(report: RunReport) -> None:
     unconverged = [s for s in steps if not s.converged]
     inverted = [s for s in steps if s.n_inverted > 0]
     if unconverged:
-        worst = max(unconverged, key=lambda s: s.residual)
+        worst = max(unconverged, key=lambda s: max(s.residual, s.contact_residual))
         report.problems.append(
             f"{len(unconverged)} of {len(steps)} steps did not converge; the worst, at t = {worst.time:.4g} s, "
             f"to a relative residual of {worst.residual:.2e}"
+            + (f", that of its contacts {worst.contact_residual:.2e}" if worst.n_contacts else "")
         )
     if inverted:
         worst = max(inverted, key=lambda s: s.n_inverted)

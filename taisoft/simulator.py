@@ -5,9 +5,10 @@ import weakref
 
 from taisoft import runtime
 from taisoft.access import StateAccess
+from taisoft.collision.overlap import find_overlap
 from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import measure
-from taisoft.errors import SimulationError
+from taisoft.errors import SceneError
 from taisoft.model import build_model
 from taisoft.records import RunReport, StepReport
 from taisoft.running import run
@@ -53,7 +54,7 @@ class Simulator(StateAccess):
         self._stable_dt: float | None = None
         self._owned = []  # what has memory of its own to give back
         self._contact: ContactStep | None = None
-        self._detection: Detection | None = None  # of a scene without contact forces, once asked for
+        self._idle_detection: Detection | None = None  # of a scene without contact forces, once asked for
         self._tangent = None  # fields of force_differential, once asked for
         if self.settings.explicit:
             self._check_stability(self._dt)
@@ -74,6 +75,8 @@ class Simulator(StateAccess):
             self._stepper = make_stepper(self._world, integrator, self._contact, contact_solver)
             self._owned.append(self._stepper)
             self.reset()
+            if touching and not scene.allow_initial_overlap:
+                self._refuse_overlap()
         except BaseException:
             _release(self._arena, self._runtime, self._owned)
             raise
@@ -83,6 +86,15 @@ class Simulator(StateAccess):
         if self._contact is not None:
             self._stepper.contact_tolerance = contact_tolerance or self._stepper.contact_tolerance
         self._release = weakref.finalize(self, _release, self._arena, self._runtime, self._owned)
+
+    def _refuse_overlap(self) -> None:
+        self._contact.search(0.0, self._dt)
+        found = find_overlap(self._contact.detection)
+        if found is not None:
+            raise SceneError(
+                f"'{found.name_a}' and '{found.name_b}' overlap at the start, {found.depth:.3g} m deep: move them apart, or set "
+                "scene.allow_initial_overlap = True"
+            )
 
     # --- stepping -------------------------------------------------------------------------------------------------
 
@@ -169,7 +181,7 @@ class Simulator(StateAccess):
     @property
     def field_bytes(self) -> dict[str, int]:
         """Bytes of every allocated field by name."""
-        searched = self._contact or self._detection
+        searched = self._contact or self._idle_detection
         return self._arena.bytes | (searched.field_bytes if searched else {}) | self._stepper.field_bytes
 
     def close(self) -> None:

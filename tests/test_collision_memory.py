@@ -62,7 +62,7 @@ def search_everything() -> None:
         x = sim.positions()
         kinds = set(sim.detect_contacts().kind)
         assert kinds == {"vertex_face", "edge_edge", "vertex_field", "face_field"}, kinds
-        detection = sim._detections[0]
+        detection = sim._detection
         assert detection.surface.serial
         ball = np.arange(sim.scene.bodies[0].n_nodes)
         inside = ball[np.linalg.norm(sim.scene.bodies[0].rest_positions, axis=1) < 1e-9]
@@ -115,7 +115,7 @@ def search_in_small_parts() -> None:
             sim.set_state(scale * sim.positions())
             with pytest.raises(SimulationError, match=r"contacts: [0-9]+ entries are needed .* max_capacity allows 65"):
                 sim.detect_contacts()
-        assert sim._detections[0].surface.chunks == 64
+        assert sim._detection.surface.chunks == 64
 
 
 def search_by_both_broad_phases() -> None:

@@ -101,7 +101,7 @@ class TestZoo:
         many.find(0.0, DT)
         first = many.contacts()
         compare(one, first, close=0.0)  # the parts of the work lie in another order
-        assert sim._detections[0].surface.serial and not many.surface.serial and many.surface.chunks > 1
+        assert sim._detection.surface.serial and not many.surface.serial and many.surface.chunks > 1
         for _ in range(5):
             many.find(0.0, DT)
             assert identical(first, many.contacts())

@@ -112,7 +112,7 @@ def test_the_life_of_a_simulator(earlier, time):
         assert len(sim.detect_contacts()) == 0
         sim.reset()
         earlier += [c, sim.detect_contacts()]
-        detection = sim._detections[0]
+        detection = sim._detection
         arenas = [detection._arena, detection._reduction_arena, detection.buffer._arena]
         assert all(arena.bytes for arena in arenas)
     assert not any(arena.bytes or arena._trees for arena in arenas) and not sim._detections
@@ -129,4 +129,4 @@ def test_a_body_alone():
         assert len(sim.detect_contacts()) == 0 and sim.intersecting_triangles() == []
         used = set(runtime.launches - before) & collision_kernels()
         assert not used & {"find_active", "count_cells", "find_proximity", "find_in_fields", "find_analytic"}
-        assert sim._detections[0].broad is None
+        assert sim._detection.broad is None

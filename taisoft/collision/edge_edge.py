@@ -86,6 +86,8 @@ def edge_contact(s: ti.template(), t, k, u, m, margin, out: ti.template(), start
             good = _within(s, u, m, g * lb, lb, over, t, k)
         if good == 1:
             good = edge_sticks_out(s, u, m, n) & edge_sticks_out(s, t, k, -n)
+            # a nearly flat edge sticks out along either normal: the sides that look at each other count
+            good &= int(n.dot(edge_normal(s, u, m)) > 0.0) & int(n.dot(edge_normal(s, t, k)) < 0.0)
         if good == 1:
             good = 1 - _end_tells(s, t, k, f * la, la, -END * gap, u, m, n)
         if good == 1:

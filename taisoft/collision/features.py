@@ -11,7 +11,8 @@ from taisoft.collision.surface import ACTIVE, dvec, ivec
 from taisoft.runtime import kernel
 
 CORNER_SLACK, EDGE_SLACK = 0.25, 0.05  # sines
-FLAT = 0.985  # cosine of 10 degrees: edges that turn by less are left to their ends
+FLAT = 0.985  # cosine of 10 degrees: edges that turn by less are blunt, and meet sharp ones only
+LEVEL = 0.9998  # cosine of 1 degree: edges that are hollow by less count as flat
 SMOOTH = 0.5  # cosine of 60 degrees: the same for bodies hit by a distance field, which sees blunt edges itself
 
 
@@ -137,7 +138,7 @@ def edge_sticks_out(s: ti.template(), t, k, n):
 
 @kernel
 def find_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template()):
-    """Bits 0-2 of each active triangle: edges that it owns and that stick out, open ones too.
+    """Bits 0-2 of each active triangle: edges that it owns and that stick out, open ones too; 3-5: those, and flat ones.
 
     way: (n_bodies) i32, 0 for bodies hit by a distance field.
     """
@@ -152,11 +153,15 @@ def find_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template())
             if (s.owns[t] >> (3 + k)) & 1:
                 w = s.neighbour[t, k]
                 if w < 0:
-                    bits |= 1 << k
+                    bits |= 9 << k
                 else:
                     i, j = s.triangle[t, k], s.triangle[t, (k + 1) % 3]
                     n = unit(area_normal(s, t))
-                    turned = n.dot(unit(area_normal(s, w))) < flat
-                    if turned and (s.x[opposite(s, w, i, j)] - s.x[i]).dot(n) < 0.0:
-                        bits |= 1 << k
+                    cosine = n.dot(unit(area_normal(s, w)))
+                    out = (s.x[opposite(s, w, i, j)] - s.x[i]).dot(n) < 0.0
+                    if out and cosine < flat:
+                        bits |= 9 << k
+                    elif out or cosine > ti.cast(LEVEL, ti.f64):
+                        if way[s.body[t]] != 0:
+                            bits |= 8 << k
         sharp[t] = bits

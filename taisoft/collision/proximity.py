@@ -120,6 +120,12 @@ def _far(s: ti.template(), i, u, half):
 
 
 @ti.func
+def meet(a, b):
+    """1 where two edges can cross: one is sharp, the other at least flat. a, b: bits of `find_sharp_edges` from the edge's on."""
+    return ((a & (b >> 3)) | ((a >> 3) & b)) & 1
+
+
+@ti.func
 def vertex_contacts(
     s: ti.template(), entry: ti.template(), first, last, i, own, margin, half, out: ti.template(), start, end
 ):  # fmt: skip
@@ -286,7 +292,7 @@ def find_proximity(
                             if u > t and sharp[u] != 0:
                                 for km in range(9):
                                     k, m = km // 3, km % 3
-                                    if (sharp[t] >> k) & 1 and (sharp[u] >> m) & 1:
+                                    if meet(sharp[t] >> k, sharp[u] >> m) == 1:
                                         at = edge_contact(s, t, k, u, m, margin, out, at, end)
                     first = last
             used[c] = at - c * part

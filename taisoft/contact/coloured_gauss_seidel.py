@@ -11,17 +11,26 @@ from taisoft.contact.gauss_seidel import relax, share, sweep
 from taisoft.contact.problem import ContactProblem
 from taisoft.runtime import kernel
 
+AT_ONCE = 4  # colours of a launch, which costs more than a loop in it
+
 __all__ = ["share", "sweep", "sweep_at_once"]
 
 
 @kernel
-def relax_colour(p: ti.template(), colour: ti.i32):
-    """The contacts of one colour, on all threads."""
-    for k in range(p.colour_start[colour], p.colour_start[colour + 1]):
-        relax(p, p.order[k])
+def relax_colours(p: ti.template(), first: ti.i32):
+    """The contacts of a few colours from `first` on, each colour on all threads."""
+    for q in ti.static(range(AT_ONCE)):
+        for k in range(_start(p, first + q), _start(p, first + q + 1)):
+            relax(p, p.order[k])
 
 
-def sweep_at_once(p: ContactProblem) -> None:
+@ti.func
+def _start(p: ti.template(), colour):
+    """Where a colour starts in `order`; behind the last one, where that ends."""
+    return p.colour_start[ti.min(colour, p.count[1])]
+
+
+def sweep_at_once(p: ContactProblem, colours: int) -> None:
     """Every contact once, on all threads."""
-    for colour in range(int(p.count[1])):
-        relax_colour(p, colour)
+    for first in range(0, colours, AT_ONCE):
+        relax_colours(p, first)

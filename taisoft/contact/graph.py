@@ -3,8 +3,8 @@
 An edge joins two contacts that share a node which can move (report, algorithm 6); obstacles and fully led nodes join nothing. For
 a W that is given as a matrix, an edge is a block off the diagonal that is not zero, either way round. Colours on the host:
     colour_greedy    networkx, largest degree first or another of its strategies;
-    colour_random    Vivace, Fratarcangeli, Tibaldo and Pellacini 2016: tentative colours at random, kept where no neighbour has
-                     the same; the palette of a contact that runs dry grows by one.
+    colour_random    Vivace, Fratarcangeli, Tibaldo and Pellacini 2016: tentative colours at random, kept where no neighbour
+                     before it has the same; the palette of a contact that runs dry grows by one.
 `colouring` colours in kernels.
 """
 
@@ -63,25 +63,27 @@ def colour_random(graph: sp.csr_matrix, seed: int = 0, shrink: float = 3.0) -> n
     edges = sp.triu(graph).tocoo()
     a, b = edges.row, edges.col
     degree = np.diff(graph.indptr)
-    size = np.maximum(1, np.ceil(degree / shrink)).astype(int)
-    free = np.arange(int(degree.max(initial=0)) + 2)[None, :] < size[:, None]  # palettes; none needs more than degree + 1
+    size = np.maximum(1, np.ceil(degree / shrink)).astype(int)  # of the palettes; none needs more than degree + 1
+    number = np.arange(int(degree.max(initial=0)) + 2)
+    taken = np.zeros((k, len(number)), dtype=bool)
     colour = np.full(k, UNCOLOURED, dtype=np.int32)
     while True:
         left = np.flatnonzero(colour == UNCOLOURED)
         if not len(left):
             return _in_use(colour)
-        dry = left[~free[left].any(axis=1)]
-        free[dry, size[dry]] = True
-        size[dry] += 1
+        free = (number < size[left, None]) & ~taken[left]
+        dry = ~free.any(axis=1)
+        size[left[dry]] += 1
+        left, free = left[~dry], free[~dry]
         tentative = np.full(k, UNCOLOURED)
-        tentative[left] = np.argmax(np.where(free[left], generator.random((len(left), free.shape[1])), -1.0), axis=1)
-        same = (tentative[a] == tentative[b]) & (tentative[a] != UNCOLOURED)
+        tentative[left] = np.argmax(np.where(free, generator.random(free.shape), -1.0), axis=1)
         keep = tentative != UNCOLOURED
-        keep[a[same]] = keep[b[same]] = False
+        # of two with the same the lower keeps it: if neither did, two that have one colour each would never end
+        keep[b[keep[a] & (tentative[a] == tentative[b])]] = False
         colour[keep] = tentative[keep]
         for one, other in ((a, b), (b, a)):
             told = keep[one]
-            free[other[told], colour[one[told]]] = False
+            taken[other[told], colour[one[told]]] = True
 
 
 def _in_use(colour: np.ndarray) -> np.ndarray:

@@ -14,6 +14,6 @@ def sweep(p: ti.template()):
     sweep_all(p, True)
 
 
-def sweep_at_once(p: ContactProblem) -> None:
+def sweep_at_once(p: ContactProblem, _colours: int) -> None:
     """Every contact once, on all threads."""
     sweep_all_at_once(p, True)

@@ -60,6 +60,6 @@ def sweep_all_at_once(p: ti.template(), fresh: ti.template()):
         exchange(p, c)
 
 
-def sweep_at_once(p: ContactProblem) -> None:
+def sweep_at_once(p: ContactProblem, _colours: int) -> None:
     """Every contact once, on all threads."""
     sweep_all_at_once(p, False)

@@ -36,6 +36,26 @@ def signed_distances(vertices: np.ndarray, triangles: np.ndarray, axes: list[np.
     return _Search(_Surface(vertices, triangles), axes).run()
 
 
+def signed_distances_at(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(k,) float64 [m] at points (k,3), negative inside; the surface as in `signed_distances`."""
+    surface = _Surface(vertices, triangles)
+    result = np.zeros(len(points))
+    if not len(points):
+        return result
+    tree = cKDTree(surface.centroid)
+    _, first = tree.query(points)
+    upper = np.sqrt(surface.nearest(points, first)[0])
+    # a triangle can be nearer only if its centroid is within the bound and its own radius
+    near = tree.query_ball_point(points, (1.0 + _SLACK) * (upper + surface.radius.max()))
+    for k, candidates in enumerate(near):
+        triangle = np.sort(candidates)
+        squared, offset, feature = surface.nearest(np.repeat(points[k : k + 1], len(triangle), axis=0), triangle)
+        best = np.argmin(squared)
+        side = surface.sides(offset[best : best + 1], triangle[best : best + 1], feature[best : best + 1])[0]
+        result[k] = np.copysign(np.sqrt(squared[best]), side if side != 0.0 else 1.0)
+    return result
+
+
 class _Surface:
     """Triangles with what distance and sign need."""
 

@@ -35,6 +35,7 @@ class Scene:
         self.obstacles: list[Obstacle] = []
         self.contact_pairs: dict[frozenset[str], tuple[float | None, float | None]] = {}
         self.collision = CollisionSettings()
+        self.allow_initial_overlap = False
 
     @property
     def gravity(self) -> np.ndarray:
@@ -57,6 +58,17 @@ class Scene:
         self._collision = value
 
     @property
+    def allow_initial_overlap(self) -> bool:
+        """Whether things may overlap at the start; otherwise a simulator refuses what is deeper than 1e-6 of the smaller size."""
+        return self._allow_initial_overlap
+
+    @allow_initial_overlap.setter
+    def allow_initial_overlap(self, value: bool) -> None:
+        if not isinstance(value, bool):
+            raise SceneError(f"scene: allow_initial_overlap must be True or False, not {value!r}")
+        self._allow_initial_overlap = value
+
+    @property
     def colliders(self) -> list[Body | Obstacle]:
         """Bodies, then obstacles, each in the order added: what numbers in contacts count."""
         return [*self.bodies, *self.obstacles]
@@ -76,7 +88,7 @@ class Scene:
             other._held = body._held.copy()
             twin.bodies.append(other)
         twin.obstacles, twin.contact_pairs = list(self.obstacles), dict(self.contact_pairs)
-        twin.collision = self.collision
+        twin.collision, twin.allow_initial_overlap = self.collision, self.allow_initial_overlap
         return twin
 
     def add_body(

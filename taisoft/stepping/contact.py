@@ -98,15 +98,16 @@ class ContactStep:
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self._told = np.zeros(4)
         self._searched: tuple[float, float] | None = None  # time and dt of the search that is at hand
-        self._last_dt = 0.0
+        self._last_time = 0.0
         self.penetration = 0.0  # [m] at the end of the last step
+        self._share = 1.0
 
     def _make_room(self, capacity: int) -> None:
         arena, m = FieldArena(), self.world.model
         problem = build_node_problem(arena, capacity, m.n_nodes, m.serial)
         self.found = build_found(arena, problem)
         self._arena.release()
-        self._arena, self._last_dt = arena, 0.0
+        self._arena, self._last_time = arena, 0.0
 
     @property
     def problem(self):
@@ -122,7 +123,7 @@ class ContactStep:
         """The state was set: the search at hand and the impulses of the last step do not belong to it."""
         self._searched = None
         self.problem.count[0] = 0
-        self._last_dt = self.penetration = 0.0
+        self._last_time = self.penetration = 0.0
 
     def numbers_changed(self) -> None:
         """Friction or restitution changed."""
@@ -143,18 +144,21 @@ class ContactStep:
             self._searched = (time, dt)
         return d.counts.contacts
 
-    def begin(self, time: float, dt: float) -> int:
-        """Fill the problem for a step of dt [s] from the state at a time; impulses are those of the last step. Returns its size."""
+    def begin(self, time: float, dt: float, share: float = 1.0) -> int:
+        """Fill the problem for a step of dt [s] from the state at a time; impulses are those of the last step. Returns its size.
+
+        share: of the step that impulses act in, beta / dt of an implicit stage.
+        """
         n, d, m = self.search(time, dt), self.detection, self.world.model
         if n > self.problem.capacity:
             self._make_room(2 * n)
         f = self.found
         keep_impulses(f)
-        warm = dt / self._last_dt if self._last_dt > 0.0 else 0.0
+        warm = dt * share / self._last_time if self._last_time > 0.0 else 0.0
         fill(f, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
         if n:
             index_nodes(f.problem)
-        self._last_dt = dt
+        self._last_time, self._share = dt * share, share
         return n
 
     def end(self, time: float, dt: float) -> float:
@@ -190,7 +194,7 @@ class ContactStep:
         f, p = self.found, self.problem
         n = p.count[0]
         normal, tangent, r = (field.to_numpy()[:n] for field in (p.normal, p.tangent, p.r))
-        impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
+        impulse = (r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)) / self._share
         nodes, weights = self._sides(n)
         return self.detection.record(
             f.point.to_numpy()[:n], normal, f.gap.to_numpy()[:n], impulse, f.body.to_numpy()[:n], f.feature.to_numpy()[:n],

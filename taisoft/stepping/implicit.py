@@ -171,7 +171,7 @@ class ImplicitStepper:
                 w.led_acceleration.from_numpy(world.motion.accelerations(time, dt, self.scheme.before == 0.0))
         self._beta = scheme.share * dt
         if self.contact is not None:
-            self.contact.begin(time, dt)
+            self.contact.begin(time, dt, scheme.share)
         self.solver.assemble_damper()
         along = (0.5 if scheme.midpoint else 1.0) if self._past > 1 and not scheme.one_iteration else 0.0
         multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)

@@ -1,0 +1,97 @@
+"""Overlap at the start of a scene: how deep bodies stick in each other and in obstacles, whatever the search for contacts sees.
+
+The search looks for what can touch in a step and passes over what lies deep inside. Here every vertex near another collider is
+asked for its exact signed distance, on the host between surfaces, and the found contacts add what no vertex tells: edges that
+cross, and faces under a ball.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+from taisoft.collision.pipeline import Detection
+from taisoft.errors import MeshError
+from taisoft.mesh.signed_distance import signed_distances_at
+from taisoft.runtime import kernel
+
+ALLOWED = 1e-6  # of the smaller body's size: deeper is an overlap
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Two colliders that overlap by a depth [m]."""
+
+    name_a: str
+    name_b: str
+    depth: float
+
+
+@kernel
+def _deepest_vertices(s: ti.template(), o: ti.template(), phi: ti.types.ndarray()):
+    """phi (n_colliders, analytic obstacles) [m]: least signed distance of each soft body's vertices from each obstacle."""
+    ti.loop_config(serialize=True)
+    for i in range(s.n_verts):
+        if s.node[i] >= 0:
+            b = s.body[s.ring[s.ring_start[i]]]
+            for k in range(o.count):
+                R = ti.Matrix.rows([o.rotation[3 * k], o.rotation[3 * k + 1], o.rotation[3 * k + 2]])
+                value, _g = o.sample(k, R.transpose() @ (s.x[i] - o.origin[k]))
+                phi[b, k] = ti.min(phi[b, k], value)
+
+
+def find_overlap(detection: Detection) -> Overlap | None:
+    """The deepest overlap in the state that was searched last, if one is deeper than ALLOWED."""
+    colliders, topology = detection.scene.colliders, detection.topology
+    x = detection.surface.x.to_numpy()
+    parts = [x[topology.vertex_first[k] : topology.vertex_first[k + 1]] for k in range(len(colliders))]
+    size = np.array([np.ptp(p, axis=0).max() if len(p) else np.inf for p in parts])
+    depth: dict[tuple[int, int], float] = {}
+
+    def tell(a: int, b: int, deep: float) -> None:
+        depth[a, b] = max(depth.get((a, b), 0.0), deep)
+
+    contacts, place = detection.contacts(), {c.name: k for k, c in enumerate(colliders)}
+    for a, b, gap in zip(contacts.body_a, contacts.body_b, contacts.gap):
+        if gap < 0.0 and a != b:
+            tell(place[a], place[b], -gap)
+    if detection.shapes.count:
+        phi = np.full((len(colliders), detection.shapes.count), np.inf)
+        _deepest_vertices(detection.surface, detection.shapes, phi)
+        owner = detection.shapes.body.to_numpy()
+        for a, k in zip(*np.nonzero(phi < 0.0)):
+            tell(int(a), int(owner[k]), -phi[a, k])
+    n_bodies = len(detection.scene.bodies)
+    for a in range(n_bodies):
+        for b in range(a + 1, len(colliders)):
+            if len(parts[b]):
+                tell(a, b, _depth_between(detection, parts, a, b))
+    return _deepest(depth, size, colliders)
+
+
+def _deepest(depth: dict[tuple[int, int], float], size: np.ndarray, colliders: list) -> Overlap | None:
+    """The pair whose depth is the largest share of the smaller one's size, if that is more than ALLOWED."""
+    worst, share = None, ALLOWED
+    for (a, b), deep in depth.items():
+        if deep / min(size[a], size[b]) > share:
+            worst, share = Overlap(colliders[a].name, colliders[b].name, float(deep)), deep / min(size[a], size[b])
+    return worst
+
+
+def _depth_between(detection: Detection, parts: list[np.ndarray], a: int, b: int) -> float:
+    """How deep [m] the vertices of two surfaces lie in each other at most; 0 where none does."""
+    lo = np.maximum(parts[a].min(axis=0), parts[b].min(axis=0))
+    hi = np.minimum(parts[a].max(axis=0), parts[b].max(axis=0))
+    if (lo > hi).any():
+        return 0.0
+    deep = 0.0
+    for inner, outer in ((a, b), (b, a)):
+        points = parts[inner][((parts[inner] >= lo) & (parts[inner] <= hi)).all(axis=1)]
+        first = detection.topology.first
+        triangles = detection.topology.triangle[first[outer] : first[outer + 1]] - detection.topology.vertex_first[outer]
+        try:
+            phi = signed_distances_at(parts[outer], triangles, points)
+        except MeshError:  # an open surface has no inside; what crosses it is a contact
+            continue
+        deep = max(deep, -float(phi.min(initial=0.0)))
+    return deep
