@@ -94,9 +94,8 @@ class Row:
     def __str__(self) -> str:
         reached = self.iterations is not None
         cost = (str(self.iterations), f"{self.time:.2f}", f"{self.operations:.3f}") if reached else ("-", "-", "-")
-        return FORMAT.format(
-            self.problem, self.contacts, self.solver, *(f"{r:.1e}" for r in self.residuals), *cost, self.verdict
-        ).rstrip()  # fmt: skip
+        residuals = (f"{r:.1e}" for r in self.residuals)
+        return FORMAT.format(self.problem, self.contacts, self.solver, *residuals, *cost, self.verdict).rstrip()
 
 
 def load(name: str) -> Problem:
@@ -258,11 +257,6 @@ def missing(names: tuple[str, ...] = tuple(YARDSTICK)) -> str | None:
     return f"contact problems are absent from {PROBLEMS}: {', '.join(absent)}" if absent else None
 
 
-def table(rows: list[Row]) -> str:
-    """Rows as text, with headings."""
-    return "\n".join([FORMAT.format(*HEADINGS).rstrip(), *map(str, rows)])
-
-
 def summary(rows: list[Row]) -> str:
     """A line for each solver: on how many problems it reaches 1e-6, and its largest cost there."""
     lines = []
@@ -284,8 +278,7 @@ def main(argv=None) -> int:
     if absent := missing(names):
         print(f"taisoft bench contact_problems: {absent}", file=sys.stderr)
         return 2
-    runtime = open_runtime("cpu", "f64", "the benchmark of contact problems")
-    rows = []
+    runtime, rows = open_runtime("cpu", "f64", "the benchmark of contact problems"), []
     print(FORMAT.format(*HEADINGS).rstrip())
     try:
         for row in compute(names, max(1, options.repeats)):

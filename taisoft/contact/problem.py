@@ -15,8 +15,7 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.collision.surface import dvec
-from taisoft.contact.prox import prox, scaled
+from taisoft.contact.prox import dvec, prox, scaled
 from taisoft.runtime import FieldArena, kernel
 
 NODES = 6  # of a contact at most, three on each side

@@ -7,7 +7,7 @@ friction * r_n. Both tangents must share one factor: with two, the fixed point i
 
 import taichi as ti
 
-from taisoft.collision.surface import dvec
+dvec = ti.types.vector(3, ti.f64)
 
 
 @ti.func

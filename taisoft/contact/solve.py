@@ -51,14 +51,14 @@ def solve(
         n = min(batch, left)
         run(p, rule, first, n, every, tolerance, int(momentum))
         left, first = left - n, 0
-        found = p.state.to_numpy()
+        residual = float(p.state[RESIDUAL])
         if history:
-            told += p.history.to_numpy()[: int(found[LOOKS])].tolist()
-        if left == 0 or found[RESIDUAL] <= tolerance:
+            told += p.history.to_numpy()[: int(p.state[LOOKS])].tolist()
+        if left == 0 or residual <= tolerance:
             break
-    residual = float(found[RESIDUAL])
-    if found[GOOD] < residual or residual != residual:
+    good = float(p.state[GOOD])
+    if good < residual or residual != residual:
         _bring_back(p)
         find_velocities(p)
-        residual = float(found[GOOD])
-    return SolveResult(int(found[SWEEPS]), residual, residual <= tolerance, told)
+        residual = good
+    return SolveResult(int(p.state[SWEEPS]), residual, residual <= tolerance, told)

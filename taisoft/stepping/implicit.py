@@ -18,7 +18,7 @@ from taisoft.stepping.world import World
 
 MAX_NEWTON = 50  # a step that needs more is reported as not converged
 MAX_CONTACT_NEWTON = 400  # with contacts, over all multipliers
-MAX_PARTS = 16  # of a step in which bodies close fast
+MAX_PARTS = 32  # of a step in which bodies close fast
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
 CONTACT_TOLERANCE = {"f32": 1e-4, "f64": 1e-6}  # residual of the contact laws
