@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.collision.surface import dvec
-from taisoft.contact.problem import NODES, ContactProblem, to_frame, to_world
-from taisoft.contact.prox import prox, tangents
+from taisoft.contact.problem import ContactProblem, to_frame, to_world
+from taisoft.contact.prox import dvec, prox, tangents
 from taisoft.runtime import FieldArena, kernel
 from taisoft.scene.scene import Scene
 
