@@ -107,14 +107,14 @@ def load(name: str) -> Problem:
 
 
 def seconds(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """The median time of each call, all of them run in turns; each has run before."""
+    """The median time of each call, all of them run in turns, once before to compile."""
     spent: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(repeats):
+    for _ in range(repeats + 1):
         for name, call in calls.items():
             start = time.perf_counter()
             call()
             spent[name].append(time.perf_counter() - start)
-    return {name: float(np.median(s)) for name, s in spent.items()}
+    return {name: float(np.median(s[1:])) for name, s in spent.items()}
 
 
 @contextmanager
@@ -218,7 +218,6 @@ def host_rows(problem: Problem, repeats: int) -> list[Row]:
         residuals = tuple(host.residual(W, b, mu, factor, run(0.1 * NONE, n)[0]) for n in (*SWEEPS[:2], 150))
         with counted_operations(problem) as told:
             _, swept, history = run(GOAL, SWEEPS[-1])
-        plain()
         took = seconds({"solve": lambda run=run: run(GOAL, SWEEPS[-1]), "1000": plain}, repeats)
         operations = sum(told) + swept * (1.2 * problem.sweep_cost + 40 * len(mu))
         share = operations / (SWEEPS[-1] * problem.sweep_cost)

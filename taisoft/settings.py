@@ -8,7 +8,6 @@ from taisoft.scene import checks
 from taisoft.scene.scene import Scene
 from taisoft.stepping import EXPLICIT, INTEGRATORS
 
-
 EXPLICIT_CONTACT = ("gauss_seidel", "jacobi", "hybrid", "coloured_gauss_seidel")
 IMPLICIT_CONTACT = ("augmented_lagrangian",)
 

@@ -43,7 +43,7 @@ def test_rows(shared):
 def test_verdicts():
     told = {row.solver: row.verdict for row in bench.judged(ROWS)}
     assert told == {bench.PLAIN: "yardstick: pass", "jacobi": "", "hybrid": "best: pass"}
-    slow = [replace(row, residuals=(1.0, 1.0, 1.0), time=2.0) for row in ROWS]
+    slow = [replace(row, residuals=(1.0, 1.0, 1.0), time=5.0 + row.time) for row in ROWS]
     assert {row.solver: row.verdict for row in bench.judged(slow)} == {
         bench.PLAIN: "yardstick: FAIL", "jacobi": "", "hybrid": "best: FAIL"
     }  # fmt: skip

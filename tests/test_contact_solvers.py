@@ -16,18 +16,17 @@ import contact_oracle as oracle
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from contact_rig import N_NODES, Rig, impulses
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import taisoft as ts
-from taisoft.contact import augmented_lagrangian, problem
+from taisoft.contact import augmented_lagrangian
 from taisoft.contact.api import METHODS
 from taisoft.contact.colouring import colour_contacts, store
 from taisoft.contact.graph import colour_greedy, matrix_graph
 from taisoft.contact.solve import SOLVERS, solve
-from taisoft.runtime import FieldArena, open_runtime
 
-CAPACITY, N_NODES, BLOCKS = 300, 40, 4096
 REFERENCES = ("cube_rest_4", "cube_slide_4", "cube_spin_slide_4", "cube_tip_mu1p5", "cube_wedge_groove", "nodal_20_mu0p7",
               "nodal_3_mu0p5", "nodal_8_mu0p3", "nodal_8_mu1")  # fmt: skip
 YARDSTICK = {  # residual of plain Gauss-Seidel after 10, 100, 1000 sweeps
@@ -43,67 +42,12 @@ YARDSTICK = {  # residual of plain Gauss-Seidel after 10, 100, 1000 sweeps
 }
 
 
-class Rig:
-    """One problem of each form, on one thread and on all, in one runtime."""
-
-    def __init__(self):
-        self.runtime = open_runtime("cpu", "f32")  # contacts are f64 there too
-        self.arena, self._made = [], {}
-
-    def _of(self, matrix: bool, serial: bool) -> problem.ContactProblem:
-        if (matrix, serial) not in self._made:
-            self.arena.append(FieldArena())
-            build = problem.build_matrix_problem if matrix else problem.build_node_problem
-            self._made[matrix, serial] = build(self.arena[-1], CAPACITY, BLOCKS if matrix else N_NODES, serial)
-        return self._made[matrix, serial]
-
-    def nodes(self, contacts: oracle.NodeContacts, serial: bool = True) -> problem.ContactProblem:
-        p, k = self._of(False, serial), len(contacts.arity)
-        for name in ("node", "arity", "weight", "normal", "tangent", "friction", "inverse_mass", "b"):
-            values = getattr(contacts, name)
-            _fill(getattr(p, name), values.reshape(k, 3) if name == "b" else values)
-        self._ready(p, k)
-        problem.index_nodes(p)
-        problem.find_factors(p)
-        return p
-
-    def matrix(self, W, b: np.ndarray, mu: np.ndarray, serial: bool = True) -> problem.ContactProblem:
-        p, k = self._of(True, serial), len(mu)
-        blocks = sp.csr_matrix(W).tobsr((3, 3))
-        blocks.sort_indices()
-        for field, values in (
-            (p.row_start, blocks.indptr), (p.column, blocks.indices), (p.block, blocks.data.reshape(-1, 9)),
-            (p.b, b.reshape(k, 3)), (p.friction, mu),
-        ):  # fmt: skip
-            _fill(field, values)
-        self._ready(p, k)
-        problem.find_factors(p)
-        return p
-
-    def _ready(self, p: problem.ContactProblem, k: int) -> None:
-        p.count[0] = k
-        p.r.fill(0.0)
-        _fill(p.order, np.arange(k))
-
-
-def _fill(field, values: np.ndarray) -> None:
-    whole = np.zeros((field.shape[0], *values.shape[1:]), np.float64 if values.dtype.kind == "f" else np.int32)
-    whole[: len(values)] = values
-    field.from_numpy(whole)
-
-
-def impulses(p: problem.ContactProblem) -> np.ndarray:
-    return p.r.to_numpy()[: p.count[0]]
-
-
 @pytest.fixture(scope="module", autouse=True)
 def rig():
     """Open for the whole file: what the public function compiles is kept too."""
     made = Rig()
     yield made
-    for arena in made.arena:
-        arena.release()
-    made.runtime.close()
+    made.close()
 
 
 def reference(shared, name: str):

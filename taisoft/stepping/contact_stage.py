@@ -23,6 +23,7 @@ from taisoft.model import Model
 from taisoft.runtime import FieldArena, kernel
 from taisoft.stepping.stage import norm2
 
+
 @dataclass(frozen=True, eq=False)
 class ContactStageWork:
     """Fields of a stage with contacts."""
