@@ -131,5 +131,12 @@ def _judge(report: RunReport) -> None:
         report.problems.append(
             f"tets were inverted in {len(inverted)} reported steps; at most {worst.n_inverted}, at t = {worst.time:.4g} s"
         )
-    if report.status == "ok" and (unconverged or inverted or report.interrupted):
+    sunk = [s for s in steps if any("deep in each other" in text for text in s.problems)]
+    if sunk:
+        worst = max(sunk, key=lambda s: s.max_penetration)
+        report.problems.append(
+            f"in {len(sunk)} of {len(steps)} reported steps bodies penetrate; the worst, at t = {worst.time:.4g} s, "
+            f"by {worst.max_penetration:.3g} m"
+        )
+    if report.status == "ok" and (unconverged or inverted or sunk or report.interrupted):
         report.status = "degraded"

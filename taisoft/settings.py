@@ -68,9 +68,8 @@ def _check_contact_solver(integrator: str, solver: str, touching: bool) -> None:
             "need not hold; take bdf2, which is of second order too, or implicit_euler"
         )
     if solver != "auto" and solver not in fitting:
-        raise SimulationError(
-            f"contact_solver {solver!r} does not fit {integrator}: " + (f"take 'auto' or one of {', '.join(fitting)}" if fitting else "take 'auto'")
-        )
+        instead = " or ".join(("'auto'", *fitting))
+        raise SimulationError(f"contact_solver {solver!r} does not fit {integrator}: take {instead}")
 
 
 def check_settings(

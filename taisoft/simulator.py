@@ -135,6 +135,8 @@ class Simulator(StateAccess):
             )
         elif not report.converged:
             found.append(f"the contact solver stopped at a residual of {report.contact_residual:.2e}")
+        if self._contact is not None and report.max_penetration > self._contact.sunk:
+            found.append(f"bodies are {report.max_penetration:.3g} m deep in each other or in obstacles")
         if report.n_inverted:
             found.append(f"{report.n_inverted} tets are inverted")
         return found

@@ -61,8 +61,9 @@ def solve_static(
     """Find the rest state under gravity, loads and constraints; paths of moved nodes are taken at `time` [s].
 
     tolerance: of |residual on free axes| / |applied load| (without any load: over the constraint forces). An open f64
-    runtime is reused, otherwise one is opened and closed. Bodies do not touch each other here. Raises SceneError where nothing
-    holds a body or the scene has obstacles, SimulationError when the runtime is taken; a solve that does not converge returns converged=False.
+    runtime is reused, otherwise one is opened and closed. Bodies do not touch each other here. Raises SceneError where
+    nothing holds a body or the scene has obstacles, SimulationError when the runtime is taken; a solve that does not
+    converge returns converged=False.
     """
     _check(scene, tolerance)
     kind = open_kind()
@@ -83,8 +84,8 @@ def _check(scene: Scene, tolerance: float) -> None:
         raise SceneError(f"tolerance = {tolerance!r}: it must lie between 0 and 1")
     if scene.obstacles:
         raise SceneError(
-            f"solve_static models no contacts, so it takes no scene with obstacles ('{scene.obstacles[0].name}'): step it to rest "
-            "with mass damping instead"
+            f"solve_static models no contacts, so it takes no scene with obstacles ('{scene.obstacles[0].name}'): step it "
+            "to rest with mass damping instead"
         )
     for body in scene.bodies:
         held = np.zeros(3, dtype=bool)

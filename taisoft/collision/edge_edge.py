@@ -47,8 +47,10 @@ def _end_tells(s: ti.template(), t, k, place, length, over, u, m, n):
 
 @ti.func
 def _within(s: ti.template(), t, k, place, length, over, u, m):
-    """1 where edge k of triangle t is crossed between its ends, or so little beyond one as `over`, if that end lies inside: of two
-    bodies side by side the edges cross beyond their ends, too, one below the other, and nothing penetrates."""
+    """1 where edge k of triangle t is crossed between its ends, or so little beyond one as `over`, if that end lies inside.
+
+    Of two bodies side by side the edges cross beyond their ends, too, one below the other, and nothing penetrates.
+    """
     good = int(-over <= place <= length + over)
     if good == 1 and (place < 0.0 or place > length):
         e = int(place > length)

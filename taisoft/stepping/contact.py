@@ -26,6 +26,7 @@ from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle, Obstacle
 from taisoft.stepping.world import World
 
 STANDOFF = 2e-3  # of the mean surface edge: gap that contacts keep, so that surfaces do not cross where motion is curved
+SUNK = 0.02  # of the mean surface edge: a penetration that is told as a problem [m]
 FAST = {True: 0.05, False: 1.0}  # share of a penetration that an explicit, an implicit step mends
 SLOW = {True: 0.005, False: 0.02}  # share of a missing standoff
 SPARE = 1024  # contacts beyond two a triangle that there is room for at first
@@ -87,7 +88,7 @@ class ContactStep:
         m, scene = world.model, world.scene
         self.detection = Detection(scene, m, world.layout, world.runtime, self_collision)
         d = self.detection
-        self.standoff = STANDOFF * d.edge
+        self.standoff, self.sunk = STANDOFF * d.edge, SUNK * d.edge
         self.fast, self.slow = FAST[explicit], SLOW[explicit]
         self._arena = FieldArena()
         self._make_room(2 * d.surface.n_triangles + SPARE)
@@ -185,8 +186,9 @@ class ContactStep:
         names = [d.scene.colliders[k].name for k in (a, b)]
         thin = float(min(self._thick[a], self._thick[b]))
         return (
-            f"'{names[0]}' and '{names[1]}' close at {told[SPEED]:.3g} m/s, {told[SPEED] * dt:.3g} m in a step of {dt:.3g} s, and the "
-            f"thinner of them is {thin:.3g} m thick, so they could pass each other unseen: take dt <= {dt / told[HASTE]:.3g} s"
+            f"'{names[0]}' and '{names[1]}' close at {told[SPEED]:.3g} m/s, {told[SPEED] * dt:.3g} m in a step of {dt:.3g} s, "
+            f"and the thinner of them is {thin:.3g} m thick, so they could pass each other unseen: take dt <= "
+            f"{dt / told[HASTE]:.3g} s"
         )
 
     def contacts(self) -> Contacts:

@@ -19,6 +19,7 @@ from taisoft.stepping.world import World
 MAX_NEWTON = 50  # a step that needs more is reported as not converged
 MAX_CONTACT_NEWTON = 400  # with contacts, over all multipliers
 MAX_PARTS = 32  # of a step in which bodies close fast
+MORE_PARTS = 4  # of a step that ended with a new deep penetration
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
 CONTACT_TOLERANCE = {"f32": 1e-4, "f64": 1e-6}  # residual of the contact laws
@@ -133,25 +134,35 @@ class ImplicitStepper:
         parts = max(1, math.ceil(contact.haste(start, dt) - 1e-9))
         if parts > MAX_PARTS:
             raise SimulationError(f"step {self.world.step_count + 1}: {contact.too_fast(start, dt)}")
-        if parts == 1:
-            result = self._part(start, dt)
-        else:
-            x, v = m.x.to_numpy(), m.v.to_numpy()
-            part, results = dt / parts, []
+        allowed = max(contact.sunk, 1.1 * contact.penetration)  # what is deep already needs no shorter steps
+        x, v = m.x.to_numpy(), m.v.to_numpy()
+        while True:
             try:
-                for k in range(parts):
-                    contact.search(start + k * part, part)
-                    results.append(self._part(start + k * part, part))
-                    if k + 1 < parts:
-                        contact.end(start + (k + 1) * part, part)
-            except BaseException:
-                m.x.from_numpy(x)
-                m.v.from_numpy(v)
-                self.forget()
+                result = self._in_parts(start, dt, parts)
+                depth = contact.end(start + dt, dt)
+            except BaseException:  # of Ctrl-C, too: the step is abandoned
+                self._put_back(x, v)
                 raise
-            result = merge(results)
-        contact.penetration = contact.end(start + dt, dt)
+            if depth <= allowed or 2 * parts > MORE_PARTS:
+                break
+            self._put_back(x, v)  # velocities at the start of the step did not tell how far things would go
+            parts *= 2
+        contact.penetration = depth
         return result
+
+    def _in_parts(self, start: float, dt: float, parts: int) -> ContactResult:
+        """A step of dt from a time, in equal parts."""
+        part, results = dt / parts, []
+        for k in range(parts):
+            if k:
+                self.contact.end(start + k * part, part)
+            results.append(self._part(start + k * part, part))
+        return merge(results)
+
+    def _put_back(self, x: np.ndarray, v: np.ndarray) -> None:
+        self.world.model.x.from_numpy(x)
+        self.world.model.v.from_numpy(v)
+        self.forget()
 
     def _part(self, time: float, dt: float) -> StageResult:
         """A step of dt from a time, in one piece."""
