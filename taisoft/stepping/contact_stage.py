@@ -102,8 +102,10 @@ def press(
         # D in the contact's frame, then in the world
         Dn = ti.select(z[0] > 0.0, Rn, 0.0)
         along, across = Rt, Rt  # along z_t, and across it
-        if size > rho:
-            along, across = 0.0 * Rt, Rt * rho / size
+        if size > rho or rho == 0.0:  # slips; without a disk nothing resists, not even where nothing moves yet
+            along, across = 0.0 * Rt, 0.0 * Rt
+            if size > 0.0:
+                across = Rt * rho / size
         if Rt > 0.0:
             psi += 0.5 * size * size / Rt if size <= rho else (rho * size - 0.5 * rho * rho) / Rt
         w.energy[c] = psi
