@@ -50,6 +50,7 @@ def zoo(scale: float = 1.0, swapped: bool = False) -> tuple[ts.Scene, Place]:
     place = Place(np.eye(3), np.zeros(3))
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.collision = ts.CollisionSettings(margin=0.02 * scale)
+    scene.allow_initial_overlap = True
     axes = np.array([[S, -S, 0.0], [0.5, 0.5, -S], [0.5, 0.5, S]]).T @ rotation((1, 2, 3), 0.05)
     half = np.array([0.25, 0.2, 0.3])
     brick = np.array([0.5, 0.3, 0.2]) - 0.008 * np.array([S, S, 0]) - axes @ (0.05, -half[1], -half[2])

@@ -45,6 +45,7 @@ def test_reasons():
         "distance_fields": (False, "every body is hit by proximity"),
         "proximity": (True, "hits beam (sharp edges), block (sharp edges), tower (sharp edges), flyer (sharp edges)"),
         "self_collision": (False, "not asked for"),
+        "contact_forces": (True, "beam, block, tower and 1 more can touch"),
     }
     assert plan.on["loads"] is True and plan.on["moving_nodes"] is False
 
@@ -86,7 +87,7 @@ def contact_plan(bodies=(), obstacles=(), self_collision=False) -> dict[str, tup
     for shape in obstacles:
         scene.add_obstacle(shape)
     entries = make_plan(scene, explicit=True, multistep=False, self_collision=self_collision).entries
-    return {e["feature"]: (e["on"], e["why"]) for e in entries[-4:]}
+    return {e["feature"]: (e["on"], e["why"]) for e in entries[-5:]}
 
 
 def test_contact_geometry_is_there_where_something_can_touch():
@@ -95,10 +96,12 @@ def test_contact_geometry_is_there_where_something_can_touch():
     alone = contact_plan([ball])
     assert not any(on for on, _ in alone.values())
     assert alone["distance_fields"] == alone["proximity"] == (False, "no triangles can hit a body")
+    assert alone["contact_forces"] == (False, "one body, and nothing that it could touch")
     # a half-space has no triangles: the body's triangles hit the half-space, nothing hits the body
     grounded = contact_plan([ball], [plane, ts.Sphere((0, 0, 0), 1), ts.Capsule((0, 0, 0), (1, 0, 0), 1)])
     assert grounded["obstacles"] == (True, "obstacle0, obstacle1, obstacle2")
     assert not grounded["distance_fields"][0] and not grounded["proximity"][0]
+    assert grounded["contact_forces"] == (True, "ball, obstacle0, obstacle1 and 1 more can touch")
     boxed = contact_plan([ball], [plane, box])
     assert boxed["distance_fields"] == (True, "hits ball (smooth and not thin)")
     assert boxed["proximity"] == (True, "hits obstacle1 (edges)")
@@ -113,6 +116,7 @@ def test_meshes_and_bodies_themselves_are_hit_by_proximity():
     assert meshed["proximity"] == (True, "hits obstacle0 (triangles)") and meshed["distance_fields"][0]
     itself = contact_plan([("ball", "auto")], self_collision=True)
     assert itself["proximity"] == (True, "hits every body (itself)") and itself["self_collision"] == (True, "asked for")
+    assert itself["contact_forces"] == (True, "it can touch itself")
     assert itself["distance_fields"] == (False, "no triangles can hit a body")
 
 

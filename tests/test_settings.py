@@ -34,9 +34,21 @@ def scene() -> ts.Scene:
         ({"linear_tolerance": np.nan}, "linear_tolerance = nan"),
         ({"linear_tolerance": True}, "linear_tolerance = True"),
         ({"allow_unstable": 1}, "allow_unstable = 1: it must be True or False"),
-        ({"contact_solver": "gauss_seidel"}, "contact_solver = 'gauss_seidel': this version computes no contact forces"),
+        ({"contact_solver": "gauss_siedel"}, "contact_solver 'gauss_siedel' is unknown .*did you mean 'gauss_seidel'"),
+        ({"contact_solver": None}, "contact_solver None is unknown: it must be one of auto, gauss_seidel, "),
+        ({"contact_solver": "gauss_seidel"}, "'gauss_seidel' does not fit implicit_euler: .* one of augmented_lagrangian"),
+        (
+            {"contact_solver": "augmented_lagrangian", "integrator": "symplectic_euler"},
+            "does not fit symplectic_euler: take 'auto' or one of gauss_seidel, jacobi, hybrid, coloured_gauss_seidel",
+        ),
+        (
+            {"contact_solver": "augmented_lagrangian", "integrator": "implicit_midpoint"},
+            "does not fit implicit_midpoint: take 'auto'$",
+        ),
+        ({"integrator": "implicit_midpoint", "self_collision": True}, "implicit_midpoint takes no contacts: .* take bdf2, "),
         ({"self_collision": 1}, "self_collision = 1: it must be True or False"),
-        ({"contact_tolerance": 1e-3}, "contact_tolerance must be None: this version computes no contact forces"),
+        ({"contact_tolerance": 0.0}, "contact_tolerance = 0.0: it must lie between 0 and 1"),
+        ({"contact_tolerance": True}, "contact_tolerance = True: it must lie between 0 and 1"),
     ],
 )
 def test_bad_settings(settings, words):
@@ -54,3 +66,24 @@ def test_bad_scenes(what, words):
 
 def test_dt_becomes_a_float():
     assert type(check_dt(1)) is float and check_dt(np.float64(0.25)) == 0.25
+
+
+def test_an_integrator_without_contacts_is_refused_where_something_can_touch():
+    touching = scene()
+    touching.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
+    with pytest.raises(ts.SimulationError, match="implicit_midpoint takes no contacts: its stage lies in the middle"):
+        ts.Simulator(touching, integrator="implicit_midpoint")
+    assert runtime.open_kind() is None
+    ts.Simulator(scene(), dt=1e-3, integrator="implicit_midpoint").close()
+
+
+@pytest.mark.parametrize("integrator, solver", [("symplectic_euler", "jacobi"), ("bdf2", "augmented_lagrangian")])
+def test_solvers_and_tolerances_that_fit_are_taken(integrator, solver):
+    """Also by a scene in which nothing can touch."""
+    asked = {"dt": 1e-3, "integrator": integrator, "contact_solver": solver, "contact_tolerance": 1e-3}
+    with ts.Simulator(scene(), **asked) as sim:
+        assert sim.settings.contact_solver == solver and sim.settings.contact_tolerance == 1e-3
+    touching = scene()
+    touching.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
+    with ts.Simulator(touching, **asked) as sim:
+        assert sim._stepper.contact_tolerance == 1e-3 and getattr(sim._stepper, "method", solver) == solver

@@ -1,0 +1,262 @@
+"""What contacts add to an implicit stage, judged by NumPy, on contacts of all states between the nodes of two bodies and against
+obstacles, in f64 and f32:
+
+* impulses, velocities and the residual of their laws are those of the formulas;
+* the impulses are minus the derivative of the energy, their own derivative is minus the blocks of the matrix;
+* J^T D J in factors is the dense one: above the diagonal, below it, on both sides, and its diagonal;
+* conjugate gradients with it, serial and parallel, find the solution of a dense solver;
+* the r-factors rest on the matrix's diagonal; impulses leave the residual as J^T p; a linearised stage is linear.
+"""
+
+from types import SimpleNamespace
+
+import contact_oracle as oracle
+import numpy as np
+import pytest
+import taichi as ti
+from scenes import built, cube, rubber
+
+import taisoft as ts
+from taisoft.contact.assemble import build_found
+from taisoft.contact.problem import RESIDUAL, build_node_problem, find_factors, index_nodes
+from taisoft.linear import block_csr, pcg
+from taisoft.linear.block_csr import to_scipy, unpacked
+from taisoft.linear.coupling import coupling_diagonal, coupling_times
+from taisoft.runtime import kernel
+from taisoft.stepping import contact_stage
+from taisoft.stepping.newton import StageSolver
+
+K, BETA, DT = 24, 0.002, 0.003  # contacts; [s]
+STANDOFF, FAST, SLOW, STIFFNESS = 1e-3, 1.0, 0.02, 5.0
+FIXED = [0, 7]  # nodes
+
+
+@kernel
+def couple(
+    m: ti.template(), k: ti.template(), x: ti.template(), above: ti.template(), below: ti.template(), both: ti.template(),
+    d: ti.template(),
+):  # fmt: skip
+    """(J^T D J x)_i above, below, on both sides; d: diagonal blocks on top of what is there."""
+    for i in range(m.n_nodes):
+        above[i] = coupling_times(m, k, i, x, True, False)
+        below[i] = coupling_times(m, k, i, x, False, True)
+        both[i] = coupling_times(m, k, i, x, True, True)
+        d[i] = coupling_diagonal(m, k, i, d[i])
+
+
+def put(field, values: np.ndarray) -> None:
+    """The first rows of a field."""
+    whole = field.to_numpy()
+    whole[: len(values)] = values
+    field.from_numpy(whole)
+
+
+@pytest.fixture(scope="module", params=["f64", "f32"])
+def rig(request):
+    scene = ts.Scene()
+    for k in range(2):
+        scene.add_body(cube(cells=(2, 1, 1)), rubber(), position=(0, 3.0 * k, 0))
+    with built(scene, request.param) as made:
+        m, arena, rng = made.model, made.arena, np.random.default_rng(3)
+        free = np.ones((m.n_nodes, 3))
+        free[FIXED] = 0.0
+        m.free.from_numpy(free.astype(made.machine.np_real))
+        contacts = oracle.random_contacts(5, K, m.n_nodes)
+        arity = contacts.arity.copy()
+        arity[::5] = (contacts.weight[::5] > 0).sum(axis=1)  # against an obstacle
+        p = build_node_problem(arena, K + 3, m.n_nodes, True)
+        f = build_found(arena, p)
+        solver = StageSolver(m, arena, made.machine.eps, np.zeros(0, dtype=int))
+        k = contact_stage.build_stage_contacts(arena, m, f, arena.vectors("x_start", ti.f64, m.n_nodes))
+        for name in ("node", "weight", "normal", "tangent"):
+            put(getattr(p, name), getattr(contacts, name))
+        carry = np.where((np.arange(K) % 5 == 0)[:, None], 1e-3 * rng.standard_normal((K, 3)), 0.0)
+        friction = np.where(np.arange(K) % 7 == 0, 0.0, 0.5)
+        gap = rng.uniform(-2, 3, K) * STANDOFF
+        for field, values in ((p.arity, arity), (p.friction, friction), (f.gap, gap), (f.carry, carry)):
+            put(field, values)
+        p.count[0] = K
+        index_nodes(p)
+        block_csr.assemble(m, solver.matrix, False)
+        block_csr.to_system(m, solver.matrix, solver.matrix, 1.0, BETA)
+        contact_stage.keep_diagonal(m, solver.matrix, k)
+        find_factors(p)
+        A = to_scipy(m, solver.matrix).toarray()
+        found = oracle.NodeContacts(
+            contacts.node, arity, contacts.weight, contacts.normal, contacts.tangent, np.zeros((m.n_nodes, 3)), np.zeros(3 * K),
+            friction,
+        )  # fmt: skip
+        start = made.oracle.rest
+        x_hat = start + 1e-4 * rng.standard_normal(start.shape)
+        x = start + 1e-3 * rng.standard_normal(start.shape)
+        k.x_start.from_numpy(start)
+        solver.work.x_hat.from_numpy(x_hat)
+        J = found.jacobian
+        W = J @ np.diag(free.ravel() / np.diag(A)) @ J.T
+        yield SimpleNamespace(
+            made=made, m=m, p=p, f=f, k=k, solver=solver, work=solver.work, A=A, J=J, W=W, free=free, start=start, x_hat=x_hat,
+            x=x, gap=gap, carry=carry, friction=friction, close=1e-12 if request.param == "f64" else 1e-5,
+            vectors=[made.vectors(f"test_{k}") for k in range(4)],
+            diagonal=arena.vectors("test_diagonal", m.real, m.n_nodes, n=block_csr.BLOCK),
+            frame=np.stack([found.normal, found.tangent, np.cross(found.normal, found.tangent)], axis=1),
+        )  # fmt: skip
+
+
+def press(rig, x: np.ndarray) -> np.ndarray:
+    """The impulses (K,3) at x (n,3); what they were before must not count."""
+    rig.m.x.from_numpy(x)
+    rig.p.r.fill(np.nan)
+    contact_stage.press(rig.m, rig.work, rig.k, BETA, DT, STANDOFF, FAST, SLOW, STIFFNESS)
+    return rig.p.r.to_numpy()[:K]
+
+
+@pytest.fixture
+def pressed(rig):
+    """Multipliers of which some open, some stick and some slip at rig.x; z (K,3), radii (K,), u (K,3)."""
+    rng = np.random.default_rng(11)
+    factor = oracle.factors(rig.W)
+    way = (rig.x - rig.start).ravel()
+    goal = np.where(rig.gap >= STANDOFF, STANDOFF, np.maximum(rig.gap, 0) + SLOW * (STANDOFF - np.maximum(rig.gap, 0)))
+    carried = np.einsum("kij,kj->ki", rig.frame, rig.carry)
+    u = (rig.J @ (rig.x - rig.x_hat).ravel() / BETA).reshape(K, 3) - carried / DT
+    u[:, 0] = (rig.gap - goal + (rig.J @ way).reshape(K, 3)[:, 0] - carried[:, 0]) / BETA
+    size = STIFFNESS * factor[:, 0] * np.abs(u).max()
+    multiplier = size[:, None] * rng.uniform([-1, -1, -1], [3, 1, 1], (K, 3))
+    multiplier[:, 0] = np.maximum(multiplier[:, 0], 0.0)
+    put(rig.p.r, multiplier)
+    contact_stage.set_multipliers(rig.k)
+    radius = rig.k.work.radius.to_numpy()[:K]
+    assert np.array_equal(rig.k.work.multiplier.to_numpy()[:K], multiplier)
+    assert np.allclose(radius, rig.friction * multiplier[:, 0], rtol=1e-15)
+    z = multiplier - STIFFNESS * factor * u
+    across = np.linalg.norm(z[:, 1:], axis=1)
+    states = [(z[:, 0] < 0).sum(), (across < radius).sum(), ((across > radius) & (radius > 0)).sum(), (radius == 0).sum()]
+    assert min(states) >= 3 and np.abs(across / np.maximum(radius, 1e-300) - 1).min() > 1e-3
+    assert np.abs(z[:, 0]).min() > 1e-3 * size.min()
+    return z, radius, u
+
+
+def test_impulses_and_their_residual(rig, pressed):
+    z, radius, u = pressed
+    r = press(rig, rig.x)
+    across = np.linalg.norm(z[:, 1:], axis=1)
+    expected = np.where(np.arange(3) == 0, np.maximum(z, 0), z * np.minimum(1, radius / across)[:, None])
+    assert np.abs(r - expected).max() < 10 * rig.close * np.abs(expected).max()
+    fixed_point = np.array([oracle.project(row, mu) for row, mu in zip(r - oracle.factors(rig.W) * u, rig.friction)])
+    wanted = np.linalg.norm(r - fixed_point) / np.linalg.norm(r)
+    assert rig.p.state[RESIDUAL] == pytest.approx(wanted, rel=10 * rig.close) and wanted > 0.01
+
+
+def test_impulses_are_the_slope_of_the_energy(rig, pressed):
+    r, rng = press(rig, rig.x), np.random.default_rng(0)
+    for _ in range(4):
+        dv = rng.standard_normal(rig.x.shape)
+        h, energy = 1e-7, []
+        for sign in (1, -1):
+            press(rig, rig.x + sign * h * BETA * dv)
+            energy.append(rig.k.work.totals[0])
+        slope = -(rig.J.T @ r.ravel()) @ dv.ravel()
+        assert (energy[0] - energy[1]) / (2 * h) == pytest.approx(slope, rel=1e-6) and abs(slope) > 1e-3 * np.linalg.norm(r)
+
+
+def test_blocks_are_the_slope_of_the_impulses(rig, pressed):
+    press(rig, rig.x)
+    blocks, active = unpacked(rig.k.work.block.to_numpy()[:K]), rig.k.work.active.to_numpy()[:K]
+    assert np.abs(blocks - blocks.swapaxes(1, 2)).max() <= rig.close * np.abs(blocks).max()
+    assert np.array_equal(active == 1, np.abs(blocks).max(axis=(1, 2)) > 0) and 0 < active.sum() < K
+    dv, h = np.random.default_rng(1).standard_normal(rig.x.shape), 1e-7
+    dr = (press(rig, rig.x + h * BETA * dv) - press(rig, rig.x - h * BETA * dv)) / (2 * h)
+    du = np.einsum("kij,ki->kj", rig.frame, (rig.J @ dv.ravel()).reshape(K, 3))
+    dp = np.einsum("kij,ki->kj", rig.frame, dr)
+    assert np.abs(np.einsum("kij,kj->ki", blocks, du) + dp).max() < max(1e-6, rig.close) * np.abs(dp).max()
+
+
+@pytest.fixture
+def dense(rig, pressed):
+    """J^T D J (3n,3n), with the blocks that are there."""
+    press(rig, rig.x)
+    D, J = unpacked(rig.k.work.block.to_numpy()[:K]), rig.J.reshape(K, 3, -1)
+    J = np.einsum("kij,kim->kjm", rig.frame, J)  # of the world's axes
+    return np.einsum("kim,kij,kjn->mn", J, D, J, optimize=True)
+
+
+def test_the_coupling_is_the_dense_matrix(rig, dense):
+    m, n, real = rig.m, rig.m.n_nodes, rig.made.machine.np_real
+    x = np.random.default_rng(2).standard_normal((n, 3)).astype(real)
+    rig.vectors[0].from_numpy(x)
+    rig.diagonal.from_numpy(np.ones((n, block_csr.BLOCK), dtype=real))
+    couple(m, rig.k.coupling, *rig.vectors, rig.diagonal)
+    blocks, node = dense.reshape(n, 3, n, 3), np.arange(n)
+    for got, part in zip(rig.vectors[1:], (node[:, None] < node, node[:, None] > node, node[:, None] != node)):
+        expected = np.einsum("iajb,ij,jb->ia", blocks, part, x.astype(float))
+        assert np.abs(got.to_numpy() - expected).max() < 10 * rig.close * np.abs(expected).max() and expected.any()
+    own = blocks[node, :, node, :]
+    assert np.abs(unpacked(rig.diagonal.to_numpy()) - own - 1.0).max() < 10 * rig.close * np.abs(own).max()
+
+
+@pytest.mark.parametrize("method", ["serial", "parallel"])
+def test_conjugate_gradients(rig, dense, method):
+    m, matrix, work = rig.m if method == "serial" else rig.made.parallel, rig.solver.matrix, rig.solver.pcg
+    rhs = np.random.default_rng(4).standard_normal(rig.x.shape).astype(rig.made.machine.np_real)
+    work.rhs.from_numpy((rig.free * rhs).astype(rhs.dtype))
+    contact_stage.stiffen(m, matrix, rig.k)
+    on = rig.free.ravel() > 0
+    whole = rig.A + dense
+    y = np.zeros(on.size)
+    y[on] = np.linalg.solve(whole[np.ix_(on, on)], rhs.ravel()[on].astype(float))
+    tolerance = 1e-12 if rig.close < 1e-9 else 1e-6
+    result = pcg.solve(m, matrix, work, tolerance, 2000, rig.k.coupling)
+    assert result.converged and np.abs(work.y.to_numpy().ravel() - y).max() < 1e3 * tolerance * np.abs(y).max()
+    without = np.linalg.solve(rig.A[np.ix_(on, on)], rhs.ravel()[on].astype(float))
+    assert np.abs(without - y[on]).max() > 0.1 * np.abs(y).max()  # contacts do count
+
+
+def test_factors_rest_on_the_diagonal(rig):
+    factor = oracle.factors(rig.W)[:, :2]
+    assert np.abs(rig.p.factor.to_numpy()[:K] / factor - 1).max() < 10 * rig.close
+
+
+def test_impulses_in_the_residual(rig, pressed):
+    r = press(rig, rig.x)
+    rng = np.random.default_rng(6)
+    size = np.abs(rig.J.T @ r.ravel()).max()
+    before, y = ((s * rng.standard_normal(rig.x.shape)).astype(rig.made.machine.np_real) for s in (size, 1.0))
+    rig.work.residual.from_numpy(before)
+    rig.solver.pcg.y.from_numpy(y)
+    norms = np.zeros(5)
+    contact_stage.add_impulses(rig.m, rig.work, rig.k, rig.solver.pcg, norms)
+    expected = before - (rig.J.T @ r.ravel()).reshape(-1, 3)
+    close = 10 * rig.close * np.abs(expected).max()
+    assert np.abs(rig.work.residual.to_numpy() - expected).max() < close
+    assert np.abs(rig.solver.pcg.rhs.to_numpy() + rig.free * expected).max() < close
+    assert norms[0] == pytest.approx(((rig.free * expected) ** 2).sum(), rel=100 * rig.close)
+    assert norms[4] == pytest.approx((((1 - rig.free) * expected) ** 2).sum(), rel=100 * rig.close) and norms[4] > 0
+    slope = (rig.free * expected * y).sum()
+    assert rig.m.scalars[12] == pytest.approx(slope, abs=100 * rig.close * np.linalg.norm(expected) * np.linalg.norm(y))
+
+
+def test_a_linearised_stage_is_linear(rig):
+    m, rng = rig.m, np.random.default_rng(7)
+    before = (1e-2 * rng.standard_normal(rig.x.shape)).astype(rig.made.machine.np_real)
+    rig.work.residual.from_numpy(before)
+    m.x.from_numpy(rig.start)
+    contact_stage.keep_linear(m, rig.work, rig.k)
+    m.x.from_numpy(rig.x)
+    contact_stage.linear_residual(m, rig.work, rig.solver.matrix, rig.k, BETA)
+    expected = before + (rig.A @ (rig.x - rig.start).ravel()).reshape(-1, 3) / BETA
+    assert np.abs(rig.work.residual.to_numpy() - expected).max() < 10 * rig.close * np.abs(expected).max()
+
+
+def test_without_friction_nothing_resists_along_the_surface(rig):
+    """Also at the kink of the energy, where nothing moves along it yet."""
+    rig.work.x_hat.from_numpy(rig.x)
+    multiplier = np.zeros((K, 3))
+    multiplier[:, 0] = 1e3
+    put(rig.p.r, multiplier)
+    contact_stage.set_multipliers(rig.k)
+    press(rig, rig.x)
+    smooth = np.flatnonzero((rig.friction == 0) & ~rig.carry.any(axis=1))
+    blocks, n = unpacked(rig.k.work.block.to_numpy()[:K]), rig.frame[:, 0]
+    normal = STIFFNESS * oracle.factors(rig.W)[:, :1, None] * n[:, :, None] * n[:, None, :]
+    assert len(smooth) >= 2 and np.abs(blocks - normal)[smooth].max() < 10 * rig.close * np.abs(normal).max()
+    rig.work.x_hat.from_numpy(rig.x_hat)
