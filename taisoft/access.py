@@ -98,9 +98,9 @@ class StateAccess:
         """Sum (3,) of the contact forces on a body or an obstacle over the last step [N]."""
         scene = self._open_world().scene
         scene.surface_of(name)
-        c = self.contacts()
-        on = (c.body_a == name).astype(float) - (c.body_b == name)
-        return on @ c.impulse / self._dt
+        if self._contact is None:
+            return np.zeros(3)
+        return self._contact.force([c.name for c in scene.colliders].index(name))
 
     def intersecting_triangles(self) -> list[tuple[str, int, str, int]]:
         """Surface triangles that intersect in the present state, each pair once: name and triangle of each.

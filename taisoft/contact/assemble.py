@@ -2,7 +2,7 @@
 
 Where a contact must be at the end of a step, its goal, is a gap of at least `standoff`, a small distance that keeps surfaces
 apart in spite of what linearising the motion misses. A gap above it may close so far. A gap below it opens slowly, a true
-penetration in a few steps: at once it would throw the bodies apart. Where the surfaces meet within the step, restitution asks
+penetration in a few steps, and never faster than strains the softest body by a percent: else it would throw the bodies apart. Where the surfaces meet within the step, restitution asks
 that they part with e times the speed at which they met. The velocity that an impulse must leave is then
     u_n = (gap - goal)/dt + n.(v_a - v_b) >= 0,
 which counts motion once: the gap is that at the start of the step.
@@ -239,13 +239,37 @@ def fill(
 
 
 @ti.func
-def short_of_goal(f: ti.template(), c, dt, standoff, fast, slow):
-    """gap - goal of contact c [m]; fast, slow: shares of a penetration and of a missing standoff that a step mends."""
+def short_of_goal(f: ti.template(), c, dt, standoff, fast, slow, fastest):
+    """gap - goal of contact c [m].
+
+    fast, slow: shares of a penetration and of a missing standoff that the step mends; fastest: speed of that at most [m/s].
+    """
     gap = f.gap[c]
     goal = standoff
     if gap < standoff:
         above = ti.max(gap, 0.0)
-        goal = above + slow * (standoff - above) + (1.0 - fast) * ti.min(gap, 0.0)
+        goal = gap + ti.min(slow * (standoff - above) + fast * (above - gap), fastest * dt)
     if f.restitution[c] > 0.0 and f.approach[c] < 0.0 and gap - standoff + dt * f.approach[c] < 0.0:
         goal = ti.max(goal, gap - dt * f.restitution[c] * f.approach[c])
     return gap - goal
+
+
+@kernel
+def find_impact(f: ti.template(), dt: ti.f64, standoff: ti.f64) -> ti.i32:
+    """1 where a contact closes within a step of dt that bore no impulse in the one before."""
+    (p,) = ti.static((f.problem,))
+    found = 0
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for c in range(p.count[0]):
+            if p.r[c][0] == 0.0 and f.approach[c] < 0.0 and f.gap[c] - standoff + dt * f.approach[c] < 0.0:
+                found = 1
+    return found
+
+
+@kernel
+def scale_impulses(p: ti.template(), share: ti.f64):
+    """Multiply all impulses."""
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        p.r[c] = share * p.r[c]

@@ -15,7 +15,9 @@ from taisoft.contact.assemble import (
     build_pair_numbers,
     carried,
     fill,
+    find_impact,
     keep_impulses,
+    scale_impulses,
     upload_pair_numbers,
 )  # fmt: skip
 from taisoft.contact.problem import NODES, build_node_problem, index_nodes
@@ -27,8 +29,9 @@ from taisoft.stepping.world import World
 
 STANDOFF = 2e-3  # of the mean surface edge: gap that contacts keep, so that surfaces do not cross where motion is curved
 SUNK = 0.02  # of the mean surface edge: a penetration that is told as a problem [m]
-FAST = {True: 0.05, False: 1.0}  # share of a penetration that an explicit, an implicit step mends
+FAST = {True: 0.05, False: 0.2}  # share of a penetration that an explicit, an implicit step mends
 SLOW = {True: 0.005, False: 0.02}  # share of a missing standoff
+PUSHED = 0.01  # of the slowest wave in a bar, sqrt(E / rho): speed at which these open at most, which strains as much
 SPARE = 1024  # contacts beyond two a triangle that there is room for at first
 CLOSEST = 0.5  # of the thinner side's thickness: how far a contact may close in one step
 THINNEST = 0.25  # of the mean surface edge: least thickness of a collider, since open meshes have none
@@ -89,7 +92,8 @@ class ContactStep:
         self.detection = Detection(scene, m, world.layout, world.runtime, self_collision)
         d = self.detection
         self.standoff, self.sunk = STANDOFF * d.edge, SUNK * d.edge
-        self.fast, self.slow = FAST[explicit], SLOW[explicit]
+        self._shares = FAST[explicit], SLOW[explicit]
+        self._portion = 1.0  # of a step that its parts are
         self._arena = FieldArena()
         self._make_room(2 * d.surface.n_triangles + SPARE)
         self._thick = np.array([collider_thickness(c, d.edge) for c in scene.colliders])
@@ -101,7 +105,10 @@ class ContactStep:
         self._searched: tuple[float, float] | None = None  # time and dt of the search that is at hand
         self._last_time = 0.0
         self.penetration = 0.0  # [m] at the end of the last step
+        self._sum: np.ndarray | None = None  # (n_colliders, 3) impulses on each over the parts of the last step, if it had several
+        self._span = 0.0  # of the last step [s]
         self._share = 1.0
+        self.met = False  # whether surfaces came together in the last step
 
     def _make_room(self, capacity: int) -> None:
         arena, m = FieldArena(), self.world.model
@@ -124,7 +131,15 @@ class ContactStep:
         """The state was set: the search at hand and the impulses of the last step do not belong to it."""
         self._searched = None
         self.problem.count[0] = 0
-        self._last_time = self.penetration = 0.0
+        self._last_time = self.penetration = self._span = 0.0
+        self._sum = None
+
+    @property
+    def goal(self) -> tuple[float, float, float, float]:
+        """Standoff [m], shares of a penetration and of a missing standoff that a part mends, speed of that at most [m/s]."""
+        materials = [b.material for b in self.world.scene.bodies]
+        slowest = min(np.sqrt(m.young / m.density) for m in materials)
+        return self.standoff, self._portion * self._shares[0], self._portion * self._shares[1], PUSHED * float(slowest)
 
     def numbers_changed(self) -> None:
         """Friction or restitution changed."""
@@ -145,22 +160,53 @@ class ContactStep:
             self._searched = (time, dt)
         return d.counts.contacts
 
-    def begin(self, time: float, dt: float, share: float = 1.0) -> int:
-        """Fill the problem for a step of dt [s] from the state at a time; impulses are those of the last step. Returns its size.
-
-        share: of the step that impulses act in, beta / dt of an implicit stage.
-        """
+    def begin(self, time: float, dt: float) -> int:
+        """Fill the problem for a step of dt [s] from the state at a time; impulses are those of the last step. Returns its size."""
         n, d, m = self.search(time, dt), self.detection, self.world.model
         if n > self.problem.capacity:
             self._make_room(2 * n)
         f = self.found
         keep_impulses(f)
-        warm = dt * share / self._last_time if self._last_time > 0.0 else 0.0
+        warm = dt / self._last_time if self._last_time > 0.0 else 0.0
         fill(f, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
         if n:
             index_nodes(f.problem)
-        self._last_time, self._share = dt * share, share
+        self._last_time, self._share, self.met = dt, 1.0, False
         return n
+
+    def acts(self, share: float) -> None:
+        """Impulses act in that share of the step, beta / dt of an implicit stage."""
+        if share != 1.0:
+            scale_impulses(self.problem, share)
+        self._last_time, self._share = share * self._last_time, share
+
+    def meets(self, dt: float) -> bool:
+        """Whether surfaces that bore nothing so far come together in a step of dt that has begun; `met` keeps it."""
+        self.met = bool(find_impact(self.found, dt, self.standoff))
+        return self.met
+
+    def start_step(self, dt: float, parts: int) -> None:
+        """A step of dt begins that is taken in parts."""
+        self._portion, self._span = 1.0 / parts, dt
+        self._sum = np.zeros((len(self.world.scene.colliders), 3)) if parts > 1 else None
+
+    def end_part(self) -> None:
+        """Count the impulses of a part."""
+        if self._sum is not None:
+            self._sum += self._impulses()
+
+    def force(self, collider: int) -> np.ndarray:
+        """Mean (3,) of the contact forces on a collider over the last step [N]."""
+        total = self._impulses() if self._sum is None else self._sum
+        return total[collider] / self._span if self._span > 0.0 else np.zeros(3)
+
+    def _impulses(self) -> np.ndarray:
+        """(n_colliders, 3) impulses on each from the contacts at hand [N s]."""
+        c, total = self.contacts(), np.zeros((len(self.world.scene.colliders), 3))
+        place = {one.name: k for k, one in enumerate(self.world.scene.colliders)}
+        for names, sign in ((c.body_a, 1.0), (c.body_b, -1.0)):
+            np.add.at(total, [place[name] for name in names], sign * c.impulse)
+        return total
 
     def end(self, time: float, dt: float) -> float:
         """Search at the end of a step, at a time, for one of dt; the deepest penetration [m] that is left."""

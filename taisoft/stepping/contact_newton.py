@@ -88,6 +88,15 @@ class ContactStageSolver(StageSolver):
         """Give their memory back."""
         self._arena.release()
 
+    def update_material(self) -> None:
+        """As without contacts; the r-factors rest on the stiffness too."""
+        super().update_material()
+        self.forget_factors()
+
+    def forget_factors(self) -> None:
+        """The r-factors rest on a matrix of other numbers or other free axes."""
+        self._weighed = None
+
     def _fit(self) -> None:
         """Room for the contacts of this step."""
         if self._k is None or self._k.found is not self.contact.found:
@@ -99,8 +108,7 @@ class ContactStageSolver(StageSolver):
     # --- what contacts add to the parts of a Newton step ----------------------------------------------------------
 
     def _press(self, beta: float) -> None:
-        contact = self.contact
-        press(self.model, self.work, self._k, beta, self._dt, contact.standoff, contact.fast, contact.slow, self._stiffness)
+        press(self.model, self.work, self._k, beta, self._dt, *self.contact.goal, self._stiffness)
 
     def _evaluate(self, c: float, beta: float) -> tuple[float, float]:
         if not self._on:

@@ -63,7 +63,7 @@ def set_multipliers(k: ti.template()):
 
 
 @ti.func
-def _stage_velocity_of(m: ti.template(), s: ti.template(), k: ti.template(), c, beta, dt, standoff, fast, slow):
+def _stage_velocity_of(m: ti.template(), s: ti.template(), k: ti.template(), c, beta, dt, standoff, fast, slow, fastest):
     """u of contact c at the present x: (normal, t1, t2) [m/s]."""
     p, f = ti.static((k.problem, k.found))
     way, v = -f.carry[c], -f.carry[c] / dt
@@ -72,13 +72,13 @@ def _stage_velocity_of(m: ti.template(), s: ti.template(), k: ti.template(), c, 
         way += weight * (m.x[i] - k.x_start[i])
         v += weight * ((m.x[i] - s.x_hat[i]) / beta)
     n, t = p.normal[c], p.tangent[c]
-    return dvec((short_of_goal(f, c, dt, standoff, fast, slow) + n.dot(way)) / beta, t.dot(v), n.cross(t).dot(v))
+    return dvec((short_of_goal(f, c, dt, standoff, fast, slow, fastest) + n.dot(way)) / beta, t.dot(v), n.cross(t).dot(v))
 
 
 @kernel
 def press(
     m: ti.template(), s: ti.template(), k: ti.template(), beta: ti.f64, dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64,
-    stiffness: ti.f64,
+    fastest: ti.f64, stiffness: ti.f64,
 ):  # fmt: skip
     """Impulses p.r, energy and matrix blocks of the contacts at the present x, and the residual of their laws.
 
@@ -87,7 +87,7 @@ def press(
     p, w = ti.static((k.problem, k.work))
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        u = _stage_velocity_of(m, s, k, c, beta, dt, standoff, fast, slow)
+        u = _stage_velocity_of(m, s, k, c, beta, dt, standoff, fast, slow, fastest)
         Rn, Rt = stiffness * p.factor[c][0], stiffness * p.factor[c][1]
         z = w.multiplier[c] - dvec(Rn * u[0], Rt * u[1], Rt * u[2])
         rho = w.radius[c]

@@ -8,11 +8,11 @@ import taichi as ti
 
 from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.problem import find_factors
-from taisoft.contact.solve import solve
+from taisoft.contact.solve import SolveResult, solve
 from taisoft.errors import SimulationError
 from taisoft.stepping import explicit
 from taisoft.stepping.contact import ContactStep
-from taisoft.stepping.explicit_contact import find_acceleration, finish_verlet, move, predict, set_free_velocities
+from taisoft.stepping.explicit_contact import find_acceleration, finish_verlet, keep_state, move, predict, set_free_velocities
 from taisoft.stepping.substeps import ExplicitStepper, SubstepResult
 from taisoft.stepping.world import World
 
@@ -54,21 +54,23 @@ class ContactExplicitStepper(ExplicitStepper):
         self.contact.forget()
 
     def advance(self, n: int, dt: float) -> ContactSubstepResult:
-        """Take n sub-steps of dt, or as many as a batch holds; as `ExplicitStepper.advance`."""
-        m, results, depth = self.world.model, [], 0.0
+        """Take n sub-steps of dt, or as many as a batch holds; whatever fails leaves the state before its sub-step."""
+        world, m, results, depth, done = self.world, self.world.model, [], 0.0, 0
         explicit.begin_parallel(m)
-        n = min(n, self.max_batch)
-        start = self.world.time
-        for done in range(n):
-            try:
-                results.append(self._substep(start + done * dt, dt))
-            except BaseException:  # what was done before stays
-                if done:
-                    self._restore()
-                    self.world.step_count += done
-                    self.world.time = start + done * dt
-                raise
-            depth = max(depth, self.contact.end(start + (done + 1) * dt, dt))
+        n, start = min(n, self.max_batch), world.time
+        self.contact.start_step(dt, 1)
+        try:
+            while done < n:
+                keep_state(m, self._good)
+                self._released = world.motion.released()
+                results.append(self._substep(world.step_count + done + 1, start + done * dt, dt))
+                depth = max(depth, self.contact.end(start + (done + 1) * dt, dt))
+                done += 1
+        except BaseException:  # Ctrl-C, too
+            self._restore()
+            world.step_count += done
+            world.time = start + done * dt
+            raise
         self.contact.penetration = depth
         return ContactSubstepResult(
             n, m.scalars[6], int(m.scalars[7]), sum(r.iterations for r in results if r),
@@ -76,11 +78,15 @@ class ContactExplicitStepper(ExplicitStepper):
         )  # fmt: skip
 
     def _restore(self) -> None:
+        world = self.world
         self._put_back(self._good.x.to_numpy(), self._good.v.to_numpy())
+        if world.motion.released() != self._released:
+            world.motion.set_released(self._released)
+            world.upload_constraints()
         self.contact.forget()
 
-    def _substep(self, time: float, dt: float):
-        """One sub-step from a time; returns the contacts' SolveResult, None where there are none."""
+    def _substep(self, step: int, time: float, dt: float) -> SolveResult | None:
+        """One sub-step, the step-th, from a time; returns what the contacts' solver did, None where there are none."""
         world, m, s, contact = self.world, self.world.model, self.work, self.contact
         if s.n_moved:
             releases = world.releases
@@ -88,16 +94,16 @@ class ContactExplicitStepper(ExplicitStepper):
             self.stale = self.stale or world.releases != releases
             self._upload_targets(target)
         if contact.haste(time, dt) > 1.0:
-            raise SimulationError(f"step {world.step_count + 1}: {contact.too_fast(time, dt)}")
+            raise SimulationError(f"step {step}: {contact.too_fast(time, dt)}")
         if s.verlet and self.stale:
             find_acceleration(m, s)
         self.stale = False
         n = contact.begin(time, dt)
-        predict(m, s, self._good, dt)
+        predict(m, s, dt)
         result = None
         if n:
             p = contact.problem
-            set_free_velocities(m, contact.found, dt, contact.standoff, contact.fast, contact.slow)
+            set_free_velocities(m, contact.found, dt, *contact.goal)
             find_factors(p)
             if self.method == "coloured_gauss_seidel":
                 colour_contacts(p)
@@ -106,7 +112,5 @@ class ContactExplicitStepper(ExplicitStepper):
         if s.verlet:
             finish_verlet(m, s, contact.problem, dt, int(n > 0))
         if m.scalars[8] != 0.0:
-            where = world.find_unfinite() or "a velocity is no longer finite"
-            self._restore()
-            raise SimulationError(f"step {world.step_count + 1}: {where}")
+            raise SimulationError(f"step {step}: {world.find_unfinite() or 'a velocity is no longer finite'}")
         return result

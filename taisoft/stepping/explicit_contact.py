@@ -38,8 +38,16 @@ def tell_volumes(m: ti.template(), b, J):
 
 
 @kernel
-def predict(m: ti.template(), s: ti.template(), g: ti.template(), dt64: ti.f64):
-    """v* of every node, and the state kept in case the sub-step fails. scalars 6, 9: smallest J so far, inverted tets.
+def keep_state(m: ti.template(), g: ti.template()):
+    """The state before a sub-step, in case it fails."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        g.x[i], g.v[i] = m.x[i], m.v[i]
+
+
+@kernel
+def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
+    """v* of every node. scalars 6, 9: smallest J so far, inverted tets.
 
     Verlet rests on the acceleration of the state, Euler finds the forces here.
     """
@@ -58,7 +66,6 @@ def predict(m: ti.template(), s: ti.template(), g: ti.template(), dt64: ti.f64):
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         dt = ti.cast(dt64, m.real)
-        g.x[i], g.v[i] = m.x[i], m.v[i]
         if ti.static(s.verlet):
             m.v[i] = verlet_half(m, s, i, dt)
         else:
@@ -71,7 +78,7 @@ def predict(m: ti.template(), s: ti.template(), g: ti.template(), dt64: ti.f64):
 
 @kernel
 def set_free_velocities(
-    m: ti.template(), f: ti.template(), dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64
+    m: ti.template(), f: ti.template(), dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64
 ):  # fmt: skip
     """b of every contact from v*, and the inverse masses."""
     (p,) = ti.static((f.problem,))
@@ -84,7 +91,7 @@ def set_free_velocities(
         for j in range(p.arity[c]):
             v += p.weight[c, j] * ti.cast(m.v[p.node[c, j]], ti.f64)
         b = to_frame(p, c, v)
-        p.b[c] = dvec(b[0] + short_of_goal(f, c, dt, standoff, fast, slow) / dt, b[1], b[2])
+        p.b[c] = dvec(b[0] + short_of_goal(f, c, dt, standoff, fast, slow, fastest) / dt, b[1], b[2])
 
 
 @ti.func

@@ -115,6 +115,7 @@ class ImplicitStepper:
         self._beta = self._dt = 0.0  # of the last step
         if self.contact is not None:
             self.contact.forget()
+            self.solver.forget_factors()
 
     def numbers_changed(self) -> None:
         """Gravity or material numbers changed."""
@@ -135,17 +136,17 @@ class ImplicitStepper:
         if parts > MAX_PARTS:
             raise SimulationError(f"step {self.world.step_count + 1}: {contact.too_fast(start, dt)}")
         allowed = max(contact.sunk, 1.1 * contact.penetration)  # what is deep already needs no shorter steps
-        x, v = m.x.to_numpy(), m.v.to_numpy()
+        kept = m.x.to_numpy(), m.v.to_numpy(), self.world.motion.released()
         while True:
             try:
                 result = self._in_parts(start, dt, parts)
                 depth = contact.end(start + dt, dt)
             except BaseException:  # of Ctrl-C, too: the step is abandoned
-                self._put_back(x, v)
+                self._put_back(*kept)
                 raise
             if depth <= allowed or 2 * parts > MORE_PARTS:
                 break
-            self._put_back(x, v)  # velocities at the start of the step did not tell how far things would go
+            self._put_back(*kept)  # velocities at the start of the step did not tell how far things would go
             parts *= 2
         contact.penetration = depth
         return result
@@ -153,15 +154,21 @@ class ImplicitStepper:
     def _in_parts(self, start: float, dt: float, parts: int) -> ContactResult:
         """A step of dt from a time, in equal parts."""
         part, results = dt / parts, []
+        self.contact.start_step(dt, parts)
         for k in range(parts):
             if k:
                 self.contact.end(start + k * part, part)
             results.append(self._part(start + k * part, part))
+            self.contact.end_part()
         return merge(results)
 
-    def _put_back(self, x: np.ndarray, v: np.ndarray) -> None:
-        self.world.model.x.from_numpy(x)
-        self.world.model.v.from_numpy(v)
+    def _put_back(self, x: np.ndarray, v: np.ndarray, released: list[bool]) -> None:
+        world = self.world
+        world.model.x.from_numpy(x)
+        world.model.v.from_numpy(v)
+        if world.motion.released() != released:
+            world.motion.set_released(released)
+            world.upload_constraints()
         self.forget()
 
     def _part(self, time: float, dt: float) -> StageResult:
@@ -171,6 +178,13 @@ class ImplicitStepper:
         target = world.next_target(time + dt)
         if world.releases != releases or dt != self._dt:
             self._past = 0
+        if self.contact is not None:
+            if world.releases != releases:
+                self.solver.forget_factors()
+            self.contact.begin(time, dt)
+            # no scheme looks back through an impact: it would take the jump for an acceleration
+            if self.scheme.before and self.contact.meets(dt):
+                self._past = 0
         self._dt = dt
         scheme = self.scheme if self._past > 0 or self.scheme.start is None else self.scheme.start
         if target is not None:
@@ -182,7 +196,7 @@ class ImplicitStepper:
                 w.led_acceleration.from_numpy(world.motion.accelerations(time, dt, self.scheme.before == 0.0))
         self._beta = scheme.share * dt
         if self.contact is not None:
-            self.contact.begin(time, dt, scheme.share)
+            self.contact.acts(scheme.share)
         self.solver.assemble_damper()
         along = (0.5 if scheme.midpoint else 1.0) if self._past > 1 and not scheme.one_iteration else 0.0
         multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)
@@ -201,6 +215,8 @@ class ImplicitStepper:
             self.forget()
             raise SimulationError(f"step {world.step_count + 1}: {where}")
         self._past += 1
+        if self.contact is not None and self.contact.met:
+            self._past = 0
         return result
 
     def _solve(self, scheme: Scheme, dt: float) -> StageResult:

@@ -46,6 +46,15 @@ class Motion:
         for g in self._groups:
             g.released = False
 
+    def released(self) -> list[bool]:
+        """Which groups have let go."""
+        return [g.released for g in self._groups]
+
+    def set_released(self, released: list[bool]) -> None:
+        """Back to what `released` told."""
+        for g, gone in zip(self._groups, released, strict=True):
+            g.released = gone
+
     @property
     def n_moved(self) -> int:
         """Rows of led nodes, released ones included."""
