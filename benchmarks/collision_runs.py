@@ -15,7 +15,7 @@ import taisoft as ts
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.pipeline import Detection
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.collision.surface import find_active, move_soft, update_boxes
+from taisoft.collision.surface import find_active
 from taisoft.model import build_model
 from taisoft.runtime import FieldArena, Runtime, compile_clock
 from taisoft.scene.plan import make_plan
@@ -161,10 +161,9 @@ class Rig:
         self.detection.find(0.0, DT)
 
     def phases(self) -> dict[str, float]:
-        """The same search in its phases: wall seconds of each. The buffers must have grown before."""
+        """The same search in its phases: wall seconds of each."""
         d, times = self.detection, [clock()]
-        move_soft(d.surface, self.model.x, self.model.v, DT)
-        update_boxes(d.surface, d.margin)
+        d._move(0.0, DT)
         times.append(clock())
         rows = d._candidates()
         times.append(clock())
@@ -188,7 +187,7 @@ class Rig:
             ratio = self.scene.collision.cell_ratio if ratio is None else ratio
             made = SpatialHash(d.surface, arena, ratio * d.edge, np.ptp(x, axis=0))
         else:
-            made = Bvh(d.surface, d.topology, x, d.margin, self.runtime, arena, int(name.split()[1]))
+            made = Bvh(d.surface, d.topology, x, d.reach, self.runtime, arena, int(name.split()[1]))
         self._others += [made, arena]
         return made
 

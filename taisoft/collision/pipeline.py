@@ -154,7 +154,13 @@ class Detection:
         time [s]: of the obstacles. led: (k,) nodes and (k,3) how far they are led during the step [m], nan where they are not.
         Raises SimulationError where positions are not finite, or a buffer may not grow as far as it must.
         """
-        s, count = self.surface, self.counts
+        self._move(time, dt, led)
+        self._search(self._candidates())
+        self._reduce()
+
+    def _move(self, time: float, dt: float, led: tuple[np.ndarray, np.ndarray] | None = None) -> None:
+        """The surface where it is and how far it goes, and the boxes."""
+        s = self.surface
         move_soft(s, self.model.x, self.model.v, dt)
         self._place_obstacles(time, dt)
         if led is not None and len(led[0]):
@@ -162,17 +168,6 @@ class Detection:
         update_boxes(s, self.reach)
         if s.count[UNFINITE]:
             raise SimulationError(self._unfinite())
-        candidates = self._candidates()
-        self._unmapped[0] = 0
-        while True:
-            self._search(candidates)
-            if self.buffer.fits():
-                break
-            self._unmapped[0] = 0
-        self._reduce()
-        count.unmapped = self._unmapped[0]
-        count.found, count.contacts = self._reduction.count[FOUND], self._reduction.count[LEFT]
-        count.growths = {b.name: b.growths for b in self._buffers()}
 
     def _candidates(self) -> Candidates | None:
         """Rows of near triangles; None where no two surfaces can touch."""
@@ -184,7 +179,15 @@ class Detection:
         return rows
 
     def _search(self, rows: Candidates | None) -> None:
-        """Fill the buffer of contacts, as far as it goes."""
+        """Fill the buffer of contacts, and let it grow until they fit."""
+        while True:
+            self._unmapped[0] = 0
+            self._fill_buffer(rows)
+            if self.buffer.fits():
+                break
+
+    def _fill_buffer(self, rows: Candidates | None) -> None:
+        """Contacts before the reduction, as far as they fit."""
         s, b = self.surface, self.buffer
         b.clear()
         if rows is not None:
@@ -203,6 +206,7 @@ class Detection:
         b.sum_up()
 
     def _reduce(self) -> None:
+        """List the contacts that are kept, and count."""
         b = self.buffer
         if self._reduction is None or self._reduction.place.shape[0] != b.capacity:
             arena = FieldArena()
@@ -210,6 +214,10 @@ class Detection:
             self._reduction_arena.release()
             self._reduction_arena = arena
         reduce_contacts(self._reduction, b.data, b.used, b.part, MERGED * self.edge, REDUCTION_CELL * self.edge)
+        count = self.counts
+        count.unmapped = self._unmapped[0]
+        count.found, count.contacts = self._reduction.count[FOUND], self._reduction.count[LEFT]
+        count.growths = {b.name: b.growths for b in self._buffers()}
 
     def _place_obstacles(self, time: float, dt: float) -> None:
         """Obstacles where they are at a time and at the end of the step; those that stand still are placed once."""
