@@ -37,7 +37,7 @@ class Quadratic:
     def __init__(self, detection: Detection):
         self._detection, self._arena = detection, FieldArena()
         self._capacity = n = detection.buffer.capacity
-        self._known: tuple[np.ndarray, np.ndarray] | None = None
+        self._known: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self._state, self._kept = (self._arena.field(name, ti.i32, n + 1) for name in ("state", "kept"))
 
     def fits(self) -> bool:
@@ -53,11 +53,12 @@ class Quadratic:
         """Places of the contacts in the order in which they are kept: by kind and feature, then by place. Made once a search."""
         d = self._detection
         place = d._reduction.place.to_numpy()[: d._reduction.count[FOUND]]
-        if self._known is None or not np.array_equal(self._known[0], place):
-            feature = d.buffer.data.feature.to_numpy()[place]
+        feature = d.buffer.data.feature.to_numpy()[place]
+        known = self._known
+        if known is None or not (np.array_equal(known[0], place) and np.array_equal(known[1], feature)):
             order = place[np.lexsort((place, feature[:, 2], feature[:, 1], feature[:, 0]))]
-            self._known = (place, order.astype(np.int32))
-        return self._known[1]
+            self._known = known = (place, feature, order.astype(np.int32))
+        return known[2]
 
     def same(self) -> bool:
         """Whether it kept what the detection's own reduction kept."""

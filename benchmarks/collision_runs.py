@@ -15,7 +15,6 @@ import taisoft as ts
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.pipeline import Detection
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.collision.surface import find_active, move_soft, update_boxes
 from taisoft.model import build_model
 from taisoft.runtime import FieldArena, Runtime, compile_clock
 from taisoft.scene.plan import make_plan
@@ -161,14 +160,13 @@ class Rig:
         self.detection.find(0.0, DT)
 
     def phases(self) -> dict[str, float]:
-        """The same search in its phases: wall seconds of each. The buffers must have grown before."""
+        """The same search in its phases: wall seconds of each."""
         d, times = self.detection, [clock()]
-        move_soft(d.surface, self.model.x, self.model.v, DT)
-        update_boxes(d.surface, d.margin)
+        d._move(0.0, DT)
         times.append(clock())
-        rows = d._candidates()
+        near = d._near()
         times.append(clock())
-        d._search(rows)
+        d._search(near)
         times.append(clock())
         d._reduce()
         times.append(clock())
@@ -176,7 +174,6 @@ class Rig:
 
     def n_pairs(self, broad=None) -> int:
         """Pairs that a broad phase finds, that of the detection by default."""
-        find_active(self.detection.surface)
         rows = (broad or self.detection.broad).find()
         return int((rows.end.to_numpy() - rows.start.to_numpy())[: self.detection.surface.n_triangles].sum()) // 2
 
@@ -188,7 +185,7 @@ class Rig:
             ratio = self.scene.collision.cell_ratio if ratio is None else ratio
             made = SpatialHash(d.surface, arena, ratio * d.edge, np.ptp(x, axis=0))
         else:
-            made = Bvh(d.surface, d.topology, x, d.margin, self.runtime, arena, int(name.split()[1]))
+            made = Bvh(d.surface, d.topology, x, d.reach, self.runtime, arena, int(name.split()[1]))
         self._others += [made, arena]
         return made
 
@@ -241,16 +238,11 @@ def measure_film(setup: Setup, geometry: str, runtime: Runtime, frames: int = FR
             numbers["quadratic"] = float(np.median(repeated(quadratic.reduce, FRAME_ROUNDS)))
             for name, other in others.items():
                 rig.n_pairs(other)
-                numbers[name] = float(np.median(repeated(lambda other=other: _find(rig, other), FRAME_ROUNDS)))
+                numbers[name] = float(np.median(repeated(other.find, FRAME_ROUNDS)))
             if k >= 0:
                 counts = rig.detection.counts
                 film.add(active=counts.active, found=counts.found, kept=counts.contacts, **numbers)
     return film
-
-
-def _find(rig: Rig, broad: SpatialHash | Bvh) -> None:
-    find_active(rig.detection.surface)
-    broad.find()
 
 
 def measure_broad(setup: Setup, runtime: Runtime, rounds: int, ratios=None) -> list[Sweep]:
@@ -270,6 +262,6 @@ def measure_broad(setup: Setup, runtime: Runtime, rounds: int, ratios=None) -> l
             rig.n_pairs(broad)
         for _ in range(3):  # in turn, so that a slow moment of the machine falls on all
             for sweep, name, broad in jobs:
-                some = repeated(lambda broad=broad: _find(rig, broad), max(rounds // 3, 1))
+                some = repeated(broad.find, max(rounds // 3, 1))
                 sweep.rounds.setdefault(name, []).extend(some)
     return sweeps

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 from lanes import opened
 
+from taisoft.collision.boxes import update_boxes
 from taisoft.collision.candidates import Candidates
-from taisoft.collision.surface import build_surface, find_active, make_topology, update_boxes
+from taisoft.collision.surface import build_surface, make_topology
 from taisoft.runtime import FieldArena
 
 
@@ -41,7 +42,6 @@ def place(made: SimpleNamespace, x: np.ndarray, move: np.ndarray | None = None) 
     made.surface.x.from_numpy(made.x)
     made.surface.move.from_numpy(made.move)
     update_boxes(made.surface, made.margin)
-    find_active(made.surface)
 
 
 def pairs_of(candidates: Candidates) -> np.ndarray:

@@ -1,7 +1,8 @@
 """The benchmark of collision detection:
 
 * configurations have the tets that the report names, and bodies touch as they say, the same whenever they are made;
-* a search is told with what it went through, in phases; both reductions keep the same contacts, all broad phases the same pairs;
+* a search is told with what it went through, in phases, which find what the whole does;
+* both reductions keep the same contacts, all broad phases the same pairs;
 * a crossover lies between two sizes, the best cell is the fastest, limits are met or not;
 * the whole prints, writes and draws; a limit that is not met is the exit status, and what fails is a row that says so.
 """
@@ -11,6 +12,7 @@ import json
 import numpy as np
 import pytest
 
+import taisoft as ts
 from benchmarks import collision, collision_runs
 from benchmarks.collision_cases import (
     CUBES,
@@ -20,6 +22,7 @@ from benchmarks.collision_cases import (
     REPORT,
     SHEET,
     SUNK,
+    Setup,
     cubes_setup,
     pile,
     pile_setup,
@@ -33,6 +36,7 @@ from benchmarks.collision_runs import (
     PHASES,
     TREES,
     Film,
+    Rig,
     Row,
     Sweep,
     measure_broad,
@@ -99,6 +103,32 @@ def test_a_search_is_measured_in_phases(runtime):
     assert 0 < row.active <= 96 and row.pairs > 0 and row.found >= row.contacts > 0
     assert len(row.whole) == 3 and set(row.phases) == set(PHASES) and all(min(x) > 0 for x in row.phases.values())
     assert row.same and len(row.quadratic) == 3 and row.first > row.compile_seconds > 0 and row.field_bytes > 0
+
+
+def test_a_search_in_phases_is_the_search(runtime):
+    """A buffer that is too small grows in either, and both keep the same contacts; more may not fit when they have moved."""
+    setup = cubes_setup(7)
+
+    def build(geometry):
+        scene = setup.build(geometry)
+        scene.collision = ts.CollisionSettings(initial_capacity=64)
+        return scene
+
+    with Rig(Setup("small", "little room", build, setup.motion), "proximity", runtime) as rig:
+        rig.place(1.0)
+        rig.phases()
+        kept, found = rig.detection.contacts(), rig.detection.counts.found
+        assert found > 64 and rig.detection.buffer.growths == 1
+        rig.search()
+        again = rig.detection.contacts()
+        assert rig.detection.counts.found == found and np.array_equal(again.feature, kept.feature)
+        assert np.array_equal(again.point, kept.point) and len(kept) == rig.detection.counts.contacts
+        quadratic = rig.quadratic()
+        for share in (1.0, 0.5):
+            rig.place(share)
+            rig.phases()
+            quadratic.reduce()
+            assert quadratic.same()
 
 
 def test_films_and_broad_phases(runtime, monkeypatch):

@@ -93,31 +93,31 @@ def test_a_buffer_that_is_large_enough_stays(rig, arena):
     buffer = used_buffer(arena, [3, 0, 5], 15, None)
     data = buffer.data
     assert (buffer.count[NEEDED], buffer.count[TOTAL]) == (5, 8)
-    assert buffer.fits() and buffer.data is data and buffer.growths == 0
+    assert not buffer.grow_if_full() and buffer.data is data and buffer.growths == 0
     assert buffer.capacity == 15 and buffer.bytes == 60
     buffer.clear()
     buffer.sum_up()
-    assert (buffer.count[NEEDED], buffer.count[TOTAL]) == (0, 0) and buffer.fits()
+    assert (buffer.count[NEEDED], buffer.count[TOTAL]) == (0, 0) and not buffer.grow_if_full()
     buffer.release()
 
 
 def test_a_buffer_grows_to_what_was_needed(rig, arena):
     buffer = used_buffer(arena, [6, 0, 40], 15, None)
-    assert not buffer.fits()
+    assert buffer.grow_if_full()
     assert (buffer.part, buffer.capacity, buffer.growths) == (60, 180, 1) and SLACK == 1.5
     assert buffer.data.shape == (180,) and buffer.bytes == 720
-    assert buffer.fits() and buffer.growths == 1
+    assert not buffer.grow_if_full() and buffer.growths == 1
     buffer.release()
 
 
 def test_a_buffer_stops_at_its_limit(rig, arena):
     buffer = used_buffer(arena, [1, 0, 40], 15, 119)
     with pytest.raises(SimulationError, match=r"^things: 120 entries are needed \(3 parts of 40\), and max_capacity allows 119$"):
-        buffer.fits()
+        buffer.grow_if_full()
     assert (buffer.capacity, buffer.growths) == (15, 0)
     buffer.most = 120
-    assert not buffer.fits() and buffer.capacity == 120
-    assert buffer.fits()
+    assert buffer.grow_if_full() and buffer.capacity == 120
+    assert not buffer.grow_if_full()
     buffer.release()
 
 
@@ -125,7 +125,7 @@ def test_a_buffer_stops_at_its_limit(rig, arena):
 def test_a_buffer_is_never_larger_than_its_limit(rig, arena, capacity, need, most):
     """Parts of equal length: what is left over is not used."""
     buffer = used_buffer(arena, [need, 0, 1], capacity, most)
-    buffer.fits()
+    buffer.grow_if_full()
     assert buffer.part >= need and buffer.capacity <= most
     buffer.release()
 

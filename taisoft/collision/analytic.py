@@ -11,8 +11,9 @@ from typing import Any
 import taichi as ti
 
 from taisoft.collision import shapes
+from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import FACE_FIELD, VERTEX_FIELD, write_contact
-from taisoft.collision.features import area_normal, corner, opposite, sticks_out, unit, vertices_of
+from taisoft.collision.features import corner, opposite, sticks_out, unit, vertices_of
 from taisoft.collision.frank_wolfe import deepest_point
 from taisoft.collision.surface import dvec, ivec, part_first
 from taisoft.runtime import kernel
@@ -56,7 +57,7 @@ def deeper_inside(s: ti.template(), t, w, n, x):
     middle of a box, no gradient tells the way out. On an edge the neighbour must not lie deeper, and of the two triangles the
     owner tells.
     """
-    facing = unit(area_normal(s, t))
+    facing = s.normal[t]
     good = 1
     zero = -1
     for j in ti.static(range(3)):
@@ -70,7 +71,7 @@ def deeper_inside(s: ti.template(), t, w, n, x):
             good = 0
         v = s.neighbour[t, k]
         if v >= 0:
-            facing += unit(area_normal(s, v))
+            facing += s.normal[v]
             e = s.x[opposite(s, v, s.triangle[t, k], s.triangle[t, (k + 1) % 3])] - x
             if e.dot(n) < -0.05 * e.norm():
                 good = 0
@@ -147,16 +148,20 @@ def _touch(s: ti.template(), o: ti.template(), t, k, margin, out: ti.template(),
 
 @kernel
 def find_analytic(
-    s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.template(), used: ti.template(), part: ti.i32
-):
-    """Add the contacts of the soft bodies' triangles with all analytic obstacles."""
+    s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.template(), used: ti.template(), count: ti.template(),
+    part: ti.i32, more: ti.i32,
+):  # fmt: skip
+    """Contacts of the soft bodies' triangles with all analytic obstacles, after those in the buffer where `more` is 1."""
     ti.loop_config(serialize=s.serial)
     for wide in range(s.chunks * s.spread):
         if wide % s.spread == 0:
             c = wide // s.spread
-            at, end = c * part + used[c], (c + 1) * part
+            at, end = c * part + more * used[c], (c + 1) * part
             for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):
                 if s.soft[s.body[t]] == 1 and (s.lo[t] <= s.hi[t]).all():
                     for k in range(o.count):
                         at = _touch(s, o, t, k, margin, out, at, end)
             used[c] = at - c * part
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        sum_parts(used, count, s.chunks)

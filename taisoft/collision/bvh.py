@@ -1,8 +1,9 @@
 """Candidates by a chunked bounding volume hierarchy of k-DOPs: what the report compares the spatial hash with.
 
 Each collider has a tree over its triangles, built once (`trees.py`). A chunk is a subtree of at most `leaves` triangles. Every
-search refits the slabs (chunks in parallel, then what stands above them) and walks tree against tree from every chunk; of two
-nodes the larger is opened, so a stack needs no more entries than both trees have levels.
+search refits the slabs (chunks in parallel, then what stands above them). What is near one vertex or triangle, `near.py` then
+finds in them. Where all pairs of triangles are asked for, tree is walked against tree from every chunk; of two nodes the larger
+is opened, so a stack needs no more entries than both trees have levels. Memory for pairs is made when they are first asked for.
 
 Slabs hold each triangle at the start and at the end of the step, grown by half the margin. k = 6 gives the boxes of the spatial
 hash and so its candidates; 14 (and the space diagonals) and 18 (and the face diagonals) fewer. Weak: the trees keep
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.collision.candidates import TOTAL, Buffer, Candidates, PairRows, pairs, sum_parts
+from taisoft.collision.candidates import Buffer, Candidates, PairRows, pairs, sum_parts
 from taisoft.collision.surface import Surface, Topology, dvec, may_touch
 from taisoft.collision.trees import TreeTables, build_trees
 from taisoft.runtime import FieldArena, Runtime, kernel
@@ -41,6 +42,7 @@ class Trees:
     slabs: int  # k / 2
     directions: tuple[tuple[int, int, int], ...]
     n_chunks: int
+    n_top: int
     levels: int  # entries of a stack
     parts: int
     link: Any  # i32
@@ -51,6 +53,7 @@ class Trees:
     lo: Any  # (nodes) vectors f64, one entry for each slab [m], times the length of its direction
     hi: Any
     stack: Any  # (parts * levels) 2-vectors i32
+    walked: bool = True  # unlike rows
 
 
 def place_trees(t: TreeTables, k: int, parts: int, arena: FieldArena) -> Trees:
@@ -64,39 +67,47 @@ def place_trees(t: TreeTables, k: int, parts: int, arena: FieldArena) -> Trees:
         return arena.vectors(f"bvh_{name}", ti.f64, max(len(t.link), 1), n=k // 2)
 
     return Trees(
-        k // 2, DIRECTIONS[k], len(t.chunk), levels, parts, ints("link", t.link), ints("root", t.root),
+        k // 2, DIRECTIONS[k], len(t.chunk), len(t.top), levels, parts, ints("link", t.link), ints("root", t.root),
         ints("chunk", t.chunk), ints("chunk_body", t.chunk_body), ints("top", t.top), slabs("lo"), slabs("hi"),
         arena.vectors("bvh_stack", ti.i32, parts * levels, n=2),
     )  # fmt: skip
 
 
 @ti.func
-def _diagonals(b: ti.template(), x):
-    """A vector's components along the directions of the slabs beyond the three axes."""
-    return ti.Vector([x.dot(dvec(b.directions[q])) for q in ti.static(range(3, b.slabs))], ti.f64)
+def _along(b: ti.template(), x):
+    """A vector's components along the directions of the slabs."""
+    return ti.Vector([x[q] if q < 3 else x.dot(dvec(b.directions[q])) for q in ti.static(range(b.slabs))], ti.f64)
 
 
 @ti.func
-def _refit_leaf(s: ti.template(), b: ti.template(), node, margin):
+def slabs_of(s: ti.template(), b: ti.template(), t, q, half):
+    """Slabs of corner q of triangle t at both ends of the step, of all of it where q is beyond 2, grown by half [m]."""
+    lo, hi = ti.Vector([ti.math.inf] * b.slabs, ti.f64), ti.Vector([-ti.math.inf] * b.slabs, ti.f64)
+    if s.lo[t][0] <= s.hi[t][0]:  # finite
+        for k in range(3):
+            if q > 2 or q == k:
+                i = s.triangle[t, k]
+                begin = _along(b, s.x[i])
+                end = _along(b, s.x[i] + s.move[i])
+                lo, hi = ti.min(lo, begin, end), ti.max(hi, begin, end)
+        for k in ti.static(range(b.slabs)):
+            grown = half
+            if ti.static(k >= 3):
+                grown = half * dvec(b.directions[k]).norm()
+            lo[k] -= grown
+            hi[k] += grown
+    return lo, hi
+
+
+@ti.func
+def _refit_leaf(s: ti.template(), b: ti.template(), node, half):
     """Slabs of a triangle at both ends of the step."""
     t = -1 - b.link[node]
-    for q in ti.static(range(3)):
-        b.lo[node][q] = s.lo[t][q]
-        b.hi[node][q] = s.hi[t][q]
-    if ti.static(b.slabs > 3):
-        lo = ti.Vector([ti.math.inf] * (b.slabs - 3), ti.f64)
-        hi = ti.Vector([-ti.math.inf] * (b.slabs - 3), ti.f64)
-        if s.lo[t][0] <= s.hi[t][0]:  # finite
-            for k in range(3):
-                i = s.triangle[t, k]
-                begin = _diagonals(b, s.x[i])
-                end = begin + _diagonals(b, s.move[i])
-                lo = ti.min(lo, ti.min(begin, end))
-                hi = ti.max(hi, ti.max(begin, end))
-        for q in ti.static(range(3, b.slabs)):
-            grown = ti.cast(0.5, ti.f64) * margin * dvec(b.directions[q]).norm()
-            b.lo[node][q] = lo[q - 3] - grown
-            b.hi[node][q] = hi[q - 3] + grown
+    if ti.static(b.slabs == 3):
+        b.lo[node], b.hi[node] = s.lo[t], s.hi[t]
+    else:
+        lo, hi = slabs_of(s, b, t, 3, half)
+        b.lo[node], b.hi[node] = lo, hi
 
 
 @ti.func
@@ -114,32 +125,45 @@ def _refit_inner(b: ti.template(), node):
 
 
 @ti.func
-def _nodes(b: ti.template(), node):
-    """Nodes of a subtree."""
+def nodes_below(b: ti.template(), node):
+    """Nodes of a subtree, its root too."""
     return ti.max(b.link[node], 1)
 
 
-@kernel
-def refit_chunks(s: ti.template(), b: ti.template(), margin: ti.f64):
+@ti.func
+def _refit_chunks(s: ti.template(), b: ti.template(), margin):
     """Slabs of all nodes in the chunks."""
     ti.loop_config(serialize=s.serial)
     for wide in range(b.n_chunks * s.spread):
         if wide % s.spread == 0:
-            c = wide // s.spread
-            first = b.chunk[c]
-            n = _nodes(b, first)
+            first = b.chunk[wide // s.spread]
+            n = nodes_below(b, first)
             for k in range(n):
                 node = first + n - 1 - k
                 if b.link[node] < 0:
-                    _refit_leaf(s, b, node, margin)
+                    _refit_leaf(s, b, node, ti.cast(0.5, ti.f64) * margin)
                 else:
                     _refit_inner(b, node)
 
 
 @kernel
-def refit_tops(b: ti.template(), first: ti.i32, last: ti.i32, serial: ti.template()):
-    """Slabs of the nodes top[first:last] above the chunks; of one level, unless serial."""
-    ti.loop_config(serialize=serial)
+def refit(s: ti.template(), b: ti.template(), margin: ti.f64):
+    """Slabs of all nodes in the chunks, and of those above them one after the other."""
+    _refit_chunks(s, b, margin)
+    ti.loop_config(serialize=True)
+    for k in range(b.n_top):
+        _refit_inner(b, b.top[k])
+
+
+@kernel
+def refit_chunks(s: ti.template(), b: ti.template(), margin: ti.f64):
+    """Slabs of all nodes in the chunks."""
+    _refit_chunks(s, b, margin)
+
+
+@kernel
+def refit_level(b: ti.template(), first: ti.i32, last: ti.i32):
+    """Slabs of the nodes top[first:last] above the chunks, all of one level."""
     for k in range(first, last):
         _refit_inner(b, b.top[k])
 
@@ -157,7 +181,7 @@ def _walk(s: ti.template(), b: ti.template(), part, root_a, root_b, pair: ti.tem
     going = 1
     while going == 1:
         split = 0
-        if j + _nodes(b, j) > i and (b.lo[i] <= b.hi[j]).all() and (b.lo[j] <= b.hi[i]).all():
+        if j + nodes_below(b, j) > i and (b.lo[i] <= b.hi[j]).all() and (b.lo[j] <= b.hi[i]).all():
             if b.link[i] < 0 and b.link[j] < 0:
                 t, u = -1 - b.link[i], -1 - b.link[j]
                 if j > i and may_touch(s, t, u) == 1:
@@ -216,42 +240,49 @@ class Bvh:
     ):  # fmt: skip
         """x: (n_verts, 3) [m], the positions that the trees are built for. k_dop: 6, 14 or 18. leaves: triangles of a chunk, at
         most. capacity: pairs at first; most: pairs, and entries of rows, at most. None for the default."""
-        n = surface.n_triangles
         self.surface, self.margin = surface, margin
         self.tables = build_trees(x[topology.triangle].mean(axis=1), topology.first, leaves or LEAVES[runtime.arch])
         self.trees = place_trees(self.tables, k_dop, surface.chunks, arena)
         self.by_levels = runtime.arch != "cpu"  # else one thread refits what stands above the chunks, in one launch
-        self.pairs = Buffer("bvh_pairs", pairs, capacity or PAIRS_PER_TRIANGLE * n + 64, most, surface.chunks, arena)
-        self.rows = PairRows(surface, arena, capacity or 2 * PAIRS_PER_TRIANGLE * n + 64, most)
+        self._limits, self._arena = (capacity, most), arena
+        self.pairs: Buffer | None = None
+        self.rows: PairRows | None = None
+
+    def near(self) -> Trees:
+        """The trees about the present boxes, for `near.py` to look into."""
+        if not self.by_levels:
+            refit(self.surface, self.trees, self.margin)
+            return self.trees
+        refit_chunks(self.surface, self.trees, self.margin)
+        first = self.tables.top_first
+        for begin, end in zip(first[:-1], first[1:]):
+            refit_level(self.trees, int(begin), int(end))
+        return self.trees
 
     def find(self) -> Candidates:
         """The candidates of the present boxes. Raises SimulationError where a buffer may not grow as far as it must."""
-        self._refit()
+        self.near()
+        if self.pairs is None:
+            self._make_room()
         while True:
             found = self.pairs
             walk_trees(self.surface, self.trees, found.data, found.used, found.count, found.part)
-            if found.fits():
+            if not found.grow_if_full():
                 return self.rows.from_pairs(found)
 
-    def _refit(self) -> None:
-        refit_chunks(self.surface, self.trees, self.margin)
-        first = self.tables.top_first
-        if not self.by_levels:
-            first = first[[0, -1]]
-        for begin, end in zip(first[:-1], first[1:]):
-            refit_tops(self.trees, int(begin), int(end), not self.by_levels)
+    def _make_room(self) -> None:
+        s, (capacity, most) = self.surface, self._limits
+        n = s.n_triangles
+        self.pairs = Buffer("bvh_pairs", pairs, capacity or PAIRS_PER_TRIANGLE * n + 64, most, s.chunks, self._arena)
+        self.rows = PairRows(s, self._arena, capacity or 2 * PAIRS_PER_TRIANGLE * n + 64, most)
 
     @property
     def buffers(self) -> tuple[Buffer, ...]:
         """What grows."""
-        return self.pairs, self.rows.rows
-
-    @property
-    def n_pairs(self) -> int:
-        """Pairs that the last search found."""
-        return self.pairs.count[TOTAL]
+        return () if self.pairs is None else (self.pairs, self.rows.rows)
 
     def release(self) -> None:
         """Give the memory of the buffers back."""
-        self.pairs.release()
-        self.rows.release()
+        if self.pairs is not None:
+            self.pairs.release()
+            self.rows.release()

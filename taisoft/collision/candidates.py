@@ -27,6 +27,7 @@ class Candidates:
     start: Any  # (n_triangles) i32
     end: Any  # (n_triangles) i32
     entry: Any  # i32
+    walked: bool = False  # unlike trees
 
 
 class Buffer:
@@ -64,14 +65,14 @@ class Buffer:
         """Memory of the entries."""
         return sum(self._arena.bytes.values())
 
-    def fits(self) -> bool:
-        """Whether the last search fitted; if not, the buffer has grown and the search must be done again.
+    def grow_if_full(self) -> bool:
+        """Grow where the last search did not fit; True where it has grown, so that the search must be done again.
 
         Raises SimulationError where it may not grow that far.
         """
         needed = self.count[NEEDED]
         if needed <= self.part:
-            return True
+            return False
         wanted = needed * self.chunks
         if self.most is not None and wanted > self.most:
             raise SimulationError(
@@ -79,7 +80,7 @@ class Buffer:
             )
         self.growths += 1
         self._allocate(int(SLACK * wanted))
-        return False
+        return True
 
     def clear(self) -> None:
         """Empty every part."""
@@ -207,7 +208,7 @@ class PairRows:
         s = self.surface
         where = (found.data, found.used, found.part, found.chunks, s.serial, self.start, self.end)
         pair_rows(s, *where, self.rows.count)
-        self.rows.fits()
+        self.rows.grow_if_full()
         fill_rows(s, *where, self.rows.data)
         return Candidates(self.start, self.end, self.rows.data)
 

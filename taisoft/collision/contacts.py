@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.runtime import FieldArena
+from taisoft.runtime import FieldArena, kernel
 
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + its number there); vertex and collider;
 # triangle and collider
@@ -111,3 +111,33 @@ def write_contact(
             out.nodes_b[at][q] = ti.select(sign > 0.0, nodes_b[q], nodes_a[q])
             out.weights_a[at][q] = ti.select(sign > 0.0, weights_a[q], weights_b[q])
             out.weights_b[at][q] = ti.select(sign > 0.0, weights_b[q], weights_a[q])
+
+
+@kernel
+def gather_contacts(
+    out: ti.template(), place: ti.template(), n: ti.i32, real: ti.types.ndarray(), whole: ti.types.ndarray()
+):  # fmt: skip
+    """`gather` for the contacts place[:n]: numbers (n,13) and integers (n,11)."""
+    ti.loop_config(serialize=True)
+    for i in range(n):
+        at = place[i]
+        real[i, 12] = out.gap[at]
+        for q in ti.static(range(3)):
+            real[i, q], real[i, 3 + q] = out.point[at][q], out.normal[at][q]
+            real[i, 6 + q], real[i, 9 + q] = out.weights_a[at][q], out.weights_b[at][q]
+            whole[i, 2 + q] = out.feature[at][q]
+            whole[i, 5 + q], whole[i, 8 + q] = out.nodes_a[at][q], out.nodes_b[at][q]
+        for q in ti.static(range(2)):
+            whole[i, q] = out.body[at][q]
+
+
+def gather(out: ContactFields, place: Any, n: int) -> dict[str, np.ndarray]:
+    """The contacts at the first n places in a field of them, (n, ...) of each: point, normal, gap, body, feature, and of both
+    sides nodes and weights (n,6)."""
+    real, whole = np.zeros((n, 13)), np.zeros((n, 11), dtype=np.int32)
+    if n:
+        gather_contacts(out, place, n, real, whole)
+    return {
+        "point": real[:, :3], "normal": real[:, 3:6], "weights": real[:, 6:12], "gap": real[:, 12],
+        "body": whole[:, :2], "feature": whole[:, 2:5], "nodes": whole[:, 5:],
+    }  # fmt: skip

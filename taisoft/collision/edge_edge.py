@@ -7,7 +7,7 @@ Where an end lies inside the other body and makes a contact of its own, that tel
 import taichi as ti
 
 from taisoft.collision.contacts import EDGE_EDGE, write_contact
-from taisoft.collision.features import area_normal, corner, edge_normal, edge_sticks_out, sticks_out, unit
+from taisoft.collision.features import corner, edge_normal, edge_sticks_out, sticks_out, unit
 from taisoft.collision.surface import dvec, ivec
 from taisoft.collision.triangles import closest_lines
 
@@ -22,10 +22,10 @@ def _is_behind(s: ti.template(), i, length, u, m):
     """1 where vertex i, of an edge of that length, lies behind both faces at edge m of triangle u."""
     d = s.x[i] - corner(s, u, m)
     slack = ti.cast(TINY, ti.f64) * (length + d.norm())
-    behind = int(d.dot(unit(area_normal(s, u))) <= slack)
+    behind = int(d.dot(s.normal[u]) <= slack)
     v = s.neighbour[u, m]
     if v >= 0:
-        behind &= int(d.dot(unit(area_normal(s, v))) <= slack)
+        behind &= int(d.dot(s.normal[v]) <= slack)
     return behind
 
 
@@ -68,32 +68,35 @@ def edge_contact(s: ti.template(), t, k, u, m, margin, out: ti.template(), start
     la, lb = da.norm(), db.norm()
     if c.norm() > ti.cast(CROSSING, ti.f64) * la * lb:
         n = unit(c)
-        if n.dot(edge_normal(s, u, m) - edge_normal(s, t, k)) < 0.0:
-            n = -n
         f, g, _ = closest_lines(a0, a1, b0, b1)
         gap = (a0 - b0).dot(n)
-        over = ti.cast(MISS, ti.f64) * ti.max(-gap, 0.0)  # what penetrates has shifted along the edges
-        move = (1.0 - f) * s.move[s.triangle[t, k]] + f * s.move[s.triangle[t, (k + 1) % 3]]
-        move -= (1.0 - g) * s.move[s.triangle[u, m]] + g * s.move[s.triangle[u, (m + 1) % 3]]
-        deepest = ti.cast(0.5, ti.f64) * ti.min(la, lb)
-        if s.body[t] == s.body[u]:  # no deeper than half of what the body's own thickness can be
-            rest = (1.0 - f) * s.rest[s.triangle[t, k]] + f * s.rest[s.triangle[t, (k + 1) % 3]]
-            rest -= (1.0 - g) * s.rest[s.triangle[u, m]] + g * s.rest[s.triangle[u, (m + 1) % 3]]
-            deepest = ti.min(deepest, ti.cast(0.5, ti.f64) * rest.norm())
-        near = gap - ti.max(-move.dot(n), 0.0) <= margin and gap >= -deepest
-        good = int(near)
+        over = ti.cast(MISS, ti.f64) * ti.abs(gap)  # what penetrates has shifted along the edges
+        # most pairs do not cross, whichever of them is above: that takes longer to tell
+        good = int(-over <= f * la <= la + over) & int(-over <= g * lb <= lb + over)
         if good == 1:
-            good = _within(s, t, k, f * la, la, over, u, m)
-        if good == 1:
-            good = _within(s, u, m, g * lb, lb, over, t, k)
-        if good == 1:
-            good = edge_sticks_out(s, u, m, n) & edge_sticks_out(s, t, k, -n)
+            n_t, n_u = edge_normal(s, t, k), edge_normal(s, u, m)
+            if n.dot(n_u - n_t) < 0.0:
+                n, gap = -n, -gap
+            move = (1.0 - f) * s.move[s.triangle[t, k]] + f * s.move[s.triangle[t, (k + 1) % 3]]
+            move -= (1.0 - g) * s.move[s.triangle[u, m]] + g * s.move[s.triangle[u, (m + 1) % 3]]
+            deepest = ti.cast(0.5, ti.f64) * ti.min(la, lb)
+            if s.body[t] == s.body[u]:  # no deeper than half of what the body's own thickness can be
+                rest = (1.0 - f) * s.rest[s.triangle[t, k]] + f * s.rest[s.triangle[t, (k + 1) % 3]]
+                rest -= (1.0 - g) * s.rest[s.triangle[u, m]] + g * s.rest[s.triangle[u, (m + 1) % 3]]
+                deepest = ti.min(deepest, ti.cast(0.5, ti.f64) * rest.norm())
+            over = ti.cast(MISS, ti.f64) * ti.max(-gap, 0.0)
+            near = gap - ti.max(-move.dot(n), 0.0) <= margin and gap >= -deepest
             # a nearly flat edge sticks out along either normal: the sides that look at each other count
-            good &= int(n.dot(edge_normal(s, u, m)) > 0.0) & int(n.dot(edge_normal(s, t, k)) < 0.0)
-        if good == 1:
-            good = 1 - _end_tells(s, t, k, f * la, la, -END * gap, u, m, n)
-        if good == 1:
-            good = 1 - _end_tells(s, u, m, g * lb, lb, -END * gap, t, k, -n)
+            good = int(near) & int(n.dot(n_u) > 0.0) & int(n.dot(n_t) < 0.0)
+        for side in range(2):  # one edge, then the other, so that what is called is compiled once
+            t1, k1, t2, k2 = ti.select(side, u, t), ti.select(side, m, k), ti.select(side, t, u), ti.select(side, k, m)
+            place, length, along = ti.select(side, g * lb, f * la), ti.select(side, lb, la), ti.select(side, -n, n)
+            if good == 1:
+                good = _within(s, t1, k1, place, length, over, t2, k2)
+            if good == 1:
+                good = edge_sticks_out(s, t2, k2, along)
+            if good == 1:
+                good = 1 - _end_tells(s, t1, k1, place, length, -END * gap, t2, k2, along)
         if good == 1:
             # where one was clamped to an end, the contact is at that end
             f_in, g_in = ti.min(ti.max(f, 0.0), 1.0), ti.min(ti.max(g, 0.0), 1.0)

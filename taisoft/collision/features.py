@@ -8,7 +8,6 @@ sine of the angle by which it may be missed: surfaces at rest on each other are 
 import taichi as ti
 
 from taisoft.collision.surface import ACTIVE, dvec, ivec
-from taisoft.runtime import kernel
 
 CORNER_SLACK, EDGE_SLACK = 0.25, 0.05  # sines
 FLAT = 0.985  # cosine of 10 degrees: edges that turn by less are blunt, and meet sharp ones only
@@ -35,13 +34,6 @@ def moved(s: ti.template(), t, w):
 
 
 @ti.func
-def area_normal(s: ti.template(), t):
-    """Normal of triangle t, twice its area long [m^2]."""
-    a = corner(s, t, 0)
-    return (corner(s, t, 1) - a).cross(corner(s, t, 2) - a)
-
-
-@ti.func
 def unit(v):
     """v over its length, 0 where it has none."""
     length = v.norm()
@@ -65,20 +57,20 @@ def opposite(s: ti.template(), t, i, j):
 def sticks_out(s: ti.template(), i, n):
     """1 where vertex i is its surface's furthest point against n near by, and some face there looks against n."""
     x = s.x[i]
-    facing = 0
     good = 1
+    k = s.around_start[i]
+    while good == 1 and k < s.around_start[i + 1]:
+        e = s.x[s.around[k]] - x
+        h = e.dot(n)
+        if h < 0.0 and h * h > ti.cast(CORNER_SLACK**2, ti.f64) * e.dot(e):
+            good = 0
+        k += 1
+    facing = 0
     r = s.ring_start[i]
-    while good == 1 and r < s.ring_start[i + 1]:
-        t = s.ring[r]
-        if area_normal(s, t).dot(n) < 0.0:
-            facing = 1
-        for k in range(3):
-            e = s.x[s.triangle[t, k]] - x
-            h = e.dot(n)
-            if h < 0.0 and h * h > ti.cast(CORNER_SLACK**2, ti.f64) * e.dot(e):
-                good = 0
+    while good == 1 and facing == 0 and r < s.ring_start[i + 1]:
+        facing = int(s.normal[s.ring[r]].dot(n) < 0.0)
         r += 1
-    return good & facing
+    return facing
 
 
 @ti.func
@@ -86,12 +78,11 @@ def nearest_of_ring(s: ti.template(), i, d):
     """1 where vertex i is the nearest point of its surface, near by, to the point d away from it."""
     x = s.x[i]
     good = 1
-    r = s.ring_start[i]
-    while good == 1 and r < s.ring_start[i + 1]:
-        for k in range(3):
-            if (s.x[s.triangle[s.ring[r], k]] - x).dot(d) > 0.0:
-                good = 0
-        r += 1
+    k = s.around_start[i]
+    while good == 1 and k < s.around_start[i + 1]:
+        if (s.x[s.around[k]] - x).dot(d) > 0.0:
+            good = 0
+        k += 1
     return good
 
 
@@ -104,16 +95,16 @@ def ring_normal(s: ti.template(), i):
         for k in range(3):
             if s.triangle[t, k] == i:
                 e, f = unit(corner(s, t, k + 1) - s.x[i]), unit(corner(s, t, k + 2) - s.x[i])
-                total += ti.acos(ti.min(ti.max(e.dot(f), -1.0), 1.0)) * unit(area_normal(s, t))
+                total += ti.acos(ti.min(ti.max(e.dot(f), -1.0), 1.0)) * s.normal[t]
     return unit(total)
 
 
 @ti.func
 def edge_normal(s: ti.template(), t, k):
     """Sum of the unit normals at edge k of triangle t."""
-    total = unit(area_normal(s, t))
+    total = s.normal[t]
     if s.neighbour[t, k] >= 0:
-        total += unit(area_normal(s, s.neighbour[t, k]))
+        total += s.normal[s.neighbour[t, k]]
     return total
 
 
@@ -136,8 +127,8 @@ def edge_sticks_out(s: ti.template(), t, k, n):
     return good
 
 
-@kernel
-def find_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template()):
+@ti.func
+def mark_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template()):
     """Bits 0-2 of each active triangle: edges that it owns and that stick out, open ones too; 3-5: those, and flat ones.
 
     way: (n_bodies) i32, 0 for bodies hit by a distance field.
@@ -156,8 +147,8 @@ def find_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template())
                     bits |= 9 << k
                 else:
                     i, j = s.triangle[t, k], s.triangle[t, (k + 1) % 3]
-                    n = unit(area_normal(s, t))
-                    cosine = n.dot(unit(area_normal(s, w)))
+                    n = s.normal[t]
+                    cosine = n.dot(s.normal[w])
                     out = (s.x[opposite(s, w, i, j)] - s.x[i]).dot(n) < 0.0
                     if out and cosine < flat:
                         bits |= 9 << k

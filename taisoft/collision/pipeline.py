@@ -10,26 +10,17 @@ import numpy as np
 import taichi as ti
 
 from taisoft.collision.analytic import NO_SHAPES, AnalyticObstacles, find_analytic
-from taisoft.collision.bvh import Bvh
-from taisoft.collision.candidates import Buffer, Candidates
-from taisoft.collision.colliders import body_grid, collider_surfaces, obstacle_frame
-from taisoft.collision.contacts import KINDS, Contacts, contact_fields
-from taisoft.collision.features import find_sharp_edges
+from taisoft.collision.boxes import move_obstacles, take_led, update_surface
+from taisoft.collision.bvh import Bvh, Trees
+from taisoft.collision.candidates import Buffer, Candidates, entries
+from taisoft.collision.colliders import body_grid, collider_surfaces, led_vertices, obstacle_frame
+from taisoft.collision.contacts import KINDS, Contacts, contact_fields, gather
 from taisoft.collision.proximity import BY_EDGES, BY_FACES, BY_FIELD, find_proximity
 from taisoft.collision.reduction import FOUND, LEFT, ReductionFields, reduce_contacts, reduction_fields
 from taisoft.collision.sdf import DistanceFields, build_fields, find_in_fields
 from taisoft.collision.self_collision import Intersections
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.collision.surface import (
-    ACTIVE,
-    UNFINITE,
-    Surface,
-    build_surface,
-    find_active,
-    move_obstacles,
-    move_soft,
-    update_boxes,
-)  # fmt: skip
+from taisoft.collision.surface import ACTIVE, PAIRS, UNFINITE, Surface, build_surface
 from taisoft.errors import SimulationError
 from taisoft.mesh.quality import mean_surface_edge
 from taisoft.mesh.sdf_grid import SdfGrid
@@ -45,6 +36,7 @@ MERGED = 1e-3  # of the mean surface edge: contacts nearer than this are one
 REDUCTION_CELL = 0.25  # of the mean surface edge: cells of the reduction
 MANY = 200  # colliders above which the spatial hash finds candidates
 CONTACTS_PER_TRIANGLE = 1  # room at first
+LONGEST_ROW = 4096  # triangles near one vertex or triangle that there is room for at first
 
 
 @dataclass
@@ -53,7 +45,7 @@ class Counts:
 
     triangles: int = 0
     active: int = 0  # triangles whose box meets another collider's
-    pairs: int = 0  # of triangles with overlapping boxes
+    pairs: int = 0  # of a vertex, an edge's triangle or a triangle before a distance field, and a triangle near it
     found: int = 0  # contacts before the reduction
     contacts: int = 0  # after it
     unmapped: int = 0  # (triangle, body) whose tet is inverted, so that the body's field could not be used
@@ -92,6 +84,10 @@ class Detection:
         self._fields = self._make_fields(grids, runtime) if any(grids) else None
         self._analytic = [(len(bodies) + k, o) for k, o in enumerate(obstacles) if not isinstance(o.shape, MeshObstacle)]
         self.shapes = self._make_shapes() if self._analytic else NO_SHAPES
+        self._led = None  # how far vertices are led, where they ever are
+        row = min(int(np.diff(self.topology.first).max(initial=1)), LONGEST_ROW) * s.chunks
+        limits = (settings.initial_capacity or row, settings.max_capacity)
+        self._row = Buffer("near", entries, *limits, s.chunks, arena) if self._rows else None
         capacity = settings.initial_capacity or CONTACTS_PER_TRIANGLE * s.n_triangles + 64
         self.buffer = Buffer("contacts", contact_fields, capacity, settings.max_capacity, s.chunks, arena)
         self._reduction_arena = FieldArena()
@@ -154,55 +150,48 @@ class Detection:
         time [s]: of the obstacles. led: (k,) nodes and (k,3) how far they are led during the step [m], nan where they are not.
         Raises SimulationError where positions are not finite, or a buffer may not grow as far as it must.
         """
-        s, count = self.surface, self.counts
-        move_soft(s, self.model.x, self.model.v, dt)
+        self._move(time, dt, led)
+        self._search(self._near())
+        self._reduce()
+
+    def _move(self, time: float, dt: float, led: tuple[np.ndarray, np.ndarray] | None = None) -> None:
+        """The surface where it is and how far it goes, and the boxes."""
+        s, m = self.surface, self.model
         self._place_obstacles(time, dt)
-        if led is not None and len(led[0]):
-            self._lead(*led)
-        update_boxes(s, self.reach)
+        leads = led is not None and len(led[0]) > 0
+        update_surface(s, m.x, m.v, leads, self._lead(*led) if leads else s.move, dt, self.reach, self._rows)
         if s.count[UNFINITE]:
             raise SimulationError(self._unfinite())
-        candidates = self._candidates()
-        self._unmapped[0] = 0
+
+    def _near(self) -> Trees | Candidates | None:
+        """Where to look for near triangles; None where no two surfaces can touch."""
+        return self.broad.near() if self._rows else None
+
+    def _search(self, near: Trees | Candidates | None) -> None:
+        """Fill the buffer of contacts; what is too small for them grows."""
         while True:
-            self._search(candidates)
-            if self.buffer.fits():
+            self._fill_buffer(near)
+            grown = near is not None and self._row.grow_if_full()
+            if not self.buffer.grow_if_full() and not grown:
                 break
-            self._unmapped[0] = 0
-        self._reduce()
-        count.unmapped = self._unmapped[0]
-        count.found, count.contacts = self._reduction.count[FOUND], self._reduction.count[LEFT]
-        count.growths = {b.name: b.growths for b in self._buffers()}
 
-    def _candidates(self) -> Candidates | None:
-        """Rows of near triangles; None where no two surfaces can touch."""
-        if not self._rows:
-            return None
-        find_active(self.surface)
-        rows = self.broad.find()
-        self.counts.active, self.counts.pairs = self.surface.count[ACTIVE], self.broad.n_pairs
-        return rows
-
-    def _search(self, rows: Candidates | None) -> None:
-        """Fill the buffer of contacts, as far as it goes."""
-        s, b = self.surface, self.buffer
-        b.clear()
-        if rows is not None:
+    def _fill_buffer(self, near: Trees | Candidates | None) -> None:
+        """Contacts before the reduction, as far as they fit."""
+        s, b, row = self.surface, self.buffer, self._row
+        out, more, half = (b.data, b.used, b.count, b.part), 0, 0.5 * self.reach
+        if near is not None:
+            rows = (row.data, row.used, row.count, row.part)
             if self._proximity:
-                find_sharp_edges(s, self._way, self._sharp)
-                find_proximity(
-                    s, rows.start, rows.end, rows.entry, self._sharp, self._way, self.margin, 0.5 * self.reach, b.data, b.used,
-                    b.part,
-                )  # fmt: skip
+                find_proximity(s, near, self._way, self._sharp, *rows, self.margin, half, *out)
+                more = 1
             if self._fields is not None:
-                find_in_fields(
-                    s, self._fields, rows.start, rows.end, rows.entry, self.margin, b.data, b.used, b.part, self._unmapped
-                )
+                find_in_fields(s, near, self._fields, self._sharp, *rows, self.margin, half, *out, more, self._unmapped)
+                more = 1
         if self.shapes.count:
-            find_analytic(s, self.shapes, self.margin, b.data, b.used, b.part)
-        b.sum_up()
+            find_analytic(s, self.shapes, self.margin, *out, more)
 
     def _reduce(self) -> None:
+        """List the contacts that are kept, and count."""
         b = self.buffer
         if self._reduction is None or self._reduction.place.shape[0] != b.capacity:
             arena = FieldArena()
@@ -210,6 +199,13 @@ class Detection:
             self._reduction_arena.release()
             self._reduction_arena = arena
         reduce_contacts(self._reduction, b.data, b.used, b.part, MERGED * self.edge, REDUCTION_CELL * self.edge)
+        count, surface = self.counts, self.surface.count
+        if self._rows:
+            count.active, count.pairs = surface[ACTIVE], surface[PAIRS]
+        if self._fields is not None:
+            count.unmapped = self._unmapped[0]
+        count.found, count.contacts = self._reduction.count[FOUND], self._reduction.count[LEFT]
+        count.growths = {b.name: b.growths for b in self._buffers()}
 
     def _place_obstacles(self, time: float, dt: float) -> None:
         """Obstacles where they are at a time and at the end of the step; those that stand still are placed once."""
@@ -230,15 +226,12 @@ class Detection:
                 fields[1].from_numpy(np.concatenate([r for _, r in frames]))
         self._placed = True
 
-    def _lead(self, nodes: np.ndarray, moves: np.ndarray) -> None:
-        """Led nodes go where their path leads them."""
-        where = np.full(self.model.n_nodes, -1)
-        on = self.topology.node >= 0
-        where[self.topology.node[on]] = np.flatnonzero(on)
-        whole = self.surface.move.to_numpy()
-        rows, axes = np.nonzero(np.isfinite(moves) & (where[nodes] >= 0)[:, None])
-        whole[where[nodes[rows]], axes] = moves[rows, axes]
-        self.surface.move.from_numpy(whole)
+    def _lead(self, nodes: np.ndarray, moves: np.ndarray):
+        """The field of how far vertices are led."""
+        if self._led is None:
+            self._led = self._arena.vectors("surface_led", ti.f64, self.surface.n_verts)
+        take_led(self.surface, self._led, led_vertices(self.topology, nodes, moves))
+        return self._led
 
     def _unfinite(self) -> str:
         x, move = self.surface.x.to_numpy(), self.surface.move.to_numpy()
@@ -252,23 +245,15 @@ class Detection:
 
     def contacts(self) -> Contacts:
         """The last search's contacts, impulses 0."""
-        r, b = self._reduction, self.buffer.data
-        rows = r.kept.to_numpy()[: r.count[LEFT]]
-        body, feature = b.body.to_numpy()[rows], b.feature.to_numpy()[rows]
+        found = gather(self.buffer.data, self._reduction.kept, self._reduction.count[LEFT])
+        body, feature = found["body"], found["feature"]
         # an order that neither threads nor parts of the work change, so that a solver sees it again in the next step
         order = np.lexsort((feature[:, 2], feature[:, 1], feature[:, 0], body[:, 1], body[:, 0]))
-        rows, body, feature = rows[order], body[order], feature[order]
-
-        def taken(f) -> np.ndarray:
-            return f.to_numpy()[rows]
-
-        nodes = np.concatenate([taken(b.nodes_a), taken(b.nodes_b)], axis=1)
-        weights = np.concatenate([taken(b.weights_a), taken(b.weights_b)], axis=1)
+        names = ("point", "normal", "gap", "body", "feature", "nodes", "weights")
+        point, normal, gap, body, feature, nodes, weights = (found[name][order] for name in names)
         nodes = np.where(nodes >= 0, np.append(self.topology.node, -1)[nodes], -1)
-        return self.record(
-            taken(b.point), taken(b.normal), taken(b.gap), np.zeros((len(rows), 3)), body, feature, nodes,
-            np.where(nodes >= 0, weights, 0.0),
-        )  # fmt: skip
+        weights = np.where(nodes >= 0, weights, 0.0)
+        return self.record(point, normal, gap, np.zeros((len(gap), 3)), body, feature, nodes, weights)
 
     def record(self, point, normal, gap, impulse, body, feature, nodes, weights) -> Contacts:
         """Arrays of contacts (k, ...) with the names of the colliders and the numbers of their pairs. body: (k,2) colliders."""
@@ -288,16 +273,15 @@ class Detection:
 
     def intersections(self) -> np.ndarray:
         """(k,2) pairs of the surface's triangles that intersect where the last search found them, without a common vertex."""
-        rows = self._candidates()
-        if rows is None:
+        if not self._rows:
             return np.zeros((0, 2), dtype=np.int64)
         if self._intersections is None:
             limits = (self.scene.collision.initial_capacity, self.scene.collision.max_capacity)
             self._intersections = Intersections(self.surface, self._arena, *limits)
-        return self._intersections.find(rows)
+        return self._intersections.find(self.broad.find())
 
     def _buffers(self) -> list[Buffer]:
-        return [self.buffer, *(self.broad.buffers if self.broad is not None else ())]
+        return [self.buffer, *((self._row, *self.broad.buffers) if self._rows else ())]
 
     @property
     def field_bytes(self) -> dict[str, int]:
@@ -306,7 +290,7 @@ class Detection:
 
     def release(self) -> None:
         """Give all memory back."""
-        for part in (self.broad, self._intersections):
+        for part in (self.broad, self._intersections, self._row):
             if part is not None:
                 part.release()
         self.buffer.release()

@@ -1,7 +1,7 @@
 """Contacts by the proximity of deformed surfaces: a vertex and a face, edge or corner of the other. Edges: `edge_edge`.
 
-Every vertex looks at the triangles of one other collider in its owner's row. Outside, each local minimum of the distance is a
-contact: above a groove there are two, across a flat edge between two triangles there is one. Inside, each face that the
+Every vertex looks at the triangles of one other collider near its way (`near.py`). Outside, each local minimum of the distance
+is a contact: above a groove there are two, across a flat edge between two triangles there is one. Inside, each face that the
 vertex can leave by is one; faces that meet in a ridge or a tip are left together, by way of that ridge or tip. Faces count only
 where the vertex's own surface sticks out along their normal: so the vertex under a block never takes the far side of a thin
 sheet for its way out.
@@ -9,12 +9,14 @@ sheet for its way out.
 
 import taichi as ti
 
+from taisoft.collision.boxes import list_near, sum_pairs
+from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import VERTEX_FACE, write_contact
 from taisoft.collision.edge_edge import edge_contact
 from taisoft.collision.features import (
-    area_normal,
     corner,
     edge_normal,
+    mark_sharp_edges,
     moved,
     nearest_of_ring,
     opposite,
@@ -23,6 +25,7 @@ from taisoft.collision.features import (
     unit,
     vertices_of,
 )
+from taisoft.collision.near import EDGES, list_triangles, query_box
 from taisoft.collision.surface import ACTIVE, dvec, ivec, part_first
 from taisoft.collision.triangles import CORNER, EDGE, closest_on_triangle
 from taisoft.runtime import kernel
@@ -47,9 +50,8 @@ def relate(s: ti.template(), i, u):
     own: 1 where it is part of the vertex's own body that is near by at rest too; behind such a face no vertex is inside.
     """
     p = s.x[i]
-    n_u = area_normal(s, u)
-    size = ti.sqrt(n_u.norm())
-    n = unit(n_u)
+    size = ti.sqrt(s.area[u])
+    n = 1.0 * s.normal[u]
     a, b, c = corner(s, u, 0), corner(s, u, 1), corner(s, u, 2)
     w, region = closest_on_triangle(p, a, b, c)
     d = p - (w[0] * a + w[1] * b + w[2] * c)
@@ -82,7 +84,7 @@ def relate(s: ti.template(), i, u):
                 n = unit(edge_normal(s, u, k))
     elif size > 0.0:
         state = INSIDE
-        if distance * distance - h * h > ti.cast(TINY, ti.f64) * n_u.norm():
+        if distance * distance - h * h > ti.cast(TINY, ti.f64) * s.area[u]:
             state = BESIDE
     own = 0
     if s.body[u] == s.body[s.ring[s.ring_start[i]]]:
@@ -109,25 +111,14 @@ def closing(s: ti.template(), i, u, w, n):
 
 
 @ti.func
-def _far(s: ti.template(), i, u, half):
-    """1 where the way of vertex i, grown by half the reach [m], misses the box of triangle u."""
-    a, b = s.x[i], s.x[i] + s.move[i]
-    far = 0
-    for q in ti.static(range(3)):
-        if ti.min(a[q], b[q]) > s.hi[u][q] + half or ti.max(a[q], b[q]) < s.lo[u][q] - half:
-            far = 1
-    return far
-
-
-@ti.func
 def meet(a, b):
-    """1 where two edges can cross: one is sharp, the other at least flat. a, b: bits of `find_sharp_edges` from the edge's on."""
+    """1 where two edges can cross: one is sharp, the other at least flat. a, b: bits of `mark_sharp_edges` from the edge's on."""
     return ((a & (b >> 3)) | ((a >> 3) & b)) & 1
 
 
 @ti.func
 def vertex_contacts(
-    s: ti.template(), entry: ti.template(), first, last, i, own, margin, half, out: ti.template(), start, end
+    s: ti.template(), entry: ti.template(), first, last, i, own, margin, out: ti.template(), start, end
 ):  # fmt: skip
     """Contacts of vertex i of collider `own` with the triangles entry[first:last], all of one collider. Returns the new count.
 
@@ -159,7 +150,7 @@ def vertex_contacts(
                 if clear == 0 and least_beside < least:
                     least, best = least_beside, best_beside
                 if state == INSIDE:
-                    n_best = unit(area_normal(s, best))
+                    n_best = 1.0 * s.normal[best]
                     slack = ti.cast(1e-6, ti.f64) * least
                     for c in ti.static(range(3)):
                         normals[0, c] = n_best[c]
@@ -189,110 +180,120 @@ def vertex_contacts(
             if phase > 0 and n_kept <= KEPT:
                 u = kept[q]
         q += 1
-        look = 1
-        if phase == 0 or (phase < 3 and n_kept > KEPT):
-            look = 1 - _far(s, i, u, half)
-        if look == 1:
-            a, n, h, distance, w, own_near = relate(s, i, u)
-            near = distance - closing(s, i, u, w, n) <= margin
-            wanted = 0
-            if phase == 0:
-                if own_near == 0 and distance <= any_nearest * one:
-                    if distance * one < any_nearest:
-                        clear, nearest_beside, best_beside, least_beside = 0, inf, -1, inf
-                    any_nearest = ti.min(any_nearest, distance)
-                    if h > ti.cast(SLIGHT, ti.f64) * ti.sqrt(area_normal(s, u).norm()):
-                        clear = 1
-                pierced = a == BESIDE and distance <= any_nearest * one
-                wanted = int(a == INSIDE or pierced or (a == OUTSIDE and near))
-                if wanted == 1:
-                    if n_kept < KEPT:
-                        kept[n_kept] = u
-                    n_kept += 1
-            elif state == OUTSIDE:
-                wanted = int(a == OUTSIDE and near)
-            elif phase < 3 and (a == INSIDE or (a == BESIDE and clear == 0 and distance <= any_nearest * one)):
-                together = 0
-                if a == INSIDE:
-                    together = _behind_each_other(s, p, best, n_best, u, n, slack)
-                known = 0
-                for k in range(count):
-                    if n.dot(dvec(normals[k, 0], normals[k, 1], normals[k, 2])) > ti.cast(SAME, ti.f64):
-                        known = 1
-                if phase == 1:
-                    wanted = int(together == 1 and known == 0 and count < FACES and -h <= TOGETHER * least + slack)
-                elif known == 1 or together == 1:
-                    if count > 1 and n.dot(way) > 0.0:
-                        depth = ti.min(depth, -h / n.dot(way))
-                else:
-                    wanted = int(n.dot(n_best) > -0.5)  # a groove's other wall
+        a, n, h, distance, w, own_near = relate(s, i, u)
+        near = distance - closing(s, i, u, w, n) <= margin
+        wanted = 0
+        if phase == 0:
+            if own_near == 0 and distance <= any_nearest * one:
+                if distance * one < any_nearest:
+                    clear, nearest_beside, best_beside, least_beside = 0, inf, -1, inf
+                any_nearest = ti.min(any_nearest, distance)
+                if h > ti.cast(SLIGHT, ti.f64) * ti.sqrt(s.area[u]):
+                    clear = 1
+            pierced = a == BESIDE and distance <= any_nearest * one
+            wanted = int(a == INSIDE or pierced or (a == OUTSIDE and near))
             if wanted == 1:
-                wanted = sticks_out(s, i, n)
-            gap = h
-            if phase == 0 and wanted == 1:
-                if a == BESIDE:
-                    nearest_beside = ti.min(nearest_beside, distance)
-                    if -h < least_beside:
-                        least_beside, best_beside = -h, u
-                else:
-                    if distance < nearest:
-                        nearest, state = distance, a
-                    if a == INSIDE and -h < least:
-                        least, best = -h, u
-            elif phase == 1 and wanted == 1:
-                for c in ti.static(range(3)):
-                    normals[count, c] = n[c]
-                count += 1
-                total += n
-            elif phase == 3:
-                wanted, gap = 1, -depth
-                n = 1.0 * way
-            elif state == OUTSIDE:
-                gap = distance
-            if phase >= 2 and wanted == 1:
-                write_contact(
-                    out, at, end, own, other, ivec(VERTEX_FACE, i, u), p, n, gap,
-                    ivec(i, -1, -1), dvec(1.0, 0.0, 0.0), vertices_of(s, u), w,
-                )  # fmt: skip
-                at += 1
+                if n_kept < KEPT:
+                    kept[n_kept] = u
+                n_kept += 1
+        elif state == OUTSIDE:
+            wanted = int(a == OUTSIDE and near)
+        elif phase < 3 and (a == INSIDE or (a == BESIDE and clear == 0 and distance <= any_nearest * one)):
+            together = 0
+            if a == INSIDE:
+                together = _behind_each_other(s, p, best, n_best, u, n, slack)
+            known = 0
+            for k in range(count):
+                if n.dot(dvec(normals[k, 0], normals[k, 1], normals[k, 2])) > ti.cast(SAME, ti.f64):
+                    known = 1
+            if phase == 1:
+                wanted = int(together == 1 and known == 0 and count < FACES and -h <= TOGETHER * least + slack)
+            elif known == 1 or together == 1:
+                if count > 1 and n.dot(way) > 0.0:
+                    depth = ti.min(depth, -h / n.dot(way))
+            else:
+                wanted = int(n.dot(n_best) > -0.5)  # a groove's other wall
+        if wanted == 1:
+            wanted = sticks_out(s, i, n)
+        gap = h
+        if phase == 0 and wanted == 1:
+            if a == BESIDE:
+                nearest_beside = ti.min(nearest_beside, distance)
+                if -h < least_beside:
+                    least_beside, best_beside = -h, u
+            else:
+                if distance < nearest:
+                    nearest, state = distance, a
+                if a == INSIDE and -h < least:
+                    least, best = -h, u
+        elif phase == 1 and wanted == 1:
+            for c in ti.static(range(3)):
+                normals[count, c] = n[c]
+            count += 1
+            total += n
+        elif phase == 3:
+            wanted, gap = 1, -depth
+            n = 1.0 * way
+        elif state == OUTSIDE:
+            gap = distance
+        if phase >= 2 and wanted == 1:
+            write_contact(
+                out, at, end, own, other, ivec(VERTEX_FACE, i, u), p, n, gap,
+                ivec(i, -1, -1), dvec(1.0, 0.0, 0.0), vertices_of(s, u), w,
+            )  # fmt: skip
+            at += 1
     return at
 
 
 @kernel
 def find_proximity(
-    s: ti.template(), start: ti.template(), row_end: ti.template(), entry: ti.template(), sharp: ti.template(),
-    way: ti.template(), margin: ti.f64, half: ti.f64, out: ti.template(), used: ti.template(), part: ti.i32,
+    s: ti.template(), near: ti.template(), way: ti.template(), sharp: ti.template(), row: ti.template(), longest: ti.template(),
+    needed: ti.template(), room: ti.i32, margin: ti.f64, half: ti.f64, out: ti.template(), used: ti.template(),
+    count: ti.template(), part: ti.i32,
 ):  # fmt: skip
-    """All contacts by proximity.
+    """All contacts by proximity: the first in the buffer `out`, of which `used` and `count` tell.
 
-    way: (n_bodies) i32, of BY_FIELD, BY_FACES, BY_EDGES; sharp: of `find_sharp_edges`;
-    half: of the reach by which boxes are grown [m].
+    near: trees or rows of a broad phase; way: (n_bodies) i32, of BY_FIELD, BY_FACES, BY_EDGES; sharp: room for what
+    `mark_sharp_edges` finds; row, longest, needed, room: the buffer of what is near one thing; half: of the reach [m].
     """
+    mark_sharp_edges(s, way, sharp)
     ti.loop_config(serialize=s.serial)
     for wide in range(s.chunks * s.spread):
         if wide % s.spread == 0:
             c = wide // s.spread
-            at, end = c * part, (c + 1) * part
+            at, end, begin = c * part, (c + 1) * part, c * room
+            own, n_near, most, pairs = -1, 0, 0, 0
             for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
                 t = s.active[j]
-                own = s.body[t]
-                first = start[t]
-                while first < row_end[t]:  # the triangles of one other collider after another
-                    other = s.body[entry[first]]
-                    last = first + 1
-                    while last < row_end[t] and s.body[entry[last]] == other:
-                        last += 1
-                    if way[other] == BY_FACES or other == own:
-                        for k in range(3):
-                            if (s.owns[t] >> k) & 1:
-                                at = vertex_contacts(s, entry, first, last, s.triangle[t, k], own, margin, half, out, at, end)
-                    if sharp[t] != 0:
-                        for e in range(first, last):
-                            u = entry[e]
-                            if u > t and sharp[u] != 0:
-                                for km in range(9):
-                                    k, m = km // 3, km % 3
-                                    if meet(sharp[t] >> k, sharp[u] >> m) == 1:
-                                        at = edge_contact(s, t, k, u, m, margin, out, at, end)
-                    first = last
-            used[c] = at - c * part
+                if s.body[t] != own:
+                    own = s.body[t]
+                    n_near = list_near(s, c, own)
+                for q in range(4):  # the corners, then the edges
+                    wanted = (s.owns[t] >> q) & 1
+                    if q == EDGES:
+                        wanted = int(sharp[t] & 7 != 0)
+                    if wanted == 1:
+                        lo, hi = query_box(s, near, t, q, half)
+                        for k in range(n_near):
+                            other = s.near[c * s.n_bodies + k]
+                            if q == EDGES or way[other] == BY_FACES or other == own:
+                                n = list_triangles(s, near, sharp, other, t, q, lo, hi, row, begin, begin + room)
+                                most, pairs = ti.max(most, n), pairs + n
+                                if q < 3:
+                                    if 0 < n <= room:
+                                        i = s.triangle[t, q]
+                                        at = vertex_contacts(s, row, begin, begin + n, i, own, margin, out, at, end)
+                                elif n <= room:
+                                    for e in range(9 * n):
+                                        u, k_t, k_u = row[begin + e // 9], e % 9 // 3, e % 3
+                                        if meet(sharp[t] >> k_t, sharp[u] >> k_u) == 1:
+                                            t1, k1, t2, k2 = t, k_t, u, k_u
+                                            if u < t:
+                                                t1, k1, t2, k2 = u, k_u, t, k_t
+                                            at = edge_contact(s, t1, k1, t2, k2, margin, out, at, end)
+            used[c], longest[c], s.part[c] = at - c * part, most, pairs
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        sum_parts(used, count, s.chunks)
+        sum_parts(longest, needed, s.chunks)
+        sum_pairs(s, 0)

@@ -18,25 +18,25 @@ from taisoft.runtime import FieldArena, kernel
 
 SAME_NORMAL = 0.996  # cosine of 5 degrees
 UNKNOWN, KEPT, DROPPED = 0, 1, 2
-FOUND, LEFT, UNDECIDED = 0, 1, 2  # places in the count
+FOUND, LEFT, UNDECIDED, MASK = 0, 1, 2, 3  # places in the count; MASK: buckets in use, less one
 
 
 @dataclass(frozen=True, eq=False)
 class ReductionFields:
     """Work space. The first count[LEFT] of `kept` are the contacts' places in the buffer, in its order."""
 
-    buckets: int  # a power of two
+    buckets: int  # a power of two; as many are used as there are contacts
     chunks: int
     serial: bool
     spread: int  # as of the surface
     place: Any  # (capacity) i32: of the i-th contact found
-    bucket: Any  # (capacity) i32: of each contact
+    bucket: Any  # (capacity) i32: of the i-th contact
     bucket_start: Any  # (buckets) i32: where its members begin and end
     bucket_end: Any
-    member: Any  # (capacity) i32
-    state: Any  # (capacity) i32
+    member: Any  # (capacity) i32: places
+    state: Any  # (capacity) i32: of the contact at each place
     kept: Any  # (capacity) i32
-    count: Any  # (3) i32
+    count: Any  # (4) i32
     first: Any  # (chunks) i32: number of the first contact of each part
 
 
@@ -50,7 +50,7 @@ def reduction_fields(arena: FieldArena, capacity: int, chunks: int, serial: bool
     return ReductionFields(
         buckets, chunks, serial, spread, ints("place", capacity), ints("bucket", capacity), ints("bucket_start", buckets),
         ints("bucket_end", buckets), ints("member", capacity),
-        ints("state", capacity), ints("kept", capacity), ints("count", 3), ints("first", chunks),
+        ints("state", capacity), ints("kept", capacity), ints("count", 4), ints("first", chunks),
     )  # fmt: skip
 
 
@@ -68,17 +68,12 @@ def _cell(p, inverse):
 def _bucket(r: ti.template(), cell):
     x, y, z = ti.cast(cell[0], ti.i64), ti.cast(cell[1], ti.i64), ti.cast(cell[2], ti.i64)
     h = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)  # Teschner et al. 2003
-    return ti.cast((h ^ (h >> 15)) & (r.buckets - 1), ti.i32)
+    return ti.cast((h ^ (h >> 15)) & r.count[MASK], ti.i32)
 
 
-@kernel
-def list_contacts(
-    r: ti.template(), out: ti.template(), used: ti.template(), part: ti.i32, inverse: ti.f64
-):  # fmt: skip
+@ti.func
+def _fill_cells(r: ti.template(), out: ti.template(), used: ti.template(), part, inverse):
     """Number the contacts of all parts through and put them into the cells."""
-    ti.loop_config(serialize=r.serial)
-    for b in range(r.buckets):
-        r.bucket_end[b] = 0
     ti.loop_config(serialize=True)
     for _ in range(1):
         total = 0
@@ -86,6 +81,13 @@ def list_contacts(
             r.first[k] = total
             total += used[k]
         r.count[FOUND] = total
+        mask = 63
+        while mask + 1 < total:
+            mask = 2 * mask + 1
+        r.count[MASK] = mask
+    ti.loop_config(serialize=r.serial)
+    for b in range(r.count[MASK] + 1):
+        r.bucket_end[b] = 0
     ti.loop_config(serialize=r.serial)
     for wide in range(r.chunks * r.spread):
         if wide % r.spread == 0:
@@ -93,20 +95,20 @@ def list_contacts(
             for k in range(used[c]):
                 i, at = r.first[c] + k, c * part + k
                 r.place[i] = at
-                r.state[i] = UNKNOWN
+                r.state[at] = UNKNOWN
                 b = _bucket(r, _cell(out.point[at], inverse))
                 r.bucket[i] = b
                 ti.atomic_add(r.bucket_end[b], 1)
     ti.loop_config(serialize=True)
     for _ in range(1):
         total = 0
-        for b in range(r.buckets):
+        for b in range(r.count[MASK] + 1):
             r.bucket_start[b] = total
             total += r.bucket_end[b]
             r.bucket_end[b] = r.bucket_start[b]
     ti.loop_config(serialize=r.serial)
     for i in range(r.count[FOUND]):
-        r.member[ti.atomic_add(r.bucket_end[r.bucket[i]], 1)] = i
+        r.member[ti.atomic_add(r.bucket_end[r.bucket[i]], 1)] = r.place[i]
 
 
 @ti.func
@@ -130,10 +132,10 @@ def is_earlier(out: ti.template(), a, b):
 
 
 @ti.func
-def _decide(r: ti.template(), out: ti.template(), i, inverse, tolerance):
-    """State of contact i by the states of the earlier ones near it."""
-    at = r.place[i]
-    lo, hi = _cell(out.point[at] - tolerance, inverse), _cell(out.point[at] + tolerance, inverse)
+def _decide(r: ti.template(), out: ti.template(), at, inverse, tolerance):
+    """State of the contact at a place by the states of the earlier ones near it."""
+    p = out.point[at]
+    lo, hi = _cell(p - tolerance, inverse), _cell(p + tolerance, inverse)
     n = ti.select(lo == hi, 1, 2)
     state = KEPT
     k = 0
@@ -142,45 +144,64 @@ def _decide(r: ti.template(), out: ti.template(), i, inverse, tolerance):
         cell = ivec(ti.select(x == 0, lo[0], hi[0]), ti.select(y == 0, lo[1], hi[1]), ti.select(z == 0, lo[2], hi[2]))
         b = _bucket(r, cell)
         for m in range(r.bucket_start[b], r.bucket_end[b]):
-            j = r.member[m]
-            if r.state[j] != DROPPED:
-                found = 0
-                if is_earlier(out, r.place[j], at) == 1:
-                    found = int(is_same(out, at, r.place[j], tolerance))
-                if found == 1:
-                    if r.state[j] == KEPT:
-                        state = DROPPED
-                    elif state == KEPT:
-                        state = UNKNOWN
+            other = r.member[m]
+            d = p - out.point[other]
+            if d.dot(d) <= tolerance * tolerance:  # most are told apart by this
+                if is_earlier(out, other, at) == 1:
+                    theirs = r.state[other]
+                    if theirs != DROPPED and is_same(out, at, other, tolerance):
+                        if theirs == KEPT:
+                            state = DROPPED
+                        elif state == KEPT:
+                            state = UNKNOWN
         k += 1
     return state
 
 
-@kernel
-def decide(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64):
+@ti.func
+def _decide_all(r: ti.template(), out: ti.template(), inverse, tolerance):
     """A round: decide what can be decided."""
     r.count[UNDECIDED] = 0
     ti.loop_config(serialize=r.serial)
     for i in range(r.count[FOUND]):
-        if r.state[i] == UNKNOWN:
-            state = _decide(r, out, i, inverse, tolerance)
+        at = r.place[i]
+        if r.state[at] == UNKNOWN:
+            state = _decide(r, out, at, inverse, tolerance)
             if state == UNKNOWN:
                 ti.atomic_add(r.count[UNDECIDED], 1)
             else:
-                r.state[i] = state
+                r.state[at] = state
 
 
-@kernel
-def list_kept(r: ti.template()):
-    """List the kept contacts in order."""
+@ti.func
+def _list_kept(r: ti.template()):
+    """List the kept contacts in order, when all are decided."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         n = 0
-        for i in range(r.count[FOUND]):
-            if r.state[i] == KEPT:
-                r.kept[n] = r.place[i]
-                n += 1
+        if r.count[UNDECIDED] == 0:
+            for i in range(r.count[FOUND]):
+                if r.state[r.place[i]] == KEPT:
+                    r.kept[n] = r.place[i]
+                    n += 1
         r.count[LEFT] = n
+
+
+@kernel
+def begin_reduction(
+    r: ti.template(), out: ti.template(), used: ti.template(), part: ti.i32, inverse: ti.f64, tolerance: ti.f64
+):  # fmt: skip
+    """Put the contacts into the cells, and the first round; the only one, unless contacts wait for others."""
+    _fill_cells(r, out, used, part, inverse)
+    _decide_all(r, out, inverse, tolerance)
+    _list_kept(r)
+
+
+@kernel
+def decide(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64):
+    """A further round."""
+    _decide_all(r, out, inverse, tolerance)
+    _list_kept(r)
 
 
 def reduce_contacts(
@@ -188,11 +209,6 @@ def reduce_contacts(
 ) -> None:  # fmt: skip
     """Fill r.kept and r.count. tolerance [m]; cell: edge of the cells [m], widened to 2.5 times the tolerance."""
     inverse = 1.0 / max(cell, 2.5 * tolerance)
-    list_contacts(r, out, used, part, inverse)
-    while True:
+    begin_reduction(r, out, used, part, inverse, tolerance)
+    while r.count[UNDECIDED] > 0:
         decide(r, out, inverse, tolerance)
-        if r.count[UNDECIDED] == 0:
-            break
-    list_kept(r)
-
-

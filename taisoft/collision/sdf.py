@@ -1,6 +1,6 @@
 """Contacts with soft bodies by their signed distance at rest, mapped by the deformation (report, section 2.3.2).
 
-A point near body B goes to B's material space through the tet behind the nearest of B's surface triangles in its row:
+A point near body B goes to B's material space through the tet behind the nearest of B's surface triangles near it:
 X = X0 + F^-1 (x - x0). There phi is read from a grid. Back in the world the normal is F^-T grad phi, normalised (a covector), and
 the gap phi / |F^-T grad phi|. Vertices of A are contacts where its surface sticks out towards B; a triangle adds its deepest
 point where that lies deeper than its corners: one Frank-Wolfe solve for each (triangle, body), and none where phi at the
@@ -15,9 +15,12 @@ import numpy as np
 import taichi as ti
 
 from taisoft.collision.analytic import DEEPER, deeper_inside
+from taisoft.collision.boxes import list_near, sum_pairs
+from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import FACE_FIELD, VERTEX_FIELD, write_contact
 from taisoft.collision.features import corner, moved, sticks_out, unit, vertices_of
 from taisoft.collision.frank_wolfe import deepest_point
+from taisoft.collision.near import WHOLE, list_triangles, query_box
 from taisoft.collision.surface import ACTIVE, dvec, ivec, part_first
 from taisoft.collision.triangles import choose, closest_on_triangle
 from taisoft.mesh.sdf_grid import SdfGrid
@@ -226,27 +229,37 @@ def _field_contacts(
 
 @kernel
 def find_in_fields(
-    s: ti.template(), f: ti.template(), start: ti.template(), row_end: ti.template(), entry: ti.template(), margin: ti.f64,
-    out: ti.template(), used: ti.template(), part: ti.i32, unmapped: ti.template(),
+    s: ti.template(), near: ti.template(), f: ti.template(), sharp: ti.template(), row: ti.template(), longest: ti.template(),
+    needed: ti.template(), room: ti.i32, margin: ti.f64, half: ti.f64, out: ti.template(), used: ti.template(),
+    count: ti.template(), part: ti.i32, more: ti.i32, unmapped: ti.template(),
 ):  # fmt: skip
-    """Add the contacts with distance fields; unmapped[0] counts the (triangle, body) that no tet maps."""
+    """Contacts with distance fields; unmapped[0] counts the (triangle, body) that no tet maps. As `find_proximity`, after whose
+    contacts they come where `more` is 1."""
+    unmapped[0] = 0
     ti.loop_config(serialize=s.serial)
     for wide in range(s.chunks * s.spread):
         if wide % s.spread == 0:
             c = wide // s.spread
-            at, end = c * part + used[c], (c + 1) * part
-            lost = 0
+            at, end, begin = c * part + more * used[c], (c + 1) * part, c * room
+            own, n_near, most, pairs, lost = -1, 0, more * longest[c], 0, 0
             for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
                 t = s.active[i]
-                first = start[t]
-                while first < row_end[t]:
-                    other = s.body[entry[first]]
-                    last = first + 1
-                    while last < row_end[t] and s.body[entry[last]] == other:
-                        last += 1
-                    if f.of_body[other] >= 0 and other != s.body[t]:
-                        at, miss = _field_contacts(s, f, entry, first, last, t, margin, out, at, end)
-                        lost += miss
-                    first = last
-            used[c] = at - c * part
+                if s.body[t] != own:
+                    own = s.body[t]
+                    n_near = list_near(s, c, own)
+                lo, hi = query_box(s, near, t, WHOLE, half)
+                for k in range(n_near):
+                    other = s.near[c * s.n_bodies + k]
+                    if f.of_body[other] >= 0 and other != own:
+                        n = list_triangles(s, near, sharp, other, t, WHOLE, lo, hi, row, begin, begin + room)
+                        most, pairs = ti.max(most, n), pairs + n
+                        if 0 < n <= room:
+                            at, miss = _field_contacts(s, f, row, begin, begin + n, t, margin, out, at, end)
+                            lost += miss
+            used[c], longest[c], s.part[c] = at - c * part, most, pairs
             ti.atomic_add(unmapped[0], lost)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        sum_parts(used, count, s.chunks)
+        sum_parts(longest, needed, s.chunks)
+        sum_pairs(s, more)

@@ -63,7 +63,7 @@ class Intersections:
         found, c = self.pairs, candidates
         while True:
             find_intersections(self.surface, c.start, c.end, c.entry, found.data, found.used, found.count, found.part)
-            if found.fits():
+            if not found.grow_if_full():
                 break
         data, used = found.data.to_numpy(), found.used.to_numpy()
         places = np.arange(found.capacity)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.collision.candidates import TOTAL, Buffer, Candidates, entries, sort_row, sum_parts
+from taisoft.collision.candidates import Buffer, Candidates, entries, sort_row, sum_parts
 from taisoft.collision.surface import ACTIVE, Surface, boxes_overlap, ivec, may_touch, part_first
 from taisoft.runtime import FieldArena, kernel
 
@@ -270,23 +270,22 @@ class SpatialHash:
         count_cells(s, g, inverse)
         scan_cells(s, g)
         self.members.count[0] = g.count[N_ENTRIES]
-        self.members.fits()
+        self.members.grow_if_full()
         scatter_cells(s, g, self.members.data)
         while True:
             rows = self.rows
             find_rows(s, g, self.members.data, rows.data, rows.used, rows.count, rows.part, inverse)
-            if rows.fits():
+            if not rows.grow_if_full():
                 return Candidates(g.start, g.end, rows.data)
+
+    def near(self) -> Candidates:
+        """The same, for `near.py` to look into."""
+        return self.find()
 
     @property
     def buffers(self) -> tuple[Buffer, ...]:
         """What grows."""
         return self.members, self.rows
-
-    @property
-    def n_pairs(self) -> int:
-        """Pairs that the last search found."""
-        return self.rows.count[TOTAL] // 2
 
     def release(self) -> None:
         """Give the memory of the buffers back."""

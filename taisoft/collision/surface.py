@@ -1,8 +1,6 @@
 """Surface: the triangles of everything that can be touched, in one list: soft bodies first, then obstacles that have faces.
 
-Positions and boxes are f64 in either precision: a gap is a small difference of large numbers. A triangle's box holds it at
-the start and at the end of the step and is grown by half the margin, so that two triangles whose distance falls below the
-margin have overlapping boxes. A triangle with a coordinate that is not finite has an empty box, which overlaps nothing.
+Positions and boxes are f64 in either precision: a gap is a small difference of large numbers. `boxes.py` fills them.
 """
 
 from dataclasses import dataclass
@@ -11,13 +9,13 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.runtime import FieldArena, Runtime, kernel
+from taisoft.runtime import FieldArena, Runtime
 
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than waking the others (about 50 us a loop)
 # Taichi gives each CPU thread at least 512 turns of a loop: so many turns belong to one part, and one of them does the work
 SPREAD = {"cpu": 512, "cuda": 1}
 CHUNKS = {"cpu": 64, "cuda": 4096}  # parts of a list that are worked on side by side, each with its own part of a buffer
-UNFINITE, ACTIVE = 0, 1  # places in Surface.count
+UNFINITE, ACTIVE, PAIRS = 0, 1, 2  # places in Surface.count
 
 dvec = ti.types.vector(3, ti.f64)
 ivec = ti.types.vector(3, ti.i32)
@@ -30,7 +28,7 @@ class Topology:
     triangle: (t,3) vertices; body: (t,) collider, ascending; first: (n_bodies + 1,) first triangle of each collider;
     vertex_first: (n_bodies + 1,) first vertex; node: (v,) the model's node, -1 for obstacles; neighbour: (t,3) triangle across
     the edge from corner k to k + 1, -1 where there is none; owns: (t,) bits 0-2 corners, 3-5 edges that this triangle
-    handles for all that share them; ring_start, ring: triangles round each vertex.
+    handles for all that share them; ring_start, ring: triangles round each vertex; around_start, around: vertices round it.
     """
 
     triangle: np.ndarray
@@ -42,6 +40,8 @@ class Topology:
     owns: np.ndarray
     ring_start: np.ndarray
     ring: np.ndarray
+    around_start: np.ndarray
+    around: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +61,8 @@ class Surface:
     owns: Any  # i32
     ring_start: Any  # i32
     ring: Any  # i32
+    around_start: Any  # i32
+    around: Any  # i32
     soft: Any  # (n_bodies) i32: 1 for soft bodies
     self_on: Any  # (n_bodies) i32: 1 where a body is tested against itself
     first_of: Any  # (n_bodies + 1) i32
@@ -69,11 +71,14 @@ class Surface:
     move: Any  # (n_verts) 3-vectors f64: how far they go in the step [m]
     lo: Any  # 3-vectors f64: boxes of the triangles [m]
     hi: Any
+    normal: Any  # 3-vectors f64: unit normals of the triangles where they are, 0 where they have none
+    area: Any  # f64: twice their areas [m^2]
     body_lo: Any  # (n_bodies) 3-vectors f64
     body_hi: Any
     active: Any  # i32: triangles whose box meets another collider's, ascending; the first count[ACTIVE] hold
-    count: Any  # (4) i32, of UNFINITE and ACTIVE
+    count: Any  # (4) i32: UNFINITE and ACTIVE triangles, and PAIRS of what is near with what
     part: Any  # (chunks) i32: counts of the parts of a list
+    near: Any  # (chunks * n_bodies) i32: colliders near that which a part is at
 
 
 def make_topology(parts: list[tuple[np.ndarray, np.ndarray]]) -> Topology:
@@ -97,8 +102,16 @@ def make_topology(parts: list[tuple[np.ndarray, np.ndarray]]) -> Topology:
     corner_owned = owner[t] == np.arange(len(t))[:, None]
     bits = np.concatenate([corner_owned, edge_owned], axis=1) @ (1 << np.arange(6))
     return Topology(
-        t, np.concatenate(body), np.array(first), np.array(vertex_first), np.concatenate(node), neighbour, bits, start, ring
-    )
+        t, np.concatenate(body), np.array(first), np.array(vertex_first), np.concatenate(node), neighbour, bits, start, ring,
+        *_around(t, vertex_first[-1]),
+    )  # fmt: skip
+
+
+def _around(t: np.ndarray, n_verts: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where each vertex's list begins (n_verts + 1,), and the vertices that share an edge with it, ascending."""
+    ends = t[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    code = np.unique(np.concatenate([ends, ends[:, ::-1]]) @ [n_verts, 1])
+    return np.searchsorted(code, np.arange(n_verts + 1) * n_verts), code % max(n_verts, 1)
 
 
 def _edges(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -142,10 +155,13 @@ def build_surface(
         n, v, bodies, serial, chunks, 1 if serial else SPREAD[runtime.arch], rows("triangle", t.triangle),
         ints("body", t.body), ints("node", t.node),
         rows("neighbour", t.neighbour), ints("owns", t.owns), ints("ring_start", t.ring_start), ints("ring", t.ring),
+        ints("around_start", t.around_start), ints("around", t.around),
         ints("soft", soft), ints("self_on", self_on), ints("first_of", t.first),
         arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None), vectors("x", v), vectors("move", v),
-        vectors("lo", n), vectors("hi", n), vectors("body_lo", bodies), vectors("body_hi", bodies),
+        vectors("lo", n), vectors("hi", n), vectors("normal", n), arena.field("surface_area", ti.f64, max(n, 1)),
+        vectors("body_lo", bodies), vectors("body_hi", bodies),
         arena.field("surface_active", i, max(n, 1)), arena.field("surface_count", i, 4), arena.field("surface_part", i, chunks),
+        arena.field("surface_near", i, chunks * max(bodies, 1)),
     )  # fmt: skip
 
 
@@ -193,100 +209,3 @@ def may_touch(s: ti.template(), t, u):
     elif s.self_on[a] == 1:
         result = 1 - share_vertex(s, t, u)
     return result
-
-
-@kernel
-def move_soft(s: ti.template(), x: ti.template(), v: ti.template(), dt: ti.f64):
-    """Take the soft bodies' positions x (n_nodes) [m] and the way v dt of a step from the model."""
-    ti.loop_config(serialize=s.serial)
-    for i in range(s.n_verts):
-        if s.node[i] >= 0:
-            s.x[i] = x[s.node[i]]
-            s.move[i] = dt * ti.cast(v[s.node[i]], ti.f64)
-
-
-@kernel
-def move_obstacles(s: ti.template(), first: ti.i32, x: ti.types.ndarray(), move: ti.types.ndarray()):
-    """Place the vertices of an obstacle, the first of which is `first`: x, move (n,3) f64 [m]."""
-    ti.loop_config(serialize=s.serial)
-    for i in range(x.shape[0]):
-        for q in ti.static(range(3)):
-            s.x[first + i][q] = x[i, q]
-            s.move[first + i][q] = move[i, q]
-
-
-@kernel
-def update_boxes(s: ti.template(), margin: ti.f64):
-    """Boxes of triangles and colliders from x and move; counts the triangles that are not finite."""
-    s.count[UNFINITE] = 0
-    ti.loop_config(serialize=s.serial)
-    for t in range(s.n_triangles):
-        lo = dvec(ti.math.inf)
-        hi = dvec(-ti.math.inf)
-        finite = 1
-        for k in range(3):
-            i = s.triangle[t, k]
-            a, d = s.x[i], s.move[i]
-            b = a + d
-            lo = ti.min(lo, ti.min(a, b))
-            hi = ti.max(hi, ti.max(a, b))
-            for q in ti.static(range(3)):
-                if not (ti.abs(a[q]) < ti.math.inf and ti.abs(b[q]) < ti.math.inf):
-                    finite = 0
-        if finite == 1:
-            s.lo[t] = lo - ti.cast(0.5, ti.f64) * margin
-            s.hi[t] = hi + ti.cast(0.5, ti.f64) * margin
-        else:
-            s.lo[t] = dvec(ti.math.inf)
-            s.hi[t] = dvec(-ti.math.inf)
-            ti.atomic_add(s.count[UNFINITE], 1)
-    ti.loop_config(serialize=s.serial)
-    for b in range(s.n_bodies):
-        lo = dvec(ti.math.inf)
-        hi = dvec(-ti.math.inf)
-        for t in range(s.first_of[b], s.first_of[b + 1]):
-            lo = ti.min(lo, s.lo[t])
-            hi = ti.max(hi, s.hi[t])
-        s.body_lo[b] = lo
-        s.body_hi[b] = hi
-
-
-@ti.func
-def _meets_another(s: ti.template(), t):
-    """Whether a triangle's box meets the box of a collider that it may touch."""
-    own, lo, hi = s.body[t], s.lo[t], s.hi[t]
-    found = 0
-    if (lo <= hi).all():
-        found = s.self_on[own]
-        b = 0
-        while found == 0 and b < s.n_bodies:
-            if b != own and (s.soft[own] | s.soft[b]) == 1 and (lo <= s.body_hi[b]).all() and (s.body_lo[b] <= hi).all():
-                found = 1
-            b += 1
-    return found
-
-
-@kernel
-def find_active(s: ti.template()):
-    """List the triangles that can have a partner, in ascending order."""
-    ti.loop_config(serialize=s.serial)
-    for wide in range(s.chunks * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
-            first = part_first(c, s.n_triangles, s.chunks)
-            n = 0
-            for t in range(first, part_first(c + 1, s.n_triangles, s.chunks)):
-                if _meets_another(s, t):
-                    s.active[first + n] = t
-                    n += 1
-            s.part[c] = n
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        total = 0
-        for k in range(s.chunks):
-            base = part_first(k, s.n_triangles, s.chunks)
-            n = s.part[k]
-            for j in range(n):  # moves left only, so nothing is overwritten before it is read
-                s.active[total + j] = s.active[base + j]
-            total += n
-        s.count[ACTIVE] = total

@@ -1,0 +1,138 @@
+"""What lies near a corner of a triangle, or near the whole of it, over scenes of random triangles, swept, flown off and with NaN:
+
+* from trees of boxes and from the rows of the spatial hash it is what brute force finds, ascending, serial and parallel;
+* from trees of more slabs it is some of that, and all that comes within the reach;
+* what does not fit is counted and not written.
+"""
+
+import numpy as np
+import pytest
+import taichi as ti
+from surfaces import place, surface_of
+from test_bvh import colliders, scatter
+
+from taisoft.collision.boxes import list_near
+from taisoft.collision.bvh import Bvh
+from taisoft.collision.near import EDGES, WHOLE, list_triangles, query_box
+from taisoft.collision.spatial_hash import SpatialHash
+from taisoft.runtime import FieldArena, kernel
+
+ROOM = 300
+
+
+@kernel
+def list_all(
+    s: ti.template(), near: ti.template(), sharp: ti.template(), q: ti.i32, half: ti.f64, room: ti.i32, entry: ti.template(),
+    count: ti.template(),
+):  # fmt: skip
+    """count[t, b]: triangles of collider b near corner q of t, -1 where b is not near; entry: the same, at (t, b, 0) and on."""
+    ti.loop_config(serialize=True)
+    for t in range(s.n_triangles):
+        for b in range(s.n_bodies):
+            count[t, b] = -1
+        lo, hi = query_box(s, near, t, q, half)
+        for k in range(list_near(s, 0, s.body[t])):
+            b = s.near[k]
+            begin = (t * s.n_bodies + b) * ROOM
+            count[t, b] = list_triangles(s, near, sharp, b, t, q, lo, hi, entry, begin, begin + room)
+
+
+@pytest.fixture(scope="module", params=[("f64", True), ("f32", False)], ids=str)
+def rig(request):
+    rng = np.random.default_rng(1)
+    precision, serial = request.param
+    with surface_of(**colliders(rng), precision=precision, serial=serial) as made:
+        made.x0, s = made.x, made.surface
+        arenas = [FieldArena() for _ in range(3)]
+        made.sources = {
+            "boxes": Bvh(s, made.topology, made.x, made.margin, made.machine, arenas[0], leaves=5),
+            "slabs": Bvh(s, made.topology, made.x, made.margin, made.machine, arenas[1], k_dop=14, leaves=5),
+            "rows": SpatialHash(s, arenas[2], 0.3, np.ones(3)),
+        }
+        made.sharp = made.arena.field("sharp", ti.i32, s.n_triangles, rng.choice([0, 8, 9], s.n_triangles).astype(np.int32))
+        made.entry = made.arena.field("entries", ti.i32, s.n_triangles * s.n_bodies * ROOM)
+        made.count = made.arena.field("counts", ti.i32, (s.n_triangles, s.n_bodies))
+        yield made
+        for part in (*made.sources.values(), *arenas):
+            part.release()
+
+
+def listed(made, source: str, q: int, room: int = ROOM) -> tuple[np.ndarray, np.ndarray]:
+    """(k,2) triangle and what is near it, in the order given; counts."""
+    s, near = made.surface, made.sources[source]
+    near.margin = made.margin
+    made.entry.fill(-7)
+    list_all(s, near.near(), made.sharp, q, 0.5 * made.margin, room, made.entry, made.count)
+    count = made.count.to_numpy()
+    entry = made.entry.to_numpy().reshape(s.n_triangles, s.n_bodies, ROOM)
+    inside = np.arange(ROOM) < np.minimum(count, room)[:, :, None]
+    assert (entry[~inside] == -7).all()
+    t = np.broadcast_to(np.arange(s.n_triangles)[:, None, None], entry.shape)
+    return np.stack([t[inside], entry[inside]], axis=1), count
+
+
+def expected(made, q: int, grown: float) -> np.ndarray:
+    """(k,2) by brute force, ascending: corners whose swept box, grown by so much [m], meets the boxes of the surface."""
+    t, body = made.topology.triangle, made.topology.body
+    lo, hi = made.surface.lo.to_numpy(), made.surface.hi.to_numpy()
+    finite = (lo <= hi).all(axis=1)
+    some = t if q > 2 else t[:, [q]]
+    ends = np.concatenate([made.x[some], (made.x + made.move)[some]], axis=1)
+    with np.errstate(invalid="ignore"):
+        mine_lo, mine_hi = ends.min(axis=1) - grown, ends.max(axis=1) + grown
+    meet = (mine_lo[:, None] <= hi[None]).all(axis=2) & (lo[None] <= mine_hi[:, None]).all(axis=2) & finite[:, None] & finite
+    shared = (t[:, None, :, None] == t[None, :, None, :]).any(axis=(2, 3))
+    same = body[:, None] == body[None]
+    meet &= np.where(same, made.self_on[body][:, None] & ~shared, made.soft[body][:, None] | made.soft[body][None])
+    if q == EDGES:
+        sharp = made.sharp.to_numpy()
+        meet &= (sharp != 0) & (np.triu(np.ones_like(meet), 1) | (sharp & 7 == 0))
+    return np.argwhere(meet)
+
+
+@pytest.mark.parametrize("q", [0, 1, 2, EDGES, WHOLE])
+def test_what_is_near_is_what_brute_force_finds(rig, q):
+    rng = np.random.default_rng(2)
+    total = 0
+    for kind in range(5):
+        scatter(rng, rig, kind)
+        wanted = expected(rig, q, 0.5 * rig.margin)
+        for source in ("boxes", "rows"):
+            assert np.array_equal(listed(rig, source, q)[0], wanted)
+        total += len(wanted)
+    assert total > (200 if q < 4 else 1000)
+
+
+@pytest.mark.parametrize("q", [1, WHOLE])
+def test_more_slabs_drop_only_what_is_apart(rig, q):
+    rng = np.random.default_rng(3)
+    some, dropped = 0, 0
+    w = np.concatenate([np.eye(3), rng.dirichlet(np.ones(3), 40)])
+    for kind in (0, 2, 0):
+        scatter(rng, rig, kind)
+        rig.margin = 0.2
+        place(rig, rig.x, rig.move)
+        fewer, _ = listed(rig, "slabs", q)
+        wanted = expected(rig, q, 0.5 * rig.margin)
+        code, all_of = (p @ [rig.surface.n_triangles, 1] for p in (fewer, wanted))
+        assert np.isin(code, all_of).all()
+        t = rig.topology.triangle
+        ends = t[wanted[:, 0]] if q > 2 else t[wanted[:, 0]][:, [q]]
+        near = np.zeros(len(wanted), dtype=bool)
+        for x in (rig.x, rig.x + rig.move):  # corners that come within the reach of points of it
+            points = np.einsum("pc,tcd->tpd", w, x[t[wanted[:, 1]]])
+            with np.errstate(over="ignore"):
+                apart = np.linalg.norm(x[ends][:, :, None] - points[:, None], axis=3)
+            near |= apart.min(axis=(1, 2)) < rig.margin * (1 - 1e-12)
+        assert np.isin(all_of[near], code).all()
+        some, dropped = some + near.sum(), dropped + len(wanted) - len(fewer)
+    assert some > 3 and dropped > 30
+
+
+def test_what_does_not_fit_is_counted(rig):
+    place(rig, rig.x0, None)
+    for source in ("boxes", "rows"):
+        whole, counts = listed(rig, source, WHOLE)
+        part, again = listed(rig, source, WHOLE, room=2)
+        assert np.array_equal(counts, again) and counts.max() > 2
+        assert len(part) == np.minimum(counts, 2).clip(0).sum() < len(whole)
