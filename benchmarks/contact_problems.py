@@ -1,20 +1,17 @@
 """Contact solvers on frictional contact problems of rigid scenes: residual after 10, 100 and 1000 sweeps, and cost to 1e-6.
 
-taisoft bench contact_problems [--problem NAME] [--repeats N]
-
-The problems are from Siconos' test data and lie beside the repository, in shared/contact_problems, with the residuals of plain
-serial Gauss-Seidel as yardstick. Cost is told as a share of what 1000 sweeps of plain Gauss-Seidel take: time, the two run in
-turns, and floating-point operations (18 a block of W and sweep, 2/3 n^3 for a dense factorisation, what its fill says for a
-sparse one). Verdicts: Gauss-Seidel must be no worse than twice the yardstick; the best solver of every problem must reach 1e-6
-at less than the cost of those sweeps, in operations and in time. A summary tells how each solver fares on all of them.
+A section of `taisoft bench contact`. The problems are from Siconos' test data and lie beside the repository, in
+shared/contact_problems, with the residuals of plain serial Gauss-Seidel as yardstick. Cost is told as a share of what 1000 sweeps
+of plain Gauss-Seidel take: time, the two run in turns, and floating-point operations (18 a block of W and sweep, 2/3 n^3 for a
+dense factorisation, what its fill says for a sparse one). Verdicts: Gauss-Seidel must be no worse than twice the yardstick; the
+best solver of every problem must reach 1e-6 at less than the cost of those sweeps, in operations and in time. A summary tells how
+each solver fares on all of them.
 """
 
-import argparse
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,8 +48,7 @@ SWEEPERS = {  # name -> (method, momentum)
     "hybrid, plain": ("hybrid", False),
     "hybrid": ("hybrid", True),
 }
-HEADINGS = ("problem", "contacts", "solver", "10", "100", "1000", "to 1e-6", "time", "operations", "")
-FORMAT = "{:31} {:>8} {:24} {:>8} {:>8} {:>8} {:>8} {:>8} {:>10} {}"
+HEADINGS = ("problem", "contacts", "solver", "10", "100", "1000", "to 1e-6", "time", "operations", "verdict")
 
 
 @dataclass(frozen=True)
@@ -91,11 +87,17 @@ class Row:
     def cost(self) -> float:
         return max(self.time, self.operations)
 
-    def __str__(self) -> str:
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """As HEADINGS has them."""
         reached = self.iterations is not None
         cost = (str(self.iterations), f"{self.time:.2f}", f"{self.operations:.3f}") if reached else ("-", "-", "-")
         residuals = (f"{r:.1e}" for r in self.residuals)
-        return FORMAT.format(self.problem, self.contacts, self.solver, *residuals, *cost, self.verdict).rstrip()
+        return self.problem, str(self.contacts), self.solver, *residuals, *cost, self.verdict
+
+    def record(self) -> dict:
+        """As plain data."""
+        return asdict(self)
 
 
 def load(name: str) -> Problem:
@@ -263,31 +265,14 @@ def summary(rows: list[Row]) -> str:
         of = [row for row in rows if row.solver == solver]
         able = [row for row in of if row.iterations is not None]
         cost = ", ".join(f"{name} {max((getattr(r, name) for r in able), default=0):.2f}" for name in ("operations", "time"))
-        lines.append(f"{solver:24} 1e-6 on {len(able)} of {len(of)} problems, at most: {cost}")
+        lines.append(f"* {solver}: 1e-6 on {len(able)} of {len(of)} problems, at most: {cost}")
     return "\n".join(lines)
 
 
-def main(argv=None) -> int:
-    """Print the table. Exit status: 0 all verdicts pass, 1 some fail, 2 no problems to solve."""
-    parser = argparse.ArgumentParser(prog="taisoft bench contact_problems", description=__doc__.partition("\n")[0])
-    parser.add_argument("--problem", choices=tuple(YARDSTICK), metavar="NAME", help=f"only this one of {', '.join(YARDSTICK)}")
-    parser.add_argument("--repeats", type=int, default=5, metavar="N", help="times that each solver is timed (default 5)")
-    options = parser.parse_args(argv)
-    names = (options.problem,) if options.problem else tuple(YARDSTICK)
-    if absent := missing(names):
-        print(f"taisoft bench contact_problems: {absent}", file=sys.stderr)
-        return 2
-    runtime, rows = open_runtime("cpu", "f64", "the benchmark of contact problems"), []
-    print(FORMAT.format(*HEADINGS).rstrip())
+def measure(names: tuple[str, ...], repeats: int) -> list[Row]:
+    """All rows of these problems, in f64 on the processor: Taichi must not be open in another kind."""
+    runtime = open_runtime("cpu", "f64", "the benchmark of contact problems")
     try:
-        for row in compute(names, max(1, options.repeats)):
-            rows.append(row)
-            print(row, flush=True)
+        return list(compute(names, repeats))
     finally:
         runtime.close()
-    print(summary(rows))
-    return 1 if any("FAIL" in row.verdict for row in rows) else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

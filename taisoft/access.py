@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 
 from taisoft.collision.contacts import Contacts
+from taisoft.collision.overlap import Overlap, find_overlap
 from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
 from taisoft.errors import SceneError, SimulationError
@@ -101,6 +102,13 @@ class StateAccess:
         if self._contact is None:
             return np.zeros(3)
         return self._contact.force([c.name for c in scene.colliders].index(name))
+
+    def deepest_overlap(self) -> Overlap | None:
+        """Which two overlap deepest in the present state, and how deep [m]; None where nothing overlaps.
+
+        Exact and slow, unlike `StepReport.max_penetration`: it also sees what has gone too deep for the search for contacts.
+        """
+        return find_overlap(self._find_contacts())
 
     def intersecting_triangles(self) -> list[tuple[str, int, str, int]]:
         """Surface triangles that intersect in the present state, each pair once: name and triangle of each.

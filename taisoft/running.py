@@ -58,6 +58,8 @@ def run(
     report.compile_seconds = sim.compile_seconds - compiled
     report.wall_seconds = time.perf_counter() - clock - report.compile_seconds
     _judge(report)
+    if report.steps and report.status != "failed":
+        _judge_end(sim, report)
     return report
 
 
@@ -103,7 +105,9 @@ def _merge(a: StepReport, b: StepReport) -> StepReport:
     b.contact_iterations += a.contact_iterations
     b.contact_residual = max(a.contact_residual, b.contact_residual)
     b.max_penetration = max(a.max_penetration, b.max_penetration)
-    b.dropped_contacts += a.dropped_contacts
+    b.n_contacts = max(a.n_contacts, b.n_contacts)
+    b.dropped_contacts = max(a.dropped_contacts, b.dropped_contacts)
+    b.deep = a.deep or b.deep
     b.converged = a.converged and b.converged
     b.problems = a.problems + b.problems
     return b
@@ -112,6 +116,14 @@ def _merge(a: StepReport, b: StepReport) -> StepReport:
 def _interrupt(report: RunReport) -> None:
     report.interrupted = True
     report.problems.append("the run was interrupted before its end")
+
+
+def _judge_end(sim: "Simulator", report: RunReport) -> None:
+    """Bodies that overlap at the end, however they got there."""
+    found = sim.deepest_overlap() if sim.contact_limit > 0.0 else None
+    if found is not None and found.depth > sim.contact_limit:
+        report.problems.append(f"at the end '{found.name_a}' and '{found.name_b}' overlap by {found.depth:.3g} m")
+        report.status = "degraded"
 
 
 def _judge(report: RunReport) -> None:
@@ -123,20 +135,22 @@ def _judge(report: RunReport) -> None:
         worst = max(unconverged, key=lambda s: max(s.residual, s.contact_residual))
         report.problems.append(
             f"{len(unconverged)} of {len(steps)} steps did not converge; the worst, at t = {worst.time:.4g} s, "
-            f"to a relative residual of {worst.residual:.2e}"
-            + (f", that of its contacts {worst.contact_residual:.2e}" if worst.n_contacts else "")
+            f"to a relative residual of {worst.residual:.2e}, its contacts to {worst.contact_residual:.2e}"
         )
     if inverted:
         worst = max(inverted, key=lambda s: s.n_inverted)
         report.problems.append(
             f"tets were inverted in {len(inverted)} reported steps; at most {worst.n_inverted}, at t = {worst.time:.4g} s"
         )
-    sunk = [s for s in steps if any("deep in each other" in text for text in s.problems)]
+    dropped = [s for s in steps if s.dropped_contacts > 0]
+    if dropped:
+        report.problems.append(f"in {len(dropped)} of {len(steps)} reported steps contacts under inverted tets were not known")
+    sunk = [s for s in steps if s.deep]
     if sunk:
         worst = max(sunk, key=lambda s: s.max_penetration)
         report.problems.append(
             f"in {len(sunk)} of {len(steps)} reported steps bodies penetrate; the worst, at t = {worst.time:.4g} s, "
             f"by {worst.max_penetration:.3g} m"
         )
-    if report.status == "ok" and (unconverged or inverted or sunk or report.interrupted):
+    if report.status == "ok" and (unconverged or inverted or dropped or sunk or report.interrupted):
         report.status = "degraded"

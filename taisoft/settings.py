@@ -3,12 +3,13 @@
 import difflib
 from dataclasses import dataclass
 
+from taisoft.contact.solve import SOLVERS
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
 from taisoft.scene.scene import Scene
 from taisoft.stepping import EXPLICIT, INTEGRATORS
 
-EXPLICIT_CONTACT = ("gauss_seidel", "jacobi", "hybrid", "coloured_gauss_seidel")
+EXPLICIT_CONTACT = tuple(SOLVERS)
 IMPLICIT_CONTACT = ("augmented_lagrangian",)
 
 

@@ -5,7 +5,6 @@ import weakref
 
 from taisoft import runtime
 from taisoft.access import StateAccess
-from taisoft.collision.overlap import find_overlap
 from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import measure
 from taisoft.errors import SceneError
@@ -88,13 +87,17 @@ class Simulator(StateAccess):
         self._release = weakref.finalize(self, _release, self._arena, self._runtime, self._owned)
 
     def _refuse_overlap(self) -> None:
-        self._contact.search(0.0, self._dt)
-        found = find_overlap(self._contact.detection)
+        found = self.deepest_overlap()
         if found is not None:
             raise SceneError(
                 f"'{found.name_a}' and '{found.name_b}' overlap at the start, {found.depth:.3g} m deep: move them apart, or set "
                 "scene.allow_initial_overlap = True"
             )
+
+    @property
+    def contact_limit(self) -> float:
+        """Penetration [m] above which a step counts as deep; 0 where nothing can touch."""
+        return self._contact.sunk if self._contact is not None else 0.0
 
     # --- stepping -------------------------------------------------------------------------------------------------
 
@@ -120,7 +123,9 @@ class Simulator(StateAccess):
         if self._contact is not None:
             report.contact_iterations, report.contact_residual = result.contact_iterations, result.contact_residual
             report.n_contacts, report.max_penetration = self._contact.n_contacts, self._contact.penetration
+            report.dropped_contacts = self._contact.dropped
             report.converged &= result.contacts_converged
+            report.deep = report.max_penetration > self._contact.sunk
         report.steps = self.step_count - start
         report.problems = [f"step {world.step_count}: {what}" for what in self._problems(report)]
         return report
@@ -135,7 +140,9 @@ class Simulator(StateAccess):
             )
         elif not report.converged:
             found.append(f"the contact solver stopped at a residual of {report.contact_residual:.2e}")
-        if self._contact is not None and report.max_penetration > self._contact.sunk:
+        if report.dropped_contacts:
+            found.append(f"{report.dropped_contacts} triangles lie under inverted tets, so their contacts are not known")
+        if report.deep:
             found.append(f"bodies are {report.max_penetration:.3g} m deep in each other or in obstacles")
         if report.n_inverted:
             found.append(f"{report.n_inverted} tets are inverted")

@@ -2,7 +2,7 @@
 
 * a row for each solver, with residuals that fall and costs that are counted;
 * verdicts on made-up rows: yardstick kept or missed, the best solver within the cost or not, nothing that gets there;
-* the exit status tells a failed verdict, and that there are no problems to solve.
+* what problems are absent is told.
 """
 
 from dataclasses import replace
@@ -31,7 +31,7 @@ def test_rows(shared):
         first, second, third = row.residuals
         assert row.iterations is not None and first >= second >= third < 1e-6
         assert row.time > 0.0 and 0.0 < row.operations < 2.0
-        assert row.problem in str(row) and f"{first:.1e}" in str(row)
+        assert len(row.cells) == len(bench.HEADINGS) and row.cells[0] == row.problem and row.cells[3] == f"{first:.1e}"
     of = {row.solver: row for row in rows}
     assert of["gauss_seidel"].iterations < of[bench.PLAIN].iterations
     assert of["auto"].iterations >= of["augmented_lagrangian"].iterations
@@ -49,25 +49,16 @@ def test_verdicts():
     }  # fmt: skip
     never = [replace(row, iterations=None) for row in ROWS]
     assert all("FAIL" in row.verdict for row in bench.judged(never))
-    assert "  -" in str(never[0])
+    assert never[0].cells[6] == "-"
 
 
 def test_summary():
     lines = bench.summary(ROWS).splitlines()
-    assert lines[1].startswith("jacobi") and "0 of 1" in lines[1]
+    assert lines[1].startswith("* jacobi:") and "0 of 1" in lines[1]
     assert "1 of 1" in lines[2] and "operations 0.20, time 0.30" in lines[2]
 
 
-@pytest.mark.parametrize("verdict, status", [("best: pass", 0), ("yardstick: FAIL", 1)])
-def test_exit_status(monkeypatch, capsys, verdict, status):
-    monkeypatch.setattr(bench, "missing", lambda names: None)
-    monkeypatch.setattr(bench, "compute", lambda names, repeats: iter([replace(PLAIN, verdict=verdict)]))
-    assert bench.main(["--problem", "Rover1039"]) == status
-    assert verdict in capsys.readouterr().out
-
-
-def test_no_problems(monkeypatch, capsys, tmp_path):
+def test_no_problems(monkeypatch, tmp_path):
     monkeypatch.setattr(bench, "PROBLEMS", tmp_path)
-    assert bench.main([]) == 2
-    told = capsys.readouterr()
-    assert "contact problems are absent" in told.err and "Rover4396" in told.err and not told.out
+    told = bench.missing()
+    assert "contact problems are absent" in told and "Rover4396" in told

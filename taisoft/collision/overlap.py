@@ -1,8 +1,8 @@
 """Overlap at the start of a scene: how deep bodies stick in each other and in obstacles, whatever the search for contacts sees.
 
 The search looks for what can touch in a step and passes over what lies deep inside. Here every vertex near another collider is
-asked for its exact signed distance, on the host between surfaces, and the found contacts add what no vertex tells: edges that
-cross, and faces under a ball.
+asked for its exact signed distance, on the host between surfaces. Triangles that cut each other add edges that cross, and the
+contacts that were found faces under a ball.
 """
 
 from dataclasses import dataclass
@@ -61,12 +61,34 @@ def find_overlap(detection: Detection) -> Overlap | None:
         owner = detection.shapes.body.to_numpy()
         for a, k in zip(*np.nonzero(phi < 0.0)):
             tell(int(a), int(owner[k]), -phi[a, k])
+    for a, b, deep in _crossings(detection, x):
+        tell(a, b, deep)
     n_bodies = len(detection.scene.bodies)
     for a in range(n_bodies):
         for b in range(a + 1, len(colliders)):
             if len(parts[b]):
                 tell(a, b, _depth_between(detection, parts, a, b))
     return _deepest(depth, size, colliders)
+
+
+def _crossings(detection: Detection, x: np.ndarray) -> list[tuple[int, int, float]]:
+    """Pairs of different colliders whose triangles cut each other, and how far at least one reaches through the other [m].
+
+    Triangles that touch reach through by rounding only.
+    """
+    pairs, topology = detection.intersections(), detection.topology
+    owner = np.searchsorted(topology.first, pairs, side="right") - 1
+    apart = owner[:, 0] != owner[:, 1]
+    pairs, owner = pairs[apart], owner[apart]
+    corners = x[topology.triangle[pairs]]  # (k, 2, 3, 3)
+    normal = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
+    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+    through = []
+    for one, other in ((0, 1), (1, 0)):
+        height = np.einsum("kcx,kx->kc", corners[:, one] - corners[:, other, :1], normal[:, other])
+        through.append(np.minimum(height.max(axis=1), -height.min(axis=1)))
+    deep = np.maximum(np.minimum(*through), 0.0)
+    return [(int(min(o)), int(max(o)), float(d)) for o, d in zip(owner, deep)]
 
 
 def _deepest(depth: dict[tuple[int, int], float], size: np.ndarray, colliders: list) -> Overlap | None:
@@ -91,7 +113,7 @@ def _depth_between(detection: Detection, parts: list[np.ndarray], a: int, b: int
         triangles = detection.topology.triangle[first[outer] : first[outer + 1]] - detection.topology.vertex_first[outer]
         try:
             phi = signed_distances_at(parts[outer], triangles, points)
-        except MeshError:  # an open surface has no inside; what crosses it is a contact
+        except MeshError:  # an open surface has no inside; what cuts it is told by the triangles
             continue
         deep = max(deep, -float(phi.min(initial=0.0)))
     return deep

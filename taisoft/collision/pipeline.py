@@ -142,24 +142,26 @@ class Detection:
 
     # --- a search -------------------------------------------------------------------------------------------------
 
-    def find(self, time: float, dt: float, led: tuple[np.ndarray, np.ndarray] | None = None) -> None:
+    def find(self, time: float, dt: float, led: tuple[np.ndarray, np.ndarray] | None = None, way=None) -> None:
         """Find the contacts of the model's present state swept by dt [s]: those nearer than the margin at some moment.
 
         Faces that have passed each other are found to a depth of `reach`, the margin and a tenth of the mean edge.
 
         time [s]: of the obstacles. led: (k,) nodes and (k,3) how far they are led during the step [m], nan where they are not.
+        way: a field of (n_nodes) f64 3-vectors [m], how far the nodes go, where that is known better than v dt.
         Raises SimulationError where positions are not finite, or a buffer may not grow as far as it must.
         """
-        self._move(time, dt, led)
+        self._move(time, dt, led, way)
         self._search(self._near())
         self._reduce()
 
-    def _move(self, time: float, dt: float, led: tuple[np.ndarray, np.ndarray] | None = None) -> None:
+    def _move(self, time: float, dt: float, led: tuple[np.ndarray, np.ndarray] | None = None, way=None) -> None:
         """The surface where it is and how far it goes, and the boxes."""
         s, m = self.surface, self.model
         self._place_obstacles(time, dt)
         leads = led is not None and len(led[0]) > 0
-        update_surface(s, m.x, m.v, leads, self._lead(*led) if leads else s.move, dt, self.reach, self._rows)
+        v, span = (m.v, dt) if way is None else (way, 1.0)
+        update_surface(s, m.x, v, leads, self._lead(*led) if leads else s.move, span, self.reach, self._rows)
         if s.count[UNFINITE]:
             raise SimulationError(self._unfinite())
 

@@ -2,8 +2,9 @@
 
 Where a contact must be at the end of a step, its goal, is a gap of at least `standoff`, a small distance that keeps surfaces
 apart in spite of what linearising the motion misses. A gap above it may close so far. A gap below it opens slowly, a true
-penetration in a few steps, and never faster than strains the softest body by a percent: else it would throw the bodies apart. Where the surfaces meet within the step, restitution asks
-that they part with e times the speed at which they met. The velocity that an impulse must leave is then
+penetration in a few steps, and never faster than strains the softest body by a percent: else bodies would fly apart.
+Where the surfaces meet within the step, restitution asks that they part with e times the speed at which they met. The
+velocity that an impulse must leave is then
     u_n = (gap - goal)/dt + n.(v_a - v_b) >= 0,
 which counts motion once: the gap is that at the start of the step.
 """
@@ -35,8 +36,7 @@ class FoundContacts:
     restitution: Any  # f64
     body: Any  # 2-vectors i32: colliders
     feature: Any  # 3-vectors i32
-    before_count: Any  # (1) i32: the step before
-    before_feature: Any  # 3-vectors i32
+    before_feature: Any  # 3-vectors i32: the step before
     before_point: Any  # 3-vectors f64
     before_impulse: Any  # 3-vectors f64, in the world
     slot: Any  # (n_slots) i32: contact of the step before, -1 where there is none
@@ -67,7 +67,7 @@ def build_found(arena: FieldArena, problem: ContactProblem) -> FoundContacts:
 
     return FoundContacts(
         problem, n_slots, vectors("point"), numbers("gap"), vectors("carry"), numbers("approach"), numbers("restitution"),
-        vectors("body", ti.i32, 2), vectors("feature", ti.i32), arena.field("before_count", ti.i32, 1),
+        vectors("body", ti.i32, 2), vectors("feature", ti.i32),
         vectors("before_feature", ti.i32), vectors("before_point"), vectors("before_impulse"),
         arena.field("found_slot", ti.i32, n_slots),
     )  # fmt: skip
@@ -172,7 +172,6 @@ def keep_impulses(f: ti.template()):
         f.slot[k] = -1
     ti.loop_config(serialize=True)
     for _ in range(1):
-        f.before_count[0] = p.count[0]
         for c in range(p.count[0]):
             k = _slot(f, f.before_feature[c])
             while f.slot[k] >= 0:

@@ -154,13 +154,19 @@ def push(p: ti.template(), c, change):
 
 
 @ti.func
-def gather_velocity(p: ti.template(), i):
-    """M^-1 J^T r at node i, its contacts in a fixed order."""
+def impulse_on(p: ti.template(), i):
+    """(J^T r) of node i [N s], its contacts in a fixed order."""
     d = dvec(0.0)
     for e in range(p.entry_start[i], p.entry_start[i + 1]):
         c, k = p.entry[e] // NODES, p.entry[e] % NODES
         d += p.weight[c, k] * to_world(p, c, p.r[c])
-    return p.inverse_mass[i] * d
+    return d
+
+
+@ti.func
+def gather_velocity(p: ti.template(), i):
+    """M^-1 J^T r at node i."""
+    return p.inverse_mass[i] * impulse_on(p, i)
 
 
 @ti.func

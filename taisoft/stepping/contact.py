@@ -21,6 +21,7 @@ from taisoft.contact.assemble import (
     upload_pair_numbers,
 )  # fmt: skip
 from taisoft.contact.problem import NODES, build_node_problem, index_nodes
+from taisoft.errors import SimulationError
 from taisoft.runtime import FieldArena, kernel
 from taisoft.scene.body import Body
 from taisoft.scene.collision import principal_extents
@@ -32,6 +33,7 @@ SUNK = 0.02  # of the mean surface edge: a penetration that is told as a problem
 FAST = {True: 0.05, False: 0.2}  # share of a penetration that an explicit, an implicit step mends
 SLOW = {True: 0.005, False: 0.02}  # share of a missing standoff
 PUSHED = 0.01  # of the slowest wave in a bar, sqrt(E / rho): speed at which these open at most, which strains as much
+TOLERANCE = {"f32": 1e-4, "f64": 1e-6}  # of the residual of the contact laws, unless asked for
 SPARE = 1024  # contacts beyond two a triangle that there is room for at first
 CLOSEST = 0.5  # of the thinner side's thickness: how far a contact may close in one step
 THINNEST = 0.25  # of the mean surface edge: least thickness of a collider, since open meshes have none
@@ -68,19 +70,48 @@ def survey(
         told[0], told[1], told[2], told[3] = depth, haste, speed, which
 
 
+@kernel
+def find_way(m: ti.template(), s: ti.template(), x_start: ti.template(), way: ti.template()) -> ti.f64:
+    """way (n_nodes) [m] since x_start; returns by how much a vertex of the surface left the straight way that was searched."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        way[i] = m.x[i] - x_start[i]
+    most = ti.cast(0.0, ti.f64)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for k in range(s.n_verts):
+            if s.node[k] >= 0:
+                d, known = way[s.node[k]], s.move[k]
+                square = known.dot(known)
+                share = ti.cast(0.0, ti.f64)
+                if square > 0.0:
+                    share = ti.min(ti.max(d.dot(known) / square, 0.0), 1.0)
+                most = ti.max(most, (d - share * known).norm())
+    return most
+
+
 def collider_thickness(collider: Body | Obstacle, edge: float) -> float:
-    """How thick a body or an obstacle is [m]: a half space without end, others their smallest extent."""
+    """How thick a body or an obstacle is [m]: a half space without end, others their smallest extent.
+
+    A bowl or a ring is thinner than its box: no surface counts as thicker than twice the plate of its volume and area.
+    """
     if isinstance(collider, Body):
-        least = float(principal_extents(collider.nodes.positions, collider.nodes.surface).min())
-    elif isinstance(collider.shape, HalfSpace):
+        return _surface_thickness(collider.nodes.positions, collider.nodes.surface)
+    if isinstance(collider.shape, HalfSpace):
         return np.inf
-    elif isinstance(collider.shape, MeshObstacle):
-        least = float(principal_extents(collider.shape.vertices, collider.shape.triangles).min())
-    elif isinstance(collider.shape, Box):
-        least = 2.0 * float(np.min(collider.shape.half_extents))
-    else:
-        least = 2.0 * float(collider.shape.radius)
-    return max(least, THINNEST * edge)
+    if isinstance(collider.shape, MeshObstacle):  # an open one has none
+        return max(_surface_thickness(collider.shape.vertices, collider.shape.triangles), THINNEST * edge)
+    if isinstance(collider.shape, Box):
+        return 2.0 * float(np.min(collider.shape.half_extents))
+    return 2.0 * float(collider.shape.radius)
+
+
+def _surface_thickness(x: np.ndarray, triangles: np.ndarray) -> float:
+    """[m], of a surface with vertices x."""
+    a, b, c = (x[triangles[:, k]] - x.mean(axis=0) for k in range(3))
+    cross = np.cross(b - a, c - a)
+    volume, area = abs(np.einsum("ij,ij->", a, cross)) / 6.0, 0.5 * np.linalg.norm(cross, axis=1).sum()
+    return min(float(principal_extents(x, triangles).min()), 4.0 * volume / area)
 
 
 class ContactStep:
@@ -92,12 +123,17 @@ class ContactStep:
         self.detection = Detection(scene, m, world.layout, world.runtime, self_collision)
         d = self.detection
         self.standoff, self.sunk = STANDOFF * d.edge, SUNK * d.edge
+        if d.margin > 0.0:
+            self.standoff = min(self.standoff, 0.5 * d.margin)
+        # what follows a path may be changed from outside between two steps, and its path may end with the last one
+        self._follows = world.motion.n_moved > 0 or any(o.path is not None for o in scene.obstacles)
         self._shares = FAST[explicit], SLOW[explicit]
         self._portion = 1.0  # of a step that its parts are
         self._arena = FieldArena()
         self._make_room(2 * d.surface.n_triangles + SPARE)
         self._thick = np.array([collider_thickness(c, d.edge) for c in scene.colliders])
         self._own_arena = FieldArena()
+        self._way = self._own_arena.vectors("way", ti.f64, m.n_nodes)
         self._thickness = self._own_arena.field("collider_thickness", ti.f64, len(self._thick), self._thick)
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
@@ -105,10 +141,11 @@ class ContactStep:
         self._searched: tuple[float, float] | None = None  # time and dt of the search that is at hand
         self._last_time = 0.0
         self.penetration = 0.0  # [m] at the end of the last step
-        self._sum: np.ndarray | None = None  # (n_colliders, 3) impulses on each over the parts of the last step, if it had several
+        self._sum: np.ndarray | None = None  # (n_colliders, 3) impulses over the parts of the last step, if it had several
         self._span = 0.0  # of the last step [s]
         self._share = 1.0
         self.met = False  # whether surfaces came together in the last step
+        self.dropped = 0  # triangles of the last step under an inverted tet, whose contacts a distance field could not tell
 
     def _make_room(self, capacity: int) -> None:
         arena, m = FieldArena(), self.world.model
@@ -161,8 +198,9 @@ class ContactStep:
         return d.counts.contacts
 
     def begin(self, time: float, dt: float) -> int:
-        """Fill the problem for a step of dt [s] from the state at a time; impulses are those of the last step. Returns its size."""
+        """Fill the problem for a step of dt [s] from the state at a time, impulses those of the last step. Returns its size."""
         n, d, m = self.search(time, dt), self.detection, self.world.model
+        self.dropped = max(self.dropped, d.counts.unmapped)
         if n > self.problem.capacity:
             self._make_room(2 * n)
         f = self.found
@@ -187,7 +225,7 @@ class ContactStep:
 
     def start_step(self, dt: float, parts: int) -> None:
         """A step of dt begins that is taken in parts."""
-        self._portion, self._span = 1.0 / parts, dt
+        self._portion, self._span, self.dropped = 1.0 / parts, dt, 0
         self._sum = np.zeros((len(self.world.scene.colliders), 3)) if parts > 1 else None
 
     def end_part(self) -> None:
@@ -211,13 +249,34 @@ class ContactStep:
     def end(self, time: float, dt: float) -> float:
         """Search at the end of a step, at a time, for one of dt; the deepest penetration [m] that is left."""
         self._searched = None
-        self.search(time, dt)
-        return float(self._survey(dt)[DEPTH])
+        try:
+            self.search(time, dt)
+        except SimulationError:
+            if not self._follows:
+                raise
+            self.detection.find(time, 0.0)  # a path that ends here: whoever steps on will be told
+        depth = float(self._survey(dt)[DEPTH])
+        if self._follows:
+            self._searched = None
+        return depth
 
-    def haste(self, time: float, dt: float) -> float:
-        """How far the contacts of a step of dt close at most, over what they may."""
+    def went_astray(self, x_start) -> bool:
+        """Whether the surface went where nobody had looked since x_start; keeps its way for `search_way`."""
+        strayed = find_way(self.world.model, self.detection.surface, x_start, self._way)
+        return bool(strayed > 0.5 * self.detection.margin)
+
+    def search_way(self, time: float, dt: float) -> bool:
+        """Search along the way that was found, from the state at the start; whether that finds contacts not known so far."""
+        self._searched = None
+        self.detection.find(time, dt, way=self._way)
+        self._searched = (time, dt)
+        return self.detection.counts.contacts > self.problem.count[0]
+
+    def look(self, time: float, dt: float) -> tuple[float, float]:
+        """The deepest penetration [m] before a step of dt, and how far its contacts close at most, over what they may."""
         self.search(time, dt)
-        return float(self._survey(dt)[HASTE])
+        told = self._survey(dt)
+        return float(told[DEPTH]), float(told[HASTE])
 
     def _survey(self, dt: float) -> np.ndarray:
         d = self.detection

@@ -12,10 +12,9 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.collision.surface import dvec
 from taisoft.contact.assemble import FoundContacts, short_of_goal
-from taisoft.contact.problem import CHANGED, NODES, RESIDUAL, SIZE, residual_of, to_world
-from taisoft.contact.prox import into_disk, prox, scaled
+from taisoft.contact.problem import CHANGED, NODES, RESIDUAL, SIZE, impulse_on, residual_of
+from taisoft.contact.prox import dvec, into_disk, prox, scaled
 from taisoft.linear.block_csr import BLOCK, block_times, part_times
 from taisoft.linear.coupling import Coupling, coupling_diagonal
 from taisoft.linear.pcg import dot64, total
@@ -143,11 +142,7 @@ def add_impulses(m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.t
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         on, off, slope = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
-            d = dvec(0.0)
-            for e in range(p.entry_start[i], p.entry_start[i + 1]):
-                c, j = p.entry[e] // NODES, p.entry[e] % NODES
-                d += p.weight[c, j] * to_world(p, c, p.r[c])
-            r, free = s.residual[i] - ti.cast(d, m.real), m.free[i]
+            r, free = s.residual[i] - ti.cast(impulse_on(p, i), m.real), m.free[i]
             s.residual[i] = r
             pcg.rhs[i] = -free * r
             on += norm2(free * r)

@@ -11,7 +11,7 @@ from taisoft.contact.problem import find_factors
 from taisoft.contact.solve import SolveResult, solve
 from taisoft.errors import SimulationError
 from taisoft.stepping import explicit
-from taisoft.stepping.contact import ContactStep
+from taisoft.stepping.contact import TOLERANCE, ContactStep
 from taisoft.stepping.explicit_contact import find_acceleration, finish_verlet, keep_state, move, predict, set_free_velocities
 from taisoft.stepping.substeps import ExplicitStepper, SubstepResult
 from taisoft.stepping.world import World
@@ -46,7 +46,7 @@ class ContactExplicitStepper(ExplicitStepper):
         self.max_batch = min(self.max_batch, LAUNCHES)
         m, arena = world.model, world.arena
         self._good = GoodState(arena.vectors("x_good", ti.f64, m.n_nodes), arena.vectors("v_good", m.real, m.n_nodes))
-        self.contact_tolerance = 1e-4 if world.runtime.precision == "f32" else 1e-6
+        self.contact_tolerance = TOLERANCE[world.runtime.precision]
 
     def forget(self) -> None:
         """The state was set."""
@@ -93,7 +93,7 @@ class ContactExplicitStepper(ExplicitStepper):
             target = world.next_targets(np.array([time + dt]))
             self.stale = self.stale or world.releases != releases
             self._upload_targets(target)
-        if contact.haste(time, dt) > 1.0:
+        if contact.look(time, dt)[1] > 1.0:
             raise SimulationError(f"step {step}: {contact.too_fast(time, dt)}")
         if s.verlet and self.stale:
             find_acceleration(m, s)

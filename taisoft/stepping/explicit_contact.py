@@ -6,9 +6,9 @@ the middle of the step, which is what moves the nodes. M is lumped, so M^-1 is k
 
 import taichi as ti
 
-from taisoft.collision.surface import dvec
 from taisoft.contact.assemble import short_of_goal
-from taisoft.contact.problem import NODES, to_frame, to_world
+from taisoft.contact.problem import impulse_on, to_frame
+from taisoft.contact.prox import dvec
 from taisoft.elasticity import count_inverted, element_force
 from taisoft.runtime import kernel
 from taisoft.stepping.explicit import (
@@ -95,32 +95,22 @@ def set_free_velocities(
 
 
 @ti.func
-def pushed(p: ti.template(), i):
-    """Impulse of all contacts on node i [N s]."""
-    d = dvec(0.0)
-    for e in range(p.entry_start[i], p.entry_start[i + 1]):
-        c, j = p.entry[e] // NODES, p.entry[e] % NODES
-        d += p.weight[c, j] * to_world(p, c, p.r[c])
-    return d
-
-
-@ti.func
-def close(m: ti.template(), s: ti.template(), p: ti.template(), dt64, touched):
+def close_substep(m: ti.template(), s: ti.template(), p: ti.template(), dt64, touched):
     """Reactions, and the counters of the sub-step: scalars 7, most inverted tets."""
     if ti.static(s.n_held > 0):
         react(m, s, ti.cast(dt64, m.real))
-        release_contacts(m, s, p, dt64, touched)
+        subtract_contacts(m, s, p, dt64, touched)
     m.scalars[7] = ti.max(m.scalars[7], m.scalars[9])
     m.scalars[9] = 0.0
 
 
 @ti.func
-def release_contacts(m: ti.template(), s: ti.template(), p: ti.template(), dt64, touched):
+def subtract_contacts(m: ti.template(), s: ti.template(), p: ti.template(), dt64, touched):
     """A held node's reaction is what neither inertia, nor elasticity, nor loads, nor contacts bear."""
     if touched == 1:
         for k in range(s.n_held):
             i = s.held[k]
-            s.reaction[k] -= (1.0 - m.free[i]) * ti.cast(pushed(p, i) / dt64, m.real)
+            s.reaction[k] -= (1.0 - m.free[i]) * ti.cast(impulse_on(p, i) / dt64, m.real)
 
 
 @kernel
@@ -134,7 +124,7 @@ def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, tou
         dt = ti.cast(dt64, m.real)
         v = m.v[i]
         if touched == 1:
-            v += ti.cast(p.inverse_mass[i] * pushed(p, i), m.real)
+            v += ti.cast(p.inverse_mass[i] * impulse_on(p, i), m.real)
         if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
             m.scalars[8] = 1.0
         if ti.static(s.verlet):
@@ -149,7 +139,7 @@ def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, tou
     ti.loop_config(serialize=True)
     for _ in range(1):
         if ti.static(not s.verlet):
-            close(m, s, p, dt64, touched)
+            close_substep(m, s, p, dt64, touched)
 
 
 @kernel
@@ -171,7 +161,7 @@ def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti
             lead_velocities(m, s, 0, dt64)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        close(m, s, p, dt64, touched)
+        close_substep(m, s, p, dt64, touched)
 
 
 @kernel

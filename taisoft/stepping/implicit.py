@@ -11,7 +11,7 @@ import taichi as ti
 
 from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
-from taisoft.stepping.contact import ContactStep
+from taisoft.stepping.contact import TOLERANCE, ContactStep
 from taisoft.stepping.contact_newton import ContactResult, ContactStageSolver, merge
 from taisoft.stepping.newton import StageResult, StageSolver
 from taisoft.stepping.world import World
@@ -19,10 +19,11 @@ from taisoft.stepping.world import World
 MAX_NEWTON = 50  # a step that needs more is reported as not converged
 MAX_CONTACT_NEWTON = 400  # with contacts, over all multipliers
 MAX_PARTS = 32  # of a step in which bodies close fast
+HASTE = 2.0  # a part may close so many times what a step may: its speed was not known when the step was cut
+SEARCHES = 3  # along the way that a step took, where it left the one that was expected
 MORE_PARTS = 4  # of a step that ended with a new deep penetration
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
-CONTACT_TOLERANCE = {"f32": 1e-4, "f64": 1e-6}  # residual of the contact laws
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class ImplicitStepper:
         common = m, arena, world.runtime.eps, world.motion.moved
         self.solver = StageSolver(*common) if contact is None else ContactStageSolver(*common, contact, self.history.x_now)
         self.tolerance = DEFAULT_TOLERANCE[world.runtime.precision]
-        self.contact_tolerance = CONTACT_TOLERANCE[world.runtime.precision]
+        self.contact_tolerance = TOLERANCE[world.runtime.precision]
         self.linear_tolerance: float | None = None
         self.forget()
 
@@ -132,10 +133,11 @@ class ImplicitStepper:
 
     def _with_contacts(self, dt: float) -> ContactResult:
         contact, m, start = self.contact, self.world.model, self.world.time
-        parts = max(1, math.ceil(contact.haste(start, dt) - 1e-9))
+        depth, haste = contact.look(start, dt)
+        parts = max(1, math.ceil(haste - 1e-9))
         if parts > MAX_PARTS:
             raise SimulationError(f"step {self.world.step_count + 1}: {contact.too_fast(start, dt)}")
-        allowed = max(contact.sunk, 1.1 * contact.penetration)  # what is deep already needs no shorter steps
+        allowed = max(contact.sunk, 1.1 * depth)  # what is deep already needs no shorter steps
         kept = m.x.to_numpy(), m.v.to_numpy(), self.world.motion.released()
         while True:
             try:
@@ -158,6 +160,10 @@ class ImplicitStepper:
         for k in range(parts):
             if k:
                 self.contact.end(start + k * part, part)
+                if self.contact.look(start + k * part, part)[1] > HASTE:
+                    raise SimulationError(
+                        f"step {self.world.step_count + 1}: {self.contact.too_fast(start + k * part, part)}"
+                    )
             results.append(self._part(start + k * part, part))
             self.contact.end_part()
         return merge(results)
@@ -172,7 +178,24 @@ class ImplicitStepper:
         self.forget()
 
     def _part(self, time: float, dt: float) -> StageResult:
-        """A step of dt from a time, in one piece."""
+        """A step of dt from a time, in one piece; again, where it led to contacts that nobody had looked for."""
+        result, m, h = self._try_part(time, dt), self.world.model, self.history
+        for _ in range(SEARCHES):
+            if self.contact is None or not self.contact.went_astray(h.x_now):
+                break
+            x, v, past = m.x.to_numpy(), m.v.to_numpy(), self._past
+            restore(m, h)
+            if not self.contact.search_way(time, dt):
+                m.x.from_numpy(x)
+                m.v.from_numpy(v)
+                break
+            self._past = 0
+            result = merge([result, self._try_part(time, dt)])
+            self._past = min(self._past, past)
+        return result
+
+    def _try_part(self, time: float, dt: float) -> StageResult:
+        """A step of dt from a time with the contacts of one search."""
         world, m, h, w = self.world, self.world.model, self.history, self.solver.work
         releases = world.releases
         target = world.next_target(time + dt)

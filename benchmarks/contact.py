@@ -1,0 +1,137 @@
+"""Contact: solvers beside each other on the problems of whole scenes, colourings, the cost of steps, problems of rigid scenes.
+
+taisoft bench contact [--quick] [--arch cpu|cuda] [--out FILE.json] [--plot FILE.png]
+
+Scenes are demos, in f32; figures named are those of the report. Of each frame of an explicit run the contact problem is taken
+where its solve would begin, and solved to a residual of 1e-4 by every solver, in turns, from the impulses of the step before and
+from none. The residual told is worked out in NumPy. A solve's time holds its colouring; a solver's loops run on one thread on the
+CPU, or, where that is said, on all. A number is a median, its range in brackets; spread is the distance between the quartiles
+over the median. Compiling is apart. Exit status: 0, or 1 where a limit is not met. --quick has one scene, few frames, and no
+limit.
+The whole takes about six minutes on two cores.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from taisoft.output.files import write_bytes
+from taisoft.output.report import json_text
+from taisoft.runtime import compile_clock, open_runtime
+
+from . import contact_problems
+from .contact_captured import GOAL, Solvers
+from .contact_colours import QUICK_SEEDS, SEEDS, colour_all, colour_table
+from .contact_crossover import QUICK_SIZES, SIZES, crossover_table, crossover_text, measure_crossover
+from .contact_plot import Snapshot, draw, take_snapshot
+from .contact_runs import measure_film, measure_run, measure_step, open_explicit, open_scene, to_impulses
+from .contact_table import (
+    PILE,
+    PILE_SECONDS,
+    count_table,
+    find_limits,
+    problem_table,
+    run_table,
+    solver_table,
+    step_table,
+)  # fmt: skip
+from .elasticity import Document
+from .elasticity_table import limit_table
+from .order import check_out, header
+from .order_plot import require_matplotlib
+from .timing import load_average
+
+SCENES = ("cube_on_box", "two_cubes_two_boxes")  # figures 20 and 19
+FRAMES, QUICK_FRAMES = 90, 6
+STEPS, QUICK_STEPS = 400, 40
+RUN_SECONDS, QUICK_RUN_SECONDS = 2.0, 0.4
+QUICK_PROBLEMS, REPEATS = ("Rover1039", "Rover4396"), 3
+
+
+def measure(quick: bool, arch: str, document: Document) -> tuple[dict, list[Snapshot]]:
+    """Everything, printed as it comes, by name; and what is drawn of the scenes."""
+    found: dict = {"films": [], "steps": [], "runs": [], "colourings": []}
+    snapshots = [_explicit(name, quick, arch, found) for name in SCENES[: 1 if quick else None]]
+    document.add(f"## Explicit steps (figs. 19, 20)\n\n{count_table(found['films'])}\n\n{solver_table(found['films'])}")
+    document.add(f"## The whole explicit step\n\n{step_table(found['steps'])}")
+    for name, seconds in [(s.scene, QUICK_RUN_SECONDS if quick else RUN_SECONDS) for s in snapshots]:
+        with open_scene(name, arch) as sim:
+            found["runs"].append(measure_run(name, sim, seconds))
+    if not quick:
+        with open_scene(PILE, arch) as sim:
+            found["runs"].append(measure_run(PILE, sim, PILE_SECONDS))
+            found["colourings"] += colour_all(PILE, sim._contact.problem, SEEDS)[0]
+    document.add(f"## Implicit steps\n\n{run_table(found['runs'])}")
+    document.add(f"## Colours (fig. 19)\n\n{colour_table(found['colourings'])}")
+    runtime = open_runtime(arch, "f32", "the benchmark of contacts")
+    try:
+        found["crossover"] = measure_crossover(QUICK_SIZES if quick else SIZES, runtime)
+    finally:
+        runtime.close()
+    table, text = crossover_table(found["crossover"]), crossover_text(found["crossover"], arch)
+    document.add(f"## Serial and coloured Gauss-Seidel\n\n{table}\n\n{text}")
+    found["problems"] = _problems(quick, document)
+    return found, snapshots
+
+
+def _explicit(name: str, quick: bool, arch: str, found: dict) -> Snapshot:
+    """Film, step and colourings of a scene, all with one simulator."""
+    with open_explicit(name, arch) as sim:
+        solvers = Solvers(threads=not quick)
+        found["films"].append(measure_film(name, sim, QUICK_FRAMES if quick else FRAMES, solvers))
+        to_impulses(sim)
+        colourings, colours = colour_all(name, sim._contact.problem, QUICK_SEEDS if quick else SEEDS)
+        found["colourings"] += colourings
+        snapshot = take_snapshot(name, sim, colours)
+        found["steps"].append(measure_step(name, sim, QUICK_STEPS if quick else STEPS))
+    return snapshot
+
+
+def _problems(quick: bool, document: Document) -> list[contact_problems.Row]:
+    names = QUICK_PROBLEMS if quick else tuple(contact_problems.YARDSTICK)
+    document.add("## Contact problems of rigid scenes, f64 on the processor")
+    if absent := contact_problems.missing(names):
+        document.add(f"Left out: {absent}.")
+        return []
+    rows = contact_problems.measure(names, 1 if quick else REPEATS)
+    document.add(f"{problem_table(rows)}\n\n{contact_problems.summary(rows)}")
+    return rows
+
+
+def main(argv=None) -> int:
+    """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
+    first, _, rest = __doc__.partition("\n")
+    parser = argparse.ArgumentParser(prog="taisoft bench contact", description=first, epilog=rest.partition("\n\n")[2])
+    parser.add_argument("--quick", action="store_true", help="one scene, few frames and sizes, no limit")
+    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
+    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the report's figures 19 and 20")
+    options = parser.parse_args(argv)
+    check_out(options.out, ".json")
+    check_out(options.plot, ".png")
+    if options.plot:
+        require_matplotlib()
+    document, (text, numbers) = Document(), header("Contact", options.arch, "f32")
+    document.add(text)
+    compiled = compile_clock()
+    found, snapshots = measure(options.quick, options.arch, document)
+    numbers |= {"arch": options.arch, "quick": options.quick, "load_at_the_end": load_average()}
+    numbers["compile_seconds"] = compile_clock() - compiled
+    document.add(f"Compiling in all: {numbers['compile_seconds']:.0f} s; load at the end: {numbers['load_at_the_end'] or 0:.1f}")
+    limits = [] if options.quick else find_limits(found, GOAL)
+    if limits:
+        document.add("## Limits\n\n" + limit_table(limits))
+    if options.out:
+        numbers |= {name: [x.record() for x in some] for name, some in found.items()}
+        numbers["limits"] = [limit.record() for limit in limits]
+        write_bytes(options.out, json_text(numbers).encode())
+        write_bytes(options.out.with_suffix(".md"), ("\n\n".join(document.parts) + "\n").encode())
+        print(f"written: {options.out} and {options.out.with_suffix('.md').name}")
+    if options.plot:
+        draw(found, snapshots, options.plot)
+        print(f"written: {options.plot}")
+    return 0 if all(limit.met for limit in limits) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,315 @@
+"""The benchmark of contacts; no test here asks how fast anything is:
+
+* the problem that a frame's solvers get is the same for all, is left as it was, and each residual told is right by an oracle;
+* colourings are proper and need no fewer colours than contacts meet at a node;
+* a step is told in parts, each call's time counted once; steps of a run with their iterations;
+* the plates of the crossover lie on each other as they say; both solvers solve them;
+* limits are met or not; the whole prints, writes and draws, and a limit that is not met is the exit status.
+"""
+
+import json
+from dataclasses import replace
+
+import contact_oracle as oracle
+import numpy as np
+import pytest
+
+from benchmarks import contact, contact_captured, contact_crossover, contact_runs
+from benchmarks.contact_captured import COLOURED, GOAL, SERIAL, Outcome, Solvers, contact_jacobian, patched, shown
+from benchmarks.contact_colours import REPORT, Colouring, colour_all, colour_table, proper
+from benchmarks.contact_crossover import Point, build_plates, crossover_text, find_under, grid, measure_crossover
+from benchmarks.contact_plot import Snapshot, take_snapshot
+from benchmarks.contact_problems import PLAIN
+from benchmarks.contact_problems import Row as ProblemRow
+from benchmarks.contact_runs import (
+    COLD,
+    PARTS,
+    REST,
+    WARM,
+    Film,
+    Run,
+    StepCost,
+    Stopwatch,
+    measure_film,
+    measure_run,
+    measure_step,
+    open_explicit,
+    open_scene,
+    to_impulses,
+)  # fmt: skip
+from benchmarks.contact_table import CONTACTS, PILE, STEP_SCENE, count_table, find_limits
+from taisoft.contact.graph import node_graph
+from taisoft.contact.solve import SOLVERS
+from taisoft.errors import OutputError
+from taisoft.runtime import FieldArena, open_runtime
+
+SCENE = "cube_on_box"
+
+
+def read(p) -> oracle.NodeContacts:
+    """The problem in NumPy."""
+    k = int(p.count[0])
+    rows = {name: getattr(p, name).to_numpy()[:k] for name in ("node", "arity", "weight", "normal", "tangent", "friction")}
+    return oracle.NodeContacts(**rows, inverse_mass=p.inverse_mass.to_numpy(), b=p.b.to_numpy()[:k].ravel())
+
+
+@pytest.fixture(scope="module")
+def sim():
+    with open_explicit(SCENE, "cpu") as made:
+        yield made
+
+
+def test_every_solver_gets_the_same_problem_and_is_judged_rightly(sim, monkeypatch):
+    judged, plain = [], contact_captured.make_judge
+
+    def logged(p):
+        judge, contacts, W = plain(p), read(p), None
+
+        def judge_too(r):
+            nonlocal W
+            W = contacts.W if W is None else W
+            value = judge(r)
+            judged.append((value, oracle.residual(W, contacts.b, contacts.friction, r), np.abs(r).max()))
+            return value
+
+        return judge_too
+
+    monkeypatch.setattr(contact_captured, "make_judge", logged)
+    film = measure_film(SCENE, sim, 6, Solvers(threads=False))
+    assert film.tets == 215 and 0 < film.dt < film.stable_dt and film.solvers == list(SOLVERS)
+    assert 2 <= len(film.time) == len(film.contacts) <= 6 and np.all(np.diff(film.time) > 0)
+    assert all(f >= n > 5 for f, n in zip(film.found, film.contacts))
+    for start in (WARM, COLD):
+        for name in film.solvers:
+            assert len(film.of(name, start)) == len(film.time)
+            assert all(o.residual <= GOAL and min(o.seconds) > 0 for o in film.of(name, start))
+    assert film.missed(film.solvers) == 0
+    assert all(o.sweeps > 0 for name in film.solvers for o in film.of(name, COLD))
+    assert sum(min(o.colouring) > 0.01 * min(o.seconds) for o in film.of(COLOURED)) == len(film.time)
+    values, wanted, size = np.array(judged).T
+    assert np.allclose(values, wanted, rtol=1e-6, atol=1e-12) and (size > 0).sum() > 3 * len(SOLVERS)
+
+
+def test_a_problem_is_left_as_it_was_and_solvers_agree(sim):
+    solvers, pushes = Solvers(threads=False), {}
+    to_impulses(sim)
+
+    def look(p):
+        k = int(p.count[0])
+        before = {name: getattr(p, name).to_numpy() for name in ("r", "order", "b", "factor", "friction")}
+        found = solvers.outcomes(p, np.zeros((p.capacity, 3)), 2)
+        assert set(found) == set(SOLVERS) and all(len(o.seconds) == 2 for o in found.values())
+        assert all(np.array_equal(getattr(p, name).to_numpy(), old) for name, old in before.items())
+        contacts = read(p)
+        assert np.allclose(contact_jacobian(p).toarray(), contacts.jacobian)
+        exact = oracle.gauss_seidel(contacts.W, contacts.b, contacts.friction, 2000)
+        assert oracle.residual(contacts.W, contacts.b, contacts.friction, exact) < 1e-8
+        pushes.update(wanted=exact[:, 0].sum(), contacts=k)
+
+    with shown(look):
+        report = sim.step()
+    # what follows is the simulator's own solve of that problem
+    assert report.n_contacts == pushes["contacts"] and report.contact_residual <= GOAL
+    assert sim._contact.problem.r.to_numpy()[: pushes["contacts"], 0].sum() == pytest.approx(pushes["wanted"], rel=1e-2, abs=1e-3)
+
+
+def test_colourings(sim):
+    to_impulses(sim)
+    p = sim._contact.problem
+    contacts = read(p)
+    graph = node_graph(contacts.node, contacts.arity, contacts.inverse_mass)
+    made, colours = colour_all(SCENE, p, 4)
+    assert [c.way for c in made] == list(colours) == ["greedy", "random", "parallel"]
+    free = (contacts.inverse_mass > 0).any(axis=1)
+    at = [i for c, n in enumerate(contacts.arity) for i in contacts.node[c, :n] if free[i]]
+    for c in made:
+        assert proper(graph, colours[c.way]) and c.contacts == len(contacts.arity)
+        assert c.least == np.bincount(at).max() <= min(c.numbers) and max(c.largest) * min(c.numbers) >= c.contacts / 2
+    assert len(made[1].numbers) == 4 and not proper(graph, 0 * colours["greedy"])
+    table = colour_table([replace(made[0], scene="two_cubes_two_boxes")])
+    assert "the report" in table and "125" in table and " 95 " in table and REPORT["two_cubes_two_boxes"][0] == 286
+    snapshot = take_snapshot(SCENE, sim, colours)
+    assert snapshot.touched.sum() == contacts.arity.sum() and snapshot.image.shape[2] == 3
+
+
+def test_a_step_in_parts(sim):
+    cost = measure_step(SCENE, sim, 5)
+    assert cost.solver == SERIAL and len(cost.whole) == 5 and cost.problems == []
+    assert min(cost.contacts) > 0 and max(cost.sweeps) > 0 and cost.residual <= GOAL
+    assert set(cost.parts) == {*PARTS, REST} and all(len(x) == 5 and min(x) > 0 for x in cost.parts.values())
+
+
+def test_a_call_inside_another_counts_once(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(contact_runs, "clock", lambda: now[0])
+    watch = Stopwatch()
+
+    def wait(seconds):
+        now[0] += seconds
+
+    inner = watch.timed(wait, "inner")
+
+    def outer():
+        wait(1.0)
+        inner(2.0)
+        inner(4.0)
+
+    watch.timed(outer, "outer")()
+    assert watch.spent == {"inner": 6.0, "outer": 1.0}
+
+
+def test_what_is_patched_comes_back():
+    class Owner:
+        def call(self):
+            return 1
+
+    made = Owner()
+    with patched(made, "call", lambda: 2), patched(Owner, "call", lambda self: 3):
+        assert made.call() == 2
+    assert made.call() == 1 and "call" not in vars(made)
+
+
+def test_plates_lie_on_each_other():
+    points = np.random.default_rng(0).uniform(-3, 3, (200, 2))
+    on, vertices, weights = find_under(points, 4)
+    assert 50 < len(on) < 150 and set(on) == set(np.flatnonzero((np.abs(points) <= 2).all(axis=1)))
+    assert weights.min() >= 0 and np.allclose(weights.sum(axis=1), 1)
+    assert np.allclose(np.einsum("kj,kja->ka", weights, grid(4)[vertices]), points[on])
+    assert len(find_under(grid(4), 4)[0]) == 25
+
+
+def test_both_solve_the_plates(sim):
+    runtime, arena = open_runtime("cpu", "f32", "a test of the benchmark"), FieldArena()
+    try:
+        p = build_plates(4, runtime, arena)
+        contacts, first = read(p), 25
+        assert (contacts.arity == 4).all() and np.allclose(contacts.weight.sum(axis=1), 0)
+        above = np.where(contacts.weight > 0, contacts.node, first)[:, :4]
+        below = np.where(contacts.weight < 0, contacts.node, 0)[:, :4]
+        assert (above >= first).all() and (below < first).all() and (contacts.b[::3] < 0).mean() > 0.5
+        fall = np.zeros((50, 3))
+        fall[first:] = 1.0, 2.0, 3.0
+        assert np.allclose((contacts.jacobian @ fall.ravel()).reshape(-1, 3), (2.0, 1.0, -3.0))
+        (point,) = measure_crossover((4,), runtime)
+    finally:
+        arena.release()
+        runtime.close()
+    assert point.contacts == len(contacts.arity) and 3 <= point.colours < point.contacts
+    assert max(point.serial.residual, point.coloured.residual) <= GOAL and min(point.serial.sweeps, point.coloured.sweeps) > 0
+    assert len(point.serial.seconds) == contact_crossover.ROUNDS and min(point.coloured.colouring) > 0
+    exact = oracle.gauss_seidel(contacts.W, contacts.b, contacts.friction, 50)
+    assert oracle.residual(contacts.W, contacts.b, contacts.friction, exact) < GOAL
+
+
+def test_a_run_is_told_with_its_iterations(sim, monkeypatch):
+    """Explicit steps, with iterations made up: implicit ones take longer to compile than the rest of this file."""
+    sim.reset()
+    plain, reports = sim.advance, []
+
+    def counted(n):
+        report = plain(n)
+        k = len(reports)
+        report.newton_iterations, report.linear_iterations, report.contact_iterations = k, 3 * k, k + 7
+        reports.append(report)
+        return report
+
+    with patched(sim, "advance", counted):
+        run = measure_run(SCENE, sim, 0.2)
+    touching = [k for k, report in enumerate(reports) if report.n_contacts]
+    assert run.status == "ok" and run.problems == [] and run.simulated == pytest.approx(0.2) and run.wall > sum(run.seconds)
+    assert 10 < len(touching) == len(run.seconds) < len(reports) == 48 and run.newton == touching
+    assert run.linear == [3 * k for k in touching] and run.outer == [k + 7 for k in touching]
+    assert run.contacts == [reports[k].n_contacts for k in touching]
+
+
+def test_scenes_are_opened_with_their_own_settings(monkeypatch):
+    opened = []
+    monkeypatch.setattr(contact_runs.ts, "Simulator", lambda scene, **settings: opened.append((scene, settings)))
+    for name in (*contact.SCENES, PILE):
+        open_scene(name, "cpu")
+        scene, settings = opened[-1]
+        assert settings["integrator"] == "implicit_euler" and settings["precision"] == "f32" and "seconds" not in settings
+    assert settings["dt"] == 1 / 100 and len(scene.bodies) == 27
+    tets = [sum(body.mesh.n_tets for body in scene.bodies) for scene, _ in opened[:2]]
+    assert tets == [215, 240]
+
+
+# --- what is told -------------------------------------------------------------------------------------------------------
+
+
+def made_film(scene: str, residual: float = 1e-5) -> Film:
+    film = Film(scene, 100, 0.004, 0.01, [0.1, 0.2], [20, 22], [30, 31])
+    for start in (WARM, COLD):
+        film.outcomes[start] = {name: [Outcome(5, residual, [0.001], [0.0])] * 2 for name in SOLVERS}
+    return film
+
+
+def made(scenes=(SCENE, "two_cubes_two_boxes"), ms=1.9, wall=2.9, status="ok", residual=1e-5, verdict="best: pass") -> dict:
+    cost = StepCost(SCENE, SERIAL, [1e-3 * ms] * 3, {part: [1e-4] for part in (*PARTS, REST)}, [20], [5], 9e-5, [])
+    runs = [Run(scene, "implicit_euler", status, [], 2.0, 2 * wall, [0.02], [20], [3], [5], [30]) for scene in (SCENE, PILE)]
+    colourings = [Colouring(scene, "greedy", 4, 2, [2], [2], [0.001]) for scene in scenes]
+    points = [
+        Point(n, 8, Outcome(5, 1e-5, [a], [0.0]), Outcome(5, 1e-5, [b], [b / 2]))
+        for n, a, b in ((100, 1.0, 2.0), (10000, 2.0, 1.0))
+    ]
+    problems = [ProblemRow("Rover1039", 4, PLAIN, (1.0, 0.1, 0.01), 10, 0.5, 0.5, verdict)]
+    return {
+        "films": [made_film(scene, residual) for scene in scenes], "steps": [cost], "runs": runs, "colourings": colourings,
+        "crossover": points, "problems": problems,
+    }  # fmt: skip
+
+
+def test_limits():
+    assert [limit.met for limit in find_limits(made(), GOAL)] == [True] * 6
+    bad = find_limits(made(ms=2.1, wall=3.1, status="degraded", residual=2e-4, verdict="best: FAIL"), GOAL)
+    assert [limit.met for limit in bad] == [False, True, False, False, False, False]
+    assert bad[4].value == 8 and STEP_SCENE in bad[0].what
+    nothing = {"films": [], "steps": [], "runs": [], "problems": []}
+    assert not any(limit.met for limit in find_limits(nothing, GOAL))
+
+
+def test_counts_beside_the_report_and_the_crossover():
+    assert CONTACTS == {SCENE: 198, "two_cubes_two_boxes": 286}
+    assert "21 (20 to 22)" in count_table([made_film(SCENE)]) and "89%" in count_table([made_film(SCENE)])
+    points = made()["crossover"]
+    assert "crossover at 1,000 contacts" in crossover_text(points, "cpu").splitlines()[0]
+    assert "no crossover up to 100 contacts, serial" in crossover_text(points[:1], "cpu")
+
+
+@pytest.fixture
+def faked(monkeypatch):
+    colours = {way: np.arange(4) % 2 for way in ("random", "greedy")}
+    snapshots = [Snapshot(SCENE, np.zeros((4, 4, 3), np.uint8), np.eye(4, dtype=bool), colours)]
+    found = [made()]
+    monkeypatch.setattr(contact, "measure", lambda quick, arch, document: (found[0], snapshots))
+    return found
+
+
+def test_the_whole_writes_and_draws(faked, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    out, plot = tmp_path / "new" / "a.json", tmp_path / "a.png"
+    assert contact.main(["--out", str(out), "--plot", str(plot)]) == 0
+    printed, numbers = capsys.readouterr().out, json.loads(out.read_text())
+    assert out.with_suffix(".md").read_text().strip() in printed and plot.read_bytes()[:4] == b"\x89PNG"
+    assert numbers["films"][0]["outcomes"][WARM][SERIAL][0]["sweeps"] == 5 and len(numbers["limits"]) == 6
+    assert "## Limits" in printed and "NOT met" not in printed
+
+
+def test_a_limit_that_is_not_met_is_the_exit_status(faked, capsys):
+    faked[0] = made(wall=3.5)
+    assert contact.main([]) == 1
+    assert "NOT met" in capsys.readouterr().out
+    assert contact.main(["--quick"]) == 0
+    assert "## Limits" not in capsys.readouterr().out
+
+
+def test_absent_problems_are_told(monkeypatch, capsys):
+    monkeypatch.setattr(contact.contact_problems, "missing", lambda names: "they are gone")
+    assert contact._problems(True, contact.Document()) == []
+    assert "Left out: they are gone." in capsys.readouterr().out
+
+
+def test_files_that_cannot_be_written_are_refused_first(monkeypatch, tmp_path):
+    monkeypatch.setattr(contact, "measure", lambda *arguments: pytest.fail("measured"))
+    with pytest.raises(OutputError, match=r"the name must end in \.json"):
+        contact.main(["--out", str(tmp_path / "a.txt")])
