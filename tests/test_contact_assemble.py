@@ -39,8 +39,9 @@ def scene() -> ts.Scene:
         position=(0, 0.2502, 0), velocity=(0.2, -0.3, 0.1),
     )  # fmt: skip
     brick = ts.Material(friction=0.9, restitution=0.1, **soft)
-    made.add_body(ts.box_mesh((1, 1, 1), (0.3, 0.2, 0.35)), brick, name="brick", position=(0.13, 0.6004, 0.08), velocity=(0, -1, 0))
-    made.add_body(ts.box_mesh((1, 1, 1), (0.3, 0.2, 0.35)), brick, name="other", position=(4.0, 0.1002, 0.03))
+    shape = ts.box_mesh((1, 1, 1), (0.3, 0.2, 0.35))
+    made.add_body(shape, brick, name="brick", position=(0.13, 0.6004, 0.08), velocity=(0, -1, 0))
+    made.add_body(shape, brick, name="other", position=(4.0, 0.1002, 0.03))
     made.add_obstacle(ts.Box((0, -0.2, 0), (0.6, 0.2, 0.7)), name="table", friction=0.6, path=turning)
     corners = [(3, 0, -1), (3, 0, 1), (5, 0, 1), (5, 0, -1)]
     made.add_obstacle(ts.MeshObstacle(corners, [(0, 1, 2), (0, 2, 3)]), name="lift", friction=0.1, restitution=0.5, path=rising)
@@ -86,7 +87,8 @@ def test_numbers_that_change(begun):
     sim.set_contact("table", "block", friction=0.05, restitution=0.9)
     sim._contact.begin(sim.time, DT)
     on = (rows(sim._contact.found.body, n) == [0, 3]).all(axis=1)
-    assert (rows(sim._contact.problem.friction, n)[on] == 0.05).all() and (rows(sim._contact.found.restitution, n)[on] == 0.9).all()
+    assert (rows(sim._contact.problem.friction, n)[on] == 0.05).all()
+    assert (rows(sim._contact.found.restitution, n)[on] == 0.9).all()
     assert 0 < on.sum() < n and (rows(sim._contact.problem.friction, n)[~on] != 0.05).all()
     sim.set_contact("block", "table", *before)
 
@@ -162,9 +164,11 @@ def test_warm_start(begun):
 
 
 @kernel
-def find_goals(f: ti.template(), dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64, out: ti.types.ndarray()):
+def find_goals(
+    f: ti.template(), dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64, out: ti.types.ndarray()
+):  # fmt: skip
     for c in range(f.problem.count[0]):
-        out[c] = short_of_goal(f, c, dt, standoff, fast, slow)
+        out[c] = short_of_goal(f, c, dt, standoff, fast, slow, fastest)
 
 
 @kernel
@@ -191,7 +195,7 @@ def put(field, values) -> None:
 
 @pytest.mark.parametrize("fast, slow", [(1.0, 0.02), (0.05, 0.005)])
 def test_how_far_a_contact_is_from_its_goal(found, fast, slow):
-    h, dt = 2e-3, 0.01
+    h, dt, fastest = 2e-3, 0.01, 2.0
     cases = [  # gap, restitution, approach, gap - goal
         (5 * h, 0.0, -9.0, 4 * h),  # may close down to the standoff
         (h, 0.0, -9.0, 0.0),
@@ -204,13 +208,14 @@ def test_how_far_a_contact_is_from_its_goal(found, fast, slow):
         (h, 1.0, -3.0, -3.0 * dt),
         (-4 * h, 0.5, -1e-3, -4 * h * fast - slow * h),  # the penetration asks for more than the bounce
         (-4 * h, 0.5, -90.0, -45.0 * dt),
+        (-3.0 * fastest * dt / fast, 0.0, 0.0, -fastest * dt),  # no faster than that
     ]  # fmt: skip
     gap, restitution, approach, expected = np.array(cases).T
     for field, values in ((found.gap, gap), (found.restitution, restitution), (found.approach, approach)):
         put(field, values)
     found.problem.count[0] = len(cases)
     out = np.zeros(len(cases))
-    find_goals(found, dt, h, fast, slow, out)
+    find_goals(found, dt, h, fast, slow, fastest, out)
     assert np.abs(out - expected).max() < 1e-15
 
 

@@ -27,7 +27,8 @@ from taisoft.stepping import contact_stage
 from taisoft.stepping.newton import StageSolver
 
 K, BETA, DT = 24, 0.002, 0.003  # contacts; [s]
-STANDOFF, FAST, SLOW, STIFFNESS = 1e-3, 1.0, 0.02, 5.0
+GOAL = 1e-3, 0.2, 0.02, 0.05  # standoff [m], shares that a step mends, speed of that at most [m/s]
+STIFFNESS = 5.0
 FIXED = [0, 7]  # nodes
 
 
@@ -72,7 +73,7 @@ def rig(request):
             put(getattr(p, name), getattr(contacts, name))
         carry = np.where((np.arange(K) % 5 == 0)[:, None], 1e-3 * rng.standard_normal((K, 3)), 0.0)
         friction = np.where(np.arange(K) % 7 == 0, 0.0, 0.5)
-        gap = rng.uniform(-2, 3, K) * STANDOFF
+        gap = rng.uniform(-2, 3, K) * GOAL[0]
         for field, values in ((p.arity, arity), (p.friction, friction), (f.gap, gap), (f.carry, carry)):
             put(field, values)
         p.count[0] = K
@@ -106,7 +107,7 @@ def press(rig, x: np.ndarray) -> np.ndarray:
     """The impulses (K,3) at x (n,3); what they were before must not count."""
     rig.m.x.from_numpy(x)
     rig.p.r.fill(np.nan)
-    contact_stage.press(rig.m, rig.work, rig.k, BETA, DT, STANDOFF, FAST, SLOW, STIFFNESS)
+    contact_stage.press(rig.m, rig.work, rig.k, BETA, DT, *GOAL, STIFFNESS)
     return rig.p.r.to_numpy()[:K]
 
 
@@ -116,7 +117,11 @@ def pressed(rig):
     rng = np.random.default_rng(11)
     factor = oracle.factors(rig.W)
     way = (rig.x - rig.start).ravel()
-    goal = np.where(rig.gap >= STANDOFF, STANDOFF, np.maximum(rig.gap, 0) + SLOW * (STANDOFF - np.maximum(rig.gap, 0)))
+    standoff, fast, slow, fastest = GOAL
+    above = np.maximum(rig.gap, 0)
+    opening = np.minimum(slow * (standoff - above) + fast * (above - rig.gap), fastest * DT)
+    goal = np.where(rig.gap >= standoff, standoff, rig.gap + opening)
+    assert 0 < (opening == fastest * DT).sum() < (rig.gap < standoff).sum()
     carried = np.einsum("kij,kj->ki", rig.frame, rig.carry)
     u = (rig.J @ (rig.x - rig.x_hat).ravel() / BETA).reshape(K, 3) - carried / DT
     u[:, 0] = (rig.gap - goal + (rig.J @ way).reshape(K, 3)[:, 0] - carried[:, 0]) / BETA

@@ -1,7 +1,8 @@
 """Every demo runs as `taisoft run` runs it, ends with status ok, and passes its own check of the physics.
 
 * demos are found in the folder, so a new one is tested without a line here;
-* the check fails where the material is 1 % stiffer than the demo says, so it would notice wrong physics;
+* the check fails where the material is 1 % stiffer than the demo says, so it would notice wrong physics (where it knows an
+  energy);
 * a demo says what it is in one line;
 * the bunny of benchmarks/scenes/ runs where its mesh is there, and says what is missing where it is not.
 """
@@ -41,6 +42,8 @@ def test_demo(name):
         assert abs(sim.time - run["seconds"]) < 1e-9
         demo.check(sim, result)
 
+        if not hasattr(demo, "ENERGY"):  # nothing in its check depends on the stiffness
+            return
         for body in sim.scene.bodies:
             sim.set_material(body.name, young=1.01 * body.material.young)
         sim.reset()

@@ -1,6 +1,6 @@
 """The package's shape, read from its source without running it:
 
-* what stands left in ORDER imports nothing of what stands right of it;
+* what stands left in ORDER imports nothing of what stands right of it, and collision and contact never meet;
 * only runtime.py starts Taichi, and records, meshes, scenes and reports know nothing of Taichi;
 * nothing evaluates text, unpickles or starts a shell, and Taichi's faulty 3x3 decompositions stay unused;
 * no kernel file postpones its annotations, which Taichi cannot compile;
@@ -28,8 +28,7 @@ ORDER = (
     ("model",),
     ("elasticity", "stability"),
     ("linear",),
-    ("collision",),
-    ("contact",),
+    ("collision", "contact"),
     ("stepping",),
     ("simulator", "access", "settings", "running", "static"),
     ("output", "view"),
@@ -37,7 +36,7 @@ ORDER = (
     ("__main__",),
 )
 LEVEL = {name: level for level, group in enumerate(ORDER) for name in group}
-FOREIGN = {("mesh", "scene")}  # (importer, imported) of one group
+FOREIGN = {("mesh", "scene"), ("collision", "contact"), ("contact", "collision")}  # (importer, imported) of one group
 
 WITHOUT_TAICHI = {"errors", "records", "mesh", "scene"}
 FAULTY = {"ti.svd", "ti.sym_eig", "ti.polar_decompose"}

@@ -153,6 +153,7 @@ def mark_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template())
                     if out and cosine < flat:
                         bits |= 9 << k
                     elif out or cosine > ti.cast(LEVEL, ti.f64):
-                        if way[s.body[t]] != 0:
+                        # a rigid face cannot bend over a rim
+                        if way[s.body[t]] != 0 and s.soft[s.body[t]] == 1:
                             bits |= 8 << k
         sharp[t] = bits

@@ -14,6 +14,7 @@ from taisoft.collision.pipeline import Detection
 from taisoft.errors import MeshError
 from taisoft.mesh.signed_distance import signed_distances_at
 from taisoft.runtime import kernel
+from taisoft.scene.obstacles import Box, HalfSpace, Shape
 
 ALLOWED = 1e-6  # of the smaller body's size: deeper is an overlap
 
@@ -68,7 +69,25 @@ def find_overlap(detection: Detection) -> Overlap | None:
         for b in range(a + 1, len(colliders)):
             if len(parts[b]):
                 tell(a, b, _depth_between(detection, parts, a, b))
+    origins = detection.shapes.origin.to_numpy() if detection.shapes.count else ()
+    for k, middle in enumerate(origins):
+        b = int(detection.shapes.body[k])
+        for a in range(n_bodies):
+            tell(a, b, _depth_round(detection, parts[a], a, colliders[b].shape, middle[None]))
     return _deepest(depth, size, colliders)
+
+
+def _depth_round(detection: Detection, vertices: np.ndarray, a: int, shape: Shape, middle: np.ndarray) -> float:
+    """How deep [m] body a lies over the middle (1,3) of a shape that may be wholly inside it; 0 where it does not."""
+    if isinstance(shape, HalfSpace):
+        return 0.0
+    radius = float(np.min(shape.half_extents)) if isinstance(shape, Box) else float(shape.radius)
+    first = detection.topology.first
+    triangles = detection.topology.triangle[first[a] : first[a + 1]] - detection.topology.vertex_first[a]
+    if (middle < vertices.min(axis=0)).any() or (middle > vertices.max(axis=0)).any():
+        return 0.0
+    phi = float(signed_distances_at(vertices, triangles, middle)[0])
+    return radius - phi if phi < 0.0 else 0.0
 
 
 def _crossings(detection: Detection, x: np.ndarray) -> list[tuple[int, int, float]]:
