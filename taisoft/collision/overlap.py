@@ -62,8 +62,6 @@ def find_overlap(detection: Detection) -> Overlap | None:
         owner = detection.shapes.body.to_numpy()
         for a, k in zip(*np.nonzero(phi < 0.0)):
             tell(int(a), int(owner[k]), -phi[a, k])
-    for a, b, deep in _crossings(detection, x):
-        tell(a, b, deep)
     n_bodies = len(detection.scene.bodies)
     for a in range(n_bodies):
         for b in range(a + 1, len(colliders)):
@@ -74,6 +72,10 @@ def find_overlap(detection: Detection) -> Overlap | None:
         b = int(detection.shapes.body[k])
         for a in range(n_bodies):
             tell(a, b, _depth_round(detection, parts[a], a, colliders[b].shape, middle[None]))
+    told = {pair for pair, deep in depth.items() if deep > ALLOWED * min(size[pair[0]], size[pair[1]])}
+    for a, b, deep in _crossings(detection, x):
+        if (a, b) not in told:  # only that something crosses is known of them, and about how far
+            tell(a, b, deep)
     return _deepest(depth, size, colliders)
 
 
@@ -93,7 +95,7 @@ def _depth_round(detection: Detection, vertices: np.ndarray, a: int, shape: Shap
 def _crossings(detection: Detection, x: np.ndarray) -> list[tuple[int, int, float]]:
     """Pairs of different colliders whose triangles cut each other, and how far at least one reaches through the other [m].
 
-    Triangles that touch reach through by rounding only.
+    No farther than the cut is long: triangles that touch in a point or side by side cut by rounding only.
     """
     pairs, topology = detection.intersections(), detection.topology
     owner = np.searchsorted(topology.first, pairs, side="right") - 1
@@ -102,12 +104,28 @@ def _crossings(detection: Detection, x: np.ndarray) -> list[tuple[int, int, floa
     corners = x[topology.triangle[pairs]]  # (k, 2, 3, 3)
     normal = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
     normal /= np.linalg.norm(normal, axis=2, keepdims=True)
-    through = []
+    along = np.cross(normal[:, 0], normal[:, 1])
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    through, ends = [], []
     for one, other in ((0, 1), (1, 0)):
         height = np.einsum("kcx,kx->kc", corners[:, one] - corners[:, other, :1], normal[:, other])
         through.append(np.minimum(height.max(axis=1), -height.min(axis=1)))
-    deep = np.maximum(np.minimum(*through), 0.0)
+        place = np.einsum("kcx,kx->kc", corners[:, one], along)
+        ends.append(_cut(height, place))
+    length = np.minimum(ends[0][1], ends[1][1]) - np.maximum(ends[0][0], ends[1][0])
+    deep = np.maximum(np.minimum(np.minimum(*through), length), 0.0)
     return [(int(min(o)), int(max(o)), float(d)) for o, d in zip(owner, deep)]
+
+
+def _cut(height: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where (k,) the sides of triangles cross height 0, from and to, in terms of the corners' places (k,3) along a line."""
+    low, high = np.full(len(height), np.inf), np.full(len(height), -np.inf)
+    for j in range(3):
+        h, g, p, q = height[:, j], height[:, (j + 1) % 3], place[:, j], place[:, (j + 1) % 3]
+        crossed = (h <= 0.0) != (g <= 0.0)
+        at = p + np.where(crossed, h / np.where(crossed, h - g, 1.0), 0.0) * (q - p)
+        low, high = np.where(crossed, np.minimum(low, at), low), np.where(crossed, np.maximum(high, at), high)
+    return low, high
 
 
 def _deepest(depth: dict[tuple[int, int], float], size: np.ndarray, colliders: list) -> Overlap | None:
