@@ -1,4 +1,4 @@
-"""Every reference problem without contact: measured beside reference, one row a check, pass or fail.
+"""Every reference problem: measured beside reference, one row a check, pass or fail.
 
 taisoft bench references [--problem NAME] [--arch cpu|cuda] [--out FILE.json]
 

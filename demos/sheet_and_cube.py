@@ -11,7 +11,7 @@ import taisoft as ts
 solver = {"integrator": "implicit_euler", "dt": 1 / 60, "seconds": 4.0, "fps": 30.0}
 
 WEIGHTS = {"sheet": 800.0 * 9.81, "cube": 300.0 * 9.81}  # [N]
-ENERGY = 1296.8  # [J] elastic, at rest
+ENERGY = 1308.5  # [J] elastic, at rest
 
 
 def build() -> ts.Scene:
@@ -28,7 +28,7 @@ def build() -> ts.Scene:
 def check(sim: ts.Simulator, result) -> None:
     """Both are at rest; the sheet bears the cube, the two ends bear both; and it sags as deep as it must."""
     last = result.step_reports[-1]
-    assert last.kinetic < 0.02, f"kinetic energy is left: {last.kinetic:.3g} J"
+    assert last.kinetic < 1e-3, f"kinetic energy is left: {last.kinetic:.3g} J"  # 4e-5 measured
     force, held = sim.contact_force("cube")[1], sim.reactions("sheet")[:, 1].sum()
     assert abs(force / WEIGHTS["cube"] - 1.0) < 0.01, f"the sheet bears the cube with {force:.0f} N, not {WEIGHTS['cube']} N"
     assert abs(held / sum(WEIGHTS.values()) - 1.0) < 0.01, f"the ends bear {held:.0f} N, not {sum(WEIGHTS.values())} N"

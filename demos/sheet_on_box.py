@@ -12,7 +12,7 @@ solver = {"integrator": "implicit_euler", "dt": 1 / 60, "seconds": 3.0, "fps": 3
 
 TURN = np.radians(20.0)
 WEIGHT = 2.0 * 0.05 * 2.0 * 1000.0 * 9.81  # [N]
-ENERGY, CORNER = 112.29, 0.297  # [J] elastic, [m] height of the lowest corner, at rest
+ENERGY, CORNER = 112.29, 0.2968  # [J] elastic, [m] height of the lowest corner, at rest
 
 
 def build() -> ts.Scene:
@@ -34,7 +34,8 @@ def check(sim: ts.Simulator, result) -> None:
     assert np.abs(force - (0.0, WEIGHT, 0.0)).max() < 0.01 * WEIGHT, f"the box bears the sheet with {force} N"  # 2.1e-3
     assert abs(last.elastic / ENERGY - 1.0) < 0.003, f"the energy is {last.elastic:.2f} J, not {ENERGY} J"  # 2e-4 measured
     x = sim.positions("sheet")
-    assert abs(x[:, 1].min() - CORNER) < 0.01, f"the corners hang at {x[:, 1].min():.3f} m, not at {CORNER} m"
+    # 2e-5 m measured; 1.7e-3 m for each hundredth of stiffness
+    assert abs(x[:, 1].min() - CORNER) < 8e-4, f"the corners hang at {x[:, 1].min():.4f} m, not at {CORNER} m"
     assert np.abs(x.mean(axis=0)[[0, 2]]).max() < 1e-3, f"the sheet has slid to {x.mean(axis=0)} m"
     deepest = max(report.max_penetration for report in result.step_reports)
     assert deepest < 1e-3, f"the sheet was {deepest:.2e} m in the box"

@@ -227,35 +227,36 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     flat_nodes = np.concatenate([lane_layout(own, lanes).reshape(-1) for own in nodes])
     rules = tuple(reference.quadrature(d) for d in sorted({b.quadrature_degree for b in scene.bodies if b.order == 2}))
     table = _rule_table(rules) if rules else None
-    mass = arena.field("mass", real, n_nodes, lumped_masses(scene).astype(npr))
-    model = Model(
-        real=real, lanes=lanes, serial=serial, n_nodes=n_nodes, n_blocks=n_blocks, groups=groups,
-        x=arena.vectors("x", ti.f64, n_nodes, layout.rest),
-        v=arena.vectors("v", real, n_nodes, velocity.astype(npr)),
-        nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
-        rules=rules, points=arena.field("points", ti.f64, (len(table), 28), table) if rules else None,
-        Dm_inv=arena.field("Dm_inv", real, (n_blocks, 9, lanes), lane_layout(Dm_inv.reshape(-1, 9), lanes).astype(npr)),
-        volume=arena.field("volume", real, (n_blocks, lanes), volume.reshape(n_blocks, lanes).astype(npr)),
-        block_body=arena.field("block_body", ti.i32, n_blocks, block_body),
-        law_constants=arena.field(
-            "law_constants", ti.f64, (n_bodies, 4), material_table([b.material for b in scene.bodies])
-        ),
-        corner=arena.field("corner", real, 3 * len(flat_nodes)),
-        gather_start=arena.field("gather_start", ti.i32, n_nodes + 1, start),
-        gather_entry=arena.field("gather_entry", ti.i32, len(entry), entry),
-        mass=mass,
-        weight=arena.field("weight", real, n_nodes, weight_masses(scene).astype(npr)) if on["consistent_weight"] else mass,
-        mass_matrix=None,
-        free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
-        gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),
-        loads=arena.vectors("loads", real, n_nodes, body_loads(scene).astype(npr)) if on["loads"] else None,
-        node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
-        damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
-        consistent=on["consistent_mass"], loaded=on["loads"], damped=damped, stiffness_damping=on["stiffness_damping"],
-        scalars=arena.field("scalars", ti.f64, 16),
-        partial=arena.field("partial", ti.f64, (chunks, 8)),
-        chunks=chunks,
-    )  # fmt: skip
+    with arena.group():
+        mass = arena.field("mass", real, n_nodes, lumped_masses(scene).astype(npr))
+        model = Model(
+            real=real, lanes=lanes, serial=serial, n_nodes=n_nodes, n_blocks=n_blocks, groups=groups,
+            x=arena.vectors("x", ti.f64, n_nodes, layout.rest),
+            v=arena.vectors("v", real, n_nodes, velocity.astype(npr)),
+            nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
+            rules=rules, points=arena.field("points", ti.f64, (len(table), 28), table) if rules else None,
+            Dm_inv=arena.field("Dm_inv", real, (n_blocks, 9, lanes), lane_layout(Dm_inv.reshape(-1, 9), lanes).astype(npr)),
+            volume=arena.field("volume", real, (n_blocks, lanes), volume.reshape(n_blocks, lanes).astype(npr)),
+            block_body=arena.field("block_body", ti.i32, n_blocks, block_body),
+            law_constants=arena.field(
+                "law_constants", ti.f64, (n_bodies, 4), material_table([b.material for b in scene.bodies])
+            ),
+            corner=arena.field("corner", real, 3 * len(flat_nodes)),
+            gather_start=arena.field("gather_start", ti.i32, n_nodes + 1, start),
+            gather_entry=arena.field("gather_entry", ti.i32, len(entry), entry),
+            mass=mass,
+            weight=arena.field("weight", real, n_nodes, weight_masses(scene).astype(npr)) if on["consistent_weight"] else mass,
+            mass_matrix=None,
+            free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
+            gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),
+            loads=arena.vectors("loads", real, n_nodes, body_loads(scene).astype(npr)) if on["loads"] else None,
+            node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
+            damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
+            consistent=on["consistent_mass"], loaded=on["loads"], damped=damped, stiffness_damping=on["stiffness_damping"],
+            scalars=arena.field("scalars", ti.f64, 16),
+            partial=arena.field("partial", ti.f64, (chunks, 8)),
+            chunks=chunks,
+        )  # fmt: skip
     if on["consistent_mass"]:
         model = replace(model, mass_matrix=_build_mass_matrix(scene, model, arena, npr))
     return model, layout

@@ -13,7 +13,7 @@ import os
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,8 @@ launches: Counter[str] = Counter()  # kernel name -> launches so far in this pro
 _open: list["Runtime"] = []  # simulators that hold the runtime now
 _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
 _clock = {"compile": 0.0}
+MAX_TREES = 480  # of field memory that may be open at once, see FieldArena
+_trees = {"open": 0}
 
 
 class Runtime:
@@ -102,6 +104,7 @@ def _initialise(arch: str, precision: str) -> None:
             arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
             fast_math=False, offline_cache=True, offline_cache_file_path=_cache_folder(), log_level=ti.ERROR, random_seed=0,
         )  # fmt: skip
+    _trees["open"] = 0
     obtained = "cuda" if ti.cfg.arch == ti.cuda else "cpu"
     if obtained != arch:
         raise SimulationError(f"arch '{arch}' is not to be had on this machine (Taichi fell back to '{obtained}')")
@@ -124,11 +127,16 @@ def open_kind() -> tuple[str, str] | None:
 
 
 class FieldArena:
-    """Fields of one simulator: allocated together, counted by name, released together."""
+    """Fields of one simulator: counted by name, released together.
+
+    Taichi holds each separately placed part of memory, a tree, in a table of 512 rows whose end it does not watch. So fields
+    that are made together share a tree, see `group`, and no more than MAX_TREES are open at once.
+    """
 
     def __init__(self) -> None:
         self.bytes: dict[str, int] = {}
         self._trees: list = []
+        self._group: tuple[ti.FieldsBuilder, list] | None = None
 
     def field(self, name: str, dtype, shape: tuple[int, ...] | int, data: np.ndarray | None = None):
         """A scalar field, filled from data when given (else zero)."""
@@ -138,6 +146,23 @@ class FieldArena:
         """A field of n-vectors, filled from data (shape, n) when given (else zero)."""
         return self._place(name, lambda: ti.Vector.field(n, dtype), dtype, n, shape, data)
 
+    @contextlib.contextmanager
+    def group(self) -> Iterator[None]:
+        """Fields made inside share a tree; they can be used, and hold their data, once the outermost group has ended."""
+        if self._group is not None:
+            yield
+            return
+        self._group = ti.FieldsBuilder(), []
+        try:
+            yield
+        finally:  # in any case: a field that is never placed stops every later kernel
+            (builder, fields), self._group = self._group, None
+            if fields:
+                self._finalize(builder, fields[0][2])
+        for field, data, _ in fields:
+            if data is not None:
+                field.from_numpy(data)
+
     def _place(self, name, make, dtype, components, shape, data):
         if name in self.bytes:
             raise ValueError(f"field '{name}' is allocated twice")
@@ -145,25 +170,32 @@ class FieldArena:
         count = int(np.prod(shape, dtype=np.int64))
         if count * components >= 2**31:
             raise SimulationError(f"field '{name}' needs {count * components} entries, more than 2^31 - 1")
-        field, builder = make(), ti.FieldsBuilder()  # not before: a field that is never placed stops every later kernel
-        if shape == ():
-            builder.place(field)
-        else:
-            builder.dense((ti.i, ti.ij, ti.ijk, ti.ijkl)[len(shape) - 1], shape).place(field)
+        with self.group():
+            builder, fields = self._group
+            field = make()  # not before: a field that is never placed stops every later kernel
+            if shape == ():
+                builder.place(field)
+            else:
+                builder.dense((ti.i, ti.ij, ti.ijk, ti.ijkl)[len(shape) - 1], shape).place(field)
+            fields.append((field, None if data is None else np.ascontiguousarray(data), name))
+        size = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.u8: 1}[dtype]
+        self.bytes[name] = count * components * size
+        return field
+
+    def _finalize(self, builder: ti.FieldsBuilder, name: str) -> None:
+        if _trees["open"] >= MAX_TREES:
+            raise SimulationError(f"too many simulators are open for Taichi to hold field '{name}' and others: close one first")
         try:
             self._trees.append(builder.finalize())
         except RuntimeError as error:
-            raise SimulationError(f"no memory for field '{name}' ({count * components * 8} bytes at most): {error}") from None
-        size = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.u8: 1}[dtype]
-        self.bytes[name] = count * components * size
-        if data is not None:
-            field.from_numpy(np.ascontiguousarray(data))
-        return field
+            raise SimulationError(f"no memory for field '{name}' and those made with it: {error}") from None
+        _trees["open"] += 1
 
     def release(self) -> None:
         """Give the memory back to Taichi."""
         while self._trees:
             self._trees.pop().destroy()
+            _trees["open"] = max(0, _trees["open"] - 1)
         self.bytes.clear()
 
 

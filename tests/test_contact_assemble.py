@@ -39,9 +39,9 @@ def scene() -> ts.Scene:
         position=(0, 0.2502, 0), velocity=(0.2, -0.3, 0.1),
     )  # fmt: skip
     brick = ts.Material(friction=0.9, restitution=0.1, **soft)
-    shape = ts.box_mesh((1, 1, 1), (0.3, 0.2, 0.35))
-    made.add_body(shape, brick, name="brick", position=(0.13, 0.6004, 0.08), velocity=(0, -1, 0))
-    made.add_body(shape, brick, name="other", position=(4.0, 0.1002, 0.03))
+    mesh = ts.box_mesh((1, 1, 1), (0.3, 0.2, 0.35))
+    made.add_body(mesh, brick, name="brick", position=(0.13, 0.6004, 0.08), velocity=(0, -1, 0))
+    made.add_body(mesh, brick, name="other", position=(4.0, 0.1002, 0.03))
     made.add_obstacle(ts.Box((0, -0.2, 0), (0.6, 0.2, 0.7)), name="table", friction=0.6, path=turning)
     corners = [(3, 0, -1), (3, 0, 1), (5, 0, 1), (5, 0, -1)]
     made.add_obstacle(ts.MeshObstacle(corners, [(0, 1, 2), (0, 2, 3)]), name="lift", friction=0.1, restitution=0.5, path=rising)
@@ -87,9 +87,9 @@ def test_numbers_that_change(begun):
     sim.set_contact("table", "block", friction=0.05, restitution=0.9)
     sim._contact.begin(sim.time, DT)
     on = (rows(sim._contact.found.body, n) == [0, 3]).all(axis=1)
-    assert (rows(sim._contact.problem.friction, n)[on] == 0.05).all()
-    assert (rows(sim._contact.found.restitution, n)[on] == 0.9).all()
-    assert 0 < on.sum() < n and (rows(sim._contact.problem.friction, n)[~on] != 0.05).all()
+    friction, restitution = rows(sim._contact.problem.friction, n), rows(sim._contact.found.restitution, n)
+    assert (friction[on] == 0.05).all() and (restitution[on] == 0.9).all()
+    assert 0 < on.sum() < n and (friction[~on] != 0.05).all()
     sim.set_contact("block", "table", *before)
 
 

@@ -66,11 +66,11 @@ def test_c1_slope():
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_c2_stack(seed):
-    """Height and penetration at 5 s are not asked here: the column topples.
+    """Drift, and what comes after 2.5 of the 5 s, are not asked here: the column topples, as one of bonded cubes would.
 
-    It is higher than its material bears, whatever the contacts do: one of the same height, bonded, buckles at 4.4 m
-    (Greenhill, (7.84 E I / (rho g A))^(1/3) with E = 1 MPa, 1 m wide), and the weight's moment then grows at about 1/s. From
-    jittered starts it leans by 0.01 m after 1 s; so the drift is followed for as long, the height for 2.5 s.
+    It is higher than its material bears: a bar buckles under its own weight from (7.84 E I / (rho g A))^(1/3) = 4.05 m on
+    (Greenhill; E = 1 MPa, 1 m wide), and what it leans grows at about 1/s from then. From these starts its top is
+    0.01 m off after 1 s, and 0.08 m after 2.5 s.
     """
     scene, mesh, rng = ts.Scene(gravity=(0, -G, 0)), box((3, 3, 3), (1, 1, 1)), np.random.default_rng(seed)
     rubber = ts.Material(law=SNH, young=1e6, poisson=0.4, density=1000.0, friction=0.3)
@@ -80,8 +80,8 @@ def test_c2_stack(seed):
     scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="plane", friction=0.3)
     with ts.Simulator(scene, dt=0.025) as sim:
         heights = []
-        top = mesh.vertices[:, 1] > 0.49
-        result = sim.run(2.5, lambda sim, k, report: heights.append(sim.positions("cube 4")[top, 1].mean()), fps=40)
+        upper = mesh.vertices[:, 1] > 0.49
+        result = sim.run(2.5, lambda sim, k, report: heights.append(sim.positions("cube 4")[upper, 1].mean()), fps=None)
     assert deepest(result.step_reports) <= 5e-3
     # it still swings up and down, by 0.02 m at 2 s
     assert abs(np.mean(heights[-40:]) - 4.877) <= 0.02
@@ -173,12 +173,10 @@ def test_c3_spike_in_hole():
 
 
 def test_r2_stiffness_ratio():
-    """The overhanging corners of the soft slab hang down to the plane, which bears 1.7 % of it."""
+    """The first second of three: it rests after half of it. The plane bears 1.7 % of the soft slab, whose corners hang down."""
     scene, mesh = ts.Scene(gravity=(0, -G, 0)), box((12, 1, 12), (1.0, 0.05, 1.0))
-    stiff, soft = (
-        ts.Material(law=SNH, young=young, poisson=0.4, density=density, friction=0.1)
-        for young, density in ((1e8, 2000.0), (1e4, 1000.0))
-    )
+    stiff = ts.Material(law=SNH, young=1e8, poisson=0.4, density=2000.0, friction=0.1)
+    soft = ts.Material(law=SNH, young=1e4, poisson=0.4, density=1000.0, friction=0.1)
     upper = turned(mesh, np.pi / 4, 1)
     scene.add_body(mesh, stiff, name="lower", position=(0, 0.025, 0))
     scene.add_body(upper, soft, name="upper", position=(0, 0.085, 0))
@@ -202,8 +200,8 @@ def test_r2_stiffness_ratio():
 
 
 def static_thickness(mesh: ts.TetMesh, soft: ts.Material, inside: np.ndarray) -> float:
-    """Mean thickness there [m] of the soft slab at rest on a rigid, rough slab of 1 x 1 m, corners cut off
-    by being held too: they lie far from where it is measured."""
+    """Mean thickness there [m] of the soft slab by statics, its whole lower side held. What differs, friction of 0.1 and the
+    corners that hang down, is far from where it is measured, or moves it by less than the 2 % that are asked."""
     scene = ts.Scene(gravity=(0, -G, 0))
     scene.add_body(mesh, soft, name="slab").fix(lambda X: X[:, 1] < -0.024)
     x = ts.solve_static(scene).positions("slab")[:, 1].reshape(13, 2, 13)

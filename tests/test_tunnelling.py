@@ -1,8 +1,8 @@
 """A shot at a thin sheet is stopped or refused, never lost:
 
 * slow shots take whole steps, fast ones are cut into parts: after every step no two triangles intersect, no shot has passed;
-* a shot too fast for that is refused with its speed, the sheet's thickness and a step that would do, and the state stays as it was;
-  with such a step it is stopped; explicit steps refuse likewise;
+* a shot too fast for that is refused with its speed, the sheet's thickness and a step that would do, and the state stays as it
+  was; with such a step it is stopped; explicit steps refuse likewise;
 * a half-space is thick enough for any speed.
 """
 
@@ -19,7 +19,7 @@ SHOT = np.array([0.013, 0.1, 0.01])  # [m] its middle at the start
 
 
 def scene() -> ts.Scene:
-    """A shot over a sheet that is held at two sides, off the middle so that nothing is symmetric; a cube far away over a plane."""
+    """A shot over a sheet that is held at two sides, off the middle so that nothing is symmetric; a cube over a plane."""
     made = ts.Scene(gravity=(0, 0, 0))
     rubber = ts.Material(young=1e6, poisson=0.3, density=1000.0)
     sheet = made.add_body(ts.box_mesh((4, 1, 4), (0.4, THICK, 0.4)), rubber, name="sheet")
@@ -74,7 +74,7 @@ def test_a_shot_is_stopped(sim, speed):
 
 
 def test_a_shot_too_fast_is_refused(sim):
-    speed = 3.0 * THICK / sim.dt if sim.settings.explicit else 300.0 * THICK / sim.dt
+    speed = (0.75 if sim.settings.explicit else 300.0) * THICK / sim.dt
     shoot(sim, speed)
     sim.set_state(positions=sim.positions("shot") - (0, 0.1 - 0.04 - 0.5 * THICK, 0), body="shot")
     x, v = sim.positions(), sim.velocities()
@@ -100,9 +100,16 @@ def test_a_shot_too_fast_is_refused(sim):
 
 
 def test_a_plane_is_thick_enough(sim):
-    shoot(sim, 2000.0, "faller")
-    lowest = np.inf
-    for _ in range(3 if not sim.settings.explicit else 12):
-        sim.step()
+    explicit = sim.settings.explicit
+    speed = 150.0 if explicit else 300.0  # [m/s], ways of 0.03 and 5 m a step, to a cube of 0.05 m
+    shoot(sim, speed, "faller")
+    borne, lowest, told = [], np.inf, []
+    for _ in range(round(3.2 / speed / sim.dt) if explicit else 4):
+        told += sim.step().problems
         lowest = min(lowest, sim.positions("faller")[:, 1].min())
-    assert -1.0 <= lowest < -0.5 and sim.contact_force("plane") is not None
+        borne.append(sim.contact_force("plane")[1])
+    assert min(borne) < -1000.0  # [N]
+    if explicit:  # at four times the speed of its waves it is crushed, and a little of it may sink in, which is told
+        assert -1.05 < lowest < -0.9 and (lowest > -1.0 or any("deep in each other" in text for text in told))
+    else:
+        assert -1.0 < lowest < -0.99 and told == []

@@ -50,7 +50,8 @@ class Buffer:
         if self.most is not None:
             part = max(min(part, self.most // self.chunks), 1)
         arena = FieldArena()
-        data = self._make(arena, part * self.chunks)  # may fail for want of memory: what was there then stays
+        with arena.group():
+            data = self._make(arena, part * self.chunks)  # may fail for want of memory: what was there then stays
         if self._arena is not None:
             self._arena.release()
         self._arena, self.data, self.part = arena, data, part

@@ -152,8 +152,10 @@ def mark_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template())
                     out = (s.x[opposite(s, w, i, j)] - s.x[i]).dot(n) < 0.0
                     if out and cosine < flat:
                         bits |= 9 << k
-                    elif out or cosine > ti.cast(LEVEL, ti.f64):
-                        # a rigid face cannot bend over a rim
+                    elif cosine > ti.cast(LEVEL, ti.f64):  # level: it may bend over a rim, unless it is rigid
                         if way[s.body[t]] != 0 and s.soft[s.body[t]] == 1:
+                            bits |= 8 << k
+                    elif out:
+                        if way[s.body[t]] != 0:
                             bits |= 8 << k
         sharp[t] = bits

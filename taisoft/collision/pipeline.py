@@ -71,9 +71,10 @@ class Detection:
         grids = self._grids() if self._rows else []  # before anything is allocated: they may be impossible
         self._arena = arena = FieldArena()
         soft = np.arange(len(scene.colliders)) < len(bodies)
-        self.surface: Surface = build_surface(
-            self.topology, self._rest, soft, soft & self_collision, runtime, arena, serial
-        )
+        with arena.group():
+            self.surface: Surface = build_surface(
+                self.topology, self._rest, soft, soft & self_collision, runtime, arena, serial
+            )
         s = self.surface
         self.broad = self._make_broad(runtime) if self._rows else None
         ways = [BY_FACES if b.hit_by == "proximity" else BY_FIELD for b in bodies]
@@ -197,7 +198,8 @@ class Detection:
         b = self.buffer
         if self._reduction is None or self._reduction.place.shape[0] != b.capacity:
             arena = FieldArena()
-            self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.serial, self.surface.spread)
+            with arena.group():
+                self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.serial, self.surface.spread)
             self._reduction_arena.release()
             self._reduction_arena = arena
         reduce_contacts(self._reduction, b.data, b.used, b.part, MERGED * self.edge, REDUCTION_CELL * self.edge)

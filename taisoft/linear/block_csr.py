@@ -57,21 +57,22 @@ def build_block_csr(model: Model, arena: FieldArena, real, prefix: str = "stiffn
     def ints(name: str, data: np.ndarray):
         return arena.field(f"{prefix}_{name}", ti.i32, data.shape, data.astype(np.int32))
 
-    if model.points is not None:
-        start, pairs, factors = pair_terms(model.rules)
-        factors = arena.field(
-            f"{prefix}_term_factor", real, factors.shape, factors.astype(np.float32 if real == ti.f32 else np.float64)
-        )
-        terms = {"term_start": ints("term_start", start), "term_pair": ints("term_pair", pairs), "term_factor": factors}
-    return BlockCsr(
-        n_edges=n_edges, row_start=ints("row_start", graph.row_start), row_upper=ints("row_upper", graph.row_upper),
-        column=ints("column", graph.column), value=arena.vectors(f"{prefix}_value", real, 2 * n_edges, n=BLOCK),
-        diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
-        element=arena.vectors(f"{prefix}_element", real, size, n=model.lanes),
-        edge_start=ints("edge_start", edge_start), edge_entry=ints("edge_entry", base[order]),
-        edge_upper=ints("edge_upper", graph.upper), edge_lower=ints("edge_lower", graph.lower),
-        **terms,
-    )  # fmt: skip
+    with arena.group():
+        if model.points is not None:
+            start, pairs, factors = pair_terms(model.rules)
+            factors = arena.field(
+                f"{prefix}_term_factor", real, factors.shape, factors.astype(np.float32 if real == ti.f32 else np.float64)
+            )
+            terms = {"term_start": ints("term_start", start), "term_pair": ints("term_pair", pairs), "term_factor": factors}
+        return BlockCsr(
+            n_edges=n_edges, row_start=ints("row_start", graph.row_start), row_upper=ints("row_upper", graph.row_upper),
+            column=ints("column", graph.column), value=arena.vectors(f"{prefix}_value", real, 2 * n_edges, n=BLOCK),
+            diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
+            element=arena.vectors(f"{prefix}_element", real, size, n=model.lanes),
+            edge_start=ints("edge_start", edge_start), edge_entry=ints("edge_entry", base[order]),
+            edge_upper=ints("edge_upper", graph.upper), edge_lower=ints("edge_lower", graph.lower),
+            **terms,
+        )  # fmt: skip
 
 
 def sibling(matrix: BlockCsr, model: Model, arena: FieldArena, real, prefix: str) -> BlockCsr:

@@ -149,8 +149,9 @@ class ContactStep:
 
     def _make_room(self, capacity: int) -> None:
         arena, m = FieldArena(), self.world.model
-        problem = build_node_problem(arena, capacity, m.n_nodes, m.serial)
-        self.found = build_found(arena, problem)
+        with arena.group():
+            problem = build_node_problem(arena, capacity, m.n_nodes, m.serial)
+            self.found = build_found(arena, problem)
         self._arena.release()
         self._arena, self._last_time = arena, 0.0
 
