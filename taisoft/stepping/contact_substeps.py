@@ -54,18 +54,29 @@ class ContactExplicitStepper(ExplicitStepper):
         self.contact.forget()
 
     def advance(self, n: int, dt: float) -> ContactSubstepResult:
-        """Take n sub-steps of dt, or as many as a batch holds; whatever fails leaves the state before its sub-step."""
+        """Take n sub-steps of dt, or fewer where led nodes let go or the batch is full; at least one.
+
+        Whatever fails leaves the state before its sub-step.
+        """
         world, m, results, depth, done = self.world, self.world.model, [], 0.0, 0
         explicit.begin_parallel(m)
         n, start = min(n, self.max_batch), world.time
+        self._released, releases, targets = world.motion.released(), world.releases, None
+        if self.work.n_moved:
+            n = min(n, self.rows)
+            targets = world.next_targets(start + dt * np.arange(1, n + 1))
+            self.stale = self.stale or world.releases != releases
+            n = len(targets)
         self.contact.start_step(dt, 1)
         try:
             while done < n:
                 keep_state(m, self._good)
-                self._released = world.motion.released()
+                if targets is not None:
+                    self._upload_targets(targets[done : done + 1])
                 results.append(self._substep(world.step_count + done + 1, start + done * dt, dt))
                 depth = max(depth, self.contact.end(start + (done + 1) * dt, dt))
                 done += 1
+                self._released = world.motion.released()
         except BaseException:  # Ctrl-C, too
             self._restore()
             world.step_count += done
@@ -88,11 +99,6 @@ class ContactExplicitStepper(ExplicitStepper):
     def _substep(self, step: int, time: float, dt: float) -> SolveResult | None:
         """One sub-step, the step-th, from a time; returns what the contacts' solver did, None where there are none."""
         world, m, s, contact = self.world, self.world.model, self.work, self.contact
-        if s.n_moved:
-            releases = world.releases
-            target = world.next_targets(np.array([time + dt]))
-            self.stale = self.stale or world.releases != releases
-            self._upload_targets(target)
         if contact.look(time, dt)[1] > 1.0:
             raise SimulationError(f"step {step}: {contact.too_fast(time, dt)}")
         if s.verlet and self.stale:

@@ -245,13 +245,13 @@ class ImplicitStepper:
     def _solve(self, scheme: Scheme, dt: float) -> StageResult:
         """The stage, with contacts or without."""
         most = 1 if scheme.one_iteration else MAX_NEWTON
+        # led nodes change their velocity once a step, not twice within the midpoint's half step
+        share = 0.5 if scheme.midpoint else 1.0
         if self.contact is None:
-            # led nodes change their velocity once a step, not twice within the midpoint's half step
-            share = 0.5 if scheme.midpoint else 1.0
             return self.solver.solve(1.0, self._beta, self.tolerance, most, self.linear_tolerance, led_share=share)
         return self.solver.solve_stage(
             1.0, self._beta, dt, self.tolerance, self.contact_tolerance, MAX_CONTACT_NEWTON, self.linear_tolerance,
-            scheme.one_iteration,
+            scheme.one_iteration, share,
         )  # fmt: skip
 
     def reactions(self) -> np.ndarray:
