@@ -33,6 +33,7 @@ _HOME = {  # public name -> the module that defines it
     "solve_static": "taisoft.static",
     "modes": "taisoft.stability",
     "evaluate_law": "taisoft.materials.evaluate",
+    "solve_contact_problem": "taisoft.contact.api",
     "Energies": "taisoft.records",
     "StepReport": "taisoft.records",
     "RunReport": "taisoft.records",

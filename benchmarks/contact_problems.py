@@ -1,0 +1,293 @@
+"""Contact solvers on frictional contact problems of rigid scenes: residual after 10, 100 and 1000 sweeps, and cost to 1e-6.
+
+taisoft bench contact_problems [--problem NAME] [--repeats N]
+
+The problems are from Siconos' test data and lie beside the repository, in shared/contact_problems, with the residuals of plain
+serial Gauss-Seidel as yardstick. Cost is told as a share of what 1000 sweeps of plain Gauss-Seidel take: time, the two run in
+turns, and floating-point operations (18 a block of W and sweep, 2/3 n^3 for a dense factorisation, what its fill says for a
+sparse one). Verdicts: Gauss-Seidel must be no worse than twice the yardstick; the best solver of every problem must reach 1e-6
+at less than the cost of those sweeps, in operations and in time. A summary tells how each solver fares on all of them.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+
+from taisoft.contact import api, augmented_lagrangian, host
+from taisoft.contact.colouring import store
+from taisoft.contact.graph import colour_greedy, matrix_graph
+from taisoft.contact.solve import solve
+from taisoft.runtime import open_runtime
+
+PROBLEMS = Path(__file__).resolve().parents[1].parent / "shared" / "contact_problems"
+SWEEPS = (10, 100, 1000)
+GOAL = 1e-6
+NONE = 1e-12  # below it a residual is rounding
+PLAIN = "gauss_seidel, plain"
+YARDSTICK = {
+    "BoxesStack1-i100000-32": (3e-2, 2e-3, 3e-5),
+    "Capsules-i100-889": (8e-3, 2e-4, 3e-5),
+    "Capsules-i125-1213": (6e-3, 2e-4, 4e-5),
+    "Confeti-ex03-Fc3D-SBM": (4e-3, 2e-10, NONE),
+    "Confeti-ex13-4contact-Fc3D-SBM": (4e-12, NONE, NONE),
+    "NESpheres_10_1": (1e-4, 1e-10, NONE),
+    "OneObject-i100000-499": (5e-2, 2e-3, 4e-6),
+    "Rover1039": (3e-2, 6e-4, 1e-10),
+    "Rover4396": (7e-3, 4e-11, NONE),
+}
+SWEEPERS = {  # name -> (method, momentum)
+    PLAIN: ("gauss_seidel", False),
+    "gauss_seidel": ("gauss_seidel", True),
+    "coloured_gauss_seidel": ("coloured_gauss_seidel", True),
+    "jacobi, plain": ("jacobi", False),
+    "jacobi": ("jacobi", True),
+    "hybrid, plain": ("hybrid", False),
+    "hybrid": ("hybrid", True),
+}
+HEADINGS = ("problem", "contacts", "solver", "10", "100", "1000", "to 1e-6", "time", "operations", "")
+FORMAT = "{:31} {:>8} {:24} {:>8} {:>8} {:>8} {:>8} {:>8} {:>10} {}"
+
+
+@dataclass(frozen=True)
+class Problem:
+    """W (3k,3k), b (3k,), mu (k,)."""
+
+    name: str
+    W: sp.csr_matrix
+    b: np.ndarray
+    mu: np.ndarray
+
+    @property
+    def sweep_cost(self) -> int:
+        """Operations of a sweep of Gauss-Seidel: its products, and about 40 for a prox."""
+        return 18 * len(self.W.tobsr((3, 3)).indices) + 40 * len(self.mu)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One solver on one problem.
+
+    residuals: after 10, 100, 1000 sweeps (outer iterates of the augmented Lagrangian; "auto" sweeps 100 times, then those).
+    iterations: until 1e-6, None where it is not reached. time, operations: until then, as a share of 1000 plain sweeps.
+    """
+
+    problem: str
+    contacts: int
+    solver: str
+    residuals: tuple[float, float, float]
+    iterations: int | None
+    time: float
+    operations: float
+    verdict: str = ""
+
+    @property
+    def cost(self) -> float:
+        return max(self.time, self.operations)
+
+    def __str__(self) -> str:
+        reached = self.iterations is not None
+        cost = (str(self.iterations), f"{self.time:.2f}", f"{self.operations:.3f}") if reached else ("-", "-", "-")
+        residuals = (f"{r:.1e}" for r in self.residuals)
+        return FORMAT.format(self.problem, self.contacts, self.solver, *residuals, *cost, self.verdict).rstrip()
+
+
+def load(name: str) -> Problem:
+    """One of the shared problems."""
+    data = np.load(PROBLEMS / f"{name}.npz")
+    n = 3 * int(data["n_contacts"])
+    W = sp.csr_matrix((data["val"], (data["row"], data["col"])), shape=(n, n))
+    return Problem(name, W, np.asarray(data["b"], float), np.asarray(data["mu"], float))
+
+
+def seconds(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """The median time of each call, all of them run in turns, once before to compile."""
+    spent: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(repeats + 1):
+        for name, call in calls.items():
+            start = time.perf_counter()
+            call()
+            spent[name].append(time.perf_counter() - start)
+    return {name: float(np.median(s[1:])) for name, s in spent.items()}
+
+
+@contextmanager
+def counted_operations(problem: Problem) -> Iterator[list[int]]:
+    """A list whose entries add up to the operations of the augmented Lagrangian meanwhile."""
+    told: list[int] = []
+    module, dense = augmented_lagrangian, np.linalg.solve
+    sparse, look = module.splu, module._linearise
+
+    def count_dense(A, b):
+        told.append(2 * len(A) ** 3 // 3 + 2 * len(A) ** 2)
+        return dense(A, b)
+
+    def count_sparse(A):
+        made = sparse(A)
+        lower, upper = np.diff(made.L.tocsc().indptr), np.diff(made.U.tocsr().indptr)
+        told.append(int(2 * (lower * upper).sum() + 2 * (lower.sum() + upper.sum())))
+        return made
+
+    def count_look(q, *rest):  # with W' q and the blocks of the linearised equations, 3x3 by 3x3
+        share = len(q) / problem.W.shape[0]
+        told.append(int(share * 4 * problem.sweep_cost))
+        return look(q, *rest)
+
+    np.linalg.solve, module.splu, module._linearise = count_dense, count_sparse, count_look
+    try:
+        yield told
+    finally:
+        np.linalg.solve, module.splu, module._linearise = dense, sparse, look
+
+
+def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
+    """All solvers that sweep; the first is plain Gauss-Seidel, in whose time the others are told."""
+    W, b, mu = problem.W, problem.b, problem.mu
+    with api._problem(W, b, mu, np.zeros((len(mu), 3))) as p:
+        store(p, colour_greedy(matrix_graph(W)))
+        orders = {True: p.order.to_numpy(), False: np.zeros(p.capacity, dtype=np.int32)}
+        orders[False][: len(mu)] = np.arange(len(mu))
+
+        def start(method: str) -> None:
+            p.order.from_numpy(orders[method == "coloured_gauss_seidel"])
+            p.r.fill(0.0)
+
+        residuals, found, calls = {}, {}, {}
+        for name, (method, momentum) in SWEEPERS.items():
+            after = []
+            for n in SWEEPS:
+                start(method)
+                solve(p, method, 0.1 * NONE, n, momentum=momentum)
+                after.append(host.residual(W, b, mu, host.find_factors(W), p.r.to_numpy()[: len(mu)]))
+            residuals[name] = tuple(after)
+            start(method)
+            found[name] = solve(p, method, GOAL, SWEEPS[-1], momentum=momentum)
+
+            def run(method=method, momentum=momentum):
+                start(method)
+                return solve(p, method, GOAL, SWEEPS[-1], momentum=momentum)
+
+            calls[name] = run
+
+        def yardstick():
+            start("gauss_seidel")
+            return solve(p, "gauss_seidel", -1.0, SWEEPS[-1], momentum=False)
+
+        took = seconds({**calls, "1000": yardstick}, repeats)
+    rows = []
+    for name, (_, momentum) in SWEEPERS.items():
+        done = found[name]
+        # a look at the residual is a product too, after every fifth sweep; momentum takes about 40 operations a contact
+        sweep = problem.sweep_cost * 1.2 + (40 * len(mu) if momentum else 0)
+        share = done.iterations * sweep / (SWEEPS[-1] * problem.sweep_cost)
+        reached = done.iterations if done.converged else None
+        rows.append(Row(problem.name, len(mu), name, residuals[name], reached, took[name] / took["1000"], share))
+    return rows
+
+
+def host_rows(problem: Problem, repeats: int) -> list[Row]:
+    """The augmented Lagrangian and "auto", by the public function's own parts; time beside 1000 plain sweeps once more."""
+    W, b, mu, rows = problem.W, problem.b, problem.mu, []
+    none, sweeps = np.zeros((len(mu), 3)), SWEEPS[-1]
+
+    def plain():
+        with api._problem(W, b, mu, none) as p:
+            return solve(p, "gauss_seidel", -1.0, sweeps, momentum=False)
+
+    def auto(goal: float, most: int):
+        with api._problem(W, b, mu, none) as p:
+            swept = solve(p, "gauss_seidel", goal, min(most, api.SWEEPS))
+            r = p.r.to_numpy()[: len(mu)]
+        if swept.converged or most <= api.SWEEPS:
+            return r, swept.iterations, [swept.residual]
+        r, history = augmented_lagrangian.solve(W, b, mu, r, goal, most - swept.iterations)
+        return r, swept.iterations, history
+
+    def lagrangian(goal: float, most: int):
+        r, history = augmented_lagrangian.solve(W, b, mu, none, goal, most)
+        return r, 0, history
+
+    for name, run in (("augmented_lagrangian", lagrangian), ("auto", auto)):
+        factor = host.find_factors(W)
+        residuals = tuple(host.residual(W, b, mu, factor, run(0.1 * NONE, n)[0]) for n in (*SWEEPS[:2], 150))
+        with counted_operations(problem) as told:
+            _, swept, history = run(GOAL, SWEEPS[-1])
+        took = seconds({"solve": lambda run=run: run(GOAL, SWEEPS[-1]), "1000": plain}, repeats)
+        operations = sum(told) + swept * (1.2 * problem.sweep_cost + 40 * len(mu))
+        share = operations / (SWEEPS[-1] * problem.sweep_cost)
+        reached = swept + len(history) - 1 if history[-1] <= GOAL else None
+        rows.append(Row(problem.name, len(mu), name, residuals, reached, took["solve"] / took["1000"], share))
+    return rows
+
+
+def judged(rows: list[Row]) -> list[Row]:
+    """The rows of one problem with their verdicts."""
+    yardstick = YARDSTICK[rows[0].problem]
+    able = [row for row in rows if row.iterations is not None]
+    best = min(able, key=lambda row: row.cost).solver if able else None
+    told = []
+    for row in rows:
+        verdict = []
+        if row.solver.startswith("gauss_seidel"):
+            kept = all(found <= 2.0 * limit for found, limit in zip(row.residuals, yardstick))
+            verdict.append("yardstick: pass" if kept else "yardstick: FAIL")
+        if row.solver == best:
+            verdict.append("best: pass" if row.cost <= 1.0 else "best: FAIL")
+        told.append(replace(row, verdict=", ".join(verdict)))
+    return told if best else [replace(row, verdict="FAIL: nothing reaches 1e-6") for row in told]
+
+
+def compute(names: tuple[str, ...] = tuple(YARDSTICK), repeats: int = 5) -> Iterator[Row]:
+    """The rows of these problems, of one after the other."""
+    for name in names:
+        problem = load(name)
+        yield from judged(sweeper_rows(problem, repeats) + host_rows(problem, repeats))
+
+
+def missing(names: tuple[str, ...] = tuple(YARDSTICK)) -> str | None:
+    """Why the problems cannot be solved here, or None."""
+    absent = [name for name in names if not (PROBLEMS / f"{name}.npz").is_file()]
+    return f"contact problems are absent from {PROBLEMS}: {', '.join(absent)}" if absent else None
+
+
+def summary(rows: list[Row]) -> str:
+    """A line for each solver: on how many problems it reaches 1e-6, and its largest cost there."""
+    lines = []
+    for solver in dict.fromkeys(row.solver for row in rows):
+        of = [row for row in rows if row.solver == solver]
+        able = [row for row in of if row.iterations is not None]
+        cost = ", ".join(f"{name} {max((getattr(r, name) for r in able), default=0):.2f}" for name in ("operations", "time"))
+        lines.append(f"{solver:24} 1e-6 on {len(able)} of {len(of)} problems, at most: {cost}")
+    return "\n".join(lines)
+
+
+def main(argv=None) -> int:
+    """Print the table. Exit status: 0 all verdicts pass, 1 some fail, 2 no problems to solve."""
+    parser = argparse.ArgumentParser(prog="taisoft bench contact_problems", description=__doc__.partition("\n")[0])
+    parser.add_argument("--problem", choices=tuple(YARDSTICK), metavar="NAME", help=f"only this one of {', '.join(YARDSTICK)}")
+    parser.add_argument("--repeats", type=int, default=5, metavar="N", help="times that each solver is timed (default 5)")
+    options = parser.parse_args(argv)
+    names = (options.problem,) if options.problem else tuple(YARDSTICK)
+    if absent := missing(names):
+        print(f"taisoft bench contact_problems: {absent}", file=sys.stderr)
+        return 2
+    runtime, rows = open_runtime("cpu", "f64", "the benchmark of contact problems"), []
+    print(FORMAT.format(*HEADINGS).rstrip())
+    try:
+        for row in compute(names, max(1, options.repeats)):
+            rows.append(row)
+            print(row, flush=True)
+    finally:
+        runtime.close()
+    print(summary(rows))
+    return 1 if any("FAIL" in row.verdict for row in rows) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Contacts to impulses: the frictional contact problem and its solvers."""

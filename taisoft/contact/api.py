@@ -1,0 +1,165 @@
+"""`solve_contact_problem`: a frictional contact problem given as a matrix, for those who have one of their own."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from taichi.lang import impl
+
+from taisoft.contact import augmented_lagrangian, host
+from taisoft.contact.colouring import store
+from taisoft.contact.graph import colour_greedy, matrix_graph
+from taisoft.contact.problem import ContactProblem, build_matrix_problem, find_factors
+from taisoft.contact.solve import SOLVERS, solve
+from taisoft.errors import SceneError
+from taisoft.runtime import FieldArena, open_kind, open_runtime
+from taisoft.scene.checks import array, choice, number
+
+METHODS = (*SOLVERS, "augmented_lagrangian", "auto")
+SWEEPS = 100  # of Gauss-Seidel, before "auto" goes on with an augmented Lagrangian
+BELOW = 0.999  # of the tolerance, which the kernels are asked for: their sums round otherwise than NumPy's
+# Kernels are compiled for the fields they are given: one problem serves all calls that fit in. Fields end with the runtime.
+_held: list[tuple[Any, ContactProblem]] = []
+
+
+@dataclass(frozen=True)
+class ContactSolution:
+    """What `solve_contact_problem` found.
+
+    impulse: (3k,) [N s]. residual: |r - prox(r - f (W r + b))| / |r| of it, worked out anew at the end; converged: whether that
+    is within the tolerance. residual_history: at the start and after each iteration; the best impulses are given back, so the
+    last one can be larger than `residual`. iterations: sweeps, and outer iterates of an augmented Lagrangian.
+    """
+
+    impulse: np.ndarray
+    residual: float
+    residual_history: list[float]
+    iterations: int
+    converged: bool
+
+
+def solve_contact_problem(
+    W, b, mu, method: str = "gauss_seidel", tolerance: float = 1e-8, max_iterations: int = 1000
+) -> ContactSolution:
+    """Impulses r between which and u = W r + b the laws of Signorini and Coulomb hold, in float64.
+
+    W: (3k,3k) array or scipy sparse matrix [1/kg], per contact (normal, t1, t2); it may be singular and a little unsymmetric.
+    b: (3k,) velocities without impulses [m/s]. mu: (k,) coefficients of friction. k may be 0. tolerance: of the residual
+    |r - prox(r - f u)| / |r|, f = 1 / W_nn for normals, 1 / max(W_t1t1, W_t2t2) for both tangents. method:
+        gauss_seidel, jacobi, hybrid, coloured_gauss_seidel    sweeps, with momentum;
+        augmented_lagrangian    Newton's method on the host, an outer iterate counts as one iteration;
+        auto    sweeps of Gauss-Seidel, then an augmented Lagrangian, which needs few iterations from there.
+    A contact with W_nn = 0 is one that nothing can move: its impulse is 0 and it is left out. W_nn < 0 is refused.
+    Raises SceneError where an input breaks a rule.
+    """
+    W, b, mu = _checked(W, b, mu)
+    choice(method, "method", METHODS)
+    number(tolerance, "tolerance", above=0.0)
+    if isinstance(max_iterations, bool) or not isinstance(max_iterations, (int, np.integer)) or max_iterations < 1:
+        raise SceneError(f"max_iterations must be a whole number of at least 1, not {max_iterations!r}")
+    start = np.zeros((len(mu), 3))
+    if method == "auto":
+        r, history = _auto(W, b, mu, start, tolerance, int(max_iterations))
+    else:
+        r, history = _run(method, W, b, mu, start, tolerance, int(max_iterations))
+    residual = host.residual(W, b, mu, host.find_factors(W), r)
+    return ContactSolution(r.ravel(), residual, history, len(history) - 1, residual <= tolerance)
+
+
+def _checked(W, b, mu) -> tuple[sp.csr_matrix, np.ndarray, np.ndarray]:
+    if not sp.issparse(W):
+        W = np.asarray(W)
+        W = W.reshape(0, 0) if W.size == 0 else W
+    if W.ndim != 2 or W.shape[0] != W.shape[1] or W.shape[0] % 3:
+        raise SceneError(f"W has shape {W.shape}: it must be (3k, 3k), three rows a contact")
+    if W.dtype.kind not in "fiu":
+        raise SceneError(f"W must hold real numbers, not {W.dtype}")
+    W = sp.csr_matrix(W, dtype=np.float64, copy=True)
+    W.sum_duplicates()
+    entries = W.tocoo()
+    bad = np.flatnonzero(~np.isfinite(entries.data))
+    if len(bad):
+        raise SceneError(f"W[{entries.row[bad[0]]}, {entries.col[bad[0]]}] is {entries.data[bad[0]]}, not finite")
+    negative = np.flatnonzero(W.diagonal() < 0.0)
+    if len(negative):
+        i = negative[0]
+        raise SceneError(f"W[{i}, {i}] is {W[i, i]:g}: an impulse must not pull its contact back, so it cannot be negative")
+    n = W.shape[0]
+    b, mu = array(b, "b", ((n,),)), array(mu, "mu", ((n // 3,),))
+    below = np.flatnonzero(mu < 0.0)
+    if len(below):
+        raise SceneError(f"mu[{below[0]}] is {mu[below[0]]:g}: a coefficient of friction cannot be negative")
+    return W, b, mu
+
+
+def _run(
+    method: str, W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray, tolerance: float, most: int
+) -> tuple[np.ndarray, list[float]]:
+    """Impulses (k,3) from the start r, and the residual at the start and after each iteration."""
+    if not len(mu):
+        return r, [0.0]
+    if method == "augmented_lagrangian":
+        return augmented_lagrangian.solve(W, b, mu, r, tolerance, most)
+    with _problem(W, b, mu, r) as p:
+        if method == "coloured_gauss_seidel":
+            store(p, colour_greedy(matrix_graph(W)))
+        found = solve(p, method, BELOW * tolerance, most, every=1, history=True)
+        return p.r.to_numpy()[: len(mu)], found.history
+
+
+def _auto(
+    W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray, tolerance: float, most: int
+) -> tuple[np.ndarray, list[float]]:
+    """Sweeps, then outer iterates with what is left of the iterations."""
+    r, told = _run("gauss_seidel", W, b, mu, r, tolerance, min(SWEEPS, most))
+    left = most - len(told) + 1
+    if told[-1] <= tolerance or not left:
+        return r, told
+    r, more = _run("augmented_lagrangian", W, b, mu, r, tolerance, left)
+    return r, told + more[1:]
+
+
+@contextmanager
+def _problem(W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray) -> Iterator[ContactProblem]:
+    """The problem in fields, on the runtime that is open or one of its own."""
+    blocks = W.tobsr((3, 3))
+    blocks.sort_indices()
+    arch, precision = open_kind() or ("cpu", "f64")
+    runtime = open_runtime(arch, precision, "solve_contact_problem")
+    try:
+        p = _room(len(mu), len(blocks.indices), arch == "cpu")
+        p.count[0] = len(mu)
+        for field, values in (
+            (p.row_start, blocks.indptr), (p.column, blocks.indices), (p.block, blocks.data.reshape(-1, 9)),
+            (p.b, b.reshape(-1, 3)), (p.friction, mu), (p.r, r), (p.order, np.arange(len(mu))),
+        ):  # fmt: skip
+            whole = np.zeros((field.shape[0], *values.shape[1:]), np.float64 if values.dtype.kind == "f" else np.int32)
+            whole[: len(values)] = values
+            field.from_numpy(whole)
+        find_factors(p)
+        yield p
+    finally:
+        runtime.close()
+
+
+def _room(n: int, n_blocks: int, serial: bool) -> ContactProblem:
+    """A problem that has room for n contacts and so many blocks."""
+    program = impl.get_runtime().prog
+    if _held and _held[0][0] is not program:
+        _held.clear()
+    if _held:
+        p = _held[0][1]
+        if p.serial == serial and n <= p.capacity and n_blocks <= p.column.shape[0]:
+            return p
+        n, n_blocks = max(n, p.capacity), max(n_blocks, p.column.shape[0])
+    p = build_matrix_problem(FieldArena(), _power(n, 64), _power(n_blocks, 1024), serial)
+    _held[:] = [(program, p)]
+    return p
+
+
+def _power(n: int, least: int) -> int:
+    """The least power of two that is not below n."""
+    return max(least, 1 << (n - 1).bit_length())

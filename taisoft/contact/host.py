@@ -1,0 +1,35 @@
+"""The frictional contact problem on the host, in NumPy: W as a matrix, impulses r (k,3), see `problem`."""
+
+import numpy as np
+import scipy.sparse as sp
+
+
+def find_factors(W: sp.spmatrix) -> np.ndarray:
+    """r-factors (k,2) of normal and tangents from the diagonal of W (3k,3k); 0 where W has nothing there."""
+    d = W.diagonal().reshape(-1, 3)
+    d = np.stack([d[:, 0], d[:, 1:].max(axis=1, initial=0.0)], axis=1)
+    return np.divide(1.0, d, out=np.zeros_like(d), where=d > 0.0)
+
+
+def prox(z: np.ndarray, friction: np.ndarray) -> np.ndarray:
+    """Admissible impulses (k,3) for z (k,3): normal parts first, then tangential ones in the disks that they open."""
+    normal = np.maximum(z[:, 0], 0.0)
+    size, radius = np.hypot(z[:, 1], z[:, 2]), friction * normal
+    share = np.divide(radius, size, out=np.ones_like(size), where=size > radius)
+    return np.column_stack([normal, share * z[:, 1], share * z[:, 2]])
+
+
+def natural_map(W, b: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """r - prox(r - f (W r + b)), (k,3)."""
+    u = (W @ r.ravel() + b).reshape(-1, 3)
+    return r - prox(r - factor[:, [0, 1, 1]] * u, friction)
+
+
+def relative(changed: float, size: float) -> float:
+    """The residual from |r - prox(r - f u)| and |r|; 1 where impulses are wanted and there are none."""
+    return changed / size if size > 0.0 else float(changed != 0.0)
+
+
+def residual(W, b: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: np.ndarray) -> float:
+    """|r - prox(r - f (W r + b))| / |r|."""
+    return float(relative(np.linalg.norm(natural_map(W, b, friction, factor, r)), np.linalg.norm(r)))

@@ -1,0 +1,258 @@
+"""The frictional contact problem: impulses r with u = W r + b, Signorini's and Coulomb's laws between r and u.
+
+W, the Delassus operator, is given in one of two forms. Over nodes: W = J M^-1 J^T, where J r pushes the nodes of each contact by
+their weights, and `w` = M^-1 J^T r is kept up to date; nothing is assembled. As a matrix: 3x3 blocks in CSR. Solvers see
+only `velocity` and `push`, so each is written once.
+The r-factors are 1 / W_nn and 1 / max(W_t1t1, W_t2t2), the same for every solver, since the residual
+    |r - prox(r - f u)| / |r|
+rests on them: a change of r between two sweeps shrinks with the step that a solver dares, and tells nothing. What a solver
+dares is its own `share` of them.
+All is f64: impulses are small differences of large ones.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import taichi as ti
+
+from taisoft.contact.prox import dvec, prox, scaled
+from taisoft.runtime import FieldArena, kernel
+
+NODES = 6  # of a contact at most, three on each side
+CHANGED, SIZE, RESIDUAL, GOOD, STEP, SWEEPS, LOOKS, AGE, MOMENTUM, VERDICT = range(10)  # places in `state`
+HISTORY = 1024  # residuals kept of a launch
+PARTS = 256  # of a sum over the contacts, so that it does not depend on threads
+
+
+@dataclass(frozen=True, eq=False)
+class ContactProblem:
+    """Fields of up to `capacity` contacts; the first count[0] hold. What a form does not need is None."""
+
+    capacity: int
+    serial: bool  # loops run on one thread
+    matrix: bool  # the form of W
+    n_nodes: int
+    count: Any  # (2) i32: contacts, colours
+    friction: Any  # f64
+    b: Any  # 3-vectors [m/s]: u without impulses; (normal, t1, t2)
+    factor: Any  # 2-vectors: r-factors of normal and tangents [kg]; 0 where nothing can move
+    r: Any  # 3-vectors: impulses [N s]
+    share: Any  # f64: of the r-factors, that a sweep takes at most; its solver's own
+    good: Any  # 3-vectors: the best impulses so far
+    guess: Any  # 3-vectors: impulses that a sweep started from
+    trial: Any  # 3-vectors: impulses after the last sweep but one
+    term: Any  # 2-vectors: what each contact adds to two sums
+    part: Any  # (PARTS) 2-vectors: sums over parts of the contacts
+    order: Any  # i32: contacts in the order of a sweep
+    colour: Any  # i32: of each contact, see `graph`
+    colour_start: Any  # (capacity + 1) i32: where each colour starts in `order`
+    state: Any  # (10) f64: two sums, residual, that of `good`, share of the r-factors, counts; see `r_factor`, `momentum`
+    history: Any  # (HISTORY) f64: residuals of the looks of a launch
+    # over nodes
+    node: Any  # (capacity, NODES) i32, the first arity[c] hold
+    arity: Any  # i32
+    weight: Any  # (capacity, NODES) f64: positive on side a, negative on side b
+    normal: Any  # 3-vectors: from b to a
+    tangent: Any  # 3-vectors: t1; t2 = normal x t1
+    inverse_mass: Any  # (n_nodes) 3-vectors [1/kg], 0 on constrained axes
+    w: Any  # (n_nodes) 3-vectors [m/s]: M^-1 J^T r
+    entry_start: Any  # (n_nodes + 1) i32: contacts of each node
+    entry: Any  # i32: NODES * contact + place
+    # as a matrix
+    row_start: Any  # (capacity + 1) i32
+    column: Any  # i32
+    block: Any  # (blocks, 9) f64
+
+
+def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: bool) -> ContactProblem:
+    """Room for contacts between the nodes of a model."""
+    def vectors(name: str, count: int = capacity):
+        return arena.vectors(f"problem_{name}", ti.f64, count)
+
+    def ints(name: str, shape):
+        return arena.field(f"problem_{name}", ti.i32, shape)
+
+    return ContactProblem(
+        **_common(arena, capacity, serial), matrix=False, n_nodes=n_nodes, node=ints("node", (capacity, NODES)),
+        arity=ints("arity", capacity), weight=arena.field("problem_weight", ti.f64, (capacity, NODES)),
+        normal=vectors("normal"), tangent=vectors("tangent"), inverse_mass=vectors("inverse_mass", n_nodes),
+        w=vectors("w", n_nodes), entry_start=ints("entry_start", n_nodes + 1), entry=ints("entry", NODES * capacity),
+        row_start=None, column=None, block=None,
+    )  # fmt: skip
+
+
+def build_matrix_problem(arena: FieldArena, n: int, n_blocks: int, serial: bool) -> ContactProblem:
+    """Room for n contacts and a W of n_blocks 3x3 blocks."""
+    def ints(name: str, count: int):
+        return arena.field(f"problem_{name}", ti.i32, count)
+
+    return ContactProblem(
+        **_common(arena, n, serial), matrix=True, n_nodes=0, node=None, arity=None, weight=None, normal=None, tangent=None,
+        inverse_mass=None, w=None, entry_start=None, entry=None, row_start=ints("row_start", n + 1),
+        column=ints("column", n_blocks), block=arena.field("problem_block", ti.f64, (n_blocks, 9)),
+    )  # fmt: skip
+
+
+def _common(arena: FieldArena, capacity: int, serial: bool) -> dict[str, Any]:
+    def vectors(name: str, n: int = 3):
+        return arena.vectors(f"problem_{name}", ti.f64, capacity, n=n)
+
+    return {
+        "capacity": capacity, "serial": serial, "count": arena.field("problem_count", ti.i32, 2),
+        "friction": arena.field("problem_friction", ti.f64, capacity), "b": vectors("b"), "factor": vectors("factor", 2),
+        "r": vectors("r"), "share": arena.field("problem_share", ti.f64, capacity), "good": vectors("good"),
+        "guess": vectors("guess"), "trial": vectors("trial"), "term": vectors("term", 2),
+        "part": arena.vectors("problem_part", ti.f64, PARTS, n=2), "order": arena.field("problem_order", ti.i32, capacity),
+        "colour": arena.field("problem_colour", ti.i32, capacity),
+        "colour_start": arena.field("problem_colour_start", ti.i32, capacity + 1),
+        "state": arena.field("problem_state", ti.f64, 10), "history": arena.field("problem_history", ti.f64, HISTORY),
+    }  # fmt: skip
+
+
+# --- what solvers see -------------------------------------------------------------------------------------------------
+
+
+@ti.func
+def to_frame(p: ti.template(), c, v):
+    """A vector of the world in the frame of contact c."""
+    n, t = p.normal[c], p.tangent[c]
+    return dvec(n.dot(v), t.dot(v), n.cross(t).dot(v))
+
+
+@ti.func
+def to_world(p: ti.template(), c, r):
+    """A vector of contact c's frame in the world."""
+    n, t = p.normal[c], p.tangent[c]
+    return r[0] * n + r[1] * t + r[2] * n.cross(t)
+
+
+@ti.func
+def velocity(p: ti.template(), c):
+    """u of contact c at the present impulses [m/s]."""
+    u = p.b[c]
+    if ti.static(p.matrix):
+        for k in range(p.row_start[c], p.row_start[c + 1]):
+            r = p.r[p.column[k]]
+            for i in ti.static(range(3)):
+                u[i] += p.block[k, 3 * i] * r[0] + p.block[k, 3 * i + 1] * r[1] + p.block[k, 3 * i + 2] * r[2]
+    else:
+        v = dvec(0.0)
+        for k in range(p.arity[c]):
+            v += p.weight[c, k] * p.w[p.node[c, k]]
+        u += to_frame(p, c, v)
+    return u
+
+
+@ti.func
+def push(p: ti.template(), c, change):
+    """Tell the nodes of contact c that its impulse changed. Contacts that are pushed at once must share no movable node."""
+    if ti.static(not p.matrix):
+        d = to_world(p, c, change)
+        for k in range(p.arity[c]):
+            i = p.node[c, k]
+            p.w[i] = p.w[i] + p.weight[c, k] * (p.inverse_mass[i] * d)
+
+
+@ti.func
+def gather_velocity(p: ti.template(), i):
+    """M^-1 J^T r at node i, its contacts in a fixed order."""
+    d = dvec(0.0)
+    for e in range(p.entry_start[i], p.entry_start[i + 1]):
+        c, k = p.entry[e] // NODES, p.entry[e] % NODES
+        d += p.weight[c, k] * to_world(p, c, p.r[c])
+    return p.inverse_mass[i] * d
+
+
+@ti.func
+def natural_map(p: ti.template(), c):
+    """(|r - prox(r - f u)|^2, |r|^2) of contact c."""
+    r = p.r[c]
+    d = r - prox(r - scaled(p.factor[c], velocity(p, c)), p.friction[c])
+    return d.dot(d), r.dot(r)
+
+
+@ti.func
+def residual_of(changed, size):
+    """The relative residual from the two sums; 1 where impulses are wanted and there are none, or are not a number."""
+    result = ti.cast(0.0, ti.f64)
+    if size > 0.0:
+        result = ti.sqrt(changed / size)
+    elif not changed == 0.0:
+        result = 1.0
+    return result
+
+
+@kernel
+def find_velocities(p: ti.template()):
+    """w = M^-1 J^T r over nodes; nothing to do for a matrix."""
+    if ti.static(not p.matrix):
+        ti.loop_config(serialize=p.serial)
+        for i in range(p.n_nodes):
+            p.w[i] = gather_velocity(p, i)
+
+
+@ti.func
+def residual(p: ti.template()):
+    """The residual of the present impulses, summed in order; w is up to date."""
+    changed, size = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    for c in range(p.count[0]):
+        d, s = natural_map(p, c)
+        changed += d
+        size += s
+    return residual_of(changed, size)
+
+
+@ti.func
+def own_block(p: ti.template(), c):
+    """The 3x3 block of W between contact c and itself."""
+    B = ti.Matrix.zero(ti.f64, 3, 3)
+    if ti.static(p.matrix):
+        for k in range(p.row_start[c], p.row_start[c + 1]):
+            if p.column[k] == c:
+                for i, j in ti.static(ti.ndrange(3, 3)):
+                    B[i, j] += p.block[k, 3 * i + j]
+    else:
+        n, t = p.normal[c], p.tangent[c]
+        E = ti.Matrix.rows([n, t, n.cross(t)])
+        h = dvec(0.0)
+        for k in range(p.arity[c]):
+            h += p.weight[c, k] * p.weight[c, k] * p.inverse_mass[p.node[c, k]]
+        for i, j in ti.static(ti.ndrange(3, 3)):
+            for q in ti.static(range(3)):
+                B[i, j] += E[i, q] * h[q] * E[j, q]
+    return B
+
+
+@kernel
+def find_factors(p: ti.template()):
+    """r-factors from the diagonal of W."""
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        B = own_block(p, c)
+        across = ti.max(B[1, 1], B[2, 2])
+        p.factor[c][0] = ti.select(B[0, 0] > 0.0, 1.0 / B[0, 0], 0.0)
+        p.factor[c][1] = ti.select(across > 0.0, 1.0 / across, 0.0)
+        if B[0, 0] <= 0.0:  # nothing can move it
+            p.r[c] = dvec(0.0)
+
+
+@kernel
+def index_nodes(p: ti.template()):
+    """List the contacts of each node, in ascending order."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for i in range(p.n_nodes + 1):
+            p.entry_start[i] = 0
+        for c in range(p.count[0]):
+            for k in range(p.arity[c]):
+                p.entry_start[p.node[c, k]] += 1
+        total = 0
+        for i in range(p.n_nodes + 1):
+            total += p.entry_start[i]
+            p.entry_start[i] = total
+        for back in range(p.count[0]):
+            c = p.count[0] - 1 - back
+            for k in range(p.arity[c]):
+                i = p.node[c, k]
+                p.entry_start[i] -= 1
+                p.entry[p.entry_start[i]] = NODES * c + k

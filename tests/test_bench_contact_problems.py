@@ -1,0 +1,73 @@
+"""The benchmark of contact problems; no test here asks how fast anything is:
+
+* a row for each solver, with residuals that fall and costs that are counted;
+* verdicts on made-up rows: yardstick kept or missed, the best solver within the cost or not, nothing that gets there;
+* the exit status tells a failed verdict, and that there are no problems to solve.
+"""
+
+from dataclasses import replace
+
+import pytest
+
+from benchmarks import contact_problems as bench
+from benchmarks.contact_problems import Row
+from taisoft.runtime import open_runtime
+
+PLAIN = Row("Rover1039", 4, bench.PLAIN, (2.8e-2, 5.9e-4, 1e-10), 430, 0.5, 0.4)
+ROWS = [PLAIN, replace(PLAIN, solver="jacobi", iterations=None), replace(PLAIN, solver="hybrid", time=0.3, operations=0.2)]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def runtime():
+    made = open_runtime("cpu", "f64", "the test")
+    yield made
+    made.close()
+
+
+def test_rows(shared):
+    rows = list(bench.compute(("Rover1039",), repeats=1))
+    assert [row.solver for row in rows] == [*bench.SWEEPERS, "augmented_lagrangian", "auto"]
+    for row in rows:
+        first, second, third = row.residuals
+        assert row.iterations is not None and first >= second >= third < 1e-6
+        assert row.time > 0.0 and 0.0 < row.operations < 2.0
+        assert row.problem in str(row) and f"{first:.1e}" in str(row)
+    of = {row.solver: row for row in rows}
+    assert of["gauss_seidel"].iterations < of[bench.PLAIN].iterations
+    assert of["auto"].iterations >= of["augmented_lagrangian"].iterations
+    # counted by hand: 16 blocks and 4 proxes a sweep, a look after every fifth
+    assert of[bench.PLAIN].operations == pytest.approx(of[bench.PLAIN].iterations * 1.2 / 1000)
+    assert sum("best" in row.verdict for row in rows) == 1
+
+
+def test_verdicts():
+    told = {row.solver: row.verdict for row in bench.judged(ROWS)}
+    assert told == {bench.PLAIN: "yardstick: pass", "jacobi": "", "hybrid": "best: pass"}
+    slow = [replace(row, residuals=(1.0, 1.0, 1.0), time=5.0 + row.time) for row in ROWS]
+    assert {row.solver: row.verdict for row in bench.judged(slow)} == {
+        bench.PLAIN: "yardstick: FAIL", "jacobi": "", "hybrid": "best: FAIL"
+    }  # fmt: skip
+    never = [replace(row, iterations=None) for row in ROWS]
+    assert all("FAIL" in row.verdict for row in bench.judged(never))
+    assert "  -" in str(never[0])
+
+
+def test_summary():
+    lines = bench.summary(ROWS).splitlines()
+    assert lines[1].startswith("jacobi") and "0 of 1" in lines[1]
+    assert "1 of 1" in lines[2] and "operations 0.20, time 0.30" in lines[2]
+
+
+@pytest.mark.parametrize("verdict, status", [("best: pass", 0), ("yardstick: FAIL", 1)])
+def test_exit_status(monkeypatch, capsys, verdict, status):
+    monkeypatch.setattr(bench, "missing", lambda names: None)
+    monkeypatch.setattr(bench, "compute", lambda names, repeats: iter([replace(PLAIN, verdict=verdict)]))
+    assert bench.main(["--problem", "Rover1039"]) == status
+    assert verdict in capsys.readouterr().out
+
+
+def test_no_problems(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(bench, "PROBLEMS", tmp_path)
+    assert bench.main([]) == 2
+    told = capsys.readouterr()
+    assert "contact problems are absent" in told.err and "Rover4396" in told.err and not told.out
