@@ -2,7 +2,6 @@
 
 import contact_oracle as oracle
 import numpy as np
-import scipy.sparse as sp
 
 from taisoft.contact import problem
 from taisoft.runtime import FieldArena, open_runtime
@@ -33,35 +32,19 @@ class Rig:
         p, k = self._of(False, serial), len(contacts.arity)
         for name in ("node", "arity", "weight", "normal", "tangent", "friction", "inverse_mass", "b"):
             values = getattr(contacts, name)
-            _fill(getattr(p, name), values.reshape(k, 3) if name == "b" else values)
-        self._ready(p, k)
+            problem.fill_field(getattr(p, name), values.reshape(k, 3) if name == "b" else values)
+        p.count[0] = k
+        p.r.fill(0.0)
+        problem.fill_field(p.order, np.arange(k))
         problem.index_nodes(p)
         problem.find_factors(p)
         return p
 
     def matrix(self, W, b: np.ndarray, mu: np.ndarray, serial: bool = True) -> problem.ContactProblem:
-        p, k = self._of(True, serial), len(mu)
-        blocks = sp.csr_matrix(W).tobsr((3, 3))
-        blocks.sort_indices()
-        for field, values in (
-            (p.row_start, blocks.indptr), (p.column, blocks.indices), (p.block, blocks.data.reshape(-1, 9)),
-            (p.b, b.reshape(k, 3)), (p.friction, mu),
-        ):  # fmt: skip
-            _fill(field, values)
-        self._ready(p, k)
-        problem.find_factors(p)
-        return p
-
-    def _ready(self, p: problem.ContactProblem, k: int) -> None:
-        p.count[0] = k
+        p = self._of(True, serial)
         p.r.fill(0.0)
-        _fill(p.order, np.arange(k))
-
-
-def _fill(field, values: np.ndarray) -> None:
-    whole = np.zeros((field.shape[0], *values.shape[1:]), np.float64 if values.dtype.kind == "f" else np.int32)
-    whole[: len(values)] = values
-    field.from_numpy(whole)
+        problem.fill_matrix_problem(p, W, b, mu)
+        return p
 
 
 def impulses(p: problem.ContactProblem) -> np.ndarray:

@@ -13,7 +13,7 @@ from rotations import rotation
 
 import taisoft as ts
 from taisoft.contact.assemble import _warm_impulse, build_found, keep_impulses, short_of_goal
-from taisoft.contact.problem import build_node_problem
+from taisoft.contact.problem import build_node_problem, fill_field
 from taisoft.runtime import FieldArena, kernel, open_runtime
 
 DT = 1e-3  # [s]
@@ -187,12 +187,6 @@ def found():
     machine.close()
 
 
-def put(field, values) -> None:
-    whole = field.to_numpy()
-    whole[: len(values)] = values
-    field.from_numpy(whole)
-
-
 @pytest.mark.parametrize("fast, slow", [(1.0, 0.02), (0.05, 0.005)])
 def test_how_far_a_contact_is_from_its_goal(found, fast, slow):
     h, dt, fastest = 2e-3, 0.01, 2.0
@@ -212,7 +206,7 @@ def test_how_far_a_contact_is_from_its_goal(found, fast, slow):
     ]  # fmt: skip
     gap, restitution, approach, expected = np.array(cases).T
     for field, values in ((found.gap, gap), (found.restitution, restitution), (found.approach, approach)):
-        put(field, values)
+        fill_field(field, values)
     found.problem.count[0] = len(cases)
     out = np.zeros(len(cases))
     find_goals(found, dt, h, fast, slow, fastest, out)
@@ -229,14 +223,14 @@ def test_the_nearest_contact_of_the_same_feature(found):
     t1 = np.cross(normal, rng.standard_normal((n, 3)))
     t1 /= np.linalg.norm(t1, axis=1, keepdims=True)
     for field, values in ((found.feature, feature), (found.point, point), (p.normal, normal), (p.tangent, t1), (p.r, impulse)):
-        put(field, values)
+        fill_field(field, values)
     p.count[0] = n
     keep_impulses(found)
     world = impulse[:, :1] * normal + impulse[:, 1:2] * t1 + impulse[:, 2:] * np.cross(normal, t1)
     asked = np.stack([rng.integers(0, 2, n), rng.integers(0, 7, n), rng.integers(0, 3, n)], axis=1)
     at = rng.standard_normal((n, 3))
-    put(found.feature, asked)
-    put(found.point, at)
+    fill_field(found.feature, asked)
+    fill_field(found.point, at)
     out = np.zeros((n, 3))
     find_warm(found, out)
     several = 0

@@ -33,9 +33,7 @@ def problems():
 
 def put(p: problem.ContactProblem, made: oracle.NodeContacts) -> None:
     for field, values in ((p.node, made.node), (p.arity, made.arity), (p.inverse_mass, made.inverse_mass)):
-        whole = np.zeros((field.shape[0], *values.shape[1:]), values.dtype)
-        whole[: len(values)] = values
-        field.from_numpy(whole)
+        problem.fill_field(field, values)
     p.count[0] = len(made.arity)
 
 

@@ -18,7 +18,7 @@ from scenes import built, cube, rubber
 
 import taisoft as ts
 from taisoft.contact.assemble import build_found
-from taisoft.contact.problem import RESIDUAL, build_node_problem, find_factors, index_nodes
+from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, find_factors, index_nodes
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import to_scipy, unpacked
 from taisoft.linear.coupling import coupling_diagonal, coupling_times
@@ -45,13 +45,6 @@ def couple(
         d[i] = coupling_diagonal(m, k, i, d[i])
 
 
-def put(field, values: np.ndarray) -> None:
-    """The first rows of a field."""
-    whole = field.to_numpy()
-    whole[: len(values)] = values
-    field.from_numpy(whole)
-
-
 @pytest.fixture(scope="module", params=["f64", "f32"])
 def rig(request):
     scene = ts.Scene()
@@ -70,12 +63,12 @@ def rig(request):
         solver = StageSolver(m, arena, made.machine.eps, np.zeros(0, dtype=int))
         k = contact_stage.build_stage_contacts(arena, m, f, arena.vectors("x_start", ti.f64, m.n_nodes))
         for name in ("node", "weight", "normal", "tangent"):
-            put(getattr(p, name), getattr(contacts, name))
+            fill_field(getattr(p, name), getattr(contacts, name))
         carry = np.where((np.arange(K) % 5 == 0)[:, None], 1e-3 * rng.standard_normal((K, 3)), 0.0)
         friction = np.where(np.arange(K) % 7 == 0, 0.0, 0.5)
         gap = rng.uniform(-2, 3, K) * GOAL[0]
         for field, values in ((p.arity, arity), (p.friction, friction), (f.gap, gap), (f.carry, carry)):
-            put(field, values)
+            fill_field(field, values)
         p.count[0] = K
         index_nodes(p)
         block_csr.assemble(m, solver.matrix, False)
@@ -128,7 +121,7 @@ def pressed(rig):
     size = STIFFNESS * factor[:, 0] * np.abs(u).max()
     multiplier = size[:, None] * rng.uniform([-1, -1, -1], [3, 1, 1], (K, 3))
     multiplier[:, 0] = np.maximum(multiplier[:, 0], 0.0)
-    put(rig.p.r, multiplier)
+    fill_field(rig.p.r, multiplier)
     contact_stage.set_multipliers(rig.k)
     radius = rig.k.work.radius.to_numpy()[:K]
     assert np.array_equal(rig.k.work.multiplier.to_numpy()[:K], multiplier)
@@ -257,7 +250,7 @@ def test_without_friction_nothing_resists_along_the_surface(rig):
     rig.work.x_hat.from_numpy(rig.x)
     multiplier = np.zeros((K, 3))
     multiplier[:, 0] = 1e3
-    put(rig.p.r, multiplier)
+    fill_field(rig.p.r, multiplier)
     contact_stage.set_multipliers(rig.k)
     press(rig, rig.x)
     smooth = np.flatnonzero((rig.friction == 0) & ~rig.carry.any(axis=1))

@@ -12,7 +12,7 @@ from taichi.lang import impl
 from taisoft.contact import augmented_lagrangian, host
 from taisoft.contact.colouring import store
 from taisoft.contact.graph import colour_greedy, matrix_graph
-from taisoft.contact.problem import ContactProblem, build_matrix_problem, find_factors
+from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_field, fill_matrix_problem
 from taisoft.contact.solve import SOLVERS, solve
 from taisoft.errors import SceneError
 from taisoft.runtime import FieldArena, open_kind, open_runtime
@@ -125,21 +125,12 @@ def _auto(
 @contextmanager
 def _problem(W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray) -> Iterator[ContactProblem]:
     """The problem in fields, on the runtime that is open or one of its own."""
-    blocks = W.tobsr((3, 3))
-    blocks.sort_indices()
     arch, precision = open_kind() or ("cpu", "f64")
     runtime = open_runtime(arch, precision, "solve_contact_problem")
     try:
-        p = _room(len(mu), len(blocks.indices), arch == "cpu")
-        p.count[0] = len(mu)
-        for field, values in (
-            (p.row_start, blocks.indptr), (p.column, blocks.indices), (p.block, blocks.data.reshape(-1, 9)),
-            (p.b, b.reshape(-1, 3)), (p.friction, mu), (p.r, r), (p.order, np.arange(len(mu))),
-        ):  # fmt: skip
-            whole = np.zeros((field.shape[0], *values.shape[1:]), np.float64 if values.dtype.kind == "f" else np.int32)
-            whole[: len(values)] = values
-            field.from_numpy(whole)
-        find_factors(p)
+        p = _room(len(mu), len(W.tobsr((3, 3)).indices), arch == "cpu")
+        fill_field(p.r, r)
+        fill_matrix_problem(p, W, b, mu)
         yield p
     finally:
         runtime.close()

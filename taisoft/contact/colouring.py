@@ -10,11 +10,12 @@ import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.contact.graph import UNCOLOURED, colour_greedy, colour_random, groups, matrix_graph, node_graph
-from taisoft.contact.problem import NODES, ContactProblem, index_nodes
+from taisoft.contact.problem import NODES, ContactProblem, fill_field, index_nodes
 from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
 
 BITS = 30  # colours that are looked at in one go
+
 
 @ti.func
 def _priority(c):
@@ -150,8 +151,6 @@ def store(p: ContactProblem, colour: np.ndarray) -> None:
     """Give the problem's contacts these colours (k,) and group them."""
     k = len(colour)
     order, start = groups(colour)
-    for held, values in ((p.colour, colour), (p.order, order), (p.colour_start, start)):
-        whole = np.zeros(held.shape[0], dtype=np.int32)
-        whole[: len(values)] = values
-        held.from_numpy(whole)
+    for field, values in ((p.colour, colour), (p.order, order), (p.colour_start, start)):
+        fill_field(field, values)
     p.count[1] = len(start) - 1 if k else 0

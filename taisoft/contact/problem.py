@@ -13,6 +13,8 @@ All is f64: impulses are small differences of large ones.
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.contact.prox import dvec, prox, scaled
@@ -107,6 +109,26 @@ def _common(arena: FieldArena, capacity: int, serial: bool) -> dict[str, Any]:
         "colour_start": arena.field("problem_colour_start", ti.i32, capacity + 1),
         "state": arena.field("problem_state", ti.f64, 10), "history": arena.field("problem_history", ti.f64, HISTORY),
     }  # fmt: skip
+
+
+def fill_field(field, values: np.ndarray) -> None:
+    """The first rows of a field from values (k, ...), 0 in the others."""
+    whole = np.zeros((field.shape[0], *values.shape[1:]), np.float64 if values.dtype.kind == "f" else np.int32)
+    whole[: len(values)] = values
+    field.from_numpy(whole)
+
+
+def fill_matrix_problem(p: ContactProblem, W: sp.spmatrix, b: np.ndarray, friction: np.ndarray) -> None:
+    """W (3k,3k), b (3k,) and coefficients of friction (k,) into a problem that has room; impulses are left as they are."""
+    blocks, k = sp.csr_matrix(W).tobsr((3, 3)), len(friction)
+    blocks.sort_indices()
+    p.count[0] = k
+    for field, values in (
+        (p.row_start, blocks.indptr), (p.column, blocks.indices), (p.block, blocks.data.reshape(-1, 9)),
+        (p.b, b.reshape(k, 3)), (p.friction, friction), (p.order, np.arange(k)),
+    ):  # fmt: skip
+        fill_field(field, values)
+    find_factors(p)
 
 
 # --- what solvers see -------------------------------------------------------------------------------------------------
