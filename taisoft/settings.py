@@ -89,7 +89,7 @@ def check_settings(
     if not isinstance(self_collision, bool):
         raise SimulationError(f"self_collision = {self_collision!r}: it must be True or False")
     _check_tolerance("contact_tolerance", contact_tolerance)
-    _check_contact_solver(integrator, contact_solver, len(scene.colliders) > 1 or self_collision)
+    _check_contact_solver(integrator, contact_solver, scene.pushes(self_collision))
     if not isinstance(allow_unstable, bool):
         raise SimulationError(f"allow_unstable = {allow_unstable!r}: it must be True or False")
     _check_tolerance("newton_tolerance", newton_tolerance)

@@ -62,8 +62,8 @@ def solve_static(
 
     tolerance: of |residual on free axes| / |applied load| (without any load: over the constraint forces). An open f64
     runtime is reused, otherwise one is opened and closed. Bodies do not touch each other here. Raises SceneError where
-    nothing holds a body or the scene has obstacles, SimulationError when the runtime is taken; a solve that does not
-    converge returns converged=False.
+    nothing holds a body or the scene has obstacles and contact forces, SimulationError when the runtime is taken; a solve
+    that does not converge returns converged=False.
     """
     _check(scene, tolerance)
     kind = open_kind()
@@ -82,7 +82,7 @@ def _check(scene: Scene, tolerance: float) -> None:
         raise SceneError("solve_static needs a Scene that holds a body")
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 0.0 < tolerance < 1.0:
         raise SceneError(f"tolerance = {tolerance!r}: it must lie between 0 and 1")
-    if scene.obstacles:
+    if scene.obstacles and scene.contact_forces:
         raise SceneError(
             f"solve_static models no contacts, so it takes no scene with obstacles ('{scene.obstacles[0].name}'): step it "
             "to rest with mass damping instead"

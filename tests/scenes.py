@@ -44,11 +44,12 @@ def mixed_scene(
 ) -> ts.Scene:  # fmt: skip
     """Four bodies whose order is not that of the laws, of 10, 5, 6 and 5 tets: none fills its last lanes.
 
-    Each has another material, and is held and loaded in another way; the first and the third are damped.
+    Each has another material, and is held and loaded in another way; the first and the third are damped. They do not touch.
     order: 1, 2, or "both": 2, 1, 2, 1. degrees: of the quadrature of the first and the third body, if they are quadratic.
     """
     orders = (2, 1, 2, 1) if order == "both" else (order,) * 4
     scene = ts.Scene(gravity=(0.3, -9.81, 0.7))
+    scene.contact_forces = False
     damping = {"mass_damping": mass_damping, "stiffness_damping": stiffness_damping}
     beam = scene.add_body(
         cube(cells=(2, 1, 1)), rubber(laws[0], **damping), name="beam", position=(0.5, 0, 0),
@@ -83,6 +84,7 @@ def driven_scene(
     """
     orders = (2, 1) if order == "both" else (order,) * 2
     scene = ts.Scene(gravity=(0.3, -9.81, 0.7))
+    scene.contact_forces = False
     damping = {"mass_damping": mass_damping, "stiffness_damping": stiffness_damping}
     beam = scene.add_body(
         cube(cells=(2, 1, 1)), rubber(law, **damping), name="beam", velocity=(0.4, 0.1, -0.2), **element(orders[0])

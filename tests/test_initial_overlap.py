@@ -187,6 +187,24 @@ def test_a_simulator_refuses_it():
             assert len(sim.detect_contacts())
 
 
+def test_without_contact_forces_bodies_pass_through_each_other():
+    made = two(0.125)
+    made.gravity, made.contact_forces = (0, -9.81, 0), False
+    with ts.Simulator(made, dt=0.01, integrator="implicit_midpoint", precision="f64") as sim:  # which takes no contacts
+        assert len(sim.detect_contacts())
+        start = sim.positions()
+        reports = [sim.step() for _ in range(3)]
+        fallen = sim.positions() - start
+    assert np.abs(fallen - 0.5 * np.array([0, -9.81, 0]) * 0.03**2).max() < 1e-9  # [m]
+    assert all(r.converged and not r.n_contacts and not r.problems for r in reports)
+    made.contact_forces = True
+    with pytest.raises(ts.SceneError, match="^scene: contact_forces must be True or False, not 1$"):
+        made.contact_forces = 1
+    with pytest.raises(ts.SceneError, match="overlap at the start"):
+        ts.Simulator(made, dt=0.01)
+
+
+
 def surfaces():
     ball, box = ts.ball_mesh(0.5, 4), ts.box_mesh((2, 1, 3), (0.6, 0.9, 0.7))
     bent = box.vertices + 0.2 * np.sin(3 * box.vertices[:, ::-1])

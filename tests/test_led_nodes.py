@@ -14,13 +14,11 @@ import taisoft as ts
 SPEED = np.array([2.0, 0.0, -1.0])  # [m/s]
 
 
-@pytest.mark.parametrize("integrator, orders", [
-    ("velocity_verlet", (1, 2)), ("linearly_implicit_euler", (1, 2)), ("bdf2", (1, 2)),
-    ("implicit_midpoint", (1,)), ("implicit_midpoint", (2,)),  # it takes no second body
-])  # fmt: skip
-def test_rigid_flight(integrator, orders):
+@pytest.mark.parametrize("integrator", ["velocity_verlet", "linearly_implicit_euler", "implicit_midpoint", "bdf2"])
+def test_rigid_flight(integrator):
     scene = ts.Scene(gravity=(0, 0, 0))
-    for order in orders:
+    scene.contact_forces = False
+    for order in (1, 2):
         body = scene.add_body(cube(cells=(2, 1, 1)), rubber(), velocity=SPEED, order=order, position=(0, 0, 3 * order))
         body.move(lambda X: X[:, 0] < -0.49, lambda t: SPEED * t)
     settings = {} if integrator == "velocity_verlet" else {"linear_tolerance": 1e-12}

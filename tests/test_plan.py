@@ -45,7 +45,7 @@ def test_reasons():
         "distance_fields": (False, "every body is hit by proximity"),
         "proximity": (True, "hits beam (sharp edges), block (sharp edges), tower (sharp edges), flyer (sharp edges)"),
         "self_collision": (False, "not asked for"),
-        "contact_forces": (True, "beam, block, tower and 1 more can touch"),
+        "contact_forces": (False, "the scene's contact_forces are off"),
     }
     assert plan.on["loads"] is True and plan.on["moving_nodes"] is False
 
@@ -54,7 +54,7 @@ def test_every_feature_can_be_on_and_off():
     off = make_plan(bare(), explicit=True, multistep=False).on
     full = driven_scene(order=2, mass_damping=1.0, stiffness_damping=1.0)
     full.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
-    full.body("beam").collision = "distance_field"
+    full.body("beam").collision, full.contact_forces = "distance_field", True
     on = make_plan(full, explicit=False, multistep=True, self_collision=True).on
     laws = {name for name in on if name.startswith("law:")}
     assert {name for name in on if not on[name]} < laws and {name for name in off if off[name]} < laws

@@ -26,6 +26,7 @@ UPRIGHT = np.eye(3)
 def pair(second_law: str = SVK, order: int = 1, degree: int | None = None) -> ts.Scene:
     """Two bodies; the first, of that order, is fixed at one end, the second flies. Damping is there to be changed."""
     scene = ts.Scene()
+    scene.contact_forces = False  # it would take long to compile
     material, elements = rubber(SNH, mass_damping=0.5), element(order, degree)
     beam = scene.add_body(cube(cells=(2, 1, 1)), material, name="beam", position=(1, 2, 0), **elements)
     beam.fix(lambda X: X[:, 0] < -0.49)
@@ -324,6 +325,7 @@ def test_invariances():
     """Of 30 explicit steps; the order of the bodies plays no part at all."""
     Q = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
     Q, shift, scene = Q * np.linalg.det(Q), np.array([30.0, -20.0, 10.0]), ts.Scene(gravity=(0, 0, 0))
+    scene.contact_forces = False
     add_pair(scene, "plain")
     add_pair(scene, "moved", Q, shift)
     add_pair(scene, "large", size=2.0)

@@ -66,6 +66,13 @@ def choice(value, what: str, allowed: tuple[str, ...]) -> str:
     raise SceneError(f"{what} must be one of {', '.join(allowed)}, not {value!r}{hint}")
 
 
+def flag(value, what: str) -> bool:
+    """value, if it is True or False."""
+    if not isinstance(value, bool):
+        raise SceneError(f"{what} must be True or False, not {value!r}")
+    return value
+
+
 def whole(value, what: str, allowed: tuple[int, ...]) -> int:
     """One of the allowed whole numbers."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value not in allowed:

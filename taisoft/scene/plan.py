@@ -89,8 +89,9 @@ def _add_collision(plan: Plan, scene: Scene, self_collision: bool) -> None:
     plan.add("distance_fields", bool(fields), "hits " + ", ".join(fields), idle + ("proximity" if hit else ""))
     plan.add("proximity", bool(near), "hits " + ", ".join(near), idle + ("its distance field" if hit else ""))
     plan.add("self_collision", self_collision, "asked for", "not asked for")
-    several = [c.name for c in scene.colliders] if len(scene.colliders) > 1 else []
+    several = len(scene.colliders) > 1
     plan.add(
-        "contact_forces", self_collision or bool(several), f"{_named(several)} can touch" if several else "it can touch itself",
-        "one body, and nothing that it could touch",
+        "contact_forces", scene.pushes(self_collision),
+        f"{_named([c.name for c in scene.colliders])} can touch" if several else "it can touch itself",
+        "one body, and nothing that it could touch" if scene.contact_forces else "the scene's contact_forces are off",
     )  # fmt: skip

@@ -36,6 +36,7 @@ class Scene:
         self.contact_pairs: dict[frozenset[str], tuple[float | None, float | None]] = {}
         self.collision = CollisionSettings()
         self.allow_initial_overlap = False
+        self.contact_forces = True
 
     @property
     def gravity(self) -> np.ndarray:
@@ -64,9 +65,20 @@ class Scene:
 
     @allow_initial_overlap.setter
     def allow_initial_overlap(self, value: bool) -> None:
-        if not isinstance(value, bool):
-            raise SceneError(f"scene: allow_initial_overlap must be True or False, not {value!r}")
-        self._allow_initial_overlap = value
+        self._allow_initial_overlap = checks.flag(value, "scene: allow_initial_overlap")
+
+    @property
+    def contact_forces(self) -> bool:
+        """Whether things that touch push each other; otherwise they pass through, and contacts are found when asked for."""
+        return self._contact_forces
+
+    @contact_forces.setter
+    def contact_forces(self, value: bool) -> None:
+        self._contact_forces = checks.flag(value, "scene: contact_forces")
+
+    def pushes(self, self_collision: bool) -> bool:
+        """Whether there can be contact forces, self_collision telling whether bodies may touch themselves."""
+        return self.contact_forces and (self_collision or len(self.colliders) > 1)
 
     @property
     def colliders(self) -> list[Body | Obstacle]:
@@ -88,7 +100,8 @@ class Scene:
             other._held = body._held.copy()
             twin.bodies.append(other)
         twin.obstacles, twin.contact_pairs = list(self.obstacles), dict(self.contact_pairs)
-        twin.collision, twin.allow_initial_overlap = self.collision, self.allow_initial_overlap
+        twin.collision, twin.contact_forces = self.collision, self.contact_forces
+        twin.allow_initial_overlap = self.allow_initial_overlap
         return twin
 
     def add_body(
