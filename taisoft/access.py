@@ -130,7 +130,8 @@ class StateAccess:
             self._contact.search(world.time, self._dt)
             return self._contact.detection
         if self._idle_detection is None:
-            self._idle_detection = Detection(world.scene, world.model, world.layout, self._runtime)
+            itself = self.settings.self_collision
+            self._idle_detection = Detection(world.scene, world.model, world.layout, self._runtime, itself)
             self._owned.append(self._idle_detection)
         self._idle_detection.find(world.time, self._dt)
         return self._idle_detection

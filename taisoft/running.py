@@ -107,7 +107,7 @@ def _merge(a: StepReport, b: StepReport) -> StepReport:
     b.max_penetration = max(a.max_penetration, b.max_penetration)
     b.n_contacts = max(a.n_contacts, b.n_contacts)
     b.dropped_contacts = max(a.dropped_contacts, b.dropped_contacts)
-    b.deep = a.deep or b.deep
+    b.deep = max(a.deep, b.deep)
     b.converged = a.converged and b.converged
     b.problems = a.problems + b.problems
     return b

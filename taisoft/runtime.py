@@ -21,6 +21,7 @@ import taichi as ti
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 from taisoft.errors import SimulationError
+from taisoft.launching import Launch, places_of, prepare
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
@@ -202,24 +203,31 @@ class FieldArena:
 def kernel(function: Callable) -> Callable:
     """`ti.kernel` whose launches are counted by name, and whose first launch per set of templates counts as compile time."""
     compiled = ti.kernel(function)
-    seen: set = set()
+    templates, arrays = places_of(compiled)
+    known: dict[tuple, Launch | None] = {}  # by what the compiled code depends on; None: Taichi launches it
 
     @functools.wraps(function)
     def launch(*arguments):
         launches[function.__name__] += 1
-        # numbers and arrays are run-time data; True and False, which are ints too, choose a template's code
-        templates = (a for a in arguments if isinstance(a, bool) or not isinstance(a, (int, float, np.ndarray)))
-        key = (_kind, *map(id, templates))
-        if key in seen:
+        key = tuple([_trait(arguments[k]) for k in templates] + [(arguments[k].dtype, arguments[k].ndim) for k in arrays])
+        ready = known.get(key, False)
+        if ready is None or (ready and not all(arguments[k].flags.c_contiguous for k in arrays)):
             return compiled(*arguments)
-        seen.add(key)
+        if ready and ready.valid:
+            return ready(arguments)
         start = time.perf_counter()
         result = compiled(*arguments)
         ti.sync()
         _clock["compile"] += time.perf_counter() - start
+        known[key] = prepare(compiled, arguments)
         return result
 
     return launch
+
+
+def _trait(template):
+    """What code depends on in a template: a number's value (True is not 1), of anything else which one it is."""
+    return (type(template), template) if isinstance(template, (int, float, str, tuple)) else id(template)
 
 
 def compile_clock() -> float:

@@ -125,7 +125,7 @@ class Simulator(StateAccess):
             report.n_contacts, report.max_penetration = self._contact.n_contacts, self._contact.penetration
             report.dropped_contacts = self._contact.dropped
             report.converged &= result.contacts_converged
-            report.deep = report.max_penetration > self._contact.sunk
+            report.deep = int(report.max_penetration > self._contact.sunk)
         report.steps = self.step_count - start
         report.problems = [f"step {world.step_count}: {what}" for what in self._problems(report)]
         return report

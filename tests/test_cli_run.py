@@ -128,7 +128,7 @@ def test_the_scene_of_the_readme_runs(tmp_path):
     assert re.search(r"^ok \[-2\. ", done.stdout, re.MULTILINE)
     path = write(tmp_path / "contacts.py", scene + contacts)
     done = subprocess.run([sys.executable, path], env=environment, capture_output=True, text=True, check=True)
-    assert re.search(r"^52 contacts: beam ground \[.*-0\.5.*\] \[0\. 1\. 0\.\] 0\.0$", done.stdout, re.MULTILINE)
+    assert re.search(r"^52 0\.0 \[ *\S+ -\S+ +\S+\]$", done.stdout, re.MULTILINE)  # the ground is pressed down
 
 
 def test_the_readme_names_every_integrator():

@@ -36,6 +36,7 @@ def shifted(shape, by: np.ndarray):
 def simulated(collision: str, chosen: dict[str, Case]) -> Iterator[dict[str, list]]:
     """Problems of every case, hit by `collision`, at all places of its body A."""
     scene = ts.Scene(gravity=(0, 0, 0))
+    scene.contact_forces = False
     scene.collision = ts.CollisionSettings(margin=P / 2)
     places = {name: offset(k, case) for k, (name, case) in enumerate(chosen.items())}
     for name, case in chosen.items():

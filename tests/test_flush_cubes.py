@@ -15,6 +15,7 @@ import taisoft as ts
 @pytest.fixture(scope="module")
 def sim():
     scene = ts.Scene()
+    scene.contact_forces = False
     for name in ("below", "above"):
         scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), rubber(), name=name, collision="proximity")
     with ts.Simulator(scene, dt=1e-3, integrator="symplectic_euler", precision="f64", allow_unstable=True) as made:

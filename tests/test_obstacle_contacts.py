@@ -115,6 +115,7 @@ class World:
     def __init__(self):
         self.Q, self.T, self.back, self.speed = np.eye(3), np.zeros(3), 0.0, 0.0
         scene = ts.Scene(gravity=(0, 0, 0))
+        scene.contact_forces = False
         scene.collision = ts.CollisionSettings(margin=MARGIN)
         for k, (name, station) in enumerate(ALL.items()):
             place = np.array([10.0 * k, 0.0, 0.0])

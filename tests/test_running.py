@@ -22,7 +22,7 @@ class StandIn:
     """Counts steps; `events` maps a step to what happens in it: an exception, or fields of its report."""
 
     def __init__(self, explicit: bool, dt: float = 0.01, events=None, largest_batch: int = 4):
-        self.settings = SimpleNamespace(explicit=explicit)
+        self.settings, self.contact_limit = SimpleNamespace(explicit=explicit), 0.0
         self.dt, self.step_count, self.time, self.compile_seconds = dt, 0, 0.0, 0.0
         self.events, self.largest_batch = events or {}, largest_batch
 

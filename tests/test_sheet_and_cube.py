@@ -43,6 +43,7 @@ class Pair:
 
     def __init__(self, collision: str):
         scene = ts.Scene(gravity=(0, 0, 0))
+        scene.contact_forces = False
         scene.collision = ts.CollisionSettings(margin=MARGIN)
         sheet = ts.sheet_mesh((20, 2, 10), (4.0, THICKNESS, 4.0))
         self.cube = ts.box_mesh((4, 4, 4), (1.0, 1.0, 1.0))
@@ -104,6 +105,7 @@ def test_the_cube_stands_on_the_upper_side(pair, sag, tilt, gap):
 def test_thin_sheets_on_each_other():
     """With a margin above their thickness: only the sides that face each other meet."""
     scene = ts.Scene(gravity=(0, 0, 0))
+    scene.contact_forces = False
     scene.collision = ts.CollisionSettings(margin=0.03)
     soft, (low, high) = ts.Material(young=1e3), (ts.sheet_mesh((n, n), (size, 0.02, size)) for n, size in ((5, 1.0), (4, 0.7)))
     scene.add_body(low, soft, name="low")

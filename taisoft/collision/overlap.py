@@ -56,22 +56,21 @@ def find_overlap(detection: Detection) -> Overlap | None:
     for a, b, gap in zip(contacts.body_a, contacts.body_b, contacts.gap):
         if gap < 0.0 and a != b:
             tell(place[a], place[b], -gap)
-    if detection.shapes.count:
-        phi = np.full((len(colliders), detection.shapes.count), np.inf)
-        _deepest_vertices(detection.surface, detection.shapes, phi)
-        owner = detection.shapes.body.to_numpy()
-        for a, k in zip(*np.nonzero(phi < 0.0)):
-            tell(int(a), int(owner[k]), -phi[a, k])
     n_bodies = len(detection.scene.bodies)
     for a in range(n_bodies):
         for b in range(a + 1, len(colliders)):
             if len(parts[b]):
                 tell(a, b, _depth_between(detection, parts, a, b))
-    origins = detection.shapes.origin.to_numpy() if detection.shapes.count else ()
-    for k, middle in enumerate(origins):
-        b = int(detection.shapes.body[k])
-        for a in range(n_bodies):
-            tell(a, b, _depth_round(detection, parts[a], a, colliders[b].shape, middle[None]))
+    if detection.shapes.count:
+        phi = np.full((len(colliders), detection.shapes.count), np.inf)
+        _deepest_vertices(detection.surface, detection.shapes, phi)
+        owner, origin = detection.shapes.body.to_numpy(), detection.shapes.origin.to_numpy()
+        for a, k in np.ndindex(n_bodies, len(owner)):
+            b = int(owner[k])
+            if phi[a, k] < 0.0:
+                tell(a, b, -phi[a, k])
+            else:
+                tell(a, b, _depth_round(detection, parts[a], a, colliders[b].shape, origin[k : k + 1]))
     told = {pair for pair, deep in depth.items() if deep > ALLOWED * min(size[pair[0]], size[pair[1]])}
     for a, b, deep in _crossings(detection, x):
         if (a, b) not in told:  # only that something crosses is known of them, and about how far

@@ -1,7 +1,9 @@
 """Terms J^T D J of a matrix, kept in factors: each couples a few nodes by weights times one symmetric 3x3 block.
 
-They come and go with the contacts, so they have no place in the pattern of a `BlockCsr`; a product needs one block for each term
-and node, where an assembled matrix would need one for each pair of nodes. Their part of the diagonal is added to the matrix's.
+They come and go with the contacts, so they have no place in the pattern of a `BlockCsr`. A product goes through the terms: each
+pulls with D J x, and a node gathers the pulls of its terms. A sweep over the nodes, which needs what the nodes passed so far
+contribute, adds each node to the pulls as it goes; so either costs one block for each term and node.
+Their part of the diagonal is added to the matrix's.
 """
 
 from dataclasses import dataclass
@@ -9,7 +11,7 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.linear.block_csr import block_times
+from taisoft.linear.block_csr import padded_times
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,6 +19,7 @@ class Coupling:
     """Terms c with nodes node[c, 0..arity[c]), and the places of each node in them: entry = width * c + place."""
 
     width: int
+    count: Any  # i32, count[0] terms
     node: Any  # (capacity, width) i32
     arity: Any  # (capacity) i32
     weight: Any  # (capacity, width) f64
@@ -24,38 +27,75 @@ class Coupling:
     entry: Any  # i32, ascending for each node
     block: Any  # (capacity) 12-vectors
     active: Any  # (capacity) i32: 0 where the block is 0
+    base: Any  # (n_nodes) 12-vectors: the matrix's diagonal without the terms
+    n_active: Any  # (n_nodes) i32: active terms of each node, listed from entry_start in the next two
+    term: Any  # (capacity * width) i32
+    share: Any  # (capacity * width): the node's weight in it
+    pull: Any  # (capacity) 4-vectors, the last entry 0
 
 
-NO_COUPLING = Coupling(0, *[None] * 7)
+NO_COUPLING = Coupling(0, *[None] * 13)
+
+
+def build_coupling(
+    arena, real, n_nodes: int, count, node, arity, weight, entry_start, entry, block, active, base
+) -> Coupling:
+    """Terms whose nodes, weights and blocks lie in fields that others fill."""
+    capacity, width = node.shape
+    return Coupling(
+        width, count, node, arity, weight, entry_start, entry, block, active, base,
+        arena.field("coupling_active", ti.i32, n_nodes), arena.field("coupling_term", ti.i32, capacity * width),
+        arena.field("coupling_share", real, capacity * width), arena.vectors("coupling_pull", real, capacity, n=4),
+    )  # fmt: skip
 
 
 @ti.func
-def coupling_times(m: ti.template(), k: ti.template(), i, x: ti.template(), above: ti.template(), below: ti.template()):
-    """(J^T D J x)_i over the nodes after i (above), before it (below), or both; never i itself."""
-    y = ti.Vector([0.0, 0.0, 0.0], m.real)
-    for e in range(k.entry_start[i], k.entry_start[i + 1]):
+def prepare_terms(m: ti.template(), k: ti.template(), i):
+    """List the active terms of node i. Returns the diagonal block of the whole matrix."""
+    total, n = k.base[i], 0
+    first = k.entry_start[i]
+    for e in range(first, k.entry_start[i + 1]):
         c, own = k.entry[e] // k.width, k.entry[e] % k.width
         if k.active[c] == 1:
-            s = ti.Vector([0.0, 0.0, 0.0], m.real)
-            for j in range(k.arity[c]):
-                other = k.node[c, j]
-                wanted = 0
-                if ti.static(above):
-                    wanted |= int(other > i)
-                if ti.static(below):
-                    wanted |= int(other < i)
-                if wanted == 1:
-                    s += ti.cast(k.weight[c, j], m.real) * x[other]
-            y += ti.cast(k.weight[c, own], m.real) * block_times(k.block[c], s)
-    return y
+            weight = ti.cast(k.weight[c, own], m.real)
+            total += weight * weight * k.block[c]
+            k.term[first + n], k.share[first + n] = c, weight
+            n += 1
+    k.n_active[i] = n
+    return total
 
 
 @ti.func
-def coupling_diagonal(m: ti.template(), k: ti.template(), i, d):
-    """The diagonal block d of node i with that of J^T D J."""
-    total = d
-    for e in range(k.entry_start[i], k.entry_start[i + 1]):
-        c, own = k.entry[e] // k.width, k.entry[e] % k.width
-        weight = ti.cast(k.weight[c, own], m.real)
-        total += weight * weight * k.block[c]
-    return total
+def clear_pulls(m: ti.template(), k: ti.template()):
+    """No node pulls."""
+    for c in range(k.count[0]):
+        k.pull[c] = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
+
+
+@ti.func
+def add_pulls(m: ti.template(), k: ti.template(), i, x):
+    """Node i pulls with x."""
+    first = k.entry_start[i]
+    for e in range(first, first + k.n_active[i]):
+        c = k.term[e]
+        k.pull[c] += padded_times(k.block[c], k.share[e] * x)
+
+
+@ti.func
+def gather_pulls(m: ti.template(), k: ti.template(), i):
+    """What the pulls make of row i of J^T D J x."""
+    y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
+    first = k.entry_start[i]
+    for e in range(first, first + k.n_active[i]):
+        y += k.share[e] * k.pull[k.term[e]]
+    return ti.Vector([y[0], y[1], y[2]])
+
+
+@ti.func
+def pull_with_all(m: ti.template(), k: ti.template(), c, x: ti.template()):
+    """Every node of term c pulls with its x."""
+    if k.active[c] == 1:
+        s = ti.Vector([0.0, 0.0, 0.0], m.real)
+        for j in range(k.arity[c]):
+            s += ti.cast(k.weight[c, j], m.real) * x[k.node[c, j]]
+        k.pull[c] = padded_times(k.block[c], s)

@@ -16,7 +16,7 @@ import taichi as ti
 from taisoft.linear.block_csr import BLOCK, BlockCsr
 from taisoft.linear.coupling import NO_COUPLING, Coupling
 from taisoft.model import Model
-from taisoft.runtime import FieldArena, kernel
+from taisoft.runtime import FieldArena
 
 SERIAL_WORK = 40_000_000  # block products per launch: about 0.2 s, so that Ctrl-C is heard
 PARALLEL_BATCH = 8  # iterations between two looks at the residual
@@ -58,10 +58,12 @@ def build_pcg(model: Model, arena: FieldArena) -> PcgWork:
 def solve(
     m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int, coupling: Coupling = NO_COUPLING
 ) -> LinearResult:
-    """Fill w.y from w.rhs. tolerance: sqrt(r.z) relative to the start. coupling: off-diagonal terms beside those of A."""
+    """Fill w.y from w.rhs. tolerance: sqrt(r.z) relative to the start.
+
+    coupling: terms beside A, whose own diagonal is then in coupling.base; A.diagonal is set to that of both.
+    """
     from taisoft.linear import pcg_parallel, pcg_serial
 
-    invert_diagonal(m, A, w)
     method = pcg_serial if m.serial else pcg_parallel
     batch = max(1, SERIAL_WORK // (2 * A.n_edges + m.n_nodes)) if m.serial else PARALLEL_BATCH
     done = 0
@@ -71,31 +73,28 @@ def solve(
             return LinearResult(done, stop == CONVERGED, stop == NEGATIVE)
 
 
-@kernel
-def invert_diagonal(m: ti.template(), A: ti.template(), w: ti.template()):
-    """Inverse diagonal blocks over the free axes."""
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        B = ti.Matrix.zero(ti.f64, 3, 3)  # in f64, so that blocks much stiffer one way than another are inverted too
-        free = m.free[i]
+@ti.func
+def inverse_block(m: ti.template(), block, free):
+    """Inverse (12) of a diagonal block over the free axes, 0 on the others."""
+    inverse = ti.Vector([0.0 for _ in ti.static(range(BLOCK))], m.real)
+    B = ti.Matrix.zero(ti.f64, 3, 3)  # in f64, so that blocks much stiffer one way than another are inverted too
+    for r in ti.static(range(3)):
+        for c in ti.static(range(3)):
+            both = free[r] * free[c]
+            B[r, c] = both * block[4 * c + r] + (1.0 - both if ti.static(r == c) else 0.0)
+    det = B.determinant()
+    solid = B[0, 0] > 0.0 and B[1, 1] > 0.0 and B[2, 2] > 0.0 and det > 1e-12 * B[0, 0] * B[1, 1] * B[2, 2]
+    if solid:
+        C = B.inverse()
         for r in ti.static(range(3)):
             for c in ti.static(range(3)):
-                both = free[r] * free[c]
-                B[r, c] = both * A.diagonal[i][4 * c + r] + (1.0 - both if ti.static(r == c) else 0.0)
-        det = B.determinant()
-        solid = B[0, 0] > 0.0 and B[1, 1] > 0.0 and B[2, 2] > 0.0 and det > 1e-12 * B[0, 0] * B[1, 1] * B[2, 2]
-        if solid:
-            C = B.inverse()
-            for r in ti.static(range(3)):
-                for c in ti.static(range(3)):
-                    w.inverse[i][4 * c + r] = free[r] * free[c] * ti.cast(C[r, c], m.real)
-        else:
-            # a nearly singular or indefinite block (unprojected, compressed): its diagonal still preconditions
-            for r in ti.static(range(3)):
-                for c in ti.static(range(3)):
-                    w.inverse[i][4 * c + r] = 0.0
-                d = abs(B[r, r])
-                w.inverse[i][5 * r] = free[r] * ti.cast(ti.select(d > 0.0, 1.0 / ti.max(d, 1e-30), 1.0), m.real)
+                inverse[4 * c + r] = free[r] * free[c] * ti.cast(C[r, c], m.real)
+    else:
+        # a nearly singular or indefinite block (unprojected, compressed): its diagonal still preconditions
+        for r in ti.static(range(3)):
+            d = abs(B[r, r])
+            inverse[5 * r] = free[r] * ti.cast(ti.select(d > 0.0, 1.0 / ti.max(d, 1e-30), 1.0), m.real)
+    return inverse
 
 
 @ti.func

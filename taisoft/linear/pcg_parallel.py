@@ -2,8 +2,8 @@
 
 import taichi as ti
 
-from taisoft.linear.block_csr import block_times, row_times
-from taisoft.linear.coupling import coupling_times
+from taisoft.linear.block_csr import block_times, part_times, row_times
+from taisoft.linear.coupling import gather_pulls, prepare_terms, pull_with_all
 from taisoft.linear.pcg import (
     CONVERGED,
     COUNT,
@@ -14,18 +14,22 @@ from taisoft.linear.pcg import (
     STEP,
     STOP,
     dot64,
+    inverse_block,
     total,
 )  # fmt: skip
 from taisoft.runtime import kernel
 
 
 @kernel
-def start(m: ti.template(), A: ti.template(), w: ti.template()):
-    """y = 0, r = rhs, z = p = B r."""
+def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()):
+    """y = 0, r = rhs, z = p = B r; the diagonal and its inverse B on the way."""
     for c in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         s = ti.cast(0.0, ti.f64)
         for i in range(c * size, ti.min(m.n_nodes, (c + 1) * size)):
+            if ti.static(k.width > 0):
+                A.diagonal[i] = prepare_terms(m, k, i)
+            w.inverse[i] = inverse_block(m, A.diagonal[i], m.free[i])
             r = m.free[i] * w.rhs[i]
             z = block_times(w.inverse[i], r)
             w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
@@ -41,7 +45,7 @@ def start(m: ti.template(), A: ti.template(), w: ti.template()):
 def iterate(m, A, coupling, w, n: int, tolerance: float, begin: bool) -> tuple[int, int]:
     """Up to n iterations, from y = 0 where the solve begins; returns the iterations so far and how it stands."""
     if begin:
-        start(m, A, w)
+        start(m, A, coupling, w)
     for _ in range(n):
         iterate_once(m, A, coupling, w, tolerance)
     return int(w.state[COUNT]), int(w.state[STOP])
@@ -50,14 +54,20 @@ def iterate(m, A, coupling, w, n: int, tolerance: float, begin: bool) -> tuple[i
 @kernel
 def iterate_once(m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), tolerance: ti.f64):
     """One iteration; does nothing once stopped."""
+    if ti.static(coupling.width > 0):
+        for c in range(coupling.count[0]):
+            pull_with_all(m, coupling, c, w.p)
     for c in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         s = ti.cast(0.0, ti.f64)
         if w.state[STOP] == RUNNING:
             for i in range(c * size, ti.min(m.n_nodes, (c + 1) * size)):
-                product = row_times(m, A, i, w.p)
+                product = ti.Vector([0.0, 0.0, 0.0], m.real)
                 if ti.static(coupling.width > 0):
-                    product += coupling_times(m, coupling, i, w.p, True, True)
+                    product = part_times(m, A, A.row_start[i], A.row_start[i + 1], w.p)
+                    product += block_times(coupling.base[i], w.p[i]) + gather_pulls(m, coupling, i)
+                else:
+                    product = row_times(m, A, i, w.p)
                 q = m.free[i] * product
                 w.q[i] = q
                 s += dot64(w.p[i], q)

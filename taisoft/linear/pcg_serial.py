@@ -10,20 +10,27 @@ Comput. 2(1), 1981. D^-1 holds the inverse of the blocks that could be inverted,
 import taichi as ti
 
 from taisoft.linear.block_csr import block_times, part_times, part_times_backward
-from taisoft.linear.coupling import coupling_times
-from taisoft.linear.pcg import CONVERGED, COUNT, NEGATIVE, RUNNING, RZ, RZ_START, STEP, STOP, dot64
+from taisoft.linear.coupling import add_pulls, clear_pulls, gather_pulls, prepare_terms
+from taisoft.linear.pcg import CONVERGED, COUNT, NEGATIVE, RUNNING, RZ, RZ_START, STEP, STOP, dot64, inverse_block
 from taisoft.runtime import kernel
 
 
 @ti.func
 def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()):
-    """y = 0, s = (D + L)^-1 rhs, t = D s."""
+    """y = 0, s = (D + L)^-1 rhs, t = D s; the diagonal and its inverse on the way."""
     rz = ti.cast(0.0, ti.f64)
+    if ti.static(k.width > 0):
+        clear_pulls(m, k)
     for i in range(m.n_nodes):
+        if ti.static(k.width > 0):
+            A.diagonal[i] = prepare_terms(m, k, i)
+        w.inverse[i] = inverse_block(m, A.diagonal[i], m.free[i])
         below = part_times(m, A, A.row_start[i], A.row_upper[i], w.r)
         if ti.static(k.width > 0):
-            below += coupling_times(m, k, i, w.r, False, True)
+            below += gather_pulls(m, k, i)
         s = block_times(w.inverse[i], w.rhs[i] - below)
+        if ti.static(k.width > 0):
+            add_pulls(m, k, i, s)
         t = block_times(A.diagonal[i], s)
         w.r[i], w.q[i] = s, t
         w.z[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
@@ -56,22 +63,31 @@ def iterate_kernel(
         elif rz <= limit:
             stop = CONVERGED
         while k < n and stop == RUNNING:
+            if ti.static(coupling.width > 0):
+                clear_pulls(m, coupling)
             for back in range(m.n_nodes):
                 i = m.n_nodes - 1 - back
                 t = w.q[i] + ti.cast(along, m.real) * w.z[i]  # w.q holds D s of the last update
                 w.z[i] = t
                 above = part_times_backward(m, A, A.row_upper[i], A.row_start[i + 1], w.p)
                 if ti.static(coupling.width > 0):
-                    above += coupling_times(m, coupling, i, w.p, True, False)
-                w.p[i] = block_times(w.inverse[i], t - above)
+                    above += gather_pulls(m, coupling, i)
+                p = block_times(w.inverse[i], t - above)
+                w.p[i] = p
+                if ti.static(coupling.width > 0):
+                    add_pulls(m, coupling, i, p)
+            if ti.static(coupling.width > 0):
+                clear_pulls(m, coupling)
             curvature = ti.cast(0.0, ti.f64)
             for i in range(m.n_nodes):
                 # now w.q holds (D + L)^-1 (t - D p), as the rows below need it
                 p, t = w.p[i], w.z[i]
                 below = part_times(m, A, A.row_start[i], A.row_upper[i], w.q)
                 if ti.static(coupling.width > 0):
-                    below += coupling_times(m, coupling, i, w.q, False, True)
+                    below += gather_pulls(m, coupling, i)
                 s = block_times(w.inverse[i], t - block_times(A.diagonal[i], p) - below)
+                if ti.static(coupling.width > 0):
+                    add_pulls(m, coupling, i, s)
                 w.q[i] = s
                 curvature += dot64(t, p + s)
             if not curvature > 0.0:

@@ -22,14 +22,16 @@ from taisoft.contact.assemble import (
 )  # fmt: skip
 from taisoft.contact.problem import NODES, build_node_problem, index_nodes
 from taisoft.errors import SimulationError
+from taisoft.mesh.quality import mean_surface_edge
 from taisoft.runtime import FieldArena, kernel
 from taisoft.scene.body import Body
 from taisoft.scene.collision import principal_extents
 from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle, Obstacle
 from taisoft.stepping.world import World
 
-STANDOFF = 2e-3  # of the mean surface edge: gap that contacts keep, so that surfaces do not cross where motion is curved
-SUNK = 0.02  # of the mean surface edge: a penetration that is told as a problem [m]
+# Both of the finest body's mean surface edge:
+STANDOFF = 2e-3  # gap that contacts keep, so that surfaces do not cross where motion is curved
+SUNK = 0.02  # penetration that is told as a problem
 FAST = {True: 0.05, False: 0.2}  # share of a penetration that an explicit, an implicit step mends
 SLOW = {True: 0.005, False: 0.02}  # share of a missing standoff
 PUSHED = 0.01  # of the slowest wave in a bar, sqrt(E / rho): speed at which these open at most, which strains as much
@@ -122,13 +124,15 @@ class ContactStep:
         m, scene = world.model, world.scene
         self.detection = Detection(scene, m, world.layout, world.runtime, self_collision)
         d = self.detection
-        self.standoff, self.sunk = STANDOFF * d.edge, SUNK * d.edge
+        finest = min(mean_surface_edge([(b.nodes.positions, b.nodes.surface)]) for b in scene.bodies)
+        self.standoff, self.sunk = STANDOFF * finest, SUNK * finest
         if d.margin > 0.0:
             self.standoff = min(self.standoff, 0.5 * d.margin)
         # what follows a path may be changed from outside between two steps, and its path may end with the last one
         self._follows = world.motion.n_moved > 0 or any(o.path is not None for o in scene.obstacles)
         self._shares = FAST[explicit], SLOW[explicit]
         self._portion = 1.0  # of a step that its parts are
+        self.goal = self._goal()
         self._arena = FieldArena()
         self._make_room(2 * d.surface.n_triangles + SPARE)
         self._thick = np.array([collider_thickness(c, d.edge) for c in scene.colliders])
@@ -172,8 +176,11 @@ class ContactStep:
         self._last_time = self.penetration = self._span = 0.0
         self._sum = None
 
-    @property
-    def goal(self) -> tuple[float, float, float, float]:
+    def start_again(self) -> None:
+        """The state of the step's start was set back; the impulses found so far are where the next try begins."""
+        self._searched = None
+
+    def _goal(self) -> tuple[float, float, float, float]:
         """Standoff [m], shares of a penetration and of a missing standoff that a part mends, speed of that at most [m/s]."""
         materials = [b.material for b in self.world.scene.bodies]
         slowest = min(np.sqrt(m.young / m.density) for m in materials)
@@ -201,6 +208,7 @@ class ContactStep:
     def begin(self, time: float, dt: float) -> int:
         """Fill the problem for a step of dt [s] from the state at a time, impulses those of the last step. Returns its size."""
         n, d, m = self.search(time, dt), self.detection, self.world.model
+        self.goal = self._goal()
         self.dropped = max(self.dropped, d.counts.unmapped)
         if n > self.problem.capacity:
             self._make_room(2 * n)
@@ -208,8 +216,7 @@ class ContactStep:
         keep_impulses(f)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
         fill(f, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
-        if n:
-            index_nodes(f.problem)
+        index_nodes(f.problem)
         self._last_time, self._share, self.met = dt, 1.0, False
         return n
 

@@ -21,18 +21,18 @@ from taisoft.model import Model
 from taisoft.runtime import FieldArena
 from taisoft.stepping.contact import ContactStep
 from taisoft.stepping.contact_stage import (
+    SHARE,
+    STAY,
+    STEP,
+    STILL,
     StageContacts,
-    add_impulses,
     build_stage_contacts,
+    evaluate,
     keep_diagonal,
     keep_linear,
-    linear_residual,
-    press,
-    set_multipliers,
-    stiffen,
 )
 from taisoft.stepping.newton import MAX_FORCING, SLOW, StageResult, StageSolver, _forcing
-from taisoft.stepping.stage import begin_stage, form_residual, start_step, try_step
+from taisoft.stepping.stage import begin_stage, form_residual
 
 # R over the r-factors at the start of a stage, at least and at most. A larger one means fewer multipliers but more and harder
 # Newton steps: it doubles after a multiplier that took one, and is halved after one that took many.
@@ -108,33 +108,22 @@ class ContactStageSolver(StageSolver):
 
     # --- what contacts add to the parts of a Newton step ----------------------------------------------------------
 
-    def _press(self, beta: float) -> None:
-        press(self.model, self.work, self._k, beta, self._dt, *self.contact.goal, self._stiffness)
-
-    def _evaluate(self, c: float, beta: float) -> tuple[float, float]:
-        if not self._on:
-            return super()._evaluate(c, beta)
-        m, w, k = self.model, self.work, self._k
-        if self._linear:
-            linear_residual(m, w, self.matrix, k, beta)
-        else:
-            form_residual(m, w, self.pcg, c, beta, self._norms)
-        self._press(beta)
-        add_impulses(m, w, k, self.pcg, self._norms)
+    def _evaluate(
+        self, c: float, beta: float, how: int = STAY, share: float = 1.0, multiply: bool = False
+    ) -> tuple[float, float]:
+        evaluate(
+            self.model, self.work, self.matrix, self._k, self.pcg, self._linear, how, share, int(multiply), c, beta, self._dt,
+            *self.contact.goal, self._stiffness, self._norms,
+        )  # fmt: skip
         return self._sizes(c, beta)
 
     def _form_system(self, c: float, beta: float, projected: bool) -> None:
         super()._form_system(c, beta, projected)
-        if self._on:
-            keep_diagonal(self.model, self.matrix, self._k)
+        keep_diagonal(self.model, self.matrix, self._k)
 
     def _direction(self, tolerance: float) -> pcg.LinearResult:
-        if not self._on:
-            return super()._direction(tolerance)
         m = self.model
-        stiffen(m, self.matrix, self._k)
-        most = max(1000, 30 * m.n_nodes)
-        return pcg.solve(m, self.matrix, self.pcg, tolerance, most, self._k.coupling)
+        return pcg.solve(m, self.matrix, self.pcg, tolerance, max(1000, 30 * m.n_nodes), self._k.coupling)
 
     def _go(self, c: float, beta: float, enough: float) -> tuple[float, float, bool]:
         """Take the step in pcg.y as far as it helps; returns (|r|, scale, moved). enough: |r| that needs no further look.
@@ -142,13 +131,12 @@ class ContactStageSolver(StageSolver):
         Contacts that open and close can raise |r| in one step and lower it in the next, round and round. The objective is convex
         along a step but for the elastic part, so its slope tells: a step that ends on a steep rise is cut back by secants.
         """
-        m, w, y = self.model, self.work, self.pcg.y
-        start_step(m, w, y, beta)
-        slope = m.scalars[13]
+        scalars = self.model.scalars
+        r, scale = self._evaluate(c, beta, STEP)
+        slope = scalars[13]
         share, low, at_low, high, at_high = 1.0, 0.0, slope, 1.0, math.inf
         for _ in range(TRIES):
-            r, scale = self._evaluate(c, beta)
-            rise = m.scalars[12]
+            rise = scalars[12]
             too_far = not rise <= -FLAT * slope  # also where it is not a number
             far_enough = share >= 0.4 * high or rise >= FLAT * slope
             if r < enough or (slope < 0.0 and not too_far and far_enough):
@@ -159,9 +147,8 @@ class ContactStageSolver(StageSolver):
                 low, at_low = share, rise
             secant = at_low / (at_low - at_high) if math.isfinite(at_high) else 0.5
             share = low + (high - low) * min(max(secant, 0.1 if low == 0.0 else 0.4), 0.9)
-            try_step(m, w, y, share, beta)
-        try_step(m, w, y, 0.0, beta)
-        r, scale = self._evaluate(c, beta)
+            r, scale = self._evaluate(c, beta, SHARE, share)
+        r, scale = self._evaluate(c, beta, SHARE, 0.0)
         return r, scale, False
 
     # --- the loop -------------------------------------------------------------------------------------------------
@@ -174,14 +161,13 @@ class ContactStageSolver(StageSolver):
 
         linear: elastic forces linearised at the present x. Without contacts this is `StageSolver.solve`.
         """
-        self._linear, self._on, self._dt = False, False, dt
+        self._linear, self._dt, self._stiffness = False, dt, STIFFNESS
         p = self.contact.problem
+        self._fit()
         if p.count[0] == 0:
             self._weighed = None
             r = self.solve(c, beta, tolerance, 1 if linear else max_newton, linear_tolerance, led_share=led_share)
             return ContactResult(r.newton_iterations, r.linear_iterations, r.residual, r.converged, r.at_rounding)
-        self._fit()
-        self._on = True
         begin_stage(self.model, self.work, beta, led_share)
         fresh = False
         if self._weighed != (c, beta) or linear:
@@ -191,13 +177,12 @@ class ContactStageSolver(StageSolver):
             self._form_system(c, beta, False)
             self._weighed, fresh = (c, beta), True
         find_factors(p)
-        set_multipliers(self._k)
-        self._linear, self._stiffness = linear, STIFFNESS
+        self._linear = linear
         return self._iterate(c, beta, tolerance, contact_tolerance, max_newton, linear_tolerance, fresh)
 
     def _iterate(self, c, beta, tolerance, contact_tolerance, max_newton, linear_tolerance, fresh) -> ContactResult:
         state = self.contact.problem.state
-        r, scale = self._evaluate(c, beta)
+        r, scale = self._evaluate(c, beta, multiply=True)
         floor = beta * self.rounding_force + c * self.rounding_mass / beta
         newton = linear = multipliers = served = taken = 0
         needs_projection, forcing, previous, goal, least = False, MAX_FORCING, 0.0, PROGRESS * r, r
@@ -212,14 +197,13 @@ class ContactStageSolver(StageSolver):
                     break
                 if multipliers >= MAX_MULTIPLIERS:
                     break
-                set_multipliers(self._k)
                 multipliers += 1
                 if taken <= 1:
                     self._stiffness = min(STIFFEST, 2.0 * self._stiffness)
                 elif taken >= MANY:
                     self._stiffness = max(SOFTEST, 0.5 * self._stiffness)
                 taken = 0
-                r, scale = self._evaluate(c, beta)
+                r, scale = self._evaluate(c, beta, STILL, multiply=True)
                 goal, least, previous, rounding = PROGRESS * r, r, 0.0, False
                 continue
             if newton >= max_newton:

@@ -21,7 +21,7 @@ MAX_CONTACT_NEWTON = 400  # with contacts, over all multipliers
 MAX_PARTS = 32  # of a step in which bodies close fast
 HASTE = 2.0  # a part may close so many times what a step may: its speed was not known when the step was cut
 SEARCHES = 3  # along the way that a step took, where it left the one that was expected
-MORE_PARTS = 4  # of a step that ended with a new deep penetration
+MORE_PARTS = 16  # of a step that ended with a new deep penetration
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
 
@@ -145,10 +145,16 @@ class ImplicitStepper:
                 depth = contact.end(start + dt, dt)
             except BaseException:  # of Ctrl-C, too: the step is abandoned
                 self._put_back(*kept)
+                self.forget()
                 raise
             if depth <= allowed or 2 * parts > MORE_PARTS:
                 break
             self._put_back(*kept)  # velocities at the start of the step did not tell how far things would go
+            self._past = 0
+            if self.scheme.before:  # tells impacts by contacts that bore nothing in the step before
+                contact.forget()
+            else:
+                contact.start_again()
             parts *= 2
         contact.penetration = depth
         return result
@@ -175,7 +181,7 @@ class ImplicitStepper:
         if world.motion.released() != released:
             world.motion.set_released(released)
             world.upload_constraints()
-        self.forget()
+            self.solver.forget_factors()
 
     def _part(self, time: float, dt: float) -> StageResult:
         """A step of dt from a time, in one piece; again, where it led to contacts that nobody had looked for."""

@@ -62,6 +62,35 @@ def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, led_share: ti.
                     m.x[i][a] = w.targets[k][a]
 
 
+@ti.func
+def set_change(m: ti.template(), w: ti.template(), i, c, beta):
+    """What the mass of node i is multiplied by."""
+    change = c * (stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64))
+    if ti.static(m.damped):
+        change += beta * ti.cast(m.damping[m.node_body[i], 0], ti.f64) * ti.cast(m.v[i], ti.f64)
+    w.change[i] = change
+
+
+@ti.func
+def residual_parts(m: ti.template(), w: ti.template(), i, beta):
+    """(r, inertia and mass damping, f_el, f_ext) of node i, without contacts; `set_change` and the elements went before."""
+    f = gather(m, i)
+    external = m.weight[i] * m.gravity[0]
+    if ti.static(m.loaded):
+        external += m.loads[i]
+    drag = ti.Vector([0.0, 0.0, 0.0], m.real)
+    if ti.static(m.stiffness_damping):
+        drag += m.damping[m.node_body[i], 1] * row_times(m, w.damper, i, m.v)
+    inertia = ti.cast(mass_times(m, i, w.change), m.real)
+    return inertia - ti.cast(beta, m.real) * (f + external - drag), inertia, f, external
+
+
+@ti.func
+def squares(r, inertia, f, external, free):
+    """What node i adds to the norms of `form_residual`."""
+    return ti.Vector([norm2(free * r), norm2(free * inertia), norm2(free * f), norm2(free * external), norm2((1.0 - free) * r)])
+
+
 @kernel
 def form_residual(
     m: ti.template(), w: ti.template(), p: ti.template(), c: ti.f64, beta: ti.f64, norms: ti.types.ndarray()
@@ -77,36 +106,16 @@ def form_residual(
             element_force(m, g, False, b)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        change = c * (stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64))
-        if ti.static(m.damped):
-            change += beta * ti.cast(m.damping[m.node_body[i], 0], ti.f64) * ti.cast(m.v[i], ti.f64)
-        w.change[i] = change
+        set_change(m, w, i, c, beta)
     ti.loop_config(serialize=m.serial)
     for k in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         s = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64)
         for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
-            b, free = ti.cast(beta, m.real), m.free[i]
-            f = gather(m, i)
-            external = m.weight[i] * m.gravity[0]
-            if ti.static(m.loaded):
-                external += m.loads[i]
-            drag = ti.Vector([0.0, 0.0, 0.0], m.real)
-            if ti.static(m.stiffness_damping):
-                drag += m.damping[m.node_body[i], 1] * row_times(m, w.damper, i, m.v)
-            inertia = ti.cast(mass_times(m, i, w.change), m.real)
-            r = inertia - b * (f + external - drag)
+            r, inertia, f, external = residual_parts(m, w, i, beta)
             w.residual[i] = r
-            p.rhs[i] = -free * r
-            s += ti.Vector(
-                [
-                    norm2(free * r),
-                    norm2(free * inertia),
-                    norm2(free * f),
-                    norm2(free * external),
-                    norm2((1.0 - free) * r),
-                ]
-            )
+            p.rhs[i] = -m.free[i] * r
+            s += squares(r, inertia, f, external, m.free[i])
         for j in ti.static(range(5)):
             m.partial[k, j] = s[j]
     ti.loop_config(serialize=True)  # a sum outside of any loop would be a loop of its own over threads, 50 us and more
@@ -121,13 +130,19 @@ def norm2(a):
     return b.dot(b)
 
 
+@ti.func
+def place_node(m: ti.template(), w: ti.template(), y: ti.template(), i, share, beta):
+    """Node i at base + share beta y, v accordingly."""
+    m.x[i] = w.base[i] + share * beta * ti.cast(y[i], ti.f64)
+    m.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
+
+
 @kernel
 def try_step(m: ti.template(), w: ti.template(), y: ti.template(), share: ti.f64, beta: ti.f64):
     """x = base + share beta y, v accordingly; y is 0 on constrained axes."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        m.x[i] = w.base[i] + share * beta * ti.cast(y[i], ti.f64)
-        m.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
+        place_node(m, w, y, i, share, beta)
 
 
 @kernel
@@ -140,8 +155,7 @@ def start_step(m: ti.template(), w: ti.template(), y: ti.template(), beta: ti.f6
         for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
             s += dot64(m.free[i] * w.residual[i], y[i])
             w.base[i] = m.x[i]
-            m.x[i] = w.base[i] + beta * ti.cast(y[i], ti.f64)
-            m.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
+            place_node(m, w, y, i, 1.0, beta)
         m.partial[k, 5] = s
     ti.loop_config(serialize=True)
     for _ in range(1):
