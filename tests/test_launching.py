@@ -25,7 +25,7 @@ def machine():
 @kernel
 def combine(x: ti.template(), n: ti.template(), a: ti.f64, k: ti.i32, out: ti.types.ndarray()) -> ti.types.vector(2, ti.f64):
     for i in range(out.shape[0]):
-        out[i] = ti.cast(a * x[i] + k + n, out.dtype)
+        out[i] = a * x[i] + k + n
     return ti.Vector([a, 2.0 * k])
 
 
@@ -44,7 +44,7 @@ def count_slow(monkeypatch) -> SimpleNamespace:
 def test_other_numbers_and_arrays(machine, monkeypatch):
     arena, slow = FieldArena(), count_slow(monkeypatch)
     x = arena.field("x", ti.f64, 5, np.arange(5.0))
-    for a, k, dtype in ((1.0, 2, np.float64), (np.float32(0.5), np.int64(-7), np.float64), (3, 1, np.float64), (2.5, 0, np.float32)):
+    for a, k, dtype in ((1.0, 2, "f8"), (np.float32(0.5), np.int64(-7), "f8"), (3, 1, "f8"), (2.5, 0, "f4")):
         out = np.zeros(4, dtype=dtype)
         returned = combine(x, 10, a, k, out)
         assert np.array_equal(out, a * np.arange(4) + k + 10) and list(returned) == [a, 2 * k]
