@@ -135,7 +135,8 @@ def _judge(report: RunReport) -> None:
         worst = max(unconverged, key=lambda s: max(s.residual, s.contact_residual))
         report.problems.append(
             f"{len(unconverged)} of {len(steps)} steps did not converge; the worst, at t = {worst.time:.4g} s, "
-            f"to a relative residual of {worst.residual:.2e}, its contacts to {worst.contact_residual:.2e}"
+            f"to a relative residual of {worst.residual:.2e}"
+            + (f", its contacts to {worst.contact_residual:.2e}" if worst.n_contacts else "")
         )
     if inverted:
         worst = max(inverted, key=lambda s: s.n_inverted)

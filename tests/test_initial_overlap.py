@@ -201,7 +201,7 @@ def test_without_contact_forces_bodies_pass_through_each_other():
     with pytest.raises(ts.SceneError, match="^scene: contact_forces must be True or False, not 1$"):
         made.contact_forces = 1
     with pytest.raises(ts.SceneError, match="overlap at the start"):
-        ts.Simulator(made, dt=0.01)
+        ts.Simulator(made, dt=0.01, precision="f64")
 
 
 
