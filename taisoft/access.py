@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 
-from taisoft.collision.contacts import Contacts
+from taisoft.collision.contacts import Contacts, no_contacts
 from taisoft.collision.overlap import Overlap, find_overlap
 from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
@@ -76,8 +76,7 @@ class StateAccess:
         and kernels for it are made at the first call. Raises MeshError where a distance field cannot be made, SimulationError
         where positions or velocities are not finite, or a buffer would grow beyond `max_capacity`.
         """
-        detection = self._find_contacts()
-        return detection.contacts()
+        return self._find_contacts(self._dt).contacts()
 
     def set_contact(
         self, name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None
@@ -93,7 +92,7 @@ class StateAccess:
         Where a step was cut into parts, of its last part. Empty before the first step, and where nothing can touch.
         """
         self._open_world()
-        return self._contact.contacts() if self._contact is not None else self._find_contacts().contacts()
+        return self._contact.contacts() if self._contact is not None else no_contacts()
 
     def contact_force(self, name: str) -> np.ndarray:
         """Sum (3,) of the contact forces on a body or an obstacle over the last step [N]."""
@@ -106,9 +105,10 @@ class StateAccess:
     def deepest_overlap(self) -> Overlap | None:
         """Which two overlap deepest in the present state, and how deep [m]; None where nothing overlaps.
 
-        Exact and slow, unlike `StepReport.max_penetration`: it also sees what has gone too deep for the search for contacts.
+        Slow, and unlike `StepReport.max_penetration` it also sees what has gone too deep for the search for contacts. The depth
+        is that of the deepest vertex, crossing edge or face, or of a sphere's, box's or capsule's middle, inside the other.
         """
-        return find_overlap(self._find_contacts())
+        return find_overlap(self._find_contacts(0.0))
 
     def intersecting_triangles(self) -> list[tuple[str, int, str, int]]:
         """Surface triangles that intersect in the present state, each pair once: name and triangle of each.
@@ -116,7 +116,7 @@ class StateAccess:
         Triangles are rows of `body.nodes.surface`, or of an obstacle's surface. Of one body only where self_collision is on;
         triangles that share a vertex are left out.
         """
-        detection = self._find_contacts()
+        detection = self._find_contacts(0.0)
         first, colliders = detection.topology.first, self._world.scene.colliders
         pairs = detection.intersections()
         owner = np.searchsorted(first, pairs, side="right") - 1
@@ -124,16 +124,17 @@ class StateAccess:
             (colliders[a].name, int(t - first[a]), colliders[b].name, int(u - first[b])) for (t, u), (a, b) in zip(pairs, owner)
         ]
 
-    def _find_contacts(self) -> Detection:
+    def _find_contacts(self, dt: float) -> Detection:
+        """The contacts of the present state swept by dt [s]; with 0 no path is asked for a later time."""
         world = self._open_world()
         if self._contact is not None:
-            self._contact.search(world.time, self._dt)
+            self._contact.search(world.time, dt)
             return self._contact.detection
         if self._idle_detection is None:
             itself = self.settings.self_collision
             self._idle_detection = Detection(world.scene, world.model, world.layout, self._runtime, itself)
             self._owned.append(self._idle_detection)
-        self._idle_detection.find(world.time, self._dt)
+        self._idle_detection.find(world.time, dt)
         return self._idle_detection
 
     @property

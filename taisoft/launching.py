@@ -3,6 +3,7 @@
 Taichi looks every argument's type up, digests templates, and asks its compiler for the kernel at each launch: 20 us and more,
 5 us for each number on top, where kernels of a small scene take less themselves. A kernel that has run before with the same
 templates needs none of that: numbers and addresses go into a context, and the context to the compiled code.
+Where fields are freed, Taichi forgets its compiled kernels, whose code stays; a launch at hand goes on with that.
 This rests on 1.7.4, the version that taisoft asks for.
 """
 
@@ -27,7 +28,7 @@ class Launch:
 
     @property
     def valid(self) -> bool:
-        """Whether Taichi has not been initialised anew since."""
+        """Whether Taichi has not been initialised anew since, by whom ever."""
         return impl.get_runtime().prog is self._program
 
     def __call__(self, arguments: tuple):
@@ -36,7 +37,7 @@ class Launch:
         for at, slot, kind in self._setters:
             value = arguments[at]
             if kind == REAL:
-                context.set_arg_float(slot, float(value))
+                context.set_arg_float(slot, value)
             elif kind == WHOLE:
                 context.set_arg_int(slot, operator.index(value))
             else:
@@ -53,10 +54,11 @@ class Launch:
 REAL, WHOLE, ARRAY = range(3)
 
 
-def places_of(compiled: Callable) -> tuple[list[int], list[int]]:
-    """Which arguments of a `ti.kernel` are templates, and which arrays."""
+def places_of(compiled: Callable) -> tuple[int, list[int], list[int]]:
+    """How many arguments a `ti.kernel` has, which are templates, and which arrays."""
     kinds = [declared.annotation for declared in compiled._primal.arguments]
     return (
+        len(kinds),
         [k for k, kind in enumerate(kinds) if isinstance(kind, template)],
         [k for k, kind in enumerate(kinds) if isinstance(kind, ndarray_type.NdarrayType)],
     )

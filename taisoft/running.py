@@ -59,7 +59,14 @@ def run(
     report.wall_seconds = time.perf_counter() - clock - report.compile_seconds
     _judge(report)
     if report.steps and report.status != "failed":
-        _judge_end(sim, report)
+        try:
+            _judge_end(sim, report)
+        except SimulationError as error:
+            report.status = "failed"
+            report.problems.append(str(error))
+        except KeyboardInterrupt:
+            report.status = "degraded"
+            _interrupt(report)
     return report
 
 

@@ -30,6 +30,7 @@ launches: Counter[str] = Counter()  # kernel name -> launches so far in this pro
 _open: list["Runtime"] = []  # simulators that hold the runtime now
 _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
 _clock = {"compile": 0.0}
+_known: list[dict] = []  # launches of each kernel
 MAX_TREES = 480  # of field memory that may be open at once, see FieldArena
 _trees = {"open": 0}
 
@@ -106,6 +107,8 @@ def _initialise(arch: str, precision: str) -> None:
             fast_math=False, offline_cache=True, offline_cache_file_path=_cache_folder(), log_level=ti.ERROR, random_seed=0,
         )  # fmt: skip
     _trees["open"] = 0
+    for known in _known:  # they hold the Taichi that was
+        known.clear()
     obtained = "cuda" if ti.cfg.arch == ti.cuda else "cpu"
     if obtained != arch:
         raise SimulationError(f"arch '{arch}' is not to be had on this machine (Taichi fell back to '{obtained}')")
@@ -203,18 +206,22 @@ class FieldArena:
 def kernel(function: Callable) -> Callable:
     """`ti.kernel` whose launches are counted by name, and whose first launch per set of templates counts as compile time."""
     compiled = ti.kernel(function)
-    templates, arrays = places_of(compiled)
+    n_arguments, templates, arrays = places_of(compiled)
     known: dict[tuple, Launch | None] = {}  # by what the compiled code depends on; None: Taichi launches it
+    _known.append(known)
 
     @functools.wraps(function)
     def launch(*arguments):
         launches[function.__name__] += 1
+        if len(arguments) != n_arguments or not all(arguments[k].flags.c_contiguous for k in arrays):
+            return compiled(*arguments)  # which says what is wrong with them
         key = tuple([_trait(arguments[k]) for k in templates] + [(arguments[k].dtype, arguments[k].ndim) for k in arrays])
-        ready = known.get(key, False)
-        if ready is None or (ready and not all(arguments[k].flags.c_contiguous for k in arrays)):
-            return compiled(*arguments)
-        if ready and ready.valid:
-            return ready(arguments)
+        if key in known:
+            ready = known[key]
+            if ready is None:
+                return compiled(*arguments)
+            if ready.valid:
+                return ready(arguments)
         start = time.perf_counter()
         result = compiled(*arguments)
         ti.sync()
@@ -226,8 +233,8 @@ def kernel(function: Callable) -> Callable:
 
 
 def _trait(template):
-    """What code depends on in a template: a number's value (True is not 1), of anything else which one it is."""
-    return (type(template), template) if isinstance(template, (int, float, str, tuple)) else id(template)
+    """What code depends on in a template: a number's value (Taichi takes True for 1), of anything else which one it is."""
+    return template if isinstance(template, (int, float, str, tuple)) else (None, id(template))
 
 
 def compile_clock() -> float:

@@ -245,3 +245,23 @@ def test_real_ctrl_c(block, monkeypatch):
     for _ in range(2):
         block.step()
     assert np.abs(after - block.positions()).max() < 1e-9  # [m]
+
+
+@pytest.mark.parametrize("end, status", [
+    (None, "ok"), (0.005, "ok"), (0.02, "degraded"), (KeyboardInterrupt(), "degraded"), (ts.SimulationError("lost"), "failed"),
+])  # fmt: skip
+def test_the_end_is_judged(end, status):
+    """By the deepest overlap [m], or what asking for it raises."""
+    sim = StandIn(True)
+    sim.contact_limit = 0.01
+
+    def deepest_overlap():
+        if isinstance(end, BaseException):
+            raise end
+        return None if end is None else SimpleNamespace(name_a="left", name_b="right", depth=end)
+
+    sim.deepest_overlap = deepest_overlap
+    result = run(sim, 0.1)
+    assert result.status == status and result.interrupted == isinstance(end, KeyboardInterrupt)
+    told = {"ok": "", "degraded": "the run was interrupted" if result.interrupted else "'left' and 'right' overlap by 0.02 m"}
+    assert told.get(status, "lost") in " ".join(result.problems)

@@ -64,6 +64,16 @@ class Contacts:
         return len(self.gap)
 
 
+def no_contacts() -> Contacts:
+    """A record of none."""
+    names, integers = np.zeros(0, dtype=object), np.zeros((0, 2), dtype=np.int64)
+    vectors, numbers = np.zeros((0, 3)), np.zeros(0)
+    return Contacts(
+        vectors, vectors, numbers, vectors, names, names, np.zeros((0, 6), dtype=np.int64), np.zeros((0, 6)), names, integers,
+        numbers, numbers, 0, 0,
+    )  # fmt: skip
+
+
 def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:
     """Room for that many contacts."""
 

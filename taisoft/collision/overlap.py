@@ -14,7 +14,7 @@ from taisoft.collision.pipeline import Detection
 from taisoft.errors import MeshError
 from taisoft.mesh.signed_distance import signed_distances_at
 from taisoft.runtime import kernel
-from taisoft.scene.obstacles import Box, HalfSpace, Shape
+from taisoft.scene.obstacles import HalfSpace, Shape
 
 ALLOWED = 1e-6  # of the smaller body's size: deeper is an overlap
 
@@ -67,10 +67,7 @@ def find_overlap(detection: Detection) -> Overlap | None:
         owner, origin = detection.shapes.body.to_numpy(), detection.shapes.origin.to_numpy()
         for a, k in np.ndindex(n_bodies, len(owner)):
             b = int(owner[k])
-            if phi[a, k] < 0.0:
-                tell(a, b, -phi[a, k])
-            else:
-                tell(a, b, _depth_round(detection, parts[a], a, colliders[b].shape, origin[k : k + 1]))
+            tell(a, b, max(-phi[a, k], _depth_of_middle(detection, parts[a], a, colliders[b].shape, origin[k : k + 1])))
     told = {pair for pair, deep in depth.items() if deep > ALLOWED * min(size[pair[0]], size[pair[1]])}
     for a, b, deep in _crossings(detection, x):
         if (a, b) not in told:  # only that something crosses is known of them, and about how far
@@ -78,17 +75,15 @@ def find_overlap(detection: Detection) -> Overlap | None:
     return _deepest(depth, size, colliders)
 
 
-def _depth_round(detection: Detection, vertices: np.ndarray, a: int, shape: Shape, middle: np.ndarray) -> float:
-    """How deep [m] body a lies over the middle (1,3) of a shape that may be wholly inside it; 0 where it does not."""
+def _depth_of_middle(detection: Detection, vertices: np.ndarray, a: int, shape: Shape, middle: np.ndarray) -> float:
+    """How deep [m] the middle (1,3) of a shape, which may be wholly inside body a, lies in it; 0 where it does not."""
     if isinstance(shape, HalfSpace):
         return 0.0
-    radius = float(np.min(shape.half_extents)) if isinstance(shape, Box) else float(shape.radius)
     first = detection.topology.first
     triangles = detection.topology.triangle[first[a] : first[a + 1]] - detection.topology.vertex_first[a]
     if (middle < vertices.min(axis=0)).any() or (middle > vertices.max(axis=0)).any():
         return 0.0
-    phi = float(signed_distances_at(vertices, triangles, middle)[0])
-    return radius - phi if phi < 0.0 else 0.0
+    return max(0.0, -float(signed_distances_at(vertices, triangles, middle)[0]))
 
 
 def _crossings(detection: Detection, x: np.ndarray) -> list[tuple[int, int, float]]:

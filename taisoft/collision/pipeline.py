@@ -21,7 +21,7 @@ from taisoft.collision.sdf import DistanceFields, build_fields, find_in_fields
 from taisoft.collision.self_collision import Intersections
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, PAIRS, UNFINITE, Surface, build_surface
-from taisoft.errors import SimulationError
+from taisoft.errors import SceneError, SimulationError
 from taisoft.mesh.quality import mean_surface_edge
 from taisoft.mesh.sdf_grid import SdfGrid
 from taisoft.model import Layout, Model
@@ -213,6 +213,12 @@ class Detection:
 
     def _place_obstacles(self, time: float, dt: float) -> None:
         """Obstacles where they are at a time and at the end of the step; those that stand still are placed once."""
+        try:
+            self._ask_paths(time, dt)
+        except SceneError as error:
+            raise SimulationError(str(error)) from None
+
+    def _ask_paths(self, time: float, dt: float) -> None:
         first = not self._placed
         start = len(self.scene.bodies)
         for k, o in enumerate(self.scene.obstacles):

@@ -128,7 +128,8 @@ def _problem(W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray) -> 
     arch, precision = open_kind() or ("cpu", "f64")
     runtime = open_runtime(arch, precision, "solve_contact_problem")
     try:
-        p = _room(len(mu), len(W.tobsr((3, 3)).indices), arch == "cpu")
+        W = W.tobsr((3, 3))
+        p = _room(len(mu), len(W.indices), arch == "cpu")
         fill_field(p.r, r)
         fill_matrix_problem(p, W, b, mu)
         yield p

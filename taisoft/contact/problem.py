@@ -120,7 +120,7 @@ def fill_field(field, values: np.ndarray) -> None:
 
 def fill_matrix_problem(p: ContactProblem, W: sp.spmatrix, b: np.ndarray, friction: np.ndarray) -> None:
     """W (3k,3k), b (3k,) and coefficients of friction (k,) into a problem that has room; impulses are left as they are."""
-    blocks, k = sp.csr_matrix(W).tobsr((3, 3)), len(friction)
+    blocks, k = sp.bsr_matrix(W, blocksize=(3, 3)), len(friction)
     blocks.sort_indices()
     p.count[0] = k
     for field, values in (

@@ -11,7 +11,7 @@ Source: Alart and Curnier 1991 for the laws as a prox; the loop is that of the m
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -64,6 +64,16 @@ def merge(results: list[ContactResult]) -> ContactResult:
         sum(r.newton_iterations for r in results), sum(r.linear_iterations for r in results),
         max(r.residual for r in results), all(r.converged for r in results), all(r.at_rounding for r in results),
         sum(r.contact_iterations for r in results), max(r.contact_residual for r in results),
+    )  # fmt: skip
+
+
+def count_all(result: ContactResult, given_up: list[ContactResult]) -> ContactResult:
+    """The result of a step with the iterations of earlier tries at it."""
+    tries = [result, *given_up]
+    return replace(
+        result, newton_iterations=sum(r.newton_iterations for r in tries),
+        linear_iterations=sum(r.linear_iterations for r in tries),
+        contact_iterations=sum(r.contact_iterations for r in tries),
     )  # fmt: skip
 
 
@@ -141,6 +151,8 @@ class ContactStageSolver(StageSolver):
             far_enough = share >= 0.4 * high or rise >= FLAT * slope
             if r < enough or (slope < 0.0 and not too_far and far_enough):
                 return r, scale, True
+            if slope >= 0.0:
+                break
             if too_far:
                 high, at_high = share, rise
             else:

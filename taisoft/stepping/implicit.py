@@ -12,7 +12,7 @@ import taichi as ti
 from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
 from taisoft.stepping.contact import TOLERANCE, ContactStep
-from taisoft.stepping.contact_newton import ContactResult, ContactStageSolver, merge
+from taisoft.stepping.contact_newton import ContactResult, ContactStageSolver, count_all, merge
 from taisoft.stepping.newton import StageResult, StageSolver
 from taisoft.stepping.world import World
 
@@ -23,7 +23,6 @@ HASTE = 2.0  # a part may close so many times what a step may: its speed was not
 SEARCHES = 3  # along the way that a step took, where it left the one that was expected
 MORE_PARTS = 16  # of a step that ended with a new deep penetration
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
-
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ class ImplicitStepper:
         if parts > MAX_PARTS:
             raise SimulationError(f"step {self.world.step_count + 1}: {contact.too_fast(start, dt)}")
         allowed = max(contact.sunk, 1.1 * depth)  # what is deep already needs no shorter steps
-        kept = m.x.to_numpy(), m.v.to_numpy(), self.world.motion.released()
+        kept, given_up = (m.x.to_numpy(), m.v.to_numpy(), self.world.motion.released()), []
         while True:
             try:
                 result = self._in_parts(start, dt, parts)
@@ -155,9 +154,10 @@ class ImplicitStepper:
                 contact.forget()
             else:
                 contact.start_again()
+            given_up.append(result)
             parts *= 2
         contact.penetration = depth
-        return result
+        return count_all(result, given_up)
 
     def _in_parts(self, start: float, dt: float, parts: int) -> ContactResult:
         """A step of dt from a time, in equal parts."""
