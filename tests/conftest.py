@@ -8,7 +8,10 @@ from command import BEAM, write
 from taisoft import runtime
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
-SLOW = ("references", "stepping", "demos", "simulator", "cli_run", "elasticity")  # files by time, slowest first
+SLOW = (
+    "references", "demos", "contact_stepping", "stepping", "cli_run", "bench_collision", "bvh", "simulator", "self_collision",
+    "static", "spatial_hash", "elasticity", "detection_runs",
+)  # files by time, slowest first
 _compiled = [0.0]  # compile clock when Taichi was last set back [s]
 
 
@@ -25,6 +28,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     The key of a kernel in the cache on disk holds the running numbers of its fields. Numbers that start anew let a scene
     of an earlier test, process or run be found there, whatever ran before: compiling takes several times as long.
     """
+    if getattr(item.module, "KEEPS_TAICHI", False):  # its kernels have no fields
+        return
     if runtime.open_kind() is None and runtime.compile_clock() > _compiled[0]:
         runtime._kind = None
         _compiled[0] = runtime.compile_clock()

@@ -254,14 +254,12 @@ def test_turned_and_shifted(sim):
 
 
 def test_order_of_bodies(sim):
-    if sim.settings.integrator == "velocity_verlet":
-        return  # as the other explicit one
-    place, close = Stage(motion=sliding(0.3)), 1e-8 if sim.settings.explicit else 1e-6
+    if sim.settings.integrator != "symplectic_euler":
+        pytest.skip("what the order could change, sweeps over contacts, is in symplectic Euler's steps, too")
+    place, close = Stage(motion=sliding(0.3)), 1e-8
     sim.place.motion = place.motion
     walk(sim)
     with opened(sim.settings.integrator, place, swapped=True) as other:
-        if not sim.settings.explicit:
-            other._stepper.scheme = sim._stepper.scheme
         walk(other)
         for body in sim.scene.bodies:
             assert np.abs(sim.positions(body.name) - other.positions(body.name)).max() < 0.1 * close

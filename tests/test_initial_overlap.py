@@ -189,11 +189,10 @@ def two(depth: float) -> ts.Scene:
 def test_a_simulator_refuses_it():
     with pytest.raises(ts.SceneError, match=r"^'lower' and 'upper' overlap at the start, 0.125 m deep: move them apart, or set "):
         ts.Simulator(two(0.125), dt=1e-4, integrator="symplectic_euler", precision="f64")
-    for depth, allowed in ((0.125, True), (0.0, False)):
-        made = two(depth)
-        made.allow_initial_overlap = allowed
-        with ts.Simulator(made, dt=1e-4, integrator="symplectic_euler", precision="f64") as sim:
-            assert len(sim.detect_contacts())
+    made = two(0.125)
+    made.allow_initial_overlap = True
+    with ts.Simulator(made, dt=1e-4, integrator="symplectic_euler", precision="f64") as sim:
+        assert len(sim.detect_contacts())
 
 
 def test_without_contact_forces_bodies_pass_through_each_other():

@@ -260,12 +260,12 @@ def hertz(cells: int, limit: float | None, reference: dict, arch: str):
 
 BOTH = (IMPLICIT, EXPLICIT)
 CASES = (
-    *(Case("incline_stick_slip", "COR", f"2x2x2 {name}", partial(incline, name)) for name in BOTH),
-    *(Case("slide_to_stop", "COR", f"2x2x2 {name}", partial(slide, name)) for name in BOTH),
+    *(Case("incline_stick_slip", "COR", f"2x2x2 {name}", partial(incline, name), fine=name == EXPLICIT) for name in BOTH),
+    *(Case("slide_to_stop", "COR", f"2x2x2 {name}", partial(slide, name), fine=name == IMPLICIT) for name in BOTH),
     Case("stack_rest", "SNH", "2x2x2", stack),
-    *(Case("newton_impact", "COR", f"2x2x2 {name}", partial(newton, name)) for name in BOTH),
-    *(Case("bar_impact", "COR", f"2x20x2 {name}", partial(bar, name, "COR")) for name in BOTH),
-    *(Case("soft_soft_momentum", "SNH", f"2x2x2 {name}", partial(momentum, name)) for name in BOTH),
+    *(Case("newton_impact", "COR", f"2x2x2 {name}", partial(newton, name), fine=name == EXPLICIT) for name in BOTH),
+    *(Case("bar_impact", "COR", f"2x20x2 {name}", partial(bar, name, "COR"), fine=name == EXPLICIT) for name in BOTH),
+    *(Case("soft_soft_momentum", "SNH", f"2x2x2 {name}", partial(momentum, name), fine=name == IMPLICIT) for name in BOTH),
     Case("hertz_ball", "SNH", "half ball, 12 cells across", partial(hertz, 12, 0.1)),
     Case("hertz_ball", "SNH", "half ball, 20 cells across", partial(hertz, 20, 0.1), fine=True),
 )
