@@ -22,6 +22,7 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 from taisoft.errors import SimulationError
 from taisoft.launching import Launch, places_of, prepare
+from taisoft.upload import upload
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
@@ -163,9 +164,7 @@ class FieldArena:
             (builder, fields), self._group = self._group, None
             if fields:
                 self._finalize(builder, fields[0][2])
-        for field, data, _ in fields:
-            if data is not None:
-                field.from_numpy(data)
+        upload([(field, data) for field, data, _ in fields if data is not None])
 
     def _place(self, name, make, dtype, components, shape, data):
         if name in self.bytes:

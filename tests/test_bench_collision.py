@@ -132,10 +132,11 @@ def test_a_search_in_phases_is_the_search(runtime):
 
 
 def test_films_and_broad_phases(runtime, monkeypatch):
-    """All kinds of trees once: each is compiled anew."""
+    """Two kinds of trees: each is compiled anew."""
+    monkeypatch.setattr(collision_runs, "TREES", ("bvh 6", "bvh 18"))
     (sweep,) = measure_broad(cubes_setup(2), runtime, 3)
-    assert sweep.at == sweep.tets == 80 and set(sweep.rounds) == {HASH, *TREES}
-    assert sweep.pairs[HASH] == sweep.pairs["bvh 6"] >= sweep.pairs["bvh 14"] >= sweep.pairs["bvh 18"] > 0
+    assert sweep.at == sweep.tets == 80 and set(sweep.rounds) == {HASH, "bvh 6", "bvh 18"}
+    assert sweep.pairs[HASH] == sweep.pairs["bvh 6"] >= sweep.pairs["bvh 18"] > 0
     (cells,) = measure_broad(cubes_setup(2), runtime, 3, (1.0,))
     assert cells.at == 1.0 and cells.pairs == {HASH: sweep.pairs[HASH]} and len(cells.rounds[HASH]) == 3
     monkeypatch.setattr(collision_runs, "TREES", ("bvh 6",))

@@ -20,7 +20,7 @@ FILES = sorted(path for path in PACKAGE.rglob("*.py"))
 # Modules under taisoft/, left to right; those of one group may import one another unless FOREIGN says otherwise.
 ORDER = (
     ("errors", "records"),
-    ("launching",),
+    ("launching", "upload"),
     ("runtime",),
     ("mesh", "scene"),
     ("math3",),

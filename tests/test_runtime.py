@@ -96,6 +96,29 @@ def test_fields():
         arena.release()
 
 
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_data_of_many_fields(precision):
+    rng = np.random.default_rng(0)
+    with opened(precision) as machine:
+        arena, wanted = FieldArena(), {}
+        with arena.group():
+            for name, dtype, shape in (
+                ("a", ti.f64, (7,)), ("b", ti.i32, (4, 3)), ("c", machine.real, (5, 2)), ("d", ti.f64, (2, 3, 4)),
+                ("e", ti.i32, (1,)),
+            ):  # fmt: skip
+                data = rng.integers(-(2**31), 2**31, shape) if dtype == ti.i32 else rng.standard_normal(shape)
+                data = data.astype({ti.i32: np.int32, ti.f32: np.float32, ti.f64: np.float64}[dtype])
+                wanted[name] = arena.field(name, dtype, shape, data), data
+            for n in (2, 3, 12):
+                data = rng.standard_normal((6, n)).astype(machine.np_real)
+                wanted[f"v{n}"] = arena.vectors(f"v{n}", machine.real, 6, data, n=n), data
+            zero = arena.field("zero", ti.f64, 3)
+        for name, (field, data) in wanted.items():
+            assert np.array_equal(field.to_numpy(), data), name
+        assert not zero.to_numpy().any()
+        arena.release()
+
+
 def test_launches_and_compile_time_are_counted():
     with opened("f64"):
         arena = FieldArena()
