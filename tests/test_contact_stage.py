@@ -70,7 +70,7 @@ def rig(request):
         free = np.ones((m.n_nodes, 3))
         free[FIXED] = 0.0
         m.free.from_numpy(free.astype(made.machine.np_real))
-        contacts = oracle.random_contacts(5, K, m.n_nodes)
+        contacts = oracle.random_contacts(5, K, m.n_nodes - 4)  # the last nodes have none
         arity = contacts.arity.copy()
         arity[::5] = (contacts.weight[::5] > 0).sum(axis=1)  # against an obstacle
         p = build_node_problem(arena, K + 3, m.n_nodes, True)
@@ -119,11 +119,11 @@ def press(rig, x: np.ndarray) -> np.ndarray:
     return rig.p.r.to_numpy()[:K]
 
 
-def evaluate(rig, how: int = STAY, share: float = 1.0, multiply: bool = False, linear: bool = False) -> np.ndarray:
-    """The norms that it tells."""
+def evaluate(rig, how: int = STAY, share: float = 1.0, multiply: bool = False, linear: bool = False, m=None) -> np.ndarray:
+    """The norms that it tells. m: the model, by default that on one thread."""
     norms, s = np.zeros(5), rig.solver
     contact_stage.evaluate(
-        rig.m, rig.work, s.matrix, rig.k, s.pcg, linear, how, share, int(multiply), 1.0, BETA, DT, *GOAL, STIFFNESS, norms
+        m or rig.m, rig.work, s.matrix, rig.k, s.pcg, linear, how, share, int(multiply), 1.0, BETA, DT, *GOAL, STIFFNESS, norms
     )
     return norms
 
@@ -224,9 +224,11 @@ def test_factors_rest_on_the_diagonal(rig):
     assert np.abs(rig.p.factor.to_numpy()[:K] / factor - 1).max() < 10 * rig.close
 
 
-def test_residual_of_a_stage(rig, pressed):
+@pytest.mark.parametrize("threads", ["one", "all"])
+def test_residual_of_a_stage(rig, pressed, threads):
     """That without contacts less J^T p, after a step, a part of it, and where only the multipliers change."""
-    m, work, cg, real = rig.m, rig.work, rig.solver.pcg, rig.made.machine.np_real
+    m = rig.m if threads == "one" else rig.made.parallel
+    work, cg, real = rig.work, rig.solver.pcg, rig.made.machine.np_real
     rng = np.random.default_rng(6)
     y = (1e-2 * rng.standard_normal(rig.x.shape)).astype(real)
     before = rng.standard_normal(rig.x.shape).astype(real)
@@ -234,7 +236,7 @@ def test_residual_of_a_stage(rig, pressed):
     work.residual.from_numpy(before)
     m.x.from_numpy(rig.x)
     for how, share in ((STEP, 1.0), (SHARE, 0.4), (STILL, 0.4)):
-        norms = evaluate(rig, how, share, multiply=how == STILL)
+        norms = evaluate(rig, how, share, multiply=how == STILL, m=m)
         got, rhs, r = work.residual.to_numpy(), cg.rhs.to_numpy(), rig.p.r.to_numpy()[:K]
         assert np.abs(m.x.to_numpy() - rig.x - share * BETA * y.astype(float)).max() < 1e-15
         assert np.abs(m.v.to_numpy() - (m.x.to_numpy() - rig.x_hat) / BETA).max() < 10 * rig.close * np.abs(m.v.to_numpy()).max()
