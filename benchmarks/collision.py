@@ -12,7 +12,6 @@ is not met. --quick has small meshes, few rounds and frames, and no limit. The w
 
 import argparse
 import sys
-from pathlib import Path
 
 from taisoft.output.files import write_bytes
 from taisoft.output.report import json_text
@@ -30,7 +29,7 @@ from .collision_cases import (
     cubes_setup,
     pile_setup,
 )  # fmt: skip
-from .collision_plot import draw, require_matplotlib
+from .collision_plot import draw
 from .collision_runs import (
     GEOMETRIES,
     QUICK_ROUNDS,
@@ -51,7 +50,7 @@ from .collision_table import (
 )  # fmt: skip
 from .elasticity import Document
 from .elasticity_table import limit_table
-from .order import check_out, header
+from .order import header, parse_options
 from .timing import load_average
 
 QUICK_FRAMES = 3
@@ -92,15 +91,8 @@ def main(argv=None) -> int:
     first, _, rest = __doc__.partition("\n")
     parser = argparse.ArgumentParser(prog="taisoft bench collision", description=first, epilog=rest.partition("\n\n")[2])
     parser.add_argument("--quick", action="store_true", help="small meshes, few rounds and frames, no limit")
-    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
     parser.add_argument("--precision", choices=("f32", "f64"), default="f32", help="of all but positions (default f32)")
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the report's figures")
-    options = parser.parse_args(argv)
-    check_out(options.out, ".json")
-    check_out(options.plot, ".png")
-    if options.plot:
-        require_matplotlib()
+    options = parse_options(parser, argv, "the report's figures")
     document, (text, numbers) = Document(), header("Collision detection", options.arch, options.precision)
     document.add(text)
     runtime = open_runtime(options.arch, options.precision, "the benchmark of collision detection")

@@ -13,7 +13,6 @@ The whole takes about six minutes on two cores.
 
 import argparse
 import sys
-from pathlib import Path
 
 from taisoft.output.files import write_bytes
 from taisoft.output.report import json_text
@@ -37,8 +36,7 @@ from .contact_table import (
 )  # fmt: skip
 from .elasticity import Document
 from .elasticity_table import limit_table
-from .order import check_out, header
-from .order_plot import require_matplotlib
+from .order import header, parse_options
 from .timing import load_average
 
 SCENES = ("cube_on_box", "two_cubes_two_boxes")  # figures 20 and 19
@@ -103,14 +101,7 @@ def main(argv=None) -> int:
     first, _, rest = __doc__.partition("\n")
     parser = argparse.ArgumentParser(prog="taisoft bench contact", description=first, epilog=rest.partition("\n\n")[2])
     parser.add_argument("--quick", action="store_true", help="one scene, few frames and sizes, no limit")
-    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the report's figures 19 and 20")
-    options = parser.parse_args(argv)
-    check_out(options.out, ".json")
-    check_out(options.plot, ".png")
-    if options.plot:
-        require_matplotlib()
+    options = parse_options(parser, argv, "the report's figures 19 and 20")
     document, (text, numbers) = Document(), header("Contact", options.arch, "f32")
     document.add(text)
     compiled = compile_clock()

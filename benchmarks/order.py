@@ -106,6 +106,19 @@ def check_out(path: Path | None, suffix: str) -> None:
         raise OutputError(f"cannot write {path}: its folder is not writable")
 
 
+def parse_options(parser: argparse.ArgumentParser, argv: list[str] | None, drawn: str) -> argparse.Namespace:
+    """--arch, --out and --plot, which is to draw what `drawn` says, beside the parser's own options; the files can be written."""
+    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
+    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help=f"draw {drawn}")
+    options = parser.parse_args(argv)
+    check_out(options.out, ".json")
+    check_out(options.plot, ".png")
+    if options.plot:
+        require_matplotlib()
+    return options
+
+
 def main(argv=None) -> int:
     """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
     first, _, rest = __doc__.partition("\n")
@@ -113,14 +126,7 @@ def main(argv=None) -> int:
     parser = argparse.ArgumentParser(prog="taisoft bench order", description=first, epilog=rest.partition("\n\n")[2])
     parser.add_argument("--quick", action="store_true", help="two meshes an order, one round")
     parser.add_argument("--case", choices=names, metavar="NAME", help=f"only this one of {', '.join(names)}")
-    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw error against time, a panel a case")
-    options = parser.parse_args(argv)
-    check_out(options.out, ".json")
-    check_out(options.plot, ".png")
-    if options.plot:
-        require_matplotlib()
+    options = parse_options(parser, argv, "error against time, a panel a case")
     name = options.case or (HANGING if options.quick else None)
     document = Document()
     numbers, found = measure([c for c in CASES if name in (None, c.name)], options.quick, options.arch, document)

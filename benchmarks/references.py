@@ -16,11 +16,11 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from taisoft.errors import OutputError, TaisoftError
+from taisoft.errors import OutputError
 from taisoft.runtime import open_runtime
 
 from .reference_cases import CASES, PROBLEMS
-from .reference_cases.record import Case, Check
+from .reference_cases.record import Case, Check, computed
 from .timing import machine, versions
 
 REFERENCES = Path(__file__).resolve().parents[1].parent / "shared" / "references"
@@ -53,17 +53,13 @@ class Row:
 def run(case: Case, reference: dict, arch: str) -> list[Row]:
     """The rows of a case; one that could not be computed is a failed row that says why."""
     start = time.perf_counter()
-    try:
-        checks = list(case.compute(reference, arch))
-    except TaisoftError as error:
-        checks = [Check(f"failed: {error}", math.nan, math.nan, math.nan, 0.0)]
+    checks = computed(lambda: case.compute(reference, arch))
     seconds = [time.perf_counter() - start] + [0.0] * (len(checks) - 1)
     return [_row(case, check, s) for check, s in zip(checks, seconds)]
 
 
 def _row(case: Case, check: Check, seconds: float) -> Row:
-    verdict = "FAIL" if not check.passed else "-" if check.limit is None else "pass"
-    return Row(case.problem, case.law, case.mesh, **asdict(check), verdict=verdict, seconds=seconds)
+    return Row(case.problem, case.law, case.mesh, **asdict(check), verdict=check.verdict, seconds=seconds)
 
 
 def _missing(problems) -> str | None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import taisoft as ts
+from taisoft.errors import TaisoftError
 from taisoft.scene.scene import Body
 
 LAWS = {"SNH": "stable_neo_hookean", "COR": "corotational", "SVK": "st_venant_kirchhoff"}
@@ -33,6 +34,19 @@ class Check:
     def passed(self) -> bool:
         """Whether the error is within the limit; one that is not a number never is."""
         return math.isfinite(self.error) if self.limit is None else bool(self.error <= self.limit)
+
+    @property
+    def verdict(self) -> str:
+        """pass, FAIL, or - where there is no limit."""
+        return "FAIL" if not self.passed else "-" if self.limit is None else "pass"
+
+
+def computed(compute: Callable[[], Iterable[Check]]) -> list[Check]:
+    """The checks of a computation; of one that fails, a check that says why and has not passed."""
+    try:
+        return list(compute())
+    except TaisoftError as error:
+        return [Check(f"failed: {error}", math.nan, math.nan, math.nan, 0.0)]
 
 
 @dataclass(frozen=True)

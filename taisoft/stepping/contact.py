@@ -76,7 +76,7 @@ class ContactStep:
             problem = build_node_problem(arena, capacity, m.n_nodes, m.serial)
             self.found = build_found(arena, problem)
         self._arena.release()
-        self._arena, self._last_time = arena, 0.0
+        self._arena, self._last_time, self._indexed = arena, 0.0, False
 
     @property
     def problem(self):
@@ -135,7 +135,9 @@ class ContactStep:
         keep_impulses(f)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
         fill(f, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
-        index_nodes(f.problem)
+        if n or self._indexed:  # an index of none stays what it is
+            index_nodes(f.problem)
+            self._indexed = n > 0
         self._last_time, self._share, self.met = dt, 1.0, False
         return n
 

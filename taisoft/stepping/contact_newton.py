@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from taisoft.contact.problem import RESIDUAL, find_factors
-from taisoft.linear import pcg
 from taisoft.model import Model
 from taisoft.runtime import FieldArena
 from taisoft.stepping.contact import ContactStep
@@ -69,11 +68,10 @@ def merge(results: list[ContactResult]) -> ContactResult:
 
 def count_all(result: ContactResult, given_up: list[ContactResult]) -> ContactResult:
     """The result of a step with the iterations of earlier tries at it."""
-    tries = [result, *given_up]
+    work = merge([result, *given_up])
     return replace(
-        result, newton_iterations=sum(r.newton_iterations for r in tries),
-        linear_iterations=sum(r.linear_iterations for r in tries),
-        contact_iterations=sum(r.contact_iterations for r in tries),
+        result, newton_iterations=work.newton_iterations, linear_iterations=work.linear_iterations,
+        contact_iterations=work.contact_iterations,
     )  # fmt: skip
 
 
@@ -114,7 +112,7 @@ class ContactStageSolver(StageSolver):
             with arena.group():
                 self._k = build_stage_contacts(arena, self.model, self.contact.found, self._x_start)
             self._arena.release()
-            self._arena, self._weighed = arena, None
+            self._arena, self._weighed, self.coupling = arena, None, self._k.coupling
 
     # --- what contacts add to the parts of a Newton step ----------------------------------------------------------
 
@@ -130,10 +128,6 @@ class ContactStageSolver(StageSolver):
     def _form_system(self, c: float, beta: float, projected: bool) -> None:
         super()._form_system(c, beta, projected)
         keep_diagonal(self.model, self.matrix, self._k)
-
-    def _direction(self, tolerance: float) -> pcg.LinearResult:
-        m = self.model
-        return pcg.solve(m, self.matrix, self.pcg, tolerance, max(1000, 30 * m.n_nodes), self._k.coupling)
 
     def _go(self, c: float, beta: float, enough: float) -> tuple[float, float, bool]:
         """Take the step in pcg.y as far as it helps; returns (|r|, scale, moved). enough: |r| that needs no further look.

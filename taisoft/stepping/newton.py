@@ -22,6 +22,7 @@ import taichi as ti
 from taisoft.elasticity import measure
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
+from taisoft.linear.coupling import NO_COUPLING
 from taisoft.model import Model
 from taisoft.runtime import FieldArena
 from taisoft.stepping.stage import StageWork, begin_stage, form_residual, stage_terms, start_step, try_step
@@ -80,6 +81,7 @@ class StageSolver:
                 led_acceleration=arena.vectors("led_acceleration", ti.f64, k) if k and model.consistent else None,
                 n_moved=k, change=arena.vectors("change", ti.f64, n), damper=self.damper,
             )  # fmt: skip
+        self.coupling = NO_COUPLING  # what the system holds beside the matrix
         self._norms = np.zeros(5)
         self.update_material()
 
@@ -139,7 +141,8 @@ class StageSolver:
         block_csr.to_system(self.model, self.matrix, self.damper or self.matrix, c, beta)
 
     def _direction(self, tolerance: float) -> pcg.LinearResult:
-        return pcg.solve(self.model, self.matrix, self.pcg, tolerance, max(1000, 30 * self.model.n_nodes))
+        m = self.model
+        return pcg.solve(m, self.matrix, self.pcg, tolerance, max(1000, 30 * m.n_nodes), self.coupling)
 
     def solve(
         self, c: float, beta: float, tolerance: float, max_newton: int, linear_tolerance: float | None = None,
