@@ -5,7 +5,8 @@ import taichi as ti
 
 from taisoft.collision.pipeline import MERGED, Detection
 from taisoft.collision.reduction import FOUND, KEPT, LEFT, UNKNOWN, is_same
-from taisoft.runtime import FieldArena, kernel
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel
 
 
 @kernel

@@ -15,8 +15,9 @@ import taisoft as ts
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.pipeline import Detection
 from taisoft.collision.spatial_hash import SpatialHash
+from taisoft.fields import FieldArena
 from taisoft.model import build_model
-from taisoft.runtime import FieldArena, Runtime, compile_clock
+from taisoft.runtime import Runtime, compile_clock
 from taisoft.scene.plan import make_plan
 
 from .collision_cases import FPS, FRAMES, Setup, start

@@ -11,7 +11,8 @@ import numpy as np
 import taichi as ti
 
 from taisoft.contact.problem import NODES, ContactProblem, build_node_problem, find_factors, index_nodes
-from taisoft.runtime import FieldArena, Runtime
+from taisoft.fields import FieldArena
+from taisoft.runtime import Runtime
 
 from .collision_table import crossovers
 from .contact_captured import COLOURED, SERIAL, THREADED, Outcome, Solvers

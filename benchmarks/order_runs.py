@@ -16,7 +16,8 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.errors import SimulationError, TaisoftError
-from taisoft.runtime import FieldArena, Runtime, compile_clock
+from taisoft.fields import FieldArena
+from taisoft.runtime import Runtime, compile_clock
 from taisoft.static import StaticSolver
 
 from .elasticity_beam import Stretch, advance

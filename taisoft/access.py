@@ -37,11 +37,11 @@ class StateAccess:
 
     def positions(self, body: str | None = None) -> np.ndarray:
         """(n_nodes, 3) float64 copy [m]; of all bodies, concatenated in the order added, without a name."""
-        return self._rows(self._open_world().model.x, body)
+        return self._open_world().state()[0][self._slice(body)]
 
     def velocities(self, body: str | None = None) -> np.ndarray:
         """(n_nodes, 3) float64 copy [m/s]."""
-        return self._rows(self._open_world().model.v, body)
+        return self._open_world().state()[1][self._slice(body)].astype(np.float64)
 
     def set_state(self, positions=None, velocities=None, body: str | None = None) -> None:
         """Set positions [m] and velocities [m/s], (n_nodes, 3) each; velocities of constrained axes become 0."""
@@ -49,13 +49,13 @@ class StateAccess:
         for name, value in (("positions", positions), ("velocities", velocities)):
             if value is not None:
                 self._check_rows(name, value, rows)
-        for field, value in ((world.model.x, positions), (world.model.v, velocities)):
-            if value is not None:
-                whole = field.to_numpy()
-                whole[rows] = value
-                if field is world.model.v:
-                    whole[world.motion.constrained()] = 0.0
-                field.from_numpy(whole)
+        x, v = world.state()
+        if positions is not None:
+            x[rows] = positions
+        if velocities is not None:
+            v[rows] = velocities
+            v[world.motion.constrained()] = 0.0
+        world.set_state(x, v)
         self._stepper.forget()
 
     def energies(self) -> Energies:
@@ -240,9 +240,6 @@ class StateAccess:
 
     def _slice(self, body: str | None) -> slice:
         return slice(None) if body is None else self._world.layout.nodes(self._index(body))
-
-    def _rows(self, field, body: str | None) -> np.ndarray:
-        return field.to_numpy()[self._slice(body)].astype(np.float64)
 
     def _check_rows(self, name: str, value, rows: slice) -> None:
         value = np.asarray(value)

@@ -14,6 +14,7 @@ import taichi as ti
 
 from taisoft.elements import reference
 from taisoft.scene.scene import Scene
+from taisoft.transfer import download, upload
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +45,12 @@ def mass_matrix(scene: Scene) -> sp.csr_matrix:
     return sp.block_diag(parts, format="csr")
 
 
-def upload_mass_matrix(scene: Scene, mass: MassMatrix, real: type) -> None:
+def upload_mass_matrix(scene: Scene, mass: MassMatrix) -> None:
     """Fill the matrix on the device from the bodies' densities."""
     M = mass_matrix(scene)
-    start, column = mass.row_start.to_numpy(), mass.column.to_numpy()
+    start, column = download([mass.row_start, mass.column])
     rows = np.repeat(np.arange(len(start) - 1), np.diff(start))
-    mass.value.from_numpy(np.asarray(M[rows, column]).reshape(-1).astype(real))
-    mass.diagonal.from_numpy(M.diagonal().astype(real))
+    upload([(mass.value, np.asarray(M[rows, column]).reshape(-1)), (mass.diagonal, M.diagonal())])
 
 
 @ti.func

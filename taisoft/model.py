@@ -15,11 +15,13 @@ import taichi as ti
 
 from taisoft.elements import reference
 from taisoft.errors import SceneError
+from taisoft.fields import FieldArena
 from taisoft.mass import MassMatrix, lumped_masses, upload_mass_matrix, weight_masses
 from taisoft.materials import LAWS
 from taisoft.node_graph import PAIRS, NodeGraph, node_graph
-from taisoft.runtime import FieldArena, Runtime
+from taisoft.runtime import Runtime
 from taisoft.scene.scene import Body, Material, Scene
+from taisoft.transfer import download
 
 PARALLEL_FROM = 100_000  # points from which parallel loops beat one serial kernel on the CPU (50 us to wake the threads)
 MATRIX_BLOCKS = {1: 6, 2: 45 + 6}  # 3x3 blocks per tet in the buffer of an assembly: node pairs, and what they come from
@@ -184,8 +186,8 @@ def _gather_table(nodes, groups: tuple[Group, ...], real: np.ndarray, n_nodes: i
 
 def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray]:
     """The node pairs that share a tet, and for each pair of each tet lanes times its place in an assembly plus its lane."""
-    lanes, flat = model.lanes, model.nodes.to_numpy().astype(np.int64)
-    real = model.volume.to_numpy().reshape(-1) > 0
+    (nodes, volume), lanes = download([model.nodes, model.volume]), model.lanes
+    flat, real = nodes.astype(np.int64), volume.reshape(-1) > 0
     ends, entries = [], []
     for g in model.groups:
         pairs, lane = np.array(PAIRS[g.order]), np.flatnonzero(real[g.first * lanes : g.last * lanes])
@@ -270,7 +272,7 @@ def _build_mass_matrix(scene: Scene, model: Model, arena: FieldArena, npr: type)
         value=arena.field("mass_value", model.real, len(graph.column)),
         diagonal=arena.field("mass_diagonal", model.real, model.n_nodes),
     )
-    upload_mass_matrix(scene, mass, npr)
+    upload_mass_matrix(scene, mass)
     return mass
 
 

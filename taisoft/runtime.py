@@ -13,7 +13,7 @@ import os
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,6 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 from taisoft.errors import SimulationError
 from taisoft.launching import Launch, places_of, prepare
-from taisoft.upload import upload
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
@@ -32,8 +31,7 @@ _open: list["Runtime"] = []  # simulators that hold the runtime now
 _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
 _clock = {"compile": 0.0}
 _known: list[dict] = []  # launches of each kernel
-MAX_TREES = 480  # of field memory that may be open at once, see FieldArena
-_trees = {"open": 0}
+trees = {"open": 0}  # of field memory, see `taisoft.fields`
 
 
 class Runtime:
@@ -107,7 +105,7 @@ def _initialise(arch: str, precision: str) -> None:
             arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
             fast_math=False, offline_cache=True, offline_cache_file_path=_cache_folder(), log_level=ti.ERROR, random_seed=0,
         )  # fmt: skip
-    _trees["open"] = 0
+    trees["open"] = 0
     for known in _known:  # they hold the Taichi that was
         known.clear()
     obtained = "cuda" if ti.cfg.arch == ti.cuda else "cpu"
@@ -129,77 +127,6 @@ ASTTransformerContext.get_pos_info = _position
 def open_kind() -> tuple[str, str] | None:
     """(arch, precision) in use by an open simulator, or None."""
     return _kind if _open else None
-
-
-class FieldArena:
-    """Fields of one simulator: counted by name, released together.
-
-    Taichi holds each separately placed part of memory, a tree, in a table of 512 rows whose end it does not watch. So fields
-    that are made together share a tree, see `group`, and no more than MAX_TREES are open at once.
-    """
-
-    def __init__(self) -> None:
-        self.bytes: dict[str, int] = {}
-        self._trees: list = []
-        self._group: tuple[ti.FieldsBuilder, list] | None = None
-
-    def field(self, name: str, dtype, shape: tuple[int, ...] | int, data: np.ndarray | None = None):
-        """A scalar field, filled from data when given (else zero)."""
-        return self._place(name, lambda: ti.field(dtype), dtype, 1, shape, data)
-
-    def vectors(self, name: str, dtype, shape: int, data: np.ndarray | None = None, n: int = 3):
-        """A field of n-vectors, filled from data (shape, n) when given (else zero)."""
-        return self._place(name, lambda: ti.Vector.field(n, dtype), dtype, n, shape, data)
-
-    @contextlib.contextmanager
-    def group(self) -> Iterator[None]:
-        """Fields made inside share a tree; they can be used, and hold their data, once the outermost group has ended."""
-        if self._group is not None:
-            yield
-            return
-        self._group = ti.FieldsBuilder(), []
-        try:
-            yield
-        finally:  # in any case: a field that is never placed stops every later kernel
-            (builder, fields), self._group = self._group, None
-            if fields:
-                self._finalize(builder, fields[0][2])
-        upload([(field, data) for field, data, _ in fields if data is not None])
-
-    def _place(self, name, make, dtype, components, shape, data):
-        if name in self.bytes:
-            raise ValueError(f"field '{name}' is allocated twice")
-        shape = (shape,) if isinstance(shape, int) else tuple(shape)
-        count = int(np.prod(shape, dtype=np.int64))
-        if count * components >= 2**31:
-            raise SimulationError(f"field '{name}' needs {count * components} entries, more than 2^31 - 1")
-        with self.group():
-            builder, fields = self._group
-            field = make()  # not before: a field that is never placed stops every later kernel
-            if shape == ():
-                builder.place(field)
-            else:
-                builder.dense((ti.i, ti.ij, ti.ijk, ti.ijkl)[len(shape) - 1], shape).place(field)
-            fields.append((field, None if data is None else np.ascontiguousarray(data), name))
-        size = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.u8: 1}[dtype]
-        self.bytes[name] = count * components * size
-        return field
-
-    def _finalize(self, builder: ti.FieldsBuilder, name: str) -> None:
-        if _trees["open"] >= MAX_TREES:
-            raise SimulationError(f"too many simulators are open for Taichi to hold field '{name}' and others: close one first")
-        try:
-            self._trees.append(builder.finalize())
-        except RuntimeError as error:
-            raise SimulationError(f"no memory for field '{name}' and those made with it: {error}") from None
-        _trees["open"] += 1
-
-    def release(self) -> None:
-        """Give the memory back to Taichi."""
-        while self._trees:
-            self._trees.pop().destroy()
-            _trees["open"] = max(0, _trees["open"] - 1)
-        self.bytes.clear()
 
 
 def kernel(function: Callable) -> Callable:
@@ -233,7 +160,9 @@ def kernel(function: Callable) -> Callable:
 
 def _trait(template):
     """What code depends on in a template: a number's value (Taichi takes True for 1), of anything else which one it is."""
-    return template if isinstance(template, (int, float, str, tuple)) else (None, id(template))
+    if isinstance(template, tuple):
+        return tuple([_trait(one) for one in template])
+    return template if isinstance(template, (int, float, str)) else (None, id(template))
 
 
 def compile_clock() -> float:

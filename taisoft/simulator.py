@@ -8,6 +8,7 @@ from taisoft.access import StateAccess
 from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import measure
 from taisoft.errors import SceneError
+from taisoft.fields import FieldArena
 from taisoft.model import build_model
 from taisoft.records import RunReport, StepReport
 from taisoft.running import run
@@ -21,7 +22,7 @@ from taisoft.stepping.motion import Motion
 from taisoft.stepping.world import World
 
 
-def _release(arena: runtime.FieldArena, claim: runtime.Runtime, owned: list) -> None:
+def _release(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:
     """Give memory and runtime back; also when a simulator is dropped without `close`."""
     while owned:
         owned.pop().release()
@@ -63,7 +64,7 @@ class Simulator(StateAccess):
         self.plan = make_plan(scene, self.settings.explicit, scheme is not None and scheme.before > 0.0, self_collision)
         self._runtime = runtime.open_runtime(arch, precision, f"the simulator of {[b.name for b in scene.bodies]}")
         self._compiled_before = runtime.compile_clock()
-        self._arena = runtime.FieldArena()
+        self._arena = FieldArena()
         try:
             model, layout = build_model(scene, self._runtime, self._arena, self.plan.on)
             self._world = World(scene, self._runtime, self._arena, model, layout, Motion(scene, layout))
@@ -157,8 +158,7 @@ class Simulator(StateAccess):
         world = self._open_world()
         world.motion.reset()
         world.upload_constraints()
-        world.model.x.from_numpy(world.layout.rest)
-        world.model.v.from_numpy(world.rest_velocities().astype(self._runtime.np_real))
+        world.set_state(world.layout.rest, world.rest_velocities())
         world.time, world.step_count, self._time_base = 0.0, 0, (0.0, 0)
         self._stepper.forget()
 

@@ -6,13 +6,15 @@ import numpy as np
 
 from taisoft.elasticity import measure
 from taisoft.errors import SceneError, SimulationError
+from taisoft.fields import FieldArena
 from taisoft.model import Layout, build_model
-from taisoft.runtime import FieldArena, Runtime, open_kind, open_runtime
+from taisoft.runtime import Runtime, open_kind, open_runtime
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
 from taisoft.stepping.motion import Motion
 from taisoft.stepping.newton import StageResult, StageSolver
 from taisoft.stepping.world import World
+from taisoft.transfer import upload
 
 MAX_NEWTON = 100
 SMALLEST_LOAD_STEP = 1.0 / 256.0
@@ -138,17 +140,14 @@ class StaticSolver:
 
     def _attempt(self, x: np.ndarray, share: float, tolerance: float, max_newton: int = MAX_NEWTON) -> StageResult:
         """Solve with a share of the load, from x."""
-        m, w, npr = self.world.model, self.solver.work, self.world.runtime.np_real
-        m.gravity.from_numpy((share * self.gravity).astype(npr)[None])
+        m, w = self.world.model, self.solver.work
+        start = [(m.gravity, share * self.gravity[None]), (w.x_hat, x), (m.x, x), (m.v, np.zeros_like(x))]
         if self.loads is not None:
-            m.loads.from_numpy((share * self.loads).astype(npr))
-        w.x_hat.from_numpy(x)
-        m.x.from_numpy(x)
-        m.v.fill(0.0)
+            start.append((m.loads, share * self.loads))
         if self.target is not None:
             rest = self.world.layout.rest[self.world.motion.moved]
-            w.targets.from_numpy(rest + share * (self.target - rest))
-            w.moved_axes.from_numpy(self.world.motion.moved_axes())
+            start += [(w.targets, rest + share * (self.target - rest)), (w.moved_axes, self.world.motion.moved_axes())]
+        upload(start)
         result = self.solver.solve(0.0, 1.0, tolerance, max_newton, by_energy=True)
         self.newton += result.newton_iterations
         self.linear += result.linear_iterations
@@ -158,12 +157,11 @@ class StaticSolver:
         world = self.world
         measure(world.model)
         s = world.model.scalars.to_numpy()
-        held = 1.0 - world.model.free.to_numpy().astype(np.float64)
         if not np.isfinite(result.residual):
             raise SimulationError(f"solve_static: {world.find_unfinite() or 'the residual is not finite'}")
         return StaticResult(
             converged=result.converged and load == 1.0, load=load, at_rounding=result.at_rounding,
             residual=result.residual, iterations=self.newton, linear_iterations=self.linear, load_steps=steps,
             elastic=float(s[0]), n_inverted=int(s[2]), _scene=world.scene, _layout=world.layout,
-            _positions=world.model.x.to_numpy(), _reactions=held * self.solver.work.residual.to_numpy(),
+            _positions=world.model.x.to_numpy(), _reactions=self.solver.held_residual(),
         )  # fmt: skip

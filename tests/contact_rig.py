@@ -4,7 +4,8 @@ import contact_oracle as oracle
 import numpy as np
 
 from taisoft.contact import problem
-from taisoft.runtime import FieldArena, open_runtime
+from taisoft.fields import FieldArena
+from taisoft.runtime import open_runtime
 
 CAPACITY, N_NODES, BLOCKS = 300, 40, 4096
 

@@ -10,7 +10,7 @@ from lanes import opened
 from taisoft.collision.boxes import update_boxes
 from taisoft.collision.candidates import Candidates
 from taisoft.collision.surface import build_surface, make_topology
-from taisoft.runtime import FieldArena
+from taisoft.fields import FieldArena
 
 
 @contextmanager

@@ -41,7 +41,8 @@ from benchmarks.contact_table import CONTACTS, PILE, STEP_SCENE, count_table, fi
 from taisoft.contact.graph import node_graph
 from taisoft.contact.solve import SOLVERS
 from taisoft.errors import OutputError
-from taisoft.runtime import FieldArena, open_runtime
+from taisoft.fields import FieldArena
+from taisoft.runtime import open_runtime
 
 SCENE = "cube_on_box"
 

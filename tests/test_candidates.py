@@ -15,7 +15,7 @@ from test_bvh import colliders, scatter
 from taisoft.collision.candidates import NEEDED, SLACK, TOTAL, Buffer, PairRows, entries, pairs
 from taisoft.collision.surface import ACTIVE
 from taisoft.errors import SimulationError
-from taisoft.runtime import FieldArena
+from taisoft.fields import FieldArena
 
 
 @pytest.fixture(scope="module", params=[("f64", True), ("f32", False)], ids=str)

@@ -23,7 +23,8 @@ from taisoft.collision import surface
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.errors import SceneError, SimulationError
-from taisoft.runtime import FieldArena, kernel
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel
 
 ROOT = Path(__file__).resolve().parents[1]
 

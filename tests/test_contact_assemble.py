@@ -14,7 +14,8 @@ from rotations import rotation
 import taisoft as ts
 from taisoft.contact.assemble import _warm_impulse, build_found, keep_impulses, short_of_goal
 from taisoft.contact.problem import build_node_problem, fill_field
-from taisoft.runtime import FieldArena, kernel, open_runtime
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel, open_runtime
 
 DT = 1e-3  # [s]
 SPIN = np.array([0.3, 2.0, -0.4])  # [rad/s]

@@ -16,7 +16,8 @@ import scipy.sparse as sp
 
 from taisoft.contact import colouring, problem
 from taisoft.contact.graph import colour_greedy, colour_random, groups, matrix_graph, node_graph
-from taisoft.runtime import FieldArena, open_runtime
+from taisoft.fields import FieldArena
+from taisoft.runtime import open_runtime
 
 N_NODES, CAPACITY = 120, 700
 

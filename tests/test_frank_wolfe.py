@@ -18,7 +18,8 @@ from lanes import opened
 from taisoft.collision import shapes
 from taisoft.collision.frank_wolfe import deepest_point
 from taisoft.collision.surface import dvec
-from taisoft.runtime import FieldArena, kernel
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel
 
 array = ti.types.ndarray(dtype=ti.f64)
 NAMES = ("plane", "sphere", "box", "capsule", "torus")  # of the reference; the first four by their numbers as obstacles

@@ -13,7 +13,8 @@ import taichi as ti
 from lanes import opened
 
 from taisoft import launching, runtime
-from taisoft.runtime import FieldArena, kernel
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel
 
 
 @pytest.fixture

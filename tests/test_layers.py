@@ -20,8 +20,10 @@ FILES = sorted(path for path in PACKAGE.rglob("*.py"))
 # Modules under taisoft/, left to right; those of one group may import one another unless FOREIGN says otherwise.
 ORDER = (
     ("errors", "records"),
-    ("launching", "upload"),
+    ("launching",),
     ("runtime",),
+    ("transfer",),
+    ("fields",),
     ("mesh", "scene"),
     ("math3",),
     ("materials", "elements", "node_graph"),

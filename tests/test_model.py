@@ -14,9 +14,9 @@ from scenes import COR, SNH, SVK, built, driven_scene, mixed_scene
 
 import taisoft as ts
 from taisoft import elasticity
+from taisoft.fields import FieldArena
 from taisoft.mass import lumped_masses, mass_matrix, weight_masses
 from taisoft.model import body_loads, build_model, changed_material
-from taisoft.runtime import FieldArena
 from taisoft.scene.plan import make_plan
 
 

@@ -15,7 +15,8 @@ from taisoft.collision.boxes import list_near
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.near import EDGES, WHOLE, list_triangles, query_box
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.runtime import FieldArena, kernel
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel
 
 ROOM = 300
 

@@ -13,7 +13,7 @@ from lanes import opened
 
 from taisoft.collision.contacts import contact_fields
 from taisoft.collision.reduction import FOUND, LEFT, SAME_NORMAL, UNDECIDED, reduce_contacts, reduction_fields
-from taisoft.runtime import FieldArena
+from taisoft.fields import FieldArena
 
 CAPACITY = 2**13
 LIMIT = np.arccos(SAME_NORMAL)  # [rad]

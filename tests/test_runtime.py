@@ -3,7 +3,6 @@
 * it holds one arch and precision at a time; a second kind is refused while one is open, by the name of who holds it;
 * after the last one closed any kind may follow, and the same kind is not initialised again;
 * a machine without CUDA refuses it with a sentence and goes on with the CPU;
-* fields are counted in bytes, named once, released together, and too large ones refused before they are made;
 * kernels are counted by name, and their first launch is compile time; a faulty one is told with its file and line.
 """
 
@@ -14,7 +13,8 @@ from lanes import opened
 
 from taisoft import runtime
 from taisoft.errors import SimulationError
-from taisoft.runtime import FieldArena, kernel, open_runtime
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel, open_runtime
 
 
 @kernel
@@ -75,48 +75,6 @@ def test_cuda_where_there_is_none(capfd):
 def test_unknown_names(kind, words):
     with pytest.raises(SimulationError, match=words):
         open_runtime(*kind)
-
-
-def test_fields():
-    with opened("f64"):
-        arena = FieldArena()
-        x = arena.field("x", ti.f64, (3, 2), np.arange(6.0).reshape(3, 2))
-        v = arena.vectors("v", ti.f32, 5)
-        arena.field("count", ti.i32, ())
-        assert arena.bytes == {"x": 48, "v": 60, "count": 4}
-        assert np.array_equal(x.to_numpy(), np.arange(6.0).reshape(3, 2)) and not v.to_numpy().any()
-        with pytest.raises(ValueError, match="'x' is allocated twice"):
-            arena.field("x", ti.f64, 1)
-        with pytest.raises(SimulationError, match=r"field 'huge' needs 3000000000 entries, more than 2\^31 - 1"):
-            arena.vectors("huge", ti.f32, 10**9)
-        assert set(arena.bytes) == {"x", "v", "count"}
-        arena.release()
-        assert not arena.bytes
-        arena.field("x", ti.f64, 2)  # the name is free again
-        arena.release()
-
-
-@pytest.mark.parametrize("precision", ["f32", "f64"])
-def test_data_of_many_fields(precision):
-    rng = np.random.default_rng(0)
-    with opened(precision) as machine:
-        arena, wanted = FieldArena(), {}
-        with arena.group():
-            for name, dtype, shape in (
-                ("a", ti.f64, (7,)), ("b", ti.i32, (4, 3)), ("c", machine.real, (5, 2)), ("d", ti.f64, (2, 3, 4)),
-                ("e", ti.i32, (1,)),
-            ):  # fmt: skip
-                data = rng.integers(-(2**31), 2**31, shape) if dtype == ti.i32 else rng.standard_normal(shape)
-                data = data.astype({ti.i32: np.int32, ti.f32: np.float32, ti.f64: np.float64}[dtype])
-                wanted[name] = arena.field(name, dtype, shape, data), data
-            for n in (2, 3, 12):
-                data = rng.standard_normal((6, n)).astype(machine.np_real)
-                wanted[f"v{n}"] = arena.vectors(f"v{n}", machine.real, 6, data, n=n), data
-            zero = arena.field("zero", ti.f64, 3)
-        for name, (field, data) in wanted.items():
-            assert np.array_equal(field.to_numpy(), data), name
-        assert not zero.to_numpy().any()
-        arena.release()
 
 
 def test_launches_and_compile_time_are_counted():

@@ -16,7 +16,7 @@ from taisoft.collision.self_collision import Intersections
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.triangles import TOUCHING
 from taisoft.errors import SimulationError
-from taisoft.runtime import FieldArena
+from taisoft.fields import FieldArena
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from test_bvh import EMPTY, colliders, scatter
 
 from taisoft.collision.spatial_hash import COUNTABLE, MOST_CELLS, N_LARGE, SpatialHash, grid_size
 from taisoft.errors import SimulationError
-from taisoft.runtime import FieldArena
+from taisoft.fields import FieldArena
 
 EXTENTS = {"usual": np.ones(3), "one cell": np.zeros(3)}  # [m]
 

@@ -22,7 +22,8 @@ import taichi as ti
 from taisoft.collision.candidates import Buffer, Candidates, PairRows, pairs, sum_parts
 from taisoft.collision.surface import Surface, Topology, dvec, may_touch
 from taisoft.collision.trees import TreeTables, build_trees
-from taisoft.runtime import FieldArena, Runtime, kernel
+from taisoft.fields import FieldArena
+from taisoft.runtime import Runtime, kernel
 
 LEAVES = {"cpu": 64, "cuda": 8}  # triangles of a chunk: on the CPU the fastest of 4 to 256, on CUDA for enough threads
 PAIRS_PER_TRIANGLE = 24  # at first

@@ -14,7 +14,8 @@ import taichi as ti
 
 from taisoft.collision.surface import Surface
 from taisoft.errors import SimulationError
-from taisoft.runtime import FieldArena, kernel
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel
 
 SLACK = 1.5  # a buffer grows to this times what was needed
 NEEDED, TOTAL = 0, 1  # places in a buffer's count

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.runtime import FieldArena, kernel
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel
 
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + its number there); vertex and collider;
 # triangle and collider

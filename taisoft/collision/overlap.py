@@ -15,6 +15,7 @@ from taisoft.errors import MeshError
 from taisoft.mesh.signed_distance import signed_distances_at
 from taisoft.runtime import kernel
 from taisoft.scene.obstacles import HalfSpace, Shape
+from taisoft.transfer import download
 
 ALLOWED = 1e-6  # of the smaller body's size: deeper is an overlap
 
@@ -64,7 +65,7 @@ def find_overlap(detection: Detection) -> Overlap | None:
     if detection.shapes.count:
         phi = np.full((len(colliders), detection.shapes.count), np.inf)
         _deepest_vertices(detection.surface, detection.shapes, phi)
-        owner, origin = detection.shapes.body.to_numpy(), detection.shapes.origin.to_numpy()
+        owner, origin = download([detection.shapes.body, detection.shapes.origin])
         for a, k in np.ndindex(n_bodies, len(owner)):
             b = int(owner[k])
             tell(a, b, max(-phi[a, k], _depth_of_middle(detection, parts[a], a, colliders[b].shape, origin[k : k + 1])))

@@ -22,13 +22,15 @@ from taisoft.collision.self_collision import Intersections
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, PAIRS, UNFINITE, Surface, build_surface
 from taisoft.errors import SceneError, SimulationError
+from taisoft.fields import FieldArena
 from taisoft.mesh.quality import mean_surface_edge
 from taisoft.mesh.sdf_grid import SdfGrid
 from taisoft.model import Layout, Model
-from taisoft.runtime import FieldArena, Runtime
+from taisoft.runtime import Runtime
 from taisoft.scene.obstacles import MeshObstacle
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
+from taisoft.transfer import download, upload
 
 MARGIN = 0.1  # of the mean surface edge: distance within which contacts are found, where the scene names none
 DEPTH = 0.1  # of the mean surface edge: flat faces that have passed each other by less are still found
@@ -227,13 +229,11 @@ class Detection:
                 now, then = o.points_at(time, self._rest[vertices]), o.points_at(time + dt, self._rest[vertices])
                 move_obstacles(self.surface, vertices.start, now, then - now)
         if self._analytic and (first or any(o.path is not None for _, o in self._analytic)):
-            for fields, t in (
-                ((self.shapes.origin, self.shapes.rotation), time),
-                ((self.shapes.next_origin, self.shapes.next_rotation), time + dt),
-            ):
-                frames = [obstacle_frame(o, t) for _, o in self._analytic]
-                fields[0].from_numpy(np.array([x for x, _ in frames]))
-                fields[1].from_numpy(np.concatenate([r for _, r in frames]))
+            s, now, then = self.shapes, *([obstacle_frame(o, t) for _, o in self._analytic] for t in (time, time + dt))
+            upload([
+                (s.origin, np.array([x for x, _ in now])), (s.rotation, np.concatenate([r for _, r in now])),
+                (s.next_origin, np.array([x for x, _ in then])), (s.next_rotation, np.concatenate([r for _, r in then])),
+            ])  # fmt: skip
         self._placed = True
 
     def _lead(self, nodes: np.ndarray, moves: np.ndarray):
@@ -244,7 +244,7 @@ class Detection:
         return self._led
 
     def _unfinite(self) -> str:
-        x, move = self.surface.x.to_numpy(), self.surface.move.to_numpy()
+        x, move = download([self.surface.x, self.surface.move])
         bad = int(np.argmin((np.isfinite(x) & np.isfinite(x + move)).all(axis=1)))
         k = int(np.searchsorted(self.topology.vertex_first, bad, side="right")) - 1
         node = self.topology.node[bad] - self.layout.node_start[k] if k < len(self.scene.bodies) else bad

@@ -14,7 +14,8 @@ import taichi as ti
 
 from taisoft.collision.contacts import ContactFields
 from taisoft.collision.surface import ivec
-from taisoft.runtime import FieldArena, kernel
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel
 
 SAME_NORMAL = 0.996  # cosine of 5 degrees
 UNKNOWN, KEPT, DROPPED = 0, 1, 2

@@ -23,8 +23,9 @@ from taisoft.collision.frank_wolfe import deepest_point
 from taisoft.collision.near import WHOLE, list_triangles, query_box
 from taisoft.collision.surface import ACTIVE, dvec, ivec, part_first
 from taisoft.collision.triangles import choose, closest_on_triangle
+from taisoft.fields import FieldArena
 from taisoft.mesh.sdf_grid import SdfGrid
-from taisoft.runtime import FieldArena, kernel
+from taisoft.runtime import kernel
 from taisoft.scene.body import Body
 
 FLATTEST = 1e-3  # det F below which a tet maps nothing

@@ -11,7 +11,9 @@ from taisoft.collision.candidates import Buffer, Candidates, pairs, sum_parts
 from taisoft.collision.features import corner
 from taisoft.collision.surface import Surface, part_first
 from taisoft.collision.triangles import triangles_intersect
-from taisoft.runtime import FieldArena, kernel
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel
+from taisoft.transfer import download
 
 
 @ti.func
@@ -65,7 +67,7 @@ class Intersections:
             find_intersections(self.surface, c.start, c.end, c.entry, found.data, found.used, found.count, found.part)
             if not found.grow_if_full():
                 break
-        data, used = found.data.to_numpy(), found.used.to_numpy()
+        data, used = download([found.data, found.used])
         places = np.arange(found.capacity)
         return data[: found.capacity][places % found.part < np.repeat(used, found.part)]
 

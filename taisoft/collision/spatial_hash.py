@@ -16,7 +16,8 @@ import taichi as ti
 
 from taisoft.collision.candidates import Buffer, Candidates, entries, sort_row, sum_parts
 from taisoft.collision.surface import ACTIVE, Surface, boxes_overlap, ivec, may_touch, part_first
-from taisoft.runtime import FieldArena, kernel
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel
 
 LARGE = 512  # cells
 COUNTABLE = 2.0**50  # cells from the origin: beyond, neighbouring cells have the same number in f64

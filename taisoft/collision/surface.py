@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.runtime import FieldArena, Runtime
+from taisoft.fields import FieldArena
+from taisoft.runtime import Runtime
 
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than waking the others (about 50 us a loop)
 # Taichi gives each CPU thread at least 512 turns of a loop: so many turns belong to one part, and one of them does the work

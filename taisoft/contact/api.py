@@ -15,7 +15,8 @@ from taisoft.contact.graph import colour_greedy, matrix_graph
 from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_field, fill_matrix_problem
 from taisoft.contact.solve import SOLVERS, solve
 from taisoft.errors import SceneError
-from taisoft.runtime import FieldArena, open_kind, open_runtime
+from taisoft.fields import FieldArena
+from taisoft.runtime import open_kind, open_runtime
 from taisoft.scene.checks import array, choice, number
 
 METHODS = (*SOLVERS, "augmented_lagrangian", "auto")

@@ -17,8 +17,10 @@ import taichi as ti
 
 from taisoft.contact.problem import ContactProblem, to_frame, to_world
 from taisoft.contact.prox import dvec, prox, tangents
-from taisoft.runtime import FieldArena, kernel
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel
 from taisoft.scene.scene import Scene
+from taisoft.transfer import upload
 
 NEGLIGIBLE = 1e-12  # a weight below it: the node is not part of the contact
 
@@ -88,10 +90,7 @@ def build_pair_numbers(arena: FieldArena, scene: Scene) -> PairNumbers:
 
 def upload_pair_numbers(numbers: PairNumbers, scene: Scene) -> bool:
     """Friction and restitution as the scene has them now; False where there are more pairs than room."""
-    place = {c.name: k for k, c in enumerate(scene.colliders)}
-    own = [scene.surface_of(c.name) for c in scene.colliders]
-    numbers.friction.from_numpy(np.array([o.friction for o in own]))
-    numbers.restitution.from_numpy(np.array([o.restitution for o in own]))
+    place, own = {c.name: k for k, c in enumerate(scene.colliders)}, [scene.surface_of(c.name) for c in scene.colliders]
     capacity = numbers.pair_friction.shape[0]
     if len(scene.contact_pairs) > capacity:
         return False
@@ -100,10 +99,11 @@ def upload_pair_numbers(numbers: PairNumbers, scene: Scene) -> bool:
         ids = sorted(place[name] for name in names)
         pairs[k] = ids[0], ids[-1]
         values[k] = -1.0 if friction is None else friction, -1.0 if restitution is None else restitution
-    numbers.pair.from_numpy(pairs)
-    numbers.pair_friction.from_numpy(np.ascontiguousarray(values[:, 0]))
-    numbers.pair_restitution.from_numpy(np.ascontiguousarray(values[:, 1]))
-    numbers.n_pairs[0] = len(scene.contact_pairs)
+    upload([
+        (numbers.friction, np.array([o.friction for o in own])), (numbers.restitution, np.array([o.restitution for o in own])),
+        (numbers.n_pairs, np.array([len(scene.contact_pairs)])), (numbers.pair, pairs),
+        (numbers.pair_friction, values[:, 0]), (numbers.pair_restitution, values[:, 1]),
+    ])  # fmt: skip
     return True
 
 

@@ -18,7 +18,8 @@ import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.contact.prox import dvec, prox, scaled
-from taisoft.runtime import FieldArena, kernel
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel
 
 NODES = 6  # of a contact at most, three on each side
 CHANGED, SIZE, RESIDUAL, GOOD, STEP, SWEEPS, LOOKS, AGE, MOMENTUM, VERDICT = range(10)  # places in `state`

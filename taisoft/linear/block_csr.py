@@ -14,9 +14,11 @@ import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.errors import SimulationError
+from taisoft.fields import FieldArena
 from taisoft.linear.element_blocks import element_blocks, pair_terms
 from taisoft.model import MATRIX_BLOCKS, Model, model_graph
-from taisoft.runtime import FieldArena, kernel
+from taisoft.runtime import kernel
+from taisoft.transfer import download
 
 # A block is a 12-vector, column by column with a zero below each, entry (r, c) in place 4 c + r: one address serves for all,
 # and a column times a number is one SIMD instruction.
@@ -205,8 +207,8 @@ def unpacked(kept: np.ndarray) -> np.ndarray:
 
 def to_scipy(m: Model, A: BlockCsr) -> sp.csr_matrix:
     """A copy on the host, (3 n_nodes, 3 n_nodes) float64."""
-    start, column = A.row_start.to_numpy().astype(np.int64), A.column.to_numpy()
-    off, diagonal = unpacked(A.value.to_numpy()), unpacked(A.diagonal.to_numpy())
+    start, column, value, diagonal = download([A.row_start, A.column, A.value, A.diagonal])
+    start, off, diagonal = start.astype(np.int64), unpacked(value), unpacked(diagonal)
     shape = (3 * m.n_nodes, 3 * m.n_nodes)
     own = np.arange(m.n_nodes)
     return (

@@ -13,10 +13,10 @@ from typing import Any
 
 import taichi as ti
 
+from taisoft.fields import FieldArena
 from taisoft.linear.block_csr import BLOCK, BlockCsr
 from taisoft.linear.coupling import NO_COUPLING, Coupling
 from taisoft.model import Model
-from taisoft.runtime import FieldArena
 
 SERIAL_WORK = 40_000_000  # block products per launch: about 0.2 s, so that Ctrl-C is heard
 PARALLEL_BATCH = 8  # iterations between two looks at the residual

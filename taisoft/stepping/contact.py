@@ -20,10 +20,11 @@ from taisoft.contact.assemble import (
 )  # fmt: skip
 from taisoft.contact.problem import NODES, build_node_problem, index_nodes
 from taisoft.errors import SimulationError
+from taisoft.fields import FieldArena
 from taisoft.mesh.quality import mean_surface_edge
-from taisoft.runtime import FieldArena
 from taisoft.stepping.tunnelling import DEPTH, HASTE, SPEED, WHICH, collider_thickness, find_way, survey
 from taisoft.stepping.world import World
+from taisoft.transfer import download
 
 # Both of the finest body's mean surface edge:
 STANDOFF = 2e-3  # gap that contacts keep, so that surfaces do not cross where motion is curved
@@ -229,26 +230,11 @@ class ContactStep:
         """The contacts of the last step with their impulses."""
         f, p = self.found, self.problem
         n = p.count[0]
-        normal, tangent, r = (field.to_numpy()[:n] for field in (p.normal, p.tangent, p.r))
+        normal, tangent, r, point, gap, body, feature, node, weight, arity = download(
+            [p.normal, p.tangent, p.r, f.point, f.gap, f.body, f.feature, p.node, p.weight, p.arity], n
+        )
         impulse = (r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)) / self._share
-        nodes, weights = self._sides(n)
-        return self.detection.record(
-            f.point.to_numpy()[:n], normal, f.gap.to_numpy()[:n], impulse, f.body.to_numpy()[:n], f.feature.to_numpy()[:n],
-            nodes, weights,
-        )  # fmt: skip
-
-    def _sides(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and weights (n,6) of the problem, three of each side."""
-        p = self.problem
-        node, weight = p.node.to_numpy()[:n], p.weight.to_numpy()[:n]
-        used = np.arange(NODES) < p.arity.to_numpy()[:n, None]
-        side_b = used & (weight < 0.0)
-        n_a = (used & ~side_b).sum(axis=1)  # side a comes first
-        row, column = np.nonzero(used)
-        place = np.where(side_b[row, column], NODES // 2 + column - n_a[row], column)
-        nodes, weights = np.full((n, NODES), -1), np.zeros((n, NODES))
-        nodes[row, place], weights[row, place] = node[row, column], np.abs(weight[row, column])
-        return nodes, weights
+        return self.detection.record(point, normal, gap, impulse, body, feature, *_sides(node, weight, arity))
 
     @property
     def field_bytes(self) -> dict[str, int]:
@@ -261,3 +247,14 @@ class ContactStep:
         for arena in (self._arena, self._numbers_arena, self._own_arena):
             arena.release()
 
+
+def _sides(node: np.ndarray, weight: np.ndarray, arity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights (n,6) of a problem's contacts, three of each side, as the record has them."""
+    n, used = len(node), np.arange(NODES) < arity[:, None]
+    side_b = used & (weight < 0.0)
+    n_a = (used & ~side_b).sum(axis=1)  # side a comes first
+    row, column = np.nonzero(used)
+    place = np.where(side_b[row, column], NODES // 2 + column - n_a[row], column)
+    nodes, weights = np.full((n, NODES), -1), np.zeros((n, NODES))
+    nodes[row, place], weights[row, place] = node[row, column], np.abs(weight[row, column])
+    return nodes, weights

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from taisoft.contact.problem import RESIDUAL, find_factors
+from taisoft.fields import FieldArena
 from taisoft.model import Model
-from taisoft.runtime import FieldArena
 from taisoft.stepping.contact import ContactStep
 from taisoft.stepping.contact_stage import (
     SHARE,

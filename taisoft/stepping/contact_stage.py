@@ -16,11 +16,12 @@ from taisoft.contact.assemble import FoundContacts, short_of_goal
 from taisoft.contact.problem import CHANGED, NODES, RESIDUAL, SIZE, residual_of
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
 from taisoft.elasticity import element_force
+from taisoft.fields import FieldArena
 from taisoft.linear.block_csr import BLOCK, block_times, part_times
 from taisoft.linear.coupling import Coupling, build_coupling
 from taisoft.linear.pcg import dot64, total
 from taisoft.model import Model
-from taisoft.runtime import FieldArena, kernel
+from taisoft.runtime import kernel
 from taisoft.stepping.stage import place_node, residual_parts, set_change, squares
 
 STAY, STILL, STEP, SHARE = range(4)  # what `evaluate` does before it looks

@@ -15,6 +15,7 @@ from taisoft.stepping.contact import TOLERANCE, ContactStep
 from taisoft.stepping.explicit_contact import find_acceleration, finish_verlet, keep_state, move, predict, set_free_velocities
 from taisoft.stepping.substeps import ExplicitStepper, SubstepResult
 from taisoft.stepping.world import World
+from taisoft.transfer import download
 
 MAX_SWEEPS = 1000  # of a contact solve; one that needs more is reported as not converged
 LAUNCHES = 200  # sub-steps between two looks at whether the run is to stop
@@ -90,7 +91,7 @@ class ContactExplicitStepper(ExplicitStepper):
 
     def _restore(self) -> None:
         world = self.world
-        self._put_back(self._good.x.to_numpy(), self._good.v.to_numpy())
+        self._put_back(*download([self._good.x, self._good.v]))
         if world.motion.released() != self._released:
             world.motion.set_released(self._released)
             world.upload_constraints()

@@ -15,6 +15,7 @@ from taisoft.stepping.contact import TOLERANCE, ContactStep
 from taisoft.stepping.contact_newton import ContactResult, ContactStageSolver, count_all, merge
 from taisoft.stepping.newton import StageResult, StageSolver
 from taisoft.stepping.world import World
+from taisoft.transfer import upload
 
 MAX_NEWTON = 50  # a step that needs more is reported as not converged
 MAX_CONTACT_NEWTON = 400  # with contacts, over all multipliers
@@ -131,13 +132,13 @@ class ImplicitStepper:
         return self._with_contacts(dt)
 
     def _with_contacts(self, dt: float) -> ContactResult:
-        contact, m, start = self.contact, self.world.model, self.world.time
+        contact, start = self.contact, self.world.time
         depth, haste = contact.look(start, dt)
         parts = max(1, math.ceil(haste - 1e-9))
         if parts > MAX_PARTS:
             raise SimulationError(f"step {self.world.step_count + 1}: {contact.too_fast(start, dt)}")
         allowed = max(contact.sunk, 1.1 * depth)  # what is deep already needs no shorter steps
-        kept, given_up = (m.x.to_numpy(), m.v.to_numpy(), self.world.motion.released()), []
+        kept, given_up = (*self.world.state(), self.world.motion.released()), []
         while True:
             try:
                 result = self._in_parts(start, dt, parts)
@@ -176,8 +177,7 @@ class ImplicitStepper:
 
     def _put_back(self, x: np.ndarray, v: np.ndarray, released: list[bool]) -> None:
         world = self.world
-        world.model.x.from_numpy(x)
-        world.model.v.from_numpy(v)
+        world.set_state(x, v)
         if world.motion.released() != released:
             world.motion.set_released(released)
             world.upload_constraints()
@@ -189,11 +189,10 @@ class ImplicitStepper:
         for _ in range(SEARCHES):
             if self.contact is None or not self.contact.went_astray(h.x_now):
                 break
-            x, v, past = m.x.to_numpy(), m.v.to_numpy(), self._past
+            state, past = self.world.state(), self._past
             restore(m, h)
             if not self.contact.search_way(time, dt):
-                m.x.from_numpy(x)
-                m.v.from_numpy(v)
+                self.world.set_state(*state)
                 break
             self._past = 0
             result = merge([result, self._try_part(time, dt)])
@@ -217,12 +216,12 @@ class ImplicitStepper:
         self._dt = dt
         scheme = self.scheme if self._past > 0 or self.scheme.start is None else self.scheme.start
         if target is not None:
-            w.moved_axes.from_numpy(world.motion.moved_axes())
             if scheme.midpoint:
                 target = 0.5 * (target + m.x.to_numpy()[world.motion.moved])
-            w.targets.from_numpy(target)
+            led = [(w.moved_axes, world.motion.moved_axes()), (w.targets, target)]
             if m.consistent:
-                w.led_acceleration.from_numpy(world.motion.accelerations(time, dt, self.scheme.before == 0.0))
+                led.append((w.led_acceleration, world.motion.accelerations(time, dt, self.scheme.before == 0.0)))
+            upload(led)
         self._beta = scheme.share * dt
         if self.contact is not None:
             self.contact.acts(scheme.share)
@@ -264,9 +263,7 @@ class ImplicitStepper:
         """(n_nodes, 3) force of the constraints in the last step [N]."""
         if self._beta == 0.0:
             return np.zeros((self.world.model.n_nodes, 3))
-        m = self.world.model
-        held = 1.0 - m.free.to_numpy().astype(np.float64)
-        return held * self.solver.work.residual.to_numpy() / self._beta
+        return self.solver.held_residual() / self._beta
 
     @property
     def field_bytes(self) -> dict[str, int]:

@@ -20,12 +20,13 @@ import numpy as np
 import taichi as ti
 
 from taisoft.elasticity import measure
+from taisoft.fields import FieldArena
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.coupling import NO_COUPLING
 from taisoft.model import Model
-from taisoft.runtime import FieldArena
 from taisoft.stepping.stage import StageWork, begin_stage, form_residual, stage_terms, start_step, try_step
+from taisoft.transfer import download
 
 MAX_BACKTRACKS = 30  # halvings: below 1e-9 of a step nothing but rounding is left
 SLOW = 0.2  # a step that leaves more of |r| than this asks for a new matrix
@@ -96,19 +97,24 @@ class StageSolver:
     def update_material(self) -> None:
         """Recompute the rounding floor: the nodal forces of a strain as large as its rounding, the momenta of that of x."""
         m = self.model
-        volume, Dm_inv = m.volume.to_numpy().astype(np.float64), m.Dm_inv.to_numpy().astype(np.float64)
-        stiff = np.abs(m.law_constants.to_numpy()[:, :2]).sum(axis=1)[m.block_body.to_numpy()]
+        volume, Dm_inv, constants, body, x, mass = download([m.volume, m.Dm_inv, m.law_constants, m.block_body, m.x, m.mass])
+        volume, Dm_inv, mass = (a.astype(np.float64) for a in (volume, Dm_inv, mass))
+        stiff = np.abs(constants[:, :2]).sum(axis=1)[body]
         g = np.sqrt((Dm_inv**2).sum(axis=1))
         if m.points is not None:  # the gradients of quadratic shape functions are larger
             steepest = float(np.abs(m.points.to_numpy()[:, 1:]).max())
             for group in m.groups:
                 g[group.first : group.last] *= steepest if group.order == 2 else 1.0
-        largest = float(np.abs(m.x.to_numpy()).max())
+        largest = float(np.abs(x).max())
         strain = self.eps + np.finfo(np.float64).eps * largest * g  # of F, and of the f64 positions it is formed from
         self.rounding_force = float(np.sqrt(((stiff[:, None] * volume * g * strain) ** 2).sum()))
         # and of v = (x - x_hat) / beta: |M| times the rounding of x, to be divided by beta
-        mass = m.mass.to_numpy().astype(np.float64)
         self.rounding_mass = float(np.linalg.norm(mass) * 4.0 * np.finfo(np.float64).eps * largest)
+
+    def held_residual(self) -> np.ndarray:
+        """(n_nodes, 3) residual on the constrained axes, 0 on free ones."""
+        free, residual = download([self.model.free, self.work.residual])
+        return (1.0 - free.astype(np.float64)) * residual
 
     def assemble_damper(self) -> None:
         """K_d = projected K at the present x, for the step that begins."""
@@ -202,9 +208,10 @@ class StageSolver:
     def _linear_residual(self) -> float:
         """|rhs - A y| / |rhs| as it really is: in f32 CG's own residual can fall while the true one stays."""
         block_csr.multiply(self.model, self.matrix, self.pcg.y, self.pcg.q)
-        rhs, free = self.pcg.rhs.to_numpy().astype(np.float64), self.model.free.to_numpy()
+        rhs, free, q = download([self.pcg.rhs, self.model.free, self.pcg.q])
+        rhs = rhs.astype(np.float64)
         size = float(np.linalg.norm(rhs))
-        return float(np.linalg.norm(rhs - free * self.pcg.q.to_numpy())) / size if size > 0.0 else 0.0
+        return float(np.linalg.norm(rhs - free * q)) / size if size > 0.0 else 0.0
 
     def _advance(self, c: float, beta: float, r: float, scale: float, blind: bool, by_energy: bool, floor: float):
         """Take the step in pcg.y as far as it helps; returns (|r|, scale, moved)."""

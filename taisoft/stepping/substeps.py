@@ -96,17 +96,17 @@ class ExplicitStepper:
             self.stale = self.stale or world.releases != releases
             n = len(targets)
             self._upload_targets(targets)
-        x, v = world.model.x.to_numpy(), world.model.v.to_numpy()
+        kept = world.state()
         try:
             result = self._launch(n, dt)
         except BaseException:  # Ctrl-C, heard when the launch has ended: the batch is abandoned
-            self._put_back(x, v)
+            self._put_back(*kept)
             raise
         if result.done < n:
-            self._put_back(x, v)
+            self._put_back(*kept)
             if result.done > 0:  # deterministic on the CPU: the same sub-steps again, up to the last good one
                 self._launch(result.done, dt)
-            good = world.model.x.to_numpy(), world.model.v.to_numpy()
+            good = world.state()
             self._put_back(*good)
             self._launch(1, dt)
             where = world.find_unfinite() or "a velocity is no longer finite"
@@ -121,8 +121,7 @@ class ExplicitStepper:
         self.work.moved_axes.from_numpy(self.world.motion.moved_axes())
 
     def _put_back(self, x: np.ndarray, v: np.ndarray) -> None:
-        self.world.model.x.from_numpy(x)
-        self.world.model.v.from_numpy(v)
+        self.world.set_state(x, v)
         self.stale = True
 
     def _launch(self, n: int, dt: float) -> SubstepResult:

@@ -4,11 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.fields import FieldArena
 from taisoft.mass import lumped_masses, upload_mass_matrix, weight_masses
 from taisoft.model import Layout, Model, damping_table, material_table
-from taisoft.runtime import FieldArena, Runtime
+from taisoft.runtime import Runtime
 from taisoft.scene.scene import Scene
 from taisoft.stepping.motion import Motion
+from taisoft.transfer import download, upload
 
 
 @dataclass
@@ -25,6 +27,15 @@ class World:
     step_count: int = 0
     releases: int = 0  # times that led nodes were let go: what steppers know of the past then no longer holds
 
+    def state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities of all nodes, as they are held."""
+        x, v = download([self.model.x, self.model.v])
+        return x, v
+
+    def set_state(self, x: np.ndarray, v: np.ndarray) -> None:
+        """Positions [m] and velocities [m/s] of all nodes (n_nodes, 3)."""
+        upload([(self.model.x, x), (self.model.v, v)])
+
     def upload_constraints(self) -> None:
         """Free axes to the device."""
         held = self.motion.constrained()
@@ -32,17 +43,17 @@ class World:
 
     def upload_material(self, density: bool) -> None:
         """Material numbers of the bodies to the device, and masses if a density changed."""
-        m, npr = self.model, self.runtime.np_real
-        m.law_constants.from_numpy(material_table([b.material for b in self.scene.bodies]))
+        m = self.model
+        numbers = [(m.law_constants, material_table([b.material for b in self.scene.bodies]))]
         if m.damping is not None:
-            m.damping.from_numpy(damping_table(self.scene).astype(npr))
-        if not density:
-            return
-        m.mass.from_numpy(lumped_masses(self.scene).astype(npr))
-        if m.weight is not m.mass:
-            m.weight.from_numpy(weight_masses(self.scene).astype(npr))
-        if m.consistent:
-            upload_mass_matrix(self.scene, m.mass_matrix, npr)
+            numbers.append((m.damping, damping_table(self.scene)))
+        if density:
+            numbers.append((m.mass, lumped_masses(self.scene)))
+            if m.weight is not m.mass:
+                numbers.append((m.weight, weight_masses(self.scene)))
+        upload(numbers)
+        if density and m.consistent:
+            upload_mass_matrix(self.scene, m.mass_matrix)
 
     def rest_velocities(self) -> np.ndarray:
         """Initial velocities with 0 on constrained axes (n_nodes, 3)."""
@@ -70,7 +81,7 @@ class World:
 
     def find_unfinite(self, force: np.ndarray | None = None) -> str | None:
         """Names the first node whose position, velocity or force (n_nodes, 3) is not finite, in a few words."""
-        x, v = self.model.x.to_numpy(), self.model.v.to_numpy()
+        x, v = self.state()
         # explicit steps give up beyond the range of f32
         good = np.isfinite(x).all(axis=1) & (np.abs(v) <= np.finfo(np.float32).max).all(axis=1)
         if force is not None:

@@ -19,7 +19,8 @@ import taichi as ti
 from taichi._lib import core
 
 from taisoft.errors import OutputError
-from taisoft.runtime import FieldArena, open_kind, open_runtime
+from taisoft.fields import FieldArena
+from taisoft.runtime import open_kind, open_runtime
 from taisoft.view.camera import Camera
 from taisoft.view.shading import lit_colours
 from taisoft.view.surfaces import Surfaces

@@ -1,0 +1,84 @@
+"""Taichi fields of a simulator: made in groups, counted by name, filled from arrays, released together."""
+
+import contextlib
+from collections.abc import Iterator
+
+import numpy as np
+import taichi as ti
+
+from taisoft.errors import SimulationError
+from taisoft.runtime import trees
+from taisoft.transfer import upload
+
+MAX_TREES = 480  # of field memory that may be open at once
+
+
+class FieldArena:
+    """Fields of one simulator: counted by name, released together.
+
+    Taichi holds each separately placed part of memory, a tree, in a table of 512 rows whose end it does not watch. So fields
+    that are made together share a tree, see `group`, and no more than MAX_TREES are open at once.
+    """
+
+    def __init__(self) -> None:
+        self.bytes: dict[str, int] = {}
+        self._trees: list = []
+        self._group: tuple[ti.FieldsBuilder, list] | None = None
+
+    def field(self, name: str, dtype, shape: tuple[int, ...] | int, data: np.ndarray | None = None):
+        """A scalar field, filled from data when given (else zero)."""
+        return self._place(name, lambda: ti.field(dtype), dtype, 1, shape, data)
+
+    def vectors(self, name: str, dtype, shape: int, data: np.ndarray | None = None, n: int = 3):
+        """A field of n-vectors, filled from data (shape, n) when given (else zero)."""
+        return self._place(name, lambda: ti.Vector.field(n, dtype), dtype, n, shape, data)
+
+    @contextlib.contextmanager
+    def group(self) -> Iterator[None]:
+        """Fields made inside share a tree; they can be used, and hold their data, once the outermost group has ended."""
+        if self._group is not None:
+            yield
+            return
+        self._group = ti.FieldsBuilder(), []
+        try:
+            yield
+        finally:  # in any case: a field that is never placed stops every later kernel
+            (builder, fields), self._group = self._group, None
+            if fields:
+                self._finalize(builder, fields[0][2])
+        upload([(field, data) for field, data, _ in fields if data is not None])
+
+    def _place(self, name, make, dtype, components, shape, data):
+        if name in self.bytes:
+            raise ValueError(f"field '{name}' is allocated twice")
+        shape = (shape,) if isinstance(shape, int) else tuple(shape)
+        count = int(np.prod(shape, dtype=np.int64))
+        if count * components >= 2**31:
+            raise SimulationError(f"field '{name}' needs {count * components} entries, more than 2^31 - 1")
+        with self.group():
+            builder, fields = self._group
+            field = make()  # not before: a field that is never placed stops every later kernel
+            if shape == ():
+                builder.place(field)
+            else:
+                builder.dense((ti.i, ti.ij, ti.ijk, ti.ijkl)[len(shape) - 1], shape).place(field)
+            fields.append((field, None if data is None else np.ascontiguousarray(data), name))
+        size = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.u8: 1}[dtype]
+        self.bytes[name] = count * components * size
+        return field
+
+    def _finalize(self, builder: ti.FieldsBuilder, name: str) -> None:
+        if trees["open"] >= MAX_TREES:
+            raise SimulationError(f"too many simulators are open for Taichi to hold field '{name}' and others: close one first")
+        try:
+            self._trees.append(builder.finalize())
+        except RuntimeError as error:
+            raise SimulationError(f"no memory for field '{name}' and those made with it: {error}") from None
+        trees["open"] += 1
+
+    def release(self) -> None:
+        """Give the memory back to Taichi."""
+        while self._trees:
+            self._trees.pop().destroy()
+            trees["open"] = max(0, trees["open"] - 1)
+        self.bytes.clear()

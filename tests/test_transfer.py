@@ -1,0 +1,86 @@
+"""Arrays into many fields and back by one kernel:
+
+* every type and number of dimensions that taisoft's fields have comes back as it was, NaN and infinities too;
+* the first rows alone;
+* what would not fit a field is refused before anything is written; one field, and too much for one launch, go Taichi's way.
+"""
+
+import numpy as np
+import pytest
+import taichi as ti
+
+from taisoft import transfer
+from taisoft.fields import FieldArena
+from taisoft.runtime import open_runtime
+from taisoft.transfer import DTYPES, download, upload
+
+SHAPES = [(7,), (5, 3), (4, 3, 2)]  # of scalar fields
+
+
+@pytest.fixture(scope="module", params=["f32", "f64"])
+def fields(request):
+    """Fields of each type and shape, and of vectors."""
+    runtime, arena = open_runtime("cpu", request.param), FieldArena()
+    with arena.group():
+        made = [arena.field(f"{t} {s}", t, s) for t in DTYPES for s in SHAPES]
+        made += [arena.vectors(f"{t} of {n}", t, 9, n=n) for t in (ti.f32, ti.f64, ti.i32) for n in (2, 3, 12)]
+    yield made
+    arena.release()
+    runtime.close()
+
+
+def random_data(fields, seed: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    arrays = []
+    for field in fields:
+        shape = (*field.shape, field.n) if hasattr(field, "n") else field.shape
+        kind = np.dtype(DTYPES[field.dtype])
+        low, high = (0, 256) if kind == np.uint8 else (-(2**31), 2**31)
+        data = rng.integers(low, high, shape) if kind.kind in "iu" else rng.normal(size=shape) * 10.0 ** rng.integers(-30, 30)
+        arrays.append(data.astype(kind))
+    return arrays
+
+
+def same(found: list[np.ndarray], wanted: list[np.ndarray]) -> bool:
+    return all(a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in zip(found, wanted))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_everything_comes_back(fields, seed):
+    data = random_data(fields, seed)
+    for array in data:
+        if array.dtype.kind == "f":
+            array.flat[:3] = np.nan, np.inf, -0.0
+    upload(list(zip(fields, data)))
+    assert same([field.to_numpy() for field in fields], data)
+    assert same(download(fields), data)
+    assert same(download(fields[:5], 3), [array[:3] for array in data[:5]])
+    assert same(download(fields[2:4], 0), [array[:0] for array in data[2:4]])
+
+
+def test_numbers_are_rounded_to_the_field(fields):
+    own = [field for field in fields if field.dtype == ti.f32 and field.shape == (9,)]
+    data = [np.random.default_rng(1).normal(size=(9, field.n)) for field in own]
+    upload(list(zip(own, data)))
+    assert same(download(own), [array.astype(np.float32) for array in data])
+
+
+def test_what_does_not_fit_is_refused(fields):
+    data = random_data(fields, 3)
+    upload(list(zip(fields, data)))
+    wrong = [np.zeros_like(array) for array in data]
+    wrong[-1] = wrong[-1][:, :-1]
+    with pytest.raises(ValueError, match=r"a field of shape \(9, 12\) cannot take an array of shape \(9, 11\)"):
+        upload(list(zip(fields, wrong)))
+    assert same(download(fields), data)
+
+
+def test_one_field_and_too_much_at_once(fields, monkeypatch):
+    data = random_data(fields, 4)
+    for field, array in zip(fields, data):
+        upload([(field, array)])
+    monkeypatch.setattr(transfer, "_launch", None)
+    assert all(same(download([field]), [array]) for field, array in zip(fields, data))
+    monkeypatch.setattr(transfer, "MOST", 10)
+    upload(list(zip(fields, random_data(fields, 5))))
+    assert same(download(fields, 2), [array[:2] for array in random_data(fields, 5)])
