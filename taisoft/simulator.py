@@ -155,11 +155,8 @@ class Simulator(StateAccess):
 
     def reset(self) -> None:
         """Back to the scene's start; numbers changed while it ran (dt, gravity, materials) stay."""
-        world = self._open_world()
-        world.motion.reset()
-        world.upload_constraints()
-        world.set_state(world.layout.rest, world.rest_velocities())
-        world.time, world.step_count, self._time_base = 0.0, 0, (0.0, 0)
+        self._open_world().restart()
+        self._time_base = (0.0, 0)
         self._stepper.forget()
 
     def _count(self, done: int) -> None:

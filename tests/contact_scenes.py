@@ -52,11 +52,8 @@ def cube(cells: int, seed: int | None = None) -> ts.TetMesh:
     return ts.TetMesh(mesh.vertices + np.random.default_rng(seed).uniform(-0.01, 0.01, mesh.vertices.shape), mesh.tets)
 
 
-def scene(place: Stage, swapped: bool = False) -> ts.Scene:
-    """cube on the belt at 0.1 m from its middle; load on shelf, which is held below; left and right, about to meet.
-
-    swapped: bodies in the opposite order.
-    """
+def scene(place: Stage) -> ts.Scene:
+    """cube on the belt at 0.1 m from its middle; load on shelf, which is held below; left and right, about to meet."""
     made = ts.Scene(gravity=place.Q @ GRAVITY)
     damped = ts.Material(young=1e5, poisson=0.3, density=1000.0, friction=FRICTION, mass_damping=4.0)
     free = ts.Material(young=1e5, poisson=0.3, density=1000.0, friction=FRICTION)
@@ -68,7 +65,7 @@ def scene(place: Stage, swapped: bool = False) -> ts.Scene:
         ("left", cube(1, 1), free, (-4.0, 3.0, 0.0), (1.0, 0.2, 0.0)),
         ("right", cube(1, 2), free, (-3.87, 3.03, 0.02), (-1.0, 0.0, 0.1)),
     ]
-    for name, mesh, material, at, v in bodies[::-1] if swapped else bodies:
+    for name, mesh, material, at, v in bodies:
         body = made.add_body(mesh, material, name=name, position=at, velocity=v)
         if name == "shelf":
             body.fix(lambda X: X[:, 1] < -0.04)

@@ -189,21 +189,17 @@ def two(depth: float) -> ts.Scene:
 def test_a_simulator_refuses_it():
     with pytest.raises(ts.SceneError, match=r"^'lower' and 'upper' overlap at the start, 0.125 m deep: move them apart, or set "):
         ts.Simulator(two(0.125), dt=1e-4, integrator="symplectic_euler", precision="f64")
-    made = two(0.125)
-    made.allow_initial_overlap = True
-    with ts.Simulator(made, dt=1e-4, integrator="symplectic_euler", precision="f64") as sim:
-        assert len(sim.detect_contacts())
 
 
 def test_without_contact_forces_bodies_pass_through_each_other():
     made = two(0.125)
     made.gravity, made.contact_forces = (0, -9.81, 0), False
-    with ts.Simulator(made, dt=0.01, integrator="implicit_midpoint", precision="f64") as sim:  # which takes no contacts
+    with ts.Simulator(made, dt=1e-4, integrator="symplectic_euler", precision="f64") as sim:
         assert len(sim.detect_contacts()) and len(sim.contacts()) == 0
         start = sim.positions()
         reports = [sim.step() for _ in range(3)]
         fallen = sim.positions() - start
-    assert np.abs(fallen - 0.5 * np.array([0, -9.81, 0]) * 0.03**2).max() < 1e-9  # [m]
+    assert np.abs(fallen - 6 * np.array([0, -9.81, 0]) * 1e-4**2).max() < 1e-14  # [m], of 1 + 2 + 3 steps' speeds
     assert all(r.converged and not r.n_contacts and not r.problems for r in reports)
     with pytest.raises(ts.SceneError, match="^scene: contact_forces must be True or False, not 1$"):
         made.contact_forces = 1

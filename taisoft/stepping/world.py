@@ -36,10 +36,16 @@ class World:
         """Positions [m] and velocities [m/s] of all nodes (n_nodes, 3)."""
         upload([(self.model.x, x), (self.model.v, v)])
 
+    def restart(self) -> None:
+        """The state at the scene's start."""
+        self.motion.reset()
+        free = ~self.motion.constrained()
+        upload([(self.model.free, free), (self.model.x, self.layout.rest), (self.model.v, self._rest_velocities())])
+        self.time, self.step_count = 0.0, 0
+
     def upload_constraints(self) -> None:
         """Free axes to the device."""
-        held = self.motion.constrained()
-        self.model.free.from_numpy((~held).astype(self.runtime.np_real))
+        upload([(self.model.free, ~self.motion.constrained())])
 
     def upload_material(self, density: bool) -> None:
         """Material numbers of the bodies to the device, and masses if a density changed."""
@@ -55,7 +61,7 @@ class World:
         if density and m.consistent:
             upload_mass_matrix(self.scene, m.mass_matrix)
 
-    def rest_velocities(self) -> np.ndarray:
+    def _rest_velocities(self) -> np.ndarray:
         """Initial velocities with 0 on constrained axes (n_nodes, 3)."""
         start = [np.broadcast_to(b.velocity, b.rest_positions.shape) for b in self.scene.bodies]
         return np.where(self.motion.constrained(), 0.0, np.concatenate(start))
