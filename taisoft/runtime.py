@@ -1,9 +1,8 @@
-"""The only place that starts Taichi: arch, precision, flags, field memory, launch counts.
+"""The only place that starts Taichi: arch, precision, flags, kernels and their launch counts.
 
 Taichi's state belongs to the process, so one (arch, precision) is open at a time. `cfg_optimization=False` works round a
 miscompilation of Taichi 1.7.4 (`A = f(A)` on a local matrix), and also compiles faster; `fast_math=False` keeps NaN
-comparisons and the order of sums (no speed lost). Fields live in one
-`FieldArena` per simulator and are released with it.
+comparisons and the order of sums (no speed lost).
 """
 
 import contextlib
@@ -153,7 +152,8 @@ def kernel(function: Callable | None = None, *, shared: bool = True) -> Callable
         if key in known:
             ready = known[key]
             if ready is None:
-                return compiled(*arguments)
+                with _sharing(shared):
+                    return compiled(*arguments)
             if ready.valid:
                 return ready(arguments)
         start = time.perf_counter()
