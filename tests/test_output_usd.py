@@ -22,7 +22,8 @@ from fake_simulator import FakeSimulator, beam_scene
 from pxr import Tf, Usd, UsdGeom, UsdShade, UsdValidation
 
 from taisoft.errors import OutputError
-from taisoft.output.usd import UsdWriter, join_chunks, prim_names
+from taisoft.output.usd import UsdWriter, join_chunks
+from taisoft.output.usd_prims import prim_names
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = ("1 cube", "1_cube", "ü", "x" * 300, "material")

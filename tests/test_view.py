@@ -33,6 +33,7 @@ from taisoft.view.surfaces import MARKER_COLOUR, Surfaces, smoothing_groups, ver
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZE = (320, 180)
+EYE = np.array([0.0, 5.0, 9.0])
 needs_vulkan = pytest.mark.skipif(bool(vulkan_missing()), reason="no Vulkan driver: Debian package mesa-vulkan-drivers")
 
 
@@ -102,9 +103,9 @@ def test_a_ball_is_smooth():
 def test_drawn_vertices_follow_the_body_and_mark_fixed_nodes(order):
     scene = beam_scene(("one", "two"), order=order)
     surfaces, sim = Surfaces(scene), FakeSimulator(scene)
-    x, normals = surfaces.vertices(sim)
+    x, normals = surfaces.vertices(sim, EYE)
     sim.time = 1.0
-    moved, _ = surfaces.vertices(sim)
+    moved, _ = surfaces.vertices(sim, EYE)
     assert len(x) == len(normals) == len(surfaces.colours)
     assert np.allclose(np.linalg.norm(normals, axis=1), 1.0)
     assert surfaces.triangles.min() == 0 and surfaces.triangles.max() == len(x) - 1
@@ -126,7 +127,7 @@ def test_a_second_order_body_is_drawn_as_finely_as_a_first_order_one_of_half_the
         scene = beam_scene(cells=cells, order=order)
         surfaces, sim = Surfaces(scene), FakeSimulator(scene)
         sim.time = 1.0
-        x, normals = surfaces.vertices(sim)
+        x, normals = surfaces.vertices(sim, EYE)
         body = (surfaces.colours != MARKER_COLOUR).any(axis=1)
         drawn.append((x[body], normals[body]))
     (coarse, coarse_normals), (fine, fine_normals) = drawn

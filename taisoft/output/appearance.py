@@ -1,4 +1,4 @@
-"""What a body looks like: its colour, and its surface with only the nodes that are on it."""
+"""What bodies and obstacles look like: their colours, and a body's surface with only the nodes that are on it."""
 
 import numpy as np
 
@@ -15,6 +15,9 @@ BODY_COLOURS = np.array(
         (0.72, 0.53, 0.42),
     ]
 )
+
+
+OBSTACLE_COLOUR = np.array([0.66, 0.67, 0.69])  # sRGB
 
 
 def body_colour(index: int) -> np.ndarray:

@@ -11,21 +11,19 @@ an attribute's time samples from the strongest layer alone, and value clips are 
 Time codes are frame numbers; metres, y up. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose
 guide, so that the two are not drawn over each other) and `material`. Both are flat: a second-order body is written as
 the linear triangles and tets that its elements are cut into, all its nodes as points (`taisoft/mesh/nodes.py`).
+An obstacle is `/World/<name>` with `surface` and `material`; its points change over time where it follows a path.
 """
 
-import re
 from pathlib import Path
 
 import numpy as np
 
 from taisoft.errors import OutputError
-from taisoft.output.appearance import body_colour, compact_surface, linear_rgb
 from taisoft.output.files import make_folder, part_path, publish, replacing, write_error
+from taisoft.output.usd_prims import ROOT, extent, scene_layer
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
-ROOT = "/World"
-MAX_NAME = 64  # characters of a prim name; the whole name of the body is kept beside it
 
 
 class UsdWriter:
@@ -43,27 +41,30 @@ class UsdWriter:
         self.path = Path(folder) / SCENE_NAME
         self.chunks = make_folder(Path(folder) / CHUNKS_NAME)
         self.chunk_frames = chunk_frames
-        self._tracks, self._template = _scene_layer(scene, fps)
+        self._tracks, self._moving, self._template = scene_layer(scene, fps)
         self._joined = _Joined(self.path, self._template)
         self._chunk = None
         self._frames: list[int] = []  # in the chunk
 
     def frame(self, sim, index: int) -> None:
         """Record sim's positions as frame index; index must ascend. Raises OutputError."""
-        from pxr import Vt
-
         if self._chunk is None:
             self._chunk = _copy(self._template)
         for name, tracks in self._tracks.items():
             x = np.asarray(sim.positions(name), dtype=np.float32)
             for prim_path, nodes in tracks:
-                points = x if nodes is None else x[nodes]
-                extent = np.array([points.min(axis=0), points.max(axis=0)])
-                self._chunk.SetTimeSample(f"{prim_path}.points", float(index), Vt.Vec3fArray.FromNumpy(points))
-                self._chunk.SetTimeSample(f"{prim_path}.extent", float(index), Vt.Vec3fArray.FromNumpy(extent))
+                self._sample(prim_path, x if nodes is None else x[nodes], index)
+        for prim_path, surface in self._moving:
+            self._sample(prim_path, surface.at(sim.time).astype(np.float32), index)
         self._frames.append(index)
         if len(self._frames) >= self.chunk_frames:
             self._publish_chunk()
+
+    def _sample(self, prim_path: str, points: np.ndarray, index: int) -> None:
+        from pxr import Vt
+
+        self._chunk.SetTimeSample(f"{prim_path}.points", float(index), Vt.Vec3fArray.FromNumpy(points))
+        self._chunk.SetTimeSample(f"{prim_path}.extent", float(index), Vt.Vec3fArray.FromNumpy(extent(points)))
 
     def close(self) -> None:
         """Complete scene.usdc and remove the chunks; without a frame no file is made. Raises OutputError.
@@ -116,25 +117,6 @@ def join_chunks(folder: str | Path) -> Path:
     return target
 
 
-def prim_names(names: list[str]) -> list[str]:
-    """Legal, distinct USD prim names for body names, in order.
-
-    Anything but ASCII letters, digits and underscores becomes an underscore (UTF-8 identifiers are young in USD, and
-    many readers refuse them); a leading digit gets one before it; a name met before gets a number behind it.
-    """
-    used: set[str] = set()
-    legal = []
-    for name in names:
-        base = re.sub(r"[^A-Za-z0-9_]", "_", name)[:MAX_NAME] or "body"
-        base = f"_{base}" if base[0].isdigit() else base
-        candidate, count = base, 1
-        while candidate in used:
-            candidate, count = f"{base}_{count}", count + 1
-        used.add(candidate)
-        legal.append(candidate)
-    return legal
-
-
 class _Joined:
     """The one-file scene in the making, under a temporary name until `publish`."""
 
@@ -177,67 +159,6 @@ class _Joined:
         self.part.unlink(missing_ok=True)
 
 
-def _scene_layer(scene, fps: float) -> tuple[dict[str, list], object]:
-    """A layer with everything but the frames, and per body the (prim path, nodes or None for all) that get points."""
-    from pxr import Sdf, Usd, UsdGeom
-
-    import taisoft
-
-    layer = Sdf.Layer.CreateAnonymous(".usdc")
-    layer.comment = f"taisoft {taisoft.__version__}"
-    stage = Usd.Stage.Open(layer)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    stage.SetTimeCodesPerSecond(fps)
-    stage.SetFramesPerSecond(fps)
-    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())
-    legal = prim_names([body.name for body in scene.bodies])
-    tracks = {body.name: _define_body(stage, body, name, k) for k, (body, name) in enumerate(zip(scene.bodies, legal))}
-    return tracks, layer
-
-
-def _define_body(stage, body, legal_name: str, index: int) -> list[tuple[str, np.ndarray | None]]:
-    from pxr import Gf, UsdGeom, UsdShade, Vt
-
-    path = f"{ROOT}/{legal_name}"
-    prim = UsdGeom.Xform.Define(stage, path).GetPrim()
-    prim.SetDisplayName(body.name)
-    prim.SetCustomDataByKey("taisoft:name", body.name)
-    colour = Gf.Vec3f(*linear_rgb(body_colour(index)).tolist())
-    material = _define_material(stage, f"{path}/material", colour)
-
-    nodes, local = compact_surface(body.nodes.surface)
-    surface = UsdGeom.Mesh.Define(stage, f"{path}/surface")
-    surface.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(local), 3, dtype=np.int32)))
-    surface.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(local.ravel().astype(np.int32)))
-    surface.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-
-    tets = UsdGeom.TetMesh.Define(stage, f"{path}/tets")
-    tets.CreateTetVertexIndicesAttr(Vt.Vec4iArray.FromNumpy(np.ascontiguousarray(body.nodes.tets, dtype=np.int32)))
-    faces = np.ascontiguousarray(body.nodes.surface, dtype=np.int32)
-    tets.CreateSurfaceFaceVertexIndicesAttr(Vt.Vec3iArray.FromNumpy(faces))
-    tets.CreatePurposeAttr(UsdGeom.Tokens.guide)
-
-    for gprim in (surface, tets):
-        gprim.CreatePointsAttr()
-        gprim.CreateExtentAttr()
-        gprim.CreateDisplayColorAttr([colour])
-        UsdShade.MaterialBindingAPI.Apply(gprim.GetPrim()).Bind(material)
-    return [(f"{path}/surface", nodes), (f"{path}/tets", None)]
-
-
-def _define_material(stage, path: str, colour):
-    from pxr import Sdf, UsdShade
-
-    material = UsdShade.Material.Define(stage, path)
-    shader = UsdShade.Shader.Define(stage, f"{path}/shader")
-    shader.CreateIdAttr("UsdPreviewSurface")
-    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(colour)
-    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.6)
-    material.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
-    return material
-
-
 def _copy(layer):
     from pxr import Sdf
 
@@ -262,6 +183,7 @@ def _sampled(layer) -> list[str]:
         for body in layer.GetPrimAtPath(ROOT).nameChildren
         for part in ("surface", "tets")
         for attribute in ("points", "extent")
+        if layer.GetPrimAtPath(f"{ROOT}/{body.name}/{part}")
     ]
 
 

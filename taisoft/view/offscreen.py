@@ -49,8 +49,8 @@ class Offscreen:
 
     def image(self, sim) -> np.ndarray:
         """Picture of sim's present state, uint8 (height, width, 3), first row on top."""
-        x, normals = self.surfaces.vertices(sim)
-        self.camera = self.camera.widened(x, self.size, self._widest)
+        x, normals = self.surfaces.vertices(sim, self.camera.position)
+        self.camera = self.camera.widened(x[: self.surfaces.n_of_bodies], self.size, self._widest)
         projected = self.camera.project(x, self._large)
         left, top, right, bottom = _box(projected, self._large)  # the rest is background, and stays as it is
         picture = self._background[::SAMPLES, ::SAMPLES].copy()

@@ -1,15 +1,18 @@
-"""The triangles that a picture shows: every body's surface, split at sharp edges, and markers of fixed nodes.
+"""The triangles that a picture shows: every body's surface, split at sharp edges, markers of fixed nodes, and obstacles.
 
 A drawn vertex belongs to one node and one smoothing group: the triangles round that node that are connected over edges
 bent by less than CREASE at rest. Its normal is the area-weighted mean over that group, so a ball looks round and a box
 keeps its edges, in every deformed state. A second-order face is drawn as four flat triangles between its six nodes.
+A half-space is drawn where the eye is outside of it: the walls of a bin that the eye looks through are not.
 """
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from taisoft.output.appearance import body_colour
+from taisoft.output.appearance import OBSTACLE_COLOUR, body_colour
+from taisoft.output.obstacle_surface import ObstacleSurface, obstacle_surfaces
+from taisoft.scene.obstacles import HalfSpace
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
@@ -20,22 +23,26 @@ MAX_MARKERS = 500  # a picture with more fixed nodes shows an even selection of 
 class Surfaces:
     """Everything drawn, as one triangle mesh whose topology and colours stay.
 
-    scene: its bodies are read once. triangles: int32 (t,3) of drawn vertices; colours: float (n,3), unshaded sRGB.
+    scene: its bodies and obstacles are read once. triangles: int32 (t,3) of drawn vertices; colours: float (n,3), unshaded
+    sRGB; n_of_bodies: drawn vertices of bodies, which come first.
     """
 
     def __init__(self, scene):
         self._bodies = [_BodySurface(body, body_colour(k)) for k, body in enumerate(scene.bodies)]
+        self._obstacles = [_RigidSurface(surface) for surface in obstacle_surfaces(scene)]
+        self.n_of_bodies = sum(len(body.colours) for body in self._bodies)
         triangles, colours, n = [], [], 0
-        for body in self._bodies:
-            triangles.append(body.triangles + n)
-            colours.append(body.colours)
-            n += len(body.colours)
+        for part in (*self._bodies, *self._obstacles):
+            triangles.append(part.triangles + n)
+            colours.append(part.colours)
+            n += len(part.colours)
         self.triangles = np.concatenate(triangles).astype(np.int32)
         self.colours = np.concatenate(colours)
 
-    def vertices(self, sim) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [m] and unit normals of the drawn vertices in sim's present state, each float64 (n,3)."""
+    def vertices(self, sim, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [m] and unit normals of the drawn vertices in sim's present state, each float64 (n,3). eye: (3,) [m]."""
         parts = [body.vertices(sim.positions(body.name)) for body in self._bodies]
+        parts += [obstacle.vertices(sim.time, eye) for obstacle in self._obstacles]
         return np.concatenate([x for x, _ in parts]), np.concatenate([n for _, n in parts])
 
 
@@ -67,6 +74,21 @@ class _BodySurface:
         markers = (x[self._marked][:, None] + self._radius * self._ball).reshape(-1, 3)
         normals = np.tile(self._ball, (len(self._marked), 1))
         return np.concatenate([drawn, markers]), np.concatenate([vertex_normals(drawn, self._corners), normals])
+
+
+class _RigidSurface:
+    def __init__(self, surface: ObstacleSurface):
+        self._surface = surface
+        self._nodes, self.triangles = smoothing_groups(surface.vertices, surface.triangles)
+        self._normals = vertex_normals(surface.vertices[self._nodes], self.triangles)
+        self.colours = np.tile(OBSTACLE_COLOUR, (len(self._nodes), 1))
+
+    def vertices(self, t: float, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, obstacle = self._surface.at(t)[self._nodes], self._surface.obstacle
+        normals = self._normals @ obstacle.pose(t)[1].T
+        if isinstance(obstacle.shape, HalfSpace) and len(x) and (eye - x[0]) @ normals[0] <= 0:
+            x = np.repeat(x[:1], len(x), axis=0)  # triangles without area do not show
+        return x, normals
 
 
 def smoothing_groups(rest: np.ndarray, surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

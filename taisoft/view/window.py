@@ -49,8 +49,9 @@ class LiveWindow:
 
     def draw(self, sim, lines: list[str]) -> None:
         """Draw sim's present state with a panel of text lines, show it, and take up keys and mouse."""
-        x, normals = self._surfaces.vertices(sim)
-        self.camera = self.camera.widened(x, self._canvas.window.get_window_shape(), self._widest)
+        x, normals = self._surfaces.vertices(sim, self.camera.position)
+        of_bodies = x[: self._surfaces.n_of_bodies]
+        self.camera = self.camera.widened(of_bodies, self._canvas.window.get_window_shape(), self._widest)
         self._canvas.draw(x, normals, self.camera, tuple(BACKGROUND_TOP))
         with self._canvas.window.get_gui().sub_window("taisoft", *PANEL) as panel:
             for line in lines:

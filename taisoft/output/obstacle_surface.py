@@ -1,0 +1,110 @@
+"""Obstacles as triangles, for pictures and for USD.
+
+Boxes and meshes are their own surface, spheres and capsules are faceted. Of a half-space's boundary a square about the bodies is
+shown, cut off where another half-space begins, so that the walls of a bin meet in its corners.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taisoft.scene.obstacles import Capsule, HalfSpace, Obstacle, Sphere
+
+REACH = 1.2  # half the side of the square of a half-space, in diagonals of the box about the bodies at the start
+CUTS = 4  # times that each triangle of it is cut in four, so that light changes over it and parts behind the eye are small
+AROUND, ALONG = 40, 10  # facets of what is round: about its axis, and from there to a pole
+
+
+@dataclass(frozen=True, eq=False)
+class ObstacleSurface:
+    """vertices: (n,3) [m], of the obstacle as it was given; triangles: (t,3) int, normals out of the solid."""
+
+    obstacle: Obstacle
+    vertices: np.ndarray
+    triangles: np.ndarray
+
+    def at(self, t: float) -> np.ndarray:
+        """Vertices (n,3) [m] at time t [s]."""
+        return self.obstacle.points_at(t, self.vertices)
+
+
+def obstacle_surfaces(scene) -> list[ObstacleSurface]:
+    """Of all obstacles of a scene, in the order added."""
+    x = np.concatenate([body.rest_positions + body.position for body in scene.bodies])
+    middle, reach = (x.min(axis=0) + x.max(axis=0)) / 2, REACH * float(np.linalg.norm(np.ptp(x, axis=0)))
+    flat = [o.shape for o in scene.obstacles if isinstance(o.shape, HalfSpace) and o.path is None]
+    made = []
+    for o in scene.obstacles:
+        shape = o.shape
+        if isinstance(shape, HalfSpace):
+            cuts = [other for other in flat if other is not shape] if o.path is None else []
+            surface = _patch(shape, middle, reach, cuts)
+        elif isinstance(shape, (Sphere, Capsule)):
+            half = shape.size()[0] if isinstance(shape, Capsule) else 0.0
+            x, triangles = _round(half, shape.radius)
+            surface = x @ shape.frame().T + shape.pivot, triangles
+        else:
+            surface = shape.surface()
+        made.append(ObstacleSurface(o, *surface))
+    return made
+
+
+def _patch(shape: HalfSpace, middle: np.ndarray, reach: float, cuts: list[HalfSpace]) -> tuple[np.ndarray, np.ndarray]:
+    """The square of half a side `reach` about the point nearest to `middle`, without what lies in the other half-spaces."""
+    z, n, x = shape.frame().T
+    at = middle - ((middle - shape.point) @ n) * n
+    corners = [at + reach * (a * z + b * x) for a, b in ((-1, -1), (-1, 1), (1, 1), (1, -1))]
+    for other in cuts:
+        corners = _clipped(corners, other)
+    if len(corners) < 3:
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    if np.cross(corners[1] - corners[0], corners[2] - corners[0]) @ n < 0:
+        corners = corners[::-1]
+    points = np.array([np.mean(corners, axis=0), *corners])
+    k = np.arange(1, len(points))
+    triangles = np.stack([np.zeros_like(k), k, np.roll(k, -1)], axis=1)
+    for _ in range(CUTS):
+        points, triangles = _cut_in_four(points, triangles)
+    return points, triangles
+
+
+def _clipped(corners: list[np.ndarray], other: HalfSpace) -> list[np.ndarray]:
+    """The convex polygon's part outside of a half-space (Sutherland and Hodgman 1974)."""
+    height = [(corner - other.point) @ other.normal for corner in corners]
+    kept = []
+    for k in range(len(corners)):
+        a, b, h, g = corners[k - 1], corners[k], height[k - 1], height[k]
+        if (h < 0) != (g < 0):
+            kept.append(a + h / (h - g) * (b - a))
+        if g >= 0:
+            kept.append(b)
+    return kept
+
+
+def _cut_in_four(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    ends = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)  # of edges ab, bc, ca
+    pairs, which = np.unique(np.sort(ends.reshape(-1, 2), axis=1), axis=0, return_inverse=True)
+    (a, b, c), (ab, bc, ca) = triangles.T, len(points) + which.reshape(-1, 3).T
+    cut = [np.stack(t, axis=1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
+    return np.concatenate([points, points[pairs].mean(axis=1)]), np.concatenate(cut)
+
+
+def _round(half: float, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """A capsule along x about the origin; with half a length of 0 a sphere."""
+    up = np.linspace(0.0, np.pi / 2, ALONG + 1)[:-1]
+    lower = np.stack([-half - radius * np.sin(up), radius * np.cos(up)], axis=1)[::-1]
+    upper = np.stack([half + radius * np.sin(up), radius * np.cos(up)], axis=1)
+    rings = np.concatenate([lower, upper if half > 0 else upper[1:]])  # place along x, distance from it
+    turn = np.linspace(0.0, 2 * np.pi, AROUND, endpoint=False)
+    x = np.stack(np.broadcast_arrays(rings[:, :1], rings[:, 1:] * np.cos(turn), rings[:, 1:] * np.sin(turn)), axis=2)
+    points = np.concatenate([x.reshape(-1, 3), [[-half - radius, 0, 0], [half + radius, 0, 0]]])
+    k, following = np.arange(AROUND), np.roll(np.arange(AROUND), -1)
+    triangles = []
+    for ring in range(len(rings) - 1):
+        a, b = AROUND * ring, AROUND * (ring + 1)
+        triangles += [np.stack(t, axis=1) for t in ((a + k, a + following, b + k), (b + k, a + following, b + following))]
+    first, last = len(points) - 2, len(points) - 1
+    top = AROUND * (len(rings) - 1)
+    triangles += [np.stack([np.full(AROUND, first), following, k], axis=1)]
+    triangles += [np.stack([np.full(AROUND, last), top + k, top + following], axis=1)]
+    return points, np.concatenate(triangles)
