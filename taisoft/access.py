@@ -37,7 +37,7 @@ class StateAccess:
 
     def positions(self, body: str | None = None) -> np.ndarray:
         """(n_nodes, 3) float64 copy [m]; of all bodies, concatenated in the order added, without a name."""
-        return self._open_world().state()[0][self._slice(body)]
+        return self._open_world().state()[0][self._slice(body)].copy()
 
     def velocities(self, body: str | None = None) -> np.ndarray:
         """(n_nodes, 3) float64 copy [m/s]."""

@@ -8,7 +8,7 @@ import taichi as ti
 
 from taisoft.errors import SimulationError
 from taisoft.runtime import trees
-from taisoft.transfer import upload
+from taisoft.transfer import DTYPES, upload
 
 MAX_TREES = 480  # of field memory that may be open at once
 
@@ -63,8 +63,7 @@ class FieldArena:
             else:
                 builder.dense((ti.i, ti.ij, ti.ijk, ti.ijkl)[len(shape) - 1], shape).place(field)
             fields.append((field, None if data is None else np.ascontiguousarray(data), name))
-        size = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.u8: 1}[dtype]
-        self.bytes[name] = count * components * size
+        self.bytes[name] = count * components * np.dtype(DTYPES[dtype]).itemsize
         return field
 
     def _finalize(self, builder: ti.FieldsBuilder, name: str) -> None:

@@ -129,15 +129,15 @@ def open_kind() -> tuple[str, str] | None:
     return _kind if _open else None
 
 
-def kernel(function: Callable | None = None, *, shared: bool = True) -> Callable:
+def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
     """`ti.kernel` whose launches are counted by name, and whose first launch per set of templates counts as compile time.
 
-    shared: whether Taichi looks for values that are computed twice, in time that grows with the square of the code. What is
-    unrolled over the nodes of an element runs up to 2.5 times as fast for that. Long code with many branches, as a search for
-    contacts, runs no faster, and compiles in 0.6 of the time without it.
+    cse: whether Taichi eliminates common subexpressions, in time that grows with the square of the code. What is unrolled over
+    the nodes of an element runs up to 2.5 times as fast for that. Long code with many branches, as a search for contacts, runs
+    no faster, and compiles in 0.6 of the time without it.
     """
     if function is None:
-        return functools.partial(kernel, shared=shared)
+        return functools.partial(kernel, cse=cse)
     compiled = ti.kernel(function)
     n_arguments, templates, arrays = places_of(compiled)
     known: dict[tuple, Launch | None] = {}  # by what the compiled code depends on; None: Taichi launches it
@@ -152,12 +152,12 @@ def kernel(function: Callable | None = None, *, shared: bool = True) -> Callable
         if key in known:
             ready = known[key]
             if ready is None:
-                with _sharing(shared):
+                with _eliminating(cse):
                     return compiled(*arguments)
             if ready.valid:
                 return ready(arguments)
         start = time.perf_counter()
-        with _sharing(shared):
+        with _eliminating(cse):
             result = compiled(*arguments)
             ti.sync()
             known[key] = prepare(compiled, arguments)
@@ -168,10 +168,10 @@ def kernel(function: Callable | None = None, *, shared: bool = True) -> Callable
 
 
 @contextlib.contextmanager
-def _sharing(shared: bool) -> Iterator[None]:
-    """Whether kernels compiled inside share what is computed twice: at level 0 Taichi leaves that pass out, and no other."""
+def _eliminating(cse: bool) -> Iterator[None]:
+    """Kernels compiled inside go through that pass, or not: at level 0 Taichi leaves it out, and no other that is on."""
     runtime = impl.get_runtime()
-    if shared or runtime.prog is None:
+    if cse or runtime.prog is None:
         yield
         return
     config = runtime.prog.config()

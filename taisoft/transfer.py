@@ -62,6 +62,10 @@ def _width(shape: tuple[int, ...]) -> int:
     return int(np.prod(shape[1:-1], dtype=np.int64)) * max(shape[-1], 1)
 
 
+def _array_shape(field) -> tuple[int, ...]:
+    return (*field.shape, field.n) if hasattr(field, "n") else field.shape
+
+
 def _launch(fields: list, rows: list[int], writes: bool, data: np.ndarray) -> None:
     shapes = tuple((*field.shape, getattr(field, "n", 0)) for field in fields)
     first = np.concatenate([[0], np.cumsum(rows)]).astype(np.int32)
@@ -70,15 +74,17 @@ def _launch(fields: list, rows: list[int], writes: bool, data: np.ndarray) -> No
 
 
 def upload(pairs: list[tuple]) -> None:
-    """pairs: field of one to three dimensions, and an array of its shape, and of its components where it has any."""
+    """pairs: field of one to three dimensions, and an array of its shape, and of its components where it has any.
+
+    Raises ValueError for an array of another shape, before anything is written.
+    """
+    for field, data in pairs:
+        if data.shape != _array_shape(field):
+            raise ValueError(f"a field of shape {_array_shape(field)} cannot take an array of shape {data.shape}")
     if len(pairs) < 2 or sum(data.size for _, data in pairs) > MOST:
         for field, data in pairs:
             field.from_numpy(np.ascontiguousarray(data, dtype=DTYPES[field.dtype]))
         return
-    for field, data in pairs:
-        shape = (*field.shape, field.n) if hasattr(field, "n") else field.shape
-        if data.shape != shape:
-            raise ValueError(f"a field of shape {shape} cannot take an array of shape {data.shape}")
     flat = np.concatenate([np.asarray(data, dtype=np.float64).ravel() for _, data in pairs])
     _launch([field for field, _ in pairs], [len(data) for _, data in pairs], True, flat)
 
@@ -86,7 +92,7 @@ def upload(pairs: list[tuple]) -> None:
 def download(fields: list, rows: int | None = None) -> list[np.ndarray]:
     """The fields as arrays, of their first `rows` rows if that is given."""
     counts = [field.shape[0] if rows is None else rows for field in fields]
-    shapes = [(*field.shape[1:], field.n) if hasattr(field, "n") else field.shape[1:] for field in fields]
+    shapes = [_array_shape(field)[1:] for field in fields]
     sizes = [n * int(np.prod(shape, dtype=np.int64)) for n, shape in zip(counts, shapes)]
     if len(fields) < 2 or sum(sizes) > MOST:
         return [field.to_numpy()[:n] for field, n in zip(fields, counts)]

@@ -256,15 +256,15 @@ def test_turned_and_shifted(sim):
 def test_order_of_bodies(sim):
     if sim.settings.integrator != "symplectic_euler":
         pytest.skip("what the order could change, sweeps over contacts, is in symplectic Euler's steps, too")
-    sim.place.motion, twins = sliding(0.3), ("cube", "load")  # alike, one before the shelf, one after it
+    sim.place.motion, twins, rest = sliding(0.3), ("cube", "load"), ("shelf", "left", "right")  # twins lie beside the shelf
     start = [sim.positions(name) for name in twins]
     walk(sim)
-    ends = [(sim.positions(name), sim.velocities(name)) for name in twins]
+    ends = [(sim.positions(name), sim.velocities(name)) for name in (*twins, *rest)]
     sim.reset()
     for name, x in zip(twins, start[::-1]):
         sim.set_state(positions=x, body=name)
     walk(sim)
-    for name, (x, v) in zip(twins[::-1], ends):
+    for name, (x, v) in zip((*twins[::-1], *rest), ends):
         assert np.abs(sim.positions(name) - x).max() < 1e-9 and np.abs(sim.velocities(name) - v).max() < 1e-7
 
 

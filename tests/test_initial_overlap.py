@@ -2,8 +2,7 @@
 
 * two bodies, a body and every kind of obstacle; one wholly inside another; a ball's face over a sphere; edges that cross, and
   a rod through a sheet, where no vertex lies inside;
-* the depth is the exact one; bodies that lie flush, and those deeper by less than 1e-6 of their size, are allowed, as is
-  everything where the scene says so;
+* the depth is the exact one; bodies that lie flush, and those deeper by less than 1e-6 of their size, are allowed;
 * signed distances at points are those of a grid and those of brute force.
 """
 

@@ -19,7 +19,7 @@ def test_a_path_that_comes_back():
     scene = ts.Scene()
     body = scene.add_body(cube(), rubber(), name="beam", order=2)
     body.move([0, 1], lambda t: None if 0.004 < t < 0.006 else (t, 0.0, 0.0))
-    with ts.Simulator(scene, dt=0.01, integrator="implicit_euler") as sim:
+    with ts.Simulator(scene, dt=0.01, integrator="implicit_euler", precision="f64") as sim:
         with pytest.raises(ts.SimulationError, match="body 'beam': the path of its moved nodes gave None at t = 0.005 s"):
             sim.step()
 
@@ -39,7 +39,8 @@ def sim(request):
 
 
 def test_rigid_flight(sim):
-    sim.paths["now"] = lambda t: SPEED * t
+    sim.paths["now"], sim.dt = lambda t: SPEED * t, 1e-4
+    sim.set_gravity((0, 0, 0))
     for method in ["velocity_verlet"] if sim.settings.explicit else SCHEMES:
         sim._stepper.scheme = SCHEMES.get(method)
         sim.reset()

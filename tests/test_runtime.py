@@ -100,6 +100,22 @@ def faulty(x: ti.template()):
         x[i] = unknown_name  # noqa: F821
 
 
+@kernel(cse=False)
+def sums(x: ti.template(), out: ti.types.ndarray()):
+    for i in range(3):
+        out[i] = (x[i] + 1.0) * (x[i] + 1.0)
+
+
+def test_without_common_subexpressions():
+    with opened("f64"):
+        arena, config = FieldArena(), ti.lang.impl.get_runtime().prog.config()
+        x, level, out = arena.field("x", ti.f64, 3, np.arange(3.0)), config.opt_level, np.zeros(3)
+        for _ in range(2):
+            sums(x, out)
+            assert np.array_equal(out, [1.0, 4.0, 9.0]) and config.opt_level == level == 1
+        arena.release()
+
+
 def test_a_faulty_kernel_is_told_with_file_and_line():
     """Taichi's excerpt of the source is left out, the place is not."""
     with opened("f64"):

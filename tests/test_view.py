@@ -33,7 +33,6 @@ from taisoft.view.surfaces import MARKER_COLOUR, Surfaces, smoothing_groups, ver
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZE = (320, 180)
-EYE = np.array([0.0, 5.0, 9.0])
 needs_vulkan = pytest.mark.skipif(bool(vulkan_missing()), reason="no Vulkan driver: Debian package mesa-vulkan-drivers")
 
 
@@ -78,6 +77,33 @@ def test_the_camera_moves_back_from_moving_bodies():
     assert camera.widened(np.array([[0.0, 900, 0]]), (200, 100), 15.0).distance == 15.0
 
 
+def test_a_floor_that_reaches_behind_the_eye():
+    """Against rays through the middle of every pixel; triangles in front stay as they are, those behind go."""
+    half = 30.0
+    floor = [[-half, 0, -half], [half, 0, -half], [half, 0, half], [-half, 0, half]]
+    corners = np.array([*floor, [0, 1, -9], [1, 1, -9], [0, 2, -9]])
+    shades, triangles = (corners + half) / (2 * half), np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [2, 3, 3]])
+    camera = Camera(target=np.array([0.0, 0.5, 0.0]), distance=3.0, azimuth=20.0, elevation=10.0)
+    x, cut, colours = camera.clipped(corners, triangles, shades)
+    assert np.array_equal(x[: len(corners)], corners) and (cut == [4, 5, 6]).all(axis=1).sum() == 1
+    image, (width, height) = np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8), SIZE
+    below = (cut != [4, 5, 6]).all(axis=1)
+    drawn = rasterise(camera.project(x, SIZE), cut[below], colours, camera.clipping[0], image)
+    focal = height / 2 / np.tan(np.radians(camera.fov) / 2)
+    v, u = np.mgrid[:height, :width] + 0.5
+    ray = np.stack([(u - width / 2) / focal, (height / 2 - v) / focal, np.ones_like(u)], axis=-1) @ camera.axes
+    with np.errstate(divide="ignore"):
+        far = -camera.position[1] / ray[..., 1]
+    hit = camera.position + far[..., None] * ray
+    expected = (far > camera.clipping[0]) & (np.abs(hit[..., [0, 2]]) < half).all(axis=-1)
+    assert (drawn != expected).mean() < 0.005 and 0.4 < expected.mean() < 0.8
+    both = drawn & expected
+    assert np.abs(image[both] / 255 - (hit[both] + half) / (2 * half))[:, [0, 2]].max() < 0.02
+    bad = corners.copy()
+    bad[1] = np.nan
+    assert not (camera.clipped(bad, triangles, shades)[1] == 1).any()
+
+
 # --- surfaces ---
 
 
@@ -103,9 +129,9 @@ def test_a_ball_is_smooth():
 def test_drawn_vertices_follow_the_body_and_mark_fixed_nodes(order):
     scene = beam_scene(("one", "two"), order=order)
     surfaces, sim = Surfaces(scene), FakeSimulator(scene)
-    x, normals = surfaces.vertices(sim, EYE)
+    x, normals = surfaces.of_bodies(sim)
     sim.time = 1.0
-    moved, _ = surfaces.vertices(sim, EYE)
+    moved, _ = surfaces.of_bodies(sim)
     assert len(x) == len(normals) == len(surfaces.colours)
     assert np.allclose(np.linalg.norm(normals, axis=1), 1.0)
     assert surfaces.triangles.min() == 0 and surfaces.triangles.max() == len(x) - 1
@@ -127,7 +153,7 @@ def test_a_second_order_body_is_drawn_as_finely_as_a_first_order_one_of_half_the
         scene = beam_scene(cells=cells, order=order)
         surfaces, sim = Surfaces(scene), FakeSimulator(scene)
         sim.time = 1.0
-        x, normals = surfaces.vertices(sim, EYE)
+        x, normals = surfaces.of_bodies(sim)
         body = (surfaces.colours != MARKER_COLOUR).any(axis=1)
         drawn.append((x[body], normals[body]))
     (coarse, coarse_normals), (fine, fine_normals) = drawn

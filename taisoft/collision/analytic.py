@@ -146,7 +146,7 @@ def _touch(s: ti.template(), o: ti.template(), t, k, margin, out: ti.template(),
     return at
 
 
-@kernel(shared=False)
+@kernel(cse=False)
 def find_analytic(
     s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.template(), used: ti.template(), count: ti.template(),
     part: ti.i32, more: ti.i32,

@@ -245,7 +245,7 @@ def vertex_contacts(
     return at
 
 
-@kernel(shared=False)
+@kernel(cse=False)
 def find_proximity(
     s: ti.template(), near: ti.template(), way: ti.template(), sharp: ti.template(), row: ti.template(), longest: ti.template(),
     needed: ti.template(), room: ti.i32, margin: ti.f64, half: ti.f64, out: ti.template(), used: ti.template(),

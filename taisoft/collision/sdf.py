@@ -228,7 +228,7 @@ def _field_contacts(
     return at, unmapped
 
 
-@kernel(shared=False)
+@kernel(cse=False)
 def find_in_fields(
     s: ti.template(), near: ti.template(), f: ti.template(), sharp: ti.template(), row: ti.template(), longest: ti.template(),
     needed: ti.template(), room: ti.i32, margin: ti.f64, half: ti.f64, out: ti.template(), used: ti.template(),

@@ -24,7 +24,7 @@ def intersect(s: ti.template(), t, u):
     )
 
 
-@kernel(shared=False)
+@kernel(cse=False)
 def find_intersections(
     s: ti.template(), start: ti.template(), end: ti.template(), entry: ti.template(), pair: ti.template(), used: ti.template(),
     total: ti.template(), part: ti.i32,

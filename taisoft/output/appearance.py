@@ -17,7 +17,7 @@ BODY_COLOURS = np.array(
 )
 
 
-OBSTACLE_COLOUR = np.array([0.66, 0.67, 0.69])  # sRGB
+OBSTACLE_COLOUR = np.array([0.72, 0.72, 0.71])  # sRGB
 
 
 def body_colour(index: int) -> np.ndarray:
@@ -29,6 +29,11 @@ def linear_rgb(srgb: np.ndarray) -> np.ndarray:
     """Linear Rec. 709 of sRGB colours (..., 3), both in [0, 1] (IEC 61966-2-1)."""
     srgb = np.asarray(srgb, dtype=float)
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def start_positions(scene) -> np.ndarray:
+    """Nodes of all bodies where they start, (n,3) [m]."""
+    return np.concatenate([body.rest_positions + body.position for body in scene.bodies])
 
 
 def compact_surface(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

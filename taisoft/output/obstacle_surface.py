@@ -1,17 +1,21 @@
 """Obstacles as triangles, for pictures and for USD.
 
 Boxes and meshes are their own surface, spheres and capsules are faceted. Of a half-space's boundary a square about the bodies is
-shown, cut off where another half-space begins, so that the walls of a bin meet in its corners.
+shown, cut off where another half-space begins, so that the walls of a bin meet in its corners. It moves along its normal and
+turns, but stays where it is while the half-space moves along itself.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.errors import OutputError, SceneError
+from taisoft.output.appearance import compact_surface, start_positions
 from taisoft.scene.obstacles import Capsule, HalfSpace, Obstacle, Sphere
 
 REACH = 1.2  # half the side of the square of a half-space, in diagonals of the box about the bodies at the start
-CUTS = 4  # times that each triangle of it is cut in four, so that light changes over it and parts behind the eye are small
+CUTS = 3  # times that each triangle of it is cut in four, so that light changes over it
+TINY = 1e-9  # of that square: a corner nearer to another boundary lies on it
 AROUND, ALONG = 40, 10  # facets of what is round: about its axis, and from there to a pole
 
 
@@ -24,13 +28,21 @@ class ObstacleSurface:
     triangles: np.ndarray
 
     def at(self, t: float) -> np.ndarray:
-        """Vertices (n,3) [m] at time t [s]."""
-        return self.obstacle.points_at(t, self.vertices)
+        """Vertices (n,3) [m] at time t [s]. Raises OutputError where the obstacle's path fails."""
+        try:
+            translation, rotation = self.obstacle.pose(t)
+        except SceneError as error:
+            raise OutputError(f"what is shown of an obstacle has no place: {error}") from error
+        shape = self.obstacle.shape
+        if isinstance(shape, HalfSpace):
+            normal = rotation @ shape.normal
+            translation = (translation @ normal) * normal
+        return (self.vertices - shape.pivot) @ rotation.T + shape.pivot + translation
 
 
 def obstacle_surfaces(scene) -> list[ObstacleSurface]:
     """Of all obstacles of a scene, in the order added."""
-    x = np.concatenate([body.rest_positions + body.position for body in scene.bodies])
+    x = start_positions(scene)
     middle, reach = (x.min(axis=0) + x.max(axis=0)) / 2, REACH * float(np.linalg.norm(np.ptp(x, axis=0)))
     flat = [o.shape for o in scene.obstacles if isinstance(o.shape, HalfSpace) and o.path is None]
     made = []
@@ -41,10 +53,12 @@ def obstacle_surfaces(scene) -> list[ObstacleSurface]:
             surface = _patch(shape, middle, reach, cuts)
         elif isinstance(shape, (Sphere, Capsule)):
             half = shape.size()[0] if isinstance(shape, Capsule) else 0.0
-            x, triangles = _round(half, shape.radius)
-            surface = x @ shape.frame().T + shape.pivot, triangles
+            local, triangles = _round(half, shape.radius)
+            surface = local @ shape.frame().T + shape.pivot, triangles
         else:
-            surface = shape.surface()
+            vertices, triangles = shape.surface()
+            used, triangles = compact_surface(triangles)
+            surface = vertices[used], triangles
         made.append(ObstacleSurface(o, *surface))
     return made
 
@@ -55,11 +69,9 @@ def _patch(shape: HalfSpace, middle: np.ndarray, reach: float, cuts: list[HalfSp
     at = middle - ((middle - shape.point) @ n) * n
     corners = [at + reach * (a * z + b * x) for a, b in ((-1, -1), (-1, 1), (1, 1), (1, -1))]
     for other in cuts:
-        corners = _clipped(corners, other)
+        corners = _clipped(corners, other, TINY * reach)
     if len(corners) < 3:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
-    if np.cross(corners[1] - corners[0], corners[2] - corners[0]) @ n < 0:
-        corners = corners[::-1]
     points = np.array([np.mean(corners, axis=0), *corners])
     k = np.arange(1, len(points))
     triangles = np.stack([np.zeros_like(k), k, np.roll(k, -1)], axis=1)
@@ -68,13 +80,16 @@ def _patch(shape: HalfSpace, middle: np.ndarray, reach: float, cuts: list[HalfSp
     return points, triangles
 
 
-def _clipped(corners: list[np.ndarray], other: HalfSpace) -> list[np.ndarray]:
-    """The convex polygon's part outside of a half-space (Sutherland and Hodgman 1974)."""
+def _clipped(corners: list[np.ndarray], other: HalfSpace, tiny: float) -> list[np.ndarray]:
+    """The convex polygon's part outside of a half-space (Sutherland and Hodgman 1974). tiny: [m] from it is on it."""
     height = [(corner - other.point) @ other.normal for corner in corners]
+    height = [0.0 if abs(h) <= tiny else h for h in height]
+    if max(height, default=0.0) <= 0.0:
+        return []
     kept = []
     for k in range(len(corners)):
         a, b, h, g = corners[k - 1], corners[k], height[k - 1], height[k]
-        if (h < 0) != (g < 0):
+        if h * g < 0:
             kept.append(a + h / (h - g) * (b - a))
         if g >= 0:
             kept.append(b)

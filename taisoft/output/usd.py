@@ -11,7 +11,8 @@ an attribute's time samples from the strongest layer alone, and value clips are 
 Time codes are frame numbers; metres, y up. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose
 guide, so that the two are not drawn over each other) and `material`. Both are flat: a second-order body is written as
 the linear triangles and tets that its elements are cut into, all its nodes as points (`taisoft/mesh/nodes.py`).
-An obstacle is `/World/<name>` with `surface` and `material`; its points change over time where it follows a path.
+An obstacle is `/World/<name>` with `surface` and `material`; its points change over time where it follows a path. A half-space
+that lies wholly within another has none.
 """
 
 from pathlib import Path
@@ -27,10 +28,11 @@ CHUNKS_NAME = "chunks"
 
 
 class UsdWriter:
-    """Observer that writes the scene's bodies over time to folder/scene.usdc.
+    """Observer that writes the scene's bodies and obstacles over time to folder/scene.usdc.
 
-    folder: the run's folder; scene: its bodies' meshes and names are read now; fps: frames per second of simulated time
-    [1/s]; chunk_frames: frames per chunk, at most so many are lost when the process is killed. Raises OutputError.
+    folder: the run's folder; scene: meshes and names of its bodies and obstacles are read now; fps: frames per second of
+    simulated time [1/s]; chunk_frames: frames per chunk, at most so many are lost when the process is killed. Raises
+    OutputError, also for an obstacle whose path fails.
     """
 
     def __init__(self, folder: str | Path, scene, fps: float = 60.0, chunk_frames: int = 10):

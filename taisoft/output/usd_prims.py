@@ -1,4 +1,7 @@
-"""The prims of a scene in OpenUSD: bodies and obstacles with their topology, colours and materials; see `usd.py`."""
+"""The prims of a scene in OpenUSD: bodies and obstacles with their topology, colours and materials; see `usd.py`.
+
+Surfaces are single-sided, so that a viewer that leaves out back faces looks into a bin.
+"""
 
 import re
 
@@ -12,7 +15,7 @@ MAX_NAME = 64  # characters of a prim name; the whole name is kept beside it
 
 
 def prim_names(names: list[str]) -> list[str]:
-    """Legal, distinct USD prim names for body names, in order.
+    """Legal, distinct USD prim names for names of bodies and obstacles, in order.
 
     Anything but ASCII letters, digits and underscores becomes an underscore (UTF-8 identifiers are young in USD, and
     many readers refuse them); a leading digit gets one before it; a name met before gets a number behind it.

@@ -39,8 +39,8 @@ class World:
     def restart(self) -> None:
         """The state at the scene's start."""
         self.motion.reset()
-        free = ~self.motion.constrained()
-        upload([(self.model.free, free), (self.model.x, self.layout.rest), (self.model.v, self._rest_velocities())])
+        self.upload_constraints()
+        self.set_state(self.layout.rest, self._rest_velocities())  # so that it is compiled before a step must be taken back
         self.time, self.step_count = 0.0, 0
 
     def upload_constraints(self) -> None:

@@ -75,6 +75,34 @@ class Camera:
         needed = np.maximum(np.abs(right) / (half * size[0] / size[1]), np.abs(up) / half) - forward
         return float(np.max(needed, initial=0.0, where=np.isfinite(needed)))
 
+    def clipped(
+        self, x: np.ndarray, triangles: np.ndarray, colours: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices (n,3) [m], triangles (t,3) and colours (n,3) with what lies nearer than the near plane cut off.
+
+        New vertices come behind the given ones. Triangles with a vertex that is not finite go.
+        """
+        depth = (x - self.position) @ self.forward - self.clipping[0] * (1.0 + 1e-6)
+        with np.errstate(invalid="ignore"):
+            front = (depth[triangles] > 0).sum(axis=1)
+        crossing = (front > 0) & (front < 3) & np.isfinite(depth[triangles]).all(axis=1)
+        made, points, shades = [], [], []
+        for corners in triangles[crossing]:
+            polygon = []
+            for i, j in zip(corners, np.roll(corners, -1)):
+                if depth[i] > 0:
+                    polygon.append(i)
+                if (depth[i] > 0) != (depth[j] > 0):
+                    share = depth[i] / (depth[i] - depth[j])
+                    polygon.append(len(x) + len(points))
+                    points.append(x[i] + share * (x[j] - x[i]))
+                    shades.append(colours[i] + share * (colours[j] - colours[i]))
+            made += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)]
+        whole = triangles[front == 3]
+        if not made:
+            return x, whole, colours
+        return np.concatenate([x, points]), np.concatenate([whole, made]), np.concatenate([colours, shades])
+
     def orbit(self, azimuth: float, elevation: float) -> "Camera":
         """Turned about the target by so many degrees; elevation stops short of the poles."""
         raised = min(max(self.elevation + elevation, -MAX_ELEVATION), MAX_ELEVATION)

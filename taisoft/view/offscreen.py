@@ -8,12 +8,13 @@ import sys
 import numpy as np
 
 from taisoft.errors import OutputError
+from taisoft.output.appearance import start_positions
 from taisoft.runtime import open_kind
 from taisoft.view.camera import MAX_WIDENING, Camera
 from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
 from taisoft.view.raster import rasterise
 from taisoft.view.shading import background, lit_colours
-from taisoft.view.surfaces import Surfaces, start_positions
+from taisoft.view.surfaces import Surfaces
 
 SIZE = (1280, 720)
 SAMPLES = 2  # per pixel and axis
@@ -24,7 +25,7 @@ _told: set[str] = set()  # sentences printed in this process
 
 
 class Offscreen:
-    """Draws a scene's bodies as pictures.
+    """Draws a scene's bodies and obstacles as pictures.
 
     scene: read once; size: (width, height) in pixels; camera: stays as given, else shows all bodies as they start,
     and moves back, never nearer, when a body would leave the picture; renderer: "vulkan", "software" or "auto": Vulkan
@@ -49,8 +50,9 @@ class Offscreen:
 
     def image(self, sim) -> np.ndarray:
         """Picture of sim's present state, uint8 (height, width, 3), first row on top."""
-        x, normals = self.surfaces.vertices(sim, self.camera.position)
-        self.camera = self.camera.widened(x[: self.surfaces.n_of_bodies], self.size, self._widest)
+        bodies = self.surfaces.of_bodies(sim)
+        self.camera = self.camera.widened(bodies[0], self.size, self._widest)
+        x, normals = self.surfaces.with_obstacles(bodies, sim.time, self.camera.position)
         projected = self.camera.project(x, self._large)
         left, top, right, bottom = _box(projected, self._large)  # the rest is background, and stays as it is
         picture = self._background[::SAMPLES, ::SAMPLES].copy()
@@ -65,8 +67,10 @@ class Offscreen:
             np.copyto(part, pixels, where=~empty[..., None])
         else:
             colours = lit_colours(x, normals, self.surfaces.colours, self.camera)
+            x, triangles, colours = self.camera.clipped(x, self.surfaces.triangles, colours)
+            projected = self.camera.project(x, self._large)
             projected[:, :2] -= (left, top)
-            rasterise(projected, self.surfaces.triangles, colours, self.camera.clipping[0], part)
+            rasterise(projected, triangles, colours, self.camera.clipping[0], part)
         picture[top // SAMPLES : bottom // SAMPLES, left // SAMPLES : right // SAMPLES] = _averaged(part)
         return picture
 

@@ -3,7 +3,7 @@
 A drawn vertex belongs to one node and one smoothing group: the triangles round that node that are connected over edges
 bent by less than CREASE at rest. Its normal is the area-weighted mean over that group, so a ball looks round and a box
 keeps its edges, in every deformed state. A second-order face is drawn as four flat triangles between its six nodes.
-A half-space is drawn where the eye is outside of it: the walls of a bin that the eye looks through are not.
+Of an obstacle those triangles are drawn whose front is turned to the eye: of a bin's walls the inner sides.
 """
 
 import numpy as np
@@ -12,7 +12,6 @@ from scipy.sparse.csgraph import connected_components
 
 from taisoft.output.appearance import OBSTACLE_COLOUR, body_colour
 from taisoft.output.obstacle_surface import ObstacleSurface, obstacle_surfaces
-from taisoft.scene.obstacles import HalfSpace
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
@@ -24,13 +23,12 @@ class Surfaces:
     """Everything drawn, as one triangle mesh whose topology and colours stay.
 
     scene: its bodies and obstacles are read once. triangles: int32 (t,3) of drawn vertices; colours: float (n,3), unshaded
-    sRGB; n_of_bodies: drawn vertices of bodies, which come first.
+    sRGB.
     """
 
     def __init__(self, scene):
         self._bodies = [_BodySurface(body, body_colour(k)) for k, body in enumerate(scene.bodies)]
         self._obstacles = [_RigidSurface(surface) for surface in obstacle_surfaces(scene)]
-        self.n_of_bodies = sum(len(body.colours) for body in self._bodies)
         triangles, colours, n = [], [], 0
         for part in (*self._bodies, *self._obstacles):
             triangles.append(part.triangles + n)
@@ -39,16 +37,22 @@ class Surfaces:
         self.triangles = np.concatenate(triangles).astype(np.int32)
         self.colours = np.concatenate(colours)
 
-    def vertices(self, sim, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [m] and unit normals of the drawn vertices in sim's present state, each float64 (n,3). eye: (3,) [m]."""
-        parts = [body.vertices(sim.positions(body.name)) for body in self._bodies]
-        parts += [obstacle.vertices(sim.time, eye) for obstacle in self._obstacles]
-        return np.concatenate([x for x, _ in parts]), np.concatenate([n for _, n in parts])
+    def of_bodies(self, sim) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [m] and unit normals of the bodies' drawn vertices in sim's present state, each float64 (n,3)."""
+        return _joined([body.vertices(sim.positions(body.name)) for body in self._bodies])
+
+    def with_obstacles(
+        self, bodies: tuple[np.ndarray, np.ndarray], t: float, eye: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Of all drawn vertices: what `of_bodies` gave, and obstacles at time t [s] as seen from the eye (3,) [m].
+
+        Raises OutputError where the path of an obstacle fails.
+        """
+        return _joined([bodies, *(obstacle.vertices(t, eye) for obstacle in self._obstacles)])
 
 
-def start_positions(scene) -> np.ndarray:
-    """Nodes of all bodies where they start, (n,3) [m]."""
-    return np.concatenate([body.rest_positions + body.position for body in scene.bodies])
+def _joined(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    return np.concatenate([x for x, _ in parts]), np.concatenate([n for _, n in parts])
 
 
 class _BodySurface:
@@ -77,18 +81,21 @@ class _BodySurface:
 
 
 class _RigidSurface:
+    """Each triangle has corners of its own, so that it can be left out."""
+
     def __init__(self, surface: ObstacleSurface):
         self._surface = surface
-        self._nodes, self.triangles = smoothing_groups(surface.vertices, surface.triangles)
-        self._normals = vertex_normals(surface.vertices[self._nodes], self.triangles)
-        self.colours = np.tile(OBSTACLE_COLOUR, (len(self._nodes), 1))
+        self._nodes, self._corners = smoothing_groups(surface.vertices, surface.triangles)
+        self.triangles = np.arange(self._corners.size).reshape(-1, 3)
+        self.colours = np.tile(OBSTACLE_COLOUR, (self._corners.size, 1))
 
     def vertices(self, t: float, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x, obstacle = self._surface.at(t)[self._nodes], self._surface.obstacle
-        normals = self._normals @ obstacle.pose(t)[1].T
-        if isinstance(obstacle.shape, HalfSpace) and len(x) and (eye - x[0]) @ normals[0] <= 0:
-            x = np.repeat(x[:1], len(x), axis=0)  # triangles without area do not show
-        return x, normals
+        x = self._surface.at(t)[self._nodes]
+        corners, normals = x[self._corners], vertex_normals(x, self._corners)[self._corners]
+        a, b, c = np.moveaxis(corners, 1, 0)
+        away = np.einsum("ti,ti->t", np.cross(b - a, c - a), eye - a) <= 0
+        corners[away] = a[away, None]  # triangles without area do not show
+        return corners.reshape(-1, 3), normals.reshape(-1, 3)
 
 
 def smoothing_groups(rest: np.ndarray, surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

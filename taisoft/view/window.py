@@ -10,10 +10,11 @@ import time
 import taichi as ti
 
 from taisoft.errors import OutputError, SimulationError, TaisoftError
+from taisoft.output.appearance import start_positions
 from taisoft.view.camera import MAX_WIDENING, Camera
 from taisoft.view.ggui import Canvas
 from taisoft.view.shading import BACKGROUND_TOP
-from taisoft.view.surfaces import Surfaces, start_positions
+from taisoft.view.surfaces import Surfaces
 
 SIZE = (1280, 720)
 PANEL = (0.012, 0.02, 0.25, 0.36)  # left, top, width, height as fractions of the window
@@ -27,7 +28,7 @@ KEYS = ("Space: pause, S or Right: step", "R: restart, Esc: quit", "Drag: left t
 class LiveWindow:
     """A window that shows a scene; also an observer, with `frame` and `close`, for `Simulator.run`.
 
-    scene: its bodies are read once; size: (width, height) in pixels; camera: where to look from, else it shows all
+    scene: its bodies and obstacles are read once; size: (width, height) in pixels; camera: where to look from, else it shows all
     bodies and moves back after them until the user moves it. `pressed` holds which of "pause", "step" and "reset" the
     user pressed up to the last draw. Raises OutputError, before anything is opened, when a display or a Vulkan driver
     is missing or the process has a window already.
@@ -49,9 +50,9 @@ class LiveWindow:
 
     def draw(self, sim, lines: list[str]) -> None:
         """Draw sim's present state with a panel of text lines, show it, and take up keys and mouse."""
-        x, normals = self._surfaces.vertices(sim, self.camera.position)
-        of_bodies = x[: self._surfaces.n_of_bodies]
-        self.camera = self.camera.widened(of_bodies, self._canvas.window.get_window_shape(), self._widest)
+        bodies = self._surfaces.of_bodies(sim)
+        self.camera = self.camera.widened(bodies[0], self._canvas.window.get_window_shape(), self._widest)
+        x, normals = self._surfaces.with_obstacles(bodies, sim.time, self.camera.position)
         self._canvas.draw(x, normals, self.camera, tuple(BACKGROUND_TOP))
         with self._canvas.window.get_gui().sub_window("taisoft", *PANEL) as panel:
             for line in lines:
