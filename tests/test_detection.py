@@ -11,6 +11,7 @@ import pytest
 from detection_scenes import DT, compare, identical, keys, pairs_of, simulator, zoo
 from rotations import rotation
 
+from taisoft.collision import surface
 from taisoft.collision.contacts import KINDS
 from taisoft.collision.pipeline import Detection
 from taisoft.errors import SimulationError
@@ -92,12 +93,16 @@ class TestZoo:
             at_vertices = c.kind != "face_field"  # the deepest point between two balls runs ahead
             assert np.abs(other.point - c.point)[at_vertices].max() < 3e-5 * k
 
-    def test_the_same_on_one_thread_and_on_many(self, still):
+    @pytest.mark.parametrize("light", [False, True])
+    def test_the_same_on_one_thread_and_on_many(self, still, monkeypatch, light):
+        """light: loops that do little at a turn on one thread, the others on many, as of surfaces of middling size."""
         sim, _, start, close = still
         if close > 1e-9:
             return  # once is enough
         one, world = sim.detect_contacts(), sim._world
-        many = Detection(sim.scene, world.model, world.layout, sim._runtime, serial=False)
+        monkeypatch.setattr(surface, "SERIAL_BELOW", 0)
+        many = Detection(sim.scene, world.model, world.layout, sim._runtime, serial=None if light else False)
+        assert many.surface.light == light
         many.find(0.0, DT)
         first = many.contacts()
         compare(one, first, close=0.0)  # the parts of the work lie in another order

@@ -14,7 +14,7 @@ from taisoft.runtime import kernel
 @kernel
 def move_obstacles(s: ti.template(), first: ti.i32, x: ti.types.ndarray(), move: ti.types.ndarray()):
     """Place the vertices of an obstacle, the first of which is `first`: x, move (n,3) f64 [m]."""
-    ti.loop_config(serialize=s.serial)
+    ti.loop_config(serialize=s.light)
     for i in range(x.shape[0]):
         for q in ti.static(range(3)):
             s.x[first + i][q] = x[i, q]
@@ -24,7 +24,7 @@ def move_obstacles(s: ti.template(), first: ti.i32, x: ti.types.ndarray(), move:
 @kernel
 def take_led(s: ti.template(), led: ti.template(), move: ti.types.ndarray()):
     """How far each vertex is led in the step: move (n_verts,3) f64 [m], nan where it is not."""
-    ti.loop_config(serialize=s.serial)
+    ti.loop_config(serialize=s.light)
     for i in range(s.n_verts):
         for q in ti.static(range(3)):
             led[i][q] = move[i, q]
@@ -33,7 +33,7 @@ def take_led(s: ti.template(), led: ti.template(), move: ti.types.ndarray()):
 @ti.func
 def _move_soft(s: ti.template(), x: ti.template(), v: ti.template(), leads: ti.template(), led: ti.template(), dt):
     """Positions of the soft bodies, and their way: where the model leads a node that, else v dt."""
-    ti.loop_config(serialize=s.serial)
+    ti.loop_config(serialize=s.light)
     for i in range(s.n_verts):
         if s.node[i] >= 0:
             s.x[i] = x[s.node[i]]
@@ -50,7 +50,7 @@ def _box_triangles(s: ti.template(), margin):
     """Boxes, normals and areas of the triangles, and the number of those that are not finite."""
     s.count[UNFINITE] = 0
     half = ti.cast(0.5, ti.f64) * margin
-    ti.loop_config(serialize=s.serial)
+    ti.loop_config(serialize=s.light)
     for t in range(s.n_triangles):
         i, j, k = s.triangle[t, 0], s.triangle[t, 1], s.triangle[t, 2]
         a, b, c = s.x[i], s.x[j], s.x[k]
@@ -76,7 +76,7 @@ def _box_triangles(s: ti.template(), margin):
 @ti.func
 def _box_bodies(s: ti.template()):
     """Boxes of the colliders."""
-    ti.loop_config(serialize=s.serial)
+    ti.loop_config(serialize=s.light)
     for wide in range(s.n_bodies * s.spread):
         if wide % s.spread == 0:
             b = wide // s.spread
@@ -132,7 +132,7 @@ def _meets_another(s: ti.template(), t, first, last):
 @ti.func
 def _list_active(s: ti.template()):
     """List the triangles that can have a partner, in ascending order."""
-    ti.loop_config(serialize=s.serial)
+    ti.loop_config(serialize=s.light)
     for wide in range(s.chunks * s.spread):
         if wide % s.spread == 0:
             c = wide // s.spread

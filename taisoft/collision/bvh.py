@@ -134,7 +134,7 @@ def nodes_below(b: ti.template(), node):
 @ti.func
 def _refit_chunks(s: ti.template(), b: ti.template(), margin):
     """Slabs of all nodes in the chunks."""
-    ti.loop_config(serialize=s.serial)
+    ti.loop_config(serialize=s.light)
     for wide in range(b.n_chunks * s.spread):
         if wide % s.spread == 0:
             first = b.chunk[wide // s.spread]

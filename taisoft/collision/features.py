@@ -133,7 +133,7 @@ def mark_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template())
 
     way: (n_bodies) i32, 0 for bodies hit by a distance field.
     """
-    ti.loop_config(serialize=s.serial)
+    ti.loop_config(serialize=s.light)
     for c in range(s.count[ACTIVE]):
         t = s.active[c]
         bits = 0

@@ -13,6 +13,8 @@ from taisoft.fields import FieldArena
 from taisoft.runtime import Runtime
 
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than waking the others (about 50 us a loop)
+# The same for loops that do little at a turn: all but those that find contacts. With two cores it holds beyond 40,000.
+LIGHT_BELOW = 30000
 # Taichi gives each CPU thread at least 512 turns of a loop: so many turns belong to one part, and one of them does the work
 SPREAD = {"cpu": 512, "cuda": 1}
 CHUNKS = {"cpu": 64, "cuda": 4096}  # parts of a list that are worked on side by side, each with its own part of a buffer
@@ -52,7 +54,8 @@ class Surface:
     n_triangles: int
     n_verts: int
     n_bodies: int  # colliders, with those that have no faces
-    serial: bool
+    serial: bool  # whether one thread does it all
+    light: bool  # whether one thread does the loops that do little at a turn
     chunks: int
     spread: int  # turns of a loop for each part, see SPREAD
     triangle: Any  # (n_triangles, 3) i32
@@ -138,8 +141,9 @@ def build_surface(
     """Allocate and fill the fields. rest: (v,3) [m]; soft, self_on: (n_bodies,) bool. serial: None decides by size."""
     t, i = topology, ti.i32
     n, v, bodies = len(t.triangle), len(t.node), len(soft)
+    light = serial
     if serial is None:
-        serial = runtime.arch == "cpu" and n < SERIAL_BELOW
+        serial, light = (runtime.arch == "cpu" and n < few for few in (SERIAL_BELOW, LIGHT_BELOW))
     chunks = 1 if serial else CHUNKS[runtime.arch]
 
     def ints(name: str, data: np.ndarray):
@@ -153,7 +157,7 @@ def build_surface(
         return arena.vectors(f"surface_{name}", ti.f64, max(count, 1))
 
     return Surface(
-        n, v, bodies, serial, chunks, 1 if serial else SPREAD[runtime.arch], rows("triangle", t.triangle),
+        n, v, bodies, serial, light, chunks, 1 if serial else SPREAD[runtime.arch], rows("triangle", t.triangle),
         ints("body", t.body), ints("node", t.node),
         rows("neighbour", t.neighbour), ints("owns", t.owns), ints("ring_start", t.ring_start), ints("ring", t.ring),
         ints("around_start", t.around_start), ints("around", t.around),
