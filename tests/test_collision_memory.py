@@ -109,7 +109,7 @@ def search_everything() -> None:
 
 def search_in_small_parts() -> None:
     """More contacts than fit into 64 parts of one entry, which may not grow: counted, and not written."""
-    surface.SERIAL_BELOW = 0
+    surface.SERIAL_BELOW = surface.LIGHT_BELOW = 0
     scene = ts.Scene()
     scene.collision = ts.CollisionSettings(initial_capacity=64, max_capacity=65)
     scene.allow_initial_overlap = True  # or the search for it would need more entries

@@ -65,12 +65,17 @@ def test_numbers_are_rounded_to_the_field(fields):
     assert same(download(own), [array.astype(np.float32) for array in data])
 
 
-def test_what_does_not_fit_is_refused(fields):
+def test_what_does_not_fit_is_refused(fields, monkeypatch):
     data = random_data(fields, 3)
     upload(list(zip(fields, data)))
     wrong = [np.zeros_like(array) for array in data]
     wrong[-1] = wrong[-1][:, :-1]
     with pytest.raises(ValueError, match=r"a field of shape \(9, 12\) cannot take an array of shape \(9, 11\)"):
+        upload(list(zip(fields, wrong)))
+    with pytest.raises(ValueError, match="cannot take an array"):
+        upload([(fields[-1], wrong[-1])])
+    monkeypatch.setattr(transfer, "MOST", 10)
+    with pytest.raises(ValueError, match="cannot take an array"):
         upload(list(zip(fields, wrong)))
     assert same(download(fields), data)
 

@@ -28,7 +28,7 @@ from taisoft.runtime import open_kind, open_runtime
 from taisoft.view.camera import BORDER, FILL, Camera
 from taisoft.view.ggui import vulkan_missing, window_holder
 from taisoft.view.offscreen import Offscreen
-from taisoft.view.raster import rasterise
+from taisoft.view.raster import LARGEST_TRIANGLE, rasterise
 from taisoft.view.surfaces import MARKER_COLOUR, Surfaces, smoothing_groups, vertex_normals
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -78,14 +78,15 @@ def test_the_camera_moves_back_from_moving_bodies():
 
 
 def test_a_floor_that_reaches_behind_the_eye():
-    """Against rays through the middle of every pixel; triangles in front stay as they are, those behind go."""
+    """Against rays through the middle of every pixel; triangles in front stay as they are, those behind go. Not to be dropped
+    as too large, either, in a picture of many pixels."""
     half = 30.0
     floor = [[-half, 0, -half], [half, 0, -half], [half, 0, half], [-half, 0, half]]
-    corners = np.array([*floor, [0, 1, -9], [1, 1, -9], [0, 2, -9]])
-    shades, triangles = (corners + half) / (2 * half), np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [2, 3, 3]])
+    corners = np.array([*floor, [0, 1, -9], [1, 1, -9], [0, 2, -9], [0, 1, 9], [1, 1, 9], [0, 2, 9]])
+    shades, triangles = (corners + half) / (2 * half), np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [7, 8, 9]])
     camera = Camera(target=np.array([0.0, 0.5, 0.0]), distance=3.0, azimuth=20.0, elevation=10.0)
-    x, cut, colours = camera.clipped(corners, triangles, shades)
-    assert np.array_equal(x[: len(corners)], corners) and (cut == [4, 5, 6]).all(axis=1).sum() == 1
+    x, cut, colours = camera.clipped(corners, triangles, shades, SIZE)
+    assert not (cut == 7).any() and np.array_equal(x[: len(corners)], corners) and (cut == [4, 5, 6]).all(axis=1).sum() == 1
     image, (width, height) = np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8), SIZE
     below = (cut != [4, 5, 6]).all(axis=1)
     drawn = rasterise(camera.project(x, SIZE), cut[below], colours, camera.clipping[0], image)
@@ -99,9 +100,12 @@ def test_a_floor_that_reaches_behind_the_eye():
     assert (drawn != expected).mean() < 0.005 and 0.4 < expected.mean() < 0.8
     both = drawn & expected
     assert np.abs(image[both] / 255 - (hit[both] + half) / (2 * half))[:, [0, 2]].max() < 0.02
-    bad = corners.copy()
-    bad[1] = np.nan
-    assert not (camera.clipped(bad, triangles, shades)[1] == 1).any()
+    large = np.abs(camera.project(camera.clipped(corners, triangles, shades, (2560, 1440))[0], (2560, 1440))[len(corners) :, :2])
+    assert 1e4 < large.max() < 0.5 * LARGEST_TRIANGLE
+    for value in (np.nan, np.inf):
+        bad = corners.copy()
+        bad[4] = value
+        assert not (camera.clipped(bad, triangles, shades, SIZE)[1] == 4).any()
 
 
 # --- surfaces ---

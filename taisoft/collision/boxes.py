@@ -77,9 +77,9 @@ def _box_triangles(s: ti.template(), margin):
 def _box_bodies(s: ti.template()):
     """Boxes of the colliders."""
     ti.loop_config(serialize=s.light)
-    for wide in range(s.n_bodies * s.spread):
-        if wide % s.spread == 0:
-            b = wide // s.spread
+    for wide in range(s.n_bodies * s.light_spread):
+        if wide % s.light_spread == 0:
+            b = wide // s.light_spread
             lo, hi = dvec(ti.math.inf), dvec(-ti.math.inf)
             for t in range(s.first_of[b], s.first_of[b + 1]):
                 lo, hi = ti.min(lo, s.lo[t]), ti.max(hi, s.hi[t])
@@ -133,9 +133,9 @@ def _meets_another(s: ti.template(), t, first, last):
 def _list_active(s: ti.template()):
     """List the triangles that can have a partner, in ascending order."""
     ti.loop_config(serialize=s.light)
-    for wide in range(s.chunks * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
+    for wide in range(s.chunks * s.light_spread):
+        if wide % s.light_spread == 0:
+            c = wide // s.light_spread
             first, near = part_first(c, s.n_triangles, s.chunks), c * s.n_bodies
             n, n_near, own = 0, 0, -1
             for t in range(first, part_first(c + 1, s.n_triangles, s.chunks)):

@@ -135,9 +135,9 @@ def nodes_below(b: ti.template(), node):
 def _refit_chunks(s: ti.template(), b: ti.template(), margin):
     """Slabs of all nodes in the chunks."""
     ti.loop_config(serialize=s.light)
-    for wide in range(b.n_chunks * s.spread):
-        if wide % s.spread == 0:
-            first = b.chunk[wide // s.spread]
+    for wide in range(b.n_chunks * s.light_spread):
+        if wide % s.light_spread == 0:
+            first = b.chunk[wide // s.light_spread]
             n = nodes_below(b, first)
             for k in range(n):
                 node = first + n - 1 - k

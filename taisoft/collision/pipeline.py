@@ -201,7 +201,7 @@ class Detection:
         if self._reduction is None or self._reduction.place.shape[0] != b.capacity:
             arena = FieldArena()
             with arena.group():
-                self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.light, self.surface.spread)
+                self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.light, self.surface.light_spread)
             self._reduction_arena.release()
             self._reduction_arena = arena
         reduce_contacts(self._reduction, b.data, b.used, b.part, MERGED * self.edge, REDUCTION_CELL * self.edge)

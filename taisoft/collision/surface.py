@@ -13,7 +13,8 @@ from taisoft.fields import FieldArena
 from taisoft.runtime import Runtime
 
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than waking the others (about 50 us a loop)
-# The same for loops that do little at a turn: all but those that find contacts. With two cores it holds beyond 40,000.
+# The same for loops that do little at a turn: boxes, the trees' refit, sharp edges, reduction. Measured with two cores, where
+# it holds beyond 40,000.
 LIGHT_BELOW = 30000
 # Taichi gives each CPU thread at least 512 turns of a loop: so many turns belong to one part, and one of them does the work
 SPREAD = {"cpu": 512, "cuda": 1}
@@ -58,6 +59,7 @@ class Surface:
     light: bool  # whether one thread does the loops that do little at a turn
     chunks: int
     spread: int  # turns of a loop for each part, see SPREAD
+    light_spread: int  # the same for light loops
     triangle: Any  # (n_triangles, 3) i32
     body: Any  # i32
     node: Any  # i32
@@ -157,7 +159,8 @@ def build_surface(
         return arena.vectors(f"surface_{name}", ti.f64, max(count, 1))
 
     return Surface(
-        n, v, bodies, serial, light, chunks, 1 if serial else SPREAD[runtime.arch], rows("triangle", t.triangle),
+        n, v, bodies, serial, light, chunks, *(1 if alone else SPREAD[runtime.arch] for alone in (serial, light)),
+        rows("triangle", t.triangle),
         ints("body", t.body), ints("node", t.node),
         rows("neighbour", t.neighbour), ints("owns", t.owns), ints("ring_start", t.ring_start), ints("ring", t.ring),
         ints("around_start", t.around_start), ints("around", t.around),

@@ -1,8 +1,8 @@
 """Obstacles as triangles, for pictures and for USD.
 
 Boxes and meshes are their own surface, spheres and capsules are faceted. Of a half-space's boundary a square about the bodies is
-shown, cut off where another half-space begins, so that the walls of a bin meet in its corners. It moves along its normal and
-turns, but stays where it is while the half-space moves along itself.
+shown, cut off where another half-space begins, so that the walls of a bin meet in its corners. With a path it turns about its
+own middle and moves along its normal, and neither cuts nor is cut.
 """
 
 from dataclasses import dataclass
@@ -34,10 +34,11 @@ class ObstacleSurface:
         except SceneError as error:
             raise OutputError(f"what is shown of an obstacle has no place: {error}") from error
         shape = self.obstacle.shape
-        if isinstance(shape, HalfSpace):
-            normal = rotation @ shape.normal
-            translation = (translation @ normal) * normal
-        return (self.vertices - shape.pivot) @ rotation.T + shape.pivot + translation
+        pivot, at = shape.pivot, shape.pivot + translation
+        if isinstance(shape, HalfSpace) and self.obstacle.path is not None:
+            pivot, normal = self.vertices.mean(axis=0), rotation @ shape.normal
+            at = pivot - ((pivot - at) @ normal) * normal
+        return (self.vertices - pivot) @ rotation.T + at
 
 
 def obstacle_surfaces(scene) -> list[ObstacleSurface]:
@@ -49,7 +50,7 @@ def obstacle_surfaces(scene) -> list[ObstacleSurface]:
     for o in scene.obstacles:
         shape = o.shape
         if isinstance(shape, HalfSpace):
-            cuts = [other for other in flat if other is not shape] if o.path is None else []
+            cuts = [other for other in flat if other is not shape and not _same(shape, other, made)] if o.path is None else []
             surface = _patch(shape, middle, reach, cuts)
         elif isinstance(shape, (Sphere, Capsule)):
             half = shape.size()[0] if isinstance(shape, Capsule) else 0.0
@@ -61,6 +62,12 @@ def obstacle_surfaces(scene) -> list[ObstacleSurface]:
             surface = vertices[used], triangles
         made.append(ObstacleSurface(o, *surface))
     return made
+
+
+def _same(shape: HalfSpace, other: HalfSpace, made: list[ObstacleSurface]) -> bool:
+    """Whether another half-space has the same boundary and comes later: the first of such is shown."""
+    close = shape.normal @ other.normal > 1.0 - TINY and abs((shape.point - other.point) @ shape.normal) <= TINY
+    return bool(close) and not any(one.obstacle.shape is other for one in made)
 
 
 def _patch(shape: HalfSpace, middle: np.ndarray, reach: float, cuts: list[HalfSpace]) -> tuple[np.ndarray, np.ndarray]:

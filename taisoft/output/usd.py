@@ -12,7 +12,7 @@ Time codes are frame numbers; metres, y up. A body is `/World/<name>` with `surf
 guide, so that the two are not drawn over each other) and `material`. Both are flat: a second-order body is written as
 the linear triangles and tets that its elements are cut into, all its nodes as points (`taisoft/mesh/nodes.py`).
 An obstacle is `/World/<name>` with `surface` and `material`; its points change over time where it follows a path. A half-space
-that lies wholly within another has none.
+whose square lies wholly within others is left out.
 """
 
 from pathlib import Path
@@ -50,14 +50,15 @@ class UsdWriter:
 
     def frame(self, sim, index: int) -> None:
         """Record sim's positions as frame index; index must ascend. Raises OutputError."""
+        moved = [(prim_path, surface.at(sim.time).astype(np.float32)) for prim_path, surface in self._moving]  # may fail
         if self._chunk is None:
             self._chunk = _copy(self._template)
         for name, tracks in self._tracks.items():
             x = np.asarray(sim.positions(name), dtype=np.float32)
             for prim_path, nodes in tracks:
                 self._sample(prim_path, x if nodes is None else x[nodes], index)
-        for prim_path, surface in self._moving:
-            self._sample(prim_path, surface.at(sim.time).astype(np.float32), index)
+        for prim_path, points in moved:
+            self._sample(prim_path, points, index)
         self._frames.append(index)
         if len(self._frames) >= self.chunk_frames:
             self._publish_chunk()

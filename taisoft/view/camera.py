@@ -10,6 +10,7 @@ MAX_ELEVATION = 89.0  # [deg]; at 90 "up" is no longer defined
 FILL = 0.62  # of the picture's width or height, whichever is reached first, that the bodies take at the start
 BORDER = 0.06  # of the picture, both sides together, kept free when the camera moves back from moving bodies
 MAX_WIDENING = 4.0  # times the first distance: a body that flies away goes out of sight in the end
+WIDE = 50.0  # pictures wide and high about the middle: what lies beyond is cut off where a triangle crosses that
 NEAR, FAR = 0.02, 50.0  # clipping planes in units of the distance to the target
 
 
@@ -76,32 +77,33 @@ class Camera:
         return float(np.max(needed, initial=0.0, where=np.isfinite(needed)))
 
     def clipped(
-        self, x: np.ndarray, triangles: np.ndarray, colours: np.ndarray
+        self, x: np.ndarray, triangles: np.ndarray, colours: np.ndarray, size: tuple[int, int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Vertices (n,3) [m], triangles (t,3) and colours (n,3) with what lies nearer than the near plane cut off.
+        """Vertices (n,3) [m], triangles (t,3) and colours (n,3) without what is nearer than the near plane or far off sideways.
 
-        New vertices come behind the given ones. Triangles with a vertex that is not finite go.
+        size: width and height of the picture. New vertices come behind the given ones; triangles that are not finite go.
         """
-        depth = (x - self.position) @ self.forward - self.clipping[0] * (1.0 + 1e-6)
+        right, up, depth = (np.where(np.isfinite(x), x, np.nan) - self.position).dot(self.axes.T).T
+        high = WIDE * math.tan(math.radians(self.fov) / 2) * depth
+        wide = high * size[0] / size[1]
+        near = depth - self.clipping[0] * (1.0 + 1e-6)
+        inside = np.stack([near, wide - right, wide + right, high - up, high + up], axis=1)  # above 0 on each plane's inner side
         with np.errstate(invalid="ignore"):
-            front = (depth[triangles] > 0).sum(axis=1)
-        crossing = (front > 0) & (front < 3) & np.isfinite(depth[triangles]).all(axis=1)
-        made, points, shades = [], [], []
+            within = inside[triangles] > 0  # (t, corners, planes)
+        whole = within.all(axis=(1, 2))
+        crossing = within.any(axis=1).all(axis=1) & ~whole & np.isfinite(inside[triangles]).all(axis=(1, 2))
+        made, points = [], []
         for corners in triangles[crossing]:
-            polygon = []
-            for i, j in zip(corners, np.roll(corners, -1)):
-                if depth[i] > 0:
-                    polygon.append(i)
-                if (depth[i] > 0) != (depth[j] > 0):
-                    share = depth[i] / (depth[i] - depth[j])
-                    polygon.append(len(x) + len(points))
-                    points.append(x[i] + share * (x[j] - x[i]))
-                    shades.append(colours[i] + share * (colours[j] - colours[i]))
-            made += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)]
-        whole = triangles[front == 3]
+            polygon = np.concatenate([inside[corners], x[corners], colours[corners]], axis=1)
+            for k in range(inside.shape[1]):
+                polygon = _cut(polygon, k)
+            first = len(x) + len(points)
+            made += [(first, first + k, first + k + 1) for k in range(1, len(polygon) - 1)]
+            points += [row[inside.shape[1] :] for row in polygon]
         if not made:
-            return x, whole, colours
-        return np.concatenate([x, points]), np.concatenate([whole, made]), np.concatenate([colours, shades])
+            return x, triangles[whole], colours
+        new = np.array(points)
+        return np.concatenate([x, new[:, :3]]), np.concatenate([triangles[whole], made]), np.concatenate([colours, new[:, 3:]])
 
     def orbit(self, azimuth: float, elevation: float) -> "Camera":
         """Turned about the target by so many degrees; elevation stops short of the poles."""
@@ -128,3 +130,14 @@ class Camera:
         depth = seen[:, 2]
         scale = focal / np.where(depth > 0, depth, np.inf)
         return np.column_stack([width / 2 + scale * seen[:, 0], height / 2 - scale * seen[:, 1], depth])
+
+
+def _cut(polygon: np.ndarray, k: int) -> np.ndarray:
+    """The part of a convex polygon where column k of its corners' rows is not negative, all columns interpolated."""
+    kept = []
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0)):
+        if a[k] >= 0:
+            kept.append(a)
+        if a[k] * b[k] < 0:
+            kept.append(a + a[k] / (a[k] - b[k]) * (b - a))
+    return np.array(kept).reshape(-1, polygon.shape[1])

@@ -67,7 +67,7 @@ class Offscreen:
             np.copyto(part, pixels, where=~empty[..., None])
         else:
             colours = lit_colours(x, normals, self.surfaces.colours, self.camera)
-            x, triangles, colours = self.camera.clipped(x, self.surfaces.triangles, colours)
+            x, triangles, colours = self.camera.clipped(x, self.surfaces.triangles, colours, self.size)
             projected = self.camera.project(x, self._large)
             projected[:, :2] -= (left, top)
             rasterise(projected, triangles, colours, self.camera.clipping[0], part)

@@ -7,7 +7,7 @@ wins, and its corner colours are interpolated with perspective. 1/depth, linear 
 import numpy as np
 
 PIXELS_AT_ONCE = 2_000_000  # bounds the memory: some 100 bytes a pixel
-LARGEST_TRIANGLE = 1e6  # pixels; beyond it float64 spans would lose whole pixels, and such triangles are behind the eye
+LARGEST_TRIANGLE = 1e6  # pixels; beyond it float64 spans would lose whole pixels; `Camera.clipped` leaves none
 
 
 def rasterise(
