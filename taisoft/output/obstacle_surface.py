@@ -11,6 +11,7 @@ import numpy as np
 
 from taisoft.errors import OutputError, SceneError
 from taisoft.output.appearance import compact_surface, start_positions
+from taisoft.output.polygons import cut_in_four, cut_off
 from taisoft.scene.obstacles import Capsule, HalfSpace, Obstacle, Sphere
 
 REACH = 1.2  # half the side of the square of a half-space, in diagonals of the box about the bodies at the start
@@ -74,41 +75,26 @@ def _patch(shape: HalfSpace, middle: np.ndarray, reach: float, cuts: list[HalfSp
     """The square of half a side `reach` about the point nearest to `middle`, without what lies in the other half-spaces."""
     z, n, x = shape.frame().T
     at = middle - ((middle - shape.point) @ n) * n
-    corners = [at + reach * (a * z + b * x) for a, b in ((-1, -1), (-1, 1), (1, 1), (1, -1))]
+    corners = np.array([at + reach * (a * z + b * x) for a, b in ((-1, -1), (-1, 1), (1, 1), (1, -1))])
     for other in cuts:
         corners = _clipped(corners, other, TINY * reach)
     if len(corners) < 3:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
-    points = np.array([np.mean(corners, axis=0), *corners])
+    points = np.concatenate([corners.mean(axis=0)[None], corners])
     k = np.arange(1, len(points))
     triangles = np.stack([np.zeros_like(k), k, np.roll(k, -1)], axis=1)
     for _ in range(CUTS):
-        points, triangles = _cut_in_four(points, triangles)
+        points, triangles = cut_in_four(points, triangles)
     return points, triangles
 
 
-def _clipped(corners: list[np.ndarray], other: HalfSpace, tiny: float) -> list[np.ndarray]:
-    """The convex polygon's part outside of a half-space (Sutherland and Hodgman 1974). tiny: [m] from it is on it."""
-    height = [(corner - other.point) @ other.normal for corner in corners]
-    height = [0.0 if abs(h) <= tiny else h for h in height]
-    if max(height, default=0.0) <= 0.0:
-        return []
-    kept = []
-    for k in range(len(corners)):
-        a, b, h, g = corners[k - 1], corners[k], height[k - 1], height[k]
-        if h * g < 0:
-            kept.append(a + h / (h - g) * (b - a))
-        if g >= 0:
-            kept.append(b)
-    return kept
-
-
-def _cut_in_four(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    ends = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)  # of edges ab, bc, ca
-    pairs, which = np.unique(np.sort(ends.reshape(-1, 2), axis=1), axis=0, return_inverse=True)
-    (a, b, c), (ab, bc, ca) = triangles.T, len(points) + which.reshape(-1, 3).T
-    cut = [np.stack(t, axis=1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
-    return np.concatenate([points, points[pairs].mean(axis=1)]), np.concatenate(cut)
+def _clipped(corners: np.ndarray, other: HalfSpace, tiny: float) -> np.ndarray:
+    """The convex polygon's part outside of a half-space. tiny: [m] from its boundary a corner is on it."""
+    height = (corners - other.point) @ other.normal
+    height[np.abs(height) <= tiny] = 0.0
+    if height.max(initial=0.0) <= 0.0:
+        return corners[:0]
+    return cut_off(np.column_stack([height, corners]))[:, 1:]
 
 
 def _round(half: float, radius: float) -> tuple[np.ndarray, np.ndarray]:

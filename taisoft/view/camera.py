@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from taisoft.output.polygons import cut_off
+
 UP = np.array([0.0, 1.0, 0.0])
 MAX_ELEVATION = 89.0  # [deg]; at 90 "up" is no longer defined
 FILL = 0.62  # of the picture's width or height, whichever is reached first, that the bodies take at the start
@@ -96,7 +98,7 @@ class Camera:
         for corners in triangles[crossing]:
             polygon = np.concatenate([inside[corners], x[corners], colours[corners]], axis=1)
             for k in range(inside.shape[1]):
-                polygon = _cut(polygon, k)
+                polygon = cut_off(polygon, k)
             first = len(x) + len(points)
             made += [(first, first + k, first + k + 1) for k in range(1, len(polygon) - 1)]
             points += [row[inside.shape[1] :] for row in polygon]
@@ -130,14 +132,3 @@ class Camera:
         depth = seen[:, 2]
         scale = focal / np.where(depth > 0, depth, np.inf)
         return np.column_stack([width / 2 + scale * seen[:, 0], height / 2 - scale * seen[:, 1], depth])
-
-
-def _cut(polygon: np.ndarray, k: int) -> np.ndarray:
-    """The part of a convex polygon where column k of its corners' rows is not negative, all columns interpolated."""
-    kept = []
-    for a, b in zip(polygon, np.roll(polygon, -1, axis=0)):
-        if a[k] >= 0:
-            kept.append(a)
-        if a[k] * b[k] < 0:
-            kept.append(a + a[k] / (a[k] - b[k]) * (b - a))
-    return np.array(kept).reshape(-1, polygon.shape[1])

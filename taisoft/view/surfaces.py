@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from taisoft.output.appearance import OBSTACLE_COLOUR, body_colour
 from taisoft.output.obstacle_surface import ObstacleSurface, obstacle_surfaces
+from taisoft.output.polygons import cut_in_four
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
@@ -159,10 +160,6 @@ def _coarse_ball() -> tuple[np.ndarray, np.ndarray]:
     # an odd number of negative axes turns the order x, y, z inward
     triangles = np.array([f if sum(k > 2 for k in f) % 2 == 0 else f[::-1] for f in faces])
     for _ in range(2):
-        corners = points[triangles]
-        middles = _unit((corners + np.roll(corners, -1, axis=1)).reshape(-1, 3)).reshape(-1, 3, 3)  # of ij, jk, ki
-        (i, j, k), (ij, jk, ki) = np.moveaxis(corners, 1, 0), np.moveaxis(middles, 1, 0)
-        cut = np.concatenate([np.stack(t, axis=1) for t in ((i, ij, ki), (j, jk, ij), (k, ki, jk), (ij, jk, ki))])
-        points, inverse = np.unique(np.round(cut.reshape(-1, 3), 12), axis=0, return_inverse=True)
-        triangles = inverse.reshape(-1, 3)
+        points, triangles = cut_in_four(points, triangles)
+        points = _unit(points)
     return points, triangles
