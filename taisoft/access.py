@@ -15,6 +15,7 @@ from taisoft.settings import Settings, check_dt
 from taisoft.stability import stable_dt
 from taisoft.stepping.contact import ContactStep
 from taisoft.stepping.world import World
+from taisoft.transfer import array_of, upload
 
 
 class StateAccess:
@@ -157,16 +158,16 @@ class StateAccess:
         _, force = self._tangent_fields()
         elastic_forces(world.model)
         gather_forces(world.model, force)
-        return force.to_numpy().astype(np.float64)
+        return array_of(force).astype(np.float64)
 
     def force_differential(self, displacement: np.ndarray) -> np.ndarray:
         """Change of the elastic forces (n_nodes, 3) [N] along a displacement (n_nodes, 3) [m] of all bodies: (df/dx) dx."""
         world = self._open_world()
         self._check_rows("displacement", displacement, slice(None))
         dx, df = self._tangent_fields()
-        dx.from_numpy(np.asarray(displacement, dtype=self._runtime.np_real))
+        upload([(dx, np.asarray(displacement))])
         force_differential(world.model, dx, df)
-        return df.to_numpy().astype(np.float64)
+        return array_of(df).astype(np.float64)
 
     def _tangent_fields(self) -> tuple:
         """Two fields of (n_nodes) 3-vectors, allocated when first asked for."""
@@ -201,7 +202,7 @@ class StateAccess:
         """Change gravity (3,) [m/s^2]."""
         world = self._open_world()
         self.scene.gravity = gravity
-        world.model.gravity.from_numpy(np.asarray(self.scene.gravity, dtype=self._runtime.np_real)[None])
+        upload([(world.model.gravity, np.asarray(self.scene.gravity)[None])])
         self._stepper.numbers_changed()
 
     def set_material(self, body: str, **numbers) -> None:

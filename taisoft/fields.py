@@ -8,7 +8,7 @@ import taichi as ti
 
 from taisoft.errors import SimulationError
 from taisoft.runtime import trees
-from taisoft.transfer import DTYPES, upload
+from taisoft.transfer import DTYPES, placed, removed, upload
 
 MAX_TREES = 480  # of field memory that may be open at once
 
@@ -45,7 +45,7 @@ class FieldArena:
         finally:  # in any case: a field that is never placed stops every later kernel
             (builder, fields), self._group = self._group, None
             if fields:
-                self._finalize(builder, fields[0][2])
+                self._finalize(builder, [field for field, _, _ in fields], fields[0][2])
         upload([(field, data) for field, data, _ in fields if data is not None])
 
     def _place(self, name, make, dtype, components, shape, data):
@@ -66,18 +66,21 @@ class FieldArena:
         self.bytes[name] = count * components * np.dtype(DTYPES[dtype]).itemsize
         return field
 
-    def _finalize(self, builder: ti.FieldsBuilder, name: str) -> None:
+    def _finalize(self, builder: ti.FieldsBuilder, fields: list, name: str) -> None:
         if trees["open"] >= MAX_TREES:
             raise SimulationError(f"too many simulators are open for Taichi to hold field '{name}' and others: close one first")
         try:
-            self._trees.append(builder.finalize())
+            self._trees.append((builder.finalize(), fields))
         except RuntimeError as error:
             raise SimulationError(f"no memory for field '{name}' and those made with it: {error}") from None
         trees["open"] += 1
+        placed(fields)
 
     def release(self) -> None:
         """Give the memory back to Taichi."""
         while self._trees:
-            self._trees.pop().destroy()
+            tree, fields = self._trees.pop()
+            removed(fields)
+            tree.destroy()
             trees["open"] = max(0, trees["open"] - 1)
         self.bytes.clear()

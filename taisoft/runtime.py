@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import taichi as ti
-from taichi.lang import impl
+from taichi.lang import impl, kernel_impl
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 from taisoft.errors import SimulationError
@@ -122,6 +122,9 @@ def _position(context: ASTTransformerContext, node) -> str:
 # a kernel's first call and its compilation; without the excerpt its messages still name file, line and function. This
 # rests on 1.7.4, the version that taisoft asks for; a test holds what the messages say.
 ASTTransformerContext.get_pos_info = _position
+# It also reads a function's source anew at each of its calls in a kernel, which takes longer than building the call.
+kernel_impl.getsourcefile = functools.cache(kernel_impl.getsourcefile)
+kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
 
 
 def open_kind() -> tuple[str, str] | None:

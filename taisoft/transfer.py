@@ -1,4 +1,11 @@
-"""Arrays into fields and back, many by one kernel: compiling one for each, as Taichi does, takes 0.08 s and more apiece."""
+"""Arrays into fields and back: on the CPU through the fields' own memory, elsewhere many by one kernel.
+
+Compiling one kernel for each, as Taichi does, takes 0.08 s and more apiece. Where a tree of fields lies, one small kernel
+tells; where each field lies in it, Taichi's layout does. This rests on 1.7.4, the version that taisoft asks for.
+"""
+
+import ctypes
+import weakref
 
 import numpy as np
 import taichi as ti
@@ -7,6 +14,60 @@ from taisoft.runtime import kernel
 
 MOST = 2**26  # entries in one launch, which are held once more as f64: half a GB
 DTYPES = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u8: np.uint8}  # each exact in f64
+
+_places: "weakref.WeakKeyDictionary" = weakref.WeakKeyDictionary()  # field -> its place, on the CPU
+
+
+class _Tree:
+    """Fields placed together; where they lie is found when one of them is first moved."""
+
+    def __init__(self, fields: list):
+        self._first = weakref.ref(fields[0])
+        self._start: int | None = None
+
+    @property
+    def start(self) -> int:
+        if self._start is None:
+            first = self._first()
+            self._start = _address(first, (0,) * len(first.shape)) - _offset(first)
+        return self._start
+
+
+class _Place:
+    def __init__(self, tree: _Tree):
+        self._tree, self._view = tree, None
+
+    def view(self, field) -> np.ndarray:
+        if self._view is None:
+            shape, kind = _array_shape(field), np.dtype(DTYPES[field.dtype])
+            size = int(np.prod(shape, dtype=np.int64)) * kind.itemsize
+            whole = (ctypes.c_char * size).from_address(self._tree.start + _offset(field))
+            self._view = np.frombuffer(whole, dtype=kind).reshape(shape)
+        return self._view
+
+
+@kernel
+def _address(field: ti.template(), entry: ti.template()) -> ti.u64:
+    return ti.get_addr(field, entry)
+
+
+def _offset(field) -> int:
+    """Bytes from the start of its tree to the field, which lies there by itself."""
+    return (field.parent() if field.shape else field.snode)._offset_bytes_in_parent_cell
+
+
+def placed(fields: list) -> None:
+    """These fields are one whole tree now: on the CPU they are moved through their memory."""
+    if ti.cfg.arch != ti.cuda:
+        tree = _Tree(fields)
+        for field in fields:
+            _places[field] = _Place(tree)
+
+
+def removed(fields: list) -> None:
+    """Their tree is about to be destroyed."""
+    for field in fields:
+        _places.pop(field, None)
 
 
 @ti.func
@@ -81,16 +142,22 @@ def upload(pairs: list[tuple]) -> None:
     for field, data in pairs:
         if data.shape != _array_shape(field):
             raise ValueError(f"a field of shape {_array_shape(field)} cannot take an array of shape {data.shape}")
-    if len(pairs) < 2 or sum(data.size for _, data in pairs) > MOST:
-        for field, data in pairs:
+    others = [pair for pair in pairs if pair[0] not in _places]
+    for field, data in pairs:
+        if field in _places:
+            np.copyto(_places[field].view(field), data, casting="unsafe")
+    if len(others) < 2 or sum(data.size for _, data in others) > MOST:
+        for field, data in others:
             field.from_numpy(np.ascontiguousarray(data, dtype=DTYPES[field.dtype]))
         return
-    flat = np.concatenate([np.asarray(data, dtype=np.float64).ravel() for _, data in pairs])
-    _launch([field for field, _ in pairs], [len(data) for _, data in pairs], True, flat)
+    flat = np.concatenate([np.asarray(data, dtype=np.float64).ravel() for _, data in others])
+    _launch([field for field, _ in others], [len(data) for _, data in others], True, flat)
 
 
 def download(fields: list, rows: int | None = None) -> list[np.ndarray]:
     """The fields as arrays, of their first `rows` rows if that is given."""
+    if all(field in _places for field in fields):
+        return [_places[field].view(field)[:rows].copy() for field in fields]
     counts = [field.shape[0] if rows is None else rows for field in fields]
     shapes = [_array_shape(field)[1:] for field in fields]
     sizes = [n * int(np.prod(shape, dtype=np.int64)) for n, shape in zip(counts, shapes)]
@@ -100,3 +167,8 @@ def download(fields: list, rows: int | None = None) -> list[np.ndarray]:
     _launch(fields, counts, False, flat)
     parts = np.split(flat, np.cumsum(sizes)[:-1])
     return [p.reshape(n, *s).astype(DTYPES[f.dtype]) for p, n, s, f in zip(parts, counts, shapes, fields)]
+
+
+def array_of(field, rows: int | None = None) -> np.ndarray:
+    """One field as `download` gives it."""
+    return download([field], rows)[0]

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from command import BEAM, write
+from long import LONG, is_long
 
 from taisoft import runtime
 
@@ -15,10 +16,28 @@ SLOW = (
 _compiled = [0.0]  # compile clock when Taichi was last set back [s]
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Slow files first, so that processes that share the files end at about the same time."""
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--long", action="store_true", help="also the variations and long runs listed in tests/long.py")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Without the long ones. Slow files first, so that processes that share the files end at about the same time."""
+    long = [item for item in items if is_long(item.nodeid)]
+    if config.getoption("--long"):
+        if config.args == [str(config.rootpath / path) for path in config.getini("testpaths")] or config.args == ["tests"]:
+            _refuse_parts_of_nothing([item.nodeid for item in long])
+    elif not (len(long) == len(items) and any("::" in name for name in config.args)):  # what is named one by one is meant
+        items[:] = [item for item in items if not is_long(item.nodeid)]
+        config.hook.pytest_deselected(items=long)
     places = {f"test_{name}": k for k, name in enumerate(SLOW)}
     items.sort(key=lambda item: places.get(item.path.stem, len(SLOW)))
+
+
+def _refuse_parts_of_nothing(names: list[str]) -> None:
+    for file, parts in LONG.items():
+        for part in parts:
+            if not any(f"/{file}.py::" in name and part in name for name in names):
+                raise pytest.UsageError(f"tests/long.py: no test of {file} has '{part}' in its name")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -147,9 +147,9 @@ def launched(sim, steps: int) -> dict[str, int]:
 
 
 def test_an_explicit_step_is_one_launch():
-    """Beside the report's own, and the copy of the state that a step goes back to where it is interrupted."""
+    """Beside the report's own."""
     with ts.Simulator(bare(), dt=1e-3, integrator="symplectic_euler") as sim:
-        assert launched(sim, 3) == {"advance_serial": 3, "measure": 3, "_transfer": 3}
+        assert launched(sim, 3) == {"advance_serial": 3, "measure": 3}
 
 
 def test_an_implicit_step_assembles_what_it_needs():

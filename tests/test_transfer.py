@@ -1,4 +1,4 @@
-"""Arrays into many fields and back by one kernel:
+"""Arrays into many fields and back, through their memory and by one kernel:
 
 * every type and number of dimensions that taisoft's fields have comes back as it was, NaN and infinities too;
 * the first rows alone;
@@ -12,18 +12,40 @@ import taichi as ti
 from taisoft import transfer
 from taisoft.fields import FieldArena
 from taisoft.runtime import open_runtime
-from taisoft.transfer import DTYPES, download, upload
+from taisoft.transfer import DTYPES, array_of, download, upload
 
 SHAPES = [(7,), (5, 3), (4, 3, 2)]  # of scalar fields
 
 
-@pytest.fixture(scope="module", params=["f32", "f64"])
+@pytest.mark.parametrize("first", [(), 3, (2, 5)])
+def test_memory_is_found_from_any_field(first):
+    """Which lies first in a tree, and of which shape, does not matter; what kernels and Taichi write is seen, and the reverse."""
+    runtime, arena = open_runtime("cpu", "f32"), FieldArena()
+    with arena.group():
+        one = arena.field("first", ti.f32, first)
+        x = arena.vectors("x", ti.f64, 4, np.arange(12.0).reshape(4, 3))
+    assert np.array_equal(x.to_numpy(), array_of(x))
+    x[2] = -1.0, -2.0, -3.0
+    assert np.array_equal(array_of(x)[2], (-1, -2, -3)) and not np.any(one.to_numpy())
+    before = array_of(x)
+    upload([(x, before + 1.0)])
+    assert x[3][2] == 12.0 and before[3, 2] == 11.0  # what was read is a copy
+    arena.release()
+    assert not [field for field in (one, x) if field in transfer._places]
+    runtime.close()
+
+
+@pytest.fixture(scope="module", params=[("f32", "memory"), ("f64", "memory"), ("f64", "kernel")], ids="-".join)
 def fields(request):
-    """Fields of each type and shape, and of vectors."""
-    runtime, arena = open_runtime("cpu", request.param), FieldArena()
+    """Fields of each type and shape, and of vectors; `kernel` is the way of devices whose memory the host does not see."""
+    (precision, way), arena = request.param, FieldArena()
+    runtime = open_runtime("cpu", precision)
     with arena.group():
         made = [arena.field(f"{t} {s}", t, s) for t in DTYPES for s in SHAPES]
         made += [arena.vectors(f"{t} of {n}", t, 9, n=n) for t in (ti.f32, ti.f64, ti.i32) for n in (2, 3, 12)]
+        scalar = arena.field("one", ti.i32, ())
+    if way == "kernel":
+        transfer.removed([*made, scalar])
     yield made
     arena.release()
     runtime.close()
@@ -85,6 +107,7 @@ def test_one_field_and_too_much_at_once(fields, monkeypatch):
     for field, array in zip(fields, data):
         upload([(field, array)])
     monkeypatch.setattr(transfer, "_launch", None)
+    assert all(np.array_equal(array_of(field), array) for field, array in zip(fields, data))
     assert all(same(download([field]), [array]) for field, array in zip(fields, data))
     monkeypatch.setattr(transfer, "MOST", 10)
     upload(list(zip(fields, random_data(fields, 5))))

@@ -26,7 +26,7 @@ import taisoft as ts
 from taisoft.errors import OutputError, SimulationError
 from taisoft.runtime import open_kind, open_runtime
 from taisoft.view.camera import BORDER, FILL, Camera
-from taisoft.view.ggui import vulkan_missing, window_holder
+from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.raster import LARGEST_TRIANGLE, rasterise
 from taisoft.view.surfaces import MARKER_COLOUR, Surfaces, smoothing_groups, vertex_normals
@@ -262,6 +262,17 @@ def test_both_renderers_draw_the_same_picture():
     difference = np.abs(images["vulkan"] - images["software"]).max(axis=2)
     assert body_mask(images["software"]).mean() > 0.1
     assert np.mean(difference > 3) < 0.005  # pixels on an outline may fall either way
+
+
+@needs_vulkan
+def test_a_picture_that_vulkan_left_empty_is_drawn_in_software(monkeypatch):
+    draw, images = Canvas.draw, []
+    for scale in (1.0, 0.0):  # at scale 0 no triangle has an area
+        monkeypatch.setattr(Canvas, "draw", lambda self, x, *more, scale=scale: draw(self, scale * x, *more))
+        drawing = Offscreen(beam_scene(), SIZE, renderer="vulkan")
+        images.append(drawing.image(FakeSimulator(beam_scene())).astype(int))
+        drawing.close()
+    assert body_mask(images[0]).mean() > 0.05 and np.mean(np.abs(images[0] - images[1]).max(axis=2) > 3) < 0.005
 
 
 def test_a_falling_body_stays_in_the_picture(renderer):

@@ -40,8 +40,9 @@ class Buffer:
 
     def __init__(self, name: str, make: Callable, capacity: int, most: int | None, chunks: int, arena: FieldArena):
         self.name, self._make, self.most, self.chunks = name, make, most, chunks
-        self.count = arena.field(f"{name}_count", ti.i32, 2)
-        self.used = arena.field(f"{name}_used", ti.i32, chunks)
+        with arena.group():
+            self.count = arena.field(f"{name}_count", ti.i32, 2)
+            self.used = arena.field(f"{name}_used", ti.i32, chunks)
         self.growths = 0
         self._arena: FieldArena | None = None
         self._allocate(capacity)
@@ -202,7 +203,8 @@ class PairRows:
     def __init__(self, surface: Surface, arena: FieldArena, capacity: int, most: int | None):
         n = max(surface.n_triangles, 1)
         self.surface = surface
-        self.start, self.end = arena.field("pair_rows_start", ti.i32, n), arena.field("pair_rows_end", ti.i32, n)
+        with arena.group():
+            self.start, self.end = arena.field("pair_rows_start", ti.i32, n), arena.field("pair_rows_end", ti.i32, n)
         self.rows = Buffer("candidate_rows", entries, capacity, most, 1, arena)
 
     def from_pairs(self, found: Buffer) -> Candidates:

@@ -15,7 +15,7 @@ from taisoft.errors import MeshError
 from taisoft.mesh.signed_distance import signed_distances_at
 from taisoft.runtime import kernel
 from taisoft.scene.obstacles import HalfSpace, Shape
-from taisoft.transfer import download
+from taisoft.transfer import array_of, download
 
 ALLOWED = 1e-6  # of the smaller body's size: deeper is an overlap
 
@@ -45,7 +45,7 @@ def _deepest_vertices(s: ti.template(), o: ti.template(), phi: ti.types.ndarray(
 def find_overlap(detection: Detection) -> Overlap | None:
     """The deepest overlap in the state that was searched last, if one is deeper than ALLOWED."""
     colliders, topology = detection.scene.colliders, detection.topology
-    x = detection.surface.x.to_numpy()
+    x = array_of(detection.surface.x)
     parts = [x[topology.vertex_first[k] : topology.vertex_first[k + 1]] for k in range(len(colliders))]
     size = np.array([np.ptp(p, axis=0).max() if len(p) else np.inf for p in parts])
     depth: dict[tuple[int, int], float] = {}

@@ -79,11 +79,12 @@ def build_pair_numbers(arena: FieldArena, scene: Scene) -> PairNumbers:
     """The scene's numbers, with room for pairs that are set later."""
     n = len(scene.colliders)
     capacity = 2 * len(scene.contact_pairs) + 64
-    numbers = PairNumbers(
-        arena.field("collider_friction", ti.f64, n), arena.field("collider_restitution", ti.f64, n),
-        arena.field("n_contact_pairs", ti.i32, 1), arena.vectors("contact_pair", ti.i32, capacity, n=2),
-        arena.field("pair_friction", ti.f64, capacity), arena.field("pair_restitution", ti.f64, capacity),
-    )  # fmt: skip
+    with arena.group():
+        numbers = PairNumbers(
+            arena.field("collider_friction", ti.f64, n), arena.field("collider_restitution", ti.f64, n),
+            arena.field("n_contact_pairs", ti.i32, 1), arena.vectors("contact_pair", ti.i32, capacity, n=2),
+            arena.field("pair_friction", ti.f64, capacity), arena.field("pair_restitution", ti.f64, capacity),
+        )  # fmt: skip
     upload_pair_numbers(numbers, scene)
     return numbers
 

@@ -20,6 +20,7 @@ import taichi as ti
 from taisoft.contact.prox import dvec, prox, scaled
 from taisoft.fields import FieldArena
 from taisoft.runtime import kernel
+from taisoft.transfer import upload
 
 NODES = 6  # of a contact at most, three on each side
 CHANGED, SIZE, RESIDUAL, GOOD, STEP, SWEEPS, LOOKS, AGE, MOMENTUM, VERDICT = range(10)  # places in `state`
@@ -114,9 +115,9 @@ def _common(arena: FieldArena, capacity: int, serial: bool) -> dict[str, Any]:
 
 def fill_field(field, values: np.ndarray) -> None:
     """The first rows of a field from values (k, ...), 0 in the others."""
-    whole = np.zeros((field.shape[0], *values.shape[1:]), np.float64 if values.dtype.kind == "f" else np.int32)
+    whole = np.zeros((field.shape[0], *values.shape[1:]))
     whole[: len(values)] = values
-    field.from_numpy(whole)
+    upload([(field, whole)])
 
 
 def fill_matrix_problem(p: ContactProblem, W: sp.spmatrix, b: np.ndarray, friction: np.ndarray) -> None:

@@ -79,11 +79,12 @@ def build_block_csr(model: Model, arena: FieldArena, real, prefix: str = "stiffn
 
 def sibling(matrix: BlockCsr, model: Model, arena: FieldArena, real, prefix: str) -> BlockCsr:
     """A second matrix with the same pattern and element buffer, its own values."""
-    return replace(
-        matrix,
-        value=arena.vectors(f"{prefix}_value", real, 2 * matrix.n_edges, n=BLOCK),
-        diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
-    )
+    with arena.group():
+        return replace(
+            matrix,
+            value=arena.vectors(f"{prefix}_value", real, 2 * matrix.n_edges, n=BLOCK),
+            diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
+        )
 
 
 @kernel

@@ -24,7 +24,7 @@ from taisoft.fields import FieldArena
 from taisoft.mesh.quality import mean_surface_edge
 from taisoft.stepping.tunnelling import DEPTH, HASTE, SPEED, WHICH, collider_thickness, find_way, survey
 from taisoft.stepping.world import World
-from taisoft.transfer import download
+from taisoft.transfer import array_of, download
 
 # Both of the finest body's mean surface edge:
 STANDOFF = 2e-3  # gap that contacts keep, so that surfaces do not cross where motion is curved
@@ -57,8 +57,9 @@ class ContactStep:
         self._make_room(2 * d.surface.n_triangles + SPARE)
         self._thick = np.array([collider_thickness(c, d.edge) for c in scene.colliders])
         self._own_arena = FieldArena()
-        self._way = self._own_arena.vectors("way", ti.f64, m.n_nodes)
-        self._thickness = self._own_arena.field("collider_thickness", ti.f64, len(self._thick), self._thick)
+        with self._own_arena.group():
+            self._way = self._own_arena.vectors("way", ti.f64, m.n_nodes)
+            self._thickness = self._own_arena.field("collider_thickness", ti.f64, len(self._thick), self._thick)
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self._told = np.zeros(4)
@@ -120,7 +121,7 @@ class ContactStep:
         if known is None or known[1] != dt or abs(known[0] - time) > 1e-6 * dt:
             self._searched = None
             moved = world.motion.moved
-            led = (moved, world.motion.places(time + dt) - world.model.x.to_numpy()[moved]) if len(moved) else None
+            led = (moved, world.motion.places(time + dt) - array_of(world.model.x)[moved]) if len(moved) else None
             d.find(time, dt, led)
             self._searched = (time, dt)
         return d.counts.contacts

@@ -15,7 +15,7 @@ from taisoft.stepping.contact import TOLERANCE, ContactStep
 from taisoft.stepping.contact_newton import ContactResult, ContactStageSolver, count_all, merge
 from taisoft.stepping.newton import StageResult, StageSolver
 from taisoft.stepping.world import World
-from taisoft.transfer import upload
+from taisoft.transfer import array_of, upload
 
 MAX_NEWTON = 50  # a step that needs more is reported as not converged
 MAX_CONTACT_NEWTON = 400  # with contacts, over all multipliers
@@ -98,11 +98,12 @@ class ImplicitStepper:
     def __init__(self, world: World, scheme: Scheme, contact: ContactStep | None = None):
         self.world, self.scheme, self.contact = world, scheme, contact
         m, arena = world.model, world.arena
-        self.history = History(
-            arena.vectors("x_now", ti.f64, m.n_nodes), arena.vectors("v_now", m.real, m.n_nodes),
-            arena.vectors("v_before", m.real, m.n_nodes),
-            arena.vectors("x_before", ti.f64, m.n_nodes) if scheme.before else None,
-        )  # fmt: skip
+        with arena.group():
+            self.history = History(
+                arena.vectors("x_now", ti.f64, m.n_nodes), arena.vectors("v_now", m.real, m.n_nodes),
+                arena.vectors("v_before", m.real, m.n_nodes),
+                arena.vectors("x_before", ti.f64, m.n_nodes) if scheme.before else None,
+            )  # fmt: skip
         common = m, arena, world.runtime.eps, world.motion.moved
         self.solver = StageSolver(*common) if contact is None else ContactStageSolver(*common, contact, self.history.x_now)
         self.tolerance = DEFAULT_TOLERANCE[world.runtime.precision]
@@ -217,7 +218,7 @@ class ImplicitStepper:
         scheme = self.scheme if self._past > 0 or self.scheme.start is None else self.scheme.start
         if target is not None:
             if scheme.midpoint:
-                target = 0.5 * (target + m.x.to_numpy()[world.motion.moved])
+                target = 0.5 * (target + array_of(m.x)[world.motion.moved])
             led = [(w.moved_axes, world.motion.moved_axes()), (w.targets, target)]
             if m.consistent:
                 led.append((w.led_acceleration, world.motion.accelerations(time, dt, self.scheme.before == 0.0)))
@@ -238,7 +239,7 @@ class ImplicitStepper:
         if scheme.midpoint:
             finish_midpoint(m, h)
         if not np.isfinite(result.residual):  # a NaN anywhere in x or v reaches the residual
-            where = world.find_unfinite(self.solver.work.residual.to_numpy()) or "the residual is not finite"
+            where = world.find_unfinite(array_of(self.solver.work.residual)) or "the residual is not finite"
             restore(m, h)
             self.forget()
             raise SimulationError(f"step {world.step_count + 1}: {where}")

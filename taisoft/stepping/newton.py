@@ -26,7 +26,7 @@ from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.coupling import NO_COUPLING
 from taisoft.model import Model
 from taisoft.stepping.stage import StageWork, begin_stage, form_residual, stage_terms, start_step, try_step
-from taisoft.transfer import download
+from taisoft.transfer import array_of, download
 
 MAX_BACKTRACKS = 30  # halvings: below 1e-9 of a step nothing but rounding is left
 SLOW = 0.2  # a step that leaves more of |r| than this asks for a new matrix
@@ -102,7 +102,7 @@ class StageSolver:
         stiff = np.abs(constants[:, :2]).sum(axis=1)[body]
         g = np.sqrt((Dm_inv**2).sum(axis=1))
         if m.points is not None:  # the gradients of quadratic shape functions are larger
-            steepest = float(np.abs(m.points.to_numpy()[:, 1:]).max())
+            steepest = float(np.abs(array_of(m.points)[:, 1:]).max())
             for group in m.groups:
                 g[group.first : group.last] *= steepest if group.order == 2 else 1.0
         largest = float(np.abs(x).max())

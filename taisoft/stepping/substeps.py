@@ -9,6 +9,7 @@ import taichi as ti
 from taisoft.errors import SimulationError
 from taisoft.stepping import explicit
 from taisoft.stepping.world import World
+from taisoft.transfer import array_of, upload
 
 LAUNCH_SECONDS = 0.1  # aim for one launch, so that Ctrl-C is heard
 SECONDS_PER_POINT = 60e-9  # of one sub-step, the slowest seen (corotational with stiffness damping): sizes a launch
@@ -118,7 +119,7 @@ class ExplicitStepper:
 
     def _upload_targets(self, targets: np.ndarray) -> None:
         explicit.set_targets(self.work, targets.reshape(-1, 3))
-        self.work.moved_axes.from_numpy(self.world.motion.moved_axes())
+        upload([(self.work.moved_axes, self.world.motion.moved_axes())])
 
     def _put_back(self, x: np.ndarray, v: np.ndarray) -> None:
         self.world.set_state(x, v)
@@ -157,5 +158,5 @@ class ExplicitStepper:
         """(n_nodes, 3) force of the constraints in the last sub-step [N]."""
         out = np.zeros((self.world.model.n_nodes, 3))
         if self.work.n_held:
-            out[self.world.motion.held] = self.work.reaction.to_numpy()
+            out[self.world.motion.held] = array_of(self.work.reaction)
         return out

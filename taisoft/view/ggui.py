@@ -21,6 +21,7 @@ from taichi._lib import core
 from taisoft.errors import OutputError
 from taisoft.fields import FieldArena
 from taisoft.runtime import open_kind, open_runtime
+from taisoft.transfer import upload
 from taisoft.view.camera import Camera
 from taisoft.view.shading import lit_colours
 from taisoft.view.surfaces import Surfaces
@@ -112,8 +113,7 @@ class Canvas:
         """Draw the surfaces with vertices x [m] and unit normals, (n,3) each; background: RGB in [0, 1]."""
         colours = lit_colours(x, normals, self._surfaces.colours, camera)
         # relative to the target: single precision would blur a scene far from the origin
-        self._x.from_numpy((x - camera.target).astype(np.float32))
-        self._colours.from_numpy(colours.astype(np.float32))
+        upload([(self._x, x - camera.target), (self._colours, colours)])
         eye = ti.ui.Camera()
         eye.position(*(camera.position - camera.target))
         eye.lookat(0.0, 0.0, 0.0)

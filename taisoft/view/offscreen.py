@@ -59,13 +59,7 @@ class Offscreen:
         if left == right or top == bottom:
             return picture
         part = self._background[top:bottom, left:right].copy()
-        if self._canvas is not None:
-            self._canvas.draw(x, normals, self.camera, KEY_COLOUR)
-            pixels = self._canvas.pixels(left, top, right, bottom)
-            red, green, blue = np.moveaxis(pixels, 2, 0)
-            empty = (red == 255) & (green == 0) & (blue == 255)
-            np.copyto(part, pixels, where=~empty[..., None])
-        else:
+        if self._canvas is None or not self._draw(x, normals, (left, top, right, bottom), part):
             colours = lit_colours(x, normals, self.surfaces.colours, self.camera)
             x, triangles, colours = self.camera.clipped(x, self.surfaces.triangles, colours, self.size)
             projected = self.camera.project(x, self._large)
@@ -73,6 +67,18 @@ class Offscreen:
             rasterise(projected, triangles, colours, self.camera.clipping[0], part)
         picture[top // SAMPLES : bottom // SAMPLES, left // SAMPLES : right // SAMPLES] = _averaged(part)
         return picture
+
+    def _draw(self, x: np.ndarray, normals: np.ndarray, box: tuple[int, int, int, int], part: np.ndarray) -> bool:
+        """Draw by Vulkan into part, what lies in the box; False where nothing came of it.
+
+        On a busy machine Taichi's renderer, now and then, hands out a picture that has been cleared and not drawn on.
+        """
+        self._canvas.draw(x, normals, self.camera, KEY_COLOUR)
+        pixels = self._canvas.pixels(*box)
+        red, green, blue = np.moveaxis(pixels, 2, 0)
+        empty = (red == 255) & (green == 0) & (blue == 255)
+        np.copyto(part, pixels, where=~empty[..., None])
+        return not empty.all()
 
     def close(self) -> None:
         """Destroy the window in memory, if there is one; a second call does nothing."""

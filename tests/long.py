@@ -1,0 +1,47 @@
+"""Tests that `make test` leaves to `make test-long`: variations of what stays, and runs of minutes.
+
+By file, parts of the names after it. What stays of each file tests every path at least once: the other precision, a second
+integrator, a second scene, or a coarser case of the same problem.
+"""
+
+LONG = {
+    "test_references": (
+        "patch_test-", "column_self_weight-", "beam_fall_semidiscrete-COR", "beam_fall_semidiscrete-SNH-11x2x2_bdf2",
+        "beam_fall_semidiscrete-SNH-11x2x2_exact", "oscillator_amplification-SVK-one_tet_bdf2", "cook_membrane_3d-",
+        "twist_bar_90deg-", "spin_block-SNH-4x3x2_implicit_midpoint", "mid_traction_beam-", "hanging_beam_E1e6-",
+        "soft_sheet_self_weight-",
+    ),
+    "test_demos": ("[two_cubes_two_boxes]", "[hanging_beam_fine]"),
+    "test_stepping": (
+        "test_implicit_steps_are_the_oracles[1-linearly", "test_parallel_kernels[velocity_verlet]",
+        "test_explicit_steps_are_the_oracles[velocity_verlet]",
+    ),
+    "test_contact_stepping": ("test_rest[bdf2-", "test_rest[velocity_verlet-"),
+    "test_simulator": ("[symplectic_euler-2]",),
+    "test_static": ("test_equilibrium[1]",),
+    "test_tunnelling": ("[symplectic_euler-",),
+    "test_bench_collision": ("test_films_and_broad_phases",),
+    "test_bench_hard": ("test_a_stiff_cube_lands_and_rests",),
+    "test_bench_contact": ("test_every_solver_gets_the_same_problem_and_is_judged_rightly",),
+    "test_collision_memory": ("test_nothing_is_out_of_bounds",),
+    "test_single_precision": ("test_single_precision_follows[symplectic_euler]",),
+    "test_led_nodes": ("test_rigid_flight[bdf2]",),
+    "test_detection_runs": ("test_sweeps",),
+    "test_stability": ("test_the_limit_is_where_steps_explode[velocity_verlet-",),
+    "test_newton": ("[1]",),
+    "test_detection": ("test_a_thousandth_of_the_size", "TestZoo::test_all_kinds_are_there[f32]"),
+    "test_bvh": ("[('f32', False)]",),
+    "test_spatial_hash": ("[('f32', False)]",),
+    "test_near": ("[('f32', False)",),
+    "test_elasticity": ("test_forces[f32]", "test_force_differential[f32]", "test_assembled_stiffness[f32]"),
+    "test_contact_stage": ("f32",),
+    "test_reduction": ("f32",),
+    "test_frank_wolfe": ("[f32]",),
+    "test_self_collision": ("test_folded_sheets_against_ipctk[f32]",),
+}
+
+
+def is_long(nodeid: str) -> bool:
+    """nodeid: as pytest gives it, such as tests/test_static.py::test_equilibrium[1]."""
+    path, _, name = nodeid.partition("::")
+    return any(part in name for part in LONG.get(path.rsplit("/", 1)[-1].removesuffix(".py"), ()))
