@@ -1,8 +1,7 @@
-"""Draws the README's pictures: `python assets/make_gallery.py` (under a minute) writes assets/gallery/*.png, one strip a
+"""Draws the README's pictures: `python assets/make_gallery.py [DEMO ...]` (minutes) writes assets/gallery/*.png, one strip a
 scene.
 
-A strip shows a scene at a few moments, from the same place, side by side. The bunny needs its mesh; see
-benchmarks/scenes/bunny_pull.py.
+A strip shows a scene at a few moments, from the same place, side by side.
 """
 
 from pathlib import Path
@@ -20,13 +19,21 @@ ASSETS = Path(__file__).resolve().parent
 GAP = 4  # white pixels between two moments
 MAX_BYTES = 200_000  # of a picture; the repository keeps them
 
-# file in the repository: moments [s], size of each picture, camera (target [m], distance [m], azimuth, elevation [deg])
+# demo: moments [s], size of each picture, camera (target [m], distance [m], azimuth, elevation [deg])
 STRIPS = {
-    "demos/hanging_beam.py": ((0.0, 0.5, 1.0, 1.5, 2.0), (300, 300), ((-0.2, -1.4, 0.0), 11.0, 28.0, 14.0)),
-    "demos/midpoint_traction.py": ((0.0, 0.5, 6.0), (504, 160), ((0.0, 0.05, 0.0), 3.2, 12.0, 8.0)),
-    "demos/bending_beam_orders.py": ((0.0, 0.7, 5.0), (504, 330), ((0.0, -1.15, 0.0), 9.0, 88.0, 3.0)),
-    "demos/twisting_bar.py": ((0.0, 0.75, 1.5, 4.0), (377, 220), ((0.0, 0.0, 0.0), 6.6, 32.0, 20.0)),
-    "benchmarks/scenes/bunny_pull.py": ((0.0, 1.0, 1.1, 1.3, 1.7), (260, 330), ((-0.3, 1.85, 0.0), 9.6, 32.0, 8.0)),
+    "bunny_ears": ((0.0, 0.9, 1.1, 1.3, 2.0), (260, 360), ((0.0, 0.95, 0.0), 4.6, 32.0, 8.0)),
+    "hanging_cloth": ((0.0, 0.2, 0.4, 0.7, 4.0), (260, 230), ((0.0, -0.45, -0.1), 3.2, 40.0, 16.0)),
+    "sheet_on_box": ((0.0, 0.2, 0.5, 3.0), (330, 240), ((0.0, 0.55, 0.0), 4.9, 32.0, 22.0)),
+    "sheet_and_cube": ((0.0, 0.3, 0.6, 4.0), (330, 260), ((0.0, 0.0, 0.0), 6.0, 32.0, 20.0)),
+    "squeeze": ((0.0, 0.6, 1.2, 1.7, 3.0), (260, 220), ((0.0, 0.0, 0.0), 1.25, 32.0, 10.0)),
+    "cube_pile": ((0.0, 0.3, 0.6, 2.0), (330, 330), ((0.0, 0.25, 0.0), 1.9, 32.0, 26.0)),
+    "cube_on_box": ((0.0, 0.3, 0.6, 3.0), (330, 230), ((0.0, 0.6, 0.0), 6.0, 32.0, 14.0)),
+    "two_cubes_two_boxes": ((0.0, 0.3, 0.6, 3.0), (330, 230), ((0.0, 0.6, 0.0), 7.0, 32.0, 14.0)),
+    "incline": ((0.0, 0.7, 1.4, 2.0), (330, 230), ((0.0, 0.0, 0.0), 7.0, 20.0, 16.0)),
+    "hanging_beam": ((0.0, 0.5, 1.0, 1.5, 2.0), (260, 260), ((-0.2, -1.4, 0.0), 11.0, 28.0, 14.0)),
+    "midpoint_traction": ((0.0, 0.5, 6.0), (440, 140), ((0.0, 0.05, 0.0), 3.2, 12.0, 8.0)),
+    "bending_beam_orders": ((0.0, 0.7, 5.0), (440, 290), ((0.0, -1.15, 0.0), 9.0, 88.0, 3.0)),
+    "twisting_bar": ((0.0, 0.75, 1.5, 4.0), (330, 200), ((0.0, 0.0, 0.0), 6.6, 32.0, 20.0)),
 }
 
 

@@ -4,12 +4,10 @@
 * the check fails where the material is 1 % stiffer than the demo says, or another number off by as much, so it would notice
   wrong physics;
 * of sheets in contact no triangle meets one of what they touch in any frame, by the judgement of ipctk;
-* a demo says what it is in one line;
-* the bunny of benchmarks/scenes/ runs where its mesh is there, and says what is missing where it is not.
+* a demo says what it is in one line.
 """
 
 from itertools import combinations
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -17,11 +15,9 @@ import pytest
 from test_self_collision import judged
 
 from taisoft.cli.scene_file import first_line, load_module, shipped_files
-from taisoft.errors import MeshError
 from taisoft.simulator import Simulator
 
 DEMOS = shipped_files("demos")
-BUNNY = Path(__file__).resolve().parents[1] / "benchmarks" / "scenes" / "bunny_pull.py"
 LINE = 100  # characters that `taisoft list` has for a demo's sentence
 
 
@@ -101,19 +97,3 @@ def test_demo(name):
 def test_demo_says_what_it_is(name):
     line = first_line(DEMOS[name])
     assert line.endswith(".") and len(line) <= LINE
-
-
-def test_bunny():
-    example = load_module(BUNNY)
-    if not example.mesh_path().is_file():
-        pytest.skip("the bunny's mesh, which is not part of the repository, is absent")
-    example.solver["dt"] = 1 / 60  # half the steps: enough for its check
-    sim, run = opened(example)
-    with sim:
-        example.check(sim, sim.run(**run))
-
-
-def test_bunny_without_its_mesh(monkeypatch, tmp_path):
-    monkeypatch.setenv("BUNNY_MESH", str(tmp_path / "gone.msh"))
-    with pytest.raises(MeshError, match=r"gone\.msh: no such file; set the variable BUNNY_MESH"):
-        load_module(BUNNY).build()

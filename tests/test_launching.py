@@ -43,8 +43,9 @@ def count_slow(monkeypatch) -> SimpleNamespace:
 
 
 def test_other_numbers_and_arrays(machine, monkeypatch):
-    arena, slow = FieldArena(), count_slow(monkeypatch)
+    arena = FieldArena()
     x = arena.field("x", ti.f64, 5, np.arange(5.0))
+    slow = count_slow(monkeypatch)
     for a, k, dtype in ((1.0, 2, "f8"), (np.float32(0.5), np.int64(-7), "f8"), (3, 1, "f8"), (2.5, 0, "f4")):
         out = np.zeros(4, dtype=dtype)
         returned = combine(x, 10, a, k, out)
@@ -90,7 +91,8 @@ def test_a_new_taichi_has_nothing_old(monkeypatch):
     for n in (1, 2):
         with opened("f64"):
             arena = FieldArena()
-            x, out = arena.field("x", ti.f64, 2, np.ones(2)), np.zeros(2)
+            x, out = arena.field("x", ti.f64, 2), np.zeros(2)
+            x.fill(1.0)
             for _ in range(3):
                 combine(x, 0, 2.0, 0, out)
             assert np.array_equal(out, [2.0, 2.0]) and slow.n == n

@@ -109,9 +109,9 @@ def sums(x: ti.template(), out: ti.types.ndarray()):
 def test_without_common_subexpressions(monkeypatch):
     with opened("f64"):
         arena, config, levels = FieldArena(), ti.lang.impl.get_runtime().prog.config(), []
+        x, out = arena.field("x", ti.f64, 3, np.arange(3.0)), np.zeros(3)
         prepare = runtime.prepare
         monkeypatch.setattr(runtime, "prepare", lambda *a: levels.append(config.opt_level) or prepare(*a))
-        x, out = arena.field("x", ti.f64, 3, np.arange(3.0)), np.zeros(3)
         for _ in range(2):
             sums(x, out)
             assert np.array_equal(out, [1.0, 4.0, 9.0]) and config.opt_level == 1

@@ -52,8 +52,17 @@ def _parser() -> argparse.ArgumentParser:
     listed.set_defaults(command="listing")
 
     mesh_info = commands.add_parser("info", help="what a mesh file holds: counts, size, quality, problems")
-    mesh_info.add_argument("mesh", metavar="MESH", help="a mesh file with tetrahedra, in any format that meshio reads")
+    mesh_info.add_argument("mesh", metavar="MESH", help="tetrahedra in any format that meshio reads, or a surface")
     mesh_info.set_defaults(command="info")
+
+    tets = commands.add_parser("tetrahedralize", help="fill a surface with tets (extra 'mesh')", allow_abbrev=False)
+    tets.add_argument("surface", metavar="SURFACE", help="an .obj, .stl, .ply or .off file of triangles")
+    tets.add_argument("--out", metavar="MESH", required=True, help="the mesh file: .msh, .vtk, .vtu or .mesh")
+    tets.add_argument("--edge-length", type=float, metavar="L", help="of the tets [m] (default: a twentieth of the diagonal)")
+    tets.add_argument("--envelope", type=float, metavar="E", help="how far the surface may move [m] (default: L / 10)")
+    tets.add_argument("--weld", type=float, default=0.0, metavar="D", help="vertices at most this far apart become one [m]")
+    tets.add_argument("--overwrite", action="store_true", help="replace MESH where it exists")
+    tets.set_defaults(command="tetrahedralize")
 
     doctor_parser = commands.add_parser("doctor", help="what this machine offers, and how to get what is missing")
     doctor_parser.set_defaults(command="doctor")

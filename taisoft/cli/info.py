@@ -1,12 +1,17 @@
-"""`taisoft info MESH`: what a mesh file holds, how good its tets are, and what a run would say about it."""
+"""`taisoft info MESH`: what a mesh file holds, how good its tets are, and what a run would say about it.
+
+Of a surface: what keeps it from bounding a solid, and how it becomes one.
+"""
 
 import warnings
 from argparse import Namespace
+from pathlib import Path
 
 import numpy as np
 
 from taisoft.mesh.files import read_mesh
 from taisoft.mesh.quality import edge_lengths, mean_ratio
+from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface
 from taisoft.mesh.tet_mesh import TetMesh
 
 SHARP = 0.1  # mean ratio below which a tet stiffens its surroundings and slows the solver noticeably
@@ -15,26 +20,55 @@ TINY_BELOW = 1e-3  # soft bodies under 1 mm are rare
 
 
 def command(arguments: Namespace) -> int:
-    """Prints counts, size, a guess at the unit, quality and problems. Raises MeshError if the file is no tet mesh."""
+    """Prints counts, size, a guess at the unit, quality and problems. Raises MeshError if the file is no mesh."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they are listed as problems below
-        mesh = read_mesh(arguments.mesh)
+        if Path(arguments.mesh).suffix.lower() in FORMATS:
+            lines = describe_surface(read_surface(arguments.mesh))
+        else:
+            lines = describe(read_mesh(arguments.mesh))
     print(arguments.mesh)
-    for name, text in describe(mesh):
+    for name, text in lines:
         print(f"  {name:<10} {text}")
     return 0
 
 
+def describe_surface(surface: SurfaceMesh) -> list[tuple[str, str]]:
+    """(name, text) lines about a surface; lengths in the file's own unit."""
+    x, faults = surface.vertices, surface.faults()
+    a, b, c = np.moveaxis(x[surface.triangles], 1, 0)
+    lengths = np.concatenate([np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))])
+    pieces = "1 piece" if surface.n_pieces == 1 else f"{surface.n_pieces} pieces"
+    lines = _head(f"{len(x)} vertices, {len(surface.triangles)} triangles, {pieces}; no tets", x)
+    lines += [
+        ("area", f"{surface.area:.6g}"),
+        ("volume", "open, none" if faults else f"{surface.volume:.6g}"),
+        ("edges", f"{lengths.min():.4g} to {lengths.max():.4g}, median {np.median(lengths):.4g}"),
+    ]
+    lines += _listed("problems", [*surface.warnings, *faults])
+    return lines + [("next", f"fill it with tets: taisoft tetrahedralize {surface.source} --out {Path(surface.source).stem}.msh")]
+
+
+def _head(counts: str, vertices: np.ndarray) -> list[tuple[str, str]]:
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    return [
+        ("counts", counts),
+        ("box", f"{_triple(low)} to {_triple(high)}, size {_triple(high - low)}"),
+        ("unit", unit_guess(float((high - low).max()))),
+    ]
+
+
+def _listed(name: str, texts: list[str]) -> list[tuple[str, str]]:
+    return [(name if i == 0 else "", text) for i, text in enumerate(texts or ["none"])]
+
+
 def describe(mesh: TetMesh) -> list[tuple[str, str]]:
     """(name, text) lines about a mesh; lengths in the file's own unit."""
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     lengths = edge_lengths(mesh.vertices, mesh.tets)
     quality = mean_ratio(lengths, mesh.volumes)
     pieces = "1 piece" if mesh.n_components == 1 else f"{mesh.n_components} pieces"
-    lines = [
-        ("counts", f"{mesh.n_verts} vertices, {mesh.n_tets} tets, {len(mesh.surface)} surface triangles, {pieces}"),
-        ("box", f"{_triple(low)} to {_triple(high)}, size {_triple(high - low)}"),
-        ("unit", unit_guess(float((high - low).max()))),
+    counts = f"{mesh.n_verts} vertices, {mesh.n_tets} tets, {len(mesh.surface)} surface triangles, {pieces}"
+    lines = _head(counts, mesh.vertices) + [
         ("volume", f"{mesh.volumes.sum():.6g}"),
         ("edges", f"{lengths.min():.4g} to {lengths.max():.4g}, median {np.median(lengths):.4g}"),
         (
@@ -43,8 +77,7 @@ def describe(mesh: TetMesh) -> list[tuple[str, str]]:
             f" {np.median(quality):.3f}; 1 is a regular tet, {np.count_nonzero(quality < SHARP)} are below {SHARP}",
         ),
     ]
-    problems = mesh.warnings or ["none"]
-    return lines + [("problems" if i == 0 else "", problem) for i, problem in enumerate(problems)]
+    return lines + _listed("problems", mesh.warnings)
 
 
 def unit_guess(longest: float) -> str:

@@ -16,6 +16,7 @@ import meshio
 import numpy as np
 
 from taisoft.errors import MeshError, OutputError
+from taisoft.mesh.content import one_line, read_content
 from taisoft.mesh.gmsh import read_gmsh
 from taisoft.mesh.quality import edge_lengths
 from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh, merge_labels
@@ -96,11 +97,12 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None) ->
     except TypeError as error:
         raise MeshError(f"read_mesh: path must be a file's name, not {path!r}") from error
     name = str(file)
-    data = _content(file, name)
+    data = read_content(file)
     ending = file.suffix.lower()
     found = None
     if ending in SURFACES:
-        raise MeshError(f"{name}: no tetrahedra; {_count_faces(ending, data)} found; make a volume mesh first")
+        found = _count_faces(ending, data)
+        raise MeshError(f"{name}: no tetrahedra; {found} found; make a volume mesh first: taisoft tetrahedralize")
     if ending == ".msh" and data.lstrip()[:1] == b"$":
         found = read_gmsh(name, data)
     elif ending in (".node", ".ele"):
@@ -116,9 +118,7 @@ def write_mesh(path, mesh: TetMesh) -> None:
     Raises MeshError for another ending or no TetMesh, OutputError where the file cannot be written.
     """
     file = Path(path)
-    ending = file.suffix.lower()
-    if ending not in WRITERS:
-        raise MeshError(f"{file}: a mesh can be written as {', '.join(WRITERS)}, not with the ending {ending!r}")
+    ending = check_ending(file)
     if not isinstance(mesh, TetMesh):
         raise MeshError(f"{file}: write_mesh needs a TetMesh, not {type(mesh).__name__}")
     record = meshio.Mesh(mesh.vertices, [("tetra", mesh.tets)])
@@ -142,25 +142,18 @@ def write_mesh(path, mesh: TetMesh) -> None:
                 os.remove(part)
 
 
+def check_ending(file: Path) -> str:
+    """The file's ending in small letters. Raises MeshError where `write_mesh` could not write such a file."""
+    ending = file.suffix.lower()
+    if ending not in WRITERS:
+        raise MeshError(f"{file}: a mesh can be written as {', '.join(WRITERS)}, not with the ending {ending!r}")
+    return ending
+
+
 def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
-
-
-def _content(file: Path, name: str) -> bytes:
-    """The file's bytes, at least one that is not blank."""
-    try:
-        if not file.exists():
-            raise MeshError(f"{name}: there is no such file")
-        if not file.is_file():
-            raise MeshError(f"{name}: this is not a file")
-        data = file.read_bytes()
-    except (OSError, ValueError) as error:
-        raise MeshError(f"{name!r}: the file cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    if not data.strip():
-        raise MeshError(f"{name}: the file is empty")
-    return data
 
 
 def _count_faces(ending: str, data: bytes) -> str:
@@ -199,7 +192,7 @@ def _read_by_meshio(file: Path, name: str, data: bytes):
     except (Exception, SystemExit) as error:
         # Before meshio ends the program it prints why.
         said = f"{type(error).__name__}: {error}" if isinstance(error, Exception) else printed.getvalue()
-        raise MeshError(f"{name}: not a supported mesh ({_one_line(said)})") from error
+        raise MeshError(f"{name}: not a supported mesh ({one_line(said)})") from error
 
 
 def _call_meshio(file: Path, ending: str, data: bytes) -> meshio.Mesh:
@@ -212,11 +205,6 @@ def _call_meshio(file: Path, ending: str, data: bytes) -> meshio.Mesh:
         if ending in (".dat", ".tec"):
             return meshio.read(_EndingText(stream, encoding="utf-8"), file_format="tecplot")
         return meshio.read(stream, file_format="ansys" if ending == ".msh" else "mdpa")
-
-
-def _one_line(text: str) -> str:
-    text = " ".join(text.split())
-    return text if len(text) <= 120 else text[:117] + "..."
 
 
 def _tets_among(name: str, cells: list[tuple[str, np.ndarray]]) -> tuple[list[np.ndarray], list[str]]:

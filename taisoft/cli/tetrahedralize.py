@@ -1,0 +1,32 @@
+"""`taisoft tetrahedralize SURFACE`: a surface filled with tets, as a mesh file."""
+
+import sys
+import warnings
+from argparse import Namespace
+from pathlib import Path
+
+from taisoft.cli.info import describe
+from taisoft.errors import OutputError
+from taisoft.mesh.files import check_ending, write_mesh
+from taisoft.mesh.surface_mesh import read_surface
+from taisoft.mesh.tetrahedralize import tetrahedralize
+
+
+def command(arguments: Namespace) -> int:
+    """Writes the mesh and tells what is in it. What can be refused is refused before the mesher starts."""
+    out = Path(arguments.out)
+    check_ending(out)
+    if out.exists() and not arguments.overwrite:
+        raise OutputError(f"{out}: the file exists; --overwrite replaces it")
+    if not out.parent.is_dir():
+        raise OutputError(f"{out}: there is no folder {out.parent}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = lambda message, *_: print(f"taisoft: warning: {message}", file=sys.stderr)
+        surface = read_surface(arguments.surface, weld=arguments.weld)
+        mesh = tetrahedralize(surface, arguments.edge_length, arguments.envelope)
+        write_mesh(out, mesh)
+    print(out)
+    for name, text in describe(mesh):
+        print(f"  {name:<10} {text}")
+    return 0

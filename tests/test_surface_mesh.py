@@ -1,0 +1,193 @@
+"""Surfaces from files, and tets inside them:
+
+* every format gives the same triangles; polygons become triangles; equal vertices, and near ones on request, become one;
+* what is left out is told; what cannot be read is one MeshError that names file, line or index, whatever the bytes;
+* holes, inner walls, turned triangles and a surface inside out are found and counted;
+* the tets of a ball enclose its volume, are all upright, keep to the edge length, wherever it lies and however large it is;
+* the mesher's failure, and its absence, are told;
+* `taisoft info` and `taisoft tetrahedralize` on the way from a surface to a mesh that can be simulated.
+"""
+
+import subprocess
+import warnings
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import taisoft as ts
+from taisoft.cli import main
+from taisoft.errors import MeshError
+from taisoft.mesh import tetrahedralize as module
+from taisoft.mesh.surface_mesh import FORMATS, read_surface
+
+BALL = ts.ball_mesh(0.5, 4)
+USED, PLACE = np.unique(BALL.surface, return_inverse=True)
+X, T = BALL.vertices[USED], PLACE.reshape(-1, 3)
+VOLUME = float(BALL.volumes.sum())
+CUBE = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+
+
+@pytest.mark.parametrize("ending", FORMATS)
+def test_formats(ending, tmp_path):
+    path = tmp_path / f"ball{ending}"
+    meshio.write(path, meshio.Mesh(X, [("triangle", T)]))
+    surface = read_surface(path)
+    assert len(surface.vertices) == len(X) and surface.triangles.shape == T.shape and surface.triangles.dtype == np.int64
+    assert surface.volume == pytest.approx(VOLUME, rel=1e-5) and not surface.faults() and surface.n_pieces == 1
+    a, b, c = (X[T[:, k]] for k in range(3))
+    assert surface.area == pytest.approx(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, rel=1e-5)
+
+
+def test_obj(tmp_path):
+    """Quads, texture and normals by the corner, ids from the end, comments."""
+    path = tmp_path / "cube.obj"
+    lines = ["# a cube", *(f"v {x} {y} {z} 1.0" for x, y, z in CUBE), "vt 0 0", "vn 0 1 0", "usemtl none"]
+    lines += [f"f {' '.join(f'{k + 1}/1/1' for k in quad)}  # side" for quad in QUADS[:-1]]
+    lines += ["f " + " ".join(f"{k - 8}//1" for k in QUADS[-1])]
+    path.write_text("\n".join(lines))
+    surface = read_surface(path)
+    assert len(surface.vertices) == 8 and len(surface.triangles) == 12 and not surface.faults() and not surface.warnings
+    assert surface.volume == pytest.approx(1.0) and surface.area == pytest.approx(6.0)
+
+
+def test_welding(tmp_path):
+    """Vertices by the triangle, as .stl has them, some a little apart."""
+    path = tmp_path / "ball.obj"
+    corners = X[T].reshape(-1, 3)
+    for apart, weld in ((0.0, 0.0), (1e-4, 1e-3)):
+        moved = corners + apart * np.random.default_rng(1).uniform(-1, 1, corners.shape) / 2
+        lines = ["v {:.17g} {:.17g} {:.17g}".format(*x) for x in moved]
+        path.write_text("\n".join([*lines, *(f"f {k} {k + 1} {k + 2}" for k in range(1, len(moved), 3))]))
+        with pytest.warns(UserWarning, match=f"{len(corners) - len(X)} of {len(corners)} vertices were welded"):
+            surface = read_surface(path, weld=weld)
+        assert len(surface.vertices) == len(X) and not surface.faults()
+        if apart:
+            assert "hole" in read_surface(path).faults()[0]
+    for wrong in (-1.0, np.nan, "1", True):
+        with pytest.raises(MeshError, match="ball.obj: weld must be a distance of at least 0 m"):
+            read_surface(path, weld=wrong)
+
+
+def test_what_is_left_out_is_told(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 2 0 0\nv 9 9 9\nf 1 2 3\nf 1 2 4\nf 3 1 2\n")
+    with pytest.warns(UserWarning) as told:
+        surface = read_surface(path)
+    texts = " ".join(str(one.message) for one in told)
+    assert "1 triangles without area are left out, the first is triangle 1" in texts
+    assert "1 triangles given twice are left out, the first is triangle 2" in texts
+    assert len(surface.vertices) == 3 and len(surface.triangles) == 1
+
+
+@pytest.mark.parametrize(
+    "name, text, rule",
+    [
+        ("a.obj", "", "the file is empty"),
+        ("a.obj", "v 0 0\n", "line 1 cannot be read: 'v 0 0'"),
+        ("a.obj", "v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "vertex 0 coordinate 2 is not finite"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", r"triangle 0: vertex 3 does not exist \(3 vertices\)"),
+        ("a.obj", "v 0 0 0\nf 1 0 1\n", "line 2 cannot be read"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no triangle has an area"),
+        ("a.obj", "v 0 0 0\n", "no triangles found"),
+        ("a.stl", "solid nothing\nfacet normal\n", "not a supported surface"),
+        ("a.msh", "x", "a surface is read from .obj, .stl, .ply, .off, not from .msh"),
+    ],
+)
+def test_broken_files(name, text, rule, tmp_path):
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(MeshError, match=rule) as told:
+        read_surface(path)
+    assert name in str(told.value)
+    if path.suffix in FORMATS:
+        with pytest.raises(MeshError, match="there is no such file"):
+            read_surface(tmp_path / f"none{path.suffix}")
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.binary(min_size=1, max_size=300), ending=st.sampled_from(FORMATS))
+def test_random_bytes(data, ending, tmp_path_factory):
+    path = tmp_path_factory.mktemp("random") / f"a{ending}"
+    path.write_bytes(data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            read_surface(path)
+        except MeshError as error:
+            assert str(path) in str(error)
+
+
+def test_faults():
+    assert not ts.SurfaceMesh(X, T).faults()
+    one, two = ts.SurfaceMesh(X, T[1:]).faults()[0], ts.SurfaceMesh(X, np.delete(T, [0, len(T) - 1], axis=0)).faults()[0]
+    assert one.startswith("1 hole: 3 edges belong to one triangle") and two.startswith("2 holes: 6 edges")
+    turned = T.copy()
+    turned[3] = turned[3, ::-1]
+    assert ts.SurfaceMesh(X, turned).faults()[0].startswith("3 edges whose two triangles look to opposite sides")
+    assert ts.SurfaceMesh(X, T[:, ::-1]).faults() == ["all triangles look inward; flip the normals"]
+    wall = np.vstack([X, X.mean(axis=0)]), np.vstack([T, [*T[0, :2], len(X)]])
+    assert any("belong to more than two triangles" in text for text in ts.SurfaceMesh(*wall).faults())
+    two = ts.SurfaceMesh(np.vstack([X, X + 3.0]), np.vstack([T, T + len(X)]))
+    assert two.n_pieces == 2 and two.volume == pytest.approx(2 * VOLUME) and not two.faults()
+
+
+@pytest.mark.parametrize("scale, shift, flipped", [(1.0, 0.0, False), (1e-3, 50.0, True)])
+def test_tets_of_a_ball(scale, shift, flipped):
+    pytest.importorskip("wildmeshing")
+    surface = ts.SurfaceMesh(scale * X + shift, T[:, ::-1] if flipped else T, "ball")
+    told = pytest.warns(UserWarning, match="look inward") if flipped else warnings.catch_warnings()
+    with told:
+        mesh = ts.tetrahedralize(surface, edge_length=0.25 * scale)
+    assert mesh.volumes.sum() == pytest.approx(VOLUME * scale**3, rel=0.05) and mesh.volumes.min() > 0 and mesh.n_components == 1
+    assert 40 < mesh.n_tets < 2000
+    assert np.linalg.norm(mesh.vertices - shift, axis=1).max() < 0.53 * scale
+
+
+def test_what_cannot_be_meshed_is_told(monkeypatch):
+    surface = ts.SurfaceMesh(X, T, "ball.obj")
+    for wrong in (0.0, -1.0, 9.0, np.nan, "x", True):
+        with pytest.raises(MeshError, match="ball.obj: edge_length must be a length above 0 and below the diagonal"):
+            ts.tetrahedralize(surface, edge_length=wrong)
+    with pytest.raises(MeshError, match="needs a SurfaceMesh"):
+        ts.tetrahedralize(BALL)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "find_spec", lambda name: None)
+        with pytest.raises(MeshError, match=r"ball.obj: .* needs the package wildmeshing: pip install 'taisoft\[mesh\]'"):
+            ts.tetrahedralize(surface)
+    monkeypatch.setattr(module, "find_spec", lambda name: True)
+    died = subprocess.CompletedProcess([], -6, b"", b"terminate called\nout of luck\n\n")
+    monkeypatch.setattr(module.subprocess, "run", lambda *a, **k: died)
+    with pytest.raises(MeshError, match="ball.obj: the mesher failed: out of luck"):
+        ts.tetrahedralize(surface)
+
+
+def test_from_a_surface_to_a_mesh(tmp_path, capsys):
+    pytest.importorskip("wildmeshing")
+    surface, out = tmp_path / "ball.obj", tmp_path / "ball.msh"
+    meshio.write(surface, meshio.Mesh(X, [("triangle", T)]))
+    assert main(["info", str(surface)]) == 0
+    shown = capsys.readouterr().out
+    assert f"{len(X)} vertices, {len(T)} triangles, 1 piece; no tets" in shown and "taisoft tetrahedralize" in shown
+    assert main(["tetrahedralize", str(surface), "--out", str(out), "--edge-length", "0.25"]) == 0
+    assert "surface triangles" in capsys.readouterr().out
+    assert ts.read_mesh(out).volumes.sum() == pytest.approx(VOLUME, rel=0.05)
+    assert main(["tetrahedralize", str(surface), "--out", str(out)]) == 3
+    assert "--overwrite replaces it" in capsys.readouterr().err
+    for path, code in ((tmp_path / "ball.txt", 2), (tmp_path / "none" / "ball.msh", 3)):
+        assert main(["tetrahedralize", str(surface), "--out", str(path)]) == code and not path.exists()
+        assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_a_bunny_of_others(shared):
+    """Texture coordinates and positions differ in number; welded it is closed."""
+    path = Path(shared) / "meshes" / "bunny_surface.obj"
+    if not path.is_file():
+        pytest.skip(f"{path.name} is absent")
+    with pytest.warns(UserWarning, match="1054 of 1806 vertices were welded"):
+        surface = read_surface(path)
+    assert len(surface.vertices) == 752 and len(surface.triangles) == 1500 and not surface.faults() and surface.volume > 0
