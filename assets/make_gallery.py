@@ -4,6 +4,7 @@ scene.
 A strip shows a scene at a few moments, from the same place, side by side.
 """
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -61,14 +62,16 @@ def strip(scene_file: Path, moments: tuple, size: tuple[int, int], view: tuple) 
 
 
 def main() -> None:
-    """Writes gallery/<scene>.png for every strip."""
-    for name, (moments, size, view) in STRIPS.items():
-        data = png_bytes(strip(ASSETS.parent / name, moments, size, view))
-        path = ASSETS / "gallery" / f"{Path(name).stem}.png"
+    """Writes gallery/<demo>.png for the demos named, or for all."""
+    names = sys.argv[1:] or list(STRIPS)
+    for name in names:
+        moments, size, view = STRIPS[name]
+        data = png_bytes(strip(ASSETS.parent / "demos" / f"{name}.py", moments, size, view))
+        path = ASSETS / "gallery" / f"{name}.png"
         if len(data) > MAX_BYTES:
             raise SystemExit(f"{path}: {len(data)} bytes, at most {MAX_BYTES} are meant to be kept")
         write_bytes(path, data)
-        print(f"{path.relative_to(ASSETS.parent)}: {len(data) / 1e3:.0f} kB")
+        print(f"{path.relative_to(ASSETS.parent)}: {len(data) / 1e3:.0f} kB", flush=True)
 
 
 if __name__ == "__main__":
