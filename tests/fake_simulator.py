@@ -55,7 +55,7 @@ class FakeSimulator:
         nodes[:, 4] = np.where(nodes[:, 3] >= 0, nodes[:, 3] + 1, -1)
         weights = np.where(nodes >= 0, (1.0, 0.0, 0.0, 0.75, 0.25, 0.0), 0.0)
         impulse = np.array([(self.time + 0.1 * j, 1.0 + j, -self.time) for j in range(k)])
-        names_b = np.array((names + names)[1 : k + 1], dtype=object)
+        names_b = np.array([*names, "an obstacle"][1 : k + 1], dtype=object)
         return SimpleNamespace(
             nodes=nodes, weights=weights, impulse=impulse, body_a=np.array(names[:k], dtype=object), body_b=names_b
         )
