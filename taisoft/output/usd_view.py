@@ -1,9 +1,10 @@
 """The camera and the lights of a scene in OpenUSD: `/View`, beside the bodies and outside of the default prim.
 
 Who references the scene gets the bodies alone, and no body's name can meet a light's. The camera is that of the pictures: it
-frames the bodies where they start and moves back after them. The lamp stands as the pictures' key lamp does at the start, the
-dome is grey all round. Intensities suit an exposure of 1 (a white face square to the lamp comes out near white); the lamp is
-normalized, since readers that know nothing of that take its intensity as the irradiance that it is then [W/m^2].
+frames the bodies where they start and moves back after them. The lamp shines over the viewer's left shoulder, from where
+upright walls along the axes that face the camera cast no shadow into a bin; the dome is grey all round. Intensities suit an
+exposure of 1 (a white face square to the lamp comes out near white); the lamp is normalized, since readers that know nothing of
+that take its intensity as the irradiance that it is then [W/m^2].
 """
 
 import math
@@ -16,7 +17,7 @@ from taisoft.output.camera import MAX_WIDENING, Camera
 VIEW = "/View"
 PICTURE = (16, 9)  # width and height
 SENSOR = 0.036  # width [m], as of a camera for film of 36 mm
-LAMP_TURN, LAMP_ELEVATION = -37.0, 54.0  # [deg]: about y from the camera's azimuth, above the horizon
+LAMP_TURN, LAMP_ELEVATION = -22.0, 54.0  # [deg]: about y from the camera's azimuth, above the horizon
 LAMP, DOME = 2.2, 0.4  # a white diffuse face returns LAMP / pi of the one, DOME of the other
 LENS = 10.0  # sizes in the lens are told in tenths of the scene's unit
 
