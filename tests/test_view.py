@@ -282,7 +282,7 @@ def test_a_falling_body_stays_in_the_picture(renderer):
         first = drawing.camera.distance
         drawing.image(sim)
         assert drawing.camera.distance == first
-        sim.positions = lambda name: scene.body(name).rest_positions - (0, 5, 0)
+        sim.positions = lambda: scene.bodies[0].rest_positions - (0, 5, 0)
         mask = body_mask(drawing.image(sim))
     finally:
         drawing.close()
