@@ -25,9 +25,11 @@ from taisoft.errors import OutputError
 from taisoft.output.files import make_folder, part_path, publish, replacing, write_error
 from taisoft.output.nodal_fields import NodalMean, contact_impulses, von_mises
 from taisoft.output.usd_prims import IMPULSE, STRESS, scene_layer
+from taisoft.output.usd_view import PLACE
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
+CHANGING = {"points", "extent", f"primvars:{STRESS}", f"primvars:{IMPULSE}", PLACE}  # names of attributes
 
 
 class UsdWriter:
@@ -189,17 +191,12 @@ def _without_samples(layer):
 
 
 def _sampled(layer) -> list:
-    """Paths of the attributes that change over time in a layer."""
+    """Paths of the attributes that change over time in a layer of this module, or would if it had frames."""
     from pxr import Sdf
 
     found = []
-
-    def look(path) -> None:
-        if layer.GetNumTimeSamplesForPath(path):
-            found.append(path)
-
-    layer.Traverse(Sdf.Path.absoluteRootPath, look)
-    return found
+    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(path) if path.name in CHANGING else None)
+    return [path for path in found if path.IsPropertyPath()]
 
 
 def _set_range(layer, first: float, last: float) -> None:

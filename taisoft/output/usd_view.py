@@ -14,7 +14,7 @@ import numpy as np
 from taisoft.output.appearance import start_positions
 from taisoft.output.camera import MAX_WIDENING, Camera
 
-VIEW = "/View"
+VIEW, PLACE = "/View", "xformOp:translate"
 PICTURE = (16, 9)  # width and height
 SENSOR = 0.036  # width [m], as of a camera for film of 36 mm
 LAMP_TURN, LAMP_ELEVATION = -22.0, 54.0  # [deg]: about y from the camera's azimuth, above the horizon
@@ -39,9 +39,8 @@ class ViewTrack:
         camera.CreateFocalLengthAttr(LENS * height / 2 / math.tan(math.radians(self.camera.fov) / 2))
         near, far = self.camera.clipping
         camera.CreateClippingRangeAttr(Gf.Vec2f(near, MAX_WIDENING * far))
-        place = camera.AddTranslateOp()
-        place.Set(Gf.Vec3d(*self.camera.position.tolist()))
-        self.attribute = place.GetAttr().GetPath()
+        camera.AddTranslateOp().Set(Gf.Vec3d(*self.camera.position.tolist()))
+        self.attribute = camera.GetPath().AppendProperty(PLACE)
         _turn(camera, self.camera.azimuth, self.camera.elevation)
 
         lamp = UsdLux.DistantLight.Define(stage, f"{VIEW}/lamp")
