@@ -11,9 +11,9 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.cli.scene_file import load_module
+from taisoft.output.camera import Camera
 from taisoft.output.files import write_bytes
 from taisoft.output.frames import png_bytes
-from taisoft.view.camera import Camera
 from taisoft.view.offscreen import Offscreen
 
 ASSETS = Path(__file__).resolve().parent

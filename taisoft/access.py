@@ -143,14 +143,15 @@ class StateAccess:
         """What finds the contacts; None where it was not needed yet."""
         return self._contact.detection if self._contact is not None else self._idle_detection
 
-    def stress(self, body: str) -> np.ndarray:
-        """Cauchy stress per tet (m,3,3) [Pa]; not finite in a flat one."""
-        world, k = self._open_world(), self._index(body)
-        m = world.model
+    def stress(self, body: str | None = None) -> np.ndarray:
+        """Cauchy stress per tet (m,3,3) [Pa], not finite in a flat one; of all bodies, in the order added, without a name."""
+        world = self._open_world()
+        m, layout = world.model, world.layout
+        bodies = range(len(layout.n_tets)) if body is None else [self._index(body)]
         sigma = np.zeros((m.n_blocks * m.lanes, 9))
         cauchy_stress(m, sigma)
-        first = world.layout.block_start[k] * m.lanes
-        return sigma[first : first + world.layout.n_tets[k]].reshape(-1, 3, 3)
+        first = layout.block_start * m.lanes
+        return np.concatenate([sigma[first[k] : first[k] + layout.n_tets[k]] for k in bodies]).reshape(-1, 3, 3)
 
     def elastic_forces(self) -> np.ndarray:
         """(n_nodes, 3) elastic forces of the present state on all nodes [N]."""

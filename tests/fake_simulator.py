@@ -1,5 +1,7 @@
 """A stand-in for Simulator whose motion is a formula: for tests of what reads a simulation, not of what computes it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 
 import taisoft as ts
@@ -18,18 +20,44 @@ def beam_scene(names=("beam",), cells=(8, 2, 2), order=1):
 
 
 class FakeSimulator:
-    """Bends every body about its left end, more and more with time; announce prints each call for a parent process."""
+    """Bends every body about its left end, more and more with time; announce prints each call for a parent process.
+
+    Stress grows with time and along x, and each body's node 0 is pushed by the next one's, or by an obstacle.
+    """
 
     def __init__(self, scene, dt=1 / 60, announce=False):
         self.scene, self.dt, self.announce = scene, dt, announce
         self.time, self.step_count = 0.0, 0
+        self._along = {b.name: b.mesh.vertices[b.mesh.tets, 0].mean(axis=1) for b in scene.bodies}
 
-    def positions(self, name):
+    def positions(self, name=None):
+        if name is None:
+            return np.concatenate([self.positions(body.name) for body in self.scene.bodies])
         body = self.scene.body(name)
         x = body.rest_positions + body.position
         bent = x.copy()
         bent[:, 1] -= 0.1 * np.sin(self.time) * (x[:, 0] - x[:, 0].min()) ** 2
         return bent
+
+    def stress(self, name=None):
+        if name is None:
+            return np.concatenate([self.stress(body.name) for body in self.scene.bodies])
+        return 1e3 * (self.time + self._along[name])[:, None, None] * np.diag([1.0, 0.2, -0.4])
+
+    def contacts(self):
+        names = [collider.name for collider in self.scene.colliders]
+        k = len(self.scene.bodies)
+        first = np.cumsum([0] + [body.n_nodes for body in self.scene.bodies])
+        nodes = np.full((k, 6), -1)
+        nodes[:, 0] = first[:-1]
+        nodes[:-1, 3] = first[1:-1]
+        nodes[:, 4] = np.where(nodes[:, 3] >= 0, nodes[:, 3] + 1, -1)
+        weights = np.where(nodes >= 0, (1.0, 0.0, 0.0, 0.75, 0.25, 0.0), 0.0)
+        impulse = np.array([(self.time + 0.1 * j, 1.0 + j, -self.time) for j in range(k)])
+        names_b = np.array([*names, "an obstacle"][1 : k + 1], dtype=object)
+        return SimpleNamespace(
+            nodes=nodes, weights=weights, impulse=impulse, body_a=np.array(names[:k], dtype=object), body_b=names_b
+        )
 
     def energies(self):
         return Energies(kinetic=1.0 + self.time, elastic=2.0, gravity=-3.0)

@@ -4,6 +4,7 @@
 * the check fails where the material is 1 % stiffer than the demo says, or another number off by as much, so it would notice
   wrong physics;
 * of sheets in contact no triangle meets one of what they touch in any frame, by the judgement of ipctk;
+* its USD file holds the positions of every frame, and no validator objects to it;
 * a demo says what it is in one line.
 """
 
@@ -12,9 +13,12 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from pxr import Usd
 from test_self_collision import judged
+from usd_stage import check_frames, faults
 
 from taisoft.cli.scene_file import first_line, load_module, shipped_files
+from taisoft.output.usd import UsdWriter
 from taisoft.simulator import Simulator
 
 DEMOS = shipped_files("demos")
@@ -70,14 +74,17 @@ def test_there_are_demos():
 
 
 @pytest.mark.parametrize("name", DEMOS)
-def test_demo(name):
+def test_demo(name, tmp_path):
     demo = load_module(DEMOS[name])
     sim, run = opened(demo)
-    crossed = []
+    crossed, seen = [], []
+    writer = UsdWriter(tmp_path, sim.scene, fps=run["fps"])
 
     def look(sim, frame, report):
         if name in NEVER_CROSS and crossing(sim):
             crossed.append(frame)
+        seen.append({body.name: sim.positions(body.name) for body in sim.scene.bodies})
+        writer.frame(sim, frame)
 
     with sim:
         result = sim.run(on_frame=look, **run)
@@ -85,6 +92,9 @@ def test_demo(name):
         assert crossed == []
         assert abs(sim.time - run["seconds"]) < 1e-9
         demo.check(sim, result)
+        writer.close()
+        assert check_frames(tmp_path / "scene.usdc", seen) == len(seen) > 1
+        assert faults(Usd.Stage.Open(str(tmp_path / "scene.usdc"))) == []
 
         WRONG.get(name, stiffer)(sim)
         sim.reset()

@@ -4,14 +4,17 @@
 * the square of a half-space lies below the bodies, and ends where another half-space begins, also where many meet in a point;
 * they follow a path, a square only along its normal; a path that fails is told;
 * of what is drawn, triangles that look away from the eye go; both renderers draw the same floor about a body;
-* in USD obstacles lie where they are in every frame, those at rest once; no validator objects; chunks join with them.
+* in USD obstacles lie where they are in every frame, those at rest once; no validator objects; chunks join with them;
+* there walls that would hide the bodies from the camera are guides, what does not close is double-sided, and all is bound to a
+  grey material.
 """
 
 import numpy as np
 import pytest
 from fake_simulator import RUBBER, FakeSimulator
-from pxr import Usd, UsdValidation
+from pxr import Usd, UsdGeom, UsdShade
 from rotations import rotation
+from usd_stage import faults
 
 import taisoft as ts
 from taisoft.mesh.half_edges import opposite_half_edges
@@ -200,8 +203,7 @@ def test_in_usd(tmp_path, killed):
     if not killed:
         writer.close()
     stage = Usd.Stage.Open(str(path))
-    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    assert not UsdValidation.ValidationContext(validators).Validate(stage)
+    assert faults(stage) == []
     ground, box = obstacle_surfaces(made)
     points = stage.GetAttributeAtPath("/World/ground/surface.points")
     assert points.GetTimeSamples() == [] and np.array_equal(points.Get(), ground.vertices.astype(np.float32))
@@ -212,3 +214,25 @@ def test_in_usd(tmp_path, killed):
     used = np.array(stage.GetAttributeAtPath("/World/a_box/surface.faceVertexIndices").Get())
     assert np.array_equal(used.reshape(-1, 3), box.triangles)
     assert stage.GetPrimAtPath("/World/a_box").GetDisplayName() == "a box"
+
+
+def test_seen_in_usd(tmp_path):
+    """A floor, two walls behind and two before the bodies, a bowl that is open and one that is closed."""
+    normals = {"left": (1, 0, 0), "right": (-1, 0, 0), "back": (0, 0, 1), "front": (0, 0, -1), "floor": (0, 1, 0)}
+    walls = {name: (ts.HalfSpace((3, 4, 0) - 2 * np.array(n), n), None) for name, n in normals.items()}
+    closed = SOLIDS["mesh"][0]
+    bowl = ts.MeshObstacle(closed.vertices, closed.triangles[closed.vertices[closed.triangles][:, :, 1].mean(axis=1) < 0])
+    made = scene(**walls, bowl=(bowl, None), ball=(closed, None))
+    writer = UsdWriter(tmp_path, made)
+    writer.frame(FakeSimulator(made), 0)
+    writer.close()
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+    assert faults(stage) == []
+    shown = {name: UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}/surface")) for name in (*walls, "bowl", "ball")}
+    hiding = {name for name, mesh in shown.items() if mesh.ComputePurpose() == UsdGeom.Tokens.guide}
+    assert hiding == {"right", "front"}  # the camera is at the right, before and above
+    assert {name for name, mesh in shown.items() if mesh.GetDoubleSidedAttr().Get()} == {"bowl"}
+    for mesh in shown.values():
+        material = UsdShade.MaterialBindingAPI(mesh.GetPrim()).ComputeBoundMaterial()[0]
+        colour = material.ComputeSurfaceSource()[0].GetInput("diffuseColor").Get()
+        assert colour == mesh.GetDisplayColorAttr().Get()[0] and np.ptp(np.array(colour)) < 0.05

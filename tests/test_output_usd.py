@@ -3,6 +3,9 @@
 * scene.usdc passes every validator of pxr.UsdValidation and holds the float32 positions of every frame, body and node,
   for elements of first and second order;
 * metres, y up, default prim, frame rate, frame range, extents, materials, tetrahedra that USD itself finds upright;
+* at every point of every frame von Mises' stress and, where there can be contacts, the impulse of contacts, whose sums over a
+  body are those of its contacts;
+* a camera that sees what the pictures' camera sees, in every frame, and lights, which are no part of the default prim;
 * body names become legal, distinct prim names, with the own name beside them;
 * killed at any time, every file under a final name opens, at most the chunk in the making is lost, an older scene.usdc
   is whole; the chunks join to the file that the run would have written;
@@ -19,9 +22,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_simulator import FakeSimulator, beam_scene
-from pxr import Tf, Usd, UsdGeom, UsdShade, UsdValidation
+from pxr import Tf, Usd, UsdGeom, UsdLux, UsdShade
+from usd_stage import check_frames, faults
 
 from taisoft.errors import OutputError
+from taisoft.output.appearance import start_positions
+from taisoft.output.camera import Camera
+from taisoft.output.nodal_fields import NodalMean, contact_impulses, von_mises
 from taisoft.output.usd import UsdWriter, join_chunks
 from taisoft.output.usd_prims import prim_names
 
@@ -42,31 +49,6 @@ def export(folder, scene, n_frames, chunk_frames=10, close=True):
     return given
 
 
-def points_of(stage, path, index):
-    return np.array(stage.GetAttributeAtPath(f"{path}.points").Get(index))
-
-
-def check_frames(path, given, first=0):
-    """Every frame in the file equals the positions given, in float32; returns the number of frames."""
-    stage = Usd.Stage.Open(str(path))
-    start, end = int(stage.GetStartTimeCode()), int(stage.GetEndTimeCode())
-    assert start == first
-    for body, legal in zip(given[0], prim_names(list(given[0]))):
-        prim = f"/World/{legal}"
-        triangles = np.array(stage.GetAttributeAtPath(f"{prim}/tets.surfaceFaceVertexIndices").Get())
-        local = np.array(stage.GetAttributeAtPath(f"{prim}/surface.faceVertexIndices").Get())
-        samples = stage.GetAttributeAtPath(f"{prim}/surface.points").GetTimeSamples()
-        assert samples == list(range(start, end + 1))
-        for index in range(start, end + 1):
-            expected = given[index][body].astype(np.float32)
-            assert np.array_equal(points_of(stage, f"{prim}/tets", index), expected)
-            surface = points_of(stage, f"{prim}/surface", index)
-            assert np.array_equal(surface[local].reshape(-1, 3, 3), expected[triangles])
-            extent = np.array(stage.GetAttributeAtPath(f"{prim}/tets.extent").Get(index))
-            assert np.array_equal(extent, [expected.min(axis=0), expected.max(axis=0)])
-    return end - start + 1
-
-
 @pytest.fixture(scope="module", params=[1, 2], ids=["order1", "order2"])
 def exported(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("usd")
@@ -76,11 +58,7 @@ def exported(request, tmp_path_factory):
 
 
 def test_no_validator_objects(exported):
-    registry = UsdValidation.ValidationRegistry()
-    validators = registry.GetOrLoadAllValidators()
-    assert len(validators) > 10
-    errors = UsdValidation.ValidationContext(validators).Validate(exported[3])
-    assert [error.GetMessage() for error in errors] == []
+    assert faults(exported[3]) == []
 
 
 def test_one_file_with_every_frame(exported):
@@ -95,6 +73,7 @@ def test_stage_units_and_range(exported):
     assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
     assert stage.GetDefaultPrim().GetPath() == "/World"
     assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (30.0, 0.0, 22.0)
+    assert stage.GetFramesPerSecond() == 30.0
 
 
 def test_surface_has_no_inner_vertex_and_a_colour(exported):
@@ -108,6 +87,93 @@ def test_surface_has_no_inner_vertex_and_a_colour(exported):
     shader = material.ComputeSurfaceSource()[0]
     assert shader.GetShaderId() == "UsdPreviewSurface"
     assert shader.GetInput("diffuseColor").Get() == surface.GetDisplayColorAttr().Get()[0]
+
+
+def primvar(stage, path, name, index):
+    """The numbers at the points of a prim in a frame."""
+    found = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(path)).GetPrimvar(name)
+    assert found.GetInterpolation() == UsdGeom.Tokens.vertex
+    return np.array(found.Get(index))
+
+
+def test_stress_and_impulses_at_the_points(exported):
+    _, scene, _, stage = exported
+    sim, mean = FakeSimulator(scene), NodalMean(scene.bodies)
+    first = np.cumsum([0] + [body.n_nodes for body in scene.bodies])
+    for index in (0, 1, 22):
+        sim.time = index / 30
+        contacts = sim.contacts()
+        stress, impulses = von_mises(mean(sim.stress())), contact_impulses(contacts, first[-1])
+        assert stress.min() >= 0 and np.ptp(stress) > 1e3 and impulses.any()
+        for k, (body, legal) in enumerate(zip(scene.bodies, prim_names(list(NAMES)))):
+            own, path = slice(first[k], first[k + 1]), f"/World/{legal}"
+            nodes = np.unique(body.nodes.surface)
+            assert np.array_equal(primvar(stage, f"{path}/tets", "vonMisesStress", index), stress[own].astype(np.float32))
+            on_surface = primvar(stage, f"{path}/surface", "vonMisesStress", index)
+            assert np.array_equal(on_surface, stress[own][nodes].astype(np.float32))
+            pushed = primvar(stage, f"{path}/surface", "contactImpulse", index)
+            assert np.array_equal(pushed, impulses[own][nodes].astype(np.float32))
+            total = contacts.impulse[contacts.body_a == body.name].sum(axis=0)
+            total = total - contacts.impulse[contacts.body_b == body.name].sum(axis=0)
+            assert np.abs(total).max() > 0.5 and np.allclose(pushed.sum(axis=0), total, atol=1e-5)
+
+
+def test_impulses_only_where_there_can_be_contacts(tmp_path):
+    scenes = {"alone": beam_scene(), "off": beam_scene(("one", "two")), "two": beam_scene(("one", "two")), "itself": beam_scene()}
+    scenes["off"].contact_forces = False
+    has = {}
+    for name, scene in scenes.items():
+        writer = UsdWriter(tmp_path / name, scene, self_collision=name == "itself")
+        writer.frame(FakeSimulator(scene), 0)
+        writer.close()
+        stage = Usd.Stage.Open(str(tmp_path / name / "scene.usdc"))
+        assert faults(stage) == []
+        has[name] = {prim.HasAttribute("primvars:contactImpulse") for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)}
+    assert has == {"alone": {False}, "off": {False}, "two": {True}, "itself": {True}}
+
+
+def test_camera(tmp_path):
+    """What falls out of the picture makes it move back; pixels are those of the pictures' camera."""
+    scene = beam_scene()
+    sim, writer, size = FakeSimulator(scene), UsdWriter(tmp_path, scene), (1600, 900)
+    camera, expected = Camera.framing(start_positions(scene), size), []
+    for index in range(4):
+        sim.time = 0.5 * index
+        writer.frame(sim, index)
+        camera = camera.widened(sim.positions(), size, 4 * camera.distance)
+        expected.append((camera, sim.positions()))
+    writer.close()
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+    (prim,) = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
+    assert not prim.GetPath().HasPrefix(stage.GetDefaultPrim().GetPath())
+    assert expected[3][0].distance > 1.2 * expected[0][0].distance
+    for index, (camera, x) in enumerate(expected):
+        seen = UsdGeom.Camera(prim).GetCamera(index)
+        frustum = seen.frustum
+        across = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
+        clip = np.column_stack([x, np.ones(len(x))]) @ np.array(across)
+        pixels = (clip[:, :2] / clip[:, 3:] * (1, -1) + 1) / 2 * size
+        assert np.abs(pixels - camera.project(x, size)[:, :2]).max() < 0.05
+        assert (np.abs(clip[:, :3]) < clip[:, 3:]).all()  # between the clipping planes too
+    # film of 36 mm and a lens of 38 mm, told in tenths of a metre
+    assert [100 * seen.horizontalAperture, 100 * seen.focalLength] == pytest.approx([36, 37.8], abs=0.1)
+
+
+def test_lights(exported):
+    stage = exported[3]
+    lights = [prim for prim in stage.Traverse() if prim.HasAPI(UsdLux.LightAPI)]
+    assert [prim.GetTypeName() for prim in lights] == ["DistantLight", "DomeLight"]
+    assert not any(prim.GetPath().HasPrefix(stage.GetDefaultPrim().GetPath()) for prim in lights)
+    lamp, dome = (UsdLux.LightAPI(prim) for prim in lights)
+    # a white diffuse face square to the lamp
+    assert lamp.GetNormalizeAttr().Get() and 0.9 < lamp.GetIntensityAttr().Get() / np.pi + dome.GetIntensityAttr().Get() < 1.2
+    away = UsdGeom.Xformable(lights[0]).ComputeLocalToWorldTransform(0).TransformDir((0, 0, -1))
+    camera = UsdGeom.Camera(stage.GetPrimAtPath("/View/camera")).GetCamera(0).transform
+    right, up, backward = (np.array(camera.TransformDir(axis)) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))
+    towards = -np.array(away)
+    # over the viewer's left shoulder, but before the walls that the camera sees, whose normals are along x and z
+    assert towards[0] > 0.05 and towards[2] > 0.05
+    assert towards @ right < -0.2 and towards @ up > 0.4 and towards @ backward > 0.4 and towards[1] > 0.7
 
 
 def test_tets_are_upright_and_not_drawn(exported):
@@ -184,7 +250,7 @@ for index in range(int(sys.argv[2])):
 print("closing", flush=True)
 writer.close()
 """
-N_KILLED_FRAMES = 400  # some 0.3 s of writing
+N_KILLED_FRAMES = 150
 
 
 def test_killed_at_any_time_leaves_files_that_open(tmp_path):
@@ -197,11 +263,11 @@ def test_killed_at_any_time_leaves_files_that_open(tmp_path):
     old = (tmp_path / "old" / "scene.usdc").read_bytes()
     dice = random.Random(1)
     stopped = []
-    for attempt in range(6):
+    for attempt, told in enumerate([1, N_KILLED_FRAMES + 1, *dice.sample(range(2, N_KILLED_FRAMES), 4)]):
         folder = tmp_path / str(attempt)
         folder.mkdir()
         (folder / "scene.usdc").write_bytes(old)
-        done = run_and_kill(folder, dice.uniform(0.0, 0.4))
+        done = run_and_kill(folder, told, dice.uniform(0.0, 0.02))
         stopped.append(len(done))
         chunks = sorted((folder / "chunks").glob("*.usdc"))
         if (folder / "scene.usdc").read_bytes() != old:
@@ -213,15 +279,15 @@ def test_killed_at_any_time_leaves_files_that_open(tmp_path):
     assert len(set(stopped)) > 2, "the kills all came at the same place"
 
 
-def run_and_kill(folder, delay):
-    """Lines that the child printed before it was killed, delay [s] after its first frame."""
+def run_and_kill(folder, told, delay):
+    """Lines that the child printed before it was killed, delay [s] after so many of them: a frame each, and that it closes."""
     child = subprocess.Popen(
         [sys.executable, "-c", CHILD, str(folder), str(N_KILLED_FRAMES)], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
-    first = child.stdout.readline()
+    lines = [child.stdout.readline().strip() for _ in range(told)]
     time.sleep(delay)
     child.kill()
-    return [first.strip(), *child.communicate()[0].split()]
+    return [*lines, *child.communicate()[0].split()]
 
 
 def test_a_full_disk_is_told_and_leaves_no_part(tmp_path):

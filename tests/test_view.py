@@ -24,8 +24,8 @@ from fake_simulator import RUBBER, FakeSimulator, beam_scene
 
 import taisoft as ts
 from taisoft.errors import OutputError, SimulationError
+from taisoft.output.camera import BORDER, FILL, Camera
 from taisoft.runtime import open_kind, open_runtime
-from taisoft.view.camera import BORDER, FILL, Camera
 from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.raster import LARGEST_TRIANGLE, rasterise
@@ -282,7 +282,7 @@ def test_a_falling_body_stays_in_the_picture(renderer):
         first = drawing.camera.distance
         drawing.image(sim)
         assert drawing.camera.distance == first
-        sim.positions = lambda name: scene.body(name).rest_positions - (0, 5, 0)
+        sim.positions = lambda: scene.bodies[0].rest_positions - (0, 5, 0)
         mask = body_mask(drawing.image(sim))
     finally:
         drawing.close()

@@ -63,7 +63,8 @@ class Recording:
     def add_writers(self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool) -> None:
         """Adds the writers of frames and USD to the observers."""
         if with_usd:
-            observers.members.append(UsdWriter(self._folder.path, sim.scene, fps=fps or 1.0 / sim.dt))
+            itself = sim.settings.self_collision
+            observers.members.append(UsdWriter(self._folder.path, sim.scene, fps=fps or 1.0 / sim.dt, self_collision=itself))
         if with_frames:
             observers.members.append(FrameWriter(self._folder.path, Offscreen(sim.scene)))
 

@@ -11,8 +11,10 @@ an attribute's time samples from the strongest layer alone, and value clips are 
 Time codes are frame numbers; metres, y up. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose
 guide, so that the two are not drawn over each other) and `material`. Both are flat: a second-order body is written as
 the linear triangles and tets that its elements are cut into, all its nodes as points (`taisoft/mesh/nodes.py`).
+Both carry `primvars:vonMisesStress` [Pa], and where there can be contacts the surface `primvars:contactImpulse` [N s], what
+the contacts of the last step before the frame gave each point; both are those of `nodal_fields.py`.
 An obstacle is `/World/<name>` with `surface` and `material`; its points change over time where it follows a path. A half-space
-whose square lies wholly within others is left out.
+whose square lies wholly within others is left out. `/View` holds a camera and lights (`usd_view.py`).
 """
 
 from pathlib import Path
@@ -21,21 +23,27 @@ import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.output.files import make_folder, part_path, publish, replacing, write_error
-from taisoft.output.usd_prims import ROOT, extent, scene_layer
+from taisoft.output.nodal_fields import NodalMean, contact_impulses, von_mises
+from taisoft.output.usd_prims import IMPULSE, STRESS, scene_layer
+from taisoft.output.usd_view import PLACE
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
+CHANGING = {"points", "extent", f"primvars:{STRESS}", f"primvars:{IMPULSE}", PLACE}  # names of attributes
 
 
 class UsdWriter:
     """Observer that writes the scene's bodies and obstacles over time to folder/scene.usdc.
 
     folder: the run's folder; scene: meshes and names of its bodies and obstacles are read now; fps: frames per second of
-    simulated time [1/s]; chunk_frames: frames per chunk, at most so many are lost when the process is killed. Raises
-    OutputError, also for an obstacle whose path fails.
+    simulated time [1/s]; chunk_frames: frames per chunk, at most so many are lost when the process is killed;
+    self_collision: the simulator's, for whether there can be contacts. Raises OutputError, also for an obstacle whose path
+    fails.
     """
 
-    def __init__(self, folder: str | Path, scene, fps: float = 60.0, chunk_frames: int = 10):
+    def __init__(
+        self, folder: str | Path, scene, fps: float = 60.0, chunk_frames: int = 10, self_collision: bool = False
+    ):  # fmt: skip
         if not fps > 0:
             raise OutputError(f"USD export: fps is {fps}, it must be positive")
         if chunk_frames < 1:
@@ -43,31 +51,34 @@ class UsdWriter:
         self.path = Path(folder) / SCENE_NAME
         self.chunks = make_folder(Path(folder) / CHUNKS_NAME)
         self.chunk_frames = chunk_frames
-        self._tracks, self._moving, self._template = scene_layer(scene, fps)
+        self._touching = scene.pushes(self_collision)
+        self._tracks, self._moving, self._view, self._template = scene_layer(scene, fps, self._touching)
+        self._mean = NodalMean(scene.bodies)
         self._joined = _Joined(self.path, self._template)
         self._chunk = None
         self._frames: list[int] = []  # in the chunk
 
     def frame(self, sim, index: int) -> None:
-        """Record sim's positions as frame index; index must ascend. Raises OutputError."""
-        moved = [(prim_path, surface.at(sim.time).astype(np.float32)) for prim_path, surface in self._moving]  # may fail
+        """Record sim's state as frame index; index must ascend. Raises OutputError."""
+        from pxr import Gf
+
+        moved = [(track, surface.at(sim.time).astype(np.float32)) for track, surface in self._moving]  # may fail
         if self._chunk is None:
             self._chunk = _copy(self._template)
-        for name, tracks in self._tracks.items():
-            x = np.asarray(sim.positions(name), dtype=np.float32)
-            for prim_path, nodes in tracks:
-                self._sample(prim_path, x if nodes is None else x[nodes], index)
-        for prim_path, points in moved:
-            self._sample(prim_path, points, index)
+        x = sim.positions()
+        points, fields = x.astype(np.float32), {STRESS: von_mises(self._mean(sim.stress())).astype(np.float32)}
+        if self._touching:
+            fields[IMPULSE] = contact_impulses(sim.contacts(), len(x)).astype(np.float32)
+        samples = [(self._view.attribute, Gf.Vec3d(*self._view.place(x).tolist()))]
+        for track in self._tracks:
+            samples += track.samples(points, fields)
+        for track, corners in moved:
+            samples += track.samples(corners, {})
+        for path, value in samples:
+            self._chunk.SetTimeSample(path, float(index), value)
         self._frames.append(index)
         if len(self._frames) >= self.chunk_frames:
             self._publish_chunk()
-
-    def _sample(self, prim_path: str, points: np.ndarray, index: int) -> None:
-        from pxr import Vt
-
-        self._chunk.SetTimeSample(f"{prim_path}.points", float(index), Vt.Vec3fArray.FromNumpy(points))
-        self._chunk.SetTimeSample(f"{prim_path}.extent", float(index), Vt.Vec3fArray.FromNumpy(extent(points)))
 
     def close(self) -> None:
         """Complete scene.usdc and remove the chunks; without a frame no file is made. Raises OutputError.
@@ -179,15 +190,13 @@ def _without_samples(layer):
     return copy
 
 
-def _sampled(layer) -> list[str]:
-    """Paths of the attributes that change over time in a layer of this module."""
-    return [
-        f"{ROOT}/{body.name}/{part}.{attribute}"
-        for body in layer.GetPrimAtPath(ROOT).nameChildren
-        for part in ("surface", "tets")
-        for attribute in ("points", "extent")
-        if layer.GetPrimAtPath(f"{ROOT}/{body.name}/{part}")
-    ]
+def _sampled(layer) -> list:
+    """Paths of the attributes that change over time in a layer of this module, or would if it had frames."""
+    from pxr import Sdf
+
+    found = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(path) if path.name in CHANGING else None)
+    return [path for path in found if path.IsPropertyPath()]
 
 
 def _set_range(layer, first: float, last: float) -> None:
@@ -209,8 +218,8 @@ def _written(path: Path, layer, write) -> None:
     except Exception as error:
         reason = _last_line(error)
     n_bytes = sum(
-        len(layer.QueryTimeSample(p, t)) * 12 for p in _sampled(layer) for t in layer.ListTimeSamplesForPath(p)
-    )  # three floats of 4 bytes a point
+        np.asarray(layer.QueryTimeSample(p, t)).nbytes for p in _sampled(layer) for t in layer.ListTimeSamplesForPath(p)
+    )
     raise OutputError(f"cannot write {path} ({n_bytes} bytes of new frames): {reason}")
 
 

@@ -1,16 +1,22 @@
 """The prims of a scene in OpenUSD: bodies and obstacles with their topology, colours and materials; see `usd.py`.
 
-Surfaces are single-sided, so that a viewer that leaves out back faces looks into a bin.
+What is solid is single-sided, a half-space too: a viewer that leaves out back faces looks into a bin. For those that show them,
+the half-spaces that hide the bodies from the camera, their backs turned to it at the start, are guides, which viewers leave out
+unless asked. Meshes of obstacles that do not close are double-sided.
 """
 
 import re
 
 import numpy as np
 
+from taisoft.mesh.half_edges import opposite_half_edges
 from taisoft.output.appearance import OBSTACLE_COLOUR, body_colour, compact_surface, linear_rgb
 from taisoft.output.obstacle_surface import ObstacleSurface, obstacle_surfaces
+from taisoft.output.usd_view import ViewTrack
+from taisoft.scene.obstacles import HalfSpace, MeshObstacle
 
 ROOT = "/World"
+STRESS, IMPULSE = "vonMisesStress", "contactImpulse"  # primvars
 MAX_NAME = 64  # characters of a prim name; the whole name is kept beside it
 
 
@@ -33,10 +39,34 @@ def prim_names(names: list[str]) -> list[str]:
     return legal
 
 
-def scene_layer(scene, fps: float) -> tuple[dict[str, list], list, object]:
-    """What gets points with the frames, and a layer with all else.
+class Track:
+    """A prim whose points change over time, and numbers at them.
 
-    Per body the (prim path, nodes or None for all), and the (prim path, surface) of each obstacle that follows a path.
+    gprim: defined; nodes: its points' places in arrays over the nodes of all bodies; primvars: names of its numbers. Paths are
+    made here, since to make them again at every frame costs as much as to set the values.
+    """
+
+    def __init__(self, gprim, nodes: np.ndarray | slice = slice(None), primvars: tuple[str, ...] = ()):
+        self._nodes = nodes
+        self._points, self._extent = gprim.GetPointsAttr().GetPath(), gprim.GetExtentAttr().GetPath()
+        self._primvars = [(name, gprim.GetPath().AppendProperty(f"primvars:{name}")) for name in primvars]
+
+    def samples(self, points: np.ndarray, fields: dict[str, np.ndarray]) -> list[tuple]:
+        """(path, value) of each attribute. points: (n,3) float32 [m]; fields: primvars by name, (n,) or (n,3) float32."""
+        from pxr import Vt
+
+        x = points[self._nodes]
+        found = [(self._points, Vt.Vec3fArray.FromNumpy(x)), (self._extent, Vt.Vec3fArray.FromNumpy(extent(x)))]
+        for name, path in self._primvars:
+            values = fields[name][self._nodes]
+            found.append((path, (Vt.FloatArray if values.ndim == 1 else Vt.Vec3fArray).FromNumpy(values)))
+        return found
+
+
+def scene_layer(scene, fps: float, touching: bool) -> tuple[list[Track], list, ViewTrack, object]:
+    """What gets values with the frames, and a layer with all else. touching: whether there can be contacts.
+
+    The tracks of the bodies, (track, surface) of each obstacle that follows a path, and the camera's.
     """
     from pxr import Sdf, Usd, UsdGeom
 
@@ -51,10 +81,14 @@ def scene_layer(scene, fps: float) -> tuple[dict[str, list], list, object]:
     stage.SetFramesPerSecond(fps)
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())
     legal = prim_names([one.name for one in (*scene.bodies, *scene.obstacles)])
-    tracks = {body.name: _define_body(stage, body, name, k) for k, (body, name) in enumerate(zip(scene.bodies, legal))}
+    tracks, first = [], 0
+    for k, (body, name) in enumerate(zip(scene.bodies, legal)):
+        tracks += _define_body(stage, body, name, k, first, touching)
+        first += body.n_nodes
+    view = ViewTrack(stage, scene)
     surfaces = [s for s in zip(obstacle_surfaces(scene), legal[len(scene.bodies) :]) if len(s[0].triangles)]
-    paths = [(_define_obstacle(stage, surface, name), surface) for surface, name in surfaces]
-    return tracks, [(path, surface) for path, surface in paths if surface.obstacle.path is not None], layer
+    moving = [(_define_obstacle(stage, surface, name, view.camera.position), surface) for surface, name in surfaces]
+    return tracks, [one for one in moving if one[1].obstacle.path is not None], view, layer
 
 
 def _define_named(stage, name: str, legal_name: str, colour: np.ndarray):
@@ -84,20 +118,27 @@ def extent(points: np.ndarray) -> np.ndarray:
     return np.array([points.min(axis=0), points.max(axis=0)], dtype=np.float32)
 
 
-def _define_obstacle(stage, shown: ObstacleSurface, legal_name: str) -> str:
-    """Its surface where it starts. Returns the path of that prim."""
-    from pxr import UsdShade, Vt
+def _define_obstacle(stage, shown: ObstacleSurface, legal_name: str, eye: np.ndarray) -> Track:
+    """Its surface where it starts, for an eye (3,) [m]."""
+    from pxr import UsdGeom, UsdShade, Vt
 
     path, colour, material = _define_named(stage, shown.obstacle.name, legal_name, OBSTACLE_COLOUR)
     surface, points = _define_surface(stage, f"{path}/surface", shown.triangles), shown.at(0.0).astype(np.float32)
     surface.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
     surface.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent(points)))
     surface.CreateDisplayColorAttr([colour])
+    if isinstance(shown.obstacle.shape, MeshObstacle) and (opposite_half_edges(shown.triangles) < 0).any():
+        surface.CreateDoubleSidedAttr(True)
+    if isinstance(shown.obstacle.shape, HalfSpace):
+        a, b, c = shown.at(0.0)[shown.triangles[0]]
+        if np.cross(b - a, c - a) @ (eye - a) <= 0.0:
+            surface.CreatePurposeAttr(UsdGeom.Tokens.guide)
     UsdShade.MaterialBindingAPI.Apply(surface.GetPrim()).Bind(material)
-    return f"{path}/surface"
+    return Track(surface)
 
 
-def _define_body(stage, body, legal_name: str, index: int) -> list[tuple[str, np.ndarray | None]]:
+def _define_body(stage, body, legal_name: str, index: int, first: int, touching: bool) -> list[Track]:
+    """first: the number of its first node among those of all bodies."""
     from pxr import UsdGeom, UsdShade, Vt
 
     path, colour, material = _define_named(stage, body.name, legal_name, body_colour(index))
@@ -114,8 +155,21 @@ def _define_body(stage, body, legal_name: str, index: int) -> list[tuple[str, np
         gprim.CreatePointsAttr()
         gprim.CreateExtentAttr()
         gprim.CreateDisplayColorAttr([colour])
+        _define_primvar(gprim, STRESS, "FloatArray", "von Mises equivalent of the mean Cauchy stress at the node [Pa]")
         UsdShade.MaterialBindingAPI.Apply(gprim.GetPrim()).Bind(material)
-    return [(f"{path}/surface", nodes), (f"{path}/tets", None)]
+    if touching:
+        _define_primvar(surface, IMPULSE, "Vector3fArray", "impulse of the contacts of the last step on the node [N s]")
+    every = slice(first, first + body.n_nodes)
+    shown = (STRESS, IMPULSE) if touching else (STRESS,)
+    return [Track(surface, first + nodes, shown), Track(tets, every, (STRESS,))]
+
+
+def _define_primvar(gprim, name: str, kind: str, meaning: str) -> None:
+    """Numbers at the points, without any yet."""
+    from pxr import Sdf, UsdGeom
+
+    primvar = UsdGeom.PrimvarsAPI(gprim).CreatePrimvar(name, getattr(Sdf.ValueTypeNames, kind), UsdGeom.Tokens.vertex)
+    primvar.GetAttr().SetDocumentation(meaning)
 
 
 def _define_material(stage, path: str, colour):

@@ -20,9 +20,9 @@ from taichi._lib import core
 
 from taisoft.errors import OutputError
 from taisoft.fields import FieldArena
+from taisoft.output.camera import Camera
 from taisoft.runtime import open_kind, open_runtime
 from taisoft.transfer import upload
-from taisoft.view.camera import Camera
 from taisoft.view.shading import lit_colours
 from taisoft.view.surfaces import Surfaces
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.output.appearance import start_positions
+from taisoft.output.camera import MAX_WIDENING, Camera
 from taisoft.runtime import open_kind
-from taisoft.view.camera import MAX_WIDENING, Camera
 from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
 from taisoft.view.raster import rasterise
 from taisoft.view.shading import background, lit_colours

@@ -6,7 +6,7 @@ sets silhouettes off. The lamps ride with the camera, so a turned view is lit as
 
 import numpy as np
 
-from taisoft.view.camera import Camera
+from taisoft.output.camera import Camera
 
 KEY, FILL = np.array([-0.35, 0.60, 0.72]), np.array([0.85, 0.15, 0.45])  # towards the lamp: right, up, backward
 KEY_STRENGTH, FILL_STRENGTH = 0.72, 0.22

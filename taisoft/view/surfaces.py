@@ -29,6 +29,7 @@ class Surfaces:
 
     def __init__(self, scene):
         self._bodies = [_BodySurface(body, body_colour(k)) for k, body in enumerate(scene.bodies)]
+        self._ends = np.cumsum([body.n_nodes for body in scene.bodies])[:-1]  # of the bodies' nodes among those of all
         self._obstacles = [_RigidSurface(surface) for surface in obstacle_surfaces(scene)]
         triangles, colours, n = [], [], 0
         for part in (*self._bodies, *self._obstacles):
@@ -40,7 +41,8 @@ class Surfaces:
 
     def of_bodies(self, sim) -> tuple[np.ndarray, np.ndarray]:
         """Positions [m] and unit normals of the bodies' drawn vertices in sim's present state, each float64 (n,3)."""
-        return _joined([body.vertices(sim.positions(body.name)) for body in self._bodies])
+        x = np.split(sim.positions(), self._ends)
+        return _joined([body.vertices(own) for body, own in zip(self._bodies, x)])
 
     def with_obstacles(
         self, bodies: tuple[np.ndarray, np.ndarray], t: float, eye: np.ndarray

@@ -11,7 +11,7 @@ import taichi as ti
 
 from taisoft.errors import OutputError, SimulationError, TaisoftError
 from taisoft.output.appearance import start_positions
-from taisoft.view.camera import MAX_WIDENING, Camera
+from taisoft.output.camera import MAX_WIDENING, Camera
 from taisoft.view.ggui import Canvas
 from taisoft.view.shading import BACKGROUND_TOP
 from taisoft.view.surfaces import Surfaces
