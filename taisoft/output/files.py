@@ -1,69 +1,25 @@
-"""Files that are whole or absent, and a folder that has one writer.
+"""A run's folder, which has one writer; its files are whole or absent (`taisoft/files.py`).
 
-Every file is written under a temporary name in its own folder (`<name>.<pid>-<n>.part`), flushed, fsynced, renamed, and
-the folder fsynced: whatever stands under a final name is complete, whenever the process is killed. The folder's lock is
-an advisory kernel lock (flock) on a file that holds the writer's process id, so that a dead writer's lock is free.
+The folder's lock is an advisory kernel lock (flock) on a file that holds the writer's process id, so that a dead writer's
+lock is free.
 """
 
-import errno
 import itertools
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 from taisoft.errors import OutputError
+from taisoft.files import part_path, publish, replacing, write_bytes, write_error
+
+__all__ = [
+    "LOCK_NAME", "RESULT_FILES", "RESULT_FOLDERS", "OutputFolder", "check_free", "make_folder", "part_path", "publish",
+    "replacing", "write_bytes", "write_error",
+]  # fmt: skip
 
 LOCK_NAME = "taisoft.lock"
 RESULT_FILES = ("report.json", "steps.csv", "scene.usdc", "checkpoint.npz")
 RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc"}  # folder -> the files in it that are ours
-
-_part_numbers = itertools.count()
-
-
-def write_error(path: Path, error: OSError, n_bytes: int | None = None) -> OutputError:
-    """The OutputError that tells of a failed write: path, bytes where known, and the system's reason."""
-    size = "" if n_bytes is None else f" ({n_bytes} bytes)"
-    return OutputError(f"cannot write {path}{size}: {error.strerror or error}")
-
-
-def part_path(path: Path) -> Path:
-    """A temporary name beside path that no other file of this process has; leftovers end in `.part`."""
-    return path.with_name(f"{path.name}.{os.getpid()}-{next(_part_numbers)}.part")
-
-
-def publish(part: Path, path: Path) -> None:
-    """Bring a finished temporary file to disk and to its final name. Raises OSError; then the part is still there."""
-    _fsync(part, os.O_RDWR)
-    os.replace(part, path)
-    if os.name == "posix":  # elsewhere a folder cannot be opened, nor needs to be
-        _fsync(path.parent, os.O_RDONLY)
-
-
-@contextmanager
-def replacing(path: str | Path, n_bytes: int | None = None) -> Iterator[Path]:
-    """Yield a temporary path to fill; at the end of the block it becomes `path`, or vanishes if the block failed.
-
-    n_bytes: size to name in the message, where known. Raises OutputError for any OSError, inside the block too.
-    """
-    path = Path(path)
-    part = part_path(path)
-    try:
-        yield part
-        publish(part, path)
-    except OSError as error:
-        raise write_error(path, error, n_bytes) from error
-    finally:
-        with suppress(OSError):  # gone after a rename; unreachable when the folder is
-            part.unlink()
-
-
-def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write data to path, whole or not at all. Raises OutputError naming path and size."""
-    with replacing(path, len(data)) as part, open(part, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def make_folder(path: str | Path) -> Path:
@@ -137,17 +93,6 @@ class OutputFolder:
                 self.discard_stale()
         finally:
             self.close()
-
-
-def _fsync(path: Path, flags: int) -> None:
-    descriptor = os.open(path, flags)
-    try:
-        os.fsync(descriptor)
-    except OSError as error:
-        if error.errno != errno.EINVAL:  # some file systems have no fsync for a folder
-            raise
-    finally:
-        os.close(descriptor)
 
 
 def _lock_folder(folder: Path) -> int:
