@@ -147,9 +147,11 @@ class Simulator(Resuming):
             found.append(f"{report.n_inverted} tets are inverted")
         return found
 
-    def run(self, seconds: float, on_frame=None, fps: float | None = 60, stop=None) -> RunReport:
+    def run(
+        self, seconds: float, on_frame=None, fps: float | None = 60, stop=None, resumed: bool = False
+    ) -> RunReport:  # fmt: skip
         """Run for some seconds; see `taisoft.running.run`."""
-        return run(self, seconds, on_frame, fps, stop)
+        return run(self, seconds, on_frame, fps, stop, resumed)
 
     def reset(self) -> None:
         """Back to the scene's start; numbers changed while it ran (dt, gravity, materials) stay."""

@@ -48,16 +48,18 @@ class OutputFolder:
     """A run's folder: created or taken over, checked, and locked until `close`.
 
     path: created where absent; an empty folder, or one with files that are not a run's, is accepted. overwrite: take a
-    folder that holds results: frames and chunks go at once, each other file when its successor is complete. Raises
-    OutputError when the folder cannot be written, another process writes to it, or it holds results without overwrite.
+    folder that holds results: frames and chunks go at once, each other file when its successor is complete. first: of a run
+    that goes on, the number of its first frame; results are accepted, what is before it stays, and other files go only for
+    their successors. Raises OutputError when the folder cannot be written, another process writes to it, or it holds
+    results without overwrite.
     """
 
-    def __init__(self, path: str | Path, overwrite: bool = False):
+    def __init__(self, path: str | Path, overwrite: bool = False, first: int | None = None):
         self.path = make_folder(path).absolute()  # a later change of the working directory must not move the output
         self._lock: int | None = _lock_folder(self.path)
         try:
-            self._old = check_free(path, overwrite)
-            _clear(self.path)
+            self._old = check_free(path, overwrite) if first is None else {}
+            _clear(self.path, first)
             _probe(self.path)
         except OSError as error:
             self.close()
@@ -140,14 +142,26 @@ def _results(folder: Path) -> dict[str, tuple[int, int] | None]:
     return found
 
 
-def _clear(folder: Path) -> None:
-    """Remove an earlier run's frames and chunks, and what a killed writer left under temporary names."""
+def _clear(folder: Path, first: int | None) -> None:
+    """Remove an earlier run's frames and chunks, and what a killed writer left under temporary names.
+
+    first: only those frames, and chunks that begin with them, from that number on.
+    """
     for name, pattern in RESULT_FOLDERS.items():
-        for file in itertools.chain((folder / name).glob(pattern), (folder / name).glob(f"{pattern}.*.part")):
+        old = (folder / name).glob(pattern)
+        if first is not None:
+            old = [file for file in old if _number(file) >= first]
+        for file in itertools.chain(old, (folder / name).glob(f"{pattern}.*.part")):
             file.unlink()
     for name in RESULT_FILES:
         for file in folder.glob(f"{name}.*.part"):
             file.unlink()
+
+
+def _number(file: Path) -> int:
+    """Of a frame, or of a chunk's first frame; -1 where the name has none."""
+    text = file.stem.removeprefix("points_")
+    return int(text) if text.isdecimal() else -1
 
 
 def _probe(folder: Path) -> None:
