@@ -78,6 +78,25 @@ def test_an_interrupted_run_goes_on(whole, tmp_path):
     assert_same_folders(whole, out)
 
 
+def test_a_run_that_was_interrupted_between_two_frames_goes_on(tmp_path):
+    """Implicit steps are interrupted one by one: step 28 of 48 lies in the middle of frame 4."""
+    raising = "import signal; signal.raise_signal(2) if 27.8 < 240 * t < 28.2 else None\n    return (0, -t, 0)"
+    implicit = ("--set", "solver.integrator=implicit_euler", "--seconds", "0.2", "--no-frames")
+    path, out, straight = tmp_path / "led.py", tmp_path / "out", tmp_path / "straight"
+    write(path, LED.replace("{body}", raising))
+    assert run(path, "--out", out, *implicit) == 130
+    assert read_checkpoint(out / "checkpoint.npz").state["world"]["step_count"] == 28
+    write(path, GENTLE)
+    assert run(path, "--out", out, "--resume", out / "checkpoint.npz", *implicit) == 0
+    assert run(path, "--out", straight, *implicit) == 0
+    assert report(out)["resumed"]["frame"] == 4 and report(out)["steps"] == 20
+    assert (out / "steps.csv").read_bytes() == (straight / "steps.csv").read_bytes()
+    assert usd(out) == usd(straight)
+    one, other = (read_checkpoint(folder / "checkpoint.npz").state for folder in (out, straight))
+    assert np.array_equal(one["world"]["v"], other["world"]["v"])
+    assert np.array_equal(one["stepper"]["x_now"], other["stepper"]["x_now"])
+
+
 def test_a_killed_run_goes_on(whole, tmp_path):
     """Killed in frame 6, with checkpoints at frames 2 and 4: no chunk of USD is full by then."""
     dying = "import os; t > 0.17 and os._exit(9)\n    return (0, -t, 0)"
