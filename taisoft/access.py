@@ -201,10 +201,14 @@ class StateAccess:
 
     def set_gravity(self, gravity) -> None:
         """Change gravity (3,) [m/s^2]."""
-        world = self._open_world()
+        self._open_world()
         self.scene.gravity = gravity
-        upload([(world.model.gravity, np.asarray(self.scene.gravity)[None])])
+        self._load_gravity()
         self._stepper.numbers_changed()
+
+    def _load_gravity(self) -> None:
+        """The scene's gravity to the device."""
+        upload([(self._world.model.gravity, self.scene.gravity[None])])
 
     def set_material(self, body: str, **numbers) -> None:
         """Change numbers of a body's material (young, poisson, density, mass_damping, stiffness_damping); law stays."""

@@ -18,35 +18,38 @@ IMPLICIT_BATCH_SECONDS = 0.5  # of simulated steps between two questions to `sto
 
 def run(
     sim: "Simulator", seconds: float, on_frame: FrameCallback | None = None, fps: float | None = 60,
-    stop: Callable[[], bool] | None = None,
+    stop: Callable[[], bool] | None = None, resumed: bool = False,
 ) -> RunReport:  # fmt: skip
     """Step until `seconds` [s] from now, to the nearest step; frames at fps, or after every step when fps is None.
 
     on_frame(sim, index, report): called for frame 0 (the start, report None) and after every frame. stop: asked between
-    steps; True ends the run. dt is lowered once to the next divisor of 1/fps, and that is reported. Never raises for a
-    failed or interrupted run: status and problems say it. Raises SimulationError for bad arguments.
+    steps; True ends the run. dt is lowered once to the next divisor of 1/fps, and that is reported. resumed: seconds and
+    frames count from time 0, not from now; the first frame is `first_frame`. Never raises for a failed or interrupted
+    run: status and problems say it. Raises SimulationError for bad arguments.
     """
     seconds = check_positive("seconds", seconds, "s")
     fps = None if fps is None else check_positive("fps", fps, "1/s")
     report = RunReport()
     compiled = sim.compile_seconds
     clock = time.perf_counter()
-    steps_per_frame = _fit_dt(sim, seconds, fps, report)
+    steps_per_frame = _fit_dt(sim, fps, report)
     total = max(1, round(seconds / sim.dt))
     start_count, start_time = sim.step_count, sim.time
+    behind = round(sim.time / sim.dt) if resumed else 0  # steps of this dt
+    zero = start_count - behind
     try:
-        if on_frame is not None:
-            on_frame(sim, 0, None)
-        frame = 0
-        while sim.step_count - start_count < total and not report.interrupted:
+        frame, over = divmod(behind, steps_per_frame)
+        if on_frame is not None and not over:
+            on_frame(sim, frame, None)
+        while sim.step_count - zero < total and not report.interrupted:
             frame += 1
             goal = min(total, frame * steps_per_frame)
-            merged = _advance_to(sim, start_count + goal, stop, report)
+            merged = _advance_to(sim, zero + goal, stop, report)
             if merged is None:
                 break
             if sim.settings.explicit:
                 report.step_reports.append(merged)
-            if on_frame is not None and sim.step_count - start_count == goal:
+            if on_frame is not None and sim.step_count - zero == goal:
                 on_frame(sim, frame, merged)
     except SimulationError as error:
         report.status = "failed"
@@ -70,15 +73,27 @@ def run(
     return report
 
 
-def _fit_dt(sim: "Simulator", seconds: float, fps: float | None, report: RunReport) -> int:
-    """Steps per frame; lowers dt to a divisor of the frame time where it is none."""
+def first_frame(sim: "Simulator", fps: float | None) -> int:
+    """Number of the first frame of a resumed run: that of the present state, or where it lies between two the next."""
+    n, dt = _fitting(sim.dt, fps)
+    return -(-round(sim.time / dt) // n)
+
+
+def _fitting(dt: float, fps: float | None) -> tuple[int, float]:
+    """Steps per frame, and the largest dt up to this one that makes them a frame."""
     if fps is None:
-        return 1
+        return 1, dt
     frame = 1.0 / fps
-    n = max(1, math.ceil(frame / sim.dt - 1e-9))
-    if abs(n * sim.dt - frame) > 1e-9 * frame:
+    n = max(1, math.ceil(frame / dt - 1e-9))
+    return n, dt if abs(n * dt - frame) <= 1e-9 * frame else frame / n
+
+
+def _fit_dt(sim: "Simulator", fps: float | None, report: RunReport) -> int:
+    """Steps per frame; lowers dt to a divisor of the frame time where it is none."""
+    n, dt = _fitting(sim.dt, fps)
+    if dt != sim.dt:
         old = sim.dt
-        sim.dt = frame / n
+        sim.dt = dt
         report.problems.append(
             f"note: dt lowered from {old:.6g} s to {sim.dt:.6g} s, so that {n} steps make a frame of 1/{fps:g} s"
         )

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from taisoft.contact.solve import SOLVERS
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
+from taisoft.scene.plan import Plan, make_plan
 from taisoft.scene.scene import Scene
-from taisoft.stepping import EXPLICIT, INTEGRATORS
+from taisoft.stepping import EXPLICIT, INTEGRATORS, SCHEMES
 
 EXPLICIT_CONTACT = tuple(SOLVERS)
 IMPLICIT_CONTACT = ("augmented_lagrangian",)
@@ -32,6 +33,12 @@ class Settings:
     def explicit(self) -> bool:
         """Whether the integrator is explicit."""
         return self.integrator in EXPLICIT
+
+
+def plan_of(scene: Scene, integrator: str, self_collision: bool) -> Plan:
+    """The plan of a scene under an integrator."""
+    scheme = SCHEMES.get(integrator)
+    return make_plan(scene, integrator in EXPLICIT, scheme is not None and scheme.before > 0.0, self_collision)
 
 
 def check_dt(dt) -> float:

@@ -4,19 +4,18 @@ import warnings
 import weakref
 
 from taisoft import runtime
-from taisoft.access import StateAccess
 from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import measure
 from taisoft.errors import SceneError
 from taisoft.fields import FieldArena
 from taisoft.model import build_model
 from taisoft.records import RunReport, StepReport
+from taisoft.resuming import Resuming
 from taisoft.running import run
-from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
-from taisoft.settings import check_settings
+from taisoft.settings import check_settings, plan_of
 from taisoft.stability import scale_warnings
-from taisoft.stepping import SCHEMES, make_stepper
+from taisoft.stepping import make_stepper
 from taisoft.stepping.contact import ContactStep
 from taisoft.stepping.motion import Motion
 from taisoft.stepping.world import World
@@ -30,7 +29,7 @@ def _release(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:
     claim.close()
 
 
-class Simulator(StateAccess):
+class Simulator(Resuming):
     """A scene being simulated, as it was when this was made. SI units; positions are float64 in either precision.
 
     dt [s]; integrator: one of taisoft.stepping.INTEGRATORS; newton_tolerance, linear_tolerance: relative, None is adaptive.
@@ -60,8 +59,7 @@ class Simulator(StateAccess):
             self._check_stability(self._dt)
         for text in scale_warnings(scene):
             warnings.warn(text, UserWarning, stacklevel=2)
-        scheme = SCHEMES.get(integrator)
-        self.plan = make_plan(scene, self.settings.explicit, scheme is not None and scheme.before > 0.0, self_collision)
+        self.plan = plan_of(scene, integrator, self_collision)
         self._runtime = runtime.open_runtime(arch, precision, f"the simulator of {[b.name for b in scene.bodies]}")
         self._compiled_before = runtime.compile_clock()
         self._arena = FieldArena()
@@ -149,9 +147,11 @@ class Simulator(StateAccess):
             found.append(f"{report.n_inverted} tets are inverted")
         return found
 
-    def run(self, seconds: float, on_frame=None, fps: float | None = 60, stop=None) -> RunReport:
+    def run(
+        self, seconds: float, on_frame=None, fps: float | None = 60, stop=None, resumed: bool = False
+    ) -> RunReport:  # fmt: skip
         """Run for some seconds; see `taisoft.running.run`."""
-        return run(self, seconds, on_frame, fps, stop)
+        return run(self, seconds, on_frame, fps, stop, resumed)
 
     def reset(self) -> None:
         """Back to the scene's start; numbers changed while it ran (dt, gravity, materials) stay."""

@@ -11,7 +11,7 @@ from taisoft import runtime
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 SLOW = (
     "references", "demos", "contact_stepping", "stepping", "cli_run", "bench_collision", "bvh", "simulator", "self_collision",
-    "static", "spatial_hash", "elasticity", "detection_runs",
+    "checkpoint", "static", "spatial_hash", "elasticity", "detection_runs",
 )  # files by time, slowest first
 _compiled = [0.0]  # compile clock when Taichi was last set back [s]
 

@@ -19,6 +19,10 @@ LONG = {
     "test_contact_stepping": ("test_rest[bdf2-", "test_rest[velocity_verlet-"),
     "test_simulator": ("[symplectic_euler-2]",),
     "test_static": ("test_equilibrium[1]",),
+    "test_checkpoint": (
+        "contacts[bdf2-f32", "contacts[velocity_verlet-f64", "contacts[symplectic_euler-f64", "contacts[implicit_",
+        "contacts[linearly_",
+    ),
     "test_tunnelling": ("[symplectic_euler-",),
     "test_bench_collision": ("test_films_and_broad_phases",),
     "test_bench_hard": ("test_a_stiff_cube_lands_and_rests",),

@@ -69,7 +69,8 @@ def test_bad_scene_file(tmp_path, capsys, text, told):
         (["--seconds", "0"], "seconds must be greater than 0, not 0.0"),
         (["--seconds", "nan"], "seconds must be finite, not nan"),
         (["--fps", "-30"], "fps must be greater than 0, not -30.0"),
-        (["--resume", "c.npz"], "--resume c.npz: this version writes and reads no checkpoints"),
+        (["--resume", "c.npz"], "c.npz: no such checkpoint"),
+        (["--checkpoint-every", "0"], "--checkpoint-every must be greater than 0 s, not 0"),
         (["--precision", "f64", "--set", "solver.precision=f32"], "disagree"),
     ],
 )

@@ -79,7 +79,7 @@ def _add_run(commands) -> None:
     parser = commands.add_parser(
         "run",
         help="run a scene: a demo's name or a .py file with build()",
-        description="Run a scene and, with --out, keep report.json, steps.csv, frames/ and scene.usdc.",
+        description="Run a scene and, with --out, keep report.json, steps.csv, checkpoint.npz, frames/ and scene.usdc.",
         allow_abbrev=False,
     )
     parser.add_argument("scene", metavar="SCENE", help="a demo's name (see `taisoft list`) or a .py file with build()")
@@ -100,7 +100,15 @@ def _add_run(commands) -> None:
         metavar="solver.KEY=VALUE",
         help="a Simulator argument, e.g. solver.dt=0.01; may be repeated",
     )
-    parser.add_argument("--resume", metavar="CHECKPOINT", help="not in this version: it writes no checkpoints")
+    parser.add_argument(
+        "--resume", metavar="CHECKPOINT", help="go on from DIR/checkpoint.npz of a run of this scene, until --seconds in all"
+    )
+    parser.add_argument(
+        "--checkpoint-every",
+        type=float,
+        metavar="T",
+        help="write DIR/checkpoint.npz whenever so much simulated time has passed [s], not only at the end",
+    )
     parser.add_argument("--no-usd", action="store_true", help="write no scene.usdc")
     parser.add_argument("--no-frames", action="store_true", help="write no pictures")
     parser.set_defaults(command="run")

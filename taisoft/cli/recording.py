@@ -5,6 +5,7 @@ from pathlib import Path
 
 from taisoft.cli.settings import RunSettings
 from taisoft.errors import OutputError
+from taisoft.output.checkpoint import CheckpointWriter
 from taisoft.output.files import RESULT_FILES, OutputFolder
 from taisoft.output.frames import FRAMES_NAME, FrameWriter
 from taisoft.output.report import write_report
@@ -51,22 +52,33 @@ class Observers:
 
 
 class Recording:
-    """The results of a run in one folder: report.json, steps.csv and, where wanted, frames/ and scene.usdc.
+    """The results of a run in one folder: report.json, steps.csv, checkpoint.npz and, where wanted, frames/ and scene.usdc.
 
-    Raises OutputError if the folder cannot be written or holds results and overwrite is off.
+    resumed: of a run that goes on, the `checkpoint`, its `time` [s] and the first `frame`; the folder's results before them
+    are continued. every: simulated time between two checkpoints [s]; None for one at the end. Raises OutputError if the folder
+    cannot be written or holds results and neither overwrite is on nor the run goes on.
     """
 
-    def __init__(self, path: str, overwrite: bool):
-        self._folder = OutputFolder(path, overwrite)
-        self.path = Path(path)
+    def __init__(self, path: str, overwrite: bool, resumed: dict | None = None, every: float | None = None):
+        self._first = None if resumed is None else resumed["frame"]
+        self._folder = OutputFolder(path, overwrite, self._first)
+        self.path, self._resumed = Path(path), resumed
+        self._checkpoints = CheckpointWriter(self._folder.path, every)
 
     def add_writers(self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool) -> None:
-        """Adds the writers of frames and USD to the observers."""
+        """Adds the writers of frames, USD and checkpoints to the observers."""
         if with_usd:
-            itself = sim.settings.self_collision
-            observers.members.append(UsdWriter(self._folder.path, sim.scene, fps=fps or 1.0 / sim.dt, self_collision=itself))
+            folder, fps, itself = self._folder.path, fps or 1.0 / sim.dt, sim.settings.self_collision
+            usd = UsdWriter(folder, sim.scene, fps=fps, self_collision=itself, first=self._first or 0)
+            observers.members.append(usd)
+            self._checkpoints.before = usd.flush
         if with_frames:
             observers.members.append(FrameWriter(self._folder.path, Offscreen(sim.scene)))
+        observers.members.append(self._checkpoints)
+
+    def checkpoint(self, sim) -> None:
+        """Writes checkpoint.npz. Raises OutputError."""
+        self._checkpoints.write(sim)
 
     def report(self, result: RunReport, sim, settings: RunSettings) -> None:
         """Writes report.json and steps.csv, and removes what an earlier run left. Raises OutputError."""
@@ -78,6 +90,7 @@ class Recording:
             precision=record["precision"],
             settings=record,
             plan=sim.plan.entries,
+            resumed=self._resumed,
         )
         self._folder.discard_stale()
 

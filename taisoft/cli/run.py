@@ -8,16 +8,20 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
+from taisoft.checkpoint import read_checkpoint
 from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL
 from taisoft.cli.recording import Observers, Recording
 from taisoft.cli.scene_file import load_scene
-from taisoft.cli.settings import RunSettings, resolve
+from taisoft.cli.settings import RunSettings, resolve, resolve_resumed
 from taisoft.cli.signals import Signals
 from taisoft.cli.summary import print_plan, print_state, print_summary
 from taisoft.errors import SceneError
 from taisoft.output.files import check_free
 from taisoft.output.progress import Progress
 from taisoft.records import RunReport
+from taisoft.running import first_frame
+from taisoft.scene import checks
+from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
 from taisoft.view.ggui import display_missing, vulkan_missing
 
@@ -26,18 +30,55 @@ def command(arguments: Namespace) -> int:
     """Runs the scene and returns the exit status. What can be refused is refused before a file is written."""
     _check_working_folder()
     with Signals() as signals, _told_warnings() as told:
-        if arguments.resume is not None:
-            raise SceneError(f"--resume {arguments.resume}: this version writes and reads no checkpoints")
         scene, solver = load_scene(arguments.scene)
-        settings = resolve(solver, arguments, Simulator)
-        if arguments.out is not None:
-            check_free(arguments.out, arguments.overwrite)
-        with Simulator(scene, **settings.simulator) as sim:
+        every = _checkpoint_interval(arguments)
+        if arguments.resume is None:
+            settings = resolve(solver, arguments, Simulator)
+            if arguments.out is not None:
+                check_free(arguments.out, arguments.overwrite)
+            sim = Simulator(scene, **settings.simulator)
+        else:
+            settings = resolve_resumed(solver, arguments, Simulator, read_checkpoint(arguments.resume).settings)
+            sim = _resumed(scene, settings, arguments)
+        with sim:
             print_plan(sim)
             has_window = not arguments.headless and _window_is_possible()
             if has_window and arguments.out is None and arguments.seconds is None:
                 return _watch(sim, settings)
-            return _run(sim, settings, arguments, signals, told, has_window)
+            _check_time_left(sim, settings, arguments)
+            return _run(sim, settings, arguments, signals, told, has_window, every)
+
+
+def _checkpoint_interval(arguments: Namespace) -> float | None:
+    """Of --checkpoint-every [s]. Raises SceneError."""
+    every = arguments.checkpoint_every
+    if every is None:
+        return None
+    if arguments.out is None:
+        raise SceneError("--checkpoint-every needs --out, the folder to write to")
+    return checks.number(every, "--checkpoint-every", above=0.0, unit="s")
+
+
+def _resumed(scene: Scene, settings: RunSettings, arguments: Namespace) -> Simulator:
+    """The simulator that goes on, with another dt where that was asked for."""
+    sim = Simulator.load_checkpoint(arguments.resume, scene, arch=settings.simulator["arch"])
+    if "dt" in settings.changed:
+        try:
+            sim.dt = settings.simulator["dt"]
+        except BaseException:
+            sim.close()
+            raise
+    print(f"resumed  from {arguments.resume}, t = {sim.time:.6g} s")
+    return sim
+
+
+def _check_time_left(sim: Simulator, settings: RunSettings, arguments: Namespace) -> None:
+    """Raises SceneError for a checkpoint from the end of the run."""
+    if arguments.resume is not None and settings.seconds - sim.time < 0.5 * sim.dt:
+        raise SceneError(
+            f"--resume {arguments.resume}: it is at t = {sim.time:g} s already, and the run ends at {settings.seconds:g} s; "
+            "--seconds sets another end"
+        )
 
 
 def _check_working_folder() -> None:
@@ -66,15 +107,18 @@ def _watch(sim: Simulator, settings: RunSettings) -> int:
 
 
 def _run(
-    sim: Simulator, settings: RunSettings, arguments: Namespace, signals: Signals, told: list[str], has_window: bool
-) -> int:
-    """A run of settings.seconds, with what was computed saved however it ends."""
-    observers = Observers()
+    sim: Simulator, settings: RunSettings, arguments: Namespace, signals: Signals, told: list[str], has_window: bool,
+    every: float | None,
+) -> int:  # fmt: skip
+    """A run until settings.seconds, with what was computed saved however it ends."""
+    observers, resumed = Observers(), None
+    if arguments.resume is not None:
+        resumed = {"checkpoint": arguments.resume, "time": sim.time, "frame": first_frame(sim, settings.fps)}
     with ExitStack() as stack:
         recording = None
         signals.run_began()
         if arguments.out is not None:
-            recording = stack.enter_context(closing(Recording(arguments.out, arguments.overwrite)))
+            recording = stack.enter_context(closing(Recording(arguments.out, arguments.overwrite, resumed, every)))
         stack.callback(observers.close)
         if has_window:
             observers.members.append(_open_window(sim))
@@ -86,8 +130,11 @@ def _run(
             on_frame=observers.on_frame,
             fps=settings.fps,
             stop=lambda: signals.asked() or observers.failed(),
+            resumed=resumed is not None,
         )
         observers.close()
+        if recording is not None:
+            observers.guard(recording.checkpoint, sim)
         result.problems[:0] = [f"warning: {text}" for text in told]
         if observers.error is not None:
             _tell_failed_output(result, observers, signals)

@@ -16,12 +16,16 @@ BARE_WORD = re.compile(r"[A-Za-z_]\w*")
 
 @dataclass
 class RunSettings:
-    """What a run starts with. simulator: arguments of Simulator; seconds [s]; fps [1/s], None for a frame a step."""
+    """What a run starts with. simulator: arguments of Simulator; seconds [s]; fps [1/s], None for a frame a step.
+
+    changed: of a run that goes on, the names of arguments that differ from the checkpoint's.
+    """
 
     simulator: dict
     seconds: float = 1.0
     fps: float | None = 60.0
     defaults: dict = field(default_factory=dict)  # Simulator's own, for the arguments that were not given
+    changed: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict:
         """Every setting of the run by name, given or by default."""
@@ -35,6 +39,29 @@ def resolve(solver: dict, arguments: Namespace, simulator_class: type) -> RunSet
     seconds and fps that are not finite and positive. Simulator checks its own arguments.
     """
     defaults = _defaults(simulator_class)
+    given = _given(arguments, defaults, solver)
+    merged = {**solver, **given}
+    simulator = {key: value for key, value in merged.items() if key not in RUN_KEYS}
+    return _with_run_keys(RunSettings(simulator=simulator, defaults=defaults), merged)
+
+
+def resolve_resumed(solver: dict, arguments: Namespace, simulator_class: type, saved: dict) -> RunSettings:
+    """As `resolve`, for a run that goes on with the settings of a checkpoint, over which the scene's do not count.
+
+    Raises SceneError for an option or a --set that asks for something else than saved; only dt and arch may change.
+    """
+    defaults = _defaults(simulator_class)
+    given = _given(arguments, defaults, solver)
+    for key, value in given.items():
+        if key not in (*RUN_KEYS, "dt", "arch") and value != saved[key]:
+            raise SceneError(f"--resume {arguments.resume}: {key} is {saved[key]} there and cannot become {value} within a run")
+    changed = {key: given[key] for key in ("dt", "arch") if key in given}
+    settings = RunSettings(simulator=saved | changed, defaults=defaults, changed=list(changed))
+    return _with_run_keys(settings, {**solver, **given})
+
+
+def _given(arguments: Namespace, defaults: dict, solver: dict) -> dict:
+    """What --set and the other options ask for; the scene's solver dict is checked, too."""
     keys = [*defaults, *RUN_KEYS]
     _refuse_unknown(solver, keys, "the scene's solver dict: ")
     given = parse_assignments(arguments.assignments, keys)
@@ -45,9 +72,10 @@ def resolve(solver: dict, arguments: Namespace, simulator_class: type) -> RunSet
         if key in given and given[key] != option:
             raise SceneError(f"--{key} {option} and --set solver.{key}={given[key]} disagree; give one of them")
         given[key] = option
-    merged = {**solver, **given}
-    simulator = {key: value for key, value in merged.items() if key not in RUN_KEYS}
-    settings = RunSettings(simulator=simulator, defaults=defaults)
+    return given
+
+
+def _with_run_keys(settings: RunSettings, merged: dict) -> RunSettings:
     settings.seconds = _positive("seconds", merged.get("seconds", settings.seconds))
     fps = merged.get("fps", settings.fps)
     settings.fps = None if fps is None else _positive("fps", fps)

@@ -1,69 +1,25 @@
-"""Files that are whole or absent, and a folder that has one writer.
+"""A run's folder, which has one writer; its files are whole or absent (`taisoft/files.py`).
 
-Every file is written under a temporary name in its own folder (`<name>.<pid>-<n>.part`), flushed, fsynced, renamed, and
-the folder fsynced: whatever stands under a final name is complete, whenever the process is killed. The folder's lock is
-an advisory kernel lock (flock) on a file that holds the writer's process id, so that a dead writer's lock is free.
+The folder's lock is an advisory kernel lock (flock) on a file that holds the writer's process id, so that a dead writer's
+lock is free.
 """
 
-import errno
 import itertools
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 from taisoft.errors import OutputError
+from taisoft.files import part_path, publish, replacing, write_bytes, write_error
+
+__all__ = [
+    "LOCK_NAME", "RESULT_FILES", "RESULT_FOLDERS", "OutputFolder", "check_free", "make_folder", "part_path", "publish",
+    "replacing", "write_bytes", "write_error",
+]  # fmt: skip
 
 LOCK_NAME = "taisoft.lock"
 RESULT_FILES = ("report.json", "steps.csv", "scene.usdc", "checkpoint.npz")
 RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc"}  # folder -> the files in it that are ours
-
-_part_numbers = itertools.count()
-
-
-def write_error(path: Path, error: OSError, n_bytes: int | None = None) -> OutputError:
-    """The OutputError that tells of a failed write: path, bytes where known, and the system's reason."""
-    size = "" if n_bytes is None else f" ({n_bytes} bytes)"
-    return OutputError(f"cannot write {path}{size}: {error.strerror or error}")
-
-
-def part_path(path: Path) -> Path:
-    """A temporary name beside path that no other file of this process has; leftovers end in `.part`."""
-    return path.with_name(f"{path.name}.{os.getpid()}-{next(_part_numbers)}.part")
-
-
-def publish(part: Path, path: Path) -> None:
-    """Bring a finished temporary file to disk and to its final name. Raises OSError; then the part is still there."""
-    _fsync(part, os.O_RDWR)
-    os.replace(part, path)
-    if os.name == "posix":  # elsewhere a folder cannot be opened, nor needs to be
-        _fsync(path.parent, os.O_RDONLY)
-
-
-@contextmanager
-def replacing(path: str | Path, n_bytes: int | None = None) -> Iterator[Path]:
-    """Yield a temporary path to fill; at the end of the block it becomes `path`, or vanishes if the block failed.
-
-    n_bytes: size to name in the message, where known. Raises OutputError for any OSError, inside the block too.
-    """
-    path = Path(path)
-    part = part_path(path)
-    try:
-        yield part
-        publish(part, path)
-    except OSError as error:
-        raise write_error(path, error, n_bytes) from error
-    finally:
-        with suppress(OSError):  # gone after a rename; unreachable when the folder is
-            part.unlink()
-
-
-def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write data to path, whole or not at all. Raises OutputError naming path and size."""
-    with replacing(path, len(data)) as part, open(part, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def make_folder(path: str | Path) -> Path:
@@ -92,16 +48,18 @@ class OutputFolder:
     """A run's folder: created or taken over, checked, and locked until `close`.
 
     path: created where absent; an empty folder, or one with files that are not a run's, is accepted. overwrite: take a
-    folder that holds results: frames and chunks go at once, each other file when its successor is complete. Raises
-    OutputError when the folder cannot be written, another process writes to it, or it holds results without overwrite.
+    folder that holds results: frames and chunks go at once, each other file when its successor is complete. first: of a run
+    that goes on, the number of its first frame; results are accepted, what is before it stays, and other files go only for
+    their successors. Raises OutputError when the folder cannot be written, another process writes to it, or it holds
+    results without overwrite.
     """
 
-    def __init__(self, path: str | Path, overwrite: bool = False):
+    def __init__(self, path: str | Path, overwrite: bool = False, first: int | None = None):
         self.path = make_folder(path).absolute()  # a later change of the working directory must not move the output
         self._lock: int | None = _lock_folder(self.path)
         try:
-            self._old = check_free(path, overwrite)
-            _clear(self.path)
+            self._old = check_free(path, overwrite) if first is None else {}
+            _clear(self.path, first)
             _probe(self.path)
         except OSError as error:
             self.close()
@@ -137,17 +95,6 @@ class OutputFolder:
                 self.discard_stale()
         finally:
             self.close()
-
-
-def _fsync(path: Path, flags: int) -> None:
-    descriptor = os.open(path, flags)
-    try:
-        os.fsync(descriptor)
-    except OSError as error:
-        if error.errno != errno.EINVAL:  # some file systems have no fsync for a folder
-            raise
-    finally:
-        os.close(descriptor)
 
 
 def _lock_folder(folder: Path) -> int:
@@ -195,14 +142,26 @@ def _results(folder: Path) -> dict[str, tuple[int, int] | None]:
     return found
 
 
-def _clear(folder: Path) -> None:
-    """Remove an earlier run's frames and chunks, and what a killed writer left under temporary names."""
+def _clear(folder: Path, first: int | None) -> None:
+    """Remove an earlier run's frames and chunks, and what a killed writer left under temporary names.
+
+    first: only those frames, and chunks that begin with them, from that number on.
+    """
     for name, pattern in RESULT_FOLDERS.items():
-        for file in itertools.chain((folder / name).glob(pattern), (folder / name).glob(f"{pattern}.*.part")):
+        old = (folder / name).glob(pattern)
+        if first is not None:
+            old = [file for file in old if _number(file) >= first]
+        for file in itertools.chain(old, (folder / name).glob(f"{pattern}.*.part")):
             file.unlink()
     for name in RESULT_FILES:
         for file in folder.glob(f"{name}.*.part"):
             file.unlink()
+
+
+def _number(file: Path) -> int:
+    """Of a frame, or of a chunk's first frame; -1 where the name has none."""
+    text = file.stem.removeprefix("points_")
+    return int(text) if text.isdecimal() else -1
 
 
 def _probe(folder: Path) -> None:

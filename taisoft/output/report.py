@@ -24,16 +24,20 @@ PACKAGES = ("taichi", "numpy", "scipy", "usd-core")
 
 
 def write_report(
-    folder: str | Path, result: RunReport, *, arch: str, precision: str, settings: dict, plan: list[dict]
-) -> None:
+    folder: str | Path, result: RunReport, *, arch: str, precision: str, settings: dict, plan: list[dict],
+    resumed: dict | None = None,
+) -> None:  # fmt: skip
     """Write report.json and steps.csv into folder. Raises OutputError.
 
     settings: every setting of the run as resolved, by name; plan: the entries of the simulator's plan. Values may be
-    plain, NumPy, paths or dataclasses; anything else is written as its text.
+    plain, NumPy, paths or dataclasses; anything else is written as its text. resumed: where a run went on from, with its
+    `time` [s]; the rows up to it in the folder's steps.csv then stay, while the report tells of what was computed since.
     """
     folder = Path(folder)
-    write_bytes(folder / "steps.csv", steps_csv(result.step_reports).encode())
+    earlier = [] if resumed is None else _rows_until(folder / "steps.csv", resumed["time"])
+    write_bytes(folder / "steps.csv", steps_csv(result.step_reports, earlier).encode())
     record = run_record(result) | {
+        "resumed": resumed,
         "arch": arch,
         "precision": precision,
         "settings": settings,
@@ -74,17 +78,32 @@ def extremes(reports: list[StepReport]) -> dict:
     return found
 
 
-def steps_csv(reports: list[StepReport]) -> str:
-    """The reports as CSV text (RFC 4180): a header and a row each; problems are joined with '; '."""
+def steps_csv(reports: list[StepReport], earlier: list[list[str]] | None = None) -> str:
+    """The reports as CSV text (RFC 4180): a header and a row each, after earlier rows; problems are joined with '; '."""
     text = io.StringIO(newline="")
     writer = csv.writer(text)
-    names = [f.name for f in dataclasses.fields(StepReport)]
+    names = _columns()
     writer.writerow(names)
+    writer.writerows(earlier or [])
     for report in reports:
         row = {name: getattr(report, name) for name in names}
         row["problems"] = "; ".join(report.problems)
         writer.writerow(row.values())
     return text.getvalue()
+
+
+def _columns() -> list[str]:
+    return [f.name for f in dataclasses.fields(StepReport)]
+
+
+def _rows_until(path: Path, time: float) -> list[list[str]]:
+    """Rows of an earlier run's steps.csv up to a time [s]; none where there is no such file with these columns."""
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            header, *rows = csv.reader(file)
+        return [row for row in rows if float(row[0]) <= time * (1.0 + 1e-12)] if header == _columns() else []
+    except (OSError, ValueError, IndexError, csv.Error):
+        return []
 
 
 def json_text(record: dict) -> str:

@@ -6,7 +6,8 @@ files that open, and loses the frames of the chunk in the making at most. The sa
 costs what the new frames cost (the crate format writes new values behind the old ones), and saved frames leave memory;
 it would ruin the file if the process died meanwhile, hence the separate chunks. Layers cannot share the work: USD takes
 an attribute's time samples from the strongest layer alone, and value clips are unknown to many readers.
-`join_chunks` makes a `scene.usdc` from the chunks of a run that was killed.
+`join_chunks` makes a `scene.usdc` from the chunks of a run that was killed. A run that goes on begins with the frames before
+its own, from both.
 
 Time codes are frame numbers; metres, y up. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose
 guide, so that the two are not drawn over each other) and `material`. Both are flat: a second-order body is written as
@@ -24,7 +25,7 @@ import numpy as np
 from taisoft.errors import OutputError
 from taisoft.output.files import make_folder, part_path, publish, replacing, write_error
 from taisoft.output.nodal_fields import NodalMean, contact_impulses, von_mises
-from taisoft.output.usd_prims import IMPULSE, STRESS, scene_layer
+from taisoft.output.usd_prims import IMPULSE, ROOT, STRESS, scene_layer
 from taisoft.output.usd_view import PLACE
 
 SCENE_NAME = "scene.usdc"
@@ -37,12 +38,13 @@ class UsdWriter:
 
     folder: the run's folder; scene: meshes and names of its bodies and obstacles are read now; fps: frames per second of
     simulated time [1/s]; chunk_frames: frames per chunk, at most so many are lost when the process is killed;
-    self_collision: the simulator's, for whether there can be contacts. Raises OutputError, also for an obstacle whose path
-    fails.
+    self_collision: the simulator's, for whether there can be contacts; first: of a run that goes on, the number of its first
+    frame: those before it are taken over from what the folder holds. Raises OutputError, also for an obstacle whose path
+    fails, and where the folder holds another scene or frame rate.
     """
 
     def __init__(
-        self, folder: str | Path, scene, fps: float = 60.0, chunk_frames: int = 10, self_collision: bool = False
+        self, folder: str | Path, scene, fps: float = 60.0, chunk_frames: int = 10, self_collision: bool = False, first: int = 0
     ):  # fmt: skip
         if not fps > 0:
             raise OutputError(f"USD export: fps is {fps}, it must be positive")
@@ -57,6 +59,23 @@ class UsdWriter:
         self._joined = _Joined(self.path, self._template)
         self._chunk = None
         self._frames: list[int] = []  # in the chunk
+        try:
+            self._take_over(first)
+        except BaseException:
+            self._joined.discard()
+            raise
+
+    def _take_over(self, first: int) -> None:
+        """Frames before the first one, of an earlier run's scene and of its chunks, which know more."""
+        old = [path for path in (self.path, *_chunk_paths(self.chunks)) if first > 0 and path.exists()]
+        for path in old:
+            layer = _opened(path)
+            if layer.timeCodesPerSecond != self._template.timeCodesPerSecond or _shape(layer) != _shape(self._template):
+                raise OutputError(f"{path} is of another scene or frame rate, so no run can go on in it: name another folder")
+            self._joined.append(layer, first)
+        times = self._joined.layer.ListTimeSamplesForPath(self._view.attribute)
+        if times:
+            self._view.go_on(np.array(self._joined.layer.QueryTimeSample(self._view.attribute, times[-1])))
 
     def frame(self, sim, index: int) -> None:
         """Record sim's state as frame index; index must ascend. Raises OutputError."""
@@ -85,12 +104,16 @@ class UsdWriter:
 
         After a failed write there is nothing to complete: the chunks stay as they are.
         """
-        if self._frames:
-            self._publish_chunk()
+        self.flush()
         if self._joined is not None:
             joined, self._joined = self._joined, None
             joined.publish()
             _remove_chunks(self.chunks)
+
+    def flush(self) -> None:
+        """Publish the chunk in the making, so that no frame before a checkpoint can be lost. Raises OutputError."""
+        if self._frames:
+            self._publish_chunk()
 
     def _publish_chunk(self) -> None:
         chunk, frames = self._chunk, self._frames
@@ -112,18 +135,13 @@ def join_chunks(folder: str | Path) -> Path:
 
     Raises OutputError where there is no chunk, one cannot be read, or the scene cannot be written.
     """
-    from pxr import Sdf
-
     target, chunks = Path(folder) / SCENE_NAME, Path(folder) / CHUNKS_NAME
-    paths = sorted(chunks.glob("points_*.usdc"), key=lambda p: int(p.stem.removeprefix("points_")))
+    paths = _chunk_paths(chunks)
     if not paths:
         raise OutputError(f"{chunks} holds no chunk of a USD export")
     joined = None
     for path in paths:
-        try:
-            chunk = Sdf.Layer.OpenAsAnonymous(str(path))
-        except Exception as error:
-            raise OutputError(f"{path} cannot be read: {_last_line(error)}") from None
+        chunk = _opened(path)
         joined = joined or _Joined(target, _without_samples(chunk))
         joined.append(chunk)
     joined.publish()
@@ -142,13 +160,17 @@ class _Joined:
         self.layer = Sdf.Layer.New(Sdf.FileFormat.FindById("usdc"), str(self.part))
         self.layer.TransferContent(template)
 
-    def append(self, chunk) -> None:
-        """Add the chunk's frames and save, which frees their memory. Raises OutputError."""
+    def append(self, chunk, end: int | None = None) -> None:
+        """Add the chunk's frames, those before `end`, and save, which frees their memory. Raises OutputError."""
+        last = chunk.endTimeCode if end is None else min(chunk.endTimeCode, end - 1)
+        if last < chunk.startTimeCode:
+            return
         for path in _sampled(chunk):
             for time in chunk.ListTimeSamplesForPath(path):
-                self.layer.SetTimeSample(path, time, chunk.QueryTimeSample(path, time))
+                if time <= last:
+                    self.layer.SetTimeSample(path, time, chunk.QueryTimeSample(path, time))
         self.first = chunk.startTimeCode if self.first is None else self.first
-        _set_range(self.layer, self.first, chunk.endTimeCode)
+        _set_range(self.layer, self.first, max(last, self.layer.endTimeCode))
         try:
             _written(self.path, chunk, self.layer.Save)
         except OutputError:
@@ -197,6 +219,26 @@ def _sampled(layer) -> list:
     found = []
     layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(path) if path.name in CHANGING else None)
     return [path for path in found if path.IsPropertyPath()]
+
+
+def _chunk_paths(chunks: Path) -> list[Path]:
+    return sorted(chunks.glob("points_*.usdc"), key=lambda p: int(p.stem.removeprefix("points_")))
+
+
+def _opened(path: Path):
+    """The layer of a file, apart from it. Raises OutputError."""
+    from pxr import Sdf
+
+    try:
+        return Sdf.Layer.OpenAsAnonymous(str(path))
+    except Exception as error:
+        raise OutputError(f"{path} cannot be read: {_last_line(error)}") from None
+
+
+def _shape(layer) -> list[str]:
+    """Names of what a layer holds, and the attributes that change in it."""
+    root = layer.GetPrimAtPath(ROOT)
+    return [*(child.name for child in root.nameChildren), *_sampled(layer)] if root else []
 
 
 def _set_range(layer, first: float, last: float) -> None:

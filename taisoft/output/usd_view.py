@@ -8,6 +8,7 @@ that take its intensity as the irradiance that it is then [W/m^2].
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -48,6 +49,10 @@ class ViewTrack:
         lamp.CreateNormalizeAttr(True)
         _turn(lamp, self.camera.azimuth + LAMP_TURN, LAMP_ELEVATION)
         UsdLux.DomeLight.Define(stage, f"{VIEW}/dome").CreateIntensityAttr(DOME)
+
+    def go_on(self, place: np.ndarray) -> None:
+        """Start from where the camera was last (3,) [m]."""
+        self.camera = replace(self.camera, distance=float(np.linalg.norm(place - self.camera.target)))
 
     def place(self, x: np.ndarray) -> np.ndarray:
         """Where the camera is (3,) [m] once it has moved back after nodes x (n,3) [m]."""

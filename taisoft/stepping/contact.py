@@ -24,7 +24,7 @@ from taisoft.fields import FieldArena
 from taisoft.mesh.quality import mean_surface_edge
 from taisoft.stepping.tunnelling import DEPTH, HASTE, SPEED, WHICH, collider_thickness, find_way, survey
 from taisoft.stepping.world import World
-from taisoft.transfer import array_of, download
+from taisoft.transfer import array_of, download, upload
 
 # Both of the finest body's mean surface edge:
 STANDOFF = 2e-3  # gap that contacts keep, so that surfaces do not cross where motion is curved
@@ -96,6 +96,43 @@ class ContactStep:
         self.problem.count[0] = 0
         self._last_time = self.penetration = self._span = 0.0
         self._sum = None
+
+    def _rows(self) -> dict:
+        """Fields of the last step's contacts: what the next step starts from, and what `contacts` tells."""
+        p, f = self.problem, self.found
+        return {
+            "normal": p.normal, "tangent": p.tangent, "r": p.r, "node": p.node, "weight": p.weight, "arity": p.arity,
+            "point": f.point, "gap": f.gap, "body": f.body, "feature": f.feature,
+        }  # fmt: skip
+
+    def snapshot(self) -> dict:
+        """The last step's contacts and impulses. The capacity too: where it does not do, a step starts without impulses.
+
+        The search at hand is not kept: from the same state the next one finds the same contacts in the same order.
+        """
+        rows = self._rows()
+        return {
+            "capacity": self.problem.capacity, "last_time": self._last_time, "share": self._share, "span": self._span,
+            "sum": self._sum, "penetration": self.penetration, "met": self.met, "dropped": self.dropped,
+            "rows": dict(zip(rows, download(list(rows.values()), self.n_contacts))),
+        }  # fmt: skip
+
+    def restore(self, kept: dict) -> None:
+        """Back to what `snapshot` told."""
+        if kept["capacity"] != self.problem.capacity:
+            self._make_room(int(kept["capacity"]))
+        rows, n = kept["rows"], len(kept["rows"]["gap"])
+        whole = []
+        for name, field in self._rows().items():
+            data = np.zeros((self.problem.capacity, *rows[name].shape[1:]), dtype=rows[name].dtype)
+            data[:n] = rows[name]
+            whole.append((field, data))
+        upload(whole)
+        self.problem.count[0] = n
+        self._last_time, self._share, self._span = (float(kept[name]) for name in ("last_time", "share", "span"))
+        self._sum, self.penetration = kept["sum"], float(kept["penetration"])
+        self.met, self.dropped = bool(kept["met"]), int(kept["dropped"])
+        self._searched, self._indexed = None, True  # so that the next step lists its contacts by nodes, however few
 
     def start_again(self) -> None:
         """The state of the step's start was set back; the impulses found so far are where the next try begins."""

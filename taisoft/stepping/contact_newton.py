@@ -32,6 +32,7 @@ from taisoft.stepping.contact_stage import (
 )
 from taisoft.stepping.newton import MAX_FORCING, SLOW, StageResult, StageSolver, _forcing
 from taisoft.stepping.stage import begin_stage, form_residual
+from taisoft.transfer import array_of, upload
 
 # R over the r-factors at the start of a stage, at least and at most. A larger one means fewer multipliers but more and harder
 # Newton steps: it doubles after a multiplier that took one, and is halved after one that took many.
@@ -104,6 +105,21 @@ class ContactStageSolver(StageSolver):
     def forget_factors(self) -> None:
         """The r-factors rest on a matrix of other numbers or other free axes."""
         self._weighed = None
+
+    def snapshot(self) -> dict:
+        """As without contacts, and the masses of the matrix that the next stage's r-factors rest on."""
+        masses = array_of(self.contact.problem.inverse_mass) if self._weighed else None
+        return super().snapshot() | {"weighed": self._weighed, "inverse_mass": masses}
+
+    def restore(self, kept: dict) -> None:
+        """Back to what `snapshot` told; the contacts have been restored."""
+        super().restore(kept)
+        self._fit()
+        self._weighed = None
+        if kept["weighed"] is not None:
+            upload([(self.contact.problem.inverse_mass, kept["inverse_mass"])])
+            c, beta = kept["weighed"]
+            self._weighed = float(c), float(beta)
 
     def _fit(self) -> None:
         """Room for the contacts of this step."""

@@ -54,6 +54,15 @@ class ContactExplicitStepper(ExplicitStepper):
         super().forget()
         self.contact.forget()
 
+    def snapshot(self) -> dict:
+        """As without contacts, and the contacts of the last sub-step."""
+        return super().snapshot() | {"contact": self.contact.snapshot()}
+
+    def restore(self, kept: dict) -> None:
+        """Back to what `snapshot` told."""
+        super().restore(kept)
+        self.contact.restore(kept["contact"])
+
     def advance(self, n: int, dt: float) -> ContactSubstepResult:
         """Take n sub-steps of dt, or fewer where led nodes let go or the batch is full; at least one.
 

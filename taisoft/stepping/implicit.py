@@ -15,7 +15,7 @@ from taisoft.stepping.contact import TOLERANCE, ContactStep
 from taisoft.stepping.contact_newton import ContactResult, ContactStageSolver, count_all, merge
 from taisoft.stepping.newton import StageResult, StageSolver
 from taisoft.stepping.world import World
-from taisoft.transfer import array_of, upload
+from taisoft.transfer import array_of, download, upload
 
 MAX_NEWTON = 50  # a step that needs more is reported as not converged
 MAX_CONTACT_NEWTON = 400  # with contacts, over all multipliers
@@ -122,6 +122,22 @@ class ImplicitStepper:
     def numbers_changed(self) -> None:
         """Gravity or material numbers changed."""
         self.solver.update_material()
+
+    def snapshot(self) -> dict:
+        """What the next step rests on beside the world: the history, what the solver keeps, the contacts."""
+        x, v = download([self.history.x_now, self.history.v_now])
+        kept = {"past": self._past, "beta": self._beta, "dt": self._dt, "x_now": x, "v_now": v}
+        if self.contact is not None:
+            kept["contact"] = self.contact.snapshot()
+        return kept | {"solver": self.solver.snapshot()}
+
+    def restore(self, kept: dict) -> None:
+        """Back to what `snapshot` told. x_before and v_before need not be: a step begins by writing them."""
+        upload([(self.history.x_now, kept["x_now"]), (self.history.v_now, kept["v_now"])])
+        self._past, self._beta, self._dt = int(kept["past"]), float(kept["beta"]), float(kept["dt"])
+        if self.contact is not None:
+            self.contact.restore(kept["contact"])
+        self.solver.restore(kept["solver"])  # after the contacts, whose fields it looks at
 
     def step(self, dt: float) -> StageResult:
         """One step of dt; on a non-finite result the state is put back and SimulationError raised.

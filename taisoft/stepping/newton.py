@@ -26,7 +26,7 @@ from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.coupling import NO_COUPLING
 from taisoft.model import Model
 from taisoft.stepping.stage import StageWork, begin_stage, form_residual, stage_terms, start_step, try_step
-from taisoft.transfer import array_of, download
+from taisoft.transfer import array_of, download, upload
 
 MAX_BACKTRACKS = 30  # halvings: below 1e-9 of a step nothing but rounding is left
 SLOW = 0.2  # a step that leaves more of |r| than this asks for a new matrix
@@ -110,6 +110,17 @@ class StageSolver:
         self.rounding_force = float(np.sqrt(((stiff[:, None] * volume * g * strain) ** 2).sum()))
         # and of v = (x - x_hat) / beta: |M| times the rounding of x, to be divided by beta
         self.rounding_mass = float(np.linalg.norm(mass) * 4.0 * np.finfo(np.float64).eps * largest)
+
+    def snapshot(self) -> dict:
+        """What lives between stages: the rounding, which tells of the state where numbers last changed, and the reactions."""
+        return {
+            "rounding_force": self.rounding_force, "rounding_mass": self.rounding_mass, "residual": array_of(self.work.residual),
+        }  # fmt: skip
+
+    def restore(self, kept: dict) -> None:
+        """Back to what `snapshot` told."""
+        self.rounding_force, self.rounding_mass = float(kept["rounding_force"]), float(kept["rounding_mass"])
+        upload([(self.work.residual, kept["residual"])])
 
     def held_residual(self) -> np.ndarray:
         """(n_nodes, 3) residual on the constrained axes, 0 on free ones."""

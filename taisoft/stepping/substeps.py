@@ -82,6 +82,23 @@ class ExplicitStepper:
         """Gravity or material numbers changed."""
         self.stale = True
 
+    def _kept_fields(self) -> dict[str, Any]:
+        """Fields that live from one sub-step to the next, by name, where the scene has them."""
+        both = {"acceleration": self.work.acceleration, "reaction": self.work.reaction}
+        return {name: field for name, field in both.items() if field is not None}
+
+    def snapshot(self) -> dict:
+        """What the next sub-step rests on beside the world, and what `reactions` tells.
+
+        Verlet's acceleration was found with a velocity of the middle, so it is kept, not found again.
+        """
+        return {"stale": self.stale} | {name: array_of(field) for name, field in self._kept_fields().items()}
+
+    def restore(self, kept: dict) -> None:
+        """Back to what `snapshot` told."""
+        upload([(field, kept[name]) for name, field in self._kept_fields().items()])
+        self.stale = bool(kept["stale"])
+
     def advance(self, n: int, dt: float) -> SubstepResult:
         """Take n sub-steps of dt, or fewer where led nodes let go or the launch would last too long; at least one.
 

@@ -36,6 +36,18 @@ class World:
         """Positions [m] and velocities [m/s] of all nodes (n_nodes, 3)."""
         upload([(self.model.x, x), (self.model.v, v)])
 
+    def snapshot(self) -> dict:
+        """What the next step rests on, for a checkpoint; see `taisoft/checkpoint.py`."""
+        x, v = self.state()
+        return {"time": self.time, "step_count": self.step_count, "released": self.motion.released(), "x": x, "v": v}
+
+    def restore(self, kept: dict) -> None:
+        """Back to what `snapshot` told, also of another world of the same scene."""
+        self.motion.set_released(kept["released"])
+        self.upload_constraints()
+        self.set_state(kept["x"], kept["v"])
+        self.time, self.step_count = float(kept["time"]), int(kept["step_count"])
+
     def restart(self) -> None:
         """The state at the scene's start."""
         self.motion.reset()

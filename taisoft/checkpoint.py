@@ -1,0 +1,208 @@
+"""Checkpoints: all that the next step rests on, in one `.npz` file that is whole or absent.
+
+A file holds arrays without pickled objects; `header`, a JSON text: versions, the Simulator's settings, numbers that may change
+while it runs, every number of the state that is no array, and a digest of each part of the scene; and `sha256` over all else.
+What lives between steps each class tells by `snapshot` and takes back by `restore`; here it is only flattened, its names joined
+by slashes. Meshes, constraints, loads and paths are not in the file: they come from the scene that is given, whose digests must
+be those of the scene that was saved. On the machine, with the versions and the number of threads that wrote it, a run goes on
+bitwise as if it had not been interrupted.
+"""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+
+from taisoft import __version__
+from taisoft.errors import SceneError, SimulationError
+from taisoft.files import replacing
+from taisoft.scene.body import Body
+from taisoft.scene.scene import Material, Scene
+
+KIND, FORMAT = "taisoft checkpoint", 1  # FORMAT grows with every change of what a file holds
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """A file's content. settings: arguments of Simulator; numbers: of the scene, that may change while it runs; marks: digests
+    of the scene's parts by name; state: nested dict of numbers and arrays."""
+
+    path: Path
+    settings: dict
+    numbers: dict
+    marks: dict[str, str]
+    state: dict
+
+
+def write_checkpoint(path: str | Path, settings: dict, scene: Scene, features: dict[str, bool], state: dict) -> None:
+    """Write the state of a simulation of a scene. features: of its plan. Raises OutputError."""
+    plain, arrays = _flat(state)
+    header = {
+        "kind": KIND, "format": FORMAT, "taisoft": __version__, "settings": settings, "numbers": _numbers(scene),
+        "marks": scene_marks(scene, features), "state": plain,
+    }  # fmt: skip
+    text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    with replacing(path) as part, open(part, "wb") as file:
+        np.savez(file, header=text, sha256=_checksum(text, arrays), **arrays)
+
+
+def read_checkpoint(path: str | Path) -> Checkpoint:
+    """The content of a file. Raises SimulationError for one that is absent, damaged, foreign, or newer than this version."""
+    header, arrays = _contents(Path(path))
+    state: dict = {}
+    for name, value in [*header["state"].items(), *arrays.items()]:
+        *folders, last = name.split("/")
+        place = state
+        for folder in folders:
+            place = place.setdefault(folder, {})
+        place[last] = value
+    return Checkpoint(Path(path), header["settings"], header["numbers"], header["marks"], state)
+
+
+def check_scene(saved: Checkpoint, scene: Scene, features: dict[str, bool]) -> None:
+    """Raises SceneError unless the scene is the one that was saved, but for what a checkpoint holds itself and for paths."""
+    marks = scene_marks(scene, features)
+    for kind in ("body", "obstacle"):
+        here, there = ([name for name in m if name.startswith(f"{kind} ") and ":" not in name] for m in (marks, saved.marks))
+        if here != there:
+            raise SceneError(
+                f"{saved.path} is a checkpoint of another scene: it has {', '.join(there) or f'no {kind}'}, "
+                f"this scene {', '.join(here) or f'no {kind}'}"
+            )
+    for name in marks:
+        if marks[name] != saved.marks.get(name):
+            raise SceneError(f"{saved.path} is a checkpoint of another scene, which differs in {name}")
+
+
+def take_numbers(saved: Checkpoint, scene: Scene) -> None:
+    """Give a scene the gravity, materials and pairs of a checkpoint. Raises SceneError for numbers outside the rules."""
+    scene.gravity = saved.numbers["gravity"]
+    for body, material in zip(scene.bodies, saved.numbers["materials"]):
+        body.material = Material(**material)
+    scene.contact_pairs.clear()
+    scene.contact_pairs.update((frozenset(names), (a, b)) for names, a, b in saved.numbers["pairs"])
+
+
+def scene_marks(scene: Scene, features: dict[str, bool]) -> dict[str, str]:
+    """A digest of each part of a scene that must be the same where a run goes on, by what to call it."""
+    marks = {}
+    for body in scene.bodies:
+        what = f"body '{body.name}'"
+        marks[what] = ""  # in the order added, which numbers nodes
+        for part, values in _body_parts(body).items():
+            marks[f"{what}: {part}"] = _digest(values)
+    for one in scene.obstacles:
+        what, shape = f"obstacle '{one.name}'", one.shape
+        own = [getattr(shape, field.name) for field in dataclasses.fields(shape)]
+        marks[what] = ""
+        marks[f"{what}: shape, friction, restitution or path"] = _digest(
+            [type(shape).__name__, *own, one.friction, one.restitution, one.path is None]
+        )
+    marks["collision settings"] = _digest([json.dumps(dataclasses.asdict(scene.collision)), scene.contact_forces])
+    # damping that was 0 at the start is compiled out, and so on
+    marks["the features that it needs"] = _digest([json.dumps(features)])
+    return marks
+
+
+def _body_parts(body: Body) -> dict[str, list]:
+    """What makes a body, by what to call it."""
+    return {
+        "mesh": [body.mesh.vertices, body.mesh.tets],
+        "order, quadrature, law or collision": [body.order, body.quadrature_degree, body.material.law, body.collision],
+        "start": [body.position, body.velocity],
+        "constraints": [x for c in body.constraints for x in (c.nodes, c.axes, c.path is None)],
+        "loads": [
+            *(x for t in body.tractions for x in ("traction", t.triangles, t.value)),
+            *(x for f in body.forces for x in ("force", f.nodes, f.value)),
+        ],
+    }
+
+
+def _numbers(scene: Scene) -> dict:
+    """Of a scene, what may change while it runs."""
+    pairs = [[sorted(names), *numbers] for names, numbers in scene.contact_pairs.items()]
+    materials = [dataclasses.asdict(body.material) for body in scene.bodies]
+    return {"gravity": scene.gravity.tolist(), "materials": materials, "pairs": pairs}
+
+
+def _digest(values: list) -> str:
+    """Of arrays and plain values."""
+    total = hashlib.sha256()
+    for value in values:
+        if isinstance(value, np.ndarray):
+            total.update(f"{value.dtype.str} {value.shape} ".encode())
+            total.update(np.ascontiguousarray(value))
+        else:
+            total.update(json.dumps(value).encode())
+    return total.hexdigest()
+
+
+def _flat(state: dict, prefix: str = "") -> tuple[dict, dict[str, np.ndarray]]:
+    """Numbers, lists and None, and arrays, each by its names joined by slashes."""
+    plain, arrays = {}, {}
+    for name, value in state.items():
+        if isinstance(value, dict):
+            inner = _flat(value, f"{prefix}{name}/")
+            plain |= inner[0]
+            arrays |= inner[1]
+        elif isinstance(value, np.ndarray):
+            arrays[f"{prefix}{name}"] = value
+        else:
+            plain[f"{prefix}{name}"] = value
+    return plain, arrays
+
+
+def _checksum(header: np.ndarray, arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """(32,) uint8."""
+    text = _digest([header, *(x for name in sorted(arrays) for x in (name, arrays[name]))])
+    return np.frombuffer(bytes.fromhex(text), dtype=np.uint8)
+
+
+def _contents(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
+    """Header and arrays, checked."""
+    try:
+        file = np.load(path, allow_pickle=False)
+    except FileNotFoundError:
+        raise SimulationError(f"{path}: no such checkpoint") from None
+    except Exception as error:  # whatever a file of another kind, or a part of one, makes NumPy and zipfile raise
+        raise _no_checkpoint(path, error) from None
+    if not isinstance(file, np.lib.npyio.NpzFile):
+        raise _no_checkpoint(path, "it holds one array")
+    with file:
+        try:
+            text = file["header"]
+            header = json.loads(text.tobytes())
+            kind, version = header["kind"], int(header["format"])
+            writer = str(header["taisoft"])
+        except Exception as error:
+            raise _no_checkpoint(path, error) from None
+        if kind != KIND:
+            raise _no_checkpoint(path, f"it is a {kind}")
+        if version != FORMAT:
+            raise SimulationError(
+                f"{path} was written by taisoft {writer} in format {version}, and taisoft {__version__} reads format {FORMAT}"
+            )
+        try:
+            arrays = {name: file[name] for name in file.files if name not in ("header", "sha256")}
+            whole = np.array_equal(file["sha256"], _checksum(text, arrays))
+        except Exception as error:
+            raise _damaged(path, error) from None
+    if not whole:
+        raise _damaged(path, "its checksum is not that of its content")
+    return header, arrays
+
+
+def _no_checkpoint(path: Path, why) -> SimulationError:
+    return SimulationError(f"{path} is no checkpoint of taisoft, or damaged: {_sentence(why)}")
+
+
+def _damaged(path: Path, why) -> SimulationError:
+    return SimulationError(f"{path} is damaged: {_sentence(why)}")
+
+
+def _sentence(why) -> str:
+    """An exception's first line, with its type where that is needed to understand it."""
+    text = str(why).strip().splitlines()
+    return why if isinstance(why, str) else f"{type(why).__name__}: {text[0] if text else 'no reason given'}"

@@ -1,0 +1,67 @@
+"""Saving a simulator's state, and a simulator that goes on from it."""
+
+import dataclasses
+from pathlib import Path
+from typing import Self
+
+from taisoft.access import StateAccess
+from taisoft.checkpoint import Checkpoint, check_scene, read_checkpoint, take_numbers, write_checkpoint
+from taisoft.errors import SceneError, SimulationError
+from taisoft.scene.scene import Scene
+from taisoft.settings import check_dt, plan_of
+
+
+class Resuming(StateAccess):
+    """Checkpoints of a simulator; `Simulator` adds building and stepping."""
+
+    def save_checkpoint(self, path: str | Path) -> None:
+        """Write all that the next step rests on to a file, whole or not at all; see `taisoft/checkpoint.py`.
+
+        Raises OutputError.
+        """
+        world, (start, count) = self._open_world(), self._time_base
+        own = {"dt": self._dt, "time_base": start, "count_base": count}
+        state = own | {"world": world.snapshot(), "stepper": self._stepper.snapshot()}
+        write_checkpoint(path, dataclasses.asdict(self.settings), self.scene, self.plan.on, state)
+
+    @classmethod
+    def load_checkpoint(cls, path: str | Path, scene: Scene, arch: str | None = None) -> Self:
+        """A simulator that goes on from a checkpoint of the same scene, with its settings and its numbers.
+
+        scene: gives what the file does not hold: meshes, constraints, loads, obstacles, and paths, which alone are not
+        compared. arch: another one than the checkpoint's; steps go on bitwise with its own only. Nothing else of the
+        settings can be changed here; dt, gravity, materials and contact pairs can be later, as in any simulator. Initial
+        overlaps are not looked for. Raises SimulationError for a file that cannot be used and SceneError for another
+        scene, both naming the file.
+        """
+        saved = read_checkpoint(path)
+        if not isinstance(scene, Scene):
+            raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
+        settings = saved.settings | ({} if arch is None else {"arch": arch})
+        check_scene(saved, scene, plan_of(scene, settings["integrator"], settings["self_collision"]).on)
+        start = scene.snapshot()
+        start.allow_initial_overlap = True  # where bodies start is not where they are
+        sim = cls(start, **settings)
+        try:
+            sim.scene.allow_initial_overlap = scene.allow_initial_overlap
+            sim._restore(saved)
+        except (KeyError, TypeError, ValueError) as error:  # a right checksum does not make it fit
+            sim.close()
+            raise SimulationError(f"{path} holds no state of this scene: {type(error).__name__}: {error}") from None
+        except BaseException:
+            sim.close()
+            raise
+        return sim
+
+    def _restore(self, saved: Checkpoint) -> None:
+        world, state = self._world, saved.state
+        take_numbers(saved, self.scene)
+        self._load_gravity()
+        world.upload_material(density=True)
+        if self._contact is not None:
+            self._contact.numbers_changed()
+        self._stable_dt = None
+        self._dt = check_dt(state["dt"])
+        self._time_base = float(state["time_base"]), int(state["count_base"])
+        world.restore(state["world"])
+        self._stepper.restore(state["stepper"])

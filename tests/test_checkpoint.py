@@ -1,0 +1,341 @@
+"""Checkpoints:
+
+* a simulator that was loaded goes on bitwise as the one that was saved: led nodes, before and after they are let go, contacts,
+  a moving obstacle, after a change of dt, gravity, material and friction; also in another process, and whatever overlaps at rest;
+* what it tells of the last step is what the saved one told, and its numbers and settings are those;
+* no part of the state is kept in vain: without it steps differ;
+* what is no checkpoint, is damaged anywhere, or newer, is refused with one sentence that names the file, and so is another scene;
+* a file is whole or absent, and one that is there is replaced only by a whole one.
+"""
+
+import copy
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from checkpoint_scenes import CUBES, LOW, cubes, follow, press
+from command import ROOT
+from scenes import RELEASE, driven_scene
+
+import taisoft as ts
+from taisoft import runtime
+from taisoft.checkpoint import read_checkpoint
+from taisoft.errors import OutputError, SceneError, SimulationError
+from taisoft.stepping import EXPLICIT
+
+
+def assert_same(a: list, b: list) -> None:
+    """Two runs, step by step and bit by bit."""
+    assert len(a) == len(b)
+    for k, (one, other) in enumerate(zip(a, b)):
+        assert one[0] == other[0], f"time of step {k}"
+        assert np.array_equal(one[1], other[1]), f"positions after step {k} differ by {np.abs(one[1] - other[1]).max():g} m"
+        assert np.array_equal(one[2], other[2]), f"velocities after step {k}"
+        assert one[3] == other[3], f"report of step {k}"
+
+
+def differ(a: list, b: list) -> bool:
+    return any(not np.array_equal(one[1], other[1]) for one, other in zip(a, b))
+
+
+def assert_every_part_counts(sim: ts.Simulator, path: Path, spoilt: dict, told: list) -> None:
+    """spoilt: names of numbers of the state, joined by slashes -> what to make of them."""
+    saved = read_checkpoint(path)
+    for name, change in spoilt.items():
+        state = copy.deepcopy(saved.state)
+        *folders, last = name.split("/")
+        place = state
+        for folder in folders:
+            place = place[folder]
+        place[last] = change(place[last])
+        sim._restore(dataclasses.replace(saved, state=state))
+        assert differ(follow(sim, len(told)), told), f"{name} does not count"
+    sim._restore(saved)  # and as it was
+    assert_same(follow(sim, len(told)), told)
+
+
+def anew() -> None:
+    """Let Taichi start again, as another process would: kernels of the same scene are then found on disk."""
+    assert runtime.open_kind() is None
+    runtime._kind = None
+
+
+# --- going on ---------------------------------------------------------------------------------------------------------
+
+COUNTS = {
+    "velocity_verlet": {"stepper/acceleration": lambda a: 0 * a},
+    "bdf2": {"stepper/x_now": lambda x: 0 * x, "stepper/past": lambda n: 0},
+}
+COUNTS_LATE = {name: {"world/released": lambda r: [False] * len(r)} for name in COUNTS}  # others do not mind a second release
+
+
+@pytest.mark.parametrize(
+    "integrator, precision",
+    [
+        ("bdf2", "f64"), ("velocity_verlet", "f32"), ("bdf2", "f32"), ("velocity_verlet", "f64"), ("symplectic_euler", "f64"),
+        ("implicit_euler", "f32"), ("implicit_midpoint", "f64"), ("linearly_implicit_euler", "f32"),
+    ],
+)  # fmt: skip
+def test_going_on_without_contacts(tmp_path, integrator, precision):
+    """Nodes are let go at RELEASE, which lies between the two checkpoints."""
+    scene, dt = driven_scene(mass_damping=0.5, stiffness_damping=1e-4), RELEASE / 19
+    early, late = tmp_path / "early.npz", tmp_path / "late.npz"
+    with ts.Simulator(scene, dt=dt, integrator=integrator, precision=precision) as sim:
+        follow(sim, 4)
+        sim.dt = 0.7 * dt
+        sim.set_gravity((0.0, -5.0, 1.0))
+        sim.set_material("flyer", young=5e4, density=900.0)
+        follow(sim, 6)
+        sim.save_checkpoint(early)
+        reactions, told = sim.reactions(), follow(sim, 30)
+        sim.save_checkpoint(late)
+        told += follow(sim, 5)
+        assert sim.time > RELEASE > 10 * dt
+    anew()
+    with ts.Simulator.load_checkpoint(early, scene) as loaded:
+        assert loaded.settings == sim.settings and loaded.dt == sim.dt and loaded.step_count == 10
+        assert np.array_equal(loaded.scene.gravity, (0.0, -5.0, 1.0))
+        assert loaded.scene.body("flyer").material == sim.scene.body("flyer").material != scene.body("flyer").material
+        assert np.array_equal(loaded.reactions(), reactions)
+        assert_same(follow(loaded, 35), told)
+        spoilt = {"world/v": lambda v: 0.5 * v, "time_base": lambda t: t + 1e-3, **COUNTS.get(integrator, {})}
+        assert_every_part_counts(loaded, early, spoilt, told[:8])
+        assert_every_part_counts(loaded, late, COUNTS_LATE.get(integrator, {}), told[30:])
+
+
+@pytest.mark.parametrize(
+    "integrator, precision, settings",
+    [
+        ("symplectic_euler", "f32", {}), ("velocity_verlet", "f64", {"self_collision": True}),
+        ("symplectic_euler", "f64", {"contact_solver": "coloured_gauss_seidel"}), ("bdf2", "f32", {"self_collision": True}),
+        ("linearly_implicit_euler", "f64", {}), ("implicit_euler", "f32", {}),
+    ],
+)  # fmt: skip
+def test_going_on_with_contacts(tmp_path, integrator, precision, settings):
+    """A plate presses a cube and is let go after the checkpoint; a ball moves into the cube.
+
+    At rest the plate is within the cube, which must not matter once it is not there any more.
+    """
+    dt, before, after = (2e-4, 60, 60) if integrator in EXPLICIT else (2e-3, 15, 15)
+    scene, path = press(1.5 * before * dt), tmp_path / "checkpoint.npz"
+    with ts.Simulator(scene, dt=dt, integrator=integrator, precision=precision, **settings) as sim:
+        sim.set_state(positions=sim.positions("plate") + (0, LOW, 0), body="plate")
+        follow(sim, before)
+        sim.set_contact("cube", "floor", friction=0.1)
+        sim.save_checkpoint(path)
+        contacts, force, reactions = sim.contacts(), sim.contact_force("floor"), sim.reactions()
+        told = follow(sim, after)
+    assert contacts.impulse.any() and set(contacts.body_b) == {"plate", "floor", "ball"} and told[-1][3].n_contacts
+    anew()
+    scene.allow_initial_overlap = False
+    with ts.Simulator.load_checkpoint(path, scene) as loaded:
+        assert not loaded.scene.allow_initial_overlap
+        assert loaded.scene.contact_numbers("cube", "floor")[0] == 0.1
+        same = loaded.contacts()
+        for name in ("point", "normal", "gap", "impulse", "nodes", "weights"):
+            assert np.array_equal(getattr(same, name), getattr(contacts, name)), name
+        assert np.array_equal(loaded.contact_force("floor"), force) and np.array_equal(loaded.reactions(), reactions)
+        assert_same(follow(loaded, after), told)
+        assert_every_part_counts(loaded, path, {"stepper/contact/rows/r": lambda r: 0 * r}, told[:3])
+
+
+def test_cubes_go_on_in_another_process(tmp_path):
+    """Case L3: bodies lie on a floor and on each other, 100 steps to a checkpoint, 100 after it."""
+    path, result = tmp_path / "checkpoint.npz", tmp_path / "result.npz"
+    with ts.Simulator(cubes(), **CUBES) as sim:
+        follow(sim, 60)
+        sim.set_material("top", density=1500.0)
+        follow(sim, 40)
+        sim.save_checkpoint(path)
+        contacts = sim.contacts()
+        pressed = contacts.impulse.any(axis=1)
+        assert {"floor", "top"} <= set(contacts.body_b[pressed]) | set(contacts.body_a[pressed])
+        told = follow(sim, 100)
+        spoilt = {"inverse_mass": lambda m: 2 * m, "weighed": lambda w: None}
+        assert_every_part_counts(
+            sim, path,
+            {"stepper/contact/rows/r": lambda r: 0 * r, "stepper/contact/last_time": lambda t: 2 * t}
+            | {f"stepper/solver/{name}": change for name, change in spoilt.items()},
+            told[:3],
+        )  # fmt: skip
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    script = Path(__file__).with_name("checkpoint_scenes.py")
+    subprocess.run([sys.executable, script, path, "100", result], env=environment, check=True)
+    with np.load(result) as other:
+        assert np.array_equal(other["time"], [t for t, *_ in told])
+        assert np.array_equal(other["x"], [x for _, x, *_ in told])
+        assert np.array_equal(other["v"], [v for _, _, v, _ in told])
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory) -> Path:
+    """A checkpoint of the driven scene."""
+    path = tmp_path_factory.mktemp("saved") / "checkpoint.npz"
+    with ts.Simulator(driven_scene(), dt=1e-4, integrator="symplectic_euler") as sim:
+        sim.step()
+        sim.save_checkpoint(path)
+    return path
+
+
+def refusal(path: Path, scene: ts.Scene | None = None) -> str:
+    """The sentence that refuses a file."""
+    with pytest.raises((SimulationError, SceneError)) as caught:
+        ts.Simulator.load_checkpoint(path, scene or driven_scene())
+    text = str(caught.value)
+    assert str(path) in text and "\n" not in text
+    return text
+
+
+def test_what_is_no_checkpoint(tmp_path):
+    assert "no such checkpoint" in refusal(tmp_path / "absent.npz")
+    assert "no checkpoint" in refusal(tmp_path)
+    path = tmp_path / "file.npz"
+    for content in (b"", b"no checkpoint", b"PK\x03\x04 no zip", b"\x93NUMPY\x01\x00"):
+        path.write_bytes(content)
+        assert "no checkpoint" in refusal(path)
+    for content in ({"x": np.zeros(3)}, {"header": np.array([{}], dtype=object)}, {"header": np.zeros(3, dtype=np.uint8)}):
+        np.savez(path, **content)
+        assert "no checkpoint" in refusal(path)
+    with open(path, "wb") as file:
+        np.save(file, np.zeros(3))
+    assert "no checkpoint" in refusal(path)
+
+
+def test_parts_of_a_file_are_refused(saved, tmp_path):
+    data, path = saved.read_bytes(), tmp_path / "part.npz"
+    for length in {0, 1, 100, len(data) // 2, len(data) - 100, len(data) - 1}:
+        path.write_bytes(data[:length])
+        refusal(path)
+
+
+def test_a_changed_byte_is_found(saved, tmp_path):
+    """Anywhere: what a byte of the zip's own says twice, or not at all, may be changed without harm, and nothing else."""
+    data, path, harmless = saved.read_bytes(), tmp_path / "changed.npz", 0
+    places = np.random.default_rng(1).choice(len(data), 300, replace=False)
+    for at in places:
+        path.write_bytes(data[:at] + bytes([data[at] ^ 0x11]) + data[at + 1 :])
+        try:
+            content = read_checkpoint(path)
+        except SimulationError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
+            continue
+        harmless += 1
+        whole = read_checkpoint(saved)
+        assert (content.settings, content.numbers, content.marks) == (whole.settings, whole.numbers, whole.marks)
+        assert np.array_equal(content.state["world"]["x"], whole.state["world"]["x"])
+    assert harmless < 100
+
+
+def changed(saved: Path, path: Path, member: str, change) -> Path:
+    """The checkpoint with the data of one array changed, in a zip that is as it should be."""
+    with np.load(saved) as file:
+        arrays = dict(file)
+    arrays[member] = change(arrays[member])
+    np.savez(path, **arrays)
+    return path
+
+
+def test_a_changed_number_is_found(saved, tmp_path):
+    path = changed(saved, tmp_path / "changed.npz", "world/x", lambda x: x + 1e-12)
+    assert "is damaged: its checksum" in refusal(path)
+
+
+def test_newer_files_are_told_from_damaged_ones(saved, tmp_path):
+    def newer(text):
+        header = json.loads(text.tobytes()) | {"format": 99, "taisoft": "9.1"}
+        return np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+
+    text = refusal(changed(saved, tmp_path / "newer.npz", "header", newer))
+    assert "written by taisoft 9.1 in format 99, and taisoft" in text and "reads format 1" in text
+
+
+def renamed(scene):
+    scene.body("flyer").name = "fly"
+
+
+def reordered(scene):
+    scene.bodies.reverse()
+
+
+def with_other_mesh(scene):
+    mesh = scene.body("flyer").mesh
+    vertices = mesh.vertices.copy()
+    vertices[0, 0] += 1e-9
+    scene.body("flyer").mesh = ts.TetMesh(vertices, mesh.tets)
+
+
+def held(scene):
+    scene.body("flyer").fix([0])
+
+
+def loaded(scene):
+    scene.body("flyer").add_force([0], (1, 0, 0))
+
+
+def with_obstacle(scene):
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="floor")
+
+
+def with_other_law(scene):
+    body = scene.body("flyer")
+    body.material = dataclasses.replace(body.material, law="corotational")
+
+
+def damped(scene):
+    body = scene.body("flyer")
+    body.material = dataclasses.replace(body.material, mass_damping=0.1)
+
+
+@pytest.mark.parametrize(
+    "change, told",
+    [
+        (renamed, "it has body 'beam', body 'flyer', this scene body 'beam', body 'fly'"),
+        (reordered, "this scene body 'flyer', body 'beam'"), (with_other_mesh, "in body 'flyer': mesh"),
+        (held, "in body 'flyer': constraints"), (loaded, "in body 'flyer': loads"),
+        (with_obstacle, "it has no obstacle, this scene obstacle 'floor'"),
+        (with_other_law, "in body 'flyer': order, quadrature, law"), (damped, "in the features that it needs"),
+    ],
+)  # fmt: skip
+def test_another_scene(saved, change, told):
+    scene = driven_scene()
+    change(scene)
+    text = refusal(saved, scene)
+    assert "is a checkpoint of another scene" in text and told in text
+
+
+def test_another_path_is_accepted(saved):
+    """Functions are not compared: they cannot be, and a run may be meant to go on in another way."""
+    scene = driven_scene()
+    led = scene.body("beam").constraints
+    led[-1] = dataclasses.replace(led[-1], path=lambda t: (0, 0, 0))
+    with ts.Simulator.load_checkpoint(saved, scene) as sim:
+        assert sim.step_count == 1
+
+
+def test_a_file_is_whole_or_absent(saved, tmp_path, monkeypatch):
+    path = tmp_path / "checkpoint.npz"
+    path.write_bytes(b"the earlier one")
+
+    def full(file, **arrays):
+        file.write(b"half of it")
+        raise OSError(28, "No space left on device")
+
+    with ts.Simulator.load_checkpoint(saved, driven_scene()) as sim:
+        monkeypatch.setattr(np, "savez", full)
+        with pytest.raises(OutputError, match="checkpoint.npz: No space left"):
+            sim.save_checkpoint(path)
+        assert path.read_bytes() == b"the earlier one" and os.listdir(tmp_path) == ["checkpoint.npz"]
+        monkeypatch.undo()
+        with pytest.raises(OutputError, match="absent"):
+            sim.save_checkpoint(tmp_path / "absent" / "checkpoint.npz")
+        sim.save_checkpoint(path)
+        assert zipfile.is_zipfile(path) and os.listdir(tmp_path) == ["checkpoint.npz"]

@@ -1,0 +1,175 @@
+"""`taisoft run --resume` and the checkpoints of a run:
+
+* a run in two parts leaves the folder that one run leaves: pictures, steps.csv and USD to the byte, and the last state;
+* so does a run that was interrupted, or killed and asked for checkpoints on its way; a failed run keeps its last good state;
+* what cannot change within a run, a checkpoint from its end or of another scene: exit status 2, and nothing is written or lost.
+"""
+
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import BEAM, LED, SHORT_OUTPUT, child, report, run, write
+
+from taisoft.checkpoint import read_checkpoint
+
+GENTLE = LED.replace("{body}", "return (0, -t, 0)")
+
+
+def usd(folder: Path) -> str:
+    """scene.usdc as text."""
+    from pxr import Sdf
+
+    return Sdf.Layer.OpenAsAnonymous(str(folder / "scene.usdc")).ExportToString()
+
+
+def assert_same_folders(a: Path, b: Path, rows: int = 0) -> None:
+    """Every result of two runs, but for what tells of the run itself; of steps.csv the rows from that on."""
+    names = [sorted(str(path.relative_to(folder)) for path in folder.rglob("*")) for folder in (a, b)]
+    assert names[0] == names[1] and "frames/00006.png" in names[0] and "chunks" not in names[0]
+    for picture in (a / "frames").iterdir():
+        assert picture.read_bytes() == (b / "frames" / picture.name).read_bytes(), picture.name
+    steps = [(folder / "steps.csv").read_text().splitlines() for folder in (a, b)]
+    assert len(steps[0]) == 7 and steps[0][rows:] == steps[1][max(0, len(steps[1]) - 7 + rows) :]
+    assert usd(a) == usd(b)
+    one, other = (read_checkpoint(folder / "checkpoint.npz") for folder in (a, b))
+    assert np.array_equal(one.state["world"]["x"], other.state["world"]["x"])
+    assert one.state["world"]["step_count"] == other.state["world"]["step_count"]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """The folder of a run of 0.2 s, in one part: frames 0 to 6."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert run(write(folder / "led.py", GENTLE), "--seconds", "0.2", "--out", folder / "out") == 0
+    return folder / "out"
+
+
+@pytest.fixture
+def begun(tmp_path) -> tuple[Path, Path]:
+    """A scene file, and the folder of its run of 0.1 s without pictures and USD."""
+    path = write(tmp_path / "led.py", GENTLE)
+    assert run(path, "--out", tmp_path / "out", *SHORT_OUTPUT) == 0
+    return path, tmp_path / "out"
+
+
+# --- going on ---------------------------------------------------------------------------------------------------------
+
+
+def test_two_parts_are_one_run(whole, tmp_path, capsys):
+    path, out = write(tmp_path / "led.py", GENTLE), tmp_path / "out"
+    assert run(path, "--out", out) == 0
+    assert run(path, "--out", out, "--resume", out / "checkpoint.npz", "--seconds", "0.2") == 0
+    assert_same_folders(whole, out)
+    record = report(out)
+    assert record["resumed"] == {"checkpoint": str(out / "checkpoint.npz"), "time": pytest.approx(0.1), "frame": 3}
+    assert record["sim_seconds"] == pytest.approx(0.1) and record["steps"] == 24
+    assert report(whole)["resumed"] is None
+    assert f"resumed  from {out / 'checkpoint.npz'}, t = 0.1 s" in capsys.readouterr().out
+
+
+def test_an_interrupted_run_goes_on(whole, tmp_path):
+    raising = f"import signal; signal.raise_signal({int(signal.SIGTERM)}) if 0.1 < t < 0.1042 else None\n    return (0, -t, 0)"
+    path, out = write(tmp_path / "led.py", LED.replace("{body}", raising)), tmp_path / "out"
+    assert run(path, "--out", out, "--seconds", "0.2") == 143
+    assert 0.1 < read_checkpoint(out / "checkpoint.npz").state["world"]["time"] < 0.15
+    assert run(path, "--out", out, "--resume", out / "checkpoint.npz", "--seconds", "0.2") == 0
+    assert_same_folders(whole, out)
+
+
+def test_a_run_that_was_interrupted_between_two_frames_goes_on(tmp_path):
+    """Implicit steps are interrupted one by one: step 28 of 48 lies in the middle of frame 4."""
+    raising = "import signal; signal.raise_signal(2) if 27.8 < 240 * t < 28.2 else None\n    return (0, -t, 0)"
+    implicit = ("--set", "solver.integrator=implicit_euler", "--seconds", "0.2", "--no-frames")
+    path, out, straight = tmp_path / "led.py", tmp_path / "out", tmp_path / "straight"
+    write(path, LED.replace("{body}", raising))
+    assert run(path, "--out", out, *implicit) == 130
+    assert read_checkpoint(out / "checkpoint.npz").state["world"]["step_count"] == 28
+    write(path, GENTLE)
+    assert run(path, "--out", out, "--resume", out / "checkpoint.npz", *implicit) == 0
+    assert run(path, "--out", straight, *implicit) == 0
+    assert report(out)["resumed"]["frame"] == 4 and report(out)["steps"] == 20
+    assert (out / "steps.csv").read_bytes() == (straight / "steps.csv").read_bytes()
+    assert usd(out) == usd(straight)
+    one, other = (read_checkpoint(folder / "checkpoint.npz").state for folder in (out, straight))
+    assert np.array_equal(one["world"]["v"], other["world"]["v"])
+    assert np.array_equal(one["stepper"]["x_now"], other["stepper"]["x_now"])
+
+
+def test_a_killed_run_goes_on(whole, tmp_path):
+    """Killed in frame 6, with checkpoints at frames 2 and 4: no chunk of USD is full by then."""
+    dying = "import os; t > 0.17 and os._exit(9)\n    return (0, -t, 0)"
+    path, out = write(tmp_path / "led.py", LED.replace("{body}", dying)), tmp_path / "out"
+    process = child("run", path, "--headless", "--out", out, "--seconds", "0.2", "--checkpoint-every", str(2 / 30))
+    process.communicate(timeout=120)
+    assert process.returncode == 9 and not (out / "scene.usdc").exists() and (out / "frames" / "00005.png").exists()
+    assert read_checkpoint(out / "checkpoint.npz").state["world"]["time"] == pytest.approx(4 / 30)
+    write(path, GENTLE)
+    assert run(path, "--out", out, "--resume", out / "checkpoint.npz", "--seconds", "0.2") == 0
+    assert_same_folders(whole, out, rows=5)  # the killed run wrote none
+
+
+def test_a_failed_run_keeps_its_last_good_state(tmp_path):
+    failing = LED.replace("{body}", "return (0, -t, 0) if t < 0.05 else (0, float('nan'), 0)")
+    path, out = write(tmp_path / "led.py", failing), tmp_path / "out"
+    assert run(path, "--out", out, *SHORT_OUTPUT) == 1
+    world = read_checkpoint(out / "checkpoint.npz").state["world"]
+    assert 0.0 < world["time"] < 0.05 and np.isfinite(world["x"]).all()
+
+
+def test_a_run_goes_on_elsewhere_with_another_dt(begun, tmp_path):
+    path, out = begun
+    other = tmp_path / "other"
+    before = (out / "report.json").read_bytes()
+    arguments = ("--resume", out / "checkpoint.npz", "--set", "solver.dt=0.002", "--seconds", "0.15", "--no-usd")
+    assert run(path, "--out", other, *arguments) == 0
+    assert report(other)["settings"]["dt"] == pytest.approx(1 / 510) and (out / "report.json").read_bytes() == before
+    assert sorted(picture.name for picture in (other / "frames").iterdir()) == ["00003.png", "00004.png", "00005.png"]
+
+
+# --- refused ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "arguments, told",
+    [
+        (["--precision", "f64"], "precision is f32 there and cannot become f64 within a run"),
+        (["--set", "solver.integrator=bdf2"], "integrator is symplectic_euler there and cannot become bdf2"),
+        (["--set", "solver.dt=0.5"], "above the estimated stability limit"),
+        (["--seconds", "0.1"], "it is at t = 0.1 s already, and the run ends at 0.1 s"),
+        (["--checkpoint-every", "-1"], "--checkpoint-every must be greater than 0 s, not -1"),
+    ],
+)
+def test_what_cannot_change(begun, capsys, arguments, told):
+    path, out = begun
+    before = {file.name: file.read_bytes() for file in out.iterdir()}
+    capsys.readouterr()
+    end = () if "--seconds" in arguments else ("--seconds", "0.2")
+    assert run(path, "--out", out, "--resume", out / "checkpoint.npz", *end, *arguments) == 2
+    error = capsys.readouterr().err
+    assert told in error and error.startswith("taisoft: ") and error.count("\n") == 1
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == before
+
+
+def test_another_scene_is_refused(begun, tmp_path, capsys):
+    _, out = begun
+    path = write(tmp_path / "beam.py", BEAM)
+    assert run(path, "--out", tmp_path / "new", "--resume", out / "checkpoint.npz", "--seconds", "0.2") == 2
+    assert "is a checkpoint of another scene, which differs in body 'beam': constraints" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_checkpoints_on_the_way_need_a_folder(beam, capsys):
+    assert run(beam, "--checkpoint-every", "0.1") == 2
+    assert "--checkpoint-every needs --out" in capsys.readouterr().err
+
+
+def test_another_frame_rate_is_refused(tmp_path, capsys):
+    path, out = write(tmp_path / "led.py", GENTLE), tmp_path / "out"
+    assert run(path, "--out", out, "--no-frames") == 0
+    before = usd(out)
+    arguments = ("--resume", out / "checkpoint.npz", "--seconds", "0.2", "--fps", "60")
+    assert run(path, "--out", out, *arguments) == 3
+    assert "is of another scene or frame rate" in capsys.readouterr().err
+    assert usd(out) == before and report(out)["resumed"] is None
