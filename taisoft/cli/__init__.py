@@ -109,6 +109,7 @@ def _add_run(commands) -> None:
         metavar="T",
         help="write DIR/checkpoint.npz whenever so much simulated time has passed [s], not only at the end",
     )
+    parser.add_argument("--video", action="store_true", help="also make video.mp4 of the pictures, by ffmpeg (extra 'video')")
     parser.add_argument("--no-usd", action="store_true", help="write no scene.usdc")
     parser.add_argument("--no-frames", action="store_true", help="write no pictures")
     parser.set_defaults(command="run")

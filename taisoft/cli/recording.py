@@ -1,5 +1,7 @@
 """What a run writes: the observers of `taisoft run` together, kept going or ended as one."""
 
+import shlex
+import sys
 import time
 from pathlib import Path
 
@@ -10,6 +12,7 @@ from taisoft.output.files import RESULT_FILES, OutputFolder
 from taisoft.output.frames import FRAMES_NAME, FrameWriter
 from taisoft.output.report import write_report
 from taisoft.output.usd import UsdWriter
+from taisoft.output.video import command, find_ffmpeg, write_video
 from taisoft.records import RunReport
 from taisoft.view.offscreen import Offscreen
 
@@ -79,6 +82,17 @@ class Recording:
     def checkpoint(self, sim) -> None:
         """Writes checkpoint.npz. Raises OutputError."""
         self._checkpoints.write(sim)
+
+    def video(self, fps: float) -> None:
+        """Writes video.mp4 from the pictures, or prints how it is made where ffmpeg is missing. Raises OutputError."""
+        folder = self._folder.path
+        if not any((folder / FRAMES_NAME).glob("[0-9]*.png")):
+            return
+        if find_ffmpeg() is None:
+            line = shlex.join(command(folder, fps))
+            print(f"taisoft: no video without ffmpeg (pip install 'taisoft[video]'); where there is one: {line}", file=sys.stderr)
+            return
+        write_video(folder, fps)
 
     def report(self, result: RunReport, sim, settings: RunSettings) -> None:
         """Writes report.json and steps.csv, and removes what an earlier run left. Raises OutputError."""

@@ -32,6 +32,8 @@ def command(arguments: Namespace) -> int:
     with Signals() as signals, _told_warnings() as told:
         scene, solver = load_scene(arguments.scene)
         every = _checkpoint_interval(arguments)
+        if arguments.video and (arguments.out is None or arguments.no_frames):
+            raise SceneError("--video needs --out, the folder to write to, and the pictures that --no-frames leaves out")
         if arguments.resume is None:
             settings = resolve(solver, arguments, Simulator)
             if arguments.out is not None:
@@ -135,6 +137,8 @@ def _run(
         observers.close()
         if recording is not None:
             observers.guard(recording.checkpoint, sim)
+            if arguments.video:
+                observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
         result.problems[:0] = [f"warning: {text}" for text in told]
         if observers.error is not None:
             _tell_failed_output(result, observers, signals)
