@@ -28,14 +28,6 @@ def mesh_path() -> Path:
     return Path(os.environ.get("BUNNY_MESH", BESIDE))
 
 
-def tip_path(t: float) -> np.ndarray | None:
-    """Displacement of the tips of the ears [m] at t [s]: up with a soft start and stop, None once released."""
-    if t >= RELEASE:
-        return None
-    s = t / RELEASE
-    return np.array([0.0, RISE * s * s * (3.0 - 2.0 * s), 0.0])
-
-
 def build() -> ts.Scene:
     """The bunny at rest, its base fixed, its ears on the way up. Raises MeshError where its mesh is not found."""
     path = mesh_path()
@@ -45,7 +37,8 @@ def build() -> ts.Scene:
     rubber = ts.Material(law="stable_neo_hookean", young=1e6, poisson=0.4, density=1000.0, stiffness_damping=0.03)
     bunny = scene.add_body(ts.read_mesh(path), rubber, name="bunny")
     bunny.fix(lambda X: X[:, 1] < BASE_BELOW)
-    bunny.move(lambda X: X[:, 1] > TIPS_ABOVE, tip_path)
+    rise = ts.KeyFrames((0.0, RELEASE), [(0.0, 0.0, 0.0), (0.0, RISE, 0.0)], smooth=True, release=True)
+    bunny.move(lambda X: X[:, 1] > TIPS_ABOVE, rise)
     return scene
 
 

@@ -28,7 +28,7 @@ def command(arguments: Namespace) -> int:
     with Signals() as signals, _told_warnings() as told:
         if arguments.resume is not None:
             raise SceneError(f"--resume {arguments.resume}: this version writes and reads no checkpoints")
-        scene, solver = load_scene(arguments.scene)
+        scene, solver = load_scene(arguments.scene, arguments.allow_outside)
         settings = resolve(solver, arguments, Simulator)
         if arguments.out is not None:
             check_free(arguments.out, arguments.overwrite)

@@ -10,6 +10,7 @@ import io
 import os
 import re
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import meshio
@@ -123,19 +124,29 @@ def write_mesh(path, mesh: TetMesh) -> None:
         raise MeshError(f"{file}: write_mesh needs a TetMesh, not {type(mesh).__name__}")
     record = meshio.Mesh(mesh.vertices, [("tetra", mesh.tets)])
     options = {"binary": False} if ending == ".msh" else {}
-    part = None
-    try:
-        handle, part = tempfile.mkstemp(suffix=f".part{ending}", prefix=f".{file.name}.", dir=file.parent)
-        os.close(handle)
+    with written_whole(file, "mesh") as part:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             meshio.write(part, record, file_format=WRITERS[ending], **options)
+
+
+@contextlib.contextmanager
+def written_whole(file: Path, what: str) -> Iterator[str]:
+    """Yield the name of an empty file beside `file` that takes its place at the end of the block, or goes if that fails.
+
+    what: a word for the message. Raises OutputError for any OSError, inside the block too.
+    """
+    part = None
+    try:
+        handle, part = tempfile.mkstemp(suffix=f".part{file.suffix}", prefix=f".{file.name}.", dir=file.parent)
+        os.close(handle)
+        yield part
         with open(part, "rb+") as written:
             os.fsync(written.fileno())
         os.chmod(part, 0o666 & ~_umask())  # mkstemp keeps the file to its owner
         os.replace(part, file)
         part = None
     except OSError as error:
-        raise OutputError(f"{file}: the mesh could not be written: {error.strerror or error}") from error
+        raise OutputError(f"{file}: the {what} could not be written: {error.strerror or error}") from error
     finally:
         if part is not None:
             with contextlib.suppress(OSError):
