@@ -37,7 +37,7 @@ from taisoft.scene.tables import Table, arguments_of, check_values, shown
 
 MESHES = {"box": box_mesh, "sheet": sheet_mesh, "ball": ball_mesh}
 SHAPES = {"half_space": HalfSpace, "sphere": Sphere, "box": Box, "capsule": Capsule, "mesh": MeshObstacle}
-LOADS = {"fix": Body.fix, "move": Body.move, "traction": Body.add_traction, "force": Body.add_force}
+CALLS = {"fix": Body.fix, "move": Body.move, "traction": Body.add_traction, "force": Body.add_force}
 ITEMS = {"traction": "triangles"}  # what a load chooses, where it is not nodes
 OWN = ("gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene
 TOP = [*OWN, "collision", "solver", "materials", "bodies", "obstacles", "contacts"]
@@ -51,7 +51,10 @@ def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
     path: the file. allow_outside: let mesh files lie outside of its folder, and be of any format that meshio reads. Raises
     SceneError or MeshError with the file, the place in it, and the rule.
     """
-    file = Path(path)
+    try:
+        file = Path(path)
+    except TypeError as error:
+        raise SceneError(f"read_scene: path must be a file's name, not {path!r}") from error
     tables = Table(file, "", _parsed(file), TOP, ["bodies"])
     scene = Scene()
     for key in OWN:
@@ -70,7 +73,7 @@ def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
         raise tables.error("bodies", "must hold a table [bodies.NAME]")
     known, _ = arguments_of(Scene.add_body, "name")
     meshes: dict[str, TetMesh] = {}  # bodies whose mesh is said alike share it
-    for name, table in _each(tables, "bodies", [*known, *LOADS], ["material", "mesh"]):
+    for name, table in _each(tables, "bodies", [*known, *CALLS], ["material", "mesh"]):
         said = str(table.values["mesh"])
         meshes[said] = meshes.get(said) or _mesh(table, allow_outside)
         _add_body(scene, name, table, materials, meshes[said])
@@ -122,18 +125,22 @@ def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Materi
     else:
         material = _material(table.table("material", *arguments_of(Material)))
     keys, _ = arguments_of(Scene.add_body, "name", "mesh", "material")
-    said = f"body {name!r}: "
-    body = table.make(scene.add_body, said, "scene: ", keys=keys, mesh=mesh, material=material, name=name)
-    for key, method in LOADS.items():
-        items = ITEMS.get(key, "nodes")
-        known, needed = ([items if k == "where" else k for k in keys] for keys in arguments_of(method))
-        points = body.mesh.vertices[body.mesh.surface].mean(axis=1) if items == "triangles" else body.rest_positions
-        for load in table.listed(key, known, needed):
-            more = {"where": _chosen(load, items, points)}
-            if "path" in known:
-                more["path"] = _key_frames(load)
-            others = [k for k in known if k not in (items, "path")]
-            load.make(getattr(body, method.__name__), f"{said}{method.__name__}: ", keys=others, **more)
+    body = table.make(scene.add_body, f"body {name!r}: ", "scene: ", keys=keys, mesh=mesh, material=material, name=name)
+    for key in CALLS:
+        _call(body, table, key)
+
+
+def _call(body: Body, table: Table, key: str) -> None:
+    """Call the body's method of a key with each of the tables there; its `where` has the name of what it chooses."""
+    method, items = CALLS[key], ITEMS.get(key, "nodes")
+    known, needed = ([items if k == "where" else k for k in keys] for keys in arguments_of(method))
+    points = body.mesh.vertices[body.mesh.surface].mean(axis=1) if items == "triangles" else body.rest_positions
+    for one in table.listed(key, known, needed):
+        more = {"where": _chosen(one, items, points)}
+        if "path" in known:
+            more["path"] = _key_frames(one)
+        others = [k for k in known if k not in (items, "path")]
+        one.make(getattr(body, method.__name__), f"body {body.name!r}: {method.__name__}: ", keys=others, **more)
 
 
 def _mesh(table: Table, allow_outside: bool) -> TetMesh:
