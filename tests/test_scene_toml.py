@@ -15,11 +15,12 @@ import os
 import re
 import tomllib
 import warnings
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command import BEAM, ROOT, SHORT_OUTPUT, report, run, write
+from command import ROOT, SHORT_OUTPUT, report, run, write
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -221,14 +222,19 @@ def test_settings_are_those_of_the_simulator():
 def test_numbers_of_numpy_are_written_as_plain_ones(tmp_path):
     scene = ts.Scene()
     scene.add_body(TURNED, ts.Material())
-    solver = {"dt": np.float64(1 / 3), "seconds": np.int64(2), "self_collision": np.bool_(True)}
+    solver = {"dt": np.float64(1 / 3), "seconds": np.int64(2), "self_collision": np.bool_(True), "fps": Fraction(1, 3)}
     ts.write_scene(tmp_path / "a.toml", scene, solver)
-    assert ts.read_scene(tmp_path / "a.toml")[1] == {"dt": 1 / 3, "seconds": 2, "self_collision": True}
+    assert ts.read_scene(tmp_path / "a.toml")[1] == {"dt": 1 / 3, "seconds": 2, "self_collision": True, "fps": 1 / 3}
 
 
-numbers = st.floats(allow_nan=False, allow_infinity=False, width=64)
-vectors = st.tuples(*[st.floats(-1e100, 1e100)] * 3)
-positive = st.floats(min_value=0, exclude_min=True, allow_infinity=False)
+def floats(*limits, **rules):
+    """Without the smallest numbers: compiled code may set the processor to drop them."""
+    return st.floats(*limits, allow_subnormal=False, **rules)
+
+
+numbers = floats(allow_nan=False, allow_infinity=False, width=64)
+vectors = st.tuples(*[floats(-1e100, 1e100)] * 3)
+positive = floats(min_value=0, exclude_min=True, allow_infinity=False)
 names = st.text(min_size=1, max_size=8).filter(str.strip)
 
 
@@ -237,17 +243,17 @@ names = st.text(min_size=1, max_size=8).filter(str.strip)
 def test_random_numbers_come_back(tmp_path, values):
     draw = values.draw
     scene = ts.Scene(gravity=draw(st.tuples(numbers, numbers, numbers)))
-    scene.collision = ts.CollisionSettings(cell_ratio=draw(positive), margin=draw(st.none() | st.floats(0, 1e9)))
-    loss = draw(st.floats(0, 1e300))
+    scene.collision = ts.CollisionSettings(cell_ratio=draw(positive), margin=draw(st.none() | floats(0, 1e9)))
+    loss = draw(floats(0, 1e300))
     material = ts.Material(
-        young=draw(positive), poisson=draw(st.floats(-1, 0.49, exclude_min=True)), density=draw(positive), friction=loss,
-        restitution=draw(st.floats(0, 1)), mass_damping=loss, stiffness_damping=draw(st.floats(0, 1e300)),
+        young=draw(positive), poisson=draw(floats(-1, 0.49, exclude_min=True)), density=draw(positive), friction=loss,
+        restitution=draw(floats(0, 1)), mass_damping=loss, stiffness_damping=draw(floats(0, 1e300)),
     )  # fmt: skip
     name, other = draw(st.lists(names, min_size=2, max_size=2, unique=True))
     body = scene.add_body(TURNED, material, name=name, position=draw(vectors), velocity=draw(vectors))
     times = sorted(draw(st.lists(numbers.filter(lambda t: t > 0), min_size=1, max_size=4, unique=True)))
     keys = [draw(vectors) for _ in times]
-    small = st.tuples(*[st.floats(-1e6, 1e6)] * 3)
+    small = st.tuples(*[floats(-1e6, 1e6)] * 3)
     turns = draw(st.none() | st.lists(small, min_size=len(times), max_size=len(times)))
     frames = ts.KeyFrames(times, keys, turns, pivot=draw(st.none() | vectors), smooth=draw(st.booleans()))
     ids = draw(st.lists(st.integers(0, 11), min_size=1, unique=True))
@@ -272,7 +278,7 @@ def places(values, at=()):
 
 WAYS = [way for way in places(tomllib.loads(TEXT)) if way]
 # No number that makes a large but possible mesh.
-scalars = st.integers(-3, 3) | st.integers(2**40) | st.floats() | st.text(max_size=5) | st.booleans()
+scalars = st.integers(-3, 3) | st.integers(2**40) | floats() | st.text(max_size=5) | st.booleans()
 scalars |= st.sampled_from(["1e5 Pa", "beam", "box", "all", "none", "rubber", "../a.msh", "__import__('os')"])
 junk = scalars | st.lists(scalars, max_size=4) | st.lists(st.lists(scalars, max_size=3), max_size=3)
 junk |= st.dictionaries(st.sampled_from(["shape", "file", "min", "box", "young", "a"]), scalars, max_size=2)
@@ -589,7 +595,6 @@ def test_a_run_of_a_scene_file_is_that_of_the_scene(tmp_path, beam):
     for path in (hand, tmp_path / "written.toml"):
         (scene, solver), (wanted, wanted_solver) = load_scene(str(path)), load_scene(str(beam))
         assert data(scene) == data(wanted) and solver == wanted_solver
-    assert BEAM.count("half_space") == 0
     for path, out in ((beam, "python"), (hand, "toml")):
         assert run(path, "--out", tmp_path / out, "--set", "solver.dt=0.003", *SHORT_OUTPUT) == 0
     one, other = (tmp_path / out / "steps.csv" for out in ("python", "toml"))

@@ -5,6 +5,7 @@ other one as a Gmsh file beside the scene file. Paths must be KeyFrames: a funct
 """
 
 import dataclasses
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +81,10 @@ def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh])
 
 
 def _solver(solver: dict) -> dict:
-    plain = {key: value.item() if isinstance(value, np.generic) else value for key, value in solver.items()}
+    plain = {}
+    for key, value in solver.items():
+        value = value.item() if isinstance(value, np.generic) else value
+        plain[key] = float(value) if isinstance(value, Real) and not isinstance(value, int) else value
     for key in plain:
         if key not in CHECKS:
             raise SceneError(f"solver: no setting is called {key!r}{nearest(str(key), CHECKS)}; there are {', '.join(CHECKS)}")
@@ -125,7 +129,9 @@ def _frames(frames: KeyFrames) -> dict:
 
 def _obstacle(obstacle: Obstacle) -> dict:
     shape = obstacle.shape
-    kind = next(name for name, known in SHAPES.items() if known is type(shape))
+    kind = next((name for name, known in SHAPES.items() if known is type(shape)), None)
+    if kind is None:
+        raise SceneError(f"obstacle {obstacle.name!r}: no file can hold a {type(shape).__name__}")
     table = {"shape": kind} | {field.name: getattr(shape, field.name) for field in dataclasses.fields(shape)}
     table |= {"friction": obstacle.friction, "restitution": obstacle.restitution}
     if obstacle.path is None:
