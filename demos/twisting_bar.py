@@ -20,18 +20,6 @@ TORQUE = 27856.3707854  # [N m] at a quarter turn
 ENERGY = 21884.3788  # [J] at a quarter turn
 
 
-def angle(t: float) -> float:
-    """Twist of the right end [rad] at t [s], smooth in time."""
-    if t < HELD:
-        return FULL * _smooth(t / TWISTED)
-    return FULL + (QUARTER - FULL) * _smooth((t - HELD) / (BACK - HELD))
-
-
-def _smooth(s: float) -> float:
-    s = min(max(s, 0.0), 1.0)
-    return s * s * (3.0 - 2.0 * s)
-
-
 def build() -> ts.Scene:
     """The untwisted bar between a fixed and a turning end."""
     scene = ts.Scene(gravity=(0.0, 0.0, 0.0))
@@ -39,14 +27,9 @@ def build() -> ts.Scene:
     rubber = ts.Material(law="stable_neo_hookean", young=1e6, poisson=0.3, density=1000.0, mass_damping=10.0)
     bar = scene.add_body(mesh, rubber, name="bar")
     bar.fix(lambda X: X[:, 0] < -1.99)
-    end = np.flatnonzero(mesh.vertices[:, 0] > 1.99)
-    y, z = mesh.vertices[end, 1], mesh.vertices[end, 2]
-
-    def path(t: float) -> np.ndarray:
-        c, s = np.cos(angle(t)), np.sin(angle(t))
-        return np.column_stack([np.zeros(len(end)), c * y - s * z - y, s * y + c * z - z])
-
-    bar.move(end, path)
+    turns = [(angle, 0.0, 0.0) for angle in (0.0, FULL, FULL, QUARTER)]
+    twist = ts.KeyFrames((0.0, TWISTED, HELD, BACK), rotations=turns, pivot=(2.0, 0.0, 0.0), smooth=True)
+    bar.move(lambda X: X[:, 0] > 1.99, twist)
     return scene
 
 

@@ -85,8 +85,8 @@ def test_bad_setting(beam, tmp_path, capsys, arguments, told):
     "name, told",
     [
         ("not_there.py", "not_there.py: no such file"),
-        ("scene.toml", "are not supported"),
-        ("no_such_demo", "neither a demo nor a .py file"),
+        ("not_there.toml", "not_there.toml: no such file"),
+        ("no_such_demo", "neither a demo nor a .toml or .py file"),
     ],
 )
 def test_unknown_scene(capsys, name, told):

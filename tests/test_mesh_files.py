@@ -63,7 +63,7 @@ def test_written_meshes_come_back_bit_for_bit(tmp_path, ending):
 
 
 def test_writing_that_fails_leaves_nothing(tmp_path, monkeypatch):
-    with pytest.raises(OutputError, match="absent/part.msh: the mesh could not be written"):
+    with pytest.raises(OutputError, match="cannot write .*absent/part.msh: No such file"):
         write_mesh(tmp_path / "absent" / "part.msh", MESH)
 
     def full(*arguments, **options):

@@ -47,6 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
     _add_run(commands)
+    _add_scene(commands)
 
     listed = commands.add_parser("list", help="the demos, one line each")
     listed.set_defaults(command="listing")
@@ -78,11 +79,11 @@ def _add_run(commands) -> None:
     """The options of `taisoft run`; their defaults are None so that what was given can be told from what was not."""
     parser = commands.add_parser(
         "run",
-        help="run a scene: a demo's name or a .py file with build()",
+        help="run a scene: a demo's name, a .toml scene file or a .py file with build()",
         description="Run a scene and, with --out, keep report.json, steps.csv, checkpoint.npz, frames/ and scene.usdc.",
         allow_abbrev=False,
     )
-    parser.add_argument("scene", metavar="SCENE", help="a demo's name (see `taisoft list`) or a .py file with build()")
+    _add_scene_name(parser)
     parser.add_argument("--arch", choices=("cpu", "cuda"), help="where to compute (default cpu)")
     parser.add_argument("--precision", choices=("f32", "f64"), help="of the arithmetic (default f32)")
     parser.add_argument("--headless", action="store_true", help="open no window")
@@ -113,3 +114,21 @@ def _add_run(commands) -> None:
     parser.add_argument("--no-usd", action="store_true", help="write no scene.usdc")
     parser.add_argument("--no-frames", action="store_true", help="write no pictures")
     parser.set_defaults(command="run")
+
+
+def _add_scene(commands) -> None:
+    """The options of `taisoft scene`."""
+    parser = commands.add_parser("scene", help="write a scene as a .toml scene file", allow_abbrev=False)
+    _add_scene_name(parser)
+    parser.add_argument("--out", metavar="FILE", required=True, help="the .toml file; its meshes are written beside it")
+    parser.add_argument("--overwrite", action="store_true", help="replace files that are there")
+    parser.set_defaults(command="scene")
+
+
+def _add_scene_name(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "scene", metavar="SCENE", help="a demo's name (see `taisoft list`), a .toml scene file or a .py file with build()"
+    )
+    parser.add_argument(
+        "--allow-outside", action="store_true", help="let a .toml file name mesh files outside of its folder"
+    )

@@ -3,8 +3,9 @@
 from argparse import Namespace
 
 from taisoft.cli.listing import print_table
-from taisoft.cli.scene_file import load_shipped, nearest, shipped_files
+from taisoft.cli.scene_file import load_shipped, shipped_files
 from taisoft.errors import SceneError
+from taisoft.scene.checks import nearest
 
 
 def command(arguments: Namespace) -> int:

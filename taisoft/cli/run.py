@@ -30,7 +30,7 @@ def command(arguments: Namespace) -> int:
     """Runs the scene and returns the exit status. What can be refused is refused before a file is written."""
     _check_working_folder()
     with Signals() as signals, _told_warnings() as told:
-        scene, solver = load_scene(arguments.scene)
+        scene, solver = load_scene(arguments.scene, arguments.allow_outside)
         every = _checkpoint_interval(arguments)
         if arguments.video and (arguments.out is None or arguments.no_frames):
             raise SceneError("--video needs --out, the folder to write to, and the pictures that --no-frames leaves out")

@@ -1,11 +1,10 @@
-"""Finding and loading what `taisoft run` and `taisoft bench` name: demos, benchmarks and a user's own .py files.
+"""Finding and loading what `taisoft run` and `taisoft bench` name: demos, benchmarks and a user's own .toml and .py files.
 
-A checkout keeps demos/ and benchmarks/ beside the package; an installed wheel carries them inside it. A scene file is
-Python and is run as such: only run files you trust.
+A checkout keeps demos/ and benchmarks/ beside the package; an installed wheel carries them inside it. A .py file is run
+as Python: only run files you trust. A .toml file is data.
 """
 
 import ast
-import difflib
 import importlib
 import importlib.util
 import sys
@@ -14,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 
 from taisoft.errors import MeshError, SceneError
+from taisoft.scene.checks import nearest
 from taisoft.scene.scene import Scene
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -47,17 +47,9 @@ def first_line(path: Path) -> str:
     return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition("\n")[0]
 
 
-def nearest(name: str, known) -> str:
-    """ " (did you mean X?)" for the known name closest to `name`, or an empty string."""
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f" (did you mean {close[0]}?)" if close else ""
-
-
 def find_scene(name: str) -> Path:
-    """Path of the .py file that SCENE names. Raises SceneError if there is none."""
-    if name.endswith(".toml"):
-        raise SceneError(f"{name}: scene files (.toml) are not supported; write a .py file with build()")
-    if name.endswith(".py"):
+    """Path of the file that SCENE names: a .toml or .py file, or a demo. Raises SceneError if there is none."""
+    if name.endswith((".py", ".toml")):
         path = Path(name)
         if not path.is_file():
             raise SceneError(f"{name}: no such file")
@@ -65,17 +57,22 @@ def find_scene(name: str) -> Path:
     demos = shipped_files("demos")
     if name not in demos:
         raise SceneError(
-            f"{name!r} is neither a demo nor a .py file{nearest(name, demos)}; `taisoft list` names the demos"
+            f"{name!r} is neither a demo nor a .toml or .py file{nearest(name, demos)}; `taisoft list` names the demos"
         )
     return demos[name]
 
 
-def load_scene(name: str) -> tuple[Scene, dict]:
+def load_scene(name: str, allow_outside: bool = False) -> tuple[Scene, dict]:
     """The scene that SCENE names and its `solver` dict (empty if the file has none).
 
-    Raises SceneError, or MeshError for a mesh, naming the file and, where its code is at fault, the line.
+    allow_outside: let a .toml file name meshes outside of its folder. Raises SceneError, or MeshError for a mesh, naming
+    the file and, where its code is at fault, the line.
     """
     path = find_scene(name)
+    if path.suffix == ".toml":
+        from taisoft.scene.toml import read_scene  # brings meshio along, which `taisoft list` does without
+
+        return read_scene(path, allow_outside)
     module = load_module(path)
     build = getattr(module, "build", None)
     if not callable(build):

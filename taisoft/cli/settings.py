@@ -6,9 +6,9 @@ import tomllib
 from argparse import Namespace
 from dataclasses import dataclass, field
 
-from taisoft.cli.scene_file import nearest
 from taisoft.errors import SceneError
 from taisoft.scene import checks
+from taisoft.scene.checks import nearest
 
 RUN_KEYS = ("seconds", "fps")  # arguments of Simulator.run that a `solver` dict may hold too
 BARE_WORD = re.compile(r"[A-Za-z_]\w*")

@@ -7,15 +7,14 @@ becomes one MeshError.
 
 import contextlib
 import io
-import os
 import re
-import tempfile
 from pathlib import Path
 
 import meshio
 import numpy as np
 
-from taisoft.errors import MeshError, OutputError
+from taisoft.errors import MeshError
+from taisoft.files import replacing
 from taisoft.mesh.content import one_line, read_content
 from taisoft.mesh.gmsh import read_gmsh
 from taisoft.mesh.quality import edge_lengths
@@ -123,23 +122,9 @@ def write_mesh(path, mesh: TetMesh) -> None:
         raise MeshError(f"{file}: write_mesh needs a TetMesh, not {type(mesh).__name__}")
     record = meshio.Mesh(mesh.vertices, [("tetra", mesh.tets)])
     options = {"binary": False} if ending == ".msh" else {}
-    part = None
-    try:
-        handle, part = tempfile.mkstemp(suffix=f".part{ending}", prefix=f".{file.name}.", dir=file.parent)
-        os.close(handle)
+    with replacing(file) as part:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             meshio.write(part, record, file_format=WRITERS[ending], **options)
-        with open(part, "rb+") as written:
-            os.fsync(written.fileno())
-        os.chmod(part, 0o666 & ~_umask())  # mkstemp keeps the file to its owner
-        os.replace(part, file)
-        part = None
-    except OSError as error:
-        raise OutputError(f"{file}: the mesh could not be written: {error.strerror or error}") from error
-    finally:
-        if part is not None:
-            with contextlib.suppress(OSError):
-                os.remove(part)
 
 
 def check_ending(file: Path) -> str:
@@ -148,12 +133,6 @@ def check_ending(file: Path) -> str:
     if ending not in WRITERS:
         raise MeshError(f"{file}: a mesh can be written as {', '.join(WRITERS)}, not with the ending {ending!r}")
     return ending
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def _count_faces(ending: str, data: bytes) -> str:

@@ -34,12 +34,13 @@ def box_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five") -> TetM
     _check_count(cells, 5 if pattern == "five" else 6, "box_mesh")
     vertices = center + size * _grid_points(cells)
     corners = _cell_corners(cells)
+    recipe = {"shape": "box", "cells": cells, "size": size, "center": center, "pattern": pattern}
     if pattern == "six":
-        return TetMesh(vertices, corners[:, _kuhn()].reshape(-1, 4))
+        return _made(recipe, vertices, corners[:, _kuhn()])
     odd = _cell_indices(cells).sum(axis=1) % 2 == 1
     # Mirroring x exchanges the corners c and c ^ 4 and turns every tet inside out; swapping two vertices turns it back.
     table = np.stack([_FIVE_EVEN, (_FIVE_EVEN ^ 4)[:, [1, 0, 2, 3]]])[odd.astype(int)]
-    return TetMesh(vertices, np.take_along_axis(corners, table.reshape(len(corners), -1), axis=1).reshape(-1, 4))
+    return _made(recipe, vertices, np.take_along_axis(corners, table.reshape(len(corners), -1), axis=1))
 
 
 def sheet_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five") -> TetMesh:
@@ -77,8 +78,16 @@ def ball_mesh(radius: float, cells: int, center=(0.0, 0.0, 0.0)) -> TetMesh:
     table = _kuhn()[None] ^ mirror[:, None, None]
     flipped = inward.sum(axis=1) % 2 == 1
     table[flipped] = table[flipped][:, :, [0, 1, 3, 2]]
-    tets = np.take_along_axis(_cell_corners(grid), table.reshape(len(table), -1), axis=1).reshape(-1, 4)
-    return TetMesh(center + radius * _rounded(2.0 * _grid_points(grid)), tets)
+    tets = np.take_along_axis(_cell_corners(grid), table.reshape(len(table), -1), axis=1)
+    recipe = {"shape": "ball", "radius": radius, "cells": int(cells), "center": center}
+    return _made(recipe, center + radius * _rounded(2.0 * _grid_points(grid)), tets)
+
+
+def _made(recipe: dict, vertices: np.ndarray, tets: np.ndarray) -> TetMesh:
+    """The mesh of vertices (n,3) and tets, four indices each, which knows how it was made."""
+    mesh = TetMesh(vertices, tets.reshape(-1, 4))
+    mesh.recipe = recipe
+    return mesh
 
 
 def _rounded(p: np.ndarray) -> np.ndarray:

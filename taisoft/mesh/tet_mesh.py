@@ -31,7 +31,8 @@ class TetMesh:
     vertices: (n,3) float64 [m]. tets: (m,4) int64, every det(x1-x0, x2-x0, x3-x0) > 0. volumes: (m,) [m^3].
     surface: (t,3) int64, the faces that belong to one tet, normals outward; surface_tets: (t,) int64, the tet of each.
     flipped: int64 indices of the tets whose orientation was changed. n_components: pieces, joined by shared vertices.
-    warnings: list of str, what was told but not refused; each is also issued as a UserWarning.
+    warnings: list of str, what was told but not refused; each is also issued as a UserWarning. recipe: of a mesh from
+    `box_mesh` and its like the shape's name and arguments, which make the same arrays again, else None.
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class TetMesh:
         a file's name; messages start with it. notes: what a reader has to tell; it joins `warnings`. Raises MeshError.
         """
         self.source = source
+        self.recipe: dict | None = None
         self.warnings: list[str] = []
         self.vertices = self._checked_vertices(vertices)
         self.tets = self._checked_tets(tets)

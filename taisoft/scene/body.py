@@ -11,6 +11,7 @@ from taisoft.mesh.nodes import Nodes, make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.collision import HIT_BY, choose_hit_by
+from taisoft.scene.key_frames import KeyFrames
 from taisoft.scene.material import Material
 
 NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock: they bend far too little
@@ -137,17 +138,19 @@ class Body:
         nodes = checks.selection(where, self.rest_positions, what, "node")
         return self._hold(Constraint(nodes, checks.axes(axes, what)), _FIXED, what)
 
-    def move(self, where, path: Callable, axes: str = "xyz") -> Constraint:
+    def move(self, where, path: Callable | KeyFrames, axes: str = "xyz") -> Constraint:
         """Lead nodes along a path.
 
         where: as for `fix`, but no id twice. path: callable t [s] -> displacement from the start, (3,) or (k,3) in the
-        order of the chosen nodes [m], or None from the moment they are released; it is called once here, for t = 0.
-        axes: the directions led. Raises SceneError when no node is chosen, one is held already, or the path is not of
-        this kind.
+        order of the chosen nodes [m], or None from the moment they are released; it is called once here, for t = 0. Or
+        `KeyFrames`, whose pivot is a place where the body starts. axes: the directions led. Raises SceneError when no node is
+        chosen, one is held already, or the path is not of this kind.
         """
         what = f"body {self.name!r}: move"
         nodes = checks.selection(where, self.rest_positions, what, "node", repeats=False)
         mask = checks.axes(axes, what)
+        if isinstance(path, KeyFrames):
+            path = path.of_nodes(self.rest_positions[nodes] + self.position)
         if not callable(path):
             raise SceneError(f"{what}: path must be a function of time, not {path!r}")
         try:

@@ -66,6 +66,12 @@ def choice(value, what: str, allowed: tuple[str, ...]) -> str:
     raise SceneError(f"{what} must be one of {', '.join(allowed)}, not {value!r}{hint}")
 
 
+def nearest(name: str, known) -> str:
+    """ " (did you mean X?)" for the known name closest to `name`, or an empty string."""
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
 def flag(value, what: str) -> bool:
     """value, if it is True or False."""
     if not isinstance(value, bool):

@@ -15,8 +15,10 @@ from taisoft.errors import MeshError, SceneError
 from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
 from taisoft.mesh.shapes import box_mesh
 from taisoft.scene import checks
+from taisoft.scene.key_frames import KeyFrames
 
 DEGENERATE = 1e-9  # a triangle's least height below this times its longest edge counts as none
+UNIT = 8 * np.finfo(np.float64).eps  # a squared length this near to 1 is left as it is: a normal read back stays the same
 RIGID = 1e-6  # largest entry of R^T R - I that a path's rotation may have
 
 
@@ -212,6 +214,8 @@ def _unit(vector: np.ndarray, rule: str) -> np.ndarray:
     largest = float(np.abs(vector).max())
     if largest == 0.0 or not np.isfinite(largest):
         raise SceneError(rule)
+    if largest <= 1.0 and abs(vector @ vector - 1.0) <= UNIT:
+        return vector.copy()
     scaled = vector / largest
     return scaled / np.linalg.norm(scaled)
 
@@ -246,8 +250,8 @@ def surface_numbers(friction, restitution, what: str) -> tuple[float, float]:
 class Obstacle:
     """A shape in a scene; made by `Scene.add_obstacle`.
 
-    path: None, or callable t [s] -> (translation (3,) [m], rotation (3,3)); it is called once here, for t = 0. Raises
-    SceneError for another shape, numbers outside the rules, and a path that gives anything else.
+    path: None, `KeyFrames`, or callable t [s] -> (translation (3,) [m], rotation (3,3)); it is called once here, for t = 0.
+    Raises SceneError for another shape, numbers outside the rules, and a path that gives anything else.
     """
 
     shape: Shape
@@ -264,6 +268,8 @@ class Obstacle:
             )
         for field, value in zip(("friction", "restitution"), surface_numbers(self.friction, self.restitution, what)):
             object.__setattr__(self, field, value)
+        if isinstance(self.path, KeyFrames):
+            object.__setattr__(self, "path", self.path.of_shape(self.shape.pivot))
         if self.path is not None and not callable(self.path):
             raise SceneError(f"{what}: path must be a function of time, not {self.path!r}")
         self.pose(0.0)

@@ -133,8 +133,8 @@ class Scene:
         """Add an obstacle and return it.
 
         shape: HalfSpace, Sphere, Box, Capsule or MeshObstacle. name: unique, "obstacle0" and so on where left out. path:
-        callable t [s] -> (translation (3,) [m], rotation (3,3) about the shape's pivot); it is called once here, for t = 0.
-        Raises SceneError.
+        callable t [s] -> (translation (3,) [m], rotation (3,3) about the shape's pivot), which is called once here, for t = 0;
+        or `KeyFrames`. Raises SceneError.
         """
         obstacle = Obstacle(shape, self._free_name(name, "obstacle"), friction, restitution, path)
         self.obstacles.append(obstacle)

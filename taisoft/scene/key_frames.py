@@ -1,0 +1,129 @@
+"""Motion by key frames: plain numbers that say where something is when, in place of a function of time.
+
+Between two keys the translation is linear and the rotation turns evenly: about one common axis by the difference of the
+angles, so that full turns count; else by the shortest turn from one to the other. Outside the keys the ends are held.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from taisoft.errors import SceneError
+from taisoft.scene import checks
+
+MOST = 1e6  # [rad] of a rotation vector's entry; above, angles lose their digits
+PARALLEL = 1e-12  # sine of the angle between two axes below which they count as one
+
+
+@dataclass(frozen=True, eq=False)
+class KeyFrames:
+    """A path for `Body.move` and `Scene.add_obstacle`; called with t [s], it gives (translation (3,) [m], rotation (3,3)).
+
+    Points move as x -> rotation @ (x - pivot) + pivot + translation, x being where they start. Raises SceneError.
+    """
+
+    times: np.ndarray  # (k,) ascending [s]
+    translations: np.ndarray | None = None  # (k,3) [m]; None: none
+    rotations: np.ndarray | None = None  # (k,3) unit axis times angle [rad]; None: none
+    pivot: np.ndarray | None = None  # (3,) [m]; None: the mean of the led nodes, the pivot of the obstacle's shape
+    smooth: bool = False  # rest at every key: the share s of the way between two is s^2 (3 - 2 s)
+    release: bool = False  # led nodes go free at the last time
+
+    def __post_init__(self):
+        what = "key frames"
+        try:
+            k = max(len(self.times), 1)
+        except TypeError:
+            k = 1
+        times = checks.array(self.times, f"{what}: times", ((k,),))
+        if (np.diff(times) <= 0).any():
+            first = int(np.argmax(np.diff(times) <= 0))
+            raise SceneError(f"{what}: times must ascend, but {times[first + 1]:g} follows {times[first]:g}")
+        if self.translations is None and self.rotations is None:
+            raise SceneError(f"{what}: translations or rotations are needed")
+        clean = {"times": times, "translations": np.zeros((k, 3))}
+        for field, shape in (("translations", (k, 3)), ("rotations", (k, 3)), ("pivot", (3,))):
+            if getattr(self, field) is not None:
+                clean[field] = checks.array(getattr(self, field), f"{what}: {field}", (shape,))
+        for field in ("smooth", "release"):
+            checks.flag(getattr(self, field), f"{what}: {field}")
+        if "rotations" in clean:
+            if np.abs(clean["rotations"]).max() > MOST:
+                raise SceneError(f"{what}: rotations must be at most {MOST:g} rad about each axis")
+            clean["_turns"] = _turns(clean["rotations"])
+        for field, value in clean.items():
+            value.setflags(write=False)
+            # The only way to store a clean value in a frozen record.
+            object.__setattr__(self, field, value)
+
+    def __call__(self, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Translation (3,) [m] and rotation (3,3) at time t [s]."""
+        last = len(self.times) - 1
+        i = min(max(int(np.searchsorted(self.times, t, side="right")) - 1, 0), last)
+        share = 0.0
+        if i < last and t > self.times[i]:
+            share = (t - self.times[i]) / (self.times[i + 1] - self.times[i])
+            share = share * share * (3.0 - 2.0 * share) if self.smooth else share
+        translation = self.translations[i].copy()
+        if share > 0.0:
+            translation += share * (self.translations[i + 1] - self.translations[i])
+        if self.rotations is None:
+            return translation, np.eye(3)
+        rotation = Rotation.from_rotvec(self.rotations[i].copy())  # scipy wants to write
+        if share > 0.0:
+            rotation = rotation * Rotation.from_rotvec(share * self._turns[i])
+        return translation, rotation.as_matrix()
+
+    def of_nodes(self, starts: np.ndarray) -> "NodePath":
+        """The path of nodes that start at `starts` (k,3) [m]."""
+        return NodePath(self, starts)
+
+    def of_shape(self, center: np.ndarray) -> "ShapePath":
+        """The path of an obstacle whose shape turns about center (3,) [m]. Raises SceneError for frames that release."""
+        if self.release:
+            raise SceneError("key frames: release is for nodes; an obstacle cannot be let go")
+        return ShapePath(self, center)
+
+
+@dataclass(frozen=True, eq=False)
+class NodePath:
+    """Key frames as `Body.move` follows them: t [s] -> displacement (3,) or (k,3) [m], or None once the nodes are free."""
+
+    frames: KeyFrames
+    starts: np.ndarray  # (k,3) [m]
+
+    def __call__(self, t: float) -> np.ndarray | None:
+        if self.frames.release and t >= self.frames.times[-1]:
+            return None
+        translation, rotation = self.frames(t)
+        if self.frames.rotations is None:
+            return translation
+        arms = self.starts - (self.starts.mean(axis=0) if self.frames.pivot is None else self.frames.pivot)
+        return arms @ rotation.T - arms + translation
+
+
+@dataclass(frozen=True, eq=False)
+class ShapePath:
+    """Key frames as an obstacle follows them: t [s] -> (translation (3,) [m], rotation (3,3) about its shape's pivot)."""
+
+    frames: KeyFrames
+    center: np.ndarray  # (3,) [m], the shape's pivot
+
+    def __call__(self, t: float) -> tuple[np.ndarray, np.ndarray]:
+        translation, rotation = self.frames(t)
+        if self.frames.pivot is not None:
+            arm = self.center - self.frames.pivot
+            translation += rotation @ arm - arm
+        return translation, rotation
+
+
+def _turns(rotations: np.ndarray) -> np.ndarray:
+    """(k-1,3) rotation vectors from each rotation to the next, in the frame of the first. rotations: (k,3)."""
+    a, b = rotations[:-1], rotations[1:]
+    if not len(a):
+        return a.copy()
+    shortest = (Rotation.from_rotvec(a).inv() * Rotation.from_rotvec(b)).as_rotvec()
+    lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    one_axis = np.linalg.norm(np.cross(a, b), axis=1) <= PARALLEL * lengths  # no rotation has every axis
+    return np.where(one_axis[:, None], b - a, shortest)

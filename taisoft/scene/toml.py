@@ -1,0 +1,249 @@
+"""Scene files: TOML in, a Scene and its `solver` dict out. Data only: nothing in a file is ever run.
+
+    gravity, allow_initial_overlap, contact_forces
+    [collision]               CollisionSettings
+    [solver]                  arguments of Simulator, seconds, fps; "none" for Python's None
+    [materials.NAME]          Material
+    [bodies.NAME]             material (a name, or a table), mesh (below), and the arguments of Scene.add_body
+    [[bodies.NAME.fix]]       nodes, axes                   [[bodies.NAME.move]]   nodes, path (KeyFrames), axes
+    [[bodies.NAME.traction]]  triangles, traction [Pa]      [[bodies.NAME.force]]  nodes, force [N]
+    [obstacles.NAME]          shape and its arguments, friction, restitution, path (KeyFrames)
+    [[contacts]]              between = ["a", "b"], friction, restitution
+
+A mesh is a shape with the arguments of its function, or a file, fix_orientation, weld. nodes and triangles are "all", a
+list of ids, or one of the tables box = { min, max } and half_space = { point, normal }, boundary included, of rest
+positions and centroids. Names of keys and defaults are those of the Python functions.
+"""
+
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+
+from taisoft.errors import SceneError
+from taisoft.mesh.files import WRITERS, read_mesh
+from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
+from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.scene import checks
+from taisoft.scene.body import Body
+from taisoft.scene.collision import CollisionSettings
+from taisoft.scene.key_frames import KeyFrames
+from taisoft.scene.material import Material
+from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Sphere
+from taisoft.scene.scene import Scene
+from taisoft.scene.solver import CHECKS, check_solver
+from taisoft.scene.tables import Table, arguments_of, check_values, shown
+
+MESHES = {"box": box_mesh, "sheet": sheet_mesh, "ball": ball_mesh}
+SHAPES = {"half_space": HalfSpace, "sphere": Sphere, "box": Box, "capsule": Capsule, "mesh": MeshObstacle}
+CALLS = {"fix": Body.fix, "move": Body.move, "traction": Body.add_traction, "force": Body.add_force}
+ITEMS = {"traction": "triangles"}  # what a load chooses, where it is not nodes
+OWN = ("gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene
+TOP = [*OWN, "collision", "solver", "materials", "bodies", "obstacles", "contacts"]
+ALONE = (*WRITERS, ".node", ".ele")  # formats whose files name no further files
+NONE = "none"
+
+
+def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
+    """The scene in a TOML file, and its `solver` dict: arguments of Simulator, seconds and fps, as far as given.
+
+    path: the file. allow_outside: let mesh files lie outside of its folder, and be of any format that meshio reads. Raises
+    SceneError or MeshError with the file, the place in it, and the rule.
+    """
+    try:
+        file = Path(path)
+    except TypeError as error:
+        raise SceneError(f"read_scene: path must be a file's name, not {path!r}") from error
+    tables = Table(file, "", _parsed(file), TOP, ["bodies"])
+    scene = Scene()
+    for key in OWN:
+        if key in tables:
+            value = tables.checked(key)
+            with tables.placed("scene: "):
+                setattr(scene, key, value)
+    if "collision" in tables:
+        table = tables.table("collision", *arguments_of(CollisionSettings))
+        scene.collision = table.make(CollisionSettings, "collision settings: ")
+    solver = {}
+    if "solver" in tables:
+        solver = tables.table("solver", list(CHECKS)).make(_solver)
+    materials = {name: _material(table) for name, table in _each(tables, "materials", *arguments_of(Material))}
+    if not tables.named("bodies"):
+        raise tables.error("bodies", "must hold a table [bodies.NAME]")
+    known, _ = arguments_of(Scene.add_body, "name")
+    meshes: dict[str, TetMesh] = {}  # bodies whose mesh is said alike share it
+    for name, table in _each(tables, "bodies", [*known, *CALLS], ["material", "mesh"]):
+        said = str(table.values["mesh"])
+        meshes[said] = meshes.get(said) or _mesh(table, allow_outside)
+        _add_body(scene, name, table, materials, meshes[said])
+    obstacles = tables.named("obstacles")
+    for name in obstacles:
+        _add_obstacle(scene, name, tables.table("obstacles", obstacles))
+    _set_contacts(scene, tables)
+    return scene, solver
+
+
+def _solver(**values) -> dict:
+    return check_solver(**{key: None if value == NONE else value for key, value in values.items()})
+
+
+def _parsed(file: Path) -> dict:
+    """The file's tables. Raises SceneError for what cannot be read or is no TOML, with the line."""
+    try:
+        text = file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
+    except (OSError, ValueError) as error:
+        if isinstance(error, UnicodeDecodeError):
+            raise SceneError(f"{file}: byte {error.start} is not UTF-8 text") from None
+        raise SceneError(f"{file}: the file cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    try:
+        tables = tomllib.loads(text)
+        check_values(file, tables)
+    except (ValueError, RecursionError) as error:
+        said = "the file is nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())
+        at = re.search(r" \(at line (\d+), column \d+\)$", said)
+        raise SceneError(f"{file}, line {at[1]}: {said[: at.start()]}" if at else f"{file}: {said}") from None
+    return tables
+
+
+def _each(tables: Table, key: str, known: list[str], needed: list[str]) -> list[tuple[str, Table]]:
+    """(name, table) of all tables under a key."""
+    names = tables.named(key)
+    return [(name, tables.table(key, names).table(name, known, needed)) for name in names]
+
+
+def _material(table: Table) -> Material:
+    return table.make(Material, "material: ")
+
+
+def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Material], mesh: TetMesh) -> None:
+    material = table.values["material"]
+    if isinstance(material, str):
+        if material not in materials:
+            raise table.error("material", f"{shown(material)} is not among the materials{checks.nearest(material, materials)}")
+        material = materials[material]
+    else:
+        material = _material(table.table("material", *arguments_of(Material)))
+    keys, _ = arguments_of(Scene.add_body, "name", "mesh", "material")
+    body = table.make(scene.add_body, f"body {name!r}: ", "scene: ", keys=keys, mesh=mesh, material=material, name=name)
+    for key in CALLS:
+        _call(body, table, key)
+
+
+def _call(body: Body, table: Table, key: str) -> None:
+    """Call the body's method of a key with each of the tables there; its `where` has the name of what it chooses."""
+    method, items = CALLS[key], ITEMS.get(key, "nodes")
+    known, needed = ([items if k == "where" else k for k in keys] for keys in arguments_of(method))
+    points = body.mesh.vertices[body.mesh.surface].mean(axis=1) if items == "triangles" else body.rest_positions
+    for one in table.listed(key, known, needed):
+        more = {"where": _chosen(one, items, points)}
+        if "path" in known:
+            more["path"] = _key_frames(one)
+        others = [k for k in known if k not in (items, "path")]
+        one.make(getattr(body, method.__name__), f"body {body.name!r}: {method.__name__}: ", keys=others, **more)
+
+
+def _mesh(table: Table, allow_outside: bool) -> TetMesh:
+    """The mesh of a body's table: a shape's, or a file's."""
+    files = ["file", *arguments_of(read_mesh, "path")[0]]
+    shapes = {key: arguments_of(function) for key, function in MESHES.items()}
+    mesh = table.table("mesh", list(dict.fromkeys(["shape", *files, *(key for known, _ in shapes.values() for key in known)])))
+    if ("shape" in mesh) == ("file" in mesh):
+        raise mesh.error("", "must have either a shape or a file")
+    if "file" in mesh:
+        mesh = table.table("mesh", files)
+        path = _inside(mesh, allow_outside)
+        if "fix_orientation" in mesh:
+            with mesh.placed():
+                checks.flag(mesh.values["fix_orientation"], "fix_orientation")
+        return mesh.make(read_mesh, keys=files[1:], path=path)
+    shape = _kind(mesh, MESHES)
+    known, needed = shapes[shape]
+    mesh = table.table("mesh", ["shape", *known], needed)
+    return mesh.make(MESHES[shape], "box_mesh: ", f"{shape}_mesh: ", keys=known)
+
+
+def _inside(mesh: Table, allow_outside: bool) -> Path:
+    """The mesh file's path; without allow_outside one in the scene file's folder, and so wherever links lead."""
+    name = mesh.values["file"]
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise mesh.error("file", f"must be a file's name, not {shown(name)}")
+    folder = mesh.file.parent
+    path = folder / name
+    if allow_outside:
+        return path
+    remedy = "--allow-outside (allow_outside=True) lifts this"
+    if path.suffix.lower() not in ALONE:
+        raise mesh.error("file", f"must be one of {', '.join(ALONE)}, since other formats can name further files; {remedy}")
+    pair = [path.with_suffix(ending) for ending in (".node", ".ele")] if path.suffix.lower() in (".node", ".ele") else [path]
+    try:
+        kept = all(one.resolve().is_relative_to(folder.resolve()) for one in pair)
+    except (OSError, RuntimeError) as error:  # such as links in a circle
+        raise mesh.error("file", f"cannot be followed: {getattr(error, 'strerror', None) or error}") from None
+    if Path(name).is_absolute() or ".." in Path(name).parts or not kept:
+        raise mesh.error("file", f"must lie inside the scene file's folder, without '..' or a link out of it; {remedy}")
+    return path
+
+
+def _kind(table: Table, kinds: dict) -> str:
+    """The value of `shape`, one of the kinds."""
+    if "shape" not in table:
+        raise table.error("shape", "is missing")
+    with table.placed():
+        return checks.choice(table.values["shape"], "shape", tuple(kinds))
+
+
+def _chosen(table: Table, key: str, points: np.ndarray):
+    """Ids or a bool mask (n,) of what a selector chooses among points (n,3)."""
+    value = table.values[key]
+    if value == "all":
+        return np.ones(len(points), dtype=bool)
+    if isinstance(value, list):
+        if not all(isinstance(entry, int) and not isinstance(entry, bool) for entry in value):
+            raise table.error(key, "must be a list of whole numbers, the ids")
+        return value
+    if not isinstance(value, dict) or len(value) != 1:
+        raise table.error(key, f'must be "all", a list of ids, or a table with one of box, half_space, not {shown(value)}')
+    choice = table.table(key, ["box", "half_space"])
+    if "box" in choice:
+        box = choice.table("box", ["min", "max"], ["min", "max"])
+        corners = {end: box.checked(end) for end in ("min", "max")}
+        with box.placed():
+            low, high = (checks.array(value, end, ((3,),)) for end, value in corners.items())
+        if not (low <= high).all():
+            raise box.error("min", "must not exceed max")
+        return ((points >= low) & (points <= high)).all(axis=1)
+    half = choice.table("half_space", *arguments_of(HalfSpace)).make(HalfSpace, "half-space: ")
+    return (points - half.point) @ half.normal <= 0.0
+
+
+def _key_frames(table: Table) -> KeyFrames:
+    return table.table("path", *arguments_of(KeyFrames)).make(KeyFrames, "key frames: ")
+
+
+def _add_obstacle(scene: Scene, name: str, obstacles: Table) -> None:
+    others = arguments_of(Scene.add_obstacle)[0]
+    known = dict.fromkeys([*others, *(key for shape in SHAPES.values() for key in arguments_of(shape)[0])])
+    known.pop("name")
+    kind = _kind(obstacles.table(name, list(known)), SHAPES)
+    keys, needed = arguments_of(SHAPES[kind])
+    table = obstacles.table(name, [key for key in known if key in keys or key in others], needed)
+    shape = table.make(SHAPES[kind], f"{SHAPES[kind].word}: ", keys=keys)
+    more = {"path": _key_frames(table)} if "path" in table else {}
+    table.make(
+        scene.add_obstacle, f"obstacle {name!r}: ", "scene: ", "key frames: ", keys=["friction", "restitution"],
+        shape=shape, name=name, **more,
+    )  # fmt: skip
+
+
+def _set_contacts(scene: Scene, tables: Table) -> None:
+    """The numbers of pairs, each pair once."""
+    numbers = ["friction", "restitution"]
+    for table in tables.listed("contacts", ["between", *numbers], ["between"]):
+        pair = table.values["between"]
+        if not isinstance(pair, list) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
+            raise table.error("between", "must be a list of two names")
+        if frozenset(pair) in scene.contact_pairs:
+            raise table.error("between", f"names {shown(pair[0])} and {shown(pair[1])}, which an earlier one did")
+        said = f"scene: contact of {pair[0]!r} and {pair[1]!r}: "
+        table.make(scene.set_contact, said, "scene: ", keys=numbers, name_a=pair[0], name_b=pair[1])

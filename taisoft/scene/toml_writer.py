@@ -1,0 +1,185 @@
+"""A Scene and its `solver` dict into a scene file, from which `read_scene` makes the same run: every number comes back bitwise.
+
+What functions of Python chose is written as ids. A mesh that `box_mesh` and its like made is written as their arguments, any
+other one as a Gmsh file beside the scene file. Paths must be KeyFrames: a function of time is no data.
+"""
+
+import dataclasses
+from numbers import Real
+from pathlib import Path
+
+import numpy as np
+
+from taisoft.errors import OutputError, SceneError
+from taisoft.files import write_bytes
+from taisoft.mesh.files import write_mesh
+from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.scene.body import Body
+from taisoft.scene.checks import nearest
+from taisoft.scene.key_frames import KeyFrames, NodePath, ShapePath
+from taisoft.scene.obstacles import Obstacle
+from taisoft.scene.scene import Scene
+from taisoft.scene.solver import CHECKS, check_solver
+from taisoft.scene.tables import bare_or_quoted, joined, quoted
+from taisoft.scene.toml import NONE, OWN, SHAPES
+
+WIDTH = 100  # of the numbers in a line
+
+
+def write_scene(path, scene: Scene, solver: dict | None = None, overwrite: bool = False) -> list[Path]:
+    """Write a scene as TOML, with its meshes beside it as NAME_mesh0.msh and so on; returns the files, the TOML first.
+
+    path: a name that ends in .toml. solver: arguments of Simulator, seconds and fps. overwrite: replace files that are
+    there. Raises SceneError for what cannot be said in a file, before any file is written, and OutputError. Every file
+    appears complete or not at all, the TOML last.
+    """
+    file = Path(path)
+    if file.suffix != ".toml":
+        raise SceneError(f"{file}: a scene file's name ends in .toml")
+    if not isinstance(scene, Scene):
+        raise SceneError(f"{file}: write_scene needs a Scene, not {type(scene).__name__}")
+    if not scene.bodies:
+        raise SceneError(f"{file}: the scene holds no body")
+    meshes: dict[str, TetMesh] = {}
+    text = toml_of(_document(scene, solver or {}, file.stem, meshes))
+    try:
+        data = text.encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise SceneError(f"{file}: {text[error.start]!r} in a name is not a character of Unicode") from None
+    files = [file, *(file.with_name(name) for name in meshes)]
+    for one in files:
+        if one.exists() and not overwrite:
+            raise OutputError(f"{one}: the file exists; overwriting must be asked for")
+    for name, mesh in meshes.items():
+        write_mesh(file.with_name(name), mesh)
+    write_bytes(file, data)
+    return files
+
+
+def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh]) -> dict:
+    """The file's tables. Meshes that need a file are added to `meshes`, file's name -> mesh."""
+    materials = {}
+    for body in scene.bodies:
+        materials.setdefault(body.material, f"material{len(materials)}")
+    collision = dataclasses.asdict(scene.collision)
+    order = [one.name for one in scene.colliders]
+    pairs = sorted(sorted(order.index(name) for name in pair) for pair in scene.contact_pairs)
+    contacts = []
+    for pair in pairs:
+        names = [order[pair[0]], order[pair[-1]]]
+        numbers = zip(("friction", "restitution"), scene.contact_pairs[frozenset(names)])
+        contacts.append({"between": names} | {key: value for key, value in numbers if value is not None})
+    return {
+        **{key: getattr(scene, key) for key in OWN},
+        "collision": {key: value for key, value in collision.items() if value is not None},
+        "solver": _solver(solver),
+        "materials": {name: dataclasses.asdict(material) for material, name in materials.items()},
+        "bodies": {body.name: _body(body, materials[body.material], stem, meshes) for body in scene.bodies},
+        "obstacles": {obstacle.name: _obstacle(obstacle) for obstacle in scene.obstacles},
+        "contacts": contacts,
+    }
+
+
+def _solver(solver: dict) -> dict:
+    plain = {}
+    for key, value in solver.items():
+        value = value.item() if isinstance(value, np.generic) else value
+        plain[key] = float(value) if isinstance(value, Real) and not isinstance(value, int) else value
+    for key in plain:
+        if key not in CHECKS:
+            raise SceneError(f"solver: no setting is called {key!r}{nearest(str(key), CHECKS)}; there are {', '.join(CHECKS)}")
+    try:
+        check_solver(**plain)
+    except SceneError as error:
+        raise SceneError(f"solver: {error}") from None
+    return {key: NONE if value is None else value for key, value in plain.items()}
+
+
+def _body(body: Body, material: str, stem: str, meshes: dict[str, TetMesh]) -> dict:
+    name = next((name for name, mesh in meshes.items() if mesh is body.mesh), None)
+    if body.mesh.recipe is None and name is None:
+        name = f"{stem}_mesh{len(meshes)}.msh"
+        meshes[name] = body.mesh
+    table = {"material": material, "mesh": {"file": name} if name else body.mesh.recipe}
+    table |= {key: getattr(body, key) for key in ("position", "velocity", "order", "quadrature_degree", "collision")}
+    table |= {key: [] for key in ("fix", "move", "traction", "force")}
+    for c in body.constraints:
+        held = {"nodes": _ids(c.nodes, body.n_nodes), "axes": "".join(np.array(list("xyz"))[c.axes])}
+        if c.path is None:
+            table["fix"].append(held)
+        elif isinstance(c.path, NodePath):
+            table["move"].append(held | {"path": _frames(c.path.frames)})
+        else:
+            raise SceneError(f"body {body.name!r}: moves along a function, which no file can hold: use ts.KeyFrames")
+    for load in body.tractions:
+        table["traction"].append({"triangles": _ids(load.triangles, len(body.mesh.surface)), "traction": load.value})
+    for load in body.forces:
+        table["force"].append({"nodes": _ids(load.nodes, body.n_nodes), "force": load.value})
+    return table
+
+
+def _ids(ids: np.ndarray, n: int):
+    return "all" if np.array_equal(ids, np.arange(n)) else ids
+
+
+def _frames(frames: KeyFrames) -> dict:
+    values = {field.name: getattr(frames, field.name) for field in dataclasses.fields(frames)}
+    return {key: value for key, value in values.items() if value is not None}
+
+
+def _obstacle(obstacle: Obstacle) -> dict:
+    shape = obstacle.shape
+    kind = next((name for name, known in SHAPES.items() if known is type(shape)), None)
+    if kind is None:
+        raise SceneError(f"obstacle {obstacle.name!r}: no file can hold a {type(shape).__name__}")
+    table = {"shape": kind} | {field.name: getattr(shape, field.name) for field in dataclasses.fields(shape)}
+    table |= {"friction": obstacle.friction, "restitution": obstacle.restitution}
+    if obstacle.path is None:
+        return table
+    if not isinstance(obstacle.path, ShapePath):
+        raise SceneError(f"obstacle {obstacle.name!r}: moves along a function, which no file can hold: use ts.KeyFrames")
+    return table | {"path": _frames(obstacle.path.frames)}
+
+
+def toml_of(tables: dict) -> str:
+    """Nested dicts as TOML: numbers, true and false, texts, lists, arrays, dicts, and lists of dicts."""
+    return "\n".join(_lines(tables, "")).lstrip("\n") + "\n"
+
+
+def _lines(table: dict, place: str) -> list[str]:
+    below = {key: value for key, value in table.items() if isinstance(value, dict) or _is_tables(value)}
+    lines = [f"{bare_or_quoted(key)} = {_value(value)}" for key, value in table.items() if key not in below and not _none(value)]
+    for key, value in below.items():
+        at = joined(place, key)
+        for one in value if isinstance(value, list) else [value]:
+            head = f"[[{at}]]" if isinstance(value, list) else f"[{at}]"
+            within = _lines(one, at)
+            # a table of tables alone needs no head of its own
+            lines += within if not isinstance(value, list) and within[:1] == [""] else ["", head, *within] if within else []
+    return lines
+
+
+def _is_tables(value) -> bool:
+    return isinstance(value, list) and bool(value) and isinstance(value[0], dict)
+
+
+def _none(value) -> bool:
+    return isinstance(value, list) and not value
+
+
+def _value(value) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return quoted(value)
+    if isinstance(value, (int, float)):
+        return repr(value)
+    entries = value.tolist() if isinstance(value, np.ndarray) else value
+    if entries and isinstance(entries[0], list):
+        return "".join(["[", *(f"\n  {_value(row)}," for row in entries), "\n]"])
+    lines = [""]
+    for text in map(_value, entries):
+        if lines[-1] and len(lines[-1]) + len(text) > WIDTH:
+            lines.append("")
+        lines[-1] += f"{text}, "
+    return f"[{lines[0][:-2]}]" if len(lines) == 1 else "".join(["[", *(f"\n  {line[:-1]}" for line in lines), "\n]"])
