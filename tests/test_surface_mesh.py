@@ -5,7 +5,7 @@
 * holes, inner walls, turned triangles and a surface inside out are found and counted;
 * the tets of a ball enclose its volume, are all upright, keep to the edge length, wherever it lies and however large it is;
 * the mesher's failure, and its absence, are told;
-* `taisoft info` and `taisoft tetrahedralize` on the way from a surface to a mesh that can be simulated.
+* `taisoft info`, `taisoft tetrahedralize` and `taisoft scene` on the way from a surface to a scene that can be run.
 """
 
 import subprocess
@@ -176,6 +176,12 @@ def test_from_a_surface_to_a_mesh(tmp_path, capsys):
     assert main(["tetrahedralize", str(surface), "--out", str(out), "--edge-length", "0.25"]) == 0
     assert "surface triangles" in capsys.readouterr().out
     assert ts.read_mesh(out).volumes.sum() == pytest.approx(VOLUME, rel=0.05)
+    assert main(["scene", str(out), "--out", str(tmp_path / "ball.toml")]) == 0
+    scene, solver = ts.read_scene(tmp_path / "ball.toml")
+    body, height = scene.body("ball"), np.ptp(scene.body("ball").rest_positions[:, 1])
+    assert (body.rest_positions + body.position)[:, 1].min() == pytest.approx(0.25 * height) and scene.obstacle("ground")
+    assert 0.5 < body.material.young / (100 * 1000 * 9.81 * height) < 2 and solver == {"dt": 0.01, "seconds": 2.0, "fps": 50.0}
+    capsys.readouterr()
     assert main(["tetrahedralize", str(surface), "--out", str(out)]) == 3
     assert "--overwrite replaces it" in capsys.readouterr().err
     for path, code in ((tmp_path / "ball.txt", 2), (tmp_path / "none" / "ball.msh", 3)):

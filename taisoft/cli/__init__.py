@@ -118,17 +118,16 @@ def _add_run(commands) -> None:
 
 def _add_scene(commands) -> None:
     """The options of `taisoft scene`."""
-    parser = commands.add_parser("scene", help="write a scene as a .toml scene file", allow_abbrev=False)
-    _add_scene_name(parser)
+    told = "write a scene, or one to start from for a mesh, as a .toml file"
+    parser = commands.add_parser("scene", help=told, allow_abbrev=False)
+    _add_scene_name(parser, "a .toml or .py file, or a mesh file: it falls on the ground")
     parser.add_argument("--out", metavar="FILE", required=True, help="the .toml file; its meshes are written beside it")
     parser.add_argument("--overwrite", action="store_true", help="replace files that are there")
     parser.set_defaults(command="scene")
 
 
-def _add_scene_name(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "scene", metavar="SCENE", help="a demo's name (see `taisoft list`), a .toml scene file or a .py file with build()"
-    )
+def _add_scene_name(parser: argparse.ArgumentParser, others: str = "a .toml scene file or a .py file with build()") -> None:
+    parser.add_argument("scene", metavar="SCENE", help=f"a demo's name (see `taisoft list`), {others}")
     parser.add_argument(
         "--allow-outside", action="store_true", help="let a .toml file name mesh files outside of its folder"
     )
