@@ -9,7 +9,9 @@ import weakref
 
 import numpy as np
 import taichi as ti
+from taichi.lang import impl
 
+from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
 
 MOST = 2**26  # entries in one launch, which are held once more as f64: half a GB
@@ -23,10 +25,14 @@ class _Tree:
 
     def __init__(self, fields: list):
         self._first = weakref.ref(fields[0])
+        self._program = impl.get_runtime().prog
         self._start: int | None = None
 
     @property
     def start(self) -> int:
+        """Its address. Raises SimulationError where it is no more."""
+        if impl.get_runtime().prog is not self._program:
+            raise SimulationError("Taichi was initialised anew in this process, which frees all memory of open simulators")
         if self._start is None:
             first = self._first()
             self._start = _address(first, (0,) * len(first.shape)) - _offset(first)
@@ -38,10 +44,11 @@ class _Place:
         self._tree, self._view = tree, None
 
     def view(self, field) -> np.ndarray:
+        start = self._tree.start
         if self._view is None:
             shape, kind = _array_shape(field), np.dtype(DTYPES[field.dtype])
             size = int(np.prod(shape, dtype=np.int64)) * kind.itemsize
-            whole = (ctypes.c_char * size).from_address(self._tree.start + _offset(field))
+            whole = (ctypes.c_char * size).from_address(start + _offset(field))
             self._view = np.frombuffer(whole, dtype=kind).reshape(shape)
         return self._view
 

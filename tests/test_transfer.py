@@ -8,8 +8,10 @@
 import numpy as np
 import pytest
 import taichi as ti
+from lanes import opened
 
 from taisoft import transfer
+from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
 from taisoft.runtime import open_runtime
 from taisoft.transfer import DTYPES, array_of, download, upload
@@ -33,6 +35,16 @@ def test_memory_is_found_from_any_field(first):
     arena.release()
     assert not [field for field in (one, x) if field in transfer._places]
     runtime.close()
+
+
+def test_memory_of_another_taichi_is_not_touched():
+    with opened("f64"):
+        arena = FieldArena()
+        x = arena.field("x", ti.f64, 3, np.arange(3.0))
+        ti.init(ti.cpu, log_level=ti.ERROR)  # by a user, say
+        for call in (lambda: array_of(x), lambda: upload([(x, np.zeros(3))])):
+            with pytest.raises(SimulationError, match="Taichi was initialised anew in this process"):
+                call()
 
 
 @pytest.fixture(scope="module", params=[("f32", "memory"), ("f64", "memory"), ("f64", "kernel")], ids="-".join)
