@@ -11,6 +11,7 @@ bitwise as if it had not been interrupted.
 import dataclasses
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,29 +20,34 @@ from taisoft import __version__
 from taisoft.errors import SceneError, SimulationError
 from taisoft.files import replacing
 from taisoft.scene.body import Body
+from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.scene import Material, Scene
 
 KIND, FORMAT = "taisoft checkpoint", 1  # FORMAT grows with every change of what a file holds
+PARTS = ("settings", "numbers", "marks", "state", "notes")  # of the header, each a table
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
     """A file's content. settings: arguments of Simulator; numbers: of the scene, that may change while it runs; marks: digests
-    of the scene's parts by name; state: nested dict of numbers and arrays."""
+    of the scene's parts by name; state: nested dict of numbers and arrays; notes: plain data of whoever wrote it."""
 
     path: Path
     settings: dict
     numbers: dict
     marks: dict[str, str]
     state: dict
+    notes: dict
 
 
-def write_checkpoint(path: str | Path, settings: dict, scene: Scene, features: dict[str, bool], state: dict) -> None:
-    """Write the state of a simulation of a scene. features: of its plan. Raises OutputError."""
+def write_checkpoint(
+    path: str | Path, settings: dict, scene: Scene, features: dict[str, bool], state: dict, notes: dict
+) -> None:
+    """Write the state of a simulation of a scene. features: of its plan; notes: see Checkpoint. Raises OutputError."""
     plain, arrays = _flat(state)
     header = {
         "kind": KIND, "format": FORMAT, "taisoft": __version__, "settings": settings, "numbers": _numbers(scene),
-        "marks": scene_marks(scene, features), "state": plain,
+        "marks": scene_marks(scene, features), "state": plain, "notes": notes,
     }  # fmt: skip
     text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     with replacing(path) as part, open(part, "wb") as file:
@@ -58,21 +64,20 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         for folder in folders:
             place = place.setdefault(folder, {})
         place[last] = value
-    return Checkpoint(Path(path), header["settings"], header["numbers"], header["marks"], state)
+    return Checkpoint(Path(path), header["settings"], header["numbers"], header["marks"], state, header["notes"])
 
 
 def check_scene(saved: Checkpoint, scene: Scene, features: dict[str, bool]) -> None:
     """Raises SceneError unless the scene is the one that was saved, but for what a checkpoint holds itself and for paths."""
     marks = scene_marks(scene, features)
-    for kind in ("body", "obstacle"):
-        here, there = ([name for name in m if name.startswith(f"{kind} ") and ":" not in name] for m in (marks, saved.marks))
-        if here != there:
+    for kinds in ("bodies", "obstacles"):
+        if marks[kinds] != saved.marks.get(kinds):
             raise SceneError(
-                f"{saved.path} is a checkpoint of another scene: it has {', '.join(there) or f'no {kind}'}, "
-                f"this scene {', '.join(here) or f'no {kind}'}"
+                f"{saved.path} is a checkpoint of another scene: its {kinds} are {saved.marks.get(kinds)}, those of this scene "
+                f"{marks[kinds]}"
             )
-    for name in marks:
-        if marks[name] != saved.marks.get(name):
+    for name in marks | saved.marks:
+        if marks.get(name) != saved.marks.get(name):
             raise SceneError(f"{saved.path} is a checkpoint of another scene, which differs in {name}")
 
 
@@ -87,18 +92,18 @@ def take_numbers(saved: Checkpoint, scene: Scene) -> None:
 
 def scene_marks(scene: Scene, features: dict[str, bool]) -> dict[str, str]:
     """A digest of each part of a scene that must be the same where a run goes on, by what to call it."""
-    marks = {}
+    marks = {  # in the order added, which numbers nodes
+        "bodies": json.dumps([body.name for body in scene.bodies]), "obstacles": json.dumps([o.name for o in scene.obstacles]),
+    }  # fmt: skip
     for body in scene.bodies:
         what = f"body '{body.name}'"
-        marks[what] = ""  # in the order added, which numbers nodes
         for part, values in _body_parts(body).items():
             marks[f"{what}: {part}"] = _digest(values)
     for one in scene.obstacles:
         what, shape = f"obstacle '{one.name}'", one.shape
         own = [getattr(shape, field.name) for field in dataclasses.fields(shape)]
-        marks[what] = ""
         marks[f"{what}: shape, friction, restitution or path"] = _digest(
-            [type(shape).__name__, *own, one.friction, one.restitution, one.path is None]
+            [type(shape).__name__, *own, one.friction, one.restitution, *_path_parts(one.path)]
         )
     marks["collision settings"] = _digest([json.dumps(dataclasses.asdict(scene.collision)), scene.contact_forces])
     # damping that was 0 at the start is compiled out, and so on
@@ -112,12 +117,21 @@ def _body_parts(body: Body) -> dict[str, list]:
         "mesh": [body.mesh.vertices, body.mesh.tets],
         "order, quadrature, law or collision": [body.order, body.quadrature_degree, body.material.law, body.collision],
         "start": [body.position, body.velocity],
-        "constraints": [x for c in body.constraints for x in (c.nodes, c.axes, c.path is None)],
+        "constraints": [x for c in body.constraints for x in (c.nodes, c.axes, *_path_parts(c.path))],
         "loads": [
             *(x for t in body.tractions for x in ("traction", t.triangles, t.value)),
             *(x for f in body.forces for x in ("force", f.nodes, f.value)),
         ],
     }
+
+
+def _path_parts(path: Callable | None) -> list:
+    """What can be compared of a path: key frames are data, of other functions only that there is one."""
+    if not isinstance(path, (NodePath, ShapePath)):
+        return [path is None]
+    frames = path.frames
+    own = [frames.times, frames.translations, frames.rotations, frames.pivot, frames.smooth, frames.release]
+    return [*own, path.starts if isinstance(path, NodePath) else path.center]
 
 
 def _numbers(scene: Scene) -> dict:
@@ -176,6 +190,7 @@ def _contents(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
             header = json.loads(text.tobytes())
             kind, version = header["kind"], int(header["format"])
             writer = str(header["taisoft"])
+            fits = all(isinstance(header.get(key), dict) for key in PARTS)
         except Exception as error:
             raise _no_checkpoint(path, error) from None
         if kind != KIND:
@@ -184,6 +199,8 @@ def _contents(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
             raise SimulationError(
                 f"{path} was written by taisoft {writer} in format {version}, and taisoft {__version__} reads format {FORMAT}"
             )
+        if not fits:
+            raise _no_checkpoint(path, "its header is of another form")
         try:
             arrays = {name: file[name] for name in file.files if name not in ("header", "sha256")}
             whole = np.array_equal(file["sha256"], _checksum(text, arrays))

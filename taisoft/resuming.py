@@ -8,28 +8,28 @@ from taisoft.access import StateAccess
 from taisoft.checkpoint import Checkpoint, check_scene, read_checkpoint, take_numbers, write_checkpoint
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene.scene import Scene
-from taisoft.settings import check_dt, plan_of
+from taisoft.settings import Settings, check_dt, plan_of
 
 
 class Resuming(StateAccess):
     """Checkpoints of a simulator; `Simulator` adds building and stepping."""
 
-    def save_checkpoint(self, path: str | Path) -> None:
+    def save_checkpoint(self, path: str | Path, notes: dict | None = None) -> None:
         """Write all that the next step rests on to a file, whole or not at all; see `taisoft/checkpoint.py`.
 
-        Raises OutputError.
+        notes: plain data to keep in it. Raises OutputError.
         """
         world, (start, count) = self._open_world(), self._time_base
         own = {"dt": self._dt, "time_base": start, "count_base": count}
         state = own | {"world": world.snapshot(), "stepper": self._stepper.snapshot()}
-        write_checkpoint(path, dataclasses.asdict(self.settings), self.scene, self.plan.on, state)
+        write_checkpoint(path, dataclasses.asdict(self.settings), self.scene, self.plan.on, state, notes or {})
 
     @classmethod
     def load_checkpoint(cls, path: str | Path, scene: Scene, arch: str | None = None) -> Self:
         """A simulator that goes on from a checkpoint of the same scene, with its settings and its numbers.
 
-        scene: gives what the file does not hold: meshes, constraints, loads, obstacles, and paths, which alone are not
-        compared. arch: another one than the checkpoint's; steps go on bitwise with its own only. Nothing else of the
+        scene: gives what the file does not hold: meshes, constraints, loads, obstacles, and paths; functions of time alone
+        are not compared. arch: another one than the checkpoint's; steps go on bitwise with its own only. Nothing else of the
         settings can be changed here; dt, gravity, materials and contact pairs can be later, as in any simulator. Initial
         overlaps are not looked for. Raises SimulationError for a file that cannot be used and SceneError for another
         scene, both naming the file.
@@ -38,6 +38,8 @@ class Resuming(StateAccess):
         if not isinstance(scene, Scene):
             raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
         settings = saved.settings | ({} if arch is None else {"arch": arch})
+        if set(settings) != {field.name for field in dataclasses.fields(Settings)}:
+            raise SimulationError(f"{path} holds no state of this scene: its settings are not those of this version")
         check_scene(saved, scene, plan_of(scene, settings["integrator"], settings["self_collision"]).on)
         start = scene.snapshot()
         start.allow_initial_overlap = True  # where bodies start is not where they are

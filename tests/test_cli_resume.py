@@ -167,9 +167,23 @@ def test_checkpoints_on_the_way_need_a_folder(beam, capsys):
 
 def test_another_frame_rate_is_refused(tmp_path, capsys):
     path, out = write(tmp_path / "led.py", GENTLE), tmp_path / "out"
-    assert run(path, "--out", out, "--no-frames") == 0
-    before = usd(out)
-    arguments = ("--resume", out / "checkpoint.npz", "--seconds", "0.2", "--fps", "60")
-    assert run(path, "--out", out, *arguments) == 3
+    assert run(path, "--out", out, "--fps", "60") == 0
+    before, pictures = usd(out), sorted((out / "frames").iterdir())
+    arguments = ("--resume", out / "checkpoint.npz", "--seconds", "0.2")
+    assert run(path, "--out", out, *arguments, "--fps", "30") == 2
+    assert "fps is 60.0 there and cannot become 30.0 within a run" in capsys.readouterr().err
+    assert usd(out) == before and report(out)["resumed"] is None and sorted((out / "frames").iterdir()) == pictures
+    assert run(path, "--out", out, *arguments) == 0  # the scene's own rate does not count
+    assert len(list((out / "frames").iterdir())) == 2 * len(pictures) - 1
+
+
+def test_what_cannot_be_continued_stays(tmp_path, capsys):
+    """Another scene's results in the folder: nothing of them goes before the refusal."""
+    path, out, other = write(tmp_path / "led.py", GENTLE), tmp_path / "out", tmp_path / "other"
+    assert run(path, "--out", out, *SHORT_OUTPUT) == 0
+    assert run(write(tmp_path / "beam.py", BEAM.replace('"beam"', '"other"')), "--out", other) == 0
+    before = {file: file.read_bytes() for file in other.rglob("*") if file.is_file()}
+    assert run(path, "--out", other, "--resume", out / "checkpoint.npz", "--seconds", "0.2") == 3
     assert "is of another scene or frame rate" in capsys.readouterr().err
-    assert usd(out) == before and report(out)["resumed"] is None
+    assert {file: file.read_bytes() for file in other.rglob("*.png")} == {f: b for f, b in before.items() if f.suffix == ".png"}
+    assert usd(other) and (other / "steps.csv").read_bytes() == before[other / "steps.csv"]

@@ -28,14 +28,16 @@ def pictures(folder, first=0, n=5, size=(48, 64)):
 
 
 @needs_ffmpeg
-@pytest.mark.parametrize("first, size", [(0, (48, 64)), (31, (47, 63))])
-def test_every_picture_is_a_frame(first, size, tmp_path):
+@pytest.mark.parametrize("first, size, name", [(0, (48, 64), "a b"), (31, (47, 63), "50%d")])
+def test_every_picture_is_a_frame(first, size, name, tmp_path):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
-    pictures(tmp_path, first, size=size)
-    write_video(tmp_path, 25.0)
-    n, seconds = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / VIDEO_NAME))
+    folder = tmp_path / name
+    pictures(folder, first, size=size)
+    (folder / "frames" / "2a.png").write_bytes(b"another's")
+    write_video(folder, 25.0)
+    n, seconds = imageio_ffmpeg.count_frames_and_secs(str(folder / VIDEO_NAME))
     assert n == 5 and seconds == pytest.approx(0.2, abs=0.01)
-    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == [VIDEO_NAME]
+    assert [path.name for path in folder.iterdir() if path.is_file()] == [VIDEO_NAME]
 
 
 @needs_ffmpeg

@@ -120,7 +120,7 @@ def _add_scene(commands) -> None:
     """The options of `taisoft scene`."""
     told = "write a scene, or one to start from for a mesh, as a .toml file"
     parser = commands.add_parser("scene", help=told, allow_abbrev=False)
-    _add_scene_name(parser, "a .toml or .py file, or a mesh file: it falls on the ground")
+    _add_scene_name(parser, "a .toml or .py file, or a mesh (.msh, .vtu, .vtk, .mesh, .node): it falls on the ground")
     parser.add_argument("--out", metavar="FILE", required=True, help="the .toml file; its meshes are written beside it")
     parser.add_argument("--overwrite", action="store_true", help="replace files that are there")
     parser.set_defaults(command="scene")

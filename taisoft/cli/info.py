@@ -3,6 +3,7 @@
 Of a surface: what keeps it from bounding a solid, and how it becomes one.
 """
 
+import shlex
 import warnings
 from argparse import Namespace
 from pathlib import Path
@@ -42,11 +43,12 @@ def describe_surface(surface: SurfaceMesh) -> list[tuple[str, str]]:
     lines = _head(f"{len(x)} vertices, {len(surface.triangles)} triangles, {pieces}; no tets", x)
     lines += [
         ("area", f"{surface.area:.6g}"),
-        ("volume", "open, none" if faults else f"{surface.volume:.6g}"),
+        ("volume", f"{surface.volume:.6g}" if surface.closed else "none, it is open"),
         ("edges", f"{lengths.min():.4g} to {lengths.max():.4g}, median {np.median(lengths):.4g}"),
     ]
     lines += _listed("problems", [*surface.warnings, *faults])
-    return lines + [("next", f"fill it with tets: taisoft tetrahedralize {surface.source} --out {Path(surface.source).stem}.msh")]
+    made = f"{Path(surface.source).stem}.msh"
+    return lines + [("next", f"fill it with tets: taisoft tetrahedralize {shlex.join([surface.source, '--out', made])}")]
 
 
 def _head(counts: str, vertices: np.ndarray) -> list[tuple[str, str]]:

@@ -12,7 +12,7 @@ from taisoft.output.files import RESULT_FILES, OutputFolder
 from taisoft.output.frames import FRAMES_NAME, FrameWriter
 from taisoft.output.report import write_report
 from taisoft.output.usd import UsdWriter
-from taisoft.output.video import command, find_ffmpeg, write_video
+from taisoft.output.video import command, find_ffmpeg, picture_numbers, write_video
 from taisoft.records import RunReport
 from taisoft.view.offscreen import Offscreen
 
@@ -58,25 +58,36 @@ class Recording:
     """The results of a run in one folder: report.json, steps.csv, checkpoint.npz and, where wanted, frames/ and scene.usdc.
 
     resumed: of a run that goes on, the `checkpoint`, its `time` [s] and the first `frame`; the folder's results before them
-    are continued. every: simulated time between two checkpoints [s]; None for one at the end. Raises OutputError if the folder
+    are continued. every: simulated time between two checkpoints [s]; None for one at the end. notes: those of the checkpoint, if
+    a run goes on. Raises OutputError if the folder
     cannot be written or holds results and neither overwrite is on nor the run goes on.
     """
 
-    def __init__(self, path: str, overwrite: bool, resumed: dict | None = None, every: float | None = None):
+    def __init__(
+        self, path: str, overwrite: bool, resumed: dict | None = None, every: float | None = None, notes: dict | None = None
+    ):  # fmt: skip
         self._first = None if resumed is None else resumed["frame"]
         self._folder = OutputFolder(path, overwrite, self._first)
-        self.path, self._resumed = Path(path), resumed
+        self.path, self._resumed, self._notes = Path(path), resumed, notes or {}
         self._checkpoints = CheckpointWriter(self._folder.path, every)
 
     def add_writers(self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool) -> None:
-        """Adds the writers of frames, USD and checkpoints to the observers."""
+        """Adds the writers of frames, USD and checkpoints to the observers. What goes on in another way is refused before
+        anything is removed."""
+        rate = fps or 1.0 / sim.dt
         if with_usd:
-            folder, fps, itself = self._folder.path, fps or 1.0 / sim.dt, sim.settings.self_collision
-            usd = UsdWriter(folder, sim.scene, fps=fps, self_collision=itself, first=self._first or 0)
+            folder, itself = self._folder.path, sim.settings.self_collision
+            usd = UsdWriter(folder, sim.scene, fps=rate, self_collision=itself, first=self._first or 0)
             observers.members.append(usd)
             self._checkpoints.before = usd.flush
+        if self._first is not None:
+            self._folder.clear(self._first)
+        drawing = None
         if with_frames:
-            observers.members.append(FrameWriter(self._folder.path, Offscreen(sim.scene)))
+            drawing = Offscreen(sim.scene)
+            drawing.go_on(self._notes.get("camera"))
+            observers.members.append(FrameWriter(self._folder.path, drawing))
+        self._checkpoints.notes = lambda: {"fps": fps, "camera": drawing.camera.distance if drawing else None}
         observers.members.append(self._checkpoints)
 
     def checkpoint(self, sim) -> None:
@@ -86,7 +97,7 @@ class Recording:
     def video(self, fps: float) -> None:
         """Writes video.mp4 from the pictures, or prints how it is made where ffmpeg is missing. Raises OutputError."""
         folder = self._folder.path
-        if not any((folder / FRAMES_NAME).glob("[0-9]*.png")):
+        if not picture_numbers(folder):
             return
         if find_ffmpeg() is None:
             line = shlex.join(command(folder, fps))

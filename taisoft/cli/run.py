@@ -2,10 +2,8 @@
 
 import os
 import sys
-import warnings
 from argparse import Namespace
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 from taisoft.checkpoint import read_checkpoint
@@ -15,6 +13,7 @@ from taisoft.cli.scene_file import load_scene
 from taisoft.cli.settings import RunSettings, resolve, resolve_resumed
 from taisoft.cli.signals import Signals
 from taisoft.cli.summary import print_plan, print_state, print_summary
+from taisoft.cli.told import told_warnings
 from taisoft.errors import SceneError
 from taisoft.output.files import check_free
 from taisoft.output.progress import Progress
@@ -29,18 +28,22 @@ from taisoft.view.ggui import display_missing, vulkan_missing
 def command(arguments: Namespace) -> int:
     """Runs the scene and returns the exit status. What can be refused is refused before a file is written."""
     _check_working_folder()
-    with Signals() as signals, _told_warnings() as told:
+    with Signals() as signals, told_warnings() as told:
         scene, solver = load_scene(arguments.scene, arguments.allow_outside)
         every = _checkpoint_interval(arguments)
         if arguments.video and (arguments.out is None or arguments.no_frames):
             raise SceneError("--video needs --out, the folder to write to, and the pictures that --no-frames leaves out")
+        notes: dict = {}
         if arguments.resume is None:
             settings = resolve(solver, arguments, Simulator)
             if arguments.out is not None:
                 check_free(arguments.out, arguments.overwrite)
             sim = Simulator(scene, **settings.simulator)
         else:
-            settings = resolve_resumed(solver, arguments, Simulator, read_checkpoint(arguments.resume).settings)
+            saved = read_checkpoint(arguments.resume)
+            notes = saved.notes
+            kept = saved.settings | {key: notes[key] for key in ("fps",) if key in notes}  # frames have numbers
+            settings = resolve_resumed(solver, arguments, Simulator, kept)
             sim = _resumed(scene, settings, arguments)
         with sim:
             print_plan(sim)
@@ -48,7 +51,7 @@ def command(arguments: Namespace) -> int:
             if has_window and arguments.out is None and arguments.seconds is None:
                 return _watch(sim, settings)
             _check_time_left(sim, settings, arguments)
-            return _run(sim, settings, arguments, signals, told, has_window, every)
+            return _run(sim, settings, arguments, signals, told, has_window, every, notes)
 
 
 def _checkpoint_interval(arguments: Namespace) -> float | None:
@@ -110,7 +113,7 @@ def _watch(sim: Simulator, settings: RunSettings) -> int:
 
 def _run(
     sim: Simulator, settings: RunSettings, arguments: Namespace, signals: Signals, told: list[str], has_window: bool,
-    every: float | None,
+    every: float | None, notes: dict,
 ) -> int:  # fmt: skip
     """A run until settings.seconds, with what was computed saved however it ends."""
     observers, resumed = Observers(), None
@@ -120,7 +123,7 @@ def _run(
         recording = None
         signals.run_began()
         if arguments.out is not None:
-            recording = stack.enter_context(closing(Recording(arguments.out, arguments.overwrite, resumed, every)))
+            recording = stack.enter_context(closing(Recording(arguments.out, arguments.overwrite, resumed, every, notes)))
         stack.callback(observers.close)
         if has_window:
             observers.members.append(_open_window(sim))
@@ -137,13 +140,13 @@ def _run(
         observers.close()
         if recording is not None:
             observers.guard(recording.checkpoint, sim)
-            if arguments.video:
-                observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
         result.problems[:0] = [f"warning: {text}" for text in told]
         if observers.error is not None:
             _tell_failed_output(result, observers, signals)
         if recording is not None:
             observers.guard(recording.report, result, sim, settings)
+            if arguments.video and not signals.asked():
+                observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
         print_summary(result, sim, observers, recording)
     if observers.error is not None:
         print(f"taisoft: {observers.error}", file=sys.stderr)
@@ -165,20 +168,3 @@ def _tell_failed_output(result: RunReport, observers: Observers, signals: Signal
     result.interrupted = signals.asked()
     if result.status == "ok":
         result.status = "degraded"
-
-
-@contextmanager
-def _told_warnings() -> Iterator[list[str]]:
-    """Prints each warning as one sentence, and yields the list of them, which the report repeats."""
-    told: list[str] = []
-
-    def tell(message, category, filename, lineno, file=None, line=None) -> None:
-        is_ours = category is UserWarning
-        text = str(message) if is_ours else f"{filename}, line {lineno}: {category.__name__}: {message}"
-        told.append(text)
-        print(f"taisoft: warning: {text}", file=sys.stderr)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = tell
-        yield told

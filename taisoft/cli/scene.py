@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.cli.scene_file import load_scene
+from taisoft.cli.told import told_warnings
 from taisoft.mesh.files import WRITERS, read_mesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene.material import Material
@@ -17,15 +18,18 @@ from taisoft.scene.toml_writer import write_scene
 HEIGHT = 0.25  # of the body's, that it falls
 STIFFNESS = 100.0  # Young's modulus in units of the pressure under the body: it sags by about 1 %
 DENSITY = 1000.0  # [kg/m^3]
+GROUND = "ground"
+MESHES = (*WRITERS, ".node", ".ele")
 
 
 def command(arguments: Namespace) -> int:
     """Writes the file and what it needs beside it, and names them. Raises SceneError for what no file can hold."""
     path = Path(arguments.scene)
-    if path.suffix.lower() in WRITERS:
-        scene, solver = start_from(read_mesh(path), path.stem)
-    else:
-        scene, solver = load_scene(arguments.scene, arguments.allow_outside)
+    with told_warnings():
+        if path.suffix.lower() in MESHES:
+            scene, solver = start_from(read_mesh(path), path.stem)
+        else:
+            scene, solver = load_scene(arguments.scene, arguments.allow_outside)
     for written in write_scene(arguments.out, scene, solver, arguments.overwrite):
         print(written)
     return 0
@@ -39,8 +43,8 @@ def start_from(mesh: TetMesh, name: str) -> tuple[Scene, dict]:
     stiff = STIFFNESS * DENSITY * 9.81 * height
     young = float(f"{stiff:.0e}")  # one digit
     rubber = Material(young=young, poisson=0.4, density=DENSITY, friction=0.5)
-    scene.add_body(mesh, rubber, name=name, position=(0.0, HEIGHT * height - float(low[1]), 0.0))
-    scene.add_obstacle(HalfSpace((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), name="ground", friction=0.5)
+    scene.add_body(mesh, rubber, name="body" if name == GROUND else name, position=(0.0, HEIGHT * height - float(low[1]), 0.0))
+    scene.add_obstacle(HalfSpace((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), name=GROUND, friction=0.5)
     fall = math.sqrt(2.0 * HEIGHT * height / 9.81)  # [s]
     fps = 50.0 if fall > 0.05 else float(np.ceil(2.5 / fall))
     return scene, {"dt": 0.5 / fps, "seconds": 100.0 / fps, "fps": fps}

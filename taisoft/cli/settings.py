@@ -48,16 +48,19 @@ def resolve(solver: dict, arguments: Namespace, simulator_class: type) -> RunSet
 def resolve_resumed(solver: dict, arguments: Namespace, simulator_class: type, saved: dict) -> RunSettings:
     """As `resolve`, for a run that goes on with the settings of a checkpoint, over which the scene's do not count.
 
+    saved: arguments of Simulator, and fps if the checkpoint tells.
+
     Raises SceneError for an option or a --set that asks for something else than saved; only dt and arch may change.
     """
     defaults = _defaults(simulator_class)
     given = _given(arguments, defaults, solver)
     for key, value in given.items():
-        if key not in (*RUN_KEYS, "dt", "arch") and value != saved[key]:
+        if key not in ("seconds", "dt", "arch") and value != saved.get(key, value):
             raise SceneError(f"--resume {arguments.resume}: {key} is {saved[key]} there and cannot become {value} within a run")
     changed = {key: given[key] for key in ("dt", "arch") if key in given}
-    settings = RunSettings(simulator=saved | changed, defaults=defaults, changed=list(changed))
-    return _with_run_keys(settings, {**solver, **given})
+    own = {key: value for key, value in saved.items() if key not in RUN_KEYS}
+    settings = RunSettings(simulator=own | changed, defaults=defaults, changed=list(changed))
+    return _with_run_keys(settings, {**solver, **given, **{key: saved[key] for key in RUN_KEYS if key in saved}})
 
 
 def _given(arguments: Namespace, defaults: dict, solver: dict) -> dict:

@@ -1,11 +1,10 @@
 """`taisoft tetrahedralize SURFACE`: a surface filled with tets, as a mesh file."""
 
-import sys
-import warnings
 from argparse import Namespace
 from pathlib import Path
 
 from taisoft.cli.info import describe
+from taisoft.cli.told import told_warnings
 from taisoft.errors import OutputError
 from taisoft.mesh.files import check_ending, write_mesh
 from taisoft.mesh.surface_mesh import read_surface
@@ -20,9 +19,7 @@ def command(arguments: Namespace) -> int:
         raise OutputError(f"{out}: the file exists; --overwrite replaces it")
     if not out.parent.is_dir():
         raise OutputError(f"{out}: there is no folder {out.parent}")
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = lambda message, *_: print(f"taisoft: warning: {message}", file=sys.stderr)
+    with told_warnings():
         surface = read_surface(arguments.surface, weld=arguments.weld)
         mesh = tetrahedralize(surface, arguments.edge_length, arguments.envelope)
         write_mesh(out, mesh)

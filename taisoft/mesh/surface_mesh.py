@@ -44,6 +44,12 @@ class SurfaceMesh:
         return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)
 
     @property
+    def closed(self) -> bool:
+        """Whether every edge belongs to more than one triangle."""
+        ends = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        return bool((np.unique(ends, axis=0, return_counts=True)[1] > 1).all())
+
+    @property
     def n_pieces(self) -> int:
         """Parts that share no vertex."""
         used, inverse = np.unique(self.triangles, return_inverse=True)

@@ -49,9 +49,9 @@ class OutputFolder:
 
     path: created where absent; an empty folder, or one with files that are not a run's, is accepted. overwrite: take a
     folder that holds results: frames and chunks go at once, each other file when its successor is complete. first: of a run
-    that goes on, the number of its first frame; results are accepted, what is before it stays, and other files go only for
-    their successors. Raises OutputError when the folder cannot be written, another process writes to it, or it holds
-    results without overwrite.
+    that goes on, the number of its first frame; results are accepted, what is before it stays, what comes after goes with
+    `clear`, and other files go only for their successors. Raises OutputError when the folder cannot be written, another
+    process writes to it, or it holds results without overwrite.
     """
 
     def __init__(self, path: str | Path, overwrite: bool = False, first: int | None = None):
@@ -59,7 +59,8 @@ class OutputFolder:
         self._lock: int | None = _lock_folder(self.path)
         try:
             self._old = check_free(path, overwrite) if first is None else {}
-            _clear(self.path, first)
+            if first is None:
+                _clear(self.path, first)
             _probe(self.path)
         except OSError as error:
             self.close()
@@ -67,6 +68,13 @@ class OutputFolder:
         except BaseException:
             self.close()
             raise
+
+    def clear(self, first: int) -> None:
+        """Remove an earlier run's frames and chunks from that number on. Raises OutputError."""
+        try:
+            _clear(self.path, first)
+        except OSError as error:
+            raise OutputError(f"cannot write to the output folder {self.path}: {error.strerror or error}") from error
 
     def discard_stale(self) -> None:
         """Remove the earlier run's result files that this run did not replace, so that a folder tells of one run."""

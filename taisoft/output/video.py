@@ -26,12 +26,17 @@ def find_ffmpeg() -> str | None:
     return found
 
 
+def picture_numbers(folder: Path) -> list[str]:
+    """Names, without their ending, of the pictures of a run in folder/frames."""
+    return [path.stem for path in (folder / FRAMES_NAME).glob("*.png") if path.stem.isdecimal()]
+
+
 def command(folder: Path, fps: float, ffmpeg: str = "ffmpeg", out: Path | None = None) -> list[str]:
     """What turns the pictures in folder/frames, shown at fps [1/s], into a film that common players and browsers show."""
-    first = min(int(path.stem) for path in (folder / FRAMES_NAME).glob("[0-9]*.png"))
+    first, place = min(map(int, picture_numbers(folder))), str(folder / FRAMES_NAME).replace("%", "%%")
     return [
         ffmpeg, "-y", "-loglevel", "error", "-xerror", "-framerate", f"{fps:g}", "-start_number", str(first),
-        "-i", str(folder / FRAMES_NAME / "%05d.png"), "-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p",
+        "-i", f"{place}/%05d.png", "-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p",
         "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-movflags", "+faststart", "-f", "mp4", str(out or folder / VIDEO_NAME),
     ]  # fmt: skip
 
@@ -44,7 +49,8 @@ def write_video(folder: Path, fps: float) -> None:
     with replacing(path) as part:
         try:
             ended = subprocess.run(
-                command(folder, fps, ffmpeg, part), stdin=subprocess.DEVNULL, capture_output=True, timeout=SECONDS, check=False
+                command(folder, fps, ffmpeg, part), stdin=subprocess.DEVNULL, capture_output=True, timeout=SECONDS, check=False,
+                start_new_session=True,  # Ctrl-C is for the run, which ends it
             )
         except subprocess.TimeoutExpired as error:
             raise OutputError(f"{path} cannot be made: {error}") from error

@@ -4,6 +4,7 @@ Both draw the same triangles with the same colours at twice the size, and four p
 """
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 
@@ -47,6 +48,11 @@ class Offscreen:
         self.renderer = _choose() if renderer == "auto" else renderer
         if self.renderer == "vulkan":
             self._canvas = Canvas(self.surfaces, self._large, visible=False)
+
+    def go_on(self, distance: float | None) -> None:
+        """Start with the camera at a distance [m] that it had moved back to; None: where it is."""
+        if distance is not None:
+            self.camera = replace(self.camera, distance=float(distance))
 
     def image(self, sim) -> np.ndarray:
         """Picture of sim's present state, uint8 (height, width, 3), first row on top."""
