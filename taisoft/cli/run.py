@@ -32,10 +32,12 @@ def command(arguments: Namespace) -> int:
         settings = resolve(solver, arguments, Simulator)
         if arguments.out is not None:
             check_free(arguments.out, arguments.overwrite)
-        with Simulator(scene, **settings.simulator) as sim:
+        has_window = not arguments.headless and _window_is_possible()
+        watched = has_window and arguments.out is None and arguments.seconds is None
+        pull = {"pullable": True} if watched else {}  # by the mouse
+        with Simulator(scene, **settings.simulator | pull) as sim:
             print_plan(sim)
-            has_window = not arguments.headless and _window_is_possible()
-            if has_window and arguments.out is None and arguments.seconds is None:
+            if watched:
                 return _watch(sim, settings)
             return _run(sim, settings, arguments, signals, told, has_window)
 
