@@ -242,6 +242,11 @@ class StateAccess:
             self._loads_changed()
 
     @property
+    def pullable(self) -> bool:
+        """Whether `pull` can be called."""
+        return self._pull is not None
+
+    @property
     def pulled(self) -> Grip | None:
         """What is pulled now, with the point [m] and the force [N] of the last step's start; None where nothing is."""
         return self._pull.grip if self._pull is not None else None
