@@ -1,7 +1,7 @@
 """The live window, on a virtual display:
 
 * a ray through a pixel is what the camera projects there, and picks the nearest surface; a patch round it has weights of sum 1;
-* keys pause, step, restart and end it; dragging beside the bodies turns the view, dragging a body moves the body;
+* keys pause, step, restart, colour and end it; dragging beside the bodies turns the view, dragging a body moves the body;
 * sliders change the run at once and compile nothing; a stiffer body lowers dt where steps are explicit;
 * pictures are recorded; making the window larger, smaller or tiny, and closing it in the middle of a drag, is survived.
 """
@@ -152,6 +152,8 @@ def test_keys_and_mouse(opened, tmp_path):
     mask = body_mask(screen[:, 400:])  # right of the panel
     assert mask.mean() > 0.05, "the beam is on the screen"
     assert (screen[60:200, 30:300] > 200).any(), "the panel's text is on the screen"
+    desktop.tool("xdotool", "key", "v")
+    desktop.wait_for(lambda: np.abs(desktop.picture()[:, 400:].astype(int) - screen[:, 400:]).max() > 60, "other colours")
     desktop.drag((900, 650), (-150, 50))
     desktop.tool("xdotool", "mouseup", "1")
     desktop.wait_for(lambda: np.mean(body_mask(desktop.picture()[:, 400:]) != mask) > 0.02, "turned view")

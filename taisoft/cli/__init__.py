@@ -102,5 +102,7 @@ def _add_run(commands) -> None:
     )
     parser.add_argument("--resume", metavar="CHECKPOINT", help="not in this version: it writes no checkpoints")
     parser.add_argument("--no-usd", action="store_true", help="write no scene.usdc")
+    colours = ("body", "stress", "stretch", "speed")
+    parser.add_argument("--colour", choices=colours, default="body", help="what pictures and the window colour bodies by")
     parser.add_argument("--no-frames", action="store_true", help="write no pictures")
     parser.set_defaults(command="run")

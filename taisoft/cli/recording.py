@@ -60,13 +60,15 @@ class Recording:
         self._folder = OutputFolder(path, overwrite)
         self.path = Path(path)
 
-    def add_writers(self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool) -> None:
+    def add_writers(
+        self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool, colour: str = "body"
+    ) -> None:
         """Adds the writers of frames and USD to the observers."""
         if with_usd:
             itself = sim.settings.self_collision
             observers.members.append(UsdWriter(self._folder.path, sim.scene, fps=fps or 1.0 / sim.dt, self_collision=itself))
         if with_frames:
-            observers.members.append(FrameWriter(self._folder.path, Offscreen(sim.scene)))
+            observers.members.append(FrameWriter(self._folder.path, Offscreen(sim.scene, colour=colour)))
 
     def report(self, result: RunReport, sim, settings: RunSettings) -> None:
         """Writes report.json and steps.csv, and removes what an earlier run left. Raises OutputError."""

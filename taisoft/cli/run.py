@@ -38,7 +38,7 @@ def command(arguments: Namespace) -> int:
         with Simulator(scene, **settings.simulator | pull) as sim:
             print_plan(sim)
             if watched:
-                return _watch(sim, settings)
+                return _watch(sim, settings, arguments.colour)
             return _run(sim, settings, arguments, signals, told, has_window)
 
 
@@ -58,11 +58,11 @@ def _window_is_possible() -> bool:
     return not missing
 
 
-def _watch(sim: Simulator, settings: RunSettings) -> int:
+def _watch(sim: Simulator, settings: RunSettings, colour: str) -> int:
     """The live window, for as long as it stays open."""
     from taisoft.view.window import show
 
-    show(sim, fps=settings.fps or 1.0 / sim.dt)
+    show(sim, fps=settings.fps or 1.0 / sim.dt, colour=colour)
     print_state(sim)
     return 0
 
@@ -79,9 +79,9 @@ def _run(
             recording = stack.enter_context(closing(Recording(arguments.out, arguments.overwrite)))
         stack.callback(observers.close)
         if has_window:
-            observers.members.append(_open_window(sim))
+            observers.members.append(_open_window(sim, arguments.colour))
         if recording is not None:
-            recording.add_writers(observers, sim, settings.fps, not arguments.no_usd, not arguments.no_frames)
+            recording.add_writers(observers, sim, settings.fps, not arguments.no_usd, not arguments.no_frames, arguments.colour)
         observers.members.append(Progress(settings.seconds, label=Path(arguments.scene).stem))
         result = sim.run(
             settings.seconds,
@@ -104,10 +104,10 @@ def _run(
     return EXIT_FAILED if result.status == "failed" else 0
 
 
-def _open_window(sim: Simulator):
+def _open_window(sim: Simulator, colour: str):
     from taisoft.view.window import LiveWindow
 
-    return LiveWindow(sim.scene)
+    return LiveWindow(sim.scene, colour=colour)
 
 
 def _tell_failed_output(result: RunReport, observers: Observers, signals: Signals) -> None:

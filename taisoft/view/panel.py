@@ -11,6 +11,7 @@ import textwrap
 import numpy as np
 
 from taisoft.errors import SimulationError
+from taisoft.view.colouring import TITLES, Colouring
 
 SAFE = 0.95  # of an explicit integrator's limit, where its slider of dt ends
 LONGEST = 0.1  # [s], an implicit one's
@@ -23,18 +24,19 @@ STRENGTHS = (-0.5, 2.5)  # decades: weights of the body for a pull as long as it
 COLUMNS = 46  # characters that fit the panel's width
 HELP = (
     "Left drag: pull a body, or turn", "Ctrl + left: turn", "Right: zoom, middle: shift", "Space: pause, S or Right: step",
-    "R: restart, P: record, Esc: quit",
+    "R: restart, V: colour, P: record, Esc: quit",
 )  # fmt: skip
 
 
 class Panel:
-    """sim: what the sliders change; loop: what the buttons ask (by `pressed`), and who is told what could not be changed.
+    """sim: what the sliders change; loop: what the buttons ask (by `pressed`), and who is told what could not be changed;
+    colouring: what the bodies' colours mean.
 
     chosen: name of the body whose Young's modulus moves, the one pulled last; strength: of a pull, 0 where none can be.
     """
 
-    def __init__(self, sim, loop):
-        self._sim, self._loop = sim, loop
+    def __init__(self, sim, loop, colouring: Colouring):
+        self._sim, self._loop, self._colouring = sim, loop, colouring
         self.pressed: set[str] = set()
         scene = sim.scene
         self.chosen = scene.bodies[0].name
@@ -90,6 +92,10 @@ class Panel:
             grip = self._sim.pulled
             force, most = (np.linalg.norm(grip.force), grip.strongest) if grip is not None else (0.0, 0.0)
             gui.text(f"pulling with {force:.3g} N of at most {most:.3g}" if grip is not None else "nothing is pulled")
+        if gui.button(f"colour: {TITLES[self._colouring.kind]}###colour"):
+            self._colouring.choose_next()
+        for text, colour in self._colouring.legend():
+            gui.text(text, color=tuple(colour))
         self._help = gui.checkbox("keys and mouse", self._help)
         for line in HELP if self._help else ():
             gui.text(line)

@@ -1,8 +1,8 @@
 """The live window: a simulation that runs while it is watched, turned, pulled, paused, stepped and changed.
 
 The left button pulls the body under the cursor, and orbits elsewhere or with Ctrl; the right one zooms, the middle one shifts.
-Space: pause or go on. S or right arrow: one step. R: back to the initial state. P: record pictures. Escape or the close button:
-end. Sliders and buttons are in the panel, see `taisoft.view.panel`.
+Space: pause or go on. S or right arrow: one step. R: back to the initial state. V: other colours. P: record pictures. Escape or
+the close button: end. Sliders and buttons are in the panel, see `taisoft.view.panel`.
 """
 
 import time
@@ -13,6 +13,7 @@ import taichi as ti
 from taisoft.errors import OutputError
 from taisoft.output.appearance import start_positions
 from taisoft.output.camera import MAX_WIDENING, Camera
+from taisoft.view.colouring import Colouring
 from taisoft.view.ggui import Canvas
 from taisoft.view.loop import Loop
 from taisoft.view.panel import Panel
@@ -29,7 +30,7 @@ MARKS = 4000  # lines that can be drawn beside the wires
 PULL_COLOUR = np.array([0.85, 0.10, 0.35])  # sRGB
 IN_FRONT = 0.1  # lines at this share of their distance from the eye cover the same pixels, and nothing hides them
 KEYS = {
-    ti.ui.SPACE: "pause", "s": "step", ti.ui.RIGHT: "step", "r": "reset", "p": "record", ti.ui.ESCAPE: "close",
+    ti.ui.SPACE: "pause", "s": "step", ti.ui.RIGHT: "step", "r": "reset", "p": "record", "v": "colour", ti.ui.ESCAPE: "close",
 }  # fmt: skip
 
 
@@ -37,15 +38,19 @@ class LiveWindow:
     """A window that shows a scene; also an observer, with `frame` and `close`, for `Simulator.run`.
 
     scene: its bodies and obstacles are read once; size: (width, height) in pixels; camera: where to look from, else it shows all
-    bodies and moves back after them until the user moves it; tall: with room for sliders in the panel. `pressed` holds what
+    bodies and moves back after them until the user moves it; tall: with room for sliders in the panel; colour: as of
+    `Offscreen`, to begin with. `pressed` holds what
     the user asked for by keys up to the last draw, values of KEYS. Raises OutputError, before anything is opened, when a
     display or a Vulkan driver is missing or the process has a window already.
     """
 
-    def __init__(self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None, tall: bool = False):
+    def __init__(
+        self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None, tall: bool = False, colour: str = "body"
+    ):  # fmt: skip
         self.camera = camera or Camera.framing(start_positions(scene), size)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # [m]; 0 once the user moves the camera
         self._surfaces = Surfaces(scene)
+        self.colouring = Colouring(scene, self._surfaces, colour)
         self._canvas = Canvas(self._surfaces, size, visible=True, n_segments=MARKS)
         self._place = PANEL if tall else SHORT_PANEL
         # GGUI places the panel once, by the window's size at that time, and does not tell where the user moves it
@@ -71,7 +76,7 @@ class LiveWindow:
         bodies = self._surfaces.of_bodies(sim)
         self.camera = self.camera.widened(bodies[0], window.get_window_shape(), self._widest)
         x, normals = self._surfaces.with_obstacles(bodies, sim.time, self.camera.position)
-        self._canvas.draw(x, normals, self.camera, tuple(BACKGROUND_TOP), lines=self._lines(sim))
+        self._canvas.draw(x, normals, self.camera, tuple(BACKGROUND_TOP), self.colouring.base(sim), self._lines(sim))
         size = window.get_window_shape()
         # GGUI shows an empty window once a picture has been taken of it at another size than the present one
         if record is not None or self._taken not in (None, size):
@@ -109,6 +114,8 @@ class LiveWindow:
         for event in self._canvas.window.get_events(ti.ui.PRESS):
             if event.key in KEYS:
                 self.pressed.add(KEYS[event.key])
+        if "colour" in self.pressed:
+            self.colouring.choose_next()
         self._asked_to_close |= "close" in self.pressed
 
     def _read_mouse(self, sim, panel: Panel | None) -> None:
@@ -157,7 +164,7 @@ class LiveWindow:
             self.camera = self.camera.pan(-right * size[0] / size[1], -up)
 
 
-def show(sim, fps: float = 60.0, paused: bool = False) -> None:
+def show(sim, fps: float = 60.0, paused: bool = False, colour: str = "body") -> None:
     """Run a simulation in a window until it is closed.
 
     sim: an open Simulator, advanced by 1/fps [s] of simulated time a picture, never faster than real time; made with
@@ -167,10 +174,10 @@ def show(sim, fps: float = 60.0, paused: bool = False) -> None:
     """
     if not fps > 0:
         raise OutputError(f"the window's fps is {fps}, it must be positive")
-    window = LiveWindow(sim.scene, tall=True)
+    window = LiveWindow(sim.scene, tall=True, colour=colour)
     try:
         loop = Loop(sim, fps, paused)
-        panel = Panel(sim, loop)
+        panel = Panel(sim, loop, window.colouring)
         while not window.closed:
             started = time.perf_counter()
             window.draw(sim, [*state_lines(sim), loop.speed()], panel, loop.record if loop.folder is not None else None)
