@@ -1,6 +1,7 @@
 """The live window, on a virtual display:
 
 * a ray through a pixel is what the camera projects there, and picks the nearest surface; a patch round it has weights of sum 1;
+* wires, contacts and arrows are where they belong; pictures do not wait for a solver that is slower than real time;
 * keys pause, step, restart, colour and end it; dragging beside the bodies turns the view, dragging a body moves the body;
 * sliders change the run at once and compile nothing; a stiffer body lowers dt where steps are explicit;
 * pictures are recorded; making the window larger, smaller or tiny, and closing it in the middle of a drag, is survived.
@@ -15,6 +16,8 @@ from fake_simulator import FakeSimulator, beam_scene
 from test_view import SIZE, body_mask, needs_vulkan
 
 from taisoft.output.camera import Camera
+from taisoft.view.layers import Layers
+from taisoft.view.loop import Loop
 from taisoft.view.picking import Drag, nearest_hit, pick
 
 WATCH = """
@@ -97,6 +100,68 @@ def test_a_body_is_picked_and_pulled_by_the_cursor(order):
     assert pick(sim, camera, (0.01, 0.99), size) is None
 
 
+# --- what is drawn over the bodies, and when ---
+
+
+def test_layers():
+    scene = beam_scene()
+    scene.bodies[0].add_traction(lambda c: c[:, 0] > 1.99, (0, 0, 50.0))
+    sim, layers, camera = FakeSimulator(scene), Layers(scene), Camera.framing(scene.bodies[0].rest_positions)
+    found = sim.contacts()
+    found.point, found.normal = np.array([[0.0, 1, 0]]), np.array([[0.0, 1, 0]])
+    sim.contacts = lambda: found
+    faces = len(scene.bodies[0].mesh.surface)
+    tips = 2 * 2 * 2
+    counts = {"wires": 3 * faces // 2, "contacts": 2, "tractions": 3 * tips, "fixed nodes": 0}
+    for name, count in counts.items():
+        layers.shown = {other: other == name for other in counts}
+        ends, colours = layers.lines(sim, camera)
+        assert len(ends) == len(colours) == 2 * count <= 2 * layers.n_segments
+        if name == "wires":
+            x, size = sim.positions(), (200, 100)
+            seen, drawn = camera.project(x, size), camera.project(ends, size)
+            gaps = np.linalg.norm(drawn[:, None, :2] - seen[None, :, :2], axis=2).min(axis=1)
+            assert gaps.max() < 1e-9, "wires end on nodes"
+        if name == "contacts":
+            a, b, _, c = (ends - camera.position) / 0.1 + camera.position
+            assert np.allclose(a, found.point) and np.allclose((b - a) / np.linalg.norm(b - a), found.normal)
+            assert np.allclose(np.cross(c - a, found.impulse[0]), 0, atol=1e-12)
+
+
+class Clock:
+    """A simulator whose steps of dt take some wall time, on a clock of its own."""
+
+    def __init__(self, dt, seconds_per_step):
+        self.dt, self.seconds_per_step, self.now, self.step_count, self.calls = dt, seconds_per_step, 0.0, 0, []
+
+    def advance(self, n):
+        self.calls.append(n)
+        self.step_count += n
+        self.now += n * self.seconds_per_step
+
+
+@pytest.mark.parametrize("dt, seconds_per_step, steps, needs", [
+    (1 / 60, 0.001, 1.0, 0.0), (1 / 600, 0.0001, 10.0, 0.0), (0.05, 0.001, 1 / 3, 0.0), (1e-4, 1e-3, 17.0, 10.0),
+    (1 / 60, 0.5, 1.0, 30.0),
+])  # fmt: skip
+def test_pictures_do_not_wait_for_a_slow_solver(monkeypatch, dt, seconds_per_step, steps, needs):
+    sim = Clock(dt, seconds_per_step)
+    monkeypatch.setattr("time.perf_counter", lambda: sim.now)
+    loop = Loop(sim, 60.0, False)
+    for k in range(120):
+        start = sim.now
+        loop.advance()
+        if k > 60:
+            assert sim.now - start < max(1.05 / 60, 1.01 * seconds_per_step)
+        sim.now = max(sim.now, start + 1 / 60)
+        loop.speed()
+        if k == 59:
+            half = sim.step_count
+    assert (sim.step_count - half) / 60 == pytest.approx(steps, rel=0.1)
+    told = loop.lines()[0]
+    assert told == "running" if needs == 0 else f"needs {needs:.1f} times real time" in told
+
+
 # --- the window ---
 
 
@@ -158,6 +223,9 @@ def test_keys_and_mouse(opened, tmp_path):
     desktop.tool("xdotool", "mouseup", "1")
     desktop.wait_for(lambda: np.mean(body_mask(desktop.picture()[:, 400:]) != mask) > 0.02, "turned view")
     assert still(desktop)
+    flat = desktop.picture()
+    desktop.tool("xdotool", "key", "w")
+    desktop.wait_for(lambda: np.mean((flat[:, 400:] > desktop.picture()[:, 400:].astype(int) + 40).any(axis=2)) > 0.003, "wires")
     press(desktop, "p", lambda: len(list(tmp_path.glob("out/window-1/*.png"))) > 1, "recorded pictures")
     desktop.tool("xdotool", "key", "p")
     assert struct.unpack(">II", (tmp_path / "out/window-1/00000.png").read_bytes()[16:24]) == (1280, 720)

@@ -131,6 +131,10 @@ class Camera:
         direction = np.array([right, up, 1.0]) @ self.axes
         return direction / np.linalg.norm(direction)
 
+    def nearer(self, points: np.ndarray, share: float) -> np.ndarray:
+        """Points (n,3) moved along their rays to a share of their distance from the eye: they stay on their pixels."""
+        return self.position + share * (points - self.position)
+
     def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """Pixel coordinates (from the left, from the top) and depth along the view [m] of points (n,3): (n,3).
 

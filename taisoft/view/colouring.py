@@ -68,7 +68,7 @@ class Colouring:
         """Lines of text from high to low, each with its colour (3,); none for the bodies' own colours."""
         if self.kind == "body" or self.span == 0.0:
             return []
-        shares = np.linspace(1.0, 0.0, len(COLOURS))
+        shares = np.linspace(1.0, 0.0, 3)
         texts = [f"{self.low + share * self.span:10.4g} {UNITS[self.kind]}" for share in shares]
         return list(zip(texts, colours_of(shares)))
 

@@ -56,7 +56,10 @@ class Loop:
         end = time.perf_counter() + 1.0 / self.fps
         while self._owed >= self.sim.dt * (1.0 - 1e-9) and not self.paused:
             before = self.sim.step_count
-            self.guarded(lambda: self._advance(max(1, int(self._owed / self.sim.dt + 1e-9))))
+            n = int(self._owed / self.sim.dt + 1e-9)
+            if self._needs > 0.0:  # of many explicit steps in one launch no more than a picture has time for
+                n = min(n, int((end - time.perf_counter()) / (self._needs * self.sim.dt) + 0.5))
+            self.guarded(lambda n=n: self._advance(max(1, n)))
             self._owed -= (self.sim.step_count - before) * self.sim.dt
             if time.perf_counter() >= end:
                 self._owed = min(self._owed, 0.0)

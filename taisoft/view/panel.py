@@ -12,6 +12,7 @@ import numpy as np
 
 from taisoft.errors import SimulationError
 from taisoft.view.colouring import TITLES, Colouring
+from taisoft.view.layers import Layers
 
 SAFE = 0.95  # of an explicit integrator's limit, where its slider of dt ends
 LONGEST = 0.1  # [s], an implicit one's
@@ -24,19 +25,19 @@ STRENGTHS = (-0.5, 2.5)  # decades: weights of the body for a pull as long as it
 COLUMNS = 46  # characters that fit the panel's width
 HELP = (
     "Left drag: pull a body, or turn", "Ctrl + left: turn", "Right: zoom, middle: shift", "Space: pause, S or Right: step",
-    "R: restart, V: colour, P: record, Esc: quit",
+    "R: restart, V: colour, P: record, Esc: quit", "W, C, T, F: wires, contacts, tractions, fixed",
 )  # fmt: skip
 
 
 class Panel:
     """sim: what the sliders change; loop: what the buttons ask (by `pressed`), and who is told what could not be changed;
-    colouring: what the bodies' colours mean.
+    colouring: what the bodies' colours mean; layers: what is drawn beside them.
 
     chosen: name of the body whose Young's modulus moves, the one pulled last; strength: of a pull, 0 where none can be.
     """
 
-    def __init__(self, sim, loop, colouring: Colouring):
-        self._sim, self._loop, self._colouring = sim, loop, colouring
+    def __init__(self, sim, loop, colouring: Colouring, layers: Layers):
+        self._sim, self._loop, self._colouring, self._layers = sim, loop, colouring, layers
         self.pressed: set[str] = set()
         scene = sim.scene
         self.chosen = scene.bodies[0].name
@@ -96,6 +97,9 @@ class Panel:
             self._colouring.choose_next()
         for text, colour in self._colouring.legend():
             gui.text(text, color=tuple(colour))
+        shown = self._layers.shown
+        for name in shown:
+            shown[name] = gui.checkbox(name, shown[name])
         self._help = gui.checkbox("keys and mouse", self._help)
         for line in HELP if self._help else ():
             gui.text(line)

@@ -39,6 +39,7 @@ class Surfaces:
             triangles.append(part.triangles + n)
             colours.append(part.colours)
             n += len(part.colours)
+        self.with_markers = True  # of fixed nodes
         self.triangles = np.concatenate(triangles).astype(np.int32)
         self.colours = np.concatenate(colours)
 
@@ -52,7 +53,7 @@ class Surfaces:
     def of_bodies(self, sim) -> tuple[np.ndarray, np.ndarray]:
         """Positions [m] and unit normals of the bodies' drawn vertices in sim's present state, each float64 (n,3)."""
         x = np.split(sim.positions(), self._ends)
-        return _joined([body.vertices(own) for body, own in zip(self._bodies, x)])
+        return _joined([body.vertices(own, self.with_markers) for body, own in zip(self._bodies, x)])
 
     def with_obstacles(
         self, bodies: tuple[np.ndarray, np.ndarray], t: float, eye: np.ndarray
@@ -87,9 +88,9 @@ class _BodySurface:
         self.colours = np.repeat([colour, MARKER_COLOUR], counts, axis=0)
         self.nodes = np.concatenate([self._nodes, np.full(counts[1], -1)])  # of each drawn vertex; -1 of markers
 
-    def vertices(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def vertices(self, x: np.ndarray, with_markers: bool) -> tuple[np.ndarray, np.ndarray]:
         drawn = x[self._nodes]
-        markers = (x[self._marked][:, None] + self._radius * self._ball).reshape(-1, 3)
+        markers = (x[self._marked][:, None] + with_markers * self._radius * self._ball).reshape(-1, 3)
         normals = np.tile(self._ball, (len(self._marked), 1))
         return np.concatenate([drawn, markers]), np.concatenate([vertex_normals(drawn, self._corners), normals])
 

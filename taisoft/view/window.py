@@ -1,7 +1,8 @@
 """The live window: a simulation that runs while it is watched, turned, pulled, paused, stepped and changed.
 
 The left button pulls the body under the cursor, and orbits elsewhere or with Ctrl; the right one zooms, the middle one shifts.
-Space: pause or go on. S or right arrow: one step. R: back to the initial state. V: other colours. P: record pictures. Escape or
+Space: pause or go on. S or right arrow: one step. R: back to the initial state. V: other colours. W, C, T, F: wires, contacts,
+tractions, fixed nodes. P: record pictures. Escape or
 the close button: end. Sliders and buttons are in the panel, see `taisoft.view.panel`.
 """
 
@@ -15,6 +16,7 @@ from taisoft.output.appearance import start_positions
 from taisoft.output.camera import MAX_WIDENING, Camera
 from taisoft.view.colouring import Colouring
 from taisoft.view.ggui import Canvas
+from taisoft.view.layers import IN_FRONT, Layers
 from taisoft.view.loop import Loop
 from taisoft.view.panel import Panel
 from taisoft.view.picking import Drag, pick
@@ -26,11 +28,10 @@ PANEL = (0.012, 0.02, 0.27, 0.94)  # left, top, width, height as fractions of th
 SHORT_PANEL = (0.012, 0.02, 0.27, 0.24)  # of a run that is only watched
 ORBIT = 240.0  # [deg] for a drag over the whole window
 ZOOM = 16.0  # factor on the distance for such a drag
-MARKS = 4000  # lines that can be drawn beside the wires
 PULL_COLOUR = np.array([0.85, 0.10, 0.35])  # sRGB
-IN_FRONT = 0.1  # lines at this share of their distance from the eye cover the same pixels, and nothing hides them
 KEYS = {
-    ti.ui.SPACE: "pause", "s": "step", ti.ui.RIGHT: "step", "r": "reset", "p": "record", "v": "colour", ti.ui.ESCAPE: "close",
+    ti.ui.SPACE: "pause", "s": "step", ti.ui.RIGHT: "step", "r": "reset", "p": "record", "v": "colour",
+    "w": "wires", "c": "contacts", "t": "tractions", "f": "fixed nodes", ti.ui.ESCAPE: "close",
 }  # fmt: skip
 
 
@@ -50,8 +51,9 @@ class LiveWindow:
         self.camera = camera or Camera.framing(start_positions(scene), size)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # [m]; 0 once the user moves the camera
         self._surfaces = Surfaces(scene)
+        self.layers = Layers(scene)
         self.colouring = Colouring(scene, self._surfaces, colour)
-        self._canvas = Canvas(self._surfaces, size, visible=True, n_segments=MARKS)
+        self._canvas = Canvas(self._surfaces, size, visible=True, n_segments=self.layers.n_segments + 1)
         self._place = PANEL if tall else SHORT_PANEL
         # GGUI places the panel once, by the window's size at that time, and does not tell where the user moves it
         self._panel_pixels = tuple(f * n for f, n in zip(self._place, (*size, *size)))
@@ -73,6 +75,7 @@ class LiveWindow:
         panel: the sliders below the lines; record: is given the picture, uint8 (height, width, 3), without the panel.
         """
         window = self._canvas.window
+        self._surfaces.with_markers = self.layers.shown["fixed nodes"]
         bodies = self._surfaces.of_bodies(sim)
         self.camera = self.camera.widened(bodies[0], window.get_window_shape(), self._widest)
         x, normals = self._surfaces.with_obstacles(bodies, sim.time, self.camera.position)
@@ -105,15 +108,19 @@ class LiveWindow:
 
     def _lines(self, sim) -> tuple[np.ndarray, np.ndarray]:
         """Ends and colours of the lines over the picture."""
-        ends = self.drag.line(sim) if self.drag is not None else np.empty((0, 3))
-        eye = self.camera.position
-        return eye + IN_FRONT * (ends - eye), np.tile(PULL_COLOUR, (len(ends), 1))
+        ends, colours = self.layers.lines(sim, self.camera)
+        if self.drag is None:
+            return ends, colours
+        pulled = self.camera.nearer(self.drag.line(sim), IN_FRONT)
+        return np.concatenate([pulled, ends]), np.concatenate([np.tile(PULL_COLOUR, (2, 1)), colours])
 
     def _read_keys(self) -> None:
         self.pressed.clear()
         for event in self._canvas.window.get_events(ti.ui.PRESS):
             if event.key in KEYS:
                 self.pressed.add(KEYS[event.key])
+        for name in self.pressed & set(self.layers.shown):
+            self.layers.shown[name] = not self.layers.shown[name]
         if "colour" in self.pressed:
             self.colouring.choose_next()
         self._asked_to_close |= "close" in self.pressed
@@ -177,7 +184,7 @@ def show(sim, fps: float = 60.0, paused: bool = False, colour: str = "body") -> 
     window = LiveWindow(sim.scene, tall=True, colour=colour)
     try:
         loop = Loop(sim, fps, paused)
-        panel = Panel(sim, loop, window.colouring)
+        panel = Panel(sim, loop, window.colouring, window.layers)
         while not window.closed:
             started = time.perf_counter()
             window.draw(sim, [*state_lines(sim), loop.speed()], panel, loop.record if loop.folder is not None else None)
