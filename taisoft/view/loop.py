@@ -28,6 +28,7 @@ class Loop:
         self.sim, self.fps, self.paused = sim, fps, paused
         self.problem = self.note = ""
         self.folder: Path | None = None
+        self._begun = False  # a step was taken, so all is compiled
         self._frames = 0
         self._owed = 0.0  # [s] of simulated time since the last step
         self._needs = 0.0  # wall time of a simulated second [s]
@@ -69,6 +70,7 @@ class Loop:
         try:
             self.sim.advance(n)
         finally:
+            self._begun = True
             self._spent[0] += time.perf_counter() - started
             self._spent[1] += (self.sim.step_count - before) * self.sim.dt
 
@@ -98,6 +100,8 @@ class Loop:
         """What there is to tell, in sentences."""
         slow = self._needs > BEHIND and not self.paused
         pace = f"running; the solver needs {self._needs:.1f} times real time" if slow else "running"
+        if not self._begun:
+            pace = "the first step is compiled, for some seconds"
         return [self.problem or ("paused" if self.paused else pace), *([self.note] if self.note else [])]
 
     # --- recording ----------------------------------------------------------------------------------------------------

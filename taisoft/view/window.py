@@ -185,11 +185,13 @@ def show(sim, fps: float = 60.0, paused: bool = False, colour: str = "body") -> 
     try:
         loop = Loop(sim, fps, paused)
         panel = Panel(sim, loop, window.colouring, window.layers)
+        pictures = 0
         while not window.closed:
             started = time.perf_counter()
             window.draw(sim, [*state_lines(sim), loop.speed()], panel, loop.record if loop.folder is not None else None)
             loop.react(window.pressed | panel.pressed)
-            if not loop.paused:
+            pictures += 1
+            if not loop.paused and pictures > 2:  # GGUI shows no panel at first, and the first step compiles for seconds
                 loop.advance()
             time.sleep(max(0.0, 1.0 / fps - (time.perf_counter() - started)))
     finally:
