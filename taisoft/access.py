@@ -14,6 +14,7 @@ from taisoft.records import Energies
 from taisoft.settings import Settings, check_dt
 from taisoft.stability import stable_dt
 from taisoft.stepping.contact import ContactStep
+from taisoft.stepping.pull import Grip, Pull
 from taisoft.stepping.world import World
 from taisoft.transfer import array_of, upload
 
@@ -25,6 +26,7 @@ class StateAccess:
     _world: World | None = None
     _contact: ContactStep | None
     _idle_detection: Detection | None
+    _pull: Pull | None = None
 
     @property
     def time(self) -> float:
@@ -224,6 +226,39 @@ class StateAccess:
             raise
         world.upload_material("density" in numbers)
         self._stepper.numbers_changed()
+
+    def pull(self, body: str, nodes, weights, target, stiffness: float) -> None:
+        """Pull a point of a body towards target (3,) [m] by a damped spring, in place of what was pulled before.
+
+        The point is the mean of nodes (k,) by weights (k,), which are made to sum to 1; stiffness [N/m]. The force is taken at
+        the start of every step; stiffness and force are limited as `taisoft.stepping.pull` says, and `pulled` tells both. Raises
+        SimulationError unless the Simulator was made with pullable=True, SceneError for what is no point of the body.
+        """
+        self._open_world()
+        if self._pull is None:
+            raise SimulationError("bodies can be pulled only where the Simulator was made with pullable=True")
+        self._pull.take(self._index(body), nodes, weights, target, stiffness)
+
+    def release(self) -> None:
+        """End the pull; does nothing where nothing is pulled."""
+        self._open_world()
+        if self._pull is not None and self._pull.let_go():
+            self._loads_changed()
+
+    @property
+    def pullable(self) -> bool:
+        """Whether `pull` can be called."""
+        return self._pull is not None
+
+    @property
+    def pulled(self) -> Grip | None:
+        """What is pulled now, with the point [m] and the force [N] of the last step's start; None where nothing is."""
+        return self._pull.grip if self._pull is not None else None
+
+    def _loads_changed(self) -> None:
+        """Explicit steps may rest on an acceleration with the old ones."""
+        if self.settings.explicit:
+            self._stepper.numbers_changed()
 
     def _open_world(self) -> World:
         if self._world is None:

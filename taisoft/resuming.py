@@ -17,9 +17,11 @@ class Resuming(StateAccess):
     def save_checkpoint(self, path: str | Path, notes: dict | None = None) -> None:
         """Write all that the next step rests on to a file, whole or not at all; see `taisoft/checkpoint.py`.
 
-        notes: plain data to keep in it. Raises OutputError.
+        notes: plain data to keep in it. Raises SimulationError while a body is pulled, OutputError.
         """
         world, (start, count) = self._open_world(), self._time_base
+        if self.pulled is not None:
+            raise SimulationError("a body is being pulled, which no checkpoint holds: release it first")
         own = {"dt": self._dt, "time_base": start, "count_base": count}
         state = own | {"world": world.snapshot(), "stepper": self._stepper.snapshot()}
         write_checkpoint(path, dataclasses.asdict(self.settings), self.scene, self.plan.on, state, notes or {})
@@ -40,7 +42,7 @@ class Resuming(StateAccess):
         settings = saved.settings | ({} if arch is None else {"arch": arch})
         if set(settings) != {field.name for field in dataclasses.fields(Settings)}:
             raise SimulationError(f"{path} holds no state of this scene: its settings are not those of this version")
-        check_scene(saved, scene, plan_of(scene, settings["integrator"], settings["self_collision"]).on)
+        check_scene(saved, scene, plan_of(scene, *(settings[key] for key in ("integrator", "self_collision", "pullable"))).on)
         start = scene.snapshot()
         start.allow_initial_overlap = True  # where bodies start is not where they are
         sim = cls(start, **settings)

@@ -18,6 +18,7 @@ from taisoft.stability import scale_warnings
 from taisoft.stepping import make_stepper
 from taisoft.stepping.contact import ContactStep
 from taisoft.stepping.motion import Motion
+from taisoft.stepping.pull import Pull, batch
 from taisoft.stepping.world import World
 
 
@@ -33,7 +34,7 @@ class Simulator(Resuming):
     """A scene being simulated, as it was when this was made. SI units; positions are float64 in either precision.
 
     dt [s]; integrator: one of taisoft.stepping.INTEGRATORS; newton_tolerance, linear_tolerance: relative, None is adaptive.
-    An explicit integrator refuses a dt above `stable_dt` unless allow_unstable, which only warns.
+    An explicit integrator refuses a dt above `stable_dt` unless allow_unstable, which only warns. pullable: `pull` is wanted.
     Raises SceneError for a scene that cannot be simulated, SimulationError for settings that cannot be met.
     """
 
@@ -41,11 +42,11 @@ class Simulator(Resuming):
         self, scene: Scene, dt: float = 1 / 60, integrator: str = "implicit_euler", contact_solver: str = "auto",
         self_collision: bool = False, precision: str = "f32", arch: str = "cpu", allow_unstable: bool = False,
         newton_tolerance: float | None = None, linear_tolerance: float | None = None,
-        contact_tolerance: float | None = None,
+        contact_tolerance: float | None = None, pullable: bool = False,
     ):  # fmt: skip
         self.settings = check_settings(
             scene, dt, integrator, contact_solver, self_collision, precision, arch, allow_unstable, newton_tolerance,
-            linear_tolerance, contact_tolerance,
+            linear_tolerance, contact_tolerance, pullable,
         )  # fmt: skip
         self.scene = scene.snapshot()  # what a user changes later, here or there, stays there
         scene = self.scene
@@ -59,7 +60,7 @@ class Simulator(Resuming):
             self._check_stability(self._dt)
         for text in scale_warnings(scene):
             warnings.warn(text, UserWarning, stacklevel=2)
-        self.plan = plan_of(scene, integrator, self_collision)
+        self.plan = plan_of(scene, integrator, self_collision, pullable)
         self._runtime = runtime.open_runtime(arch, precision, f"the simulator of {[b.name for b in scene.bodies]}")
         self._compiled_before = runtime.compile_clock()
         self._arena = FieldArena()
@@ -70,6 +71,7 @@ class Simulator(Resuming):
             if touching:
                 self._contact = ContactStep(self._world, self_collision, self.settings.explicit)
                 self._owned.append(self._contact)
+            self._pull = Pull(self._world) if pullable else None
             self._stepper = make_stepper(self._world, integrator, self._contact, contact_solver)
             self._owned.append(self._stepper)
             self.reset()
@@ -107,6 +109,11 @@ class Simulator(Resuming):
     def advance(self, n: int) -> StepReport:
         """Up to n steps of dt, at least one: explicit ones in one launch, implicit ones one at a time."""
         world, start = self._open_world(), self.step_count
+        if self.pulled is not None:
+            most = batch(self._dt) if self.settings.explicit else 1
+            n = min(n, most)
+            self._pull.apply(most * self._dt)  # of less than a batch, too: the spring must not change its stiffness
+            self._loads_changed()
         if self.settings.explicit:
             result = self._stepper.advance(n, self._dt)
             self._count(result.done)
@@ -156,6 +163,7 @@ class Simulator(Resuming):
     def reset(self) -> None:
         """Back to the scene's start; numbers changed while it ran (dt, gravity, materials) stay."""
         self._open_world().restart()
+        self.release()
         self._time_base = (0.0, 0)
         self._stepper.forget()
 

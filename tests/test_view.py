@@ -7,15 +7,12 @@
 * without a Vulkan driver pictures are drawn in software, and one line says which package is missing;
 * without a display or a driver a window is refused with a sentence, and the process lives on;
 * a window leaves no file behind, and a file of the name it would have used stays as it is;
-* a process holds one window, and an open one keeps the runtime from being initialised anew;
-* the window answers keys and mouse (on a virtual display).
+* a process holds one window, and an open one keeps the runtime from being initialised anew.
 """
 
 import os
-import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -414,109 +411,3 @@ def test_pictures_in_either_precision(precision):
     finally:
         drawing.close()
         runtime.close()
-
-
-# --- the window, on a virtual display ---
-
-TOOLS = [tool for tool in ("Xvfb", "xdotool", "import") if shutil.which(tool) is None]
-WATCH = PROLOGUE + """
-show(sim)
-print("closed")
-"""
-
-
-class Desktop:
-    """A virtual display with one child process that opens a window; `say` waits for what the child prints."""
-
-    def __init__(self, folder, code):
-        self.folder = folder
-        read, write = os.pipe()
-        command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x760x24"]
-        self.server = subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL)
-        os.close(write)
-        with os.fdopen(read) as pipe:
-            self.environment = os.environ | {"DISPLAY": f":{pipe.readline().strip()}"}
-        self.log = folder / "log"
-        with open(self.log, "w") as log:
-            self.child = subprocess.Popen(
-                [sys.executable, "-c", code], cwd=ROOT, env=self.environment, stdout=log, stderr=subprocess.STDOUT
-            )
-
-    def tool(self, *arguments):
-        subprocess.run(arguments, env=self.environment, capture_output=True, timeout=30, check=True)
-
-    def wait_for(self, condition, what):
-        end = time.monotonic() + 60
-        while not condition():
-            assert time.monotonic() < end, f"no {what}: {self.log.read_text()}"
-            time.sleep(0.05)
-
-    def printed(self):
-        """Lines of the child so far."""
-        return self.log.read_text().split()
-
-    def picture(self):
-        """The whole screen, uint8 (height, width, 3)."""
-        path = self.folder / "screen.ppm"
-        self.tool("import", "-window", "root", "-depth", "8", str(path))
-        data = path.read_bytes()
-        size, at = [], 2  # "P6", width, height, 255, then the pixels
-        while len(size) < 3:
-            end = at + 1
-            while not data[end : end + 1].isspace():
-                end += 1
-            size.append(int(data[at:end]))
-            at = end
-        return np.frombuffer(data, np.uint8, offset=at + 1).reshape(size[1], size[0], 3)
-
-    def close(self):
-        for process in (self.child, self.server):
-            process.kill()
-            process.wait()
-
-
-@pytest.fixture
-def desktop(tmp_path):
-    if TOOLS:
-        pytest.skip(f"a virtual display needs {', '.join(TOOLS)} (Debian: xvfb, xdotool, imagemagick)")
-    made = Desktop(tmp_path, WATCH)
-    yield made
-    made.close()
-
-
-@needs_vulkan
-def test_window_answers_keys_and_mouse(desktop):
-    desktop.wait_for(lambda: desktop.printed().count("run") >= 3, "running simulation")
-    desktop.tool("xdotool", "search", "--sync", "--name", "taisoft", "windowmove", "0", "0", "windowfocus")
-
-    def press(key, condition, what):
-        desktop.tool("xdotool", "key", key)
-        desktop.wait_for(condition, what)
-
-    def settled():
-        """True once the simulation has stopped running."""
-        before = desktop.printed().count("run")
-        time.sleep(0.4)
-        return desktop.printed().count("run") == before
-
-    press("space", settled, "pause")
-    press("s", lambda: desktop.printed().count("step") == 1, "single step")
-    press("Right", lambda: desktop.printed().count("step") == 2, "single step")
-    assert settled()
-    screen = desktop.picture()
-    mask = body_mask(screen[:, 400:])  # right of the panel
-    assert mask.mean() > 0.05, "the beam is on the screen"
-    assert (screen[60:200, 30:300] > 200).any(), "the panel's text is on the screen"
-    desktop.tool("xdotool", "mousemove", "900", "500", "mousedown", "1")
-    for _ in range(5):
-        desktop.tool("xdotool", "mousemove_relative", "--", "-30", "10")
-        time.sleep(0.1)
-    desktop.tool("xdotool", "mouseup", "1")
-    time.sleep(0.3)
-    turned = body_mask(desktop.picture()[:, 400:])
-    assert np.mean(turned != mask) > 0.02, "dragging turns the view"
-    press("r", lambda: "reset" in desktop.printed(), "restart")
-    press("space", lambda: not settled(), "running on")
-    desktop.tool("xdotool", "key", "Escape")
-    assert desktop.child.wait(timeout=30) == 0
-    assert desktop.printed()[-1] == "closed"

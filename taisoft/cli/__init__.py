@@ -112,6 +112,8 @@ def _add_run(commands) -> None:
     )
     parser.add_argument("--video", action="store_true", help="also make video.mp4 of the pictures, by ffmpeg (extra 'video')")
     parser.add_argument("--no-usd", action="store_true", help="write no scene.usdc")
+    colours = ("body", "stress", "stretch", "speed")
+    parser.add_argument("--colour", choices=colours, default="body", help="what pictures and the window colour bodies by")
     parser.add_argument("--no-frames", action="store_true", help="write no pictures")
     parser.set_defaults(command="run")
 

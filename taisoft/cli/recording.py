@@ -71,7 +71,9 @@ class Recording:
         self.path, self._resumed, self._notes = Path(path), resumed, notes or {}
         self._checkpoints = CheckpointWriter(self._folder.path, every)
 
-    def add_writers(self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool) -> None:
+    def add_writers(
+        self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool, colour: str = "body"
+    ) -> None:
         """Adds the writers of frames, USD and checkpoints to the observers. What goes on in another way is refused before
         anything is removed."""
         rate = fps or 1.0 / sim.dt
@@ -84,7 +86,7 @@ class Recording:
             self._folder.clear(self._first)
         drawing = None
         if with_frames:
-            drawing = Offscreen(sim.scene)
+            drawing = Offscreen(sim.scene, colour=colour)
             drawing.go_on(self._notes.get("camera"))
             observers.members.append(FrameWriter(self._folder.path, drawing))
         self._checkpoints.notes = lambda: {"fps": fps, "camera": drawing.camera.distance if drawing else None}

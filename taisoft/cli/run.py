@@ -34,11 +34,13 @@ def command(arguments: Namespace) -> int:
         if arguments.video and (arguments.out is None or arguments.no_frames):
             raise SceneError("--video needs --out, the folder to write to, and the pictures that --no-frames leaves out")
         notes: dict = {}
+        has_window = not arguments.headless and _window_is_possible()
+        watched = has_window and arguments.out is None and arguments.seconds is None
         if arguments.resume is None:
             settings = resolve(solver, arguments, Simulator)
             if arguments.out is not None:
                 check_free(arguments.out, arguments.overwrite)
-            sim = Simulator(scene, **settings.simulator)
+            sim = Simulator(scene, **settings.simulator | ({"pullable": True} if watched else {}))  # by the mouse
         else:
             saved = read_checkpoint(arguments.resume)
             notes = saved.notes
@@ -47,9 +49,8 @@ def command(arguments: Namespace) -> int:
             sim = _resumed(scene, settings, arguments)
         with sim:
             print_plan(sim)
-            has_window = not arguments.headless and _window_is_possible()
-            if has_window and arguments.out is None and arguments.seconds is None:
-                return _watch(sim, settings)
+            if watched:
+                return _watch(sim, settings, arguments.colour)
             _check_time_left(sim, settings, arguments)
             return _run(sim, settings, arguments, signals, told, has_window, every, notes)
 
@@ -102,11 +103,11 @@ def _window_is_possible() -> bool:
     return not missing
 
 
-def _watch(sim: Simulator, settings: RunSettings) -> int:
+def _watch(sim: Simulator, settings: RunSettings, colour: str) -> int:
     """The live window, for as long as it stays open."""
     from taisoft.view.window import show
 
-    show(sim, fps=settings.fps or 1.0 / sim.dt)
+    show(sim, fps=settings.fps or 1.0 / sim.dt, colour=colour)
     print_state(sim)
     return 0
 
@@ -126,9 +127,9 @@ def _run(
             recording = stack.enter_context(closing(Recording(arguments.out, arguments.overwrite, resumed, every, notes)))
         stack.callback(observers.close)
         if has_window:
-            observers.members.append(_open_window(sim))
+            observers.members.append(_open_window(sim, arguments.colour))
         if recording is not None:
-            recording.add_writers(observers, sim, settings.fps, not arguments.no_usd, not arguments.no_frames)
+            recording.add_writers(observers, sim, settings.fps, not arguments.no_usd, not arguments.no_frames, arguments.colour)
         observers.members.append(Progress(settings.seconds, label=Path(arguments.scene).stem))
         result = sim.run(
             settings.seconds,
@@ -156,10 +157,10 @@ def _run(
     return EXIT_FAILED if result.status == "failed" else 0
 
 
-def _open_window(sim: Simulator):
+def _open_window(sim: Simulator, colour: str):
     from taisoft.view.window import LiveWindow
 
-    return LiveWindow(sim.scene)
+    return LiveWindow(sim.scene, colour=colour)
 
 
 def _tell_failed_output(result: RunReport, observers: Observers, signals: Signals) -> None:

@@ -121,6 +121,20 @@ class Camera:
         height = 2 * self.distance * math.tan(math.radians(self.fov) / 2)
         return replace(self, target=self.target + height * (right * self.axes[0] + up * self.axes[1]))
 
+    def ray(self, at: tuple[float, float], size: tuple[int, int]) -> np.ndarray:
+        """Unit vector (3,) from the eye through a point of the picture, in [0, 1] from its lower left corner.
+
+        size: width and height of the picture, in any unit.
+        """
+        half = math.tan(math.radians(self.fov) / 2)
+        right, up = half * (2 * at[0] - 1) * size[0] / size[1], half * (2 * at[1] - 1)
+        direction = np.array([right, up, 1.0]) @ self.axes
+        return direction / np.linalg.norm(direction)
+
+    def nearer(self, points: np.ndarray, share: float) -> np.ndarray:
+        """Points (n,3) moved along their rays to a share of their distance from the eye: they stay on their pixels."""
+        return self.position + share * (points - self.position)
+
     def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """Pixel coordinates (from the left, from the top) and depth along the view [m] of points (n,3): (n,3).
 

@@ -4,7 +4,6 @@ The folder's lock is an advisory kernel lock (flock) on a file that holds the wr
 lock is free.
 """
 
-import itertools
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -59,8 +58,9 @@ class OutputFolder:
         self._lock: int | None = _lock_folder(self.path)
         try:
             self._old = check_free(path, overwrite) if first is None else {}
+            _clear_parts(self.path)
             if first is None:
-                _clear(self.path, first)
+                _clear_frames(self.path, 0)
             _probe(self.path)
         except OSError as error:
             self.close()
@@ -72,7 +72,7 @@ class OutputFolder:
     def clear(self, first: int) -> None:
         """Remove an earlier run's frames and chunks from that number on. Raises OutputError."""
         try:
-            _clear(self.path, first)
+            _clear_frames(self.path, first)
         except OSError as error:
             raise OutputError(f"cannot write to the output folder {self.path}: {error.strerror or error}") from error
 
@@ -150,16 +150,18 @@ def _results(folder: Path) -> dict[str, tuple[int, int] | None]:
     return found
 
 
-def _clear(folder: Path, first: int | None) -> None:
-    """Remove an earlier run's frames and chunks, and what a killed writer left under temporary names.
-
-    first: only those frames, and chunks that begin with them, from that number on.
-    """
+def _clear_frames(folder: Path, first: int) -> None:
+    """Remove an earlier run's frames, and chunks that begin with them, from that number on."""
     for name, pattern in RESULT_FOLDERS.items():
-        old = (folder / name).glob(pattern)
-        if first is not None:
-            old = [file for file in old if _number(file) >= first]
-        for file in itertools.chain(old, (folder / name).glob(f"{pattern}.*.part")):
+        for file in (folder / name).glob(pattern):
+            if first == 0 or _number(file) >= first:
+                file.unlink()
+
+
+def _clear_parts(folder: Path) -> None:
+    """Remove what a killed writer left under temporary names."""
+    for name, pattern in RESULT_FOLDERS.items():
+        for file in (folder / name).glob(f"{pattern}.*.part"):
             file.unlink()
     for name in RESULT_FILES:
         for file in folder.glob(f"{name}.*.part"):

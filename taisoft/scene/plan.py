@@ -27,8 +27,10 @@ def _named(names: list[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: bool = False) -> Plan:
-    """Decide from the scene, the kind of integrator, and whether bodies may touch themselves."""
+def make_plan(
+    scene: Scene, explicit: bool, multistep: bool, self_collision: bool = False, pullable: bool = False
+) -> Plan:
+    """Decide from the scene, the kind of integrator, and whether bodies may touch themselves or are to be pulled."""
     plan = Plan()
     laws = {name: [b.name for b in scene.bodies if b.material.law == name] for name in LAWS}
     for law, names in laws.items():
@@ -48,7 +50,8 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         "explicit steps need a diagonal mass" if quadratic else "the mass of linear tets is lumped",
     )  # fmt: skip
     loaded = bodies(lambda b: b.tractions or b.forces)
-    plan.add("loads", bool(loaded), f"tractions or forces on {_named(loaded)}", "no traction and no force")
+    why = f"tractions or forces on {_named(loaded)}" if loaded else "bodies are to be pulled"
+    plan.add("loads", bool(loaded) or pullable, why, "no traction and no force")
     fixed = bodies(lambda b: any(c.path is None for c in b.constraints))
     plan.add("fixed_nodes", bool(fixed), f"on {_named(fixed)}", "no node is fixed")
     moved = bodies(lambda b: any(c.path is not None for c in b.constraints))

@@ -26,6 +26,8 @@ from taisoft.transfer import upload
 from taisoft.view.shading import lit_colours
 from taisoft.view.surfaces import Surfaces
 
+LINE_WIDTH = 2.0
+
 _holder: list[str] = []  # what holds the process's one window
 
 
@@ -73,11 +75,11 @@ def _panel_file_to_come() -> Path | None:
 class Canvas:
     """The process's one Taichi window with the scene's surfaces in it; on the screen, or only in memory.
 
-    surfaces: what is drawn; size: (width, height) in pixels; visible: on the screen. Raises OutputError, before
-    anything is opened, when a Vulkan driver or a display is missing or a window is open already.
+    surfaces: what is drawn; size: (width, height) in pixels; visible: on the screen; n_segments: most lines that can be drawn.
+    Raises OutputError, before anything is opened, when a Vulkan driver or a display is missing or a window is open already.
     """
 
-    def __init__(self, surfaces: Surfaces, size: tuple[int, int], visible: bool, title: str = "taisoft"):
+    def __init__(self, surfaces: Surfaces, size: tuple[int, int], visible: bool, n_segments: int = 0):
         missing = (visible and display_missing()) or vulkan_missing()
         if missing:
             raise OutputError(f"cannot open a window: {missing}")
@@ -96,11 +98,13 @@ class Canvas:
         self._normals = self._fields.vectors("picture normals", ti.f32, n, np.tile(np.float32([0, 1, 0]), (n, 1)))
         self._colours = self._fields.vectors("picture colours", ti.f32, n)
         triangles = surfaces.triangles.ravel()
+        self._ends = self._fields.vectors("picture lines", ti.f32, 2 * n_segments) if n_segments else None
+        self._end_colours = self._fields.vectors("picture line colours", ti.f32, 2 * n_segments) if n_segments else None
         self._indices = self._fields.field("picture triangles", ti.i32, len(triangles), triangles)
         self.window = self._canvas = self._scene = None
         self._litter = _panel_file_to_come()
         try:
-            self.window = ti.ui.Window(title, size, show_window=visible)
+            self.window = ti.ui.Window("taisoft", size, show_window=visible)
             self._canvas = self.window.get_canvas()
             self._scene = self.window.get_scene()
         except RuntimeError as error:
@@ -108,10 +112,15 @@ class Canvas:
             raise OutputError(f"cannot open a window: Taichi says: {error}") from error
 
     def draw(
-        self, x: np.ndarray, normals: np.ndarray, camera: Camera, background: tuple[float, float, float]
-    ) -> None:
-        """Draw the surfaces with vertices x [m] and unit normals, (n,3) each; background: RGB in [0, 1]."""
-        colours = lit_colours(x, normals, self._surfaces.colours, camera)
+        self, x: np.ndarray, normals: np.ndarray, camera: Camera, background: tuple[float, float, float],
+        base: np.ndarray | None = None, lines: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:  # fmt: skip
+        """Draw the surfaces with vertices x [m] and unit normals, (n,3) each; background: RGB in [0, 1].
+
+        base: unshaded colours (n,3) in place of the surfaces' own; lines: ends (2k,3) [m] and their colours (2k,3), of which
+        the first n_segments are drawn.
+        """
+        colours = lit_colours(x, normals, self._surfaces.colours if base is None else base, camera)
         # relative to the target: single precision would blur a scene far from the origin
         upload([(self._x, x - camera.target), (self._colours, colours)])
         eye = ti.ui.Camera()
@@ -130,7 +139,17 @@ class Canvas:
             self._scene.mesh(
                 self._x, indices=self._indices, normals=self._normals, per_vertex_color=self._colours, two_sided=True
             )
+            if self._ends is not None:
+                self._draw_lines(camera, *(lines or (np.empty((0, 3)), np.empty((0, 3)))))
             self._canvas.scene(self._scene)
+
+    def _draw_lines(self, camera: Camera, ends: np.ndarray, colours: np.ndarray) -> None:
+        """With none to draw a line without length, so that Taichi compiles its copying at the first picture."""
+        n = min(len(ends), self._ends.shape[0])
+        all_ends, all_colours = np.zeros((self._ends.shape[0], 3)), np.zeros((self._ends.shape[0], 3))
+        all_ends[:n], all_colours[:n] = ends[:n] - camera.target, colours[:n]
+        upload([(self._ends, all_ends), (self._end_colours, all_colours)])
+        self._scene.lines(self._ends, LINE_WIDTH, per_vertex_color=self._end_colours, vertex_count=max(n, 2))
 
     def pixels(self, left: int, top: int, right: int, bottom: int) -> np.ndarray:
         """That part of the drawn picture, uint8 (bottom - top, right - left, 3), first row on top."""

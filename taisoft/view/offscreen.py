@@ -12,6 +12,7 @@ from taisoft.errors import OutputError
 from taisoft.output.appearance import start_positions
 from taisoft.output.camera import MAX_WIDENING, Camera
 from taisoft.runtime import open_kind
+from taisoft.view.colouring import Colouring
 from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
 from taisoft.view.raster import rasterise
 from taisoft.view.shading import background, lit_colours
@@ -30,10 +31,13 @@ class Offscreen:
 
     scene: read once; size: (width, height) in pixels; camera: stays as given, else shows all bodies as they start,
     and moves back, never nearer, when a body would leave the picture; renderer: "vulkan", "software" or "auto": Vulkan
-    where it can be had, else one line on stderr says why not. Raises OutputError.
+    where it can be had, else one line on stderr says why not; colour: of the bodies, their own ("body") or by "stress",
+    "stretch" or "speed". Raises OutputError.
     """
 
-    def __init__(self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None, renderer: str = "auto"):
+    def __init__(
+        self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None, renderer: str = "auto", colour: str = "body"
+    ):  # fmt: skip
         if renderer not in RENDERERS:
             raise OutputError(f"renderer '{renderer}' is unknown: it must be one of {', '.join(RENDERERS)}")
         if min(size) < 1:
@@ -42,6 +46,7 @@ class Offscreen:
         self.camera = camera or Camera.framing(start_positions(scene), size)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # [m]
         self.surfaces = Surfaces(scene)
+        self.colouring = Colouring(scene, self.surfaces, colour)
         self._large = (self.size[0] * SAMPLES, self.size[1] * SAMPLES)
         self._background = background(self._large)
         self._canvas = None
@@ -61,12 +66,13 @@ class Offscreen:
         x, normals = self.surfaces.with_obstacles(bodies, sim.time, self.camera.position)
         projected = self.camera.project(x, self._large)
         left, top, right, bottom = _box(projected, self._large)  # the rest is background, and stays as it is
+        base = self.colouring.base(sim)
         picture = self._background[::SAMPLES, ::SAMPLES].copy()
         if left == right or top == bottom:
             return picture
         part = self._background[top:bottom, left:right].copy()
-        if self._canvas is None or not self._draw(x, normals, (left, top, right, bottom), part):
-            colours = lit_colours(x, normals, self.surfaces.colours, self.camera)
+        if self._canvas is None or not self._draw(x, normals, base, (left, top, right, bottom), part):
+            colours = lit_colours(x, normals, base, self.camera)
             x, triangles, colours = self.camera.clipped(x, self.surfaces.triangles, colours, self.size)
             projected = self.camera.project(x, self._large)
             projected[:, :2] -= (left, top)
@@ -74,12 +80,14 @@ class Offscreen:
         picture[top // SAMPLES : bottom // SAMPLES, left // SAMPLES : right // SAMPLES] = _averaged(part)
         return picture
 
-    def _draw(self, x: np.ndarray, normals: np.ndarray, box: tuple[int, int, int, int], part: np.ndarray) -> bool:
+    def _draw(
+        self, x: np.ndarray, normals: np.ndarray, base: np.ndarray, box: tuple[int, int, int, int], part: np.ndarray
+    ) -> bool:
         """Draw by Vulkan into part, what lies in the box; False where nothing came of it.
 
         On a busy machine Taichi's renderer, now and then, hands out a picture that has been cleared and not drawn on.
         """
-        self._canvas.draw(x, normals, self.camera, KEY_COLOUR)
+        self._canvas.draw(x, normals, self.camera, KEY_COLOUR, base)
         pixels = self._canvas.pixels(*box)
         red, green, blue = np.moveaxis(pixels, 2, 0)
         empty = (red == 255) & (green == 0) & (blue == 255)

@@ -32,17 +32,28 @@ class Surfaces:
         self._ends = np.cumsum([body.n_nodes for body in scene.bodies])[:-1]  # of the bodies' nodes among those of all
         self._obstacles = [_RigidSurface(surface) for surface in obstacle_surfaces(scene)]
         triangles, colours, n = [], [], 0
+        starts = np.concatenate([[0], self._ends])
+        nodes = [np.where(body.nodes >= 0, body.nodes + start, -1) for body, start in zip(self._bodies, starts)]
+        self._nodes = np.concatenate(nodes)  # of the bodies' drawn vertices among the nodes of all; -1 of markers
         for part in (*self._bodies, *self._obstacles):
             triangles.append(part.triangles + n)
             colours.append(part.colours)
             n += len(part.colours)
+        self.with_markers = True  # of fixed nodes
         self.triangles = np.concatenate(triangles).astype(np.int32)
         self.colours = np.concatenate(colours)
+
+    def coloured(self, colours: np.ndarray) -> np.ndarray:
+        """Colours (n,3) of all drawn vertices where the bodies' nodes have colours (n_nodes,3)."""
+        every = self.colours.copy()
+        drawn = np.flatnonzero(self._nodes >= 0)
+        every[drawn] = colours[self._nodes[drawn]]
+        return every
 
     def of_bodies(self, sim) -> tuple[np.ndarray, np.ndarray]:
         """Positions [m] and unit normals of the bodies' drawn vertices in sim's present state, each float64 (n,3)."""
         x = np.split(sim.positions(), self._ends)
-        return _joined([body.vertices(own) for body, own in zip(self._bodies, x)])
+        return _joined([body.vertices(own, self.with_markers) for body, own in zip(self._bodies, x)])
 
     def with_obstacles(
         self, bodies: tuple[np.ndarray, np.ndarray], t: float, eye: np.ndarray
@@ -75,10 +86,11 @@ class _BodySurface:
         self.triangles = np.concatenate([corners, markers])
         counts = (len(self._nodes), len(ball) * len(self._marked))
         self.colours = np.repeat([colour, MARKER_COLOUR], counts, axis=0)
+        self.nodes = np.concatenate([self._nodes, np.full(counts[1], -1)])  # of each drawn vertex; -1 of markers
 
-    def vertices(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def vertices(self, x: np.ndarray, with_markers: bool) -> tuple[np.ndarray, np.ndarray]:
         drawn = x[self._nodes]
-        markers = (x[self._marked][:, None] + self._radius * self._ball).reshape(-1, 3)
+        markers = (x[self._marked][:, None] + with_markers * self._radius * self._ball).reshape(-1, 3)
         normals = np.tile(self._ball, (len(self._marked), 1))
         return np.concatenate([drawn, markers]), np.concatenate([vertex_normals(drawn, self._corners), normals])
 

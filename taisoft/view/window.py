@@ -1,46 +1,67 @@
-"""The live window: a simulation that runs while it is watched, turned, paused and stepped.
+"""The live window: a simulation that runs while it is watched, turned, pulled, paused, stepped and changed.
 
-Drag with the left button to orbit, the right one to zoom, the middle one to shift. Space: pause or go on. S or right
-arrow: one step. R: back to the initial state. Escape or the close button: end.
+The left button pulls the body under the cursor, and orbits elsewhere or with Ctrl; the right one zooms, the middle one shifts.
+Space: pause or go on. S or right arrow: one step. R: back to the initial state. V: other colours. W, C, T, F: wires, contacts,
+tractions, fixed nodes. P: record pictures. Escape or
+the close button: end. Sliders and buttons are in the panel, see `taisoft.view.panel`.
 """
 
-import textwrap
 import time
 
+import numpy as np
 import taichi as ti
 
-from taisoft.errors import OutputError, SimulationError, TaisoftError
+from taisoft.errors import OutputError
 from taisoft.output.appearance import start_positions
 from taisoft.output.camera import MAX_WIDENING, Camera
+from taisoft.view.colouring import Colouring
 from taisoft.view.ggui import Canvas
+from taisoft.view.layers import IN_FRONT, Layers
+from taisoft.view.loop import Loop
+from taisoft.view.panel import Panel
+from taisoft.view.picking import Drag, pick
 from taisoft.view.shading import BACKGROUND_TOP
 from taisoft.view.surfaces import Surfaces
 
 SIZE = (1280, 720)
-PANEL = (0.012, 0.02, 0.25, 0.36)  # left, top, width, height as fractions of the window
-PANEL_COLUMNS = 42  # characters that fit its width
+PANEL = (0.012, 0.02, 0.27, 0.94)  # left, top, width, height as fractions of the window as it opens
+SHORT_PANEL = (0.012, 0.02, 0.27, 0.24)  # of a run that is only watched
 ORBIT = 240.0  # [deg] for a drag over the whole window
 ZOOM = 16.0  # factor on the distance for such a drag
-SPEED_OVER = 0.5  # [s] of wall time that steps/s is averaged over
-KEYS = ("Space: pause, S or Right: step", "R: restart, Esc: quit", "Drag: left turn, right zoom, middle shift")
+PULL_COLOUR = np.array([0.85, 0.10, 0.35])  # sRGB
+KEYS = {
+    ti.ui.SPACE: "pause", "s": "step", ti.ui.RIGHT: "step", "r": "reset", "p": "record", "v": "colour",
+    "w": "wires", "c": "contacts", "t": "tractions", "f": "fixed nodes", ti.ui.ESCAPE: "close",
+}  # fmt: skip
 
 
 class LiveWindow:
     """A window that shows a scene; also an observer, with `frame` and `close`, for `Simulator.run`.
 
     scene: its bodies and obstacles are read once; size: (width, height) in pixels; camera: where to look from, else it shows all
-    bodies and moves back after them until the user moves it. `pressed` holds which of "pause", "step" and "reset" the
-    user pressed up to the last draw. Raises OutputError, before anything is opened, when a display or a Vulkan driver
-    is missing or the process has a window already.
+    bodies and moves back after them until the user moves it; tall: with room for sliders in the panel; colour: as of
+    `Offscreen`, to begin with. `pressed` holds what
+    the user asked for by keys up to the last draw, values of KEYS. Raises OutputError, before anything is opened, when a
+    display or a Vulkan driver is missing or the process has a window already.
     """
 
-    def __init__(self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None):
+    def __init__(
+        self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None, tall: bool = False, colour: str = "body"
+    ):  # fmt: skip
         self.camera = camera or Camera.framing(start_positions(scene), size)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # [m]; 0 once the user moves the camera
         self._surfaces = Surfaces(scene)
-        self._canvas = Canvas(self._surfaces, size, visible=True)
-        self._cursor: tuple[float, float] | None = None  # of the drag that is going on
+        self.layers = Layers(scene)
+        self.colouring = Colouring(scene, self._surfaces, colour)
+        self._canvas = Canvas(self._surfaces, size, visible=True, n_segments=self.layers.n_segments + 1)
+        self._place = PANEL if tall else SHORT_PANEL
+        # GGUI places the panel once, by the window's size at that time, and does not tell where the user moves it
+        self._panel_pixels = tuple(f * n for f, n in zip(self._place, (*size, *size)))
+        self._cursor: tuple[float, float] | None = None  # at the last picture
+        self._mode = ""  # of the drag that is going on: "turn", "zoom", "shift", "pull", or "panel", which is not ours
+        self._taken: tuple[int, int] | None = None  # size of the last picture that was recorded
         self._asked_to_close = False
+        self.drag: Drag | None = None
         self.pressed: set[str] = set()
 
     @property
@@ -48,19 +69,33 @@ class LiveWindow:
         """True once the user asked to close the window, or `close` was called."""
         return self._asked_to_close or self._canvas.window is None or not self._canvas.window.running
 
-    def draw(self, sim, lines: list[str]) -> None:
-        """Draw sim's present state with a panel of text lines, show it, and take up keys and mouse."""
+    def draw(self, sim, lines: list[str], panel: Panel | None = None, record=None) -> None:
+        """Draw sim's present state with a panel of text lines, show it, and take up keys and mouse.
+
+        panel: the sliders below the lines; record: is given the picture, uint8 (height, width, 3), without the panel.
+        """
+        window = self._canvas.window
+        self._surfaces.with_markers = self.layers.shown["fixed nodes"]
         bodies = self._surfaces.of_bodies(sim)
-        self.camera = self.camera.widened(bodies[0], self._canvas.window.get_window_shape(), self._widest)
+        self.camera = self.camera.widened(bodies[0], window.get_window_shape(), self._widest)
         x, normals = self._surfaces.with_obstacles(bodies, sim.time, self.camera.position)
-        self._canvas.draw(x, normals, self.camera, tuple(BACKGROUND_TOP))
-        with self._canvas.window.get_gui().sub_window("taisoft", *PANEL) as panel:
+        self._canvas.draw(x, normals, self.camera, tuple(BACKGROUND_TOP), self.colouring.base(sim), self._lines(sim))
+        size = window.get_window_shape()
+        # GGUI shows an empty window once a picture has been taken of it at another size than the present one
+        if record is not None or self._taken not in (None, size):
+            picture = self._canvas.pixels(0, 0, *size)  # before the panel is declared, which would be in it
+            self._taken = size
+            if record is not None:
+                record(picture)
+        # a line that comes and goes above the sliders would move them under the cursor
+        with window.get_gui().sub_window("taisoft", *self._place) as gui:
             for line in lines:
-                for piece in textwrap.wrap(line, PANEL_COLUMNS) or [""]:
-                    panel.text(piece)
-        self._canvas.window.show()
+                gui.text(line)
+            if panel is not None:
+                panel.draw(gui)
+        window.show()
         self._read_keys()
-        self._read_mouse()
+        self._read_mouse(sim, panel)
 
     def frame(self, sim, index: int) -> None:
         """Show a frame of a run that is driven from elsewhere; does nothing once closed."""
@@ -71,102 +106,98 @@ class LiveWindow:
         """Destroy the window; a second call does nothing."""
         self._canvas.close()
 
+    def _lines(self, sim) -> tuple[np.ndarray, np.ndarray]:
+        """Ends and colours of the lines over the picture."""
+        ends, colours = self.layers.lines(sim, self.camera)
+        if self.drag is None:
+            return ends, colours
+        pulled = self.camera.nearer(self.drag.line(sim), IN_FRONT)
+        return np.concatenate([pulled, ends]), np.concatenate([np.tile(PULL_COLOUR, (2, 1)), colours])
+
     def _read_keys(self) -> None:
-        actions = {ti.ui.SPACE: "pause", "s": "step", ti.ui.RIGHT: "step", "r": "reset"}
         self.pressed.clear()
         for event in self._canvas.window.get_events(ti.ui.PRESS):
-            if event.key == ti.ui.ESCAPE:
-                self._asked_to_close = True
-            elif event.key in actions:
-                self.pressed.add(actions[event.key])
+            if event.key in KEYS:
+                self.pressed.add(KEYS[event.key])
+        for name in self.pressed & set(self.layers.shown):
+            self.layers.shown[name] = not self.layers.shown[name]
+        if "colour" in self.pressed:
+            self.colouring.choose_next()
+        self._asked_to_close |= "close" in self.pressed
 
-    def _read_mouse(self) -> None:
+    def _read_mouse(self, sim, panel: Panel | None) -> None:
         window = self._canvas.window
+        size = window.get_window_shape()
         button = next((b for b in (ti.ui.LMB, ti.ui.RMB, ti.ui.MMB) if window.is_pressed(b)), None)
         cursor = window.get_cursor_pos()  # from the lower left corner, in [0, 1]
-        if button is None or (self._cursor is None and _on_panel(cursor)):
-            self._cursor = None
-            return
-        if self._cursor is not None:
-            self._widest = 0.0
-            right, up = cursor[0] - self._cursor[0], cursor[1] - self._cursor[1]
-            if button == ti.ui.LMB:
-                self.camera = self.camera.orbit(-ORBIT * right, -ORBIT * up)
-            elif button == ti.ui.RMB:
-                self.camera = self.camera.zoom(ZOOM**-up)
-            else:
-                width, height = window.get_window_shape()
-                self.camera = self.camera.pan(-right * width / height, -up)
+        if button is None or min(size) < 1:  # a window made as small as nothing has no cursor either
+            if self.drag is not None:
+                self.drag = None
+                sim.release()
+            self._mode = ""
+        elif not self._mode:
+            self._mode = self._begin(sim, panel, button, cursor, size)
+        else:
+            self._move(button, (cursor[0] - self._cursor[0], cursor[1] - self._cursor[1]), size)
+        if self.drag is not None:
+            self.drag.pull(sim, self.camera, cursor, size, panel.strength)
         self._cursor = cursor
 
+    def _begin(self, sim, panel: Panel | None, button, cursor, size) -> str:
+        """What the drag that begins here does."""
+        left, top, width, height = self._panel_pixels
+        if left <= cursor[0] * size[0] <= left + width and top <= (1.0 - cursor[1]) * size[1] <= top + height:
+            return "panel"
+        if button != ti.ui.LMB:
+            return "zoom" if button == ti.ui.RMB else "shift"
+        if panel is not None and panel.strength > 0.0 and not self._canvas.window.is_pressed(ti.ui.CTRL):
+            hit = pick(sim, self.camera, cursor, size)
+            if hit is not None:
+                self._widest = 0.0  # a camera that moves back would pull, too
+                self.drag = Drag(sim, hit)
+                panel.chosen = self.drag.body
+                return "pull"
+        return "turn"
 
-def show(sim, fps: float = 60.0, paused: bool = False) -> None:
+    def _move(self, button, way: tuple[float, float], size) -> None:
+        right, up = way
+        if self._mode in ("turn", "zoom", "shift"):
+            self._widest = 0.0
+        if self._mode == "turn":
+            self.camera = self.camera.orbit(-ORBIT * right, -ORBIT * up)
+        elif self._mode == "zoom":
+            self.camera = self.camera.zoom(ZOOM**-up)
+        elif self._mode == "shift":
+            self.camera = self.camera.pan(-right * size[0] / size[1], -up)
+
+
+def show(sim, fps: float = 60.0, paused: bool = False, colour: str = "body") -> None:
     """Run a simulation in a window until it is closed.
 
-    sim: an open Simulator, advanced by 1/fps [s] of simulated time a picture, never faster than real time. A step that
-    fails pauses the run and its reason is shown; R starts anew. Raises OutputError, before anything is opened, when a
-    display or a Vulkan driver is missing or the process has a window already.
+    sim: an open Simulator, advanced by 1/fps [s] of simulated time a picture, never faster than real time; made with
+    pullable=True its bodies can be pulled with the mouse. A step that fails pauses the run and its reason is shown; R starts
+    anew. Raises OutputError, before anything is opened, when a display or a Vulkan driver is missing or the process has a
+    window already.
     """
     if not fps > 0:
         raise OutputError(f"the window's fps is {fps}, it must be positive")
-    window = LiveWindow(sim.scene)
-    loop = _Loop(sim, fps, paused)
+    window = LiveWindow(sim.scene, tall=True, colour=colour)
     try:
+        loop = Loop(sim, fps, paused)
+        panel = Panel(sim, loop, window.colouring, window.layers)
+        pictures = 0
         while not window.closed:
             started = time.perf_counter()
-            window.draw(sim, loop.lines())
-            loop.react(window.pressed)
-            if not loop.paused:
+            window.draw(sim, [*state_lines(sim), loop.speed()], panel, loop.record if loop.folder is not None else None)
+            loop.react(window.pressed | panel.pressed)
+            pictures += 1
+            if not loop.paused and pictures > 2:  # GGUI shows no panel at first, and the first step compiles for seconds
                 loop.advance()
             time.sleep(max(0.0, 1.0 / fps - (time.perf_counter() - started)))
     finally:
         window.close()
-
-
-class _Loop:
-    """What `show` does between two pictures: running, stepping, restarting, and how fast it goes."""
-
-    def __init__(self, sim, fps: float, paused: bool):
-        self.sim, self.fps, self.paused = sim, fps, paused
-        self.problem = ""
-        self._speed = 0.0  # [steps/s]
-        self._mark = (time.perf_counter(), sim.step_count)
-
-    def react(self, pressed: set[str]) -> None:
-        if "pause" in pressed:
-            self.paused = not self.paused
-        if "reset" in pressed:
-            self.sim.reset()
-            self.problem = ""
-            self._mark = (time.perf_counter(), self.sim.step_count)
-        if "step" in pressed:
-            self.paused = True
-            self._guarded(self.sim.step)
-
-    def advance(self) -> None:
-        """One picture's worth of simulated time."""
-        self._guarded(self._run)
-
-    def _run(self) -> None:
-        result = self.sim.run(1.0 / self.fps, fps=self.fps)
-        if result.status == "failed":
-            raise SimulationError("; ".join(result.problems) or "the run failed")
-
-    def _guarded(self, call) -> None:
-        try:
-            call()
-        except TaisoftError as error:
-            self.problem, self.paused = str(error), True
-
-    def lines(self) -> list[str]:
-        """The panel's text."""
-        now, steps = time.perf_counter(), self.sim.step_count
-        since = now - self._mark[0]
-        if since >= SPEED_OVER:
-            self._speed = (steps - self._mark[1]) / since
-            self._mark = (now, steps)
-        state = f"failed: {self.problem}" if self.problem else "paused" if self.paused else "running"
-        return [*state_lines(self.sim), f"speed    {self._speed:10.1f} steps/s", state, "", *KEYS]
+        if sim.pulled is not None:
+            sim.release()
 
 
 def state_lines(sim) -> list[str]:
@@ -174,8 +205,3 @@ def state_lines(sim) -> list[str]:
     energies = sim.energies()
     values = {"kinetic": energies.kinetic, "elastic": energies.elastic, "gravity": energies.gravity}
     return [f"time     {sim.time:10.4f} s", *(f"{name:8} {value:10.4g} J" for name, value in values.items())]
-
-
-def _on_panel(cursor: tuple[float, float]) -> bool:
-    left, top, width, height = PANEL
-    return left <= cursor[0] <= left + width and top <= 1.0 - cursor[1] <= top + height

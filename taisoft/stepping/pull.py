@@ -1,0 +1,104 @@
+"""A point of a body pulled towards a target by a damped spring, as a mouse does.
+
+The point is x_p = sum_i w_i x_i over some nodes, and node i bears w_i F of
+    F = k (target - x_p) - c v_p,
+taken anew at the start of every step, or of every batch of explicit sub-steps, and held over that time T.
+A force held over T is stable where k T^2 and c T are small against the mass that it meets, m_p = 1 / sum_i (w_i^2 / m_i), so
+k is limited to SOFT m_p / T^2 and c, half of the critical 2 sqrt(k m_p), to SOFT m_p / T: with SOFT = 0.5 a mass on such a
+spring comes to rest under every integrator here, BDF2 included. Finer meshes and longer steps thus allow weaker springs.
+|F| is limited, too, so that no pull turns tets inside out: to STRAIN young A, A = (m_p / density)^(2/3) the
+area that is gripped, and to HEAVY times the body's weight.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taisoft.errors import SceneError
+from taisoft.model import body_loads
+from taisoft.scene import checks
+from taisoft.stepping.world import World
+from taisoft.transfer import array_of, upload
+
+SOFT = 0.5
+STRAIN = 0.25
+HEAVY = 20.0
+EARTH = 9.81  # [m/s^2], for the weight of a body in a scene without gravity, too
+HELD = 0.002  # [s] that explicit sub-steps may hold the force, if it is more than one of them
+BATCH = 16  # and as many of them at most
+
+
+@dataclass
+class Grip:
+    """What is pulled, and how: nodes (k,) of all bodies, weights (k,) of sum 1, target (3,) [m], stiffness [N/m] asked for."""
+
+    body: str
+    nodes: np.ndarray
+    weights: np.ndarray
+    target: np.ndarray
+    stiffness: float
+    mass: float  # that the force meets [kg]
+    strongest: float  # |F| is at most this [N]
+    point: np.ndarray  # (3,) where it was when the force was taken [m]
+    force: np.ndarray  # (3,) [N]
+
+
+def batch(dt: float) -> int:
+    """Explicit sub-steps of dt [s] over which the force is held."""
+    return max(1, min(BATCH, int(HELD / dt)))
+
+
+class Pull:
+    """The pull on a world whose model has loads."""
+
+    def __init__(self, world: World):
+        self._world = world
+        self._loads = body_loads(world.scene)  # of the scene itself
+        self.grip: Grip | None = None
+
+    def take(self, body: int, nodes, weights, target, stiffness) -> None:
+        """Pull that point of a body from the next step on, in place of what was pulled before. Raises SceneError."""
+        own, layout = self._world.scene.bodies[body], self._world.layout
+        nodes, weights = np.atleast_1d(nodes), np.atleast_1d(np.asarray(weights, dtype=np.float64))
+        good = nodes.ndim == 1 and nodes.dtype.kind in "iu" and len(nodes) > 0
+        if not good or nodes.min() < 0 or nodes.max() >= own.n_nodes:
+            raise SceneError(f"body '{own.name}': the nodes to pull at must be whole numbers from 0 to {own.n_nodes - 1}")
+        if weights.shape != nodes.shape or not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
+            raise SceneError(f"body '{own.name}': the weights of a pull must be {len(nodes)} numbers, none below 0, not all 0")
+        target = checks.array(target, f"body '{own.name}': the target of a pull", ((3,),))
+        stiffness = checks.number(stiffness, "the stiffness of a pull", above=0.0, unit="N/m")
+        nodes, weights = nodes + layout.node_start[body], weights / weights.sum()
+        masses = array_of(self._world.model.mass).astype(np.float64)
+        mass = 1.0 / float((weights**2 / masses[nodes]).sum())
+        area = (mass / own.material.density) ** (2 / 3)
+        strongest = min(STRAIN * own.material.young * area, HEAVY * EARTH * float(masses[layout.nodes(body)].sum()))
+        self._put(None)  # the nodes may be others
+        self.grip = Grip(own.name, nodes, weights, target, stiffness, mass, strongest, target, np.zeros(3))
+        self.grip.point = weights @ self._world.state()[0][nodes]
+
+    def apply(self, held: float) -> None:
+        """Take the force anew, to be held over a time [s]."""
+        grip = self.grip
+        x, v = self._world.state()
+        k = min(grip.stiffness, SOFT * grip.mass / held**2)
+        c = min(np.sqrt(k * grip.mass), SOFT * grip.mass / held)
+        grip.point = grip.weights @ x[grip.nodes]
+        force = k * (grip.target - grip.point) - c * (grip.weights @ v[grip.nodes].astype(np.float64))
+        size = float(np.linalg.norm(force))
+        grip.force = force * min(1.0, grip.strongest / size) if size > 0.0 else force
+        self._put(grip)
+
+    def let_go(self) -> bool:
+        """The scene's own loads alone; False where nothing was pulled."""
+        if self.grip is None:
+            return False
+        self.grip = None
+        self._put(None)
+        return True
+
+    def _put(self, grip: Grip | None) -> None:
+        loads = self._loads
+        if grip is not None:
+            loads = loads.copy()
+            np.add.at(loads, grip.nodes, np.outer(grip.weights, grip.force))
+        upload([(self._world.model.loads, loads)])

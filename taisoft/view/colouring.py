@@ -1,0 +1,101 @@
+"""Bodies coloured by what happens in them: von Mises' stress, the largest principal stretch, or speed, at their nodes.
+
+The scale begins at 0 (stretch: at 1) and ends at 1, 2 or 5 times a power of ten above a running maximum that fades slowly,
+and falls only when it is clearly too high: so it does not flicker, and an impact does not leave everything pale after it.
+"""
+
+import math
+
+import numpy as np
+
+from taisoft.elements.reference import inverse_rest_edges
+from taisoft.errors import OutputError
+from taisoft.output.nodal_fields import NodalMean, von_mises
+from taisoft.view.surfaces import Surfaces
+
+UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s"}
+TITLES = {"body": "own colour", "stress": "von Mises stress", "stretch": "largest stretch", "speed": "speed"}
+FADE = 0.998  # of the running maximum from picture to picture
+ROOM = 1.5  # times the running maximum must lie below a lower end before the scale falls to it
+SMALLEST = {"stress": 1.0, "stretch": 1e-3, "speed": 1e-3}  # ends of a scale in a scene where nothing happens
+# sRGB, from low to high
+COLOURS = np.array([(0.27, 0.42, 0.80), (0.33, 0.70, 0.78), (0.72, 0.82, 0.45), (0.97, 0.70, 0.27), (0.82, 0.20, 0.17)])
+
+
+class Colouring:
+    """Colours of drawn vertices by one of UNITS. Raises OutputError for another name."""
+
+    def __init__(self, scene, surfaces: Surfaces, kind: str = "body"):
+        self._bodies, self._surfaces = scene.bodies, surfaces
+        self._mean = NodalMean(scene.bodies)
+        self._Dm_inv: list[np.ndarray] = []  # per body, once stretch is asked for
+        self.choose(kind)
+
+    def choose(self, kind: str) -> None:
+        """Colour by another quantity, with a scale of its own."""
+        if kind not in UNITS:
+            raise OutputError(f"colour '{kind}' is unknown: it must be one of {', '.join(UNITS)}")
+        self.kind = kind
+        self._peak = self.span = 0.0
+
+    def choose_next(self) -> None:
+        """Colour by the next of UNITS."""
+        kinds = list(UNITS)
+        self.choose(kinds[(kinds.index(self.kind) + 1) % len(kinds)])
+
+    @property
+    def low(self) -> float:
+        """Where the scale begins."""
+        return 1.0 if self.kind == "stretch" else 0.0
+
+    def values(self, sim) -> np.ndarray:
+        """The quantity at the nodes of all bodies (n_nodes,) in sim's present state."""
+        if self.kind == "stress":
+            return von_mises(self._mean(sim.stress()))
+        if self.kind == "stretch":
+            return self._mean(self._stretches(sim))
+        return np.linalg.norm(sim.velocities(), axis=1)
+
+    def base(self, sim) -> np.ndarray:
+        """Unshaded colours (n,3) of all drawn vertices, sRGB."""
+        if self.kind == "body":
+            return self._surfaces.colours
+        above = self.values(sim) - self.low
+        self._follow(float(np.max(above, initial=0.0, where=np.isfinite(above))))
+        return self._surfaces.coloured(colours_of(np.nan_to_num(above / self.span)))
+
+    def legend(self) -> list[tuple[str, np.ndarray]]:
+        """Lines of text from high to low, each with its colour (3,); none for the bodies' own colours."""
+        if self.kind == "body" or self.span == 0.0:
+            return []
+        shares = np.linspace(1.0, 0.0, 3)
+        texts = [f"{self.low + share * self.span:10.4g} {UNITS[self.kind]}" for share in shares]
+        return list(zip(texts, colours_of(shares)))
+
+    def _follow(self, now: float) -> None:
+        self._peak = max(now, FADE * self._peak, SMALLEST[self.kind])
+        if self._peak > self.span or round_up(ROOM * self._peak) < self.span:
+            self.span = round_up(self._peak)
+
+    def _stretches(self, sim) -> np.ndarray:
+        """Largest principal stretch of every tet (m,), of its corners where it is quadratic."""
+        if not self._Dm_inv:
+            self._Dm_inv = [inverse_rest_edges(b.mesh.vertices, b.mesh.tets)[0] for b in self._bodies]
+        parts = []
+        for body, Dm_inv in zip(self._bodies, self._Dm_inv):
+            corner = sim.positions(body.name)[body.mesh.tets]
+            F = (corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1) @ Dm_inv
+            parts.append(np.sqrt(np.linalg.eigvalsh(F.transpose(0, 2, 1) @ F)[:, 2]))
+        return np.concatenate(parts)
+
+
+def colours_of(shares: np.ndarray) -> np.ndarray:
+    """sRGB colours (n,3) of shares (n,) of the scale; what lies outside has the colours of its ends."""
+    at = np.linspace(0.0, 1.0, len(COLOURS))
+    return np.column_stack([np.interp(shares, at, COLOURS[:, k]) for k in range(3)])
+
+
+def round_up(value: float) -> float:
+    """The next of 1, 2, 5 times a power of ten, or the value where it is one of them."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return next((k * power for k in (1.0, 2.0, 5.0) if k * power >= value * (1.0 - 1e-12)), 10.0 * power)

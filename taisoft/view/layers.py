@@ -1,0 +1,79 @@
+"""Lines over a picture: wires of the bodies' surfaces, contacts with their normals and impulses, and arrows of tractions.
+
+Lines are moved along their rays towards the eye, where they cover the same pixels: wires so little that only their own surface is
+behind them, contacts and arrows so far that nothing hides them.
+"""
+
+import numpy as np
+
+from taisoft.output.camera import Camera
+
+MARKS = 4000  # contacts' lines and arrows' lines that are drawn at most, beside the wires
+ON_SURFACE, IN_FRONT = 0.996, 0.1  # shares of the distance from the eye
+NORMAL, IMPULSE, ARROW, HEAD = 0.04, 0.15, 0.10, 0.3  # lengths in units of the scene's size; a head's in those of its arrow
+MAX_ARROWS = 60  # of one traction
+FADE = 0.99  # of the largest impulse from picture to picture
+WIRE_COLOUR, NORMAL_COLOUR = np.array([0.12, 0.14, 0.18]), np.array([0.10, 0.55, 0.25])  # sRGB
+IMPULSE_COLOUR, TRACTION_COLOUR = np.array([0.85, 0.12, 0.12]), np.array([0.55, 0.15, 0.65])
+
+
+class Layers:
+    """What is drawn beside surfaces. shown: name -> whether it is; n_segments: most lines that `lines` gives."""
+
+    def __init__(self, scene):
+        self.shown = {"wires": False, "contacts": False, "tractions": True, "fixed nodes": True}
+        starts = np.cumsum([0] + [body.n_nodes for body in scene.bodies])
+        self._edges = np.concatenate([_edges(np.asarray(b.nodes.surface)) + n for b, n in zip(scene.bodies, starts)])
+        self.n_segments = len(self._edges) + MARKS
+        points = np.concatenate([body.rest_positions + body.position for body in scene.bodies])
+        self._size = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+        self._peak = 0.0  # [N s]
+        pulls = [(body, t, n) for body, n in zip(scene.bodies, starts) for t in body.tractions]
+        most = max((float(np.linalg.norm(t.value)) for _, t, _ in pulls), default=0.0) or 1.0
+        self._arrows = []  # nodes of the corners (k,3), and the arrow (3,) [m]
+        for body, t, n in pulls:
+            chosen = t.triangles[:: -(-len(t.triangles) // MAX_ARROWS)]
+            self._arrows.append((body.mesh.surface[chosen] + n, ARROW * self._size / most * t.value))
+
+    def lines(self, sim, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Ends (2k,3) [m] of the lines, as drawn for this camera, and their colours (2k,3)."""
+        x = sim.positions()
+        marks = self._contact_lines(sim) if self.shown["contacts"] else []
+        if self.shown["tractions"]:
+            marks += [(_arrows(x[corners].mean(axis=1), arrow, camera), TRACTION_COLOUR) for corners, arrow in self._arrows]
+        marks = [(camera.nearer(ends, IN_FRONT), colour) for ends, colour in marks]
+        if self.shown["wires"]:  # last: what is too much goes
+            marks.append((camera.nearer(x[self._edges].reshape(-1, 3), ON_SURFACE), WIRE_COLOUR))
+        ends = [np.empty((0, 3)), *(part for part, _ in marks)]
+        return np.concatenate(ends), np.concatenate([np.empty((0, 3)), *(np.tile(c, (len(part), 1)) for part, c in marks)])
+
+    def _contact_lines(self, sim) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Normals of one length, and impulses by their size against the largest of late."""
+        found = sim.contacts()
+        k = slice(0, MARKS // 4)
+        point, normal, impulse = found.point[k], found.normal[k], found.impulse[k]
+        self._peak = max(FADE * self._peak, float(np.linalg.norm(impulse, axis=1).max(initial=0.0)))
+        share = impulse / self._peak if self._peak > 0.0 else 0.0 * impulse
+        return [
+            (_joined(point, point + NORMAL * self._size * normal), NORMAL_COLOUR),
+            (_joined(point, point + IMPULSE * self._size * share), IMPULSE_COLOUR),
+        ]
+
+
+def _edges(triangles: np.ndarray) -> np.ndarray:
+    """Every edge of triangles (t,3) once: (e,2)."""
+    ends = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    return np.unique(ends, axis=0)
+
+
+def _joined(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Ends (2k,3) of the lines from a (k,3) to b (k,3)."""
+    return np.stack([a, b], axis=1).reshape(-1, 3)
+
+
+def _arrows(tips: np.ndarray, arrow: np.ndarray, camera: Camera) -> np.ndarray:
+    """Lines of arrows (3,) that end at tips (k,3): a shaft and two strokes of the head, which lie in the picture's plane."""
+    side = np.cross(arrow, camera.forward)
+    return np.concatenate(
+        [_joined(tips - arrow, tips)] + [_joined(tips - HEAD * (arrow + s * 0.5 * side), tips) for s in (-1.0, 1.0)]
+    )

@@ -1,0 +1,80 @@
+"""A virtual display for tests of windows."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+TOOLS = [tool for tool in ("Xvfb", "xdotool", "import") if shutil.which(tool) is None]  # what is missing
+
+
+class Desktop:
+    """A virtual display with one child process that opens a window; `say` waits for what the child prints."""
+
+    def __init__(self, folder, code):
+        self.folder = folder
+        read, write = os.pipe()
+        command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x760x24"]
+        self.server = subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL)
+        os.close(write)
+        with os.fdopen(read) as pipe:
+            self.environment = os.environ | {"DISPLAY": f":{pipe.readline().strip()}"}
+        self.log = folder / "log"
+        with open(self.log, "w") as log:
+            self.child = subprocess.Popen(
+                [sys.executable, "-c", code], cwd=ROOT, env=self.environment, stdout=log, stderr=subprocess.STDOUT
+            )
+
+    def tool(self, *arguments):
+        subprocess.run(arguments, env=self.environment, capture_output=True, timeout=30, check=True)
+
+    def wait_for(self, condition, what):
+        end = time.monotonic() + 60
+        while not condition():
+            assert time.monotonic() < end, f"no {what}: {self.log.read_text()}"
+            time.sleep(0.05)
+
+    @staticmethod
+    def pause(seconds):
+        time.sleep(seconds)
+
+    def printed(self):
+        """Lines of the child so far."""
+        return self.log.read_text().split()
+
+    def picture(self):
+        """The whole screen, uint8 (height, width, 3)."""
+        path = self.folder / "screen.ppm"
+        self.tool("import", "-window", "root", "-depth", "8", str(path))
+        data = path.read_bytes()
+        size, at = [], 2  # "P6", width, height, 255, then the pixels
+        while len(size) < 3:
+            end = at + 1
+            while not data[end : end + 1].isspace():
+                end += 1
+            size.append(int(data[at:end]))
+            at = end
+        return np.frombuffer(data, np.uint8, offset=at + 1).reshape(size[1], size[0], 3)
+
+    def last(self, key):
+        """The last line of the child that starts with key, as a list of words; empty without one."""
+        found = [line.split() for line in self.log.read_text().splitlines() if line.startswith(key)]
+        return found[-1] if found else []
+
+    def drag(self, start, way, hold=0.0):
+        """Press the left button at start, move it in parts, hold it [s]; it stays pressed."""
+        self.tool("xdotool", "mousemove", *map(str, start), "mousedown", "1")
+        for _ in range(5):
+            time.sleep(0.1)
+            self.tool("xdotool", "mousemove_relative", "--", *(str(pixels // 5) for pixels in way))
+        time.sleep(hold)
+
+    def close(self):
+        for process in (self.child, self.server):
+            process.kill()
+            process.wait()

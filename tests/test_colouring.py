@@ -1,0 +1,84 @@
+"""Bodies coloured by stress, stretch or speed:
+
+* a bar stretched by s has the stretch s at every node, linear and quadratic, and turning it changes nothing;
+* the scale ends at 1, 2 or 5 times a power of ten, rises at once, does not flicker, and falls where it is much too high;
+* markers and obstacles keep their colours, unknown names are refused;
+* a picture by stress is not one in the bodies' own colours, and `taisoft run --colour` makes it.
+"""
+
+import numpy as np
+import pytest
+from command import BEAM, run, write
+from fake_simulator import FakeSimulator, beam_scene
+
+import taisoft as ts
+from taisoft.errors import OutputError
+from taisoft.view.colouring import COLOURS, Colouring, round_up
+from taisoft.view.offscreen import Offscreen
+from taisoft.view.surfaces import MARKER_COLOUR, Surfaces
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_stretch(order):
+    scene = beam_scene(order=order)
+    sim, colouring = FakeSimulator(scene), Colouring(scene, Surfaces(scene), "stretch")
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    x = sim.positions()
+    sim.positions = lambda name=None: x * (1.3, 0.9, 0.9) @ turn
+    assert np.allclose(colouring.values(sim), 1.3)
+    colouring.base(sim)
+    assert colouring.low == 1.0 and colouring.span == pytest.approx(0.5)
+    assert colouring.legend()[0][0].strip() == "1.5" and np.array_equal(colouring.legend()[0][1], COLOURS[-1])
+
+
+def test_the_scale_does_not_flicker():
+    scene = beam_scene()
+    colouring, spans = Colouring(scene, Surfaces(scene), "speed"), []
+    values = [3.0, 2.1, 4.9, 5.1, 4.8, *[5.2, 4.9] * 50, *[0.3] * 2000]
+    sim = FakeSimulator(scene)
+    for value in values:
+        sim.velocities = lambda value=value: np.full((sim.positions().shape), value / np.sqrt(3))
+        colouring.base(sim)
+        spans.append(colouring.span)
+    assert spans[:4] == [5.0, 5.0, 5.0, 10.0] and set(spans[3:105]) == {10.0}
+    assert spans[-1] == 0.5 and (np.diff(spans[105:]) <= 0).all()
+    assert [round_up(v) for v in (1.0, 1.1, 2.3, 0.07, 5e4)] == [1.0, 2.0, 5.0, 0.1, 5e4]
+
+
+def test_what_keeps_its_colour():
+    scene = beam_scene()
+    scene.add_obstacle(ts.HalfSpace((0, -3, 0), (0, 1, 0)))
+    surfaces, sim = Surfaces(scene), FakeSimulator(scene)
+    sim.time = 1.0
+    base = Colouring(scene, surfaces, "stress").base(sim)
+    kept = (base == surfaces.colours).all(axis=1)
+    marked = (surfaces.colours == MARKER_COLOUR).all(axis=1)
+    grey = surfaces.colours.max(axis=1) - surfaces.colours.min(axis=1) < 0.1
+    assert marked.any() and kept[marked | grey].all() and not kept[~(marked | grey)].any()
+    with pytest.raises(OutputError, match="colour 'heat' is unknown"):
+        Colouring(scene, surfaces, "heat")
+
+
+def test_pictures_by_stress():
+    scene, images = beam_scene(), []
+    sim = FakeSimulator(scene)
+    sim.time = 1.0
+    for colour in ("body", "stress"):
+        images.append(Offscreen(scene, (160, 90), renderer="software", colour=colour).image(sim).astype(int))
+    own, stress = images
+    differs = np.abs(own - stress).max(axis=2) > 30
+    assert 0.03 < differs.mean() < 0.4, "bodies only"
+    red = stress[..., 0] - stress[..., 2] > 60
+    assert red[:, 80:].any() and not red[:, :60].any(), "the stand-in's stress grows along x"
+
+
+def test_the_option_of_the_command(tmp_path):
+    scene = write(tmp_path / "beam.py", BEAM)
+    pictures = []
+    for colour in ("body", "stress"):
+        out = tmp_path / colour
+        assert run(scene, "--out", out, "--no-usd", "--colour", colour) == 0
+        pictures.append((out / "frames" / "00003.png").read_bytes())
+    assert pictures[0] != pictures[1]
+    with pytest.raises(SystemExit, match="2"):
+        run(scene, "--colour", "heat")

@@ -1,0 +1,130 @@
+"""A body pulled at a point:
+
+* pulled sideways it comes to lie where statics with the force of the same spring says, and released it comes back;
+* the stiffest pull stays bounded, and so does a mad one: no tet turns over, and the force keeps its limit;
+* where pulling is not wanted nothing is allocated for it, and it is refused; a released pull leaves no trace;
+* pulling compiles nothing.
+"""
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.errors import SceneError, SimulationError
+from taisoft.runtime import compile_clock
+from taisoft.stepping.pull import HEAVY, SOFT, STRAIN, batch
+
+RUBBER = ts.Material(law="stable_neo_hookean", young=1e6, poisson=0.3, density=1000.0, mass_damping=8.0)
+SETTINGS = {"implicit_euler": 0.02, "bdf2": 0.02, "implicit_midpoint": 0.02, "velocity_verlet": 1e-3, "symplectic_euler": 1e-3}
+
+
+def beam(order=1):
+    scene = ts.Scene(gravity=(0, 0, 0))
+    body = scene.add_body(ts.box_mesh((6, 2, 2), (2, 0.5, 0.5)), RUBBER, name="beam", order=order)
+    body.fix(lambda X: X[:, 0] < -0.99)
+    return scene, np.flatnonzero(body.rest_positions[:, 0] > 0.99)
+
+
+CASES = [("implicit_euler", 1), ("bdf2", 2), ("velocity_verlet", 1)]
+
+
+@pytest.mark.parametrize("integrator, order", CASES)
+def test_pulled_to_rest_and_back(integrator, order):
+    scene, tip = beam(order)
+    rest = scene.bodies[0].rest_positions
+    start = rest[tip].mean(axis=0)
+    target = start + (0, 0.1, 0.15)
+    with ts.Simulator(scene, dt=SETTINGS[integrator], integrator=integrator, pullable=True) as sim:
+        if sim.settings.explicit:
+            sim.dt = 0.5 * sim.stable_dt
+        sim.pull("beam", tip, np.ones(len(tip)), target, 15000.0)
+        sim.run(2.0, fps=20)
+        grip, pulled = sim.pulled, sim.positions()
+        assert np.allclose(grip.force, 15000.0 * (target - pulled[tip].mean(axis=0)), rtol=0.01, atol=0.5)
+        way, wanted = pulled[tip].mean(axis=0) - start, target - start
+        assert 0.2 < way @ wanted / (wanted @ wanted) < 0.95
+        sim.release()
+        sim.run(2.0, fps=20)
+        assert np.abs(sim.positions() - rest).max() < 0.003
+    still, _ = beam(order)
+    still.bodies[0].add_force(tip, np.outer(np.full(len(tip), 1 / len(tip)), grip.force))
+    static = ts.solve_static(still, precision="f32", tolerance=1e-4)
+    assert np.abs(static.positions("beam") - pulled).max() < 0.02 * np.linalg.norm(way)
+
+
+@pytest.mark.parametrize("integrator", SETTINGS)
+def test_the_stiffest_pull_stays_bounded(integrator):
+    scene, tip = beam()
+    corner = tip[:1]
+    with ts.Simulator(scene, dt=SETTINGS[integrator], integrator=integrator, pullable=True) as sim:
+        if sim.settings.explicit:
+            sim.dt = 0.9 * sim.stable_dt
+        target = scene.bodies[0].rest_positions[corner[0]] + (0, 0.1, 0)
+        sim.pull("beam", corner, [2.0], target, 1e12)
+        energies = []
+        for _ in range(40):
+            assert sim.run(0.05, fps=20).status == "ok"
+            assert np.linalg.norm(sim.pulled.force) <= 1.0001 * sim.pulled.strongest
+            energies.append(sim.energies().kinetic + sim.energies().elastic)
+        grip, held = sim.pulled, sim.dt * (batch(sim.dt) if sim.settings.explicit else 1)
+        assert max(energies) < 0.5 * SOFT * grip.mass / held**2 * 0.1**2, "no more than the spring held at the start"
+        assert sim.energies().kinetic < 0.05 * sim.energies().elastic, "it comes to rest"
+        assert np.linalg.norm(sim.positions()[corner[0]] - target) < 0.09
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "symplectic_euler"])
+def test_a_mad_pull_is_held_back(integrator):
+    scene, tip = beam()
+    with ts.Simulator(scene, dt=SETTINGS[integrator], integrator=integrator, pullable=True) as sim:
+        if sim.settings.explicit:
+            sim.dt = 0.5 * sim.stable_dt
+        for far in ((9.0, 50.0, 0.0), (-90.0, 0.0, 0.0)):
+            sim.pull("beam", tip[:3], np.ones(3), far, 1e12)
+            for _ in range(10):
+                result = sim.run(0.05, fps=20)
+                assert result.status != "failed"
+                assert all(step.n_inverted == 0 for step in result.step_reports)
+            grip, mass = sim.pulled, 1000.0 * 0.5
+            assert np.linalg.norm(grip.force) <= 1.0001 * min(HEAVY * 9.81 * mass, STRAIN * 1e6 * (grip.mass / 1000.0) ** (2 / 3))
+            assert np.abs(sim.positions()).max() < 5.0
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "velocity_verlet"])
+def test_a_pull_compiles_nothing_and_leaves_nothing(integrator):
+    ways = []
+    for pulled in (False, True):
+        scene, tip = beam()
+        scene.gravity = (0, -1, 0)
+        with ts.Simulator(scene, dt=1e-3, integrator=integrator, pullable=True) as sim:
+            sim.advance(4)
+            if pulled:
+                compiled = compile_clock()
+                sim.pull("beam", tip, np.ones(len(tip)), (1, 1, 0), 100.0)
+                sim.advance(4)
+                assert compile_clock() == compiled and np.linalg.norm(sim.pulled.force) > 0
+                sim.reset()
+                assert sim.pulled is None
+                sim.advance(4)
+            ways.append(sim.positions())
+    assert np.array_equal(*ways)
+
+
+def test_pulling_is_refused_unless_wanted():
+    scene, tip = beam()
+    with ts.Simulator(scene, dt=0.01) as sim:
+        assert not sim.plan.on["loads"] and "loads" not in sim.field_bytes
+        sim.release()
+        with pytest.raises(SimulationError, match="pullable=True"):
+            sim.pull("beam", tip, np.ones(len(tip)), (0, 0, 0), 1.0)
+    with ts.Simulator(scene, dt=0.01, pullable=True) as sim:
+        entry = next(e for e in sim.plan.entries if e["feature"] == "loads")
+        assert entry["on"] and entry["why"] == "bodies are to be pulled"
+        for nodes, weights, target, message in (
+            ([99999], [1.0], (0, 0, 0), "from 0 to"), ([0], [1.0, 1.0], (0, 0, 0), "weights"),
+            ([0], [-1.0], (0, 0, 0), "weights"),
+            ([0], [1.0], (0, np.nan, 0), "target"),
+        ):  # fmt: skip
+            with pytest.raises(SceneError, match=message):
+                sim.pull("beam", nodes, weights, target, 1.0)
+    with pytest.raises(SimulationError, match="pullable = 1"):
+        ts.Simulator(scene, pullable=1)

@@ -1,0 +1,271 @@
+"""The live window, on a virtual display:
+
+* a ray through a pixel is what the camera projects there, and picks the nearest surface; a patch round it has weights of sum 1;
+* wires, contacts and arrows are where they belong; pictures do not wait for a solver that is slower than real time;
+* keys pause, step, restart, colour and end it; dragging beside the bodies turns the view, dragging a body moves the body;
+* sliders change the run at once and compile nothing; a stiffer body lowers dt where steps are explicit;
+* pictures are recorded; making the window larger, smaller or tiny, and closing it in the middle of a drag, is survived.
+"""
+
+import struct
+
+import numpy as np
+import pytest
+from desktop import ROOT, TOOLS, Desktop
+from fake_simulator import FakeSimulator, beam_scene
+from test_view import SIZE, body_mask, needs_vulkan
+
+from taisoft.output.camera import Camera
+from taisoft.view.layers import Layers
+from taisoft.view.loop import Loop
+from taisoft.view.picking import Drag, nearest_hit, pick
+
+WATCH = """
+import os, sys
+sys.path[:0] = [{root!r} + "/tests", {root!r}]
+os.chdir({folder!r})
+from fake_simulator import beam_scene
+import taisoft as ts
+from taisoft.runtime import compile_clock
+from taisoft.view.window import show
+
+
+class Told(ts.Simulator):
+    def advance(self, n):
+        report = super().advance(n)
+        x, body = self.positions()[-14], self.scene.bodies[0]
+        numbers = self.dt, body.material.young, -self.scene.gravity[1], compile_clock()
+        print("step", self.step_count, *x.round(4), *numbers, flush=True)
+        return report
+
+    def reset(self):
+        super().reset()
+        print("reset", flush=True)
+
+
+with Told(beam_scene(), dt={dt}, integrator={integrator!r}, pullable=True) as sim:
+    show(sim)
+print("closed")
+"""
+SLIDERS = {"dt": 228, "gravity": 251, "young": 274}  # pixels from the top, with one body
+TIP = (965, 350)  # where the beam's end is in the window as it starts
+
+
+# --- picking ---
+
+
+def test_a_ray_is_the_inverse_of_the_projection():
+    camera = Camera(target=np.array([1.0, 2, 3]), distance=4.0, azimuth=70.0, elevation=-30.0)
+    for point in np.random.default_rng(1).uniform(-1, 1, (20, 3)) + camera.target:
+        across, down, _ = camera.project(point[None], SIZE)[0]
+        ray = camera.ray((across / SIZE[0], 1 - down / SIZE[1]), SIZE)
+        assert np.allclose(np.cross(ray, point - camera.position), 0, atol=1e-12) and ray @ camera.forward > 0
+
+
+def test_the_nearest_triangle_is_hit():
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 2], [1, 0, 2], [0, 1, 2]])
+    triangles = np.array([[3, 4, 5], [0, 2, 1]])
+    ray = np.array([0.0, 0, 1])
+    t, weights = nearest_hit(np.array([0.2, 0.3, -1]), ray, x, triangles)
+    assert t == 1 and np.allclose(weights @ x[triangles[t]], (0.2, 0.3, 0))
+    t, weights = nearest_hit(np.array([0.2, 0.3, 1]), ray, x, triangles)
+    assert t == 0 and np.allclose(weights, (0.5, 0.2, 0.3))
+    assert nearest_hit(np.array([0.2, 0.3, 3]), ray, x, triangles) is None
+    assert nearest_hit(np.array([0.9, 0.3, -1]), ray, x, triangles) is None
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_body_is_picked_and_pulled_by_the_cursor(order):
+    scene = beam_scene(("one", "two"), order=order)
+    sim, camera, size = FakeSimulator(scene), Camera.framing(np.array([[-2.0, -1, -1], [2, 2, 1]])), (1600, 900)
+    sim.time, calls = 1.0, []
+    sim.pull = lambda *arguments: calls.append(arguments)
+    aim = sim.positions("two")[scene.bodies[1].nodes.surface].mean(axis=1)
+    aim = aim[np.argmin(np.linalg.norm(aim - camera.position, axis=1))]  # the nearest triangle is not hidden
+    across, down, _ = camera.project(aim[None], size)[0]
+    cursor = (across / size[0], 1 - down / size[1])
+    hit = pick(sim, camera, cursor, size)
+    assert scene.bodies[hit.body].name == "two" and np.allclose(hit.point, aim) and np.allclose(hit.weights, 1 / 3)
+    drag = Drag(sim, hit)
+    assert drag.weights.sum() == pytest.approx(1.0) and len(drag.nodes) >= 3
+    drag.pull(sim, camera, cursor, size, 10.0)
+    name, nodes, weights, target, stiffness = calls[0]
+    assert name == "two" and np.allclose(target, weights @ sim.positions("two")[nodes]), "no way, no force"
+    assert stiffness == pytest.approx(10 * 4000 * 9.81 / np.sqrt(18))
+    drag.pull(sim, camera, (cursor[0], cursor[1] + 0.1), size, 10.0)
+    moved = calls[1][3] - target
+    assert moved @ camera.axes[0] == pytest.approx(0, abs=1e-9) and moved @ camera.forward == pytest.approx(0, abs=1e-9)
+    assert moved @ camera.axes[1] > 0
+    assert np.allclose(drag.line(sim), [aim, aim + moved])
+    assert pick(sim, camera, (0.01, 0.99), size) is None
+
+
+# --- what is drawn over the bodies, and when ---
+
+
+def test_layers():
+    scene = beam_scene()
+    scene.bodies[0].add_traction(lambda c: c[:, 0] > 1.99, (0, 0, 50.0))
+    sim, layers, camera = FakeSimulator(scene), Layers(scene), Camera.framing(scene.bodies[0].rest_positions)
+    found = sim.contacts()
+    found.point, found.normal = np.array([[0.0, 1, 0]]), np.array([[0.0, 1, 0]])
+    sim.contacts = lambda: found
+    faces = len(scene.bodies[0].mesh.surface)
+    tips = 2 * 2 * 2
+    counts = {"wires": 3 * faces // 2, "contacts": 2, "tractions": 3 * tips, "fixed nodes": 0}
+    for name, count in counts.items():
+        layers.shown = {other: other == name for other in counts}
+        ends, colours = layers.lines(sim, camera)
+        assert len(ends) == len(colours) == 2 * count <= 2 * layers.n_segments
+        if name == "wires":
+            x, size = sim.positions(), (200, 100)
+            seen, drawn = camera.project(x, size), camera.project(ends, size)
+            gaps = np.linalg.norm(drawn[:, None, :2] - seen[None, :, :2], axis=2).min(axis=1)
+            assert gaps.max() < 1e-9, "wires end on nodes"
+        if name == "contacts":
+            a, b, _, c = (ends - camera.position) / 0.1 + camera.position
+            assert np.allclose(a, found.point) and np.allclose((b - a) / np.linalg.norm(b - a), found.normal)
+            assert np.allclose(np.cross(c - a, found.impulse[0]), 0, atol=1e-12)
+
+
+class Clock:
+    """A simulator whose steps of dt take some wall time, on a clock of its own."""
+
+    def __init__(self, dt, seconds_per_step):
+        self.dt, self.seconds_per_step, self.now, self.step_count, self.calls = dt, seconds_per_step, 0.0, 0, []
+
+    def advance(self, n):
+        self.calls.append(n)
+        self.step_count += n
+        self.now += n * self.seconds_per_step
+
+
+@pytest.mark.parametrize("dt, seconds_per_step, steps, needs", [
+    (1 / 60, 0.001, 1.0, 0.0), (1 / 600, 0.0001, 10.0, 0.0), (0.05, 0.001, 1 / 3, 0.0), (1e-4, 1e-3, 17.0, 10.0),
+    (1 / 60, 0.5, 1.0, 30.0),
+])  # fmt: skip
+def test_pictures_do_not_wait_for_a_slow_solver(monkeypatch, dt, seconds_per_step, steps, needs):
+    sim = Clock(dt, seconds_per_step)
+    monkeypatch.setattr("time.perf_counter", lambda: sim.now)
+    loop = Loop(sim, 60.0, False)
+    for k in range(120):
+        start = sim.now
+        loop.advance()
+        if k > 60:
+            assert sim.now - start < max(1.05 / 60, 1.01 * seconds_per_step)
+        sim.now = max(sim.now, start + 1 / 60)
+        loop.speed()
+        if k == 59:
+            half = sim.step_count
+    assert (sim.step_count - half) / 60 == pytest.approx(steps, rel=0.1)
+    told = loop.lines()[0]
+    assert told == "running" if needs == 0 else f"needs {needs:.1f} times real time" in told
+
+
+# --- the window ---
+
+
+@pytest.fixture
+def opened(tmp_path):
+    if TOOLS:
+        pytest.skip(f"a virtual display needs {', '.join(TOOLS)} (Debian: xvfb, xdotool, imagemagick)")
+    made = []
+
+    def start(dt=1 / 60, integrator="implicit_euler"):
+        code = WATCH.format(root=str(ROOT), folder=str(tmp_path), dt=dt, integrator=integrator)
+        desktop = Desktop(tmp_path, code)
+        made.append(desktop)
+        desktop.wait_for(lambda: steps(desktop) >= 3, "running simulation")
+        desktop.tool("xdotool", "search", "--sync", "--name", "taisoft", "windowmove", "0", "0", "windowfocus")
+        return desktop
+
+    yield start
+    for desktop in made:
+        desktop.close()
+
+
+def steps(desktop):
+    return int((desktop.last("step") or [0, 0])[1])
+
+
+def press(desktop, key, condition, what):
+    desktop.tool("xdotool", "key", key)
+    desktop.wait_for(condition, what)
+
+
+def still(desktop):
+    """True once the simulation has stopped running."""
+    before = steps(desktop)
+    desktop.pause(0.4)
+    return steps(desktop) == before
+
+
+def end(desktop):
+    desktop.tool("xdotool", "key", "Escape")
+    assert desktop.child.wait(timeout=30) == 0
+    assert desktop.printed()[-1] == "closed"
+
+
+@needs_vulkan
+def test_keys_and_mouse(opened, tmp_path):
+    desktop = opened()
+    press(desktop, "space", lambda: still(desktop), "pause")
+    for k, key in enumerate(("s", "Right")):
+        before = steps(desktop)
+        press(desktop, key, lambda at=before: steps(desktop) == at + 1, f"single step {k}")
+    screen = desktop.picture()
+    mask = body_mask(screen[:, 400:])  # right of the panel
+    assert mask.mean() > 0.05, "the beam is on the screen"
+    assert (screen[60:200, 30:300] > 200).any(), "the panel's text is on the screen"
+    desktop.tool("xdotool", "key", "v")
+    desktop.wait_for(lambda: np.abs(desktop.picture()[:, 400:].astype(int) - screen[:, 400:]).max() > 60, "other colours")
+    desktop.drag((900, 650), (-150, 50))
+    desktop.tool("xdotool", "mouseup", "1")
+    desktop.wait_for(lambda: np.mean(body_mask(desktop.picture()[:, 400:]) != mask) > 0.02, "turned view")
+    assert still(desktop)
+    flat = desktop.picture()
+    desktop.tool("xdotool", "key", "w")
+    desktop.wait_for(lambda: np.mean((flat[:, 400:] > desktop.picture()[:, 400:].astype(int) + 40).any(axis=2)) > 0.003, "wires")
+    press(desktop, "p", lambda: len(list(tmp_path.glob("out/window-1/*.png"))) > 1, "recorded pictures")
+    desktop.tool("xdotool", "key", "p")
+    assert struct.unpack(">II", (tmp_path / "out/window-1/00000.png").read_bytes()[16:24]) == (1280, 720)
+    press(desktop, "r", lambda: desktop.printed().count("reset") == 2, "restart")
+    press(desktop, "space", lambda: not still(desktop), "running on")
+    for width, height in ((800, 600), (1, 1), (1000, 700)):
+        desktop.tool("xdotool", "search", "--name", "taisoft", "windowsize", str(width), str(height))
+        before = steps(desktop)
+        desktop.wait_for(lambda at=before: steps(desktop) > at + 2, f"steps in a window of {width} x {height}")
+    desktop.wait_for(lambda: body_mask(desktop.picture()[:, 400:]).mean() > 0.03, "beam in a resized window")
+    end(desktop)
+
+
+def numbers(desktop):
+    """x, y, z of the beam's end, dt, Young's modulus, gravity, seconds of compiling."""
+    return [float(word) for word in desktop.last("step")[2:]]
+
+
+def click(desktop, across, down):
+    desktop.tool("xdotool", "mousemove", str(across), str(down), "click", "1")
+
+
+@needs_vulkan
+def test_pulling_and_sliders(opened):
+    desktop = opened(dt=8e-3, integrator="symplectic_euler")
+    compiled = numbers(desktop)[-1]
+    press(desktop, "r", lambda: desktop.printed().count("reset") == 2, "restart")
+    before = numbers(desktop)
+    click(desktop, 30, SLIDERS["gravity"])
+    desktop.wait_for(lambda: numbers(desktop)[5] < 5.0, "less gravity")
+    desktop.drag(TIP, (0, -250), 0.5)
+    desktop.wait_for(lambda: numbers(desktop)[1] > before[1] + 0.3, "pulled beam")
+    desktop.tool("xdotool", "mouseup", "1")
+    desktop.wait_for(lambda: numbers(desktop)[1] < before[1] + 0.2, "beam that comes back")
+    click(desktop, 225, SLIDERS["young"])
+    desktop.wait_for(lambda: numbers(desktop)[4] > 2e6, "stiffer beam")
+    stiff = numbers(desktop)
+    assert stiff[3] < 4e-3, "as an explicit step must be"
+    click(desktop, 60, SLIDERS["dt"])
+    desktop.wait_for(lambda: numbers(desktop)[3] < 0.5 * stiff[3], "shorter steps")
+    assert numbers(desktop)[-1] == compiled, "nothing is compiled anew"
+    desktop.drag((640, 650), (0, -20))  # and closed while a button is pressed
+    end(desktop)
