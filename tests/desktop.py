@@ -39,6 +39,17 @@ class Desktop:
             assert time.monotonic() < end, f"no {what}: {self.log.read_text()}"
             time.sleep(0.05)
 
+    def repeat(self, action, condition, what):
+        """Act until the condition holds: a window does not see of the mouse what is over before its next picture."""
+        end = time.monotonic() + 60
+        while time.monotonic() < end:
+            action()
+            for _ in range(60):
+                if condition():
+                    return
+                time.sleep(0.05)
+        raise AssertionError(f"no {what}: {self.log.read_text()}")
+
     @staticmethod
     def pause(seconds):
         time.sleep(seconds)
@@ -69,6 +80,7 @@ class Desktop:
     def drag(self, start, way, hold=0.0):
         """Press the left button at start, move it in parts, hold it [s]; it stays pressed."""
         self.tool("xdotool", "mousemove", *map(str, start), "mousedown", "1")
+        time.sleep(0.2)
         for _ in range(5):
             time.sleep(0.1)
             self.tool("xdotool", "mousemove_relative", "--", *(str(pixels // 5) for pixels in way))

@@ -298,10 +298,10 @@ def damped(scene):
 @pytest.mark.parametrize(
     "change, told",
     [
-        (renamed, "it has body 'beam', body 'flyer', this scene body 'beam', body 'fly'"),
-        (reordered, "this scene body 'flyer', body 'beam'"), (with_other_mesh, "in body 'flyer': mesh"),
+        (renamed, 'its bodies are ["beam", "flyer"], those of this scene ["beam", "fly"]'),
+        (reordered, 'this scene ["flyer", "beam"]'), (with_other_mesh, "in body 'flyer': mesh"),
         (held, "in body 'flyer': constraints"), (loaded, "in body 'flyer': loads"),
-        (with_obstacle, "it has no obstacle, this scene obstacle 'floor'"),
+        (with_obstacle, 'its obstacles are [], those of this scene ["floor"]'),
         (with_other_law, "in body 'flyer': order, quadrature, law"), (damped, "in the features that it needs"),
     ],
 )  # fmt: skip

@@ -219,9 +219,12 @@ def test_keys_and_mouse(opened, tmp_path):
     assert (screen[60:200, 30:300] > 200).any(), "the panel's text is on the screen"
     desktop.tool("xdotool", "key", "v")
     desktop.wait_for(lambda: np.abs(desktop.picture()[:, 400:].astype(int) - screen[:, 400:]).max() > 60, "other colours")
-    desktop.drag((900, 650), (-150, 50))
-    desktop.tool("xdotool", "mouseup", "1")
-    desktop.wait_for(lambda: np.mean(body_mask(desktop.picture()[:, 400:]) != mask) > 0.02, "turned view")
+
+    def turn():
+        desktop.drag((900, 650), (-150, 50), 0.3)
+        desktop.tool("xdotool", "mouseup", "1")
+
+    desktop.repeat(turn, lambda: np.mean(body_mask(desktop.picture()[:, 400:]) != mask) > 0.02, "turned view")
     assert still(desktop)
     flat = desktop.picture()
     desktop.tool("xdotool", "key", "w")
@@ -254,18 +257,19 @@ def test_pulling_and_sliders(opened):
     compiled = numbers(desktop)[-1]
     press(desktop, "r", lambda: desktop.printed().count("reset") == 2, "restart")
     before = numbers(desktop)
-    click(desktop, 30, SLIDERS["gravity"])
-    desktop.wait_for(lambda: numbers(desktop)[5] < 5.0, "less gravity")
-    desktop.drag(TIP, (0, -250), 0.5)
-    desktop.wait_for(lambda: numbers(desktop)[1] > before[1] + 0.3, "pulled beam")
+    desktop.repeat(lambda: click(desktop, 30, SLIDERS["gravity"]), lambda: numbers(desktop)[5] < 5.0, "less gravity")
+
+    def pull():
+        desktop.tool("xdotool", "mouseup", "1")
+        desktop.drag(TIP, (0, -250), 0.5)
+
+    desktop.repeat(pull, lambda: numbers(desktop)[1] > before[1] + 0.3, "pulled beam")
     desktop.tool("xdotool", "mouseup", "1")
     desktop.wait_for(lambda: numbers(desktop)[1] < before[1] + 0.2, "beam that comes back")
-    click(desktop, 225, SLIDERS["young"])
-    desktop.wait_for(lambda: numbers(desktop)[4] > 2e6, "stiffer beam")
+    desktop.repeat(lambda: click(desktop, 225, SLIDERS["young"]), lambda: numbers(desktop)[4] > 2e6, "stiffer beam")
     stiff = numbers(desktop)
     assert stiff[3] < 4e-3, "as an explicit step must be"
-    click(desktop, 60, SLIDERS["dt"])
-    desktop.wait_for(lambda: numbers(desktop)[3] < 0.5 * stiff[3], "shorter steps")
+    desktop.repeat(lambda: click(desktop, 60, SLIDERS["dt"]), lambda: numbers(desktop)[3] < 0.5 * stiff[3], "shorter steps")
     assert numbers(desktop)[-1] == compiled, "nothing is compiled anew"
     desktop.drag((640, 650), (0, -20))  # and closed while a button is pressed
     end(desktop)
