@@ -1,7 +1,8 @@
 """Bodies coloured by what happens in them: von Mises' stress, the largest principal stretch, or speed, at their nodes.
 
-The scale begins at 0 (stretch: at 1) and ends at 1, 2 or 5 times a power of ten above a running maximum that fades slowly,
-and falls only when it is clearly too high: so it does not flicker, and an impact does not leave everything pale after it.
+The scale begins at 0 (stretch: at 1) and ends at 1, 2 or 5 times a power of ten above a running maximum of what 99 % of the
+nodes stay below, since stress in a tet that is nearly flat knows no bounds. The maximum fades slowly, and the end falls only when
+it is clearly too high: so it does not flicker, and an impact does not leave everything pale after it.
 """
 
 import math
@@ -15,6 +16,7 @@ from taisoft.view.surfaces import Surfaces
 
 UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s"}
 TITLES = {"body": "own colour", "stress": "von Mises stress", "stretch": "largest stretch", "speed": "speed"}
+BELOW = 0.99  # share of the nodes whose values the scale holds
 FADE = 0.998  # of the running maximum from picture to picture
 ROOM = 1.5  # times the running maximum must lie below a lower end before the scale falls to it
 SMALLEST = {"stress": 1.0, "stretch": 1e-3, "speed": 1e-3}  # ends of a scale in a scene where nothing happens
@@ -61,7 +63,8 @@ class Colouring:
         if self.kind == "body":
             return self._surfaces.colours
         above = self.values(sim) - self.low
-        self._follow(float(np.max(above, initial=0.0, where=np.isfinite(above))))
+        known = above[np.isfinite(above)]
+        self._follow(float(np.quantile(known, BELOW)) if len(known) else 0.0)
         return self._surfaces.coloured(colours_of(np.nan_to_num(above / self.span)))
 
     def legend(self) -> list[tuple[str, np.ndarray]]:
