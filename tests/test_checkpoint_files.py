@@ -1,10 +1,12 @@
 """What a checkpoint's file tells of the scene, and what it lacks:
 
 * a header without a part, or with one of another form, is told, though its checksum is right;
+* nothing in a file is run: pickled objects are refused;
 * key frames are compared, and what is left out of a scene or called otherwise, whatever characters its name has.
 """
 
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -53,3 +55,26 @@ def test_scenes_are_compared(saved):
     for other in (scene(2.0), scene(1.0, "wall:right"), driven_scene()):
         with pytest.raises(ts.SceneError, match="is a checkpoint of another scene"):
             checkpoint.check_scene(read, other, {})
+
+
+class Canary:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (self.path, "w")
+
+
+def test_pickled_objects_are_refused(saved, tmp_path):
+    canary, wrong = tmp_path / "canary", tmp_path / "b.npz"
+    assert pickle.loads(pickle.dumps(Canary(str(tmp_path / "works")))) and (tmp_path / "works").exists()
+    with np.load(saved) as file:
+        content = {name: file[name] for name in file.files}
+    for name in ("header", "x", "more"):
+        np.savez(wrong, **content | {name: np.array([Canary(str(canary))], dtype=object)})
+        with pytest.raises(ts.SimulationError, match="b.npz is"):
+            ts.Simulator.load_checkpoint(wrong, scene(1.0))
+    np.save(tmp_path / "one.npy", np.array([Canary(str(canary))], dtype=object))
+    with pytest.raises(ts.SimulationError, match="one.npy is no checkpoint"):
+        ts.Simulator.load_checkpoint(tmp_path / "one.npy", scene(1.0))
+    assert not canary.exists()
