@@ -90,9 +90,11 @@ MESH = '[bodies.a]\nmaterial = {{}}\nmesh = {{ file = "{}" }}\n'
 
 
 def path_data(path):
+    """Of a path, its frames and where what it leads starts."""
     frames = getattr(path, "frames", path)
     names = ("times", "translations", "rotations", "pivot", "smooth", "release")
-    return {name: np.asarray(getattr(frames, name)).tobytes() for name in names} if path else None
+    said = {name: np.asarray(getattr(frames, name)).tobytes() for name in names} if path else None
+    return said and said | {name: getattr(path, name).tobytes() for name in ("starts", "center") if hasattr(path, name)}
 
 
 def data(scene: ts.Scene) -> dict:
@@ -102,11 +104,10 @@ def data(scene: ts.Scene) -> dict:
         arrays = (b.rest_positions, b.nodes.elements, b.mesh.tets, b.mesh.surface, b.position, b.velocity)
         fixed = [(c.nodes.tolist(), c.axes.tolist()) for c in b.constraints if c.path is None]
         moved = [(c.nodes.tolist(), c.axes.tolist(), path_data(c.path)) for c in b.constraints if c.path is not None]
-        starts = [c.path.starts.tobytes() for c in b.constraints if c.path is not None]
         loads = [(load.triangles.tolist(), load.value.tobytes()) for load in b.tractions]
         loads += [(load.nodes.tolist(), load.value.shape, load.value.tobytes()) for load in b.forces]
         numbers = (b.name, b.order, b.quadrature_degree, b.collision, b.material)
-        bodies.append((numbers, [a.tobytes() for a in arrays], fixed, moved, starts, loads))
+        bodies.append((numbers, [a.tobytes() for a in arrays], fixed, moved, loads))
     obstacles = []
     for o in scene.obstacles:
         fields = {name: np.asarray(value).tobytes() for name, value in vars(o.shape).items()}
