@@ -11,6 +11,7 @@ import contextlib
 import io
 import os
 import re
+import threading
 import time
 from pathlib import Path
 
@@ -145,8 +146,23 @@ def test_tetgen_counts_from_zero_or_one(tmp_path):
     with pytest.raises(MeshError, match="t.ele: line 2: 2 tets were announced, but the file ends after 1"):
         read_mesh(tmp_path / "t.node")
     (tmp_path / "t.ele").unlink()
-    with pytest.raises(MeshError, match="t.ele: the file cannot be read: .* come in pairs"):
+    with pytest.raises(MeshError, match="t.ele: there is no such file; TetGen's files come in pairs"):
         read_mesh(tmp_path / "t.node")
+
+
+@pytest.mark.parametrize("ending, other", [(".node", ".ele"), (".ele", ".node")])
+def test_the_other_of_tetgens_pair_is_a_pipe(tmp_path, ending, other):
+    """Nobody writes into it: to open it would be to wait for ever."""
+    pipe = tmp_path / f"t{other}"
+    os.mkfifo(pipe)
+    (tmp_path / f"t{ending}").write_text("4 3\n0 0 0 0\n1 1 0 0\n2 0 1 0\n3 0 0 1\n" if ending == ".node" else "1 4\n0 0 1 2 3\n")
+    end = threading.Timer(5.0, lambda: os.close(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)))
+    end.start()
+    try:
+        with pytest.raises(MeshError, match=f"t{other}: this is not a file; TetGen's files come in pairs"):
+            read_mesh(tmp_path / f"t{ending}")
+    finally:
+        end.cancel()
 
 
 # Files that hold no good mesh

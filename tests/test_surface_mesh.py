@@ -2,6 +2,7 @@
 
 * every format gives the same triangles; polygons become triangles; equal vertices, and near ones on request, become one;
 * what is left out is told; what cannot be read is one MeshError that names file, line or index, whatever the bytes;
+* arrays are checked, so that no index out of range and no number that is not finite goes further;
 * holes, inner walls, turned triangles and a surface inside out are found and counted;
 * the tets of a ball enclose its volume, are all upright, keep to the edge length, wherever it lies and however large it is;
 * the mesher's failure, and its absence, are told;
@@ -55,6 +56,59 @@ def test_obj(tmp_path):
     assert surface.volume == pytest.approx(1.0) and surface.area == pytest.approx(6.0)
 
 
+OFF_HEADS = ["OFF\n8 6 12\n", "OFF # a cube\n\n# counts\n8 6\n", "COFF 8 6 12\n", "OFF8 6 0\n", "\n#\nSTCNOFF\n8 6 0\n"]
+
+
+@pytest.mark.parametrize("head", OFF_HEADS)
+def test_off(head, tmp_path):
+    """Quads and a polygon, colours, comments, and heads as programs write them."""
+    path = tmp_path / "cube.off"
+    lines = [f"{x} {y} {z} 255 0 0 255 # corner" for x, y, z in CUBE]
+    lines += [f"4  {' '.join(map(str, quad))} 0.5 0.5 0.5" for quad in QUADS]
+    path.write_text(head + "\n\n".join(lines))
+    surface = read_surface(path)
+    assert len(surface.vertices) == 8 and len(surface.triangles) == 12 and not surface.faults() and not surface.warnings
+    assert surface.volume == pytest.approx(1.0) and surface.area == pytest.approx(6.0)
+    path.write_text("OFF 5 1 0\n0 0 0\n2 0 0\n2 1 0\n1 2 0\n0 1 0\n5 0 1 2 3 4")
+    surface = read_surface(path)
+    assert surface.triangles.tolist() == [[0, 1, 2], [0, 2, 3], [0, 3, 4]] and surface.area == pytest.approx(3.0)
+
+
+OFF_TEXTS = st.text("0123-.e#\n ", min_size=1).map(lambda text: f"OFF {text}".encode())
+OFF_POINTS = "0 0 0\n1 0 0\n0 1 0\n"
+
+
+@pytest.mark.parametrize(
+    "text, rule",
+    [
+        ("# nothing\n", "the file is empty"),
+        ("3 1 0\n" + OFF_POINTS, "line 1: not a supported surface: OFF should stand here, not '3'"),
+        ("4OFF 3 1 0\n" + OFF_POINTS, "line 1: not a supported surface"),
+        ("OFF\n", "line 1: the counts of vertices and faces should stand here"),
+        ("OFF BINARY\n", "line 1: the counts of vertices and faces should stand here"),
+        ("OFF\n3 -1 0\n", "line 2: the counts"),
+        ("OFF\n3\n", "line 2: the counts"),
+        ("OFF\n1000000000 1 0\n" + OFF_POINTS, "line 2 announces 1000000000 vertices and 1 faces, but 3 lines follow"),
+        ("OFF 3 1000000000 0\n" + OFF_POINTS, "line 1 announces 3 vertices and 1000000000 faces, but 3 lines follow"),
+        (f"OFF 3 {'9' * 5000} 0\n", "line 1: the counts"),
+        ("OFF 3 1 0\n0 0 0\n# x\n1 0\n0 1 0\n3 0 1 2\n", "line 4: three coordinates should stand here, not '1 0'"),
+        ("OFF 3 1 0\n" + OFF_POINTS + "2 0 1\n", "line 5: a number of at least 3 corners and as many vertices should"),
+        ("OFF 3 1 0\n" + OFF_POINTS + "1000000000 0 1\n", "line 5: a number of at least 3 corners and as many vertices should"),
+        ("OFF 3 1 0\n" + OFF_POINTS + "3 0 1 x\n", "line 5: a number of at least 3 corners"),
+        ("OFF 3 1 0\n" + OFF_POINTS + "3 0 1 3\n", r"line 5: vertex 3 does not exist \(3 vertices\)"),
+        ("OFF 3 1 0\n" + OFF_POINTS + "3 0 1 -1\n", r"line 5: vertex -1 does not exist \(3 vertices\)"),
+        ("OFF 3 1 0\n0 0 0\n1 0 0\n0 inf 0\n3 0 1 2\n", "vertex 2 coordinate 1 is not finite"),
+        ("OFF 3 0 0\n" + OFF_POINTS, "no triangles found"),
+    ],
+)
+def test_broken_off(text, rule, tmp_path):
+    path = tmp_path / "a.off"
+    path.write_text(text)
+    with pytest.raises(MeshError, match=rule) as told:
+        read_surface(path)
+    assert str(told.value).startswith(str(path)) and len(str(told.value)) < 400
+
+
 def test_welding(tmp_path):
     """Vertices by the triangle, as .stl has them, some a little apart."""
     path = tmp_path / "ball.obj"
@@ -68,7 +122,7 @@ def test_welding(tmp_path):
         assert len(surface.vertices) == len(X) and not surface.faults()
         if apart:
             assert "hole" in read_surface(path).faults()[0]
-    for wrong in (-1.0, np.nan, "1", True):
+    for wrong in (-1.0, np.nan, "1", True, 1j):
         with pytest.raises(MeshError, match="ball.obj: weld must be a distance of at least 0 m"):
             read_surface(path, weld=wrong)
 
@@ -110,7 +164,7 @@ def test_broken_files(name, text, rule, tmp_path):
 
 
 @settings(max_examples=60, deadline=None)
-@given(data=st.binary(min_size=1, max_size=300), ending=st.sampled_from(FORMATS))
+@given(data=st.binary(min_size=1, max_size=300) | OFF_TEXTS, ending=st.sampled_from(FORMATS))
 def test_random_bytes(data, ending, tmp_path_factory):
     path = tmp_path_factory.mktemp("random") / f"a{ending}"
     path.write_bytes(data)
@@ -120,6 +174,43 @@ def test_random_bytes(data, ending, tmp_path_factory):
             read_surface(path)
         except MeshError as error:
             assert str(path) in str(error)
+
+
+def test_arrays_are_checked():
+    """Lists become arrays; what the mesher would trip over is refused, with item and rule."""
+    surface = ts.SurfaceMesh(X.tolist(), T.tolist())
+    assert surface.vertices.dtype == np.float64 and surface.triangles.dtype == np.int64
+    assert surface.volume == pytest.approx(VOLUME) and not surface.faults()
+    given = X.copy()
+    surface = ts.SurfaceMesh(given, T.astype(np.uint8))
+    given[:] = 0.0
+    assert surface.volume == pytest.approx(VOLUME) and not surface.vertices.flags.writeable
+    for vertices, triangles, rule in (
+        (X[:, :2], T, r"vertices must have shape \(n, 3\), not \(\d+, 2\)"),
+        ([[0, 0, 0], [1, 0]], T, r"vertices must be numbers of shape \(n, 3\)"),
+        (None, T, "vertices must be numbers, not object"),
+        ("ball", T, "vertices must be numbers, not <U4"),
+        (X * 1j, T, "vertices must be numbers, not complex128"),
+        ([], [], "no vertices found"),
+        (np.where(np.arange(3) == 1, np.nan, X), T, "vertex 0 coordinate 1 is not finite"),
+        (X, T.astype(float), "triangles must be integers, not float64"),
+        (X, T > 0, "triangles must be integers, not bool"),
+        (X, T[0], r"triangles must have shape \(n, 3\), not \(3,\)"),
+        (X, [], "no triangles found"),
+        (X, [*T, (0, 1, len(X))], f"triangle {len(T)}: vertex {len(X)} does not exist \\({len(X)} vertices\\)"),
+        (X, [(0, 1, -1)], "triangle 0: vertex -1 does not exist"),
+        (X, [(0, 1, 2**64)], "triangles must be integers, not object"),
+        (X, np.array([(0, 1, 2**63)], dtype=np.uint64), "triangle 0: vertex 9223372036854775808 does not exist"),
+    ):
+        with pytest.raises(MeshError, match=rule) as told:
+            ts.SurfaceMesh(vertices, triangles, "here")
+        assert str(told.value).startswith("here: ") and "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("path", [None, 3, ["a.obj"]])
+def test_a_path_of_the_wrong_type(path):
+    with pytest.raises(MeshError, match="read_surface: path must be a file's name, not "):
+        read_surface(path)
 
 
 def test_faults():

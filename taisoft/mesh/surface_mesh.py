@@ -2,8 +2,10 @@
 
 import contextlib
 import io
+import re
 import warnings
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 
 import meshio
@@ -16,17 +18,51 @@ from taisoft.mesh.content import one_line, read_content
 from taisoft.mesh.tet_mesh import merge_labels
 
 FORMATS = (".obj", ".stl", ".ply", ".off")
+HEAD = re.compile(r"(?:ST)?C?N?OFF(\d*)$")  # of .off; some programs leave no blank before the counts
 FLAT = 1e-12  # a triangle's area below this times its longest edge squared counts as none
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMesh:
-    """vertices: (n,3) float64 [m]; triangles: (t,3) int64; source: where it comes from; warnings: what the reader changed."""
+    """Triangles in space, checked and read-only.
+
+    vertices: (n,3) float64 [m]; triangles: (t,3) int64, counted from 0; source: where it comes from, messages start with it;
+    warnings: what the reader changed. Takes anything that NumPy makes such arrays of. Raises MeshError.
+    """
 
     vertices: np.ndarray
     triangles: np.ndarray
     source: str = "surface"
     warnings: list[str] = field(default_factory=list)
+
+    def __post_init__(self):
+        vertices = self._as_array("vertices", "fiu", "numbers").astype(np.float64)
+        bad = np.argwhere(~np.isfinite(vertices))
+        if len(bad):
+            raise MeshError(f"{self.source}: vertex {bad[0, 0]} coordinate {bad[0, 1]} is not finite")
+        triangles = self._as_array("triangles", "iu", "integers")
+        bad = np.argwhere((triangles < 0) | (triangles >= len(vertices)))
+        if len(bad):
+            t, k = bad[0]
+            raise MeshError(f"{self.source}: triangle {t}: vertex {triangles[t, k]} does not exist ({len(vertices)} vertices)")
+        for field_name, array in (("vertices", vertices), ("triangles", triangles.astype(np.int64))):
+            array.setflags(write=False)
+            # The only way to store a clean value in a frozen record.
+            object.__setattr__(self, field_name, array)
+
+    def _as_array(self, what: str, kinds: str, said: str) -> np.ndarray:
+        """The field as an array (n,3) of these kinds, at least one row."""
+        try:
+            array = np.asarray(getattr(self, what))
+        except (ValueError, TypeError, OverflowError) as error:
+            raise MeshError(f"{self.source}: {what} must be {said} of shape (n, 3): {one_line(str(error))}") from error
+        if array.size == 0:
+            raise MeshError(f"{self.source}: no {what} found")
+        if array.dtype.kind not in kinds:
+            raise MeshError(f"{self.source}: {what} must be {said}, not {array.dtype}")
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise MeshError(f"{self.source}: {what} must have shape (n, 3), not {array.shape}")
+        return array
 
     def __repr__(self) -> str:
         return f"SurfaceMesh({len(self.vertices)} vertices, {len(self.triangles)} triangles)"
@@ -103,28 +139,24 @@ def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
     each vertex several times). Triangles without area and doubled ones, and vertices of none, are left out and told as a
     warning. Raises MeshError.
     """
-    file = Path(path)
+    try:
+        file = Path(path)
+    except TypeError as error:
+        raise MeshError(f"read_surface: path must be a file's name, not {path!r}") from error
     name, ending = str(file), file.suffix.lower()
     if ending not in FORMATS:
         raise MeshError(f"{name}: a surface is read from {', '.join(FORMATS)}, not from {ending or 'a file without ending'}")
-    if not np.isscalar(weld) or isinstance(weld, (bool, str)) or not 0.0 <= weld < np.inf:
+    if isinstance(weld, bool) or not isinstance(weld, Real) or not 0.0 <= weld < np.inf:
         raise MeshError(f"{name}: weld must be a distance of at least 0 m, not {weld!r}")
     data = read_content(file)
-    points, triangles = _read_obj(name, data) if ending == ".obj" else _read_by_meshio(file, name)
-    return _cleaned(name, points, triangles, float(weld))
+    own = {".obj": _read_obj, ".off": _read_off}.get(ending)
+    points, triangles = own(name, data) if own else _read_by_meshio(file, name)
+    return _cleaned(SurfaceMesh(points, triangles, name), float(weld))
 
 
-def _cleaned(name: str, points: np.ndarray, triangles: np.ndarray, weld: float) -> SurfaceMesh:
-    if len(triangles) == 0:
-        raise MeshError(f"{name}: no triangles found")
-    bad = np.argwhere(~np.isfinite(points))
-    if len(bad):
-        raise MeshError(f"{name}: vertex {bad[0, 0]} coordinate {bad[0, 1]} is not finite")
-    bad = np.argwhere((triangles < 0) | (triangles >= len(points)))
-    if len(bad):
-        raise MeshError(
-            f"{name}: triangle {bad[0, 0]}: vertex {triangles[tuple(bad[0])]} does not exist ({len(points)} vertices)"
-        )
+def _cleaned(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
+    """The surface welded, without what has no area or is given twice."""
+    name, points, triangles = surface.source, surface.vertices, surface.triangles
     notes = []
     labels = merge_labels(points, weld)
     first = np.unique(labels, return_index=True)[1]
@@ -145,7 +177,7 @@ def _cleaned(name: str, points: np.ndarray, triangles: np.ndarray, weld: float) 
     used, inverse = np.unique(triangles, return_inverse=True)
     for text in notes:
         warnings.warn(f"{name}: {text}", UserWarning, stacklevel=3)
-    return SurfaceMesh(points[used], inverse.reshape(-1, 3).astype(np.int64), name, notes)
+    return SurfaceMesh(points[used], inverse.reshape(-1, 3), name, notes)
 
 
 def _fans(polygons: list[np.ndarray]) -> np.ndarray:
@@ -158,7 +190,7 @@ def _read_obj(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Positions and faces of a Wavefront file; meshio refuses those with fewer texture coordinates than positions."""
     points, polygons = [], []
     for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
-        words = line.split("#", 1)[0].split()
+        words = _words(line)
         try:
             if words[:1] == ["v"]:
                 x, y, z = words[1:4]
@@ -173,13 +205,62 @@ def _read_obj(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     return np.array(points, dtype=np.float64).reshape(-1, 3), _fans(polygons)
 
 
+def _read_off(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and faces of an Object File Format: OFF, the counts of vertices and faces, a line for each, # for comments.
+
+    What follows a vertex's position and a face's corners, such as colours, is passed over.
+    Source: Geomview manual, "OFF Files".
+    """
+    lines = [(i, words) for i, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1) if (words := _words(line))]
+    if not lines:
+        raise MeshError(f"{name}: the file is empty")
+    number, words = lines[0]
+    head = HEAD.match(words[0])
+    if not head:
+        raise MeshError(f"{name}: line {number}: not a supported surface: OFF should stand here, not {one_line(words[0])!r}")
+    counts, rows = [*filter(None, head.groups()), *words[1:]], lines[1:]
+    if not counts and rows:
+        (number, counts), rows = rows[0], rows[1:]
+    try:
+        n_points, n_faces = int(counts[0]), int(counts[1])
+        if min(n_points, n_faces) < 0:
+            raise ValueError
+    except (ValueError, IndexError):
+        raise MeshError(f"{name}: line {number}: the counts of vertices and faces should stand here") from None
+    if n_points + n_faces > len(rows):
+        raise MeshError(f"{name}: line {number} announces {n_points} vertices and {n_faces} faces, but {len(rows)} lines follow")
+    points, polygons = [], []
+    for k, (number, words) in enumerate(rows[: n_points + n_faces]):
+        try:
+            if k < n_points:
+                x, y, z = words[:3]
+                points.append((float(x), float(y), float(z)))
+                continue
+            n_corners = int(words[0])
+            corners = [int(word) for word in words[1 : 1 + n_corners]]
+            if n_corners < 3 or len(corners) < n_corners:
+                raise ValueError
+        except ValueError:
+            what = "three coordinates" if k < n_points else "a number of at least 3 corners and as many vertices"
+            raise MeshError(f"{name}: line {number}: {what} should stand here, not {one_line(' '.join(words))!r}") from None
+        wrong = [corner for corner in corners if not 0 <= corner < n_points]
+        if wrong:
+            raise MeshError(f"{name}: line {number}: vertex {wrong[0]} does not exist ({n_points} vertices)")
+        polygons.append(np.array([corners]))
+    return np.array(points, dtype=np.float64).reshape(-1, 3), _fans(polygons)
+
+
+def _words(line: str) -> list[str]:
+    return line.split("#", 1)[0].split()
+
+
 def _read_by_meshio(file: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), np.errstate(all="ignore"):
             mesh = meshio.read(file)
         blocks = [np.asarray(b.data) for b in mesh.cells if b.type in ("triangle", "quad", "polygon") or "polygon" in b.type]
-        return np.asarray(mesh.points, dtype=np.float64).reshape(-1, 3), _fans([b for b in blocks if b.ndim == 2])
+        return np.asarray(mesh.points), _fans([b for b in blocks if b.ndim == 2])
     except (Exception, SystemExit) as error:  # meshio may end the program or raise anything on a broken file
         said = f"{type(error).__name__}: {error}" if isinstance(error, Exception) else printed.getvalue()
         raise MeshError(f"{name}: not a supported surface ({one_line(said)})") from error

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.errors import MeshError
+from taisoft.mesh.content import read_content
 
 
 def read_tetgen(file: Path) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
@@ -32,9 +33,9 @@ def read_tetgen(file: Path) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
 def _table(file: Path, what: str) -> tuple[list[int], np.ndarray]:
     """The head line as integers, and the rows that it announces, at least 1 + head[1] numbers each."""
     try:
-        text = file.read_bytes().decode("utf-8", "replace")
-    except OSError as error:
-        raise MeshError(f"{file}: the file cannot be read: {error.strerror}; TetGen's files come in pairs") from error
+        text = read_content(file).decode("utf-8", "replace")
+    except MeshError as error:
+        raise MeshError(f"{error}; TetGen's files come in pairs") from error
     lines = [(i, words) for i, line in enumerate(text.splitlines(), 1) if (words := line.split("#")[0].split())]
     if not lines:
         raise MeshError(f"{file}: the file is empty")

@@ -78,9 +78,9 @@ class Table:
         self.file, self.place, self.known = file, place, known
         if not isinstance(values, dict):
             raise self.error("", f"must be a table, not {shown(values)}")
-        self.values = values
+        self.values, among = values, set(known)  # names are known by the thousand
         for key in values:
-            if key not in known:
+            if key not in among:
                 raise self.error(key, f"is not known{checks.nearest(key, known)}; there are {', '.join(known)}")
         for key in needed:
             if key not in values:

@@ -77,9 +77,10 @@ def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
         said = str(table.values["mesh"])
         meshes[said] = meshes.get(said) or _mesh(table, allow_outside)
         _add_body(scene, name, table, materials, meshes[said])
-    obstacles = tables.named("obstacles")
-    for name in obstacles:
-        _add_obstacle(scene, name, tables.table("obstacles", obstacles))
+    if obstacles := tables.named("obstacles"):
+        parent = tables.table("obstacles", obstacles)
+        for name in obstacles:
+            _add_obstacle(scene, name, parent)
     _set_contacts(scene, tables)
     return scene, solver
 
@@ -108,8 +109,10 @@ def _parsed(file: Path) -> dict:
 
 def _each(tables: Table, key: str, known: list[str], needed: list[str]) -> list[tuple[str, Table]]:
     """(name, table) of all tables under a key."""
-    names = tables.named(key)
-    return [(name, tables.table(key, names).table(name, known, needed)) for name in names]
+    if not (names := tables.named(key)):
+        return []
+    parent = tables.table(key, names)
+    return [(name, parent.table(name, known, needed)) for name in names]
 
 
 def _material(table: Table) -> Material:

@@ -1,7 +1,8 @@
 """A Scene and its `solver` dict into a scene file, from which `read_scene` makes the same run: every number comes back bitwise.
 
 What functions of Python chose is written as ids. A mesh that `box_mesh` and its like made is written as their arguments, any
-other one as a Gmsh file beside the scene file. Paths must be KeyFrames: a function of time is no data.
+other one as a Gmsh file beside the scene file. Paths must be KeyFrames: a function of time is no data, and a path that turns
+about a pivot and was made for other nodes or another obstacle moves in a way that no key frames of its own say.
 """
 
 import dataclasses
@@ -24,6 +25,7 @@ from taisoft.scene.tables import bare_or_quoted, joined, quoted
 from taisoft.scene.toml import NONE, OWN, SHAPES
 
 WIDTH = 100  # of the numbers in a line
+STRANGE = "turns with a path made for {}, which no file can hold: give the ts.KeyFrames themselves"
 
 
 def write_scene(path, scene: Scene, solver: dict | None = None, overwrite: bool = False) -> list[Path]:
@@ -108,6 +110,9 @@ def _body(body: Body, material: str, stem: str, meshes: dict[str, TetMesh]) -> d
         if c.path is None:
             table["fix"].append(held)
         elif isinstance(c.path, NodePath):
+            own = np.array_equal(c.path.starts, body.rest_positions[c.nodes] + body.position)
+            if not own and c.path.frames.rotations is not None:  # without them they move alike wherever they start
+                raise SceneError(f"body {body.name!r}: {STRANGE.format('nodes that start elsewhere')}")
             table["move"].append(held | {"path": _frames(c.path.frames)})
         else:
             raise SceneError(f"body {body.name!r}: moves along a function, which no file can hold: use ts.KeyFrames")
@@ -138,7 +143,10 @@ def _obstacle(obstacle: Obstacle) -> dict:
         return table
     if not isinstance(obstacle.path, ShapePath):
         raise SceneError(f"obstacle {obstacle.name!r}: moves along a function, which no file can hold: use ts.KeyFrames")
-    return table | {"path": _frames(obstacle.path.frames)}
+    frames, own = obstacle.path.frames, np.array_equal(obstacle.path.center, shape.pivot)
+    if not own and frames.rotations is not None and frames.pivot is not None:  # else the center does not count
+        raise SceneError(f"obstacle {obstacle.name!r}: {STRANGE.format('a shape with another center')}")
+    return table | {"path": _frames(frames)}
 
 
 def toml_of(tables: dict) -> str:

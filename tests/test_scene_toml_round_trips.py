@@ -1,0 +1,121 @@
+"""From scenes to files and back:
+
+* every demo, and a scene with one of everything, comes back from its file with the same numbers, bit for bit;
+* so do random numbers and names.
+"""
+
+import inspect
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from toml_scenes import TURNED, floats, there_and_back
+
+import taisoft as ts
+from taisoft.cli.scene_file import load_module, shipped_files
+from taisoft.cli.settings import RUN_KEYS
+from taisoft.scene.solver import CHECKS
+
+DEMOS = shipped_files("demos")
+
+
+@pytest.mark.parametrize("name", DEMOS)
+def test_demos_come_back(tmp_path, name):
+    demo = load_module(DEMOS[name])
+    there_and_back(tmp_path / f"{name}.toml", demo.build(), demo.solver)
+
+
+def everything() -> ts.Scene:
+    """A scene that says everything a scene can say."""
+    scene = ts.Scene(gravity=(0.1, -9.81, -0.0))
+    scene.collision = ts.CollisionSettings("bvh", margin=1e-3, k_dop=14, field_cells=40, max_capacity=1000)
+    scene.allow_initial_overlap, scene.contact_forces = True, False
+    rubber, foam = ts.Material(young=1 / 3), ts.Material("corotational", 1e22, -0.3, 1e-7, 0.1, 0.2, 0.3, 0.4)
+    frames = ts.KeyFrames((0, 1 / 3), [(0, 0, 0), (0.1, 0, 0)], [(0, 0, 0), (0, 1e-3, 7)], (1, 2, 3), smooth=True, release=True)
+    a = scene.add_body(TURNED, rubber, name="a", position=(0.1, 0.2, 1e-300), order=2, quadrature_degree=4, collision="proximity")
+    a.move([3, 1, 2], frames, axes="zy")
+    a.fix([7, 5], axes="x")
+    a.add_traction(lambda c: c[:, 1] > 0.3, (1 / 7, 0, -0.0))
+    a.add_traction([4, 2], (0, 1, 0))
+    a.add_force(range(a.n_nodes), (0, 0, 1))
+    a.add_force([2, 1], [(0, 0, 1), (1 / 3, 0, 0)])
+    velocity = np.random.default_rng(0).standard_normal((12, 3))
+    scene.add_body(TURNED, foam, name='b "2"\n\\ü', velocity=velocity)
+    scene.add_body(ts.ball_mesh(0.3, 4, (1, 2, 3)), rubber, name="c.d")
+    scene.add_body(ts.sheet_mesh((3, 3), (1, 0.3, 1), pattern="six"), rubber, name="1")
+    lift = ts.KeyFrames((1,), [(0, 1 / 3, 0)])
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (1, 2, 3)), name="ground", friction=0.1, restitution=0.9)
+    scene.add_obstacle(ts.Sphere((0, 0, 0), 1 / 3), path=lift)
+    turn = ts.KeyFrames((0, 1), rotations=[(0, 0, 0), (1, 2, 3)], pivot=(1, 1, 1))
+    scene.add_obstacle(ts.Box((0, 0, 0), (1, 1 / 3, 1)), path=turn)
+    scene.add_obstacle(ts.Capsule((0, 0, 0), (1 / 3, 0, 0), 2))
+    scene.add_obstacle(ts.MeshObstacle(TURNED.vertices, TURNED.surface))
+    scene.set_contact("ground", "a", friction=0.3)
+    scene.set_contact("a", "a", restitution=0.3)
+    scene.set_contact("a", 'b "2"\n\\ü', 0.1, 0.2)
+    return scene
+
+
+EVERY_SETTING = {
+    "dt": 1 / 120, "integrator": "bdf2", "contact_solver": "auto", "self_collision": True, "precision": "f64", "arch": "cpu",
+    "allow_unstable": False, "newton_tolerance": 1e-5, "linear_tolerance": None, "contact_tolerance": 1e-3, "seconds": 2,
+    "fps": None,
+}  # fmt: skip
+
+
+def test_everything_comes_back(tmp_path):
+    assert set(EVERY_SETTING) == set(CHECKS)
+    there_and_back(tmp_path / "all.toml", everything(), EVERY_SETTING)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["all.toml", "all_mesh0.msh"]  # shared by two bodies
+    text = (tmp_path / "all.toml").read_text()
+    again, solver = ts.read_scene(tmp_path / "all.toml")
+    ts.write_scene(tmp_path / "all.toml", again, solver, overwrite=True)
+    assert (tmp_path / "all.toml").read_text() == text
+
+
+def test_settings_are_those_of_the_simulator():
+    names = set(inspect.signature(ts.Simulator).parameters) - {"scene"}
+    assert set(CHECKS) == names | set(RUN_KEYS)
+
+
+def test_numbers_of_numpy_are_written_as_plain_ones(tmp_path):
+    scene = ts.Scene()
+    scene.add_body(TURNED, ts.Material())
+    solver = {"dt": np.float64(1 / 3), "seconds": np.int64(2), "self_collision": np.bool_(True), "fps": Fraction(1, 3)}
+    ts.write_scene(tmp_path / "a.toml", scene, solver)
+    assert ts.read_scene(tmp_path / "a.toml")[1] == {"dt": 1 / 3, "seconds": 2, "self_collision": True, "fps": 1 / 3}
+
+
+numbers = floats(allow_nan=False, allow_infinity=False, width=64)
+vectors = st.tuples(*[floats(-1e100, 1e100)] * 3)
+positive = floats(min_value=0, exclude_min=True, allow_infinity=False)
+names = st.text(min_size=1, max_size=8).filter(str.strip)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_random_numbers_come_back(tmp_path, values):
+    draw = values.draw
+    scene = ts.Scene(gravity=draw(st.tuples(numbers, numbers, numbers)))
+    scene.collision = ts.CollisionSettings(cell_ratio=draw(positive), margin=draw(st.none() | floats(0, 1e9)))
+    loss = draw(floats(0, 1e300))
+    material = ts.Material(
+        young=draw(positive), poisson=draw(floats(-1, 0.49, exclude_min=True)), density=draw(positive), friction=loss,
+        restitution=draw(floats(0, 1)), mass_damping=loss, stiffness_damping=draw(floats(0, 1e300)),
+    )  # fmt: skip
+    name, other = draw(st.lists(names, min_size=2, max_size=2, unique=True))
+    body = scene.add_body(TURNED, material, name=name, position=draw(vectors), velocity=draw(vectors))
+    times = sorted(draw(st.lists(numbers.filter(lambda t: t > 0), min_size=1, max_size=4, unique=True)))
+    keys = [draw(vectors) for _ in times]
+    small = st.tuples(*[floats(-1e6, 1e6)] * 3)
+    turns = draw(st.none() | st.lists(small, min_size=len(times), max_size=len(times)))
+    frames = ts.KeyFrames(times, keys, turns, pivot=draw(st.none() | vectors), smooth=draw(st.booleans()))
+    ids = draw(st.lists(st.integers(0, 11), min_size=1, unique=True))
+    body.move(ids, frames, axes=draw(st.sampled_from(["x", "zy", "xyz"])))
+    body.add_force(ids, draw(st.lists(vectors, min_size=len(ids), max_size=len(ids)) | vectors))
+    normal = draw(vectors.filter(lambda v: max(map(abs, v)) > 0))
+    scene.add_obstacle(ts.HalfSpace(draw(vectors), normal), name=other)
+    scene.set_contact(name, other, friction=loss)
+    there_and_back(tmp_path / "random.toml", scene, {"dt": draw(positive), "fps": draw(st.none() | positive)})
