@@ -217,7 +217,8 @@ def _clean_mesh(name, points, blocks, notes, fix_orientation, weld) -> TetMesh:
     tets = np.concatenate([nodes[..., :4] for nodes in blocks])
     sound = (
         points.ndim == 2 and points.shape[1] == 3 and points.dtype.kind in "fiu"
-        and (np.abs(points) <= LARGEST_COORDINATE).all() and tets.ndim == 2 and tets.min() >= 0 and tets.max() < len(points)
+        and (np.abs(points) <= LARGEST_COORDINATE).all() and tets.ndim == 2 and tets.size > 0
+        and tets.min() >= 0 and tets.max() < len(points)
         and all(nodes.dtype.kind in "iu" for nodes in blocks)
     )  # fmt: skip
     if not sound:

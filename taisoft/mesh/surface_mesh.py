@@ -19,6 +19,7 @@ from taisoft.mesh.tet_mesh import merge_labels
 
 FORMATS = (".obj", ".stl", ".ply", ".off")
 HEAD = re.compile(r"(?:ST)?C?N?OFF(\d*)$")  # of .off; some programs leave no blank before the counts
+INWARD = "all triangles look inward; flip the normals"
 FLAT = 1e-12  # a triangle's area below this times its longest edge squared counts as none
 
 
@@ -118,7 +119,7 @@ class SurfaceMesh:
                 "make the normals consistent"
             )
         if not found and self.volume < 0.0:
-            found.append("all triangles look inward; flip the normals")
+            found.append(INWARD)
         return found
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from taisoft.errors import MeshError
 from taisoft.mesh.content import one_line
-from taisoft.mesh.surface_mesh import SurfaceMesh
+from taisoft.mesh.surface_mesh import INWARD, SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
 
 EDGES_PER_DIAGONAL = 20  # where no length is given
@@ -43,7 +43,8 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
     faults = surface.faults()
     for text in faults:
         warnings.warn(f"{name}: {text}", UserWarning, stacklevel=2)
-    triangles = surface.triangles if faults or surface.volume > 0 else surface.triangles[:, ::-1]
+    inward = faults == [INWARD]
+    triangles = surface.triangles[:, ::-1] if inward else surface.triangles
     vertices, tets = _in_a_process(name, surface.vertices, triangles, edge_length / diagonal, envelope / diagonal)
     if len(tets) == 0:
         raise MeshError(f"{name}: the surface encloses nothing: no tets were made")
@@ -53,7 +54,7 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
     used, inverse = np.unique(tets, return_inverse=True)
     mesh = TetMesh(vertices[used], inverse.reshape(-1, 4), source=name)
     lost = abs(mesh.volumes.sum() - abs(surface.volume))
-    if not faults and lost > envelope * surface.area:
+    if (inward or not faults) and lost > envelope * surface.area:
         raise MeshError(
             f"{name}: the tets fill {mesh.volumes.sum():.4g} m^3 of {abs(surface.volume):.4g}, more off than an envelope of "
             f"{envelope:.3g} m allows: take a smaller edge_length"
@@ -77,12 +78,18 @@ def _in_a_process(name: str, vertices: np.ndarray, triangles: np.ndarray, length
         np.savez(given, vertices=vertices - middle, triangles=triangles, numbers=(length, envelope))
         command = [sys.executable, "-c", f"import {__name__} as m; m._mesh({str(given)!r}, {str(made)!r})"]
         path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")])
-        ended = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, cwd=folder, env=os.environ | {"PYTHONPATH": path}
-        )
-        if ended.returncode != 0 or not made.is_file():
-            lines = ended.stderr.decode("utf-8", "replace").split("\n")
-            said = next((line for line in reversed(lines) if line.strip()), f"exit status {ended.returncode}")
+        child = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, cwd=folder,
+            env=os.environ | {"PYTHONPATH": path},
+        )  # fmt: skip
+        try:
+            told = child.communicate()[1]
+        finally:  # a signal must not leave it behind
+            child.kill()
+            child.wait()
+        if child.returncode != 0 or not made.is_file():
+            lines = told.decode("utf-8", "replace").split("\n")
+            said = next((line for line in reversed(lines) if line.strip()), f"exit status {child.returncode}")
             raise MeshError(f"{name}: the mesher failed: {one_line(said)}")
         with np.load(made) as found:
             return found["vertices"] + middle, found["tets"]
