@@ -55,8 +55,9 @@ class Desktop:
         time.sleep(seconds)
 
     def printed(self):
-        """Lines of the child so far."""
-        return self.log.read_text().split()
+        """Words of the child so far, of lines that are whole."""
+        text = self.log.read_text()
+        return text[: text.rfind("\n") + 1].split()
 
     def picture(self):
         """The whole screen, uint8 (height, width, 3)."""
@@ -73,8 +74,9 @@ class Desktop:
         return np.frombuffer(data, np.uint8, offset=at + 1).reshape(size[1], size[0], 3)
 
     def last(self, key):
-        """The last line of the child that starts with key, as a list of words; empty without one."""
-        found = [line.split() for line in self.log.read_text().splitlines() if line.startswith(key)]
+        """The last whole line of the child that starts with key, as a list of words; empty without one."""
+        text = self.log.read_text()
+        found = [line.split() for line in text[: text.rfind("\n") + 1].splitlines() if line.startswith(key)]
         return found[-1] if found else []
 
     def drag(self, start, way, hold=0.0):
