@@ -36,12 +36,16 @@ class Resuming(StateAccess):
         overlaps are not looked for. Raises SimulationError for a file that cannot be used and SceneError for another
         scene, both naming the file.
         """
-        saved = read_checkpoint(path)
+        return cls.from_checkpoint(read_checkpoint(path), scene, arch)
+
+    @classmethod
+    def from_checkpoint(cls, saved: Checkpoint, scene: Scene, arch: str | None = None) -> Self:
+        """As `load_checkpoint`, from a file's content."""
         if not isinstance(scene, Scene):
             raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
         settings = saved.settings | ({} if arch is None else {"arch": arch})
         if set(settings) != {field.name for field in dataclasses.fields(Settings)}:
-            raise SimulationError(f"{path} holds no state of this scene: its settings are not those of this version")
+            raise SimulationError(f"{saved.path} holds no state of this scene: its settings are not those of this version")
         check_scene(saved, scene, plan_of(scene, *(settings[key] for key in ("integrator", "self_collision", "pullable"))).on)
         start = scene.snapshot()
         start.allow_initial_overlap = True  # where bodies start is not where they are
@@ -51,7 +55,7 @@ class Resuming(StateAccess):
             sim._restore(saved)
         except (KeyError, TypeError, ValueError) as error:  # a right checksum does not make it fit
             sim.close()
-            raise SimulationError(f"{path} holds no state of this scene: {type(error).__name__}: {error}") from None
+            raise SimulationError(f"{saved.path} holds no state of this scene: {type(error).__name__}: {error}") from None
         except BaseException:
             sim.close()
             raise

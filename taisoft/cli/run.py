@@ -6,7 +6,7 @@ from argparse import Namespace
 from contextlib import ExitStack, closing
 from pathlib import Path
 
-from taisoft.checkpoint import read_checkpoint
+from taisoft.checkpoint import Checkpoint, read_checkpoint
 from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL
 from taisoft.cli.recording import Observers, Recording
 from taisoft.cli.scene_file import load_scene
@@ -44,9 +44,9 @@ def command(arguments: Namespace) -> int:
         else:
             saved = read_checkpoint(arguments.resume)
             notes = saved.notes
-            kept = saved.settings | {key: notes[key] for key in ("fps",) if key in notes}  # frames have numbers
+            kept = saved.settings | ({"fps": notes["fps"]} if "fps" in notes else {})  # frames have numbers
             settings = resolve_resumed(solver, arguments, Simulator, kept)
-            sim = _resumed(scene, settings, arguments)
+            sim = _resumed(saved, scene, settings)
         with sim:
             print_plan(sim)
             if watched:
@@ -65,16 +65,16 @@ def _checkpoint_interval(arguments: Namespace) -> float | None:
     return checks.number(every, "--checkpoint-every", above=0.0, unit="s")
 
 
-def _resumed(scene: Scene, settings: RunSettings, arguments: Namespace) -> Simulator:
+def _resumed(saved: Checkpoint, scene: Scene, settings: RunSettings) -> Simulator:
     """The simulator that goes on, with another dt where that was asked for."""
-    sim = Simulator.load_checkpoint(arguments.resume, scene, arch=settings.simulator["arch"])
+    sim = Simulator.from_checkpoint(saved, scene, arch=settings.simulator["arch"])
     if "dt" in settings.changed:
         try:
             sim.dt = settings.simulator["dt"]
         except BaseException:
             sim.close()
             raise
-    print(f"resumed  from {arguments.resume}, t = {sim.time:.6g} s")
+    print(f"resumed  from {saved.path}, t = {sim.time:.6g} s")
     return sim
 
 

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from taisoft.errors import MeshError
 from taisoft.mesh.content import one_line, read_content
 from taisoft.mesh.tet_mesh import merge_labels
+from taisoft.mesh.topology import triangle_edges
 
 FORMATS = (".obj", ".stl", ".ply", ".off")
 HEAD = re.compile(r"(?:ST)?C?N?OFF(\d*)$")  # of .off; some programs leave no blank before the counts
@@ -83,8 +84,7 @@ class SurfaceMesh:
     @property
     def closed(self) -> bool:
         """Whether every edge belongs to more than one triangle."""
-        ends = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        return bool((np.unique(ends, axis=0, return_counts=True)[1] > 1).all())
+        return bool((triangle_edges(self.triangles)[1] > 1).all())
 
     @property
     def n_pieces(self) -> int:

@@ -68,10 +68,14 @@ def count_components(tets: np.ndarray, n_verts: int) -> int:
     return int(connected_components(graph, directed=False)[0])
 
 
+def triangle_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Every edge of triangles (t,3) once, (e,2) with ascending vertices, and how many triangles each belongs to (e,)."""
+    return np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+
+
 def joint_edges(surface: np.ndarray) -> np.ndarray:
     """(k,2) surface edges with more than two triangles: parts hang together by an edge alone. surface: (t,3) int."""
-    edges = np.sort(surface[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    distinct, counts = np.unique(edges, axis=0, return_counts=True)
+    distinct, counts = triangle_edges(surface)
     return distinct[counts > 2]
 
 

@@ -29,7 +29,7 @@ class Colouring:
 
     def __init__(self, scene, surfaces: Surfaces, kind: str = "body"):
         self._bodies, self._surfaces = scene.bodies, surfaces
-        self._mean = NodalMean(scene.bodies)
+        self._nodal_mean: NodalMean | None = None  # once stress or stretch is asked for
         self._Dm_inv: list[np.ndarray] = []  # per body, once stretch is asked for
         self.choose(kind)
 
@@ -53,9 +53,9 @@ class Colouring:
     def values(self, sim) -> np.ndarray:
         """The quantity at the nodes of all bodies (n_nodes,) in sim's present state."""
         if self.kind == "stress":
-            return von_mises(self._mean(sim.stress()))
+            return von_mises(self._mean()(sim.stress()))
         if self.kind == "stretch":
-            return self._mean(self._stretches(sim))
+            return self._mean()(self._stretches(sim))
         return np.linalg.norm(sim.velocities(), axis=1)
 
     def base(self, sim) -> np.ndarray:
@@ -74,6 +74,11 @@ class Colouring:
         shares = np.linspace(1.0, 0.0, 3)
         texts = [f"{self.low + share * self.span:10.4g} {UNITS[self.kind]}" for share in shares]
         return list(zip(texts, colours_of(shares)))
+
+    def _mean(self) -> NodalMean:
+        if self._nodal_mean is None:
+            self._nodal_mean = NodalMean(self._bodies)
+        return self._nodal_mean
 
     def _follow(self, now: float) -> None:
         self._peak = max(now, FADE * self._peak, SMALLEST[self.kind])

@@ -6,6 +6,7 @@ behind them, contacts and arrows so far that nothing hides them.
 
 import numpy as np
 
+from taisoft.mesh.topology import triangle_edges
 from taisoft.output.camera import Camera
 
 MARKS = 4000  # contacts' lines and arrows' lines that are drawn at most, beside the wires
@@ -23,7 +24,7 @@ class Layers:
     def __init__(self, scene):
         self.shown = {"wires": False, "contacts": False, "tractions": True, "fixed nodes": True}
         starts = np.cumsum([0] + [body.n_nodes for body in scene.bodies])
-        self._edges = np.concatenate([_edges(np.asarray(b.nodes.surface)) + n for b, n in zip(scene.bodies, starts)])
+        self._edges = np.concatenate([triangle_edges(np.asarray(b.nodes.surface))[0] + n for b, n in zip(scene.bodies, starts)])
         self.n_segments = len(self._edges) + MARKS
         points = np.concatenate([body.rest_positions + body.position for body in scene.bodies])
         self._size = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
@@ -58,12 +59,6 @@ class Layers:
             (_joined(point, point + NORMAL * self._size * normal), NORMAL_COLOUR),
             (_joined(point, point + IMPULSE * self._size * share), IMPULSE_COLOUR),
         ]
-
-
-def _edges(triangles: np.ndarray) -> np.ndarray:
-    """Every edge of triangles (t,3) once: (e,2)."""
-    ends = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
-    return np.unique(ends, axis=0)
 
 
 def _joined(a: np.ndarray, b: np.ndarray) -> np.ndarray:
