@@ -43,7 +43,7 @@ def test_reasons():
         "inversion_handling": (False, entries["inversion_handling"][1]),
         "obstacles": (False, "the scene has none"),
         "distance_fields": (False, "every body is hit by proximity"),
-        "proximity": (True, "hits beam (sharp edges), block (sharp edges), tower (sharp edges), flyer (sharp edges)"),
+        "proximity": (True, "hits beam, block, tower, flyer"),
         "self_collision": (False, "not asked for"),
         "contact_forces": (False, "the scene's contact_forces are off"),
     }
@@ -92,7 +92,7 @@ def contact_plan(bodies=(), obstacles=(), self_collision=False) -> dict[str, tup
 
 def test_contact_geometry_is_there_where_something_can_touch():
     plane, box = ts.HalfSpace((0, 0, 0), (0, 1, 0)), ts.Box((0, 0, 0), (1, 1, 1))
-    ball = ("ball", "auto")
+    ball = ("ball", "distance_field")
     alone = contact_plan([ball])
     assert not any(on for on, _ in alone.values())
     assert alone["distance_fields"] == alone["proximity"] == (False, "no triangles can hit a body")
@@ -103,16 +103,16 @@ def test_contact_geometry_is_there_where_something_can_touch():
     assert not grounded["distance_fields"][0] and not grounded["proximity"][0]
     assert grounded["contact_forces"] == (True, "ball, obstacle0, obstacle1 and 1 more can touch")
     boxed = contact_plan([ball], [plane, box])
-    assert boxed["distance_fields"] == (True, "hits ball (smooth and not thin)")
+    assert boxed["distance_fields"] == (True, "hits ball (asked for)")
     assert boxed["proximity"] == (True, "hits obstacle1 (edges)")
-    two = contact_plan([ball, ("told", "proximity")])
-    assert two["distance_fields"] == (True, "hits ball (smooth and not thin)")
-    assert two["proximity"] == (True, "hits told (asked for)")
+    two = contact_plan([ball, ("told", "proximity"), ("free", "auto")])
+    assert two["distance_fields"] == (True, "hits ball (asked for)")
+    assert two["proximity"] == (True, "hits told (asked for), free")
 
 
 def test_meshes_and_bodies_themselves_are_hit_by_proximity():
     vertices, triangles = ts.Box((0, 0, 0), (1, 1, 1)).surface()
-    meshed = contact_plan([("ball", "auto")], [ts.MeshObstacle(vertices, triangles)])
+    meshed = contact_plan([("ball", "distance_field")], [ts.MeshObstacle(vertices, triangles)])
     assert meshed["proximity"] == (True, "hits obstacle0 (triangles)") and meshed["distance_fields"][0]
     itself = contact_plan([("ball", "auto")], self_collision=True)
     assert itself["proximity"] == (True, "hits every body (itself)") and itself["self_collision"] == (True, "asked for")

@@ -13,7 +13,7 @@ from taisoft.errors import SceneError
 from taisoft.mesh.half_edges import opposite_half_edges
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.mesh.tet_mesh import TetMesh
-from taisoft.scene.collision import CollisionSettings, _sharpest_turn
+from taisoft.scene.collision import CollisionSettings, _sharpest_turn, has_sharp_edges
 from taisoft.scene.obstacles import Box, HalfSpace, Sphere
 from taisoft.scene.scene import Material, Scene
 
@@ -179,21 +179,19 @@ def prism(sides: int, height: float = 1.0) -> TetMesh:
     return TetMesh(vertices, np.concatenate([np.stack(t, axis=1) for t in tets]), fix_orientation=True)
 
 
-def test_a_body_is_hit_by_what_fits_its_shape(scene):
+def test_which_bodies_have_sharp_edges(scene):
     ball = ball_mesh(1.0, 8)
     turned = TetMesh(ball.vertices @ np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0].T, ball.tets)
     rows = {
-        "ball": (ball, ("distance_field", "smooth and not thin")),
-        "turned": (turned, ("distance_field", "smooth and not thin")),
-        "flattened": (TetMesh(ball.vertices * (1, 0.12, 1), ball.tets), ("proximity", "thin")),
-        "sheet": (sheet_mesh((8, 8), (4, 0.05, 4)), ("proximity", "thin")),
-        "box": (box_mesh((4, 4, 4), (1, 1, 1)), ("proximity", "sharp edges")),
-        "coarse": (prism(4), ("proximity", "sharp edges")),
+        "ball": (ball, False),
+        "turned": (turned, False),
+        "sheet": (sheet_mesh((8, 8), (4, 0.05, 4)), True),
+        "box": (box_mesh((4, 4, 4), (1, 1, 1)), True),
+        "coarse": (prism(4), True),
     }
-    for name, (mesh, choice) in rows.items():
+    for name, (mesh, sharp) in rows.items():
         for order in (1, 2):
-            body = scene.add_body(mesh, Material(), name=f"{name}{order}", order=order)
-            assert body.collision_choice == choice and body.hit_by == choice[0], name
+            assert has_sharp_edges(scene.add_body(mesh, Material(), name=f"{name}{order}", order=order).nodes) == sharp, name
 
 
 def test_only_convex_edges_are_sharp():
@@ -207,19 +205,17 @@ def test_only_convex_edges_are_sharp():
         assert _sharpest_turn(mesh.vertices, hollow, opposite_half_edges(hollow)) == pytest.approx(0, abs=1e-5)
 
 
-def test_parts_joined_at_an_edge_are_hit_by_proximity(scene):
+def test_parts_joined_at_an_edge_count_as_sharp(scene):
     vertices = np.array([(0, 0, 0), (0, 1, 0), (1, 0, 0), (1, 0, 1), (-1, 0, 0), (-1, 0, -1)], dtype=float)
     with pytest.warns(UserWarning, match="joined at an edge"):
         mesh = TetMesh(vertices, [(1, 0, 2, 3), (1, 0, 4, 5)])
-    assert scene.add_body(mesh, Material()).collision_choice == ("proximity", "parts joined at an edge")
+    assert has_sharp_edges(scene.add_body(mesh, Material()).nodes)
 
 
-def test_a_body_may_say_by_what_it_is_hit(scene, body, monkeypatch):
-    assert body.collision == "auto" and body.hit_by == "proximity"
-    monkeypatch.setattr("taisoft.scene.body.choose_hit_by", None)  # asked once
-    assert body.collision_choice == scene.snapshot().body("beam").collision_choice == ("proximity", "sharp edges")
+def test_a_body_may_say_by_what_it_is_hit(scene, body):
+    assert body.collision == "auto" and body.hit_by == scene.snapshot().body("beam").hit_by == "proximity"
     told = scene.add_body(MESH, Material(), collision="distance_field")
-    assert told.collision_choice == ("distance_field", "asked for") and told.hit_by == "distance_field"
+    assert told.hit_by == "distance_field"
     body.collision = "distance_field"
     assert body.hit_by == "distance_field"
     with pytest.raises(SceneError, match="^body 'beam': collision must be one of auto, distance_field, proximity"):

@@ -7,8 +7,11 @@ from taisoft.errors import MeshError
 from taisoft.mesh.sdf_grid import SdfGrid, cached_sdf_grid
 from taisoft.model import Layout
 from taisoft.scene.body import Body
-from taisoft.scene.obstacles import Obstacle
+from taisoft.scene.collision import principal_extents
+from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle, Obstacle
 from taisoft.scene.scene import Scene
+
+THINNEST = 0.25  # of the mean surface edge: least thickness of a collider, since open meshes have none
 
 
 def body_grid(body: Body, cells: int, margin: float) -> SdfGrid:
@@ -52,3 +55,27 @@ def led_vertices(topology: Topology, nodes: np.ndarray, moves: np.ndarray) -> np
     led = where[nodes] >= 0  # not those inside
     whole[where[nodes[led]]] = moves[led]
     return whole
+
+
+def collider_thickness(collider: Body | Obstacle, edge: float) -> float:
+    """How thick a body or an obstacle is [m]: a half space without end, others their smallest extent.
+
+    A bowl or a ring is thinner than its box: no surface counts as thicker than twice the plate of its volume and area.
+    """
+    if isinstance(collider, Body):
+        return _surface_thickness(collider.nodes.positions, collider.nodes.surface)
+    if isinstance(collider.shape, HalfSpace):
+        return np.inf
+    if isinstance(collider.shape, MeshObstacle):  # an open one has none
+        return max(_surface_thickness(collider.shape.vertices, collider.shape.triangles), THINNEST * edge)
+    if isinstance(collider.shape, Box):
+        return 2.0 * float(np.min(collider.shape.half_extents))
+    return 2.0 * float(collider.shape.radius)
+
+
+def _surface_thickness(x: np.ndarray, triangles: np.ndarray) -> float:
+    """[m], of a surface with vertices x."""
+    a, b, c = (x[triangles[:, k]] - x.mean(axis=0) for k in range(3))
+    cross = np.cross(b - a, c - a)
+    volume, area = abs(np.einsum("ij,ij->", a, cross)) / 6.0, 0.5 * np.linalg.norm(cross, axis=1).sum()
+    return min(float(principal_extents(x, triangles).min()), 4.0 * volume / area)

@@ -1,19 +1,23 @@
 """Contacts of two edges that cross: where their lines are nearest, along the normal that is across both.
 
 Both edges must stick out along it. Edges that penetrate have shifted along each other, so they may cross a little beyond an end.
-Where an end lies inside the other body and makes a contact of its own, that tells already.
+Where an end lies inside the other body and the way out of its own contact frees the edge, that tells already.
 """
 
 import taichi as ti
 
 from taisoft.collision.contacts import EDGE_EDGE, write_contact
-from taisoft.collision.features import corner, edge_normal, edge_sticks_out, sticks_out, unit
-from taisoft.collision.surface import dvec, ivec
+from taisoft.collision.features import BY_FACES, corner, edge_normal, edge_sticks_out, sticks_out, unit
+from taisoft.collision.surface import INSIDE_BITS, dvec, ivec
 from taisoft.collision.triangles import closest_lines
 
-MISS = 2.0  # how far beyond the ends of edges that penetrate, in depths, they may cross: they have shifted along each other
+# How far beyond the ends of edges that penetrate they may cross, since they have shifted along each other: in depths, and at most
+# in lengths of the edge, since farther out the surfaces are elsewhere
+MISS, BEYOND = 2.0, 0.05
 CROSSING = 0.02  # sine below which two edges count as parallel
 END = 10.0  # depths from an end within which it tells of a crossing
+FREED = 0.1  # of a crossing's depth: less than that does not count once the end is out
+SHALLOW = 0.2  # of the crossed edge's length: deeper, a crossing is likely none but seen across a groove
 TINY = 1e-9  # of lengths: rounding
 
 
@@ -30,17 +34,37 @@ def _is_behind(s: ti.template(), i, length, u, m):
 
 
 @ti.func
-def _end_tells(s: ti.template(), t, k, place, length, over, u, m, n):
-    """1 where edge k of triangle t crosses so near an end that the end's own contact tells of it: it lies inside, behind both
-    faces at edge m of triangle u, and sticks out along n."""
-    told = 0
-    for e in range(2):
-        near = place <= over
-        if e == 1:
-            near = length - place <= over
-        if near and over > 0.0:
+def _is_freed(s: ti.template(), p, i, u, m, gap):
+    """1 where point p of an edge, which lies `gap` < 0 deep below edge m of triangle u, is carried out by what takes vertex i out: to
+    less than a tenth of that depth. One that lies deeper than SHALLOW is taken to be far from where i came in."""
+    d = p + s.way_out[i] - corner(s, u, m)
+    depth = -d.dot(s.normal[u])
+    v = s.neighbour[u, m]
+    if v >= 0:
+        depth = ti.min(depth, -d.dot(s.normal[v]))
+    shallow = ti.cast(SHALLOW, ti.f64) * (corner(s, u, m + 1) - corner(s, u, m)).norm()
+    return int(depth < -ti.cast(FREED, ti.f64) * gap) | int(-gap > shallow)
+
+
+@ti.func
+def _end_tells(s: ti.template(), t, k, p, place, length, gap, u, m, n, by_faces):
+    """1 where edge k of triangle t crosses at p so near an end that the end's own contact tells of it: it lies inside, behind both
+    faces at edge m of triangle u, sticks out along n, and once it is out the crossing is, too.
+
+    by_faces: whether vertices find their contacts with u's collider by faces, so that it is known whether this one has any.
+    """
+    told, over = 0, -ti.cast(END, ti.f64) * gap
+    if gap < 0.0:
+        for e in range(2):
             i = s.triangle[t, (k + e) % 3]
-            if _is_behind(s, i, length, u, m) == 1:
+            good = int(ti.select(e == 0, place, length - place) <= over)
+            if good == 1 and by_faces == 1:
+                good = (s.inside[i] >> (s.body[u] % INSIDE_BITS)) & 1
+                if good == 1:
+                    good = _is_freed(s, p, i, u, m, gap)
+            if good == 1:
+                good = _is_behind(s, i, length, u, m)
+            if good == 1:
                 told = told | sticks_out(s, i, n)
     return told
 
@@ -51,7 +75,8 @@ def _within(s: ti.template(), t, k, place, length, over, u, m):
 
     Of two bodies side by side the edges cross beyond their ends, too, one below the other, and nothing penetrates.
     """
-    good = int(-over <= place <= length + over)
+    beyond = ti.min(over, ti.cast(BEYOND, ti.f64) * length)
+    good = int(-beyond <= place <= length + beyond)
     if good == 1 and (place < 0.0 or place > length):
         e = int(place > length)
         good = _is_behind(s, s.triangle[t, (k + e) % 3], length, u, m)
@@ -59,8 +84,9 @@ def _within(s: ti.template(), t, k, place, length, over, u, m):
 
 
 @ti.func
-def edge_contact(s: ti.template(), t, k, u, m, margin, out: ti.template(), start, end):
-    """The contact of edge k of triangle t with edge m of triangle u, if they cross. Returns the new count."""
+def edge_contact(s: ti.template(), way: ti.template(), t, k, u, m, margin, out: ti.template(), start, end):
+    """The contact of edge k of triangle t with edge m of triangle u, if they cross. way: as in `find_proximity`. Returns the new
+    count."""
     at = start
     a0, a1, b0, b1 = corner(s, t, k), corner(s, t, k + 1), corner(s, u, m), corner(s, u, m + 1)
     da, db = a1 - a0, b1 - b0
@@ -79,7 +105,8 @@ def edge_contact(s: ti.template(), t, k, u, m, margin, out: ti.template(), start
                 n, gap = -n, -gap
             move = (1.0 - f) * s.move[s.triangle[t, k]] + f * s.move[s.triangle[t, (k + 1) % 3]]
             move -= (1.0 - g) * s.move[s.triangle[u, m]] + g * s.move[s.triangle[u, (m + 1) % 3]]
-            deepest = ti.cast(0.5, ti.f64) * ti.min(la, lb)
+            # of thin bodies side by side, edges of the far sides cross too, as deep as both are thick
+            deepest = ti.cast(0.5, ti.f64) * ti.min(la, lb, s.thickness[s.body[t]], s.thickness[s.body[u]])
             if s.body[t] == s.body[u]:  # no deeper than half of what the body's own thickness can be
                 rest = (1.0 - f) * s.rest[s.triangle[t, k]] + f * s.rest[s.triangle[t, (k + 1) % 3]]
                 rest -= (1.0 - g) * s.rest[s.triangle[u, m]] + g * s.rest[s.triangle[u, (m + 1) % 3]]
@@ -96,7 +123,9 @@ def edge_contact(s: ti.template(), t, k, u, m, margin, out: ti.template(), start
             if good == 1:
                 good = edge_sticks_out(s, t2, k2, along)
             if good == 1:
-                good = 1 - _end_tells(s, t1, k1, place, length, -END * gap, t2, k2, along)
+                by_faces = int(way[s.body[t2]] == BY_FACES) | int(s.body[t1] == s.body[t2])
+                p = corner(s, t1, k1) + place * unit(corner(s, t1, k1 + 1) - corner(s, t1, k1))
+                good = 1 - _end_tells(s, t1, k1, p, place, length, gap, t2, k2, along, by_faces)
         if good == 1:
             # where one was clamped to an end, the contact is at that end
             f_in, g_in = ti.min(ti.max(f, 0.0), 1.0), ti.min(ti.max(g, 0.0), 1.0)

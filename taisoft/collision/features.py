@@ -9,8 +9,9 @@ import taichi as ti
 
 from taisoft.collision.surface import ACTIVE, dvec, ivec
 
+BY_FIELD, BY_FACES, BY_EDGES = 0, 1, 2  # how a collider is hit; a box by its edges beside its analytic distance
 CORNER_SLACK, EDGE_SLACK = 0.25, 0.05  # sines
-FLAT = 0.985  # cosine of 10 degrees: edges that turn by less are blunt, and meet sharp ones only
+FLAT = 0.9994  # cosine of 2 degrees: edges that turn by less are blunt and meet sharp ones only; two sink by < 1 % of an edge
 LEVEL = 0.9998  # cosine of 1 degree: edges that are hollow by less count as flat
 SMOOTH = 0.5  # cosine of 60 degrees: the same for bodies hit by a distance field, which sees blunt edges itself
 
@@ -129,7 +130,8 @@ def edge_sticks_out(s: ti.template(), t, k, n):
 
 @ti.func
 def mark_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template()):
-    """Bits 0-2 of each active triangle: edges that it owns and that stick out, open ones too; 3-5: those, and flat ones.
+    """Bits 0-2 of each active triangle: edges that it owns and that stick out, open ones too; 3-5: those, and flat ones. Vertices
+    of them are inside nothing yet.
 
     way: (n_bodies) i32, 0 for bodies hit by a distance field.
     """
@@ -138,9 +140,11 @@ def mark_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template())
         t = s.active[c]
         bits = 0
         flat = ti.cast(FLAT, ti.f64)
-        if way[s.body[t]] == 0:
+        if way[s.body[t]] == BY_FIELD:
             flat = SMOOTH
         for k in range(3):
+            s.inside[s.triangle[t, k]] = 0
+            s.way_out[s.triangle[t, k]] = dvec(0.0)
             if (s.owns[t] >> (3 + k)) & 1:
                 w = s.neighbour[t, k]
                 if w < 0:
@@ -153,9 +157,9 @@ def mark_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template())
                     if out and cosine < flat:
                         bits |= 9 << k
                     elif cosine > ti.cast(LEVEL, ti.f64):  # level: it may bend over a rim, unless it is rigid
-                        if way[s.body[t]] != 0 and s.soft[s.body[t]] == 1:
+                        if way[s.body[t]] != BY_FIELD and s.soft[s.body[t]] == 1:
                             bits |= 8 << k
                     elif out:
-                        if way[s.body[t]] != 0:
+                        if way[s.body[t]] != BY_FIELD:
                             bits |= 8 << k
         sharp[t] = bits

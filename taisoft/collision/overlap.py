@@ -18,6 +18,7 @@ from taisoft.scene.obstacles import HalfSpace, Shape
 from taisoft.transfer import array_of, download
 
 ALLOWED = 1e-6  # of the smaller body's size: deeper is an overlap
+PARALLEL = 1e-6  # sine below which two edges have no common normal
 
 
 @dataclass(frozen=True)
@@ -88,39 +89,28 @@ def _depth_of_middle(detection: Detection, vertices: np.ndarray, a: int, shape: 
 
 
 def _crossings(detection: Detection, x: np.ndarray) -> list[tuple[int, int, float]]:
-    """Pairs of different colliders whose triangles cut each other, and how far at least one reaches through the other [m].
+    """Pairs of different colliders whose triangles cut each other, and how far the two triangles must part to be clear [m].
 
-    No farther than the cut is long: triangles that touch in a point or side by side cut by rounding only.
+    Bodies overlap by at least as much. Two triangles are clear of each other along one of their normals, or along what is across
+    an edge of each (Gottschalk, Lin, Manocha 1996).
     """
     pairs, topology = detection.intersections(), detection.topology
     owner = np.searchsorted(topology.first, pairs, side="right") - 1
     apart = owner[:, 0] != owner[:, 1]
     pairs, owner = pairs[apart], owner[apart]
     corners = x[topology.triangle[pairs]]  # (k, 2, 3, 3)
-    normal = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
-    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
-    along = np.cross(normal[:, 0], normal[:, 1])
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
-    through, ends = [], []
-    for one, other in ((0, 1), (1, 0)):
-        height = np.einsum("kcx,kx->kc", corners[:, one] - corners[:, other, :1], normal[:, other])
-        through.append(np.minimum(height.max(axis=1), -height.min(axis=1)))
-        place = np.einsum("kcx,kx->kc", corners[:, one], along)
-        ends.append(_cut(height, place))
-    length = np.minimum(ends[0][1], ends[1][1]) - np.maximum(ends[0][0], ends[1][0])
-    deep = np.maximum(np.minimum(np.minimum(*through), length), 0.0)
-    return [(int(min(o)), int(max(o)), float(d)) for o, d in zip(owner, deep)]
-
-
-def _cut(height: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where (k,) the sides of triangles cross height 0, from and to, in terms of the corners' places (k,3) along a line."""
-    low, high = np.full(len(height), np.inf), np.full(len(height), -np.inf)
-    for j in range(3):
-        h, g, p, q = height[:, j], height[:, (j + 1) % 3], place[:, j], place[:, (j + 1) % 3]
-        crossed = (h <= 0.0) != (g <= 0.0)
-        at = p + np.where(crossed, h / np.where(crossed, h - g, 1.0), 0.0) * (q - p)
-        low, high = np.where(crossed, np.minimum(low, at), low), np.where(crossed, np.maximum(high, at), high)
-    return low, high
+    edges = np.roll(corners, -1, axis=2) - corners
+    normals = np.cross(edges[:, :, 0], edges[:, :, 1])
+    across = np.cross(edges[:, 0, :, None], edges[:, 1, None, :]).reshape(-1, 9, 3)
+    axes = np.concatenate([normals, across], axis=1)
+    length = np.linalg.norm(axes, axis=2)
+    size = np.linalg.norm(edges, axis=3).max(axis=(1, 2))[:, None] ** 2
+    usable = length > PARALLEL * size
+    places = np.einsum("kncx,kax->knac", corners, axes / np.where(usable, length, 1.0)[..., None])
+    low, high = places.min(axis=3), places.max(axis=3)  # (k, 2, 11)
+    width = np.minimum(high[:, 0] - low[:, 1], high[:, 1] - low[:, 0])
+    deep = np.maximum(np.where(usable, width, np.inf).min(axis=1, initial=np.inf), 0.0)
+    return [(int(min(o)), int(max(o)), float(d)) for o, d in zip(owner, deep) if np.isfinite(d)]
 
 
 def _deepest(depth: dict[tuple[int, int], float], size: np.ndarray, colliders: list) -> Overlap | None:

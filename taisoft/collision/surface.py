@@ -20,6 +20,7 @@ LIGHT_BELOW = 30000
 SPREAD = {"cpu": 512, "cuda": 1}
 CHUNKS = {"cpu": 64, "cuda": 4096}  # parts of a list that are worked on side by side, each with its own part of a buffer
 UNFINITE, ACTIVE, PAIRS = 0, 1, 2  # places in Surface.count
+INSIDE_BITS = 31  # of Surface.inside
 
 dvec = ti.types.vector(3, ti.f64)
 ivec = ti.types.vector(3, ti.i32)
@@ -72,6 +73,7 @@ class Surface:
     soft: Any  # (n_bodies) i32: 1 for soft bodies
     self_on: Any  # (n_bodies) i32: 1 where a body is tested against itself
     first_of: Any  # (n_bodies + 1) i32
+    thickness: Any  # (n_bodies) f64: how thick each is [m], inf for half-spaces
     rest: Any  # (n_verts) 3-vectors f64: at rest [m]
     x: Any  # (n_verts) 3-vectors f64: where they are [m]
     move: Any  # (n_verts) 3-vectors f64: how far they go in the step [m]
@@ -85,6 +87,8 @@ class Surface:
     count: Any  # (4) i32: UNFINITE and ACTIVE triangles, and PAIRS of what is near with what
     part: Any  # (chunks) i32: counts of the parts of a list
     near: Any  # (chunks * n_bodies) i32: colliders near that which a part is at
+    inside: Any  # (n_verts) i32: bit k % INSIDE_BITS where the vertex lies in collider k and has contacts that lead out of it
+    way_out: Any  # (n_verts) 3-vectors f64: by those contacts together [m]
 
 
 def make_topology(parts: list[tuple[np.ndarray, np.ndarray]]) -> Topology:
@@ -137,10 +141,11 @@ def _edges(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def build_surface(
-    topology: Topology, rest: np.ndarray, soft: np.ndarray, self_on: np.ndarray, runtime: Runtime, arena: FieldArena,
-    serial: bool | None = None,
+    topology: Topology, rest: np.ndarray, soft: np.ndarray, self_on: np.ndarray, thickness: np.ndarray, runtime: Runtime,
+    arena: FieldArena, serial: bool | None = None,
 ) -> Surface:  # fmt: skip
-    """Allocate and fill the fields. rest: (v,3) [m]; soft, self_on: (n_bodies,) bool. serial: None decides by size."""
+    """Allocate and fill the fields. rest: (v,3) [m]; soft, self_on: (n_bodies,) bool; thickness: (n_bodies,) [m]. serial: None
+    decides by size."""
     t, i = topology, ti.i32
     n, v, bodies = len(t.triangle), len(t.node), len(soft)
     light = serial
@@ -165,11 +170,13 @@ def build_surface(
         rows("neighbour", t.neighbour), ints("owns", t.owns), ints("ring_start", t.ring_start), ints("ring", t.ring),
         ints("around_start", t.around_start), ints("around", t.around),
         ints("soft", soft), ints("self_on", self_on), ints("first_of", t.first),
+        arena.field("surface_thickness", ti.f64, max(bodies, 1), thickness if bodies else None),
         arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None), vectors("x", v), vectors("move", v),
         vectors("lo", n), vectors("hi", n), vectors("normal", n), arena.field("surface_area", ti.f64, max(n, 1)),
         vectors("body_lo", bodies), vectors("body_hi", bodies),
         arena.field("surface_active", i, max(n, 1)), arena.field("surface_count", i, 4), arena.field("surface_part", i, chunks),
-        arena.field("surface_near", i, chunks * max(bodies, 1)),
+        arena.field("surface_near", i, chunks * max(bodies, 1)), arena.field("surface_inside", i, max(v, 1)),
+        vectors("way_out", v),
     )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from taisoft.errors import SceneError
 from taisoft.mesh.nodes import Nodes, make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
-from taisoft.scene.collision import HIT_BY, choose_hit_by
+from taisoft.scene.collision import HIT_BY
 from taisoft.scene.key_frames import KeyFrames
 from taisoft.scene.material import Material
 
@@ -75,7 +75,6 @@ class Body:
         self.position = checks.array(position, f"{what}: position", ((3,),))
         self.velocity = checks.array(velocity, f"{what}: velocity", ((3,), (self.n_nodes, 3)))
         self.collision = collision
-        self._fitting: tuple[str, str] | None = None  # what "auto" gives, once asked for
         self.constraints: list[Constraint] = []
         self.tractions: list[Traction] = []
         self.forces: list[NodalForce] = []
@@ -101,18 +100,9 @@ class Body:
         self._collision = checks.choice(value, f"body {self.name!r}: collision", HIT_BY)
 
     @property
-    def collision_choice(self) -> tuple[str, str]:
-        """By what the body is hit, "distance_field" or "proximity", and why; for "auto" decided once, when first asked."""
-        if self.collision != "auto":
-            return self.collision, "asked for"
-        if self._fitting is None:
-            self._fitting = choose_hit_by(self.rest_positions, self.nodes.surface)
-        return self._fitting
-
-    @property
     def hit_by(self) -> str:
-        """ "distance_field" or "proximity"."""
-        return self.collision_choice[0]
+        """ "proximity", which "auto" is, or "distance_field"."""
+        return "proximity" if self.collision == "auto" else self.collision
 
     def __repr__(self) -> str:
         kind = f"{self.mesh.n_tets} tets of order {self.order}"

@@ -80,8 +80,7 @@ def _add_collision(plan: Plan, scene: Scene, self_collision: bool) -> None:
     hit = scene.bodies if with_triangles > 1 else []
     modes: dict[str, list[str]] = {"distance_field": [], "proximity": []}
     for body in hit:
-        mode, why = body.collision_choice
-        modes[mode].append(f"{body.name} ({why})")
+        modes[body.hit_by].append(body.name if body.collision == "auto" else f"{body.name} (asked for)")
     modes["proximity"] += [f"{o.name} (triangles)" for o in obstacles if isinstance(o.shape, MeshObstacle) and scene.bodies]
     modes["proximity"] += [f"{o.name} (edges)" for o in obstacles if isinstance(o.shape, Box) and scene.bodies]
     modes["proximity"] += [f"{b.name} (sharp edges)" for b in hit if b.hit_by == "distance_field" and has_sharp_edges(b.nodes)]

@@ -120,7 +120,7 @@ class Scene:
         mesh: its shape at rest. name: unique, "body0" and so on where left out. position: (3,) [m], shift of the start.
         velocity: (3,) for all nodes or (n,3) [m/s]. order: 1, linear tets, or 2, quadratic ones with nodes in the middle of
         every edge. quadrature_degree: None for the default, for order 2 four points (2) or fourteen (4). collision: by what
-        others hit it, "distance_field", "proximity", or "auto" for what fits its shape. Raises SceneError.
+        others hit it, "proximity", which is also "auto", or "distance_field". Raises SceneError.
         """
         name = self._free_name(name, "body")
         body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision)

@@ -22,7 +22,7 @@ from taisoft.contact.problem import NODES, build_node_problem, index_nodes
 from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
 from taisoft.mesh.quality import mean_surface_edge
-from taisoft.stepping.tunnelling import DEPTH, HASTE, SPEED, WHICH, collider_thickness, find_way, survey
+from taisoft.stepping.tunnelling import DEPTH, HASTE, SPEED, WHICH, find_way, survey
 from taisoft.stepping.world import World
 from taisoft.transfer import array_of, download, upload
 
@@ -55,11 +55,9 @@ class ContactStep:
         self.goal = self._goal()
         self._arena = FieldArena()
         self._make_room(2 * d.surface.n_triangles + SPARE)
-        self._thick = np.array([collider_thickness(c, d.edge) for c in scene.colliders])
         self._own_arena = FieldArena()
         with self._own_arena.group():
             self._way = self._own_arena.vectors("way", ti.f64, m.n_nodes)
-            self._thickness = self._own_arena.field("collider_thickness", ti.f64, len(self._thick), self._thick)
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self._told = np.zeros(4)
@@ -248,7 +246,7 @@ class ContactStep:
 
     def _survey(self, dt: float) -> np.ndarray:
         d = self.detection
-        survey(d.surface, d.shapes, d.buffer.data, d.kept, self._thickness, d.counts.contacts, dt, self._told)
+        survey(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts, dt, self._told)
         return self._told
 
     def too_fast(self, time: float, dt: float) -> str:
@@ -257,7 +255,7 @@ class ContactStep:
         told, d = self._survey(dt), self.detection
         a, b = d.buffer.data.body[d.kept[int(told[WHICH])]]
         names = [d.scene.colliders[k].name for k in (a, b)]
-        thin = float(min(self._thick[a], self._thick[b]))
+        thin = float(min(d.thickness[a], d.thickness[b]))
         return (
             f"'{names[0]}' and '{names[1]}' close at {told[SPEED]:.3g} m/s, {told[SPEED] * dt:.3g} m in a step of {dt:.3g} s, "
             f"and the thinner of them is {thin:.3g} m thick, so they could pass each other unseen: take dt <= "

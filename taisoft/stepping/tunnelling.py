@@ -1,24 +1,19 @@
 """How far contacts close in a step, against how far they may before things could pass each other unseen."""
 
-import numpy as np
 import taichi as ti
 
 from taisoft.collision.surface import dvec
 from taisoft.contact.assemble import carried
 from taisoft.runtime import kernel
-from taisoft.scene.body import Body
-from taisoft.scene.collision import principal_extents
-from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle, Obstacle
 
 CLOSEST = 0.5  # of the thinner side's thickness: how far a contact may close in one step
-THINNEST = 0.25  # of the mean surface edge: least thickness of a collider, since open meshes have none
 DEPTH, HASTE, SPEED, WHICH = range(4)  # places in what `survey` tells
 
 
 @kernel
 def survey(
-    s: ti.template(), o: ti.template(), found: ti.template(), kept: ti.template(), thickness: ti.template(), n: ti.i32,
-    dt: ti.f64, told: ti.types.ndarray(),
+    s: ti.template(), o: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32, dt: ti.f64,
+    told: ti.types.ndarray(),
 ):  # fmt: skip
     """told (4,): deepest penetration [m]; the most that a contact closes in the coming step, over what it may; the speed of
     that [m/s]; its number among the kept."""
@@ -39,8 +34,8 @@ def survey(
                 if found.nodes_b[at][j] >= 0:
                     way -= found.weights_b[at][j] * s.move[found.nodes_b[at][j]]
             closing = -way.dot(found.normal[at])
-            allowed = CLOSEST * ti.min(thickness[a], thickness[b])
-            if thickness[b] < ti.math.inf and closing > haste * allowed:
+            allowed = CLOSEST * ti.min(s.thickness[a], s.thickness[b])
+            if s.thickness[b] < ti.math.inf and closing > haste * allowed:
                 haste, speed, which = closing / allowed, closing / dt, c
         told[0], told[1], told[2], told[3] = depth, haste, speed, which
 
@@ -63,27 +58,3 @@ def find_way(m: ti.template(), s: ti.template(), x_start: ti.template(), way: ti
                     share = ti.min(ti.max(d.dot(known) / square, 0.0), 1.0)
                 most = ti.max(most, (d - share * known).norm())
     return most
-
-
-def collider_thickness(collider: Body | Obstacle, edge: float) -> float:
-    """How thick a body or an obstacle is [m]: a half space without end, others their smallest extent.
-
-    A bowl or a ring is thinner than its box: no surface counts as thicker than twice the plate of its volume and area.
-    """
-    if isinstance(collider, Body):
-        return _surface_thickness(collider.nodes.positions, collider.nodes.surface)
-    if isinstance(collider.shape, HalfSpace):
-        return np.inf
-    if isinstance(collider.shape, MeshObstacle):  # an open one has none
-        return max(_surface_thickness(collider.shape.vertices, collider.shape.triangles), THINNEST * edge)
-    if isinstance(collider.shape, Box):
-        return 2.0 * float(np.min(collider.shape.half_extents))
-    return 2.0 * float(collider.shape.radius)
-
-
-def _surface_thickness(x: np.ndarray, triangles: np.ndarray) -> float:
-    """[m], of a surface with vertices x."""
-    a, b, c = (x[triangles[:, k]] - x.mean(axis=0) for k in range(3))
-    cross = np.cross(b - a, c - a)
-    volume, area = abs(np.einsum("ij,ij->", a, cross)) / 6.0, 0.5 * np.linalg.norm(cross, axis=1).sum()
-    return min(float(principal_extents(x, triangles).min()), 4.0 * volume / area)
