@@ -7,7 +7,7 @@ Where an end lies inside the other body and the way out of its own contact frees
 import taichi as ti
 
 from taisoft.collision.contacts import EDGE_EDGE, write_contact
-from taisoft.collision.features import BY_FACES, corner, edge_normal, edge_sticks_out, sticks_out, unit
+from taisoft.collision.features import BY_FACES, EDGE_SLACK, corner, edge_normal, edge_sticks_out, sticks_out, unit
 from taisoft.collision.surface import INSIDE_BITS, dvec, ivec
 from taisoft.collision.triangles import closest_lines
 
@@ -34,9 +34,25 @@ def _is_behind(s: ti.template(), i, length, u, m):
 
 
 @ti.func
+def _is_past_end(s: ti.template(), t, k, place, length, gap, q):
+    """1 where edge k of triangle t is crossed so near an end that point q of the other edge, below it, is out of the body again:
+    in front of a face at that end that the edge lies behind."""
+    past = 0
+    for e in range(2):
+        if ti.select(e == 0, place, length - place) < -gap:
+            i, j = s.triangle[t, (k + e) % 3], s.triangle[t, (k + 1 - e) % 3]
+            r = s.ring_start[i]
+            while past == 0 and r < s.ring_start[i + 1]:
+                n = s.normal[s.ring[r]]
+                past = int((s.x[j] - s.x[i]).dot(n) < -ti.cast(EDGE_SLACK, ti.f64) * length) & int((q - s.x[i]).dot(n) > 0.0)
+                r += 1
+    return past
+
+
+@ti.func
 def _is_freed(s: ti.template(), p, i, u, m, gap):
-    """1 where point p of an edge, which lies `gap` < 0 deep below edge m of triangle u, is carried out by what takes vertex i out: to
-    less than a tenth of that depth. One that lies deeper than SHALLOW is taken to be far from where i came in."""
+    """1 where point p of an edge, which lies `gap` < 0 deep below edge m of triangle u, is carried out by what takes vertex i
+    out: to less than a tenth of that depth. One that lies deeper than SHALLOW is taken to be far from where i came in."""
     d = p + s.way_out[i] - corner(s, u, m)
     depth = -d.dot(s.normal[u])
     v = s.neighbour[u, m]
@@ -48,8 +64,8 @@ def _is_freed(s: ti.template(), p, i, u, m, gap):
 
 @ti.func
 def _end_tells(s: ti.template(), t, k, p, place, length, gap, u, m, n, by_faces):
-    """1 where edge k of triangle t crosses at p so near an end that the end's own contact tells of it: it lies inside, behind both
-    faces at edge m of triangle u, sticks out along n, and once it is out the crossing is, too.
+    """1 where edge k of triangle t crosses at p so near an end that the end's own contact tells of it: it lies inside, behind
+    both faces at edge m of triangle u, sticks out along n, and once it is out the crossing is, too.
 
     by_faces: whether vertices find their contacts with u's collider by faces, so that it is known whether this one has any.
     """
@@ -123,8 +139,10 @@ def edge_contact(s: ti.template(), way: ti.template(), t, k, u, m, margin, out: 
             if good == 1:
                 good = edge_sticks_out(s, t2, k2, along)
             if good == 1:
+                good = 1 - _is_past_end(s, t1, k1, place, length, gap, ti.select(side, a0 + f * da, b0 + g * db))
+            if good == 1:
                 by_faces = int(way[s.body[t2]] == BY_FACES) | int(s.body[t1] == s.body[t2])
-                p = corner(s, t1, k1) + place * unit(corner(s, t1, k1 + 1) - corner(s, t1, k1))
+                p = ti.select(side, b0 + g * db, a0 + f * da)
                 good = 1 - _end_tells(s, t1, k1, p, place, length, gap, t2, k2, along, by_faces)
         if good == 1:
             # where one was clamped to an end, the contact is at that end
