@@ -22,6 +22,7 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 from taisoft.errors import SimulationError
 from taisoft.launching import Launch, places_of, prepare
+from taisoft.timing import usable_cores
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
@@ -104,6 +105,7 @@ def _initialise(arch: str, precision: str) -> None:
         ti.init(
             arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
             fast_math=False, offline_cache=True, offline_cache_file_path=_cache_folder(), log_level=ti.ERROR, random_seed=0,
+            cpu_max_num_threads=len(usable_cores()),  # Taichi would count the cores that this process may not use, too
         )  # fmt: skip
     trees["open"] = 0
     for known in _known:  # they hold the Taichi that was
