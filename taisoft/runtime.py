@@ -129,6 +129,11 @@ kernel_impl.getsourcefile = functools.cache(kernel_impl.getsourcefile)
 kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
 
 
+def threads() -> int:
+    """Number of threads of Taichi's parallel loops on the CPU."""
+    return ti.cfg.cpu_max_num_threads
+
+
 def open_kind() -> tuple[str, str] | None:
     """(arch, precision) in use by an open simulator, or None."""
     return _kind if _open else None

@@ -98,16 +98,16 @@ def parse_assignments(assignments: list[str], keys: list[str]) -> dict:
     return values
 
 
-def parse_scalar(text: str, assignment: str) -> float | int | bool | str | None:
+def parse_scalar(text: str, assignment: str, option: str = "--set") -> float | int | bool | str | None:
     """A number, true, false or "text" as TOML writes them; a bare word is text, and none is Python's None."""
     try:
         table = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
         if not BARE_WORD.fullmatch(text):
-            raise SceneError(f"--set {assignment}: {text!r} is not a number, true, false, none or a word") from None
+            raise SceneError(f"{option} {assignment}: {text!r} is not a number, true, false, none or a word") from None
         return None if text == "none" else text
     if set(table) != {"value"} or not isinstance(table["value"], (float, int, bool, str)):
-        raise SceneError(f"--set {assignment}: {text!r} is not a single number, true, false, none or a word")
+        raise SceneError(f"{option} {assignment}: {text!r} is not a single number, true, false, none or a word")
     return table["value"]
 
 
