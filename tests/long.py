@@ -41,6 +41,10 @@ LONG = {
     "test_contact_stage": ("f32",),
     "test_reduction": ("f32",),
     "test_frank_wolfe": ("[f32]",),
+    "test_study_runs": (
+        "integrators[symplectic_euler-1]", "integrators[implicit_euler-1]", "integrators[bdf2-2]",
+        "integrators[implicit_midpoint-2]", "test_refinement", "test_a_run_that_fails",
+    ),
     "test_self_collision": ("test_folded_sheets_against_ipctk[f32]",),
 }
 

@@ -57,7 +57,8 @@ def _told(study: Study, arguments: Namespace, signals: Signals) -> int:
     if arguments.out is not None:
         if told := write(study, Path(arguments.out)):
             _tell(told)
-        print(f"\nwritten to {arguments.out}: {', '.join(name for name in FILES if (Path(arguments.out) / name).exists())}, runs/")
+        files = [name for name in FILES if (Path(arguments.out) / name).exists()]
+        print(f"\nwritten to {arguments.out}: {', '.join(files)}, runs/")
     if signals.number is not None:
         return EXIT_SIGNAL + signals.number
     return 0 if any(row.status in (*ENDED, "left out") for row in study.rows) else EXIT_FAILED

@@ -13,7 +13,7 @@ from taisoft.errors import SceneError
 
 MOST_FRAMES = 48  # at which runs are compared
 FEWEST_FRAMES = 4
-FINEST_TICK = 10**6  # denominators of dt above which it counts as no ratio [1/s]
+LARGEST_RATIO = 10_000  # denominator of the ratio of two steps above which they never meet
 IMPLICIT_DEFAULT = ("implicit_euler", "bdf2")
 FACTORS = {False: (2.0, 1.0, 0.5, 0.25), True: (0.5, 1.0, 4.0, 8.0, 16.0)}  # of the scene's dt; whether that is an explicit one
 
@@ -103,21 +103,21 @@ def frame_time(steps: Iterable[float], seconds: float) -> tuple[float, int]:
     Raises SceneError where steps have no common multiple that leaves some frames.
     """
     steps = sorted(set(steps))
-    ratios = [Fraction(step).limit_denominator(FINEST_TICK) for step in steps]
-    for step, ratio in zip(steps, ratios):
-        if abs(float(ratio) - step) > 1e-9 * step:
-            raise SceneError(f"dt = {step!r} s: it must be a ratio of whole numbers below {FINEST_TICK:g}, so that runs can meet")
-    common = Fraction(math.lcm(*(r.numerator for r in ratios)), math.gcd(*(r.denominator for r in ratios)))
-    if float(common) > seconds / FEWEST_FRAMES * (1.0 + 1e-9):
+    ratios = [Fraction(step / steps[0]).limit_denominator(LARGEST_RATIO) for step in steps]
+    told = ", ".join(f"{step:.6g}" for step in steps)
+    if any(abs(float(ratio) * steps[0] - step) > 1e-9 * step for step, ratio in zip(steps, ratios)):
+        raise SceneError(f"the steps {told} s never meet: take steps that are multiples of one another")
+    common = steps[0] * math.lcm(*(r.numerator for r in ratios)) / math.gcd(*(r.denominator for r in ratios))
+    if common > seconds / FEWEST_FRAMES * (1.0 + 1e-9):
         raise SceneError(
-            f"the steps {', '.join(f'{step:.6g}' for step in steps)} s meet only every {float(common):.6g} s, less than "
-            f"{FEWEST_FRAMES} times in {seconds:g} s: take steps that are multiples of one another, or more --seconds"
+            f"the steps {told} s meet only every {common:.6g} s, less than {FEWEST_FRAMES} times in {seconds:g} s: take steps "
+            "that are multiples of one another, or more --seconds"
         )
-    every = math.ceil(seconds / float(common) / MOST_FRAMES - 1e-9)
+    every = math.ceil(seconds / common / MOST_FRAMES - 1e-9)
     # Of the numbers of steps near that, one that ends at `seconds` where there is one
-    whole = round(seconds / float(common))
+    whole = round(seconds / common)
     every = next((k for k in range(every, 2 * every + 1) if whole % k == 0 and whole // k >= FEWEST_FRAMES), every)
-    return every * float(common), max(1, round(seconds / (every * float(common))))
+    return every * common, max(1, round(seconds / (every * common)))
 
 
 def steps_in(frame: float, dt: float) -> int:

@@ -113,4 +113,5 @@ def _label_front(panel, study: Study) -> None:
     for row in front[:: -(-len(front) // LABELS)]:
         place = (row.timing.median, row.claimed(study.ask.by))
         text = f"{1e3 * row.setting['dt']:.3g} ms"
-        panel.annotate(text, place, (5, 6), textcoords="offset points", fontsize=7, color="#555555")
+        box = {"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 0.5}
+        panel.annotate(text, place, (5, 7), textcoords="offset points", fontsize=7, color="#333333", bbox=box)

@@ -1,7 +1,7 @@
 """Carrying out a study: plan, runs that are not there yet, and what comes of them. No Taichi here: every run is a process."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from taisoft.errors import SceneError, SimulationError
 from taisoft.study.grid import tasks_of
@@ -26,7 +26,7 @@ class Outcome:
 
 @dataclass
 class Runner:
-    """Carries out a study. places: where; machines: what they are; tell: for a line on what goes on."""
+    """Carries out a study. places: where; machines: what they are; tell: for a line on what goes on; planner: loads the scene."""
 
     ask: Ask
     places: list[Place]
@@ -35,6 +35,7 @@ class Runner:
     asked: Callable[[], bool]
     seconds_left: Callable[[], float]
     tell: Callable[[str], None]
+    planner: Place = field(default_factory=lambda: LocalPlace(usable_cores()))
 
     def run(self) -> Study | None:
         """The study; None where it was interrupted before it had a plan. Raises SceneError for what cannot be studied."""
@@ -58,10 +59,11 @@ class Runner:
         """Of a child of ours on this machine, which loads the scene; its time is not of the budget."""
         answers: list[dict] = []
         request = self._request("plan") | {"ask": self.ask.of_plan()}
-        place = LocalPlace(usable_cores())
-        left = carry_out(
-            [("plan", request)], [place], lambda _, answer: answers.append(answer), seconds_left=lambda: 1.0, asked=self.asked
-        )
+
+        def done(_: str, answer: dict) -> None:
+            answers.append(answer)
+
+        left = carry_out([("plan", request)], [self.planner], done, seconds_left=lambda: 1.0, asked=self.asked)
         if left:
             return None
         if "answer" not in answers[0]:

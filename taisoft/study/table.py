@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 from dataclasses import asdict
 
 from taisoft.output.tables import markdown, percent, spread_of
@@ -111,13 +112,22 @@ def _mesh(setting: dict) -> str:
 
 def _reasons(title: str, rows: list[Row], status: str) -> str:
     """A list of settings with the reason of their status; equal reasons together."""
-    by_reason: dict[str, list[str]] = {}
+    by_reason: dict[str, list[dict]] = {}
     for row in rows:
         if row.status == status:
-            by_reason.setdefault(row.reason, []).append(describe({"setting": row.setting}))
+            by_reason.setdefault(row.reason, []).append(row.setting)
     if not by_reason:
         return ""
-    return f"{title}:\n\n" + "\n".join(f"* {'; '.join(names)}: {reason}" for reason, names in by_reason.items())
+    return f"{title}:\n\n" + "\n".join(f"* {_all_of(settings)}: {reason}" for reason, settings in by_reason.items())
+
+
+def _all_of(settings: list[dict]) -> str:
+    """Settings in short: what they are the product of, where they are one."""
+    values = {key: list(dict.fromkeys(s[key] for s in settings)) for key in AXES}
+    if len(settings) > 2 and len(settings) == math.prod(map(len, values.values())):
+        varying = [f"{key} {' | '.join(map(_axis, of))}" for key, of in values.items() if len(of) > 1]
+        return f"{settings[0]['integrator']}, " * (len(values["integrator"]) == 1) + ", ".join(varying)
+    return "; ".join(describe({"setting": setting}) for setting in settings)
 
 
 def shown_error(error: float, sure: float) -> str:

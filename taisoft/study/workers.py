@@ -103,7 +103,7 @@ def local_places(number: int) -> list[LocalPlace]:
 
 def carry_out(
     requests: Iterable[tuple[str, dict]], places: list, done: Callable[[str, dict], None], *,
-    seconds_left: Callable[[], float], asked: Callable[[], bool], begun: Callable[[str], None] = lambda key: None,
+    seconds_left: Callable[[], float], asked: Callable[[], bool],
 ) -> dict[str, str]:  # fmt: skip
     """Hand out requests (key, request) in their order, and each answer to done(key, answer).
 
@@ -119,19 +119,20 @@ def carry_out(
                 why = "; ".join(dict.fromkeys(lost.values()))
             if why:
                 return dict.fromkeys((key for key, _ in [*busy.values(), *waiting]), why)
+            moved = False
             for k, place in enumerate(places):
                 if k in busy and (answer := place.poll()) is not None:
-                    key, request = busy.pop(k)
+                    moved, (key, request) = True, busy.pop(k)
                     if "lost" in answer:  # another place may still do it
                         lost[k] = answer["lost"]
                         waiting.insert(0, (key, request))
                     else:
                         done(key, answer)
                 if k not in busy and k not in lost and waiting:
-                    busy[k] = waiting.pop(0)
-                    begun(busy[k][0])
+                    moved, busy[k] = True, waiting.pop(0)
                     place.start(busy[k][1])
-            time.sleep(LOOK_EVERY)
+            if not moved:
+                time.sleep(LOOK_EVERY)
         return {}
     finally:
         for place in places:
