@@ -1,6 +1,7 @@
 """Places of a study that start no process: runs in this one, or of a program made up."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 
@@ -71,3 +72,11 @@ class Pendulum(InProcess):
             "smallest_edge": 1.0, "keeps_energy": True, "momentum_rate": None, "bodies": [["mass", 2]],
             "energies": energies, "momentum": momentum, "path": None if why else pack(path),
         }  # fmt: skip
+
+
+def is_running(pid: int) -> bool:
+    """Whether the process is there and no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False

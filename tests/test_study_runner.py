@@ -41,7 +41,8 @@ def plan(dts=DTS, integrators=("implicit_euler", "bdf2"), reference=0.0125, **mo
 
 def run(place: Pendulum, store=None, ask=ASK, machines=("here",), asked=lambda: False, left=lambda: 1.0):
     told: list[str] = []
-    return Runner(ask, [place], list(machines), store or NoStore(), asked, left, told.append, planner=place).run()
+    runner = Runner(ask, [place], list(machines), asked, left, told.append, store or NoStore(), planner=place)
+    return None if (planned := runner.plan()) is None else runner.run(planned)
 
 
 def rows_of(study, integrator: str) -> list:

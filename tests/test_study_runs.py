@@ -17,7 +17,6 @@ from taisoft.simulator import Simulator
 from taisoft.study import measure
 from taisoft.study.results import Ask
 from taisoft.study.runner import Runner
-from taisoft.study.store import NoStore
 from taisoft.study.workers import LocalPlace, carry_out, local_places
 from taisoft.timing import usable_cores
 
@@ -62,7 +61,8 @@ def study_of(tmp_path, hold: str = HELD, **ask):
 
 
 def run(place: InProcess, ask: Ask):
-    return Runner(ask, [place], ["here"], NoStore(), lambda: False, lambda: 1.0, lambda _: None, place).run()
+    runner = Runner(ask, [place], ["here"], lambda: False, lambda: 1.0, lambda _: None, planner=place)
+    return runner.run(runner.plan())
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from taisoft.study.grid import AXES
 from taisoft.study.output import FILES, write
 from taisoft.study.results import Ask, Study
 from taisoft.study.runner import Runner
-from taisoft.study.store import NoStore, Store
+from taisoft.study.store import Store
 from taisoft.study.table import ENDED, text_of
 from taisoft.study.workers import local_places
 
@@ -34,21 +34,20 @@ def command(arguments: Namespace) -> int:
     budget = checks.number(arguments.budget, "--budget", above=0.0, unit="s")
     with Signals(ENDING) as signals, ExitStack() as stack:
         places, machines = _places(arguments, ask, stack)
-        store = NoStore()
         if arguments.out is not None:
             check_free(arguments.out, overwrite=False)
-            folder = make_folder(arguments.out)
-            stack.enter_context(closing(FolderLock(folder)))
-            store = Store(folder)
         signals.run_began()
         end = time.monotonic() + budget
-        runner = Runner(ask, places, machines, store, signals.asked, lambda: end - time.monotonic(), _tell)
-        study = runner.run()
-        if study is None:
+        runner = Runner(ask, places, machines, signals.asked, lambda: end - time.monotonic(), _tell)
+        plan = runner.plan()
+        if plan is None:
             raise Left(signals.number)
-        if not any(not case["refused"] for case in study.plan["cases"]):
-            raise SceneError(f"no combination of the grid can be run: {study.plan['cases'][0]['refused']}")
-        return _told(study, arguments, signals)
+        if arguments.out is not None:
+            folder = make_folder(arguments.out)
+            stack.enter_context(closing(FolderLock(folder)))
+            runner.store = Store(folder)
+        end = time.monotonic() + budget
+        return _told(runner.run(plan), arguments, signals)
 
 
 def _told(study: Study, arguments: Namespace, signals: Signals) -> int:

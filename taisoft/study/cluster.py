@@ -15,7 +15,7 @@ from taisoft.output.report import machine
 from taisoft.study.workers import LOOK_EVERY, LocalPlace
 from taisoft.timing import usable_cores
 
-CONNECT_SECONDS, STOP_SECONDS = 10, 5
+CONNECT_SECONDS = 10
 ASK_EVERY = 2.0  # [s] between two looks at which workers are alive
 
 _running: dict[str, LocalPlace] = {}  # on a worker: what it carries out, by name
@@ -53,7 +53,7 @@ class ClusterPlace:
         """See Place. Dask ends no task that has begun, so the worker is asked to."""
         if self._future is not None:
             with suppress(Exception):  # whatever Dask raises where worker or scheduler are gone: then nothing is left to end
-                self._client.run(end, self._name, workers=[self._address], on_error="ignore", wait=False)
+                self._client.run(end, self._name, workers=[self._address], on_error="ignore")
                 self._future.cancel()
             self._future = None
 

@@ -26,22 +26,19 @@ class Outcome:
 
 @dataclass
 class Runner:
-    """Carries out a study. places: where; machines: what they are; tell: for a line on what goes on; planner: loads the scene."""
+    """Plans and carries out a study. places: where; machines: what they are; tell: for a line on what goes on."""
 
     ask: Ask
     places: list[Place]
     machines: list[dict]
-    store: Store | NoStore
     asked: Callable[[], bool]
     seconds_left: Callable[[], float]
     tell: Callable[[str], None]
+    store: Store | NoStore = field(default_factory=NoStore)
     planner: Place = field(default_factory=lambda: LocalPlace(usable_cores()))
 
-    def run(self) -> Study | None:
-        """The study; None where it was interrupted before it had a plan. Raises SceneError for what cannot be studied."""
-        plan = self._plan()
-        if plan is None:
-            return None
+    def run(self, plan: dict) -> Study:
+        """The study of a plan. Raises OutputError where a finished run cannot be kept."""
         study = Study(self.ask, plan, machines=self.machines)
         references, settings = tasks_of(plan)
         tasks = [*references, *settings]
@@ -55,8 +52,11 @@ class Runner:
         _tell_differences(study, records)
         return study
 
-    def _plan(self) -> dict | None:
-        """Of a child of ours on this machine, which loads the scene; its time is not of the budget."""
+    def plan(self) -> dict | None:
+        """Of a child of ours on this machine, which loads the scene; its time is not of the budget.
+
+        None where it was interrupted. Raises SceneError for what cannot be studied.
+        """
         answers: list[dict] = []
         request = self._request("plan") | {"ask": self.ask.of_plan()}
 
@@ -68,7 +68,11 @@ class Runner:
             return None
         if "answer" not in answers[0]:
             raise SceneError(answers[0].get("error") or f"the scene {self.ask.scene}: {answers[0]['crash']}")
-        return answers[0]["answer"]
+        plan = answers[0]["answer"]
+        if all(case["refused"] for case in plan["cases"]):
+            reasons = "; ".join(dict.fromkeys(case["refused"] for case in plan["cases"]))
+            raise SceneError(f"no combination of the grid can be run: {reasons}")
+        return plan
 
     def _request(self, do: str) -> dict:
         return {"do": do, "scene": self.ask.scene, "allow_outside": self.ask.allow_outside}

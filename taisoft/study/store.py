@@ -39,10 +39,13 @@ def digest(values) -> str:
 
 
 class Store:
-    """The finished runs in a study's folder. damaged: sentences on files that could not be used; taken: how many were."""
+    """The finished runs in a study's folder, which is locked. damaged: sentences on files that could not be used; taken: how
+    many were."""
 
     def __init__(self, folder: Path):
         self._folder = make_folder(folder / RUNS)
+        for part in (*self._folder.glob("*.part"), *folder.glob("study.*.part")):
+            part.unlink(missing_ok=True)  # of a study that was killed; the folder is ours
         self.damaged: list[str] = []
         self.taken = 0
 
