@@ -127,4 +127,5 @@ def test_interrupted_then_killed_a_study_goes_on(tmp_path, capsys):
     assert len(last) == 4 and all(last[name] == at for name, at in second.items()) and first.items() <= second.items()
     record = json.loads((out / "study.json").read_text())
     assert not record["ended"] and [row["status"] for row in record["rows"]] == ["ok", "ok"]
+    assert all(row["cores"] == usable_cores() and row["threads"] == len(row["cores"]) for row in record["rows"])
     assert not list(out.rglob("*.part"))

@@ -126,6 +126,17 @@ def test_without_its_reference_a_study_has_times_but_no_errors(how):
     assert "No setting has both a time and an error" in text_of(study)
 
 
+def test_refused_combinations_are_told_as_a_product_where_they_are_one():
+    def refused(*settings) -> str:
+        cases = [{"setting": asdict(one), "refused": "it does not fit"} for one in settings]
+        made = plan()
+        return text_of(run(Pendulum(made | {"cases": [*made["cases"], *cases]})))
+
+    whole = [Setting(dt, "bdf2", precision=p) for dt in (0.2, 0.1) for p in ("f32", "f64")]
+    assert "* bdf2, dt 0.2 | 0.1, precision f32 | f64: it does not fit" in refused(*whole)
+    assert "* bdf2, dt = 0.2 s, f32; bdf2, dt = 0.2 s, f64; bdf2, dt = 0.1 s, f32: it does not fit" in refused(*whole[:3])
+
+
 def test_a_spent_budget_leaves_runs_out_and_says_so():
     place = Pendulum(plan())
     study = run(place, left=lambda: 4.0 - len(place.requests))  # planning is one of them, and not of the budget
