@@ -88,8 +88,24 @@ def test_references_are_of_second_order_and_within_the_limit(dt, density, integr
     assert setting["dt"] <= dt / 16 * (1 + 1e-9)
 
 
-def test_damping_makes_the_reference_one_of_first_order():
+def test_what_makes_the_reference_one_of_first_order():
     assert plan_of(scene_of(mass_damping=1.0), {"dt": [0.01]})["references"][0]["order_in_time"] == 1
+    moved = scene_of()
+    moved.bodies[0].move(lambda X: X[:, 0] > 0.99, lambda t: (0, t, 0))
+    assert plan_of(moved, {"dt": [0.01]})["references"][0]["order_in_time"] == 1
+    plan = plan_of(scene_of(), {"dt": [0.01]}, reference_integrator="implicit_euler")
+    assert plan["references"][0]["order_in_time"] == 1
+
+
+def test_a_reference_integrator_of_the_other_mass_is_replaced_and_told():
+    axes = {"dt": [0.005], "integrator": ["velocity_verlet", "bdf2"], "order": [2]}
+    plan = plan_of(scene_of(), axes, reference_integrator="implicit_midpoint")
+    assert {r["kind"]: r["setting"]["integrator"] for r in plan["references"]} == {
+        "explicit": "velocity_verlet", "implicit": "implicit_midpoint",
+    }  # fmt: skip
+    assert plan["notes"] == [
+        "the explicit steps of quadratic tets have the reference velocity_verlet, since implicit_midpoint has another mass matrix"
+    ]
 
 
 def test_quadratic_tets_have_a_reference_for_each_kind_of_mass():

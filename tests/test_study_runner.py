@@ -35,7 +35,7 @@ def plan(dts=DTS, integrators=("implicit_euler", "bdf2"), reference=0.0125, **mo
     return {
         "digest": "scene", "code": "code", "fixed": {}, "frame": 0.2, "frames": 20, "seconds": 4.0, "touching": False,
         "names": ["mass"], "cases": [refused, *({"setting": s, "refused": ""} for s in settings)], "references": [of],
-        "space": None,
+        "space": None, "notes": [],
     } | more  # fmt: skip
 
 

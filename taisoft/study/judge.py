@@ -66,6 +66,7 @@ class Row:
     in_time_sure: Error | None = None  # the reference's own error: below it nothing is known
     in_space: Error | None = None
     in_space_sure: Error | None = None
+    by_space: bool = False  # whether the error in space is the one that counts
     energy: float | None = None
     energy_kept: bool = False  # whether `energy` is a drift, or an error to the reference
     momentum: float | None = None
@@ -80,8 +81,8 @@ class Row:
         return summarise(self.seconds) if self.seconds else None
 
     def error(self, by: str) -> tuple[float, float] | None:
-        """The error that counts, in space where it is known, and the one below which nothing is known. by: "rms" | "max"."""
-        pair = (self.in_space, self.in_space_sure) if self.in_space is not None else (self.in_time, self.in_time_sure)
+        """The error that counts, and the one below which nothing is known; None where it is not told. by: "rms" | "max"."""
+        pair = (self.in_space, self.in_space_sure) if self.by_space else (self.in_time, self.in_time_sure)
         return None if pair[0] is None or pair[1] is None else (getattr(pair[0], by), getattr(pair[1], by))
 
     def claimed(self, by: str) -> float | None:

@@ -21,6 +21,8 @@ FINER = 8  # the study's smallest dt over the reference's
 LIMIT_SHARE = 0.9  # of the stable step, for a reference's coarser run
 SMALLEST_SHARE = 16  # explicit references may take steps that are so much smaller than those asked for: they are quick
 
+SECOND_ORDER = ("velocity_verlet", "bdf2", "implicit_midpoint")
+
 Variant = Callable[[int, int | None], Scene]  # (refine, order) -> scene
 
 
@@ -36,6 +38,7 @@ class Planner:
         self._variant, self._solver, self._ask = variant, solver, ask
         self._scenes: dict[tuple, Scene | str] = {}
         self._limits: dict[tuple, float] = {}
+        self._notes: list[str] = []
         # what is no axis of the study and no argument of the run holds for all runs
         left_out = (*AXES, "seconds", "fps", "pullable")
         self.fixed = {key: value for key, value in solver.items() if key not in left_out}
@@ -52,7 +55,7 @@ class Planner:
             "fixed": self.fixed, "seconds": seconds,
             "cases": [{"setting": asdict(case.setting), "refused": case.refused} for case in found],
             "touching": base.pushes(self.self_collision), "names": [body.name for body in base.bodies],
-            "frame": None, "frames": 0, "references": [], "space": None,
+            "frame": None, "frames": 0, "references": [], "space": None, "notes": self._notes,
         }  # fmt: skip
         if settings:
             target = self._ask["reference_dt"] or min(s.dt for s in settings) / FINER
@@ -109,9 +112,6 @@ class Planner:
     def _reference(self, refine: int, order: int | None, kind: str, target: float, frame: float) -> dict:
         """One reference, as plain data: a setting with its steps per frame, an even number."""
         scene = self._scene(refine, order)
-        smooth = not scene.pushes(self.self_collision) and not any(
-            body.material.mass_damping or body.material.stiffness_damping for body in scene.bodies
-        )
         integrator = self._integrator(scene, refine, order, kind, target)
         steps = 2 * math.ceil(frame / target / 2 - 1e-9)
         if integrator in EXPLICIT:
@@ -124,8 +124,15 @@ class Planner:
             steps = max(steps, 2 * math.ceil(frame / limit))
         setting = Setting(frame / steps, integrator, order, refine, "f64")
         self._check(scene, setting)
-        # Of second order where motion is smooth; contacts and forces that depend on velocities lower that to the first.
-        return {"setting": asdict(setting), "kind": kind, "order_in_time": 2 if smooth else 1, "steps": steps}
+        order_in_time = 2 if integrator in SECOND_ORDER and self._is_smooth(scene) else 1
+        return {"setting": asdict(setting), "kind": kind, "order_in_time": order_in_time, "steps": steps}
+
+    def _is_smooth(self, scene: Scene) -> bool:
+        """Whether methods keep their order: not with contacts, forces that depend on velocities, or paths, which may jump."""
+        materials = [body.material for body in scene.bodies]
+        led = any(c.path is not None for body in scene.bodies for c in body.constraints)
+        damped = any(material.mass_damping or material.stiffness_damping for material in materials)
+        return not (led or damped or scene.pushes(self.self_collision))
 
     def _integrator(self, scene: Scene, refine: int, order: int | None, kind: str, target: float) -> str:
         asked = self._ask["reference_integrator"]
@@ -133,7 +140,11 @@ class Planner:
             if asked not in INTEGRATORS:
                 raise SceneError(f"--reference-integrator {asked}: it must be one of {', '.join(INTEGRATORS)}")
             if kind and (kind == "explicit") != (asked in EXPLICIT):
-                return "velocity_verlet" if kind == "explicit" else "bdf2"
+                instead = "velocity_verlet" if kind == "explicit" else "bdf2"
+                self._notes.append(
+                    f"the {kind} steps of quadratic tets have the reference {instead}, since {asked} has another mass matrix"
+                )
+                return instead
             return asked
         if kind == "explicit":
             return "velocity_verlet"

@@ -40,6 +40,7 @@ class Study:
     space_told_by: str = ""
     notes: list[str] = field(default_factory=list)
     machines: list[dict] = field(default_factory=list)
+    workers: int = 1  # runs at a time
     versions: dict = field(default_factory=dict)
     ended: str = ""
 
@@ -101,7 +102,7 @@ def plain(study: Study) -> dict:
     return {
         "ask": asdict(study.ask), "frame": study.plan["frame"], "frames": study.plan["frames"], "rows": rows,
         "references": references, "cheapest": cheapest and cheapest.setting, "nearest": nearest and nearest.setting,
-        "notes": study.notes, "ended": study.ended, "machines": study.machines, "versions": study.versions,
+        "notes": study.notes, "ended": study.ended, "machines": study.machines, "workers": study.workers, "versions": study.versions,
         "scene_digest": study.plan["digest"], "code_digest": study.plan["code"],
     }  # fmt: skip
 

@@ -39,7 +39,7 @@ class Runner:
 
     def run(self, plan: dict) -> Study:
         """The study of a plan. Raises OutputError where a finished run cannot be kept."""
-        study = Study(self.ask, plan, machines=self.machines)
+        study = Study(self.ask, plan, notes=list(plan["notes"]), machines=self.machines, workers=len(self.places))
         references, settings = tasks_of(plan)
         tasks = [*references, *settings]
         keys = [self._key(plan, task) for task in tasks]
@@ -143,11 +143,19 @@ class Runner:
                 continue
             study.versions = study.versions or record["versions"]
             row = row_of(record, _own_reference(study.plan, references, record))
-            if study.space is not None and record["path"] is not None:
-                row.in_space, row.in_space_sure = error_in_space(unpack(record["path"]), record["bodies"], study.space), sure
-            elif study.plan["space"] is not None:
-                row.in_time = None  # not what the others are judged by
+            row.by_space = study.plan["space"] is not None
+            if study.space is not None and sure is not None and record["path"] is not None:
+                row.in_space, row.in_space_sure = _in_space(study, record), sure
             study.rows.append(row)
+
+
+def _in_space(study: Study, record: dict) -> Error | None:
+    """The record's error in space; None, with a note, where the two meshes have nothing to compare."""
+    try:
+        return error_in_space(unpack(record["path"]), record["bodies"], study.space)
+    except SimulationError as error:
+        study.notes.append(f"{describe(record['task'])}: {error}")
+        return None
 
 
 def _sure(study: Study) -> tuple[Error | None, str]:
@@ -156,7 +164,11 @@ def _sure(study: Study) -> tuple[Error | None, str]:
         return None, ""
     mesh = [study.space.setting[key] for key in ("refine", "order")]
     others = [r for r in study.references if [r.setting[key] for key in ("refine", "order")] != mesh]
-    return in_space_sure(study.space, others)
+    try:
+        return in_space_sure(study.space, others)
+    except SimulationError as error:
+        study.notes.append(f"what the finest mesh is good to is not known, so that errors in space are not told: {error}")
+        return None, ""
 
 
 def _own_reference(plan: dict, references: list[Reference | None], record: dict) -> Reference | None:

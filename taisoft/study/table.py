@@ -92,11 +92,11 @@ def _how(study: Study) -> str:
             )
     seconds = study.plan["frame"] * study.plan["frames"] if study.plan["frame"] else 0.0
     threads = sorted({row.threads for row in study.rows if row.threads})
+    on = f"{' or '.join(map(str, threads)) or 'no'} thread{'s' if threads != [1] else ''}, {study.workers} at a time"
     told = (
         f"{seconds:g} s simulated, compared at {study.plan['frames']} frames. Errors are distances over the reference's largest "
-        f"excursion; `<` marks one below what the reference is good to. Times are medians of {_repeats(study)} runs on "
-        f"{' or '.join(map(str, threads)) or 'no'} thread{'s' if threads != [1] else ''}, compiling apart; spread is the "
-        "distance of the quartiles over the median; * marks the front."
+        f"excursion; `<` marks one below what the reference is good to. Times are medians of {_repeats(study)} runs on {on}, "
+        "compiling apart; spread is the distance of the quartiles over the median; * marks the front."
     )
     return told + ("\n\nReferences:\n\n" + "\n".join(lines) if lines else "")
 
