@@ -13,6 +13,7 @@ MARKERS = {
     "symplectic_euler": "v", "velocity_verlet": "^", "linearly_implicit_euler": "D", "implicit_euler": "o", "bdf2": "s",
     "implicit_midpoint": "P",
 }  # fmt: skip
+SURE = "#222222"  # colour of what references are good to
 SIZE = (7.4, 5.4)  # [inch]
 KINDS = ("refine", "order", "precision", "contact_solver", "arch")  # axes that colours tell apart, where they vary
 LABELS = 8  # points of the front that are named at most
@@ -90,10 +91,10 @@ def _lines(panel, study: Study, rows: list[Row]) -> None:
     panel.axhline(study.ask.tolerance, color="#555555", lw=0.9, ls="--", zorder=1, label=f"tolerance {study.ask.tolerance:g}")
     shown = _shown_sure(study, rows)
     for k, sure in enumerate(shown):
-        panel.axhline(sure, color="#cc79a7", lw=1.2, ls=":", zorder=1, label="reference's own error" if k == 0 else None)
+        panel.axhline(sure, color=SURE, lw=1.4, ls=":", zorder=1, label="reference's own error" if k == 0 else None)
     if not shown:
         label = f"reference's own error:\n{_sure(study, rows)[-1]:.1g}, far below"
-        panel.plot([], [], color="#cc79a7", lw=1.2, ls=":", label=label)
+        panel.plot([], [], color=SURE, lw=1.4, ls=":", label=label)
 
 
 def _sure(study: Study, rows: list[Row]) -> list[float]:

@@ -102,8 +102,8 @@ def plain(study: Study) -> dict:
     return {
         "ask": asdict(study.ask), "frame": study.plan["frame"], "frames": study.plan["frames"], "rows": rows,
         "references": references, "cheapest": cheapest and cheapest.setting, "nearest": nearest and nearest.setting,
-        "notes": study.notes, "ended": study.ended, "machines": study.machines, "workers": study.workers, "versions": study.versions,
-        "scene_digest": study.plan["digest"], "code_digest": study.plan["code"],
+        "notes": study.notes, "ended": study.ended, "machines": study.machines, "workers": study.workers,
+        "versions": study.versions, "scene_digest": study.plan["digest"], "code_digest": study.plan["code"],
     }  # fmt: skip
 
 
