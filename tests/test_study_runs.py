@@ -13,6 +13,7 @@ import pytest
 from command import write
 from study_places import InProcess
 
+from taisoft.errors import SceneError
 from taisoft.simulator import Simulator
 from taisoft.study import measure
 from taisoft.study.results import Ask
@@ -98,6 +99,20 @@ def test_a_run_that_fails_is_a_record_with_its_reason(tmp_path):
     study = run(place, ask)
     assert study.rows[0].status == "failed" and "ZeroDivisionError" in study.rows[0].reason
     assert "ZeroDivisionError" in study.notes[0]
+
+
+@pytest.mark.parametrize(
+    "solver, told",
+    [
+        ('{"dtt": 0.1}', "solver dict: no setting is called 'dtt' (did you mean dt?)"),
+        ('{"dt": "a"}', "the scene's solver dict: dt must be a number, not 'a'"),
+    ],
+)
+def test_a_bad_solver_dict_is_told(tmp_path, solver, told):
+    path = write(tmp_path / "bar.py", SCENE.replace("HOLD", HELD) + f"\n\nsolver = {solver}\n")
+    with pytest.raises(SceneError) as error:
+        run(InProcess(), Ask(str(path)))
+    assert told in str(error.value)
 
 
 # --- processes --------------------------------------------------------------------------------------------------------

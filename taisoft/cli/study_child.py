@@ -46,6 +46,7 @@ def _leave_with_parent() -> None:
 def _answer(request: dict) -> dict:
     from taisoft.checkpoint import scene_digest
     from taisoft.cli.scene_file import find_scene, load_scene
+    from taisoft.cli.settings import check_scene_solver
     from taisoft.errors import TaisoftError
     from taisoft.study.measure import measure
     from taisoft.study.plan import make_plan
@@ -59,6 +60,7 @@ def _answer(request: dict) -> dict:
     try:
         if request["do"] == "plan":
             scene, solver = load()
+            check_scene_solver(solver)
             made = make_plan(lambda refine, order: load(refine, order)[0], solver, request["ask"])
             return {"answer": made | {"digest": content(scene), "code": code_digest()}}
         if code_digest() != request["code"]:

@@ -8,6 +8,7 @@ import base64
 import hashlib
 import json
 import zlib
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,8 @@ class Store:
     def __init__(self, folder: Path):
         self._folder = make_folder(folder / RUNS)
         for part in (*self._folder.glob("*.part"), *folder.glob("study.*.part")):
-            part.unlink(missing_ok=True)  # of a study that was killed; the folder is ours
+            with suppress(OSError):  # of a study that was killed; what cannot be removed harms nothing
+                part.unlink()
         self.damaged: list[str] = []
         self.taken = 0
 
