@@ -137,12 +137,15 @@ def test_refused_combinations_are_told_as_a_product_where_they_are_one():
     assert "* bdf2, dt = 0.2 s, f32; bdf2, dt = 0.2 s, f64; bdf2, dt = 0.1 s, f32: it does not fit" in refused(*whole[:3])
 
 
-def test_a_spent_budget_leaves_runs_out_and_says_so():
+@pytest.mark.parametrize(
+    "kept, told", [(True, "The same command goes on with it."), (False, "Without --out nothing of it is kept.")]
+)
+def test_a_spent_budget_leaves_runs_out_and_says_so(tmp_path, kept, told):
     place = Pendulum(plan())
-    study = run(place, left=lambda: 4.0 - len(place.requests))  # planning is one of them, and not of the budget
+    study = run(place, Store(tmp_path) if kept else None, left=lambda: 4.0 - len(place.requests))  # planning is one of them, and not of the budget
     left_out = [row for row in study.rows if row.status == "left out"]
     assert left_out and all(row.reason == "the budget was spent" for row in left_out)
-    assert "Not complete: the budget was spent. The same command goes on with it." in text_of(study)
+    assert f"Not complete: the budget was spent. {told}" in text_of(study)
 
 
 # --- finished runs ----------------------------------------------------------------------------------------------------

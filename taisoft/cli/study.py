@@ -32,7 +32,7 @@ def command(arguments: Namespace) -> int:
     ask = asked(arguments)
     find_scene(ask.scene)
     budget = checks.number(arguments.budget, "--budget", above=0.0, unit="s")
-    with Signals(ENDING) as signals, ExitStack() as stack:
+    with Signals(ENDING if arguments.out is not None else "ending") as signals, ExitStack() as stack:
         places, machines = _places(arguments, ask, stack)
         if arguments.out is not None:
             check_free(arguments.out, overwrite=False)

@@ -43,6 +43,7 @@ class Study:
     workers: int = 1  # runs at a time
     versions: dict = field(default_factory=dict)
     ended: str = ""
+    kept: bool = False  # whether finished runs are kept, so that a study can go on
 
     def judged(self) -> list[Row]:
         """The rows that have a time and an error."""

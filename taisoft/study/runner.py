@@ -40,6 +40,7 @@ class Runner:
     def run(self, plan: dict) -> Study:
         """The study of a plan. Raises OutputError where a finished run cannot be kept."""
         study = Study(self.ask, plan, notes=list(plan["notes"]), machines=self.machines, workers=len(self.places))
+        study.kept = isinstance(self.store, Store)
         references, settings = tasks_of(plan)
         tasks = [*references, *settings]
         keys = [self._key(plan, task) for task in tasks]

@@ -18,7 +18,8 @@ def text_of(study: Study) -> str:
     """The whole study in Markdown: answer, table, what was not run, references, notes."""
     parts = [f"# {study.ask.scene}: speed against error", answer(study)]
     if study.ended:
-        parts.append(f"Not complete: {study.ended}. The same command goes on with it.")
+        on = "The same command goes on with it." if study.kept else "Without --out nothing of it is kept."
+        parts.append(f"Not complete: {study.ended}. {on}")
     ran = [row for row in study.rows if row.status in (*ENDED, "failed")]
     if ran:
         parts.append(run_table(study, ran))
