@@ -142,7 +142,8 @@ def test_refused_combinations_are_told_as_a_product_where_they_are_one():
 )
 def test_a_spent_budget_leaves_runs_out_and_says_so(tmp_path, kept, told):
     place = Pendulum(plan())
-    study = run(place, Store(tmp_path) if kept else None, left=lambda: 4.0 - len(place.requests))  # planning is one of them, and not of the budget
+    # planning is one of the requests, and not of the budget
+    study = run(place, Store(tmp_path) if kept else None, left=lambda: 4.0 - len(place.requests))
     left_out = [row for row in study.rows if row.status == "left out"]
     assert left_out and all(row.reason == "the budget was spent" for row in left_out)
     assert f"Not complete: the budget was spent. {told}" in text_of(study)
