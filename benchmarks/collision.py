@@ -16,6 +16,7 @@ import sys
 from taisoft.output.files import write_bytes
 from taisoft.output.report import json_text
 from taisoft.runtime import Runtime, open_runtime
+from taisoft.timing import load_average
 
 from .collision_cases import (
     CUBES,
@@ -51,7 +52,6 @@ from .collision_table import (
 from .elasticity import Document
 from .elasticity_table import limit_table
 from .order import header, parse_options
-from .timing import load_average
 
 QUICK_FRAMES = 3
 

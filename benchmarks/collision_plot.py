@@ -1,13 +1,11 @@
 """The picture of `collision.py`: a panel for each of the report's figures on the collision system."""
 
-import io
 from pathlib import Path
 
-from taisoft.output.files import write_bytes
+from taisoft.output.plot import require_matplotlib, save, ticks
 
 from .collision_runs import GEOMETRIES, HASH, TREES, Film, Row, Sweep
 from .collision_table import REPORTS_BEST, best_cell
-from .order_plot import require_matplotlib, ticks
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 COLUMNS, PANEL = 4, (4.2, 3.2)  # panels in a row, their size in inches
@@ -41,10 +39,7 @@ def draw(found: dict, path: Path) -> None:
                 ticks(axis, most / least)
         if panel.get_legend_handles_labels()[1]:
             panel.legend(fontsize="small", frameon=False)
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=130)
-    pyplot.close(figure)
-    write_bytes(path, picture.getvalue())
+    save(figure, path)
 
 
 def _ms(seconds) -> list[float]:

@@ -19,10 +19,10 @@ from taisoft.fields import FieldArena
 from taisoft.model import build_model
 from taisoft.runtime import Runtime, compile_clock
 from taisoft.scene.plan import make_plan
+from taisoft.timing import Timing, summarise
 
 from .collision_cases import FPS, FRAMES, Setup, start
 from .collision_quadratic import Quadratic
-from .timing import Timing, summarise
 
 PHASES = ("boxes", "candidates", "contacts", "reduction")
 GEOMETRIES = ("proximity", "distance_field")

@@ -5,9 +5,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from taisoft.output.tables import markdown, percent, spread_of
+
 from .collision_cases import LARGE_PILE, OLDER, SHEET, pile_setup
 from .collision_runs import GEOMETRIES, HASH, PHASES, TREES, Film, Row, Sweep
-from .elasticity_table import Limit, markdown, percent, spread_of
+from .elasticity_table import Limit
 
 LIMITS = {pile_setup(6).name: 8.0, pile_setup(LARGE_PILE).name: 80.0}  # [ms] of a whole search, f32 on two cores
 WANTED_GAIN = 1000.0  # of the sheet and cube over the older code

@@ -17,6 +17,7 @@ import sys
 from taisoft.output.files import write_bytes
 from taisoft.output.report import json_text
 from taisoft.runtime import compile_clock, open_runtime
+from taisoft.timing import load_average
 
 from . import contact_problems
 from .contact_captured import GOAL, Solvers
@@ -37,7 +38,6 @@ from .contact_table import (
 from .elasticity import Document
 from .elasticity_table import limit_table
 from .order import header, parse_options
-from .timing import load_average
 
 SCENES = ("cube_on_box", "two_cubes_two_boxes")  # figures 20 and 19
 FRAMES, QUICK_FRAMES = 90, 6

@@ -9,9 +9,9 @@ import scipy.sparse as sp
 from taisoft.contact.colouring import colour_parallel, graph_of
 from taisoft.contact.graph import colour_greedy, colour_random
 from taisoft.contact.problem import ContactProblem, index_nodes
+from taisoft.output.tables import markdown
 
 from .contact_captured import clock
-from .elasticity_table import markdown
 
 SEEDS, QUICK_SEEDS = 15, 3  # of random colourings
 ROUNDS = 3  # of the colourings that give one result

@@ -12,11 +12,11 @@ import taichi as ti
 
 from taisoft.contact.problem import NODES, ContactProblem, build_node_problem, find_factors, index_nodes
 from taisoft.fields import FieldArena
+from taisoft.output.tables import markdown
 from taisoft.runtime import Runtime
 
 from .collision_table import crossovers
 from .contact_captured import COLOURED, SERIAL, THREADED, Outcome, Solvers
-from .elasticity_table import markdown
 
 SIZES, QUICK_SIZES = (4, 8, 16, 32, 64, 128, 192), (8, 16)
 TURN, FRICTION, SEED = np.radians(10.0), 0.5, 1

@@ -1,19 +1,17 @@
 """The picture of `contact.py`: the report's figure 19, a row a scene, its figure 20 below, and the crossover."""
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from taisoft.contact.graph import groups
-from taisoft.output.files import write_bytes
+from taisoft.output.plot import require_matplotlib, save, ticks
 from taisoft.view.offscreen import Offscreen
 
 from .contact_captured import THREADED, contact_jacobian
 from .contact_crossover import Point
 from .contact_runs import Film
-from .order_plot import require_matplotlib, ticks
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#555555")
 BANDS = ("#0072b2", "#d55e00")  # of groups in turn
@@ -58,10 +56,7 @@ def draw(found: dict, snapshots: list[Snapshot], path: Path) -> None:
             panels[3].set_visible(False)
     handles, labels = grid[len(snapshots), 1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize="small", frameon=False)
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=110)
-    pyplot.close(figure)
-    write_bytes(path, picture.getvalue())
+    save(figure, path, dpi=110)
 
 
 def _figure_19(panels, s: Snapshot) -> None:

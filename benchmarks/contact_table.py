@@ -5,10 +5,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.timing import summarise
+
 from .contact_problems import HEADINGS, Row
 from .contact_runs import COLD, PARTS, REST, WARM, Film, Run, StepCost
-from .elasticity_table import Limit, markdown, percent, spread_of
-from .timing import summarise
+from .elasticity_table import Limit
 
 CONTACTS = {"cube_on_box": 198, "two_cubes_two_boxes": 286}  # of the report's figures 20 and 19
 STEP_SCENE, STEP_LIMIT = "cube_on_box", 2.0  # [ms] an explicit step, f32, to a residual of GOAL

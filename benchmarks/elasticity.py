@@ -22,14 +22,15 @@ import taisoft as ts
 from taisoft.errors import OutputError, SimulationError
 from taisoft.output.files import make_folder, write_bytes
 from taisoft.output.report import json_text
+from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.timing import Timing, load_average, machine, versions
 
 from .elasticity_beam import measure_memory, n_tets
 from .elasticity_cost import Cost, cost_limits, cost_table, measure_costs
 from .elasticity_runs import MUJOCO, TAISOFT, Row, make_rows, measure_rows, time_ratio
-from .elasticity_table import Limit, limit_table, markdown, percent, slug, spread_of
+from .elasticity_table import Limit, limit_table, slug
 from .exact_path import MESHES, SECONDS
 from .peers.mujoco_flex import run_mujoco
-from .timing import Timing, load_average, machine, versions
 
 RESULTS = Path(__file__).parent / "results"
 TARGET_MESH = MESHES[-1]  # whose implicit runs have targets

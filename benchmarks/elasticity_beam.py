@@ -4,8 +4,6 @@ Below model.PARALLEL_FROM tets taisoft steps on one thread of the CPU, and so do
 """
 
 import math
-import time
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,28 +11,12 @@ import taisoft as ts
 from taisoft.output.report import peak_memory
 from taisoft.scene.scene import Scene
 from taisoft.stability import stable_dt
+from taisoft.study.stretch import Stretch, advance, warm_up
 
 from .exact_path import DENSITY, GRAVITY, POISSON, SAMPLE, SIZE, YOUNG
 
 LAWS = {"SNH": "stable_neo_hookean", "SVK": "st_venant_kirchhoff", "COR": "corotational"}
 MARGIN = 0.9  # of the largest stable step about the rest shape
-WARM_STEPS = 3  # a multistep integrator has met all its kernels by then
-
-
-@dataclass
-class Stretch:
-    """What some steps did. seconds: wall time without compiling [s]; inverted: the most tets in one report."""
-
-    steps: int = 0
-    seconds: float = 0.0
-    unconverged: int = 0
-    inverted: int = 0
-    newton_iterations: int = 0
-    linear_iterations: int = 0
-
-    def __add__(self, other: "Stretch") -> "Stretch":
-        sums = {k: a + b for (k, a), b in zip(vars(self).items(), vars(other).values())}
-        return Stretch(**sums | {"inverted": max(self.inverted, other.inverted)})
 
 
 def n_tets(cells) -> int:
@@ -54,29 +36,6 @@ def beam_scene(cells, law: str = "SVK") -> Scene:
 def steps_within_limit(cells) -> int:
     """Smallest number of explicit steps in 10 ms whose dt is at most MARGIN of the limit; one limit for all laws."""
     return math.ceil(SAMPLE / (MARGIN * stable_dt(beam_scene(cells), verlet=True)))
-
-
-def advance(sim: ts.Simulator, steps: int) -> Stretch:
-    """Take `steps` steps in the largest batches that sim.advance takes, as sim.run does between two frames."""
-    stretch = Stretch(steps)
-    compiled, start = sim.compile_seconds, time.perf_counter()
-    done = 0
-    while done < steps:
-        report = sim.advance(steps - done)
-        done += report.steps
-        stretch.unconverged += not report.converged
-        stretch.inverted = max(stretch.inverted, report.n_inverted)
-        stretch.newton_iterations += report.newton_iterations
-        stretch.linear_iterations += report.linear_iterations
-    stretch.seconds = time.perf_counter() - start - (sim.compile_seconds - compiled)
-    return stretch
-
-
-def warm_up(sim: ts.Simulator) -> None:
-    """Compile what steps need, and go back to the start."""
-    for _ in range(WARM_STEPS):
-        sim.step()
-    sim.reset()
 
 
 def follow_tip(sim: ts.Simulator, steps: int, samples: int) -> tuple[np.ndarray, Stretch]:

@@ -9,12 +9,14 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 
 import taisoft as ts
+from taisoft.output.tables import markdown, percent, spread_of
 from taisoft.stepping import EXPLICIT
+from taisoft.study.stretch import advance, warm_up
+from taisoft.timing import Timing, summarise
 
-from .elasticity_beam import LAWS, advance, beam_scene, n_tets, steps_within_limit, warm_up
-from .elasticity_table import Limit, markdown, percent, spread_of
+from .elasticity_beam import LAWS, beam_scene, n_tets, steps_within_limit
+from .elasticity_table import Limit
 from .exact_path import SAMPLE
-from .timing import Timing, summarise
 
 SAMPLE_SECONDS = 0.05  # wall time of a sample, about
 GUESSED_SECONDS_PER_TET = 12e-9  # of a step, sizes a sample; 5 to 30 ns were met on the CPU

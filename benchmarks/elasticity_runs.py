@@ -15,11 +15,12 @@ import numpy as np
 import taisoft as ts
 from taisoft.errors import SimulationError
 from taisoft.stepping import EXPLICIT
+from taisoft.study.stretch import Stretch, advance, warm_up
+from taisoft.timing import Timing, summarise
 
-from .elasticity_beam import MARGIN, Stretch, advance, beam_scene, follow_tip, n_tets, steps_within_limit, warm_up
+from .elasticity_beam import MARGIN, beam_scene, follow_tip, n_tets, steps_within_limit
 from .exact_path import FOLDING_STARTS, SAMPLE, load_exact
 from .peers.mujoco_flex import STABLE_STEPS, run_mujoco
-from .timing import Timing, summarise
 
 IMPLICIT = ("bdf2", "implicit_midpoint", "implicit_euler", "linearly_implicit_euler")
 TAISOFT, MUJOCO = "taisoft", "MuJoCo"

@@ -22,16 +22,17 @@ from pathlib import Path
 import taisoft as ts
 from taisoft.errors import OutputError
 from taisoft.output.files import make_folder, write_bytes
+from taisoft.output.plot import require_matplotlib
 from taisoft.output.report import json_text
 from taisoft.runtime import open_runtime
+from taisoft.timing import load_average, machine, versions
 
 from .elasticity import Document
 from .elasticity_table import limit_table
 from .order_cases import CASES, HANGING, LINEAR, QUADRATIC, Case, Reference
-from .order_plot import draw, require_matplotlib
+from .order_plot import draw
 from .order_runs import Row, measure_case
 from .order_table import GOAL, GOALS, compare, compare_table, find_limits, row_table
-from .timing import load_average, machine, versions
 
 ROUNDS, QUICK_ROUNDS, QUICK_MESHES = 5, 1, 2
 

@@ -1,11 +1,10 @@
 """The picture of `order.py`: error against time, one panel a case, both axes logarithmic."""
 
-import io
 import math
 from pathlib import Path
 
 from taisoft.errors import OutputError
-from taisoft.output.files import write_bytes
+from taisoft.output.plot import require_matplotlib, save, ticks
 
 from .order_cases import Case, Reference
 from .order_runs import Row
@@ -18,16 +17,6 @@ STYLES = {  # (order, degree) -> label, colour, marker, line
 }
 COLUMNS, PANEL = 3, (4.2, 3.2)  # panels in a row, their size in inches
 SURE = 1e-5  # the lowest error that is drawn, for references that are exact
-
-
-def require_matplotlib():
-    """The module. Raises OutputError where it is missing."""
-    try:
-        import matplotlib
-    except ImportError:
-        raise OutputError("--plot needs the package matplotlib, which is missing: pip install 'taisoft[plot]'") from None
-    matplotlib.use("Agg")
-    return matplotlib
 
 
 def draw(cases: list[tuple[Case, list[Row], Reference]], path: Path) -> None:
@@ -51,10 +40,7 @@ def draw(cases: list[tuple[Case, list[Row], Reference]], path: Path) -> None:
     figure.legend(drawn.values(), drawn.keys(), loc="outside upper center", ncols=min(len(drawn), 2 * columns), frameon=False)
     figure.supxlabel("time of a solution [s], median of the rounds")
     figure.supylabel("error [%]")
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=130)
-    pyplot.close(figure)
-    write_bytes(path, picture.getvalue())
+    save(figure, path)
 
 
 def _panel(panel, case: Case, rows: list[Row], reference: Reference) -> dict:
@@ -81,12 +67,3 @@ def _panel(panel, case: Case, rows: list[Row], reference: Reference) -> dict:
     panel.grid(True, which="major", color="#eeeeee")
     panel.set_axisbelow(True)
     return handles
-
-
-def ticks(axis, ratio: float) -> None:
-    """Plain numbers at powers of ten, and between them too where the axis spans few."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axis.set_major_locator(LogLocator(subs=(1.0,) if ratio > 300.0 else (1.0, 3.0) if ratio > 30.0 else (1.0, 2.0, 5.0)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())

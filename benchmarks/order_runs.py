@@ -19,12 +19,12 @@ from taisoft.errors import SimulationError, TaisoftError
 from taisoft.fields import FieldArena
 from taisoft.runtime import Runtime, compile_clock
 from taisoft.static import StaticSolver
+from taisoft.study.stretch import Stretch, advance
+from taisoft.timing import Timing, summarise, time_repeats
 
-from .elasticity_beam import Stretch, advance
 from .order_cases import Case, Element, Reference, mesh_name
 from .reference_cases.motion import parabola_vertex
 from .reference_cases.record import nearest
-from .timing import Timing, summarise, time_repeats
 
 TOLERANCE = 1e-6  # of |residual| / |load|
 FALL_SECONDS = 1.2  # the first swing is over

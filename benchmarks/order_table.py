@@ -4,11 +4,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from .elasticity_table import Limit, markdown, percent, spread_of
+from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.timing import Timing, summarise
+
+from .elasticity_table import Limit
 from .order_cases import HANGING, Case, Reference
 from .order_runs import Row
 from .reference_cases.record import label
-from .timing import Timing, summarise
 
 GOALS = (0.1, 0.03, 0.01)  # errors whose times are told
 GOAL = GOALS[-1]  # the one that cases are summed up by

@@ -18,10 +18,10 @@ from pathlib import Path
 
 from taisoft.errors import OutputError
 from taisoft.runtime import open_runtime
+from taisoft.timing import machine, versions
 
 from .reference_cases import CASES, PROBLEMS
 from .reference_cases.record import Case, Check, computed
-from .timing import machine, versions
 
 REFERENCES = Path(__file__).resolve().parents[1].parent / "shared" / "references"
 HEADINGS = ("problem", "law", "mesh", "quantity", "measured", "reference", "error", "limit", "", "seconds")

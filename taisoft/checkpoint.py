@@ -111,6 +111,11 @@ def scene_marks(scene: Scene, features: dict[str, bool]) -> dict[str, str]:
     return marks
 
 
+def scene_digest(scene: Scene) -> str:
+    """A digest of all that can be compared of a scene: its parts as a checkpoint compares them, and its numbers."""
+    return _digest([json.dumps(scene_marks(scene, {})), json.dumps(_numbers(scene)), scene.allow_initial_overlap])
+
+
 def _body_parts(body: Body) -> dict[str, list]:
     """What makes a body, by what to call it."""
     return {

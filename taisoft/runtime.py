@@ -22,6 +22,7 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 from taisoft.errors import SimulationError
 from taisoft.launching import Launch, places_of, prepare
+from taisoft.timing import usable_cores
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
@@ -104,6 +105,7 @@ def _initialise(arch: str, precision: str) -> None:
         ti.init(
             arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
             fast_math=False, offline_cache=True, offline_cache_file_path=_cache_folder(), log_level=ti.ERROR, random_seed=0,
+            cpu_max_num_threads=len(usable_cores()),  # Taichi would count the cores that this process may not use, too
         )  # fmt: skip
     trees["open"] = 0
     for known in _known:  # they hold the Taichi that was
@@ -125,6 +127,11 @@ ASTTransformerContext.get_pos_info = _position
 # It also reads a function's source anew at each of its calls in a kernel, which takes longer than building the call.
 kernel_impl.getsourcefile = functools.cache(kernel_impl.getsourcefile)
 kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
+
+
+def threads() -> int:
+    """Number of threads of Taichi's parallel loops on the CPU."""
+    return ti.cfg.cpu_max_num_threads
 
 
 def open_kind() -> tuple[str, str] | None:

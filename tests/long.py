@@ -41,6 +41,12 @@ LONG = {
     "test_contact_stage": ("f32",),
     "test_reduction": ("f32",),
     "test_frank_wolfe": ("[f32]",),
+    "test_study_cli": ("test_interrupted_then_killed",),
+    "test_study_cluster": ("test_a_study_on_a_cluster", "test_workers_have_cores"),
+    "test_study_runs": (
+        "integrators[symplectic_euler-1]", "integrators[implicit_euler-1]", "integrators[bdf2-2]",
+        "integrators[implicit_midpoint-2]", "test_refinement", "test_a_run_that_fails",
+    ),
     "test_self_collision": ("test_folded_sheets_against_ipctk[f32]",),
 }
 

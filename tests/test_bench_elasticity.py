@@ -15,13 +15,15 @@ import pytest
 
 import taisoft as ts
 from benchmarks import elasticity, elasticity_runs
-from benchmarks.elasticity_beam import Stretch, advance, beam_scene, follow_tip, measure_memory, steps_within_limit
+from benchmarks.elasticity_beam import beam_scene, follow_tip, measure_memory, steps_within_limit
 from benchmarks.elasticity_cost import Cost, cost_limits, cost_table, measure_costs
 from benchmarks.elasticity_runs import Row, lasting_steps, make_rows, measure_rows, time_ratio
-from benchmarks.elasticity_table import Limit, markdown, slug
+from benchmarks.elasticity_table import Limit, slug
 from benchmarks.exact_path import SAMPLE, FallingBeam, load_exact
 from taisoft.errors import OutputError, SimulationError
 from taisoft.mass import lumped_masses
+from taisoft.output.tables import markdown
+from taisoft.study.stretch import Stretch, advance
 
 CELLS = (12, 3, 3)
 TINY = elasticity.Extent(meshes=(CELLS,), precisions=("f32",), repeats=2, rounds=(2,), seconds=0.02)

@@ -19,7 +19,7 @@ FILES = sorted(path for path in PACKAGE.rglob("*.py"))
 
 # Modules under taisoft/, left to right; those of one group may import one another unless FOREIGN says otherwise.
 ORDER = (
-    ("errors", "records", "files"),
+    ("errors", "records", "files", "timing"),
     ("launching",),
     ("runtime",),
     ("transfer",),
@@ -35,13 +35,14 @@ ORDER = (
     ("stepping",),
     ("simulator", "access", "settings", "running", "static", "checkpoint", "resuming"),
     ("output", "view"),
+    ("study",),
     ("cli",),
     ("__main__",),
 )
 LEVEL = {name: level for level, group in enumerate(ORDER) for name in group}
 FOREIGN = {("mesh", "scene"), ("collision", "contact"), ("contact", "collision")}  # (importer, imported) of one group
 
-WITHOUT_TAICHI = {"errors", "records", "files", "mesh", "scene"}
+WITHOUT_TAICHI = {"errors", "records", "files", "timing", "mesh", "scene"}
 FAULTY = {"ti.svd", "ti.sym_eig", "ti.polar_decompose"}
 FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "yaml.load"} | FAULTY
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "shelve", "marshal", "yaml"}

@@ -23,6 +23,7 @@ import warnings
 import numpy as np
 
 from taisoft.errors import SceneError, SimulationError
+from taisoft.timing import load_average, machine, summarise, versions
 
 from ..exact_path import (
     DENSITY,
@@ -37,7 +38,6 @@ from ..exact_path import (
     FallingBeam,
     load_exact,
 )
-from ..timing import load_average, machine, summarise, versions
 
 INTEGRATORS = ("euler", "euler_staggered", "rk4", "discrete")
 # For each mesh the smallest number of steps within 10 ms that is stable for 1 s, (Euler, RK4): one step fewer diverges.

@@ -48,6 +48,7 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_run(commands)
     _add_scene(commands)
+    _add_study(commands)
 
     listed = commands.add_parser("list", help="the demos, one line each")
     listed.set_defaults(command="listing")
@@ -126,6 +127,42 @@ def _add_scene(commands) -> None:
     parser.add_argument("--out", metavar="FILE", required=True, help="the .toml file; its meshes are written beside it")
     parser.add_argument("--overwrite", action="store_true", help="replace files that are there")
     parser.set_defaults(command="scene")
+
+
+def _add_study(commands) -> None:
+    """The options of `taisoft study`; those of the grid are comma lists."""
+    parser = commands.add_parser(
+        "study",
+        help="run a scene over a grid of settings: speed against error",
+        description="Run a scene over a grid of settings, each in its own process, against a reference. Lists are divided by "
+        "commas; what is not given is the scene's.",
+        allow_abbrev=False,
+    )
+    _add_scene_name(parser)
+    grid = parser.add_argument_group("grid (comma lists)")
+    for name, told in (
+        ("dt", "steps [s]"), ("integrator", "see the README"), ("order", "of the elements of all bodies, 1 or 2"),
+        ("refine", "how often every tet is cut into eight"), ("precision", "f32, f64"),
+        ("newton-tolerance", "relative, or none: adaptive"), ("linear-tolerance", "of conjugate gradients, relative, or none"),
+        ("contact-solver", "auto or a solver"), ("contact-tolerance", "relative, or none"), ("arch", "cpu, cuda"),
+    ):  # fmt: skip
+        grid.add_argument(f"--{name}", metavar="LIST", help=told)
+    parser.add_argument("--seconds", type=float, metavar="T", help="simulated time [s] (default: the scene's, or 1)")
+    parser.add_argument("--tolerance", type=float, default=0.01, metavar="X", help="error that is good enough (default 0.01)")
+    parser.add_argument("--by", choices=("max", "rms"), default="max", help="the error that counts (default max)")
+    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="timed runs of each setting (default 3)")
+    parser.add_argument("--reference-dt", type=float, metavar="DT", help="(default: the smallest dt over 8)")
+    parser.add_argument("--reference-integrator", metavar="NAME", help="(default: one of second order that fits the scene)")
+    parser.add_argument(
+        "--reference-refine", type=int, default=0, metavar="N", help="how much finer than the finest mesh the reference's is"
+    )
+    parser.add_argument("--out", metavar="DIR", help="folder for the results; a study that is there goes on")
+    parser.add_argument(
+        "--budget", type=float, default=600.0, metavar="SECONDS", help="wall time after which no more is run (default 600)"
+    )
+    parser.add_argument("--workers", type=int, metavar="N", help="processes at a time, each on its own cores (default 1)")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="run on a Dask cluster, e.g. tcp://host:8786 (extra 'cluster')")
+    parser.set_defaults(command="study")
 
 
 def _add_scene_name(parser: argparse.ArgumentParser, others: str = "a .toml scene file or a .py file with build()") -> None:

@@ -5,8 +5,10 @@ as Python: only run files you trust. A .toml file is data.
 """
 
 import ast
+import functools
 import importlib
 import importlib.util
+import inspect
 import sys
 import traceback
 from pathlib import Path
@@ -14,6 +16,7 @@ from types import ModuleType
 
 from taisoft.errors import MeshError, SceneError
 from taisoft.scene.checks import nearest
+from taisoft.scene.refine import refined, with_order
 from taisoft.scene.scene import Scene
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -62,28 +65,39 @@ def find_scene(name: str) -> Path:
     return demos[name]
 
 
-def load_scene(name: str, allow_outside: bool = False) -> tuple[Scene, dict]:
+def load_scene(name: str, allow_outside: bool = False, refine: int = 0, order: int | None = None) -> tuple[Scene, dict]:
     """The scene that SCENE names and its `solver` dict (empty if the file has none).
 
-    allow_outside: let a .toml file name meshes outside of its folder. Raises SceneError, or MeshError for a mesh, naming
-    the file and, where its code is at fault, the line.
+    allow_outside: let a .toml file name meshes outside of its folder. refine: how often the meshes are to be refined; order:
+    that of all bodies, None for what the scene says. A build() with a parameter of that name does it itself, elsewhere it is
+    done as `taisoft.scene.refine` says. Raises SceneError, or MeshError for a mesh, naming the file and, where its code is at
+    fault, the line.
     """
+    scene, solver, made = _built(name, allow_outside, {"refine": refine, "order": order})
+    for _ in range(0 if "refine" in made else refine):
+        scene = refined(scene)
+    return scene if order is None or "order" in made else with_order(scene, order), solver
+
+
+def _built(name: str, allow_outside: bool, asked: dict) -> tuple[Scene, dict, set]:
+    """Scene and `solver` dict, and which of the things asked for build() has seen to; None is not asked for."""
     path = find_scene(name)
     if path.suffix == ".toml":
         from taisoft.scene.toml import read_scene  # brings meshio along, which `taisoft list` does without
 
-        return read_scene(path, allow_outside)
+        return *read_scene(path, allow_outside), set()
     module = load_module(path)
     build = getattr(module, "build", None)
     if not callable(build):
         raise SceneError(f"{path}: no function build() that returns a Scene")
-    scene = _call(path, build)
+    takes = {key: value for key, value in asked.items() if value is not None and key in inspect.signature(build).parameters}
+    scene = _call(path, functools.partial(build, **takes))
     if not isinstance(scene, Scene):
         raise SceneError(f"{path}: build() returned {type(scene).__name__}, a Scene is needed")
     solver = getattr(module, "solver", {})
     if not isinstance(solver, dict) or not all(isinstance(key, str) for key in solver):
         raise SceneError(f"{path}: solver must be a dict of Simulator arguments")
-    return scene, dict(solver)
+    return scene, dict(solver), set(takes)
 
 
 def load_module(path: Path) -> ModuleType:

@@ -9,7 +9,9 @@ from dataclasses import dataclass, field
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 from taisoft.scene.checks import nearest
+from taisoft.scene.solver import CHECKS, check_solver
 
+OF_SCENE = "the scene's solver dict: "
 RUN_KEYS = ("seconds", "fps")  # arguments of Simulator.run that a `solver` dict may hold too
 BARE_WORD = re.compile(r"[A-Za-z_]\w*")
 
@@ -66,7 +68,7 @@ def resolve_resumed(solver: dict, arguments: Namespace, simulator_class: type, s
 def _given(arguments: Namespace, defaults: dict, solver: dict) -> dict:
     """What --set and the other options ask for; the scene's solver dict is checked, too."""
     keys = [*defaults, *RUN_KEYS]
-    _refuse_unknown(solver, keys, "the scene's solver dict: ")
+    _refuse_unknown(solver, keys, OF_SCENE)
     given = parse_assignments(arguments.assignments, keys)
     for key in ("arch", "precision", *RUN_KEYS):
         option = getattr(arguments, key)
@@ -98,17 +100,26 @@ def parse_assignments(assignments: list[str], keys: list[str]) -> dict:
     return values
 
 
-def parse_scalar(text: str, assignment: str) -> float | int | bool | str | None:
+def parse_scalar(text: str, assignment: str, option: str = "--set") -> float | int | bool | str | None:
     """A number, true, false or "text" as TOML writes them; a bare word is text, and none is Python's None."""
     try:
         table = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
         if not BARE_WORD.fullmatch(text):
-            raise SceneError(f"--set {assignment}: {text!r} is not a number, true, false, none or a word") from None
+            raise SceneError(f"{option} {assignment}: {text!r} is not a number, true, false, none or a word") from None
         return None if text == "none" else text
     if set(table) != {"value"} or not isinstance(table["value"], (float, int, bool, str)):
-        raise SceneError(f"--set {assignment}: {text!r} is not a single number, true, false, none or a word")
+        raise SceneError(f"{option} {assignment}: {text!r} is not a single number, true, false, none or a word")
     return table["value"]
+
+
+def check_scene_solver(solver: dict) -> None:
+    """Raises SceneError for a `solver` dict of a scene with unknown keys or values that no run takes."""
+    _refuse_unknown(solver, list(CHECKS), OF_SCENE)
+    try:
+        check_solver(**solver)
+    except SceneError as error:
+        raise SceneError(f"{OF_SCENE}{error}") from None
 
 
 def _defaults(simulator_class: type) -> dict:

@@ -19,9 +19,11 @@ class Signals:
 
     `number` is the first signal's number, or None. Until `run_began()` a signal raises Left: there is nothing
     to save yet. After it, `asked()` turns true and the run is expected to end by itself and save what it has.
+    ending: what the first signal is answered with.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ending: str = "ending after the current step and saving") -> None:
+        self._ending = ending
         self.number: int | None = None
         self._running = False
         self._old_handlers: dict = {}
@@ -49,4 +51,4 @@ class Signals:
             os._exit(128 + number)  # files are published by rename, so leaving here tears none of them
         self.number = number
         # os.write, since print could be interrupted in the middle of its own buffer
-        os.write(2, b"\ntaisoft: ending after the current step and saving; a second signal leaves at once\n")
+        os.write(2, f"\ntaisoft: {self._ending}; a second signal leaves at once\n".encode())

@@ -12,8 +12,8 @@ from taisoft.errors import OutputError
 from taisoft.files import part_path, publish, replacing, write_bytes, write_error
 
 __all__ = [
-    "LOCK_NAME", "RESULT_FILES", "RESULT_FOLDERS", "OutputFolder", "check_free", "make_folder", "part_path", "publish",
-    "replacing", "write_bytes", "write_error",
+    "LOCK_NAME", "RESULT_FILES", "RESULT_FOLDERS", "FolderLock", "OutputFolder", "check_free", "make_folder", "part_path",
+    "publish", "replacing", "write_bytes", "write_error",
 ]  # fmt: skip
 
 LOCK_NAME = "taisoft.lock"
@@ -55,7 +55,7 @@ class OutputFolder:
 
     def __init__(self, path: str | Path, overwrite: bool = False, first: int | None = None):
         self.path = make_folder(path).absolute()  # a later change of the working directory must not move the output
-        self._lock: int | None = _lock_folder(self.path)
+        self._lock = FolderLock(self.path)
         try:
             self._old = check_free(path, overwrite) if first is None else {}
             _clear_parts(self.path)
@@ -88,11 +88,7 @@ class OutputFolder:
 
     def close(self) -> None:
         """Release the lock. A second call does nothing."""
-        if self._lock is not None:
-            with suppress(OSError):  # the folder may be gone; the kernel frees the lock with the descriptor anyway
-                (self.path / LOCK_NAME).unlink()
-            os.close(self._lock)
-            self._lock = None
+        self._lock.close()
 
     def __enter__(self) -> "OutputFolder":
         return self
@@ -103,6 +99,22 @@ class OutputFolder:
                 self.discard_stale()
         finally:
             self.close()
+
+
+class FolderLock:
+    """A folder's lock, held until `close`. Raises OutputError where another process has it, or where none can be had."""
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+        self._descriptor: int | None = _lock_folder(folder)
+
+    def close(self) -> None:
+        """Release it. A second call does nothing."""
+        if self._descriptor is not None:
+            with suppress(OSError):  # the folder may be gone; the kernel frees the lock with the descriptor anyway
+                (self._folder / LOCK_NAME).unlink()
+            os.close(self._descriptor)
+            self._descriptor = None
 
 
 def _lock_folder(folder: Path) -> int:

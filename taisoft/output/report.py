@@ -19,6 +19,7 @@ import numpy as np
 
 from taisoft.output.files import write_bytes
 from taisoft.records import RunReport, StepReport
+from taisoft.timing import processor
 
 PACKAGES = ("taichi", "numpy", "scipy", "usd-core")
 
@@ -126,7 +127,7 @@ def versions() -> dict[str, str | None]:
 
 def machine() -> dict:
     """Name, system, processor and its number of logical cores."""
-    return {"name": platform.node(), "system": platform.platform(), "cpu": _cpu_name(), "cores": os.cpu_count()}
+    return {"name": platform.node(), "system": platform.platform(), "cpu": processor(), "cores": os.cpu_count()}
 
 
 def peak_memory() -> int | None:
@@ -143,17 +144,6 @@ def _numeric_fields() -> list[str]:
     blank = StepReport(time=0.0)
     names = [f.name for f in dataclasses.fields(StepReport) if f.name != "time"]
     return [n for n in names if isinstance(getattr(blank, n), int | float) and not isinstance(getattr(blank, n), bool)]
-
-
-def _cpu_name() -> str:
-    try:
-        with open("/proc/cpuinfo") as file:
-            for line in file:
-                if line.startswith("model name"):
-                    return line.partition(":")[2].strip()
-    except OSError:
-        pass  # not Linux: platform knows as much as there is
-    return platform.processor() or platform.machine()
 
 
 def _plain(value):

@@ -26,6 +26,7 @@ class Constraint:
     nodes: np.ndarray  # (k,) int64 node ids
     axes: np.ndarray  # (3,) bool
     path: Callable | None = None  # t [s] -> displacement (3,) or (k,3) [m], None once released; no path: they stay
+    where: Callable | None = None  # what chose the nodes, where that was a function: on another mesh it can choose again
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,7 @@ class NodalForce:
 
     nodes: np.ndarray  # (k,) int64 node ids
     value: np.ndarray  # (3,) total force, or (k,3) one a node [N]
+    where: Callable | None = None  # as of a Constraint
 
 
 class Body:
@@ -126,7 +128,7 @@ class Body:
         """
         what = f"body {self.name!r}: fix"
         nodes = checks.selection(where, self.rest_positions, what, "node")
-        return self._hold(Constraint(nodes, checks.axes(axes, what)), _FIXED, what)
+        return self._hold(Constraint(nodes, checks.axes(axes, what), where=_function(where)), _FIXED, what)
 
     def move(self, where, path: Callable | KeyFrames, axes: str = "xyz") -> Constraint:
         """Lead nodes along a path.
@@ -150,7 +152,7 @@ class Body:
         if start is None:
             raise SceneError(f"{what}: the path must give a displacement at t = 0, not None")
         checks.array(start, f"{what}: the path's displacement at t = 0", ((3,), (len(nodes), 3)))
-        return self._hold(Constraint(nodes, mask, path), _MOVED, what)
+        return self._hold(Constraint(nodes, mask, path, _function(where)), _MOVED, what)
 
     def add_traction(self, where, traction) -> Traction:
         """Load surface triangles with a dead force per reference area.
@@ -174,7 +176,7 @@ class Body:
         """
         what = f"body {self.name!r}: add_force"
         nodes = checks.selection(where, self.rest_positions, what, "node")
-        load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,), (len(nodes), 3))))
+        load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,), (len(nodes), 3))), _function(where))
         self.forces.append(load)
         return load
 
@@ -191,3 +193,7 @@ class Body:
         self._held[at] = kind
         self.constraints.append(constraint)
         return constraint
+
+
+def _function(where) -> Callable | None:
+    return where if callable(where) else None

@@ -137,9 +137,8 @@ def _call(body: Body, table: Table, key: str) -> None:
     """Call the body's method of a key with each of the tables there; its `where` has the name of what it chooses."""
     method, items = CALLS[key], ITEMS.get(key, "nodes")
     known, needed = ([items if k == "where" else k for k in keys] for keys in arguments_of(method))
-    points = body.mesh.vertices[body.mesh.surface].mean(axis=1) if items == "triangles" else body.rest_positions
     for one in table.listed(key, known, needed):
-        more = {"where": _chosen(one, items, points)}
+        more = {"where": _chosen(one, items)}
         if "path" in known:
             more["path"] = _key_frames(one)
         others = [k for k in known if k not in (items, "path")]
@@ -196,11 +195,11 @@ def _kind(table: Table, kinds: dict) -> str:
         return checks.choice(table.values["shape"], "shape", tuple(kinds))
 
 
-def _chosen(table: Table, key: str, points: np.ndarray):
-    """Ids or a bool mask (n,) of what a selector chooses among points (n,3)."""
+def _chosen(table: Table, key: str):
+    """Ids, or a function of points (n,3), which can also choose on another mesh, to a bool mask (n,)."""
     value = table.values[key]
     if value == "all":
-        return np.ones(len(points), dtype=bool)
+        return lambda X: np.ones(len(X), dtype=bool)
     if isinstance(value, list):
         if not all(isinstance(entry, int) and not isinstance(entry, bool) for entry in value):
             raise table.error(key, "must be a list of whole numbers, the ids")
@@ -215,9 +214,9 @@ def _chosen(table: Table, key: str, points: np.ndarray):
             low, high = (checks.array(value, end, ((3,),)) for end, value in corners.items())
         if not (low <= high).all():
             raise box.error("min", "must not exceed max")
-        return ((points >= low) & (points <= high)).all(axis=1)
+        return lambda X: ((X >= low) & (X <= high)).all(axis=1)
     half = choice.table("half_space", *arguments_of(HalfSpace)).make(HalfSpace, "half-space: ")
-    return (points - half.point) @ half.normal <= 0.0
+    return lambda X: (X - half.point) @ half.normal <= 0.0
 
 
 def _key_frames(table: Table) -> KeyFrames:

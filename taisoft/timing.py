@@ -48,8 +48,7 @@ def load_average() -> float | None:
 
 def machine() -> dict:
     """Name of the processor, number of cores this process may use, operating system, and the present load."""
-    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"processor": _processor(), "cores": allowed, "system": platform.platform(), "load": load_average()}
+    return {"processor": processor(), "cores": len(usable_cores()), "system": platform.platform(), "load": load_average()}
 
 
 def versions(*packages: str) -> dict[str, str | None]:
@@ -63,7 +62,13 @@ def versions(*packages: str) -> dict[str, str | None]:
     return found
 
 
-def _processor() -> str:
+def usable_cores() -> list[int]:
+    """Numbers of the cores that this process may use, ascending; all of them on a system that pins no process."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+
+
+def processor() -> str:
+    """Name of the processor, as far as the system tells."""
     info = Path("/proc/cpuinfo")  # platform.processor() is empty on many Linux systems
     if info.exists():
         for line in info.read_text().splitlines():

@@ -1,0 +1,117 @@
+"""`taisoft study SCENE`: a scene over a grid of settings, speed against error."""
+
+import sys
+import time
+from argparse import Namespace
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+from taisoft.cli import EXIT_FAILED, EXIT_SIGNAL
+from taisoft.cli.scene_file import find_scene
+from taisoft.cli.settings import parse_scalar
+from taisoft.cli.signals import Left, Signals
+from taisoft.errors import SceneError
+from taisoft.output.files import FolderLock, check_free, make_folder
+from taisoft.output.report import machine
+from taisoft.scene import checks
+from taisoft.scene.solver import check_solver
+from taisoft.study.grid import AXES
+from taisoft.study.output import FILES, write
+from taisoft.study.results import Ask, Study
+from taisoft.study.runner import Runner
+from taisoft.study.store import Store
+from taisoft.study.table import ENDED, text_of
+from taisoft.study.workers import local_places
+
+WHOLE = {"order": (1, 2), "refine": (0, 1, 2, 3, 4)}
+ENDING = "ending; runs that are finished are kept"
+
+
+def command(arguments: Namespace) -> int:
+    """Runs the study and returns the exit status: 1 where no run of the grid ended."""
+    ask = asked(arguments)
+    find_scene(ask.scene)
+    budget = checks.number(arguments.budget, "--budget", above=0.0, unit="s")
+    with Signals(ENDING if arguments.out is not None else "ending") as signals, ExitStack() as stack:
+        places, machines = _places(arguments, ask, stack)
+        if arguments.out is not None:
+            check_free(arguments.out, overwrite=False)
+        signals.run_began()
+        end = time.monotonic() + budget
+        runner = Runner(ask, places, machines, signals.asked, lambda: end - time.monotonic(), _tell)
+        plan = runner.plan()
+        if plan is None:
+            raise Left(signals.number)
+        if arguments.out is not None:
+            folder = make_folder(arguments.out)
+            stack.enter_context(closing(FolderLock(folder)))
+            runner.store = Store(folder)
+        end = time.monotonic() + budget
+        return _told(runner.run(plan), arguments, signals)
+
+
+def _told(study: Study, arguments: Namespace, signals: Signals) -> int:
+    """Prints and writes what was found."""
+    print(text_of(study), end="")
+    if arguments.out is not None:
+        if told := write(study, Path(arguments.out)):
+            _tell(told)
+        files = [name for name in FILES if (Path(arguments.out) / name).exists()]
+        print(f"\nwritten to {arguments.out}: {', '.join(files)}, runs/")
+    if signals.number is not None:
+        return EXIT_SIGNAL + signals.number
+    return 0 if any(row.status in (*ENDED, "left out") for row in study.rows) else EXIT_FAILED
+
+
+def _places(arguments: Namespace, ask: Ask, stack: ExitStack) -> tuple[list, list[dict]]:
+    """Where runs are carried out, and on which machines."""
+    if arguments.scheduler is None:
+        places = local_places(1 if arguments.workers is None else arguments.workers)
+        if len(places) > 1 and "cuda" in ask.axes.get("arch", ()):
+            raise SceneError("--workers above 1 does not go with --arch cuda: timed runs would share the device")
+        return places, [machine()]
+    if arguments.workers is not None:
+        raise SceneError("--workers is for this machine's processes, and --scheduler has workers of its own: give one of them")
+    from taisoft.study.cluster import cluster_places, connect
+
+    client = stack.enter_context(closing(connect(arguments.scheduler)))
+    ask.scene = str(Path(ask.scene).absolute()) if ask.scene.endswith((".py", ".toml")) else ask.scene
+    return cluster_places(client)
+
+
+def asked(arguments: Namespace) -> Ask:
+    """What the options ask for. Raises SceneError for values that no study takes."""
+    axes = {}
+    for key in AXES:
+        if (text := getattr(arguments, key)) is not None:
+            axes[key] = values_of(key, text)
+    for key in ("seconds", "reference_dt", "tolerance"):
+        if (value := getattr(arguments, key)) is not None:
+            checks.number(value, f"--{key.replace('_', '-')}", above=0.0)
+    checks.whole(arguments.repeats, "--repeats", tuple(range(1, 101)))
+    checks.whole(arguments.reference_refine, "--reference-refine", WHOLE["refine"])
+    return Ask(
+        arguments.scene, axes, arguments.allow_outside, arguments.seconds, arguments.reference_dt,
+        arguments.reference_integrator, arguments.reference_refine, arguments.repeats, arguments.tolerance, arguments.by,
+    )  # fmt: skip
+
+
+def values_of(key: str, text: str) -> list:
+    """The values of an axis from a comma list, each once; `none` is adaptive."""
+    option = f"--{key.replace('_', '-')}"
+    values = [parse_scalar(part.strip(), part, option) for part in text.split(",")]
+    for k, value in enumerate(values):
+        if key in WHOLE:
+            checks.whole(value, option, WHOLE[key])
+        else:
+            try:
+                check_solver(**{key: value})
+            except SceneError as error:
+                raise SceneError(f"{option} {text}: {error}") from None
+        if value in values[:k]:
+            raise SceneError(f"{option} {text}: {value} is given twice")
+    return [float(value) if key == "dt" else value for value in values]
+
+
+def _tell(text: str) -> None:
+    print(f"taisoft: {text}", file=sys.stderr, flush=True)

@@ -1,0 +1,152 @@
+"""One run of a study, in a process of its own: followed once at the frames, then timed from its start without them."""
+
+import time
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+
+from taisoft import runtime
+from taisoft.elements.reference import lumped_mass, traction_forces, weight_mass
+from taisoft.errors import SimulationError, TaisoftError
+from taisoft.mesh.quality import edge_lengths
+from taisoft.output.report import extremes, machine, peak_memory, versions
+from taisoft.records import RunReport
+from taisoft.scene.scene import Scene
+from taisoft.simulator import Simulator
+from taisoft.study.store import pack
+from taisoft.study.stretch import advance
+from taisoft.timing import load_average, usable_cores
+
+ENOUGH_SECONDS = 20.0  # a run of so much wall time is not repeated: the followed one is its time
+SHORT_SECONDS, MOST_RUNS = 0.5, 25  # short ones are repeated more often, until they took so long or were so many
+
+
+def measure(variant: Callable[[int, int | None], Scene], task: dict) -> dict:
+    """The record of one run, as plain data; a run that fails is a record that says why.
+
+    task: `setting`, `fixed` (further arguments of Simulator), `frame` [s], `frames`, `steps` (in a frame), `repeats` (timed
+    runs at least, 0 for none). Raises TaisoftError for a scene that cannot be made.
+    """
+    setting = dict(task["setting"])
+    refine, order = setting.pop("refine"), setting.pop("order")
+    scene = variant(refine, order)
+    record = {"task": task} | _facts(scene, setting["integrator"], task) | _place()
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", UserWarning)
+        record |= _run(scene, setting | task["fixed"], task)
+    record["warnings"] = list(dict.fromkeys(str(one.message) for one in told if issubclass(one.category, UserWarning)))
+    return record | {"load_at_the_end": load_average(), "peak_memory_bytes": peak_memory(), "threads": runtime.threads()}
+
+
+def _place() -> dict:
+    return {"machine": machine(), "versions": versions(), "cores": usable_cores(), "load": load_average()}
+
+
+def _facts(scene: Scene, integrator: str, task: dict) -> dict:
+    """What is known before the run: sizes, and which laws of conservation hold."""
+    bodies = scene.bodies
+    damped = any(b.material.mass_damping or b.material.stiffness_damping for b in bodies)
+    led = any(c.path is not None for b in bodies for c in b.constraints) or any(o.path is not None for o in scene.obstacles)
+    loaded = any(b.tractions or b.forces for b in bodies)
+    pushes = scene.pushes(task["fixed"].get("self_collision", False))
+    free = not any(b.constraints for b in bodies) and not any(b.material.mass_damping for b in bodies)
+    free = free and not (pushes and scene.obstacles)
+    return {
+        "bodies": [[b.name, b.n_nodes] for b in bodies],
+        "nodes": sum(b.n_nodes for b in bodies),
+        "tets": sum(b.mesh.n_tets for b in bodies),
+        "orders": sorted({b.order for b in bodies}),
+        "smallest_edge": min(float(edge_lengths(b.mesh.vertices, b.mesh.tets).min()) for b in bodies),  # [m]
+        "keeps_energy": not (damped or led or loaded or pushes),
+        "momentum_rate": _load_of(scene).tolist() if free else None,  # [N]
+    }
+
+
+def _load_of(scene: Scene) -> np.ndarray:
+    """Sum of weights, tractions and forces (3,) [N]."""
+    total = sum(weight_mass(b).sum() for b in scene.bodies) * scene.gravity
+    for body in scene.bodies:
+        for load in body.tractions:
+            total = total + traction_forces(body, load.triangles, load.value).sum(axis=0)
+        for load in body.forces:
+            total = total + (load.value if load.value.ndim == 1 else load.value.sum(axis=0))
+    return total
+
+
+def _run(scene: Scene, simulator: dict, task: dict) -> dict:
+    start = time.perf_counter()
+    try:
+        with Simulator(scene, **simulator) as sim:
+            built = time.perf_counter() - start
+            return {"build_seconds": built} | _follow_and_time(sim, task)
+    except TaisoftError as error:
+        return {"status": "failed", "problems": [str(error)], "seconds": [], "path": None}
+
+
+def _follow_and_time(sim: Simulator, task: dict) -> dict:
+    observer, length = Observer(sim), task["frame"] * task["frames"]
+    result = sim.run(length, on_frame=observer.frame, fps=1.0 / task["frame"])
+    numbers = {
+        "status": result.status, "problems": result.problems, "steps": result.steps, "reports": len(result.step_reports),
+        "extremes": extremes(result.step_reports), "explicit": sim.settings.explicit, "dt": sim.dt,
+        **_counts(result), "seconds": [], "path": None,
+    }  # fmt: skip
+    if result.status == "failed":
+        return numbers | {"compile_seconds": sim.compile_seconds}
+    if task["repeats"]:
+        try:
+            numbers["seconds"] = list(_timed(sim, task, (result.wall_seconds - observer.seconds) / length))
+        except SimulationError as error:  # what ran once may still fail, where threads change the order of sums
+            return numbers | {"status": "failed", "problems": [*result.problems, f"when it was repeated: {error}"]}
+    return numbers | observer.numbers() | {"compile_seconds": sim.compile_seconds}
+
+
+def _counts(result: RunReport) -> dict:
+    reports = result.step_reports
+    return {
+        "unconverged": sum(not r.converged for r in reports),
+        "newton_iterations": sum(r.newton_iterations for r in reports),
+        "linear_iterations": sum(r.linear_iterations for r in reports),
+        "contact_iterations": sum(r.contact_iterations for r in reports),
+    }
+
+
+def _timed(sim: Simulator, task: dict, followed: float):
+    """Wall seconds per simulated second of each timed run; followed: those of the run that was followed."""
+    length = task["frame"] * task["frames"]
+    if followed * length > ENOUGH_SECONDS:  # without the first launch of each kernel
+        yield followed
+        return
+    total, count = 0.0, 0
+    while count < task["repeats"] or (total < SHORT_SECONDS and count < MOST_RUNS):
+        sim.reset()
+        seconds = advance(sim, task["steps"] * task["frames"]).seconds
+        total, count = total + seconds, count + 1
+        yield seconds / length
+
+
+class Observer:
+    """Positions, energies and momentum at the frames. seconds: wall time that this took."""
+
+    def __init__(self, sim: Simulator):
+        self.seconds = 0.0
+        of = lumped_mass if sim.settings.explicit else weight_mass
+        self._mass = np.concatenate([of(body) for body in sim.scene.bodies])
+        self._path: list[np.ndarray] = []
+        self._energies: list[tuple] = []
+        self._momentum: list[np.ndarray] = []
+
+    def frame(self, sim: Simulator, _index: int, _report) -> None:
+        """For Simulator.run."""
+        start = time.perf_counter()
+        self._path.append(sim.positions())
+        e = sim.energies()
+        self._energies.append((e.kinetic, e.elastic, e.gravity))
+        self._momentum.append(self._mass @ sim.velocities())
+        self.seconds += time.perf_counter() - start
+
+    def numbers(self) -> dict:
+        """As plain data: energies (k,3) [J], momentum (k,3) [kg m/s], path (k,n,3) [m] packed."""
+        momentum = np.array(self._momentum).tolist()
+        return {"energies": np.array(self._energies).tolist(), "momentum": momentum, "path": pack(np.array(self._path))}

@@ -1,0 +1,34 @@
+"""The files of a study: study.md, study.csv, study.json and, with matplotlib, study.png."""
+
+from pathlib import Path
+
+from taisoft.errors import OutputError
+from taisoft.output.files import write_bytes
+from taisoft.output.plot import require_matplotlib
+from taisoft.output.report import json_text
+from taisoft.study.plot import draw
+from taisoft.study.results import Study, plain
+from taisoft.study.table import csv_of, text_of
+
+FILES = ("study.md", "study.csv", "study.json", "study.png")
+
+
+def write(study: Study, folder: Path) -> str:
+    """Write all of them; returns a sentence where there is no picture, else an empty text. Raises OutputError."""
+    write_bytes(folder / "study.md", text_of(study).encode())
+    write_bytes(folder / "study.csv", csv_of(study).encode())
+    write_bytes(folder / "study.json", json_text(plain(study)).encode())
+    picture = folder / "study.png"
+    try:
+        require_matplotlib("study.png")
+    except OutputError as error:
+        why = str(error)
+    else:
+        if draw(study, picture):
+            return ""
+        why = "study.png is not drawn, since no setting has both a time and an error"
+    try:
+        picture.unlink(missing_ok=True)  # of an earlier study: the folder tells of one
+    except OSError as error:
+        raise OutputError(f"cannot remove the earlier {picture}: {error.strerror or error}") from error
+    return why

@@ -1,0 +1,198 @@
+"""Carrying out a study: plan, runs that are not there yet, and what comes of them. No Taichi here: every run is a process."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from taisoft.errors import SceneError, SimulationError
+from taisoft.study.grid import tasks_of
+from taisoft.study.judge import Error, Reference, Row, error_in_space, in_space_sure, make_reference, row_of
+from taisoft.study.results import Ask, Study, describe
+from taisoft.study.store import NoStore, Store, digest, unpack
+from taisoft.study.workers import LocalPlace, Place, carry_out
+from taisoft.timing import summarise, usable_cores
+
+EXPLICIT_KINDS = {True: "explicit", False: "implicit"}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a task: a record, or why there is none: it failed without one, or was left out."""
+
+    task: dict
+    record: dict | None
+    failed: str
+    left_out: str
+
+
+@dataclass
+class Runner:
+    """Plans and carries out a study. places: where; machines: what they are; tell: for a line on what goes on."""
+
+    ask: Ask
+    places: list[Place]
+    machines: list[dict]
+    asked: Callable[[], bool]
+    seconds_left: Callable[[], float]
+    tell: Callable[[str], None]
+    store: Store | NoStore = field(default_factory=NoStore)
+    planner: Place = field(default_factory=lambda: LocalPlace(usable_cores()))
+
+    def run(self, plan: dict) -> Study:
+        """The study of a plan. Raises OutputError where a finished run cannot be kept."""
+        study = Study(self.ask, plan, notes=list(plan["notes"]), machines=self.machines, workers=len(self.places))
+        study.kept = isinstance(self.store, Store)
+        references, settings = tasks_of(plan)
+        tasks = [*references, *settings]
+        keys = [self._key(plan, task) for task in tasks]
+        records, failed, unfinished = self._carry_out(plan, dict(zip(keys, tasks)))
+        study.ended = "; ".join(dict.fromkeys(unfinished.values()))
+        study.notes += self.store.damaged
+        outcomes = [Outcome(task, records.get(k), failed.get(k, ""), unfinished.get(k, "")) for k, task in zip(keys, tasks)]
+        found = self._references(study, outcomes[: len(references)])
+        self._rows(study, outcomes[len(references) :], found)
+        _tell_differences(study, records)
+        return study
+
+    def plan(self) -> dict | None:
+        """Of a child of ours on this machine, which loads the scene; its time is not of the budget.
+
+        None where it was interrupted. Raises SceneError for what cannot be studied.
+        """
+        answers: list[dict] = []
+        request = self._request("plan") | {"ask": self.ask.of_plan()}
+
+        def done(_: str, answer: dict) -> None:
+            answers.append(answer)
+
+        left = carry_out([("plan", request)], [self.planner], done, seconds_left=lambda: 1.0, asked=self.asked)
+        if left:
+            return None
+        if "answer" not in answers[0]:
+            raise SceneError(answers[0].get("error") or f"the scene {self.ask.scene}: {answers[0]['crash']}")
+        plan = answers[0]["answer"]
+        if all(case["refused"] for case in plan["cases"]):
+            reasons = "; ".join(dict.fromkeys(case["refused"] for case in plan["cases"]))
+            raise SceneError(f"no combination of the grid can be run: {reasons}")
+        return plan
+
+    def _request(self, do: str) -> dict:
+        return {"do": do, "scene": self.ask.scene, "allow_outside": self.ask.allow_outside}
+
+    def _task(self, plan: dict, task: dict) -> dict:
+        """As `measure` takes it."""
+        shared = {"fixed": plan["fixed"], "frame": plan["frame"], "frames": plan["frames"]}
+        return {"setting": task["setting"], "steps": task["steps"], "repeats": self.ask.repeats if task["timed"] else 0} | shared
+
+    def _key(self, plan: dict, task: dict) -> str:
+        on = [self.machines, len(self.places[0].cores)]
+        return digest([self._task(plan, task), plan["digest"], plan["code"], on])[:32]
+
+    def _carry_out(self, plan: dict, tasks: dict[str, dict]) -> tuple[dict, dict, dict]:
+        """Records by key, those of runs that were finished before among them; sentences on those that gave none."""
+        records, failed = {}, {}
+        for key in tasks:
+            if (record := self.store.read(key)) is not None:
+                records[key] = record
+        before = f", {len(records)} of them done before" if records else ""
+        self.tell(f"{len(tasks)} runs of {plan['frame'] * plan['frames']:g} s{before}")
+        missing = [key for key in tasks if key not in records]
+
+        def done(key: str, answer: dict) -> None:
+            if "answer" in answer:
+                records[key] = self.store.write(key, answer["answer"])
+            else:
+                failed[key] = answer.get("error") or answer["crash"]
+            told = failed.get(key) or _in_short(records[key])
+            self.tell(f"{len(records) + len(failed)} of {len(tasks)}: {describe(tasks[key])}: {told}")
+
+        same = self._request("run") | {"digest": plan["digest"], "code": plan["code"]}
+        requests = [(key, same | {"task": self._task(plan, tasks[key])}) for key in missing]
+        left = carry_out(requests, self.places, done, seconds_left=self.seconds_left, asked=self.asked)
+        return records, failed, left
+
+    def _references(self, study: Study, outcomes: list[Outcome]) -> list[Reference | None]:
+        """Of each planned one, None where it could not be had, which is noted."""
+        found: list[Reference | None] = []
+        for planned, fine, coarse in zip(study.plan["references"], outcomes[::2], outcomes[1::2]):
+            try:
+                for one in (fine, coarse):
+                    if one.record is None:
+                        raise SimulationError(f"{describe(one.task)} is missing: {one.failed or one.left_out}")
+                made = make_reference(fine.record, coarse.record, planned["kind"], planned["order_in_time"])
+                study.references.append(made)
+                study.notes += [f"{describe(fine.task)}: {text}" for text in dict.fromkeys(made.problems)]
+                found.append(made)
+            except SimulationError as error:
+                found.append(None)
+                study.notes.append(f"{error}; what it is needed for has no error")
+        if study.plan["space"] is not None:
+            study.space = found[study.plan["space"]]
+        return found
+
+    def _rows(self, study: Study, outcomes: list[Outcome], references: list[Reference | None]) -> None:
+        """A row a combination, in the order of the grid."""
+        runs = iter(outcomes)
+        sure, study.space_told_by = _sure(study)
+        for case in study.plan["cases"]:
+            if case["refused"]:
+                study.rows.append(Row(case["setting"], "refused", case["refused"]))
+                continue
+            run = next(runs)
+            record = run.record
+            if record is None:
+                study.rows.append(Row(run.task["setting"], "failed" if run.failed else "left out", run.failed or run.left_out))
+                continue
+            study.versions = study.versions or record["versions"]
+            row = row_of(record, _own_reference(study.plan, references, record))
+            row.by_space = study.plan["space"] is not None
+            if study.space is not None and sure is not None and record["path"] is not None:
+                row.in_space, row.in_space_sure = _in_space(study, record), sure
+            study.rows.append(row)
+
+
+def _in_space(study: Study, record: dict) -> Error | None:
+    """The record's error in space; None, with a note, where the two meshes have nothing to compare."""
+    try:
+        return error_in_space(unpack(record["path"]), record["bodies"], study.space)
+    except SimulationError as error:
+        study.notes.append(f"{describe(record['task'])}: {error}")
+        return None
+
+
+def _sure(study: Study) -> tuple[Error | None, str]:
+    """What the reference in space is good to."""
+    if study.space is None:
+        return None, ""
+    mesh = [study.space.setting[key] for key in ("refine", "order")]
+    others = [r for r in study.references if [r.setting[key] for key in ("refine", "order")] != mesh]
+    try:
+        return in_space_sure(study.space, others)
+    except SimulationError as error:
+        study.notes.append(f"what the finest mesh is good to is not known, so that errors in space are not told: {error}")
+        return None, ""
+
+
+def _own_reference(plan: dict, references: list[Reference | None], record: dict) -> Reference | None:
+    """The one on the record's mesh, that solves the same equations."""
+    setting, kind = record["task"]["setting"], EXPLICIT_KINDS[record.get("explicit", False)]
+    for planned, reference in zip(plan["references"], references):
+        same = all(planned["setting"][key] == setting[key] for key in ("refine", "order"))
+        if same and planned["kind"] in ("", kind):
+            return reference
+    return None
+
+
+def _tell_differences(study: Study, records: dict) -> None:
+    """Times that were not taken alike are noted."""
+    names = {record["machine"]["name"] for record in records.values() if record["seconds"]}
+    if len(names) > 1:
+        told = ", ".join(sorted(names))
+        study.notes.append(f"times are of {len(names)} machines ({told}) and can be compared as far as these are alike")
+    study.notes += list(dict.fromkeys(f"warning: {text}" for record in records.values() for text in record["warnings"]))
+
+
+def _in_short(record: dict) -> str:
+    if record["status"] == "failed":
+        return f"failed: {record['problems'][-1]}"
+    seconds = record["seconds"]
+    return record["status"] + (f", {summarise(seconds).median:.3g} s a simulated second" if seconds else "")

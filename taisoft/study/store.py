@@ -1,0 +1,106 @@
+"""Finished runs of a study on disk: one JSON file each, whole or absent, found again by what it depends on.
+
+The key of a run is a digest of the scene's content, the settings, the code that computes, the machine and its threads. A file
+holds its record and a digest of it; one that is damaged is told and run anew.
+"""
+
+import base64
+import hashlib
+import json
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from taisoft import __version__
+from taisoft.output.files import make_folder, write_bytes
+from taisoft.output.report import json_text
+
+RUNS = "runs"
+KIND, FORMAT = "taisoft study run", 1
+PACKAGE = Path(__file__).resolve().parents[1]
+NOT_COMPUTING = ("cli", "view", "output", "study")  # folders of the package that no result depends on
+COMPUTING = ("study/measure.py", "study/stretch.py")  # but for these
+
+
+def code_digest() -> str:
+    """Of taisoft's version and of its files that a result depends on: an edited solver's runs are others."""
+    total = hashlib.sha256(__version__.encode())
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = path.relative_to(PACKAGE).as_posix()
+        if name in COMPUTING or name.split("/")[0] not in NOT_COMPUTING:
+            total.update(name.encode() + path.read_bytes())
+    return total.hexdigest()
+
+
+def digest(values) -> str:
+    """Of plain data."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+class Store:
+    """The finished runs in a study's folder, which is locked. damaged: sentences on files that could not be used; taken: how
+    many were."""
+
+    def __init__(self, folder: Path):
+        self._folder = make_folder(folder / RUNS)
+        for part in (*self._folder.glob("*.part"), *folder.glob("study.*.part")):
+            with suppress(OSError):  # of a study that was killed; what cannot be removed harms nothing
+                part.unlink()
+        self.damaged: list[str] = []
+        self.taken = 0
+
+    def read(self, key: str) -> dict | None:
+        """The record of that key, or None where there is none or it is damaged."""
+        path = self._folder / f"{key}.json"
+        try:
+            content = json.loads(path.read_bytes())
+            if (content["kind"], content["format"]) != (KIND, FORMAT) or content["key"] != key:
+                raise ValueError("it is of another kind, format or run")
+            if content["sha256"] != digest(content["record"]):
+                raise ValueError("its digest is not that of its content")
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+            why = " ".join(str(error).split()) or type(error).__name__
+            self.damaged.append(f"{path} is damaged and its run is done anew: {why}")
+            return None
+        self.taken += 1
+        return content["record"]
+
+    def write(self, key: str, record: dict) -> dict:
+        """Keep a record; returns it as it will be read. Raises OutputError."""
+        plain = json.loads(json_text(record))  # numbers that are not finite become null, here as in the file
+        content = {"kind": KIND, "format": FORMAT, "key": key, "sha256": digest(plain), "record": plain}
+        write_bytes(self._folder / f"{key}.json", json.dumps(content).encode())
+        return plain
+
+
+class NoStore:
+    """Of a study without a folder: it keeps nothing."""
+
+    damaged: list[str] = []
+    taken = 0
+
+    def read(self, key: str) -> None:
+        """Nothing."""
+
+    def write(self, key: str, record: dict) -> dict:
+        """As Store.write."""
+        return json.loads(json_text(record))
+
+
+def pack(values: np.ndarray) -> dict:
+    """An array of float64 as text, bit by bit."""
+    data = zlib.compress(np.ascontiguousarray(values, dtype="<f8").tobytes(), 1)
+    return {"shape": list(values.shape), "zlib_base64": base64.b64encode(data).decode()}
+
+
+def unpack(packed: dict) -> np.ndarray:
+    """The array of `pack`. Raises ValueError for what it did not make."""
+    try:
+        data = zlib.decompress(base64.b64decode(packed["zlib_base64"], validate=True))
+        return np.frombuffer(data, dtype="<f8").reshape(packed["shape"])
+    except (zlib.error, KeyError, TypeError) as error:
+        raise ValueError(f"{type(error).__name__}: {error}") from None

@@ -1,0 +1,189 @@
+"""A study as text: study.md and study.csv."""
+
+import csv
+import io
+import math
+from dataclasses import asdict
+
+from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.study.grid import AXES
+from taisoft.study.judge import Error, Row
+from taisoft.study.results import Study, describe
+
+ALWAYS = ("integrator", "dt")  # axes that have a column even where they do not vary
+ENDED = ("ok", "degraded")
+
+
+def text_of(study: Study) -> str:
+    """The whole study in Markdown: answer, table, what was not run, references, notes."""
+    parts = [f"# {study.ask.scene}: speed against error", answer(study)]
+    if study.ended:
+        on = "The same command goes on with it." if study.kept else "Without --out nothing of it is kept."
+        parts.append(f"Not complete: {study.ended}. {on}")
+    ran = [row for row in study.rows if row.status in (*ENDED, "failed")]
+    if ran:
+        parts.append(run_table(study, ran))
+    parts += [_reasons(title, study.rows, status) for title, status in (("Failed", "failed"), ("Degraded", "degraded"))]
+    parts += [_reasons(title, study.rows, status) for title, status in (("Refused", "refused"), ("Left out", "left out"))]
+    parts.append(_how(study))
+    if study.notes:
+        parts.append("Notes:\n\n" + "\n".join(f"* {note}" for note in study.notes))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def answer(study: Study) -> str:
+    """The cheapest setting within the tolerance, or the nearest one, in a sentence."""
+    goal = f"{study.ask.tolerance:.3g}"
+    if (row := study.cheapest()) is not None:
+        careful = "" if row.status == "ok" else f"; its run is {row.status}"
+        return f"Cheapest within {goal} ({study.ask.by} error): {_named(row, study.ask.by)}{careful}."
+    if (row := study.nearest()) is not None:
+        sure, finer = row.error(study.ask.by)[1], "--reference-refine" if study.space is not None else "--reference-dt"
+        known = "" if sure <= study.ask.tolerance else f" Below {sure:.2g} nothing is known; {finer} gives a better reference."
+        return f"No setting is within {goal} ({study.ask.by} error); the nearest: {_named(row, study.ask.by)}.{known}"
+    return "No setting has both a time and an error."
+
+
+def _named(row: Row, by: str) -> str:
+    return f"{describe({'setting': row.setting})}, {_seconds(row)} s a simulated second, error {shown_error(*row.error(by))}"
+
+
+def run_table(study: Study, rows: list[Row]) -> str:
+    """A row a run; * marks the front. Columns that say the same in every row are left out."""
+    front = study.front()
+    axes = [key for key in AXES if key in ALWAYS or len({row.setting[key] for row in rows}) > 1]
+    in_space = any(row.in_space is not None for row in rows)
+    columns: dict[str, list[str]] = {"": ["*" if row in front else "" for row in rows]}
+    columns |= {_heading(key): [_axis(row.setting[key]) for row in rows] for key in axes}
+    columns["s/sim. s"] = [_seconds(row) for row in rows]
+    columns["spread"] = [percent(spread_of(row.timing)) if row.seconds else "" for row in rows]
+    for name, get in (("time", lambda r: (r.in_time, r.in_time_sure)), ("space", lambda r: (r.in_space, r.in_space_sure))):
+        if name == "time" or in_space:
+            of = f"error in {name}" if in_space else "error"
+            columns[f"{of}, max"] = [_error(*get(row), "max") for row in rows]
+            columns["rms" if not in_space else f"rms in {name}"] = [_error(*get(row), "rms") for row in rows]
+    kept = any(row.energy_kept for row in rows)
+    columns["energy drift" if kept else "energy error"] = [_number(row.energy) for row in rows]
+    columns["momentum"] = [_number(row.momentum) for row in rows]
+    if study.plan["touching"]:
+        columns["penetration/edge"] = [_number(row.penetration) for row in rows]
+        columns["contact residual"] = [_number(row.contact_residual) for row in rows]
+    columns["unconverged"] = [_count(row.unconverged) for row in rows]
+    columns["inverted"] = [_count(row.inverted) for row in rows]
+    columns["status"] = [row.status for row in rows]
+    left = [k for k, name in enumerate(columns) if name in ("", "integrator", "status", "precision", "contact solver")]
+    return markdown(list(columns), list(zip(*columns.values())), left=left)
+
+
+def _how(study: Study) -> str:
+    """What the errors are of, what the references are good to, and how times were taken."""
+    lines = []
+    for reference in study.references:
+        own, setting = reference.own, reference.setting
+        lines.append(
+            f"* {describe({'setting': setting, 'timed': False})}: largest excursion {reference.excursion:.4g} m, own error "
+            f"{own.max:.2g} (max), {own.rms:.2g} (rms), from dt against 2 dt as of order {reference.order_in_time}"
+        )
+    if study.space is not None:
+        sure = next((row.in_space_sure for row in study.rows if row.in_space_sure is not None), None)
+        if sure is not None:
+            lines.append(
+                f"* errors in space are those to the reference with {_mesh(study.space.setting)}; it is good to {sure.max:.2g} "
+                f"(max), {sure.rms:.2g} (rms): {study.space_told_by}"
+            )
+    seconds = study.plan["frame"] * study.plan["frames"] if study.plan["frame"] else 0.0
+    threads = sorted({row.threads for row in study.rows if row.threads})
+    on = f"{' or '.join(map(str, threads)) or 'no'} thread{'s' if threads != [1] else ''}, {study.workers} at a time"
+    told = (
+        f"{seconds:g} s simulated, compared at {study.plan['frames']} frames. Errors are distances over the reference's largest "
+        f"excursion; `<` marks one below what the reference is good to. Times are medians of {_repeats(study)} runs on {on}, "
+        "compiling apart; spread is the distance of the quartiles over the median; * marks the front."
+    )
+    return told + ("\n\nReferences:\n\n" + "\n".join(lines) if lines else "")
+
+
+def _repeats(study: Study) -> str:
+    counts = sorted({len(row.seconds) for row in study.rows if row.seconds}) or [0]
+    return str(counts[0]) if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+
+
+def _mesh(setting: dict) -> str:
+    return f"refine {setting['refine']}" + ("" if setting["order"] is None else f", order {setting['order']}")
+
+
+def _reasons(title: str, rows: list[Row], status: str) -> str:
+    """A list of settings with the reason of their status; equal reasons together."""
+    by_reason: dict[str, list[dict]] = {}
+    for row in rows:
+        if row.status == status:
+            by_reason.setdefault(row.reason, []).append(row.setting)
+    if not by_reason:
+        return ""
+    return f"{title}:\n\n" + "\n".join(f"* {_all_of(settings)}: {reason}" for reason, settings in by_reason.items())
+
+
+def _all_of(settings: list[dict]) -> str:
+    """Settings in short: what they are the product of, where they are one."""
+    values = {key: list(dict.fromkeys(s[key] for s in settings)) for key in AXES}
+    if len(settings) > 2 and len(settings) == math.prod(map(len, values.values())):
+        varying = [f"{key} {' | '.join(map(_axis, of))}" for key, of in values.items() if len(of) > 1]
+        return f"{settings[0]['integrator']}, " * (len(values["integrator"]) == 1) + ", ".join(varying)
+    return "; ".join(describe({"setting": setting}) for setting in settings)
+
+
+def shown_error(error: float, sure: float) -> str:
+    """An error, or "< " what its reference is good to."""
+    return f"< {sure:.2g}" if error < sure else f"{error:.3g}"
+
+
+def _error(error: Error | None, sure: Error | None, by: str) -> str:
+    return "" if error is None else shown_error(getattr(error, by), getattr(sure, by))
+
+
+def _heading(key: str) -> str:
+    return "dt [s]" if key == "dt" else key.replace("_", " ")
+
+
+def _axis(value) -> str:
+    return "adaptive" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _seconds(row: Row) -> str:
+    return f"{row.timing.median:.3g}" if row.seconds else ""
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.2g}"
+
+
+def _count(value: int | None) -> str:
+    return "" if value is None else str(value)
+
+
+def csv_of(study: Study) -> str:
+    """A row a combination with every number of it, RFC 4180; what is not known is empty."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    front = study.front()
+    for number, row in enumerate(study.rows):
+        values = _cells(row, study, row in front)
+        if number == 0:
+            writer.writerow(values)
+        writer.writerow(values.values())
+    return text.getvalue()
+
+
+def _cells(row: Row, study: Study, on_front: bool) -> dict:
+    timing = row.timing
+    cells = dict(row.setting) | {"status": row.status, "reason": row.reason, "on_front": on_front}
+    cells |= {"seconds_per_simulated_second": timing and timing.median, "spread": timing and spread_of(timing)}
+    cells |= {"repeats": len(row.seconds)}
+    for name in ("in_time", "in_space"):
+        error, sure = getattr(row, name), getattr(row, f"{name}_sure")
+        for by in ("max", "rms"):
+            cells[f"error_{name}_{by}"] = error and getattr(error, by)
+            cells[f"reference_{name}_{by}"] = sure and getattr(sure, by)
+    told = ("energy", "energy_kept", "momentum", "penetration", "contact_residual", "unconverged", "inverted")
+    rest = asdict(row)
+    cells |= {key: rest[key] for key in (*told, "compile_seconds", "steps", "nodes", "tets", "threads", "machine")}
+    return {key: "" if value is None else value for key, value in cells.items()} | {"error_by": study.ask.by}

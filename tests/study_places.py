@@ -1,0 +1,82 @@
+"""Places of a study that start no process: runs in this one, or of a program made up."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from taisoft.cli import study_child
+from taisoft.output.report import json_text
+from taisoft.study.store import pack
+
+
+class InProcess:
+    """Carries out requests in this process."""
+
+    cores = [0]
+
+    def __init__(self):
+        self.requests, self._answer = [], None
+
+    def start(self, request: dict) -> None:
+        self.requests.append(request)
+        self._answer = json.loads(json_text(study_child._answer(request)))
+
+    def poll(self) -> dict | None:
+        answer, self._answer = self._answer, None
+        return answer
+
+    def stop(self) -> None:
+        self._answer = None
+
+
+class Pendulum(InProcess):
+    """Answers as if a mass on a spring, x'' = -x, had been run by implicit Euler, or by trapezes under other names.
+
+    failing: sentences by dt, of runs that fail; crashing: by dt, of processes that end without an answer.
+    """
+
+    def __init__(self, plan: dict, failing=(), crashing=()):
+        super().__init__()
+        self.plan, self.failing, self.crashing = plan, dict(failing), dict(crashing)
+
+    def start(self, request: dict) -> None:
+        self.requests.append(request)
+        if request["do"] == "plan":
+            self._answer = {"answer": self.plan}
+            return
+        dt = request["task"]["setting"]["dt"]
+        self._answer = {"crash": self.crashing[dt]} if dt in self.crashing else {"answer": self._record(request["task"])}
+
+    def _record(self, task: dict) -> dict:
+        setting = task["setting"]
+        A = np.array([[0.0, 1.0], [-1.0, 0.0]])
+        h, eye = setting["dt"], np.eye(2)
+        euler = setting["integrator"] == "implicit_euler"
+        step = np.linalg.inv(eye - h * A) if euler else np.linalg.solve(eye - h / 2 * A, eye + h / 2 * A)
+        states = [np.array([1.0, 0.0])]
+        for _ in range(task["frames"]):
+            states.append(np.linalg.matrix_power(step, task["steps"]) @ states[-1])
+        x, v = np.array(states).T
+        path = np.zeros((len(x), 2, 3))
+        path[:, 1, 0] = x
+        why = self.failing.get(h)
+        energies = np.stack([v**2 / 2, x**2 / 2, 0 * x], axis=1).tolist()
+        momentum = np.stack([v, 0 * v, 0 * v], axis=1).tolist()
+        extremes = {name: {"max": 0.0} for name in ("n_inverted", "contact_residual", "max_penetration")}
+        return {
+            "task": task, "status": "failed" if why else "ok", "problems": [why] if why else [], "warnings": [],
+            "seconds": [] if why else [0.1 / h * (1.0 + 0.1 * k) for k in range(task["repeats"])],
+            "compile_seconds": 1.0, "threads": 1, "cores": [0], "machine": {"name": "here"}, "versions": {}, "nodes": 2,
+            "tets": 1, "steps": task["steps"] * task["frames"], "unconverged": 0, "explicit": False, "extremes": extremes,
+            "smallest_edge": 1.0, "keeps_energy": True, "momentum_rate": None, "bodies": [["mass", 2]],
+            "energies": energies, "momentum": momentum, "path": None if why else pack(path),
+        }  # fmt: skip
+
+
+def is_running(pid: int) -> bool:
+    """Whether the process is there and no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False

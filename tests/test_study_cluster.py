@@ -1,0 +1,95 @@
+"""A study on a Dask cluster of two worker processes on this machine, on loopback addresses:
+
+* every run is carried out by a worker, in a process of its own on cores of its own, and the answer is that of local runs;
+* a worker that is gone hands its run to another one; without any the study says so; runs are ended when the study ends.
+"""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+
+import pytest
+from command import BEAM, ROOT, write
+from study_places import is_running
+
+pytest.importorskip("distributed")
+
+from taisoft.cli import main
+from taisoft.study.cluster import cluster_places, connect
+from taisoft.study.workers import carry_out
+
+SLOW = "import os, time\n\n\ndef build():\n    open({file!r}, 'a').write(f'{{os.getpid()}}\\n')\n    time.sleep(60)\n"
+
+
+def dask(stack: ExitStack, *arguments) -> subprocess.Popen:
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "DASK_DISTRIBUTED__DIAGNOSTICS__NVML": "False"}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "distributed.cli." + arguments[0], *map(str, arguments[1:])], env=environment,
+        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
+    )  # fmt: skip
+    stack.callback(process.wait)
+    stack.callback(process.kill)
+    return process
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """(address, worker processes) of a scheduler and two workers on 127.0.0.1."""
+    with ExitStack() as stack:
+        scheduler = dask(stack, "dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show")
+        address = next(m[1] for line in scheduler.stderr if (m := re.search(r"(tcp://127\.0\.0\.1:\d+)", line)))
+        common = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", tmp_path)
+        workers = [dask(stack, "dask_worker", address, *common, "--host", "127.0.0.1") for _ in range(2)]
+        with connect(address) as client:
+            client.wait_for_workers(2, timeout=60)
+        yield address, workers
+
+
+def test_a_study_on_a_cluster(cluster, tmp_path, capsys):
+    address, _ = cluster
+    path = write(tmp_path / "beam.py", BEAM)
+    arguments = ["--repeats", "1", "--dt", "0.00625,0.003125", "--integrator", "symplectic_euler"]
+    assert main(["study", str(path), "--out", str(tmp_path / "a"), "--scheduler", address, *arguments]) == 0
+    table = capsys.readouterr().out
+    assert "1 thread," in table and table.count("| ok ") == 2
+    errors = re.findall(r"^\|.*\| symplectic_euler \|[^|]*\|[^|]*\| *(\S+) \|", table, re.MULTILINE)
+    assert main(["study", str(path), "--out", str(tmp_path / "b"), *arguments]) == 0
+    local = re.findall(r"^\|.*\| symplectic_euler \|[^|]*\|[^|]*\| *(\S+) \|", capsys.readouterr().out, re.MULTILINE)
+    assert errors == local and len(errors) == 2
+
+
+def test_workers_have_cores_of_their_own_and_can_be_lost(cluster, tmp_path):
+    address, processes = cluster
+    pids = tmp_path / "pids"
+    path = write(tmp_path / "slow.py", SLOW.format(file=str(pids)))
+    request = {"do": "plan", "scene": str(path), "allow_outside": False, "ask": {}}
+    with connect(address) as client:
+        places, machines = cluster_places(client)
+        assert len(places) == 2 and len(machines) == 1
+        assert len(set(places[0].cores) | set(places[1].cores)) == len(places[0].cores) + len(places[1].cores)
+
+        def started() -> list[int]:
+            return [int(line) for line in pids.read_text().split()] if pids.exists() else []
+
+        seen: list[int] = []
+
+        def asked() -> bool:
+            """Kill a worker when both runs have begun; its run then waits for the other worker, which is busy."""
+            if len(started()) == 2 and not seen:
+                seen.extend(started())
+                processes[0].kill()
+            return False
+
+        end = time.monotonic() + 20
+        left = carry_out(
+            [("a", request), ("b", request)], places, lambda key, answer: None, asked=asked,
+            seconds_left=lambda: end - time.monotonic(),
+        )  # fmt: skip
+        assert set(left.values()) == {"the budget was spent"} and len(left) == 2 and len(seen) == 2
+    deadline = time.monotonic() + 10
+    while any(map(is_running, started())):
+        assert time.monotonic() < deadline, "a run outlives the study"
+        time.sleep(0.1)

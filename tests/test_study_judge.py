@@ -1,0 +1,59 @@
+"""Errors between meshes: nodes are paired by the places where they start, body by body, and what the finest mesh is good to."""
+
+import numpy as np
+import pytest
+
+from taisoft.errors import SimulationError
+from taisoft.mesh.nodes import make_nodes
+from taisoft.mesh.shapes import box_mesh
+from taisoft.study.judge import Error, Reference, distance, error_in_space, in_space_sure, shared_nodes
+
+COARSE = box_mesh((2, 1, 1), (2.0, 1.0, 1.0))
+FINE = make_nodes(COARSE, 2).positions
+
+
+def reference(start: np.ndarray, bodies: list, shift: float, own: float = 0.0, refine: int = 0) -> Reference:
+    """Whose nodes all go 1 + shift [m] along x, in two frames."""
+    path = np.stack([start, start + [1.0 + shift, 0, 0]])
+    zeros = np.zeros(2), 1.0, np.zeros((2, 3))
+    return Reference({"refine": refine, "order": None}, path, 1.0 + shift, Error(own, own), *zeros, bodies)
+
+
+def test_nodes_are_paired_by_place_within_their_body():
+    shuffled = np.random.default_rng(0).permutation(len(FINE))
+    start = np.concatenate([COARSE.vertices, COARSE.vertices])  # two bodies in one place
+    other = np.concatenate([FINE[shuffled], FINE])
+    n, m = COARSE.n_verts, len(FINE)
+    own, theirs = shared_nodes(start, [["a", n], ["b", n]], other, [["a", m], ["b", m]])
+    assert np.array_equal(own, np.arange(2 * n)) and np.array_equal(start[own], other[theirs])
+    assert (theirs[:n] < m).all() and (theirs[n:] >= m).all()
+
+
+def test_meshes_that_share_no_node_cannot_be_compared():
+    with pytest.raises(SimulationError, match="body 'a': no node of one mesh"):
+        shared_nodes(COARSE.vertices + 0.1, [["a", COARSE.n_verts]], FINE, [["a", len(FINE)]])
+
+
+def test_the_error_in_space_is_over_shared_nodes_and_the_finest_excursion():
+    finest = reference(FINE, [["a", len(FINE)]], shift=1.0)
+    path = np.stack([COARSE.vertices, COARSE.vertices + [1.5, 0, 0]])
+    found = error_in_space(path, [["a", COARSE.n_verts]], finest)
+    assert (found.max, found.rms) == (pytest.approx(0.25), pytest.approx(0.25 / np.sqrt(2)))
+
+
+def test_the_finest_mesh_is_as_good_as_a_third_of_the_distance_to_the_next():
+    finest = reference(FINE, [["a", len(FINE)]], shift=1.0, own=1e-3, refine=2)
+    near = reference(COARSE.vertices, [["a", COARSE.n_verts]], shift=0.9, refine=1)
+    far = reference(COARSE.vertices, [["a", COARSE.n_verts]], shift=0.5)
+    own, told = in_space_sure(finest, [far, near])
+    assert own.max == pytest.approx(0.1 / 2.0 / 3.0) and "refine 1" in told
+    assert in_space_sure(finest, [])[0] == finest.own
+    finest.own = Error(0.5, 0.5)
+    assert in_space_sure(finest, [far, near])[0].max == 0.5
+
+
+def test_distances_are_relative():
+    path = np.zeros((2, 2, 3))
+    other = path.copy()
+    other[1, 0] = (3.0, 0.0, 4.0)
+    assert distance(path, other, 10.0) == Error(pytest.approx(0.25), 0.5)

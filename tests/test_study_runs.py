@@ -1,0 +1,156 @@
+"""A study's real runs of small scenes, most of them in this process:
+
+* the order of convergence that a study sees is that of the integrator;
+* errors in space fall with refinement; energy and momentum are kept where they should be;
+* a run that fails is a record with its reason; timed runs are on the cores and threads that were theirs.
+"""
+
+import os
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+from command import write
+from study_places import InProcess
+
+from taisoft.errors import SceneError
+from taisoft.simulator import Simulator
+from taisoft.study import measure
+from taisoft.study.results import Ask
+from taisoft.study.runner import Runner
+from taisoft.study.workers import LocalPlace, carry_out, local_places
+from taisoft.timing import usable_cores
+
+SCENE = '''"""A bar that swings: held at one end, or free and thrown."""
+import taisoft as ts
+
+solver = {"dt": 0.01, "integrator": "INTEGRATOR", "seconds": 0.4, "fps": 50}
+
+
+def build():
+    scene = ts.Scene()
+    bar = scene.add_body(ts.box_mesh((2, 1, 1), (2.0, 1.0, 1.0)), ts.Material(young=1e5), name="bar")
+    HOLD
+    return scene
+'''
+HELD, FREE = "bar.fix(lambda X: X[:, 0] < -0.99)", "bar.velocity[:] = (1.0, 5.0, 0.0)"
+
+
+@pytest.fixture
+def lent(monkeypatch):
+    """Runs that differ in dt alone get one simulator, from its start: compiling takes most of the time."""
+    made: dict[tuple, Simulator] = {}
+
+    def lend(scene, *, dt, **settings):
+        key = (scene.bodies[0].n_nodes, *settings.items())
+        if key not in made:
+            made[key] = Simulator(scene, dt=dt, **settings)
+        made[key].dt = dt
+        made[key].reset()
+        return nullcontext(made[key])
+
+    monkeypatch.setattr(measure, "Simulator", lend)
+    yield
+    for sim in made.values():
+        sim.close()
+
+
+def study_of(tmp_path, hold: str = HELD, **ask):
+    path = write(tmp_path / "bar.py", SCENE.replace("HOLD", hold))
+    place = InProcess()
+    return run(place, Ask(str(path), repeats=1, **ask))
+
+
+def run(place: InProcess, ask: Ask):
+    runner = Runner(ask, [place], ["here"], lambda: False, lambda: 1.0, lambda _: None, planner=place)
+    return runner.run(runner.plan())
+
+
+@pytest.mark.parametrize(
+    "integrator, order",
+    [("velocity_verlet", 2), ("symplectic_euler", 1), ("implicit_euler", 1), ("bdf2", 2), ("implicit_midpoint", 2)],
+)
+def test_the_order_of_convergence_is_the_integrators(tmp_path, lent, integrator, order):
+    axes = {"dt": [0.01, 0.005, 0.0025], "integrator": [integrator], "precision": ["f64"]}
+    study = study_of(tmp_path, axes=axes, reference_integrator="velocity_verlet")
+    rows = study.judged()
+    assert [row.setting["dt"] for row in rows] == axes["dt"] and study.references[0].setting["integrator"] == "velocity_verlet"
+    errors = np.array([row.in_time.rms for row in rows])
+    assert np.allclose(np.log2(errors[:-1] / errors[1:]), order, atol=0.25), errors
+    assert (errors > 10 * study.references[0].own.rms).all()  # so that they are facts
+    assert all(row.status == "ok" and row.unconverged == 0 and row.energy_kept for row in rows)
+
+
+def test_refinement_and_what_is_kept_in_flight(tmp_path, lent):
+    axes = {"dt": [0.005], "integrator": ["velocity_verlet"], "precision": ["f64"], "refine": [0, 1]}
+    study = study_of(tmp_path, FREE, axes=axes, reference_refine=0)
+    coarse, fine = study.rows
+    assert fine.nodes > coarse.nodes and fine.tets == 8 * coarse.tets
+    for row in study.rows:  # nothing deforms: both meshes fly alike, and exactly
+        assert row.in_time.max < 1e-9 and row.in_space.max < 1e-9 and row.energy < 1e-9 and row.momentum < 1e-9
+
+
+def test_a_run_that_fails_is_a_record_with_its_reason(tmp_path):
+    path = write(tmp_path / "bar.py", SCENE.replace("HOLD", "bar.move(lambda X: X[:, 0] < -0.99, path)") + (
+        "\n\ndef path(t):\n    return (0, 0, 0) if t < 0.2 else 1 / 0\n"
+    ))  # fmt: skip
+    place = InProcess()
+    ask = Ask(str(path), {"dt": [0.01], "integrator": ["velocity_verlet"], "precision": ["f64"]}, repeats=1)
+    study = run(place, ask)
+    assert study.rows[0].status == "failed" and "ZeroDivisionError" in study.rows[0].reason
+    assert "ZeroDivisionError" in study.notes[0]
+
+
+@pytest.mark.parametrize(
+    "solver, told",
+    [
+        ('{"dtt": 0.1}', "solver dict: no setting is called 'dtt' (did you mean dt?)"),
+        ('{"dt": "a"}', "the scene's solver dict: dt must be a number, not 'a'"),
+    ],
+)
+def test_a_bad_solver_dict_is_told(tmp_path, solver, told):
+    path = write(tmp_path / "bar.py", SCENE.replace("HOLD", HELD) + f"\n\nsolver = {solver}\n")
+    with pytest.raises(SceneError) as error:
+        run(InProcess(), Ask(str(path)))
+    assert told in str(error.value)
+
+
+# --- processes --------------------------------------------------------------------------------------------------------
+
+PINNED = '''"""Tells its cores, as a scene that fails."""
+import os
+
+
+def build():
+    import taichi, threading
+    raise ValueError(f"cores {sorted(os.sched_getaffinity(0))}")
+'''
+
+
+def answers_of(requests: list, places: list) -> dict:
+    answers: dict = {}
+    assert carry_out(requests, places, answers.__setitem__, seconds_left=lambda: 1.0, asked=lambda: False) == {}
+    return answers
+
+
+def request(path) -> dict:
+    return {"do": "plan", "scene": str(path), "allow_outside": False, "ask": {}}
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system pins no process")
+def test_workers_are_pinned_to_cores_of_their_own(tmp_path):
+    path = write(tmp_path / "pinned.py", PINNED)
+    cores = usable_cores()
+    number = min(2, len(cores))
+    places = local_places(number)
+    own = [set(place.cores) for place in places]
+    assert len(own) == number and len(set.union(*own)) == sum(map(len, own)) <= len(cores)
+    answers = answers_of([(str(k), request(path)) for k in range(number)], places)
+    told = {answer["error"].partition("ValueError: ")[2] for answer in answers.values()}
+    assert told == {f"cores {sorted(cores)}" for cores in own}
+
+
+def test_a_process_that_ends_without_an_answer_is_told(tmp_path):
+    path = write(tmp_path / "dead.py", "import os, sys\nprint('hello', file=sys.stderr, flush=True)\nos._exit(7)\n")
+    answers = answers_of([("a", request(path))], [LocalPlace(usable_cores())])
+    assert answers["a"] == {"crash": "its process ended with exit status 7 without an answer: hello"}
