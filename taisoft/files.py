@@ -7,6 +7,7 @@ folder fsynced: whatever stands under a final name is complete.
 import errno
 import itertools
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -50,6 +51,23 @@ def replacing(path: str | Path, n_bytes: int | None = None) -> Iterator[Path]:
         raise write_error(path, error, n_bytes) from error
     finally:
         with suppress(OSError):  # gone after a rename; unreachable when the folder is
+            part.unlink()
+
+
+def name_also(path: Path, other: Path) -> None:
+    """Let a file, if it is there, have another name too, which it takes from any other file in one step. Raises OSError."""
+    part = part_path(other)
+    try:
+        try:
+            os.link(path, part)
+        except FileNotFoundError:
+            return
+        except OSError:  # a file system without links
+            shutil.copyfile(path, part)
+            _fsync(part, os.O_RDWR)
+        os.replace(part, other)
+    finally:
+        with suppress(OSError):
             part.unlink()
 
 

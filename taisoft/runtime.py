@@ -22,9 +22,11 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 from taisoft.errors import SimulationError
 from taisoft.launching import Launch, places_of, prepare
+from taisoft.memory import address_space, told
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
+POOL = 2**30  # bytes of address space that Taichi asks for at a time on the CPU
 
 launches: Counter[str] = Counter()  # kernel name -> launches so far in this process
 _open: list["Runtime"] = []  # simulators that hold the runtime now
@@ -100,11 +102,18 @@ def _initialise(arch: str, precision: str) -> None:
         os.getcwd()
     except FileNotFoundError:
         raise SimulationError("the working folder no longer exists: change to one that does") from None
-    with contextlib.redirect_stdout(io.StringIO()):  # its greeting
-        ti.init(
-            arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
-            fast_math=False, offline_cache=True, offline_cache_file_path=_cache_folder(), log_level=ti.ERROR, random_seed=0,
-        )  # fmt: skip
+    folder = _cache_folder()
+    room = address_space()
+    if arch == "cpu" and room is not None and room < POOL:
+        raise SimulationError(f"not enough memory to start Taichi: {told(POOL)} are needed at once, available: {told(room)}")
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # its greeting
+            ti.init(
+                arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
+                fast_math=False, offline_cache=True, offline_cache_file_path=folder, log_level=ti.ERROR, random_seed=0,
+            )  # fmt: skip
+    except RuntimeError as error:
+        raise SimulationError(f"Taichi does not start: {(str(error).splitlines() or ['no reason given'])[0]}") from None
     trees["open"] = 0
     for known in _known:  # they hold the Taichi that was
         known.clear()

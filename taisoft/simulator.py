@@ -6,7 +6,7 @@ import weakref
 from taisoft import runtime
 from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import measure
-from taisoft.errors import SceneError
+from taisoft.errors import SceneError, no_memory
 from taisoft.fields import FieldArena
 from taisoft.model import build_model
 from taisoft.records import RunReport, StepReport
@@ -77,8 +77,10 @@ class Simulator(Resuming):
             self.reset()
             if touching and not scene.allow_initial_overlap:
                 self._refuse_overlap()
-        except BaseException:
+        except BaseException as error:
             _release(self._arena, self._runtime, self._owned)
+            if isinstance(error, MemoryError):
+                raise no_memory("this scene", error) from None
             raise
         if not self.settings.explicit:
             self._stepper.tolerance = newton_tolerance or self._stepper.tolerance
@@ -197,6 +199,12 @@ class Simulator(Resuming):
         """Bytes of every allocated field by name."""
         searched = self._contact or self._idle_detection
         return self._arena.bytes | (searched.field_bytes if searched else {}) | self._stepper.field_bytes
+
+    @property
+    def buffer_growths(self) -> dict[str, int]:
+        """How often each buffer of the search for contacts grew since the start; those that never did are left out."""
+        searched = self._contact.detection if self._contact is not None else self._idle_detection
+        return {name: n for name, n in searched.counts.growths.items() if n} if searched is not None else {}
 
     def close(self) -> None:
         """Release the fields and the runtime; a closed simulator cannot be used."""
