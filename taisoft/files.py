@@ -8,6 +8,7 @@ import errno
 import itertools
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,6 +16,18 @@ from pathlib import Path
 from taisoft.errors import OutputError
 
 _part_numbers = itertools.count()
+
+
+def cache_folders() -> Iterator[Path]:
+    """Where what can be computed anew may be kept: the user's cache, where the user has one, and then the folder for what is
+    temporary."""
+    home = os.path.expanduser("~")
+    if chosen := os.environ.get("XDG_CACHE_HOME"):
+        yield Path(chosen) / "taisoft"
+    elif home != "~":  # a user without a home
+        yield Path(home) / ".cache" / "taisoft"
+    with suppress(OSError):  # there is none that can be written
+        yield Path(tempfile.gettempdir()) / "taisoft"
 
 
 def write_error(path: Path, error: OSError, n_bytes: int | None = None) -> OutputError:

@@ -9,11 +9,9 @@ import contextlib
 import functools
 import io
 import os
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import taichi as ti
@@ -21,6 +19,7 @@ from taichi.lang import impl, kernel_impl
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 from taisoft.errors import SimulationError
+from taisoft.files import cache_folders
 from taisoft.launching import Launch, places_of, prepare
 from taisoft.memory import address_space, told
 
@@ -86,8 +85,8 @@ def open_runtime(arch: str, precision: str, owner: str = "a simulator") -> Runti
 
 def _cache_folder() -> str:
     """A folder for compiled kernels that can be written: Taichi ends the process where its own cannot."""
-    for folder in (Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"), Path(tempfile.gettempdir())):
-        path = folder / "taisoft" / "kernels"
+    for folder in cache_folders():
+        path = folder / "kernels"
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError:

@@ -14,7 +14,7 @@ from taisoft.cli.settings import RunSettings, resolve, resolve_resumed
 from taisoft.cli.signals import Signals
 from taisoft.cli.summary import print_plan, print_state, print_summary
 from taisoft.cli.told import told_warnings
-from taisoft.errors import SceneError
+from taisoft.errors import SceneError, SimulationError
 from taisoft.output.checkpoint import read_last_good
 from taisoft.output.files import check_free
 from taisoft.output.progress import Progress
@@ -142,7 +142,11 @@ def _run(
         )
         observers.close()
         if recording is not None:
-            observers.guard(recording.checkpoint, sim)
+            try:
+                observers.guard(recording.checkpoint, sim)
+            except SimulationError as error:  # the state is not worth keeping; an earlier checkpoint stays
+                result.problems.append(str(error))
+                result.status = "failed"
         result.problems[:0] = [f"warning: {text}" for text in told]
         if observers.error is not None:
             _tell_failed_output(result, observers, signals)

@@ -7,6 +7,7 @@ here that becomes one MeshError.
 import contextlib
 import io
 import math
+import re
 import sys
 from contextvars import ContextVar
 from pathlib import Path
@@ -118,9 +119,16 @@ def read_fenced(file: Path, name: str, data: bytes, kind: str = "mesh") -> meshi
     except (Exception, SystemExit) as error:
         # Before meshio ends the program it prints why.
         said = f"{type(error).__name__}: {error}" if isinstance(error, Exception) else printed.getvalue()
-        raise MeshError(f"{name}: not a supported {kind} ({one_line(said)})") from error
+        raise MeshError(f"{name}: not a supported {kind} ({one_line(_without_content(said, data))})") from error
     finally:
         _most.reset(bound)
+
+
+def _without_content(said: str, data: bytes) -> str:
+    """A message without what the file holds: it may be a file that others must not read."""
+    content = data.lower()
+    plain = re.sub(r"(['\"`]).*?\1", "...", said, flags=re.DOTALL)
+    return " ".join("..." if len(word) > 3 and word.lower().encode() in content else word for word in plain.split())
 
 
 def _call(file: Path, ending: str, data: bytes) -> meshio.Mesh:

@@ -48,7 +48,7 @@ _COUNTS = {
 }
 
 # Of these, what a mesh cannot be without.
-_NEEDED = {".vtk": rb"(?:POINTS|CELLS)\s+(\d+)", ".vtu": rb"NumberOf(?:Points|Cells)\s*=\s*\"(\d+)"}
+_NEEDED = {".vtk": rb"(?:POINTS\s+|CELLS\s+(?:1\s+)?)(\d+)", ".vtu": rb"NumberOf(?:Points|Cells)\s*=\s*\"(\d+)"}
 
 _PLURAL = {"vertex": "vertices", "line": "lines", "triangle": "triangles", "quad": "quads", "hexahedron": "hexahedra"}
 
