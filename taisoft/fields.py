@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import taichi as ti
+from taichi.lang import impl
 
 from taisoft.errors import SimulationError
 from taisoft.memory import available_memory, told
@@ -69,24 +70,28 @@ class FieldArena:
         return field
 
     def _finalize(self, builder: ti.FieldsBuilder, fields: list, names: list[str]) -> None:
-        if trees["open"] >= MAX_TREES:
-            raise SimulationError(
-                f"too many simulators are open for Taichi to hold field '{names[0]}' and others: close one first"
-            )
+        on_cpu = ti.cfg.arch != ti.cuda
         needed = sum(self.bytes[name] for name in names)
-        if needed > SMALL and ti.cfg.arch != ti.cuda and needed > (free := available_memory() or needed):
-            self._refuse(names, needed, free)
+        free = available_memory() if on_cpu and needed > SMALL else None
+        problem = None
+        if trees["open"] >= MAX_TREES:
+            problem = f"too many simulators are open for Taichi to hold field '{names[0]}' and others: close one first"
+        elif free is not None and needed > free:
+            problem = self._no_memory(names, needed, free)
+        if problem is not None:
+            impl.get_runtime().finalize_fields_builder(builder)  # what is left open stops every later kernel
+            raise SimulationError(problem)
         try:
             self._trees.append((builder.finalize(), fields))
         except RuntimeError:  # whose text is the C++ layer's
-            self._refuse(names, needed, None if ti.cfg.arch == ti.cuda else available_memory())
+            raise SimulationError(self._no_memory(names, needed, available_memory() if on_cpu else None)) from None
         trees["open"] += 1
         placed(fields)
 
-    def _refuse(self, names: list[str], needed: int, free: int | None) -> None:
-        """Raises SimulationError for fields that do not fit, naming the largest of them."""
+    def _no_memory(self, names: list[str], needed: int, free: int | None) -> str:
+        """A sentence about fields that do not fit, which names the largest of them."""
         largest = max(names, key=lambda name: self.bytes[name])
-        raise SimulationError(
+        return (
             f"not enough memory for the field '{largest}' and {len(names) - 1} made with it: {told(needed)} are needed, "
             f"available: {told(free)}"
         )

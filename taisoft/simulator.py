@@ -6,7 +6,7 @@ import weakref
 from taisoft import runtime
 from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import measure
-from taisoft.errors import SceneError, no_memory
+from taisoft.errors import SceneError, SimulationError, no_memory
 from taisoft.fields import FieldArena
 from taisoft.model import build_model
 from taisoft.records import RunReport, StepReport
@@ -116,14 +116,16 @@ class Simulator(Resuming):
             n = min(n, most)
             self._pull.apply(most * self._dt)  # of less than a batch, too: the spring must not change its stiffness
             self._loads_changed()
+        try:
+            result = self._stepper.advance(n, self._dt) if self.settings.explicit else self._stepper.step(self._dt)
+        except SimulationError as error:
+            raise self._failure(error) from None
         if self.settings.explicit:
-            result = self._stepper.advance(n, self._dt)
             self._count(result.done)
             report = self._report()
             report.min_volume_ratio = min(report.min_volume_ratio, result.min_volume_ratio)
             report.n_inverted = max(report.n_inverted, result.n_inverted)
         else:
-            result = self._stepper.step(self._dt)
             self._count(1)
             report = self._report()
             report.newton_iterations, report.linear_iterations = result.newton_iterations, result.linear_iterations
@@ -137,6 +139,13 @@ class Simulator(Resuming):
         report.steps = self.step_count - start
         report.problems = [f"step {world.step_count}: {what}" for what in self._problems(report)]
         return report
+
+    def _failure(self, error: SimulationError) -> SimulationError:
+        """The error of a step with the step's number; where the state that it began with was spoilt, with the place."""
+        where, step = self._world.find_unfinite(), f"step {self.step_count + 1}: "
+        if where is not None:
+            return SimulationError(f"{step}{where} at its start")
+        return error if str(error).startswith("step ") else SimulationError(f"{step}{error}")
 
     def _problems(self, report: StepReport) -> list[str]:
         """What was not as it should be, in sentences."""
