@@ -1,5 +1,8 @@
-"""Random and randomly changed files, for every reader: a result or a TaisoftError in one line that names the file, within seconds,
-and with no more memory than a bound that follows from the file's size; nothing is printed."""
+"""Random and randomly changed files, for every reader:
+
+a result or a TaisoftError in one line that names the file, within seconds, and with no more memory than a bound that follows
+from the file's size; nothing is printed.
+"""
 
 import contextlib
 import io
@@ -23,8 +26,8 @@ MESH = ts.box_mesh((2, 1, 1), (2, 1, 1), pattern="six")
 GMSH = {"part.msh": "gmsh", "text.msh": ("gmsh", False), "old.msh": ("gmsh22", False), "older.msh": "gmsh22",
         "ansys.msh": ("ansys", False)}  # fmt: skip
 OTHERS = (
-    "vtk", "vtu", "mesh", "meshb", "vol", "su2", "xml", "dat", "bdf", "nas", "fem", "inp", "mdpa", "avs", "f3grid", "post", "ugrid",
-    "node",
+    "vtk", "vtu", "mesh", "meshb", "vol", "su2", "xml", "dat", "bdf", "nas", "fem", "inp", "mdpa", "avs", "f3grid", "post",
+    "ugrid", "node",
 )  # fmt: skip
 PIECES = (
     b"-1", b"9", b"nan", b"1e400", b" ", b"\n", b"$End", b"\0", b"\xff\xfe", b"99999", b"3000000", b"\xff\xff\xff\x7f",
