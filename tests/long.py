@@ -6,7 +6,7 @@ integrator, a second scene, or a coarser case of the same problem.
 
 LONG = {
     "test_fuzz": ("[10000-",),
-    "test_determinism": ("[cube_explicit]", "[cubes_"),
+    "test_determinism": ("[cube_implicit]", "[cubes_"),
     "test_faults": (
         "test_a_disk_that_fails[others]", "test_killed_while_files_are_replaced[100]", "[300000000", "[body-", "[ground-",
         "test_a_buffer_that_grows",
