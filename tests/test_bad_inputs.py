@@ -137,7 +137,7 @@ def test_what_a_file_holds_is_not_repeated(tmp_path, capsys, ending):
 
 SCENES = {
     "margin": (scene_text(head="[collision]\nmargin = 1e-3", mesh=BOX.replace("[1, 1, 1]", "[1e-6, 1e-6, 1e-6]"), more=GROUND),
-               "margin = 0.001 m is larger than the shortest surface edge of body 'part', 5e-07 m"),
+               "margin = 0.001 m is larger than the mean surface edge of body 'part', 5.69e-07 m"),
     "poisson_half": (scene_text(material="poisson = 0.5"), "poisson must lie in the open interval (-1, 0.5), not 0.5"),
     "poisson_above": (scene_text(material="poisson = 0.7"), "poisson must lie in the open interval (-1, 0.5), not 0.7"),
     "poisson_below": (scene_text(material="poisson = -1"), "poisson must lie in the open interval (-1, 0.5), not -1"),

@@ -23,7 +23,7 @@ from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, PAIRS, UNFINITE, Surface, build_surface
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fields import FieldArena
-from taisoft.mesh.quality import mean_surface_edge, shortest_surface_edge
+from taisoft.mesh.quality import mean_surface_edge
 from taisoft.mesh.sdf_grid import SdfGrid
 from taisoft.model import Layout, Model
 from taisoft.runtime import Runtime
@@ -56,13 +56,13 @@ class Counts:
 
 
 def _fitting_margin(margin: float, bodies: list[Body]) -> float:
-    """The margin [m], which must not exceed any body's shortest surface edge: all would be near all."""
+    """The margin [m], which must not exceed any body's mean surface edge: all of its triangles would be near one another."""
     for body in bodies:
-        shortest = shortest_surface_edge(body.nodes.positions, body.nodes.surface)
-        if margin > shortest:
+        mean = mean_surface_edge([(body.nodes.positions, body.nodes.surface)])
+        if margin > mean:
             raise SceneError(
-                f"collision settings: margin = {margin:g} m is larger than the shortest surface edge of body '{body.name}', "
-                f"{shortest:.3g} m"
+                f"collision settings: margin = {margin:g} m is larger than the mean surface edge of body '{body.name}', "
+                f"{mean:.3g} m"
             )
     return margin
 

@@ -22,14 +22,5 @@ def mean_ratio(lengths: np.ndarray, volumes: np.ndarray) -> np.ndarray:
 
 def mean_surface_edge(surfaces: list[tuple[np.ndarray, np.ndarray]]) -> float:
     """Mean length [m] of the edges of all triangles of the surfaces, each vertices (n,3) [m] and triangles (t,3)."""
-    return float(np.concatenate([_surface_edges(x, t) for x, t in surfaces]).mean())
-
-
-def shortest_surface_edge(vertices: np.ndarray, triangles: np.ndarray) -> float:
-    """Length [m] of the shortest edge of triangles (t,3). vertices: (n,3) [m]."""
-    return float(_surface_edges(vertices, triangles).min())
-
-
-def _surface_edges(x: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """(3t,) [m]."""
-    return np.linalg.norm(x[t] - x[np.roll(t, -1, axis=1)], axis=2).reshape(-1)
+    lengths = [np.linalg.norm(x[t] - x[np.roll(t, -1, axis=1)], axis=2).reshape(-1) for x, t in surfaces]
+    return float(np.concatenate(lengths).mean())
