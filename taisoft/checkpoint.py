@@ -11,6 +11,8 @@ bitwise as if it had not been interrupted.
 import dataclasses
 import hashlib
 import json
+import math
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -179,6 +181,21 @@ def _checksum(header: np.ndarray, arrays: dict[str, np.ndarray]) -> np.ndarray:
     return np.frombuffer(bytes.fromhex(text), dtype=np.uint8)
 
 
+def _check_sizes(path: Path) -> None:
+    """Raises ValueError where an array would take more room than the file has: a head may announce anything."""
+    size = path.stat().st_size
+    with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            if info.file_size > size:
+                raise ValueError(f"{info.file_size} bytes are announced, but the file has {size}")
+            with archive.open(info) as member:
+                version = np.lib.format.read_magic(member)
+                read_head = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+                shape, _, dtype = read_head(member)
+                if math.prod(shape) * dtype.itemsize > info.file_size:
+                    raise ValueError(f"an array of shape {shape} is announced, but it has {info.file_size} bytes")
+
+
 def _contents(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
     """Header and arrays, checked."""
     try:
@@ -190,6 +207,10 @@ def _contents(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
     if not isinstance(file, np.lib.npyio.NpzFile):
         raise _no_checkpoint(path, "it holds one array")
     with file:
+        try:
+            _check_sizes(path)
+        except Exception as error:
+            raise _no_checkpoint(path, error) from None
         try:
             text = file["header"]
             header = json.loads(text.tobytes())

@@ -19,3 +19,11 @@ class OutputError(TaisoftError):
 
 class SimulationError(TaisoftError):
     """A run cannot start, or a step failed; the state is the last good one."""
+
+
+def no_memory(what: str, error: MemoryError) -> SimulationError:
+    """The SimulationError for a MemoryError, whose text tells how much was asked for where NumPy raised it."""
+    from taisoft.memory import available_memory, told  # a rare case, in a module that everything imports
+
+    asked = str(error).rstrip(".") or "the system gave no more"
+    return SimulationError(f"not enough memory for {what}: {asked}; available: {told(available_memory())}")

@@ -5,12 +5,15 @@ from collections.abc import Iterator
 
 import numpy as np
 import taichi as ti
+from taichi.lang import impl
 
 from taisoft.errors import SimulationError
+from taisoft.memory import available_memory, told
 from taisoft.runtime import trees
 from taisoft.transfer import DTYPES, placed, removed, upload
 
 MAX_TREES = 480  # of field memory that may be open at once
+SMALL = 2**20  # bytes of a tree that are not worth a look at what is free
 
 
 class FieldArena:
@@ -45,7 +48,7 @@ class FieldArena:
         finally:  # in any case: a field that is never placed stops every later kernel
             (builder, fields), self._group = self._group, None
             if fields:
-                self._finalize(builder, [field for field, _, _ in fields], fields[0][2])
+                self._finalize(builder, [field for field, _, _ in fields], [name for _, _, name in fields])
         upload([(field, data) for field, data, _ in fields if data is not None])
 
     def _place(self, name, make, dtype, components, shape, data):
@@ -63,18 +66,35 @@ class FieldArena:
             else:
                 builder.dense((ti.i, ti.ij, ti.ijk, ti.ijkl)[len(shape) - 1], shape).place(field)
             fields.append((field, None if data is None else np.ascontiguousarray(data), name))
-        self.bytes[name] = count * components * np.dtype(DTYPES[dtype]).itemsize
+            self.bytes[name] = count * components * np.dtype(DTYPES[dtype]).itemsize
         return field
 
-    def _finalize(self, builder: ti.FieldsBuilder, fields: list, name: str) -> None:
+    def _finalize(self, builder: ti.FieldsBuilder, fields: list, names: list[str]) -> None:
+        on_cpu = ti.cfg.arch != ti.cuda
+        needed = sum(self.bytes[name] for name in names)
+        free = available_memory() if on_cpu and needed > SMALL else None
+        problem = None
         if trees["open"] >= MAX_TREES:
-            raise SimulationError(f"too many simulators are open for Taichi to hold field '{name}' and others: close one first")
+            problem = f"too many simulators are open for Taichi to hold field '{names[0]}' and others: close one first"
+        elif free is not None and needed > free:
+            problem = self._no_memory(names, needed, free)
+        if problem is not None:
+            impl.get_runtime().finalize_fields_builder(builder)  # what is left open stops every later kernel
+            raise SimulationError(problem)
         try:
             self._trees.append((builder.finalize(), fields))
-        except RuntimeError as error:
-            raise SimulationError(f"no memory for field '{name}' and those made with it: {error}") from None
+        except RuntimeError:  # whose text is the C++ layer's
+            raise SimulationError(self._no_memory(names, needed, available_memory() if on_cpu else None)) from None
         trees["open"] += 1
         placed(fields)
+
+    def _no_memory(self, names: list[str], needed: int, free: int | None) -> str:
+        """A sentence about fields that do not fit, which names the largest of them."""
+        largest = max(names, key=lambda name: self.bytes[name])
+        return (
+            f"not enough memory for the field '{largest}' and {len(names) - 1} made with it: {told(needed)} are needed, "
+            f"available: {told(free)}"
+        )
 
     def release(self) -> None:
         """Give the memory back to Taichi."""

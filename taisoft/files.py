@@ -7,6 +7,8 @@ folder fsynced: whatever stands under a final name is complete.
 import errno
 import itertools
 import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,6 +16,18 @@ from pathlib import Path
 from taisoft.errors import OutputError
 
 _part_numbers = itertools.count()
+
+
+def cache_folders() -> Iterator[Path]:
+    """Where what can be computed anew may be kept: the user's cache, where the user has one, and then the folder for what is
+    temporary."""
+    home = os.path.expanduser("~")
+    if chosen := os.environ.get("XDG_CACHE_HOME"):
+        yield Path(chosen) / "taisoft"
+    elif home != "~":  # a user without a home
+        yield Path(home) / ".cache" / "taisoft"
+    with suppress(OSError):  # there is none that can be written
+        yield Path(tempfile.gettempdir()) / "taisoft"
 
 
 def write_error(path: Path, error: OSError, n_bytes: int | None = None) -> OutputError:
@@ -50,6 +64,23 @@ def replacing(path: str | Path, n_bytes: int | None = None) -> Iterator[Path]:
         raise write_error(path, error, n_bytes) from error
     finally:
         with suppress(OSError):  # gone after a rename; unreachable when the folder is
+            part.unlink()
+
+
+def name_also(path: Path, other: Path) -> None:
+    """Let a file, if it is there, have another name too, which it takes from any other file in one step. Raises OSError."""
+    part = part_path(other)
+    try:
+        try:
+            os.link(path, part)
+        except FileNotFoundError:
+            return
+        except OSError:  # a file system without links
+            shutil.copyfile(path, part)
+            _fsync(part, os.O_RDWR)
+        os.replace(part, other)
+    finally:
+        with suppress(OSError):
             part.unlink()
 
 

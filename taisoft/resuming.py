@@ -17,11 +17,15 @@ class Resuming(StateAccess):
     def save_checkpoint(self, path: str | Path, notes: dict | None = None) -> None:
         """Write all that the next step rests on to a file, whole or not at all; see `taisoft/checkpoint.py`.
 
-        notes: plain data to keep in it. Raises SimulationError while a body is pulled, OutputError.
+        notes: plain data to keep in it. Raises SimulationError while a body is pulled and for a state that is not finite, and
+        OutputError.
         """
         world, (start, count) = self._open_world(), self._time_base
         if self.pulled is not None:
             raise SimulationError("a body is being pulled, which no checkpoint holds: release it first")
+        bad = world.find_unfinite()
+        if bad is not None:
+            raise SimulationError(f"no checkpoint is made of such a state: {bad}")
         own = {"dt": self._dt, "time_base": start, "count_base": count}
         state = own | {"world": world.snapshot(), "stepper": self._stepper.snapshot()}
         write_checkpoint(path, dataclasses.asdict(self.settings), self.scene, self.plan.on, state, notes or {})

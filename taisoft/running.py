@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from taisoft.errors import SimulationError
+from taisoft.errors import SimulationError, no_memory
 from taisoft.records import RunReport, StepReport
 from taisoft.settings import check_positive
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 FrameCallback = Callable[["Simulator", int, StepReport | None], None]
 IMPLICIT_BATCH_SECONDS = 0.5  # of simulated steps between two questions to `stop`
+MOST_STEPS = 2.0**52  # of a run: beyond, the time of a float64 stands still
 
 
 def run(
@@ -29,6 +30,7 @@ def run(
     """
     seconds = check_positive("seconds", seconds, "s")
     fps = None if fps is None else check_positive("fps", fps, "1/s")
+    check_length(seconds, sim.dt, fps)
     report = RunReport()
     compiled = sim.compile_seconds
     clock = time.perf_counter()
@@ -51,9 +53,9 @@ def run(
                 report.step_reports.append(merged)
             if on_frame is not None and sim.step_count - zero == goal:
                 on_frame(sim, frame, merged)
-    except SimulationError as error:
+    except (SimulationError, MemoryError) as error:
         report.status = "failed"
-        report.problems.append(str(error))
+        report.problems.append(str(no_memory("the next step", error) if isinstance(error, MemoryError) else error))
     except KeyboardInterrupt:
         _interrupt(report)
     report.steps = sim.step_count - start_count
@@ -73,6 +75,15 @@ def run(
     return report
 
 
+def check_length(seconds: float, dt: float, fps: float | None) -> None:
+    """Raises SimulationError where steps of dt [s], fitted to fps, would never reach `seconds` [s]."""
+    dt = _fitting(dt, fps)[1]
+    if not seconds <= MOST_STEPS * dt:
+        raise SimulationError(
+            f"seconds = {seconds:g} s in steps of {dt:g} s are more than {MOST_STEPS:.2g} steps: the run would never end"
+        )
+
+
 def first_frame(sim: "Simulator", fps: float | None) -> int:
     """Number of the first frame of a resumed run: that of the present state, or where it lies between two the next."""
     n, dt = _fitting(sim.dt, fps)
@@ -84,6 +95,8 @@ def _fitting(dt: float, fps: float | None) -> tuple[int, float]:
     if fps is None:
         return 1, dt
     frame = 1.0 / fps
+    if not frame <= MOST_STEPS * dt:  # a run that long is refused, see `check_length`
+        return 1, dt
     n = max(1, math.ceil(frame / dt - 1e-9))
     return n, dt if abs(n * dt - frame) <= 1e-9 * frame else frame / n
 

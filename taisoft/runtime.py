@@ -9,11 +9,9 @@ import contextlib
 import functools
 import io
 import os
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import taichi as ti
@@ -21,11 +19,14 @@ from taichi.lang import impl, kernel_impl
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 from taisoft.errors import SimulationError
+from taisoft.files import cache_folders
 from taisoft.launching import Launch, places_of, prepare
+from taisoft.memory import address_space, told
 from taisoft.timing import usable_cores
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
+POOL = 2**30  # bytes of address space that Taichi asks for at a time on the CPU
 
 launches: Counter[str] = Counter()  # kernel name -> launches so far in this process
 _open: list["Runtime"] = []  # simulators that hold the runtime now
@@ -85,8 +86,8 @@ def open_runtime(arch: str, precision: str, owner: str = "a simulator") -> Runti
 
 def _cache_folder() -> str:
     """A folder for compiled kernels that can be written: Taichi ends the process where its own cannot."""
-    for folder in (Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"), Path(tempfile.gettempdir())):
-        path = folder / "taisoft" / "kernels"
+    for folder in cache_folders():
+        path = folder / "kernels"
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError:
@@ -101,12 +102,19 @@ def _initialise(arch: str, precision: str) -> None:
         os.getcwd()
     except FileNotFoundError:
         raise SimulationError("the working folder no longer exists: change to one that does") from None
-    with contextlib.redirect_stdout(io.StringIO()):  # its greeting
-        ti.init(
-            arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
-            fast_math=False, offline_cache=True, offline_cache_file_path=_cache_folder(), log_level=ti.ERROR, random_seed=0,
-            cpu_max_num_threads=len(usable_cores()),  # Taichi would count the cores that this process may not use, too
-        )  # fmt: skip
+    folder = _cache_folder()
+    room = address_space()
+    if arch == "cpu" and room is not None and room < POOL:
+        raise SimulationError(f"not enough memory to start Taichi: {told(POOL)} are needed at once, available: {told(room)}")
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # its greeting
+            ti.init(
+                arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
+                fast_math=False, offline_cache=True, offline_cache_file_path=folder, log_level=ti.ERROR, random_seed=0,
+                cpu_max_num_threads=len(usable_cores()),  # Taichi would count the cores that it may not use, too
+            )  # fmt: skip
+    except RuntimeError as error:
+        raise SimulationError(f"Taichi does not start: {(str(error).splitlines() or ['no reason given'])[0]}") from None
     trees["open"] = 0
     for known in _known:  # they hold the Taichi that was
         known.clear()

@@ -6,7 +6,7 @@ import weakref
 from taisoft import runtime
 from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import measure
-from taisoft.errors import SceneError
+from taisoft.errors import SceneError, SimulationError, no_memory
 from taisoft.fields import FieldArena
 from taisoft.model import build_model
 from taisoft.records import RunReport, StepReport
@@ -77,8 +77,10 @@ class Simulator(Resuming):
             self.reset()
             if touching and not scene.allow_initial_overlap:
                 self._refuse_overlap()
-        except BaseException:
+        except BaseException as error:
             _release(self._arena, self._runtime, self._owned)
+            if isinstance(error, MemoryError):
+                raise no_memory("this scene", error) from None
             raise
         if not self.settings.explicit:
             self._stepper.tolerance = newton_tolerance or self._stepper.tolerance
@@ -114,14 +116,16 @@ class Simulator(Resuming):
             n = min(n, most)
             self._pull.apply(most * self._dt)  # of less than a batch, too: the spring must not change its stiffness
             self._loads_changed()
+        try:
+            result = self._stepper.advance(n, self._dt) if self.settings.explicit else self._stepper.step(self._dt)
+        except SimulationError as error:
+            raise self._failure(error) from None
         if self.settings.explicit:
-            result = self._stepper.advance(n, self._dt)
             self._count(result.done)
             report = self._report()
             report.min_volume_ratio = min(report.min_volume_ratio, result.min_volume_ratio)
             report.n_inverted = max(report.n_inverted, result.n_inverted)
         else:
-            result = self._stepper.step(self._dt)
             self._count(1)
             report = self._report()
             report.newton_iterations, report.linear_iterations = result.newton_iterations, result.linear_iterations
@@ -135,6 +139,13 @@ class Simulator(Resuming):
         report.steps = self.step_count - start
         report.problems = [f"step {world.step_count}: {what}" for what in self._problems(report)]
         return report
+
+    def _failure(self, error: SimulationError) -> SimulationError:
+        """The error of a step with the step's number; where the state that it began with was spoilt, with the place."""
+        where, step = self._world.find_unfinite(), f"step {self.step_count + 1}: "
+        if where is not None:
+            return SimulationError(f"{step}{where} at its start")
+        return error if str(error).startswith("step ") else SimulationError(f"{step}{error}")
 
     def _problems(self, report: StepReport) -> list[str]:
         """What was not as it should be, in sentences."""
@@ -197,6 +208,12 @@ class Simulator(Resuming):
         """Bytes of every allocated field by name."""
         searched = self._contact or self._idle_detection
         return self._arena.bytes | (searched.field_bytes if searched else {}) | self._stepper.field_bytes
+
+    @property
+    def buffer_growths(self) -> dict[str, int]:
+        """How often each buffer of the search for contacts grew since the start; those that never did are left out."""
+        searched = self._contact.detection if self._contact is not None else self._idle_detection
+        return {name: n for name, n in searched.counts.growths.items() if n} if searched is not None else {}
 
     def close(self) -> None:
         """Release the fields and the runtime; a closed simulator cannot be used."""

@@ -5,6 +5,13 @@ integrator, a second scene, or a coarser case of the same problem.
 """
 
 LONG = {
+    "test_fuzz": ("[10000-",),
+    "test_determinism": ("[cube_implicit]", "[cubes_"),
+    "test_faults": (
+        "test_a_disk_that_fails[others]", "test_killed_while_files_are_replaced[100]", "[300000000",
+        "[body-", "[ground-", "[nothing-implicit_euler]",
+        "test_a_buffer_that_grows",
+    ),
     "test_references": (
         "patch_test-", "column_self_weight-", "beam_fall_semidiscrete-COR", "beam_fall_semidiscrete-SNH-11x2x2_bdf2",
         "beam_fall_semidiscrete-SNH-11x2x2_exact", "oscillator_amplification-SVK-one_tet_bdf2", "cook_membrane_3d-",

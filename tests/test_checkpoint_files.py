@@ -2,11 +2,16 @@
 
 * a header without a part, or with one of another form, is told, though its checksum is right;
 * nothing in a file is run: pickled objects are refused;
+* sizes are checked before room is made for them;
+* a file that cannot be read gives way to the one before it, which is told; the one before is of the same run;
 * key frames are compared, and what is left out of a scene or called otherwise, whatever characters its name has.
 """
 
 import json
+import os
 import pickle
+import tracemalloc
+import zipfile
 
 import numpy as np
 import pytest
@@ -14,6 +19,7 @@ from scenes import driven_scene
 
 import taisoft as ts
 from taisoft import checkpoint
+from taisoft.output.checkpoint import CHECKPOINT_NAME, PREVIOUS_NAME, CheckpointWriter, read_last_good
 
 
 def scene(height: float, obstacle: str = "wall:left") -> ts.Scene:
@@ -78,3 +84,97 @@ def test_pickled_objects_are_refused(saved, tmp_path):
     with pytest.raises(ts.SimulationError, match="one.npy is no checkpoint"):
         ts.Simulator.load_checkpoint(tmp_path / "one.npy", scene(1.0))
     assert not canary.exists()
+
+
+# --- the previous one -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def two(saved, tmp_path):
+    """A run's folder with its checkpoint and the one before."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    for name, time in ((PREVIOUS_NAME, 1.0), (CHECKPOINT_NAME, 2.0)):
+        checkpoint.write_checkpoint(folder / name, {}, scene(1.0), {}, {"time": time, "x": np.arange(3000.0)}, {})
+    return folder
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.999])
+def test_a_file_cut_off_gives_way_to_the_previous_one(two, share):
+    path, previous = two / CHECKPOINT_NAME, two / PREVIOUS_NAME
+    assert read_last_good(path).state["time"] == 2.0
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    told = rf"^{path} is (no checkpoint of taisoft, or )?damaged.*; going on from the previous checkpoint instead, {previous}$"
+    with pytest.warns(UserWarning, match=told):
+        found = read_last_good(path)
+    assert found.state["time"] == 1.0 and found.path == previous
+    previous.write_bytes(b"x")
+    with pytest.raises(ts.SimulationError, match=rf"^{path} .*damaged.*; nor can the previous one be used: {previous} is no"):
+        read_last_good(path)
+    previous.unlink()
+    with pytest.raises(ts.SimulationError, match=rf"^{path} is .*damaged"):
+        read_last_good(path)
+
+
+class Saved:
+    """A simulator with a time."""
+
+    def __init__(self, time):
+        self.time = time
+
+    def save_checkpoint(self, path, notes):
+        checkpoint.write_checkpoint(path, {}, scene(1.0), {}, {"time": self.time}, notes)
+
+
+def times(folder):
+    names = [name for name in (PREVIOUS_NAME, CHECKPOINT_NAME) if (folder / name).exists()]
+    return [checkpoint.read_checkpoint(folder / name).state["time"] for name in names]
+
+
+def test_the_previous_one_is_of_the_same_run(two, tmp_path, monkeypatch):
+    """Also on a file system without links; a run that goes on from the previous one keeps it until there is another."""
+    writer = CheckpointWriter(two)  # another run's are in the folder
+    writer.write(Saved(3.0))
+    assert times(two) == [3.0]
+    writer.write(Saved(4.0))
+    assert times(two) == [3.0, 4.0]
+    CheckpointWriter(two, resumed=two / ".." / "out" / CHECKPOINT_NAME).write(Saved(5.0))
+    assert times(two) == [4.0, 5.0]
+    writer = CheckpointWriter(two, resumed=two / PREVIOUS_NAME)
+    writer.write(Saved(6.0))
+    assert times(two) == [4.0, 6.0]
+
+    def no_links(*_):
+        raise PermissionError("no links here")
+
+    monkeypatch.setattr(os, "link", no_links)
+    writer.write(Saved(7.0))
+    assert times(two) == [6.0, 7.0] and sorted(os.listdir(two)) == [CHECKPOINT_NAME, PREVIOUS_NAME]
+
+
+def test_sizes_are_checked_before_there_is_room(saved, tmp_path):
+    """Heads that announce terabytes, in the zip and in an array; and zeros that were packed."""
+    whole, path = saved.read_bytes(), tmp_path / "b.npz"
+    packed = np.lib.format.magic(1, 0)
+    for shape in (f"({10**13},)", f"({10**7},)"):
+        head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("header.npy", packed + len(head).to_bytes(2, "little") + head.encode() + bytes(24))
+        assert_refused_within(path, 2_000_000)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, zipfile.ZipFile(saved) as source:
+        for name in source.namelist():
+            archive.writestr(name, source.read(name))
+        archive.writestr("more.npy", bytes(50_000_000))
+    assert path.stat().st_size < 60_000 and len(whole) < 60_000
+    assert_refused_within(path, 2_000_000)
+
+
+def assert_refused_within(path, n_bytes):
+    tracemalloc.start()
+    try:
+        with pytest.raises(ts.SimulationError, match="b.npz is no checkpoint of taisoft, or damaged: .*announced"):
+            checkpoint.read_checkpoint(path)
+        assert tracemalloc.get_traced_memory()[1] < n_bytes
+    finally:
+        tracemalloc.stop()

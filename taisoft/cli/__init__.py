@@ -11,7 +11,7 @@ from importlib import import_module
 
 from taisoft import __version__
 from taisoft.cli.signals import Left
-from taisoft.errors import OutputError, TaisoftError
+from taisoft.errors import OutputError, TaisoftError, no_memory
 
 EXIT_FAILED = 1
 EXIT_BAD_INPUT = 2
@@ -32,6 +32,9 @@ def main(argv: list[str] | None = None) -> int:
     except TaisoftError as error:
         print(f"taisoft: {error}", file=sys.stderr)
         return EXIT_OUTPUT if isinstance(error, OutputError) else EXIT_BAD_INPUT
+    except MemoryError as error:
+        print(f"taisoft: {no_memory('this scene or file', error)}", file=sys.stderr)
+        return EXIT_BAD_INPUT
     except Left as leave:
         print("taisoft: ended by a signal; nothing was written", file=sys.stderr)
         return EXIT_SIGNAL + leave.signal_number

@@ -10,7 +10,7 @@ from taisoft.errors import OutputError
 from taisoft.output.checkpoint import CheckpointWriter
 from taisoft.output.files import RESULT_FILES, OutputFolder
 from taisoft.output.frames import FRAMES_NAME, FrameWriter
-from taisoft.output.report import write_report
+from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
 from taisoft.output.video import command, find_ffmpeg, picture_numbers, write_video
 from taisoft.records import RunReport
@@ -69,7 +69,7 @@ class Recording:
         self._first = None if resumed is None else resumed["frame"]
         self._folder = OutputFolder(path, overwrite, self._first)
         self.path, self._resumed, self._notes = Path(path), resumed, notes or {}
-        self._checkpoints = CheckpointWriter(self._folder.path, every)
+        self._checkpoints = CheckpointWriter(self._folder.path, every, None if resumed is None else resumed["checkpoint"])
 
     def add_writers(
         self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool, colour: str = "body"
@@ -118,6 +118,8 @@ class Recording:
             settings=record,
             plan=sim.plan.entries,
             resumed=self._resumed,
+            bodies=body_records(sim.scene),
+            buffer_growths=sim.buffer_growths,
         )
         self._folder.discard_stale()
 

@@ -6,7 +6,7 @@ from argparse import Namespace
 from contextlib import ExitStack, closing
 from pathlib import Path
 
-from taisoft.checkpoint import Checkpoint, read_checkpoint
+from taisoft.checkpoint import Checkpoint
 from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL
 from taisoft.cli.recording import Observers, Recording
 from taisoft.cli.scene_file import load_scene
@@ -14,11 +14,12 @@ from taisoft.cli.settings import RunSettings, resolve, resolve_resumed
 from taisoft.cli.signals import Signals
 from taisoft.cli.summary import print_plan, print_state, print_summary
 from taisoft.cli.told import told_warnings
-from taisoft.errors import SceneError
+from taisoft.errors import SceneError, SimulationError
+from taisoft.output.checkpoint import read_last_good
 from taisoft.output.files import check_free
 from taisoft.output.progress import Progress
 from taisoft.records import RunReport
-from taisoft.running import first_frame
+from taisoft.running import check_length, first_frame
 from taisoft.scene import checks
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
@@ -33,7 +34,7 @@ def command(arguments: Namespace) -> int:
         every = _checkpoint_interval(arguments)
         if arguments.video and (arguments.out is None or arguments.no_frames):
             raise SceneError("--video needs --out, the folder to write to, and the pictures that --no-frames leaves out")
-        notes: dict = {}
+        saved: Checkpoint | None = None
         has_window = not arguments.headless and _window_is_possible()
         watched = has_window and arguments.out is None and arguments.seconds is None
         if arguments.resume is None:
@@ -42,9 +43,8 @@ def command(arguments: Namespace) -> int:
                 check_free(arguments.out, arguments.overwrite)
             sim = Simulator(scene, **settings.simulator | ({"pullable": True} if watched else {}))  # by the mouse
         else:
-            saved = read_checkpoint(arguments.resume)
-            notes = saved.notes
-            kept = saved.settings | ({"fps": notes["fps"]} if "fps" in notes else {})  # frames have numbers
+            saved = read_last_good(arguments.resume)
+            kept = saved.settings | ({"fps": saved.notes["fps"]} if "fps" in saved.notes else {})  # frames have numbers
             settings = resolve_resumed(solver, arguments, Simulator, kept)
             sim = _resumed(saved, scene, settings)
         with sim:
@@ -52,7 +52,8 @@ def command(arguments: Namespace) -> int:
             if watched:
                 return _watch(sim, settings, arguments.colour)
             _check_time_left(sim, settings, arguments)
-            return _run(sim, settings, arguments, signals, told, has_window, every, notes)
+            check_length(settings.seconds, sim.dt, settings.fps)
+            return _run(sim, settings, arguments, signals, told, has_window, every, saved)
 
 
 def _checkpoint_interval(arguments: Namespace) -> float | None:
@@ -114,12 +115,13 @@ def _watch(sim: Simulator, settings: RunSettings, colour: str) -> int:
 
 def _run(
     sim: Simulator, settings: RunSettings, arguments: Namespace, signals: Signals, told: list[str], has_window: bool,
-    every: float | None, notes: dict,
+    every: float | None, saved: Checkpoint | None,
 ) -> int:  # fmt: skip
     """A run until settings.seconds, with what was computed saved however it ends."""
-    observers, resumed = Observers(), None
-    if arguments.resume is not None:
-        resumed = {"checkpoint": arguments.resume, "time": sim.time, "frame": first_frame(sim, settings.fps)}
+    observers, resumed, notes = Observers(), None, {}
+    if saved is not None:
+        notes = saved.notes
+        resumed = {"checkpoint": str(saved.path), "time": sim.time, "frame": first_frame(sim, settings.fps)}
     with ExitStack() as stack:
         recording = None
         signals.run_began()
@@ -140,7 +142,11 @@ def _run(
         )
         observers.close()
         if recording is not None:
-            observers.guard(recording.checkpoint, sim)
+            try:
+                observers.guard(recording.checkpoint, sim)
+            except SimulationError as error:  # the state is not worth keeping; an earlier checkpoint stays
+                result.problems.append(str(error))
+                result.status = "failed"
         result.problems[:0] = [f"warning: {text}" for text in told]
         if observers.error is not None:
             _tell_failed_output(result, observers, signals)

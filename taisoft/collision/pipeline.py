@@ -28,6 +28,7 @@ from taisoft.mesh.quality import mean_surface_edge
 from taisoft.mesh.sdf_grid import SdfGrid
 from taisoft.model import Layout, Model
 from taisoft.runtime import Runtime
+from taisoft.scene.body import Body
 from taisoft.scene.obstacles import MeshObstacle
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
@@ -55,6 +56,18 @@ class Counts:
     growths: dict[str, int] = field(default_factory=dict)  # times that each buffer grew since the start
 
 
+def _fitting_margin(margin: float, bodies: list[Body]) -> float:
+    """The margin [m], which must not exceed any body's mean surface edge: all of its triangles would be near one another."""
+    for body in bodies:
+        mean = mean_surface_edge([(body.nodes.positions, body.nodes.surface)])
+        if margin > mean:
+            raise SceneError(
+                f"collision settings: margin = {margin:g} m is larger than the mean surface edge of body '{body.name}', "
+                f"{mean:.3g} m"
+            )
+    return margin
+
+
 class Detection:
     """Finds the contacts of a scene. edge: mean surface edge of the soft bodies at rest; margin, reach: as in `find` [m]."""
 
@@ -66,7 +79,7 @@ class Detection:
         self.scene, self.model, self.layout = scene, model, layout
         settings, bodies, obstacles = scene.collision, scene.bodies, scene.obstacles
         self.edge = mean_surface_edge([(b.nodes.positions, b.nodes.surface) for b in bodies])
-        self.margin = MARGIN * self.edge if settings.margin is None else settings.margin
+        self.margin = MARGIN * self.edge if settings.margin is None else _fitting_margin(settings.margin, bodies)
         self.reach = self.margin + DEPTH * self.edge  # by half of it boxes grow
         self.topology, self._rest = collider_surfaces(scene, layout)
         self._rows = self_collision or int((np.diff(self.topology.first) > 0).sum()) > 1

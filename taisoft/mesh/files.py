@@ -1,8 +1,7 @@
 """Meshes from files and into files.
 
 Gmsh's and TetGen's files are read by `gmsh.py` and `tetgen.py`, which say where one is broken; every other format by
-meshio, behind a fence: on a broken file it may end the program, print, raise anything or wait for ever, and here that
-becomes one MeshError.
+meshio, behind a fence (`fence.py`).
 """
 
 import contextlib
@@ -15,7 +14,8 @@ import numpy as np
 
 from taisoft.errors import MeshError
 from taisoft.files import replacing
-from taisoft.mesh.content import one_line, read_content
+from taisoft.mesh.content import read_content
+from taisoft.mesh.fence import read_fenced
 from taisoft.mesh.gmsh import read_gmsh
 from taisoft.mesh.quality import edge_lengths
 from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh, merge_labels
@@ -47,41 +47,10 @@ _COUNTS = {
     ".msh": rb"\$(?:Nodes|Elements)\s+(\d+)[ \t\r]*\n",
 }
 
+# Of these, what a mesh cannot be without.
+_NEEDED = {".vtk": rb"(?:POINTS\s+|CELLS\s+(?:1\s+)?)(\d+)", ".vtu": rb"NumberOf(?:Points|Cells)\s*=\s*\"(\d+)"}
+
 _PLURAL = {"vertex": "vertices", "line": "lines", "triangle": "triangles", "quad": "quads", "hexahedron": "hexahedra"}
-
-_PATIENCE = 100  # times that a reader may ask past the end of a file
-
-
-class _Ending(io.BufferedReader):
-    """A file that raises where a reader asks again and again past its end; some of meshio's readers would for ever."""
-
-    asked = 0
-
-    def _told(self, found: bytes) -> bytes:
-        self.asked = 0 if found else self.asked + 1
-        if self.asked > _PATIENCE:
-            raise EOFError("the file ends too early")
-        return found
-
-    def readline(self, size: int | None = -1, /) -> bytes:
-        return self._told(super().readline(size))
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        return self._told(super().read(size))
-
-
-class _EndingText(io.TextIOWrapper):
-    """The same for text."""
-
-    asked = 0
-
-    def readline(self, size: int = -1, /) -> str:
-        line = super().readline(size)
-        self.asked = 0 if line else self.asked + 1
-        if self.asked > _PATIENCE:
-            raise EOFError("the file ends too early")
-        return line
-
 
 def read_mesh(path, fix_orientation: bool = False, weld: float | None = None) -> TetMesh:
     """Read a tetrahedral mesh from a file of any format that meshio knows.
@@ -159,31 +128,13 @@ def _read_by_meshio(file: Path, name: str, data: bytes):
             raise MeshError(
                 f"{name}: line {line} announces {found[1][:30].decode()} items, but the file has {len(data)} bytes"
             )
-    printed = io.StringIO()
     try:
-        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), np.errstate(all="ignore"):
-            mesh = _call_meshio(file, ending, data)
-        return mesh.points, [(block.type, np.asarray(block.data)) for block in mesh.cells]
-    except ImportError as error:
-        raise MeshError(f"{name}: files {ending!r} need the Python package {error.name or error}") from error
-    except MemoryError as error:
-        raise MeshError(f"{name}: not a supported mesh: it asks for more memory than there is") from error
-    except (Exception, SystemExit) as error:
-        # Before meshio ends the program it prints why.
-        said = f"{type(error).__name__}: {error}" if isinstance(error, Exception) else printed.getvalue()
-        raise MeshError(f"{name}: not a supported mesh ({one_line(said)})") from error
-
-
-def _call_meshio(file: Path, ending: str, data: bytes) -> meshio.Mesh:
-    """meshio's mesh; the three readers that would wait for ever at the end of a broken file get one that stops them."""
-    if ending == ".msh" and data.lstrip()[:1] != b"(":
-        return meshio.read(file, file_format="gmsh")
-    if ending not in (".msh", ".mdpa", ".dat", ".tec"):
-        return meshio.read(file)
-    with _Ending(io.FileIO(file)) as stream:
-        if ending in (".dat", ".tec"):
-            return meshio.read(_EndingText(stream, encoding="utf-8"), file_format="tecplot")
-        return meshio.read(stream, file_format="ansys" if ending == ".msh" else "mdpa")
+        mesh = read_fenced(file, name, data)
+    except MeshError as error:
+        if any(int(found[1][:30]) == 0 for found in re.finditer(_NEEDED.get(ending, rb"(?!)"), data)):
+            raise MeshError(f"{name}: no tetrahedra; the file announces 0 points or cells") from error
+        raise
+    return mesh.points, [(block.type, np.asarray(block.data)) for block in mesh.cells]
 
 
 def _tets_among(name: str, cells: list[tuple[str, np.ndarray]]) -> tuple[list[np.ndarray], list[str]]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.errors import MeshError
+from taisoft.files import cache_folders
 from taisoft.mesh.signed_distance import signed_distances
 
 FORMAT = 1  # of what a kept grid holds; raised when its numbers or their meaning change
@@ -85,7 +86,7 @@ def cached_sdf_grid(
 
 def cache_folder() -> Path:
     """Where grids are kept."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "taisoft" / "sdf"
+    return next(cache_folders(), Path(os.devnull)) / "sdf"  # the latter can hold nothing
 
 
 def _arrays(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

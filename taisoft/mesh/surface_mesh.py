@@ -1,20 +1,18 @@
 """A surface of triangles as modelling programs give it: read, welded, and looked at for what makes it unfit for a solid."""
 
-import contextlib
-import io
 import re
 import warnings
 from dataclasses import dataclass, field
 from numbers import Real
 from pathlib import Path
 
-import meshio
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from taisoft.errors import MeshError
 from taisoft.mesh.content import one_line, read_content
+from taisoft.mesh.fence import read_fenced
 from taisoft.mesh.tet_mesh import merge_labels
 from taisoft.mesh.topology import triangle_edges
 
@@ -151,7 +149,7 @@ def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
         raise MeshError(f"{name}: weld must be a distance of at least 0 m, not {weld!r}")
     data = read_content(file)
     own = {".obj": _read_obj, ".off": _read_off}.get(ending)
-    points, triangles = own(name, data) if own else _read_by_meshio(file, name)
+    points, triangles = own(name, data) if own else _read_by_meshio(file, name, data)
     return _cleaned(SurfaceMesh(points, triangles, name), float(weld))
 
 
@@ -198,7 +196,7 @@ def _read_obj(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
                 points.append((float(x), float(y), float(z)))
             elif words[:1] == ["f"]:
                 corners = [int(word.split("/", 1)[0]) for word in words[1:]]
-                if len(corners) < 3 or 0 in corners:
+                if len(corners) < 3 or 0 in corners or max(map(abs, corners)) > len(data):
                     raise ValueError
                 polygons.append(np.array([[k - 1 if k > 0 else len(points) + k for k in corners]]))
         except (ValueError, OverflowError):
@@ -255,13 +253,15 @@ def _words(line: str) -> list[str]:
     return line.split("#", 1)[0].split()
 
 
-def _read_by_meshio(file: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
-    printed = io.StringIO()
+def _read_by_meshio(file: Path, name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    counts = re.finditer(rb"^element (\w{1,20}) (\d+)", data, re.MULTILINE) if file.suffix.lower() == ".ply" else ()
+    for found in counts:
+        if int(found[2][:30]) > len(data):
+            what = f"{found[2][:30].decode()} of element {found[1].decode()}"
+            raise MeshError(f"{name}: the head announces {what}, but the file has {len(data)} bytes")
+    mesh = read_fenced(file, name, data, "surface")
     try:
-        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), np.errstate(all="ignore"):
-            mesh = meshio.read(file)
-        blocks = [np.asarray(b.data) for b in mesh.cells if b.type in ("triangle", "quad", "polygon") or "polygon" in b.type]
+        blocks = [np.asarray(b.data) for b in mesh.cells if b.type in ("triangle", "quad") or "polygon" in b.type]
         return np.asarray(mesh.points), _fans([b for b in blocks if b.ndim == 2])
-    except (Exception, SystemExit) as error:  # meshio may end the program or raise anything on a broken file
-        said = f"{type(error).__name__}: {error}" if isinstance(error, Exception) else printed.getvalue()
-        raise MeshError(f"{name}: not a supported surface ({one_line(said)})") from error
+    except (ValueError, OverflowError) as error:  # rows of different lengths
+        raise MeshError(f"{name}: not a supported surface ({one_line(str(error))})") from error

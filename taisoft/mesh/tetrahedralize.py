@@ -91,7 +91,7 @@ def _in_a_process(name: str, vertices: np.ndarray, triangles: np.ndarray, length
             lines = told.decode("utf-8", "replace").split("\n")
             said = next((line for line in reversed(lines) if line.strip()), f"exit status {child.returncode}")
             raise MeshError(f"{name}: the mesher failed: {one_line(said)}")
-        with np.load(made) as found:
+        with np.load(made, allow_pickle=False) as found:
             return found["vertices"] + middle, found["tets"]
 
 
@@ -99,7 +99,7 @@ def _mesh(given: str, made: str) -> None:
     """What the process does."""
     import wildmeshing
 
-    with np.load(given) as surface:
+    with np.load(given, allow_pickle=False) as surface:
         vertices, triangles, (length, envelope) = surface["vertices"], surface["triangles"], surface["numbers"]
     mesher = wildmeshing.Tetrahedralizer(
         stop_quality=QUALITY, max_its=ROUNDS, edge_length_r=float(length), epsilon=float(envelope)

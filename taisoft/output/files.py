@@ -17,7 +17,7 @@ __all__ = [
 ]  # fmt: skip
 
 LOCK_NAME = "taisoft.lock"
-RESULT_FILES = ("report.json", "steps.csv", "scene.usdc", "checkpoint.npz", "video.mp4")
+RESULT_FILES = ("report.json", "steps.csv", "scene.usdc", "checkpoint.npz", "checkpoint.previous.npz", "video.mp4")
 RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc"}  # folder -> the files in it that are ours
 
 

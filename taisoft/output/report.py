@@ -26,13 +26,14 @@ PACKAGES = ("taichi", "numpy", "scipy", "usd-core")
 
 def write_report(
     folder: str | Path, result: RunReport, *, arch: str, precision: str, settings: dict, plan: list[dict],
-    resumed: dict | None = None,
+    resumed: dict | None = None, bodies: list[dict] | None = None, buffer_growths: dict[str, int] | None = None,
 ) -> None:  # fmt: skip
     """Write report.json and steps.csv into folder. Raises OutputError.
 
     settings: every setting of the run as resolved, by name; plan: the entries of the simulator's plan. Values may be
     plain, NumPy, paths or dataclasses; anything else is written as its text. resumed: where a run went on from, with its
     `time` [s]; the rows up to it in the folder's steps.csv then stay, while the report tells of what was computed since.
+    bodies: an entry for each, see `body_records`. buffer_growths: how often each buffer of the search for contacts grew.
     """
     folder = Path(folder)
     earlier = [] if resumed is None else _rows_until(folder / "steps.csv", resumed["time"])
@@ -43,11 +44,24 @@ def write_report(
         "precision": precision,
         "settings": settings,
         "plan": plan,
+        "bodies": bodies or [],
+        "buffer_growths": buffer_growths or {},
         "versions": versions(),
         "machine": machine(),
         "peak_memory_bytes": peak_memory(),
     }
     write_bytes(folder / "report.json", json_text(record).encode())
+
+
+def body_records(scene) -> list[dict]:
+    """What each body of a scene is made of: its name, law, order, numbers of vertices, tets, nodes and pieces."""
+    return [
+        {
+            "name": b.name, "law": b.material.law, "order": b.order, "vertices": b.mesh.n_verts, "tets": b.mesh.n_tets,
+            "nodes": b.n_nodes, "pieces": b.mesh.n_components,
+        }
+        for b in scene.bodies
+    ]  # fmt: skip
 
 
 def run_record(result: RunReport) -> dict:

@@ -7,6 +7,8 @@ import numpy as np
 
 from taisoft.errors import SceneError
 
+LARGEST, SMALLEST = float(np.finfo(np.float32).max), float(np.finfo(np.float32).tiny)  # what may be computed in 32 bits
+
 
 def number(
     value,
@@ -17,7 +19,10 @@ def number(
     most: float | None = None,
     unit: str = "",
 ) -> float:
-    """A finite real number, > above, >= least, <= most where these are given. what: the start of the message."""
+    """A finite real number, > above, >= least, <= most where these are given, which 32 bits can hold.
+
+    what: the start of the message.
+    """
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         raise SceneError(f"{what} must be a number, not {value!r}")
     try:
@@ -36,6 +41,8 @@ def number(
     if not all(kept for kept, _ in rules):
         rule = " and ".join(text for _, text in rules)
         raise SceneError(f"{what} must be {rule}{unit and ' ' + unit}, not {value!r}")
+    if abs(result) > LARGEST or (above == 0.0 and result < SMALLEST):
+        raise SceneError(f"{what} is {result:g}, too {'large' if abs(result) > 1.0 else 'small'} for a 32-bit float")
     return result
 
 
@@ -54,6 +61,9 @@ def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
     bad = np.argwhere(~np.isfinite(result))
     if len(bad):
         raise SceneError(f"{what}: entry {bad[0].tolist()} is {result[tuple(bad[0])]}, not finite")
+    bad = np.argwhere(np.abs(result) > LARGEST)
+    if len(bad):
+        raise SceneError(f"{what}: entry {bad[0].tolist()} is {result[tuple(bad[0])]:g}, too large for a 32-bit float")
     return result
 
 

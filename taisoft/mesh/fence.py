@@ -1,0 +1,146 @@
+"""meshio behind a fence.
+
+On a broken file meshio may end the program, print, raise anything, wait for ever, or ask for memory that the file cannot fill;
+here that becomes one MeshError.
+"""
+
+import contextlib
+import io
+import math
+import re
+import sys
+from contextvars import ContextVar
+from pathlib import Path
+
+import meshio
+import numpy as np
+
+from taisoft.errors import MeshError
+from taisoft.mesh.content import one_line
+
+PATIENCE = 100  # times that a reader may ask past the end of a file
+PER_BYTE = 16  # numbers that a reader may make room for, for each byte of a file
+
+# Readers that would wait for ever at the end of a broken file, by ending.
+_WAITING = {
+    ".mdpa": "mdpa", ".ply": "ply", ".dat": "tecplot", ".tec": "tecplot", ".nas": "nastran", ".bdf": "nastran", ".fem": "nastran",
+}  # fmt: skip
+_OF_TEXT = ("tecplot", "nastran")
+
+_most: ContextVar[float] = ContextVar("most numbers in an array", default=math.inf)
+
+
+class _Ending(io.BufferedReader):
+    """A file that raises where a reader asks again and again past its end; some of meshio's readers would for ever."""
+
+    asked = 0
+
+    def _told(self, found: bytes) -> bytes:
+        self.asked = 0 if found else self.asked + 1
+        if self.asked > PATIENCE:
+            raise EOFError("the file ends too early")
+        return found
+
+    def readline(self, size: int | None = -1, /) -> bytes:
+        return self._told(super().readline(size))
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return self._told(super().read(size))
+
+
+class _EndingText(io.TextIOWrapper):
+    """The same for text."""
+
+    asked = 0
+
+    def readline(self, size: int = -1, /) -> str:
+        line = super().readline(size)
+        self.asked = 0 if line else self.asked + 1
+        if self.asked > PATIENCE:
+            raise EOFError("the file ends too early")
+        return line
+
+
+class _CountingNumpy:
+    """NumPy as meshio sees it: arrays whose size a file announces are refused before room is made for what it cannot fill."""
+
+    def __getattr__(self, name: str):
+        return getattr(np, name)
+
+    @staticmethod
+    def _check(n: float) -> None:
+        if n > _most.get():
+            raise MemoryError
+
+    def fromfile(self, file, dtype=float, count=-1, sep="", **more):
+        self._check(count)
+        return np.fromfile(file, dtype, count, sep, **more)
+
+    def arange(self, *bounds, **more):
+        low, high, step = (*bounds, 1)[:3] if len(bounds) > 1 else (0, *bounds, 1)
+        self._check((high - low) / step if step else 0)
+        return np.arange(*bounds, **more)
+
+    def empty(self, shape, *more, **named):
+        self._check(math.prod(np.atleast_1d(shape).tolist()))
+        return np.empty(shape, *more, **named)
+
+    def zeros(self, shape, *more, **named):
+        self._check(math.prod(np.atleast_1d(shape).tolist()))
+        return np.zeros(shape, *more, **named)
+
+    def ones(self, shape, *more, **named):
+        self._check(math.prod(np.atleast_1d(shape).tolist()))
+        return np.ones(shape, *more, **named)
+
+    def full(self, shape, *more, **named):
+        self._check(math.prod(np.atleast_1d(shape).tolist()))
+        return np.full(shape, *more, **named)
+
+
+for _name, _module in list(sys.modules.items()):
+    if _name.startswith("meshio.") and getattr(_module, "np", None) is np:
+        _module.np = _CountingNumpy()
+
+
+def read_fenced(file: Path, name: str, data: bytes, kind: str = "mesh") -> meshio.Mesh:
+    """What meshio reads from a file. name: the file, for messages; data: its content; kind: "mesh" or "surface".
+
+    Raises MeshError, whatever meshio does.
+    """
+    printed, bound = io.StringIO(), _most.set(PER_BYTE * len(data) + 4096)
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), np.errstate(all="ignore"):
+            return _call(file, file.suffix.lower(), data)
+    except ImportError as error:
+        raise MeshError(f"{name}: files {file.suffix!r} need the Python package {error.name or error}") from error
+    except MemoryError as error:
+        raise MeshError(f"{name}: not a supported {kind}: it asks for more memory than it can fill") from error
+    except (Exception, SystemExit) as error:
+        # Before meshio ends the program it prints why.
+        said = f"{type(error).__name__}: {error}" if isinstance(error, Exception) else printed.getvalue()
+        raise MeshError(f"{name}: not a supported {kind} ({one_line(_without_content(said, data))})") from error
+    finally:
+        _most.reset(bound)
+
+
+def _without_content(said: str, data: bytes) -> str:
+    """A message without what the file holds: it may be a file that others must not read."""
+    content = data.lower()
+    plain = re.sub(r"(['\"`]).*?\1", "...", said, flags=re.DOTALL)
+    return " ".join("..." if len(word) > 3 and word.lower().encode() in content else word for word in plain.split())
+
+
+def _call(file: Path, ending: str, data: bytes) -> meshio.Mesh:
+    """meshio's mesh; readers that would wait for ever get a file that stops them."""
+    file_format = _WAITING.get(ending)
+    if ending == ".msh":
+        if data.lstrip()[:1] != b"(":
+            return meshio.read(file, file_format="gmsh")
+        file_format = "ansys"
+    if file_format is None:
+        return meshio.read(file)
+    with _Ending(io.FileIO(file)) as stream:
+        if file_format in _OF_TEXT:
+            return meshio.read(_EndingText(stream, encoding="utf-8"), file_format=file_format)
+        return meshio.read(stream, file_format=file_format)

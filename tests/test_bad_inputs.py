@@ -1,0 +1,265 @@
+"""Bad input as a user meets it, through `taisoft run` on a scene file:
+
+* what cannot be simulated is refused before any output exists: status 2 and one sentence with file, item and rule;
+* what can be, but is suspect, runs, and the report says what was found: mirrored, doubled, joined and far meshes, pieces,
+  millimetres, nearly incompressible rubber, names that USD does not take.
+"""
+
+import contextlib
+import io
+import os
+import random
+
+import meshio
+import numpy as np
+import pytest
+from command import report, run, write
+
+import taisoft as ts
+from taisoft.checkpoint import read_checkpoint
+
+MESH = ts.box_mesh((2, 2, 2), (1, 1, 1), pattern="six")
+X, TETS = np.array(MESH.vertices), np.array(MESH.tets)
+SIZE = len(X)  # 27
+BOX = 'shape = "box", cells = [2, 2, 2], size = [1, 1, 1]'
+GROUND = '[obstacles.ground]\nshape = "half_space"\npoint = [0, -2, 0]\nnormal = [0, 1, 0]\n'
+
+
+def scene_text(mesh=BOX, material="", head="", more="", solver="dt = 0.01"):
+    return f"{head}\n[solver]\nseconds = 0.02\nfps = 50\n{solver}\n[bodies.part]\nmaterial = {{ {material} }}\n" \
+        f"mesh = {{ {mesh} }}\n{more}"  # fmt: skip
+
+
+def write_mesh(path, points=X, cells=(("tetra", TETS),)):
+    options = {"file_format": "gmsh", "binary": False} if path.suffix == ".msh" else {}
+    with contextlib.redirect_stdout(io.StringIO()):
+        meshio.write(path, meshio.Mesh(points, list(cells)), **options)
+
+
+def refusal(tmp_path, capsys, text, *arguments, scene="scene.toml") -> str:
+    """The one sentence with which a scene is refused; nothing is written."""
+    path = write(tmp_path / scene, text)
+    before = sorted(os.listdir(tmp_path))
+    assert run(path, "--out", tmp_path / "out", *arguments) == 2
+    told = capsys.readouterr().err
+    assert sorted(os.listdir(tmp_path)) == before and told.startswith("taisoft: ") and told.count("\n") == 1, told
+    return told
+
+
+# --- meshes -----------------------------------------------------------------------------------------------------------
+
+
+def with_vertex(value):
+    points = X.copy()
+    points[17, 0] = value
+    return {"points": points}
+
+
+def with_tet(tet):
+    return {"cells": [("tetra", np.vstack([TETS[:5], [tet], TETS[5:]]))]}
+
+
+FLAT = np.vstack([X, np.array([(5, 0, 0), (6, 0, 0), (5, 1, 0), (6, 1, 1e-10)])])
+CROWDED = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0.3, 0.3, 1), (0.3, 0.3, -1), (0.3, 0.3, 2)])
+HEXAHEDRON = ("hexahedron", np.array([[0, 9, 12, 3, 1, 10, 13, 4]]))
+MESHES = {
+    "nan": (with_vertex(np.nan), "vertex 17 coordinate 0 is not finite"),
+    "inf": (with_vertex(np.inf), "vertex 17 coordinate 0 is not finite"),
+    "large": (with_vertex(1e39), "vertex 17 coordinate 0 is 1e+39 m, too large for a 32-bit float"),
+    "beyond": (with_tet([0, 1, 3, SIZE]), "tet 5: vertex 27 does not exist (27 vertices, counted from 0)"),
+    "negative": (with_tet([0, 1, 3, -1]), "tet 5: vertex -1 does not exist"),
+    "from_one": ({"cells": [("tetra", TETS + 1)]}, "they seem to count from 1, subtract 1"),
+    "inverted": ({"cells": [("tetra", np.vstack([TETS[:7], TETS[7:8, [0, 1, 3, 2]], TETS[8:]]))]},
+                 "1 of 48 tets are inverted, the first is tet 7; fix_orientation"),
+    "flat": ({"points": FLAT, "cells": [("tetra", np.vstack([TETS, [[27, 28, 29, 30]]]))]}, "tet 48 has no volume"),
+    "no_tets": ({"cells": []}, "no tetrahedra; "),
+    "nothing": ({"points": np.zeros((0, 3)), "cells": []}, "no tetrahedra; "),
+    "surface": ({"cells": [("triangle", MESH.surface)]}, "no tetrahedra; 48 triangles found; make a volume mesh first"),
+    "quads": ({"cells": [("tetra", TETS), ("quad", np.array([[0, 1, 4, 3]]))]}, "but the file holds 1 quad"),
+    "hexahedra": ({"cells": [HEXAHEDRON]}, "but the file holds 1 hexahedron"),
+    "three": ({"points": CROWDED, "cells": [("tetra", np.array([[0, 1, 2, 3], [0, 2, 1, 4], [0, 1, 2, 5]]))]},
+              "face (0, 1, 2) is shared by 3 tets (0, 1, 2)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("ending", [".vtk", ".vtu", ".mesh"])
+@pytest.mark.parametrize("name", MESHES)
+def test_broken_meshes(tmp_path, capsys, name, ending):
+    parts, rule = MESHES[name]
+    write_mesh(tmp_path / f"part{ending}", **parts)
+    told = refusal(tmp_path, capsys, scene_text(f'file = "part{ending}"'))
+    assert f"scene.toml: bodies.part.mesh: {tmp_path}/part{ending}: " in told and rule in told
+
+
+@pytest.mark.parametrize("name", ["nan", "large", "beyond", "negative", "inverted", "flat", "surface", "hexahedra", "three"])
+def test_broken_gmsh_files(tmp_path, capsys, name):
+    """There tets name nodes by tags, from 1 here."""
+    parts, rule = MESHES[name]
+    write_mesh(tmp_path / "part.msh", **parts)
+    rule = {"beyond": "tet 5: node 28 does not exist (27 nodes)", "negative": "tet 5: node 0 does not exist"}.get(name, rule)
+    assert rule in refusal(tmp_path, capsys, scene_text('file = "part.msh"'))
+
+
+def test_files_that_are_no_meshes(tmp_path, capsys):
+    """Empty, cut off in the elements, random, and of a format without tets."""
+    path, text = tmp_path / "part.msh", scene_text('file = "part.msh"')
+    write_mesh(path)
+    whole = path.read_bytes()
+    for content, rule in (
+        (b"", "the file is empty"),
+        (whole[: whole.index(b"$Elements") + 300], "line 86: the file ends inside $Elements, before $EndElements"),
+        (random.Random(0).randbytes(500), "not a supported mesh"),
+    ):
+        path.write_bytes(content)
+        assert f"part.msh: {rule}" in refusal(tmp_path, capsys, text)
+    write_mesh(tmp_path / "part.obj", cells=[("triangle", MESH.surface)])
+    text = scene_text('file = "part.obj"')
+    assert "no tetrahedra; 48 triangles found" in refusal(tmp_path, capsys, text, "--allow-outside")
+
+
+@pytest.mark.parametrize("ending", [".msh", ".vtk", ".vtu", ".mesh", ".node", ".ele"])
+def test_what_a_file_holds_is_not_repeated(tmp_path, capsys, ending):
+    """A link or --allow-outside could name any file."""
+    secrets = [
+        "root:passphrase:17", "passphrase 0 1\n2 passphrase", "passphrase", "1 3 0 0\n0 passphrase 0 0\n",
+        "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\npassphrase\n", "<VTKFile><passphrase/></VTKFile>",
+        "# vtk DataFile Version 4.2\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS passphrase 1",
+        "# vtk DataFile Version 4.2\nx\nASCII\npassphrase", "MeshVersionFormatted 1\nDimension 3\nVertices\npassphrase",
+        "# vtk DataFile Version 5.1\nx\npassphrase", "MeshVersionFormatted 1\nDimension passphrase",
+    ]  # fmt: skip
+    for secret in secrets:
+        (tmp_path / f"part{ending}").write_text(secret)
+        told = refusal(tmp_path, capsys, scene_text(f'file = "part{ending}"'), "--allow-outside")
+        assert "passphrase" not in told, told
+
+
+# --- numbers, keys and names ------------------------------------------------------------------------------------------
+
+SCENES = {
+    "margin": (scene_text(head="[collision]\nmargin = 1e-3", mesh=BOX.replace("[1, 1, 1]", "[1e-6, 1e-6, 1e-6]"), more=GROUND),
+               "margin = 0.001 m is larger than the mean surface edge of body 'part', 5.69e-07 m"),
+    "poisson_half": (scene_text(material="poisson = 0.5"), "poisson must lie in the open interval (-1, 0.5), not 0.5"),
+    "poisson_above": (scene_text(material="poisson = 0.7"), "poisson must lie in the open interval (-1, 0.5), not 0.7"),
+    "poisson_below": (scene_text(material="poisson = -1"), "poisson must lie in the open interval (-1, 0.5), not -1"),
+    "young_zero": (scene_text(material="young = 0"), "part.material.young must be greater than 0 Pa, not 0"),
+    "young_below": (scene_text(material="young = -1"), "young must be greater than 0 Pa, not -1"),
+    "young_nan": (scene_text(material="young = nan"), "young must be finite, not nan"),
+    "young_text": (scene_text(material='young = "1e5 Pa"'), "young must be a number, not '1e5 Pa'"),
+    "young_large": (scene_text(material="young = 1e300"), "young is 1e+300, too large for a 32-bit float"),
+    "density_zero": (scene_text(material="density = 0"), "density must be greater than 0 kg/m^3, not 0"),
+    "density_below": (scene_text(material="density = -1"), "density must be greater than 0 kg/m^3, not -1"),
+    "density_small": (scene_text(material="density = 1e-300"), "density is 1e-300, too small for a 32-bit float"),
+    "dt_zero": (scene_text(solver="dt = 0"), "solver.dt must be greater than 0, not 0"),
+    "dt_below": (scene_text(solver="dt = -0.01"), "solver.dt must be greater than 0, not -0.01"),
+    "dt_nan": (scene_text(solver="dt = nan"), "solver.dt must be finite, not nan"),
+    "dt_inf": (scene_text(solver="dt = inf"), "solver.dt must be finite, not inf"),
+    "dt_small": (scene_text(solver="dt = 1e-30"), "in steps of 1e-30 s are more than 4.5e+15 steps: the run would never end"),
+    "seconds": (scene_text().replace("seconds = 0.02", "seconds = -1"), "solver.seconds must be greater than 0, not -1"),
+    "endless": (scene_text().replace("seconds = 0.02", "seconds = 1e30"), "the run would never end"),
+    "friction": (scene_text(material="friction = -0.1"), "friction must be at least 0, not -0.1"),
+    "friction_nan": (scene_text(more=GROUND + "friction = nan"), "obstacles.ground.friction must be finite, not nan"),
+    "restitution": (scene_text(material="restitution = 1.5"), "restitution must be at least 0 and at most 1, not 1.5"),
+    "tolerance": (scene_text(solver="newton_tolerance = 0"), "solver.newton_tolerance must be greater than 0, not 0"),
+    "tolerance_below": (scene_text(solver="contact_tolerance = -1"), "solver.contact_tolerance must be greater than 0, not -1"),
+    "cap": (scene_text(solver="max_iterations = 0"), "solver.max_iterations is not known"),
+    "unstable": (scene_text(solver='dt = 0.01\nintegrator = "symplectic_euler"', material="young = 1e8"),
+                 "dt = 0.01 s is above the estimated stability limit of 0.000844 s of symplectic_euler: take a smaller dt"),
+    "gravity_two": (scene_text(head="gravity = [0, -9.81]"), "gravity must have shape (3,), not (2,)"),
+    "gravity_text": (scene_text(head='gravity = "down"'), "gravity must be numbers of shape (3,), not 'down'"),
+    "gravity_large": (scene_text(head="gravity = [0, 1e300, 0]"), "gravity: entry [1] is 1e+300, too large for a 32-bit float"),
+    "key": (scene_text(material="youngs_modulu = 1e5"), "part.material.youngs_modulu is not known (did you mean young?)"),
+    "gone": (scene_text('file = "gone.msh"'), "bodies.part.mesh: "),
+    "kind": (scene_text().replace("{ shape", "7 # {"), "bodies.part.mesh must be a table, not 7"),
+    "material": (scene_text().replace("{  }", '"ruber"', 1), "bodies.part.material 'ruber' is not among the materials"),
+    "outside": (scene_text('file = "../../part.msh"'), "must lie inside the scene file's folder, without '..'"),
+    "passwd": (scene_text('file = "/etc/passwd"'), "bodies.part.mesh.file must be one of .msh, .vtk"),
+    "expression": (scene_text(material="""young = "__import__('os').system('touch CANARY')\""""), "young must be a number, not"),
+    "selector": (scene_text(more="""[[bodies.part.fix]]\nnodes = "open('CANARY', 'w')"\n"""), 'nodes must be "all", a list of'),
+    "yaml": ("!!python/object/apply:os.system ['touch CANARY']\n", "scene.toml, line 1: Invalid statement"),
+    "include": (scene_text(head='include = "scene.toml"'), "include is not known"),
+    "empty_name": (scene_text().replace("bodies.part", 'bodies.""'), "body name must be a text that is not empty"),
+    "cells": (scene_text(BOX.replace("[2, 2, 2]", "[1000000000, 2, 2]")), "give more than the 50000000 tets allowed"),
+    "many_cells": (scene_text(BOX.replace("[2, 2, 2]", "[3000, 3000, 3000]")), "give 135000000000 tets, about 5.4e+04 GB"),
+    "buffers": (scene_text(head="[collision]\ninitial_capacity = 2000000000", more=GROUND), "2^31 - 1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_bad_scenes(tmp_path, capsys, name):
+    text, rule = SCENES[name]
+    told = refusal(tmp_path, capsys, text.replace("CANARY", str(tmp_path / "canary")))
+    assert rule in told and not (tmp_path / "canary").exists()
+
+
+def test_other_files_are_no_scenes(tmp_path, capsys):
+    text = f"!!python/object/apply:os.system ['touch {tmp_path / 'canary'}']\n"
+    assert "neither a demo nor a .toml or .py file" in refusal(tmp_path, capsys, text, scene="scene.yaml")
+    assert not (tmp_path / "canary").exists()
+
+
+def test_one_step_more_than_there_can_be(tmp_path, capsys):
+    """Also where the number comes from options, and through the API."""
+    scene = ts.read_scene(write(tmp_path / "a.toml", scene_text()))[0]
+    assert "the run would never end" in refusal(tmp_path, capsys, scene_text(), "--seconds", "1e30")
+    assert "the run would never end" in refusal(tmp_path, capsys, scene_text(), "--fps", "1e25")
+    with ts.Simulator(scene) as sim, pytest.raises(ts.SimulationError, match="the run would never end"):
+        sim.run(1e30, fps=None)
+
+
+# --- what runs, and is told -------------------------------------------------------------------------------------------
+
+
+def test_what_is_suspect_is_told(tmp_path):
+    """One run of many bodies; its report, its USD names and its last state."""
+    twice = np.vstack([TETS, TETS + SIZE])
+    files = {
+        "mirrored": (X, TETS[:, [0, 1, 3, 2]]), "doubled": (np.vstack([X, X + [1, 0, 0]]), twice),
+        "corner": (np.vstack([X, X + 1.0]), twice), "edge": (np.vstack([X, X + [1, 1, 0]]), twice),
+        "two": (np.vstack([X, X + [3, 0, 0]]), twice), "far": (0.1 * X + 1e6, TETS), "near": (0.1 * X, TETS),
+        "millimetres": (100.0 * X, TETS), "turned": (X, np.vstack([TETS[:-1], TETS[-1:, [0, 1, 3, 2]]])),
+    }  # fmt: skip
+    options = {"corner": ", weld = 0", "edge": ", weld = 0", "turned": ", fix_orientation = true"}
+    text = 'contact_forces = false\n[solver]\ndt = 0.01\nseconds = 0.05\nfps = 100\nprecision = "f32"\n'
+    for name, (points, tets) in files.items():
+        write_mesh(tmp_path / f"{name}.vtu", points, [("tetra", tets)])
+        text += f'[bodies.{name}]\nmaterial = {{ young = 1e5 }}\nmesh = {{ file = "{name}.vtu"{options.get(name, "")} }}\n'
+    for name, side in (("near", -0.04), ("far", 1e6 - 0.04)):
+        text += f"[[bodies.{name}.fix]]\nnodes = {{ half_space = {{ point = [{side}, 0, 0], normal = [1, 0, 0] }} }}\n"
+    names = ["1 cube", "a/b", "a_b", "\u00fc", "x" * 300, "../../x"]
+    for name in names:
+        text += f'[bodies."{name}"]\nmaterial = {{ young = 1e5, poisson = 0.495 }}\nmesh = {{ {BOX} }}\n'
+    assert run(write(tmp_path / "scene.toml", text), "--out", tmp_path / "out", "--no-frames") == 0
+    found = report(tmp_path / "out")
+    told = "\n".join(found["problems"])
+    for sentence in (
+        "mirrored.vtu: all 48 tets are inverted (a mirrored mesh?); all have been flipped",
+        "doubled.vtu: 9 vertices coincide with another one, the first is vertex 27 on vertex 18",
+        "corner.vtu: parts are joined at a vertex only at 1 vertices: 26",
+        "edge.vtu: parts are joined at an edge only at 2 edges, the first is (24, 25)",
+        "turned.vtu: 1 of 48 inverted tets have been flipped: 47",
+        "far.vtu: the mesh lies 1e+06 m from the origin",
+        "body 'millimetres': 100 m long and 1e+09 kg, its own weight strains it by about 9.8; a wave crosses it in 10 s",
+        "body '1 cube': poisson = 0.495 is above 0.49, where linear tets lock",
+    ):
+        assert sentence in told
+    pieces = {body["name"]: body["pieces"] for body in found["bodies"]}
+    assert [name for name, n in pieces.items() if n == 2] == ["doubled", "two"] and set(pieces) == {*files, *names}
+    assert_far_is_near(tmp_path / "out", files, {body["name"]: body["nodes"] for body in found["bodies"]})
+    assert_named(tmp_path / "out" / "scene.usdc", pieces)
+
+
+def assert_far_is_near(out, files, sizes):
+    """The same cube 1e6 m away bends by the same, but for the digits that the distance takes."""
+    x = read_checkpoint(out / "checkpoint.npz").state["world"]["x"]
+    starts = dict(zip(sizes, np.cumsum([0, *sizes.values()])))
+    moves = [x[starts[name] : starts[name] + SIZE] - files[name][0] for name in ("near", "far")]
+    assert 1e-4 < np.abs(moves[0]).max() < 0.05 and np.abs(moves[0] - moves[1]).max() < 1e-5 * np.abs(moves[0]).max()
+
+
+def assert_named(path, names):
+    """Every body has a prim of its own, whose name USD takes, and keeps its own name beside."""
+    from pxr import Usd
+
+    stage = Usd.Stage.Open(str(path))
+    kept = [prim.GetCustomDataByKey("taisoft:name") for prim in stage.GetPrimAtPath("/World").GetChildren()]
+    assert sorted(kept) == sorted(names)

@@ -1,0 +1,371 @@
+"""Faults of the machine, and how a run ends under them:
+
+* a disk that fills, a folder that becomes read-only, a disk that fails in fsync, rename or write: status 3, a sentence with the
+  path, no file that is torn, and no word of success;
+* killed at random times while report and checkpoint are replaced: each is the old or the new one;
+* too little memory: a sentence with what is needed and what there is, before the first step;
+* a number that is spoilt in the middle of a run is found in the same step, and the last good checkpoint stays;
+* buffers for contacts that are too small grow, and the report tells, or the run stops;
+* a second writer, a jumping clock, another locale, no home, no cache: refused, or without effect.
+"""
+
+import json
+import os
+import re
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import BEAM, ROOT, SHORT_OUTPUT, report, run, write
+
+import taisoft as ts
+from taisoft import fields
+from taisoft.checkpoint import read_checkpoint
+from taisoft.output.checkpoint import CheckpointWriter
+from taisoft.output.files import OutputFolder
+
+RESULTS = {"report.json", "steps.csv", "checkpoint.npz", "scene.usdc", "frames"}
+
+
+def python(code: str, *arguments, **environment) -> subprocess.CompletedProcess:
+    """Code in a process of its own; None takes a variable out of its environment."""
+    given = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"} | environment
+    given = {name: value for name, value in given.items() if value is not None}
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, env=given, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.fixture(scope="module")
+def shim(tmp_path_factory) -> Path:
+    """The library of failing calls."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None or not sys.platform.startswith("linux"):
+        pytest.skip("there is no C compiler, or nothing can be preloaded here")
+    path = tmp_path_factory.mktemp("shim") / "failing_calls.so"
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", path, ROOT / "tests" / "failing_calls.c", "-ldl"], check=True)
+    return path
+
+
+# --- disks ------------------------------------------------------------------------------------------------------------
+
+# Each run in the same process, so that kernels are compiled once: (call, part of the path, where it fails)
+FAILING = """
+import contextlib, io, json, os, sys
+from taisoft import runtime
+from taisoft.cli import main
+scene, base, shown = sys.argv[1], sys.argv[2], []
+for k, (call, name) in enumerate(json.loads(sys.argv[3])):
+    out, err = io.StringIO(), io.StringIO()
+    os.environ["FAIL_CALL"], os.environ["FAIL_NAME"] = call, name
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        status = main(["run", scene, "--headless", "--out", f"{base}/{k}", "--overwrite"])
+    os.environ["FAIL_NAME"], runtime._kind = "", None  # Taichi anew: kernels are then found in its cache
+    shown.append((status, out.getvalue(), err.getvalue()))
+print(json.dumps(shown))
+"""
+CALLS = {
+    "some": [("fsync", "report.json"), ("rename", "checkpoint.npz")],
+    "others": [
+        ("rename", "report.json"), ("fsync", "scene.usdc"), ("rename", "00001.png"), ("write", "steps.csv"),
+        ("write", "checkpoint.npz"),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("which", CALLS)
+def test_a_disk_that_fails(beam, tmp_path, shim, which):
+    calls = CALLS[which]
+    for k in range(len(calls)):
+        (tmp_path / str(k)).mkdir()
+        (tmp_path / str(k) / "report.json").write_text("old")
+    done = python(FAILING, beam, tmp_path, json.dumps(calls), LD_PRELOAD=str(shim))
+    assert done.returncode == 0, done.stderr
+    for k, ((call, name), (status, out, err)) in enumerate(zip(calls, json.loads(done.stdout.splitlines()[-1]))):
+        folder = tmp_path / str(k)
+        reason = "No space left on device" if call == "write" else "Input/output error"
+        assert status == 3, (call, name, out, err)
+        assert re.search(rf"taisoft: cannot write {folder}/\S*{name}\S*.*: {reason}", err), err
+        assert not list(folder.rglob("*.part")) and not list(folder.glob("*.lock"))
+        if name == "report.json":
+            assert (folder / name).read_text() == "old"
+        else:
+            assert not (folder / name).exists()
+            assert name == "steps.csv" or (report(folder)["status"] == "degraded" and "status   degraded" in out)
+        if name != "checkpoint.npz":  # the state is kept, so that the run can go on elsewhere
+            read_checkpoint(folder / "checkpoint.npz")
+
+
+def fill(folder: Path) -> bool:
+    """Make the folder a disk of 1 MB; False where that is not allowed."""
+    command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
+    return shutil.which("mount") is not None and subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+
+def test_a_disk_that_is_full(beam, tmp_path, capsys):
+    """Pictures fill it; what was written before is whole, and the simulation can be saved elsewhere."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted, limits = fill(disk), resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        if mounted:
+            (disk / "ballast").write_bytes(bytes(2**20 - 150_000))
+        else:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+        status = run(beam, "--out", disk / "out", "--seconds", "0.5")
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        told = capsys.readouterr().err
+        assert status == 3 and re.search(rf"taisoft: cannot write {disk}/out/\S+ \(\d+ bytes.*: .+", told), told
+        files = [path for path in (disk / "out").rglob("*") if path.is_file()]
+        assert not [path for path in files if path.suffix == ".part" or path.stat().st_size == 0]
+        if (disk / "out" / "checkpoint.npz").exists():
+            read_checkpoint(disk / "out" / "checkpoint.npz")
+        if (disk / "out" / "report.json").exists():
+            assert report(disk / "out")["status"] == "degraded"
+        with ts.Simulator(small_scene(), 0.01, "symplectic_euler") as sim:
+            sim.step()
+            if mounted:
+                (disk / "more").write_bytes(bytes(os.statvfs(disk).f_bavail * os.statvfs(disk).f_bsize))
+            else:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+            with pytest.raises(ts.OutputError, match="checkpoint.npz: "):
+                sim.save_checkpoint(disk / "checkpoint.npz")
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+            assert not (disk / "checkpoint.npz").exists()
+            sim.save_checkpoint(tmp_path / "elsewhere.npz")
+            assert np.array_equal(read_checkpoint(tmp_path / "elsewhere.npz").state["world"]["x"], sim.positions())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        if mounted:
+            subprocess.run(["umount", str(disk)], check=True)
+
+
+TAKEN = """
+    body.move(lambda X: X[:, 0] > 1.99, path)
+    return scene
+
+
+def path(t):
+    from pathlib import Path
+
+    out = Path(__file__).parent / "out"
+    if t > 0.05 and out.is_dir():
+        out.rename(out.with_name("taken"))
+        out.write_text("a file")
+    return (0, 0, 0)
+"""
+
+
+def test_a_folder_that_is_taken_away(tmp_path, capsys):
+    """In the middle of the run, in a way that also stops the superuser: what was written before stays whole. And before it."""
+    path, out = write(tmp_path / "scene.py", BEAM.replace("\n    return scene\n", TAKEN)), tmp_path / "out"
+    assert run(path, "--out", out) == 3
+    captured = capsys.readouterr()
+    assert re.search(rf"taisoft: cannot write {out}/\S+.*: Not a directory", captured.err), captured.err
+    assert "status   degraded" in captured.out
+    kept = sorted(str(file.relative_to(tmp_path / "taken")) for file in (tmp_path / "taken").rglob("*.*"))
+    assert kept[:2] == ["frames/00000.png", "frames/00001.png"] and "report.json" not in kept
+    assert run(path, "--out", out / "new") == 3
+    captured = capsys.readouterr()
+    assert "cannot create the folder" in captured.err and "status" not in captured.out
+
+
+KILLED = """
+import json, os, random, signal, sys, time
+from pathlib import Path
+import numpy as np
+from fake_simulator import beam_scene
+from taisoft.checkpoint import read_checkpoint, write_checkpoint
+from taisoft.errors import SimulationError
+from taisoft.output.checkpoint import CheckpointWriter, read_last_good
+from taisoft.output.report import write_report
+from taisoft.records import RunReport, StepReport
+
+folder, scene = Path(sys.argv[1]), beam_scene()
+
+class Saved:
+    time = 0.0
+    def save_checkpoint(self, path, notes):
+        write_checkpoint(path, {}, scene, {}, {"n": self.time, "x": np.full(20_000, self.time)}, notes)
+
+def replace(kill, begun):
+    sim, writer = Saved(), CheckpointWriter(folder, resumed=folder / "checkpoint.npz")
+    for k in range(1_000_000):
+        sim.time = 1000.0 * kill + k
+        writer.write(sim)
+        reports = [StepReport(time=0.01 * j) for j in range(k % 50)]
+        write_report(folder, RunReport(steps=k, step_reports=reports), arch="cpu", precision="f32", settings={}, plan=[])
+        if k == 0:
+            os.write(begun, b".")
+
+dice, seen = random.Random(2), set()
+Saved().save_checkpoint(folder / "checkpoint.npz", {})
+for kill in range(1, 1 + int(sys.argv[2])):
+    told, begun = os.pipe()
+    child = os.fork()
+    if child == 0:
+        replace(kill, begun)
+    os.read(told, 1)
+    time.sleep(dice.uniform(0.0, 0.05))
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    for name in ("checkpoint.npz", "checkpoint.previous.npz"):
+        if (folder / name).exists():
+            state = read_checkpoint(folder / name).state
+            assert (state["x"] == state["n"]).all()
+    seen.add(read_checkpoint(folder / "checkpoint.npz").state["n"])
+    json.loads((folder / "report.json").read_text())
+    rows = (folder / "steps.csv").read_text()
+    assert rows.endswith("\\n") and len(set(row.count(",") for row in rows.splitlines())) == 1
+print(len(seen), len(list(folder.glob("*.part"))))
+"""
+
+
+@pytest.mark.parametrize("kills", [10, 100])
+def test_killed_while_files_are_replaced(tmp_path, kills):
+    done = python(KILLED, tmp_path, kills)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout.split()[0]) == kills  # each child has come to write
+    OutputFolder(tmp_path, overwrite=True).close()
+    assert not list(tmp_path.glob("*.part"))
+
+
+# --- memory and numbers -----------------------------------------------------------------------------------------------
+
+
+def small_scene() -> ts.Scene:
+    scene = ts.Scene()
+    scene.add_body(ts.box_mesh((2, 1, 1), (2, 1, 1)), ts.Material(young=1e5), name="part")
+    return scene
+
+
+SHORT_OF_MEMORY = """
+import resource, sys
+import taisoft.cli.run
+from pathlib import Path
+used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + int(sys.argv[1]),) * 2)
+sys.exit(taisoft.cli.main(["run", sys.argv[2], "--headless", "--out", sys.argv[3]]))
+"""
+HUNGRY = """
+import taisoft as ts
+
+
+def build():
+    scene = ts.Scene()
+    scene.add_body(ts.box_mesh((2, 1, 1), (2, 1, 1)), ts.Material(young=1e5), name="part")
+    scene.add_obstacle(ts.HalfSpace((0, -2, 0), (0, 1, 0)))
+    scene.collision = ts.CollisionSettings(initial_capacity=100_000_000)
+    return scene
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells how much is in use")
+@pytest.mark.parametrize("more, needed", [(3 * 10**8, "start Taichi: 1073741824 bytes"), (4 * 10**9, "the field '")])
+def test_too_little_memory(tmp_path, more, needed):
+    done = python(SHORT_OF_MEMORY, more, write(tmp_path / "scene.py", HUNGRY), tmp_path / "out")
+    assert done.returncode == 2, done.stdout + done.stderr
+    told = re.search(r"taisoft: not enough memory .*: (\d+) bytes \(.*\) are needed.*, available: (\d+) bytes", done.stderr)
+    assert told and needed in told[0] and int(told[1]) > int(told[2]) and "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_too_little_memory_for_the_fields(monkeypatch):
+    monkeypatch.setattr(fields, "SMALL", 0)
+    monkeypatch.setattr(fields, "available_memory", lambda: 17)
+    with pytest.raises(ts.SimulationError, match=r"not enough memory for the field '\w+' and \d+ made with it: .*: 17 bytes"):
+        ts.Simulator(small_scene(), 0.01, "symplectic_euler")
+    monkeypatch.undo()
+    with ts.Simulator(small_scene(), 0.01, "symplectic_euler") as sim:  # nothing is left behind
+        assert sim.step().converged
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_euler"])
+@pytest.mark.parametrize("others", ["nothing", "ground", "body"])
+def test_a_number_that_is_spoilt(tmp_path, integrator, others):
+    """In frame 2 a velocity becomes NaN behind the simulator's back; step 3 finds it, before any search for contacts."""
+    scene = small_scene()
+    if others != "nothing":
+        scene.add_obstacle(ts.HalfSpace((0, -0.55, 0), (0, 1, 0)))
+    if others == "body":
+        scene.add_body(scene.bodies[0].mesh, scene.bodies[0].material, name="other", position=(0, 1.05, 0))
+        scene.collision = ts.CollisionSettings("spatial_hash")
+    checkpoints = CheckpointWriter(tmp_path, every=0.001)
+    shown = []
+
+    def spoil(sim, index, _report):
+        checkpoints.frame(sim, index)
+        shown.append(sim.positions())
+        if index == 2:
+            x, v = sim._world.state()
+            v[5] = np.nan
+            sim._world.set_state(x, v)
+
+    with ts.Simulator(scene, 0.001, integrator) as sim:
+        result = sim.run(0.01, spoil, fps=None)
+        assert result.status == "failed" and result.steps == 2 and len(shown) == 3
+        assert re.search(r"^step 3: body 'part', node 5: position, velocity or force is no longer finite", result.problems[-1])
+        assert np.array_equal(sim.positions(), shown[-1])
+        with pytest.raises(ts.SimulationError, match="no checkpoint is made of such a state: body 'part', node 5"):
+            checkpoints.write(sim)
+    world = read_checkpoint(tmp_path / "checkpoint.npz").state["world"]
+    assert world["step_count"] == 2 and np.array_equal(world["x"], shown[-1]) and np.isfinite(world["v"]).all()
+
+
+def landed(capacity: int | None, most: int | None):
+    """A plate falls on the ground: the run, and the last state."""
+    scene = ts.Scene()
+    scene.add_body(ts.box_mesh((9, 1, 9), (0.9, 0.1, 0.9)), ts.Material(young=1e5), name="plate", position=(0, 0.08, 0))
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground")
+    scene.collision = ts.CollisionSettings(initial_capacity=capacity, max_capacity=most)
+    with ts.Simulator(scene, 0.002, "symplectic_euler") as sim:
+        result = sim.run(0.1, fps=100)
+        return result, sim.positions(), sim.buffer_growths
+
+
+def test_a_buffer_that_may_not_grow():
+    """Its contacts are more than there is room for when it lands: the run stops with the numbers, in the last good state."""
+    result, x, growths = landed(64, 65)
+    assert result.status == "failed" and 1 < result.steps < 50 and np.isfinite(x).all() and growths == {}
+    assert re.search(r"^step \d+: contacts: \d+ entries are needed .* max_capacity allows 65$", result.problems[-1])
+
+
+def test_a_buffer_that_grows():
+    """It does not show in the result, only in the report."""
+    (result, x, growths), (_, enough, none) = landed(64, None), landed(None, None)
+    assert result.step_reports[-1].n_contacts > 65 and result.step_reports[0].n_contacts == 0
+    assert growths == {"contacts": 1} and none == {} and np.array_equal(x, enough)
+
+
+# --- surroundings -----------------------------------------------------------------------------------------------------
+
+
+def test_a_second_writer(beam, tmp_path, capsys):
+    with OutputFolder(tmp_path / "out"):
+        assert run(beam, "--out", tmp_path / "out", "--overwrite", *SHORT_OUTPUT) == 3
+        captured = capsys.readouterr()
+    assert f"process {os.getpid()} is writing to the output folder {tmp_path / 'out'}" in captured.err
+    assert "status" not in captured.out and not list((tmp_path / "out").iterdir())
+
+
+def test_a_poor_machine(beam, tmp_path, shim):
+    """A clock that jumps by days, a locale with decimal commas, a user without a home, and caches that cannot be written."""
+    assert run(beam, "--out", tmp_path / "rich", "--no-frames", "--no-usd") == 0
+    (tmp_path / "file").write_text("no folder")
+    surroundings = {
+        "LD_PRELOAD": str(shim), "JUMP": "100000", "LC_ALL": "de_DE.UTF-8", "LANG": "de_DE.UTF-8", "HOME": None,
+        "XDG_CACHE_HOME": str(tmp_path / "file" / "cache"),
+    }  # fmt: skip
+    code = "import sys; from taisoft.cli import main; sys.exit(main(sys.argv[1:]))"
+    arguments = ("run", beam, "--headless", "--out", tmp_path / "poor", *SHORT_OUTPUT)
+    done = python(code, *arguments, **surroundings)
+    assert done.returncode == 0 and "status   ok" in done.stdout, done.stderr
+    assert (tmp_path / "poor" / "steps.csv").read_bytes() == (tmp_path / "rich" / "steps.csv").read_bytes()
+    found = report(tmp_path / "poor")
+    assert 0.0 <= found["wall_seconds"] < 60.0 and 0.0 <= found["compile_seconds"] < 300.0
+    homeless = "import os, tempfile; tempfile.tempdir = os.devnull; " + code
+    done = python(homeless, *arguments, "--overwrite", **surroundings)
+    assert done.returncode == 2 and "no folder for compiled kernels can be written: set XDG_CACHE_HOME" in done.stderr

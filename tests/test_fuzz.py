@@ -1,0 +1,133 @@
+"""Random and randomly changed files, for every reader:
+
+a result or a TaisoftError in one line that names the file, within seconds, and with no more memory than a bound that follows
+from the file's size; nothing is printed.
+"""
+
+import contextlib
+import io
+import random
+import re
+import signal
+import tracemalloc
+import warnings
+
+import meshio
+import numpy as np
+import pytest
+from fake_simulator import beam_scene
+from toml_scenes import TEXT
+
+import taisoft as ts
+from taisoft.checkpoint import read_checkpoint, write_checkpoint
+from taisoft.mesh.surface_mesh import FORMATS, read_surface
+
+MESH = ts.box_mesh((2, 1, 1), (2, 1, 1), pattern="six")
+GMSH = {"part.msh": "gmsh", "text.msh": ("gmsh", False), "old.msh": ("gmsh22", False), "older.msh": "gmsh22",
+        "ansys.msh": ("ansys", False)}  # fmt: skip
+OTHERS = (
+    "vtk", "vtu", "mesh", "meshb", "vol", "su2", "xml", "dat", "bdf", "nas", "fem", "inp", "mdpa", "avs", "f3grid", "post",
+    "ugrid", "node",
+)  # fmt: skip
+PIECES = (
+    b"-1", b"9", b"nan", b"1e400", b" ", b"\n", b"$End", b"\0", b"\xff\xfe", b"99999", b"3000000", b"\xff\xff\xff\x7f",
+    b"\0\0\0@",
+)  # fmt: skip
+SIZES = (0, -1, 10**5, 10**6, 10**7, 10**9, 2**31, 2**32 - 1, 2**63, 10**30)
+ROOM, PER_BYTE = 5_000_000, 400  # bytes that a reader may take in all, and beside that for each byte of the file
+SECONDS = 20
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory) -> dict[str, bytes]:
+    """A good file of each kind."""
+    folder = tmp_path_factory.mktemp("samples")
+    found = {}
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        tets, triangles = (meshio.Mesh(MESH.vertices, [cells]) for cells in (("tetra", MESH.tets), ("triangle", MESH.surface)))
+        for name, kind in GMSH.items():
+            kind, binary = kind if isinstance(kind, tuple) else (kind, True)
+            meshio.write(folder / name, tets, file_format=kind, binary=binary)
+        meshio.write(folder / "text.vtk", tets, binary=False)
+        for ending in OTHERS:
+            meshio.write(folder / f"part.{ending}", tets)
+        for ending in FORMATS:
+            meshio.write(folder / f"surface{ending}", triangles)
+        meshio.write(folder / "text.ply", triangles, binary=False)
+        meshio.write(folder / "binary.stl", triangles, binary=True)
+    write_checkpoint(folder / "a.npz", {}, beam_scene(), {}, {"x": np.arange(300.0), "n": 3}, {"fps": 30.0})
+    # without numbers of cells, which may ask for a large but possible mesh
+    (folder / "scene.toml").write_text(TEXT[: TEXT.index("[bodies.beam]")] + "[bodies.beam]\nmesh = { file = 'part.vtk' }\n")
+    for path in folder.iterdir():
+        found[path.name] = path.read_bytes()
+    return found
+
+
+def read(path) -> None:
+    if path.suffix == ".toml":
+        ts.read_scene(path)
+    elif path.suffix == ".npz":
+        read_checkpoint(path)
+    elif path.suffix in FORMATS:
+        read_surface(path)
+    else:
+        ts.read_mesh(path)
+
+
+def changed(data: bytes, dice: random.Random) -> bytes:
+    """Random bytes, or the file cut off, with another number, or with pieces put in."""
+    way, content = dice.random(), bytearray(data)
+    if way < 0.1:
+        return dice.randbytes(dice.randint(1, 400))
+    if way < 0.25:
+        return data[: dice.randint(0, len(data))]
+    if way < 0.6:
+        numbers = list(re.finditer(rb"\d+", data))
+        at = dice.choice(numbers) if numbers else None
+        return data[: at.start()] + str(dice.choice(SIZES)).encode() + data[at.end() :] if at else data
+    for _ in range(dice.randint(1, 4)):
+        at = dice.randint(0, len(content) - 1)
+        content[at : at + dice.randint(0, 4)] = dice.choice(PIECES)
+    return bytes(content)
+
+
+def look(path, data: bytes) -> None:
+    path.write_bytes(data)
+    printed = io.StringIO()
+    tracemalloc.start()
+    signal.alarm(SECONDS)
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            read(path)
+    except ts.TaisoftError as error:
+        text = str(error)
+        assert str(path.with_suffix("")) in text and "\n" not in text and len(text) < 1200, text
+    finally:
+        signal.alarm(0)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert printed.getvalue() == "" and peak < ROOM + PER_BYTE * len(data), f"{peak} bytes for {len(data)}"
+
+
+def too_long(*_):
+    raise AssertionError(f"a reader took more than {SECONDS} s")
+
+
+@pytest.mark.parametrize("n, seed", [(400, 1), (10_000, 2)])
+def test_every_reader(tmp_path, samples, n, seed):
+    """Where it fails, tmp_path holds the file."""
+    dice, names = random.Random(seed), sorted(samples)
+    before = signal.signal(signal.SIGALRM, too_long)
+    (tmp_path / "file.ele").write_bytes(samples["part.ele"])
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for name in names:  # as they are: what is imported or kept at first counts for no file
+                (tmp_path / f"file.{name.rsplit('.', 1)[1]}").write_bytes(samples[name])
+                with contextlib.suppress(ts.TaisoftError):  # meshio cannot read every file that it writes
+                    read(tmp_path / f"file.{name.rsplit('.', 1)[1]}")
+            for k in range(n):
+                name = names[k % len(names)] if k < 2 * len(names) else dice.choice(names)
+                look(tmp_path / f"file.{name.rsplit('.', 1)[1]}", changed(samples[name], dice))
+    finally:
+        signal.signal(signal.SIGALRM, before)
