@@ -16,6 +16,7 @@ from fake_simulator import FakeSimulator, beam_scene
 from test_view import SIZE, body_mask, needs_vulkan
 
 from taisoft.output.camera import Camera
+from taisoft.records import StepReport
 from taisoft.view.layers import Layers
 from taisoft.view.loop import Loop
 from taisoft.view.picking import Drag, nearest_hit, pick
@@ -112,7 +113,7 @@ def test_layers():
     sim.contacts = lambda: found
     faces = len(scene.bodies[0].mesh.surface)
     tips = 2 * 2 * 2
-    counts = {"wires": 3 * faces // 2, "contacts": 2, "tractions": 3 * tips, "fixed nodes": 0}
+    counts = {"wires": 3 * faces // 2, "contacts": 2, "tractions": 3 * tips, "fixed_nodes": 0}
     for name, count in counts.items():
         layers.shown = {other: other == name for other in counts}
         ends, colours = layers.lines(sim, camera)
@@ -133,11 +134,13 @@ class Clock:
 
     def __init__(self, dt, seconds_per_step):
         self.dt, self.seconds_per_step, self.now, self.step_count, self.calls = dt, seconds_per_step, 0.0, 0, []
+        self.compile_seconds = 0.0
 
     def advance(self, n):
         self.calls.append(n)
         self.step_count += n
         self.now += n * self.seconds_per_step
+        return StepReport(time=self.step_count * self.dt, steps=n)
 
 
 @pytest.mark.parametrize("dt, seconds_per_step, steps, needs", [
