@@ -6,6 +6,7 @@ behind them, contacts and arrows so far that nothing hides them.
 
 import numpy as np
 
+from taisoft.errors import OutputError
 from taisoft.mesh.topology import triangle_edges
 from taisoft.output.camera import Camera
 
@@ -22,9 +23,12 @@ IMPULSE_COLOUR, TRACTION_COLOUR = np.array([0.85, 0.12, 0.12]), np.array([0.55, 
 
 class Layers:
     """What is drawn beside surfaces. shown: name -> whether it is, to begin with those of `names`; n_segments: most lines
-    that `lines` gives."""
+    that `lines` gives. Raises OutputError for a name that is unknown."""
 
     def __init__(self, scene, names: tuple[str, ...] = IN_WINDOW):
+        for name in names:
+            if name not in LAYERS:
+                raise OutputError(f"layer '{name}' is unknown: it must be one of {', '.join(LAYERS)}")
         self.shown = {name: name in names for name in LAYERS}
         starts = np.cumsum([0] + [body.n_nodes for body in scene.bodies])
         self._edges = np.concatenate([triangle_edges(np.asarray(b.nodes.surface))[0] + n for b, n in zip(scene.bodies, starts)])

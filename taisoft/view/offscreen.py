@@ -13,7 +13,7 @@ from taisoft.output.appearance import start_positions
 from taisoft.output.camera import MAX_WIDENING, Camera
 from taisoft.runtime import open_kind
 from taisoft.view.colouring import Colouring
-from taisoft.view.ggui import LINE_WIDTH, Canvas, vulkan_missing, window_holder
+from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
 from taisoft.view.layers import IN_PICTURES, Layers
 from taisoft.view.raster import rasterise, stroke
 from taisoft.view.shading import background, lit_colours
@@ -21,6 +21,7 @@ from taisoft.view.surfaces import Surfaces
 
 SIZE = (1280, 720)
 SAMPLES = 2  # per pixel and axis
+LINE_WIDTH = 1.25  # pixels
 KEY_COLOUR = (1.0, 0.0, 1.0)  # magenta, of what no triangle covers; no lit body has it
 RENDERERS = ("auto", "vulkan", "software")
 

@@ -13,6 +13,7 @@ import numpy as np
 from taisoft.errors import SceneError
 from taisoft.output.history import QUANTITIES, History
 from taisoft.records import StepReport
+from taisoft.scene.checks import nearest
 from taisoft.view.colouring import round_up
 
 BLUE, ORANGE, GREEN, DARK = (0.16, 0.42, 0.74), (0.87, 0.42, 0.13), (0.20, 0.56, 0.28), (0.30, 0.30, 0.36)  # sRGB
@@ -42,7 +43,7 @@ class Plot:
 
 
 PLOTS = {
-    "energies": Plot("energies since the start", "J", (
+    "energies": Plot("energy change", "J", (
         Series("kinetic", "kinetic", BLUE), Series("elastic", "elastic", ORANGE),
         Series("gravity", "gravity", GREEN), Series("total", "total", DARK),
     )),
@@ -84,8 +85,10 @@ class Plots:
     def __init__(self, sim, names: tuple[str, ...] = ()):
         self._sim, self.history = sim, History()
         for name in names:
+            if name not in PLOTS:
+                raise SceneError(f"no plot is called '{name}'{nearest(name, PLOTS)}; there are {', '.join(PLOTS)}")
             if name not in self.offered():
-                raise SceneError(f"there is no plot '{name}': {self._why_not()}")
+                raise SceneError(f"there is no plot '{name}': {self._why_not(name)}")
         self.shown = {name: name in names for name in PLOTS}
         self._last_shown = tuple(names)
         self.history.start(sim)
@@ -126,12 +129,14 @@ class Plots:
     def _touching(self) -> bool:
         return self._sim.plan.on["contact_forces"]
 
-    def _why_not(self) -> str:
-        """Why plots are not offered, in words."""
-        entry = next(e for e in self._sim.plan.entries if e["feature"] == "contact_forces")
-        why = [f"steps of {self._sim.settings.integrator} are explicit and solve no equations"] * self._sim.settings.explicit
-        why += [f"contact forces are not modelled ({entry['why']})"] * (not entry["on"])
-        return f"{', and '.join(why)}; there are {', '.join(self.offered())}"
+    def _why_not(self, name: str) -> str:
+        """Why a plot is not offered, in words."""
+        reasons = {
+            "implicit": f"steps of {self._sim.settings.integrator} are explicit and solve no equations",
+            "contact": f"contact forces are not modelled ({self._sim.plan.why('contact_forces')})",
+        }
+        needs = {series.needs for series in PLOTS[name].series}
+        return f"{', and '.join(text for need, text in reasons.items() if need in needs)}; there are {', '.join(self.offered())}"
 
 
 def curves_of(plot: Plot, history: History) -> Curves:
