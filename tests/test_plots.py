@@ -84,8 +84,9 @@ def test_any_values_can_be_drawn(values):
 
 
 def test_only_what_is_modelled_is_offered():
+    all_of_them = {"residuals": ["Newton", "contacts"], "iterations": ["Newton", "CG", "contacts"], "contacts": ["contacts"]}
     series = {
-        (False, True): {"residuals": ["Newton", "contacts"], "iterations": ["Newton", "CG", "contacts"], "contacts": ["contacts"]},
+        (False, True): all_of_them,
         (False, False): {"residuals": ["Newton"], "iterations": ["Newton", "CG"]},
         (True, True): {"residuals": ["contacts"], "iterations": ["contacts"], "contacts": ["contacts"]},
         (True, False): {},
