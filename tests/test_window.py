@@ -175,6 +175,37 @@ def test_pictures_do_not_wait_for_a_slow_solver(monkeypatch, dt, seconds_per_ste
     assert told == "running" if needs == 0 else f"needs {needs:.1f} times real time" in told
 
 
+def test_a_simulator_is_built_after_a_picture_has_told_of_it():
+    sim = Clock(1 / 60, 1e-3)
+    loop, built = Loop(sim, 60.0, False), []
+    for _ in range(5):
+        loop.advance()
+    count, refused = sim.step_count, [True, False]
+    assert count > 0 and loop.lines() == ["running"]
+
+    def build():
+        built.append(sim.step_count)
+        return not refused.pop(0)
+
+    for works in (False, True):
+        loop.ask(build, "it is built")
+        loop.react(set())
+        loop.advance()
+        assert loop.lines()[1] == "it is built" and len(built) == int(works) and sim.step_count == count
+        loop.react(set())
+        assert len(built) == 1 + int(works)
+        compiled = loop.lines()[0] == "the next step is compiled, for some seconds"
+        assert compiled == works
+        if not works:
+            loop.advance()
+            count = sim.step_count
+    for _ in range(2):
+        loop.advance()
+        assert sim.step_count == count, "pictures that tell of it come first"
+    loop.advance()
+    assert sim.step_count > count and loop.lines()[0] == "running"
+
+
 # --- the window ---
 
 

@@ -104,6 +104,7 @@ class Canvas:
         triangles = surfaces.triangles.ravel()
         self._ends = self._fields.vectors("picture lines", ti.f32, 2 * n_segments) if n_segments else None
         self._end_colours = self._fields.vectors("picture line colours", ti.f32, 2 * n_segments) if n_segments else None
+        self._has_drawn_lines = False
         self._indices = self._fields.field("picture triangles", ti.i32, len(triangles), triangles)
         self._flat: tuple | None = None  # fields of what is drawn over the picture, once something is
         self._flat_ends: np.ndarray | None = None  # what they hold
@@ -150,8 +151,11 @@ class Canvas:
             self._canvas.scene(self._scene)
 
     def _draw_lines(self, camera: Camera, ends: np.ndarray, colours: np.ndarray) -> None:
-        """With none to draw a line without length, so that Taichi compiles its copying at the first picture."""
+        """With none to draw, in the first picture, a line without length, so that Taichi compiles its copying then."""
         n = min(len(ends), self._ends.shape[0])
+        if n == 0 and self._has_drawn_lines:
+            return
+        self._has_drawn_lines = True
         all_ends, all_colours = np.zeros((self._ends.shape[0], 3)), np.zeros((self._ends.shape[0], 3))
         all_ends[:n], all_colours[:n] = ends[:n] - camera.target, colours[:n]
         upload([(self._ends, all_ends), (self._end_colours, all_colours)])
