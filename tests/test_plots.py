@@ -5,6 +5,7 @@
 * in the window they lie beside one another, within it, as many as there is room for.
 """
 
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +15,7 @@ from taisoft.errors import SceneError
 from taisoft.output.history import CAPACITY, QUANTITIES
 from taisoft.records import Energies, StepReport
 from taisoft.view.plots import GRID_LINES, PLOTS, Plots, curves_of
-from taisoft.view.strip import MOST_SEGMENTS, cells, drawing
+from taisoft.view.strip import MOST_SEGMENTS, cells, drawing, write
 
 
 class Settled:
@@ -38,6 +39,19 @@ def filled(n=1000, **kind):
         report = StepReport(time=0.01 * (k + 1), residual=10.0 ** rng.uniform(-9, -3), n_contacts=k % 7, **energies)
         plots.take(report, rng.uniform(0.001, 0.1))
     return plots
+
+
+class Told:
+    """A GGUI that keeps the names and places of sub-windows."""
+
+    def __init__(self):
+        self.named, self.places = [], []
+
+    @contextmanager
+    def sub_window(self, name, *place):
+        self.named.append(name)
+        self.places.append(place)
+        yield SimpleNamespace(text=lambda line, color=None: None)
 
 
 def of(series: dict, name: str, times=None):
@@ -136,6 +150,11 @@ def test_plots_lie_in_the_window(kind, size):
     boxes, ends, colours = drawing(shown, size)
     assert len(boxes) == len(shown) and len(ends) == len(colours) and len(ends) <= 2 * MOST_SEGMENTS
     assert np.isfinite(ends).all() and (ends >= 0).all() and (ends <= 1).all() and (boxes >= 0).all() and (boxes <= 1).all()
+    gui = Told()
+    write(gui, shown, (1280, 720))  # the size as it opened
+    assert len(set(gui.named)) == len(shown) and all(name.endswith(str(cell.text)) for name, cell in zip(gui.named, shown))
+    for cell, place in zip(shown, gui.places):
+        assert np.array(place) * (1280, 720, 1280, 720) == pytest.approx(cell.text)
     tops = [cell.box[1] for cell in shown]
     assert all(b >= a + cell.box[3] for a, b, cell in zip(tops, tops[1:], shown))
     for cell in shown:

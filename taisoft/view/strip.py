@@ -1,7 +1,7 @@
 """The plots in the window: a column at its right edge, each a box with lines beside its numbers, which are GGUI's text.
 
-GGUI writes in sub-windows only, and places each once by its name. So a name also tells place and size, which change with the
-window and with the plots that are shown.
+GGUI writes in sub-windows only, and places each once by its name, in units of the size that the window had as it opened. So a
+name also tells place and size, which change with the window and with the plots that are shown.
 """
 
 import math
@@ -36,10 +36,13 @@ class Cell:
 
 
 class Strip:
-    """What the window shows of plots, worked out anew when they or the window change, and EVERY seconds at most otherwise."""
+    """What the window shows of plots, worked out anew when they or the window change, and EVERY seconds at most otherwise.
 
-    def __init__(self, plots: Plots):
-        self.plots, self.cells = plots, []
+    opened: size of the window as it opened, (width, height) in pixels.
+    """
+
+    def __init__(self, plots: Plots, opened: tuple[int, int]):
+        self.plots, self.cells, self._opened = plots, [], opened
         self._drawing = drawing([], (1, 1))
         self._of, self._made = None, -math.inf  # what the drawing is of; when it was made [s]
 
@@ -51,7 +54,7 @@ class Strip:
             self._drawing, self._of, self._made = drawing(self.cells, size), what, now
         if self.cells:
             canvas.draw_over(*self._drawing, (MOST_BOXES, MOST_SEGMENTS), BOX_COLOUR)
-            write(gui, self.cells, size)
+            write(gui, self.cells, self._opened)
 
     def holds(self, x: float, y: float) -> bool:
         """Whether a pixel, from the upper left corner, lies in one of the plots."""
@@ -88,12 +91,12 @@ def drawing(shown: list[Cell], size: tuple[int, int]) -> tuple[np.ndarray, np.nd
     return boxes, np.concatenate(ends), np.concatenate(colours)
 
 
-def write(gui, shown: list[Cell], size: tuple[int, int]) -> None:
-    """The numbers of the plots, in sub-windows of GGUI."""
+def write(gui, shown: list[Cell], opened: tuple[int, int]) -> None:
+    """The numbers of the plots, in sub-windows of GGUI; opened: as of `Strip`."""
     for cell in shown:
         curves, (left, top, width, height) = cell.curves, cell.text
-        place = left / size[0], top / size[1], width / size[0], height / size[1]
-        with gui.sub_window(f"{curves.title}##{size}{cell.text}", *place) as page:
+        place = left / opened[0], top / opened[1], width / opened[0], height / opened[1]
+        with gui.sub_window(f"{curves.title}##{cell.text}", *place) as page:
             for name, value, colour in curves.legend:
                 lighter = tuple(LIGHTER + (1 - LIGHTER) * c for c in colour)
                 page.text(f"{name:9}{value:>13}", color=lighter)

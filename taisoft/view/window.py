@@ -55,7 +55,7 @@ class LiveWindow:
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # [m]; 0 once the user moves the camera
         self._surfaces = Surfaces(scene)
         self.layers = Layers(scene, layers)
-        self.strip = Strip(plots) if plots is not None else None
+        self.strip = Strip(plots, size) if plots is not None else None
         self.colouring = Colouring(scene, self._surfaces, colour)
         self._canvas = Canvas(self._surfaces, size, visible=True, n_segments=self.layers.n_segments + 1)
         self._place = PANEL if tall else SHORT_PANEL
