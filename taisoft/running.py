@@ -13,20 +13,22 @@ if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
 FrameCallback = Callable[["Simulator", int, StepReport | None], None]
+StepCallback = Callable[[StepReport, float], None]
 IMPLICIT_BATCH_SECONDS = 0.5  # of simulated steps between two questions to `stop`
 MOST_STEPS = 2.0**52  # of a run: beyond, the time of a float64 stands still
 
 
 def run(
     sim: "Simulator", seconds: float, on_frame: FrameCallback | None = None, fps: float | None = 60,
-    stop: Callable[[], bool] | None = None, resumed: bool = False,
+    stop: Callable[[], bool] | None = None, resumed: bool = False, on_step: StepCallback | None = None,
 ) -> RunReport:  # fmt: skip
     """Step until `seconds` [s] from now, to the nearest step; frames at fps, or after every step when fps is None.
 
     on_frame(sim, index, report): called for frame 0 (the start, report None) and after every frame. stop: asked between
     steps; True ends the run. dt is lowered once to the next divisor of 1/fps, and that is reported. resumed: seconds and
-    frames count from time 0, not from now; the first frame is `first_frame`. Never raises for a failed or interrupted
-    run: status and problems say it. Raises SimulationError for bad arguments.
+    frames count from time 0, not from now; the first frame is `first_frame`. on_step(report, seconds): called after every
+    implicit step and every batch of explicit ones with its wall time, less that of compiling. Never raises for a failed or
+    interrupted run: status and problems say it. Raises SimulationError for bad arguments.
     """
     seconds = check_positive("seconds", seconds, "s")
     fps = None if fps is None else check_positive("fps", fps, "1/s")
@@ -46,7 +48,7 @@ def run(
         while sim.step_count - zero < total and not report.interrupted:
             frame += 1
             goal = min(total, frame * steps_per_frame)
-            merged = _advance_to(sim, zero + goal, stop, report)
+            merged = _advance_to(sim, zero + goal, stop, report, on_step)
             if merged is None:
                 break
             if sim.settings.explicit:
@@ -113,7 +115,9 @@ def _fit_dt(sim: "Simulator", fps: float | None, report: RunReport) -> int:
     return n
 
 
-def _advance_to(sim: "Simulator", goal: int, stop, report: RunReport) -> StepReport | None:
+def _advance_to(
+    sim: "Simulator", goal: int, stop, report: RunReport, on_step: StepCallback | None
+) -> StepReport | None:
     """Step up to a step count. Explicit batches are merged into one report; implicit steps are listed one by one.
 
     Returns the merged report, or that of the last implicit step; None when nothing was done.
@@ -123,13 +127,22 @@ def _advance_to(sim: "Simulator", goal: int, stop, report: RunReport) -> StepRep
         if stop is not None and stop():
             _interrupt(report)
             break
-        one = sim.advance(goal - sim.step_count)
+        one = timed_advance(sim, goal - sim.step_count, on_step)
         if sim.settings.explicit:
             merged = one if merged is None else _merge(merged, one)
         else:
             report.step_reports.append(one)
             merged = one
     return merged
+
+
+def timed_advance(sim: "Simulator", n: int, on_step: StepCallback | None) -> StepReport:
+    """sim.advance(n), with on_step told of it."""
+    clock, compiled = time.perf_counter(), sim.compile_seconds
+    report = sim.advance(n)
+    if on_step is not None:
+        on_step(report, time.perf_counter() - clock - (sim.compile_seconds - compiled))
+    return report
 
 
 def _merge(a: StepReport, b: StepReport) -> StepReport:

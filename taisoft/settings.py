@@ -62,10 +62,14 @@ def _check_tolerance(name: str, value) -> None:
         raise SimulationError(f"{name} = {value!r}: it must lie between 0 and 1, or be None for the adaptive one")
 
 
+def contact_solvers(integrator: str) -> tuple[str, ...]:
+    """The contact solvers that fit an integrator, beside "auto"."""
+    return EXPLICIT_CONTACT if integrator in EXPLICIT else () if integrator == "implicit_midpoint" else IMPLICIT_CONTACT
+
+
 def _check_contact_solver(integrator: str, solver: str, touching: bool) -> None:
     """Which integrator takes which contact solver; touching: whether anything can touch."""
-    explicit = integrator in EXPLICIT
-    fitting = EXPLICIT_CONTACT if explicit else () if integrator == "implicit_midpoint" else IMPLICIT_CONTACT
+    fitting = contact_solvers(integrator)
     known = ("auto", *EXPLICIT_CONTACT, *IMPLICIT_CONTACT)
     if solver not in known:
         near = difflib.get_close_matches(str(solver), known, 1)

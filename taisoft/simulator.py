@@ -1,5 +1,6 @@
 """Simulator: builds a scene into the machine, steps it, and tells about it."""
 
+import dataclasses
 import warnings
 import weakref
 
@@ -166,10 +167,10 @@ class Simulator(Resuming):
         return found
 
     def run(
-        self, seconds: float, on_frame=None, fps: float | None = 60, stop=None, resumed: bool = False
+        self, seconds: float, on_frame=None, fps: float | None = 60, stop=None, resumed: bool = False, on_step=None
     ) -> RunReport:  # fmt: skip
         """Run for some seconds; see `taisoft.running.run`."""
-        return run(self, seconds, on_frame, fps, stop, resumed)
+        return run(self, seconds, on_frame, fps, stop, resumed, on_step)
 
     def reset(self) -> None:
         """Back to the scene's start; numbers changed while it ran (dt, gravity, materials) stay."""
@@ -177,6 +178,26 @@ class Simulator(Resuming):
         self.release()
         self._time_base = (0.0, 0)
         self._stepper.forget()
+
+    def rebuild(self, **changes) -> None:
+        """Go on from the present state with other settings, arguments of this class; arch and precision cannot change.
+
+        Positions, velocities, time, count of steps, let-go nodes and changed numbers stay as they are. What the integrator knew
+        of earlier steps is forgotten, as by `set_state`, and a pull ends. Memory is held twice meanwhile, and the next step
+        compiles anew. Raises SimulationError where the settings cannot be met; this simulator is then as it was.
+        """
+        kept, start = self._open_world().snapshot(), self.scene.snapshot()
+        start.allow_initial_overlap = True  # where bodies start is not where they are
+        new = Simulator(start, **(dataclasses.asdict(self.settings) | {"dt": self._dt} | changes))
+        new.scene.allow_initial_overlap = self.scene.allow_initial_overlap
+        new._world.restore(kept)
+        new._stepper.forget()
+        new._time_base = self.time, self.step_count
+        new._compiled_before = self._compiled_before
+        self._release()
+        _, give_back, owned, _ = new._release.detach()
+        self.__dict__.update(new.__dict__)
+        self._release = weakref.finalize(self, give_back, *owned)
 
     def _count(self, done: int) -> None:
         world = self._world

@@ -25,6 +25,7 @@ LONG = {
     ),
     "test_contact_stepping": ("test_rest[bdf2-", "test_rest[velocity_verlet-"),
     "test_simulator": ("[symplectic_euler-2]",),
+    "test_rebuild": ("test_another_contact_solver",),
     "test_static": ("test_equilibrium[1]",),
     "test_checkpoint": (
         "contacts[bdf2-f32", "contacts[velocity_verlet-f64", "contacts[symplectic_euler-f64", "contacts[implicit_",

@@ -2,6 +2,7 @@
 
 * frames come at fps or after every step, frame 0 first, and the run ends at `seconds` to the nearest step;
 * dt is lowered once, to the next divisor of the frame time, and that is reported; a dt that divides it stays;
+* whoever asks is told of every implicit step and every batch, as it was, with its time but not that of compiling;
 * explicit batches give a report a frame with the extremes of their sub-steps, implicit steps a report each;
 * stop and Ctrl-C end it as interrupted, at the last whole step; a failure ends it as failed; neither raises;
 * status: inverted tets and steps that did not converge make it degraded, and the problems say how many and when.
@@ -109,6 +110,25 @@ def test_batches_are_merged():
     assert first.time == pytest.approx(0.1)
     assert result.status == "degraded"
     assert result.problems == ["tets were inverted in 1 reported steps; at most 3, at t = 0.1 s"]
+
+
+@pytest.mark.parametrize("explicit", [True, False])
+def test_steps_are_told(explicit, monkeypatch):
+    sim, now, told = StandIn(explicit, dt=0.01), [0.0], []
+    advance = sim.advance
+
+    def slow(n):
+        now[0] += 3.0
+        sim.compile_seconds += 1.0
+        return advance(n)
+
+    sim.advance = slow
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    result = run(sim, 0.3, fps=10, on_step=lambda report, seconds: told.append((report.time, report.steps, seconds)))
+    steps = [4, 4, 2] * 3 if explicit else [1] * 30
+    assert [(n, seconds) for _, n, seconds in told] == [(n, 2.0) for n in steps]
+    assert [time for time, _, _ in told] == pytest.approx(0.01 * np.cumsum(steps))
+    assert result.wall_seconds == pytest.approx(2.0 * len(steps))
 
 
 def test_steps_that_did_not_converge():

@@ -3,6 +3,7 @@
 * a ray through a pixel is what the camera projects there, and picks the nearest surface; a patch round it has weights of sum 1;
 * wires, contacts and arrows are where they belong; pictures do not wait for a solver that is slower than real time;
 * keys pause, step, restart, colour and end it; dragging beside the bodies turns the view, dragging a body moves the body;
+* another integrator is chosen there, and the run goes on with it from where it was; plots are shown beside their numbers;
 * sliders change the run at once and compile nothing; a stiffer body lowers dt where steps are explicit;
 * pictures are recorded; making the window larger, smaller or tiny, and closing it in the middle of a drag, is survived.
 """
@@ -16,6 +17,7 @@ from fake_simulator import FakeSimulator, beam_scene
 from test_view import SIZE, body_mask, needs_vulkan
 
 from taisoft.output.camera import Camera
+from taisoft.records import StepReport
 from taisoft.view.layers import Layers
 from taisoft.view.loop import Loop
 from taisoft.view.picking import Drag, nearest_hit, pick
@@ -25,6 +27,7 @@ import os, sys
 sys.path[:0] = [{root!r} + "/tests", {root!r}]
 os.chdir({folder!r})
 from fake_simulator import beam_scene
+import numpy as np
 import taisoft as ts
 from taisoft.runtime import compile_clock
 from taisoft.view.window import show
@@ -38,6 +41,12 @@ class Told(ts.Simulator):
         print("step", self.step_count, *x.round(4), *numbers, flush=True)
         return report
 
+    def rebuild(self, **changes):
+        before = self.positions(), self.velocities(), self.time
+        super().rebuild(**changes)
+        same = all(np.array_equal(a, b) for a, b in zip(before, (self.positions(), self.velocities(), self.time)))
+        print("rebuilt", self.settings.integrator, self.step_count, "same" if same else "other", flush=True)
+
     def reset(self):
         super().reset()
         print("reset", flush=True)
@@ -45,9 +54,11 @@ class Told(ts.Simulator):
 
 with Told(beam_scene(), dt={dt}, integrator={integrator!r}, pullable=True) as sim:
     show(sim)
+    print("ended", sim.settings.integrator, sim.step_count, np.isfinite(sim.energies().total))
 print("closed")
 """
 SLIDERS = {"dt": 228, "gravity": 251, "young": 274}  # pixels from the top, with one body
+SOLVER, INTEGRATOR, USE = 411, 434, 457  # with a legend: the section, its button, and the one that takes what was chosen
 TIP = (965, 350)  # where the beam's end is in the window as it starts
 
 
@@ -112,7 +123,7 @@ def test_layers():
     sim.contacts = lambda: found
     faces = len(scene.bodies[0].mesh.surface)
     tips = 2 * 2 * 2
-    counts = {"wires": 3 * faces // 2, "contacts": 2, "tractions": 3 * tips, "fixed nodes": 0}
+    counts = {"wires": 3 * faces // 2, "contacts": 2, "tractions": 3 * tips, "fixed_nodes": 0}
     for name, count in counts.items():
         layers.shown = {other: other == name for other in counts}
         ends, colours = layers.lines(sim, camera)
@@ -133,11 +144,13 @@ class Clock:
 
     def __init__(self, dt, seconds_per_step):
         self.dt, self.seconds_per_step, self.now, self.step_count, self.calls = dt, seconds_per_step, 0.0, 0, []
+        self.compile_seconds = 0.0
 
     def advance(self, n):
         self.calls.append(n)
         self.step_count += n
         self.now += n * self.seconds_per_step
+        return StepReport(time=self.step_count * self.dt, steps=n)
 
 
 @pytest.mark.parametrize("dt, seconds_per_step, steps, needs", [
@@ -160,6 +173,37 @@ def test_pictures_do_not_wait_for_a_slow_solver(monkeypatch, dt, seconds_per_ste
     assert (sim.step_count - half) / 60 == pytest.approx(steps, rel=0.1)
     told = loop.lines()[0]
     assert told == "running" if needs == 0 else f"needs {needs:.1f} times real time" in told
+
+
+def test_a_simulator_is_built_after_a_picture_has_told_of_it():
+    sim = Clock(1 / 60, 1e-3)
+    loop, built = Loop(sim, 60.0, False), []
+    for _ in range(5):
+        loop.advance()
+    count, refused = sim.step_count, [True, False]
+    assert count > 0 and loop.lines() == ["running"]
+
+    def build():
+        built.append(sim.step_count)
+        return not refused.pop(0)
+
+    for works in (False, True):
+        loop.ask(build, "it is built")
+        loop.react(set())
+        loop.advance()
+        assert loop.lines()[1] == "it is built" and len(built) == int(works) and sim.step_count == count
+        loop.react(set())
+        assert len(built) == 1 + int(works)
+        compiled = loop.lines()[0] == "the next step is compiled, for some seconds"
+        assert compiled == works
+        if not works:
+            loop.advance()
+            count = sim.step_count
+    for _ in range(2):
+        loop.advance()
+        assert sim.step_count == count, "pictures that tell of it come first"
+    loop.advance()
+    assert sim.step_count > count and loop.lines()[0] == "running"
 
 
 # --- the window ---
@@ -232,14 +276,50 @@ def test_keys_and_mouse(opened, tmp_path):
     press(desktop, "p", lambda: len(list(tmp_path.glob("out/window-1/*.png"))) > 1, "recorded pictures")
     desktop.tool("xdotool", "key", "p")
     assert struct.unpack(">II", (tmp_path / "out/window-1/00000.png").read_bytes()[16:24]) == (1280, 720)
+    press(desktop, "g", lambda: plotted(desktop) == 4, "plots")
+    press(desktop, "g", lambda: plotted(desktop) == 0, "no plots")
     press(desktop, "r", lambda: desktop.printed().count("reset") == 2, "restart")
     press(desktop, "space", lambda: not still(desktop), "running on")
+    choose_the_next_integrator(desktop)
     for width, height in ((800, 600), (1, 1), (1000, 700)):
         desktop.tool("xdotool", "search", "--name", "taisoft", "windowsize", str(width), str(height))
         before = steps(desktop)
         desktop.wait_for(lambda at=before: steps(desktop) > at + 2, f"steps in a window of {width} x {height}")
     desktop.wait_for(lambda: body_mask(desktop.picture()[:, 400:]).mean() > 0.03, "beam in a resized window")
     end(desktop)
+    assert desktop.last("ended")[1] == "bdf2" and desktop.last("ended")[3] == "True"
+
+
+def plotted(desktop):
+    """How many plots are on the screen at the right: dark windows of text, high enough for three lines, beside light boxes."""
+    screen = desktop.picture()[:720]
+    dark = np.flatnonzero((screen[:, 1030:1038] < 60).all(axis=(1, 2)))
+    tall = [run for run in np.split(dark, np.flatnonzero(np.diff(dark) > 1) + 1) if len(run) > 40]
+    return sum((screen[run, 1046:1260] > 225).all(axis=2).mean() > 0.5 for run in tall)
+
+
+def choose_the_next_integrator(desktop):
+    """By the panel: its section is opened, bdf2 comes after implicit_euler, and the run goes on."""
+    desktop.repeat(lambda: hold(desktop, 32, SOLVER), lambda: bright(desktop, INTEGRATOR), "section of the solver")
+    for height in (INTEGRATOR, USE):
+        hold(desktop, 60, height)
+    desktop.wait_for(lambda: desktop.last("rebuilt"), "other integrator")
+    _, name, count, same = desktop.last("rebuilt")
+    assert name == "bdf2" and same == "same"
+    desktop.wait_for(lambda: steps(desktop) > int(count) + 2, "steps of it")
+
+
+def bright(desktop, height):
+    """Whether a button is at that height of the panel."""
+    return (desktop.picture()[height - 8 : height + 8, 24:140, 2] > 90).mean() > 0.5
+
+
+def hold(desktop, across, down):
+    """A click that a slow picture sees too."""
+    desktop.tool("xdotool", "mousemove", str(across), str(down), "mousedown", "1")
+    desktop.pause(0.4)
+    desktop.tool("xdotool", "mouseup", "1")
+    desktop.pause(0.4)
 
 
 def numbers(desktop):

@@ -118,6 +118,13 @@ def _add_run(commands) -> None:
     parser.add_argument("--no-usd", action="store_true", help="write no scene.usdc")
     colours = ("body", "stress", "stretch", "speed")
     parser.add_argument("--colour", choices=colours, default="body", help="what pictures and the window colour bodies by")
+    parser.add_argument(
+        "--layers", metavar="NAME,...", help="what they show beside bodies: wires, contacts, tractions, fixed_nodes, or none"
+    )
+    parser.add_argument(
+        "--plots", metavar="NAME,...", help="what they plot over time: energies, residuals, iterations, contacts, step_time"
+    )
+    parser.add_argument("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
     parser.add_argument("--no-frames", action="store_true", help="write no pictures")
     parser.set_defaults(command="run")
 

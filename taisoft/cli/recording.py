@@ -5,6 +5,7 @@ import sys
 import time
 from pathlib import Path
 
+from taisoft.cli.pictures import Shown
 from taisoft.cli.settings import RunSettings
 from taisoft.errors import OutputError
 from taisoft.output.checkpoint import CheckpointWriter
@@ -15,6 +16,7 @@ from taisoft.output.usd import UsdWriter
 from taisoft.output.video import command, find_ffmpeg, picture_numbers, write_video
 from taisoft.records import RunReport
 from taisoft.view.offscreen import Offscreen
+from taisoft.view.plots import Plots
 
 
 class Observers:
@@ -72,8 +74,9 @@ class Recording:
         self._checkpoints = CheckpointWriter(self._folder.path, every, None if resumed is None else resumed["checkpoint"])
 
     def add_writers(
-        self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool, colour: str = "body"
-    ) -> None:
+        self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool, shown: Shown,
+        plots: Plots | None,
+    ) -> None:  # fmt: skip
         """Adds the writers of frames, USD and checkpoints to the observers. What goes on in another way is refused before
         anything is removed."""
         rate = fps or 1.0 / sim.dt
@@ -86,9 +89,9 @@ class Recording:
             self._folder.clear(self._first)
         drawing = None
         if with_frames:
-            drawing = Offscreen(sim.scene, colour=colour)
+            drawing = Offscreen(sim.scene, colour=shown.colour, layers=shown.in_pictures)
             drawing.go_on(self._notes.get("camera"))
-            observers.members.append(FrameWriter(self._folder.path, drawing))
+            observers.members.append(FrameWriter(self._folder.path, drawing, shown.annotate(plots, drawing.colouring)))
         self._checkpoints.notes = lambda: {"fps": fps, "camera": drawing.camera.distance if drawing else None}
         observers.members.append(self._checkpoints)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from taisoft.checkpoint import Checkpoint
 from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL
+from taisoft.cli.pictures import Shown, check_modelled, shown_of
 from taisoft.cli.recording import Observers, Recording
 from taisoft.cli.scene_file import load_scene
 from taisoft.cli.settings import RunSettings, resolve, resolve_resumed
@@ -24,6 +25,7 @@ from taisoft.scene import checks
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
 from taisoft.view.ggui import display_missing, vulkan_missing
+from taisoft.view.plots import Plots
 
 
 def command(arguments: Namespace) -> int:
@@ -32,10 +34,9 @@ def command(arguments: Namespace) -> int:
     with Signals() as signals, told_warnings() as told:
         scene, solver = load_scene(arguments.scene, arguments.allow_outside)
         every = _checkpoint_interval(arguments)
-        if arguments.video and (arguments.out is None or arguments.no_frames):
-            raise SceneError("--video needs --out, the folder to write to, and the pictures that --no-frames leaves out")
         saved: Checkpoint | None = None
         has_window = not arguments.headless and _window_is_possible()
+        shown = shown_of(arguments, has_window)
         watched = has_window and arguments.out is None and arguments.seconds is None
         if arguments.resume is None:
             settings = resolve(solver, arguments, Simulator)
@@ -48,12 +49,13 @@ def command(arguments: Namespace) -> int:
             settings = resolve_resumed(solver, arguments, Simulator, kept)
             sim = _resumed(saved, scene, settings)
         with sim:
+            check_modelled(shown, sim)
             print_plan(sim)
             if watched:
-                return _watch(sim, settings, arguments.colour)
+                return _watch(sim, settings, shown)
             _check_time_left(sim, settings, arguments)
             check_length(settings.seconds, sim.dt, settings.fps)
-            return _run(sim, settings, arguments, signals, told, has_window, every, saved)
+            return _run(sim, settings, arguments, signals, told, has_window, every, saved, shown)
 
 
 def _checkpoint_interval(arguments: Namespace) -> float | None:
@@ -104,21 +106,22 @@ def _window_is_possible() -> bool:
     return not missing
 
 
-def _watch(sim: Simulator, settings: RunSettings, colour: str) -> int:
+def _watch(sim: Simulator, settings: RunSettings, shown: Shown) -> int:
     """The live window, for as long as it stays open."""
     from taisoft.view.window import show
 
-    show(sim, fps=settings.fps or 1.0 / sim.dt, colour=colour)
+    show(sim, fps=settings.fps or 1.0 / sim.dt, colour=shown.colour, layers=shown.in_window, plots=shown.plots)
     print_state(sim)
     return 0
 
 
 def _run(
     sim: Simulator, settings: RunSettings, arguments: Namespace, signals: Signals, told: list[str], has_window: bool,
-    every: float | None, saved: Checkpoint | None,
+    every: float | None, saved: Checkpoint | None, shown: Shown,
 ) -> int:  # fmt: skip
     """A run until settings.seconds, with what was computed saved however it ends."""
     observers, resumed, notes = Observers(), None, {}
+    plots = Plots(sim, shown.plots) if shown.plots or has_window else None
     if saved is not None:
         notes = saved.notes
         resumed = {"checkpoint": str(saved.path), "time": sim.time, "frame": first_frame(sim, settings.fps)}
@@ -129,9 +132,9 @@ def _run(
             recording = stack.enter_context(closing(Recording(arguments.out, arguments.overwrite, resumed, every, notes)))
         stack.callback(observers.close)
         if has_window:
-            observers.members.append(_open_window(sim, arguments.colour))
+            observers.members.append(_open_window(sim, shown, plots))
         if recording is not None:
-            recording.add_writers(observers, sim, settings.fps, not arguments.no_usd, not arguments.no_frames, arguments.colour)
+            recording.add_writers(observers, sim, settings.fps, not arguments.no_usd, not arguments.no_frames, shown, plots)
         observers.members.append(Progress(settings.seconds, label=Path(arguments.scene).stem))
         result = sim.run(
             settings.seconds,
@@ -139,6 +142,7 @@ def _run(
             fps=settings.fps,
             stop=lambda: signals.asked() or observers.failed(),
             resumed=resumed is not None,
+            on_step=plots.take if plots is not None else None,
         )
         observers.close()
         if recording is not None:
@@ -163,10 +167,10 @@ def _run(
     return EXIT_FAILED if result.status == "failed" else 0
 
 
-def _open_window(sim: Simulator, colour: str):
+def _open_window(sim: Simulator, shown: Shown, plots: Plots):
     from taisoft.view.window import LiveWindow
 
-    return LiveWindow(sim.scene, colour=colour)
+    return LiveWindow(sim.scene, colour=shown.colour, layers=shown.in_window, plots=plots)
 
 
 def _tell_failed_output(result: RunReport, observers: Observers, signals: Signals) -> None:

@@ -107,6 +107,24 @@ class Camera:
         new = np.array(points)
         return np.concatenate([x, new[:, :3]]), np.concatenate([triangles[whole], made]), np.concatenate([colours, new[:, 3:]])
 
+    def clipped_lines(self, ends: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lines, ends (2k,3) [m] and their colours (2k,3), without what is nearer than the near plane; those not finite go."""
+        a, b = ends[0::2], ends[1::2]
+        near = self.clipping[0] * (1.0 + 1e-6)
+        first, second = ((end - self.position) @ self.forward - near for end in (a, b))
+        with np.errstate(invalid="ignore"):
+            kept = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1) & (np.maximum(first, second) > 0)
+        lines = np.concatenate([a, colours[0::2], b, colours[1::2]], axis=1)[kept]
+        first, second = first[kept], second[kept]
+        crossing = np.minimum(first, second) < 0
+        share = (first[crossing] / (first[crossing] - second[crossing]))[:, None]
+        cut = lines[crossing, :6] + share * (lines[crossing, 6:] - lines[crossing, :6])
+        ahead = (first[crossing] > 0)[:, None]
+        lines[crossing, :6] = np.where(ahead, lines[crossing, :6], cut)
+        lines[crossing, 6:] = np.where(ahead, cut, lines[crossing, 6:])
+        lines = lines.reshape(-1, 6)
+        return lines[:, :3], lines[:, 3:]
+
     def orbit(self, azimuth: float, elevation: float) -> "Camera":
         """Turned about the target by so many degrees; elevation stops short of the poles."""
         raised = min(max(self.elevation + elevation, -MAX_ELEVATION), MAX_ELEVATION)

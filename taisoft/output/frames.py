@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +17,20 @@ class FrameWriter:
     """Observer that writes folder/frames/<index>.png.
 
     folder: the run's folder; renderer: has `image(sim) -> uint8 (height, width, 3)` and `close()`, such as
-    `taisoft.view.offscreen.Offscreen`, and is closed with this writer. Raises OutputError.
+    `taisoft.view.offscreen.Offscreen`, and is closed with this writer; annotate: takes such a picture, sim and the index, and
+    gives the one to write. Raises OutputError.
     """
 
-    def __init__(self, folder: str | Path, renderer):
+    def __init__(self, folder: str | Path, renderer, annotate: Callable | None = None):
         self.folder = make_folder(Path(folder) / FRAMES_NAME)
-        self.renderer = renderer
+        self.renderer, self._annotate = renderer, annotate
 
     def frame(self, sim, index: int) -> None:
         """Draw sim's present state and write it as picture number index. Raises OutputError."""
-        write_bytes(self.folder / f"{index:05d}.png", png_bytes(self.renderer.image(sim)))
+        picture = self.renderer.image(sim)
+        if self._annotate is not None:
+            picture = self._annotate(picture, sim, index)
+        write_bytes(self.folder / f"{index:05d}.png", png_bytes(picture))
 
     def close(self) -> None:
         """Close the renderer."""

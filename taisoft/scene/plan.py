@@ -18,6 +18,10 @@ class Plan:
         """feature -> whether it is modelled."""
         return {e["feature"]: e["on"] for e in self.entries}
 
+    def why(self, feature: str) -> str:
+        """Why a feature is modelled, or why it is not."""
+        return next(e["why"] for e in self.entries if e["feature"] == feature)
+
     def add(self, feature: str, on: bool, why: str, why_not: str) -> None:
         """Decide one feature."""
         self.entries.append({"feature": feature, "on": bool(on), "why": why if on else why_not})

@@ -26,7 +26,8 @@ from taisoft.transfer import upload
 from taisoft.view.shading import lit_colours
 from taisoft.view.surfaces import Surfaces
 
-LINE_WIDTH = 2.0
+LINE_WIDTH = 2.0  # pixels
+FLAT_WIDTH = 0.002  # of lines over the picture, in units of its height
 
 _holder: list[str] = []  # what holds the process's one window
 
@@ -75,11 +76,14 @@ def _panel_file_to_come() -> Path | None:
 class Canvas:
     """The process's one Taichi window with the scene's surfaces in it; on the screen, or only in memory.
 
-    surfaces: what is drawn; size: (width, height) in pixels; visible: on the screen; n_segments: most lines that can be drawn.
+    surfaces: what is drawn; size: (width, height) in pixels; visible: on the screen; n_segments: most lines that can be drawn;
+    line_width: theirs in pixels.
     Raises OutputError, before anything is opened, when a Vulkan driver or a display is missing or a window is open already.
     """
 
-    def __init__(self, surfaces: Surfaces, size: tuple[int, int], visible: bool, n_segments: int = 0):
+    def __init__(
+        self, surfaces: Surfaces, size: tuple[int, int], visible: bool, n_segments: int = 0, line_width: float = LINE_WIDTH
+    ):  # fmt: skip
         missing = (visible and display_missing()) or vulkan_missing()
         if missing:
             raise OutputError(f"cannot open a window: {missing}")
@@ -92,7 +96,7 @@ class Canvas:
         self._runtime = open_runtime(arch, precision, owner=owner)
         _holder.append(owner)
         self._fields = FieldArena()
-        self._surfaces = surfaces
+        self._surfaces, self._line_width = surfaces, line_width
         n = len(surfaces.colours)
         self._x = self._fields.vectors("picture positions", ti.f32, n)
         self._normals = self._fields.vectors("picture normals", ti.f32, n, np.tile(np.float32([0, 1, 0]), (n, 1)))
@@ -100,7 +104,10 @@ class Canvas:
         triangles = surfaces.triangles.ravel()
         self._ends = self._fields.vectors("picture lines", ti.f32, 2 * n_segments) if n_segments else None
         self._end_colours = self._fields.vectors("picture line colours", ti.f32, 2 * n_segments) if n_segments else None
+        self._has_drawn_lines = False
         self._indices = self._fields.field("picture triangles", ti.i32, len(triangles), triangles)
+        self._flat: tuple | None = None  # fields of what is drawn over the picture, once something is
+        self._flat_ends: np.ndarray | None = None  # what they hold
         self.window = self._canvas = self._scene = None
         self._litter = _panel_file_to_come()
         try:
@@ -144,12 +151,46 @@ class Canvas:
             self._canvas.scene(self._scene)
 
     def _draw_lines(self, camera: Camera, ends: np.ndarray, colours: np.ndarray) -> None:
-        """With none to draw a line without length, so that Taichi compiles its copying at the first picture."""
+        """With none to draw, in the first picture, a line without length, so that Taichi compiles its copying then."""
         n = min(len(ends), self._ends.shape[0])
+        if n == 0 and self._has_drawn_lines:
+            return
+        self._has_drawn_lines = True
         all_ends, all_colours = np.zeros((self._ends.shape[0], 3)), np.zeros((self._ends.shape[0], 3))
         all_ends[:n], all_colours[:n] = ends[:n] - camera.target, colours[:n]
         upload([(self._ends, all_ends), (self._end_colours, all_colours)])
-        self._scene.lines(self._ends, LINE_WIDTH, per_vertex_color=self._end_colours, vertex_count=max(n, 2))
+        self._scene.lines(self._ends, self._line_width, per_vertex_color=self._end_colours, vertex_count=max(n, 2))
+
+    def draw_over(
+        self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray, most: tuple[int, int], box_colour: tuple
+    ) -> None:  # fmt: skip
+        """Draw boxes (k,4), left, bottom, right, top, and lines, ends (2n,2) of colours (2n,3), over the picture.
+
+        All in [0, 1] from its lower left corner; most: how many boxes and lines there can be, the same in every call. Arrays that
+        are those of the last call are not moved again.
+        """
+        if self._flat is None:
+            make = self._fields.vectors
+            self._flat = (
+                make("flat boxes", ti.f32, 6 * most[0], n=2), make("flat lines", ti.f32, 2 * most[1], n=2),
+                make("flat line colours", ti.f32, 2 * most[1]),
+            )  # fmt: skip
+        if self._flat_ends is not ends:
+            self._move_over(boxes, ends, colours, most)
+            self._flat_ends = ends
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # as in `draw`
+            self._canvas.triangles(self._flat[0], color=box_colour)
+            self._canvas.lines(self._flat[1], FLAT_WIDTH, per_vertex_color=self._flat[2])
+
+    def _move_over(self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray, most: tuple[int, int]) -> None:
+        """What `draw_over` draws to the device; the rest are boxes and lines without size."""
+        arrays = [np.zeros((6 * most[0], 2)), np.zeros((2 * most[1], 2)), np.zeros((2 * most[1], 3))]
+        left, bottom, right, top = boxes.T
+        corners = [(left, bottom), (right, bottom), (right, top), (left, bottom), (right, top), (left, top)]
+        arrays[0][: 6 * len(boxes)] = np.array(corners).transpose(2, 0, 1).reshape(-1, 2)
+        arrays[1][: len(ends)], arrays[2][: len(ends)] = ends, colours
+        upload(list(zip(self._flat, arrays)))
 
     def pixels(self, left: int, top: int, right: int, bottom: int) -> np.ndarray:
         """That part of the drawn picture, uint8 (bottom - top, right - left, 3), first row on top."""

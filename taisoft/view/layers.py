@@ -6,9 +6,12 @@ behind them, contacts and arrows so far that nothing hides them.
 
 import numpy as np
 
+from taisoft.errors import OutputError
 from taisoft.mesh.topology import triangle_edges
 from taisoft.output.camera import Camera
 
+LAYERS = ("wires", "contacts", "tractions", "fixed_nodes")
+IN_WINDOW, IN_PICTURES = ("tractions", "fixed_nodes"), ("fixed_nodes",)  # what is shown unless asked otherwise
 MARKS = 4000  # contacts' lines and arrows' lines that are drawn at most, beside the wires
 ON_SURFACE, IN_FRONT = 0.996, 0.1  # shares of the distance from the eye
 NORMAL, IMPULSE, ARROW, HEAD = 0.04, 0.15, 0.10, 0.3  # lengths in units of the scene's size; a head's in those of its arrow
@@ -19,10 +22,14 @@ IMPULSE_COLOUR, TRACTION_COLOUR = np.array([0.85, 0.12, 0.12]), np.array([0.55, 
 
 
 class Layers:
-    """What is drawn beside surfaces. shown: name -> whether it is; n_segments: most lines that `lines` gives."""
+    """What is drawn beside surfaces. shown: name -> whether it is, to begin with those of `names`; n_segments: most lines
+    that `lines` gives. Raises OutputError for a name that is unknown."""
 
-    def __init__(self, scene):
-        self.shown = {"wires": False, "contacts": False, "tractions": True, "fixed nodes": True}
+    def __init__(self, scene, names: tuple[str, ...] = IN_WINDOW):
+        for name in names:
+            if name not in LAYERS:
+                raise OutputError(f"layer '{name}' is unknown: it must be one of {', '.join(LAYERS)}")
+        self.shown = {name: name in names for name in LAYERS}
         starts = np.cumsum([0] + [body.n_nodes for body in scene.bodies])
         self._edges = np.concatenate([triangle_edges(np.asarray(b.nodes.surface))[0] + n for b, n in zip(scene.bodies, starts)])
         self.n_segments = len(self._edges) + MARKS
@@ -35,6 +42,11 @@ class Layers:
         for body, t, n in pulls:
             chosen = t.triangles[:: -(-len(t.triangles) // MAX_ARROWS)]
             self._arrows.append((body.mesh.surface[chosen] + n, ARROW * self._size / most * t.value))
+
+    @property
+    def has_lines(self) -> bool:
+        """Whether one of the layers that are lines is shown; fixed nodes are among the surfaces' triangles."""
+        return any(self.shown[name] for name in LAYERS if name != "fixed_nodes")
 
     def lines(self, sim, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Ends (2k,3) [m] of the lines, as drawn for this camera, and their colours (2k,3)."""

@@ -5,6 +5,7 @@ missing is let go, so the picture stays fluid while the simulation falls behind 
 """
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,12 @@ import numpy as np
 from taisoft.errors import OutputError, SimulationError, TaisoftError
 from taisoft.output.files import make_folder, write_bytes
 from taisoft.output.frames import png_bytes
+from taisoft.records import StepReport
+from taisoft.running import timed_advance
+from taisoft.view.plots import Plots
 
 SPEED_OVER = 0.5  # [s] of wall time that steps/s is averaged over
+FIRST_PICTURES = 2  # without a step, which compiles for seconds: GGUI shows no panel at first
 BEHIND = 1.1  # times real time above which the panel says so
 OUT = Path("out")
 
@@ -21,14 +26,17 @@ OUT = Path("out")
 class Loop:
     """Drives sim at fps pictures a second; `problem` is why it paused, `note` what it did, each a sentence or empty.
 
-    folder: where pictures go while it records, else None.
+    folder: where pictures go while it records, else None; plots: what keeps what steps tell.
     """
 
-    def __init__(self, sim, fps: float, paused: bool):
-        self.sim, self.fps, self.paused = sim, fps, paused
+    def __init__(self, sim, fps: float, paused: bool, plots: Plots | None = None):
+        self.sim, self.fps, self.paused, self._plots = sim, fps, paused, plots
         self.problem = self.note = ""
         self.folder: Path | None = None
         self._begun = False  # a step was taken, so all is compiled
+        self._wait = FIRST_PICTURES  # pictures before the next step
+        self._asked: Callable[[], bool] | None = None  # what is to be done once a picture has told of it
+        self._told = False
         self._frames = 0
         self._owed = 0.0  # [s] of simulated time since the last step
         self._needs = 0.0  # wall time of a simulated second [s]
@@ -36,13 +44,24 @@ class Loop:
         self._speed = 0.0  # [steps/s]
         self._mark = (time.perf_counter(), sim.step_count)
 
+    def ask(self, build: Callable[[], bool], note: str) -> None:
+        """Have a simulator built anew, once a picture has shown the note; build: says whether it was."""
+        self._asked, self._told, self.note = build, False, note
+
     def react(self, pressed: set[str]) -> None:
         """Do what keys and buttons ask for."""
+        if self._asked is not None and self._told:
+            build, self._asked = self._asked, None
+            if build():
+                self._begun, self._wait, self._owed, self._needs, self.problem = False, FIRST_PICTURES, 0.0, 0.0, ""
+        self._told = self._asked is not None
         if "pause" in pressed:
             self.paused = not self.paused
             self.problem = ""
         if "reset" in pressed:
             self.sim.reset()
+            if self._plots is not None:
+                self._plots.restart()
             self.problem = ""
             self._mark = (time.perf_counter(), self.sim.step_count)
         if "step" in pressed:
@@ -53,6 +72,9 @@ class Loop:
 
     def advance(self) -> None:
         """One picture's worth of simulated time, or less where that takes longer than a picture may."""
+        if self._wait > 0 or self._asked is not None:
+            self._wait -= 1
+            return
         self._owed += 1.0 / self.fps
         end = time.perf_counter() + 1.0 / self.fps
         while self._owed >= self.sim.dt * (1.0 - 1e-9) and not self.paused:
@@ -66,13 +88,15 @@ class Loop:
                 self._owed = min(self._owed, 0.0)
 
     def _advance(self, n: int) -> None:
-        started, before = time.perf_counter(), self.sim.step_count
-        try:
-            self.sim.advance(n)
-        finally:
-            self._begun = True
-            self._spent[0] += time.perf_counter() - started
-            self._spent[1] += (self.sim.step_count - before) * self.sim.dt
+        self._wait = 0
+        timed_advance(self.sim, n, self._took)
+        self._begun = True
+
+    def _took(self, report: StepReport, seconds: float) -> None:
+        self._spent[0] += seconds
+        self._spent[1] += report.steps * self.sim.dt
+        if self._plots is not None:
+            self._plots.take(report, seconds)
 
     def guarded(self, call) -> bool:
         """Whether it went well; else the run pauses and `problem` says why."""
@@ -101,7 +125,7 @@ class Loop:
         slow = self._needs > BEHIND and not self.paused
         pace = f"running; the solver needs {self._needs:.1f} times real time" if slow else "running"
         if not self._begun:
-            pace = "the first step is compiled, for some seconds"
+            pace = "the next step is compiled, for some seconds"
         return [self.problem or ("paused" if self.paused else pace), *([self.note] if self.note else [])]
 
     # --- recording ----------------------------------------------------------------------------------------------------

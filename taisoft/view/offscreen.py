@@ -14,12 +14,14 @@ from taisoft.output.camera import MAX_WIDENING, Camera
 from taisoft.runtime import open_kind
 from taisoft.view.colouring import Colouring
 from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
-from taisoft.view.raster import rasterise
+from taisoft.view.layers import IN_PICTURES, Layers
+from taisoft.view.raster import rasterise, stroke
 from taisoft.view.shading import background, lit_colours
 from taisoft.view.surfaces import Surfaces
 
 SIZE = (1280, 720)
 SAMPLES = 2  # per pixel and axis
+LINE_WIDTH = 1.25  # pixels
 KEY_COLOUR = (1.0, 0.0, 1.0)  # magenta, of what no triangle covers; no lit body has it
 RENDERERS = ("auto", "vulkan", "software")
 
@@ -32,11 +34,12 @@ class Offscreen:
     scene: read once; size: (width, height) in pixels; camera: stays as given, else shows all bodies as they start,
     and moves back, never nearer, when a body would leave the picture; renderer: "vulkan", "software" or "auto": Vulkan
     where it can be had, else one line on stderr says why not; colour: of the bodies, their own ("body") or by "stress",
-    "stretch" or "speed". Raises OutputError.
+    "stretch" or "speed"; layers: names of LAYERS that are shown. Raises OutputError.
     """
 
     def __init__(
-        self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None, renderer: str = "auto", colour: str = "body"
+        self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None, renderer: str = "auto", colour: str = "body",
+        layers: tuple[str, ...] = IN_PICTURES,
     ):  # fmt: skip
         if renderer not in RENDERERS:
             raise OutputError(f"renderer '{renderer}' is unknown: it must be one of {', '.join(RENDERERS)}")
@@ -47,12 +50,15 @@ class Offscreen:
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # [m]
         self.surfaces = Surfaces(scene)
         self.colouring = Colouring(scene, self.surfaces, colour)
+        self.layers = Layers(scene, layers)
+        self.surfaces.with_markers = self.layers.shown["fixed_nodes"]
         self._large = (self.size[0] * SAMPLES, self.size[1] * SAMPLES)
         self._background = background(self._large)
         self._canvas = None
         self.renderer = _choose() if renderer == "auto" else renderer
         if self.renderer == "vulkan":
-            self._canvas = Canvas(self.surfaces, self._large, visible=False)
+            n = self.layers.n_segments if self.layers.has_lines else 0
+            self._canvas = Canvas(self.surfaces, self._large, visible=False, n_segments=n, line_width=SAMPLES * LINE_WIDTH)
 
     def go_on(self, distance: float | None) -> None:
         """Start with the camera at a distance [m] that it had moved back to; None: where it is."""
@@ -64,30 +70,41 @@ class Offscreen:
         bodies = self.surfaces.of_bodies(sim)
         self.camera = self.camera.widened(bodies[0], self.size, self._widest)
         x, normals = self.surfaces.with_obstacles(bodies, sim.time, self.camera.position)
-        projected = self.camera.project(x, self._large)
+        lines = self.layers.lines(sim, self.camera) if self.layers.has_lines else None
+        projected = self.camera.project(x if lines is None else np.concatenate([x, lines[0]]), self._large)
         left, top, right, bottom = _box(projected, self._large)  # the rest is background, and stays as it is
         base = self.colouring.base(sim)
         picture = self._background[::SAMPLES, ::SAMPLES].copy()
         if left == right or top == bottom:
             return picture
         part = self._background[top:bottom, left:right].copy()
-        if self._canvas is None or not self._draw(x, normals, base, (left, top, right, bottom), part):
+        if self._canvas is None or not self._draw(x, normals, base, lines, (left, top, right, bottom), part):
             colours = lit_colours(x, normals, base, self.camera)
-            x, triangles, colours = self.camera.clipped(x, self.surfaces.triangles, colours, self.size)
-            projected = self.camera.project(x, self._large)
-            projected[:, :2] -= (left, top)
-            rasterise(projected, triangles, colours, self.camera.clipping[0], part)
+            self._rasterise(x, colours, lines, (left, top), part)
         picture[top // SAMPLES : bottom // SAMPLES, left // SAMPLES : right // SAMPLES] = _averaged(part)
         return picture
 
+    def _rasterise(self, x: np.ndarray, colours: np.ndarray, lines, corner: tuple[int, int], part: np.ndarray) -> None:
+        """Draw in NumPy into part, whose upper left corner is at that pixel: triangles with lit colours, and lines as bands."""
+        x, triangles, colours = self.camera.clipped(x, self.surfaces.triangles, colours, self.size)
+        projected = self.camera.project(x, self._large)
+        if lines is not None:
+            ends, line_colours = self.camera.clipped_lines(*lines)
+            corners, bands = stroke(self.camera.project(ends, self._large), SAMPLES * LINE_WIDTH)
+            triangles = np.concatenate([triangles, len(projected) + bands])
+            projected = np.concatenate([projected, corners])
+            colours = np.concatenate([colours, np.repeat(line_colours, 2, axis=0)])
+        projected[:, :2] -= corner
+        rasterise(projected, triangles, colours, self.camera.clipping[0], part)
+
     def _draw(
-        self, x: np.ndarray, normals: np.ndarray, base: np.ndarray, box: tuple[int, int, int, int], part: np.ndarray
+        self, x: np.ndarray, normals: np.ndarray, base: np.ndarray, lines, box: tuple[int, int, int, int], part: np.ndarray
     ) -> bool:
         """Draw by Vulkan into part, what lies in the box; False where nothing came of it.
 
         On a busy machine Taichi's renderer, now and then, hands out a picture that has been cleared and not drawn on.
         """
-        self._canvas.draw(x, normals, self.camera, KEY_COLOUR, base)
+        self._canvas.draw(x, normals, self.camera, KEY_COLOUR, base, lines)
         pixels = self._canvas.pixels(*box)
         red, green, blue = np.moveaxis(pixels, 2, 0)
         empty = (red == 255) & (green == 0) & (blue == 255)

@@ -10,9 +10,13 @@ import textwrap
 
 import numpy as np
 
-from taisoft.errors import SimulationError
+from taisoft.errors import SimulationError, TaisoftError
+from taisoft.settings import contact_solvers
+from taisoft.stability import stable_dt
+from taisoft.stepping import EXPLICIT, INTEGRATORS
 from taisoft.view.colouring import TITLES, Colouring
 from taisoft.view.layers import Layers
+from taisoft.view.plots import PLOTS, Plots
 
 SAFE = 0.95  # of an explicit integrator's limit, where its slider of dt ends
 LONGEST = 0.1  # [s], an implicit one's
@@ -26,23 +30,26 @@ COLUMNS = 46  # characters that fit the panel's width
 HELP = (
     "Left drag: pull a body, or turn", "Ctrl + left: turn", "Right: zoom, middle: shift", "Space: pause, S or Right: step",
     "R: restart, V: colour, P: record, Esc: quit", "W, C, T, F: wires, contacts, tractions, fixed",
+    "G: plots over time",
 )  # fmt: skip
 
 
 class Panel:
     """sim: what the sliders change; loop: what the buttons ask (by `pressed`), and who is told what could not be changed;
-    colouring: what the bodies' colours mean; layers: what is drawn beside them.
+    colouring: what the bodies' colours mean; layers: what is drawn beside them; plots: over time. What is chosen once in a while
+    is in sections, of which one is open at a time.
 
     chosen: name of the body whose Young's modulus moves, the one pulled last; strength: of a pull, 0 where none can be.
     """
 
-    def __init__(self, sim, loop, colouring: Colouring, layers: Layers):
-        self._sim, self._loop, self._colouring, self._layers = sim, loop, colouring, layers
+    def __init__(self, sim, loop, colouring: Colouring, layers: Layers, plots: Plots):
+        self._sim, self._loop, self._colouring, self._layers, self._plots = sim, loop, colouring, layers, plots
         self.pressed: set[str] = set()
         scene = sim.scene
         self.chosen = scene.bodies[0].name
         self._all = len(scene.bodies) > 1
-        self._help = True
+        self._open = "keys and mouse"
+        self._integrator, self._solver = sim.settings.integrator, sim.settings.contact_solver  # chosen, in use or not
         self._wanted = self._first = sim.dt
         g = np.asarray(scene.gravity, dtype=float)
         self._g = float(np.linalg.norm(g))
@@ -97,15 +104,67 @@ class Panel:
             self._colouring.choose_next()
         for text, colour in self._colouring.legend():
             gui.text(text, color=tuple(colour))
-        shown = self._layers.shown
-        for name in shown:
-            shown[name] = gui.checkbox(name, shown[name])
-        self._help = gui.checkbox("keys and mouse", self._help)
-        for line in HELP if self._help else ():
-            gui.text(line)
+        self._sections(gui)
         for line in self._loop.lines():
             for piece in textwrap.wrap(line, COLUMNS) or [""]:
                 gui.text(piece)
+
+    # --- what is chosen once in a while -------------------------------------------------------------------------------
+
+    def _sections(self, gui) -> None:
+        drawn = {"solver": self._choose_solver, "layers": self._choose_layers, "plots": self._choose_plots}
+        for name in (*drawn, "keys and mouse"):
+            is_open = gui.checkbox(name, self._open == name)
+            if is_open != (self._open == name):
+                self._open = name if is_open else ""
+            if is_open and name in drawn:
+                drawn[name](gui)
+        for line in HELP if self._open == "keys and mouse" else ():
+            gui.text(line)
+
+    def _choose_layers(self, gui) -> None:
+        shown = self._layers.shown
+        for name in shown:
+            shown[name] = gui.checkbox(name.replace("_", " "), shown[name])
+
+    def _choose_plots(self, gui) -> None:
+        shown = self._plots.shown
+        for name in self._plots.offered():
+            shown[name] = gui.checkbox(f"{PLOTS[name].title}###plot {name}", shown[name])
+
+    def _choose_solver(self, gui) -> None:
+        """Two buttons that go through what there is, and one that takes what was chosen: it compiles for seconds."""
+        if gui.button(f"integrator: {self._integrator}###integrator"):
+            self._integrator = _next(INTEGRATORS, self._integrator)
+        solvers = ("auto", *contact_solvers(self._integrator))
+        if self._solver not in solvers:
+            self._solver = "auto"
+        if self._sim.plan.on["contact_forces"] and len(solvers) > 2:
+            if gui.button(f"contacts: {self._solver}###contact solver"):
+                self._solver = _next(solvers, self._solver)
+        now = self._sim.settings
+        if (self._integrator, self._solver) == (now.integrator, now.contact_solver):
+            gui.text("in use")
+        elif gui.button("use this: compiles for some seconds###use"):
+            self._loop.ask(self._rebuild, f"{self._integrator} is built and compiled, for some seconds")
+
+    def _rebuild(self) -> bool:
+        """The integrator and contact solver that were chosen, with the dt asked for or the largest that is stable."""
+        sim, loop, dt = self._sim, self._loop, self._wanted
+        chosen = {"integrator": self._integrator, "contact_solver": self._solver}
+        if self._integrator in EXPLICIT:
+            dt = min(dt, SAFE * stable_dt(sim.scene, self._integrator == "velocity_verlet"))
+        try:
+            sim.rebuild(dt=dt, **chosen)
+        except TaisoftError as error:
+            loop.note = str(error)
+            self._integrator, self._solver = sim.settings.integrator, sim.settings.contact_solver
+            return False
+        lowered = f"; dt is {dt:.3g} s, since {self._wanted:.3g} s is not stable" if dt < self._wanted else ""
+        loop.note = f"{self._integrator} is in use{lowered}"
+        return True
+
+    # --- sliders ------------------------------------------------------------------------------------------------------
 
     def _dt_slider(self, gui) -> None:
         sim = self._sim
@@ -146,6 +205,11 @@ class Panel:
             except SimulationError:
                 sim.dt = 0.5 * sim.dt
         self._set_dt()
+
+
+def _next(names: tuple[str, ...], name: str) -> str:
+    """The name after this one, and the first after the last."""
+    return names[(names.index(name) + 1) % len(names)]
 
 
 def changed(new: float, old: float) -> bool:

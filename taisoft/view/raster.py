@@ -50,6 +50,22 @@ def rasterise(
     return (owner >= 0).reshape(height, width)
 
 
+def stroke(ends: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lines as pairs of triangles, for `rasterise`.
+
+    ends: (2k,3) pixel coordinates and depth, two rows a line; width in pixels. Returns corners (4k,3), those of a line being
+    its first end twice and its second end twice, and triangles (2k,3). Lines without length become triangles without area.
+    """
+    a, b = ends[0::2], ends[1::2]
+    way = b[:, :2] - a[:, :2]
+    length = np.linalg.norm(way, axis=1, keepdims=True)
+    side = np.zeros_like(a)
+    side[:, :2] = 0.5 * width * way[:, ::-1] * (-1.0, 1.0) / np.where(length > 0, length, np.inf)
+    corners = np.stack([a - side, a + side, b - side, b + side], axis=1).reshape(-1, 3)
+    first = 4 * np.arange(len(a))[:, None, None]
+    return corners, (first + [[0, 1, 2], [1, 3, 2]]).reshape(-1, 3)
+
+
 def _edge_functions(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Barycentric weights of triangles (t,3,2) as planes (t,3,3), weight k = a x + b y + c; and twice |area| (t,)."""
     q, r = np.roll(p, -1, axis=1), np.roll(p, -2, axis=1)  # weight k vanishes on the edge from q to r

@@ -147,7 +147,8 @@ def smoothing_groups(rest: np.ndarray, surface: np.ndarray) -> tuple[np.ndarray,
 def vertex_normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Unit normals (n,3): per vertex the area-weighted mean over its triangles (t,3); zero where they cancel."""
     a, b, c = (x[triangles[:, k]] for k in range(3))
-    areas = np.cross(b - a, c - a)
+    (u0, u1, u2), (v0, v1, v2) = (b - a).T, (c - a).T
+    areas = np.stack([u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0], axis=1)  # np.cross takes twice as long
     total = np.empty_like(x)
     for axis in range(3):
         total[:, axis] = np.bincount(triangles.ravel(), np.repeat(areas[:, axis], 3), minlength=len(x))

@@ -2,7 +2,7 @@
 
 The left button pulls the body under the cursor, and orbits elsewhere or with Ctrl; the right one zooms, the middle one shifts.
 Space: pause or go on. S or right arrow: one step. R: back to the initial state. V: other colours. W, C, T, F: wires, contacts,
-tractions, fixed nodes. P: record pictures. Escape or
+tractions, fixed nodes. G: plots over time. P: record pictures. Escape or
 the close button: end. Sliders and buttons are in the panel, see `taisoft.view.panel`.
 """
 
@@ -16,11 +16,13 @@ from taisoft.output.appearance import start_positions
 from taisoft.output.camera import MAX_WIDENING, Camera
 from taisoft.view.colouring import Colouring
 from taisoft.view.ggui import Canvas
-from taisoft.view.layers import IN_FRONT, Layers
+from taisoft.view.layers import IN_FRONT, IN_WINDOW, Layers
 from taisoft.view.loop import Loop
 from taisoft.view.panel import Panel
 from taisoft.view.picking import Drag, pick
+from taisoft.view.plots import Plots
 from taisoft.view.shading import BACKGROUND_TOP
+from taisoft.view.strip import Strip
 from taisoft.view.surfaces import Surfaces
 
 SIZE = (1280, 720)
@@ -31,7 +33,7 @@ ZOOM = 16.0  # factor on the distance for such a drag
 PULL_COLOUR = np.array([0.85, 0.10, 0.35])  # sRGB
 KEYS = {
     ti.ui.SPACE: "pause", "s": "step", ti.ui.RIGHT: "step", "r": "reset", "p": "record", "v": "colour",
-    "w": "wires", "c": "contacts", "t": "tractions", "f": "fixed nodes", ti.ui.ESCAPE: "close",
+    "w": "wires", "c": "contacts", "t": "tractions", "f": "fixed_nodes", "g": "plots", ti.ui.ESCAPE: "close",
 }  # fmt: skip
 
 
@@ -39,19 +41,21 @@ class LiveWindow:
     """A window that shows a scene; also an observer, with `frame` and `close`, for `Simulator.run`.
 
     scene: its bodies and obstacles are read once; size: (width, height) in pixels; camera: where to look from, else it shows all
-    bodies and moves back after them until the user moves it; tall: with room for sliders in the panel; colour: as of
-    `Offscreen`, to begin with. `pressed` holds what
-    the user asked for by keys up to the last draw, values of KEYS. Raises OutputError, before anything is opened, when a
-    display or a Vulkan driver is missing or the process has a window already.
+    bodies and moves back after them until the user moves it; tall: with room for sliders in the panel; colour and
+    layers: as of `Offscreen`, to begin with; plots: what can be shown of them. `pressed` holds what the user asked for by keys up
+    to the last draw, values of KEYS. Raises OutputError, before anything is opened, when a display or a Vulkan driver is missing
+    or the process has a window already.
     """
 
     def __init__(
-        self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None, tall: bool = False, colour: str = "body"
+        self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None, tall: bool = False, colour: str = "body",
+        layers: tuple[str, ...] = IN_WINDOW, plots: Plots | None = None,
     ):  # fmt: skip
         self.camera = camera or Camera.framing(start_positions(scene), size)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # [m]; 0 once the user moves the camera
         self._surfaces = Surfaces(scene)
-        self.layers = Layers(scene)
+        self.layers = Layers(scene, layers)
+        self.strip = Strip(plots, size) if plots is not None else None
         self.colouring = Colouring(scene, self._surfaces, colour)
         self._canvas = Canvas(self._surfaces, size, visible=True, n_segments=self.layers.n_segments + 1)
         self._place = PANEL if tall else SHORT_PANEL
@@ -75,7 +79,7 @@ class LiveWindow:
         panel: the sliders below the lines; record: is given the picture, uint8 (height, width, 3), without the panel.
         """
         window = self._canvas.window
-        self._surfaces.with_markers = self.layers.shown["fixed nodes"]
+        self._surfaces.with_markers = self.layers.shown["fixed_nodes"]
         bodies = self._surfaces.of_bodies(sim)
         self.camera = self.camera.widened(bodies[0], window.get_window_shape(), self._widest)
         x, normals = self._surfaces.with_obstacles(bodies, sim.time, self.camera.position)
@@ -87,6 +91,8 @@ class LiveWindow:
             self._taken = size
             if record is not None:
                 record(picture)
+        if self.strip is not None:
+            self.strip.draw(self._canvas, window.get_gui(), size)
         # a line that comes and goes above the sliders would move them under the cursor
         with window.get_gui().sub_window("taisoft", *self._place) as gui:
             for line in lines:
@@ -121,6 +127,8 @@ class LiveWindow:
                 self.pressed.add(KEYS[event.key])
         for name in self.pressed & set(self.layers.shown):
             self.layers.shown[name] = not self.layers.shown[name]
+        if "plots" in self.pressed and self.strip is not None:
+            self.strip.plots.toggle()
         if "colour" in self.pressed:
             self.colouring.choose_next()
         self._asked_to_close |= "close" in self.pressed
@@ -146,7 +154,8 @@ class LiveWindow:
     def _begin(self, sim, panel: Panel | None, button, cursor, size) -> str:
         """What the drag that begins here does."""
         left, top, width, height = self._panel_pixels
-        if left <= cursor[0] * size[0] <= left + width and top <= (1.0 - cursor[1]) * size[1] <= top + height:
+        x, y = cursor[0] * size[0], (1.0 - cursor[1]) * size[1]
+        if left <= x <= left + width and top <= y <= top + height or (self.strip is not None and self.strip.holds(x, y)):
             return "panel"
         if button != ti.ui.LMB:
             return "zoom" if button == ti.ui.RMB else "shift"
@@ -171,27 +180,29 @@ class LiveWindow:
             self.camera = self.camera.pan(-right * size[0] / size[1], -up)
 
 
-def show(sim, fps: float = 60.0, paused: bool = False, colour: str = "body") -> None:
+def show(
+    sim, fps: float = 60.0, paused: bool = False, colour: str = "body", layers: tuple[str, ...] = IN_WINDOW,
+    plots: tuple[str, ...] = (),
+) -> None:  # fmt: skip
     """Run a simulation in a window until it is closed.
 
     sim: an open Simulator, advanced by 1/fps [s] of simulated time a picture, never faster than real time; made with
     pullable=True its bodies can be pulled with the mouse. A step that fails pauses the run and its reason is shown; R starts
-    anew. Raises OutputError, before anything is opened, when a display or a Vulkan driver is missing or the process has a
-    window already.
+    anew. colour, layers, plots: what is shown to begin with. Raises OutputError, before anything is opened, when a display or a
+    Vulkan driver is missing or the process has a window already, SceneError for a plot of what is not modelled.
     """
     if not fps > 0:
         raise OutputError(f"the window's fps is {fps}, it must be positive")
-    window = LiveWindow(sim.scene, tall=True, colour=colour)
+    history = Plots(sim, plots)
+    window = LiveWindow(sim.scene, tall=True, colour=colour, layers=layers, plots=history)
     try:
-        loop = Loop(sim, fps, paused)
-        panel = Panel(sim, loop, window.colouring, window.layers)
-        pictures = 0
+        loop = Loop(sim, fps, paused, history)
+        panel = Panel(sim, loop, window.colouring, window.layers, history)
         while not window.closed:
             started = time.perf_counter()
             window.draw(sim, [*state_lines(sim), loop.speed()], panel, loop.record if loop.folder is not None else None)
             loop.react(window.pressed | panel.pressed)
-            pictures += 1
-            if not loop.paused and pictures > 2:  # GGUI shows no panel at first, and the first step compiles for seconds
+            if not loop.paused:
                 loop.advance()
             time.sleep(max(0.0, 1.0 / fps - (time.perf_counter() - started)))
     finally:

@@ -1,0 +1,75 @@
+"""What `taisoft run` shows in pictures and in the window beside the bodies: colours, layers, plots, a caption."""
+
+from argparse import Namespace
+from dataclasses import dataclass
+from pathlib import Path
+
+from taisoft.errors import SceneError
+from taisoft.scene.checks import nearest
+from taisoft.view.annotations import Annotations, text_missing
+from taisoft.view.colouring import Colouring
+from taisoft.view.layers import IN_PICTURES, IN_WINDOW, LAYERS
+from taisoft.view.plots import PLOTS, Plots
+
+
+@dataclass(frozen=True)
+class Shown:
+    """colour: as of `Offscreen`; layers: names, or None for those of old; plots: names; caption: the scene's name, or None."""
+
+    colour: str = "body"
+    layers: tuple[str, ...] | None = None
+    plots: tuple[str, ...] = ()
+    caption: str | None = None
+
+    @property
+    def in_pictures(self) -> tuple[str, ...]:
+        """Layers of pictures."""
+        return IN_PICTURES if self.layers is None else self.layers
+
+    @property
+    def in_window(self) -> tuple[str, ...]:
+        """Layers of the window."""
+        return IN_WINDOW if self.layers is None else self.layers
+
+    def annotate(self, plots: Plots | None, colouring: Colouring):
+        """What draws plots and caption on pictures, for `FrameWriter`; None where there is nothing to draw."""
+        if not self.plots and self.caption is None:
+            return None
+        return Annotations(plots if self.plots else None, self.caption, colouring).draw
+
+
+def shown_of(arguments: Namespace, has_window: bool) -> Shown:
+    """What the options ask for. Raises SceneError for unknown names, and where nothing would show what is asked for."""
+    has_pictures = arguments.out is not None and not arguments.no_frames
+    needs = "needs --out, the folder to write to, and the pictures that --no-frames leaves out"
+    layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS)
+    asked = {"video": arguments.video, "caption": arguments.caption}
+    if not has_window and arguments.headless:
+        asked |= {"layers": layers is not None, "plots": bool(plots)}
+    for option, given in asked.items():
+        if given and not has_pictures:
+            raise SceneError(f"--{option} {needs}")
+    if has_pictures and (plots or arguments.caption) and text_missing():
+        raise SceneError(f"{'--plots' if plots else '--caption'}: {text_missing()}")
+    caption = Path(arguments.scene).stem if arguments.caption else None
+    return Shown(arguments.colour, layers, plots or (), caption)
+
+
+def check_modelled(shown: Shown, sim) -> None:
+    """Raises SceneError for a layer or plot of what sim does not model."""
+    if "contacts" in (shown.layers or ()) and not sim.plan.on["contact_forces"]:
+        raise SceneError(f"--layers contacts: contact forces are not modelled ({sim.plan.why('contact_forces')})")
+    Plots(sim, shown.plots)
+
+
+def _names(option: str, text: str | None, known) -> tuple[str, ...] | None:
+    """Names of an option's value, joined by commas; `none` is none of them, no value None."""
+    if text is None:
+        return None
+    names = tuple(name.strip() for name in text.split(",")) if text.strip() != "none" else ()
+    for name in names:
+        if name not in known:
+            raise SceneError(
+                f"--{option} {text}: {name!r} is none of its names{nearest(name, known)}; there are {', '.join(known)}, and none"
+            )
+    return names

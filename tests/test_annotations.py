@@ -1,0 +1,146 @@
+"""Text and plots over pictures:
+
+* a plot lies at the right, with its lines in their colours, and nothing elsewhere; a caption lies below, with the colours' scale;
+* both grow with the picture; without Pillow they are refused with a sentence;
+* `taisoft run --plots --caption --layers` draws them, and refuses what it does not know, does not model or cannot show.
+"""
+
+import numpy as np
+import pytest
+from command import BEAM, run, write
+from fake_simulator import FakeSimulator, beam_scene
+from test_output_frames import decode
+from test_plots import filled
+from test_view import body_mask
+
+from taisoft.errors import OutputError
+from taisoft.output.history import QUANTITIES
+from taisoft.view import annotations
+from taisoft.view.annotations import Annotations
+from taisoft.view.colouring import Colouring
+from taisoft.view.offscreen import Offscreen
+from taisoft.view.plots import PLOTS
+from taisoft.view.surfaces import Surfaces
+
+SIZE = (640, 360)
+
+
+def grey(size=SIZE):
+    return np.full((size[1], size[0], 3), 120, dtype=np.uint8)
+
+
+def drawn(picture, before):
+    """Left, top, right, bottom of what differs."""
+    rows, columns = np.nonzero((picture != before).any(axis=2))
+    return columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+
+
+def near(picture, colour, by=60):
+    return np.abs(picture.astype(int) - np.round(255 * np.array(colour))).max(axis=2) < by
+
+
+@pytest.mark.parametrize("size", [SIZE, (1280, 720), (300, 300)])
+def test_plots_lie_at_the_right(size):
+    plots, sim, unit = filled(), FakeSimulator(beam_scene()), size[1] / 720
+    for names in (["contacts"], list(PLOTS)):
+        plots.shown = {name: name in names for name in PLOTS}
+        before = grey(size)
+        picture = Annotations(plots).draw(before, sim, 3)
+        assert (before == 120).all() and picture.shape == before.shape and picture.dtype == np.uint8
+        left, top, right, bottom = drawn(picture, before)
+        assert left >= size[0] - 317 * unit and right <= size[0] - 15 * unit and top >= 15 * unit
+        assert bottom <= (156 if len(names) == 1 else 705) * unit
+        part = picture[top:bottom, left:right]
+        assert (part > 230).all(axis=2).mean() > 0.25, "paper"
+        for series in PLOTS[names[-1]].series:
+            assert near(part, series.colour).sum() > 30, series.name
+    plots.shown = dict.fromkeys(PLOTS, False)
+    assert np.array_equal(Annotations(plots).draw(grey(size), sim, 3), grey(size))
+
+
+def test_a_line_is_where_its_values_are():
+    plots, sim = filled(300), FakeSimulator(beam_scene())
+    column, half = QUANTITIES.index("n_contacts"), len(plots.history.times) // 2
+    for part, value in ((slice(0, half), 1.0), (slice(half, None), 4.5)):
+        plots.history.low[part, column] = plots.history.high[part, column] = value
+    plots.shown = {name: name == "contacts" for name in PLOTS}
+    picture = Annotations(plots).draw(grey((1280, 720)), sim, 0)
+    rows, columns = np.nonzero(near(picture[30:140, 975:1255], PLOTS["contacts"].series[0].colour))
+    low, high = rows[columns < 100], rows[(columns > 180) & (rows > 8)]  # below the last value, which is told in this colour
+    assert np.ptp(low) < 4 and np.ptp(high) < 4 and low.min() == pytest.approx(high.min() + 0.7 * 92, abs=2)
+
+
+def test_a_caption_lies_below():
+    sim, scene = FakeSimulator(beam_scene()), beam_scene()
+    sim.time = 0.5
+    plain = Annotations(name="bücher").draw(grey(), sim, 7)
+    left, top, right, bottom = drawn(plain, grey())
+    assert left < 12 and 190 < right < 340 and 318 < top < 336 and bottom <= 355
+    colouring = Colouring(scene, Surfaces(scene), "stress")
+    colouring.base(sim)
+    coloured = Annotations(name="bücher", colouring=colouring).draw(grey(), sim, 7)
+    scale = coloured[drawn(coloured, grey())[1] : top, :120]
+    assert body_mask(scale).mean() > 0.1 and scale.shape[0] > 20
+    assert np.array_equal(coloured[top + 1 :], plain[top + 1 :])
+    later = Annotations(name="bücher").draw(grey(), sim, 8)
+    assert not np.array_equal(later, plain), "the number of the frame"
+
+
+def test_a_caption_beside_plots_stays_below_the_bodies():
+    sim, scene, plots = FakeSimulator(beam_scene()), beam_scene(), filled()
+    picture = Offscreen(scene, SIZE, renderer="software").image(sim)
+    both = Annotations(plots, "beam").draw(picture, sim, 0)
+    assert np.array_equal(both[10:280, : SIZE[0] - 160], picture[10:280, : SIZE[0] - 160])
+
+
+def test_what_is_missing_is_told(monkeypatch):
+    monkeypatch.setattr(annotations, "find_spec", lambda name: None if name == "PIL" else 1)
+    with pytest.raises(OutputError, match=r"text in pictures needs Pillow: pip install 'taisoft\[plot\]'"):
+        Annotations(name="beam")
+
+
+# --- the command ---
+
+
+def test_a_run_draws_them(tmp_path):
+    path = write(tmp_path / "beam.py", BEAM)
+    asked = ("--plots", "energies,step_time", "--caption", "--layers", "wires")
+    assert run(path, "--out", tmp_path / "out", "--no-usd", "--fps", 10, *asked) == 0
+    first, last = (decode(file.read_bytes()) for file in sorted((tmp_path / "out" / "frames").iterdir()))
+    energies, step_time = last[30:140, 970:], last[170:280, 970:]
+    for series in PLOTS["energies"].series[:3]:
+        assert near(energies, series.colour).sum() > 40, series.name
+    assert near(step_time, PLOTS["step_time"].series[0].colour).sum() > 20
+    assert (last[650:710, 10:600] < 60).all(axis=2).sum() > 500, "a caption"
+    body = body_mask(last)
+    dark = (last[200:500, 300:900] < 70).all(axis=2)
+    assert dark.sum() > 500 and body.sum() > 20 * dark.sum() / 2, "wires"
+    assert not np.array_equal(first[650:710], last[650:710])
+
+
+@pytest.mark.parametrize(
+    "arguments, told",
+    [
+        (["--plots", "energy"], "--plots energy: 'energy' is none of its names (did you mean energies?); there are energies, "),
+        (["--plots", "energies,"], "'' is none of its names"),
+        (["--layers", "wires,contact"], "'contact' is none of its names (did you mean contacts?)"),
+        (["--layers", "contacts"], "--layers contacts: contact forces are not modelled (one body, and nothing that it could"),
+        (["--plots", "contacts"], "no plot 'contacts': contact forces are not modelled (one body, and nothing"),
+        (["--plots", "iterations"], "no plot 'iterations': steps of symplectic_euler are explicit"),
+        (["--caption", "--no-frames"], "--caption needs --out, the folder to write to, and the pictures that --no-frames"),
+        (["--plots", "energies", "--no-frames"], "--plots needs --out"),
+        (["--layers", "none", "--no-frames"], "--layers needs --out"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(beam, tmp_path, capsys, arguments, told):
+    assert run(beam, "--out", tmp_path / "out", *arguments) == 2
+    error = capsys.readouterr().err
+    assert told in error and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_text_that_cannot_be_written_is_refused(beam, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(annotations, "find_spec", lambda name: None)
+    assert run(beam, "--out", tmp_path / "out", "--caption") == 2
+    assert "--caption: text in pictures needs Pillow and matplotlib" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

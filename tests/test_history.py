@@ -1,0 +1,76 @@
+"""What steps told over time, in a memory of fixed size:
+
+* runs of steps follow one another without a gap, each is as long as the others but the last, and holds their lows and highs;
+* at least half of the memory is used, and none beyond it, however many steps there were;
+* energies are told as their change; what is not modelled, or not finite, is unknown, and hides no neighbour.
+"""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from taisoft.output.history import QUANTITIES, History
+from taisoft.records import Energies, StepReport
+
+COLUMN = {name: k for k, name in enumerate(QUANTITIES)}
+
+
+def begun(capacity: int = 8, time: float = 0.0, kinetic: float = 0.0) -> History:
+    history = History(capacity)
+    history.start(SimpleNamespace(time=time, energies=lambda: Energies(kinetic, 1.0, 2.0)))
+    return history
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.floats(-1e6, 1e6) | st.just(float("nan")), max_size=200), st.sampled_from([2, 4, 8, 10]))
+def test_runs_are_what_they_are_of(values, capacity):
+    history = begun(capacity)
+    for k, value in enumerate(values):
+        history.take(StepReport(time=k + 1.0, kinetic=value, elastic=1.0, gravity=2.0, n_contacts=k), 0.001, False, True)
+    told, steps = np.array([0.0, *values]), np.arange(len(values) + 1.0)
+    n = len(history.times)
+    length = 2 ** math.ceil(math.log2(len(told) / n))
+    assert n <= capacity and (length == 1 or 2 * n > capacity)
+    for j in range(n):
+        part = told[j * length : (j + 1) * length]
+        known = part[np.isfinite(part)]
+        low, high = history.low[j, 0], history.high[j, 0]
+        if len(known):
+            assert (low, high) == (known.min(), known.max())
+        else:
+            assert np.isnan(low) and np.isnan(high)
+        assert history.times[j] == steps[j * length : (j + 1) * length][-1]
+    assert history.times[-1] == len(values)
+
+
+def test_no_peak_is_lost_and_memory_stays():
+    history = begun(256)
+    arrays = history._times, history._low, history._high
+    for k in range(20_000):
+        report = StepReport(time=5e-3 * (k + 1), n_contacts=7777 if k == 6_234 else 3, elastic=1.0, gravity=2.0)
+        history.take(report, 0.001, True, True)
+    assert history.high[:, COLUMN["n_contacts"]].max() == 7777 and 128 <= len(history.times) <= 256
+    assert (np.diff(history.times) > 0).all() and history.times[-1] == pytest.approx(100.0)
+    assert all(a is b for a, b in zip(arrays, (history._times, history._low, history._high)))
+
+
+def test_change_of_energy_and_what_is_not_known():
+    history = begun(kinetic=10.0, time=3.0)
+    report = StepReport(
+        time=3.1, steps=4, kinetic=11.0, elastic=3.0, gravity=-1.0, residual=1e-5, newton_iterations=2, linear_iterations=30,
+        contact_residual=float("inf"), contact_iterations=8, n_contacts=5,
+    )  # fmt: skip
+    expected = {"kinetic": 1.0, "elastic": 2.0, "gravity": -3.0, "total": 0.0, "step_time": 5.0}
+    implicit = {"newton_residual": 1e-5, "newton_iterations": 2, "linear_iterations": 30}
+    contact = {"contact_iterations": 2.0, "n_contacts": 5}
+    for explicit, touching in ((False, True), (True, True), (True, False), (False, False)):
+        history.take(report, 0.02, explicit, touching)
+        known = expected | (implicit if not explicit else {}) | (contact if touching else {})
+        assert {name: value for name, value in zip(QUANTITIES, history.last) if np.isfinite(value)} == pytest.approx(known)
+    assert history.begin == 3.0
+    history.start(SimpleNamespace(time=0.0, energies=lambda: Energies(0.0, 0.0, 0.0)))
+    assert len(history.times) == 1 and history.begin == 0.0

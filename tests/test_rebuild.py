@@ -1,0 +1,95 @@
+"""A simulator that goes on with other settings:
+
+* positions, velocities, time, steps, changed numbers and let-go nodes are carried over bit by bit, and the next step is that of a
+  simulator made with those settings from that state;
+* what cannot be met is refused with the sentence of a new simulator, and everything is as it was;
+* the memory of the one before is given back, and nothing is left open.
+"""
+
+import numpy as np
+import pytest
+from checkpoint_scenes import cubes
+from fake_simulator import beam_scene
+from scenes import RELEASE, driven_scene
+
+import taisoft as ts
+from taisoft import runtime
+from taisoft.errors import SimulationError
+
+
+def told(sim) -> tuple:
+    """All that is carried over."""
+    return sim.positions(), sim.velocities(), sim.time, sim.step_count, sim.energies()
+
+
+def assert_same(a: tuple, b: tuple) -> None:
+    assert np.array_equal(a[0], b[0]) and np.array_equal(a[1], b[1]) and a[2:] == b[2:]
+
+
+def test_the_state_is_carried_over_and_the_next_step_is_that_of_a_new_simulator():
+    scene = beam_scene(cells=(3, 1, 1))
+    with ts.Simulator(scene, dt=0.004, integrator="symplectic_euler") as sim:
+        trees = runtime.trees["open"]
+        sim.advance(20)
+        sim.set_gravity((0.0, -5.0, 1.0))
+        sim.set_material("beam", young=2e4)
+        before = told(sim)
+        sim.rebuild(integrator="bdf2", dt=0.01)
+        assert_same(told(sim), before)
+        assert sim.settings.integrator == "bdf2" and sim.dt == 0.01 and runtime.trees["open"] <= trees + 1
+        scene.gravity, scene.bodies[0].material = sim.scene.gravity, sim.scene.bodies[0].material
+        with ts.Simulator(scene, dt=0.01, integrator="bdf2") as other:
+            other.set_state(positions=before[0], velocities=before[1])
+            other.step()
+            expected = other.positions(), other.velocities()
+        report = sim.step()
+        assert np.array_equal(sim.positions(), expected[0]) and np.array_equal(sim.velocities(), expected[1])
+        assert sim.time == before[2] + 0.01 and sim.step_count == 21 and report.newton_iterations > 0
+        sim.reset()
+        assert sim.time == 0.0 and np.array_equal(sim.positions(), scene.bodies[0].rest_positions)
+    assert runtime.open_kind() is None
+
+
+def test_led_nodes_that_were_let_go_stay_free(tmp_path):
+    with ts.Simulator(driven_scene(), dt=2e-4, integrator="symplectic_euler", precision="f64") as sim:
+        while sim.time < RELEASE + 0.002:
+            sim.advance(10)
+        before = told(sim)
+        sim.rebuild(integrator="velocity_verlet")
+        assert_same(told(sim), before)
+        sim.save_checkpoint(tmp_path / "c.npz")
+        sim.advance(5)
+        after = told(sim)
+    assert np.abs(after[0][8:10] - before[0][8:10]).max() > 1e-5
+    with ts.Simulator.load_checkpoint(tmp_path / "c.npz", driven_scene()) as sim:
+        assert sim.settings.integrator == "velocity_verlet"
+        sim.advance(5)
+        assert_same(told(sim), after)
+
+
+def test_what_cannot_be_met_changes_nothing():
+    with ts.Simulator(cubes(), dt=0.01) as sim:
+        before, world = told(sim), sim._world
+        for changes, why in (
+            ({"integrator": "implicit_midpoint"}, "implicit_midpoint takes no contacts"),
+            ({"integrator": "symplectic_euler"}, "above the estimated stability limit"),
+            ({"contact_solver": "jacobi"}, "does not fit implicit_euler"),
+            ({"precision": "f64"}, "is open"),
+            ({"dt": -1.0}, "dt must be greater than 0 s"),
+        ):
+            with pytest.raises(SimulationError, match=why):
+                sim.rebuild(**changes)
+            assert_same(told(sim), before)
+        assert sim._world is world and sim.settings.integrator == "implicit_euler" and not sim.scene.allow_initial_overlap
+    assert runtime.open_kind() is None
+
+
+def test_another_contact_solver_goes_on_with_bodies_in_contact():
+    with ts.Simulator(cubes(), dt=5e-4, integrator="symplectic_euler", contact_solver="gauss_seidel") as sim:
+        sim.advance(200)
+        before = told(sim)
+        assert len(sim.contacts().gap) > 0
+        sim.rebuild(contact_solver="jacobi")
+        assert_same(told(sim), before)
+        report = sim.advance(20)
+        assert report.n_contacts > 0 and report.converged and report.max_penetration < 1e-3
