@@ -31,7 +31,7 @@ class StepReport:
     n_contacts: int = 0
     dropped_contacts: int = 0
     max_penetration: float = 0.0  # [m], of the contacts found: what is deeper than their search reaches is not among them
-    deep: int = 0  # 1 where that is more than 2 % of the finest body's mean surface edge; a number among numbers
+    deep: int = 0  # 1 where that is more than 2 % of the finer side's mean surface edge; a number among numbers
     min_volume_ratio: float = 1.0  # smallest J = det F
     n_inverted: int = 0  # tets with J <= 0
     kinetic: float = 0.0  # [J]

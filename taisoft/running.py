@@ -168,8 +168,8 @@ def _interrupt(report: RunReport) -> None:
 
 def _judge_end(sim: "Simulator", report: RunReport) -> None:
     """Bodies that overlap at the end, however they got there."""
-    found = sim.deepest_overlap() if sim.contact_limit > 0.0 else None
-    if found is not None and found.depth > sim.contact_limit:
+    found = sim.deepest_overlap() if sim.touches else None
+    if found is not None and found.depth > sim.contact_limit(found.name_a, found.name_b):
         report.problems.append(f"at the end '{found.name_a}' and '{found.name_b}' overlap by {found.depth:.3g} m")
         report.status = "degraded"
 

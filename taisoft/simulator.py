@@ -17,7 +17,7 @@ from taisoft.scene.scene import Scene
 from taisoft.settings import check_settings, plan_of
 from taisoft.stability import scale_warnings
 from taisoft.stepping import make_stepper
-from taisoft.stepping.contact import ContactStep
+from taisoft.stepping.contact import SUNK, ContactStep
 from taisoft.stepping.motion import Motion
 from taisoft.stepping.pull import Pull, batch
 from taisoft.stepping.world import World
@@ -99,9 +99,14 @@ class Simulator(Resuming):
             )
 
     @property
-    def contact_limit(self) -> float:
-        """Penetration [m] above which a step counts as deep; 0 where nothing can touch."""
-        return self._contact.sunk if self._contact is not None else 0.0
+    def touches(self) -> bool:
+        """Whether contact forces are modelled."""
+        return self._contact is not None
+
+    def contact_limit(self, a: str, b: str) -> float:
+        """Penetration [m] of two colliders, by name, above which a step counts as deep, where contact forces are modelled."""
+        edges = dict(zip((c.name for c in self.scene.colliders), self._contact.detection.edges))
+        return SUNK * float(min(edges[a], edges[b]))
 
     # --- stepping -------------------------------------------------------------------------------------------------
 
@@ -136,7 +141,7 @@ class Simulator(Resuming):
             report.n_contacts, report.max_penetration = self._contact.n_contacts, self._contact.penetration
             report.dropped_contacts = self._contact.dropped
             report.converged &= result.contacts_converged
-            report.deep = int(report.max_penetration > self._contact.sunk)
+            report.deep = int(self._contact.sinking > SUNK)
         report.steps = self.step_count - start
         report.problems = [f"step {world.step_count}: {what}" for what in self._problems(report)]
         return report

@@ -27,7 +27,7 @@ def surface_of(
     move = np.zeros_like(x) if move is None else move
     arena = FieldArena()
     with opened(precision) as machine:
-        surface = build_surface(topology, x, soft, self_on, np.full(len(soft), np.inf), machine, arena, serial)
+        surface = build_surface(topology, x, soft, self_on, *[np.full(len(soft), np.inf)] * 2, machine, arena, serial)
         made = SimpleNamespace(
             surface=surface, topology=topology, soft=soft, self_on=self_on, margin=margin, arena=arena, machine=machine
         )

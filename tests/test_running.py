@@ -23,7 +23,7 @@ class StandIn:
     """Counts steps; `events` maps a step to what happens in it: an exception, or fields of its report."""
 
     def __init__(self, explicit: bool, dt: float = 0.01, events=None, largest_batch: int = 4):
-        self.settings, self.contact_limit = SimpleNamespace(explicit=explicit), 0.0
+        self.settings, self.touches = SimpleNamespace(explicit=explicit), False
         self.dt, self.step_count, self.time, self.compile_seconds = dt, 0, 0.0, 0.0
         self.events, self.largest_batch = events or {}, largest_batch
 
@@ -275,7 +275,7 @@ def test_real_ctrl_c(block, monkeypatch):
 def test_the_end_is_judged(end, status):
     """By the deepest overlap [m], or what asking for it raises."""
     sim = StandIn(True)
-    sim.contact_limit = 0.01
+    sim.touches, sim.contact_limit = True, lambda a, b: 0.01
 
     def deepest_overlap():
         if isinstance(end, BaseException):

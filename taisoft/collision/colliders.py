@@ -4,6 +4,7 @@ import numpy as np
 
 from taisoft.collision.surface import Topology, make_topology
 from taisoft.errors import MeshError
+from taisoft.mesh.quality import mean_surface_edge
 from taisoft.mesh.sdf_grid import SdfGrid, cached_sdf_grid
 from taisoft.model import Layout
 from taisoft.scene.body import Body
@@ -79,3 +80,12 @@ def _surface_thickness(x: np.ndarray, triangles: np.ndarray) -> float:
     cross = np.cross(b - a, c - a)
     volume, area = abs(np.einsum("ij,ij->", a, cross)) / 6.0, 0.5 * np.linalg.norm(cross, axis=1).sum()
     return min(float(principal_extents(x, triangles).min()), 4.0 * volume / area)
+
+
+def collider_edge(collider: Body | Obstacle) -> float:
+    """Mean surface edge of a body or of an obstacle of triangles [m]; of other obstacles without end."""
+    if isinstance(collider, Body):
+        return mean_surface_edge([(collider.nodes.positions, collider.nodes.surface)])
+    if isinstance(collider.shape, MeshObstacle):
+        return mean_surface_edge([(collider.shape.vertices, collider.shape.triangles)])
+    return np.inf

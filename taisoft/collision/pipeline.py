@@ -13,7 +13,14 @@ from taisoft.collision.analytic import NO_SHAPES, AnalyticObstacles, find_analyt
 from taisoft.collision.boxes import move_obstacles, take_led, update_surface
 from taisoft.collision.bvh import Bvh, Trees
 from taisoft.collision.candidates import Buffer, Candidates, entries
-from taisoft.collision.colliders import body_grid, collider_surfaces, collider_thickness, led_vertices, obstacle_frame
+from taisoft.collision.colliders import (
+    body_grid,
+    collider_edge,
+    collider_surfaces,
+    collider_thickness,
+    led_vertices,
+    obstacle_frame,
+)
 from taisoft.collision.contacts import KINDS, Contacts, contact_fields, gather
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.proximity import find_proximity
@@ -88,12 +95,13 @@ class Detection:
         self._arena = arena = FieldArena()
         soft = np.arange(len(scene.colliders)) < len(bodies)
         self.thickness = np.array([collider_thickness(c, self.edge) for c in scene.colliders])
+        self.edges = np.array([collider_edge(c) for c in scene.colliders])
         self._analytic = [(len(bodies) + k, o) for k, o in enumerate(obstacles) if not isinstance(o.shape, MeshObstacle)]
         ways = [BY_FACES if b.hit_by == "proximity" else BY_FIELD for b in bodies]
         ways += [BY_FACES if isinstance(o.shape, MeshObstacle) else BY_EDGES for o in obstacles]
         with arena.group():
             self.surface: Surface = build_surface(
-                self.topology, self._rest, soft, soft & self_collision, self.thickness, runtime, arena, serial
+                self.topology, self._rest, soft, soft & self_collision, self.thickness, self.edges, runtime, arena, serial
             )
             s = self.surface
             self.broad = self._make_broad(runtime) if self._rows else None

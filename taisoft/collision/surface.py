@@ -74,6 +74,7 @@ class Surface:
     self_on: Any  # (n_bodies) i32: 1 where a body is tested against itself
     first_of: Any  # (n_bodies + 1) i32
     thickness: Any  # (n_bodies) f64: how thick each is [m], inf for half-spaces
+    edge: Any  # (n_bodies) f64: their mean surface edges [m], inf for analytic obstacles
     rest: Any  # (n_verts) 3-vectors f64: at rest [m]
     x: Any  # (n_verts) 3-vectors f64: where they are [m]
     move: Any  # (n_verts) 3-vectors f64: how far they go in the step [m]
@@ -141,11 +142,11 @@ def _edges(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def build_surface(
-    topology: Topology, rest: np.ndarray, soft: np.ndarray, self_on: np.ndarray, thickness: np.ndarray, runtime: Runtime,
-    arena: FieldArena, serial: bool | None = None,
+    topology: Topology, rest: np.ndarray, soft: np.ndarray, self_on: np.ndarray, thickness: np.ndarray, edge: np.ndarray,
+    runtime: Runtime, arena: FieldArena, serial: bool | None = None,
 ) -> Surface:  # fmt: skip
-    """Allocate and fill the fields. rest: (v,3) [m]; soft, self_on: (n_bodies,) bool; thickness: (n_bodies,) [m]. serial: None
-    decides by size."""
+    """Allocate and fill the fields. rest: (v,3) [m]; soft, self_on: (n_bodies,) bool; thickness, edge: (n_bodies,) [m].
+    serial: None decides by size."""
     t, i = topology, ti.i32
     n, v, bodies = len(t.triangle), len(t.node), len(soft)
     light = serial
@@ -171,6 +172,7 @@ def build_surface(
         ints("around_start", t.around_start), ints("around", t.around),
         ints("soft", soft), ints("self_on", self_on), ints("first_of", t.first),
         arena.field("surface_thickness", ti.f64, max(bodies, 1), thickness if bodies else None),
+        arena.field("surface_edge", ti.f64, max(bodies, 1), edge if bodies else None),
         arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None), vectors("x", v), vectors("move", v),
         vectors("lo", n), vectors("hi", n), vectors("normal", n), arena.field("surface_area", ti.f64, max(n, 1)),
         vectors("body_lo", bodies), vectors("body_hi", bodies),

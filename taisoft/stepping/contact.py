@@ -21,14 +21,12 @@ from taisoft.contact.assemble import (
 from taisoft.contact.problem import NODES, build_node_problem, index_nodes
 from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
-from taisoft.mesh.quality import mean_surface_edge
-from taisoft.stepping.tunnelling import DEPTH, HASTE, SPEED, WHICH, find_way, survey
+from taisoft.stepping.tunnelling import DEPTH, HASTE, SINKING, SPEED, WHICH, find_way, survey
 from taisoft.stepping.world import World
 from taisoft.transfer import array_of, download, upload
 
-# Both of the finest body's mean surface edge:
-STANDOFF = 2e-3  # gap that contacts keep, so that surfaces do not cross where motion is curved
-SUNK = 0.02  # penetration that is told as a problem
+STANDOFF = 2e-3  # of the finest body's mean surface edge: gap that contacts keep, so that surfaces do not cross in curved motion
+SUNK = 0.02  # of the finer side's mean surface edge: penetration that is told as a problem
 FAST = {True: 0.05, False: 0.2}  # share of a penetration that an explicit, an implicit step mends
 SLOW = {True: 0.005, False: 0.02}  # share of a missing standoff
 PUSHED = 0.01  # of the slowest wave in a bar, sqrt(E / rho): speed at which these open at most, which strains as much
@@ -44,8 +42,7 @@ class ContactStep:
         m, scene = world.model, world.scene
         self.detection = Detection(scene, m, world.layout, world.runtime, self_collision)
         d = self.detection
-        finest = min(mean_surface_edge([(b.nodes.positions, b.nodes.surface)]) for b in scene.bodies)
-        self.standoff, self.sunk = STANDOFF * finest, SUNK * finest
+        self.standoff = STANDOFF * float(d.edges[: len(scene.bodies)].min())
         if d.margin > 0.0:
             self.standoff = min(self.standoff, 0.5 * d.margin)
         # what follows a path may be changed from outside between two steps, and its path may end with the last one
@@ -60,10 +57,10 @@ class ContactStep:
             self._way = self._own_arena.vectors("way", ti.f64, m.n_nodes)
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
-        self._told = np.zeros(4)
+        self._told = np.zeros(5)
         self._searched: tuple[float, float] | None = None  # time and dt of the search that is at hand
         self._last_time = 0.0
-        self.penetration = 0.0  # [m] at the end of the last step
+        self.penetration = self.sinking = 0.0  # at the end of the last step [m], and over the finer side's mean surface edge
         self._sum: np.ndarray | None = None  # (n_colliders, 3) impulses over the parts of the last step, if it had several
         self._span = 0.0  # of the last step [s]
         self._share = 1.0
@@ -92,7 +89,7 @@ class ContactStep:
         """The state was set: the search at hand and the impulses of the last step do not belong to it."""
         self._searched = None
         self.problem.count[0] = 0
-        self._last_time = self.penetration = self._span = 0.0
+        self._last_time = self.penetration = self.sinking = self._span = 0.0
         self._sum = None
 
     def _rows(self) -> dict:
@@ -111,7 +108,7 @@ class ContactStep:
         rows = self._rows()
         return {
             "capacity": self.problem.capacity, "last_time": self._last_time, "share": self._share, "span": self._span,
-            "sum": self._sum, "penetration": self.penetration, "met": self.met, "dropped": self.dropped,
+            "sum": self._sum, "penetration": self.penetration, "sinking": self.sinking, "met": self.met, "dropped": self.dropped,
             "rows": dict(zip(rows, download(list(rows.values()), self.n_contacts))),
         }  # fmt: skip
 
@@ -128,7 +125,7 @@ class ContactStep:
         upload(whole)
         self.problem.count[0] = n
         self._last_time, self._share, self._span = (float(kept[name]) for name in ("last_time", "share", "span"))
-        self._sum, self.penetration = kept["sum"], float(kept["penetration"])
+        self._sum, self.penetration, self.sinking = kept["sum"], float(kept["penetration"]), float(kept["sinking"])
         self.met, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self._searched, self._indexed = None, True  # so that the next step lists its contacts by nodes, however few
 
@@ -213,7 +210,7 @@ class ContactStep:
         return total
 
     def end(self, time: float, dt: float) -> float:
-        """Search at the end of a step, at a time, for one of dt; the deepest penetration [m] that is left."""
+        """Search at the end of a step, at a time, for one of dt; the deepest penetration [m] that is left. Sets `sinking`."""
         self._searched = None
         try:
             self.search(time, dt)
@@ -221,7 +218,8 @@ class ContactStep:
             if not self._follows:
                 raise
             self.detection.find(time, 0.0)  # a path that ends here: whoever steps on will be told
-        depth = float(self._survey(dt)[DEPTH])
+        told = self._survey(dt)
+        depth, self.sinking = float(told[DEPTH]), float(told[SINKING])
         if self._follows:
             self._searched = None
         return depth
@@ -239,10 +237,11 @@ class ContactStep:
         return self.detection.counts.contacts > self.problem.count[0]
 
     def look(self, time: float, dt: float) -> tuple[float, float]:
-        """The deepest penetration [m] before a step of dt, and how far its contacts close at most, over what they may."""
+        """The deepest penetration before a step of dt, over the finer side's mean surface edge, and how far contacts close at
+        most in it, over what they may."""
         self.search(time, dt)
         told = self._survey(dt)
-        return float(told[DEPTH]), float(told[HASTE])
+        return float(told[SINKING]), float(told[HASTE])
 
     def _survey(self, dt: float) -> np.ndarray:
         d = self.detection

@@ -78,6 +78,7 @@ class ContactExplicitStepper(ExplicitStepper):
             self.stale = self.stale or world.releases != releases
             n = len(targets)
         self.contact.start_step(dt, 1)
+        sinking = 0.0
         try:
             while done < n:
                 keep_state(m, self._good)
@@ -85,6 +86,7 @@ class ContactExplicitStepper(ExplicitStepper):
                     self._upload_targets(targets[done : done + 1])
                 results.append(self._substep(world.step_count + done + 1, start + done * dt, dt))
                 depth = max(depth, self.contact.end(start + (done + 1) * dt, dt))
+                sinking = max(sinking, self.contact.sinking)
                 done += 1
                 self._released = world.motion.released()
         except BaseException:  # Ctrl-C, too
@@ -92,7 +94,7 @@ class ContactExplicitStepper(ExplicitStepper):
             world.step_count += done
             world.time = start + done * dt
             raise
-        self.contact.penetration = depth
+        self.contact.penetration, self.contact.sinking = depth, sinking
         return ContactSubstepResult(
             n, m.scalars[6], int(m.scalars[7]), sum(r.iterations for r in results if r),
             max((r.residual for r in results if r), default=0.0), all(r.converged for r in results if r),

@@ -7,7 +7,7 @@ from taisoft.contact.assemble import carried
 from taisoft.runtime import kernel
 
 CLOSEST = 0.5  # of the thinner side's thickness: how far a contact may close in one step
-DEPTH, HASTE, SPEED, WHICH = range(4)  # places in what `survey` tells
+DEPTH, HASTE, SPEED, WHICH, SINKING = range(5)  # places in what `survey` tells
 
 
 @kernel
@@ -15,15 +15,17 @@ def survey(
     s: ti.template(), o: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32, dt: ti.f64,
     told: ti.types.ndarray(),
 ):  # fmt: skip
-    """told (4,): deepest penetration [m]; the most that a contact closes in the coming step, over what it may; the speed of
-    that [m/s]; its number among the kept."""
+    """told (5,): deepest penetration [m]; the most that a contact closes in the coming step, over what it may; the speed of
+    that [m/s]; its number among the kept; the deepest penetration over the finer side's mean surface edge."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         depth, haste, speed, which = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), -1
+        sinking = ti.cast(0.0, ti.f64)
         for c in range(n):
             at = kept[c]
             depth = ti.max(depth, -found.gap[at])
             a, b = found.body[at][0], found.body[at][1]
+            sinking = ti.max(sinking, -found.gap[at] / ti.min(s.edge[a], s.edge[b]))
             way = dvec(0.0)
             if ti.static(o.count > 0):
                 if found.nodes_b[at][0] < 0:
@@ -37,7 +39,7 @@ def survey(
             allowed = CLOSEST * ti.min(s.thickness[a], s.thickness[b])
             if s.thickness[b] < ti.math.inf and closing > haste * allowed:
                 haste, speed, which = closing / allowed, closing / dt, c
-        told[0], told[1], told[2], told[3] = depth, haste, speed, which
+        told[0], told[1], told[2], told[3], told[4] = depth, haste, speed, which, sinking
 
 
 @kernel
