@@ -44,7 +44,7 @@ def shown_of(arguments: Namespace, has_window: bool) -> Shown:
     needs = "needs --out, the folder to write to, and the pictures that --no-frames leaves out"
     layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS)
     asked = {"video": arguments.video, "caption": arguments.caption}
-    if not has_window and arguments.headless:
+    if not has_window:
         asked |= {"layers": layers is not None, "plots": bool(plots)}
     for option, given in asked.items():
         if given and not has_pictures:

@@ -50,9 +50,12 @@ def _table(file: Path, what: str) -> tuple[list[int], np.ndarray]:
         last, found = lines[-1][0], len(lines) - 1
         raise MeshError(f"{file}: line {last}: {head[0]} {what} were announced, but the file ends after {found}")
     least = 1 + head[1]
-    rows = np.empty((head[0], min(least, 1000)))
+    widest = max((len(words) for _, words in lines[1 : head[0] + 1]), default=0)
+    rows = np.empty((head[0], min(least, widest)))
     for k, (number, words) in enumerate(lines[1 : head[0] + 1]):
         try:
+            if len(words) < least:
+                raise ValueError
             rows[k] = [float(word) for word in words[:least]]
         except ValueError:
             raise MeshError(f"{file}: line {number}: {least} numbers should stand here") from None

@@ -2,8 +2,8 @@
 
 The left button pulls the body under the cursor, and orbits elsewhere or with Ctrl; the right one zooms, the middle one shifts.
 Space: pause or go on. S or right arrow: one step. R: back to the initial state. V: other colours. W, C, T, F: wires, contacts,
-tractions, fixed nodes. G: plots over time. P: record pictures. Escape or
-the close button: end. Sliders and buttons are in the panel, see `taisoft.view.panel`.
+tractions, fixed nodes. G: plots over time. P: record pictures. Escape or the close button: end. Sliders and buttons are in the
+panel, see `taisoft.view.panel`.
 """
 
 import time
