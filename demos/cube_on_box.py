@@ -32,4 +32,4 @@ def check(sim: ts.Simulator, result) -> None:
     assert np.abs(force - (0.0, WEIGHT, 0.0)).max() < 0.005 * WEIGHT, f"the box bears the cube with {force} N"  # 1.6e-3
     assert abs(last.elastic / ENERGY - 1.0) < 0.004, f"the energy is {last.elastic:.2f} J, not {ENERGY} J"  # 1e-3 measured
     deepest = max(report.max_penetration for report in result.step_reports)
-    assert deepest < 1e-3, f"the cube was {deepest:.2e} m in the box"
+    assert deepest < 2e-3, f"the cube was {deepest:.2e} m in the box"

@@ -1,4 +1,4 @@
-"""A box, a ball, a ring, a plank and the bunny fall on each other, onto the ground between a rigid sphere and a step.
+"""A box, a ball, a ring, a plank and a bunny fall on each other, beside a sphere and a step.
 
 Soft rubber (some 4,800 tets), stable neo-Hookean, E = 0.6 MPa, nu = 0.35, 1000 kg/m^3, friction 0.5. They hit each other at up to
 5 m/s, with sharp edges too.

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 
 from taisoft.collision.contacts import Contacts, no_contacts
-from taisoft.collision.overlap import Overlap, find_overlap
+from taisoft.collision.overlap import Overlap, find_overlaps
 from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
 from taisoft.errors import SceneError, SimulationError
@@ -111,7 +111,11 @@ class StateAccess:
         Slow, and unlike `StepReport.max_penetration` it also sees what has gone too deep for the search for contacts. The depth
         is that of the deepest vertex, crossing edge or face, or of a sphere's, box's or capsule's middle, inside the other.
         """
-        return find_overlap(self._find_contacts(0.0))
+        return next(iter(self.overlaps()), None)
+
+    def overlaps(self) -> list[Overlap]:
+        """All pairs that overlap in the present state, as `deepest_overlap`; the deepest, by the smaller one's size, first."""
+        return find_overlaps(self._find_contacts(0.0))
 
     def intersecting_triangles(self) -> list[tuple[str, int, str, int]]:
         """Surface triangles that intersect in the present state, each pair once: name and triangle of each.

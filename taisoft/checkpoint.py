@@ -25,7 +25,7 @@ from taisoft.scene.body import Body
 from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.scene import Material, Scene
 
-KIND, FORMAT = "taisoft checkpoint", 1  # FORMAT grows with every change of what a file holds
+KIND, FORMAT = "taisoft checkpoint", 2  # FORMAT grows with every change of what a file holds
 PARTS = ("settings", "numbers", "marks", "state", "notes")  # of the header, each a table
 
 
@@ -182,12 +182,13 @@ def _checksum(header: np.ndarray, arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _check_sizes(path: Path) -> None:
-    """Raises ValueError where an array would take more room than the file has: a head may announce anything."""
+    """Raises ValueError where arrays would take more room than the file has: a head may announce anything."""
     size = path.stat().st_size
     with zipfile.ZipFile(path) as archive:
+        whole = sum(info.file_size for info in archive.infolist())  # nothing is packed
+        if whole > size:
+            raise ValueError(f"{whole} bytes are announced, but the file has {size}")
         for info in archive.infolist():
-            if info.file_size > size:
-                raise ValueError(f"{info.file_size} bytes are announced, but the file has {size}")
             with archive.open(info) as member:
                 version = np.lib.format.read_magic(member)
                 read_head = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

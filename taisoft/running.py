@@ -68,9 +68,9 @@ def run(
     if report.steps and report.status != "failed":
         try:
             _judge_end(sim, report)
-        except SimulationError as error:
+        except (SimulationError, MemoryError) as error:
             report.status = "failed"
-            report.problems.append(str(error))
+            report.problems.append(str(no_memory("a look at the end", error) if isinstance(error, MemoryError) else error))
         except KeyboardInterrupt:
             report.status = "degraded"
             _interrupt(report)
@@ -167,9 +167,11 @@ def _interrupt(report: RunReport) -> None:
 
 
 def _judge_end(sim: "Simulator", report: RunReport) -> None:
-    """Bodies that overlap at the end, however they got there."""
-    found = sim.deepest_overlap() if sim.touches else None
-    if found is not None and found.depth > sim.contact_limit(found.name_a, found.name_b):
+    """Bodies that overlap at the end, however they got there: the pair that is farthest beyond its limit."""
+    found = sim.overlaps() if sim.touches else []
+    beyond, worst = max(((o.depth / sim.contact_limit(o.name_a, o.name_b), k) for k, o in enumerate(found)), default=(0.0, 0))
+    if beyond > 1.0:
+        found = found[worst]
         report.problems.append(f"at the end '{found.name_a}' and '{found.name_b}' overlap by {found.depth:.3g} m")
         report.status = "degraded"
 

@@ -45,7 +45,7 @@ def sim(shared_sim):
 
 
 def patch_end(sim, monkeypatch, events: dict) -> list:
-    """events: by the number of the call of the step's look at its end, an exception or a depth [m] that it tells."""
+    """events: by the number of the call of the step's look at its end, an exception or how deep it tells, in edges."""
     calls, end = [], sim._contact.end
 
     def told(time, dt):
@@ -54,7 +54,9 @@ def patch_end(sim, monkeypatch, events: dict) -> list:
         event = events.get(len(calls))
         if isinstance(event, Exception):
             raise event
-        return depth if event is None else event
+        if event is not None:
+            sim._contact.sinking = event
+        return depth
 
     monkeypatch.setattr(sim._contact, "end", told)
     return calls

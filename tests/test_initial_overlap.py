@@ -11,7 +11,7 @@ import pytest
 from rotations import rotation
 
 import taisoft as ts
-from taisoft.collision.overlap import find_overlap
+from taisoft.collision.overlap import find_overlaps
 from taisoft.mesh.signed_distance import signed_distances, signed_distances_at
 
 FAR = np.array([0.0, 50.0, 0.0])  # [m] where a body is out of the way
@@ -60,7 +60,7 @@ def put(sim, name: str, at, turn=None) -> None:
 
 def overlap(sim) -> tuple[set[str], float] | None:
     sim._contact.search(0.0, sim.dt)
-    found = find_overlap(sim._contact.detection)
+    found = next(iter(find_overlaps(sim._contact.detection)), None)
     return None if found is None else ({found.name_a, found.name_b}, found.depth)
 
 

@@ -271,18 +271,20 @@ def test_real_ctrl_c(block, monkeypatch):
 
 @pytest.mark.parametrize("end, status", [
     (None, "ok"), (0.005, "ok"), (0.02, "degraded"), (KeyboardInterrupt(), "degraded"), (ts.SimulationError("lost"), "failed"),
+    (MemoryError("lost"), "failed"),
 ])  # fmt: skip
 def test_the_end_is_judged(end, status):
     """By the deepest overlap [m], or what asking for it raises."""
     sim = StandIn(True)
-    sim.touches, sim.contact_limit = True, lambda a, b: 0.01
+    sim.touches, sim.contact_limit = True, lambda a, b: 0.01 if a == "left" else 1.0
 
-    def deepest_overlap():
+    def overlaps():
         if isinstance(end, BaseException):
             raise end
-        return None if end is None else SimpleNamespace(name_a="left", name_b="right", depth=end)
+        large = SimpleNamespace(name_a="coarse", name_b="right", depth=0.5)  # within its own limit
+        return [] if end is None else [large, SimpleNamespace(name_a="left", name_b="right", depth=end)]
 
-    sim.deepest_overlap = deepest_overlap
+    sim.overlaps = overlaps
     result = run(sim, 0.1)
     assert result.status == status and result.interrupted == isinstance(end, KeyboardInterrupt)
     told = {"ok": "", "degraded": "the run was interrupted" if result.interrupted else "'left' and 'right' overlap by 0.02 m"}

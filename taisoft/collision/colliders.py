@@ -83,9 +83,7 @@ def _surface_thickness(x: np.ndarray, triangles: np.ndarray) -> float:
 
 
 def collider_edge(collider: Body | Obstacle) -> float:
-    """Mean surface edge of a body or of an obstacle of triangles [m]; of other obstacles without end."""
+    """Mean surface edge of a body [m]; of an obstacle, however fine, without end."""
     if isinstance(collider, Body):
         return mean_surface_edge([(collider.nodes.positions, collider.nodes.surface)])
-    if isinstance(collider.shape, MeshObstacle):
-        return mean_surface_edge([(collider.shape.vertices, collider.shape.triangles)])
     return np.inf

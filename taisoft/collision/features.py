@@ -11,7 +11,7 @@ from taisoft.collision.surface import ACTIVE, dvec, ivec
 
 BY_FIELD, BY_FACES, BY_EDGES = 0, 1, 2  # how a collider is hit; a box by its edges beside its analytic distance
 CORNER_SLACK, EDGE_SLACK = 0.25, 0.05  # sines
-FLAT = 0.9994  # cosine of 2 degrees: edges that turn by less are blunt and meet sharp ones only; two sink by < 1 % of an edge
+FLAT = 0.99985  # cosine of 1 degree: edges that turn by less are blunt, meet sharp ones only, and sink by < 0.5 % of an edge
 LEVEL = 0.9998  # cosine of 1 degree: edges that are hollow by less count as flat
 SMOOTH = 0.5  # cosine of 60 degrees: the same for bodies hit by a distance field, which sees blunt edges itself
 

@@ -1,8 +1,8 @@
 """Overlap at the start of a scene: how deep bodies stick in each other and in obstacles, whatever the search for contacts sees.
 
 The search looks for what can touch in a step and passes over what lies deep inside. Here every vertex near another collider is
-asked for its exact signed distance, on the host between surfaces. Triangles that cut each other add edges that cross, and the
-contacts that were found faces under a ball.
+asked for its exact signed distance, on the host between surfaces. Triangles that cut each other add how far they must part, and
+the contacts that were found faces under a ball.
 """
 
 from dataclasses import dataclass
@@ -43,8 +43,8 @@ def _deepest_vertices(s: ti.template(), o: ti.template(), phi: ti.types.ndarray(
                 phi[b, k] = ti.min(phi[b, k], value)
 
 
-def find_overlap(detection: Detection) -> Overlap | None:
-    """The deepest overlap in the state that was searched last, if one is deeper than ALLOWED."""
+def find_overlaps(detection: Detection) -> list[Overlap]:
+    """The overlaps in the state that was searched last that are deeper than ALLOWED, the largest share of a size first."""
     colliders, topology = detection.scene.colliders, detection.topology
     x = array_of(detection.surface.x)
     parts = [x[topology.vertex_first[k] : topology.vertex_first[k + 1]] for k in range(len(colliders))]
@@ -74,7 +74,9 @@ def find_overlap(detection: Detection) -> Overlap | None:
     for a, b, deep in _crossings(detection, x):
         if (a, b) not in told:  # only that something crosses is known of them, and about how far
             tell(a, b, deep)
-    return _deepest(depth, size, colliders)
+    shares = {(a, b): deep / min(size[a], size[b]) for (a, b), deep in depth.items()}
+    pairs = sorted((pair for pair in depth if shares[pair] > ALLOWED), key=lambda pair: -shares[pair])
+    return [Overlap(colliders[a].name, colliders[b].name, float(depth[a, b])) for a, b in pairs]
 
 
 def _depth_of_middle(detection: Detection, vertices: np.ndarray, a: int, shape: Shape, middle: np.ndarray) -> float:
@@ -104,22 +106,14 @@ def _crossings(detection: Detection, x: np.ndarray) -> list[tuple[int, int, floa
     across = np.cross(edges[:, 0, :, None], edges[:, 1, None, :]).reshape(-1, 9, 3)
     axes = np.concatenate([normals, across], axis=1)
     length = np.linalg.norm(axes, axis=2)
-    size = np.linalg.norm(edges, axis=3).max(axis=(1, 2))[:, None] ** 2
-    usable = length > PARALLEL * size
+    one, other = np.moveaxis(np.linalg.norm(edges, axis=3), 1, 0)  # (k, 3) each
+    pairwise = (one[:, :, None] * other[:, None]).reshape(-1, 9)
+    usable = length > PARALLEL * np.column_stack([one[:, 0] * one[:, 1], other[:, 0] * other[:, 1], pairwise])
     places = np.einsum("kncx,kax->knac", corners, axes / np.where(usable, length, 1.0)[..., None])
     low, high = places.min(axis=3), places.max(axis=3)  # (k, 2, 11)
     width = np.minimum(high[:, 0] - low[:, 1], high[:, 1] - low[:, 0])
     deep = np.maximum(np.where(usable, width, np.inf).min(axis=1, initial=np.inf), 0.0)
     return [(int(min(o)), int(max(o)), float(d)) for o, d in zip(owner, deep) if np.isfinite(d)]
-
-
-def _deepest(depth: dict[tuple[int, int], float], size: np.ndarray, colliders: list) -> Overlap | None:
-    """The pair whose depth is the largest share of the smaller one's size, if that is more than ALLOWED."""
-    worst, share = None, ALLOWED
-    for (a, b), deep in depth.items():
-        if deep / min(size[a], size[b]) > share:
-            worst, share = Overlap(colliders[a].name, colliders[b].name, float(deep)), deep / min(size[a], size[b])
-    return worst
 
 
 def _depth_between(detection: Detection, parts: list[np.ndarray], a: int, b: int) -> float:

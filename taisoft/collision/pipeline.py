@@ -1,7 +1,7 @@
 """Detection: from a state to a list of contacts. Boxes, candidates, the three kinds of geometry, reduction.
 
-What a scene does not need is neither allocated nor launched: without two surfaces there are no candidates, without a smooth body
-no distance fields, without an analytic obstacle no analytic distances.
+What a scene does not need is neither allocated nor launched: without two surfaces there are no candidates, where they are not
+asked for no distance fields, without an analytic obstacle no analytic distances.
 """
 
 from dataclasses import dataclass, field

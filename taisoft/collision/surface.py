@@ -20,7 +20,7 @@ LIGHT_BELOW = 30000
 SPREAD = {"cpu": 512, "cuda": 1}
 CHUNKS = {"cpu": 64, "cuda": 4096}  # parts of a list that are worked on side by side, each with its own part of a buffer
 UNFINITE, ACTIVE, PAIRS = 0, 1, 2  # places in Surface.count
-INSIDE_BITS = 31  # of Surface.inside
+INSIDE_BITS = 31  # of Surface.inside; colliders that share a bit lie in one vertex at once next to never
 
 dvec = ti.types.vector(3, ti.f64)
 ivec = ti.types.vector(3, ti.i32)
@@ -74,7 +74,7 @@ class Surface:
     self_on: Any  # (n_bodies) i32: 1 where a body is tested against itself
     first_of: Any  # (n_bodies + 1) i32
     thickness: Any  # (n_bodies) f64: how thick each is [m], inf for half-spaces
-    edge: Any  # (n_bodies) f64: their mean surface edges [m], inf for analytic obstacles
+    edge: Any  # (n_bodies) f64: mean surface edges of the bodies [m], inf for obstacles
     rest: Any  # (n_verts) 3-vectors f64: at rest [m]
     x: Any  # (n_verts) 3-vectors f64: where they are [m]
     move: Any  # (n_verts) 3-vectors f64: how far they go in the step [m]

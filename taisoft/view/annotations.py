@@ -47,6 +47,7 @@ class Annotations:
         import matplotlib
 
         self._plots, self._name, self._colouring = plots, name, colouring
+        self._names = plots.visible() if plots is not None else []  # a window may show others meanwhile
         self._font_file = Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"
         self._fonts: dict = {}
 
@@ -55,7 +56,7 @@ class Annotations:
         height, width = picture.shape[:2]
         self._unit = SAMPLES * height / HEIGHT  # pixels of what is drawn for one of the lengths
         size = width * HEIGHT / height, HEIGHT
-        names = self._plots.visible() if self._plots is not None else []
+        names = self._names
         done = picture.copy()
         if names:
             with self._sheet(done, (size[0] - MARGIN - WIDTH, MARGIN, size[0] - MARGIN, size[1] - MARGIN)):

@@ -54,6 +54,7 @@ class Loop:
             build, self._asked = self._asked, None
             if build():
                 self._begun, self._wait, self._owed, self._needs, self.problem = False, FIRST_PICTURES, 0.0, 0.0, ""
+                self._spent, self._mark = [0.0, 0.0], (time.perf_counter(), self.sim.step_count)
         self._told = self._asked is not None
         if "pause" in pressed:
             self.paused = not self.paused

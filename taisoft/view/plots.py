@@ -106,7 +106,8 @@ class Plots:
     def toggle(self) -> None:
         """Hide all, or show again those that were shown last; all that are offered where there were none."""
         visible = self.visible()
-        chosen = () if visible else self._last_shown or tuple(self.offered())
+        offered = self.offered()
+        chosen = () if visible else [name for name in self._last_shown if name in offered] or offered
         self._last_shown = tuple(visible) or self._last_shown
         self.shown = {name: name in chosen for name in PLOTS}
 
