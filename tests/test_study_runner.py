@@ -16,12 +16,14 @@ import pytest
 from study_places import Pendulum
 
 from taisoft.errors import OutputError
+from taisoft.study import store
 from taisoft.study.grid import Setting
 from taisoft.study.output import check_scene, write
 from taisoft.study.results import Ask
 from taisoft.study.runner import Runner
 from taisoft.study.store import NoStore, Store, pack, unpack
 from taisoft.study.table import csv_of, text_of
+from taisoft.timing import versions
 
 DTS = (0.2, 0.1, 0.05)
 ASK = Ask("pendulum", repeats=3)
@@ -254,3 +256,11 @@ def test_a_folder_takes_a_study_of_its_own_scene_alone(tmp_path):
     (tmp_path / "study.json").write_text("[]")
     with pytest.raises(OutputError, match="holds a study.json that is no study's"):
         check_scene(tmp_path, "scene")
+
+
+def test_code_is_of_the_packages_that_compute_too(monkeypatch):
+    own = store.code_digest()
+    assert store.code_digest() == own
+    for other in ({"taichi": "9.9"}, {"numpy": "9.9"}):
+        monkeypatch.setattr(store, "versions", lambda *names, other=other: versions(*names) | other)
+        assert store.code_digest() != own

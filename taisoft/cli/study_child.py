@@ -70,7 +70,7 @@ def _answer(request: dict) -> dict:
             own = sources(find_scene(request["scene"]))
             return {"answer": made | {"scenes": scenes, "sources": own, "code": code_digest()}}
         if code_digest() != request["code"]:
-            return {"error": "taisoft there is not the one that planned the study"}
+            return {"error": "taisoft, Taichi or NumPy there is not the one that planned the study"}
         task = request["task"]
         scene = variant(task["setting"]["refine"], task["setting"]["order"])
         told = digests(find_scene(request["scene"]), request["sources"])

@@ -20,6 +20,7 @@ import numpy as np
 from taisoft import __version__
 from taisoft.output.files import make_folder, write_bytes
 from taisoft.output.report import json_text
+from taisoft.timing import versions
 
 RUNS = "runs"
 KIND, FORMAT = "taisoft study run", 1
@@ -29,8 +30,9 @@ COMPUTING = ("study/measure.py", "study/stretch.py")  # but for these
 
 
 def code_digest() -> str:
-    """Of taisoft's version and of its files that a result depends on: an edited solver's runs are others."""
-    total = hashlib.sha256(__version__.encode())
+    """Of taisoft's files that a result depends on, and of versions, its own, Taichi's and NumPy's: an edit makes others."""
+    found = versions("taichi", "numpy")
+    total = hashlib.sha256(f"{__version__} {found['taichi']} {found['numpy']}".encode())
     for path in sorted(PACKAGE.rglob("*.py")):
         name = path.relative_to(PACKAGE).as_posix()
         if name in COMPUTING or name.split("/")[0] not in NOT_COMPUTING:
