@@ -11,13 +11,18 @@ import signal
 import subprocess
 import sys
 import time
+from argparse import Namespace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from command import BEAM, ROOT, child, write
 from study_places import is_running
 
 from taisoft.cli import main
+from taisoft.cli import study as study_command
+from taisoft.cli.study import check_device
+from taisoft.errors import SceneError
 from taisoft.timing import usable_cores
 
 
@@ -72,6 +77,26 @@ def test_nothing_that_can_be_run_is_bad_input(beam, tmp_path, capsys):
     assert study(beam, "--dt", "10", "--integrator", "symplectic_euler", "--out", tmp_path / "out") == 2
     assert not (tmp_path / "out").exists()
     assert "no combination of the grid can be run: dt = 10 s is above the stability limit" in capsys.readouterr().err
+
+
+def test_workers_do_not_share_a_device():
+    def plan(refused: str) -> dict:
+        return {"cases": [{"setting": {"arch": "cpu"}, "refused": ""}, {"setting": {"arch": "cuda"}, "refused": refused}]}
+
+    check_device(plan(""), 1)
+    check_device(plan("there is none"), 2)
+    with pytest.raises(SceneError, match="does not go with arch cuda"):
+        check_device(plan(""), 2)
+
+
+@pytest.mark.parametrize(
+    "rows, ended, signal_number, status",
+    [(1, "", None, 0), (1, "", 2, 0), (1, "it was interrupted", 2, 130), (0, "", None, 1), (0, "the budget was spent", None, 1)],
+)
+def test_exit_status(monkeypatch, rows, ended, signal_number, status):
+    monkeypatch.setattr(study_command, "text_of", lambda study: "")
+    study = SimpleNamespace(judged=lambda: [object()] * rows, ended=ended)
+    assert study_command._told(study, Namespace(out=None), SimpleNamespace(number=signal_number)) == status
 
 
 # --- interrupted ------------------------------------------------------------------------------------------------------

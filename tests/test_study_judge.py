@@ -1,12 +1,14 @@
 """Errors between meshes: nodes are paired by the places where they start, body by body, and what the finest mesh is good to."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from taisoft.errors import SimulationError
 from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.shapes import box_mesh
-from taisoft.study.judge import Error, Reference, distance, error_in_space, in_space_sure, shared_nodes
+from taisoft.study.judge import Error, Reference, _momentum_error, distance, error_in_space, in_space_sure, shared_nodes
 
 COARSE = box_mesh((2, 1, 1), (2.0, 1.0, 1.0))
 FINE = make_nodes(COARSE, 2).positions
@@ -47,6 +49,10 @@ def test_the_finest_mesh_is_as_good_as_a_third_of_the_distance_to_the_next():
     far = reference(COARSE.vertices, [["a", COARSE.n_verts]], shift=0.5)
     own, told = in_space_sure(finest, [far, near])
     assert own.max == pytest.approx(0.1 / 2.0 / 3.0) and "refine 1" in told
+    chance = reference(COARSE.vertices, [["a", COARSE.n_verts]], shift=0.99)  # nearer, but a coarser mesh
+    assert in_space_sure(finest, [chance, near])[0] == own
+    own, told = in_space_sure(replace(finest, order_in_time=1), [far, near])  # as with contacts
+    assert own.max == pytest.approx(0.1 / 2.0) and told.startswith("the distance")
     assert in_space_sure(finest, [])[0] == finest.own
     finest.own = Error(0.5, 0.5)
     assert in_space_sure(finest, [far, near])[0].max == 0.5
@@ -57,3 +63,11 @@ def test_distances_are_relative():
     other = path.copy()
     other[1, 0] = (3.0, 0.0, 4.0)
     assert distance(path, other, 10.0) == Error(pytest.approx(0.25), 0.5)
+
+
+@pytest.mark.parametrize("start, change, scale", [(100.0, 2.0, 2.0), (100.0, 1e-12, 100.0), (0.0, 2.0, 2.0)])
+def test_momentum_is_over_its_largest_change_where_it_changes(start, change, scale):
+    known = reference(FINE, [["a", len(FINE)]], shift=1.0)
+    known.momentum = np.array([[start, 0, 0], [start + change, 0, 0]])
+    off = known.momentum + [[0, 0, 0], [0, 0.5, 0]]
+    assert _momentum_error({"momentum_rate": None}, off, known) == pytest.approx(0.5 / scale)

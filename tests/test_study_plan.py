@@ -127,6 +127,11 @@ def test_the_finest_mesh_is_the_reference_in_space():
     assert plan["references"][plan["space"]]["setting"]["refine"] == 1 and len(plan["references"]) == 2
 
 
+def test_a_reference_that_nobody_asked_for_is_named():
+    with pytest.raises(SceneError, match=r"^the reference \(refine 1\): body 'bar'"):
+        plan_of(scene_of(ids=True), {"dt": [0.01], "integrator": ["bdf2"]}, reference_refine=1)
+
+
 @pytest.mark.parametrize(
     "ask, error",
     [
@@ -147,6 +152,8 @@ def test_a_scene_file_may_refine_itself(tmp_path):
     )
     path = str(write(tmp_path / "cube.py", text))
     assert load_scene(path)[0].bodies[0].mesh.n_tets == 5
+    own = str(write(tmp_path / "own.py", text.replace("refine=0", "refine=1")))
+    assert [load_scene(own, refine=k)[0].bodies[0].mesh.n_tets for k in (None, 0)] == [40, 5]
     assert load_scene(path, refine=1)[0].bodies[0].mesh.n_tets == 40
     quadratic = load_scene(path, refine=1, order=2)[0].bodies[0]  # the order it leaves to us
     assert quadratic.order == 2 and quadratic.mesh.n_tets == 40

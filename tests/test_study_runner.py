@@ -15,12 +15,15 @@ import numpy as np
 import pytest
 from study_places import Pendulum
 
+from taisoft.errors import OutputError
+from taisoft.study import store
 from taisoft.study.grid import Setting
-from taisoft.study.output import write
+from taisoft.study.output import check_scene, write
 from taisoft.study.results import Ask
 from taisoft.study.runner import Runner
 from taisoft.study.store import NoStore, Store, pack, unpack
 from taisoft.study.table import csv_of, text_of
+from taisoft.timing import versions
 
 DTS = (0.2, 0.1, 0.05)
 ASK = Ask("pendulum", repeats=3)
@@ -33,13 +36,14 @@ def plan(dts=DTS, integrators=("implicit_euler", "bdf2"), reference=0.0125, **mo
     setting = asdict(Setting(reference, "implicit_midpoint", precision="f64"))
     of = {"setting": setting, "kind": "", "order_in_time": 2, "steps": steps}
     return {
-        "digest": "scene", "code": "code", "fixed": {}, "frame": 0.2, "frames": 20, "seconds": 4.0, "touching": False,
+        "scenes": {"refine 0": "scene"}, "sources": {"scene.py": "text"}, "code": "code",
+        "fixed": {}, "frame": 0.2, "frames": 20, "seconds": 4.0, "touching": False,
         "names": ["mass"], "cases": [refused, *({"setting": s, "refused": ""} for s in settings)], "references": [of],
         "space": None, "notes": [],
     } | more  # fmt: skip
 
 
-def run(place: Pendulum, store=None, ask=ASK, machines=("here",), asked=lambda: False, left=lambda: 1.0):
+def run(place: Pendulum, store=None, ask=ASK, machines=({"name": "here"},), asked=lambda: False, left=lambda: 1.0):
     told: list[str] = []
     runner = Runner(ask, [place], list(machines), asked, left, told.append, store or NoStore(), planner=place)
     return None if (planned := runner.plan()) is None else runner.run(planned)
@@ -145,8 +149,10 @@ def test_a_spent_budget_leaves_runs_out_and_says_so(tmp_path, kept, told):
     # planning is one of the requests, and not of the budget
     study = run(place, Store(tmp_path) if kept else None, left=lambda: 4.0 - len(place.requests))
     left_out = [row for row in study.rows if row.status == "left out"]
-    assert left_out and all(row.reason == "the budget was spent" for row in left_out)
-    assert f"Not complete: the budget was spent. {told}" in text_of(study)
+    assert left_out[0].reason == "the budget was spent while it ran"
+    assert len(left_out) > 1 and all(row.reason == "the budget was spent" for row in left_out[1:])
+    text = text_of(study)
+    assert f"Not complete: the budget was spent. {told} Cut: implicit_euler, dt = 0.2 s, f32; if it takes longer than" in text
 
 
 # --- finished runs ----------------------------------------------------------------------------------------------------
@@ -155,22 +161,33 @@ def test_a_spent_budget_leaves_runs_out_and_says_so(tmp_path, kept, told):
 def test_finished_runs_are_found_again(tmp_path):
     first = run(Pendulum(plan()), Store(tmp_path))
     place = Pendulum(plan())
-    store = Store(tmp_path)
-    again = run(place, store)
-    assert [request["do"] for request in place.requests] == ["plan"] and store.taken == 8
+    again = run(place, Store(tmp_path))
+    assert [request["do"] for request in place.requests] == ["plan"]
     assert text_of(again) == text_of(first)
     assert not list(tmp_path.rglob("*.part"))
 
 
 @pytest.mark.parametrize(
-    "other", [{"machines": ["there"]}, {"ask": replace(ASK, repeats=4)}, {"digest": "another scene"}, {"code": "edited"}]
-)
+    "other",
+    [
+        {"machines": [{"name": "there"}]}, {"ask": replace(ASK, repeats=4)}, {"scenes": {"refine 0": "another scene"}},
+        {"code": "edited"}, {"sources": {"scene.py": "text", "helper.py": "text"}},
+    ],
+)  # fmt: skip
 def test_other_machines_settings_scenes_and_code_find_none(tmp_path, other):
     run(Pendulum(plan()), Store(tmp_path))
-    changed = {key: other.pop(key) for key in ("digest", "code") if key in other}
-    store = Store(tmp_path)
-    run(Pendulum(plan(**changed)), store, **other)
-    assert store.taken == (2 if "ask" in other else 0)  # references are not repeated
+    changed = {key: other.pop(key) for key in ("scenes", "sources", "code") if key in other}
+    place = Pendulum(plan(**changed))
+    run(place, Store(tmp_path), **other)
+    assert len(place.requests) == 1 + (6 if "ask" in other else 8)  # references are not repeated
+
+
+def test_the_order_in_which_machines_are_told_does_not_count(tmp_path):
+    machines = [{"name": "here"}, {"name": "there"}]
+    run(Pendulum(plan()), Store(tmp_path), machines=machines)
+    place = Pendulum(plan())
+    run(place, Store(tmp_path), machines=machines[::-1])
+    assert [request["do"] for request in place.requests] == ["plan"]
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "other", "empty"])
@@ -185,7 +202,7 @@ def test_a_damaged_record_is_done_anew_and_told(tmp_path, damage):
         path.write_text({"cut": text[:-100], "other": json.dumps({"kind": "something"}), "empty": ""}[damage])
     place, store = Pendulum(plan()), Store(tmp_path)
     again = run(place, store)
-    assert store.taken == 7 and len(place.requests) == 2
+    assert len(place.requests) == 2
     assert len(store.damaged) == 1 and f"{path} is damaged and its run is done anew: " in text_of(again)
     assert [row.in_time for row in again.rows] == [row.in_time for row in first.rows]
     assert Store(tmp_path).read(path.stem) is not None
@@ -228,3 +245,22 @@ def test_a_picture_of_an_earlier_study_does_not_stay(tmp_path):
     (tmp_path / "study.png").write_bytes(b"old")
     told = write(run(Pendulum(plan(), failing={0.0125: "no"})), tmp_path)
     assert "no setting has both a time and an error" in told and not (tmp_path / "study.png").exists()
+
+
+def test_a_folder_takes_a_study_of_its_own_scene_alone(tmp_path):
+    check_scene(tmp_path, "scene")
+    write(run(Pendulum(plan())), tmp_path)
+    check_scene(tmp_path, "scene")
+    with pytest.raises(OutputError, match="holds a study of another scene .pendulum"):
+        check_scene(tmp_path, "another")
+    (tmp_path / "study.json").write_text("[]")
+    with pytest.raises(OutputError, match="holds a study.json that is no study's"):
+        check_scene(tmp_path, "scene")
+
+
+def test_code_is_of_the_packages_that_compute_too(monkeypatch):
+    own = store.code_digest()
+    assert store.code_digest() == own
+    for other in ({"taichi": "9.9"}, {"numpy": "9.9"}):
+        monkeypatch.setattr(store, "versions", lambda *names, other=other: versions(*names) | other)
+        assert store.code_digest() != own

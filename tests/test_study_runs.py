@@ -6,6 +6,7 @@
 """
 
 import os
+import sys
 from contextlib import nullcontext
 
 import numpy as np
@@ -15,7 +16,8 @@ from study_places import InProcess
 
 from taisoft.errors import SceneError
 from taisoft.simulator import Simulator
-from taisoft.study import measure
+from taisoft.study import measure, workers
+from taisoft.study.grid import tasks_of
 from taisoft.study.results import Ask
 from taisoft.study.runner import Runner
 from taisoft.study.workers import LocalPlace, carry_out, local_places
@@ -62,7 +64,7 @@ def study_of(tmp_path, hold: str = HELD, **ask):
 
 
 def run(place: InProcess, ask: Ask):
-    runner = Runner(ask, [place], ["here"], lambda: False, lambda: 1.0, lambda _: None, planner=place)
+    runner = Runner(ask, [place], [{"name": "here"}], lambda: False, lambda: 1.0, lambda _: None, planner=place)
     return runner.run(runner.plan())
 
 
@@ -115,6 +117,32 @@ def test_a_bad_solver_dict_is_told(tmp_path, solver, told):
     assert told in str(error.value)
 
 
+def test_a_change_of_a_neighbour_or_of_a_refined_mesh_is_another_run(tmp_path):
+    write(tmp_path / "neighbour_of_a_study.py", "YOUNG = 1e5")
+    text = SCENE.replace("def build():", "def build(refine=0):\n    import neighbour_of_a_study as own")
+    text = text.replace("1e5", "own.YOUNG")
+    length = write(tmp_path / "length.txt", "2")
+    text = text.replace("(2, 1, 1), (2.0", "(2, 1, 1), (float(open(LENGTH).read()) if refine else 2.0")
+    path = write(tmp_path / "bar.py", text.replace("HOLD", HELD).replace("LENGTH", repr(str(length))))
+    axes = {"dt": [0.01], "integrator": ["velocity_verlet"], "refine": [0, 1]}
+    place = InProcess()
+    runner = Runner(Ask(str(path), axes), [place], [{"name": "here"}], bool, lambda: 1.0, str, planner=place)
+    first = runner.plan()
+    assert set(first["scenes"]) == {"refine 0", "refine 1"} and set(first["sources"]) == {"bar.py", "neighbour_of_a_study.py"}
+    assert runner.plan() == first
+
+    length.write_text("2.5")
+    other = runner.plan()
+    changed = [runner._key(first, task) != runner._key(other, task) for task in sum(tasks_of(first), [])]
+    assert changed == [bool(task["setting"]["refine"]) for task in sum(tasks_of(first), [])] and any(changed)
+
+    (tmp_path / "neighbour_of_a_study.py").write_text("YOUNG = 1e6")
+    edited = runner.run(other)  # refused before anything is run
+    assert all("it was changed meanwhile" in row.reason for row in edited.rows)
+    third = runner.plan()
+    assert all(runner._key(other, task) != runner._key(third, task) for task in sum(tasks_of(other), []))
+
+
 # --- processes --------------------------------------------------------------------------------------------------------
 
 PINNED = '''"""Tells its cores, as a scene that fails."""
@@ -154,3 +182,13 @@ def test_a_process_that_ends_without_an_answer_is_told(tmp_path):
     path = write(tmp_path / "dead.py", "import os, sys\nprint('hello', file=sys.stderr, flush=True)\nos._exit(7)\n")
     answers = answers_of([("a", request(path))], [LocalPlace(usable_cores())])
     assert answers["a"] == {"crash": "its process ended with exit status 7 without an answer: hello"}
+
+
+def test_a_process_that_reads_nothing_is_told(monkeypatch):
+    monkeypatch.setattr(workers, "CHILD", (sys.executable, "-c", "import os; os._exit(3)"))
+    large = {"text": "x" * 1_000_000}  # more than a pipe holds
+    answers = answers_of([("a", large)], [LocalPlace(usable_cores())])
+    assert answers["a"] == {"crash": "its process ended with exit status 3 without an answer"}
+    place = LocalPlace(usable_cores())
+    place.start(large)
+    place.stop()

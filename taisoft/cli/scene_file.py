@@ -65,16 +65,18 @@ def find_scene(name: str) -> Path:
     return demos[name]
 
 
-def load_scene(name: str, allow_outside: bool = False, refine: int = 0, order: int | None = None) -> tuple[Scene, dict]:
+def load_scene(
+    name: str, allow_outside: bool = False, refine: int | None = None, order: int | None = None
+) -> tuple[Scene, dict]:
     """The scene that SCENE names and its `solver` dict (empty if the file has none).
 
     allow_outside: let a .toml file name meshes outside of its folder. refine: how often the meshes are to be refined; order:
-    that of all bodies, None for what the scene says. A build() with a parameter of that name does it itself, elsewhere it is
+    that of all bodies; None for what the scene says. A build() with a parameter of that name does it itself, elsewhere it is
     done as `taisoft.scene.refine` says. Raises SceneError, or MeshError for a mesh, naming the file and, where its code is at
     fault, the line.
     """
     scene, solver, made = _built(name, allow_outside, {"refine": refine, "order": order})
-    for _ in range(0 if "refine" in made else refine):
+    for _ in range(0 if "refine" in made else refine or 0):
         scene = refined(scene)
     return scene if order is None or "order" in made else with_order(scene, order), solver
 

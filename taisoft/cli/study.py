@@ -16,11 +16,11 @@ from taisoft.output.report import machine
 from taisoft.scene import checks
 from taisoft.scene.solver import check_solver
 from taisoft.study.grid import AXES
-from taisoft.study.output import FILES, write
+from taisoft.study.output import FILES, check_scene, write
 from taisoft.study.results import Ask, Study
 from taisoft.study.runner import Runner
 from taisoft.study.store import Store
-from taisoft.study.table import ENDED, text_of
+from taisoft.study.table import text_of
 from taisoft.study.workers import local_places
 
 WHOLE = {"order": (1, 2), "refine": (0, 1, 2, 3, 4)}
@@ -28,7 +28,7 @@ ENDING = "ending; runs that are finished are kept"
 
 
 def command(arguments: Namespace) -> int:
-    """Runs the study and returns the exit status: 1 where no run of the grid ended."""
+    """Runs the study and returns the exit status: 1 where no run of the grid has both a time and an error."""
     ask = asked(arguments)
     find_scene(ask.scene)
     budget = checks.number(arguments.budget, "--budget", above=0.0, unit="s")
@@ -37,12 +37,14 @@ def command(arguments: Namespace) -> int:
         if arguments.out is not None:
             check_free(arguments.out, overwrite=False)
         signals.run_began()
-        end = time.monotonic() + budget
         runner = Runner(ask, places, machines, signals.asked, lambda: end - time.monotonic(), _tell)
         plan = runner.plan()
         if plan is None:
             raise Left(signals.number)
+        if arguments.scheduler is None:
+            check_device(plan, len(places))
         if arguments.out is not None:
+            check_scene(Path(arguments.out), plan["scenes"]["refine 0"])
             folder = make_folder(arguments.out)
             stack.enter_context(closing(FolderLock(folder)))
             runner.store = Store(folder)
@@ -58,18 +60,21 @@ def _told(study: Study, arguments: Namespace, signals: Signals) -> int:
             _tell(told)
         files = [name for name in FILES if (Path(arguments.out) / name).exists()]
         print(f"\nwritten to {arguments.out}: {', '.join(files)}, runs/")
-    if signals.number is not None:
+    if signals.number is not None and study.ended:  # a signal while the table is written leaves a whole study
         return EXIT_SIGNAL + signals.number
-    return 0 if any(row.status in (*ENDED, "left out") for row in study.rows) else EXIT_FAILED
+    return 0 if study.judged() else EXIT_FAILED
+
+
+def check_device(plan: dict, workers: int) -> None:
+    """Raises SceneError where several processes of this machine would be timed on one device."""
+    if workers > 1 and any(case["setting"]["arch"] == "cuda" for case in plan["cases"] if not case["refused"]):
+        raise SceneError("--workers above 1 does not go with arch cuda: timed runs would share the device")
 
 
 def _places(arguments: Namespace, ask: Ask, stack: ExitStack) -> tuple[list, list[dict]]:
     """Where runs are carried out, and on which machines."""
     if arguments.scheduler is None:
-        places = local_places(1 if arguments.workers is None else arguments.workers)
-        if len(places) > 1 and "cuda" in ask.axes.get("arch", ()):
-            raise SceneError("--workers above 1 does not go with --arch cuda: timed runs would share the device")
-        return places, [machine()]
+        return local_places(1 if arguments.workers is None else arguments.workers), [machine()]
     if arguments.workers is not None:
         raise SceneError("--workers is for this machine's processes, and --scheduler has workers of its own: give one of them")
     from taisoft.study.cluster import cluster_places, connect

@@ -23,7 +23,7 @@ def main() -> None:
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     request = json.loads(line)
-    if request.get("cores"):
+    if request.get("cores") and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, request["cores"])
     out.write(_text(_answer(request)))
     out.flush()
@@ -48,26 +48,35 @@ def _answer(request: dict) -> dict:
     from taisoft.cli.scene_file import find_scene, load_scene
     from taisoft.cli.settings import check_scene_solver
     from taisoft.errors import TaisoftError
+    from taisoft.study.grid import mesh_name
     from taisoft.study.measure import measure
     from taisoft.study.plan import make_plan
-    from taisoft.study.store import code_digest, digest
+    from taisoft.study.store import code_digest, digests, sources
 
-    def content(scene) -> str:
-        # with the file's text, too: paths that are functions are told apart by nothing else
-        return digest([scene_digest(scene), find_scene(request["scene"]).read_text(encoding="utf-8")])
-
+    scenes: dict[str, str] = {}  # digest of each variant that was loaded
     load = functools.partial(load_scene, request["scene"], request["allow_outside"])
+
+    def variant(refine, order):
+        scene = load(refine, order)[0]
+        scenes[mesh_name({"refine": refine, "order": order})] = scene_digest(scene)
+        return scene
+
     try:
         if request["do"] == "plan":
-            scene, solver = load()
+            _, solver = load(0)
             check_scene_solver(solver)
-            made = make_plan(lambda refine, order: load(refine, order)[0], solver, request["ask"])
-            return {"answer": made | {"digest": content(scene), "code": code_digest()}}
+            made = make_plan(variant, solver, request["ask"])
+            # with the files' content, too: paths that are functions are told apart by nothing else
+            own = sources(find_scene(request["scene"]))
+            return {"answer": made | {"scenes": scenes, "sources": own, "code": code_digest()}}
         if code_digest() != request["code"]:
-            return {"error": "taisoft there is not the one that planned the study"}
-        if content(load()[0]) != request["digest"]:
+            return {"error": "taisoft, Taichi or NumPy there is not the one that planned the study"}
+        task = request["task"]
+        scene = variant(task["setting"]["refine"], task["setting"]["order"])
+        told = digests(find_scene(request["scene"]), request["sources"])
+        if scenes != {mesh_name(task["setting"]): request["digest"]} or told != request["sources"]:
             return {"error": "the scene there is not the one that was planned: it was changed meanwhile, or is another file"}
-        return {"answer": measure(lambda refine, order: load(refine, order)[0], request["task"])}
+        return {"answer": measure(scene, task)}
     except TaisoftError as error:
         return {"error": str(error)}
 

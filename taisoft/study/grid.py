@@ -54,6 +54,11 @@ class Case:
     refused: str = ""
 
 
+def mesh_name(setting: dict) -> str:
+    """What a setting asks of the scene, in short."""
+    return f"refine {setting['refine']}" + ("" if setting["order"] is None else f", order {setting['order']}")
+
+
 def complete(given: dict[str, list], solver: dict, explicit: Iterable[str]) -> dict[str, list]:
     """All axes: as given, else as the scene's solver dict says; without any dt or integrator some about the scene's."""
     own = {"dt": 1 / 60, "integrator": "implicit_euler"} | {key: value for key, value in solver.items() if key in AXES}

@@ -5,7 +5,7 @@ at any frame. `max` is the largest over nodes and frames, `rms` the root of the 
 reference on the same mesh, over all nodes; errors in space those to the finest mesh's reference, over the nodes that both have
 (the places where both start). A reference's own error is the distance between its runs with dt and 2 dt over 2^p - 1, p being
 its order in time; for the finest mesh also a third of the distance to the next coarser reference, as of second order in the
-mesh width.
+mesh width, or all of it where the motion is not smooth.
 """
 
 from dataclasses import dataclass, field
@@ -14,11 +14,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from taisoft.errors import SimulationError
+from taisoft.study.grid import mesh_name
 from taisoft.study.store import unpack
 from taisoft.timing import Timing, summarise
 
 SAME_PLACE = 1e-9  # of the size, between two nodes that count as one
 COARSER = 3.0  # 2^2 - 1
+UNCHANGED = 1e-9  # of the momentum, below which a change of it is rounding
 
 
 @dataclass(frozen=True)
@@ -125,17 +127,19 @@ def make_reference(fine: dict, coarse: dict, kind: str, order_in_time: int) -> R
 
 def in_space_sure(finest: Reference, others: list[Reference]) -> tuple[Error, str]:
     """What the finest reference is good to, and by what that was told."""
-    tried = [(compare(other, finest), other) for other in others if other is not finest]
-    if not tried:
+    others = [other for other in others if other is not finest]
+    if not others:
         return finest.own, "its error in time alone"
-    near, other = min(tried, key=lambda pair: pair[0].rms)
-    own = Error(max(finest.own.rms, near.rms / COARSER), max(finest.own.max, near.max / COARSER))
-    return own, f"a third of the distance to the reference with {_mesh(other.setting)}"
+    other = max(others, key=lambda one: _nearness(one, finest))
+    near, smooth = compare(other, finest), finest.order_in_time == 2  # which is 1 where methods lose their order
+    share = COARSER if smooth else 1.0
+    own = Error(max(finest.own.rms, near.rms / share), max(finest.own.max, near.max / share))
+    return own, f"{'a third of ' if smooth else ''}the distance to the reference with {mesh_name(other.setting)}"
 
 
-def _mesh(setting: dict) -> str:
-    order = "" if setting["order"] is None else f", order {setting['order']}"
-    return f"refine {setting['refine']}{order}"
+def _nearness(one: Reference, finest: Reference) -> tuple:
+    """Is larger for the mesh that comes before the finest: of the same elements where there is one, the most refined."""
+    return one.setting["order"] == finest.setting["order"], one.setting["refine"], one.path.shape[1], one.kind == finest.kind
 
 
 def compare(coarse: Reference, finest: Reference) -> Error:
@@ -192,13 +196,16 @@ def row_of(record: dict, reference: Reference | None) -> Row:
 
 
 def _momentum_error(record: dict, momentum: np.ndarray, reference: Reference) -> float | None:
-    """Of momentum (k,3) [kg m/s], to the law where nothing holds the bodies, else to the reference, over its largest change."""
+    """Of momentum (k,3) [kg m/s], to the law where nothing holds the bodies, else to the reference, over the
+    reference's largest change from the start, or its momentum where that does not change."""
     wanted = reference.momentum
     if record["momentum_rate"] is not None:
         times = np.arange(len(momentum))[:, None] * record["task"]["frame"]
         wanted = momentum[0] + times * np.array(record["momentum_rate"])
     most = np.linalg.norm(reference.momentum, axis=1).max()
-    return _relative(np.linalg.norm(momentum - wanted, axis=1).max(), most)
+    change = np.linalg.norm(reference.momentum - reference.momentum[0], axis=1).max()
+    scale = change if change > UNCHANGED * most else most
+    return _relative(np.linalg.norm(momentum - wanted, axis=1).max(), scale)
 
 
 def _relative(value: float, scale: float) -> float | None:

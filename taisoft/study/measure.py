@@ -2,7 +2,6 @@
 
 import time
 import warnings
-from collections.abc import Callable
 
 import numpy as np
 
@@ -22,15 +21,13 @@ ENOUGH_SECONDS = 20.0  # a run of so much wall time is not repeated: the followe
 SHORT_SECONDS, MOST_RUNS = 0.5, 25  # short ones are repeated more often, until they took so long or were so many
 
 
-def measure(variant: Callable[[int, int | None], Scene], task: dict) -> dict:
-    """The record of one run, as plain data; a run that fails is a record that says why.
+def measure(scene: Scene, task: dict) -> dict:
+    """The record of one run of a scene, refined as `setting` says, as plain data; a run that fails is one that says why.
 
     task: `setting`, `fixed` (further arguments of Simulator), `frame` [s], `frames`, `steps` (in a frame), `repeats` (timed
-    runs at least, 0 for none). Raises TaisoftError for a scene that cannot be made.
+    runs at least, 0 for none).
     """
-    setting = dict(task["setting"])
-    refine, order = setting.pop("refine"), setting.pop("order")
-    scene = variant(refine, order)
+    setting = {key: value for key, value in task["setting"].items() if key not in ("refine", "order")}
     record = {"task": task} | _facts(scene, setting["integrator"], task) | _place()
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", UserWarning)
@@ -127,7 +124,7 @@ def _timed(sim: Simulator, task: dict, followed: float):
 
 
 class Observer:
-    """Positions, energies and momentum at the frames. seconds: wall time that this took."""
+    """Positions, energies and momentum at the frames. seconds: wall time that this took, without compiling."""
 
     def __init__(self, sim: Simulator):
         self.seconds = 0.0
@@ -139,12 +136,12 @@ class Observer:
 
     def frame(self, sim: Simulator, _index: int, _report) -> None:
         """For Simulator.run."""
-        start = time.perf_counter()
+        compiled, start = sim.compile_seconds, time.perf_counter()
         self._path.append(sim.positions())
         e = sim.energies()
         self._energies.append((e.kinetic, e.elastic, e.gravity))
         self._momentum.append(self._mass @ sim.velocities())
-        self.seconds += time.perf_counter() - start
+        self.seconds += time.perf_counter() - start - (sim.compile_seconds - compiled)
 
     def numbers(self) -> dict:
         """As plain data: energies (k,3) [J], momentum (k,3) [kg m/s], path (k,n,3) [m] packed."""

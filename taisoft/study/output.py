@@ -1,5 +1,6 @@
 """The files of a study: study.md, study.csv, study.json and, with matplotlib, study.png."""
 
+import json
 from pathlib import Path
 
 from taisoft.errors import OutputError
@@ -11,6 +12,19 @@ from taisoft.study.results import Study, plain
 from taisoft.study.table import csv_of, text_of
 
 FILES = ("study.md", "study.csv", "study.json", "study.png")
+
+
+def check_scene(folder: Path, scene: str) -> None:
+    """Raises OutputError where the folder holds a study of another scene than the one with this digest."""
+    try:
+        found = json.loads((folder / "study.json").read_bytes())
+        name, same = found["ask"]["scene"], found["scene_digest"] == scene
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise OutputError(f"the folder {folder} holds a study.json that is no study's: name another folder") from error
+    if not same:
+        raise OutputError(f"the folder {folder} holds a study of another scene ({name}, with other content): name another folder")
 
 
 def write(study: Study, folder: Path) -> str:

@@ -15,7 +15,7 @@ from taisoft.scene.scene import Scene
 from taisoft.settings import check_settings
 from taisoft.stability import stable_dt
 from taisoft.stepping import EXPLICIT, INTEGRATORS
-from taisoft.study.grid import AXES, Setting, cases, complete, expand, frame_time
+from taisoft.study.grid import AXES, Setting, cases, complete, expand, frame_time, mesh_name
 
 FINER = 8  # the study's smallest dt over the reference's
 LIMIT_SHARE = 0.9  # of the stable step, for a reference's coarser run
@@ -110,7 +110,14 @@ class Planner:
         return *setting.mesh, kind
 
     def _reference(self, refine: int, order: int | None, kind: str, target: float, frame: float) -> dict:
-        """One reference, as plain data: a setting with its steps per frame, an even number."""
+        """One reference, as plain data. Raises SceneError, naming it, where it cannot be: nobody need have asked for it."""
+        try:
+            return self._reference_on(refine, order, kind, target, frame)
+        except TaisoftError as error:
+            raise SceneError(f"the reference ({mesh_name({'refine': refine, 'order': order})}): {error}") from error
+
+    def _reference_on(self, refine: int, order: int | None, kind: str, target: float, frame: float) -> dict:
+        """A setting with its steps per frame, an even number."""
         scene = self._scene(refine, order)
         integrator = self._integrator(scene, refine, order, kind, target)
         steps = 2 * math.ceil(frame / target / 2 - 1e-9)

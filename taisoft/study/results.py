@@ -30,7 +30,11 @@ class Ask:
 
 @dataclass
 class Study:
-    """What a study found. rows: one a combination; notes: sentences that a reader must know; ended: why it is not complete."""
+    """What a study found.
+
+    rows: one a combination; notes: sentences that a reader must know; ended: why it is not complete; cut: the runs that the end
+    of the budget stopped.
+    """
 
     ask: Ask
     plan: dict
@@ -43,6 +47,7 @@ class Study:
     workers: int = 1  # runs at a time
     versions: dict = field(default_factory=dict)
     ended: str = ""
+    cut: list[str] = field(default_factory=list)
     kept: bool = False  # whether finished runs are kept, so that a study can go on
 
     def judged(self) -> list[Row]:
@@ -104,7 +109,7 @@ def plain(study: Study) -> dict:
         "ask": asdict(study.ask), "frame": study.plan["frame"], "frames": study.plan["frames"], "rows": rows,
         "references": references, "cheapest": cheapest and cheapest.setting, "nearest": nearest and nearest.setting,
         "notes": study.notes, "ended": study.ended, "machines": study.machines, "workers": study.workers,
-        "versions": study.versions, "scene_digest": study.plan["digest"], "code_digest": study.plan["code"],
+        "versions": study.versions, "scene_digest": study.plan["scenes"]["refine 0"], "code_digest": study.plan["code"],
     }  # fmt: skip
 
 

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from taisoft.errors import SceneError, SimulationError
-from taisoft.study.grid import tasks_of
+from taisoft.study.grid import mesh_name, tasks_of
 from taisoft.study.judge import Error, Reference, Row, error_in_space, in_space_sure, make_reference, row_of
 from taisoft.study.results import Ask, Study, describe
 from taisoft.study.store import NoStore, Store, digest, unpack
-from taisoft.study.workers import LocalPlace, Place, carry_out
+from taisoft.study.workers import CUT, SPENT, LocalPlace, Place, carry_out
 from taisoft.timing import summarise, usable_cores
 
 EXPLICIT_KINDS = {True: "explicit", False: "implicit"}
@@ -45,7 +45,8 @@ class Runner:
         tasks = [*references, *settings]
         keys = [self._key(plan, task) for task in tasks]
         records, failed, unfinished = self._carry_out(plan, dict(zip(keys, tasks)))
-        study.ended = "; ".join(dict.fromkeys(unfinished.values()))
+        study.ended = "; ".join(dict.fromkeys(SPENT if why == CUT else why for why in unfinished.values()))
+        study.cut = [describe(task) for key, task in zip(keys, tasks) if unfinished.get(key) == CUT]
         study.notes += self.store.damaged
         outcomes = [Outcome(task, records.get(k), failed.get(k, ""), unfinished.get(k, "")) for k, task in zip(keys, tasks)]
         found = self._references(study, outcomes[: len(references)])
@@ -84,8 +85,10 @@ class Runner:
         return {"setting": task["setting"], "steps": task["steps"], "repeats": self.ask.repeats if task["timed"] else 0} | shared
 
     def _key(self, plan: dict, task: dict) -> str:
-        on = [self.machines, len(self.places[0].cores)]
-        return digest([self._task(plan, task), plan["digest"], plan["code"], on])[:32]
+        machines = sorted(self.machines, key=lambda one: one["name"])  # a cluster tells them in any order
+        on = [machines, len(self.places[0].cores)]
+        scene = [plan["scenes"][mesh_name(task["setting"])], plan["sources"]]
+        return digest([self._task(plan, task), scene, plan["code"], on])[:32]
 
     def _carry_out(self, plan: dict, tasks: dict[str, dict]) -> tuple[dict, dict, dict]:
         """Records by key, those of runs that were finished before among them; sentences on those that gave none."""
@@ -105,8 +108,11 @@ class Runner:
             told = failed.get(key) or _in_short(records[key])
             self.tell(f"{len(records) + len(failed)} of {len(tasks)}: {describe(tasks[key])}: {told}")
 
-        same = self._request("run") | {"digest": plan["digest"], "code": plan["code"]}
-        requests = [(key, same | {"task": self._task(plan, tasks[key])}) for key in missing]
+        same = self._request("run") | {"sources": plan["sources"], "code": plan["code"]}
+        requests = []
+        for key in missing:
+            scene = plan["scenes"][mesh_name(tasks[key]["setting"])]
+            requests.append((key, same | {"digest": scene, "task": self._task(plan, tasks[key])}))
         left = carry_out(requests, self.places, done, seconds_left=self.seconds_left, asked=self.asked)
         return records, failed, left
 

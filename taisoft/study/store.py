@@ -1,13 +1,17 @@
 """Finished runs of a study on disk: one JSON file each, whole or absent, found again by what it depends on.
 
-The key of a run is a digest of the scene's content, the settings, the code that computes, the machine and its threads. A file
-holds its record and a digest of it; one that is damaged is told and run anew.
+The key of a run is a digest of the content of the scene as it is run, its file and the modules beside it, the settings, the
+code that computes, the versions of Taichi and NumPy, the machine and its threads. A file holds its record and a digest of it;
+one that is damaged is told and run anew.
 """
 
 import base64
 import hashlib
 import json
+import sys
+import sysconfig
 import zlib
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -16,6 +20,7 @@ import numpy as np
 from taisoft import __version__
 from taisoft.output.files import make_folder, write_bytes
 from taisoft.output.report import json_text
+from taisoft.timing import versions
 
 RUNS = "runs"
 KIND, FORMAT = "taisoft study run", 1
@@ -25,13 +30,33 @@ COMPUTING = ("study/measure.py", "study/stretch.py")  # but for these
 
 
 def code_digest() -> str:
-    """Of taisoft's version and of its files that a result depends on: an edited solver's runs are others."""
-    total = hashlib.sha256(__version__.encode())
+    """Of taisoft's files that a result depends on, and of versions, its own, Taichi's and NumPy's: an edit makes others."""
+    found = versions("taichi", "numpy")
+    total = hashlib.sha256(f"{__version__} {found['taichi']} {found['numpy']}".encode())
     for path in sorted(PACKAGE.rglob("*.py")):
         name = path.relative_to(PACKAGE).as_posix()
         if name in COMPUTING or name.split("/")[0] not in NOT_COMPUTING:
             total.update(name.encode() + path.read_bytes())
     return total.hexdigest()
+
+
+def sources(path: Path) -> dict[str, str]:
+    """Digests of a scene file and of what is loaded from its folder, by path in it; installed packages are not the scene's."""
+    path = path.absolute()
+    installed = [PACKAGE, *(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))]
+    loaded = {Path(file).absolute() for module in list(sys.modules.values()) if (file := getattr(module, "__file__", None))}
+    own = (one for one in loaded if path.parent in one.parents and not any(place in one.parents for place in installed))
+    names = sorted(one.relative_to(path.parent).as_posix() for one in {path, *own})
+    return digests(path, names)
+
+
+def digests(path: Path, names: Iterable[str]) -> dict[str, str]:
+    """Of these files in the folder of a scene file; empty for one that cannot be read."""
+    found = dict.fromkeys(names, "")
+    for name in found:
+        with suppress(OSError):
+            found[name] = hashlib.sha256((path.parent / name).read_bytes()).hexdigest()
+    return found
 
 
 def digest(values) -> str:
@@ -40,8 +65,7 @@ def digest(values) -> str:
 
 
 class Store:
-    """The finished runs in a study's folder, which is locked. damaged: sentences on files that could not be used; taken: how
-    many were."""
+    """The finished runs in a study's folder, which is locked. damaged: sentences on files that could not be used."""
 
     def __init__(self, folder: Path):
         self._folder = make_folder(folder / RUNS)
@@ -49,7 +73,6 @@ class Store:
             with suppress(OSError):  # of a study that was killed; what cannot be removed harms nothing
                 part.unlink()
         self.damaged: list[str] = []
-        self.taken = 0
 
     def read(self, key: str) -> dict | None:
         """The record of that key, or None where there is none or it is damaged."""
@@ -66,7 +89,6 @@ class Store:
             why = " ".join(str(error).split()) or type(error).__name__
             self.damaged.append(f"{path} is damaged and its run is done anew: {why}")
             return None
-        self.taken += 1
         return content["record"]
 
     def write(self, key: str, record: dict) -> dict:
@@ -81,7 +103,6 @@ class NoStore:
     """Of a study without a folder: it keeps nothing."""
 
     damaged: list[str] = []
-    taken = 0
 
     def read(self, key: str) -> None:
         """Nothing."""

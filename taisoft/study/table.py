@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict
 
 from taisoft.output.tables import markdown, percent, spread_of
-from taisoft.study.grid import AXES
+from taisoft.study.grid import AXES, mesh_name
 from taisoft.study.judge import Error, Row
 from taisoft.study.results import Study, describe
 
@@ -19,7 +19,8 @@ def text_of(study: Study) -> str:
     parts = [f"# {study.ask.scene}: speed against error", answer(study)]
     if study.ended:
         on = "The same command goes on with it." if study.kept else "Without --out nothing of it is kept."
-        parts.append(f"Not complete: {study.ended}. {on}")
+        needed = "if it takes longer than the whole budget, it needs a larger --budget"
+        parts.append(" ".join([f"Not complete: {study.ended}. {on}", *(f"Cut: {run}; {needed}." for run in study.cut)]))
     ran = [row for row in study.rows if row.status in (*ENDED, "failed")]
     if ran:
         parts.append(run_table(study, ran))
@@ -88,8 +89,8 @@ def _how(study: Study) -> str:
         sure = next((row.in_space_sure for row in study.rows if row.in_space_sure is not None), None)
         if sure is not None:
             lines.append(
-                f"* errors in space are those to the reference with {_mesh(study.space.setting)}; it is good to {sure.max:.2g} "
-                f"(max), {sure.rms:.2g} (rms): {study.space_told_by}"
+                f"* errors in space are those to the reference with {mesh_name(study.space.setting)}; it is good to "
+                f"{sure.max:.2g} (max), {sure.rms:.2g} (rms): {study.space_told_by}"
             )
     seconds = study.plan["frame"] * study.plan["frames"] if study.plan["frame"] else 0.0
     threads = sorted({row.threads for row in study.rows if row.threads})
@@ -105,10 +106,6 @@ def _how(study: Study) -> str:
 def _repeats(study: Study) -> str:
     counts = sorted({len(row.seconds) for row in study.rows if row.seconds}) or [0]
     return str(counts[0]) if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
-
-
-def _mesh(setting: dict) -> str:
-    return f"refine {setting['refine']}" + ("" if setting["order"] is None else f", order {setting['order']}")
 
 
 def _reasons(title: str, rows: list[Row], status: str) -> str:

@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Protocol
 
 from taisoft.errors import SceneError
@@ -19,6 +20,7 @@ from taisoft.timing import usable_cores
 
 CHILD = (sys.executable, "-m", "taisoft.cli.study_child")
 LOOK_EVERY = 0.05  # [s]
+SPENT, CUT = "the budget was spent", "the budget was spent while it ran"
 
 
 class Place(Protocol):
@@ -61,7 +63,7 @@ class LocalPlace:
         if process is None or process.poll() is None:
             return None
         self._process = None
-        process.stdin.close()
+        _close_stdin(process)
         out, told = _content(self._out), _content(self._told).decode(errors="replace")
         try:
             return json.loads(out)
@@ -73,8 +75,13 @@ class LocalPlace:
         if self._process is not None:
             self._process.kill()
             self._process.wait()
-            self._process.stdin.close()
+            _close_stdin(self._process)
             self._process = None
+
+
+def _close_stdin(process: subprocess.Popen) -> None:
+    with suppress(BrokenPipeError):  # what it did not read before it ended is still to be written
+        process.stdin.close()
 
 
 def _content(file) -> bytes:
@@ -114,11 +121,12 @@ def carry_out(
     lost: dict[int, str] = {}
     try:
         while waiting or busy:
-            why = "the study was interrupted" if asked() else "the budget was spent" if seconds_left() <= 0.0 else ""
+            why = "the study was interrupted" if asked() else SPENT if seconds_left() <= 0.0 else ""
             if len(lost) == len(places):
                 why = "; ".join(dict.fromkeys(lost.values()))
             if why:
-                return dict.fromkeys((key for key, _ in [*busy.values(), *waiting]), why)
+                cut = dict.fromkeys((key for key, _ in busy.values()), CUT if why == SPENT else why)
+                return cut | dict.fromkeys((key for key, _ in waiting), why)
             moved = False
             for k, place in enumerate(places):
                 if k in busy and (answer := place.poll()) is not None:
