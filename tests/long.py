@@ -18,7 +18,7 @@ LONG = {
         "twist_bar_90deg-", "spin_block-SNH-4x3x2_implicit_midpoint", "mid_traction_beam-", "hanging_beam_E1e6-",
         "soft_sheet_self_weight-",
     ),
-    "test_demos": ("[two_cubes_two_boxes]", "[hanging_beam_fine]"),
+    "test_demos": ("test_demo[incline]", "[two_cubes_two_boxes]", "[hanging_beam_fine]"),
     "test_stepping": (
         "test_implicit_steps_are_the_oracles[1-linearly", "test_parallel_kernels[velocity_verlet]",
         "test_explicit_steps_are_the_oracles[velocity_verlet]",
@@ -37,7 +37,8 @@ LONG = {
     "test_bench_contact": ("test_every_solver_gets_the_same_problem_and_is_judged_rightly",),
     "test_collision_memory": ("test_nothing_is_out_of_bounds",),
     "test_single_precision": ("test_single_precision_follows[symplectic_euler]",),
-    "test_led_nodes": ("test_rigid_flight[bdf2]",),
+    "test_led_nodes": ("test_rigid_flight[bdf2]", "test_second_order_with_a_led_end[bdf2-implicit_midpoint]"),
+    "test_pull": ("test_pulled_to_rest_and_back[bdf2-2]",),
     "test_detection_runs": ("test_sweeps",),
     "test_stability": ("test_the_limit_is_where_steps_explode[velocity_verlet-",),
     "test_newton": ("[1]",),
