@@ -25,10 +25,12 @@ from taisoft.collision.surface import INSIDE_BITS, dvec, ivec
 from taisoft.collision.triangles import CORNER, EDGE, closest_on_triangle
 
 TOGETHER = 2.0  # depths behind two faces of a ridge that differ by less are left together
+GROOVE = 10.0  # depths behind a groove's wall, beyond the margin, that there may be behind its other one
 SAME = 0.999  # cosine above which two faces count as one plane
 KEPT = 16  # faces near a vertex that are remembered between passes
 FACES = 8  # of a tip that are told apart
 FACING = -0.5  # cosine between normals below which a vertex looks at a face
+SLIGHTER = 0.25  # of the depth behind the face that it sticks out to: less behind one that it looks at goes before
 SLIGHT = 1e-6  # of a triangle's size: a vertex so little outside a side is not yet outside; wider than what `edge_edge` allows
 TINY = 1e-9  # of a triangle's size: nearer, a direction comes from normals
 
@@ -138,8 +140,10 @@ def vertex_contacts(
                     state = INSIDE
                 if clear == 0 and least_beside < least:
                     least, best = least_beside, best_beside
-                if clear == 0 and state == NONE and best_facing >= 0:  # the neighbour may be out on the other side already
-                    state, least, best = INSIDE, least_facing, best_facing
+                if clear == 0 and best_facing >= 0:
+                    # the neighbour may be out on the other side already; no far side is the way out of a slight penetration
+                    if state == NONE or (state == INSIDE and least_facing < ti.cast(SLIGHTER, ti.f64) * least):
+                        state, least, best = INSIDE, least_facing, best_facing
                 if state == INSIDE:
                     n_best = 1.0 * s.normal[best]
                     slack = ti.cast(1e-6, ti.f64) * least
@@ -203,7 +207,8 @@ def vertex_contacts(
                 if count > 1 and n.dot(way) > 0.0:
                     depth = ti.min(depth, -h / n.dot(way))
             else:
-                wanted = int(n.dot(n_best) > -0.5)  # a groove's other wall
+                # a groove's other wall; the sides of a plate that has warped are deeper
+                wanted = int(n.dot(n_best) > -0.5) & int(-h <= ti.cast(GROOVE, ti.f64) * least + margin)
         if wanted == 1:
             wanted = sticks_out(s, i, n)
             if phase == 0 and wanted == 0 and a == INSIDE and -h < least_facing:

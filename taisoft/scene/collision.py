@@ -2,8 +2,8 @@
 
 A body is hit either by vertex-face and edge-edge proximity of its deformed surface, or through its signed distance grid at rest,
 mapped by the tets behind the surface. A grid is smooth, but it rounds edges off, has cells thicker than a sheet, and where
-neighbouring tets are deformed unlike each other the map tears: a soft ball of radius 0.2 m, squeezed by what falls on it, let
-the edges of others 2 cm in unseen. So it is taken only where it is asked for.
+neighbouring tets are deformed unlike each other the map tears: hit so, the ball of the demo drop_everything (radius 0.2 m) and
+the edge of a step come to lie 2 cm in each other. So it is taken only where it is asked for.
 """
 
 from dataclasses import dataclass
