@@ -102,14 +102,19 @@ class Offscreen:
     ) -> bool:
         """Draw by Vulkan into part, what lies in the box; False where nothing came of it.
 
-        On a busy machine Taichi's renderer, now and then, hands out a picture that has been cleared and not drawn on.
+        On a busy machine Taichi's renderer, now and then, hands out a picture that has been cleared and not drawn on, or that
+        has nothing on it but lines.
         """
         self._canvas.draw(x, normals, self.camera, KEY_COLOUR, base, lines)
         pixels = self._canvas.pixels(*box)
         red, green, blue = np.moveaxis(pixels, 2, 0)
         empty = (red == 255) & (green == 0) & (blue == 255)
-        np.copyto(part, pixels, where=~empty[..., None])
-        return not empty.all()
+        surface = ~empty
+        for colour in np.unique(np.rint(255.0 * lines[1]), axis=0) if lines is not None else ():
+            surface &= (np.abs(pixels - colour) > 2.0).any(axis=2)
+        if surface.any():
+            np.copyto(part, pixels, where=~empty[..., None])
+        return bool(surface.any())
 
     def close(self) -> None:
         """Destroy the window in memory, if there is one; a second call does nothing."""
