@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 FrameCallback = Callable[["Simulator", int, StepReport | None], None]
 StepCallback = Callable[[StepReport, float], None]
-IMPLICIT_BATCH_SECONDS = 0.5  # of simulated steps between two questions to `stop`
 MOST_STEPS = 2.0**52  # of a run: beyond, the time of a float64 stands still
 
 

@@ -63,10 +63,9 @@ class Counts:
     growths: dict[str, int] = field(default_factory=dict)  # times that each buffer grew since the start
 
 
-def _fitting_margin(margin: float, bodies: list[Body]) -> float:
+def _fitting_margin(margin: float, bodies: list[Body], edges: np.ndarray) -> float:
     """The margin [m], which must not exceed any body's mean surface edge: all of its triangles would be near one another."""
-    for body in bodies:
-        mean = mean_surface_edge([(body.nodes.positions, body.nodes.surface)])
+    for body, mean in zip(bodies, edges):
         if margin > mean:
             raise SceneError(
                 f"collision settings: margin = {margin:g} m is larger than the mean surface edge of body '{body.name}', "
@@ -86,7 +85,8 @@ class Detection:
         self.scene, self.model, self.layout = scene, model, layout
         settings, bodies, obstacles = scene.collision, scene.bodies, scene.obstacles
         self.edge = mean_surface_edge([(b.nodes.positions, b.nodes.surface) for b in bodies])
-        self.margin = MARGIN * self.edge if settings.margin is None else _fitting_margin(settings.margin, bodies)
+        self.edges = np.array([collider_edge(c) for c in scene.colliders])
+        self.margin = MARGIN * self.edge if settings.margin is None else _fitting_margin(settings.margin, bodies, self.edges)
         self.reach = self.margin + DEPTH * self.edge  # by half of it boxes grow
         self.topology, self._rest = collider_surfaces(scene, layout)
         self._rows = self_collision or int((np.diff(self.topology.first) > 0).sum()) > 1
@@ -95,7 +95,6 @@ class Detection:
         self._arena = arena = FieldArena()
         soft = np.arange(len(scene.colliders)) < len(bodies)
         self.thickness = np.array([collider_thickness(c, self.edge) for c in scene.colliders])
-        self.edges = np.array([collider_edge(c) for c in scene.colliders])
         self._analytic = [(len(bodies) + k, o) for k, o in enumerate(obstacles) if not isinstance(o.shape, MeshObstacle)]
         ways = [BY_FACES if b.hit_by == "proximity" else BY_FIELD for b in bodies]
         ways += [BY_FACES if isinstance(o.shape, MeshObstacle) else BY_EDGES for o in obstacles]

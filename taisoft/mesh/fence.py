@@ -61,6 +61,16 @@ class _EndingText(io.TextIOWrapper):
         return line
 
 
+def _counted(make):
+    """As a method of `_CountingNumpy`: a function of NumPy that makes an array of a shape."""
+
+    def method(self, shape, *more, **named):
+        self._check(math.prod(np.atleast_1d(shape).tolist()))
+        return make(shape, *more, **named)
+
+    return method
+
+
 class _CountingNumpy:
     """NumPy as meshio sees it: arrays whose size a file announces are refused before room is made for what it cannot fill."""
 
@@ -81,21 +91,7 @@ class _CountingNumpy:
         self._check((high - low) / step if step else 0)
         return np.arange(*bounds, **more)
 
-    def empty(self, shape, *more, **named):
-        self._check(math.prod(np.atleast_1d(shape).tolist()))
-        return np.empty(shape, *more, **named)
-
-    def zeros(self, shape, *more, **named):
-        self._check(math.prod(np.atleast_1d(shape).tolist()))
-        return np.zeros(shape, *more, **named)
-
-    def ones(self, shape, *more, **named):
-        self._check(math.prod(np.atleast_1d(shape).tolist()))
-        return np.ones(shape, *more, **named)
-
-    def full(self, shape, *more, **named):
-        self._check(math.prod(np.atleast_1d(shape).tolist()))
-        return np.full(shape, *more, **named)
+    empty, zeros, ones, full = map(_counted, (np.empty, np.zeros, np.ones, np.full))
 
 
 for _name, _module in list(sys.modules.items()):

@@ -12,7 +12,6 @@ import math
 import os
 import platform
 import sys
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ import numpy as np
 from taisoft.output.files import write_bytes
 from taisoft.records import RunReport, StepReport
 from taisoft.timing import processor
+from taisoft.timing import versions as installed
 
 PACKAGES = ("taichi", "numpy", "scipy", "usd-core")
 
@@ -130,13 +130,8 @@ def versions() -> dict[str, str | None]:
     """Versions of Python, taisoft and the packages that take part in a run; None where a package cannot tell."""
     import taisoft
 
-    found: dict[str, str | None] = {"python": platform.python_version(), "taisoft": taisoft.__version__}
-    for package in PACKAGES:
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            found[package] = None
-    return found
+    found = installed(*PACKAGES)
+    return {"python": found.pop("python"), "taisoft": taisoft.__version__} | found
 
 
 def machine() -> dict:
