@@ -44,3 +44,15 @@ def test_what_f32_cannot_hold_is_refused():
         v[17, 1] = 1e39
         with pytest.raises(ts.SceneError, match="velocities: node 17 is not finite or too large for f32"):
             sim.set_state(velocities=v)
+
+
+def test_rounding_in_single_precision_ends_a_step():
+    """A thin stiff sheet in f32: what rounding leaves of |r| lies above the tolerance and, once it bends, above the floor."""
+    scene = ts.Scene()
+    stiff = ts.Material(law="stable_neo_hookean", young=1e6, poisson=0.3, density=1000.0)
+    sheet = scene.add_body(ts.box_mesh((10, 2, 5), (4, 0.05, 4)), stiff, name="sheet")
+    sheet.fix(lambda X: np.abs(X[:, 0]) > 1.9)
+    with ts.Simulator(scene, integrator="implicit_euler", dt=0.01, precision="f32") as sim:
+        reports = [sim.step() for _ in range(20)]
+    assert all(report.converged for report in reports)
+    assert max(report.newton_iterations for report in reports) <= 6
