@@ -30,7 +30,7 @@ from .elasticity_cost import Cost, cost_limits, cost_table, measure_costs
 from .elasticity_runs import MUJOCO, TAISOFT, Row, make_rows, measure_rows, time_ratio
 from .elasticity_table import Limit, limit_table, slug
 from .exact_path import MESHES, SECONDS
-from .peers.mujoco_flex import run_mujoco
+from .programs.mujoco_flex import run_mujoco
 
 RESULTS = Path(__file__).parent / "results"
 TARGET_MESH = MESHES[-1]  # whose implicit runs have targets
@@ -243,7 +243,7 @@ def default_out(arch: str) -> Path:
     return RESULTS / f"elasticity-{slug(where['processor'])}-{where['cores']}-cores{'-cuda' if arch == 'cuda' else ''}.json"
 
 
-def _check_out(path: Path) -> None:
+def check_out(path: Path) -> None:
     """Raises OutputError, before minutes of measuring, where the results could not be written."""
     if path.suffix != ".json":
         raise OutputError(f"{path}: the name must end in .json")
@@ -266,7 +266,7 @@ def main(argv=None) -> int:
     out = options.out
     if out is not None:
         out = default_out(options.arch) if out == RESULTS else out
-        _check_out(out)
+        check_out(out)
     document = Document()
     numbers = measure(QUICK if options.quick else FULL, options.arch, not options.no_peers, document)
     if out is not None:

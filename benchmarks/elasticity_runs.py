@@ -20,7 +20,7 @@ from taisoft.timing import Timing, summarise
 
 from .elasticity_beam import MARGIN, beam_scene, follow_tip, n_tets, steps_within_limit
 from .exact_path import FOLDING_STARTS, SAMPLE, load_exact
-from .peers.mujoco_flex import STABLE_STEPS, run_mujoco
+from .programs.mujoco_flex import STABLE_STEPS, run_mujoco
 
 IMPLICIT = ("bdf2", "implicit_midpoint", "implicit_euler", "linearly_implicit_euler")
 TAISOFT, MUJOCO = "taisoft", "MuJoCo"
@@ -130,7 +130,7 @@ def _taisoft_round(row: Row, cells, arch: str, seconds: float, first: bool) -> N
             sim.reset()
             return advance(sim, row.steps * samples).seconds / seconds
 
-        row.rounds.append(list(_repeat(run)))
+        row.rounds.append(list(repeat_short(run)))
         row.build_seconds.append(made + sim.compile_seconds - compiled)
         row.compile_seconds.append(sim.compile_seconds)
 
@@ -142,10 +142,10 @@ def _mujoco_round(row: Row, cells, arch: str, seconds: float, first: bool) -> No
         row.error, row.error_unfolded = result["error"], result["error_unfolded"]
         return result["seconds_per_simulated_second"]
 
-    row.rounds.append(list(_repeat(run)))
+    row.rounds.append(list(repeat_short(run)))
 
 
-def _repeat(run: Callable[[], float]) -> Iterator[float]:
+def repeat_short(run: Callable[[], float]) -> Iterator[float]:
     """Results of run(), seconds, until their sum or number is enough for a round; at least one."""
     total, count = 0.0, 0
     while count == 0 or (total < ROUND_SECONDS and count < ROUND_RUNS):

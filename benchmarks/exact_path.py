@@ -20,10 +20,11 @@ from pathlib import Path
 
 import numpy as np
 from scipy.integrate import DOP853
-from scipy.sparse import csr_matrix
 
 from taisoft.errors import SimulationError
 from taisoft.mesh.shapes import box_mesh
+
+from .works.semi_discrete import SemiDiscrete
 
 SIZE = (4.0, 1.0, 1.0)  # m, centred at the origin
 YOUNG, POISSON, DENSITY = 1e6, 0.3, 1000.0  # Pa, 1, kg/m^3
@@ -35,64 +36,17 @@ FOLDING_STARTS = 0.8  # s
 DATA = Path(__file__).parent / "data" / "falling_beam_svk.npz"
 
 
-class FallingBeam:
-    """The semi-discrete beam: mesh, masses and acceleration, in float64 NumPy.
+class FallingBeam(SemiDiscrete):
+    """The semi-discrete beam, by default that of the stored path.
 
-    cells: (nx, ny, nz). Attributes: vertices (n,3) [m], tets (m,4), volumes (m,) [m^3], mass (n,) [kg], free (n,) bool,
-    tip (k,) ids of the nodes of the free end face x = 2.
+    cells: (nx, ny, nz). Further attributes: cells, tip (k,) ids of the nodes of the free end face x = 2.
     """
 
-    def __init__(self, cells):
+    def __init__(self, cells, law: str = "SVK", young: float = YOUNG, equal_masses: bool = False) -> None:
         mesh = box_mesh(cells, SIZE)
-        self.cells, self.vertices, self.tets, self.volumes = tuple(cells), mesh.vertices, mesh.tets, mesh.volumes
-        n, m = len(self.vertices), len(self.tets)
-        self.mass = np.bincount(self.tets.ravel(), np.repeat(DENSITY * self.volumes / 4, 4), n)
-        self.free = self.vertices[:, 0] > -SIZE[0] / 2 + 1e-9
-        self.tip = np.flatnonzero(self.vertices[:, 0] > SIZE[0] / 2 - 1e-9)
-        self.lam = YOUNG * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
-        self.mu = YOUNG / (2 * (1 + POISSON))
-        # Row j m + e of the operator: the derivative along X_j in tet e of a nodal quantity.
-        edges = self.vertices[self.tets[:, 1:]] - self.vertices[self.tets[:, :1]]
-        gradients = np.linalg.inv(edges).transpose(0, 2, 1)
-        gradients = np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)  # (m, 4 corners, 3)
-        rows = np.broadcast_to(np.arange(3) * m + np.arange(m)[:, None, None], gradients.shape)
-        columns = np.broadcast_to(self.tets[:, :, None], gradients.shape)
-        self._gradient = csr_matrix((gradients.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * m, n))
-        self._divergence = self._gradient.T.tocsr()
-
-    def elastic_force(self, u):
-        """Force of the material on each node (3,n) [N] at the displacement u (3,n) [m]."""
-        m = len(self.tets)
-        grad_u = [(self._gradient @ u[i]).reshape(3, m) for i in range(3)]  # grad_u[i][j] = du_i / dX_j
-        stress = self._weighted_stress(grad_u)
-        force = np.empty_like(u)
-        weighted_pk1 = np.empty((3, m))
-        for i in range(3):
-            for j in range(3):  # P = F S with F = I + grad u
-                weighted_pk1[j] = stress[i][j] + sum(grad_u[i][k] * stress[k][j] for k in range(3))
-            force[i] = -(self._divergence @ weighted_pk1.ravel())
-        return force
-
-    def _weighted_stress(self, grad_u):
-        """Second Piola-Kirchhoff stress times the tet's volume, as a symmetric 3 x 3 list of (m,) [N m]."""
-        strain = [[None] * 3 for _ in range(3)]
-        for i in range(3):
-            for j in range(i, 3):
-                strain[i][j] = 0.5 * (grad_u[i][j] + grad_u[j][i] + sum(grad_u[k][i] * grad_u[k][j] for k in range(3)))
-        pressure = self.lam * (strain[0][0] + strain[1][1] + strain[2][2])
-        stress = [[None] * 3 for _ in range(3)]
-        for i in range(3):
-            for j in range(i, 3):
-                value = 2 * self.mu * strain[i][j] + (pressure if i == j else 0.0)
-                stress[i][j] = stress[j][i] = self.volumes * value
-        return stress
-
-    def acceleration(self, u):
-        """Acceleration (3,n) [m/s^2] at the displacement u (3,n) [m]; zero for the fixed nodes."""
-        a = self.elastic_force(u) / self.mass
-        a[1] -= GRAVITY
-        a[:, ~self.free] = 0.0
-        return a
+        free = mesh.vertices[:, 0] > -SIZE[0] / 2 + 1e-9
+        super().__init__(mesh, law, young, POISSON, DENSITY, GRAVITY, free, equal_masses=equal_masses)
+        self.cells, self.tip = tuple(cells), np.flatnonzero(self.vertices[:, 0] > SIZE[0] / 2 - 1e-9)
 
 
 def integrate(beam: FallingBeam, tolerance: float, seconds: float = SECONDS, points=None):

@@ -14,7 +14,7 @@ from taisoft.errors import SceneError, SimulationError
 
 mujoco = pytest.importorskip("mujoco", minversion="4.0")
 
-from benchmarks.peers.mujoco_flex import STABLE_STEPS, build_model, run_mujoco, table_rows  # noqa: E402
+from benchmarks.programs.mujoco_flex import STABLE_STEPS, build_model, run_mujoco, table_rows  # noqa: E402
 
 CELLS = (12, 3, 3)
 

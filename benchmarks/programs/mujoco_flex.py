@@ -11,7 +11,7 @@ Elasticity is integrated in two ways (MuJoCo's own names); `implicit` and `impli
 * implicitly by `discrete`: (M + dt^2 K) a = f - dt K v, one linear solve a step, K kept positive. Here, without
   constraints, the same iterative solve runs whichever of its solvers is named (equal paths and times were measured).
 
-`python -m benchmarks.peers.mujoco_flex` prints the table. Its step sizes divide the 10 ms between two samples; those of
+`python -m benchmarks.programs.mujoco_flex` prints the table. Its step sizes divide the 10 ms between two samples; those of
 `euler` and `rk4` are the largest such ones that stay stable for the whole second.
 """
 
@@ -65,7 +65,7 @@ def run_mujoco(
     seconds_per_simulated_second (median over the repeats), compile_seconds, load (1 minute; before, after), settings.
     Raises SceneError for arguments outside these rules, SimulationError where the run diverges.
     """
-    mujoco = _import_mujoco()
+    mujoco = import_mujoco()
     steps = _steps_per_sample(dt, seconds, integrator)
     exact, beam = load_exact(cells), FallingBeam(cells)
     load_before, start = load_average(), time.perf_counter()
@@ -131,7 +131,7 @@ def _simulate(mujoco, model, beam: FallingBeam, integrator: str, steps: int, sam
     tip = (3 * rank[beam.tip, None] + np.arange(3)).ravel()
     path = np.tile(beam.vertices[beam.tip].mean(axis=0), (samples + 1, 1))
     pieces = np.empty(samples)
-    with _quiet_warnings(mujoco):
+    with quiet_warnings(mujoco):
         for k in range(samples):
             start = time.perf_counter()
             mujoco.mj_step(model, data, nstep=steps)
@@ -175,7 +175,7 @@ def _steps_per_sample(dt: float, seconds: float, integrator: str) -> int:
     return steps
 
 
-def _import_mujoco():
+def import_mujoco():
     try:
         import mujoco
     except ImportError:
@@ -188,7 +188,7 @@ def _import_mujoco():
 
 
 @contextlib.contextmanager
-def _quiet_warnings(mujoco):
+def quiet_warnings(mujoco):
     """Warnings are read from the data afterwards: keep MuJoCo from printing them and from writing a log file."""
     mujoco.set_mju_user_warning(lambda message: None)
     try:

@@ -1,0 +1,118 @@
+"""The works W1 to W4, taisoft beside MuJoCo, PyBullet and Newton: time against error, and what stands.
+
+taisoft bench peers [--work KEY] [--program NAME] [--arch cpu|cuda] [--rounds N] [--quick] [--out [FILE.json]]
+
+W1 is a beam that hangs from its end (three meshes; on the coarse one also 1e8 and 1e9 Pa), W2 a cube that drops on the ground, W3
+three cubes that fall on each other, W4 a cube that drops on a clamped sheet (benchmarks/works/scenes.py). Everyone gets the
+same nodes and tets. W1's and W2's errors are measured from the exact path of a program's own law and masses, at the largest in
+position over the excursion, or the root mean square of the mass centre's height over the 0.5 m it drops. W3 and W4 are to
+stand for a second: nothing falls or leans, turns inside out, or sinks in by 1 % of an edge (the least of the bodies' mean
+ones), as measured by taisoft in every program's positions every 10 ms. taisoft runs on as many threads as the machine has cores
+where that pays, the others on one. Times are without building and compiling. The whole takes about half an hour on two cores.
+"""
+
+import argparse
+import sys
+from datetime import datetime
+from pathlib import Path
+from types import ModuleType
+
+import taisoft as ts
+from taisoft.output.files import write_bytes
+from taisoft.output.report import json_text
+from taisoft.timing import load_average, machine, versions
+
+from .elasticity import RESULTS, Document, check_out
+from .elasticity_table import limit_table, slug
+from .programs import mujoco_works, newton_vbd, own, pybullet_soft
+from .works.plot import draw
+from .works.runs import Row, measure
+from .works.scenes import WORKS, Work
+from .works.table import compare_table, limits_of, run_table
+
+PROGRAMS = (own, mujoco_works, pybullet_soft, newton_vbd)
+QUICK = ("W1 12x3x3", "W2")
+ROUNDS = 3
+
+
+def header(arch: str, programs: list[ModuleType]) -> tuple[str, dict]:
+    """What is measured where, as text and as data."""
+    found = machine() | {"date": datetime.now().isoformat(timespec="minutes"), "arch": arch}
+    packages = {"taisoft": ts.__version__, **versions("taichi", "mujoco", "pybullet", "newton", "warp-lang", "numpy")}
+    told = ", ".join(f"{name} {version or 'absent'}" for name, version in packages.items())
+    load = "unknown" if found["load"] is None else f"{found['load']:.1f}"
+    text = (
+        f"# Speed against error, beside other programs\n\n{found['processor']}, {found['cores']} cores, "
+        f"load {load} at the start; {found['date']}\n{told}\n\n" + __doc__.partition("\n\n")[2].partition("\n\n")[2].strip()
+    )
+    left_out = {program.NAME: problem for program in programs if (problem := program.problem())}
+    text += "".join(f"\n\n{name} is left out: {problem}." for name, problem in left_out.items())
+    return text, found | {"versions": packages, "left_out": left_out}
+
+
+def title(work: Work) -> str:
+    """Heading of a work's part."""
+    return f"## {work.key}: {work.title}, {work.tets:,} tets"
+
+
+def run(
+    works: list[Work], programs: list[ModuleType], arch: str, rounds: int, document: Document
+) -> tuple[dict, list[list[Row]]]:
+    """Everything, printed as it comes. Returns the numbers, and the rows of each work."""
+    text, numbers = header(arch, programs)
+    document.add(text)
+    here = [program for program in programs if program.NAME not in numbers["left_out"]]
+    found = []
+    for work in works:
+        rows = measure(work, here, rounds, arch)
+        document.add(f"{title(work)}\n\n{run_table(rows)}")
+        found.append(rows)
+    document.add(f"## The fastest of each at equal error\n\n{compare_table(found)}")
+    limits = [limit for rows in found for limit in limits_of(rows)]
+    document.add(f"## Limits\n\n{limit_table(limits)}")
+    document.add(f"Load at the end: {load_average():.1f}")
+    rows = [row.record() for rows in found for row in rows]
+    return numbers | {"runs": rows, "limits": [limit.record() for limit in limits]}, found
+
+
+def main(argv=None) -> int:
+    """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
+    first, _, rest = __doc__.partition("\n")
+    parser = argparse.ArgumentParser(prog="taisoft bench peers", description=first, epilog=rest.partition("\n\n")[2])
+    parser.add_argument("--work", metavar="KEY", help=f"only those that begin so: {', '.join(work.key for work in WORKS)}")
+    names = [program.NAME for program in PROGRAMS]
+    parser.add_argument("--program", choices=names[1:], action="append", help="only this one beside taisoft; may be repeated")
+    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where taisoft computes (default cpu)")
+    parser.add_argument("--rounds", type=int, default=ROUNDS, help="rounds over all settings (default %(default)s)")
+    parser.add_argument("--quick", action="store_true", help=f"only {' and '.join(QUICK)}, one round")
+    parser.add_argument(
+        "--out", type=Path, nargs="?", const=RESULTS, metavar="FILE.json",
+        help="write FILE.json, FILE.md and FILE.png; without a name into benchmarks/results, named after the machine",
+    )  # fmt: skip
+    options = parser.parse_args(argv)
+    works = [work for work in WORKS if work.key.startswith(options.work or "") and (not options.quick or work.key in QUICK)]
+    if not works:
+        parser.error(f"no work begins with {options.work!r}")
+    out = options.out
+    if out is not None:
+        out = default_out(options.arch) if out == RESULTS else out
+        check_out(out)
+    programs = [one for one in PROGRAMS if one is own or not options.program or one.NAME in options.program]
+    document = Document()
+    numbers, found = run(works, programs, options.arch, 1 if options.quick else options.rounds, document)
+    if out is not None:
+        write_bytes(out, json_text(numbers | {"quick": options.quick}).encode())
+        write_bytes(out.with_suffix(".md"), ("\n\n".join(document.parts) + f"\n\n![]({out.stem}.png)\n").encode())
+        draw(found, out.with_suffix(".png"))
+        print(f"written: {out}, {out.with_suffix('.md').name} and {out.with_suffix('.png').name}")
+    return 0
+
+
+def default_out(arch: str) -> Path:
+    """results/peers-<machine>.json beside this file."""
+    where = machine()
+    return RESULTS / f"peers-{slug(where['processor'])}-{where['cores']}-cores{'-cuda' if arch == 'cuda' else ''}.json"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,143 @@
+"""MuJoCo's flex on the works: what mujoco_flex.py says of the beam, for several bodies, and with contact.
+
+Its contact is a spring and damper, whose time constant `solref` may not be below two steps. All vertices of a flex meet the
+ground, also inner ones; two flexes meet by triangles. St. Venant-Kirchhoff material, of which much is squeezed inside out when
+W2's cube lands.
+"""
+
+import warnings
+from time import perf_counter
+
+import numpy as np
+
+from taisoft.errors import SimulationError
+
+from ..exact_path import POISSON, SAMPLE
+from ..works.references import MUJOCO, masses
+from ..works.scenes import Work
+from .mujoco_flex import FALSE_ALARM, STABLE_STEPS, SWITCHED_OFF, TOLERANCE, import_mujoco, quiet_warnings
+from .session import Setting, finite
+
+NAME, MODEL = "MuJoCo", MUJOCO
+CONTACT = ("CONSTRAINT", "CONTACT", "MIDPHASE", "WARMSTART", "REFSAFE", "ISLAND")  # what contact needs of SWITCHED_OFF
+RADIUS = 1e-4  # of a flex [m]; surfaces rest that far apart
+STIFF_STEPS = {1e8: 20, 1e9: 62}  # of the coarse beam: the least that Euler bears
+
+
+def problem() -> str:
+    """Why it cannot be had."""
+    try:
+        import_mujoco()
+    except SimulationError as error:
+        return str(error)
+    return ""
+
+
+def settings(work: Work, arch: str = "cpu") -> list[Setting]:
+    """Explicit steps at the largest stable dt and finer, implicit ("discrete") ones; with contact its time constants."""
+    if not work.touches:
+        return _of_beam(work)
+    found = []
+    for method, steps, constants in (("euler", 4, (2, 4)), ("euler", 10, (2,)), ("discrete", 1, (2,)), ("discrete", 2, (2, 4))):
+        steps *= 5 if work.key == "W4" and method == "euler" else 1  # its sheet is thin
+        for constant in constants:
+            found.append(Setting(NAME, MODEL, method, steps, {"solref": constant * SAMPLE / steps}))
+    return found
+
+
+def _of_beam(work: Work) -> list[Setting]:
+    cells = tuple(int(n) for n in work.key.split()[1].rstrip(",").split("x"))
+    young = work.bodies[0].young
+    euler, rk4 = STABLE_STEPS[cells] if young == 1e6 else (STIFF_STEPS[young],) * 2
+    finer = (1, 2, 4, 12) if young == 1e6 else (1,)
+    found = [Setting(NAME, MODEL, "euler_staggered", k * euler) for k in finer] + [Setting(NAME, MODEL, "rk4", rk4)]
+    return found + [Setting(NAME, MODEL, "discrete", k) for k in (1, 4)]
+
+
+class Run:
+    """A Session."""
+
+    unconverged = 0  # it does not tell
+
+    def __init__(self, work: Work, setting: Setting) -> None:
+        self.mujoco, self.work, self.setting = import_mujoco(), work, setting
+        start = perf_counter()
+        spec = self.mujoco.MjSpec()
+        self._options(spec)
+        self.free = np.concatenate([~body.fixed for body in work.bodies])
+        mass, nodes = masses(work, MODEL), work.slices()
+        if work.ground:
+            turned = [np.sqrt(0.5), -np.sqrt(0.5), 0, 0]  # its normal is its z
+            spec.worldbody.add_geom(
+                type=self.mujoco.mjtGeom.mjGEOM_PLANE, size=[10, 10, 0.1], quat=turned, **self._contact()
+            )
+        for body in work.bodies:
+            self._add(spec, body, mass[nodes[body.name]], work.touches)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=FALSE_ALARM.replace("beam", ".*"))
+            self.model = spec.compile()
+        self.build_seconds = perf_counter() - start
+
+    def _options(self, spec) -> None:
+        mujoco, method = self.mujoco, self.setting.method
+        spec.option.timestep, spec.option.gravity = self.setting.dt, (0.0, -self.work.gravity, 0.0)
+        spec.option.tolerance = TOLERANCE if not self.work.touches else 1e-8
+        # Newton's method is faster in explicit steps with contact, and 20 to 40 times slower in implicit ones
+        newton = self.work.touches and method != "discrete"
+        spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON if newton else mujoco.mjtSolver.mjSOL_CG
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        names = {"rk4": "RK4", "discrete": "DISCRETE"}
+        spec.option.integrator = getattr(mujoco.mjtIntegrator, "mjINT_" + names.get(method, "EULER"))
+        off = [name for name in SWITCHED_OFF if not (self.work.touches and name in CONTACT)]
+        spec.option.disableflags = sum(int(getattr(mujoco.mjtDisableBit, "mjDSBL_" + name)) for name in off)
+
+    def _contact(self) -> dict:
+        if not self.work.touches:
+            return {"contype": 0, "conaffinity": 0}
+        return {"friction": [self.work.friction, 0, 0], "solref": [self.setting.options["solref"], 1.0]}
+
+    def _add(self, spec, body, mass: np.ndarray, touches: bool) -> None:
+        """A body of its mass with three slides for every free node, and the flex on them."""
+        owners = []
+        for node, (position, kg, held) in enumerate(zip(body.mesh.vertices, mass, body.fixed)):
+            owners.append("world" if held else f"{body.name} {node}")
+            if not held:
+                inertial = {"mass": kg, "inertia": [kg * 1e-3] * 3, "explicitinertial": True}
+                made = spec.worldbody.add_body(name=owners[-1], pos=position, **inertial)
+                for axis in np.eye(3):
+                    made.add_joint(type=self.mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+        elastic = {"young": body.young, "poisson": POISSON, "damping": 0.0}
+        flex = spec.add_flex(name=body.name, dim=3, radius=RADIUS, **elastic, **self._contact())
+        flex.selfcollide = self.mujoco.mjtFlexSelf.mjFLEXSELF_NONE
+        flex.vertbody = owners
+        flex.vert = np.where(body.fixed[:, None], body.mesh.vertices, 0.0).ravel()  # in the frame of the owner
+        flex.elem = body.mesh.tets.ravel().astype(int)
+
+    def run(self, follow: bool) -> tuple[np.ndarray | None, float]:
+        mujoco, start, data = self.mujoco, self.work.start, self.mujoco.MjData(self.model)
+        if self.setting.method == "euler_staggered":
+            data.qvel[1::3] = self.work.gravity * self.setting.dt / 2  # -a(0) dt/2: at rest gravity alone accelerates
+        positions, seconds = [start], 0.0
+        with quiet_warnings(mujoco):
+            for k in range(round(self.work.seconds / SAMPLE)):
+                begun = perf_counter()
+                mujoco.mj_step(self.model, data, nstep=self.setting.steps)
+                seconds += perf_counter() - begun
+                time = (k + 1) * SAMPLE
+                told = [mujoco.mjtWarning(k).name for k, one in enumerate(data.warning) if one.number and k != 0]
+                if told:
+                    raise SimulationError(f"{NAME} gives up before t = {time:.2f} s: {', '.join(told)}")
+                now = start.copy()
+                now[self.free] += data.qpos.reshape(-1, 3)
+                finite(now, start, NAME, time)
+                if follow:
+                    positions.append(now)
+        return np.array(positions) if follow else None, seconds
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def start(work: Work, setting: Setting) -> Run:
+    """Ready to run."""
+    return Run(work, setting)

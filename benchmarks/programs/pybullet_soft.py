@@ -1,0 +1,143 @@
+"""PyBullet's deformable bodies on the works: stable neo-Hookean, explicit elasticity, the same mass at every node.
+
+Meshes go in as files. Nodes are held by anchors. Its springs beside the tets (loadSoftBody's useMassSpring) stay off, and its
+damping is zero. Contact of soft bodies among each other is a spring of `repulsion` [N/m] and a velocity solve; with the ground
+a velocity solve with a margin [m].
+"""
+
+import contextlib
+import os
+import tempfile
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from taisoft.errors import SimulationError
+
+from ..exact_path import DENSITY, POISSON, SAMPLE
+from ..works.references import PYBULLET
+from ..works.scenes import Body, Work
+from .session import Setting, finite
+
+NAME, MODEL = "PyBullet", PYBULLET
+MARGIN = 1e-3  # m
+
+
+def problem() -> str:
+    """Why it cannot be had."""
+    try:
+        with _silent():
+            import pybullet  # noqa: F401
+    except ImportError:
+        return "the comparison with PyBullet needs the package pybullet"
+    return ""
+
+
+def settings(work: Work, arch: str = "cpu") -> list[Setting]:
+    """Steps from the largest that lasts on; with several bodies two strengths of repulsion."""
+    steps = {"W2": (4, 8, 16), "W3": (4, 8, 16), "W4": (20, 40)}.get(work.key)
+    if steps is None:
+        cells, young = work.bodies[0].mesh.n_tets, work.bodies[0].young
+        steps = {540: (2, 4, 8), 4320: (5, 10), 34560: (11,)}[cells] if young == 1e6 else {1e8: (20,), 1e9: (62,)}[young]
+    repulsions = ({"repulsion": 1e3}, {"repulsion": 1e5}) if len(work.bodies) > 1 else ({},)
+    return [Setting(NAME, MODEL, "explicit", n, options) for n in steps for options in repulsions]
+
+
+class Run:
+    """A Session."""
+
+    unconverged = 0  # it does not tell
+
+    def __init__(self, work: Work, setting: Setting) -> None:
+        with _silent():
+            import pybullet
+
+            self.bullet, self.work, self.setting = pybullet, work, setting
+            self.client = pybullet.connect(pybullet.DIRECT)
+            self.bodies: list[int] = []
+            start = perf_counter()
+            self._reset()
+            self.build_seconds = perf_counter() - start
+
+    def _reset(self) -> None:
+        bullet, here = self.bullet, {"physicsClientId": self.client}
+        bullet.resetSimulation(bullet.RESET_USE_DEFORMABLE_WORLD, **here)
+        bullet.setGravity(0, -self.work.gravity, 0, **here)
+        bullet.setPhysicsEngineParameter(numSubSteps=0, **here)
+        bullet.setTimeStep(self.setting.dt, **here)
+        if self.work.ground:
+            plane = bullet.createCollisionShape(bullet.GEOM_PLANE, planeNormal=[0, 1, 0], **here)
+            ground = bullet.createMultiBody(0, plane, **here)
+            bullet.changeDynamics(ground, -1, lateralFriction=self.work.friction, **here)
+        self.bodies = [self._load(body) for body in self.work.bodies]
+
+    def _load(self, body: Body) -> int:
+        bullet, work, here = self.bullet, self.work, {"physicsClientId": self.client}
+        lam = body.young * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
+        mu = body.young / (2 * (1 + POISSON))
+        law = {"NeoHookeanMu": 4 / 3 * mu, "NeoHookeanLambda": lam + 5 / 6 * mu, "NeoHookeanDamping": 0.0}
+        several = {"repulsionStiffness": self.setting.options["repulsion"]} if len(work.bodies) > 1 else {}
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "body.vtk"
+            path.write_text(_vtk(body))
+            made = bullet.loadSoftBody(
+                str(path), mass=DENSITY * float(body.mesh.volumes.sum()), useNeoHookean=1, **law, collisionMargin=MARGIN,
+                frictionCoeff=work.friction, useFaceContact=int(len(work.bodies) > 1), useSelfCollision=0, **several, **here,
+            )  # fmt: skip
+        if np.abs(self._positions_of(made) - body.mesh.vertices).max() > 1e-9:
+            raise SimulationError(f"{NAME} has put the nodes of {body.name!r} in another order")
+        for node in np.flatnonzero(body.fixed):
+            bullet.createSoftBodyAnchor(made, int(node), -1, -1, **here)
+        return made
+
+    def _positions_of(self, body: int) -> np.ndarray:
+        return np.array(
+            self.bullet.getMeshData(body, -1, flags=self.bullet.MESH_DATA_SIMULATION_MESH, physicsClientId=self.client)[1]
+        )
+
+    def run(self, follow: bool) -> tuple[np.ndarray | None, float]:
+        start, seconds = self.work.start, 0.0
+        positions = [start]
+        with _silent():
+            self._reset()
+            for k in range(round(self.work.seconds / SAMPLE)):
+                begun = perf_counter()
+                for _ in range(self.setting.steps):
+                    self.bullet.stepSimulation(physicsClientId=self.client)
+                seconds += perf_counter() - begun
+                now = np.concatenate([self._positions_of(body) for body in self.bodies])
+                finite(now, start, NAME, (k + 1) * SAMPLE)
+                if follow:
+                    positions.append(now)
+        return np.array(positions) if follow else None, seconds
+
+    def close(self) -> None:
+        self.bullet.disconnect(self.client)
+
+
+def start(work: Work, setting: Setting) -> Run:
+    """Ready to run."""
+    return Run(work, setting)
+
+
+def _vtk(body: Body) -> str:
+    """The mesh as a legacy VTK file in the one layout that PyBullet reads."""
+    points = "\n".join("{:.17g} {:.17g} {:.17g}".format(*x) for x in body.mesh.vertices)
+    cells = "\n".join("4 {} {} {} {}".format(*tet) for tet in body.mesh.tets)
+    n, m = body.mesh.n_verts, body.mesh.n_tets
+    head = f"# vtk DataFile Version 2.0\nbody\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS {n} double"
+    return f"{head}\n{points}\nCELLS {m} {5 * m}\n{cells}\nCELL_TYPES {m}\n" + "10\n" * m
+
+
+@contextlib.contextmanager
+def _silent():
+    """Keep what PyBullet's library prints out of the tables."""
+    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)

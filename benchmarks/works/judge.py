@@ -1,0 +1,89 @@
+"""What a followed run is judged by, the same for every program: error where a path is known, else whether it stands."""
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.mesh.quality import mean_surface_edge
+
+from ..exact_path import SAMPLE
+from ..programs.own import make_scene
+from . import references
+from .scenes import Work
+from .semi_discrete import inverted
+
+SHALLOW = 0.01  # of an edge: what a body may sink in
+LEAN = 0.1  # of a width: how far a centre may be off the axis
+LEAST = 0.2  # of a height at rest: how far a centre is above what bears it, at least
+
+
+@dataclass
+class Verdict:
+    """error: None where no path is known; good_to: of the reference. inverted: the most tets in one sample.
+
+    penetration: the deepest in any sample [m], None where nothing can touch; edge: the least of the bodies' mean surface edges
+    [m]. fell: when it no longer stood [s], None where it always did, or need not.
+    """
+
+    inverted: int
+    error: float | None = None
+    good_to: float | None = None
+    penetration: float | None = None
+    edge: float | None = None
+    fell: float | None = None
+
+    @property
+    def stands(self) -> bool:
+        """Neither fell, nor turned a tet inside out, nor sank in by 1 % of an edge."""
+        return self.fell is None and self.inverted == 0 and self.penetration <= SHALLOW * self.edge
+
+
+def judge(work: Work, model: references.Model, positions: np.ndarray) -> Verdict:
+    """Of the positions (k,n,3) [m] that a program with this model gave."""
+    verdict = Verdict(max(_inverted(work, x) for x in positions))
+    if work.kind == "path":
+        reference = references.load(work, model)
+        path = references.observed(work, positions, references.masses(work, model))
+        verdict.error, verdict.good_to = reference.error(path), reference.good_to
+    if work.touches:
+        verdict.edge = min(mean_surface_edge([(body.mesh.vertices, body.mesh.surface)]) for body in work.bodies)
+        verdict.penetration = deepest(work, positions)
+    if work.kind == "stand":
+        fallen = [k for k, x in enumerate(positions) if not _stands(work, x)]
+        verdict.fell = fallen[0] * SAMPLE if fallen else None
+    return verdict
+
+
+def _inverted(work: Work, x: np.ndarray) -> int:
+    return sum(inverted(body.mesh, x[nodes]) for body, nodes in zip(work.bodies, work.slices().values()))
+
+
+def deepest(work: Work, positions: np.ndarray) -> float:
+    """The deepest overlap of two bodies, or of one and the ground, in any of the samples [m], by taisoft's own measure."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        made = ts.Simulator(make_scene(work), dt=1e-6, integrator="velocity_verlet", precision="f64")
+    depth = 0.0
+    with made as sim:
+        for x in positions:
+            sim.set_state(x, np.zeros_like(x))
+            depth = max([depth, *(one.depth for one in sim.overlaps())])
+    return depth
+
+
+def _stands(work: Work, x: np.ndarray) -> bool:
+    """Whether every body that is not held lies on the one before, or on the ground, and about the axis."""
+    floor = 0.0
+    for body, nodes in zip(work.bodies, work.slices().values()):
+        size = np.ptp(body.mesh.vertices, axis=0)
+        centre = x[nodes].mean(axis=0)
+        if not body.fixed.any():
+            if np.abs(centre[[0, 2]]).max() > LEAN * size[0] or centre[1] - floor < LEAST * size[1]:
+                return False
+            floor = centre[1] + LEAST * size[1]
+        else:
+            below = np.abs(body.mesh.vertices[:, [0, 2]]).max(axis=1) <= work.bodies[-1].mesh.vertices[:, 0].max() + 1e-9
+            floor = x[nodes][below, 1].mean()
+    return True

@@ -1,0 +1,162 @@
+"""Exact paths of W1 and W2 for each program's own law and masses, stored in data/works.npz with what they are good to.
+
+W1: the mean of the beam's end face, by Runge-Kutta of order 8 (exact_path.py, which stores St. Venant-Kirchhoff's at 1 MPa).
+W2: the mass centre's height, by velocity Verlet with contact at the nodes: those that would be below the ground after a step
+are stopped on it, and slowed along it by friction at most. That is of first order in dt; the path is that of DT / 2, and what
+it is good to its distance to that of DT.
+
+`python -m benchmarks.works.references` makes the file (some 20 minutes).
+"""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from taisoft.errors import SimulationError
+
+from ..exact_path import DENSITY, POISSON, SAMPLE, YOUNG, FallingBeam, integrate, load_exact
+from .scenes import WORKS, Work
+from .semi_discrete import SemiDiscrete
+
+DATA = Path(__file__).parent.parent / "data" / "works.npz"
+DT = 1e-4  # s
+TOLERANCES = (1e-7, 1e-9)  # of W1
+
+
+@dataclass(frozen=True)
+class Model:
+    """What a program solves: its law (see semi_discrete.LAWS) and whether all nodes have the same mass."""
+
+    law: str
+    equal_masses: bool = False
+
+    def __str__(self) -> str:
+        return self.law + (", equal masses" if self.equal_masses else "")
+
+
+TAISOFT, MUJOCO, PYBULLET, NEWTON = Model("SNH"), Model("SVK"), Model("SNH", equal_masses=True), Model("SNH13")
+MODELS = (TAISOFT, MUJOCO, PYBULLET, NEWTON)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """path (k,d) [m], a point every SAMPLE from 0 on; good_to: the error of it, as `error` counts."""
+
+    work: Work
+    path: np.ndarray
+    good_to: float
+
+    def error(self, path: np.ndarray) -> float:
+        """Of a path (k,d) [m]: W1's largest distance over the excursion; W2's root mean square over 0.5 m, as it drops."""
+        return _error(self.work, path, self.path)
+
+
+def _error(work: Work, path: np.ndarray, exact: np.ndarray) -> float:
+    away = np.linalg.norm(path - exact, axis=1)
+    if work.key == "W2":
+        return float(np.sqrt(np.mean(away**2)) / 0.5)
+    return float(away.max() / np.linalg.norm(exact - exact[0], axis=1).max())
+
+
+def observed(work: Work, positions: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """What a reference tells of positions (k,n,3) [m]: W1's tip (k,3), W2's height of the mass centre (k,1)."""
+    if work.key == "W2":
+        return (positions[:, :, 1] @ mass / mass.sum())[:, None]
+    x = work.start[:, 0]
+    return positions[:, x > x.max() - 1e-9].mean(axis=1)
+
+
+def masses(work: Work, model: Model) -> np.ndarray:
+    """Of all nodes (n,) [kg]; of W3 and W4 body by body."""
+    return np.concatenate([_semi_discrete(work, k, model).mass for k in range(len(work.bodies))])
+
+
+def _semi_discrete(work: Work, k: int, model: Model) -> SemiDiscrete:
+    body = work.bodies[k]
+    numbers = (model.law, body.young, POISSON, DENSITY, work.gravity)
+    return SemiDiscrete(body.mesh, *numbers, ~body.fixed, equal_masses=model.equal_masses)
+
+
+def fall_on_ground(body: SemiDiscrete, friction: float, dt: float, seconds: float) -> np.ndarray:
+    """Height of the mass centre (k,1) [m] every SAMPLE. Raises SimulationError where it diverges."""
+    steps = round(SAMPLE / dt)
+    u, v = np.zeros((2, 3, len(body.mass)))
+    height, heights = body.vertices[:, 1], []
+    v += 0.5 * dt * body.acceleration(u)
+    for k in range(round(seconds / SAMPLE) * steps + 1):
+        if k % steps == 0:
+            heights.append(body.mass @ (height + u[1]) / body.mass.sum())
+        down = -(height + u[1]) / dt  # below it a velocity leads under the ground
+        hit = v[1] < down
+        pushed = (down - v[1])[hit]
+        v[1, hit] = down[hit]
+        speed = np.hypot(v[0, hit], v[2, hit])
+        v[::2, hit] *= np.maximum(1 - friction * pushed / np.maximum(speed, 1e-300), 0)
+        u += dt * v
+        v += dt * body.acceleration(u)
+    if not np.isfinite(heights).all():
+        raise SimulationError(f"dt = {dt} s diverges")
+    return np.array(heights)[:, None]
+
+
+def make(work: Work, model: Model) -> tuple[np.ndarray, float]:
+    """Path and what it is good to."""
+    if work.key == "W2":
+        body = _semi_discrete(work, 0, model)
+        loose, path = (fall_on_ground(body, work.friction, dt, work.seconds) for dt in (DT, DT / 2))
+    else:
+        body = work.bodies[0]
+        beam = FallingBeam(_cells(work), model.law, body.young, model.equal_masses)
+        loose, path = (integrate(beam, tolerance)[1] for tolerance in TOLERANCES)
+    return path, _error(work, loose, path)
+
+
+def _cells(work: Work) -> tuple[int, ...]:
+    return tuple(int(n) for n in work.key.removeprefix("W1 ").partition(",")[0].split("x"))
+
+
+def stored_elsewhere(work: Work, model: Model) -> bool:
+    """Whether exact_path.py has it."""
+    return work.key.startswith("W1") and model == MUJOCO and work.bodies[0].young == YOUNG
+
+
+def load(work: Work, model: Model) -> Reference:
+    """The stored reference. Raises SimulationError where there is none."""
+    if stored_elsewhere(work, model):
+        exact = load_exact(_cells(work))
+        return Reference(work, exact.path, float(exact.convergence.max()))
+    with np.load(DATA) as data:
+        if f"{work.key}: {model}" not in data:
+            raise SimulationError(f"no reference is stored for {work.key} with {model}")
+        return Reference(work, data[f"{work.key}: {model}"], float(data[f"{work.key}: {model}: good to"]))
+
+
+def main(arguments=None) -> None:
+    """Make the file; what it holds already is kept unless --anew."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--anew", action="store_true", help="make all of them")
+    options = parser.parse_args(arguments)
+    kept = {}
+    if DATA.exists() and not options.anew:
+        with np.load(DATA) as data:
+            kept = dict(data)
+    for work in (work for work in WORKS if work.kind == "path"):
+        for model in MODELS:
+            name = f"{work.key}: {model}"
+            if stored_elsewhere(work, model) or name in kept:
+                continue
+            start = perf_counter()
+            try:
+                kept[name], kept[f"{name}: good to"] = make(work, model)
+            except SimulationError as error:
+                print(f"{name}: {error}", flush=True)
+                continue
+            print(f"{name}: good to {kept[f'{name}: good to']:.1e}, {perf_counter() - start:.0f} s", flush=True)
+            np.savez_compressed(DATA, **kept)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""All programs' settings on one work, in rounds, so that a slow minute of the machine falls on all of them."""
+
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from types import ModuleType
+
+import numpy as np
+
+from taisoft.errors import TaisoftError
+from taisoft.study.pareto import cheapest
+from taisoft.timing import Timing, summarise
+
+from ..elasticity_runs import repeat_short
+from ..programs.session import Setting
+from .judge import Verdict, judge
+from .scenes import Work
+
+ENOUGH_SECONDS = 20.0  # a run of so much wall time is not repeated
+
+
+@dataclass
+class Row:
+    """One setting of one program on one work. rounds: wall seconds per simulated second of every run; failure: why none."""
+
+    work: Work
+    setting: Setting
+    rounds: list[list[float]] = field(default_factory=list)
+    build_seconds: list[float] = field(default_factory=list)
+    verdict: Verdict | None = None
+    unconverged: int = 0
+    failure: str = ""
+
+    @property
+    def timing(self) -> Timing | None:
+        """Of a simulated second [s]; None where no run ended."""
+        runs = [seconds for one in self.rounds for seconds in one]
+        return summarise(runs) if runs else None
+
+    @property
+    def stood(self) -> bool:
+        """Whether it did a work that must stand."""
+        return self.verdict is not None and self.verdict.stands and not self.unconverged
+
+    @property
+    def claimed(self) -> float:
+        """Its error, at least what the reference is good to; not a number where it has none."""
+        known = self.verdict is not None and self.verdict.error is not None
+        return max(self.verdict.error, self.verdict.good_to) if known else float("nan")
+
+    def record(self) -> dict:
+        """As plain data."""
+        setting = asdict(self.setting) | {"model": str(self.setting.model), "dt": self.setting.dt}
+        verdict = self.verdict and asdict(self.verdict)
+        return {
+            "work": self.work.key, "tets": self.work.tets, "setting": setting, "rounds": self.rounds, "verdict": verdict,
+            "build_seconds": self.build_seconds, "unconverged": self.unconverged, "failure": self.failure,
+            "seconds_per_simulated_second": self.timing and asdict(self.timing),
+        }  # fmt: skip
+
+
+def measure(work: Work, programs: Iterable[ModuleType], rounds: int, arch: str = "cpu") -> list[Row]:
+    """The rows of a work. What diverges or is refused says so and is left out of what follows."""
+    adapters = {program.NAME: program for program in programs}
+    rows = [Row(work, setting) for program in adapters.values() for setting in program.settings(work, arch)]
+    for number in range(rounds):
+        for row in rows:
+            slow = row.rounds and row.rounds[0][0] * work.seconds > ENOUGH_SECONDS
+            if row.failure or slow:
+                continue
+            told = f"{work.key}, round {number + 1} of {rounds}: {row.setting.program} {row.setting}"
+            print(told, file=sys.stderr, flush=True)
+            try:
+                _round(row, adapters[row.setting.program])
+            except TaisoftError as error:
+                row.failure = str(error)
+    return rows
+
+
+def _round(row: Row, program: ModuleType) -> None:
+    session = program.start(row.work, row.setting)
+    try:
+        row.build_seconds.append(session.build_seconds)
+        if row.verdict is None:
+            positions, seconds = session.run(follow=True)
+            row.verdict = judge(row.work, row.setting.model, positions)
+            row.unconverged = session.unconverged
+            if seconds > ENOUGH_SECONDS:
+                row.rounds.append([seconds / row.work.seconds])
+                return
+        row.rounds.append(list(repeat_short(lambda: session.run(follow=False)[1] / row.work.seconds)))
+    finally:
+        session.close()
+
+
+def fastest_within(rows: list[Row], error: float) -> Row | None:
+    """Of these rows the fastest whose error is at most that."""
+    timed = [row for row in rows if row.timing is not None]
+    found = cheapest([(row.timing.median, row.claimed) for row in timed], error)
+    return None if found is None else timed[found]
+
+
+def fastest_standing(rows: list[Row]) -> Row | None:
+    """Of these rows the fastest that stood."""
+    stood = [row for row in rows if row.timing is not None and row.stood]
+    return min(stood, key=lambda row: row.timing.median, default=None)
+
+
+def time_ratio(slow: Row, fast: Row) -> Timing:
+    """Time of `slow` over that of `fast`, from the medians of each round that both have."""
+    return summarise(np.median(a) / np.median(b) for a, b in zip(slow.rounds, fast.rounds))

@@ -1,0 +1,116 @@
+"""Tables of the works: all runs of one, and the programs beside each other at equal error."""
+
+from taisoft.output.tables import markdown, percent, spread_of
+
+from ..elasticity_table import Limit
+from ..programs import own
+from .runs import Row, fastest_standing, fastest_within, time_ratio
+from .scenes import Work
+
+LEVELS = (1e-2, 1e-3, 1e-4, 1e-5)  # errors at which W1 is compared
+FASTER = 4.0  # times the best peer, on W1 at equal error
+W2_ERROR, W2_SECONDS = 0.005, 0.4
+
+
+def run_table(rows: list[Row]) -> str:
+    """A row a setting, with the failures below."""
+    work = rows[0].work
+    path = ("error", "good to") if work.kind == "path" else ("stands", "fell at [s]")
+    contact = ("penetration [mm]", "over an edge") if work.touches else ()
+    headings = (
+        "program", "law", "setting", "dt [ms]", "s/sim. s", "spread", *path, *contact, "inverted tets", "unconverged",
+        "build [s]",
+    )  # fmt: skip
+    lines = [_line(row) for row in rows if row.timing is not None]
+    told = markdown(headings, lines, left=(0, 1, 2)) if lines else "Nothing ran to its end."
+    failed = [(row.setting, row.failure) for row in rows if row.failure]
+    failures = [f"* {setting.program} {setting}, dt = {1e3 * setting.dt:.3g} ms: {why}" for setting, why in failed]
+    return told + ("\n\n" + "\n".join(failures) if failures else "")
+
+
+def _line(row: Row) -> tuple[str, ...]:
+    setting, verdict, t = row.setting, row.verdict, row.timing
+    if row.work.kind == "path":
+        found: tuple[str, ...] = _percent(verdict.error), _percent(verdict.good_to)
+    else:
+        found = ("yes" if row.stood else "no"), "-" if verdict.fell is None else f"{verdict.fell:.2f}"
+    if row.work.touches:
+        found += (f"{1e3 * verdict.penetration:.3g}", _percent(verdict.penetration / verdict.edge))
+    return (
+        setting.program, str(setting.model), str(setting), f"{1e3 * setting.dt:.3g}", f"{t.median:.4g}", percent(spread_of(t)),
+        *found, str(verdict.inverted), str(row.unconverged) if setting.program == own.NAME else "-",
+        f"{row.build_seconds[0]:.2f}",
+    )  # fmt: skip
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"
+
+
+def own_and_peers(rows: list[Row]) -> tuple[list[Row], list[Row]]:
+    """taisoft's rows and the others'."""
+    ours = [row for row in rows if row.setting.program == own.NAME]
+    return ours, [row for row in rows if row.setting.program != own.NAME]
+
+
+def pairs_of(rows: list[Row]) -> list[tuple[str, Row | None, Row | None]]:
+    """At what, the fastest of taisoft and the fastest of the others; a path's at LEVELS, where anything is as exact."""
+    ours, others = own_and_peers(rows)
+    if rows[0].work.kind == "stand":
+        return [("stands", fastest_standing(ours), fastest_standing(others))]
+    return [
+        (f"error <= {level:g}", a, b)
+        for level in LEVELS
+        for a, b in [(fastest_within(ours, level), fastest_within(others, level))]
+        if a or b
+    ]
+
+
+def compare_table(works: list[list[Row]]) -> str:
+    """A row a work and level."""
+    lines = []
+    for rows in works:
+        for at, ours, theirs in pairs_of(rows):
+            ratio = time_ratio(theirs, ours) if ours and theirs else None
+            lines.append((
+                rows[0].work.key, f"{rows[0].work.tets:,}", at, *_named(ours), *_named(theirs),
+                f"{ratio.median:.3g}" if ratio else "-", percent(spread_of(ratio)) if ratio else "",
+            ))  # fmt: skip
+    headings = ("work", "tets", "at", "taisoft", "s/sim. s", "best of the others", "s/sim. s", "its time / taisoft's", "spread")
+    return markdown(headings, lines, left=(0, 2, 3, 5))
+
+
+def _named(row: Row | None) -> tuple[str, str]:
+    if row is None:
+        return "none", "-"
+    return f"{row.setting.program} {row.setting.method}, {1e3 * row.setting.dt:.3g} ms", f"{row.timing.median:.4g}"
+
+
+def limits_of(rows: list[Row]) -> list[Limit]:
+    """What was aimed at, of a work."""
+    work = rows[0].work
+    ours, _ = own_and_peers(rows)
+    if work.key == "W2":
+        return _limits_of_drop(work, ours)
+    found = []
+    for at, a, b in pairs_of(rows):
+        stiff = "E =" in work.key
+        if a is None or (b is None and work.kind == "path") or stiff:
+            if a is None and not stiff:
+                found.append(Limit(f"{work.key}, {at}: taisoft's settings that do", 0, 1, at_least=True))
+            continue
+        if b is None:
+            found.append(Limit(f"{work.key}, {at}: taisoft's settings that do, no other program's", 1, 1, at_least=True))
+            continue
+        ratio, wanted = time_ratio(b, a), FASTER if work.kind == "path" else 1.0
+        what = f"{work.key}, {at}: time of {b.setting.program} / taisoft"
+        found.append(Limit(what, ratio.median, wanted, spread_of(ratio), at_least=True))
+    return found
+
+
+def _limits_of_drop(work: Work, ours: list[Row]) -> list[Limit]:
+    best = fastest_within(ours, W2_ERROR)
+    if best is None:
+        return [Limit(f"{work.key}: taisoft's settings with an error of at most {W2_ERROR:g}", 0, 1, at_least=True)]
+    t = best.timing
+    return [Limit(f"{work.key}: s/sim. s of taisoft with an error of {best.claimed:.2g}", t.median, W2_SECONDS, spread_of(t))]

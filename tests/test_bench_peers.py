@@ -1,0 +1,188 @@
+"""The works on which programs are held against each other:
+
+* the laws in NumPy are those of small strains, those that taisoft has too give taisoft's stress, and no rotation stresses any;
+* the laws in NumPy are those of small strains, those that taisoft has too give its stress, and no rotation stresses any;
+* a verdict flips where a body falls, leans, turns inside out or sinks in; errors are distances over what the work says;
+* the comparison takes the fastest that is good enough, and says where nothing is;
+* taisoft's adapter gives the positions of its simulator; the others', where they are installed, start where the work does.
+"""
+
+import importlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from benchmarks.programs import own
+from benchmarks.programs.session import Setting
+from benchmarks.works import judge, references, scenes
+from benchmarks.works.references import MODELS, NEWTON, PYBULLET, TAISOFT
+from benchmarks.works.runs import Row, fastest_standing, fastest_within
+from benchmarks.works.semi_discrete import LAWS, SemiDiscrete
+from benchmarks.works.table import compare_table, limits_of, run_table
+
+MU, LAM = 3e4, 7e4  # [Pa]
+
+
+def rotation(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_laws_are_linear_elasticity_at_small_strain_and_blind_to_rotations(law):
+    grad = 1e-6 * np.random.default_rng(3).standard_normal((3, 3, 5))
+    strain = 0.5 * (grad + grad.transpose(1, 0, 2))
+    linear = 2 * MU * strain + LAM * np.trace(strain) * np.eye(3)[:, :, None]
+    stress = LAWS[law](np.eye(3)[:, :, None] + grad, MU, LAM)
+    assert np.abs(stress - linear).max() < 1e-5 * np.abs(linear).max()
+    F = np.eye(3)[:, :, None] + 0.2 * np.random.default_rng(4).standard_normal((3, 3, 5))
+    R = rotation(0.8)
+    turned = LAWS[law](np.einsum("ij,jkm->ikm", R, F), MU, LAM)
+    assert np.allclose(turned, np.einsum("ij,jkm->ikm", R, LAWS[law](F, MU, LAM)), rtol=0, atol=1e-9 * np.abs(turned).max())
+
+
+@pytest.mark.parametrize("law", own.LAWS)
+def test_stresses_are_those_of_taisoft(law):
+    F = np.eye(3) + 0.3 * np.random.default_rng(5).standard_normal((6, 3, 3))
+    young = MU * (3 * LAM + 2 * MU) / (LAM + MU)
+    _, found = ts.evaluate_law(own.LAWS[law], F, young=young, poisson=LAM / (2 * (LAM + MU)))
+    expected = LAWS[law](F.transpose(1, 2, 0), MU, LAM).transpose(2, 0, 1)
+    assert np.abs(found - expected).max() < 1e-9 * np.abs(expected).max()
+
+
+def test_equal_masses_share_the_total():
+    work = scenes.dropped_cube()
+    lumped, equal = references.masses(work, TAISOFT), references.masses(work, PYBULLET)
+    assert lumped.sum() == pytest.approx(1000.0) and equal.sum() == pytest.approx(1000.0)
+    assert np.ptp(equal) == 0.0 and np.ptp(lumped) > 0.0
+
+
+@pytest.mark.parametrize("work", [work for work in scenes.WORKS if work.kind == "path"], ids=lambda work: work.key)
+@pytest.mark.parametrize("model", MODELS, ids=str)
+def test_every_reference_is_stored_and_converged(work, model):
+    reference = references.load(work, model)
+    assert reference.path.shape[0] == 101 and np.isfinite(reference.path).all()
+    assert reference.good_to < (2e-3 if work.key == "W2" else 1e-6)
+    assert reference.error(reference.path) == 0.0
+    moved = reference.path.copy()
+    moved[50] += 0.01
+    assert reference.error(moved) > 0.0
+
+
+def test_what_is_not_stored_is_refused():
+    with pytest.raises(ts.SimulationError, match="no reference is stored for W1 2x1x1 with SNH"):
+        references.load(scenes.hanging_beam((2, 1, 1)), TAISOFT)
+
+
+def test_a_fall_is_a_parabola_and_ends_on_the_ground():
+    mesh = ts.box_mesh((2, 2, 2), (1, 1, 1))
+    mesh = ts.TetMesh(mesh.vertices + [0, 0.6, 0], mesh.tets)
+    free = np.ones(mesh.n_verts, bool)
+    body = SemiDiscrete(mesh, "SNH", 1e5, 0.3, 1000.0, 9.81, free)
+    heights = references.fall_on_ground(body, 0.5, 1e-3, 0.4)[:, 0]
+    t = np.arange(len(heights)) * 0.01
+    falling = 0.5 * 9.81 * t**2 < 0.1
+    assert np.allclose(heights[falling], 0.6 - 0.5 * 9.81 * t[falling] ** 2, atol=1e-9)
+    assert 0.3 < heights.min() < 0.499
+
+
+def still(work: scenes.Work, samples: int = 3) -> np.ndarray:
+    return np.repeat(work.start[None], samples, axis=0)
+
+
+def test_verdicts_flip():
+    work = scenes.stack()
+    nodes = work.slices()
+    assert judge.judge(work, TAISOFT, still(work)).stands
+    for change, told in (
+        ([0.2, 0, 0], lambda v: v.fell == 0.01),  # leans off its axis
+        ([0, -0.9, 0], lambda v: v.fell == 0.01 and v.penetration > 0.01),  # falls through
+        ([0, -0.05, 0], lambda v: v.fell is None and v.penetration == pytest.approx(0.049, abs=1e-3)),  # sinks in
+    ):
+        moved = still(work)
+        moved[1, nodes["cube 1"]] += change
+        verdict = judge.judge(work, TAISOFT, moved)
+        assert told(verdict) and not verdict.stands
+    mirrored = still(work)
+    mirrored[2, nodes["cube 2"], 0] *= -1
+    verdict = judge.judge(work, TAISOFT, mirrored)
+    assert verdict.inverted == work.bodies[2].mesh.n_tets and not verdict.stands
+
+
+def made_row(work: scenes.Work, program: str, seconds: float, error: float | None = None, inverted: int = 0) -> Row:
+    row = Row(work, Setting(program, TAISOFT, "explicit", 2), [[seconds], [1.1 * seconds]], [0.1])
+    penetration, edge = (0.0, 0.1) if work.touches else (None, None)
+    good_to = None if error is None else 1e-6
+    row.verdict = judge.Verdict(inverted, error, good_to, penetration, edge)
+    return row
+
+
+def test_the_fastest_that_is_good_enough_is_compared():
+    work = scenes.hanging_beam((12, 3, 3))
+    rows = [
+        made_row(work, "taisoft", 0.1, 5e-3), made_row(work, "taisoft", 0.5, 5e-5), made_row(work, "MuJoCo", 1.0, 5e-5),
+        made_row(work, "MuJoCo", 0.3, 0.5),
+    ]  # fmt: skip
+    assert fastest_within(rows, 1e-2) is rows[0] and fastest_within(rows, 1e-4) is rows[1] and fastest_within(rows, 1e-5) is None
+    limits = limits_of(rows)
+    assert [round(limit.value, 6) for limit in limits] == [10.0, 2.0, 2.0]
+    assert [limit.met for limit in limits] == [True, False, False]
+    told = compare_table([rows])
+    assert "| error <= 0.01 " in told and told.count("MuJoCo explicit") == 3
+    rows[0].verdict.error = 1e-8  # below what the reference is good to
+    assert rows[0].claimed == 1e-6
+    assert "5e-05" not in run_table(rows) and "0.005 %" in run_table(rows)
+
+
+def test_what_does_not_stand_is_not_compared():
+    work = scenes.stack()
+    rows = [made_row(work, "taisoft", 0.5), made_row(work, "taisoft", 0.1, inverted=3)]
+    rows.append(made_row(work, "Newton", 0.01, inverted=1))
+    assert fastest_standing(rows) is rows[0]
+    assert [(limit.value, limit.met) for limit in limits_of(rows)] == [(1, True)]
+    assert not limits_of(rows[1:])[0].met
+    rows[0].unconverged = 1
+    assert not rows[0].stood
+
+
+def test_a_drop_has_limits_of_its_own():
+    work = scenes.dropped_cube()
+    met = [made_row(work, "taisoft", 0.2, 4e-3)]
+    assert limits_of(met)[0].met and not limits_of([made_row(work, "taisoft", 0.2, 6e-3)])[0].met
+    assert not limits_of([made_row(work, "taisoft", 0.5, 4e-3)])[0].met
+
+
+def small_drop() -> scenes.Work:
+    mesh = ts.box_mesh((1, 1, 1), (1, 1, 1))
+    cube = scenes.Body("cube", ts.TetMesh(mesh.vertices + [0, 0.51, 0], mesh.tets), 1e5, np.zeros(mesh.n_verts, bool))
+    return replace(scenes.dropped_cube(), key="small", kind="stand", bodies=(cube,), seconds=0.1)
+
+
+def test_taisoft_does_a_work():
+    work = small_drop()
+    session = own.start(work, Setting("taisoft", TAISOFT, "velocity_verlet", 4, {"precision": "f64"}))
+    positions, seconds = session.run(follow=True)
+    again, _ = session.run(follow=False)
+    session.close()
+    assert positions.shape == (11, work.bodies[0].mesh.n_verts, 3) and again is None and seconds > 0.0
+    assert np.array_equal(positions[0], work.start) and session.unconverged == 0
+    assert positions[3, :, 1].mean() == pytest.approx(0.51 - 0.5 * 9.81 * 0.03**2, abs=1e-9)
+    assert judge.judge(work, TAISOFT, positions).stands
+
+
+@pytest.mark.parametrize(
+    "name, model", [("pybullet_soft", PYBULLET), ("newton_vbd", NEWTON), ("mujoco_works", references.MUJOCO)]
+)
+def test_peers_fall_alike(name, model):
+    program = importlib.import_module(f"benchmarks.programs.{name}")
+    if program.problem():
+        pytest.skip(program.problem())
+    work = small_drop()
+    setting = next(one for one in program.settings(work))
+    session = program.start(work, setting)
+    positions, _ = session.run(follow=True)
+    session.close()
+    assert program.MODEL == model and np.array_equal(positions[0], work.start)
+    assert positions[3, :, 1].mean() == pytest.approx(0.51 - 0.5 * 9.81 * 0.03**2, abs=1.6e-3)  # half a step of 10 ms of the fall
