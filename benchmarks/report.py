@@ -30,7 +30,7 @@ from .elasticity import RESULTS
 from .elasticity_table import slug
 from .order import header
 from .report_parts import bound, broad, colours, demos, phases, points, reduction, solvers
-from .report_parts.page import Extent, Part, again_text, part_text, summary_table
+from .report_parts.page import Extent, Part, again_text, part_text, short_text, summary_table
 
 PARTS: dict[str, Callable[[Extent], Part]] = {
     "demos": demos.measure, "phases": phases.measure, "points": points.measure, "reduction": reduction.measure,
@@ -70,13 +70,12 @@ def page_text(head: str, numbers: dict, parts: list[Part], again: str) -> str:
     load = numbers["load_at_the_end"]
     end = "unknown" if load is None else f"{load:.1f}"
     told = (
-        f"{head}\nload {end} at the end; {numbers['seconds']:.0f} s in all, {numbers['compile_seconds']:.0f} s of them compiling"
-        f"{'; a quick run, with fewer scenes, sizes and rounds' if numbers['quick'] else ''}.\n\n"
-        "Made by `taisoft bench report`; nothing on this page is written by hand. Claims are the report's in our words, and "
-        "hold or "
-        "not by the numbers beside them. Times are medians; spread is the distance between the quartiles over the median."
+        f"{head}\nload {end} at the end; {numbers['seconds']:.0f} s in all, {numbers['compile_seconds']:.0f} s of them "
+        f"compiling{'; a quick run, with fewer scenes, sizes and rounds' if numbers['quick'] else ''}.\n\nMade by `taisoft bench "
+        "report`; nothing on this page is written by hand. Claims are the report's in our words, and hold or not by the numbers "
+        "beside them. Times are medians; spread is the distance between the quartiles over the median."
     )
-    return "\n\n".join([told, summary_table(parts), *map(part_text, parts), again]) + "\n"
+    return "\n\n".join([told, summary_table(parts), *map(part_text, parts), short_text(parts), again]) + "\n"
 
 
 def check_out(folder: Path) -> None:

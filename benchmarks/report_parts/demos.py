@@ -195,4 +195,8 @@ def measure(extent: Extent) -> Part:
     for s in shown:
         part.pictures[f"{s.scene.demo}.png"] = s.picture
         part.times[f"{s.scene.demo}, a simulated second"] = s.timing
+        part.short += [f"{s.scene.demo} ends {s.result.status}: {'; '.join(s.result.problems)}"] * (s.result.status != "ok")
+    part.short.append("the report's pictures are not in its text, so the likeness to them is judged by its captions.")
+    if extent.quick:
+        part.short.append("a quick run leaves out figure 1.")
     return part

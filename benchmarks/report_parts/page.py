@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from taisoft.output.plot import require_matplotlib
+from taisoft.output.plot import log_ticks, require_matplotlib
 from taisoft.output.tables import markdown, percent, spread_of
 from taisoft.timing import Timing, summarise
 
@@ -42,12 +42,16 @@ class Claim:
     found: str
     why: str = ""
 
+    def __post_init__(self):
+        object.__setattr__(self, "holds", bool(self.holds))  # comparisons of NumPy numbers give no bool of Python
+
 
 @dataclass
 class Part:
     """An experiment as measured. where: in the report; method: what was run; times: what a second run is held against.
 
-    pictures: file name -> PNG; failure: why it could not be measured, empty where it could.
+    pictures: file name -> PNG; short: what is not as the report has it, or was left out; failure: why it could not be measured,
+    empty where it could.
     """
 
     name: str
@@ -58,6 +62,7 @@ class Part:
     tables: list[str] = field(default_factory=list)
     pictures: dict[str, bytes] = field(default_factory=dict)
     times: dict[str, Timing] = field(default_factory=dict)
+    short: list[str] = field(default_factory=list)
     seconds: float = 0.0
     failure: str = ""
 
@@ -138,9 +143,11 @@ def new_figure(columns: int, lines: int = 1):
 
 
 def plot_png(figure) -> bytes:
-    """A figure as a small PNG; it is closed."""
+    """A figure as a small PNG, its logarithmic axes with plain numbers; it is closed."""
     from matplotlib import pyplot
 
+    for panel in figure.axes:
+        log_ticks(panel)
     figure.canvas.draw()
     image = np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
     pyplot.close(figure)
@@ -157,7 +164,7 @@ def part_text(part: Part) -> str:
         return "\n\n".join([*lines, f"**{MISSING}**: {part.failure}"])
     lines += [f"**{part.verdict}**", "\n".join(claim_text(claim) for claim in part.claims), f"Run: {part.method}"]
     lines += part.tables
-    lines += [f"![{part.title}]({name})" for name in part.pictures]
+    lines += [f"![{name.removesuffix('.png')}]({name})" for name in part.pictures]
     return "\n\n".join(lines)
 
 
@@ -171,6 +178,12 @@ def summary_table(parts: Sequence[Part]) -> str:
     """A row a part: the verdict, and how many claims hold."""
     rows = [(p.title, p.where, p.verdict, f"{sum(c.holds for c in p.claims)} of {len(p.claims)}") for p in parts]
     return markdown(("experiment", "in the report", "verdict", "claims that hold"), rows, left=(0, 1, 2))
+
+
+def short_text(parts: Sequence[Part]) -> str:
+    """What falls short, part by part."""
+    lines = [f"* {part.title}: {told}" for part in parts for told in ([part.failure] if part.failure else part.short)]
+    return "## What falls short\n\n" + ("\n".join(lines) if lines else "Nothing that this run knows of.")
 
 
 # --- a second run -----------------------------------------------------------------------------------------------------

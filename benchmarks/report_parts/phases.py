@@ -123,8 +123,7 @@ def claims_of(found: list[Shares]) -> list[Claim]:
             "collision detection is where most of the time "
             "goes.", own.search > 0.5, f"the search takes {told(lambda s: s.search)}.",
             "Compiled, it costs no more than the rest of an explicit step by proximity, and beside the linear systems of an "
-            "implicit "
-            "step little." if any(s.search <= 0.5 for s in found) else "",
+            "implicit step little." if any(s.search <= 0.5 for s in found) else "",
         ),
         Claim(
             "within it the contact points, by Frank-Wolfe, take most.", own.points > 0.5,
@@ -134,8 +133,7 @@ def claims_of(found: list[Shares]) -> list[Claim]:
             "reducing contacts and updating the tree are significant too.", all(share > SIGNIFICANT for share in rest.values()),
             "of the search they take " + " and ".join(f"{percent(share)} ({name})" for name, share in rest.items()) + ".",
             "" if all(share > SIGNIFICANT for share in rest.values()) else "Trees are refitted here, not built, and what a few "
-            "tens of "
-            "contacts need is launching the kernels.",
+            "tens of contacts need is launching the kernels.",
         ),
     ]  # fmt: skip
 
@@ -181,5 +179,6 @@ def measure(extent: Extent) -> Part:
     found = [measure_shares(integrator, way, extent) for integrator, way in kinds[: extent.of(None, 1)]]
     part.claims, part.tables = claims_of(found), [share_table(found)]
     part.pictures["phases.png"] = draw(found)
+    part.short.append("the report profiled its whole program, mesh and drawing included; these are the steps alone.")
     part.times = {f"{s.integrator}, {s.hit_by}: a step": summarise(s.whole) for s in found}
     return part

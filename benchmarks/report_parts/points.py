@@ -13,7 +13,6 @@ import numpy as np
 
 from taisoft.collision.surface import SERIAL_BELOW
 from taisoft.errors import SimulationError
-from taisoft.output.plot import ticks
 from taisoft.output.tables import markdown
 from taisoft.runtime import open_runtime, threads
 from taisoft.timing import summarise, usable_cores
@@ -166,17 +165,14 @@ def claims_of(many: Measured, one: Measured) -> list[Claim]:
         Claim(
             "it is running in parallel that gains this.", min(by_threads) > max(by_compiling),
             f"compiled for one thread they take {min(by_compiling):,.0f} to {max(by_compiling):,.0f} times less than "
-            "interpreted; "
-            f"{here} they are {min(by_threads):.2f} to {max(by_threads):.2f} times as fast as that.",
+            f"interpreted; {here} they are {min(by_threads):.2f} to {max(by_threads):.2f} times as fast as that.",
             "" if min(by_threads) > max(by_compiling) else "Most is gained by not interpreting, which a GPU kernel does not "
-            "either; "
-            f"below {SERIAL_BELOW:,} triangles one thread does it all on the CPU, since waking others costs more.",
+            f"either; below {SERIAL_BELOW:,} triangles one thread does it all on the CPU, since waking others costs more.",
         ),
         Claim(
             "the parallel computation is slow at its start, and steady afterwards (figure 11).", slow,
             f"the first search takes {min(p.first for p in many.sizes):.1f} to {max(p.first for p in many.sizes):.1f} s, its "
-            "contact "
-            f"points {ms(steady)} ms afterwards.", "Here the start is compiling the kernels, there it was moving data.",
+            f"contact points {ms(steady)} ms afterwards.", "Here the start is compiling the kernels, there it was moving data.",
         ),
         Claim(
             "its time stays near zero however many tets there are, while the plain one's grows (figure "
@@ -216,7 +212,6 @@ def draw(many: Measured, one: Measured) -> bytes:
     frames.set(title="contact points of each frame", xlabel="frame", ylabel="ms", yscale="log")
     frames.legend(fontsize="small", frameon=False)
     sizes.set(title="over tets", xlabel="tets", ylabel="ms", xscale="log", yscale="log")
-    ticks(sizes.xaxis, 100.0)
     return plot_png(figure)
 
 
@@ -226,12 +221,15 @@ def measure(extent: Extent) -> Part:
     one = measure_on_one_thread(extent.quick)
     part = Part(
         "points", "Contact points, parallel and not", "section 3.1.2, figures 11 and 12",
-        "contact points alone of searches through distance fields (Frank-Wolfe), bodies as in `taisoft bench collision`, "
-        "in f32: compiled on all threads, compiled on one (a process that has one core), and an interpreted NumPy loop over the "
-        "same "
-        f"pairs, which is not run on more than {MOST_PLAIN:,}. The deepest point of both tells that they do the same.",
+        "contact points alone of searches through distance fields (Frank-Wolfe), bodies as in `taisoft bench collision`, in "
+        "f32: compiled on all threads, compiled on one (a process that has one core), and an interpreted NumPy loop over the "
+        f"same pairs, which is not run on more than {MOST_PLAIN:,}. The deepest point of both tells that they do the same.",
         claims_of(many, one), [size_table(many, one)], {"points.png": draw(many, one)},
     )  # fmt: skip
+    if extent.arch == "cpu":
+        part.short.append(f"the report has a GPU, this run {many.where} of a processor; `--arch cuda` runs it on a GPU.")
+    if left := [p.setup for p in many.sizes if not p.plain]:
+        part.short.append(f"the interpreted loop was left out for {', '.join(left)}, so the ratios end below.")
     part.times = {f"{p.setup}, all threads": summarise(p.seconds) for p in many.sizes}
     part.times |= {f"{p.setup}, one thread": summarise(p.seconds) for p in one.sizes}
     part.times |= {f"{p.setup}, interpreted": summarise(p.plain) for p in many.sizes if p.plain}
