@@ -13,6 +13,7 @@ import numpy as np
 import taisoft as ts
 from taisoft.cli.scene_file import load_scene
 from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.stability import stable_dt
 from taisoft.timing import summarise
 
 from ..collision_runs import PHASES
@@ -75,21 +76,20 @@ def watched(watch: Stopwatch, sim: ts.Simulator) -> Iterator[None]:
         yield
 
 
-def open_scene(integrator: str, hit_by: str, arch: str) -> ts.Simulator:
+def open_demo(integrator: str, hit_by: str, arch: str) -> ts.Simulator:
     """The demo in the demo's own steps, or in explicit ones near their limit."""
     scene, own = load_scene(SCENE)
     for body in scene.bodies:
         body.collision = hit_by
     settings = {key: own[key] for key in SETTINGS if key in own}
-    if integrator != IMPLICIT:
-        with ts.Simulator(scene, arch=arch, integrator=integrator, dt=1e-6) as sim:
-            settings = {"integrator": integrator, "dt": SHARE * sim.stable_dt}
+    if integrator == EXPLICIT:
+        settings = {"integrator": integrator, "dt": SHARE * stable_dt(scene, verlet=False)}
     return ts.Simulator(scene, arch=arch, **settings)
 
 
 def measure_shares(integrator: str, hit_by: str, extent: Extent) -> Shares:
     """Time the parts of steps from the first impulse on."""
-    with open_scene(integrator, hit_by, extent.arch) as sim:
+    with open_demo(integrator, hit_by, extent.arch) as sim:
         to_first_impulse(sim)
         sim.step()  # compiles what the first contact needs
         parts = (*PHASES, OTHER, *(name for name in PARTS if name != SEARCH and sim.settings.explicit), REST)
@@ -120,8 +120,8 @@ def claims_of(found: list[Shares]) -> list[Claim]:
     rest = {name: own.total(name) / own.search for name in ("reduction", "candidates")}
     return [
         Claim(
-            "collision detection is where most of the time "
-            "goes.", own.search > 0.5, f"the search takes {told(lambda s: s.search)}.",
+            "collision detection is where most of the time goes.", own.search > 0.5,
+            f"the search takes {told(lambda s: s.search)}.",
             "Compiled, it costs no more than the rest of an explicit step by proximity, and beside the linear systems of an "
             "implicit step little." if any(s.search <= 0.5 for s in found) else "",
         ),
