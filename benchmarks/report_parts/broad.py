@@ -29,6 +29,7 @@ def claims_of(film: Film, sweeps: list[Sweep]) -> list[Claim]:
     places = crossovers([s.tets for s in sweeps], *([s.median(n) for s in sweeps] for n in (HASH, TREE)))
     near = any(REPORTS_CROSSOVER / NEAR_CROSSOVER <= x <= REPORTS_CROSSOVER * NEAR_CROSSOVER for x in places)
     ratios = [s.median(HASH) / s.median(TREE) for s in sweeps]
+    crossed = f"they cross at {', '.join(f'{x:,.0f}' for x in places)} tets." if places else "they do not cross."
     why = (
         "The trees here are built once and only refitted; a hash is filled anew in every search, and with the few surface "
         "triangles of such scenes neither is short of work that the other saves."
@@ -46,9 +47,8 @@ def claims_of(film: Film, sweeps: list[Sweep]) -> list[Claim]:
         ),
         Claim(
             "above that it is the faster one, with the crossover just there (figure 17, right).", near and all(faster),
-            f"over {sweeps[0].tets:,} to {sweeps[-1].tets:,} tets it takes {min(ratios):.2g} to {max(ratios):.2g} times the "
-            "tree's time; "
-            + (f"they cross at {', '.join(f'{x:,.0f}' for x in places)} tets." if places else "they do not cross."),
+            f"over {sweeps[0].tets:,} to {sweeps[-1].tets:,} tets it takes {min(ratios):.2g} to {max(ratios):.2g} times "
+            f"the tree's time; {crossed}",
             "" if near and all(faster) else why,
         ),
     ]  # fmt: skip

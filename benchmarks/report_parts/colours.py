@@ -24,7 +24,7 @@ def claims_of(found: list[Colouring]) -> list[Claim]:
     spans = [int(np.ptp(by[scene, "random"].numbers)) for scene in scenes]
     each = f"of {_listed(contacts)} contacts"
     groups = [is_near(k / n, CONTACTS / COLOURS_FOUND["greedy"], NEAR * 3) for k, n in zip(contacts, greedy)]
-    fewer = all(g < r for g, r in zip(greedy, random))
+    fewer, theirs = all(g < r for g, r in zip(greedy, random)), COLOURS_FOUND["greedy"]
     return [
         Claim(
             f"the scene has {CONTACTS} contacts.", any(is_near(k, CONTACTS, NEAR * CONTACTS) for k in contacts),
@@ -32,8 +32,7 @@ def claims_of(found: list[Colouring]) -> list[Claim]:
             "The number is that of the mesh, which the report does not tell, and of what its reduction leaves.",
         ),
         Claim(
-            f"greedy colouring needs fewer groups than random, {COLOURS_FOUND['greedy']} against "
-            f"{COLOURS_FOUND['random']}.", fewer,
+            f"greedy colouring needs fewer groups than random, {theirs} against {COLOURS_FOUND['random']}.", fewer,
             f"greedy needs {_listed(greedy)}, random {_listed(random)} (median over seeds), {each}.",
             "" if fewer else "Both come to the fewest that there can be, so that neither can be better.",
         ),
@@ -41,7 +40,8 @@ def claims_of(found: list[Colouring]) -> list[Claim]:
             "so many groups are needed that each holds about three contacts.", all(groups),
             f"greedy groups hold {_listed(round(k / n, 1) for k, n in zip(contacts, greedy))} contacts each, {each}.",
             "" if all(groups) else f"No colouring can do with fewer groups than contacts meet at one node, here "
-            f"{_listed(least)}, and greedy comes to about that; the report's contacts must meet by tens at its nodes.",
+            f"{_listed(least)}, and greedy comes to about that. A greedy colouring of {theirs} colours says that some contact of "
+            f"the report's has at least {theirs - 1} neighbours.",
         ),
         Claim(
             "random colouring is not steady.", max(spans) > 0,

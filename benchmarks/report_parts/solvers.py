@@ -17,6 +17,7 @@ FRAMES, QUICK_FRAMES = 60, 5
 PLATES = (8, 32, 96)  # cells of two plates on each other: some 130 to 17,000 contacts
 JACOBI, HYBRID = "jacobi", "hybrid"
 SPIKE = 5.0  # times the median: a frame that counts as a spike
+MOSTLY = 0.9  # of the frames in which what is by far the fastest is faster
 NEAR = 0.25  # of the report's number of contacts
 
 
@@ -29,7 +30,9 @@ def claims_of(film: Film, points: list[Point]) -> list[Claim]:
     beaten = float((sweeps[SERIAL] <= sweeps[JACOBI]).mean())
     few = beaten == 1.0 and np.median(sweeps[SERIAL]) < np.median(sweeps[JACOBI])
     fastest = min(times, key=lambda name: np.median(times[name]))
-    clear = all(clearly_less(times[HYBRID], t) for name, t in times.items() if HYBRID not in name)
+    hybrid = min((name for name in times if name.startswith(HYBRID)), key=lambda name: np.median(times[name]))
+    won = [float(np.less(times[hybrid], t).mean()) for name, t in times.items() if not name.startswith(HYBRID)]
+    clear = min(won) >= MOSTLY
     parallel = [name for name in times if name.startswith(COLOURED)]
     slow = all(np.median(times[SERIAL]) <= np.median(times[name]) for name in parallel)
     jacobi = [name for name in times if name.startswith(JACOBI)]
@@ -48,7 +51,8 @@ def claims_of(film: Film, points: list[Point]) -> list[Claim]:
         ),
         Claim(
             "the parallel hybrid is by far the fastest.", clear,
-            f"{fastest} is the fastest in the median; ms: {told}.",
+            f"{fastest} is the fastest in the median; {hybrid} is faster than each of the others in at least {min(won):.0%} of "
+            f"the frames. Medians, in ms: {told}.",
             "" if clear else "Hybrid sweeps are Jacobi's with the newest normal impulse in the friction bound: they need about "
             "as many. With tens of contacts a compiled serial sweep takes microseconds, less than waking a thread.",
         ),
