@@ -122,8 +122,8 @@ def claims_of(found: list[Shares]) -> list[Claim]:
         Claim(
             "collision detection is where most of the time goes.", own.search > 0.5,
             f"the search takes {told(lambda s: s.search)}.",
-            "Compiled, it costs no more than the rest of an explicit step by proximity, and beside the linear systems of an "
-            "implicit step little." if any(s.search <= 0.5 for s in found) else "",
+            "Where it is less than half, it is compiled code beside other compiled code: the linear systems of implicit steps, "
+            "the contact solve and the report of explicit ones." if any(s.search <= 0.5 for s in found) else "",
         ),
         Claim(
             "within it the contact points, by Frank-Wolfe, take most.", own.points > 0.5,
