@@ -13,7 +13,7 @@ from .page import COLOURS, Claim, Extent, Part, clearly_less, new_figure, plot_p
 TREE = TREES[-1]  # k-DOPs of 18 planes, as wide as the report's
 REPORTS_CROSSOVER = 7500  # tets
 QUICK_CELLS = (0.5, 1.0, 2.2, 4.0)
-CELL_ROUNDS = 60  # cells near each other differ by little
+CELL_ROUNDS, CELL_TURNS = 60, (20, 3)  # cells near each other differ by little
 NEAR_BEST = 1.1  # times the best: what a cell may take to be called as good
 NEAR_CROSSOVER = 2.0  # a factor from the report's that still counts as its
 
@@ -129,7 +129,8 @@ def measure_cells(extent: Extent) -> Part:
     runtime = open_runtime(extent.arch, "f32", "the report's cells")
     try:
         ratios, rounds = extent.of(RATIOS, QUICK_CELLS), extent.of(CELL_ROUNDS, QUICK_ROUNDS)
-        sweeps = [s for n in extent.of(SWEPT, SWEPT[:1]) for s in measure_broad(cubes_setup(n), runtime, rounds, ratios)]
+        turns, sizes = extent.of(*CELL_TURNS), extent.of(SWEPT, SWEPT[:1])
+        sweeps = [s for n in sizes for s in measure_broad(cubes_setup(n), runtime, rounds, ratios, turns)]
     finally:
         runtime.close()
     return Part(

@@ -206,13 +206,16 @@ def draw(many: Measured, one: Measured) -> bytes:
     figure, ((frames, sizes),) = new_figure(2)
     for k, (m, line) in enumerate(((many, "-"), (one, "--"))):
         frames.plot([1e3 * np.median(f) for f in m.frames], line, color=COLOURS[k], label=m.where)
-        sizes.plot([p.tets for p in m.sizes], [1e3 * np.median(p.seconds) for p in m.sizes], f"o{line}", ms=4, color=COLOURS[k])
+        for kind, marker in (("cubes", "o"), ("pile", "s")):
+            own = [p for p in m.sizes if p.setup.startswith(kind)]
+            times = [1e3 * np.median(p.seconds) for p in own]
+            sizes.plot([p.tets for p in own], times, f"{marker}{line}", ms=4, color=COLOURS[k])
     frames.plot([1e3 * np.median(f) for f in many.plain_frames], color=COLOURS[2], label="interpreted")
     plain = [p for p in many.sizes if p.plain]
     sizes.plot([p.tets for p in plain], [1e3 * np.median(p.plain) for p in plain], "o-", ms=4, color=COLOURS[2])
     frames.set(title="contact points of each frame", xlabel="frame", ylabel="ms", yscale="log")
     frames.legend(fontsize="small", frameon=False)
-    sizes.set(title="over tets", xlabel="tets", ylabel="ms", xscale="log", yscale="log")
+    sizes.set(title="over tets; squares: the pile", xlabel="tets", ylabel="ms", xscale="log", yscale="log")
     return plot_png(figure)
 
 
