@@ -5,6 +5,7 @@ A strip shows a scene at a few moments, from the same place, side by side.
 """
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from taisoft.cli.scene_file import load_module
 from taisoft.output.camera import Camera
 from taisoft.output.files import write_bytes
 from taisoft.output.frames import png_bytes
+from taisoft.view.layers import IN_PICTURES
 from taisoft.view.offscreen import Offscreen
 
 ASSETS = Path(__file__).resolve().parent
@@ -39,27 +41,41 @@ STRIPS = {
 }
 
 
+def film(
+    sim: ts.Simulator, moments: tuple, size: tuple[int, int], view: tuple, seconds: float, fps: float,
+    layers: tuple[str, ...] = IN_PICTURES, on_moment: Callable[[ts.Simulator], None] | None = None, on_step=None,
+) -> tuple[np.ndarray, ts.RunReport]:  # fmt: skip
+    """Run for some seconds; the pictures of the moments [s] side by side, uint8 (height, width, 3), and what the run did.
+
+    on_moment: called with each picture; on_step: as `Simulator.run` has it.
+    """
+    target, distance, azimuth, elevation = view
+    drawing = Offscreen(sim.scene, size, Camera(np.array(target), distance, azimuth, elevation), layers=layers)
+    frames = [round(moment * fps) for moment in moments]
+    pictures: list[np.ndarray] = []
+
+    def on_frame(sim, index, _report) -> None:
+        if index in frames:
+            pictures.append(drawing.image(sim))
+            if on_moment is not None:
+                on_moment(sim)
+
+    result = sim.run(seconds, on_frame, fps, on_step=on_step)
+    drawing.close()
+    gap = np.full((size[1], GAP, 3), 255, dtype=np.uint8)
+    return np.concatenate([part for picture in pictures for part in (gap, picture)][1:], axis=1), result
+
+
 def strip(scene_file: Path, moments: tuple, size: tuple[int, int], view: tuple) -> np.ndarray:
     """The pictures of a scene at some times, uint8 (height, width, 3); its run ends with the last."""
-    target, distance, azimuth, elevation = view
-    camera = Camera(np.array(target), distance, azimuth, elevation)
     module = load_module(scene_file)
     settings = {name: value for name, value in module.solver.items() if name != "seconds"}
     fps = settings.pop("fps")
-    pictures: list[np.ndarray] = []
     with ts.Simulator(module.build(), **settings) as sim:
-        drawing = Offscreen(sim.scene, size, camera)
-
-        def on_frame(sim, index, _report) -> None:
-            if index in [round(moment * fps) for moment in moments]:
-                pictures.append(drawing.image(sim))
-
-        result = sim.run(moments[-1], on_frame, fps)
-        drawing.close()
+        picture, result = film(sim, moments, size, view, moments[-1], fps)
     if result.status != "ok":
         raise SystemExit(f"{scene_file}: the run is {result.status}: {'; '.join(result.problems)}")
-    gap = np.full((size[1], GAP, 3), 255, dtype=np.uint8)
-    return np.concatenate([part for picture in pictures for part in (gap, picture)][1:], axis=1)
+    return picture
 
 
 def main() -> None:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from taisoft.output.plot import require_matplotlib, save, ticks
+from taisoft.output.plot import log_ticks, require_matplotlib, save
 
 from .collision_runs import GEOMETRIES, HASH, TREES, Film, Row, Sweep
 from .collision_table import REPORTS_BEST, best_cell
@@ -34,9 +34,7 @@ def draw(found: dict, path: Path) -> None:
         panel.set(title=title, xlabel=below, ylabel="ms")
         panel.grid(True, which="major", color="#eeeeee")
         panel.set_axisbelow(True)
-        for axis, (least, most) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
-            if axis.get_scale() == "log":
-                ticks(axis, most / least)
+        log_ticks(panel)
         if panel.get_legend_handles_labels()[1]:
             panel.legend(fontsize="small", frameon=False)
     save(figure, path)

@@ -31,6 +31,7 @@ DT = 1 / FPS
 ROUNDS, QUICK_ROUNDS = 15, 2
 ENOUGH_SECONDS = 3.0  # of rounds: slow searches are repeated less often
 FRAME_ROUNDS = 3
+TURNS = 3  # in which the rounds of broad phases beside each other are taken
 
 
 @dataclass
@@ -246,7 +247,7 @@ def measure_film(setup: Setup, geometry: str, runtime: Runtime, frames: int = FR
     return film
 
 
-def measure_broad(setup: Setup, runtime: Runtime, rounds: int, ratios=None) -> list[Sweep]:
+def measure_broad(setup: Setup, runtime: Runtime, rounds: int, ratios=None, turns: int = TURNS) -> list[Sweep]:
     """Broad phases of a configuration in the middle of its motion: all of them, or the hash over ratios of cell to edge."""
     with Rig(setup, "proximity", runtime) as rig:
         rig.place(0.5)
@@ -261,8 +262,8 @@ def measure_broad(setup: Setup, runtime: Runtime, rounds: int, ratios=None) -> l
         for sweep, name, broad in jobs:
             sweep.pairs[name] = rig.n_pairs(broad)  # compiles, and lets the buffers grow
             rig.n_pairs(broad)
-        for _ in range(3):  # in turn, so that a slow moment of the machine falls on all
+        for _ in range(turns):  # so that a slow moment of the machine falls on all
             for sweep, name, broad in jobs:
-                some = repeated(broad.find, max(rounds // 3, 1))
+                some = repeated(broad.find, max(rounds // turns, 1))
                 sweep.rounds.setdefault(name, []).extend(some)
     return sweeps

@@ -47,9 +47,9 @@ def draw(found: dict, snapshots: list[Snapshot], path: Path) -> None:
     size = PANEL[0] * COLUMNS, PANEL[1] * rows
     figure, grid = pyplot.subplots(rows, COLUMNS, figsize=size, layout="constrained", squeeze=False)
     for panels, snapshot in zip(grid, snapshots):
-        _figure_19(panels, snapshot)
+        figure_19(panels, snapshot)
     for k, (panels, film) in enumerate(zip(grid[len(snapshots) :], found["films"])):
-        _figure_20(panels, film)
+        figure_20(panels, film)
         if k == 0:
             _crossover(panels[3], found["crossover"])
         else:
@@ -59,7 +59,7 @@ def draw(found: dict, snapshots: list[Snapshot], path: Path) -> None:
     save(figure, path, dpi=110)
 
 
-def _figure_19(panels, s: Snapshot) -> None:
+def figure_19(panels, s: Snapshot) -> None:
     """The scene, its Jacobian, and that with its rows grouped by colour; groups have two tints in turn."""
     panels[0].imshow(s.image)
     panels[0].set_axis_off()
@@ -82,7 +82,7 @@ def _spy(panel, touched: np.ndarray, band: np.ndarray, title: str) -> None:
     panel.set_ylim(touched.shape[0] - 0.5, -0.5)
 
 
-def _figure_20(panels, film: Film) -> None:
+def figure_20(panels, film: Film) -> None:
     """Sweeps and time of each solver over frames, and the contacts."""
     for name, colour in zip(film.solvers, COLOURS):
         style = {"color": colour, "label": name, "lw": 1.2, "ls": "--" if name.endswith(THREADED) else "-"}

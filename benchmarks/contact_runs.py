@@ -106,16 +106,16 @@ class Run:
 # --- explicit ---------------------------------------------------------------------------------------------------------
 
 
-def open_scene(name: str, arch: str, **settings) -> ts.Simulator:
-    """A simulator of a demo's scene in f32; settings as they are, else the demo's own."""
-    scene, own = load_scene(name)
+def open_scene(name: str, arch: str, refine: int | None = None, **settings) -> ts.Simulator:
+    """A simulator of a demo's scene in f32, refined so often; settings as they are, else the demo's own."""
+    scene, own = load_scene(name, refine=refine)
     settings = settings or {key: own[key] for key in SETTINGS if key in own}
     return ts.Simulator(scene, precision="f32", arch=arch, **settings)
 
 
-def open_explicit(name: str, arch: str) -> ts.Simulator:
+def open_explicit(name: str, arch: str, refine: int | None = None) -> ts.Simulator:
     """The same in explicit steps."""
-    return open_scene(name, arch, dt=DT, integrator="symplectic_euler")
+    return open_scene(name, arch, refine, dt=DT, integrator="symplectic_euler")
 
 
 def to_first_impulse(sim: ts.Simulator) -> None:

@@ -36,6 +36,7 @@ LONG = {
     "test_bench_peers": ("test_peers_fall_alike",),
     "test_bench_hard": ("test_a_stiff_cube_lands_and_rests",),
     "test_bench_contact": ("test_every_solver_gets_the_same_problem_and_is_judged_rightly",),
+    "test_bench_report": ("test_one_thread_is_one_thread", "does_what_the_search_does"),
     "test_collision_memory": ("test_nothing_is_out_of_bounds",),
     "test_single_precision": ("test_single_precision_follows[symplectic_euler]",),
     "test_led_nodes": ("test_rigid_flight[bdf2]", "test_second_order_with_a_led_end[bdf2-implicit_midpoint]"),

@@ -1,0 +1,125 @@
+"""The report's figures and experiments run again: its statement, our measurement, agree or not and why, on one page.
+
+taisoft bench report [--quick] [--arch cpu|cuda] [--only NAME] [--out DIR]
+
+The page is DIR/README.md, with its pictures and all numbers (report.json) beside it. Scenes are ours: the report's text tells
+few sizes, and neither its machine nor its materials. A verdict follows from the numbers: a claim holds or not, and a part agrees,
+disagrees, or partly agrees. Times are medians; spread is the distance between the quartiles over the median; compiling is apart.
+A second run into the same folder says which times have not come again within the spreads. Exit status: 0, or 1 where a part could
+not be measured; a verdict, whatever it is, is no failure. --quick has fewer scenes, sizes and rounds; it and --only print alone,
+unless --out says where to write. The whole takes about twelve minutes on two cores.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import taisoft as ts
+from taisoft.errors import OutputError
+from taisoft.output.files import make_folder, write_bytes
+from taisoft.output.plot import require_matplotlib
+from taisoft.output.report import json_text
+from taisoft.runtime import compile_clock
+from taisoft.timing import load_average, machine
+
+from .elasticity import RESULTS
+from .elasticity_table import slug
+from .order import header
+from .report_parts import bound, broad, colours, demos, phases, points, reduction, solvers
+from .report_parts.page import Extent, Part, again_text, part_text, short_text, summary_table
+
+PARTS: dict[str, Callable[[Extent], Part]] = {
+    "demos": demos.measure, "phases": phases.measure, "points": points.measure, "reduction": reduction.measure,
+    "broad": broad.measure, "cells": broad.measure_cells, "colours": colours.measure, "solvers": solvers.measure,
+    "bound": bound.measure,
+}  # fmt: skip
+PAGE, NUMBERS = "README.md", "report.json"
+
+
+def default_out(arch: str) -> Path:
+    """results/report-<machine> beside this file."""
+    where = machine()
+    return RESULTS / f"report-{slug(where['processor'])}-{where['cores']}-cores{'-cuda' if arch == 'cuda' else ''}"
+
+
+def measure_part(name: str, extent: Extent) -> Part:
+    """An experiment; where it could not be measured, a part that says why."""
+    begin = time.perf_counter()
+    try:
+        part = PARTS[name](extent)
+    except ts.TaisoftError as error:
+        part = Part(name, name, "-", "", failure=str(error))
+    part.seconds = time.perf_counter() - begin
+    return part
+
+
+def earlier_numbers(folder: Path) -> dict | None:
+    """What an earlier run wrote into the folder, None where there is nothing that can be read."""
+    try:
+        return json.loads((folder / NUMBERS).read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def page_text(head: str, numbers: dict, parts: list[Part], again: str) -> str:
+    """The whole page."""
+    load = numbers["load_at_the_end"]
+    end = "unknown" if load is None else f"{load:.1f}"
+    told = (
+        f"{head}\nload {end} at the end; {numbers['seconds']:.0f} s in all, {numbers['compile_seconds']:.0f} s of them "
+        f"compiling{'; a quick run, with fewer scenes, sizes and rounds' if numbers['quick'] else ''}.\n\nMade by `taisoft bench "
+        "report`; nothing on this page is written by hand. Claims are the report's in our words, and hold or not by the numbers "
+        "beside them. Times are medians; spread is the distance between the quartiles over the median."
+    )
+    return "\n\n".join([told, summary_table(parts), *map(part_text, parts), short_text(parts), again]) + "\n"
+
+
+def check_out(folder: Path) -> None:
+    """Raises OutputError, before minutes of measuring, where the page could not be written."""
+    if not os.access(make_folder(folder), os.W_OK):
+        raise OutputError(f"cannot write to the folder {folder}")
+
+
+def write(folder: Path, head: str, numbers: dict, parts: list[Part]) -> None:
+    """The page, its pictures and its numbers. Raises OutputError."""
+    page = page_text(head, numbers, parts, again_text(earlier_numbers(folder), parts, numbers))
+    for part in parts:
+        for name, data in part.pictures.items():
+            write_bytes(folder / name, data)
+    write_bytes(folder / PAGE, page.encode())
+    write_bytes(folder / NUMBERS, json_text(numbers | {"parts": [part.record() for part in parts]}).encode())
+
+
+def main(argv=None) -> int:
+    """Measure and write. Raises OutputError, or SimulationError where the arch cannot be had."""
+    first, _, rest = __doc__.partition("\n")
+    parser = argparse.ArgumentParser(prog="taisoft bench report", description=first, epilog=rest.partition("\n\n")[2])
+    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
+    parser.add_argument("--quick", action="store_true", help="fewer scenes, sizes and rounds")
+    parser.add_argument("--only", choices=tuple(PARTS), metavar="NAME", help=f"one of {', '.join(PARTS)}")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="default of the whole: benchmarks/results/report-<machine>")
+    options = parser.parse_args(argv)
+    folder = options.out or (None if options.quick or options.only else default_out(options.arch))
+    require_matplotlib("the page's plots")
+    if folder is not None:
+        check_out(folder)
+    head, numbers = header("The report, measured again", options.arch)
+    begin, compiled = time.perf_counter(), compile_clock()
+    parts = []
+    for name in [options.only] if options.only else PARTS:
+        parts.append(measure_part(name, Extent(options.quick, options.arch)))
+        print(part_text(parts[-1]) + "\n", flush=True)
+    numbers |= {"arch": options.arch, "quick": options.quick, "load_at_the_end": load_average()}
+    numbers |= {"seconds": time.perf_counter() - begin, "compile_seconds": compile_clock() - compiled}
+    if folder is not None:
+        write(folder, head, numbers, parts)
+        print(f"written: {folder / PAGE}")
+    return 1 if any(part.failure for part in parts) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,202 @@
+"""Demonstrations 1 to 3 and figures 1 to 4 of the report: our demos of those scenes, each with its own check of the physics.
+
+A demo is run once with pictures, at moments like those of the report's figures, and again without them for its time. The
+time is that of the steps alone, without compiling and drawing.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import ModuleType
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.cli.scene_file import load_module, shipped_files, shipped_folder
+from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.records import RunReport
+from taisoft.timing import Timing, summarise
+
+from .page import Claim, Extent, Part, small_png
+
+ROUNDS = 3
+REPORTS_HOURS, HOUR = 10.0, 3600.0  # of demonstration 3; [s]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A demo. said: of it in the report; moments [s]: of the pictures; number: read at each moment [m], called `what`;
+    shows: whether those numbers are as the report has it."""
+
+    demo: str
+    where: str
+    said: str
+    moments: tuple[float, ...]
+    what: str
+    number: Callable[[ts.Simulator], float]
+    shows: Callable[[list[float]], bool]
+    layers: tuple[str, ...] = ("fixed_nodes",)
+    quick: bool = False
+
+
+def _falls(x: list[float]) -> bool:
+    return bool((np.diff(x) < 0).all())
+
+
+SCENES = (
+    Scene(
+        "hanging_beam", "demonstration 1, figure 2", "a beam held at its left end falls under gravity, here from 0 to 1 s",
+        (0.0, 1 / 3, 2 / 3, 1.0), "height of the free end", lambda sim: _at(sim, "beam", lambda X: X[:, 0] > 1.99), _falls,
+        quick=True,
+    ),
+    Scene(
+        "midpoint_traction", "demonstration 2, figure 4", "a beam held at both ends is bent up by a traction under its middle",
+        (0.0, 0.5, 6.0), "height of the middle", lambda sim: _at(sim, "beam", lambda X: np.linalg.norm(X, axis=1) < 1e-9),
+        lambda y: y[1] > 0 and y[2] > 0, ("fixed_nodes", "tractions"), quick=True,
+    ),
+    Scene(
+        "sheet_and_cube", "demonstration 3, figure 3", "a sheet held at two ends sags under a cube that lies on it",
+        (0.0, 0.3, 0.6, 4.0), "lowest node of the sheet", lambda sim: float(sim.positions("sheet")[:, 1].min()),
+        lambda y: y[-1] < y[0] - 0.05, quick=True,
+    ),
+    Scene(
+        "bunny_ears", "figure 1, left above", "the ears of a bunny are stretched long", (0.0, 0.9, 1.1, 1.3, 2.0),
+        "tips of the ears", lambda sim: float(sim.positions("bunny")[:, 1].max()), lambda y: y[1] > y[0] + 0.5 > y[-1],
+    ),
+    Scene(
+        "sheet_on_box", "figure 1, left below", "a sheet rests on top of a box", (0.0, 0.2, 0.5, 3.0),
+        "lowest node of the sheet", lambda sim: float(sim.positions("sheet")[:, 1].min()), lambda y: 0.0 < y[-1] < 1.0,
+    ),
+    Scene(
+        "hanging_cloth", "figure 1, right", "a cloth hangs from its upper corners", (0.0, 0.2, 0.4, 0.7, 4.0),
+        "lowest node", lambda sim: float(sim.positions("cloth")[:, 1].min()), lambda y: y[-1] < -0.9,
+    ),
+)  # fmt: skip
+
+
+def _at(sim: ts.Simulator, body: str, chosen: Callable[[np.ndarray], np.ndarray]) -> float:
+    """Mean height [m] of nodes chosen by their rest positions."""
+    return float(sim.positions(body)[chosen(sim.scene.body(body).rest_positions), 1].mean())
+
+
+@dataclass
+class Shown:
+    """A demo as run. numbers: at the moments [m]; problem: of its own check, empty where it passed; spent: wall seconds of the
+    steps of each round; contacts: most at a time."""
+
+    scene: Scene
+    tets: int
+    seconds: float
+    settings: str
+    result: RunReport
+    problem: str
+    numbers: list[float]
+    picture: bytes
+    spent: list[float] = field(default_factory=list)
+
+    @property
+    def timing(self) -> Timing:
+        """Wall seconds per simulated second."""
+        return summarise(s / self.seconds for s in self.spent)
+
+    @property
+    def good(self) -> bool:
+        """Whether the run is to be trusted: its status, and its own check."""
+        return self.result.status == "ok" and not self.problem
+
+
+def _problem(module: ModuleType, sim: ts.Simulator, result: RunReport) -> str:
+    """What the demo's check objects to."""
+    try:
+        module.check(sim, result)
+    except AssertionError as error:
+        return str(error)
+    return ""
+
+
+def show(scene: Scene, arch: str, rounds: int) -> Shown:
+    """Run a demo with pictures, check it, and run it again for its time."""
+    gallery = load_module(shipped_folder("assets") / "make_gallery.py")
+    _, size, view = gallery.STRIPS[scene.demo]
+    module = load_module(shipped_files("demos")[scene.demo])
+    settings = dict(module.solver)
+    seconds, fps = settings.pop("seconds"), settings.pop("fps")
+    numbers: list[float] = []
+    with ts.Simulator(module.build(), arch=arch, **settings) as sim:
+        rounds_spent = []
+        for k in range(rounds):
+            steps: list[float] = []
+
+            def on_step(_report, took, steps=steps) -> None:
+                steps.append(took)
+
+            sim.reset()
+            if k == 0:
+                image, result = gallery.film(
+                    sim, scene.moments, size, view, seconds, fps, scene.layers,
+                    lambda sim: numbers.append(scene.number(sim)), on_step,
+                )  # fmt: skip
+                problem = _problem(module, sim, result)
+            else:
+                sim.run(seconds, fps=fps, on_step=on_step)
+            rounds_spent.append(sum(steps))
+        tets = sum(body.mesh.n_tets for body in sim.scene.bodies)
+        told = f"{sim.settings.integrator}, dt = {1e3 * sim.dt:.3g} ms"
+    return Shown(scene, tets, seconds, told, result, problem, numbers, small_png(image), rounds_spent)
+
+
+def claim_of(shown: Shown) -> Claim:
+    """Whether the demo shows what the report's does, and is to be trusted."""
+    s, r = shown.scene, shown.result
+    heights = ", ".join(f"{y:.3f}" for y in shown.numbers)
+    times = ", ".join(f"{t:.3g}" for t in s.moments)
+    told = f"{s.what} {heights} m at {times} s; the run is {r.status}"
+    told += "; its own check passed." if not shown.problem else f"; its check failed: {shown.problem}."
+    return Claim(f"{s.where}: {s.said}.", shown.good and s.shows(shown.numbers), told)
+
+
+def hours_claim(seconds: float, simulated: float) -> Claim:
+    """Demonstration 3 took the report ten hours."""
+    slow = seconds > HOUR
+    times = HOUR * REPORTS_HOURS / seconds
+    found = f"{simulated:g} s of it take {seconds:.2g} s of computing, {times:,.0f} times less than {REPORTS_HOURS:g} hours."
+    why = "The report tells neither its machine nor how much it simulated; it ran interpreted Python in small explicit steps."
+    return Claim(f"demonstration 3 takes hours, about {REPORTS_HOURS:g} (section 3.1).", slow, found, "" if slow else why)
+
+
+def demo_table(shown: list[Shown]) -> str:
+    """A row a demo."""
+    lines = []
+    for s in shown:
+        t = s.timing
+        contacts = max((r.n_contacts for r in s.result.step_reports), default=0)
+        lines.append((
+            s.scene.demo, s.scene.where, f"{s.tets:,}", s.settings, f"{s.seconds:g}", f"{contacts}", f"{t.median:.3g}",
+            percent(spread_of(t)), f"{s.result.compile_seconds:.1f}", s.result.status, "failed" if s.problem else "passed",
+        ))  # fmt: skip
+    headings = (
+        "demo", "in the report", "tets", "steps", "simulated [s]", "contacts at most", "wall s per simulated s", "spread",
+        "compile [s]", "status", "own check",
+    )  # fmt: skip
+    return markdown(headings, lines, left=(0, 1, 3, 9, 10))
+
+
+def measure(extent: Extent) -> Part:
+    """All demos of the report's scenes; a quick run has demonstrations 1 to 3 once."""
+    part = Part(
+        "demos", "The demonstrations", "demonstrations 1 to 3, figures 1 to 4",
+        "each demo as `taisoft run` runs it, with its own check; times are of the steps alone, medians over "
+        f"{extent.of(ROUNDS, 1)} runs. Meshes and materials are ours, since the report does not tell its own.",
+    )  # fmt: skip
+    shown = [show(s, extent.arch, extent.of(ROUNDS, 1)) for s in SCENES if s.quick or not extent.quick]
+    part.claims = [claim_of(s) for s in shown]
+    third = next(s for s in shown if s.scene.demo == "sheet_and_cube")
+    part.claims.append(hours_claim(float(np.median(third.spent)), third.seconds))
+    part.tables.append(demo_table(shown))
+    for s in shown:
+        part.pictures[f"{s.scene.demo}.png"] = s.picture
+        part.times[f"{s.scene.demo}, a simulated second"] = s.timing
+        part.short += [f"{s.scene.demo} ends {s.result.status}: {'; '.join(s.result.problems)}"] * (s.result.status != "ok")
+    part.short.append("the report's pictures are not in its text, so the likeness to them is judged by its captions.")
+    if extent.quick:
+        part.short.append("a quick run leaves out figure 1.")
+    return part

@@ -1,0 +1,218 @@
+"""What an experiment of `report.py` hands over, how its verdict follows from its claims, and how both become Markdown.
+
+A claim is one statement of the report beside our numbers; whether it holds is computed where the numbers are. The verdict
+of a part is "agree" where all its claims hold, "disagree" where none does, else "partly".
+"""
+
+import io
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from taisoft.output.plot import log_ticks, require_matplotlib
+from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.timing import Timing, summarise
+
+AGREE, PARTLY, DISAGREE, MISSING = "agree", "partly", "disagree", "not measured"
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#555555")
+PALETTE = 128  # colours of a picture: a plot needs few, and a shaded scene shows no bands yet
+PANEL, DPI = (4.4, 3.1), 85  # size of a panel in inches
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How much is measured, and where."""
+
+    quick: bool
+    arch: str
+
+    def of(self, full, quick):
+        """The one or the other."""
+        return quick if self.quick else full
+
+
+@dataclass(frozen=True)
+class Claim:
+    """said: the report's statement in our words; found: our numbers in a sentence; why: they agree with it, or do not."""
+
+    said: str
+    holds: bool
+    found: str
+    why: str = ""
+
+    def __post_init__(self):
+        object.__setattr__(self, "holds", bool(self.holds))  # comparisons of NumPy numbers give no bool of Python
+
+
+@dataclass
+class Part:
+    """An experiment as measured. where: in the report; method: what was run; times: what a second run is held against.
+
+    pictures: file name -> PNG; short: what is not as the report has it, or was left out; failure: why it could not be measured,
+    empty where it could.
+    """
+
+    name: str
+    title: str
+    where: str
+    method: str
+    claims: list[Claim] = field(default_factory=list)
+    tables: list[str] = field(default_factory=list)
+    pictures: dict[str, bytes] = field(default_factory=dict)
+    times: dict[str, Timing] = field(default_factory=dict)
+    short: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+    failure: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """Of all claims together."""
+        return verdict_of([claim.holds for claim in self.claims]) if not self.failure else MISSING
+
+    def record(self) -> dict:
+        """As plain data, without the pictures."""
+        kept = {name: value for name, value in vars(self).items() if name not in ("pictures", "claims", "times")}
+        claims, times = [asdict(c) for c in self.claims], {name: asdict(t) for name, t in self.times.items()}
+        return kept | {"verdict": self.verdict, "claims": claims, "times": times, "pictures": sorted(self.pictures)}
+
+
+def verdict_of(holds: Sequence[bool]) -> str:
+    """Of claims that hold or not; of none at all MISSING."""
+    if not holds:
+        return MISSING
+    return AGREE if all(holds) else PARTLY if any(holds) else DISAGREE
+
+
+# --- numbers ----------------------------------------------------------------------------------------------------------
+
+
+def exponent(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
+    """p of y ~ x^p by least squares in the logarithms, and how far the farthest point lies off the fit, as a share of y."""
+    a, b = np.log(np.asarray(x, float)), np.log(np.asarray(y, float))
+    p, c = np.polyfit(a, b, 1)
+    return float(p), float(np.expm1(np.abs(b - (p * a + c)).max()))
+
+
+def is_near(value: float, wanted: float, tolerance: float) -> bool:
+    """Whether |value - wanted| <= tolerance; never of what is not a number."""
+    return math.isfinite(value) and abs(value - wanted) <= tolerance
+
+
+def ms(seconds: float) -> str:
+    """Milliseconds, three digits."""
+    return f"{1e3 * seconds:.3g}"
+
+
+def timed(seconds: Iterable[float]) -> tuple[str, str]:
+    """Median [ms] and spread as cells of a table."""
+    t = summarise(seconds)
+    return ms(t.median), percent(spread_of(t))
+
+
+def clearly_less(a: Sequence[float], b: Sequence[float]) -> bool:
+    """Whether times `a` are less than `b` by more than their spread: the upper quartile of one below the lower of the other."""
+    return float(np.percentile(a, 75)) < float(np.percentile(b, 25))
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def small_png(image: np.ndarray) -> bytes:
+    """A picture uint8 (height, width, 3) as a PNG with a palette."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    reduced = Image.fromarray(image).quantize(PALETTE, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    reduced.save(out, format="png", optimize=True)
+    return out.getvalue()
+
+
+def new_figure(columns: int, lines: int = 1):
+    """A figure and its panels (lines, columns), each with a light grid."""
+    require_matplotlib("the page's plots")
+    from matplotlib import pyplot
+
+    size = PANEL[0] * columns, PANEL[1] * lines
+    figure, grid = pyplot.subplots(lines, columns, figsize=size, dpi=DPI, layout="constrained", squeeze=False)
+    for panel in grid.flat:
+        panel.grid(True, which="major", color="#eeeeee")
+        panel.set_axisbelow(True)
+    return figure, grid
+
+
+def plot_png(figure) -> bytes:
+    """A figure as a small PNG, its logarithmic axes with plain numbers; it is closed."""
+    from matplotlib import pyplot
+
+    for panel in figure.axes:
+        log_ticks(panel)
+    figure.canvas.draw()
+    image = np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
+    pyplot.close(figure)
+    return small_png(image)
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+def part_text(part: Part) -> str:
+    """A part's section of the page."""
+    lines = [f"## {part.title}", f"The report: {part.where}. Name: `{part.name}`. Took {part.seconds:.0f} s, compiling included."]
+    if part.failure:
+        return "\n\n".join([*lines, f"**{MISSING}**: {part.failure}"])
+    lines += [f"**{part.verdict}**", "\n".join(claim_text(claim) for claim in part.claims), f"Run: {part.method}"]
+    lines += part.tables
+    lines += [f"![{name.removesuffix('.png')}]({name})" for name in part.pictures]
+    return "\n\n".join(lines)
+
+
+def claim_text(claim: Claim) -> str:
+    """A line for what is said, what was found, and why."""
+    why = f" {claim.why}" if claim.why else ""
+    return f"* The report: {claim.said} **{'Agree' if claim.holds else 'Disagree'}**: {claim.found}{why}"
+
+
+def summary_table(parts: Sequence[Part]) -> str:
+    """A row a part: the verdict, and how many claims hold."""
+    rows = [(p.title, p.where, p.verdict, f"{sum(c.holds for c in p.claims)} of {len(p.claims)}") for p in parts]
+    return markdown(("experiment", "in the report", "verdict", "claims that hold"), rows, left=(0, 1, 2))
+
+
+def short_text(parts: Sequence[Part]) -> str:
+    """What falls short, part by part."""
+    lines = [f"* {part.title}: {told}" for part in parts for told in ([part.failure] if part.failure else part.short)]
+    return "## What falls short\n\n" + ("\n".join(lines) if lines else "Nothing that this run knows of.")
+
+
+# --- a second run -----------------------------------------------------------------------------------------------------
+
+
+def agrees(one: dict, two: dict) -> bool:
+    """Whether two timings, as plain data, lie no farther apart than their spreads together."""
+    apart = abs(one["median"] - two["median"])
+    return apart <= one["spread"] * one["median"] + two["spread"] * two["median"]
+
+
+def again_text(earlier: dict | None, parts: Sequence[Part], numbers: dict) -> str:
+    """How the times of an earlier run into the same folder compare; earlier: its numbers, None where there are none."""
+    told = "## Beside an earlier run\n\n"
+    if earlier is None:
+        return told + "There was no earlier run in this folder."
+    differing = [name for name in ("processor", "cores", "arch", "quick") if earlier.get(name) != numbers[name]]
+    if differing:
+        return told + f"The earlier run in this folder had another {' and '.join(differing)}."
+    before = {part["name"]: part["times"] for part in earlier["parts"]}
+    rows, compared = [], 0
+    for part in parts:
+        for name, t in part.times.items():
+            was = before.get(part.name, {}).get(name)
+            compared += was is not None
+            if was is not None and not agrees(was, asdict(t)):
+                cells = ms(was["median"]), percent(was["spread"]), ms(t.median), percent(t.spread)
+                rows.append((part.name, name, *cells, f"{t.median / was['median']:.2f}"))
+    text = f"{compared - len(rows)} of {compared} times agree with those of {earlier['date']} within the spreads of both."
+    headings = ("experiment", "time", "then [ms]", "spread", "now [ms]", "spread", "now / then")
+    return told + text + ("\n\nThe others:\n\n" + markdown(headings, rows, left=(0, 1)) if rows else "")
+
