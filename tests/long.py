@@ -36,6 +36,7 @@ LONG = {
     "test_bench_scaling": (
         "_kind[explicit, one", "_kind[implicit", "_kind[search]", "_kind[explicit contact]", "test_a_child_answers",
     ),
+    "test_regression": ("test_as_stored_too",),
     "test_bench_hard": ("test_a_stiff_cube_lands_and_rests",),
     "test_bench_contact": ("test_every_solver_gets_the_same_problem_and_is_judged_rightly",),
     "test_collision_memory": ("test_nothing_is_out_of_bounds",),
