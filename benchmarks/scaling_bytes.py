@@ -43,9 +43,10 @@ LOOPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # reads, writes
         ),
         ("pcg_y", "pcg_r", "pcg_z", "pcg_p", "pcg_q"),
     ),
-    # a search: boxes of triangles and of the tree
+    # a search: boxes of triangles, and those of a tree or the cells of a grid
     "boxes": (("surface_triangle", "surface_x", "surface_move"), ("surface_lo", "surface_hi", "surface_normal", "surface_area")),
     "tree": (("surface_lo", "surface_hi", "bvh_link"), ("bvh_lo", "bvh_hi")),
+    "cells": (("surface_lo", "surface_hi"), ("hash_first_cell", "hash_cell_count")),
     # a sweep over as many contacts as there is room for
     "sweep": (
         tuple(f"problem_{name}" for name in ("node", "arity", "weight", "normal", "tangent", "b", "friction", "factor", "r")),

@@ -275,7 +275,8 @@ def search(row: Row, size: int) -> None:
             counts, found = rig.detection.counts, rig.detection.field_bytes
             row.counts = {"triangles": counts.triangles, "found": counts.found, "contacts": counts.contacts}
             row.field_bytes = {"search": sum(found.values())}
-            row.moved = floor_bytes(("boxes", "tree"), found) + found["contacts"] * counts.found / rig.detection.buffer.capacity
+            broad = "tree" if "bvh_link" in found else "cells"
+            row.moved = floor_bytes(("boxes", broad), found) + found["contacts"] * counts.found / rig.detection.buffer.capacity
     finally:
         runtime.close()
 

@@ -15,7 +15,7 @@ import pytest
 
 import taisoft as ts
 from benchmarks import scaling
-from benchmarks.collision_cases import pile_setup
+from benchmarks.collision_cases import Setup, pile, pile_setup
 from benchmarks.collision_runs import Rig
 from benchmarks.scaling_bytes import GROUPS, LOOPS, Copy, copy_rate, floor_bytes, group_bytes, measure_copy
 from benchmarks.scaling_runs import EXPLICIT, KINDS, ON_ONE, Row, beam, cubes_on_ground, measure
@@ -29,6 +29,13 @@ def row(kind="implicit", tets=1000, seconds=1.0, **more) -> Row:
     found = {"samples": [seconds] * 3, "phases": {"a": 0.75 * seconds, "b": 0.25 * seconds}, "counts": {"newton": 2.5}}
     found |= {"moved": 8.0 * tets, "field_bytes": {"matrix": 100 * tets}, "setup_seconds": 1e-6 * tets, "base": 10, "peak": 50}
     return Row(kind, "cpu", tets, 300, **found | more)
+
+
+def hashed(collision: str) -> ts.Scene:
+    """The smallest pile, searched by a spatial hash, as on CUDA."""
+    scene = pile(1, collision)
+    scene.collision = ts.CollisionSettings(broad_phase="spatial_hash")
+    return scene
 
 
 # --- numbers ----------------------------------------------------------------------------------------------------------
@@ -65,8 +72,9 @@ def test_every_field_that_is_counted_is_there():
             assert (groups["matrix"] > 0) == (integrator == "bdf2") and (groups["contacts"] > 0) == (len(scene.bodies) == 2)
     runtime = open_runtime("cpu", "f32")
     try:
-        with Rig(pile_setup(1), "proximity", runtime) as rig:
-            known |= set(rig.detection.field_bytes)
+        for build in (pile_setup(1).build, hashed):
+            with Rig(Setup("pile", "", build), "proximity", runtime) as rig:
+                known |= set(rig.detection.field_bytes)
     finally:
         runtime.close()
     assert {name for loop in LOOPS.values() for names in loop for name in names} <= known
