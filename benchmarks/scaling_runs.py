@@ -4,7 +4,7 @@ explicit:   velocity Verlet of a clamped beam that falls, stable neo-Hookean, at
 explicit, one thread: the same where taisoft would take all threads, on one.
 implicit:   BDF2 of that beam, steps of 10 ms.
 search:     a search for contacts by proximity among 27 cubes at rest that touch, the pile of `collision.py`.
-explicit contact, implicit contact: two cubes on the ground, the upper one turned and sunk into the lower a little: symplectic
+explicit contact, implicit contact: two cubes on the ground, the upper one aside and sunk into the lower a little: symplectic
             Euler and Gauss-Seidel at 0.9 of the largest stable step, implicit Euler and the augmented Lagrangian at 10 ms.
 
 All in f32. Steps are timed first as they are, then done again from the same start with a watch on their parts, whose looks at
