@@ -9,7 +9,7 @@ the median. Exponents: of time, set-up and memory over the tets, fitted in the l
 over contacts grow with the surface, with the power 2/3 of the tets. Bytes moved are a floor: each array that a loop over the
 mesh uses counts once where it is read and once where it is written (benchmarks/scaling_bytes.py); they stand against the
 best copy of 256 MB on as many threads, measured first. Exit status: 0, or 1 where something could not be measured.
-The whole takes about eight minutes on two cores.
+The whole took ten minutes on two cores that others used, too.
 """
 
 import argparse
