@@ -6,7 +6,7 @@ every solver, from the impulses of the step before and from none. The steps them
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 
@@ -163,16 +163,18 @@ def measure_film(name: str, sim: ts.Simulator, frames: int, solvers: Solvers) ->
 
 
 class Stopwatch:
-    """Seconds by part, each call's own: what a call spends in another part counts there."""
+    """Seconds by part, each call's own: what a call spends in another part counts there; and calls by name."""
 
     def __init__(self) -> None:
         self.spent: Counter[str] = Counter()
+        self.calls: Counter[str] = Counter()
         self._inner: list[float] = []  # of the calls under way: seconds spent in calls inside
 
     def timed(self, call: Callable, part: str) -> Callable:
         """The call, timed."""
 
         def run(*arguments, **named):
+            self.calls[getattr(call, "__name__", part)] += 1
             begin = clock()
             self._inner.append(0.0)
             try:
@@ -186,16 +188,19 @@ class Stopwatch:
         return run
 
     @contextmanager
-    def on(self, sim: ts.Simulator) -> Iterator[None]:
-        """Times the parts of the simulator's explicit steps meanwhile."""
-        contact = sim._contact
-        owners = {"find": contact.detection, "_survey": contact, "begin": contact}
+    def on(self, places: Iterable[tuple[str, object, str]]) -> Iterator[None]:
+        """Times calls meanwhile. places: part, and the owner and the name under which what is called is looked up."""
         with ExitStack() as stack:
-            for part, names in PARTS.items():
-                for name in names:
-                    owner = owners.get(name, contact_substeps)
-                    stack.enter_context(patched(owner, name, self.timed(getattr(owner, name), part)))
+            for part, owner, name in places:
+                stack.enter_context(patched(owner, name, self.timed(getattr(owner, name), part)))
             yield
+
+
+def explicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
+    """Where the parts of the simulator's explicit steps are called, for `Stopwatch.on`."""
+    contact = sim._contact
+    owners = {"find": contact.detection, "_survey": contact, "begin": contact}
+    return [(part, owners.get(name, contact_substeps), name) for part, names in PARTS.items() for name in names]
 
 
 def measure_step(name: str, sim: ts.Simulator, steps: int) -> StepCost:
@@ -212,7 +217,7 @@ def measure_step(name: str, sim: ts.Simulator, steps: int) -> StepCost:
         cost.problems += report.problems
     to_first_impulse(sim)
     watch = Stopwatch()
-    with watch.on(sim):
+    with watch.on(explicit_places(sim)):
         for _ in range(steps):
             watch.spent.clear()
             begin = clock()

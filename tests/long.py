@@ -34,6 +34,10 @@ LONG = {
     "test_tunnelling": ("[symplectic_euler-",),
     "test_bench_collision": ("test_films_and_broad_phases",),
     "test_bench_peers": ("test_peers_fall_alike",),
+    "test_bench_scaling": (
+        "_kind[explicit, one", "_kind[implicit", "_kind[search]", "_kind[explicit contact]", "test_a_child_answers",
+    ),
+    "test_regression": ("test_as_stored_too",),
     "test_bench_hard": ("test_a_stiff_cube_lands_and_rests",),
     "test_bench_contact": ("test_every_solver_gets_the_same_problem_and_is_judged_rightly",),
     "test_bench_report": ("test_one_thread_is_one_thread", "does_what_the_search_does"),

@@ -156,7 +156,7 @@ def test_a_call_inside_another_counts_once(monkeypatch):
         inner(4.0)
 
     watch.timed(outer, "outer")()
-    assert watch.spent == {"inner": 6.0, "outer": 1.0}
+    assert watch.spent == {"inner": 6.0, "outer": 1.0} and watch.calls == {"wait": 2, "outer": 1}
 
 
 def test_what_is_patched_comes_back():

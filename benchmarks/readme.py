@@ -1,0 +1,124 @@
+"""README: its measured tables, made anew from the files in benchmarks/results.
+
+taisoft bench readme [--check]
+
+What stands in README.md between `<!-- begin NAME -->` and `<!-- end NAME -->` is the text of TABLES[NAME], made from the newest
+results of a benchmark, so that no measured number is typed by hand. A table is a function of the folder of results. --check
+writes nothing. Exit status: 0, or with --check 1 where README.md is not what the results say.
+"""
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from taisoft.errors import OutputError
+from taisoft.output.files import write_bytes
+from taisoft.output.tables import markdown
+
+from .order_cases import HANGING
+from .order_table import DEFAULT_DEGREE, GOAL
+from .reference_cases.record import label
+
+RESULTS = Path(__file__).resolve().parent / "results"
+README = Path(__file__).resolve().parents[1] / "README.md"
+BLOCK = re.compile(r"(<!-- begin (\w+) -->\n).*?(<!-- end \2 -->\n)", re.DOTALL)
+MARKER = re.compile(r"<!-- (?:begin|end) (\w+) -->")
+ORDERS = {1: "linear", 2: "quadratic"}
+
+
+def newest(results: Path, benchmark: str) -> dict:
+    """The newest whole results of a benchmark, from BENCHMARK-*.json. Raises OutputError where there are none."""
+    found = []
+    for path in sorted(results.glob(f"{benchmark}-*.json")):
+        try:
+            found.append(json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, ValueError) as error:
+            raise OutputError(f"{path} cannot be read: {error}") from error
+    found = [numbers for numbers in found if not numbers.get("quick")]
+    if not found:
+        raise OutputError(f"{results} holds no results of `taisoft bench {benchmark}`")
+    return max(found, key=lambda numbers: numbers["date"])
+
+
+def measured_on(numbers: dict) -> str:
+    """Where and with what numbers were measured, in a line."""
+    return f"{numbers['processor']}, {numbers['cores']} cores, {numbers['arch']}, {numbers['precision']}, {numbers['date'][:10]}"
+
+
+def order_errors(results: Path) -> str:
+    """Errors of the hanging beam by order and mesh, with four and with fourteen quadrature points."""
+    numbers = newest(results, "order")
+    exact = numbers["references"][HANGING]["values"][0]
+    rows = [row for row in numbers["rows"] if row["case"] == HANGING and row["measured"]]
+
+    def error(order: int, degree: int | None, cells: list[int]) -> str:
+        own = [row for row in rows if (row["order"], row["degree"], row["cells"]) == (order, degree, cells)]
+        return f"{own[0]['measured'][0] / exact - 1:+.3%}" if own else ""
+
+    lines = [
+        (
+            ORDERS[row["order"]], label(row["cells"]), f"{row['tets']:,}", f"{row['nodes']:,}",
+            error(row["order"], row["degree"], row["cells"]), error(row["order"], 4, row["cells"]),
+        )
+        for row in rows if row["degree"] == DEFAULT_DEGREE[row["order"]]
+    ]  # fmt: skip
+    return markdown(("tets", "cells", "number", "nodes", "error", "with 14 points"), lines, left=(0, 1))
+
+
+def order_times(results: Path) -> str:
+    """Times to 1 % error of both orders, of the cases in which both reach it."""
+    numbers = newest(results, "order")
+    titles = {row["case"]: f"{row['case']}, {row['law']}" for row in numbers["rows"]}
+    lines = []
+    for c in numbers["comparisons"]:
+        reached = [c["reach"][str(order)] for order in ORDERS]
+        if c["goal"] == GOAL and all(reach is not None and reach["bound"] == "=" for reach in reached):
+            times = [f"{reach['seconds']:.3g}" for reach in reached]
+            lines.append((titles[c["case"]], *times, f"{c['ratio']['median']:.2g}"))
+    table = markdown(("case", "linear [s]", "quadratic [s]", "times less"), lines, left=(0,))
+    return f"{table}\n\nMeasured on: {measured_on(numbers)}."
+
+
+TABLES: dict[str, Callable[[Path], str]] = {"order_errors": order_errors, "order_times": order_times}  # by marker
+
+
+def filled(text: str, results: Path = RESULTS) -> str:
+    """The text with every marked part made anew. Raises OutputError for a marker that is not known or stands alone."""
+    whole = [name for _, name, _ in BLOCK.findall(text)]
+    marked = MARKER.findall(text)
+    if sorted(marked) != sorted(2 * whole):
+        alone = next(name for name in marked if marked.count(name) != 2 or name not in whole)
+        raise OutputError(f"the marker '{alone}' needs one begin and one end after it")
+    unknown = [name for name in whole if name not in TABLES]
+    if unknown:
+        raise OutputError(f"the marker '{unknown[0]}' is unknown; there are {', '.join(TABLES)}")
+    return BLOCK.sub(lambda m: f"{m[1]}\n{TABLES[m[2]](results)}\n\n{m[3]}", text)
+
+
+def main(argv=None) -> int:
+    """Write README.md anew, or tell whether it is as it should be. Raises OutputError."""
+    first, _, rest = __doc__.partition("\n")
+    parser = argparse.ArgumentParser(prog="taisoft bench readme", description=first, epilog=rest.partition("\n\n")[2])
+    parser.add_argument("--check", action="store_true", help="write nothing")
+    options = parser.parse_args(argv)
+    try:
+        text = README.read_text(encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{README} cannot be read: {error.strerror}") from error
+    made = filled(text)
+    if made == text:
+        print(f"{README.name} is what the results say")
+        return 0
+    if options.check:
+        print(f"{README.name} is not what the results say: `taisoft bench readme` writes it anew")
+        return 1
+    write_bytes(README, made.encode())
+    print(f"written: {README}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

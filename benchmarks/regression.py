@@ -1,0 +1,170 @@
+"""Regression: error, iterations, memory and time of short cases against those stored.
+
+taisoft bench regression [--update] [--case NAME] [--arch cpu|cuda]
+
+The numbers lie in benchmarks/data/regression.json, those of each arch apart. They tell of drifts that limits elsewhere let
+through: an error that has doubled within its limit, a solver that needs more iterations. A number counts as the same within
+
+    errors      5 % of the stored one, plus what another order of sums may make of it: 1e-5 in f32, 1e-9 in f64, or the case's own
+    counts      5 %, at least 2: of Newton and CG iterations, sweeps, contacts, pairs
+    memory      0.1 % of the bytes of all fields
+    status      the same
+
+since runs on the CPU are the same bit by bit on one machine with one number of threads, while another processor or compiler
+rounds otherwise, which moves the last digits, and an iteration that stops at a tolerance by one. A number that is better than
+stored counts as changed too: --update stores what is found, after the differences have been printed for review. References
+that are no formulas are computed then, and kept.
+
+Times are told, and never judged: as a ratio to products of a sparse matrix with a vector (1 = 100 of 20,000 rows of 27), on one
+thread of the same machine in the same run. These gather and multiply as steps do, so that the ratio changes less between machines
+than seconds, or a ratio to a product of dense matrices, which are another kind of work. Exit status: 0, 1 where a number has
+changed, 2 where none is stored.
+"""
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+
+from taisoft.errors import OutputError
+from taisoft.output.files import write_bytes
+from taisoft.output.report import json_text
+from taisoft.output.tables import markdown
+from taisoft.timing import machine, time_repeats, versions
+
+from .regression_cases import CASES, Case, Found
+
+STORE = Path(__file__).resolve().parent / "data" / "regression.json"
+ERROR_MARGIN, COUNT_MARGIN, COUNT_LEAST, MEMORY_MARGIN = 0.05, 0.05, 2, 1e-3
+ROWS, BESIDE, PRODUCTS = 20_000, 13, 100  # of the baseline: rows, entries on each side of the diagonal, products in one unit
+
+
+@dataclass(frozen=True)
+class Entry:
+    """The numbers of a case. reference: what it is judged by; time: over the baseline."""
+
+    reference: list[float]
+    error: float
+    counts: dict[str, int]
+    status: str
+    field_bytes: int
+    time: float
+
+
+def baseline() -> float:
+    """Seconds of the unit that times are told in: the best of several, on one thread."""
+    matrix = sp.diags([1.0] * (2 * BESIDE + 1), range(-BESIDE, BESIDE + 1), shape=(ROWS, ROWS), format="csr")
+    x = np.ones(ROWS)
+
+    def products() -> None:
+        for _ in range(PRODUCTS):
+            matrix @ x
+
+    return time_repeats(products, 5).minimum
+
+
+def make_entry(found: Found, reference: list[float], unit: float) -> Entry:
+    """What is stored of a computation. unit: seconds of the baseline."""
+    exact = np.array(reference)
+    error = float(np.abs(np.array(found.measured) - exact).max() / np.abs(exact).max())
+    return Entry(list(reference), error, found.counts, found.status, found.field_bytes, found.seconds / unit)
+
+
+def differences(case: Case, new: Entry, old: Entry) -> list[str]:
+    """What has changed beyond its margin, in words; times are no part of it."""
+    found = []
+    if new.status != old.status:
+        found.append(f"status '{new.status}', stored '{old.status}'")
+    if not abs(new.error - old.error) <= ERROR_MARGIN * old.error + case.slack:
+        found.append(f"error {new.error:.4g}, stored {old.error:.4g}")
+    for name in dict.fromkeys([*old.counts, *new.counts]):
+        now, before = new.counts.get(name, 0), old.counts.get(name, 0)
+        if abs(now - before) > max(COUNT_LEAST, COUNT_MARGIN * before):
+            found.append(f"{name} {now}, stored {before}")
+    if abs(new.field_bytes - old.field_bytes) > MEMORY_MARGIN * old.field_bytes:
+        found.append(f"field bytes {new.field_bytes}, stored {old.field_bytes}")
+    return found
+
+
+def load(arch: str, path: Path) -> dict[str, Entry]:
+    """What is stored for an arch, by the name of the case. Raises OutputError where the file cannot be read."""
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        return {name: Entry(**entry) for name, entry in stored.get(arch, {}).get("cases", {}).items()}
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise OutputError(f"{path} cannot be read: {error}") from error
+
+
+def store(entries: dict[str, Entry], arch: str, path: Path) -> None:
+    """Put the entries in place of those stored for an arch; other cases and archs stay, cases that are no more go."""
+    whole = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    known = load(arch, path) | entries
+    kept = {case.name: asdict(known[case.name]) for case in CASES if case.name in known}
+    made = {"processor": machine()["processor"], "versions": versions("taichi", "numpy", "scipy")}
+    whole[arch] = {"stored_on": made, "cases": kept}
+    write_bytes(path, json_text(dict(sorted(whole.items()))).encode())
+
+
+def check(case: Case, arch: str, stored: dict[str, Entry], unit: float = 1.0) -> tuple[Entry, list[str]]:
+    """A case computed and compared. Raises KeyError where nothing is stored of it."""
+    new = make_entry(case.run(arch), stored[case.name].reference, unit)
+    return new, differences(case, new, stored[case.name])
+
+
+def row(case: Case, new: Entry, old: Entry | None, seconds: float) -> tuple[str, ...]:
+    """A line of the table."""
+    counts = ", ".join(f"{n:,} {name}" for name, n in new.counts.items())
+    verdict = "new" if old is None else "CHANGED" if differences(case, new, old) else "same"
+    before = ("-", "-") if old is None else (f"{old.error:.3e}", f"{old.time:.3g}")
+    return (
+        case.name, case.precision, f"{new.error:.3e}", before[0], counts, f"{new.field_bytes:,}", f"{new.time:.3g}", before[1],
+        verdict, f"{seconds:.0f}",
+    )  # fmt: skip
+
+
+HEADINGS = ("case", "", "error", "stored", "counts", "bytes", "time", "stored", "", "s")
+
+
+def main(argv=None) -> int:
+    """Compute, compare and print. Raises OutputError, or SimulationError where the arch cannot be had."""
+    first, _, rest = __doc__.partition("\n")
+    parser = argparse.ArgumentParser(
+        prog="taisoft bench regression", description=first, epilog=rest.partition("\n\n")[2],
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("--update", action="store_true", help="store what is found")
+    parser.add_argument("--case", metavar="NAME", help="only those whose name begins so")
+    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
+    options = parser.parse_args(argv)
+    cases = [case for case in CASES if case.name.startswith(options.case or "")]
+    if not cases:
+        parser.error(f"no case begins with {options.case!r}; there are {', '.join(case.name for case in CASES)}")
+    stored, entries, lines, told = load(options.arch, STORE), {}, [], []
+    missing = [case.name for case in cases if case.name not in stored]
+    if missing and not options.update:
+        print(f"taisoft bench regression: nothing is stored for {options.arch} of {', '.join(missing)}: --update stores it")
+        return 2
+    for case in cases:
+        print(case.name, file=sys.stderr, flush=True)
+        begin, old = time.perf_counter(), stored.get(case.name)
+        unit = baseline()
+        reference = case.reference(options.arch) if options.update or old is None else old.reference
+        new = entries[case.name] = make_entry(case.run(options.arch), reference, unit)
+        lines.append(row(case, new, old, time.perf_counter() - begin))
+        told += [f"* {case.name}: {change} ({case.what})" for change in (differences(case, new, old) if old else ())]
+    print(markdown(HEADINGS, lines, left=(0, 1, 4, 8)))
+    print("\n".join(["", *(told or ["nothing has changed"])]))
+    if options.update:
+        store(entries, options.arch, STORE)
+        print(f"written: {STORE}")
+        return 0
+    return 1 if told else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,130 @@
+"""Bytes that work must move at least, and what a copy of memory reaches.
+
+A loop over the whole mesh must read each array that it uses from memory once and write each that it makes once: that is its
+floor, counted from the sizes of the fields. What a loop reads again, gathers by indices from a cache line that it uses in part,
+or fetches before it writes, is not counted; so a small mesh that stays in the caches exceeds a copy, and a share of 100 % of a
+copy means that a step is as fast as memory lets it be. LOOPS names what each loop reads and writes. Contacts: a sweep reads the
+numbers of every contact, reads and writes its impulse, and reads and writes the velocities `w` of the nodes.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+import taisoft as ts
+from taisoft.fields import FieldArena
+from taisoft.runtime import kernel, open_runtime, threads
+
+from .collision_runs import clock
+
+ELEMENTS = ("x", "nodes", "Dm_inv", "volume", "block_body")
+GATHER = ("corner", "gather_start", "gather_entry", "mass", "free")
+LOOPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # reads, writes
+    # an explicit step
+    "drift": (("x", "v", "acceleration"), ("x", "v")),
+    "elements": (ELEMENTS, ("corner",)),
+    "nodes": ((*GATHER, "v"), ("v", "acceleration")),
+    "update": ((*GATHER, "x", "v"), ("x", "v")),
+    # an implicit one
+    "residual": ((*GATHER, "x", "x_hat", "v_hat"), ("change", "residual", "pcg_rhs")),
+    "blocks": (ELEMENTS, ("stiffness_element",)),
+    "edges": (
+        ("stiffness_element", "stiffness_edge_start", "stiffness_edge_entry", "stiffness_edge_upper", "stiffness_edge_lower"),
+        ("stiffness_value",),
+    ),
+    "system": (("stiffness_value", "mass"), ("stiffness_value", "stiffness_diagonal")),
+    "iteration": (
+        (
+            "stiffness_value", "stiffness_column", "stiffness_row_start", "stiffness_diagonal", "pcg_inverse",
+            "pcg_y", "pcg_r", "pcg_z", "pcg_p", "pcg_q",
+        ),
+        ("pcg_y", "pcg_r", "pcg_z", "pcg_p", "pcg_q"),
+    ),
+    # a search: boxes of triangles, and those of a tree or the cells of a grid
+    "boxes": (("surface_triangle", "surface_x", "surface_move"), ("surface_lo", "surface_hi", "surface_normal", "surface_area")),
+    "tree": (("surface_lo", "surface_hi", "bvh_link"), ("bvh_lo", "bvh_hi")),
+    "cells": (("surface_lo", "surface_hi"), ("hash_first_cell", "hash_cell_count")),
+    # a sweep over as many contacts as there is room for
+    "sweep": (
+        tuple(f"problem_{name}" for name in ("node", "arity", "weight", "normal", "tangent", "b", "friction", "factor", "r")),
+        ("problem_r",),
+    ),
+}  # fmt: skip
+GROUPS = ("elements and nodes", "matrix", "search", "contacts")
+COPY_BYTES, COPY_ROUNDS = 2**28, 7  # of one of the two arrays: larger than any cache
+WIDTH = 16  # numbers that the kernel copies at a time
+
+
+@dataclass(frozen=True)
+class Copy:
+    """A copy of memory. rate: bytes per second, read and written both counted."""
+
+    by: str
+    threads: int
+    rate: float
+
+
+def floor_bytes(loops: Iterable[str], field_bytes: Mapping[str, int]) -> float:
+    """Bytes that these loops read and write at least, of fields with these sizes. Raises KeyError for one that is absent."""
+    return float(sum(field_bytes[name] for loop in loops for names in LOOPS[loop] for name in names))
+
+
+def group_bytes(sim: ts.Simulator) -> dict[str, int]:
+    """Bytes of the simulator's fields by GROUPS."""
+    search = sim._contact.detection.field_bytes if sim._contact else {}
+    contacts = (sim._contact.field_bytes if sim._contact else {}) | sim._stepper.field_bytes
+    found = dict.fromkeys(GROUPS, 0)
+    for name, size in sim.field_bytes.items():
+        group = "search" if name in search else "contacts" if name in contacts else GROUPS[name.startswith("stiffness_")]
+        found[group] += size
+    return found
+
+
+# --- the copy ---------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def copy_field(source: ti.template(), target: ti.template(), serial: ti.template()):
+    """target = source."""
+    ti.loop_config(serialize=serial)
+    for i in range(source.shape[0]):
+        target[i] = source[i]
+
+
+def measure_copy(arch: str, n_bytes: int = COPY_BYTES) -> list[Copy]:
+    """The best of several copies by NumPy and by a kernel, on one thread and on all; on CUDA by a kernel alone."""
+    runtime, arena = open_runtime(arch, "f32", "the benchmark of scaling"), FieldArena()
+    try:
+        with arena.group():
+            source, target = (arena.vectors(name, ti.f32, n_bytes // (4 * WIDTH), n=WIDTH) for name in ("source", "target"))
+        if arch == "cuda":
+            return [Copy("Taichi", threads(), _best(n_bytes, lambda: copy_field(source, target, 0)))]
+        a, b, n = np.zeros(n_bytes // 4, np.float32), np.ones(n_bytes // 4, np.float32), threads()
+        parts = list(zip(np.array_split(a, n), np.array_split(b, n)))
+        with ThreadPoolExecutor(n) as pool:  # NumPy copies without the interpreter's lock
+            return [
+                Copy("NumPy", 1, _best(n_bytes, lambda: np.copyto(a, b))),
+                Copy("NumPy", n, _best(n_bytes, lambda: list(pool.map(lambda part: np.copyto(*part), parts)))),
+                Copy("Taichi", 1, _best(n_bytes, lambda: copy_field(source, target, 1))),
+                Copy("Taichi", n, _best(n_bytes, lambda: copy_field(source, target, 0))),
+            ]
+    finally:
+        arena.release()
+        runtime.close()
+
+
+def _best(n_bytes: int, call: Callable[[], object]) -> float:
+    seconds = []
+    for _ in range(COPY_ROUNDS + 1):
+        begin = clock()
+        call()
+        seconds.append(clock() - begin)
+    return 2 * n_bytes / min(seconds[1:])  # the first compiles, or has its pages made
+
+
+def copy_rate(copies: Iterable[Copy], n_threads: int) -> float:
+    """The best copy [bytes/s] on at most as many threads."""
+    return max(copy.rate for copy in copies if copy.threads <= n_threads)

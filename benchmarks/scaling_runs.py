@@ -1,0 +1,287 @@
+"""What `scaling.py` measures: one kind of work on one mesh, in a process that does nothing else.
+
+explicit:   velocity Verlet of a clamped beam that falls, stable neo-Hookean, at most 0.9 of the largest stable step.
+explicit, one thread: the same where taisoft would take all threads, on one.
+implicit:   BDF2 of that beam, steps of 10 ms.
+search:     a search for contacts by proximity among 27 cubes at rest that touch, the pile of `collision.py`.
+explicit contact, implicit contact: two cubes on the ground, the upper one aside and sunk into the lower a little: symplectic
+            Euler and Gauss-Seidel at 0.9 of the largest stable step, implicit Euler and the augmented Lagrangian at 10 ms.
+
+All in f32. Steps are timed first as they are, then done again from the same start with a watch on their parts, whose looks at
+the clock cost a little. The first steps, which compile and let buffers grow, are left out.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from time import perf_counter
+
+import numpy as np
+import taichi as ti
+
+import taisoft as ts
+from taisoft import model, simulator
+from taisoft.elasticity import HUGE, elastic_forces, element_force
+from taisoft.elements.lanes import broadcast
+from taisoft.linear import block_csr, pcg
+from taisoft.output.report import peak_memory
+from taisoft.runtime import compile_clock, kernel, open_runtime, threads
+from taisoft.scene.scene import Scene
+from taisoft.stepping import contact_newton, newton
+from taisoft.study.stretch import advance, warm_up
+from taisoft.timing import Timing, summarise
+
+from .collision_cases import pile_setup, two_cubes
+from .collision_runs import Rig, clock, repeated
+from .contact_captured import patched
+from .contact_runs import REST, Stopwatch, explicit_places
+from .elasticity_beam import MARGIN, beam_scene, n_tets
+from .elasticity_cost import LONGEST_FALL, MOST_STEPS, SAMPLE_SECONDS
+from .scaling_bytes import floor_bytes, group_bytes
+
+DT, TINY_DT = 0.01, 1e-6  # [s] of implicit steps; of explicit ones until their limit is known
+SAMPLES, ROUNDS = 7, 15  # of explicit steps without contacts; of searches
+WARM, ENOUGH_SECONDS, FEWEST, MOST = 3, 3.0, 3, 20  # steps before, and steps that are timed one by one: time and number
+COUNTS = {"newton": "newton_iterations", "linear": "linear_iterations", "sweeps": "contact_iterations", "contacts": "n_contacts"}
+PRECISION = "f32"
+EXPLICIT, ON_ONE = "explicit", "explicit, one thread"
+
+
+@dataclass
+class Row:
+    """A kind of work on one mesh. samples: seconds of a step or a search; phases: seconds of each phase of one, medians; counts:
+    of one, means; moved: bytes that one moves at least; field_bytes: by group; base, peak: resident bytes before the scene was
+    made, and the most; setup_seconds: of making the scene and the simulator, without compiling."""
+
+    kind: str
+    arch: str
+    tets: int = 0
+    nodes: int = 0
+    threads: int = 1
+    samples: list[float] = field(default_factory=list)
+    phases: dict[str, float] = field(default_factory=dict)
+    counts: dict[str, float] = field(default_factory=dict)
+    moved: float = 0.0
+    field_bytes: dict[str, int] = field(default_factory=dict)
+    setup_seconds: float = 0.0
+    compile_seconds: float = 0.0
+    base: int | None = None
+    peak: int | None = None
+    failure: str = ""
+
+    @property
+    def timing(self) -> Timing | None:
+        """Of a step or a search [s]; None where there is none."""
+        return summarise(self.samples) if self.samples else None
+
+    def record(self) -> dict:
+        """As plain data, of which Row(**record) makes the row again."""
+        return asdict(self)
+
+
+def measure(kind: str, size: int, arch: str) -> Row:
+    """A kind of work on a mesh of about so many tets. Raises TaisoftError where it cannot be done."""
+    row = Row(kind, arch, base=peak_memory())
+    before = compile_clock()
+    KINDS[kind](row, size)
+    row.compile_seconds, row.peak = compile_clock() - before, peak_memory()
+    return row
+
+
+# --- what is simulated ------------------------------------------------------------------------------------------------
+
+
+def beam(size: int) -> Scene:
+    """A beam of 4 n x n x n cells."""
+    n = max(1, round((size / n_tets((4, 1, 1))) ** (1 / 3)))
+    return beam_scene((4 * n, n, n), "SNH")
+
+
+def cubes_on_ground(size: int) -> Scene:
+    """Two cubes on each other on the ground."""
+    scene = two_cubes(max(1, round((size / 10) ** (1 / 3))), "proximity")
+    scene.gravity, scene.contact_forces = (0.0, -9.81, 0.0), True
+    scene.allow_initial_overlap = True  # they are sunk into each other
+    scene.add_obstacle(ts.HalfSpace((0, -0.5, 0), (0, 1, 0)), name="ground")
+    return scene
+
+
+def pile_cells(size: int) -> int:
+    """Cells along the edges of the cubes of a pile."""
+    return max(1, round((size / (27 * 6)) ** (1 / 3)))
+
+
+def _open(row: Row, build: Callable[[int], Scene], size: int, integrator: str, dt: float | None) -> ts.Simulator:
+    """A scene's simulator; its numbers go into the row. dt None: MARGIN of the largest stable one."""
+    begin = perf_counter()
+    scene = build(size)
+    sim = ts.Simulator(scene, dt=dt or TINY_DT, integrator=integrator, precision=PRECISION, arch=row.arch)
+    if dt is None:
+        sim.dt = MARGIN * sim.stable_dt
+    row.setup_seconds = perf_counter() - begin - sim.compile_seconds
+    m = sim._world.model
+    row.tets = sum(body.mesh.n_tets for body in scene.bodies)
+    row.nodes, row.threads = m.n_nodes, 1 if m.serial else threads()
+    return sim
+
+
+# --- kinds of work ----------------------------------------------------------------------------------------------------
+
+
+def explicit_on_one(row: Row, size: int) -> None:
+    """The same on one thread, however large the mesh is."""
+    with patched(model, "PARALLEL_FROM", math.inf):
+        explicit(row, size)
+
+
+def explicit(row: Row, size: int) -> None:
+    """Steps without contacts, many in one launch."""
+    with _open(row, beam, size, "velocity_verlet", None) as sim:
+        warm_up(sim)
+        a_few = advance(sim, 10).seconds / 10
+        steps = max(1, min(MOST_STEPS, round(SAMPLE_SECONDS / a_few)))
+        sim.dt = min(sim.dt, LONGEST_FALL / steps)
+        _element_seconds(sim, steps)  # compiles
+        share = []
+        for _ in range(SAMPLES):  # in turn, so that a slow moment of the machine falls on both
+            sim.reset()
+            row.samples.append(advance(sim, steps).seconds / steps)
+            share.append(min(1.0, _element_seconds(sim, steps) / row.samples[-1]))
+        elements = float(np.median(share)) * row.timing.median
+        row.phases = {"elements": elements, "nodes": row.timing.median - elements}
+        row.field_bytes = group_bytes(sim)
+        row.moved = floor_bytes(("drift", "elements", "nodes"), sim.field_bytes)
+
+
+@kernel
+def repeat_elements(m: ti.template(), n: ti.i32):
+    """The element loop of an explicit step n times on one thread; scalars 6: the least J of a lane."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        low = broadcast(ti.cast(HUGE, m.real), m.lanes)
+        for _k in range(n):
+            for g in ti.static(m.groups):
+                for b in range(g.first, g.last):
+                    low = ti.min(low, element_force(m, g, False, b))
+        m.scalars[6] = low[0]
+
+
+def _element_seconds(sim: ts.Simulator, n: int) -> float:
+    """Seconds of the element loop of a step, done n times."""
+    m, begin = sim._world.model, clock()
+    if m.serial:
+        repeat_elements(m, n)
+    else:
+        for _ in range(n):
+            elastic_forces(m)
+    return (clock() - begin) / n
+
+
+def implicit(row: Row, size: int) -> None:
+    """Steps without contacts."""
+    with _open(row, beam, size, "bdf2", DT) as sim:
+        watch = _one_by_one(row, sim, implicit_places(sim))
+        _end_implicit(row, sim, watch)
+
+
+def explicit_contact(row: Row, size: int) -> None:
+    """Steps with contacts, each with a search and a solve."""
+    with _open(row, cubes_on_ground, size, "symplectic_euler", None) as sim:
+        _one_by_one(row, sim, explicit_places(sim))
+        row.field_bytes = group_bytes(sim)
+        sweep = floor_bytes(("sweep",), sim.field_bytes) * row.counts["contacts"] / sim._contact.problem.capacity
+        row.moved = floor_bytes(("elements", "update"), sim.field_bytes) + sweep * row.counts["sweeps"]
+
+
+def implicit_contact(row: Row, size: int) -> None:
+    """Steps with contacts inside the Newton loop."""
+    with _open(row, cubes_on_ground, size, "implicit_euler", DT) as sim:
+        watch = _one_by_one(row, sim, implicit_places(sim))
+        _end_implicit(row, sim, watch)
+
+
+def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
+    """Where the parts of the simulator's implicit steps are called, for `Stopwatch.on`."""
+    places = [
+        ("residual", newton, "form_residual"), ("residual", contact_newton, "form_residual"),
+        ("residual", contact_newton, "evaluate"), ("matrix", block_csr, "assemble"), ("matrix", block_csr, "to_system"),
+        ("matrix", contact_newton, "keep_diagonal"), ("linear solve", pcg, "solve"), ("report", simulator, "measure"),
+    ]  # fmt: skip
+    contact = sim._contact
+    if contact is not None:
+        places += [("search", contact.detection, "find"), ("search", contact, "_survey"), ("problem", contact, "begin")]
+        places.append(("problem", contact_newton, "find_factors"))
+    return places
+
+
+def _end_implicit(row: Row, sim: ts.Simulator, watch: Stopwatch) -> None:
+    """Bytes of an implicit step: those of its residuals, matrices and iterations of CG without what contacts add."""
+    fields, steps = sim.field_bytes, len(row.samples)
+    row.field_bytes = group_bytes(sim)
+    residuals, matrices = watch.calls["form_residual"] + watch.calls["evaluate"], watch.calls["assemble"]
+    row.counts |= {"residuals": residuals / steps, "matrices": matrices / steps}
+    row.moved = (
+        row.counts["residuals"] * floor_bytes(("elements", "residual"), fields)
+        + row.counts["matrices"] * floor_bytes(("blocks", "edges", "system"), fields)
+        + row.counts["linear"] * floor_bytes(("iteration",), fields)
+    )
+
+
+def _one_by_one(row: Row, sim: ts.Simulator, places: list[tuple[str, object, str]]) -> Stopwatch:
+    """Time steps one by one, then the same steps by their parts."""
+    reports = []
+    _warm(sim)
+    while len(row.samples) < FEWEST or (sum(row.samples) < ENOUGH_SECONDS and len(row.samples) < MOST):
+        begin = clock()
+        reports.append(sim.step())
+        row.samples.append(clock() - begin)
+    if not all(report.converged for report in reports):
+        row.failure = "not every step converged"
+    row.counts = {name: float(np.mean([getattr(report, own) for report in reports])) for name, own in COUNTS.items()}
+    _warm(sim)
+    watch, parts = Stopwatch(), []
+    with watch.on(places):
+        for _ in row.samples:
+            watch.spent.clear()
+            begin = clock()
+            sim.step()
+            whole = clock() - begin
+            parts.append(dict(watch.spent) | {REST: whole - sum(watch.spent.values())})
+    row.phases = {part: float(np.median([one.get(part, 0.0) for one in parts])) for part in {p: 0 for one in parts for p in one}}
+    return watch
+
+
+def _warm(sim: ts.Simulator) -> None:
+    """The first steps from the start."""
+    sim.reset()
+    for _ in range(WARM):
+        sim.step()
+
+
+def search(row: Row, size: int) -> None:
+    """Whole searches, and their phases."""
+    runtime = open_runtime(row.arch, PRECISION, "the benchmark of scaling")
+    try:
+        compiled, begin = compile_clock(), perf_counter()
+        with Rig(pile_setup(pile_cells(size)), "proximity", runtime) as rig:
+            row.setup_seconds = perf_counter() - begin - (compile_clock() - compiled)
+            row.tets, row.nodes = rig.tets, rig.model.n_nodes
+            row.threads = 1 if rig.detection.surface.serial else threads()
+            for _ in range(2):
+                rig.search()
+            row.samples = repeated(rig.search, ROUNDS)
+            taken = [rig.phases() for _ in row.samples]
+            row.phases = {name: float(np.median([one[name] for one in taken])) for name in taken[0]}
+            counts, found = rig.detection.counts, rig.detection.field_bytes
+            row.counts = {"triangles": counts.triangles, "found": counts.found, "contacts": counts.contacts}
+            row.field_bytes = {"search": sum(found.values())}
+            broad = "tree" if "bvh_link" in found else "cells"
+            row.moved = floor_bytes(("boxes", broad), found) + found["contacts"] * counts.found / rig.detection.buffer.capacity
+    finally:
+        runtime.close()
+
+
+KINDS: dict[str, Callable[[Row, int], None]] = {
+    EXPLICIT: explicit, ON_ONE: explicit_on_one, "implicit": implicit, "search": search,
+    "explicit contact": explicit_contact, "implicit contact": implicit_contact,
+}  # fmt: skip

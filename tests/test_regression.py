@@ -1,0 +1,146 @@
+"""Drifts within limits: short cases against the numbers stored of them in benchmarks/data/regression.json:
+
+* every case comes to the errors, iterations, memory and status stored, and every one is stored;
+* a number that changes by more than its margin is caught, for the better too, and one within it is not;
+* what is stored comes back as it was, beside other cases and archs, and damaged files are refused in a sentence;
+* the benchmark prints differences, stores them when asked to, and its exit status tells.
+"""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks import regression
+from benchmarks.regression import STORE, Entry, baseline, check, differences, load, make_entry, store
+from benchmarks.regression_cases import CASES, METHODS, Found, random_problem
+from taisoft.errors import OutputError
+
+NAMES = [case.name for case in CASES]
+ENTRY = Entry([1.0, -2.0], 0.01, {"newton": 100, "contacts": 9}, "ok", 1_000_000, 3.5)
+CASE = CASES[0]
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if c.quick], ids=lambda case: case.name)
+def test_as_stored(case):
+    assert check(case, "cpu", load("cpu", STORE))[1] == []
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if not c.quick], ids=lambda case: case.name)
+def test_as_stored_too(case):
+    assert check(case, "cpu", load("cpu", STORE))[1] == []
+
+
+def test_every_case_is_stored_and_told_apart():
+    assert len(set(NAMES)) == len(NAMES) and sum(case.quick for case in CASES) >= 3
+    stored = load("cpu", STORE)
+    assert list(stored) == NAMES and all(entry.status == "ok" for entry in stored.values())
+    assert all(entry.error < 0.2 for entry in stored.values())
+
+
+# --- margins ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "told, changes",
+    [
+        ("error 0.0107", {"error": 0.0107}), ("error 0.009", {"error": 0.009}), ("error nan", {"error": float("nan")}),
+        ("status 'degraded'", {"status": "degraded"}), ("field bytes 1002000", {"field_bytes": 1_002_000}),
+        ("field bytes 998000", {"field_bytes": 998_000}), ("newton 106", {"counts": {"newton": 106, "contacts": 9}}),
+        ("newton 94", {"counts": {"newton": 94, "contacts": 9}}), ("contacts 12", {"counts": {"newton": 100, "contacts": 12}}),
+        ("contacts 0", {"counts": {"newton": 100}}), ("sweeps 3", {"counts": {"newton": 100, "contacts": 9, "sweeps": 3}}),
+    ],
+)  # fmt: skip
+def test_a_changed_number_is_caught(told, changes):
+    found = differences(CASE, replace(ENTRY, **changes), ENTRY)
+    assert len(found) == 1 and found[0].startswith(f"{told}, stored ")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"error": 0.0104}, {"error": 0.0096}, {"time": 99.0}, {"field_bytes": 1_000_500},
+        {"counts": {"newton": 105, "contacts": 11}}, {"counts": {"newton": 95, "contacts": 7}},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_rounding_may_change_is_not(changes):
+    assert differences(CASE, replace(ENTRY, **changes), ENTRY) == []
+
+
+def test_errors_at_rounding_are_not_told_apart():
+    tiny = replace(ENTRY, error=1e-7)
+    assert differences(CASE, replace(tiny, error=0.9 * CASE.slack), tiny) == []
+    assert differences(CASE, replace(tiny, error=2.0 * CASE.slack), tiny) != []
+
+
+def test_errors_are_over_the_largest_number_of_the_reference():
+    entry = make_entry(Found([1.0, -1.9], {"newton": 3}, seconds=6.0), [1.0, -2.0], 2.0)
+    assert entry.error == pytest.approx(0.05) and entry.time == 3.0 and entry.counts == {"newton": 3}
+
+
+def test_a_real_computation_gone_wrong_is_caught(monkeypatch):
+    """Friction is a tenth larger than in what was stored."""
+    case = next(c for c in CASES if c.name == "contact problem")
+    W, b, mu = random_problem()
+    monkeypatch.setattr("benchmarks.regression_cases.random_problem", lambda: (W, b, 1.1 * mu))
+    found = check(case, "cpu", load("cpu", STORE))[1]
+    assert any(text.startswith("error") for text in found)
+    assert np.linalg.eigvalsh(W)[0] > 0.1 and set(load("cpu", STORE)["contact problem"].counts) == set(METHODS)
+
+
+# --- the file ---------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_stored_comes_back(tmp_path):
+    path = tmp_path / "stored.json"
+    assert load("cpu", path) == {}
+    store({NAMES[1]: ENTRY, NAMES[0]: ENTRY}, "cpu", path)
+    store({NAMES[2]: replace(ENTRY, error=0.5)}, "cuda", path)
+    store({NAMES[1]: replace(ENTRY, time=1.0)}, "cpu", path)
+    assert load("cpu", path) == {NAMES[0]: ENTRY, NAMES[1]: replace(ENTRY, time=1.0)} and list(load("cpu", path)) == NAMES[:2]
+    assert load("cuda", path) == {NAMES[2]: replace(ENTRY, error=0.5)}
+    gone = json.loads(path.read_text())
+    gone["cpu"]["cases"]["no case any more"] = gone["cpu"]["cases"][NAMES[0]]
+    path.write_text(json.dumps(gone))
+    store({}, "cpu", path)
+    assert list(load("cpu", path)) == NAMES[:2]
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"cpu": {"cases": {"a": {"error": 1}}}}'])
+def test_a_damaged_file_is_refused(text, tmp_path):
+    path = tmp_path / "stored.json"
+    path.write_text(text)
+    with pytest.raises(OutputError, match="stored.json"):
+        load("cpu", path)
+
+
+def test_the_unit_of_times_is_work():
+    assert 1e-4 < baseline() < 60.0
+
+
+# --- the benchmark ----------------------------------------------------------------------------------------------------
+
+
+def test_prints_stores_and_tells(monkeypatch, tmp_path, capsys):
+    newton = [100]
+    fake = replace(
+        CASE, name="fake", what="made up", run=lambda arch: Found([1.0, -2.02], {"newton": newton[0]}, "ok", 1000, 1.0),
+        reference=lambda arch: [1.0, -2.0],
+    )  # fmt: skip
+    monkeypatch.setattr(regression, "CASES", (fake,))
+    monkeypatch.setattr(regression, "STORE", tmp_path / "stored.json")
+    monkeypatch.setattr(regression, "baseline", lambda: 0.5)
+    assert regression.main([]) == 2 and "--update" in capsys.readouterr().out
+    assert regression.main(["--update"]) == 0
+    assert load("cpu", regression.STORE)["fake"] == Entry([1.0, -2.0], pytest.approx(0.01), {"newton": 100}, "ok", 1000, 2.0)
+    assert regression.main([]) == 0 and "nothing has changed" in capsys.readouterr().out
+    newton[0] = 120
+    assert regression.main([]) == 1
+    printed = capsys.readouterr().out
+    assert "CHANGED" in printed and "* fake: newton 120, stored 100 (made up)" in printed
+    assert regression.main(["--update", "--case", "fa"]) == 0 and "newton 120, stored 100" in capsys.readouterr().out
+    assert regression.main([]) == 0
+    with pytest.raises(SystemExit):
+        regression.main(["--case", "nothing"])
