@@ -191,14 +191,15 @@ C1 = Case(
     size=0.1, quick=("friction 0.51",),
 )  # fmt: skip
 
+BUCKLES = "a column of 5 m is higher than the 4.05 m from which a bar of this material buckles under its own weight"
 C2 = Case(
     "C2", "five cubes on each other", stack,
     tuple(
         Variant(f"start {seed}", {"dt": 0.025, "integrator": IMPLICIT}, {"seed": seed}, (OK, DEGRADED)) for seed in range(10)
     ),
     (
-        Criterion("height less 4.877 m, mean of 1.5 to 2.5 s [m]", 0.02, ANALYTIC),
-        Criterion("centroid's drift in the first second [m]", 0.01, PROPOSED),
+        Criterion("height less 4.877 m, mean of 1.5 to 2.5 s [m]", 0.02, ANALYTIC, note=f"not asked at the end: {BUCKLES}"),
+        Criterion("centroid's drift in the first second [m]", 0.01, PROPOSED, note=f"not asked of all 5 s: {BUCKLES}"),
         Criterion(DEEPEST, 5e-3, PROPOSED),
     ),
     size=5.0,
@@ -212,8 +213,11 @@ C3 = Case(
         Criterion("numbers that are not finite at the end", 0.0, PROPOSED, of=A),
         Criterion(DEEPEST, 1e-3, PROPOSED, of=A),
         Criterion("largest speed upwards [m/s]", 0.5, PROPOSED, of=A),
-        Criterion("depth of the tip under the rims at the end [m]", 0.1, PROPOSED, at_least=True, of=A),
-        Criterion("kinetic energy at the end [J]", 1e-6, PROPOSED, of=A),
+        Criterion(
+            "depth of the tip under the rims at the end [m]", 0.1, PROPOSED, at_least=True, of=A,
+            note="that the spike rests, with 1e-6 J at most, is not asked: its base is as wide as the hole, so that it wobbles "
+            "through and falls on, in f64 and in steps of 1 ms too",
+        ),
         Criterion("sideways deviation [m]", 1e-3, PROPOSED, of=B),
         Criterion("hop [m]", 1e-3, PROPOSED, of=B),
         Criterion("loss of speed", 0.01, PROPOSED, of=B),

@@ -103,6 +103,7 @@ def knives(session: Session) -> dict[str, float]:
         "deepest of vertices and triangles' middles in a knife [m]": max(deepest),
         "numbers that are not finite at the end": float(not finite),
         "inverted tets, most": float(max(report.n_inverted for report in session.reports)),
+        "deepest of the contacts after any step [m]": session.deepest,
     }
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 import taisoft as ts
+from taisoft.errors import SimulationError
 
 from ..reference_cases.record import face
 from .record import ANALYTIC, DEGRADED, FAILED, OK, PROPOSED, Case, Criterion, Variant
@@ -115,7 +116,11 @@ def flood(session: Session, capacities: dict, broad_phase: str) -> dict[str, flo
 
     ample, _ = run()
     before = len(session.problems)
-    small, grown = run(**capacities)
+    small, grown = np.full_like(ample, np.nan), {}
+    try:
+        small, grown = run(**capacities)
+    except SimulationError as error:  # it is refused before the first step
+        session.tell(FAILED, [str(error)])
     told = " ".join(session.problems[before:])
     return {
         "off the run with room enough [m]": np.abs(small - ample).max(),

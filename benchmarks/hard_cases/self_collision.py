@@ -3,7 +3,7 @@
 import numpy as np
 
 import taisoft as ts
-from taisoft.elements.reference import lumped_mass
+from taisoft.elements.reference import lumped_mass, weight_mass
 from taisoft.scene.key_frames import KeyFrames
 
 from ..reference_cases.record import face
@@ -53,24 +53,22 @@ def clamp(session: Session, law: str) -> dict[str, float]:
     for y, way in ((0.14, -0.04), (0.0, 0.04)):
         moved = KeyFrames([0.0, 1.0, 1.5], [WEIGHTLESS, (0.0, way, 0.0), (0.0, way, 0.0)], release=True)
         body.move(lambda X, y=y: (np.abs(X[:, 0] - 0.16) < 1e-9) & (np.abs(X[:, 1] - y) < 1e-9), moved)
-    uneven = [0.0]
+    mass, momenta, impulses = weight_mass(body), [], []
 
     def look(sim, k, report):
-        c = sim.contacts()
-        if len(c.gap):
-            # each contact gives its impulse to one side and takes it from the other, by weights that sum to 1
-            size = np.abs(c.impulse).sum()
-            sides = [np.where(n >= 0, w, 0.0).sum(axis=1) for n, w in ((c.nodes_a, c.weights_a), (c.nodes_b, c.weights_b))]
-            total = np.abs(c.impulse.T @ (sides[0] - sides[1])).max()
-            uneven[0] = max(uneven[0], total / size if size > 0.0 else 0.0)
+        momenta.append(mass @ sim.velocities())
+        impulses.append(np.abs(sim.contacts().impulse).sum())
 
     with session.simulator(scene) as sim:
         session.go(sim, 450, look)
         found = rest_at_last(sim, 0.16)
+        decay = 1.0 + soft.mass_damping * sim.dt  # of an implicit Euler step without forces
+    free = np.array(momenta[151:])  # the step that ends at 1.5 s is led
+    made = float(np.linalg.norm(decay * free[1:] - free[:-1], axis=1).max()) if len(free) > 1 else np.nan
     return found | {
         "contacts, most": float(max(report.n_contacts for report in session.reports)),
         DEEPEST: session.deepest,
-        "sum of the contacts' impulses over their sizes, most": uneven[0],
+        "what steps after the release add to the momentum, over the impulses of contacts": made / max(impulses),
     }
 
 
@@ -165,7 +163,10 @@ S2 = Case(
         Criterion("contacts, most", 1.0, ANALYTIC, at_least=True),
         Criterion(DEEPEST, 1e-3, PROPOSED),
         Criterion("shape error at the end, over L", 5e-3, PROPOSED),
-        Criterion("sum of the contacts' impulses over their sizes, most", 1e-6, ANALYTIC, of={"precision": "f64"}),
+        Criterion(
+            "what steps after the release add to the momentum, over the impulses of contacts", 1e-6, ANALYTIC,
+            of={"precision": "f64"},
+        ),
     ),
     size=0.16,
 )  # fmt: skip

@@ -33,6 +33,7 @@ class Session:
         self.case, self.variant, self.arch, self.finer = case, variant, arch, finer
         self.status = OK
         self.problems: list[str] = []
+        self._warned: list[warnings.WarningMessage] = []
         self.steps = 0
         self.seconds = 0.0  # wall time of steps without compiling
         self.step_seconds: list[float] = []  # of a step, of each advance
@@ -77,6 +78,11 @@ class Session:
         self.problems += problems
 
     @property
+    def warnings(self) -> list[str]:
+        """What was warned of so far."""
+        return [str(one.message) for one in self._warned if issubclass(one.category, UserWarning)]
+
+    @property
     def deepest(self) -> float:
         """The deepest penetration after any step [m]."""
         return max((report.max_penetration for report in self.reports), default=0.0)
@@ -89,16 +95,15 @@ class Session:
     def record(self) -> dict:
         """Run the variant. Returns plain data: its end, its numbers, its cost, its path."""
         start = time.perf_counter()
-        with warnings.catch_warnings(record=True) as told:
+        with warnings.catch_warnings(record=True) as self._warned:
             warnings.simplefilter("always", UserWarning)
             try:
                 numbers = self.case.run(self, **self.variant.parameters)
             except TaisoftError as error:
                 numbers = {}
                 self.tell(FAILED, [str(error)])
-        warned = [str(one.message) for one in told if issubclass(one.category, UserWarning)]
         return {
-            "status": self.status, "problems": list(dict.fromkeys(self.problems)), "warnings": list(dict.fromkeys(warned)),
+            "status": self.status, "problems": list(dict.fromkeys(self.problems)), "warnings": list(dict.fromkeys(self.warnings)),
             "numbers": {name: float(value) for name, value in numbers.items()},
             "steps": self.steps, "seconds": self.seconds, "total_seconds": time.perf_counter() - start,
             "step_seconds": float(np.median(self.step_seconds)) if self.step_seconds else None,

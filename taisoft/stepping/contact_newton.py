@@ -30,7 +30,7 @@ from taisoft.stepping.contact_stage import (
     keep_diagonal,
     keep_linear,
 )
-from taisoft.stepping.newton import MAX_FORCING, SLOW, StageResult, StageSolver, _forcing
+from taisoft.stepping.newton import MAX_FORCING, ROUNDINGS, SLOW, StageResult, StageSolver, _forcing
 from taisoft.stepping.stage import begin_stage, form_residual
 from taisoft.transfer import array_of, upload
 
@@ -254,7 +254,7 @@ class ContactStageSolver(StageSolver):
             taken += 1
             if not np.isfinite(r):
                 break
-            if r <= floor and r > 0.5 * previous:
+            if r <= ROUNDINGS * floor and r > 0.5 * previous:
                 rounding = True  # nothing but rounding is left
             if not moved:
                 if needs_projection or self._linear:

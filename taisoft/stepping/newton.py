@@ -8,8 +8,8 @@ c = 1 for a time step, 0 for statics (v is then a displacement). A full step tha
 decides by backtracking. K is unprojected; negative curvature in CG asks for the projected one. CG's tolerance follows
 Newton's progress (Eisenstat and Walker 1996, choice 2).
 Convergence: |r| <= tolerance * scale, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes. The rounding of F
-makes forces of its own; a residual below those (the floor) that a Newton step no longer halves is rounding, which moves
-nothing by more than the rounding of a strain, and ends the stage as converged, its residual told as it is. In statics the
+makes forces of its own (the floor); a residual below twice those that a Newton step no longer halves is rounding, which moves
+nothing by more than twice the rounding of a strain, and ends the stage as converged, its residual told as it is. In statics the
 scale is the applied load (without any: the constraint forces), and rounding above the tolerance is not convergence.
 """
 
@@ -34,6 +34,7 @@ LINEAR_LIMIT = 0.01  # true relative residual of a linearly implicit step above 
 MAX_FORCING = 0.1  # CG's loosest tolerance
 UNSEEN = 1e-10  # share of Phi below which small strains round it: F - I cancels
 RISEN_FORCING = 3e-2  # CG's tolerance after a step that lowered Phi but raised |r|
+ROUNDINGS = 2.0  # of a strain in a law: F and, of the corotational one, R
 SUFFICIENT = 1e-4  # Armijo's share of the predicted decrease
 
 
@@ -202,7 +203,7 @@ class StageSolver:
             previous = r
             r, scale, moved = self._advance(c, beta, r, scale, max_newton == 1, by_energy, floor)
             newton += 1
-            if r <= floor and r > 0.5 * previous:
+            if r <= ROUNDINGS * floor and r > 0.5 * previous:
                 rounding = True  # nothing but rounding is left
                 break
             if not moved:
