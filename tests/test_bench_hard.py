@@ -74,6 +74,7 @@ def test_a_run_that_cannot_be_made():
     assert [verdict.passed for verdict in judge(case, variant, record)] == [True, False, False]
 
 
+@pytest.mark.filterwarnings("ignore:.*nearly flat")
 def test_shapes():
     ball = time_step.ball()
     assert ball.n_tets == 6 * round(ball.volumes.sum() / 0.004**3) and ball.n_tets == 3312
