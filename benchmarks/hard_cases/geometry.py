@@ -89,9 +89,10 @@ def knives(session: Session) -> dict[str, float]:
     for k, x in enumerate(places):
         scene.add_obstacle(knife(x), name=f"knife {k}", friction=0.0)
     scene.add_obstacle(ts.HalfSpace((0, -0.11, 0), (0, 1, 0)), name="plane", friction=0.0)
-    deepest = []
+    deepest, cut = [], []
 
     def look(sim, k, report):
+        cut.append(len(sim.intersecting_triangles()))
         x = sim.positions()
         points = np.concatenate([x, x[body.mesh.surface].mean(axis=1)])
         deepest.append(max(depth_in_knife(points, place) for place in places))
@@ -101,6 +102,7 @@ def knives(session: Session) -> dict[str, float]:
         finite = np.isfinite(sim.positions()).all()
     return {
         "deepest of vertices and triangles' middles in a knife [m]": max(deepest),
+        "pairs of triangles that cut each other, most": float(max(cut)),
         "numbers that are not finite at the end": float(not finite),
         "inverted tets, most": float(max(report.n_inverted for report in session.reports)),
         "deepest of the contacts after any step [m]": session.deepest,
@@ -130,10 +132,18 @@ G2 = Case(
     "G2", "mat on knives", knives,
     (Variant(SNH, {"dt": 0.01, "integrator": IMPLICIT}, ends=(OK, DEGRADED)),),
     (
+        Criterion(
+            "pairs of triangles that cut each other, most", 0.0, PROPOSED,
+            note='"never crosses a knife": a point in a knife, which is 4 mm thick, is 2 mm deep at most on whichever side it lies',
+        ),
         Criterion("deepest of vertices and triangles' middles in a knife [m]", 2e-3, PROPOSED),
         Criterion("numbers that are not finite at the end", 0.0, PROPOSED),
     ),
     size=0.6,
+    shortfall="where the mat, draped over an edge, slides, a fold of its mesh passes over the edge within a step. Only the contacts "
+    "of the side of the fold that lies over the edge at the start of the step are found, so that the other side sinks through "
+    "by some 0.1 mm a step and in the end is not found any more. Next: look for edges that come to cross along the way of the "
+    "step, as vertices and faces are looked for.",
 )  # fmt: skip
 
 CASES = (G1, G2)
