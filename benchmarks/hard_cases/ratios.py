@@ -100,7 +100,7 @@ R1 = Case(
         Criterion("longest step over the median", 10.0, PROPOSED),
     ),
     size=0.1,
-    shortfall="the step of the impact takes some hundred multipliers and Newton iterations, one at rest a single one, so the ratio "
+    shortfall="the step of the impact takes some hundred multipliers and Newton iterations, one at rest a single one: the ratio "
     "tells of cheap steps at rest as much as of the dear one. Next: start the multipliers of new contacts from the impulses of a "
     "rigid impact.",
 )  # fmt: skip

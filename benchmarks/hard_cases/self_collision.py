@@ -194,8 +194,8 @@ S4 = Case(
         Criterion("inverted tets at the end", 0.0, PROPOSED),
     ),
     size=0.2,
-    shortfall="arms that are pushed into each other's corners turn tets inside out, and the contacts under those are not found, so "
-    "that the arms pass and stay hooked. Next: keep steps from inverting tets where contacts push (a bound on the step as of "
+    shortfall="arms that are pushed into each other's corners turn tets inside out, and the contacts under those are not found: "
+    "the arms pass and stay hooked. Next: keep steps from inverting tets where contacts push (a bound on the step as of "
     "barrier methods), or resolve what has crossed by its way out as a whole.",
 )  # fmt: skip
 
