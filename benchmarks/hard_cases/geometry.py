@@ -140,8 +140,8 @@ G2 = Case(
         Criterion("numbers that are not finite at the end", 0.0, PROPOSED),
     ),
     size=0.6,
-    shortfall="where the mat, draped over an edge, slides, a fold of its mesh passes over the edge within a step. Only contacts of "
-    "the side of the fold that lies over the edge at the start of the step are found, so that the other side sinks through "
+    shortfall="where the mat, draped over an edge, slides, a fold of its mesh passes over the edge within a step. Only contacts "
+    "of the side of the fold that lies over the edge at the start of the step are found, so that the other side sinks through "
     "by some 0.1 mm a step and in the end is not found any more. Next: look for edges that come to cross along the way of the "
     "step, as vertices and faces are looked for.",
 )  # fmt: skip

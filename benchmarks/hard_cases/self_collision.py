@@ -135,6 +135,11 @@ def jack(session: Session, law: str) -> dict[str, float]:
     }
 
 
+CROSSED = (
+    "edges come to cross within a step that did not lie over each other at its start, which is not looked for (see G2), and what "
+    "has crossed is not undone as a whole. Next: look for edges that cross along the way of the step, and redo a step that ends "
+    "with triangles cut that were not"
+)
 TWIST = {"dt": 0.04, "integrator": IMPLICIT, "self_collision": True}
 ANY = (OK, DEGRADED, FAILED)
 S1 = Case(
@@ -150,6 +155,7 @@ S1 = Case(
         Criterion(DEEPEST, 5e-3, PROPOSED, of={"seconds": 5.0}),
     ),
     size=1.0,
+    shortfall=f"from the first contacts on, at t = 1.4 s of start 0, edges are crossed, by 1 mm at first; {CROSSED}.",
 )  # fmt: skip
 
 CLOSE = {"dt": 0.01, "integrator": IMPLICIT, "self_collision": True}
@@ -194,9 +200,8 @@ S4 = Case(
         Criterion("inverted tets at the end", 0.0, PROPOSED),
     ),
     size=0.2,
-    shortfall="arms that are pushed into each other's corners turn tets inside out, and the contacts under those are not found: "
-    "the arms pass and stay hooked. Next: keep steps from inverting tets where contacts push (a bound on the step as of "
-    "barrier methods), or resolve what has crossed by its way out as a whole.",
+    shortfall=f"the first contacts of the arms, at t = 0.86 s, leave edges crossed by 0.3 mm, without an inverted tet; {CROSSED}, and "
+    "the arms stay hooked when the planes open.",
 )  # fmt: skip
 
 CASES = (S1, S2, S3, S4)
