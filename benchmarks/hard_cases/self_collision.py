@@ -200,7 +200,7 @@ S4 = Case(
         Criterion("inverted tets at the end", 0.0, PROPOSED),
     ),
     size=0.2,
-    shortfall=f"the first contacts of the arms, at t = 0.86 s, leave edges crossed by 0.3 mm, without an inverted tet; {CROSSED}, and "
+    shortfall=f"the first contacts of the arms, at t = 0.86 s, leave edges crossed by 0.3 mm, no tet inverted; {CROSSED}, and "
     "the arms stay hooked when the planes open.",
 )  # fmt: skip
 
