@@ -370,7 +370,7 @@ def test_softening_is_told_once(integrator):
     for law, x in ((SNH, 0.0), (SVK, 3.0)):
         scene.add_body(cube(cells=(2, 1, 1)), rubber(law), name=law, position=(x, 0, 0))
     scene.contact_forces = False
-    with ts.Simulator(scene, 1e-5, integrator) as sim:
+    with ts.Simulator(scene, 1e-5, integrator, precision="f64") as sim:
         rest = sim.positions()
         told = []
         for squeeze in (0.65, 0.55, 0.5):

@@ -199,7 +199,7 @@ def test_a_motion_that_diverges_is_stopped_while_it_is_finite(plane):
     scene = one_body(rubber(COR), cells=(2, 1, 1))
     if plane:
         scene.add_obstacle(ts.HalfSpace((0, -100, 0), (0, 1, 0)))
-    with ts.Simulator(scene, 1.2 * stable_dt(scene, False), "symplectic_euler", allow_unstable=True) as sim:
+    with ts.Simulator(scene, 1.2 * stable_dt(scene, False), "symplectic_euler", precision="f64", allow_unstable=True) as sim:
         x = sim.positions()
         sim.set_state(x + 1e-3 * np.random.default_rng(0).standard_normal(x.shape))
         result = sim.run(400 * sim.dt, fps=None)
