@@ -237,10 +237,10 @@ def measure(extent: Extent, arch: str, peers: bool, document: Document) -> dict:
     }  # fmt: skip
 
 
-def default_out(arch: str) -> Path:
-    """results/elasticity-<machine>.json beside this file."""
+def default_out(arch: str, what: str = "elasticity") -> Path:
+    """results/<what>-<machine>.json beside this file."""
     where = machine()
-    return RESULTS / f"elasticity-{slug(where['processor'])}-{where['cores']}-cores{'-cuda' if arch == 'cuda' else ''}.json"
+    return RESULTS / f"{what}-{slug(where['processor'])}-{where['cores']}-cores{'-cuda' if arch == 'cuda' else ''}.json"
 
 
 def check_out(path: Path) -> None:

@@ -1,61 +1,98 @@
-"""Hard cases: what each must keep to, measured, pass or fail.
+"""Hard cases, each against its limits: 26 settings that break solvers, run for their time.
 
-taisoft bench hard [--case NAME] [--arch cpu|cuda]
+taisoft bench hard [--case ID] [--quick] [--references] [--arch cpu|cuda] [--budget SECONDS] [--keep DIR] [--out [FILE.json]]
 
-A row is a number that a case must keep to. Seconds include compiling. Exit status: 0 all passed, 1 some failed.
+A case is run in all its variants: laws, integrators, precisions, starts. Each is a process of its own, so that its peak memory
+is its own; wall time is that of its steps without compiling, the time of a step is the median. A limit is measured, analytic
+or proposed; of a proposed one that an honest baseline replaces the table tells both. Error: the largest distance of a node, at
+about 20 times of the run, to the same run in f64 with an eighth of the step, over the case's size; "-" where that run would
+take long (--references runs them all) or has no shape to compare. --keep holds finished runs in DIR, and the same command goes
+on from there. Exit status: 0 all limits met, 1 some not, or some not run.
 """
 
 import argparse
 import sys
 import time
-from collections.abc import Callable, Iterable
-from functools import partial
+from contextlib import ExitStack, closing
+from pathlib import Path
 
-from . import hard_contact
-from .reference_cases.record import Check, computed
+from taisoft.cli.signals import Signals
+from taisoft.cli.study_child import serve
+from taisoft.output.files import FolderLock, make_folder, write_bytes
+from taisoft.output.report import json_text
+from taisoft.study.store import NoStore, Store
+from taisoft.timing import load_average
 
-CASES: dict[str, Callable[[str], Iterable[Check]]] = {
-    "C1 slope": hard_contact.slope,
-    "C2 stack, start 0": partial(hard_contact.stack, seed=0),
-    "C2 stack, start 1": partial(hard_contact.stack, seed=1),
-    "C3 inner edges": hard_contact.inner_edges,
-    "C3 spike in a hole": hard_contact.spike_in_hole,
-    "R2 stiffness ratio": hard_contact.stiffness_ratio,
-    "T4 stiff cube, corotational": partial(hard_contact.stiff_cube, law=hard_contact.COR),
-    "T4 stiff cube, neo-Hookean": partial(hard_contact.stiff_cube, law=hard_contact.SNH),
-    "L2 rest": hard_contact.rest,
-}
-FORMAT = "{:28} {:64} {:>12} {:>9} {:>9} {:5} {:>7}"
+from .elasticity import RESULTS, Document, default_out
+from .hard_cases import CASES
+from .hard_runs import Row, answer, measure
+from .hard_table import notes, summary, table
+from .order import check_out, header
+
+DAY = 86_400.0  # [s]
 
 
-def run(name: str, arch: str) -> list[Check]:
-    """The checks of a case."""
-    return computed(lambda: CASES[name](arch))
+def chosen(case: str | None, quick: bool) -> list[Row]:
+    """The rows of a case, or of all; quick: only variants that are cheap."""
+    return [
+        Row(one, variant) for one in CASES if case in (None, one.id)
+        for variant in one.variants if not quick or variant.name in one.quick
+    ]  # fmt: skip
+
+
+def measured(rows: list[Row], options: argparse.Namespace, document: Document) -> dict:
+    """Run the rows and print what is found. Returns the numbers. Raises OutputError."""
+    text, numbers = header("Hard cases", f"arch {options.arch}")
+    document.add(text)
+    end = time.monotonic() + options.budget
+    with Signals("ending; runs that are finished are kept") as signals, ExitStack() as stack:
+        store = NoStore()
+        if options.keep is not None:
+            folder = make_folder(options.keep)
+            stack.enter_context(closing(FolderLock(folder)))
+            store = Store(folder)
+        signals.run_began()
+        measure(rows, options.arch, options.references, store, lambda: end - time.monotonic(), signals.asked, _tell)
+    document.add(table(rows))
+    for told in (notes(rows), "\n".join(store.damaged), summary(rows)):
+        if told:
+            document.add(told)
+    return numbers | {
+        "arch": options.arch, "quick": options.quick, "load_at_the_end": load_average(), "rows": [row.data() for row in rows],
+    }  # fmt: skip
+
+
+def _tell(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def main(argv=None) -> int:
-    """Run the cases and print their table."""
-    parser = argparse.ArgumentParser(prog="taisoft bench hard", description=__doc__.partition("\n")[0])
-    parser.add_argument("--case", metavar="NAME", help=f"only those whose name begins so: {', '.join(CASES)}")
+    """Measure and print. Raises OutputError."""
+    first, _, rest = __doc__.partition("\n")
+    parser = argparse.ArgumentParser(prog="taisoft bench hard", description=first, epilog=rest.partition("\n\n")[2])
+    parser.add_argument("--case", choices=[case.id for case in CASES], metavar="ID", help="only this one, such as M1")
+    parser.add_argument("--quick", action="store_true", help="a few variants that are cheap")
+    parser.add_argument("--references", action="store_true", help="references of all variants that can have one")
     parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
+    parser.add_argument("--budget", type=float, default=DAY, metavar="SECONDS", help="what is not begun by then is left out")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep finished runs there, and take up those that it holds")
+    parser.add_argument(
+        "--out", type=Path, nargs="?", const=RESULTS, metavar="FILE.json",
+        help="write FILE.json and FILE.md too; without a name into benchmarks/results, named after the machine",
+    )  # fmt: skip
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)  # how this command runs one variant
     options = parser.parse_args(argv)
-    names = [name for name in CASES if name.startswith(options.case or "")]
-    if not names:
-        parser.error(f"no case begins with {options.case!r}")
-    print(FORMAT.format("case", "quantity", "measured", "error", "limit", "", "seconds"))
-    failed = 0
-    for name in names:
-        start = time.perf_counter()
-        checks = run(name, options.arch)
-        seconds = f"{time.perf_counter() - start:.0f}"
-        for check in checks:
-            failed += not check.passed
-            limit = "-" if check.limit is None else f"{check.limit:.1e}"
-            numbers = f"{check.measured:.6g}", f"{check.error:.1e}", limit
-            print(FORMAT.format(name, check.quantity, *numbers, check.verdict, seconds))
-            seconds = ""
-    print("all passed" if not failed else f"{failed} failed")
-    return 1 if failed else 0
+    if options.child:
+        serve(answer)
+    out = default_out(options.arch, "hard") if options.out == RESULTS else options.out
+    check_out(out, ".json")
+    document, rows = Document(), chosen(options.case, options.quick)
+    numbers = measured(rows, options, document)
+    if out is not None:
+        write_bytes(out, json_text(numbers).encode())
+        write_bytes(out.with_suffix(".md"), ("\n\n".join(document.parts) + "\n").encode())
+        print(f"written: {out} and {out.with_suffix('.md').name}")
+    return 0 if all(row.passed for row in rows) else 1
 
 
 if __name__ == "__main__":

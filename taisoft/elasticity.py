@@ -23,7 +23,7 @@ from taisoft.elements.lanes import (
 )
 from taisoft.mass import mass_times
 from taisoft.materials.projection import dpk1_projected, prepare_projected
-from taisoft.math3 import determinant, matmul_nt
+from taisoft.math3 import determinant, matmul_nt, matmul_tn
 from taisoft.runtime import kernel
 
 HUGE = 1e30  # above any volume ratio
@@ -170,6 +170,27 @@ def measure(m: ti.template()):
                 else:
                     total += value
             m.scalars[k] = total
+
+
+@kernel
+def find_softened(m: ti.template(), found: ti.types.ndarray()):
+    """found (1,) int32: made the first tet, counted by blocks and lanes, that is squeezed below the stretch s where its law
+    softens, if it comes before what is there: F^T F - s^2 I is not positive definite, which its leading minors tell."""
+    for g in ti.static(m.groups):
+        if ti.static(g.law.SOFTENS_BELOW > 0.0):
+            ti.loop_config(serialize=m.serial)
+            for b in range(g.first, g.last):
+                X = differences(m, g, m.x, b, m.real)
+                M = rest_gradients(m, b, m.real)
+                for q in range(g.n_points):
+                    F = gradient_at(m, g, X, M, q, m.real)
+                    C = matmul_tn(F, F)
+                    square = ti.static(g.law.SOFTENS_BELOW**2)
+                    D = [C[k] - (square if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
+                    least = ti.min(D[0], D[0] * D[4] - D[1] * D[3], determinant(D))
+                    for l in ti.static(range(m.lanes)):
+                        if least[l] <= 0.0:
+                            ti.atomic_min(found[0], b * m.lanes + l)
 
 
 @kernel

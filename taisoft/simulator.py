@@ -4,11 +4,14 @@ import dataclasses
 import warnings
 import weakref
 
+import numpy as np
+
 from taisoft import runtime
 from taisoft.collision.pipeline import Detection
-from taisoft.elasticity import measure
+from taisoft.elasticity import find_softened, measure
 from taisoft.errors import SceneError, SimulationError, no_memory
 from taisoft.fields import FieldArena
+from taisoft.materials import LAWS
 from taisoft.model import build_model
 from taisoft.records import RunReport, StepReport
 from taisoft.resuming import Resuming
@@ -56,6 +59,7 @@ class Simulator(Resuming):
         self._owned = []  # what has memory of its own to give back
         self._contact: ContactStep | None = None
         self._idle_detection: Detection | None = None  # of a scene without contact forces, once asked for
+        self._softens = any(LAWS[b.material.law].SOFTENS_BELOW for b in scene.bodies)  # and it was not told yet
         self._tangent = None  # fields of force_differential, once asked for
         if self.settings.explicit:
             self._check_stability(self._dt)
@@ -143,6 +147,8 @@ class Simulator(Resuming):
             report.converged &= result.contacts_converged
             report.deep = int(self._contact.sinking > SUNK)
         report.steps = self.step_count - start
+        if self._softens:
+            self._tell_softened()
         report.problems = [f"step {world.step_count}: {what}" for what in self._problems(report)]
         return report
 
@@ -152,6 +158,24 @@ class Simulator(Resuming):
         if where is not None:
             return SimulationError(f"{step}{where} at its start")
         return error if str(error).startswith("step ") else SimulationError(f"{step}{error}")
+
+    def _tell_softened(self) -> None:
+        """Warn, once, of the first tet that is squeezed so far that its law softens."""
+        layout, none = self._world.layout, np.iinfo(np.int32).max
+        found = np.array([none], dtype=np.int32)
+        find_softened(self._world.model, found)
+        if found[0] == none:
+            return
+        self._softens = False
+        place = found[0] - layout.block_start * self._runtime.lanes
+        k = int(np.flatnonzero((place >= 0) & (place < layout.n_tets))[0])
+        body = self.scene.bodies[k]
+        law = LAWS[body.material.law]
+        warnings.warn(
+            f"step {self.step_count}: tet {place[k]} of body '{body.name}' is squeezed to less than {law.SOFTENS_BELOW} of its "
+            f"length, where {law.NAME} softens: tets may collapse and turn inside out, and stay so",
+            UserWarning, stacklevel=3,
+        )  # fmt: skip
 
     def _problems(self, report: StepReport) -> list[str]:
         """What was not as it should be, in sentences."""

@@ -2,6 +2,7 @@
 
 * a step that ended too deep starts again from its own start in twice as many parts, led nodes that it had let go included; the
   result is that of so many steps, its iterations are those of all tries;
+* an implicit part that ended in something is looked at along its way, and edges that come to cross within a step are met;
 * where a try fails, the state is that before the step;
 * a run whose paths end with it ends as any other, and its end is judged.
 """
@@ -95,6 +96,36 @@ def test_a_try_that_fails_leaves_the_state_before_the_step(sim, monkeypatch):
     sim.reset()
     sim.step()
     assert np.abs(sim.positions() - first).max() < 1e-9  # [m]
+
+
+def test_a_part_that_sank_is_looked_at_along_its_way(sim, monkeypatch):
+    """Nothing is there that was not known: the part stays what it was."""
+    first = sim.step()
+    wanted, searched, search = sim.positions(), [], sim._contact.search_way
+    sim.reset()
+    monkeypatch.setattr(sim._contact, "sank", lambda time, dt: True)
+    monkeypatch.setattr(sim._contact, "search_way", lambda *at: searched.append((at, search(*at))))
+    report = sim.step()
+    assert searched == [((0.0, DT), False)] and report.newton_iterations == first.newton_iterations
+    assert np.array_equal(sim.positions(), wanted) and report.max_penetration == first.max_penetration
+
+
+def test_edges_that_come_to_cross_are_met():
+    """An edge falls past the end of a ridge's cross-section, over which it does not lie at the start of the step."""
+    mesh, r = ts.box_mesh((1, 1, 1), (0.1, 0.1, 0.1)), np.sqrt(0.5)
+    scene = ts.Scene(gravity=(0, 0, 0))
+    for name, turn, at, v in (
+        ("ridge", [[r, -r, 0], [r, r, 0], [0, 0, 1]], (0, -0.1 * r, 0), (0, 0, 0)),
+        ("edge", [[1, 0, 0], [0, r, -r], [0, r, r]], (0.051, 0.1 * r + 0.002, 0), (-2, -3, 0)),
+    ):
+        turned = ts.TetMesh(mesh.vertices @ np.transpose(turn), mesh.tets)
+        scene.add_body(turned, ts.Material(young=1e5), name=name, position=at, velocity=v)
+    with ts.Simulator(scene, dt=1e-3, precision="f64") as sim:
+        c = sim.detect_contacts()
+        edges = c.kind == "edge_edge"
+        assert edges.sum() == 1 and c.gap[edges] == pytest.approx(0.002) and abs(c.normal[edges][0, 1]) == pytest.approx(1.0)
+        sim.set_state(velocities=np.tile([0.5, -3.0, 0.0], (8, 1)), body="edge")  # it moves away from the ridge
+        assert not (sim.detect_contacts().kind == "edge_edge").any()
 
 
 def test_a_path_that_ends_with_the_run(sim):

@@ -5,10 +5,12 @@
 * gravity, dt and material numbers take effect at once and compile nothing;
 * a step that fails names body and vertex and leaves the last good state, from which it can go on;
 * a closed simulator says so, and so does one that is asked for a body it does not have;
+* a law that softens where it is squeezed is told with the first tet that is, once;
 * turning, shifting and enlarging a scene does the same to its result, and the order of the bodies does not matter.
 """
 
 import gc
+import warnings
 
 import numpy as np
 import oracle_laws as exact
@@ -360,3 +362,22 @@ def test_turning_the_state_turns_the_result(sim):
     assert np.abs(sim.positions() - expected[0]).max() < 1e-10  # [m]
     assert np.abs(sim.velocities() - expected[1]).max() < 1e-8  # [m/s]
     assert np.abs(sim.reactions() - expected[2]).max() < 1e-6 * np.abs(expected[2]).max()
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "symplectic_euler"])
+def test_softening_is_told_once(integrator):
+    scene = ts.Scene(gravity=(0, 0, 0))
+    for law, x in ((SNH, 0.0), (SVK, 3.0)):
+        scene.add_body(cube(cells=(2, 1, 1)), rubber(law), name=law, position=(x, 0, 0))
+    scene.contact_forces = False
+    with ts.Simulator(scene, 1e-5, integrator, precision="f64") as sim:
+        rest = sim.positions()
+        told = []
+        for squeeze in (0.65, 0.55, 0.5):
+            sim.set_state(rest * (1.0, squeeze, 1.0))
+            with warnings.catch_warnings(record=True) as found:
+                warnings.simplefilter("always", UserWarning)
+                sim.step()
+            told.append([str(one.message) for one in found])
+    assert [len(texts) for texts in told] == [0, 1, 0]
+    assert told[1][0].startswith(f"step 2: tet 0 of body '{SVK}' is squeezed to less than 0.6 of its length")

@@ -7,6 +7,7 @@
 * above the limit the simulator refuses, or warns where that is allowed; a stiffer material is refused while it runs.
 """
 
+import re
 from functools import partial
 
 import numpy as np
@@ -189,3 +190,19 @@ def test_the_limit_is_the_least_of_all_bodies():
     held = one_body(cells=(1, 1, 1))
     held.bodies[0].fix(lambda X: X[:, 0] < 9)
     assert stable_dt(held, False) == np.inf
+
+
+@pytest.mark.filterwarnings("ignore:dt = .* is above the estimated stability limit")
+@pytest.mark.parametrize("plane", [False, True], ids=["alone", "over a plane"])
+def test_a_motion_that_diverges_is_stopped_while_it_is_finite(plane):
+    """The corotational law grows no number beyond its range for many steps: a tet that has exploded ends the run."""
+    scene = one_body(rubber(COR), cells=(2, 1, 1))
+    if plane:
+        scene.add_obstacle(ts.HalfSpace((0, -100, 0), (0, 1, 0)))
+    with ts.Simulator(scene, 1.2 * stable_dt(scene, False), "symplectic_euler", precision="f64", allow_unstable=True) as sim:
+        x = sim.positions()
+        sim.set_state(x + 1e-3 * np.random.default_rng(0).standard_normal(x.shape))
+        result = sim.run(400 * sim.dt, fps=None)
+        assert result.status == "failed" and result.steps < 200
+        assert re.search(r"^step \d+: a tet is inside out by .* times its volume: the motion has diverged", result.problems[0])
+        assert np.abs(sim.positions()).max() < 1e6 and sim._report().min_volume_ratio < 0.0

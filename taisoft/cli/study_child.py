@@ -9,10 +9,16 @@ import json
 import os
 import sys
 import threading
+from collections.abc import Callable
 
 
 def main() -> None:
     """Reads {"do": "plan" or "run", ...} and writes {"answer": ...} or {"error": sentence}."""
+    serve(_answer)
+
+
+def serve(answer: Callable[[dict], dict]) -> None:
+    """Read one request, write its answer, and end the process."""
     line = b""
     while not line.endswith(b"\n"):
         part = os.read(0, 65536)
@@ -25,7 +31,7 @@ def main() -> None:
     request = json.loads(line)
     if request.get("cores") and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, request["cores"])
-    out.write(_text(_answer(request)))
+    out.write(_text(answer(request)))
     out.flush()
     sys.stderr.flush()
     os._exit(0)  # nothing is left to do, and taking Taichi down takes time

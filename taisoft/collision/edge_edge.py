@@ -100,61 +100,80 @@ def _within(s: ti.template(), t, k, place, length, over, u, m):
 
 
 @ti.func
+def _way(s: ti.template(), t, k, f):
+    """How far the point a share f along edge k of triangle t goes in the step (3,) [m]."""
+    return (1.0 - f) * s.move[s.triangle[t, k]] + f * s.move[s.triangle[t, (k + 1) % 3]]
+
+
+@ti.func
+def _deepest(s: ti.template(), t, k, u, m, f, g, la, lb):
+    """How deep [m] edges that really cross can be: of thin bodies side by side, those of the far sides cross too, as deep as both
+    are thick."""
+    deepest = ti.cast(0.5, ti.f64) * ti.min(la, lb, s.thickness[s.body[t]], s.thickness[s.body[u]])
+    if s.body[t] == s.body[u]:  # no deeper than half of what the body's own thickness can be
+        rest = (1.0 - f) * s.rest[s.triangle[t, k]] + f * s.rest[s.triangle[t, (k + 1) % 3]]
+        rest -= (1.0 - g) * s.rest[s.triangle[u, m]] + g * s.rest[s.triangle[u, (m + 1) % 3]]
+        deepest = ti.min(deepest, ti.cast(0.5, ti.f64) * rest.norm())
+    return deepest
+
+
+@ti.func
 def edge_contact(s: ti.template(), way: ti.template(), t, k, u, m, margin, out: ti.template(), start, end):
-    """The contact of edge k of triangle t with edge m of triangle u, if they cross. way: as in `find_proximity`. Returns the new
-    count."""
+    """The contact of edge k of triangle t with edge m of triangle u, if they cross, or if they cross at the end of the step and
+    penetrate by then: a fold that slides over an edge. Its gap is that of the same points at the start. way: as in
+    `find_proximity`. Returns the new count."""
     at = start
-    a0, a1, b0, b1 = corner(s, t, k), corner(s, t, k + 1), corner(s, u, m), corner(s, u, m + 1)
-    da, db = a1 - a0, b1 - b0
-    c = da.cross(db)
-    la, lb = da.norm(), db.norm()
-    if c.norm() > ti.cast(CROSSING, ti.f64) * la * lb:
-        n = unit(c)
-        f, g, _ = closest_lines(a0, a1, b0, b1)
-        gap = (a0 - b0).dot(n)
-        over = ti.cast(MISS, ti.f64) * ti.abs(gap)  # what penetrates has shifted along the edges
-        # most pairs do not cross, whichever of them is above: that takes longer to tell
-        good = int(-over <= f * la <= la + over) & int(-over <= g * lb <= lb + over)
-        if good == 1:
-            n_t, n_u = edge_normal(s, t, k), edge_normal(s, u, m)
-            if n.dot(n_u - n_t) < 0.0:
-                n, gap = -n, -gap
-            move = (1.0 - f) * s.move[s.triangle[t, k]] + f * s.move[s.triangle[t, (k + 1) % 3]]
-            move -= (1.0 - g) * s.move[s.triangle[u, m]] + g * s.move[s.triangle[u, (m + 1) % 3]]
-            # of thin bodies side by side, edges of the far sides cross too, as deep as both are thick
-            deepest = ti.cast(0.5, ti.f64) * ti.min(la, lb, s.thickness[s.body[t]], s.thickness[s.body[u]])
-            if s.body[t] == s.body[u]:  # no deeper than half of what the body's own thickness can be
-                rest = (1.0 - f) * s.rest[s.triangle[t, k]] + f * s.rest[s.triangle[t, (k + 1) % 3]]
-                rest -= (1.0 - g) * s.rest[s.triangle[u, m]] + g * s.rest[s.triangle[u, (m + 1) % 3]]
-                deepest = ti.min(deepest, ti.cast(0.5, ti.f64) * rest.norm())
-            over = ti.cast(MISS, ti.f64) * ti.max(-gap, 0.0)
-            near = gap - ti.max(-move.dot(n), 0.0) <= margin and gap >= -deepest
-            # a nearly flat edge sticks out along either normal: the sides that look at each other count
-            good = int(near) & int(n.dot(n_u) > 0.0) & int(n.dot(n_t) < 0.0)
-        for side in range(2):  # one edge, then the other, so that what is called is compiled once
-            t1, k1, t2, k2 = ti.select(side, u, t), ti.select(side, m, k), ti.select(side, t, u), ti.select(side, k, m)
-            place, length, along = ti.select(side, g * lb, f * la), ti.select(side, lb, la), ti.select(side, -n, n)
-            if good == 1:
-                good = _within(s, t1, k1, place, length, over, t2, k2)
-            if good == 1:
-                good = edge_sticks_out(s, t2, k2, along)
-            if good == 1:
-                good = 1 - _is_past_end(s, t1, k1, place, length, gap, ti.select(side, a0 + f * da, b0 + g * db))
-            if good == 1:
-                by_faces = int(way[s.body[t2]] == BY_FACES) | int(s.body[t1] == s.body[t2])
-                p = ti.select(side, b0 + g * db, a0 + f * da)
-                good = 1 - _end_tells(s, t1, k1, p, place, length, gap, t2, k2, along, by_faces)
-        if good == 1:
-            # where one was clamped to an end, the contact is at that end
-            f_in, g_in = ti.min(ti.max(f, 0.0), 1.0), ti.min(ti.max(g, 0.0), 1.0)
-            middle = a0 + f_in * da - 0.5 * gap * n
-            if g_in != g:
-                middle = b0 + g_in * db + 0.5 * gap * n
-            f, g = f_in, g_in
-            write_contact(
-                out, at, end, s.body[t], s.body[u], ivec(EDGE_EDGE, 3 * t + k, 3 * u + m), middle + 0.5 * gap * n, n, gap,
-                ivec(s.triangle[t, k], s.triangle[t, (k + 1) % 3], -1), dvec(1.0 - f, f, 0.0),
-                ivec(s.triangle[u, m], s.triangle[u, (m + 1) % 3], -1), dvec(1.0 - g, g, 0.0),
-            )  # fmt: skip
-            at += 1
+    for ahead in range(2):
+        if at == start:
+            late, closing = ti.cast(ahead, ti.f64), ti.cast(0.0, ti.f64)
+            a0, a1 = corner(s, t, k) + late * _way(s, t, k, 0.0), corner(s, t, k + 1) + late * _way(s, t, k, 1.0)
+            b0, b1 = corner(s, u, m) + late * _way(s, u, m, 0.0), corner(s, u, m + 1) + late * _way(s, u, m, 1.0)
+            da, db = a1 - a0, b1 - b0
+            c = da.cross(db)
+            la, lb = da.norm(), db.norm()
+            if c.norm() > ti.cast(CROSSING, ti.f64) * la * lb:
+                n = unit(c)
+                f, g, _ = closest_lines(a0, a1, b0, b1)
+                gap = (a0 - b0).dot(n)
+                over = (1.0 - late) * ti.cast(MISS, ti.f64) * ti.abs(gap)  # what penetrates has shifted along the edges
+                # most pairs do not cross, whichever of them is above: that takes longer to tell
+                good = int(-over <= f * la <= la + over) & int(-over <= g * lb <= lb + over)
+                if good == 1:
+                    n_t, n_u = edge_normal(s, t, k), edge_normal(s, u, m)
+                    if n.dot(n_u - n_t) < 0.0:
+                        n, gap = -n, -gap
+                    closing = -(_way(s, t, k, f) - _way(s, u, m, g)).dot(n)
+                    over = ti.cast(MISS, ti.f64) * ti.max(-gap, 0.0)
+                    near = gap - ti.max(closing, 0.0) <= margin and gap >= -_deepest(s, t, k, u, m, f, g, la, lb)
+                    if ahead == 1:  # of what comes from farther away others are the nearest then
+                        near = near and gap < 0.0 and gap + closing > 0.0 and gap + closing <= margin
+                    # a nearly flat edge sticks out along either normal: the sides that look at each other count
+                    good = int(near) & int(n.dot(n_u) > 0.0) & int(n.dot(n_t) < 0.0)
+                for side in range(2):  # one edge, then the other, so that what is called is compiled once
+                    t1, k1, t2, k2 = ti.select(side, u, t), ti.select(side, m, k), ti.select(side, t, u), ti.select(side, k, m)
+                    place, length, along = ti.select(side, g * lb, f * la), ti.select(side, lb, la), ti.select(side, -n, n)
+                    if good == 1:
+                        good = edge_sticks_out(s, t2, k2, along)
+                    if good == 1 and ahead == 0:
+                        good = _within(s, t1, k1, place, length, over, t2, k2)
+                    if good == 1 and ahead == 0:
+                        good = 1 - _is_past_end(s, t1, k1, place, length, gap, ti.select(side, a0 + f * da, b0 + g * db))
+                    if good == 1 and ahead == 0:
+                        by_faces = int(way[s.body[t2]] == BY_FACES) | int(s.body[t1] == s.body[t2])
+                        p = ti.select(side, b0 + g * db, a0 + f * da)
+                        good = 1 - _end_tells(s, t1, k1, p, place, length, gap, t2, k2, along, by_faces)
+                if good == 1:
+                    gap += late * closing
+                    # where one was clamped to an end, the contact is at that end
+                    f_in, g_in = ti.min(ti.max(f, 0.0), 1.0), ti.min(ti.max(g, 0.0), 1.0)
+                    middle = a0 + f_in * da - late * _way(s, t, k, f) - 0.5 * gap * n
+                    if g_in != g:
+                        middle = b0 + g_in * db + 0.5 * gap * n
+                    f, g = f_in, g_in
+                    write_contact(
+                        out, at, end, s.body[t], s.body[u], ivec(EDGE_EDGE, 3 * t + k, 3 * u + m), middle + 0.5 * gap * n, n, gap,
+                        ivec(s.triangle[t, k], s.triangle[t, (k + 1) % 3], -1), dvec(1.0 - f, f, 0.0),
+                        ivec(s.triangle[u, m], s.triangle[u, (m + 1) % 3], -1), dvec(1.0 - g, g, 0.0),
+                    )  # fmt: skip
+                    at += 1
     return at

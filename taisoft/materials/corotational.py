@@ -13,6 +13,7 @@ import taichi as ti
 from taisoft.math3 import cofactor, cross, ddot, determinant, dot, matmul, matmul_nt, matmul_tn, signed_svd, transform
 
 NAME = "corotational"
+SOFTENS_BELOW = 0.0
 EXTRA_STEPS = 8  # of Halley beyond the two that moderate strain needs
 SETTLED = 1e-5  # relative change whose cube is below rounding: the next step would change nothing
 SVD_BELOW = 0.04  # relative size of the denominator under which the closed form loses more than about a digit

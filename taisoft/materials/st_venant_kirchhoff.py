@@ -11,6 +11,7 @@ import taichi as ti
 from taisoft.math3 import ddot, dot, matmul, matmul_nt, matmul_tn, transform
 
 NAME = "st_venant_kirchhoff"
+SOFTENS_BELOW = 0.6  # stretch told with a warning, a little before 1/sqrt(3)
 
 
 def constants(mu: float, lam: float) -> tuple[float, float, float, float]:

@@ -12,6 +12,7 @@ import taichi as ti
 from taisoft.math3 import cofactor, cofactor_differential, cross, ddot, dot, transform
 
 NAME = "stable_neo_hookean"
+SOFTENS_BELOW = 0.0
 
 
 def constants(mu: float, lam: float) -> tuple[float, float, float, float]:

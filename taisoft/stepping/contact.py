@@ -27,6 +27,7 @@ from taisoft.transfer import array_of, download, upload
 
 STANDOFF = 2e-3  # of the finest body's mean surface edge: gap that contacts keep, so that surfaces do not cross in curved motion
 SUNK = 0.02  # of the finer side's mean surface edge: penetration that is told as a problem
+SANK = 1e-3  # of the same: penetration after which the way of an implicit part is searched
 FAST = {True: 0.05, False: 0.2}  # share of a penetration that an explicit, an implicit step mends
 SLOW = {True: 0.005, False: 0.02}  # share of a missing standoff
 PUSHED = 0.01  # of the slowest wave in a bar, sqrt(E / rho): speed at which these open at most, which strains as much
@@ -59,6 +60,8 @@ class ContactStep:
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self._told = np.zeros(5)
         self._searched: tuple[float, float] | None = None  # time and dt of the search that is at hand
+        self._ended: tuple[float, float] | None = None  # those of the end that was looked at, until the next part begins
+        self._depth = 0.0  # the deepest penetration found there [m]
         self._last_time = 0.0
         self.penetration = self.sinking = 0.0  # at the end of the last step [m], and over the finer side's mean surface edge
         self._sum: np.ndarray | None = None  # (n_colliders, 3) impulses over the parts of the last step, if it had several
@@ -87,7 +90,7 @@ class ContactStep:
 
     def forget(self) -> None:
         """The state was set: the search at hand and the impulses of the last step do not belong to it."""
-        self._searched = None
+        self._searched = self._ended = None
         self.problem.count[0] = 0
         self._last_time = self.penetration = self.sinking = self._span = 0.0
         self._sum = None
@@ -127,11 +130,12 @@ class ContactStep:
         self._last_time, self._share, self._span = (float(kept[name]) for name in ("last_time", "share", "span"))
         self._sum, self.penetration, self.sinking = kept["sum"], float(kept["penetration"]), float(kept["sinking"])
         self.met, self.dropped = bool(kept["met"]), int(kept["dropped"])
-        self._searched, self._indexed = None, True  # so that the next step lists its contacts by nodes, however few
+        self._searched = self._ended = None
+        self._indexed = True  # so that the next step lists its contacts by nodes, however few
 
     def start_again(self) -> None:
         """The state of the step's start was set back; the impulses found so far are where the next try begins."""
-        self._searched = None
+        self._searched = self._ended = None
 
     def _goal(self) -> tuple[float, float, float, float]:
         """Standoff [m], shares of a penetration and of a missing standoff that a part mends, speed of that at most [m/s]."""
@@ -160,7 +164,7 @@ class ContactStep:
 
     def begin(self, time: float, dt: float) -> int:
         """Fill the problem for a step of dt [s] from the state at a time, impulses those of the last step. Returns its size."""
-        n, d, m = self.search(time, dt), self.detection, self.world.model
+        n, d, m, self._ended = self.search(time, dt), self.detection, self.world.model, None
         self.goal = self._goal()
         self.dropped = max(self.dropped, d.counts.unmapped)
         if n > self.problem.capacity:
@@ -211,6 +215,18 @@ class ContactStep:
 
     def end(self, time: float, dt: float) -> float:
         """Search at the end of a step, at a time, for one of dt; the deepest penetration [m] that is left. Sets `sinking`."""
+        return self._look_at_end(time, dt)
+
+    def sank(self, time: float, dt: float) -> bool:
+        """Whether a part of dt, which ends at a time, ends with something in each other."""
+        self._look_at_end(time, dt)
+        return self.sinking > SANK
+
+    def _look_at_end(self, time: float, dt: float) -> float:
+        """As `end`, unless that end has been looked at."""
+        ended = self._ended
+        if ended is not None and ended[1] == dt and abs(ended[0] - time) <= 1e-6 * dt:
+            return self._depth
         self._searched = None
         try:
             self.search(time, dt)
@@ -222,6 +238,7 @@ class ContactStep:
         depth, self.sinking = float(told[DEPTH]), float(told[SINKING])
         if self._follows:
             self._searched = None
+        self._depth, self._ended = depth, (time, dt)
         return depth
 
     def went_astray(self, x_start) -> bool:
@@ -231,10 +248,13 @@ class ContactStep:
 
     def search_way(self, time: float, dt: float) -> bool:
         """Search along the way that was found, from the state at the start; whether that finds contacts not known so far."""
-        self._searched = None
+        self._searched = self._ended = None
         self.detection.find(time, dt, way=self._way)
         self._searched = (time, dt)
-        return self.detection.counts.contacts > self.problem.count[0]
+        known = set(map(tuple, download([self.found.feature], self.n_contacts)[0].tolist()))
+        kept = download([self.detection.kept], self.detection.counts.contacts)[0]
+        found = array_of(self.detection.buffer.data.feature)[kept]
+        return not known.issuperset(map(tuple, found.tolist()))
 
     def look(self, time: float, dt: float) -> tuple[float, float]:
         """The deepest penetration before a step of dt, over the finer side's mean surface edge, and how far contacts close at

@@ -110,7 +110,7 @@ class ContactExplicitStepper(ExplicitStepper):
 
     def _substep(self, step: int, time: float, dt: float) -> SolveResult | None:
         """One sub-step, the step-th, from a time; returns what the contacts' solver did, None where there are none."""
-        world, m, s, contact = self.world, self.world.model, self.work, self.contact
+        m, s, contact = self.world.model, self.work, self.contact
         if contact.look(time, dt)[1] > 1.0:
             raise SimulationError(f"step {step}: {contact.too_fast(time, dt)}")
         if s.verlet and self.stale:
@@ -130,5 +130,5 @@ class ContactExplicitStepper(ExplicitStepper):
         if s.verlet:
             finish_verlet(m, s, contact.problem, dt, int(n > 0))
         if m.scalars[8] != 0.0:
-            raise SimulationError(f"step {step}: {world.find_unfinite() or 'a velocity is no longer finite'}")
+            raise SimulationError(f"step {step}: {self._fault()}")
         return result

@@ -13,6 +13,8 @@ from taisoft.elasticity import HUGE, count_inverted, element_force
 from taisoft.elements.lanes import broadcast, gather
 from taisoft.runtime import kernel
 
+EXPLODED = 1e9  # size of a negative J beyond which a motion has diverged: inside out, stretched a thousandfold along every axis
+
 
 @ti.func
 def unfinite(value):
@@ -143,14 +145,15 @@ def keep_held(m: ti.template(), s: ti.template()):
 def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, restart: ti.i32):
     """n sub-steps of dt on one thread. scalars 5..7: sub-steps done, smallest J, most inverted tets in a sub-step.
 
-    Stops after the sub-step in which a velocity stops being finite. restart: Verlet's acceleration is stale.
+    Stops after the sub-step in which a velocity stops being finite, or that met an exploded tet. restart: Verlet's acceleration
+    is stale.
     """
     ti.loop_config(serialize=True)
     for _ in range(1):
         dt = ti.cast(dt64, m.real)
         done, going = 0, True
         lowest = broadcast(ti.cast(HUGE, m.real), m.lanes)
-        most = 0
+        low, most = ti.cast(HUGE, m.real), 0
         if ti.static(s.verlet):
             if restart != 0:
                 for g in ti.static(m.groups):
@@ -190,11 +193,11 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
             for q in ti.static(range(m.lanes)):
                 count += inverted[q]
             most = ti.max(most, count)
-            going = not unfinite(ti.cast(total[0] + total[1] + total[2], ti.f64))
+            low = lowest[0]
+            for q in ti.static(range(1, m.lanes)):
+                low = ti.min(low, lowest[q])
+            going = low > -EXPLODED and not unfinite(ti.cast(total[0] + total[1] + total[2], ti.f64))
             done += 1
-        low = lowest[0]
-        for q in ti.static(range(1, m.lanes)):
-            low = ti.min(low, lowest[q])
         m.scalars[5], m.scalars[6], m.scalars[7] = done - (0 if going else 1), low, most
 
 
@@ -206,18 +209,25 @@ def set_targets(s: ti.template(), rows: ti.types.ndarray()):
             s.targets[k][a] = rows[k, a]
 
 
+@ti.func
+def tell_volumes(m: ti.template(), b, J):
+    """Of block b: smallest J and inverted tets into scalars 6 and 9; scalars 8: 1 where one has exploded."""
+    bad = count_inverted(m, b, J)
+    low, count = J[0], bad[0]
+    for q in ti.static(range(1, m.lanes)):
+        low, count = ti.min(low, J[q]), count + bad[q]
+    ti.atomic_min(m.scalars[6], ti.cast(low, ti.f64))
+    ti.atomic_add(m.scalars[9], ti.cast(count, ti.f64))
+    if not low > -EXPLODED:
+        m.scalars[8] = 1.0
+
+
 @kernel
 def elements_parallel(m: ti.template()):
     """One sub-step's element loop over threads; scalars 6, 9: smallest J so far, inverted tets of this sub-step."""
     for g in ti.static(m.groups):
         for b in range(g.first, g.last):
-            J = element_force(m, g, m.stiffness_damping, b)
-            bad = count_inverted(m, b, J)
-            low, count = J[0], bad[0]
-            for q in ti.static(range(1, m.lanes)):
-                low, count = ti.min(low, J[q]), count + bad[q]
-            ti.atomic_min(m.scalars[6], ti.cast(low, ti.f64))
-            ti.atomic_add(m.scalars[9], ti.cast(count, ti.f64))
+            tell_volumes(m, b, element_force(m, g, m.stiffness_damping, b))
 
 
 @kernel

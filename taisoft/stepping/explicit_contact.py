@@ -9,7 +9,7 @@ import taichi as ti
 from taisoft.contact.assemble import short_of_goal
 from taisoft.contact.problem import impulse_on, to_frame
 from taisoft.contact.prox import dvec
-from taisoft.elasticity import count_inverted, element_force
+from taisoft.elasticity import element_force
 from taisoft.runtime import kernel
 from taisoft.stepping.explicit import (
     acceleration,
@@ -19,22 +19,12 @@ from taisoft.stepping.explicit import (
     lead_velocities,
     react,
     remember,
+    tell_volumes,
     unfinite,
     verlet_half,
     verlet_kick,
     verlet_move,
 )  # fmt: skip
-
-
-@ti.func
-def tell_volumes(m: ti.template(), b, J):
-    """Smallest J and inverted tets of block b into scalars 6 and 9."""
-    bad = count_inverted(m, b, J)
-    low, count = J[0], bad[0]
-    for q in ti.static(range(1, m.lanes)):
-        low, count = ti.min(low, J[q]), count + bad[q]
-    ti.atomic_min(m.scalars[6], ti.cast(low, ti.f64))
-    ti.atomic_add(m.scalars[9], ti.cast(count, ti.f64))
 
 
 @kernel

@@ -201,10 +201,10 @@ class ImplicitStepper:
             self.solver.forget_factors()
 
     def _part(self, time: float, dt: float) -> StageResult:
-        """A step of dt from a time, in one piece; again, where it led to contacts that nobody had looked for."""
+        """A step of dt from a time, in one piece; again, where it led to contacts that had not been found."""
         result, m, h = self._try_part(time, dt), self.world.model, self.history
         for _ in range(SEARCHES):
-            if self.contact is None or not self.contact.went_astray(h.x_now):
+            if self.contact is None or not (self.contact.went_astray(h.x_now) or self.contact.sank(time + dt, dt)):
                 break
             state, past = self.world.state(), self._past
             restore(m, h)

@@ -127,12 +127,18 @@ class ExplicitStepper:
             good = world.state()
             self._put_back(*good)
             self._launch(1, dt)
-            where = world.find_unfinite() or "a velocity is no longer finite"
+            where = self._fault()
             self._put_back(*good)
             world.step_count += result.done
             world.time += result.done * dt
             raise SimulationError(f"step {world.step_count + 1}: {where}")
         return result
+
+    def _fault(self) -> str:
+        """What ended the last sub-step, whose state is at hand."""
+        lowest = self.world.model.scalars[6]
+        exploded = f"a tet is inside out by {-lowest:.1e} times its volume: the motion has diverged, and a smaller dt is needed"
+        return self.world.find_unfinite() or (exploded if lowest <= -explicit.EXPLODED else "a velocity is no longer finite")
 
     def _upload_targets(self, targets: np.ndarray) -> None:
         explicit.set_targets(self.work, targets.reshape(-1, 3))

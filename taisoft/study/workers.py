@@ -39,17 +39,17 @@ class Place(Protocol):
 
 
 class LocalPlace:
-    """Child processes on this machine, one at a time."""
+    """Child processes on this machine, one at a time. child: their command, which speaks as `study_child`."""
 
-    def __init__(self, cores: list[int]):
-        self.cores = cores
+    def __init__(self, cores: list[int], child: tuple[str, ...] = CHILD):
+        self.cores, self._child = cores, child
         self._process: subprocess.Popen | None = None
 
     def start(self, request: dict) -> None:
         """See Place. A session of its own keeps the terminal's Ctrl-C from it; it leaves when we do, by its stdin."""
         self._out, self._told = tempfile.TemporaryFile(), tempfile.TemporaryFile()
         self._process = subprocess.Popen(
-            CHILD, stdin=subprocess.PIPE, stdout=self._out, stderr=self._told, start_new_session=True
+            self._child, stdin=subprocess.PIPE, stdout=self._out, stderr=self._told, start_new_session=True
         )
         try:
             self._process.stdin.write(json.dumps(request | {"cores": self.cores}).encode() + b"\n")

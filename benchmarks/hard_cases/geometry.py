@@ -1,0 +1,146 @@
+"""Degenerate geometry: slivers in a mesh, obstacles thinner than a triangle."""
+
+import re
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.cli.info import describe
+
+from ..reference_cases.record import face, nearest
+from .record import DEGRADED, MEASURED, OK, PROPOSED, Case, Criterion, Variant
+from .session import Session, refusal
+from .shapes import COR, DOWN, SNH, box
+
+IMPLICIT, EXPLICIT = "implicit_euler", "symplectic_euler"
+LIMITS = {1.0: 2.22e-3, 1e-2: 2.68e-4, 1e-4: 2.67e-5}  # [s] for 1000 kg/m^3, by power iteration
+DENSITY = 100.0  # [kg/m^3]
+LENGTH = 0.5  # [m]
+
+
+def sliver_mesh(s: float) -> ts.TetMesh:
+    """A bar whose least volume of a tet is about s times the mean. It tells of its worst tets with a warning."""
+    good = box((10, 2, 2), (LENGTH, 0.1, 0.1), (0.25, 0.05, 0.05))
+    x = good.vertices.copy()
+    x[nearest(x, (0.25, 0.05, 0.05))[0], 2] = 0.05 * (2.0 - s)
+    return ts.TetMesh(x, good.tets)
+
+
+def sliver_scene(law: str, s: float) -> ts.Scene:
+    """The bar, clamped, under a tenth of gravity."""
+    scene = ts.Scene(gravity=(0.0, -0.981, 0.0))
+    soft = ts.Material(law=law, young=1e5, poisson=0.4, density=DENSITY, mass_damping=2.0)
+    scene.add_body(sliver_mesh(s), soft, name="bar").fix(face(0, 0.0))
+    return scene
+
+
+def tip_path(session: Session, law: str, s: float, follow: bool = True) -> np.ndarray:
+    """(k,3) [m] of the middle of the free end."""
+    scene = sliver_scene(law, s)
+    tip = face(0, LENGTH)(scene.bodies[0].rest_positions)
+    path = []
+    with session.simulator(scene) as sim:
+        session.go(sim, 200, lambda sim, k, report: path.append(sim.positions()[tip].mean(axis=0)), follow=follow)
+    return np.array(path)
+
+
+def slivers(session: Session, law: str, s: float) -> dict[str, float]:
+    """G1: the bar with slivers beside that without."""
+    mesh = sliver_mesh(s)
+    worst = int(re.search(r"\(tet (\d+)\)", dict(describe(mesh))["quality"])[1])
+    numbers = {NAMED: mesh.volumes[worst] / (s * mesh.volumes.mean())}
+    settings = session.variant.settings
+    if settings["integrator"] == EXPLICIT and s < 1.0:
+        limit = LIMITS[s] * np.sqrt(DENSITY / 1000.0)
+        said = refusal(lambda: session.simulator(sliver_scene(law, s)))
+        with session.simulator(sliver_scene(law, s), dt=0.5 * limit) as sim:
+            estimate = sim.stable_dt
+        return numbers | {"refused": float("stability limit" in said), "estimated limit, off by": abs(estimate / limit - 1.0)}
+    path, good = tip_path(session, law, s), tip_path(session, law, 1.0, follow=False)
+    off = np.linalg.norm(path - good, axis=1) / LENGTH if len(path) == len(good) else np.array([np.nan])
+    return numbers | {"tip off the bar's without slivers at the end, over L": off[-1], "the same, most": off.max()}
+
+
+EDGE_HEIGHT, BASE = 0.1, 0.004  # [m] of a knife, whose edge lies at y = 0
+
+
+def knife(x: float) -> ts.MeshObstacle:
+    """A prism with its edge along z, 0.8 m long, at x [m]."""
+    section = np.array([(x - 0.5 * BASE, -EDGE_HEIGHT), (x + 0.5 * BASE, -EDGE_HEIGHT), (x, 0.0)])
+    vertices = np.array([(*p, z) for z in (-0.4, 0.4) for p in section])
+    triangles = [(0, 2, 1), (3, 4, 5), (0, 1, 4), (0, 4, 3), (1, 2, 5), (1, 5, 4), (2, 0, 3), (2, 3, 5)]
+    return ts.MeshObstacle(vertices, triangles)
+
+
+def depth_in_knife(points: np.ndarray, x: float) -> float:
+    """How deep the deepest of the points (n,3) [m] lies in the knife at x; 0 where none does."""
+    side = np.array([EDGE_HEIGHT, 0.5 * BASE]) / np.hypot(EDGE_HEIGHT, 0.5 * BASE)
+    across = side[0] * np.abs(points[:, 0] - x) + side[1] * points[:, 1]  # signed distance from the nearer of both sides
+    outside = np.maximum(across, -EDGE_HEIGHT - points[:, 1])
+    return max(0.0, -float(outside.min()))
+
+
+def knives(session: Session) -> dict[str, float]:
+    """G2: a mat falls 0.02 m onto five knives."""
+    scene, places = ts.Scene(gravity=DOWN), 0.1 * np.arange(-2, 3)
+    soft = ts.Material(law=SNH, young=2e4, poisson=0.4, density=1000.0, friction=0.0)
+    body = scene.add_body(box((15, 1, 15), (0.6, 0.02, 0.6)), soft, name="mat", position=(0, 0.03, 0))
+    for k, x in enumerate(places):
+        scene.add_obstacle(knife(x), name=f"knife {k}", friction=0.0)
+    scene.add_obstacle(ts.HalfSpace((0, -0.11, 0), (0, 1, 0)), name="plane", friction=0.0)
+    deepest, cut = [], []
+
+    def look(sim, k, report):
+        cut.append(len(sim.intersecting_triangles()))
+        x = sim.positions()
+        points = np.concatenate([x, x[body.mesh.surface].mean(axis=1)])
+        deepest.append(max(depth_in_knife(points, place) for place in places))
+
+    with session.simulator(scene) as sim:
+        session.go(sim, 400, look)
+        finite = np.isfinite(sim.positions()).all()
+    return {
+        "deepest of vertices and triangles' middles in a knife [m]": max(deepest),
+        "pairs of triangles that cut each other, most": float(max(cut)),
+        "numbers that are not finite at the end": float(not finite),
+        "inverted tets, most": float(max(report.n_inverted for report in session.reports)),
+        "deepest of the contacts after any step [m]": session.deepest,
+    }
+
+
+NAMED = "volume of the tet that the load report names as worst, over s times the mean"
+SI = 2e-3 / np.sqrt(10.0)
+G1 = Case(
+    "G1", "slivers", slivers,
+    tuple(
+        Variant(
+            f"s {s:g}, {law}, {kind}", {"dt": dt, "integrator": kind}, {"law": law, "s": s}, (OK, DEGRADED),
+            reference=kind == IMPLICIT or s == 1.0,
+        )
+        for law in (COR, SNH) for kind, dt in ((IMPLICIT, 0.01), (EXPLICIT, SI)) for s in LIMITS
+    ),
+    (
+        Criterion(NAMED, 1.5, PROPOSED, note="the load report is that of `taisoft info`"),
+        Criterion("tip off the bar's without slivers at the end, over L", 0.02, PROPOSED, of={"integrator": IMPLICIT}),
+        Criterion("refused", 1.0, MEASURED, at_least=True, of={"integrator": EXPLICIT, "s": (1e-2, 1e-4)}),
+        Criterion("estimated limit, off by", 0.2, MEASURED, of={"integrator": EXPLICIT, "s": (1e-2, 1e-4)}),
+    ),
+    size=LENGTH, quick=(f"s 0.0001, {SNH}, {EXPLICIT}",),
+)  # fmt: skip
+
+G2 = Case(
+    "G2", "mat on knives", knives,
+    (Variant(SNH, {"dt": 0.01, "integrator": IMPLICIT}, ends=(OK, DEGRADED)),),
+    (
+        Criterion(
+            "deepest of the contacts after any step [m]", 2e-3, PROPOSED,
+            note="the catalogue asks for the depth of vertices and middles alone; a point in a knife, which is 4 mm thick, is "
+            "never deeper than 2 mm",
+        ),
+        Criterion("deepest of vertices and triangles' middles in a knife [m]", 2e-3, PROPOSED),
+        Criterion("numbers that are not finite at the end", 0.0, PROPOSED),
+    ),
+    size=0.6,
+)  # fmt: skip
+
+CASES = (G1, G2)

@@ -1,0 +1,139 @@
+"""Materials at their worst: collapsed, mirrored and random shapes, squeezes, a bar that is drawn, twisted and let go."""
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.scene.key_frames import KeyFrames
+
+from ..reference_cases.record import face
+from .record import ANALYTIC, DEGRADED, FAILED, MEASURED, OK, PROPOSED, Case, Criterion, Variant
+from .session import Session
+from .shapes import COR, SNH, SVK, WEIGHTLESS, box, cube, rest_at_last
+
+LAWS = (COR, SNH)
+SHAPE = "shape error at the end, over L"
+INVERTED = "inverted tets at the end"
+SMALLEST = "smallest volume ratio at the end"
+STARTS = ("plane", "mirrored", "random")
+
+
+def start_of(name: str, X: np.ndarray) -> np.ndarray:
+    """Where the vertices X (n,3) [m] are put."""
+    if name == "random":
+        return np.random.default_rng(1).uniform(-0.5, 0.5, X.shape)
+    return X * {"plane": (1.0, 1.0, 0.0), "mirrored": (-1.0, 1.0, 1.0)}[name]
+
+
+def recover(session: Session, law: str, start: str, steps: int) -> dict[str, float]:
+    """M1, M2: a free cube of 1 m from a start in which tets have no volume or a negative one, for 14 s."""
+    scene = ts.Scene(gravity=WEIGHTLESS)
+    soft = ts.Material(law=law, young=1e5, poisson=0.4, density=1000.0, mass_damping=6.0)
+    body = scene.add_body(cube(4, 1.0), soft, name="cube")
+    with session.simulator(scene) as sim:
+        sim.set_state(start_of(start, body.rest_positions))
+        session.go(sim, steps, every=max(1, steps // 700))
+        finite = np.isfinite(sim.positions()).all() and np.isfinite(sim.velocities()).all()
+        return rest_at_last(sim, 1.0) | {"numbers that are not finite in the last state": float(not finite)}
+
+
+def squeeze(session: Session, law: str) -> dict[str, float]:
+    """M3: a cube of 0.1 m is squeezed to half its height, held, and drawn back."""
+    scene = ts.Scene(gravity=WEIGHTLESS)
+    body = scene.add_body(cube(4, 0.1), ts.Material(law=law, young=1e5, poisson=0.3, density=1000.0), name="cube")
+    body.fix(face(1, -0.05))
+    down = [0.0, 0.0, 0.0], [0.0, -0.05, 0.0]
+    body.move(face(1, 0.05), KeyFrames([0.0, 1.0, 1.5, 2.5], [down[0], down[1], down[1], down[0]]))
+    with session.simulator(scene) as sim:
+        session.go(sim, 350)
+        found = rest_at_last(sim, 0.1)
+        way = float(np.linalg.norm(sim.positions() - body.rest_positions, axis=1).max())
+    told = [text for text in session.warnings if "step " in text and "tet " in text and "softens" in text]
+    return found | {
+        "largest displacement at the end [m]": way,
+        "smallest volume ratio of all steps": min(report.min_volume_ratio for report in session.reports),
+        "warnings of softening that name step and tet": float(len(told)),
+        "run is ok though tets are inverted at the end": float(session.status == OK and found[INVERTED] > 0.0),
+    }
+
+
+def draw_and_twist(session: Session, law: str) -> dict[str, float]:
+    """M4: a bar's end is drawn to four times its length, turned once and let go."""
+    scene = ts.Scene(gravity=WEIGHTLESS)
+    soft = ts.Material(law=law, young=3e4, poisson=0.4, density=1000.0, mass_damping=2.0)
+    body = scene.add_body(box((10, 3, 3), (0.5, 0.15, 0.15), (0.25, 0.0, 0.0)), soft, name="bar")
+    body.fix(face(0, 0.0))
+    far, turn = [1.5, 0.0, 0.0], [2.0 * np.pi, 0.0, 0.0]
+    path = KeyFrames([0.0, 1.0, 2.0], [WEIGHTLESS, far, far], [WEIGHTLESS, WEIGHTLESS, turn], release=True)
+    body.move(face(0, 0.5), path)
+    with session.simulator(scene) as sim:
+        session.go(sim, 1000)
+        return rest_at_last(sim, 0.5) | {"steps that did not converge": float(session.unconverged)}
+
+
+def _recovery(law: str, kind: str, start: str, dt: float, **more) -> Variant:
+    name = f"{start}, {law}, {kind}, dt {dt:g} s"
+    settings, parameters = {"dt": dt, "integrator": kind}, {"law": law, "start": start, "steps": round(14.0 / dt)}
+    return Variant(name, settings, parameters, **({"ends": (OK, DEGRADED), "reference": start != "random"} | more))
+
+
+IMPLICIT, EXPLICIT = "implicit_euler", "symplectic_euler"
+FINITE = Criterion("numbers that are not finite in the last state", 0.0, ANALYTIC)
+
+M1 = Case(
+    "M1", "collapsed to a plane; mirrored", recover,
+    tuple(
+        _recovery(law, kind, start, dt, ends=(DEGRADED, FAILED) if law == SVK else (OK, DEGRADED))
+        for law in (*LAWS, SVK) for kind, dt in ((IMPLICIT, 0.02), (EXPLICIT, 1e-3)) for start in STARTS[:2]
+    ),
+    (
+        Criterion(SHAPE, 1e-3, MEASURED, of={"law": LAWS}),
+        Criterion(SMALLEST, 0.99, MEASURED, at_least=True, of={"law": LAWS}),
+        Criterion(INVERTED, 0.0, MEASURED, of={"law": LAWS}),
+        FINITE,
+    ),
+    size=1.0, quick=(f"mirrored, {COR}, {EXPLICIT}, dt 0.001 s",),
+)  # fmt: skip
+
+M2 = Case(
+    "M2", "random vertices", recover,
+    tuple(
+        _recovery(law, kind, "random", dt, ends=ends)
+        for law in LAWS
+        for kind, dt, ends in (
+            (IMPLICIT, 0.01, (OK, DEGRADED)), (EXPLICIT, 2.2e-4, (OK, DEGRADED)), (EXPLICIT, 1.12e-3, (OK, DEGRADED, FAILED)),
+        )
+    ),
+    (
+        Criterion(SHAPE, 1e-3, PROPOSED, of={"integrator": IMPLICIT}),
+        Criterion(INVERTED, 0.0, PROPOSED, of={"integrator": IMPLICIT}),
+        Criterion(SHAPE, 1e-3, MEASURED, of={"dt": 2.2e-4}),
+        Criterion(INVERTED, 0.0, MEASURED, of={"dt": 2.2e-4}),
+        FINITE,
+    ),
+    size=1.0, quick=(f"random, {SNH}, {EXPLICIT}, dt 0.00112 s",),
+)  # fmt: skip
+
+M3 = Case(
+    "M3", "squeezed past a stretch of 0.577", squeeze,
+    tuple(
+        Variant(law, {"dt": 0.01, "integrator": IMPLICIT}, {"law": law}, ends=(OK, DEGRADED) if law == SVK else (OK,))
+        for law in (SVK, *LAWS)
+    ),
+    (
+        Criterion("smallest volume ratio of all steps", 0.05, PROPOSED, at_least=True, of={"law": LAWS}),
+        Criterion("largest displacement at the end [m]", 1e-4, PROPOSED, of={"law": LAWS}),
+        Criterion(INVERTED, 0.0, PROPOSED, of={"law": LAWS}),
+        Criterion("warnings of softening that name step and tet", 1.0, ANALYTIC, at_least=True, of={"law": SVK}),
+        Criterion("run is ok though tets are inverted at the end", 0.0, ANALYTIC, of={"law": SVK}),
+    ),
+    size=0.1,
+)  # fmt: skip
+
+M4 = Case(
+    "M4", "stretch of 4, a full turn, release", draw_and_twist,
+    tuple(Variant(law, {"dt": 0.01, "integrator": IMPLICIT}, {"law": law}, ends=(OK, DEGRADED)) for law in LAWS),
+    (Criterion(INVERTED, 0.0, PROPOSED), Criterion(SHAPE, 5e-3, PROPOSED)),
+    size=0.5,
+)  # fmt: skip
+
+CASES = (M1, M2, M3, M4)

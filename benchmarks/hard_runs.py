@@ -1,0 +1,140 @@
+"""Runs of the hard cases: each variant, and its reference, in a process of its own, and kept by what it depends on."""
+
+import hashlib
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from taisoft.study.store import NoStore, Store, code_digest, digest, pack, unpack
+from taisoft.study.workers import LocalPlace, carry_out
+from taisoft.timing import machine, usable_cores
+
+from .hard_cases import CASES
+from .hard_cases.record import FAILED, Case, Variant, Verdict, judge
+from .hard_cases.session import FINER, Session
+
+CHILD = (sys.executable, "-m", "taisoft", "bench", "hard", "--child")
+CHEAP_SECONDS = 60.0  # of a reference, guessed: a longer one is run only when asked for
+
+
+@dataclass
+class Row:
+    """A variant of a case, what came of it, and what came of its reference, each None where it was not run.
+
+    left_out: why there is no record.
+    """
+
+    case: Case
+    variant: Variant
+    record: dict | None = None
+    reference: dict | None = None
+    left_out: str = ""
+    verdicts: list[Verdict] = field(default_factory=list)
+
+    @property
+    def passed(self) -> bool:
+        """Whether it was run and every limit is met."""
+        return self.record is not None and all(verdict.passed is not False for verdict in self.verdicts)
+
+    @property
+    def error(self) -> float | None:
+        """Largest distance to the reference run over the case's size, where both came to their ends."""
+        if self.record is None or self.reference is None or self.reference["status"] == FAILED:
+            return None
+        own, finer = unpack(self.record["points"]), unpack(self.reference["points"])
+        if own.shape != finer.shape or not len(own):
+            return None
+        return float(np.linalg.norm(own - finer, axis=1).max() / self.case.size)
+
+    def data(self) -> dict:
+        """As plain data, without points."""
+
+        def bare(record: dict | None) -> dict | None:
+            return record and {key: value for key, value in record.items() if key != "points"}
+
+        return {
+            "case": self.case.id, "variant": self.variant.name, "settings": self.variant.settings, "passed": self.passed,
+            "run": bare(self.record), "reference": bare(self.reference), "error": self.error, "left_out": self.left_out,
+            "verdicts": [verdict.record() for verdict in self.verdicts],
+        }  # fmt: skip
+
+
+def find(case: str, variant: str) -> tuple[Case, Variant]:
+    """The case of that id and its variant of that name."""
+    found = next(one for one in CASES if one.id == case)
+    return found, next(one for one in found.variants if one.name == variant)
+
+
+def run(case: Case, variant: Variant, arch: str, finer: int = 1) -> dict:
+    """The record of one run, as plain data, made in this process."""
+    record = Session(case, variant, arch, finer).record()
+    return record | {"points": pack(record["points"])}
+
+
+def answer(request: dict) -> dict:
+    """For a child: the request's run."""
+    return {"answer": run(*find(request["case"], request["variant"]), request["arch"], request["finer"])}
+
+
+def sources() -> str:
+    """A digest of the files that say what the cases are and how they are run."""
+    total = hashlib.sha256()
+    for path in sorted((Path(__file__).parent / "hard_cases").glob("*.py")):
+        total.update(path.name.encode() + path.read_bytes())
+    return total.hexdigest()
+
+
+def measure(
+    rows: list[Row], arch: str, references: bool, store: Store | NoStore, seconds_left: Callable[[], float],
+    asked: Callable[[], bool], tell: Callable[[str], None],
+) -> None:  # fmt: skip
+    """Fill the rows: all runs first, then the references that are cheap, or all of them. Raises OutputError."""
+    _carry_out(rows, arch, 1, store, seconds_left, asked, tell)
+    finer = [
+        row for row in rows
+        if row.record and row.variant.reference and row.record["status"] != FAILED
+        and (references or 2.0 * FINER * row.record["seconds"] <= CHEAP_SECONDS)
+    ]  # fmt: skip
+    _carry_out(finer, arch, FINER, store, seconds_left, asked, tell)
+    for row in rows:
+        if row.record is not None:
+            row.verdicts = judge(row.case, row.variant, row.record)
+
+
+def _carry_out(rows: Iterable[Row], arch, finer, store, seconds_left, asked, tell) -> None:
+    on = [machine() | {"load": None}, code_digest(), sources(), arch]
+    requests, waiting = [], {}
+    for row in rows:
+        request = {"case": row.case.id, "variant": row.variant.name, "arch": arch, "finer": finer}
+        key = digest([request, on])[:32]
+        kept = store.read(key)
+        if kept is None:
+            requests.append((key, request))
+            waiting[key] = row
+        else:
+            _take(row, kept, finer)
+
+    def done(key: str, told: dict) -> None:
+        row = waiting[key]
+        what = f"{row.case.id}, {row.variant.name}{', reference' if finer > 1 else ''}"
+        if "answer" in told:
+            _take(row, store.write(key, told["answer"]), finer)
+            tell(f"{what}: {told['answer']['status']}, {told['answer']['seconds']:.1f} s")
+        else:
+            row.left_out = row.left_out or told.get("error") or told["crash"]
+            tell(f"{what}: {row.left_out}")
+
+    left = carry_out(requests, [LocalPlace(usable_cores(), CHILD)], done, seconds_left=seconds_left, asked=asked)
+    for key, why in left.items():
+        if finer == 1:
+            waiting[key].left_out = why
+
+
+def _take(row: Row, record: dict, finer: int) -> None:
+    if finer == 1:
+        row.record = record
+    else:
+        row.reference = record
