@@ -14,6 +14,7 @@ from taisoft.collision.triangles import closest_lines
 # How far beyond the ends of edges that penetrate they may cross, since they have shifted along each other: in depths, and at most
 # in lengths of the edge, since farther out the surfaces are elsewhere
 MISS, BEYOND = 2.0, 0.05
+AHEAD = 1e-3  # of the shorter edge: relative motion in a step below which nothing comes to cross that counts
 CROSSING = 0.02  # sine below which two edges count as parallel
 END = 10.0  # depths from an end within which it tells of a crossing
 FREED = 0.1  # of a crossing's depth: less than that does not count once the end is out
@@ -106,6 +107,17 @@ def _way(s: ti.template(), t, k, f):
 
 
 @ti.func
+def _close_in(s: ti.template(), t, k, u, m):
+    """Whether two edges move towards each other in the step by enough to count: where most rest, that saves the second look."""
+    far = ti.cast(0.0, ti.f64)
+    for i in range(2):
+        for j in range(2):
+            far = ti.max(far, (_way(s, t, k, ti.cast(i, ti.f64)) - _way(s, u, m, ti.cast(j, ti.f64))).norm())
+    shorter = ti.min((corner(s, t, k + 1) - corner(s, t, k)).norm(), (corner(s, u, m + 1) - corner(s, u, m)).norm())
+    return int(far > ti.cast(AHEAD, ti.f64) * shorter)
+
+
+@ti.func
 def _deepest(s: ti.template(), t, k, u, m, f, g, la, lb):
     """How deep [m] edges that really cross can be: of thin bodies side by side, those of the far sides cross too, as deep as both
     are thick."""
@@ -124,7 +136,10 @@ def edge_contact(s: ti.template(), way: ti.template(), t, k, u, m, margin, out: 
     `find_proximity`. Returns the new count."""
     at = start
     for ahead in range(2):
-        if at == start:
+        good = int(at == start)
+        if ahead == 1 and good == 1:
+            good = _close_in(s, t, k, u, m)
+        if good == 1:
             late, closing = ti.cast(ahead, ti.f64), ti.cast(0.0, ti.f64)
             a0, a1 = corner(s, t, k) + late * _way(s, t, k, 0.0), corner(s, t, k + 1) + late * _way(s, t, k, 1.0)
             b0, b1 = corner(s, u, m) + late * _way(s, u, m, 0.0), corner(s, u, m + 1) + late * _way(s, u, m, 1.0)
