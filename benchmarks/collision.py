@@ -49,9 +49,9 @@ from .collision_table import (
     reduction_table,
     row_table,
 )  # fmt: skip
-from .elasticity import Document
+from .document import Document, header
 from .elasticity_table import limit_table
-from .order import header, parse_options
+from .order import parse_options
 
 QUICK_FRAMES = 3
 
@@ -109,7 +109,7 @@ def main(argv=None) -> int:
         numbers |= {"load_at_the_end": load_average()} | records
         numbers["limits"] = [limit.record() for limit in limits]
         write_bytes(options.out, json_text(numbers).encode())
-        write_bytes(options.out.with_suffix(".md"), ("\n\n".join(document.parts) + "\n").encode())
+        write_bytes(options.out.with_suffix(".md"), document.text().encode())
         print(f"written: {options.out} and {options.out.with_suffix('.md').name}")
     if options.plot:
         draw(found, options.plot)

@@ -35,9 +35,9 @@ from .contact_table import (
     solver_table,
     step_table,
 )  # fmt: skip
-from .elasticity import Document
+from .document import Document, header
 from .elasticity_table import limit_table
-from .order import header, parse_options
+from .order import parse_options
 
 SCENES = ("cube_on_box", "two_cubes_two_boxes")  # figures 20 and 19
 FRAMES, QUICK_FRAMES = 90, 6
@@ -116,7 +116,7 @@ def main(argv=None) -> int:
         numbers |= {name: [x.record() for x in some] for name, some in found.items()}
         numbers["limits"] = [limit.record() for limit in limits]
         write_bytes(options.out, json_text(numbers).encode())
-        write_bytes(options.out.with_suffix(".md"), ("\n\n".join(document.parts) + "\n").encode())
+        write_bytes(options.out.with_suffix(".md"), document.text().encode())
         print(f"written: {options.out} and {options.out.with_suffix('.md').name}")
     if options.plot:
         draw(found, snapshots, options.plot)

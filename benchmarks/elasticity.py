@@ -12,27 +12,24 @@ a quarter of an hour on two cores; leave the package's files alone meanwhile, si
 """
 
 import argparse
-import os
 import sys
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 
-import taisoft as ts
-from taisoft.errors import OutputError, SimulationError
-from taisoft.output.files import make_folder, write_bytes
+from taisoft.errors import SimulationError
+from taisoft.output.files import write_bytes
 from taisoft.output.report import json_text
 from taisoft.output.tables import markdown, percent, spread_of
-from taisoft.timing import Timing, load_average, machine, versions
+from taisoft.timing import Timing, load_average
 
+from .document import RESULTS, Document, check_out, default_out, header, load_text
 from .elasticity_beam import measure_memory, n_tets
 from .elasticity_cost import Cost, cost_limits, cost_table, measure_costs
 from .elasticity_runs import MUJOCO, TAISOFT, Row, make_rows, measure_rows, time_ratio
-from .elasticity_table import Limit, limit_table, slug
+from .elasticity_table import Limit, limit_table
 from .exact_path import MESHES, SECONDS
 from .programs.mujoco_flex import run_mujoco
 
-RESULTS = Path(__file__).parent / "results"
 TARGET_MESH = MESHES[-1]  # whose implicit runs have targets
 SPEED_TARGET, ERROR_TARGET = 3.0, 0.0015  # MuJoCo's time over ours, at least; error of a path, at most
 MEMORY_LIMIT = 1000.0  # bytes of fields per tet, f32
@@ -57,18 +54,6 @@ class Extent:
 
 FULL = Extent(MESHES, ("f32", "f64"), repeats=15, rounds=(3, 3, 3))
 QUICK = Extent(MESHES[:2], ("f32",), repeats=5, rounds=(1, 1))
-
-
-class Document:
-    """What is printed, kept for the file."""
-
-    def __init__(self) -> None:
-        self.parts: list[str] = []
-
-    def add(self, text: str) -> None:
-        """Print a part and keep it."""
-        self.parts.append(text)
-        print(text, end="\n\n", flush=True)
 
 
 def run_table(rows: list[Row]) -> str:
@@ -179,30 +164,21 @@ def peer_problem() -> str | None:
     return None
 
 
-def header(arch: str) -> tuple[str, dict]:
+def opening(arch: str) -> tuple[str, dict]:
     """What is measured where, as text and as data."""
-    found = machine() | {"device": None, "date": datetime.now().isoformat(timespec="minutes")}
+    text, found = header("Elasticity: the falling beam", packages=("taichi", "mujoco", "numpy", "scipy"))
+    found |= {"device": None, "arch": arch}
     if arch == "cuda":
         from taisoft.cli.doctor import cuda
 
         found["device"] = cuda().removeprefix("yes: ")
-    packages = {"taisoft": ts.__version__, **versions("taichi", "mujoco", "numpy", "scipy")}
-    told = ", ".join(f"{name} {version or 'absent'}" for name, version in packages.items())
     where = f"taisoft on {found['device']}, MuJoCo on the processor" if arch == "cuda" else "both programs on the processor"
-    text = (
-        f"# Elasticity: the falling beam\n\n{found['processor']}, {found['cores']} cores, "
-        f"load {_load(found['load'])} at the start; {found['date']}\n{told}\n{where}, and there on one thread each"
-    )
-    return text, found | {"versions": packages, "arch": arch}
-
-
-def _load(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.1f}"
+    return f"{text}\n{where}, and there on one thread each", found
 
 
 def measure(extent: Extent, arch: str, peers: bool, document: Document) -> dict:
     """Everything, printed as it comes. Returns the numbers."""
-    text, numbers = header(arch)
+    text, numbers = opening(arch)
     document.add(text)
     memory = measure_memory(extent.meshes, arch)  # first: the process's peak is then taisoft's own
     problem = peer_problem() if peers else "left out with --no-peers"
@@ -230,25 +206,11 @@ def measure(extent: Extent, arch: str, peers: bool, document: Document) -> dict:
     document.add("## Limits")
     document.add(limit_table(limits))
     load = load_average()
-    document.add(f"Load at the end: {_load(load)}")
+    document.add(f"Load at the end: {load_text(load)}")
     return numbers | {
         "load_at_the_end": load, "mujoco_left_out": problem, "cost": [x.record() for x in costs],
         "runs": [x.record() for x in runs], "memory": memory, "limits": [x.record() for x in limits],
     }  # fmt: skip
-
-
-def default_out(arch: str, what: str = "elasticity") -> Path:
-    """results/<what>-<machine>.json beside this file."""
-    where = machine()
-    return RESULTS / f"{what}-{slug(where['processor'])}-{where['cores']}-cores{'-cuda' if arch == 'cuda' else ''}.json"
-
-
-def check_out(path: Path) -> None:
-    """Raises OutputError, before minutes of measuring, where the results could not be written."""
-    if path.suffix != ".json":
-        raise OutputError(f"{path}: the name must end in .json")
-    if not os.access(make_folder(path.parent), os.W_OK):
-        raise OutputError(f"cannot write {path}: its folder is not writable")
 
 
 def main(argv=None) -> int:
@@ -265,13 +227,13 @@ def main(argv=None) -> int:
     options = parser.parse_args(argv)
     out = options.out
     if out is not None:
-        out = default_out(options.arch) if out == RESULTS else out
-        check_out(out)
+        out = default_out(options.arch, "elasticity") if out == RESULTS else out
+        check_out(out, ".json")
     document = Document()
     numbers = measure(QUICK if options.quick else FULL, options.arch, not options.no_peers, document)
     if out is not None:
         write_bytes(out, json_text(numbers | {"quick": options.quick}).encode())
-        write_bytes(out.with_suffix(".md"), ("\n\n".join(document.parts) + "\n").encode())
+        write_bytes(out.with_suffix(".md"), document.text().encode())
         print(f"written: {out} and {out.with_suffix('.md').name}")
     return 0
 

@@ -33,9 +33,14 @@ def beam_scene(cells, law: str = "SVK") -> Scene:
     return scene
 
 
+def explicit_steps(scene: Scene) -> int:
+    """Smallest number of explicit steps in 10 ms whose dt is at most MARGIN of the limit."""
+    return math.ceil(SAMPLE / (MARGIN * stable_dt(scene, verlet=True)))
+
+
 def steps_within_limit(cells) -> int:
-    """Smallest number of explicit steps in 10 ms whose dt is at most MARGIN of the limit; one limit for all laws."""
-    return math.ceil(SAMPLE / (MARGIN * stable_dt(beam_scene(cells), verlet=True)))
+    """Those of the beam; one limit for all laws."""
+    return explicit_steps(beam_scene(cells))
 
 
 def follow_tip(sim: ts.Simulator, steps: int, samples: int) -> tuple[np.ndarray, Stretch]:

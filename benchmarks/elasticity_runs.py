@@ -14,11 +14,12 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.errors import SimulationError
+from taisoft.scene.scene import Scene
 from taisoft.stepping import EXPLICIT
 from taisoft.study.stretch import Stretch, advance, warm_up
 from taisoft.timing import Timing, summarise
 
-from .elasticity_beam import MARGIN, beam_scene, follow_tip, n_tets, steps_within_limit
+from .elasticity_beam import MARGIN, beam_scene, explicit_steps, follow_tip, n_tets
 from .exact_path import FOLDING_STARTS, SAMPLE, load_exact
 from .programs.mujoco_flex import STABLE_STEPS, run_mujoco
 
@@ -65,14 +66,14 @@ class Row:
         return asdict(self) | {"dt": self.dt, "seconds_per_simulated_second": self.timing and asdict(self.timing)}
 
 
-def lasting_steps(cells, integrator: str, arch: str, seconds: float) -> tuple[int, str]:
+def lasting_steps(scene: Scene, integrator: str, arch: str, seconds: float) -> tuple[int, str]:
     """Smallest number of explicit steps in 10 ms, from MARGIN of the limit on, that lasts `seconds`; and what did not.
 
-    The limit is that of small vibrations about the rest shape; the law stiffens where the beam is squeezed.
+    The limit is that of small vibrations about the rest shape; a law stiffens where a body is squeezed.
     """
-    least, failures = steps_within_limit(cells), []
+    least, failures = explicit_steps(scene), []
     samples = round(seconds / SAMPLE)
-    with ts.Simulator(beam_scene(cells), dt=SAMPLE / least, integrator=integrator, precision="f32", arch=arch) as sim:
+    with ts.Simulator(scene, dt=SAMPLE / least, integrator=integrator, precision="f32", arch=arch) as sim:
         for steps in range(least, 4 * least):
             sim.dt = SAMPLE / steps
             sim.reset()
@@ -83,12 +84,12 @@ def lasting_steps(cells, integrator: str, arch: str, seconds: float) -> tuple[in
                 continue
             told = f"from {MARGIN} of the limit at rest on, dt = {', '.join(failures)} diverged" if failures else ""
             return steps, told
-    raise SimulationError(f"{integrator} on the mesh {cells}: even dt = {1e3 * sim.dt:.3f} ms does not last {seconds} s")
+    raise SimulationError(f"{integrator}: even dt = {1e3 * sim.dt:.3f} ms does not last {seconds} s")
 
 
 def make_rows(cells, arch: str, peers: bool, seconds: float, implicit=IMPLICIT) -> list[Row]:
     """The rows of a mesh, in the order of their measurement: each of taisoft beside one of MuJoCo."""
-    verlet, euler = (lasting_steps(cells, name, arch, seconds) for name in reversed(EXPLICIT))
+    verlet, euler = (lasting_steps(beam_scene(cells), name, arch, seconds) for name in reversed(EXPLICIT))
     stable = STABLE_STEPS[tuple(cells)][0]
     own = [
         ("velocity_verlet", *verlet), ("velocity_verlet", 2 * verlet[0], ""), ("symplectic_euler", *euler),

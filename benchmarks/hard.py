@@ -23,11 +23,10 @@ from taisoft.output.report import json_text
 from taisoft.study.store import NoStore, Store
 from taisoft.timing import load_average
 
-from .elasticity import RESULTS, Document, default_out
+from .document import RESULTS, Document, check_out, default_out, header
 from .hard_cases import CASES
 from .hard_runs import Row, answer, measure
 from .hard_table import notes, summary, table
-from .order import check_out, header
 
 DAY = 86_400.0  # [s]
 
@@ -90,7 +89,7 @@ def main(argv=None) -> int:
     numbers = measured(rows, options, document)
     if out is not None:
         write_bytes(out, json_text(numbers).encode())
-        write_bytes(out.with_suffix(".md"), ("\n\n".join(document.parts) + "\n").encode())
+        write_bytes(out.with_suffix(".md"), document.text().encode())
         print(f"written: {out} and {out.with_suffix('.md').name}")
     return 0 if all(row.passed for row in rows) else 1
 

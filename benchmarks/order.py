@@ -13,21 +13,17 @@ takes about ten minutes on two cores.
 """
 
 import argparse
-import os
 import sys
 from dataclasses import asdict
-from datetime import datetime
 from pathlib import Path
 
-import taisoft as ts
-from taisoft.errors import OutputError
-from taisoft.output.files import make_folder, write_bytes
+from taisoft.output.files import write_bytes
 from taisoft.output.plot import require_matplotlib
 from taisoft.output.report import json_text
 from taisoft.runtime import open_runtime
-from taisoft.timing import load_average, machine, versions
+from taisoft.timing import load_average
 
-from .elasticity import Document
+from .document import Document, check_out, header
 from .elasticity_table import limit_table
 from .order_cases import CASES, HANGING, LINEAR, QUADRATIC, Case, Reference
 from .order_plot import draw
@@ -35,19 +31,6 @@ from .order_runs import Row, measure_case
 from .order_table import GOAL, GOALS, compare, compare_table, find_limits, row_table
 
 ROUNDS, QUICK_ROUNDS, QUICK_MESHES = 5, 1, 2
-
-
-def header(title: str, *how: str) -> tuple[str, dict]:
-    """What is measured where and how, as text and as data."""
-    found = machine() | {"date": datetime.now().isoformat(timespec="minutes")}
-    packages = {"taisoft": ts.__version__, **versions("taichi", "numpy", "scipy")}
-    load = "unknown" if found["load"] is None else f"{found['load']:.1f}"
-    text = (
-        f"# {title}\n\n{', '.join([found['processor'], str(found['cores']) + ' cores', *how])}, "
-        f"load {load} at the start; {found['date']}\n"
-        + ", ".join(f"{name} {version or 'absent'}" for name, version in packages.items())
-    )
-    return text, found | {"versions": packages}
 
 
 def case_text(case: Case, rows: list[Row], reference: Reference) -> str:
@@ -97,16 +80,6 @@ def measure(cases: list[Case], quick: bool, arch: str, document: Document) -> tu
     return numbers, found
 
 
-def check_out(path: Path | None, suffix: str) -> None:
-    """Raises OutputError, before minutes of measuring, where a file could not be written."""
-    if path is None:
-        return
-    if path.suffix != suffix:
-        raise OutputError(f"{path}: the name must end in {suffix}")
-    if not os.access(make_folder(path.parent), os.W_OK):
-        raise OutputError(f"cannot write {path}: its folder is not writable")
-
-
 def parse_options(parser: argparse.ArgumentParser, argv: list[str] | None, drawn: str) -> argparse.Namespace:
     """--arch, --out and --plot, which is to draw what `drawn` says, beside the parser's own options; the files can be written."""
     parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
@@ -133,7 +106,7 @@ def main(argv=None) -> int:
     numbers, found = measure([c for c in CASES if name in (None, c.name)], options.quick, options.arch, document)
     if options.out:
         write_bytes(options.out, json_text(numbers).encode())
-        write_bytes(options.out.with_suffix(".md"), ("\n\n".join(document.parts) + "\n").encode())
+        write_bytes(options.out.with_suffix(".md"), document.text().encode())
         print(f"written: {options.out} and {options.out.with_suffix('.md').name}")
     if options.plot:
         draw(found, options.plot)

@@ -8,46 +8,41 @@ same nodes and tets. W1's and W2's errors are measured from the exact path of a 
 position over the excursion, or the root mean square of the mass centre's height over the 0.5 m it drops. W3 and W4 are to
 stand for a second: nothing falls or leans, turns inside out, or sinks in by 1 % of an edge (the least of the bodies' mean
 ones), as measured by taisoft in every program's positions every 10 ms. taisoft runs on as many threads as the machine has cores
-where that pays, the others on one. Times are without building and compiling. The whole takes about half an hour on two cores.
+where that pays, the others on one core. Times are without building and compiling. Nothing here passes or fails: limits are
+marked as met or not. The whole takes about half an hour on two cores.
 """
 
 import argparse
 import sys
-from datetime import datetime
 from pathlib import Path
 from types import ModuleType
 
-import taisoft as ts
 from taisoft.output.files import write_bytes
+from taisoft.output.plot import require_matplotlib
 from taisoft.output.report import json_text
-from taisoft.timing import load_average, machine, versions
+from taisoft.timing import load_average
 
-from .elasticity import RESULTS, Document, check_out
-from .elasticity_table import limit_table, slug
+from .document import RESULTS, Document, check_out, default_out, header, load_text
+from .elasticity_table import limit_table
 from .programs import mujoco_works, newton_vbd, own, pybullet_soft
 from .works.plot import draw
 from .works.runs import Row, measure
 from .works.scenes import WORKS, Work
-from .works.table import compare_table, limits_of, run_table
+from .works.table import compare_table, comparisons, implicit_table, limits_of, run_table
 
 PROGRAMS = (own, mujoco_works, pybullet_soft, newton_vbd)
 QUICK = ("W1 12x3x3", "W2")
 ROUNDS = 3
 
 
-def header(arch: str, programs: list[ModuleType]) -> tuple[str, dict]:
-    """What is measured where, as text and as data."""
-    found = machine() | {"date": datetime.now().isoformat(timespec="minutes"), "arch": arch}
-    packages = {"taisoft": ts.__version__, **versions("taichi", "mujoco", "pybullet", "newton", "warp-lang", "numpy")}
-    told = ", ".join(f"{name} {version or 'absent'}" for name, version in packages.items())
-    load = "unknown" if found["load"] is None else f"{found['load']:.1f}"
-    text = (
-        f"# Speed against error, beside other programs\n\n{found['processor']}, {found['cores']} cores, "
-        f"load {load} at the start; {found['date']}\n{told}\n\n" + __doc__.partition("\n\n")[2].partition("\n\n")[2].strip()
-    )
+def opening(arch: str, programs: list[ModuleType]) -> tuple[str, dict]:
+    """What is measured where, and which programs are missing, as text and as data."""
+    packages = ("taichi", "mujoco", "pybullet", "newton", "warp-lang", "numpy")
+    text, numbers = header("Speed against error, beside other programs", arch, packages=packages)
+    text += "\n\n" + __doc__.partition("\n\n")[2].partition("\n\n")[2].strip()
     left_out = {program.NAME: problem for program in programs if (problem := program.problem())}
     text += "".join(f"\n\n{name} is left out: {problem}." for name, problem in left_out.items())
-    return text, found | {"versions": packages, "left_out": left_out}
+    return text, numbers | {"arch": arch, "left_out": left_out}
 
 
 def title(work: Work) -> str:
@@ -59,7 +54,7 @@ def run(
     works: list[Work], programs: list[ModuleType], arch: str, rounds: int, document: Document
 ) -> tuple[dict, list[list[Row]]]:
     """Everything, printed as it comes. Returns the numbers, and the rows of each work."""
-    text, numbers = header(arch, programs)
+    text, numbers = opening(arch, programs)
     document.add(text)
     here = [program for program in programs if program.NAME not in numbers["left_out"]]
     found = []
@@ -67,12 +62,15 @@ def run(
         rows = measure(work, here, rounds, arch)
         document.add(f"{title(work)}\n\n{run_table(rows)}")
         found.append(rows)
-    document.add(f"## The fastest of each at equal error\n\n{compare_table(found)}")
+    compared = comparisons(found)
+    document.add(f"## The fastest of each at equal error\n\n{compare_table(compared)}")
+    if any(work.stiff for work in works):
+        document.add(f"## Steps of 10 ms in the stiff beam; PyBullet has none but explicit ones\n\n{implicit_table(found)}")
     limits = [limit for rows in found for limit in limits_of(rows)]
     document.add(f"## Limits\n\n{limit_table(limits)}")
-    document.add(f"Load at the end: {load_average():.1f}")
+    document.add(f"Load at the end: {load_text(load_average())}")
     rows = [row.record() for rows in found for row in rows]
-    return numbers | {"runs": rows, "limits": [limit.record() for limit in limits]}, found
+    return numbers | {"runs": rows, "comparisons": compared, "limits": [limit.record() for limit in limits]}, found
 
 
 def main(argv=None) -> int:
@@ -95,23 +93,19 @@ def main(argv=None) -> int:
         parser.error(f"no work begins with {options.work!r}")
     out = options.out
     if out is not None:
-        out = default_out(options.arch) if out == RESULTS else out
-        check_out(out)
+        out = default_out(options.arch, "peers") if out == RESULTS else out
+        check_out(out, ".json")
+        require_matplotlib("--out")
     programs = [one for one in PROGRAMS if one is own or not options.program or one.NAME in options.program]
     document = Document()
     numbers, found = run(works, programs, options.arch, 1 if options.quick else options.rounds, document)
     if out is not None:
         write_bytes(out, json_text(numbers | {"quick": options.quick}).encode())
-        write_bytes(out.with_suffix(".md"), ("\n\n".join(document.parts) + f"\n\n![]({out.stem}.png)\n").encode())
+        picture = f"\n![]({out.stem}.png)\n" if any(work.kind == "path" for work in works) else ""
+        write_bytes(out.with_suffix(".md"), f"{document.text()}{picture}".encode())
         draw(found, out.with_suffix(".png"))
-        print(f"written: {out}, {out.with_suffix('.md').name} and {out.with_suffix('.png').name}")
+        print(f"written: {out}, {out.with_suffix('.md').name} and, where a path is known, {out.with_suffix('.png').name}")
     return 0
-
-
-def default_out(arch: str) -> Path:
-    """results/peers-<machine>.json beside this file."""
-    where = machine()
-    return RESULTS / f"peers-{slug(where['processor'])}-{where['cores']}-cores{'-cuda' if arch == 'cuda' else ''}.json"
 
 
 if __name__ == "__main__":

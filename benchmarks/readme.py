@@ -18,11 +18,12 @@ from taisoft.errors import OutputError
 from taisoft.output.files import write_bytes
 from taisoft.output.tables import markdown
 
+from .document import RESULTS
 from .order_cases import HANGING
 from .order_table import DEFAULT_DEGREE, GOAL
 from .reference_cases.record import label
+from .works.table import compare_table
 
-RESULTS = Path(__file__).resolve().parent / "results"
 README = Path(__file__).resolve().parents[1] / "README.md"
 BLOCK = re.compile(r"(<!-- begin (\w+) -->\n).*?(<!-- end \2 -->\n)", re.DOTALL)
 MARKER = re.compile(r"<!-- (?:begin|end) (\w+) -->")
@@ -82,7 +83,18 @@ def order_times(results: Path) -> str:
     return f"{table}\n\nMeasured on: {measured_on(numbers)}."
 
 
-TABLES: dict[str, Callable[[Path], str]] = {"order_errors": order_errors, "order_times": order_times}  # by marker
+def peers(results: Path) -> str:
+    """taisoft beside other programs at equal error."""
+    numbers = newest(results, "peers")
+    told = [numbers["versions"][name] for name in ("mujoco", "pybullet", "newton")]
+    programs = "MuJoCo {}, PyBullet {}, Newton {}".format(*told)
+    where = f"{numbers['processor']}, {numbers['cores']} cores, {numbers['arch']}, {numbers['date'][:10]}; {programs}"
+    return f"{compare_table(numbers['comparisons'])}\n\nMeasured on: {where}."
+
+
+TABLES: dict[str, Callable[[Path], str]] = {  # by marker
+    "order_errors": order_errors, "order_times": order_times, "peers": peers,
+}  # fmt: skip
 
 
 def filled(text: str, results: Path = RESULTS) -> str:

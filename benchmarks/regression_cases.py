@@ -23,7 +23,8 @@ from .collision_cases import SHEET, SUNK, cubes_setup
 from .collision_runs import Rig
 from .contact_runs import SETTINGS
 from .elasticity_beam import LAWS
-from .hard_contact import SNH, G, box, on_slope
+from .hard_cases.contact import on_slope
+from .hard_cases.shapes import SNH, G, box
 from .reference_cases.record import face
 
 # of a reference: share of the step, and what contacts are solved to even in the step in which sliding ends

@@ -24,11 +24,9 @@ from taisoft.output.files import make_folder, write_bytes
 from taisoft.output.plot import require_matplotlib
 from taisoft.output.report import json_text
 from taisoft.runtime import compile_clock
-from taisoft.timing import load_average, machine
+from taisoft.timing import load_average
 
-from .elasticity import RESULTS
-from .elasticity_table import slug
-from .order import header
+from .document import default_out, header
 from .report_parts import bound, broad, colours, demos, phases, points, reduction, solvers
 from .report_parts.page import Extent, Part, again_text, part_text, short_text, summary_table
 
@@ -38,12 +36,6 @@ PARTS: dict[str, Callable[[Extent], Part]] = {
     "bound": bound.measure,
 }  # fmt: skip
 PAGE, NUMBERS = "README.md", "report.json"
-
-
-def default_out(arch: str) -> Path:
-    """results/report-<machine> beside this file."""
-    where = machine()
-    return RESULTS / f"report-{slug(where['processor'])}-{where['cores']}-cores{'-cuda' if arch == 'cuda' else ''}"
 
 
 def measure_part(name: str, extent: Extent) -> Part:
@@ -103,7 +95,7 @@ def main(argv=None) -> int:
     parser.add_argument("--only", choices=tuple(PARTS), metavar="NAME", help=f"one of {', '.join(PARTS)}")
     parser.add_argument("--out", type=Path, metavar="DIR", help="default of the whole: benchmarks/results/report-<machine>")
     options = parser.parse_args(argv)
-    folder = options.out or (None if options.quick or options.only else default_out(options.arch))
+    folder = options.out or (None if options.quick or options.only else default_out(options.arch, "report", suffix=""))
     require_matplotlib("the page's plots")
     if folder is not None:
         check_out(folder)

@@ -27,8 +27,8 @@ from taisoft.output.files import write_bytes
 from taisoft.output.report import json_text
 from taisoft.timing import load_average
 
-from .elasticity import Document
-from .order import header, parse_options
+from .document import Document, header
+from .order import parse_options
 from .scaling_bytes import Copy, measure_copy
 from .scaling_plot import draw
 from .scaling_runs import EXPLICIT, KINDS, ON_ONE, PRECISION, Row, measure
@@ -121,7 +121,7 @@ def main(argv=None) -> int:
     numbers["load_at_the_end"] = load_average()
     if options.out:
         write_bytes(options.out, json_text(numbers).encode())
-        write_bytes(options.out.with_suffix(".md"), ("\n\n".join(document.parts) + "\n").encode())
+        write_bytes(options.out.with_suffix(".md"), document.text().encode())
         print(f"written: {options.out} and {options.out.with_suffix('.md').name}")
     if options.plot:
         draw(rows, copies, options.plot)

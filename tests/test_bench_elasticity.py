@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from benchmarks import elasticity, elasticity_runs
+from benchmarks import document, elasticity, elasticity_runs
 from benchmarks.elasticity_beam import beam_scene, follow_tip, measure_memory, steps_within_limit
 from benchmarks.elasticity_cost import Cost, cost_limits, cost_table, measure_costs
 from benchmarks.elasticity_runs import Row, lasting_steps, make_rows, measure_rows, time_ratio
@@ -89,7 +89,7 @@ def test_steps_that_diverge_are_told_and_left_behind(lent, monkeypatch):
 
     monkeypatch.setattr(elasticity_runs, "advance", stumble)
     first = steps_within_limit(CELLS)
-    steps, told = lasting_steps(CELLS, "velocity_verlet", "cpu", 0.02)
+    steps, told = lasting_steps(beam_scene(CELLS), "velocity_verlet", "cpu", 0.02)
     assert steps == first + 2 and tried == [SAMPLE / n for n in (first, first + 1, first + 2)]
     assert "3.333 ms (at t = 0.00 s), 2.500 ms (at t = 0.00 s) diverged" in told
 
@@ -252,6 +252,6 @@ def test_where_results_cannot_be_written_nothing_is_measured(tmp_path, monkeypat
 
 
 def test_results_are_named_after_the_machine(monkeypatch):
-    monkeypatch.setattr(elasticity, "machine", lambda: {"processor": "AMD EPYC", "cores": 2})
-    assert elasticity.default_out("cpu").name == "elasticity-amd-epyc-2-cores.json"
-    assert elasticity.default_out("cuda").name == "elasticity-amd-epyc-2-cores-cuda.json"
+    monkeypatch.setattr(document, "machine", lambda: {"processor": "AMD EPYC", "cores": 2})
+    assert document.default_out("cpu", "elasticity").name == "elasticity-amd-epyc-2-cores.json"
+    assert document.default_out("cuda", "elasticity").name == "elasticity-amd-epyc-2-cores-cuda.json"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from matplotlib import image as pictures
 
-from benchmarks import report
+from benchmarks import document, report
 from benchmarks.collision_cases import cubes_setup
 from benchmarks.collision_runs import HASH, PHASES, TREES, Rig, Row, Sweep
 from benchmarks.collision_runs import Film as SearchFilm
@@ -320,7 +320,7 @@ def test_what_cannot_be_measured_is_said(monkeypatch, tmp_path):
 
 
 def test_a_part_of_a_run_writes_nothing_unasked(faked, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(report, "RESULTS", tmp_path)
+    monkeypatch.setattr(document, "RESULTS", tmp_path)
     assert report.main(["--quick"]) == 0 and report.main(["--only", "bound"]) == 0
     assert not list(tmp_path.iterdir()) and "A bound" in capsys.readouterr().out
     assert report.main([]) == 0 and (next(tmp_path.iterdir()) / "README.md").is_file()

@@ -16,7 +16,7 @@ from study_places import InProcess
 
 from taisoft.errors import SceneError
 from taisoft.simulator import Simulator
-from taisoft.study import measure, workers
+from taisoft.study import measure
 from taisoft.study.grid import tasks_of
 from taisoft.study.results import Ask
 from taisoft.study.runner import Runner
@@ -184,11 +184,11 @@ def test_a_process_that_ends_without_an_answer_is_told(tmp_path):
     assert answers["a"] == {"crash": "its process ended with exit status 7 without an answer: hello"}
 
 
-def test_a_process_that_reads_nothing_is_told(monkeypatch):
-    monkeypatch.setattr(workers, "CHILD", (sys.executable, "-c", "import os; os._exit(3)"))
+def test_a_process_that_reads_nothing_is_told():
+    child = (sys.executable, "-c", "import os; os._exit(3)")
     large = {"text": "x" * 1_000_000}  # more than a pipe holds
-    answers = answers_of([("a", large)], [LocalPlace(usable_cores())])
+    answers = answers_of([("a", large)], [LocalPlace(usable_cores(), child)])
     assert answers["a"] == {"crash": "its process ended with exit status 3 without an answer"}
-    place = LocalPlace(usable_cores())
+    place = LocalPlace(usable_cores(), child)
     place.start(large)
     place.stop()

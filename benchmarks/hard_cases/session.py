@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 import taisoft as ts
-from taisoft.errors import SimulationError, TaisoftError
+from taisoft.errors import TaisoftError
 from taisoft.output.report import peak_memory
 from taisoft.records import RunReport, StepReport
 
@@ -120,6 +120,6 @@ def refusal(make: Callable[[], ts.Simulator]) -> str:
     """The sentence with which a simulator refuses to be made; empty where it is made after all."""
     try:
         make().close()
-    except (SimulationError, TaisoftError) as error:
+    except TaisoftError as error:
         return str(error)
     return ""

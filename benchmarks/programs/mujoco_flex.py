@@ -103,23 +103,31 @@ def build_model(mujoco, beam: FallingBeam, integrator: str, dt: float, tolerance
     names = {"rk4": "RK4", "discrete": "DISCRETE"}
     spec.option.integrator = getattr(mujoco.mjtIntegrator, "mjINT_" + names.get(integrator, "EULER"))
     spec.option.disableflags = sum(int(getattr(mujoco.mjtDisableBit, "mjDSBL_" + name)) for name in SWITCHED_OFF)
-    owners = []
-    for node, (position, mass, free) in enumerate(zip(beam.vertices, beam.mass, beam.free)):
-        owners.append(f"node{node}" if free else "world")
-        if free:
-            # A body must have an inertia; without a rotation it plays no part.
-            inertial = {"mass": mass, "inertia": [mass * 1e-3] * 3, "explicitinertial": True}
-            body = spec.worldbody.add_body(name=owners[-1], pos=position, **inertial)
-            for axis in np.eye(3):
-                body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-    flex = spec.add_flex(name="beam", dim=3, young=YOUNG, poisson=POISSON, damping=0.0, contype=0, conaffinity=0)
-    flex.selfcollide = mujoco.mjtFlexSelf.mjFLEXSELF_NONE
-    flex.vertbody = owners
-    flex.vert = np.where(beam.free[:, None], 0.0, beam.vertices).ravel()  # in the frame of the owner
-    flex.elem = beam.tets.ravel().astype(int)
+    add_flex(mujoco, spec, "beam", beam.vertices, beam.tets, beam.mass, beam.free, YOUNG, contype=0, conaffinity=0)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=FALSE_ALARM)
         return spec.compile()
+
+
+def add_flex(mujoco, spec, name: str, vertices, tets, mass, free, young: float, **contact) -> None:
+    """A flex named so, of vertices (n,3) [m], tets (m,4), mass (n,) [kg], free (n,) bool and young [Pa].
+
+    A body of its mass with three slides for every free node, and the flex on them. contact: arguments of add_flex.
+    """
+    owners = []
+    for node, (position, kg, is_free) in enumerate(zip(vertices, mass, free)):
+        owners.append(f"{name} {node}" if is_free else "world")
+        if is_free:
+            # A body must have an inertia; without a rotation it plays no part.
+            inertial = {"mass": kg, "inertia": [kg * 1e-3] * 3, "explicitinertial": True}
+            body = spec.worldbody.add_body(name=owners[-1], pos=position, **inertial)
+            for axis in np.eye(3):
+                body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+    flex = spec.add_flex(name=name, dim=3, young=young, poisson=POISSON, damping=0.0, **contact)
+    flex.selfcollide = mujoco.mjtFlexSelf.mjFLEXSELF_NONE
+    flex.vertbody = owners
+    flex.vert = np.where(free[:, None], 0.0, vertices).ravel()  # in the frame of the owner
+    flex.elem = tets.ravel().astype(int)
 
 
 def _simulate(mujoco, model, beam: FallingBeam, integrator: str, steps: int, samples: int):

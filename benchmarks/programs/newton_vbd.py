@@ -8,6 +8,8 @@ from time import perf_counter
 
 import numpy as np
 
+import taisoft as ts
+
 from ..exact_path import DENSITY, POISSON, SAMPLE
 from ..works.references import NEWTON
 from ..works.scenes import Body, Work
@@ -30,10 +32,14 @@ def problem() -> str:
 
 
 def settings(work: Work, arch: str = "cpu") -> list[Setting]:
-    """Steps and sweeps, coarse to fine; large meshes the coarse ones only."""
+    """Steps and sweeps, coarse to fine; large meshes the coarse ones only; with contact soft and stiff springs."""
     tried = ((1, 20), (2, 10), (5, 20)) if work.tets < 10_000 else ((1, 20),)
-    contact = {"stiffness": 1e5} if work.touches else {}
-    return [Setting(NAME, MODEL, "vbd", steps, {"sweeps": sweeps} | contact) for steps, sweeps in tried]
+    springs = ({"stiffness": 1e5}, {"stiffness": 1e6}) if work.touches else ({},)
+    return [
+        Setting(NAME, MODEL, "vbd", steps, {"sweeps": sweeps} | spring)
+        for steps, sweeps in tried for spring in springs
+        if steps < 5 or spring is springs[-1]
+    ]  # fmt: skip
 
 
 class Run:
@@ -103,13 +109,12 @@ def start(work: Work, setting: Setting) -> Run:
 
 
 def _add(builder, body: Body, newton, warp) -> None:
-    lam = body.young * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
-    mu = body.young / (2 * (1 + POISSON))
+    material = ts.Material(young=body.young, poisson=POISSON)
     first = builder.particle_count
     builder.add_soft_mesh(
-        pos=warp.vec3(0.0), rot=warp.quat_identity(), scale=1.0, vel=warp.vec3(0.0), density=DENSITY, k_mu=mu, k_lambda=lam,
-        vertices=[warp.vec3(*x) for x in body.mesh.vertices], indices=body.mesh.tets.ravel().tolist(), k_damp=0.0,
-        add_surface_mesh_edges=True,
+        pos=warp.vec3(0.0), rot=warp.quat_identity(), scale=1.0, vel=warp.vec3(0.0), density=DENSITY, k_mu=material.mu,
+        k_lambda=material.lam, k_damp=0.0, vertices=[warp.vec3(*x) for x in body.mesh.vertices],
+        indices=body.mesh.tets.ravel().tolist(), add_surface_mesh_edges=True,
     )  # fmt: skip
     for node in first + np.flatnonzero(body.fixed):
         builder.particle_mass[node] = 0.0

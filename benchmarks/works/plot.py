@@ -12,11 +12,13 @@ COLUMNS, PANEL = 3, (4.2, 3.4)  # panels in a row, their size in inches
 
 
 def draw(works: list[list[Row]], path: Path) -> None:
-    """Write a PNG. Raises OutputError where it cannot be written or drawn."""
+    """Write a PNG; nothing where no path is known. Raises OutputError where it cannot be written or drawn."""
+    works = [rows for rows in works if rows[0].work.kind == "path" and any(row.timing for row in rows)]
+    if not works:
+        return
     require_matplotlib()
     from matplotlib import pyplot
 
-    works = [rows for rows in works if rows[0].work.kind == "path" and any(row.timing for row in rows)]
     lines = -(-len(works) // COLUMNS)
     figure, grid = pyplot.subplots(
         lines, COLUMNS, figsize=(PANEL[0] * COLUMNS, PANEL[1] * lines + 0.4), squeeze=False, layout="constrained"

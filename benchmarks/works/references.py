@@ -56,14 +56,14 @@ class Reference:
 
 def _error(work: Work, path: np.ndarray, exact: np.ndarray) -> float:
     away = np.linalg.norm(path - exact, axis=1)
-    if work.key == "W2":
+    if work.cells is None:
         return float(np.sqrt(np.mean(away**2)) / 0.5)
     return float(away.max() / np.linalg.norm(exact - exact[0], axis=1).max())
 
 
 def observed(work: Work, positions: np.ndarray, mass: np.ndarray) -> np.ndarray:
     """What a reference tells of positions (k,n,3) [m]: W1's tip (k,3), W2's height of the mass centre (k,1)."""
-    if work.key == "W2":
+    if work.cells is None:
         return (positions[:, :, 1] @ mass / mass.sum())[:, None]
     x = work.start[:, 0]
     return positions[:, x > x.max() - 1e-9].mean(axis=1)
@@ -104,29 +104,25 @@ def fall_on_ground(body: SemiDiscrete, friction: float, dt: float, seconds: floa
 
 def make(work: Work, model: Model) -> tuple[np.ndarray, float]:
     """Path and what it is good to."""
-    if work.key == "W2":
+    if work.cells is None:
         body = _semi_discrete(work, 0, model)
         loose, path = (fall_on_ground(body, work.friction, dt, work.seconds) for dt in (DT, DT / 2))
     else:
         body = work.bodies[0]
-        beam = FallingBeam(_cells(work), model.law, body.young, model.equal_masses)
+        beam = FallingBeam(work.cells, model.law, body.young, model.equal_masses)
         loose, path = (integrate(beam, tolerance)[1] for tolerance in TOLERANCES)
     return path, _error(work, loose, path)
 
 
-def _cells(work: Work) -> tuple[int, ...]:
-    return tuple(int(n) for n in work.key.removeprefix("W1 ").partition(",")[0].split("x"))
-
-
 def stored_elsewhere(work: Work, model: Model) -> bool:
     """Whether exact_path.py has it."""
-    return work.key.startswith("W1") and model == MUJOCO and work.bodies[0].young == YOUNG
+    return work.cells is not None and model == MUJOCO and work.bodies[0].young == YOUNG
 
 
 def load(work: Work, model: Model) -> Reference:
     """The stored reference. Raises SimulationError where there is none."""
     if stored_elsewhere(work, model):
-        exact = load_exact(_cells(work))
+        exact = load_exact(work.cells)
         return Reference(work, exact.path, float(exact.convergence.max()))
     with np.load(DATA) as data:
         if f"{work.key}: {model}" not in data:

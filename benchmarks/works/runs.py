@@ -11,6 +11,7 @@ from taisoft.errors import TaisoftError
 from taisoft.study.pareto import cheapest
 from taisoft.timing import Timing, summarise
 
+from ..elasticity_runs import TAISOFT as OWN
 from ..elasticity_runs import repeat_short
 from ..programs.session import Setting
 from .judge import Verdict, judge
@@ -70,27 +71,34 @@ def measure(work: Work, programs: Iterable[ModuleType], rounds: int, arch: str =
                 continue
             told = f"{work.key}, round {number + 1} of {rounds}: {row.setting.program} {row.setting}"
             print(told, file=sys.stderr, flush=True)
-            try:
-                _round(row, adapters[row.setting.program])
-            except TaisoftError as error:
-                row.failure = str(error)
+            positions = _round(row, adapters[row.setting.program])
+            if positions is not None:
+                row.verdict = judge(work, row.setting.model, positions)
     return rows
 
 
-def _round(row: Row, program: ModuleType) -> None:
-    session = program.start(row.work, row.setting)
+def _round(row: Row, program: ModuleType) -> np.ndarray | None:
+    """Run a row once more. Returns the positions of a run that was followed, the first; a failure is the row's."""
+    positions = None
     try:
-        row.build_seconds.append(session.build_seconds)
-        if row.verdict is None:
-            positions, seconds = session.run(follow=True)
-            row.verdict = judge(row.work, row.setting.model, positions)
-            row.unconverged = session.unconverged
-            if seconds > ENOUGH_SECONDS:
-                row.rounds.append([seconds / row.work.seconds])
-                return
-        row.rounds.append(list(repeat_short(lambda: session.run(follow=False)[1] / row.work.seconds)))
-    finally:
-        session.close()
+        session = program.start(row.work, row.setting)
+        try:
+            row.build_seconds.append(session.build_seconds)
+            if row.verdict is None:
+                positions, seconds = session.run(follow=True)
+                row.unconverged = session.unconverged
+                if seconds > ENOUGH_SECONDS:
+                    row.rounds.append([seconds / row.work.seconds])
+                    return positions
+            row.rounds.append(list(repeat_short(lambda: session.run(follow=False)[1] / row.work.seconds)))
+        finally:
+            session.close()
+    except Exception as error:  # of another program's own kinds; ours are known
+        if program.NAME == OWN and not isinstance(error, TaisoftError):
+            raise
+        row.failure = str(error)
+        return None
+    return positions
 
 
 def fastest_within(rows: list[Row], error: float) -> Row | None:
@@ -104,8 +112,3 @@ def fastest_standing(rows: list[Row]) -> Row | None:
     """Of these rows the fastest that stood."""
     stood = [row for row in rows if row.timing is not None and row.stood]
     return min(stood, key=lambda row: row.timing.median, default=None)
-
-
-def time_ratio(slow: Row, fast: Row) -> Timing:
-    """Time of `slow` over that of `fast`, from the medians of each round that both have."""
-    return summarise(np.median(a) / np.median(b) for a, b in zip(slow.rounds, fast.rounds))

@@ -31,7 +31,7 @@ class Body:
 class Work:
     """kind: "path" (an exact path of a point is known) or "stand" (it must stand). ground: the plane y = 0. seconds [s].
 
-    gravity [m/s^2] along -y. friction: of everything.
+    gravity [m/s^2] along -y. friction: of everything. cells: of the beam's mesh, None elsewhere.
     """
 
     key: str
@@ -42,6 +42,12 @@ class Work:
     seconds: float
     gravity: float = G
     friction: float = FRICTION
+    cells: tuple[int, int, int] | None = None
+
+    @property
+    def stiff(self) -> bool:
+        """Whether explicit steps are far shorter than anything that is looked at."""
+        return max(body.young for body in self.bodies) > 1e7
 
     @property
     def tets(self) -> int:
@@ -73,9 +79,10 @@ def _box(name: str, cells, size, young: float, at=(0.0, 0.0, 0.0), fixed=None) -
 def hanging_beam(cells, young: float = YOUNG) -> Work:
     """W1: the beam of exact_path.py."""
     stiff = f", E = {young:.0e} Pa" if young != YOUNG else ""
+    cells = tuple(cells)
     beam = _box("beam", cells, SIZE, young, fixed=lambda x: x[:, 0] < -SIZE[0] / 2 + 1e-9)
     name = "x".join(map(str, cells))
-    return Work(f"W1 {name}{stiff}", f"hanging beam of {name} cells{stiff}", "path", (beam,), False, 1.0, GRAVITY)
+    return Work(f"W1 {name}{stiff}", f"hanging beam of {name} cells{stiff}", "path", (beam,), False, 1.0, GRAVITY, cells=cells)
 
 
 def dropped_cube() -> Work:

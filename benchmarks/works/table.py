@@ -2,9 +2,10 @@
 
 from taisoft.output.tables import markdown, percent, spread_of
 
+from ..elasticity_runs import time_ratio
 from ..elasticity_table import Limit
 from ..programs import own
-from .runs import Row, fastest_standing, fastest_within, time_ratio
+from .runs import Row, fastest_standing, fastest_within
 from .scenes import Work
 
 LEVELS = (1e-2, 1e-3, 1e-4, 1e-5)  # errors at which W1 is compared
@@ -54,28 +55,35 @@ def own_and_peers(rows: list[Row]) -> tuple[list[Row], list[Row]]:
 
 
 def pairs_of(rows: list[Row]) -> list[tuple[str, Row | None, Row | None]]:
-    """At what, the fastest of taisoft and the fastest of the others; a path's at LEVELS, where anything is as exact."""
+    """At what, the fastest of taisoft and the fastest of the others; a path's at LEVELS."""
     ours, others = own_and_peers(rows)
     if rows[0].work.kind == "stand":
         return [("stands", fastest_standing(ours), fastest_standing(others))]
-    return [
-        (f"error <= {level:g}", a, b)
-        for level in LEVELS
-        for a, b in [(fastest_within(ours, level), fastest_within(others, level))]
-        if a or b
-    ]
+    return [(f"error <= {level:g}", fastest_within(ours, level), fastest_within(others, level)) for level in LEVELS]
 
 
-def compare_table(works: list[list[Row]]) -> str:
-    """A row a work and level."""
-    lines = []
+def comparisons(works: list[list[Row]]) -> list[dict]:
+    """For each work and level the fastest of taisoft and of the others, as plain data."""
+    found = []
     for rows in works:
         for at, ours, theirs in pairs_of(rows):
             ratio = time_ratio(theirs, ours) if ours and theirs else None
-            lines.append((
-                rows[0].work.key, f"{rows[0].work.tets:,}", at, *_named(ours), *_named(theirs),
-                f"{ratio.median:.3g}" if ratio else "-", percent(spread_of(ratio)) if ratio else "",
-            ))  # fmt: skip
+            found.append({
+                "work": rows[0].work.key, "tets": rows[0].work.tets, "at": at, "taisoft": _named(ours), "others": _named(theirs),
+                "ratio": ratio and ratio.median, "spread": ratio and spread_of(ratio),
+            })  # fmt: skip
+    return found
+
+
+def compare_table(found: list[dict]) -> str:
+    """A row a work and level, of `comparisons`."""
+    lines = [
+        (
+            one["work"], f"{one['tets']:,}", one["at"], *one["taisoft"], *one["others"],
+            f"{one['ratio']:.3g}" if one["ratio"] else "-", percent(one["spread"]),
+        )
+        for one in found
+    ]  # fmt: skip
     headings = ("work", "tets", "at", "taisoft", "s/sim. s", "best of the others", "s/sim. s", "its time / taisoft's", "spread")
     return markdown(headings, lines, left=(0, 2, 3, 5))
 
@@ -83,29 +91,38 @@ def compare_table(works: list[list[Row]]) -> str:
 def _named(row: Row | None) -> tuple[str, str]:
     if row is None:
         return "none", "-"
-    return f"{row.setting.program} {row.setting.method}, {1e3 * row.setting.dt:.3g} ms", f"{row.timing.median:.4g}"
+    name = row.setting.method if row.setting.program == own.NAME else f"{row.setting.program} {row.setting.method}"
+    return f"{name}, {row.setting.model.law}, {1e3 * row.setting.dt:.3g} ms", f"{row.timing.median:.3g}"
 
 
 def limits_of(rows: list[Row]) -> list[Limit]:
-    """What was aimed at, of a work."""
+    """What was aimed at, of a work; nothing of the stiff ones."""
     work = rows[0].work
     ours, _ = own_and_peers(rows)
-    if work.key == "W2":
+    if work.stiff:
+        return []
+    if work.cells is None and work.kind == "path":
         return _limits_of_drop(work, ours)
     found = []
     for at, a, b in pairs_of(rows):
-        stiff = "E =" in work.key
-        if a is None or (b is None and work.kind == "path") or stiff:
-            if a is None and not stiff:
-                found.append(Limit(f"{work.key}, {at}: taisoft's settings that do", 0, 1, at_least=True))
-            continue
-        if b is None:
-            found.append(Limit(f"{work.key}, {at}: taisoft's settings that do, no other program's", 1, 1, at_least=True))
-            continue
-        ratio, wanted = time_ratio(b, a), FASTER if work.kind == "path" else 1.0
-        what = f"{work.key}, {at}: time of {b.setting.program} / taisoft"
-        found.append(Limit(what, ratio.median, wanted, spread_of(ratio), at_least=True))
+        found.append(Limit(f"{work.key}, {at}: settings of taisoft that do", float(a is not None), 1.0, at_least=True))
+        if a and b:
+            ratio, wanted = time_ratio(b, a), FASTER if work.kind == "path" else 1.0
+            what = f"{work.key}, {at}: time of {b.setting.program} / taisoft"
+            found.append(Limit(what, ratio.median, wanted, spread_of(ratio), at_least=True))
     return found
+
+
+def implicit_table(works: list[list[Row]]) -> str:
+    """Of stiff works every program's steps of 10 ms."""
+    lines = [
+        (
+            row.work.key, row.setting.program, str(row.setting), str(row.setting.model),
+            *(("-", "-") if row.timing is None else (_percent(row.verdict.error), f"{row.timing.median:.3g}")), row.failure,
+        )
+        for rows in works for row in rows if row.work.stiff and row.setting.steps == 1
+    ]  # fmt: skip
+    return markdown(("work", "program", "setting", "law", "error", "s/sim. s", ""), lines, left=(0, 1, 2, 3, 6))
 
 
 def _limits_of_drop(work: Work, ours: list[Row]) -> list[Limit]:

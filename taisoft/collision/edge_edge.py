@@ -1,7 +1,9 @@
 """Contacts of two edges that cross: where their lines are nearest, along the normal that is across both.
 
 Both edges must stick out along it. Edges that penetrate have shifted along each other, so they may cross a little beyond an end.
-Where an end lies inside the other body and the way out of its own contact frees the edge, that tells already.
+Where an end lies inside the other body and the way out of its own contact frees the edge, that tells already. Edges that do not
+cross are looked at again where they will be at the end of the step, with the faces as they stand at its start: where these turn
+far within a step, the side may be taken wrongly.
 """
 
 import taichi as ti
@@ -107,8 +109,8 @@ def _way(s: ti.template(), t, k, f):
 
 
 @ti.func
-def _close_in(s: ti.template(), t, k, u, m):
-    """Whether two edges move towards each other in the step by enough to count: where most rest, that saves the second look."""
+def _moves(s: ti.template(), t, k, u, m):
+    """Whether two edges move relative to each other by enough to count in the step: where most rest, that saves a look."""
     far = ti.cast(0.0, ti.f64)
     for i in range(2):
         for j in range(2):
@@ -138,7 +140,7 @@ def edge_contact(s: ti.template(), way: ti.template(), t, k, u, m, margin, out: 
     for ahead in range(2):
         good = int(at == start)
         if ahead == 1 and good == 1:
-            good = _close_in(s, t, k, u, m)
+            good = _moves(s, t, k, u, m)
         if good == 1:
             late, closing = ti.cast(ahead, ti.f64), ti.cast(0.0, ti.f64)
             a0, a1 = corner(s, t, k) + late * _way(s, t, k, 0.0), corner(s, t, k + 1) + late * _way(s, t, k, 1.0)

@@ -52,12 +52,16 @@ class ViewTrack:
 
     def go_on(self, place: np.ndarray) -> None:
         """Start from where the camera was last (3,) [m]."""
-        self.camera = replace(self.camera, distance=float(np.linalg.norm(place - self.camera.target)))
+        self._stand_off(float(np.linalg.norm(place - self.camera.target)))
 
     def place(self, x: np.ndarray) -> np.ndarray:
         """Where the camera is (3,) [m] once it has moved back after nodes x (n,3) [m]."""
-        self.camera = self.camera.widened(x, PICTURE, self._widest)
+        self._stand_off(self.camera.widened(x, PICTURE, self._widest).distance)
         return self.camera.position
+
+    def _stand_off(self, distance: float) -> None:
+        """Rounded, so that a run that goes on finds the same distance from the place that it reads."""
+        self.camera = replace(self.camera, distance=float(f"{distance:.12g}"))
 
 
 def _turn(prim, azimuth: float, elevation: float) -> None:

@@ -213,17 +213,17 @@ class ContactStep:
             np.add.at(total, [place[name] for name in names], sign * c.impulse)
         return total
 
+    def sank(self, time: float, dt: float, before: float) -> bool:
+        """Whether a part of dt that ends at a time ends with something newly in each other, or deeper; before: `sinking` then."""
+        self._look_at_end(time, dt)
+        return self.sinking > max(SANK, 1.1 * before)
+
     def end(self, time: float, dt: float) -> float:
-        """Search at the end of a step, at a time, for one of dt; the deepest penetration [m] that is left. Sets `sinking`."""
+        """The deepest penetration [m] that is left at the end of a step or part of dt, at a time. Sets `sinking`."""
         return self._look_at_end(time, dt)
 
-    def sank(self, time: float, dt: float) -> bool:
-        """Whether a part of dt, which ends at a time, ends with something in each other."""
-        self._look_at_end(time, dt)
-        return self.sinking > SANK
-
     def _look_at_end(self, time: float, dt: float) -> float:
-        """As `end`, unless that end has been looked at."""
+        """Search there, once: until the next part begins the answer is known."""
         ended = self._ended
         if ended is not None and ended[1] == dt and abs(ended[0] - time) <= 1e-6 * dt:
             return self._depth

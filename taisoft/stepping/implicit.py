@@ -202,13 +202,14 @@ class ImplicitStepper:
 
     def _part(self, time: float, dt: float) -> StageResult:
         """A step of dt from a time, in one piece; again, where it led to contacts that had not been found."""
+        contact, before = self.contact, self.contact.sinking if self.contact is not None else 0.0
         result, m, h = self._try_part(time, dt), self.world.model, self.history
         for _ in range(SEARCHES):
-            if self.contact is None or not (self.contact.went_astray(h.x_now) or self.contact.sank(time + dt, dt)):
+            if contact is None or not (contact.went_astray(h.x_now) or contact.sank(time + dt, dt, before)):
                 break
             state, past = self.world.state(), self._past
             restore(m, h)
-            if not self.contact.search_way(time, dt):
+            if not contact.search_way(time, dt):
                 self.world.set_state(*state)
                 break
             self._past = 0

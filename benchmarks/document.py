@@ -1,0 +1,63 @@
+"""What every benchmark does with its results: header, text as it comes, and files named after the machine."""
+
+import os
+from datetime import datetime
+from pathlib import Path
+
+import taisoft as ts
+from taisoft.errors import OutputError
+from taisoft.output.files import make_folder
+from taisoft.timing import machine, versions
+
+from .elasticity_table import slug
+
+RESULTS = Path(__file__).resolve().parent / "results"
+
+
+class Document:
+    """What is printed, kept for the file."""
+
+    def __init__(self) -> None:
+        self.parts: list[str] = []
+
+    def add(self, text: str) -> None:
+        """Print a part and keep it."""
+        self.parts.append(text)
+        print(text, end="\n\n", flush=True)
+
+    def text(self) -> str:
+        """All parts."""
+        return "\n\n".join(self.parts) + "\n"
+
+
+def header(title: str, *how: str, packages: tuple[str, ...] = ("taichi", "numpy", "scipy")) -> tuple[str, dict]:
+    """What is measured where and how, as text and as data."""
+    found = machine() | {"date": datetime.now().isoformat(timespec="minutes")}
+    used = {"taisoft": ts.__version__, **versions(*packages)}
+    text = (
+        f"# {title}\n\n{', '.join([found['processor'], str(found['cores']) + ' cores', *how])}, "
+        f"load {load_text(found['load'])} at the start; {found['date']}\n"
+        + ", ".join(f"{name} {version or 'absent'}" for name, version in used.items())
+    )
+    return text, found | {"versions": used}
+
+
+def load_text(value: float | None) -> str:
+    """A load average."""
+    return "unknown" if value is None else f"{value:.1f}"
+
+
+def check_out(path: Path | None, suffix: str) -> None:
+    """Raises OutputError, before minutes of measuring, where a file could not be written."""
+    if path is None:
+        return
+    if path.suffix != suffix:
+        raise OutputError(f"{path}: the name must end in {suffix}")
+    if not os.access(make_folder(path.parent), os.W_OK):
+        raise OutputError(f"cannot write {path}: its folder is not writable")
+
+
+def default_out(arch: str, what: str, suffix: str = ".json") -> Path:
+    """results/<what>-<machine><suffix> beside this file; without a suffix a folder."""
+    where = machine()
+    return RESULTS / f"{what}-{slug(where['processor'])}-{where['cores']}-cores{'-cuda' if arch == 'cuda' else ''}{suffix}"
