@@ -24,7 +24,7 @@ CHEAP_SECONDS = 60.0  # of a reference, guessed: a longer one is run only when a
 class Row:
     """A variant of a case, what came of it, and what came of its reference, each None where it was not run.
 
-    left_out: why there is no record.
+    left_out, reference_left_out: why there is no record of it.
     """
 
     case: Case
@@ -32,6 +32,7 @@ class Row:
     record: dict | None = None
     reference: dict | None = None
     left_out: str = ""
+    reference_left_out: str = ""
     verdicts: list[Verdict] = field(default_factory=list)
 
     @property
@@ -58,6 +59,7 @@ class Row:
         return {
             "case": self.case.id, "variant": self.variant.name, "settings": self.variant.settings, "passed": self.passed,
             "run": bare(self.record), "reference": bare(self.reference), "error": self.error, "left_out": self.left_out,
+            "reference_left_out": self.reference_left_out,
             "verdicts": [verdict.record() for verdict in self.verdicts],
         }  # fmt: skip
 
@@ -82,7 +84,8 @@ def answer(request: dict) -> dict:
 def sources() -> str:
     """A digest of the files that say what the cases are and how they are run."""
     total = hashlib.sha256()
-    for path in sorted((Path(__file__).parent / "hard_cases").glob("*.py")):
+    here = Path(__file__).parent
+    for path in sorted([*here.glob("hard_cases/*.py"), *here.glob("reference_cases/*.py")]):
         total.update(path.name.encode() + path.read_bytes())
     return total.hexdigest()
 
@@ -124,13 +127,20 @@ def _carry_out(rows: Iterable[Row], arch, finer, store, seconds_left, asked, tel
             _take(row, store.write(key, told["answer"]), finer)
             tell(f"{what}: {told['answer']['status']}, {told['answer']['seconds']:.1f} s")
         else:
-            row.left_out = row.left_out or told.get("error") or told["crash"]
-            tell(f"{what}: {row.left_out}")
+            why = told.get("error") or told["crash"]
+            _leave_out(row, why, finer)
+            tell(f"{what}: {why}")
 
     left = carry_out(requests, [LocalPlace(usable_cores(), CHILD)], done, seconds_left=seconds_left, asked=asked)
     for key, why in left.items():
-        if finer == 1:
-            waiting[key].left_out = why
+        _leave_out(waiting[key], why, finer)
+
+
+def _leave_out(row: Row, why: str, finer: int) -> None:
+    if finer == 1:
+        row.left_out = why
+    else:
+        row.reference_left_out = why
 
 
 def _take(row: Row, record: dict, finer: int) -> None:

@@ -72,9 +72,17 @@ def notes(rows: list[Row]) -> str:
             told = row.record["problems"] if row.record else []
             lines += [f"* {row.variant.name}: {text}" for text in told[:3]]
             lines += [f"* {row.variant.name}: {len(told) - 3} more sentences" for _ in told[3:4]]
+            lines += [f"* {row.variant.name}, reference: {why}" for why in [reference_trouble(row)] if why]
         if lines:
             parts.append(f"{case.id}, {case.name}\n\n" + "\n".join(lines))
     return "\n\n".join(parts)
+
+
+def reference_trouble(row: Row) -> str:
+    """Why a reference that was begun tells no error."""
+    if row.reference is not None and row.error is None:
+        return f"{row.reference['status']}, " + ("; ".join(row.reference["problems"][:1]) or "at other times")
+    return row.reference_left_out
 
 
 def summary(rows: list[Row]) -> str:

@@ -22,6 +22,7 @@ from taisoft.output.plot import require_matplotlib
 from taisoft.output.report import json_text
 from taisoft.timing import load_average
 
+from .again import again_text, earlier_numbers, plain
 from .document import RESULTS, Document, check_out, default_out, header, load_text
 from .elasticity_table import limit_table
 from .programs import mujoco_works, newton_vbd, own, pybullet_soft
@@ -51,10 +52,11 @@ def title(work: Work) -> str:
 
 
 def run(
-    works: list[Work], programs: list[ModuleType], arch: str, rounds: int, document: Document
+    works: list[Work], programs: list[ModuleType], arch: str, rounds: int, document: Document, earlier: dict | None = None
 ) -> tuple[dict, list[list[Row]]]:
-    """Everything, printed as it comes. Returns the numbers, and the rows of each work."""
+    """Everything, printed as it comes. Returns the numbers, and the rows of each work. earlier: those of an earlier run."""
     text, numbers = opening(arch, programs)
+    numbers |= {"quick": rounds < ROUNDS or len(works) < len(WORKS) or len(programs) < len(PROGRAMS)}
     document.add(text)
     here = [program for program in programs if program.NAME not in numbers["left_out"]]
     found = []
@@ -67,10 +69,14 @@ def run(
     if any(work.stiff for work in works):
         document.add(f"## Steps of 10 ms in the stiff beam; PyBullet has none but explicit ones\n\n{implicit_table(found)}")
     limits = [limit for rows in found for limit in limits_of(rows)]
-    document.add(f"## Limits\n\n{limit_table(limits)}")
+    if limits:
+        document.add(f"## Limits\n\n{limit_table(limits)}")
+    times = {f"{row.work.key}: {row}": row.timing for rows in found for row in rows if row.timing is not None}
+    document.add(again_text(earlier, times, numbers))
     document.add(f"Load at the end: {load_text(load_average())}")
     rows = [row.record() for rows in found for row in rows]
-    return numbers | {"runs": rows, "comparisons": compared, "limits": [limit.record() for limit in limits]}, found
+    numbers |= {"times": plain(times), "runs": rows, "comparisons": compared}
+    return numbers | {"limits": [limit.record() for limit in limits]}, found
 
 
 def main(argv=None) -> int:
@@ -98,9 +104,10 @@ def main(argv=None) -> int:
         require_matplotlib("--out")
     programs = [one for one in PROGRAMS if one is own or not options.program or one.NAME in options.program]
     document = Document()
-    numbers, found = run(works, programs, options.arch, 1 if options.quick else options.rounds, document)
+    rounds = 1 if options.quick else options.rounds
+    numbers, found = run(works, programs, options.arch, rounds, document, earlier_numbers(out))
     if out is not None:
-        write_bytes(out, json_text(numbers | {"quick": options.quick}).encode())
+        write_bytes(out, json_text(numbers).encode())
         picture = f"\n![]({out.stem}.png)\n" if any(work.kind == "path" for work in works) else ""
         write_bytes(out.with_suffix(".md"), f"{document.text()}{picture}".encode())
         draw(found, out.with_suffix(".png"))

@@ -11,7 +11,6 @@ unless --out says where to write. The whole takes about twelve minutes on two co
 """
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -26,9 +25,10 @@ from taisoft.output.report import json_text
 from taisoft.runtime import compile_clock
 from taisoft.timing import load_average
 
+from .again import again_text, earlier_numbers, plain
 from .document import default_out, header
 from .report_parts import bound, broad, colours, demos, phases, points, reduction, solvers
-from .report_parts.page import Extent, Part, again_text, part_text, short_text, summary_table
+from .report_parts.page import Extent, Part, part_text, short_text, summary_table
 
 PARTS: dict[str, Callable[[Extent], Part]] = {
     "demos": demos.measure, "phases": phases.measure, "points": points.measure, "reduction": reduction.measure,
@@ -47,14 +47,6 @@ def measure_part(name: str, extent: Extent) -> Part:
         part = Part(name, name, "-", "", failure=str(error))
     part.seconds = time.perf_counter() - begin
     return part
-
-
-def earlier_numbers(folder: Path) -> dict | None:
-    """What an earlier run wrote into the folder, None where there is nothing that can be read."""
-    try:
-        return json.loads((folder / NUMBERS).read_text())
-    except (OSError, ValueError):
-        return None
 
 
 def page_text(head: str, numbers: dict, parts: list[Part], again: str) -> str:
@@ -78,12 +70,14 @@ def check_out(folder: Path) -> None:
 
 def write(folder: Path, head: str, numbers: dict, parts: list[Part]) -> None:
     """The page, its pictures and its numbers. Raises OutputError."""
-    page = page_text(head, numbers, parts, again_text(earlier_numbers(folder), parts, numbers))
+    times = {f"{part.name}: {name}": t for part in parts for name, t in part.times.items()}
+    page = page_text(head, numbers, parts, again_text(earlier_numbers(folder / NUMBERS), times, numbers))
     for part in parts:
         for name, data in part.pictures.items():
             write_bytes(folder / name, data)
     write_bytes(folder / PAGE, page.encode())
-    write_bytes(folder / NUMBERS, json_text(numbers | {"parts": [part.record() for part in parts]}).encode())
+    numbers = numbers | {"times": plain(times), "parts": [part.record() for part in parts]}
+    write_bytes(folder / NUMBERS, json_text(numbers).encode())
 
 
 def main(argv=None) -> int:

@@ -27,6 +27,7 @@ from taisoft.output.files import write_bytes
 from taisoft.output.report import json_text
 from taisoft.timing import load_average
 
+from .again import again_text, earlier_numbers, plain
 from .document import Document, header
 from .order import parse_options
 from .scaling_bytes import Copy, measure_copy
@@ -118,7 +119,9 @@ def main(argv=None) -> int:
     rows = list(measure_all([options.kind] if options.kind else list(KINDS), sizes, options.arch))
     document.add("## Time\n\n" + time_table(rows))
     numbers |= {"arch": options.arch, "precision": PRECISION, "quick": options.quick} | report(rows, copies, document)
-    numbers["load_at_the_end"] = load_average()
+    times = {f"{row.kind}, {row.tets:,} tets": row.timing for row in rows if row.samples}
+    document.add(again_text(earlier_numbers(options.out), times, numbers))
+    numbers |= {"load_at_the_end": load_average(), "times": plain(times)}
     if options.out:
         write_bytes(options.out, json_text(numbers).encode())
         write_bytes(options.out.with_suffix(".md"), document.text().encode())

@@ -4,10 +4,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from taisoft.output.tables import markdown, percent, spread_of
 
+from .fit import exponent
 from .scaling_bytes import GROUPS, Copy, copy_rate
 from .scaling_runs import Row
 
@@ -29,14 +28,6 @@ class Growth:
         return dict(vars(self))
 
 
-def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
-    """p of the power law value = c size^p by least squares in the logarithms; nan for fewer than two sizes or where some value
-    is 0."""
-    if len(set(sizes)) < 2 or min(values) <= 0.0:
-        return math.nan
-    return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
-
-
 def measured(rows: Sequence[Row]) -> list[Row]:
     """The rows that have times."""
     return [row for row in rows if row.samples]
@@ -49,8 +40,8 @@ def growths(rows: Sequence[Row]) -> list[Growth]:
         own = sorted((row for row in measured(rows) if row.kind == kind), key=lambda row: row.tets)
         tets, step = [row.tets for row in own], [row.timing.median for row in own]
         found.append(Growth(
-            kind, len(own), exponent(tets, step), exponent(tets[-2:], step[-2:]), exponent(tets, [r.setup_seconds for r in own]),
-            exponent(tets, [sum(r.field_bytes.values()) for r in own]),
+            kind, len(own), exponent(tets, step)[0], exponent(tets[-2:], step[-2:])[0],
+            exponent(tets, [r.setup_seconds for r in own])[0], exponent(tets, [sum(r.field_bytes.values()) for r in own])[0],
         ))  # fmt: skip
     return found
 

@@ -15,6 +15,7 @@ import pytest
 from matplotlib import image as pictures
 
 from benchmarks import document, report
+from benchmarks.again import again_text, agrees
 from benchmarks.collision_cases import cubes_setup
 from benchmarks.collision_runs import HASH, PHASES, TREES, Rig, Row, Sweep
 from benchmarks.collision_runs import Film as SearchFilm
@@ -22,6 +23,7 @@ from benchmarks.contact_captured import COLOURED, THREADED, Outcome
 from benchmarks.contact_colours import Colouring
 from benchmarks.contact_crossover import Point
 from benchmarks.contact_runs import COLD, PARTS, REST, WARM, Film
+from benchmarks.fit import exponent
 from benchmarks.report_parts import bound, broad, colours, demos, phases, plain, points, reduction, solvers
 from benchmarks.report_parts.page import (
     AGREE,
@@ -30,10 +32,7 @@ from benchmarks.report_parts.page import (
     PARTLY,
     Claim,
     Part,
-    again_text,
-    agrees,
     clearly_less,
-    exponent,
     part_text,
     short_text,
     small_png,
@@ -305,7 +304,7 @@ def test_a_second_run_is_held_against_the_first(faked, tmp_path):
 def test_agreement_is_within_both_spreads():
     one, two = ({"median": m, "spread": s} for m, s in ((1.0, 0.1), (1.25, 0.1)))
     assert not agrees(one, two) and agrees(one, two | {"spread": 0.2})
-    assert "no earlier run" in again_text(None, [], {})
+    assert "no earlier run" in again_text(None, {}, {})
 
 
 def test_what_cannot_be_measured_is_said(monkeypatch, tmp_path):

@@ -22,13 +22,20 @@ RADIUS = 1e-3  # m
 def problem() -> str:
     """Why it cannot be had."""
     try:
-        import warp
-
-        warp.config.quiet = True
-        import newton  # noqa: F401
+        _import_newton()
     except ImportError:
         return "the comparison with Newton needs the package newton"
     return ""
+
+
+def _import_newton():
+    """Newton and Warp, who would tell of every module that they compile."""
+    import warp
+
+    warp.config.log_level = warp.LOG_WARNING
+    import newton
+
+    return newton, warp
 
 
 def settings(work: Work, arch: str = "cpu") -> list[Setting]:
@@ -48,10 +55,7 @@ class Run:
     unconverged = 0  # it does not tell
 
     def __init__(self, work: Work, setting: Setting) -> None:
-        import warp
-
-        warp.config.quiet = True  # before Newton is imported, which tells of every module it compiles
-        import newton
+        newton, warp = _import_newton()
 
         self.work, self.setting, start = work, setting, perf_counter()
         builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=(0.0, -work.gravity, 0.0))

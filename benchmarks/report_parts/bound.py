@@ -16,7 +16,8 @@ from taisoft.errors import SimulationError
 from taisoft.output.tables import markdown
 from taisoft.study.stretch import advance
 
-from .page import COLOURS, Claim, Extent, Part, exponent, is_near, new_figure, plot_png
+from ..fit import exponent
+from .page import COLOURS, Claim, Extent, Part, is_near, new_figure, plot_png
 
 EXPLICIT, IMPLICIT = "symplectic_euler", "implicit_euler"
 YOUNGS = (1e4, 1e5, 1e6, 1e7, 1e8, 1e9), (1e4, 1e6, 1e9)  # [Pa], in a full and in a quick run

@@ -88,13 +88,6 @@ def verdict_of(holds: Sequence[bool]) -> str:
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 
-def exponent(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
-    """p of y ~ x^p by least squares in the logarithms, and how far the farthest point lies off the fit, as a share of y."""
-    a, b = np.log(np.asarray(x, float)), np.log(np.asarray(y, float))
-    p, c = np.polyfit(a, b, 1)
-    return float(p), float(np.expm1(np.abs(b - (p * a + c)).max()))
-
-
 def is_near(value: float, wanted: float, tolerance: float) -> bool:
     """Whether |value - wanted| <= tolerance; never of what is not a number."""
     return math.isfinite(value) and abs(value - wanted) <= tolerance
@@ -187,32 +180,3 @@ def short_text(parts: Sequence[Part]) -> str:
 
 
 # --- a second run -----------------------------------------------------------------------------------------------------
-
-
-def agrees(one: dict, two: dict) -> bool:
-    """Whether two timings, as plain data, lie no farther apart than their spreads together."""
-    apart = abs(one["median"] - two["median"])
-    return apart <= one["spread"] * one["median"] + two["spread"] * two["median"]
-
-
-def again_text(earlier: dict | None, parts: Sequence[Part], numbers: dict) -> str:
-    """How the times of an earlier run into the same folder compare; earlier: its numbers, None where there are none."""
-    told = "## Beside an earlier run\n\n"
-    if earlier is None:
-        return told + "There was no earlier run in this folder."
-    differing = [name for name in ("processor", "cores", "arch", "quick") if earlier.get(name) != numbers[name]]
-    if differing:
-        return told + f"The earlier run in this folder had another {' and '.join(differing)}."
-    before = {part["name"]: part["times"] for part in earlier["parts"]}
-    rows, compared = [], 0
-    for part in parts:
-        for name, t in part.times.items():
-            was = before.get(part.name, {}).get(name)
-            compared += was is not None
-            if was is not None and not agrees(was, asdict(t)):
-                cells = ms(was["median"]), percent(was["spread"]), ms(t.median), percent(t.spread)
-                rows.append((part.name, name, *cells, f"{t.median / was['median']:.2f}"))
-    text = f"{compared - len(rows)} of {compared} times agree with those of {earlier['date']} within the spreads of both."
-    headings = ("experiment", "time", "then [ms]", "spread", "now [ms]", "spread", "now / then")
-    return told + text + ("\n\nThe others:\n\n" + markdown(headings, rows, left=(0, 1)) if rows else "")
-

@@ -19,7 +19,8 @@ from taisoft.timing import summarise, usable_cores
 
 from ..collision_cases import Setup, cubes_setup, pile_setup
 from ..collision_runs import Rig, clock, repeated
-from .page import COLOURS, Claim, Extent, Part, clearly_less, exponent, ms, new_figure, plot_png, timed
+from ..fit import exponent
+from .page import COLOURS, Claim, Extent, Part, clearly_less, ms, new_figure, plot_png, timed
 from .plain import PlainPoints, candidate_pairs
 
 HIT_BY = "distance_field"  # the report's way

@@ -9,7 +9,8 @@ from taisoft.timing import summarise
 from ..collision_cases import PILES, cubes_setup, pile_setup
 from ..collision_runs import QUICK_ROUNDS, ROUNDS, Film, Row, measure_film, measure_row
 from ..collision_table import reduction_table
-from .page import COLOURS, Claim, Extent, Part, clearly_less, exponent, ms, new_figure, plot_png
+from ..fit import exponent
+from .page import COLOURS, Claim, Extent, Part, clearly_less, ms, new_figure, plot_png
 
 HIT_BY = "proximity"  # has the more contacts to reduce
 FILM, FRAMES = 15, (60, 6)  # cells of two cubes that turn on each other

@@ -32,6 +32,10 @@ class Row:
     unconverged: int = 0
     failure: str = ""
 
+    def __str__(self) -> str:
+        s = self.setting
+        return f"{s.program}, {s.model}, {s}, {1e3 * s.dt:.3g} ms"
+
     @property
     def timing(self) -> Timing | None:
         """Of a simulated second [s]; None where no run ended."""
