@@ -9,25 +9,26 @@ position over the excursion, or the root mean square of the mass centre's height
 stand for a second: nothing falls or leans, turns inside out, or sinks in by 1 % of an edge (the least of the bodies' mean
 ones), as measured by taisoft in every program's positions every 10 ms. taisoft runs on as many threads as the machine has cores
 where that pays, the others on one core. Times are without building and compiling. Nothing here passes or fails: limits are
-marked as met or not. The whole takes about half an hour on two cores.
+marked as met or not. With --work the other works of FILE.json are kept. The whole takes about half an hour on two cores.
 """
 
 import argparse
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 
 from taisoft.output.files import write_bytes
 from taisoft.output.plot import require_matplotlib
 from taisoft.output.report import json_text
-from taisoft.timing import load_average
+from taisoft.timing import Timing, load_average
 
 from .again import again_text, earlier_numbers, plain
 from .document import RESULTS, Document, check_out, default_out, header, load_text
 from .elasticity_table import limit_table
 from .programs import mujoco_works, newton_vbd, own, pybullet_soft
 from .works.plot import draw
-from .works.runs import Row, measure
+from .works.runs import Row, measure, row_of
 from .works.scenes import WORKS, Work
 from .works.table import compare_table, comparisons, implicit_table, limits_of, run_table
 
@@ -51,32 +52,56 @@ def title(work: Work) -> str:
     return f"## {work.key}: {work.title}, {work.tets:,} tets"
 
 
-def run(
-    works: list[Work], programs: list[ModuleType], arch: str, rounds: int, document: Document, earlier: dict | None = None
-) -> tuple[dict, list[list[Row]]]:
-    """Everything, printed as it comes. Returns the numbers, and the rows of each work. earlier: those of an earlier run."""
-    text, numbers = opening(arch, programs)
-    numbers |= {"quick": rounds < ROUNDS or len(works) < len(WORKS) or len(programs) < len(PROGRAMS)}
+def page(text: str, found: list[list[Row]], document: Document) -> dict:
+    """Write the tables of all works. Returns their numbers."""
     document.add(text)
-    here = [program for program in programs if program.NAME not in numbers["left_out"]]
-    found = []
-    for work in works:
-        rows = measure(work, here, rounds, arch)
-        document.add(f"{title(work)}\n\n{run_table(rows)}")
-        found.append(rows)
+    for rows in found:
+        document.add(f"{title(rows[0].work)}\n\nMeasured {rows[0].date}.\n\n{run_table(rows)}")
     compared = comparisons(found)
     document.add(f"## The fastest of each at equal error\n\n{compare_table(compared)}")
-    if any(work.stiff for work in works):
+    if any(rows[0].work.stiff for rows in found):
         document.add(f"## Steps of 10 ms in the stiff beam; PyBullet has none but explicit ones\n\n{implicit_table(found)}")
     limits = [limit for rows in found for limit in limits_of(rows)]
     if limits:
         document.add(f"## Limits\n\n{limit_table(limits)}")
-    times = {f"{row.work.key}: {row}": row.timing for rows in found for row in rows if row.timing is not None}
-    document.add(again_text(earlier, times, numbers))
-    document.add(f"Load at the end: {load_text(load_average())}")
     rows = [row.record() for rows in found for row in rows]
-    numbers |= {"times": plain(times), "runs": rows, "comparisons": compared}
-    return numbers | {"limits": [limit.record() for limit in limits]}, found
+    return {"runs": rows, "comparisons": compared, "limits": [limit.record() for limit in limits]}
+
+
+def kept_rows(earlier: dict | None, works: list[Work], numbers: dict) -> dict[str, list[Row]]:
+    """By key the rows that an earlier run on the same machine has of the works that are not measured now."""
+    if earlier is None or any(earlier.get(name) != numbers[name] for name in ("processor", "cores", "arch")):
+        return {}
+    found: dict[str, list[Row]] = {}
+    anew = {work.key for work in works}
+    for work in (work for work in WORKS if work.key not in anew):
+        rows = [row_of(work, one, earlier["date"]) for one in earlier["runs"] if one["work"] == work.key]
+        if rows:
+            found[work.key] = rows
+    return found
+
+
+def run(
+    works: list[Work], programs: list[ModuleType], arch: str, rounds: int, document: Document, earlier: dict | None = None
+) -> tuple[dict, list[list[Row]]]:
+    """Everything, printed. Returns the numbers, and the rows of each work. earlier: numbers of an earlier run, whose other works
+    are kept."""
+    text, numbers = opening(arch, programs)
+    here = [program for program in programs if program.NAME not in numbers["left_out"]]
+    rows = kept_rows(earlier, works, numbers)
+    for work in works:
+        rows[work.key] = measure(work, here, rounds, arch)
+    found = [rows[work.key] for work in WORKS if work.key in rows]
+    numbers |= {"quick": rounds < ROUNDS or len(found) < len(WORKS) or len(programs) < len(PROGRAMS)}
+    numbers |= page(text, found, document)
+    document.add(again_text(earlier, times_of(rows[work.key] for work in works), numbers))
+    document.add(f"Load at the end: {load_text(load_average())}")
+    return numbers | {"times": plain(times_of(found))}, found
+
+
+def times_of(works: Iterable[list[Row]]) -> dict[str, Timing]:
+    """By name, of all rows that have one."""
+    return {f"{row.work.key}: {row}": row.timing for rows in works for row in rows if row.timing is not None}
 
 
 def main(argv=None) -> int:
@@ -108,7 +133,7 @@ def main(argv=None) -> int:
     numbers, found = run(works, programs, options.arch, rounds, document, earlier_numbers(out))
     if out is not None:
         write_bytes(out, json_text(numbers).encode())
-        picture = f"\n![]({out.stem}.png)\n" if any(work.kind == "path" for work in works) else ""
+        picture = f"\n![]({out.stem}.png)\n" if any(rows[0].work.kind == "path" for rows in found) else ""
         write_bytes(out.with_suffix(".md"), f"{document.text()}{picture}".encode())
         draw(found, out.with_suffix(".png"))
         print(f"written: {out}, {out.with_suffix('.md').name} and, where a path is known, {out.with_suffix('.png').name}")

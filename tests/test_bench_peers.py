@@ -8,12 +8,14 @@
 """
 
 import importlib
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import taisoft as ts
+from benchmarks import peers
 from benchmarks.programs import own
 from benchmarks.programs.session import Setting
 from benchmarks.works import judge, references, scenes
@@ -180,6 +182,41 @@ def test_rows_are_measured_and_judged(capsys):
     assert "small, round 1 of 1: taisoft velocity_verlet" in capsys.readouterr().err
     assert all(row.verdict is not None and row.verdict.stands and row.timing for row in rows[:-1]) and len(rows) == 5
     assert rows[-1].failure == "it is broken" and rows[-1].timing is None and "it is broken" in run_table(rows)
+
+
+def test_works_that_are_not_measured_again_are_kept(tmp_path, monkeypatch, capsys):
+    first, second = small_drop(), replace(small_drop(), key="second")
+    seconds = {"small": 1.0, "second": 1.0}
+
+    class Still:
+        NAME = "taisoft"
+        problem = staticmethod(lambda: "")
+        settings = staticmethod(lambda work, arch: [Setting("taisoft", TAISOFT, "still", 1, {"precision": "f64"})])
+
+        def __init__(self, work):
+            self.work, self.build_seconds, self.unconverged = work, 0.1, 0
+
+        start = classmethod(lambda cls, work, setting: cls(work))
+
+        def run(self, follow):
+            return (still(self.work) if follow else None), seconds[self.work.key] * self.work.seconds
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(peers, "WORKS", (first, second))
+    monkeypatch.setattr(peers, "PROGRAMS", (Still,))
+    monkeypatch.setattr(peers, "own", Still)
+    out = tmp_path / "peers.json"
+    assert peers.main(["--out", str(out)]) == 0
+    seconds.update(small=3.0, second=3.0)
+    assert peers.main(["--work", "second", "--out", str(out)]) == 0
+    numbers = json.loads(out.read_text())
+    assert [row["rounds"][0][0] for row in numbers["runs"]] == pytest.approx([1.0, 3.0]) and not numbers["quick"]
+    text = out.with_suffix(".md").read_text()
+    assert "0 of 1 times agree" in text and "## small" in text and "| second: taisoft, SNH, still" in text
+    assert peers.main(["--work", "small", "--rounds", "1", "--out", str(tmp_path / "new.json")]) == 0
+    assert json.loads((tmp_path / "new.json").read_text())["quick"] and not (tmp_path / "new.png").exists()
 
 
 def test_explicit_steps_come_to_the_exact_path():

@@ -70,8 +70,9 @@ class Run:
         bullet.setPhysicsEngineParameter(numSubSteps=0, **here)
         bullet.setTimeStep(self.setting.dt, **here)
         if self.work.ground:
-            plane = bullet.createCollisionShape(bullet.GEOM_PLANE, planeNormal=[0, 1, 0], **here)
-            ground = bullet.createMultiBody(0, plane, **here)
+            # soft bodies come to rest 0.1 m above its own planes, whatever the margins
+            box = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=[5, 1, 5], **here)
+            ground = bullet.createMultiBody(0, box, basePosition=[0, -1, 0], **here)
             bullet.changeDynamics(ground, -1, lateralFriction=self.work.friction, **here)
         self.bodies = [self._load(body) for body in self.work.bodies]
 

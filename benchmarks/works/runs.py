@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
+from datetime import datetime
 from types import ModuleType
 
 import numpy as np
@@ -15,6 +16,7 @@ from ..elasticity_runs import TAISOFT as OWN
 from ..elasticity_runs import repeat_short
 from ..programs.session import Setting
 from .judge import Verdict, judge
+from .references import MODELS
 from .scenes import Work
 
 ENOUGH_SECONDS = 20.0  # a run of so much wall time is not repeated
@@ -31,6 +33,7 @@ class Row:
     verdict: Verdict | None = None
     unconverged: int = 0
     failure: str = ""
+    date: str = ""  # when it was begun
 
     def __str__(self) -> str:
         s = self.setting
@@ -59,15 +62,27 @@ class Row:
         verdict = self.verdict and asdict(self.verdict)
         return {
             "work": self.work.key, "tets": self.work.tets, "setting": setting, "rounds": self.rounds, "verdict": verdict,
-            "build_seconds": self.build_seconds, "unconverged": self.unconverged, "failure": self.failure,
+            "build_seconds": self.build_seconds, "unconverged": self.unconverged, "failure": self.failure, "date": self.date,
             "seconds_per_simulated_second": self.timing and asdict(self.timing),
         }  # fmt: skip
+
+
+def row_of(work: Work, record: dict, date: str) -> Row:
+    """The row that `Row.record` told of. date: where the record has none."""
+    told = record["setting"]
+    model = next(model for model in MODELS if str(model) == told["model"])
+    setting = Setting(told["program"], model, told["method"], told["steps"], told["options"])
+    verdict = record["verdict"] and Verdict(**record["verdict"])
+    same = {key: record[key] for key in ("rounds", "build_seconds", "unconverged", "failure")}
+    return Row(work, setting, verdict=verdict, date=record.get("date") or date, **same)
 
 
 def measure(work: Work, programs: Iterable[ModuleType], rounds: int, arch: str = "cpu") -> list[Row]:
     """The rows of a work. What diverges or is refused says so and is left out of what follows."""
     adapters = {program.NAME: program for program in programs}
-    rows = [Row(work, setting) for program in adapters.values() for setting in program.settings(work, arch)]
+    date = datetime.now().isoformat(timespec="minutes")
+    settings = [setting for program in adapters.values() for setting in program.settings(work, arch)]
+    rows = [Row(work, setting, date=date) for setting in settings]
     for number in range(rounds):
         for row in rows:
             slow = row.rounds and row.rounds[0][0] * work.seconds > ENOUGH_SECONDS
