@@ -55,11 +55,17 @@ def own_and_peers(rows: list[Row]) -> tuple[list[Row], list[Row]]:
 
 
 def pairs_of(rows: list[Row]) -> list[tuple[str, Row | None, Row | None]]:
-    """At what, the fastest of taisoft and the fastest of the others; a path's at LEVELS."""
+    """At what, the fastest of taisoft and the fastest of the others; a path's at LEVELS, and of the law of
+    that one where taisoft has run it."""
     ours, others = own_and_peers(rows)
     if rows[0].work.kind == "stand":
         return [("stands", fastest_standing(ours), fastest_standing(others))]
-    return [(f"error <= {level:g}", fastest_within(ours, level), fastest_within(others, level)) for level in LEVELS]
+    found = []
+    for level in LEVELS:
+        theirs = fastest_within(others, level)
+        alike = [row for row in ours if theirs is not None and row.setting.model.law == theirs.setting.model.law]
+        found.append((f"error <= {level:g}", fastest_within(alike or ours, level), theirs))
+    return found
 
 
 def comparisons(works: list[list[Row]]) -> list[dict]:
