@@ -75,7 +75,8 @@ def comparisons(works: list[list[Row]]) -> list[dict]:
         for at, ours, theirs in pairs_of(rows):
             ratio = time_ratio(theirs, ours) if ours and theirs else None
             found.append({
-                "work": rows[0].work.key, "tets": rows[0].work.tets, "at": at, "taisoft": _named(ours), "others": _named(theirs),
+                "work": rows[0].work.key, "tets": rows[0].work.tets, "stiff": rows[0].work.stiff, "at": at,
+                "taisoft": _named(ours), "others": _named(theirs),
                 "ratio": ratio and ratio.median, "spread": ratio and spread_of(ratio),
             })  # fmt: skip
     return found
