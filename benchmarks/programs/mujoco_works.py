@@ -16,7 +16,7 @@ from ..exact_path import SAMPLE
 from ..works.references import MUJOCO, masses
 from ..works.scenes import Work
 from .mujoco_flex import FALSE_ALARM, STABLE_STEPS, SWITCHED_OFF, TOLERANCE, add_flex, import_mujoco, quiet_warnings
-from .session import Setting, finite
+from .session import Setting, sampled
 
 NAME, MODEL = "MuJoCo", MUJOCO
 CONTACT = ("CONSTRAINT", "CONTACT", "MIDPHASE", "WARMSTART", "REFSAFE", "ISLAND")  # what contact needs of SWITCHED_OFF
@@ -105,22 +105,18 @@ class Run:
         mujoco, start, data = self.mujoco, self.work.start, self.mujoco.MjData(self.model)
         if self.setting.method == "euler_staggered":
             data.qvel[1::3] = self.work.gravity * self.setting.dt / 2  # -a(0) dt/2: at rest gravity alone accelerates
-        positions, seconds = [start], 0.0
+
+        def positions() -> np.ndarray:
+            told = [mujoco.mjtWarning(k).name for k, one in enumerate(data.warning) if one.number and k != INERTIA]
+            if told:
+                raise SimulationError(f"{NAME} gives up before t = {data.time:.2f} s: {', '.join(told)}")
+            now = start.copy()
+            now[self.free] += data.qpos.reshape(-1, 3)
+            return now
+
         with quiet_warnings(mujoco):
-            for k in range(round(self.work.seconds / SAMPLE)):
-                begun = perf_counter()
-                mujoco.mj_step(self.model, data, nstep=self.setting.steps)
-                seconds += perf_counter() - begun
-                time = (k + 1) * SAMPLE
-                told = [mujoco.mjtWarning(k).name for k, one in enumerate(data.warning) if one.number and k != INERTIA]
-                if told:
-                    raise SimulationError(f"{NAME} gives up before t = {time:.2f} s: {', '.join(told)}")
-                now = start.copy()
-                now[self.free] += data.qpos.reshape(-1, 3)
-                finite(now, start, NAME, time)
-                if follow:
-                    positions.append(now)
-        return np.array(positions) if follow else None, seconds
+            steps = self.setting.steps
+            return sampled(self.work, NAME, follow, lambda: mujoco.mj_step(self.model, data, nstep=steps), positions)
 
     def close(self) -> None:
         """Nothing is held."""

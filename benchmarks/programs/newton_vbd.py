@@ -10,10 +10,10 @@ import numpy as np
 
 import taisoft as ts
 
-from ..exact_path import DENSITY, POISSON, SAMPLE
+from ..exact_path import DENSITY, POISSON
 from ..works.references import NEWTON
 from ..works.scenes import Body, Work
-from .session import Setting, finite
+from .session import Setting, sampled
 
 NAME, MODEL = "Newton", NEWTON
 RADIUS = 1e-3  # m
@@ -91,17 +91,12 @@ class Run:
 
     def run(self, follow: bool) -> tuple[np.ndarray | None, float]:
         self.states = [self.model.state(), self.model.state()]
-        start, seconds = self.work.start, 0.0
-        positions = [start]
-        for k in range(round(self.work.seconds / SAMPLE)):
-            begun = perf_counter()
+
+        def steps() -> None:
             for _ in range(self.setting.steps):
                 self._step()
-            seconds += perf_counter() - begun
-            now = finite(self.states[0].particle_q.numpy().astype(float), start, NAME, (k + 1) * SAMPLE)
-            if follow:
-                positions.append(now)
-        return np.array(positions) if follow else None, seconds
+
+        return sampled(self.work, NAME, follow, steps, lambda: self.states[0].particle_q.numpy().astype(float))
 
     def close(self) -> None:
         """Nothing is held."""

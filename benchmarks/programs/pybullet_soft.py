@@ -18,10 +18,10 @@ import numpy as np
 import taisoft as ts
 from taisoft.errors import SimulationError
 
-from ..exact_path import DENSITY, POISSON, SAMPLE
+from ..exact_path import DENSITY, POISSON
 from ..works.references import PYBULLET
 from ..works.scenes import Body, Work
-from .session import Setting, finite
+from .session import Setting, sampled
 
 NAME, MODEL = "PyBullet", PYBULLET
 MARGIN = 1e-3  # m
@@ -101,20 +101,16 @@ class Run:
         )
 
     def run(self, follow: bool) -> tuple[np.ndarray | None, float]:
-        start, seconds = self.work.start, 0.0
-        positions = [start]
+        def steps() -> None:
+            for _ in range(self.setting.steps):
+                self.bullet.stepSimulation(physicsClientId=self.client)
+
+        def positions() -> np.ndarray:
+            return np.concatenate([self._positions_of(body) for body in self.bodies])
+
         with _silent():
             self._reset()
-            for k in range(round(self.work.seconds / SAMPLE)):
-                begun = perf_counter()
-                for _ in range(self.setting.steps):
-                    self.bullet.stepSimulation(physicsClientId=self.client)
-                seconds += perf_counter() - begun
-                now = np.concatenate([self._positions_of(body) for body in self.bodies])
-                finite(now, start, NAME, (k + 1) * SAMPLE)
-                if follow:
-                    positions.append(now)
-        return np.array(positions) if follow else None, seconds
+            return sampled(self.work, NAME, follow, steps, positions)
 
     def close(self) -> None:
         self.bullet.disconnect(self.client)

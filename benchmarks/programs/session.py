@@ -4,7 +4,9 @@ An adapter is a module with NAME, MODEL (what it solves, of works.references), `
 can, `settings(work)` and `start(work, setting)` -> Session. Positions are those of all nodes of a work, body after body.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from time import perf_counter
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +15,7 @@ from taisoft.errors import SimulationError
 
 from ..exact_path import SAMPLE
 from ..works.references import Model
+from ..works.scenes import Work
 
 
 @dataclass(frozen=True)
@@ -58,3 +61,21 @@ def finite(positions: np.ndarray, start: np.ndarray, name: str, time: float) -> 
     if not np.isfinite(positions).all() or np.abs(positions - start).max() > 1e3:
         raise SimulationError(f"{name} diverges before t = {time:.2f} s")
     return positions
+
+
+def sampled(
+    work: Work, name: str, follow: bool, step: Callable[[], None], positions: Callable[[], np.ndarray]
+) -> tuple[np.ndarray | None, float]:
+    """What `Session.run` returns, of a program of that name that stands at the work's start.
+
+    step: takes the steps of one SAMPLE, which alone are timed. positions: of all nodes then (n,3) [m], in an array of their own.
+    """
+    path, seconds = [work.start], 0.0
+    for k in range(round(work.seconds / SAMPLE)):
+        begun = perf_counter()
+        step()
+        seconds += perf_counter() - begun
+        now = finite(positions(), work.start, name, (k + 1) * SAMPLE)
+        if follow:
+            path.append(now)
+    return np.array(path) if follow else None, seconds
