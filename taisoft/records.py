@@ -30,7 +30,8 @@ class StepReport:
     contact_residual: float = 0.0
     n_contacts: int = 0
     dropped_contacts: int = 0
-    max_penetration: float = 0.0  # [m], of the contacts found: what is deeper than their search reaches is not among them
+    max_penetration: float = 0.0  # [m], of the contacts found, and how far triangles that cross must part
+    crossings: int = 0  # pairs of surface triangles that cross by more than 0.1 % of the finer side's mean surface edge
     deep: int = 0  # 1 where that is more than 2 % of the finer side's mean surface edge; a number among numbers
     min_volume_ratio: float = 1.0  # smallest J = det F
     n_inverted: int = 0  # tets with J <= 0

@@ -154,7 +154,7 @@ def _merge(a: StepReport, b: StepReport) -> StepReport:
     b.max_penetration = max(a.max_penetration, b.max_penetration)
     b.n_contacts = max(a.n_contacts, b.n_contacts)
     b.dropped_contacts = max(a.dropped_contacts, b.dropped_contacts)
-    b.deep = max(a.deep, b.deep)
+    b.crossings, b.deep = max(a.crossings, b.crossings), max(a.deep, b.deep)
     b.converged = a.converged and b.converged
     b.problems = a.problems + b.problems
     return b
@@ -197,10 +197,10 @@ def _judge(report: RunReport) -> None:
         report.problems.append(f"in {len(dropped)} of {len(steps)} reported steps contacts under inverted tets were not known")
     sunk = [s for s in steps if s.deep]
     if sunk:
-        worst = max(sunk, key=lambda s: s.max_penetration)
+        worst, most = max(sunk, key=lambda s: s.max_penetration), max(s.crossings for s in sunk)
         report.problems.append(
             f"in {len(sunk)} of {len(steps)} reported steps bodies penetrate; the worst, at t = {worst.time:.4g} s, "
-            f"by {worst.max_penetration:.3g} m"
+            f"by {worst.max_penetration:.3g} m" + (f", with {most} pairs of triangles that cross" if most else "")
         )
     if report.status == "ok" and (unconverged or inverted or dropped or sunk or report.interrupted):
         report.status = "degraded"

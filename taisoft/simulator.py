@@ -145,7 +145,7 @@ class Simulator(Resuming):
             report.n_contacts, report.max_penetration = self._contact.n_contacts, self._contact.penetration
             report.dropped_contacts = self._contact.dropped
             report.converged &= result.contacts_converged
-            report.deep = int(self._contact.sinking > SUNK)
+            report.deep, report.crossings = int(self._contact.sinking > SUNK), self._contact.crossings
         report.steps = self.step_count - start
         if self._softens:
             self._tell_softened()
@@ -190,7 +190,10 @@ class Simulator(Resuming):
         if report.dropped_contacts:
             found.append(f"{report.dropped_contacts} triangles lie under inverted tets, so their contacts are not known")
         if report.deep:
-            found.append(f"bodies are {report.max_penetration:.3g} m deep in each other or in obstacles")
+            found.append(
+                f"bodies are {report.max_penetration:.3g} m deep in each other or in obstacles"
+                + (f", {report.crossings} pairs of surface triangles cross" if report.crossings else "")
+            )
         if report.n_inverted:
             found.append(f"{report.n_inverted} tets are inverted")
         return found

@@ -12,6 +12,7 @@ from taisoft.collision.contacts import EDGE_EDGE, write_contact
 from taisoft.collision.features import BY_FACES, EDGE_SLACK, corner, edge_normal, edge_sticks_out, sticks_out, unit
 from taisoft.collision.surface import INSIDE_BITS, dvec, ivec
 from taisoft.collision.triangles import closest_lines
+from taisoft.collision.vertex_face import through
 
 # How far beyond the ends of edges that penetrate they may cross, since they have shifted along each other: in depths, and at most
 # in lengths of the edge, since farther out the surfaces are elsewhere
@@ -124,10 +125,10 @@ def _deepest(s: ti.template(), t, k, u, m, f, g, la, lb):
     """How deep [m] edges that really cross can be: of thin bodies side by side, those of the far sides cross too, as deep as both
     are thick."""
     deepest = ti.cast(0.5, ti.f64) * ti.min(la, lb, s.thickness[s.body[t]], s.thickness[s.body[u]])
-    if s.body[t] == s.body[u]:  # no deeper than half of what the body's own thickness can be
+    if s.body[t] == s.body[u]:  # deeper it is the body's own thickness, squeezed
         rest = (1.0 - f) * s.rest[s.triangle[t, k]] + f * s.rest[s.triangle[t, (k + 1) % 3]]
         rest -= (1.0 - g) * s.rest[s.triangle[u, m]] + g * s.rest[s.triangle[u, (m + 1) % 3]]
-        deepest = ti.min(deepest, ti.cast(0.5, ti.f64) * rest.norm())
+        deepest = ti.min(deepest, through(s, s.body[t], rest.norm()))
     return deepest
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
+from taisoft.collision.crossings import PARALLEL
 from taisoft.collision.pipeline import Detection
 from taisoft.errors import MeshError
 from taisoft.mesh.signed_distance import signed_distances_at
@@ -18,7 +19,6 @@ from taisoft.scene.obstacles import HalfSpace, Shape
 from taisoft.transfer import array_of, download
 
 ALLOWED = 1e-6  # of the smaller body's size: deeper is an overlap
-PARALLEL = 1e-6  # sine below which two edges have no common normal
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from taisoft.collision.colliders import (
     obstacle_frame,
 )
 from taisoft.collision.contacts import KINDS, Contacts, contact_fields, gather
+from taisoft.collision.crossings import find_crossings
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.proximity import find_proximity
 from taisoft.collision.reduction import FOUND, LEFT, ReductionFields, reduce_contacts, reduction_fields
@@ -107,6 +108,7 @@ class Detection:
             self._way = arena.field("contact_way", ti.i32, len(ways), np.array(ways, dtype=np.int32))
             self._sharp = arena.field("surface_sharp", ti.i32, max(s.n_triangles, 1))
             self._unmapped = arena.field("unmapped", ti.i32, 1)
+            self._crossed = arena.vectors("crossed", ti.f64, s.chunks)
             self._fields = self._make_fields(grids, runtime) if any(grids) else None
             self.shapes = self._make_shapes() if self._analytic else NO_SHAPES
         self._led = None  # how far vertices are led, where they ever are
@@ -119,6 +121,7 @@ class Detection:
         self._reduction: ReductionFields | None = None
         self._intersections: Intersections | None = None
         self._placed = False  # whether obstacles have been placed
+        self._looked: Trees | Candidates | None = None  # where the last search looked
         self.counts = Counts(triangles=s.n_triangles)
 
     def _make_broad(self, runtime: Runtime) -> SpatialHash | Bvh:
@@ -177,7 +180,8 @@ class Detection:
         Raises SimulationError where positions are not finite, or a buffer may not grow as far as it must.
         """
         self._move(time, dt, led, way)
-        self._search(self._near())
+        self._looked = self._near()
+        self._search(self._looked)
         self._reduce()
 
     def _move(self, time: float, dt: float, led: tuple[np.ndarray, np.ndarray] | None = None, way=None) -> None:
@@ -311,6 +315,16 @@ class Detection:
             limits = (self.scene.collision.initial_capacity, self.scene.collision.max_capacity)
             self._intersections = Intersections(self.surface, self._arena, *limits)
         return self._intersections.find(self.broad.find())
+
+    def crossings(self) -> np.ndarray:
+        """(3,) f64: how deep surfaces have passed through each other where the last search found them, see `find_crossings`."""
+        told, row = np.zeros(3), self._row
+        while self._looked is not None and self.counts.active:
+            rows = (row.data, row.used, row.count, row.part)
+            find_crossings(self.surface, self._looked, self._sharp, *rows, 0.5 * self.reach, self._crossed, told)
+            if not row.grow_if_full():
+                break
+        return told
 
     def _buffers(self) -> list[Buffer]:
         return [self.buffer, *((self._row, *self.broad.buffers) if self._rows else ())]

@@ -32,9 +32,17 @@ FACES = 8  # of a tip that are told apart
 FACING = -0.5  # cosine between normals below which a vertex looks at a face
 SLIGHTER = 0.25  # of the depth behind the face that it sticks out to: less behind one that it looks at goes before
 SLIGHT = 1e-6  # of a triangle's size: a vertex so little outside a side is not yet outside; wider than what `edge_edge` allows
+THROUGH = 0.5  # of their distance at rest: so far apart or farther, parts of one body count as near by at rest too
 TINY = 1e-9  # of a triangle's size: nearer, a direction comes from normals
 
 NONE, OUTSIDE, INSIDE, BESIDE = 0, 1, 2, 3
+
+
+@ti.func
+def through(s: ti.template(), body, apart):
+    """How deep [m] parts of a body that are `apart` [m] at rest can be in each other: deeper, the body is squeezed between them.
+    Parts less than an edge apart cannot: a thin body that is squeezed to half would be taken for one that meets itself."""
+    return ti.select(apart > s.edge[body], ti.cast(THROUGH, ti.f64) * apart, ti.cast(0.0, ti.f64))
 
 
 @ti.func
@@ -86,7 +94,9 @@ def relate(s: ti.template(), i, u):
     if s.body[u] == s.body[s.ring[s.ring_start[i]]]:
         c0, c1, c2 = s.rest[s.triangle[u, 0]], s.rest[s.triangle[u, 1]], s.rest[s.triangle[u, 2]]
         apart = s.rest[i] - (w[0] * c0 + w[1] * c1 + w[2] * c2)
-        own = int(2.0 * distance > apart.norm())
+        own = int(distance > ti.cast(THROUGH, ti.f64) * apart.norm())
+        if h < 0.0:
+            own = int(distance > through(s, s.body[u], apart.norm()))
         if state == BESIDE or (own == 1 and state == INSIDE):
             state = NONE
     return state, n, h, distance, w, own

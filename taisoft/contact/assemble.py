@@ -1,10 +1,10 @@
 """From contacts that were found to the contact problem: frames, weights, numbers of each pair, warm start.
 
 Where a contact must be at the end of a step, its goal, is a gap of at least `standoff`, a small distance that keeps surfaces
-apart in spite of what linearising the motion misses. A gap above it may close so far. A gap below it opens slowly, a true
-penetration in a few steps, and never faster than strains the softest body by a percent: else bodies would fly apart.
-Where the surfaces meet within the step, restitution asks that they part with e times the speed at which they met. The
-velocity that an impulse must leave is then
+apart in spite of what linearising the motion misses; OWN times that within a body. A gap above it may close so far. A gap below
+it opens slowly, a true penetration in a few steps, and never faster than strains the softest body by a percent: else bodies
+would fly apart. Where the surfaces meet within the step, restitution asks that they part with e times the speed at which they
+met. The velocity that an impulse must leave is then
     u_n = (gap - goal)/dt + n.(v_a - v_b) >= 0,
 which counts motion once: the gap is that at the start of the step.
 """
@@ -23,6 +23,7 @@ from taisoft.scene.scene import Scene
 from taisoft.transfer import upload
 
 NEGLIGIBLE = 1e-12  # a weight below it: the node is not part of the contact
+OWN = 5.0  # times the standoff, and times the share of what is mended, between parts of one body: folds turn as they meet
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,16 +240,25 @@ def fill(
 
 
 @ti.func
-def short_of_goal(f: ti.template(), c, dt, standoff, fast, slow, fastest):
+def _own(f: ti.template(), c):
+    """OWN where contact c is of a body with itself, else 1."""
+    return ti.select(f.body[c][0] == f.body[c][1], ti.cast(OWN, ti.f64), ti.cast(1.0, ti.f64))
+
+
+@ti.func
+def short_of_goal(f: ti.template(), c, dt, common_standoff, fast, slow, fastest):
     """gap - goal of contact c [m].
+
+    common_standoff [m]: of contacts between bodies.
 
     fast, slow: shares of a penetration and of a missing standoff that the step mends; fastest: speed of that at most [m/s].
     """
-    gap = f.gap[c]
+    gap, own = f.gap[c], _own(f, c)
+    standoff = own * common_standoff
     goal = standoff
     if gap < standoff:
         above = ti.max(gap, 0.0)
-        goal = gap + ti.min(slow * (standoff - above) + fast * (above - gap), fastest * dt)
+        goal = gap + ti.min(own * (slow * (standoff - above) + fast * (above - gap)), fastest * dt)
     if f.restitution[c] > 0.0 and f.approach[c] < 0.0 and gap - standoff + dt * f.approach[c] < 0.0:
         goal = ti.max(goal, gap - dt * f.restitution[c] * f.approach[c])
     return gap - goal
@@ -262,7 +272,7 @@ def find_impact(f: ti.template(), dt: ti.f64, standoff: ti.f64) -> ti.i32:
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
-            if p.r[c][0] == 0.0 and f.approach[c] < 0.0 and f.gap[c] - standoff + dt * f.approach[c] < 0.0:
+            if p.r[c][0] == 0.0 and f.approach[c] < 0.0 and f.gap[c] - _own(f, c) * standoff + dt * f.approach[c] < 0.0:
                 found = 1
     return found
 

@@ -8,8 +8,10 @@ import numpy as np
 import taichi as ti
 
 from taisoft.collision.contacts import Contacts
+from taisoft.collision.crossings import CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.collision.pipeline import Detection
 from taisoft.contact.assemble import (
+    OWN,
     build_found,
     build_pair_numbers,
     fill,
@@ -27,6 +29,7 @@ from taisoft.transfer import array_of, download, upload
 
 STANDOFF = 2e-3  # of the finest body's mean surface edge: gap that contacts keep, so that surfaces do not cross in curved motion
 SUNK = 0.02  # of the finer side's mean surface edge: penetration that is told as a problem
+CROSSED_FAR = 2e-3  # of the same: depth of crossing triangles after which an implicit step is done again in smaller parts
 SANK = 1e-3  # of the same: penetration after which the way of an implicit part is searched
 FAST = {True: 0.05, False: 0.2}  # share of a penetration that an explicit, an implicit step mends
 SLOW = {True: 0.005, False: 0.02}  # share of a missing standoff
@@ -45,7 +48,7 @@ class ContactStep:
         d = self.detection
         self.standoff = STANDOFF * float(d.edges[: len(scene.bodies)].min())
         if d.margin > 0.0:
-            self.standoff = min(self.standoff, 0.5 * d.margin)
+            self.standoff = min(self.standoff, 0.5 * d.margin / OWN)
         # what follows a path may be changed from outside between two steps, and its path may end with the last one
         self._follows = world.motion.n_moved > 0 or any(o.path is not None for o in scene.obstacles)
         self._shares = FAST[explicit], SLOW[explicit]
@@ -62,6 +65,9 @@ class ContactStep:
         self._searched: tuple[float, float] | None = None  # time and dt of the search that is at hand
         self._ended: tuple[float, float] | None = None  # those of the end that was looked at, until the next part begins
         self._depth = 0.0  # the deepest penetration found there [m]
+        self.crossing: float | None = None  # how deep triangles cross, over the finer side's edge, where somebody looked
+        self.crossings = 0  # pairs of triangles that cross at the end of the last step
+        self._explicit = explicit
         self._last_time = 0.0
         self.penetration = self.sinking = 0.0  # at the end of the last step [m], and over the finer side's mean surface edge
         self._sum: np.ndarray | None = None  # (n_colliders, 3) impulses over the parts of the last step, if it had several
@@ -93,7 +99,7 @@ class ContactStep:
         self._searched = self._ended = None
         self.problem.count[0] = 0
         self._last_time = self.penetration = self.sinking = self._span = 0.0
-        self._sum = None
+        self._sum, self.crossing, self.crossings = None, None, 0
 
     def _rows(self) -> dict:
         """Fields of the last step's contacts: what the next step starts from, and what `contacts` tells."""
@@ -130,6 +136,7 @@ class ContactStep:
         self._last_time, self._share, self._span = (float(kept[name]) for name in ("last_time", "share", "span"))
         self._sum, self.penetration, self.sinking = kept["sum"], float(kept["penetration"]), float(kept["sinking"])
         self.met, self.dropped = bool(kept["met"]), int(kept["dropped"])
+        self.crossing, self.crossings = None, 0
         self._searched = self._ended = None
         self._indexed = True  # so that the next step lists its contacts by nodes, however few
 
@@ -236,10 +243,20 @@ class ContactStep:
             self.detection.find(time, 0.0)  # a path that ends here: whoever steps on will be told
         told = self._survey(dt)
         depth, self.sinking = float(told[DEPTH]), float(told[SINKING])
+        if not self._explicit:
+            crossing = self.cross()
+            depth, self.sinking = max(depth, crossing[0]), max(self.sinking, crossing[1])
         if self._follows:
             self._searched = None
         self._depth, self._ended = depth, (time, dt)
         return depth
+
+    def cross(self) -> tuple[float, float]:
+        """How deep triangles cross where the last search found them [m], and over the finer side's mean surface edge; counts
+        them as `crossings`."""
+        told = self.detection.crossings()
+        self.crossing, self.crossings = float(told[DEPTH_OVER_EDGE]), int(told[CROSSINGS])
+        return float(told[CROSSING_DEPTH]), self.crossing
 
     def went_astray(self, x_start) -> bool:
         """Whether the surface went where nobody had looked since x_start; keeps its way for `search_way`."""
@@ -261,7 +278,9 @@ class ContactStep:
         most in it, over what they may."""
         self.search(time, dt)
         told = self._survey(dt)
-        return float(told[SINKING]), float(told[HASTE])
+        if self.crossing is None:
+            self.cross()
+        return max(float(told[SINKING]), self.crossing), float(told[HASTE])
 
     def _survey(self, dt: float) -> np.ndarray:
         d = self.detection

@@ -94,7 +94,8 @@ class ContactExplicitStepper(ExplicitStepper):
             world.step_count += done
             world.time = start + done * dt
             raise
-        self.contact.penetration, self.contact.sinking = depth, sinking
+        crossing = self.contact.cross()
+        self.contact.penetration, self.contact.sinking = max(depth, crossing[0]), max(sinking, crossing[1])
         return ContactSubstepResult(
             n, m.scalars[6], int(m.scalars[7]), sum(r.iterations for r in results if r),
             max((r.residual for r in results if r), default=0.0), all(r.converged for r in results if r),

@@ -11,7 +11,7 @@ import taichi as ti
 
 from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
-from taisoft.stepping.contact import SUNK, TOLERANCE, ContactStep
+from taisoft.stepping.contact import CROSSED_FAR, SUNK, TOLERANCE, ContactStep
 from taisoft.stepping.contact_newton import ContactResult, ContactStageSolver, count_all, merge
 from taisoft.stepping.newton import StageResult, StageSolver
 from taisoft.stepping.world import World
@@ -155,6 +155,7 @@ class ImplicitStepper:
         if parts > MAX_PARTS:
             raise SimulationError(f"step {self.world.step_count + 1}: {contact.too_fast(start, dt)}")
         allowed = max(SUNK, 1.1 * sinking)  # what is deep already needs no shorter steps
+        allowed_crossing = max(CROSSED_FAR, 1.1 * contact.crossing)
         kept, given_up = (*self.world.state(), self.world.motion.released()), []
         while True:
             try:
@@ -164,7 +165,7 @@ class ImplicitStepper:
                 self._put_back(*kept)
                 self.forget()
                 raise
-            if contact.sinking <= allowed or 2 * parts > MORE_PARTS:
+            if (contact.sinking <= allowed and contact.crossing <= allowed_crossing) or 2 * parts > MORE_PARTS:
                 break
             self._put_back(*kept)  # velocities at the start of the step did not tell how far things would go
             self._past = 0
