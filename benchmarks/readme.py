@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from statistics import median
 
 from taisoft.errors import OutputError
 from taisoft.output.files import write_bytes
@@ -93,8 +94,24 @@ def peers(results: Path) -> str:
     return f"{compare_table(shown)}\n\nMeasured on: {where}."
 
 
+def scaling(results: Path) -> str:
+    """Time and memory a tet on the smallest and the largest mesh, and how the time grows between them."""
+    numbers = newest(results, "scaling")
+    lines = []
+    for growth in numbers["exponents"]:
+        own = sorted((r for r in numbers["rows"] if r["kind"] == growth["kind"] and r["samples"]), key=lambda r: r["tets"])
+        if len(own) < 2:
+            continue
+        each = [f"{1e9 * median(row['samples']) / row['tets']:.3g}" for row in (own[0], own[-1])]
+        memory = sum(own[-1]["field_bytes"].values()) / own[-1]["tets"]
+        sizes = [f"{row['tets']:,}" for row in (own[0], own[-1])]
+        lines.append((growth["kind"], sizes[0], each[0], sizes[1], each[1], f"{growth['step']:.2f}", f"{memory:.0f}"))
+    headings = ("step or search", "tets", "ns/tet", "tets", "ns/tet", "exponent of the time", "fields there [B/tet]")
+    return f"{markdown(headings, lines, left=(0,))}\n\nMeasured on: {measured_on(numbers)}."
+
+
 TABLES: dict[str, Callable[[Path], str]] = {  # by marker
-    "order_errors": order_errors, "order_times": order_times, "peers": peers,
+    "order_errors": order_errors, "order_times": order_times, "peers": peers, "scaling": scaling,
 }  # fmt: skip
 
 

@@ -23,7 +23,8 @@ class StepReport:
 
     time: float  # at the end of the step [s]
     steps: int = 1  # sub-steps of size dt that this report covers
-    newton_iterations: int = 0
+    parts: int = 1  # that an implicit step was taken in, more where it did not converge or bodies would have passed each other
+    newton_iterations: int = 0  # with those of tries that were given up
     linear_iterations: int = 0
     contact_iterations: int = 0
     residual: float = 0.0  # relative residual of the implicit equations, 0 for explicit steps

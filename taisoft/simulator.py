@@ -139,12 +139,13 @@ class Simulator(Resuming):
             self._count(1)
             report = self._report()
             report.newton_iterations, report.linear_iterations = result.newton_iterations, result.linear_iterations
-            report.residual, report.converged = result.residual, result.converged
+            report.residual, report.converged, report.parts = result.residual, result.converged, self._stepper.parts
         if self._contact is not None:
             report.contact_iterations, report.contact_residual = result.contact_iterations, result.contact_residual
             report.n_contacts, report.max_penetration = self._contact.n_contacts, self._contact.penetration
             report.dropped_contacts = self._contact.dropped
-            report.converged &= result.contacts_converged
+            if self.settings.explicit:
+                report.converged = result.contacts_converged
             report.deep, report.crossings = int(self._contact.sinking > SUNK), self._contact.crossings
         report.steps = self.step_count - start
         if self._softens:

@@ -12,7 +12,7 @@ import taichi as ti
 from rotations import rotation
 
 import taisoft as ts
-from taisoft.contact.assemble import _warm_impulse, build_found, keep_impulses, short_of_goal
+from taisoft.contact.assemble import OWN, _warm_impulse, build_found, keep_impulses, short_of_goal
 from taisoft.contact.problem import build_node_problem, fill_field
 from taisoft.fields import FieldArena
 from taisoft.runtime import kernel, open_runtime
@@ -210,7 +210,11 @@ def test_how_far_a_contact_is_from_its_goal(found, fast, slow):
         fill_field(field, values)
     found.problem.count[0] = len(cases)
     out = np.zeros(len(cases))
+    fill_field(found.body, np.tile([0, 1], (len(cases), 1)))
     find_goals(found, dt, h, fast, slow, fastest, out)
+    assert np.abs(out - expected).max() < 1e-15
+    fill_field(found.body, np.ones((len(cases), 2), dtype=int))  # of a body with itself: the same with other numbers
+    find_goals(found, dt, h / OWN, fast / OWN, slow / OWN, fastest, out)
     assert np.abs(out - expected).max() < 1e-15
 
 

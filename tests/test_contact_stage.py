@@ -82,7 +82,8 @@ def rig(request):
         carry = np.where((np.arange(K) % 5 == 0)[:, None], 1e-3 * rng.standard_normal((K, 3)), 0.0)
         friction = np.where(np.arange(K) % 7 == 0, 0.0, 0.5)
         gap = rng.uniform(-2, 3, K) * GOAL[0]
-        for field, values in ((p.arity, arity), (p.friction, friction), (f.gap, gap), (f.carry, carry)):
+        apart = np.tile([0, 1], (K, 1))  # contacts of a body with itself have other goals
+        for field, values in ((p.arity, arity), (p.friction, friction), (f.gap, gap), (f.carry, carry), (f.body, apart)):
             fill_field(field, values)
         p.count[0] = K
         index_nodes(p)

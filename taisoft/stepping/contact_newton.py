@@ -11,7 +11,6 @@ Source: Alart and Curnier 1991 for the laws as a prox; the loop is that of the m
 """
 
 import math
-from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,37 +42,6 @@ FLAT = 0.5  # of the slope at its start: a step that ends on a steeper rise has 
 TRIES = 12  # of a step's length
 KEPT = 3  # Newton steps that a matrix serves at least: most of what changes is what touches
 MAX_MULTIPLIERS = 200
-
-
-@dataclass(frozen=True)
-class ContactResult(StageResult):
-    """What a solve with contacts did."""
-
-    contact_iterations: int = 0  # multipliers
-    contact_residual: float = 0.0
-
-    @property
-    def contacts_converged(self) -> bool:
-        """As `converged`, which speaks for the contacts too."""
-        return self.converged
-
-
-def merge(results: list[ContactResult]) -> ContactResult:
-    """The parts of one step: iterations in all, the worst residuals."""
-    return ContactResult(
-        sum(r.newton_iterations for r in results), sum(r.linear_iterations for r in results),
-        max(r.residual for r in results), all(r.converged for r in results), all(r.at_rounding for r in results),
-        sum(r.contact_iterations for r in results), max(r.contact_residual for r in results),
-    )  # fmt: skip
-
-
-def count_all(result: ContactResult, given_up: list[ContactResult]) -> ContactResult:
-    """The result of a step with the iterations of earlier tries at it."""
-    work = merge([result, *given_up])
-    return replace(
-        result, newton_iterations=work.newton_iterations, linear_iterations=work.linear_iterations,
-        contact_iterations=work.contact_iterations,
-    )  # fmt: skip
 
 
 class ContactStageSolver(StageSolver):
@@ -178,7 +146,7 @@ class ContactStageSolver(StageSolver):
     def solve_stage(
         self, c: float, beta: float, dt: float, tolerance: float, contact_tolerance: float, max_newton: int,
         linear_tolerance: float | None, linear: bool, led_share: float = 1.0,
-    ) -> ContactResult:  # fmt: skip
+    ) -> StageResult:  # fmt: skip
         """Solve the stage of a step of dt from the present v, contacts as `ContactStep.begin` left them.
 
         linear: elastic forces linearised at the present x. Without contacts this is `StageSolver.solve`.
@@ -189,7 +157,7 @@ class ContactStageSolver(StageSolver):
         if p.count[0] == 0:
             self._weighed = None
             r = self.solve(c, beta, tolerance, 1 if linear else max_newton, linear_tolerance, led_share=led_share)
-            return ContactResult(r.newton_iterations, r.linear_iterations, r.residual, r.converged, r.at_rounding)
+            return StageResult(r.newton_iterations, r.linear_iterations, r.residual, r.converged, r.at_rounding)
         begin_stage(self.model, self.work, beta, led_share)
         fresh = False
         if self._weighed != (c, beta) or linear:
@@ -202,7 +170,7 @@ class ContactStageSolver(StageSolver):
         self._linear = linear
         return self._iterate(c, beta, tolerance, contact_tolerance, max_newton, linear_tolerance, fresh)
 
-    def _iterate(self, c, beta, tolerance, contact_tolerance, max_newton, linear_tolerance, fresh) -> ContactResult:
+    def _iterate(self, c, beta, tolerance, contact_tolerance, max_newton, linear_tolerance, fresh) -> StageResult:
         state = self.contact.problem.state
         r, scale = self._evaluate(c, beta, multiply=True)
         floor = beta * self.rounding_force + c * self.rounding_mass / beta
@@ -261,7 +229,7 @@ class ContactStageSolver(StageSolver):
                     break
                 needs_projection, fresh = True, False
         relative = r / scale if scale > 0.0 else r
-        return ContactResult(
+        return StageResult(
             newton, linear, relative, bool(converged and np.isfinite(r)), bool(rounding or r <= floor), multipliers,
             float(state[RESIDUAL]),
         )  # fmt: skip

@@ -12,8 +12,8 @@ import taichi as ti
 from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
 from taisoft.stepping.contact import CROSSED_FAR, SUNK, TOLERANCE, ContactStep
-from taisoft.stepping.contact_newton import ContactResult, ContactStageSolver, count_all, merge
-from taisoft.stepping.newton import StageResult, StageSolver
+from taisoft.stepping.contact_newton import ContactStageSolver
+from taisoft.stepping.newton import StageResult, StageSolver, count_all, merge
 from taisoft.stepping.world import World
 from taisoft.transfer import array_of, download, upload
 
@@ -22,7 +22,8 @@ MAX_CONTACT_NEWTON = 400  # with contacts, over all multipliers
 MAX_PARTS = 32  # of a step in which bodies close fast
 HASTE = 2.0  # a part may close so many times what a step may: its speed was not known when the step was cut
 SEARCHES = 3  # along the way that a step took, where it left the one that was expected
-MORE_PARTS = 16  # of a step that ended with a new deep penetration
+MORE_PARTS = 16  # of a step that ended with a new deep penetration, or with triangles that newly cross
+RETRIES = 4  # parts at most of a step that did not converge
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
 
@@ -109,6 +110,7 @@ class ImplicitStepper:
         self.tolerance = DEFAULT_TOLERANCE[world.runtime.precision]
         self.contact_tolerance = TOLERANCE[world.runtime.precision]
         self.linear_tolerance: float | None = None
+        self.parts = 1  # that the last step was taken in
         self.forget()
 
     def forget(self) -> None:
@@ -142,45 +144,53 @@ class ImplicitStepper:
     def step(self, dt: float) -> StageResult:
         """One step of dt; on a non-finite result the state is put back and SimulationError raised.
 
-        With contacts it is cut into parts where bodies close so fast that they could pass each other unseen.
+        One that does not converge is done again in smaller parts; with contacts it is cut into parts where bodies close so fast
+        that they could pass each other unseen, and done again where it ended with something newly deep in each other or crossed.
         """
-        if self.contact is None:
-            return self._part(self.world.time, dt)
-        return self._with_contacts(dt)
-
-    def _with_contacts(self, dt: float) -> ContactResult:
-        contact, start = self.contact, self.world.time
-        sinking, haste = contact.look(start, dt)
-        parts = max(1, math.ceil(haste - 1e-9))
-        if parts > MAX_PARTS:
-            raise SimulationError(f"step {self.world.step_count + 1}: {contact.too_fast(start, dt)}")
-        allowed = max(SUNK, 1.1 * sinking)  # what is deep already needs no shorter steps
-        allowed_crossing = max(CROSSED_FAR, 1.1 * contact.crossing)
-        kept, given_up = (*self.world.state(), self.world.motion.released()), []
+        contact, start, parts, kept, given_up = self.contact, self.world.time, 1, None, []
+        released = self.world.motion.released()
+        if contact is not None:
+            sinking, haste = contact.look(start, dt)
+            parts = max(1, math.ceil(haste - 1e-9))
+            if parts > MAX_PARTS:
+                raise SimulationError(f"step {self.world.step_count + 1}: {contact.too_fast(start, dt)}")
+            # what is deep already needs no shorter steps
+            allowed, allowed_crossing = max(SUNK, 1.1 * sinking), max(CROSSED_FAR, 1.1 * contact.crossing)
+            kept = self.world.state()
         while True:
             try:
                 result = self._in_parts(start, dt, parts)
-                depth = contact.end(start + dt, dt)
+                depth = 0.0 if contact is None else contact.end(start + dt, dt)
             except BaseException:  # of Ctrl-C, too: the step is abandoned
-                self._put_back(*kept)
+                if kept is not None:
+                    self._put_back(*kept, released)
                 self.forget()
                 raise
-            if (contact.sinking <= allowed and contact.crossing <= allowed_crossing) or 2 * parts > MORE_PARTS:
+            deep = contact is not None and (contact.sinking > allowed or contact.crossing > allowed_crossing)
+            lost = not (result.converged or self.scheme.one_iteration)
+            if not (deep or lost) or 2 * parts > (MORE_PARTS if deep else RETRIES):
                 break
-            self._put_back(*kept)  # velocities at the start of the step did not tell how far things would go
+            if kept is None:
+                restore(self.world.model, self.history)
+                kept = self.world.state()
+            self._put_back(*kept, released)
             self._past = 0
-            if self.scheme.before:  # tells impacts by contacts that bore nothing in the step before
+            if contact is not None and self.scheme.before:  # it tells impacts by contacts that bore nothing in the step before
                 contact.forget()
-            else:
+            elif contact is not None:
                 contact.start_again()
             given_up.append(result)
             parts *= 2
-        contact.penetration = depth
+        self.parts = parts
+        if contact is not None:
+            contact.penetration = depth
         return count_all(result, given_up)
 
-    def _in_parts(self, start: float, dt: float, parts: int) -> ContactResult:
+    def _in_parts(self, start: float, dt: float, parts: int) -> StageResult:
         """A step of dt from a time, in equal parts."""
         part, results = dt / parts, []
+        if self.contact is None:
+            return merge([self._part(start + k * part, part) for k in range(parts)])
         self.contact.start_step(dt, parts)
         for k in range(parts):
             if k:
@@ -199,7 +209,8 @@ class ImplicitStepper:
         if world.motion.released() != released:
             world.motion.set_released(released)
             world.upload_constraints()
-            self.solver.forget_factors()
+            if self.contact is not None:
+                self.solver.forget_factors()
 
     def _part(self, time: float, dt: float) -> StageResult:
         """A step of dt from a time, in one piece; again, where it led to contacts that had not been found."""

@@ -1,0 +1,90 @@
+"""Implicit steps that do not converge:
+
+* one that does in two parts is that of two half steps, and says in how many parts it was taken and what all tries cost;
+* one that does in none is told as not converged, and the next one starts from where it ended;
+* nodes that it let go hold on again for the next try; where a try fails, the state is that before the step.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.stepping import implicit
+
+DT = 0.05  # [s]
+LEAD = 0.04  # [s]
+
+
+@pytest.fixture(scope="module", params=["implicit_euler", "bdf2", "implicit_midpoint"])
+def shared_sim(request):
+    scene = ts.Scene()
+    bar = scene.add_body(ts.box_mesh((4, 1, 1), (0.4, 0.1, 0.1)), ts.Material(young=2e4), name="bar")
+    bar.fix(lambda X: X[:, 0] < -0.19)
+    bar.move(lambda X: X[:, 0] > 0.19, lambda t: (0.0, -2.0 * t, 0.0) if t < LEAD else None)
+    with ts.Simulator(scene, dt=DT, integrator=request.param, precision="f64", newton_tolerance=1e-10) as sim:
+        yield sim
+
+
+@pytest.fixture
+def sim(shared_sim):
+    shared_sim.dt = DT
+    shared_sim.reset()
+    return shared_sim
+
+
+def test_a_step_that_does_not_converge_is_taken_in_parts(sim, monkeypatch):
+    sim.dt = DT / 2
+    halves = [sim.step() for _ in range(2)]
+    wanted = sim.positions(), sim.velocities()
+    sim.dt = DT
+    sim.reset()
+    whole = sim.step()
+    assert whole.parts == 1 and np.abs(sim.positions() - wanted[0]).max() > 1e-3  # [m]
+    sim.reset()
+    solve, results = sim._stepper.solver.solve, []
+
+    def stopping(*arguments, **named):
+        results.append(solve(*arguments, **named))
+        return dataclasses.replace(results[-1], converged=len(results) > 1)
+
+    monkeypatch.setattr(sim._stepper.solver, "solve", stopping)
+    report = sim.step()
+    assert report.converged and report.parts == 2 and sim.step_count == 1 and sim.time == DT
+    assert report.newton_iterations == sum(r.newton_iterations for r in (whole, *halves))
+    close = 1e-9 * np.abs(wanted[1]).max()
+    assert np.abs(sim.positions() - wanted[0]).max() < close * DT and np.abs(sim.velocities() - wanted[1]).max() < close
+
+
+def test_one_that_never_does_is_told(sim, monkeypatch):
+    monkeypatch.setattr(implicit, "MAX_NEWTON", 2)
+    result = sim.run(DT, fps=None)
+    report = result.step_reports[-1]
+    assert not report.converged and report.parts == implicit.RETRIES and result.status == "degraded"
+    assert report.newton_iterations == 2 * sum(2**k for k in range(1 + int(np.log2(implicit.RETRIES))))
+    assert sim.step_count == 1 and np.isfinite(sim.positions()).all()
+
+
+def test_a_try_that_fails_leaves_the_state_before_the_step(sim, monkeypatch):
+    before = sim.positions(), sim.velocities()
+    monkeypatch.setattr(implicit, "MAX_NEWTON", 2)
+    solve, calls = sim._stepper.solver.solve, []
+
+    def failing(*arguments, **named):
+        calls.append(arguments)
+        if len(calls) == 3:  # the second part of the second try
+            raise ts.SimulationError("no room")
+        return solve(*arguments, **named)
+
+    monkeypatch.setattr(sim._stepper.solver, "solve", failing)
+    with pytest.raises(ts.SimulationError, match="no room"):
+        sim.step()
+    assert np.array_equal(sim.positions(), before[0]) and np.array_equal(sim.velocities(), before[1])
+    assert sim.time == 0.0 and sim.step_count == 0 and not any(sim._world.motion.released())
+    monkeypatch.undo()
+    sim.step()
+    first = sim.positions()
+    sim.reset()
+    sim.step()
+    assert np.abs(sim.positions() - first).max() < 1e-12  # [m]
