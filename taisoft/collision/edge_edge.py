@@ -22,14 +22,18 @@ CROSSING = 0.02  # sine below which two edges count as parallel
 END = 10.0  # depths from an end within which it tells of a crossing
 FREED = 0.1  # of a crossing's depth: less than that does not count once the end is out
 SHALLOW = 0.2  # of the crossed edge's length: deeper, a crossing is likely none but seen across a groove
+# Of an edge's length: an end that lies so little before the faces counts as behind them. Where a vertex passes a sharp edge, the
+# edges on both sides of it cross that a little beyond it, each along its own normal
+NEARLY = 5e-4
 TINY = 1e-9  # of lengths: rounding
 
 
 @ti.func
-def _is_behind(s: ti.template(), i, length, u, m):
-    """1 where vertex i, of an edge of that length, lies behind both faces at edge m of triangle u."""
+def _is_behind(s: ti.template(), i, length, u, m, share):
+    """1 where vertex i, of an edge of that length, lies behind both faces at edge m of triangle u, or before them by no more than
+    a share of the length."""
     d = s.x[i] - corner(s, u, m)
-    slack = ti.cast(TINY, ti.f64) * (length + d.norm())
+    slack = share * length + ti.cast(TINY, ti.f64) * (length + d.norm())
     behind = int(d.dot(s.normal[u]) <= slack)
     v = s.neighbour[u, m]
     if v >= 0:
@@ -83,7 +87,7 @@ def _end_tells(s: ti.template(), t, k, p, place, length, gap, u, m, n, by_faces)
                 if good == 1:
                     good = _is_freed(s, p, i, u, m, gap)
             if good == 1:
-                good = _is_behind(s, i, length, u, m)
+                good = _is_behind(s, i, length, u, m, ti.cast(0.0, ti.f64))
             if good == 1:
                 told = told | sticks_out(s, i, n)
     return told
@@ -99,7 +103,7 @@ def _within(s: ti.template(), t, k, place, length, over, u, m):
     good = int(-beyond <= place <= length + beyond)
     if good == 1 and (place < 0.0 or place > length):
         e = int(place > length)
-        good = _is_behind(s, s.triangle[t, (k + e) % 3], length, u, m)
+        good = _is_behind(s, s.triangle[t, (k + e) % 3], length, u, m, ti.cast(NEARLY, ti.f64))
     return good
 
 
@@ -164,7 +168,8 @@ def edge_contact(s: ti.template(), way: ti.template(), t, k, u, m, margin, out: 
                     over = ti.cast(MISS, ti.f64) * ti.max(-gap, 0.0)
                     near = gap - ti.max(closing, 0.0) <= margin and gap >= -_deepest(s, t, k, u, m, f, g, la, lb)
                     if ahead == 1:  # of what comes from farther away others are the nearest then
-                        near = near and gap < 0.0 and gap + closing > 0.0 and gap + closing <= margin
+                        least = -ti.cast(AHEAD, ti.f64) * ti.min(la, lb)  # what is so little past each other counts as above
+                        near = near and gap < 0.0 and gap + closing > least and gap + closing <= margin
                     # a nearly flat edge sticks out along either normal: the sides that look at each other count
                     good = int(near) & int(n.dot(n_u) > 0.0) & int(n.dot(n_t) < 0.0)
                 for side in range(2):  # one edge, then the other, so that what is called is compiled once
