@@ -152,15 +152,18 @@ def _run(
                 result.problems.append(str(error))
                 result.status = "failed"
         result.problems[:0] = [f"warning: {text}" for text in told]
-        if observers.error is not None:
-            _tell_failed_output(result, observers, signals)
+        _tell_failed_output(result, observers, signals)
         if recording is not None:
-            observers.guard(recording.report, result, sim, settings)
-            if arguments.video and not signals.asked():
-                observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
+            reported = observers.guard(recording.report, result, sim, settings)
+            video = arguments.video and not signals.asked()
+            filmed = not video or observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
+            _tell_failed_output(result, observers, signals)
+            if reported and not filmed:
+                observers.guard(recording.report, result, sim, settings)  # anew, with what became of the video
         print_summary(result, sim, observers, recording)
-    if observers.error is not None:
-        print(f"taisoft: {observers.error}", file=sys.stderr)
+    if observers.failed():
+        for error in observers.errors:
+            print(f"taisoft: {error}", file=sys.stderr)
         return EXIT_OUTPUT
     if signals.number is not None:
         return EXIT_SIGNAL + signals.number
@@ -174,8 +177,9 @@ def _open_window(sim: Simulator, shown: Shown, plots: Plots):
 
 
 def _tell_failed_output(result: RunReport, observers: Observers, signals: Signals) -> None:
-    """The run's report tells of the output that failed: report.json may still fit where a picture did not."""
-    result.problems.append(str(observers.error))
-    result.interrupted = signals.asked()
-    if result.status == "ok":
+    """The run's report tells of all output that failed: report.json may still fit where a picture did not."""
+    result.problems += [error for error in observers.errors if error not in result.problems]
+    if observers.failed():
+        result.interrupted = result.interrupted and signals.asked()
+    if observers.failed() and result.status == "ok":
         result.status = "degraded"
