@@ -2,7 +2,8 @@
 
 * a disk that fills, a folder that becomes read-only, a disk that fails in fsync, rename or write: status 3, a sentence with the
   path, no file that is torn, and no word of success;
-* killed at random times while report and checkpoint are replaced: each is the old or the new one;
+* killed at random times while report and checkpoint are replaced: each is the old or the new one; killed anywhere in a run:
+  every file is whole, and the next run leaves nothing behind;
 * too little memory: a sentence with what is needed and what there is, before the first step;
 * a number that is spoilt in the middle of a run is found in the same step, and the last good checkpoint stays;
 * buffers for contacts that are too small grow, and the report tells, or the run stops;
@@ -11,22 +12,27 @@
 
 import json
 import os
+import random
 import re
 import resource
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command import BEAM, ROOT, SHORT_OUTPUT, report, run, write
+from command import BEAM, ROOT, SHORT_OUTPUT, child, report, run, write
+from png import decode
+from pxr import Usd
 
 import taisoft as ts
 from taisoft import fields
 from taisoft.checkpoint import read_checkpoint
 from taisoft.output.checkpoint import CheckpointWriter
-from taisoft.output.files import OutputFolder
+from taisoft.output.files import LOCK_NAME, OutputFolder
 
 RESULTS = {"report.json", "steps.csv", "checkpoint.npz", "scene.usdc", "frames"}
 
@@ -240,6 +246,45 @@ def test_killed_while_files_are_replaced(tmp_path, kills):
     assert int(done.stdout.split()[0]) == kills  # each child has come to write
     OutputFolder(tmp_path, overwrite=True).close()
     assert not list(tmp_path.glob("*.part"))
+
+
+def assert_whole(out: Path) -> None:
+    """Every file under a final name, of a run that may have been killed."""
+    for picture in (out / "frames").glob("*.png"):
+        assert decode(picture.read_bytes()).ndim == 3
+    for path in (*(out / "chunks").glob("*.usdc"), *out.glob("*.usdc")):
+        stage = Usd.Stage.Open(str(path))
+        points = stage.GetAttributeAtPath("/World/beam/tets.points")
+        assert points.GetTimeSamples()
+        assert all(np.isfinite(np.array(points.Get(moment))).all() for moment in points.GetTimeSamples())
+    for path in out.glob("checkpoint*.npz"):
+        assert np.isfinite(read_checkpoint(path).state["world"]["x"]).all()
+    if (out / "report.json").exists():
+        assert report(out)["status"] == "ok" and (out / "steps.csv").exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="there is no SIGKILL")
+@pytest.mark.parametrize("kills", [3, 20])
+def test_a_run_that_is_killed(beam, tmp_path, kills):
+    """At random times, evenly spread over a run that follows on the one killed before; the last run is whole."""
+    out, dice, ended = tmp_path / "out", random.Random(kills), []
+    arguments = ("run", beam, "--headless", "--seconds", "0.2", "--out", out, "--overwrite", "--checkpoint-every", "0.03")
+    for kill in range(kills):
+        process = child(*arguments)
+        while not (out / LOCK_NAME).exists() or (out / LOCK_NAME).read_text() != f"{process.pid}\n":
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.005)
+        time.sleep(1.5 * (kill + dice.random()) / kills)  # [s]
+        process.kill()
+        process.communicate()
+        ended.append(process.returncode)
+        assert_whole(out)
+    assert -signal.SIGKILL in ended and set(ended) <= {-signal.SIGKILL, 0}
+    assert run(*arguments[1:2], *arguments[3:]) == 0
+    assert_whole(out)
+    kept = {path.name for path in out.iterdir()}
+    assert RESULTS <= kept <= RESULTS | {"checkpoint.previous.npz"} and not list(tmp_path.rglob("*.part"))
+    assert len(list((out / "frames").iterdir())) == 7
 
 
 # --- memory and numbers -----------------------------------------------------------------------------------------------
