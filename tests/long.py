@@ -10,7 +10,7 @@ LONG = {
     "test_faults": (
         "test_a_disk_that_fails[others]", "test_killed_while_files_are_replaced[100]",
         "test_a_run_that_is_killed[20]", "[300000000",
-        "[body-", "[ground-", "[nothing-implicit_euler]",
+        "[body-implicit_euler]", "[ground-", "[nothing-implicit_euler]",
         "test_a_buffer_that_grows",
     ),
     "test_references": (

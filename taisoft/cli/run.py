@@ -3,7 +3,8 @@
 import os
 import sys
 from argparse import Namespace
-from contextlib import ExitStack, closing
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from taisoft.checkpoint import Checkpoint
@@ -42,7 +43,8 @@ def command(arguments: Namespace) -> int:
             settings = resolve(solver, arguments, Simulator)
             if arguments.out is not None:
                 check_free(arguments.out, arguments.overwrite)
-            sim = Simulator(scene, **settings.simulator | ({"pullable": True} if watched else {}))  # by the mouse
+            with _naming(arguments.scene):
+                sim = Simulator(scene, **settings.simulator | ({"pullable": True} if watched else {}))  # by the mouse
         else:
             saved = read_last_good(arguments.resume)
             kept = saved.settings | ({"fps": saved.notes["fps"]} if "fps" in saved.notes else {})  # frames have numbers
@@ -54,8 +56,18 @@ def command(arguments: Namespace) -> int:
             if watched:
                 return _watch(sim, settings, shown)
             _check_time_left(sim, settings, arguments)
-            check_length(settings.seconds, sim.dt, settings.fps)
+            with _naming(arguments.scene):
+                check_length(settings.seconds, sim.dt, settings.fps)
             return _run(sim, settings, arguments, signals, told, has_window, every, saved, shown)
+
+
+@contextmanager
+def _naming(scene: str) -> Iterator[None]:
+    """Why the scene cannot be simulated as it was asked for is told with its name."""
+    try:
+        yield
+    except (SceneError, SimulationError) as error:
+        raise type(error)(f"{scene}: {error}") from error
 
 
 def _checkpoint_interval(arguments: Namespace) -> float | None:

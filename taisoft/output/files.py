@@ -50,8 +50,8 @@ class OutputFolder:
     path: created where absent; an empty folder, or one with files that are not a run's, is accepted. overwrite: take a
     folder that holds results: report.json, steps.csv, frames and chunks go at once, each other file when its successor is
     complete. first: of a run that goes on, the number of its first frame; results are accepted, what is before it stays, what
-    comes after goes with `clear`, as report.json does, and other files go only for their successors. Raises OutputError when the folder cannot be written, another
-    process writes to it, or it holds results without overwrite.
+    comes after goes with `clear`, as report.json does, and other files go only for their successors. Raises OutputError when
+    the folder cannot be written, another process writes to it, or it holds results without overwrite.
     """
 
     def __init__(self, path: str | Path, overwrite: bool = False, first: int | None = None):
