@@ -76,6 +76,14 @@ FILE *fopen64(const char *path, const char *mode) {
     return ((FILE *(*)(const char *, const char *))dlsym(RTLD_NEXT, "fopen64"))(path, mode);
 }
 
+int mkstemp(char *path) {
+    return is_read_only(path) ? -1 : ((int (*)(char *))dlsym(RTLD_NEXT, "mkstemp"))(path);
+}
+
+int mkstemp64(char *path) {
+    return is_read_only(path) ? -1 : ((int (*)(char *))dlsym(RTLD_NEXT, "mkstemp64"))(path);
+}
+
 int unlink(const char *path) {
     if (is_read_only(path)) return -1;
     return ((int (*)(const char *))dlsym(RTLD_NEXT, "unlink"))(path);

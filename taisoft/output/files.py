@@ -181,12 +181,13 @@ def _remove(folder: Path, *names: str) -> None:
 
 
 def _clear_parts(folder: Path) -> None:
-    """Remove what a killed writer left under temporary names."""
+    """Remove what a killed writer left under temporary names: ours, and those that USD gives while it writes ours."""
+    temporary = "[0-9]*-[0-9]*.*"  # see `taisoft.files.part_path`; USD has another ending than .part
     for name, pattern in RESULT_FOLDERS.items():
-        for file in (folder / name).glob(f"{pattern}.*.part"):
+        for file in (folder / name).glob(f"{pattern}.{temporary}"):
             file.unlink()
     for name in RESULT_FILES:
-        for file in folder.glob(f"{name}.*.part"):
+        for file in folder.glob(f"{name}.{temporary}"):
             file.unlink()
 
 
