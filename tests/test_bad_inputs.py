@@ -13,7 +13,7 @@ import random
 import meshio
 import numpy as np
 import pytest
-from command import report, run, write
+from command import SHORT_OUTPUT, report, run, write
 
 import taisoft as ts
 from taisoft.checkpoint import read_checkpoint
@@ -206,18 +206,24 @@ def test_one_step_more_than_there_can_be(tmp_path, capsys):
         sim.run(1e30, fps=None)
 
 
+PLATE = {"mesh": 'shape = "box", cells = [9, 1, 9], size = [9, 1, 9]', "more": GROUND.replace("-2", "-0.49"),
+         "solver": 'dt = 0.01\nintegrator = "symplectic_euler"'}  # fmt: skip
+SMALL_BUFFERS = "[collision]\ninitial_capacity = 64\n"
+
+
 def test_an_overlap_at_the_start(tmp_path, capsys):
-    """Refused with both names and the depth; where it is allowed it runs, here with buffers that grow, which the report tells."""
-    box, small = 'shape = "box", cells = [9, 1, 9], size = [9, 1, 9]', "[collision]\ninitial_capacity = 64\n"
-    options = {"mesh": box, "more": GROUND.replace("-2", "-0.49"), "solver": 'dt = 0.01\nintegrator = "symplectic_euler"'}
-    told = refusal(tmp_path, capsys, scene_text(head=small, **options))
+    told = refusal(tmp_path, capsys, scene_text(head=SMALL_BUFFERS, **PLATE))
     assert f"{tmp_path}/scene.toml: 'part' and 'ground' overlap at the start, 0.01 m deep: move them apart" in told
-    text = scene_text(head="allow_initial_overlap = true\n" + small, **options)
-    assert run(write(tmp_path / "scene.toml", text), "--out", tmp_path / "out", "--no-frames", "--no-usd") == 0
-    assert report(tmp_path / "out")["buffer_growths"] == {"contacts": 1}
 
 
 # --- what runs, and is told -------------------------------------------------------------------------------------------
+
+
+def test_an_overlap_that_is_allowed(tmp_path):
+    """It runs; the buffers, too small for so many contacts, grow, and the report tells."""
+    text = scene_text(head="allow_initial_overlap = true\n" + SMALL_BUFFERS, **PLATE)
+    assert run(write(tmp_path / "scene.toml", text), "--out", tmp_path / "out", *SHORT_OUTPUT) == 0
+    assert report(tmp_path / "out")["buffer_growths"] == {"contacts": 1}
 
 
 def test_what_is_suspect_is_told(tmp_path):

@@ -130,7 +130,7 @@ def test_a_video_that_cannot_be_written(beam, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     monkeypatch.setattr(recording, "write_video", refuse)
     monkeypatch.setattr(recording, "find_ffmpeg", lambda: "ffmpeg")
-    assert run(beam, "--out", out, "--video", "--no-usd") == 3
+    assert run(beam, "--out", out, "--video", "--no-usd", "--seconds", "0.03") == 3
     assert_degraded(capsys.readouterr(), "cannot write video.mp4")
     assert report(out)["status"] == "degraded" and "cannot write video.mp4" in report(out)["problems"][-1]
 
