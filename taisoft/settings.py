@@ -3,6 +3,8 @@
 import difflib
 from dataclasses import dataclass
 
+import numpy as np
+
 from taisoft.contact.solve import SOLVERS
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
@@ -53,6 +55,13 @@ def check_positive(name: str, value, unit: str) -> float:
         return checks.number(value, name, above=0.0, unit=unit)
     except SceneError as error:
         raise SimulationError(str(error)) from None
+
+
+def check_count(name: str, value) -> int:
+    """value as an int; SimulationError unless it is an integer of at least 1."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise SimulationError(f"{name} must be an integer of at least 1, not {value!r}")
+    return int(value)
 
 
 def _check_tolerance(name: str, value) -> None:

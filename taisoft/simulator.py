@@ -17,7 +17,7 @@ from taisoft.records import RunReport, StepReport
 from taisoft.resuming import Resuming
 from taisoft.running import run
 from taisoft.scene.scene import Scene
-from taisoft.settings import check_settings, plan_of
+from taisoft.settings import check_count, check_settings, plan_of
 from taisoft.stability import scale_warnings
 from taisoft.stepping import make_stepper
 from taisoft.stepping.contact import SUNK, ContactStep
@@ -119,8 +119,11 @@ class Simulator(Resuming):
         return self.advance(1)
 
     def advance(self, n: int) -> StepReport:
-        """Up to n steps of dt, at least one: explicit ones in one launch, implicit ones one at a time."""
-        world, start = self._open_world(), self.step_count
+        """Up to n steps of dt, at least one: explicit ones in one launch, implicit ones one at a time.
+
+        Raises SimulationError as `step` does, and unless n is an integer of at least 1.
+        """
+        world, start, n = self._open_world(), self.step_count, check_count("n", n)
         if self.pulled is not None:
             most = batch(self._dt) if self.settings.explicit else 1
             n = min(n, most)

@@ -1,10 +1,13 @@
 /* Preloaded into a process: system calls fail as a broken disk's do, and the clock jumps.
 
-FAIL_CALL: fsync, rename or write; FAIL_NAME: what the file's path must hold. JUMP: seconds by which each reading of the clock
+FAIL_CALL: fsync, rename, write or, as of a disk that was mounted anew to be read only, change: opening for writing, rename and
+unlink. FAIL_NAME: what the file's path must hold, or several texts with | between them, one of which it must hold. JUMP: seconds by which each reading of the clock
 goes on or back. Both are looked up at each call, so that a process can change them. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
+#include <fcntl.h>
+#include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -14,7 +17,18 @@ goes on or back. Both are looked up at each call, so that a process can change t
 
 static int fails(const char *call, const char *path) {
     const char *which = getenv("FAIL_CALL"), *name = getenv("FAIL_NAME");
-    return which && name && *name && !strcmp(which, call) && path && strstr(path, name);
+    if (!which || !name || strcmp(which, call) || !path) return 0;
+    char names[4096], *rest = names;
+    snprintf(names, sizeof names, "%s", name);
+    for (char *one; (one = strsep(&rest, "|"));)
+        if (*one && strstr(path, one)) return 1;
+    return 0;
+}
+
+static int is_read_only(const char *path) {
+    if (!fails("change", path)) return 0;
+    errno = EROFS;
+    return 1;
 }
 
 static int fails_at(const char *call, int descriptor) {
@@ -31,7 +45,52 @@ int fsync(int descriptor) {
     return ((int (*)(int))dlsym(RTLD_NEXT, "fsync"))(descriptor);
 }
 
+static int open_as(const char *name, const char *path, int flags, mode_t mode) {
+    if ((flags & O_ACCMODE) != O_RDONLY && is_read_only(path)) return -1;
+    return ((int (*)(const char *, int, ...))dlsym(RTLD_NEXT, name))(path, flags, mode);
+}
+
+int open(const char *path, int flags, ...) {
+    va_list rest;
+    va_start(rest, flags);
+    mode_t mode = flags & (O_CREAT | O_TMPFILE) ? va_arg(rest, mode_t) : 0;
+    va_end(rest);
+    return open_as("open", path, flags, mode);
+}
+
+int open64(const char *path, int flags, ...) {
+    va_list rest;
+    va_start(rest, flags);
+    mode_t mode = flags & (O_CREAT | O_TMPFILE) ? va_arg(rest, mode_t) : 0;
+    va_end(rest);
+    return open_as("open64", path, flags, mode);
+}
+
+FILE *fopen(const char *path, const char *mode) {
+    if (strpbrk(mode, "wa+") && is_read_only(path)) return NULL;
+    return ((FILE *(*)(const char *, const char *))dlsym(RTLD_NEXT, "fopen"))(path, mode);
+}
+
+FILE *fopen64(const char *path, const char *mode) {
+    if (strpbrk(mode, "wa+") && is_read_only(path)) return NULL;
+    return ((FILE *(*)(const char *, const char *))dlsym(RTLD_NEXT, "fopen64"))(path, mode);
+}
+
+int mkstemp(char *path) {
+    return is_read_only(path) ? -1 : ((int (*)(char *))dlsym(RTLD_NEXT, "mkstemp"))(path);
+}
+
+int mkstemp64(char *path) {
+    return is_read_only(path) ? -1 : ((int (*)(char *))dlsym(RTLD_NEXT, "mkstemp64"))(path);
+}
+
+int unlink(const char *path) {
+    if (is_read_only(path)) return -1;
+    return ((int (*)(const char *))dlsym(RTLD_NEXT, "unlink"))(path);
+}
+
 int rename(const char *from, const char *to) {
+    if (is_read_only(to)) return -1;
     if (fails("rename", to)) { errno = EIO; return -1; }
     return ((int (*)(const char *, const char *))dlsym(RTLD_NEXT, "rename"))(from, to);
 }

@@ -8,8 +8,9 @@ LONG = {
     "test_fuzz": ("[10000-",),
     "test_determinism": ("[cube_implicit]", "[cubes_"),
     "test_faults": (
-        "test_a_disk_that_fails[others]", "test_killed_while_files_are_replaced[100]", "[300000000",
-        "[body-", "[ground-", "[nothing-implicit_euler]",
+        "test_a_disk_that_fails[others]", "test_killed_while_files_are_replaced[100]",
+        "test_a_run_that_is_killed[20]", "[300000000",
+        "[body-implicit_euler]", "[ground-", "[nothing-implicit_euler]",
         "test_a_buffer_that_grows",
     ),
     "test_references": (

@@ -13,7 +13,7 @@ import random
 import meshio
 import numpy as np
 import pytest
-from command import report, run, write
+from command import SHORT_OUTPUT, report, run, write
 
 import taisoft as ts
 from taisoft.checkpoint import read_checkpoint
@@ -168,7 +168,7 @@ SCENES = {
     "gravity_text": (scene_text(head='gravity = "down"'), "gravity must be numbers of shape (3,), not 'down'"),
     "gravity_large": (scene_text(head="gravity = [0, 1e300, 0]"), "gravity: entry [1] is 1e+300, too large for a 32-bit float"),
     "key": (scene_text(material="youngs_modulu = 1e5"), "part.material.youngs_modulu is not known (did you mean young?)"),
-    "gone": (scene_text('file = "gone.msh"'), "bodies.part.mesh: "),
+    "gone": (scene_text('file = "gone.msh"'), "gone.msh: there is no such file"),
     "kind": (scene_text().replace("{ shape", "7 # {"), "bodies.part.mesh must be a table, not 7"),
     "material": (scene_text().replace("{  }", '"ruber"', 1), "bodies.part.material 'ruber' is not among the materials"),
     "outside": (scene_text('file = "../../part.msh"'), "must lie inside the scene file's folder, without '..'"),
@@ -188,7 +188,7 @@ SCENES = {
 def test_bad_scenes(tmp_path, capsys, name):
     text, rule = SCENES[name]
     told = refusal(tmp_path, capsys, text.replace("CANARY", str(tmp_path / "canary")))
-    assert rule in told and not (tmp_path / "canary").exists()
+    assert "scene.toml" in told and rule in told and not (tmp_path / "canary").exists()
 
 
 def test_other_files_are_no_scenes(tmp_path, capsys):
@@ -206,7 +206,24 @@ def test_one_step_more_than_there_can_be(tmp_path, capsys):
         sim.run(1e30, fps=None)
 
 
+PLATE = {"mesh": 'shape = "box", cells = [9, 1, 9], size = [9, 1, 9]', "more": GROUND.replace("-2", "-0.49"),
+         "solver": 'dt = 0.01\nintegrator = "symplectic_euler"'}  # fmt: skip
+SMALL_BUFFERS = "[collision]\ninitial_capacity = 64\n"
+
+
+def test_an_overlap_at_the_start(tmp_path, capsys):
+    told = refusal(tmp_path, capsys, scene_text(head=SMALL_BUFFERS, **PLATE))
+    assert f"{tmp_path}/scene.toml: 'part' and 'ground' overlap at the start, 0.01 m deep: move them apart" in told
+
+
 # --- what runs, and is told -------------------------------------------------------------------------------------------
+
+
+def test_an_overlap_that_is_allowed(tmp_path):
+    """It runs; the buffers, too small for so many contacts, grow, and the report tells."""
+    text = scene_text(head="allow_initial_overlap = true\n" + SMALL_BUFFERS, **PLATE)
+    assert run(write(tmp_path / "scene.toml", text), "--out", tmp_path / "out", *SHORT_OUTPUT) == 0
+    assert report(tmp_path / "out")["buffer_growths"] == {"contacts": 1}
 
 
 def test_what_is_suspect_is_told(tmp_path):
@@ -238,7 +255,8 @@ def test_what_is_suspect_is_told(tmp_path):
         "edge.vtu: parts are joined at an edge only at 2 edges, the first is (24, 25)",
         "turned.vtu: 1 of 48 inverted tets have been flipped: 47",
         "far.vtu: the mesh lies 1e+06 m from the origin",
-        "body 'millimetres': 100 m long and 1e+09 kg, its own weight strains it by about 9.8; a wave crosses it in 10 s",
+        "body 'millimetres': 100 m long and 1e+09 kg, its own weight strains it by about 9.8; a wave crosses it in 10 s, "
+        "explicit steps must stay below ",
         "body '1 cube': poisson = 0.495 is above 0.49, where linear tets lock",
     ):
         assert sentence in told

@@ -102,13 +102,44 @@ def test_a_picture_that_cannot_be_written_ends_the_run(beam, tmp_path, monkeypat
 
 
 def test_a_report_that_cannot_be_written(beam, tmp_path, monkeypatch, capsys):
+    """Of a run that goes on, or of one in the place of an earlier run: the earlier report does not stay to tell of it."""
+
     def refuse(*_, **__):
         raise OutputError("cannot write report.json (9 bytes): No space left on device")
 
+    out = tmp_path / "out"
+    assert run(beam, "--out", out, *SHORT_OUTPUT) == 0 and report(out)["status"] == "ok"
+    before = (out / "report.json").read_bytes()
+    capsys.readouterr()
     monkeypatch.setattr(recording, "write_report", refuse)
-    assert run(beam, "--out", tmp_path / "out", *SHORT_OUTPUT) == 3
-    captured = capsys.readouterr()
-    assert "taisoft: cannot write report.json" in captured.err and "status   ok" in captured.out
+    assert run(beam, "--out", out, "--resume", out / "checkpoint.npz", "--seconds", "0.2", *SHORT_OUTPUT) == 3
+    assert_degraded(capsys.readouterr(), "cannot write report.json")
+    assert not (out / "report.json").exists() and (out / "steps.csv").exists()
+    (out / "report.json").write_bytes(before)
+    assert run(beam, "--out", out, "--overwrite", *SHORT_OUTPUT) == 3
+    assert_degraded(capsys.readouterr(), "cannot write report.json")
+    assert not (out / "report.json").exists() and not (out / "steps.csv").exists()
+
+
+def test_a_video_that_cannot_be_written(beam, tmp_path, monkeypatch, capsys):
+    """The report, written before it, tells of it too."""
+
+    def refuse(*_):
+        raise OutputError("cannot write video.mp4: No space left on device")
+
+    out = tmp_path / "out"
+    monkeypatch.setattr(recording, "write_video", refuse)
+    monkeypatch.setattr(recording, "find_ffmpeg", lambda: "ffmpeg")
+    assert run(beam, "--out", out, "--video", "--no-usd", "--seconds", "0.03") == 3
+    assert_degraded(capsys.readouterr(), "cannot write video.mp4")
+    assert report(out)["status"] == "degraded" and "cannot write video.mp4" in report(out)["problems"][-1]
+
+
+def assert_degraded(captured, *errors):
+    """The summary says so, and stderr has a line for each output that failed."""
+    assert "status   degraded" in captured.out and not re.search(r"\bok\b", captured.out)
+    told = captured.err.splitlines()
+    assert len(told) == len(errors) and all(line.startswith(f"taisoft: {error}") for line, error in zip(told, errors)), told
 
 
 def test_no_display_means_no_window(beam, monkeypatch, capsys):

@@ -6,33 +6,15 @@
 
 import io
 import re
-import struct
-import zlib
 
 import numpy as np
 import pytest
 from fake_simulator import FakeSimulator, beam_scene
+from png import decode
 
 from taisoft.output import progress
 from taisoft.output.frames import FrameWriter, png_bytes
 from taisoft.output.progress import Progress
-
-
-def decode(png):
-    """The picture in a PNG file of 8-bit RGB rows with filter "up", by the format's own rules."""
-    assert png[:8] == b"\x89PNG\r\n\x1a\n"
-    parts, at = {}, 8
-    while at < len(png):
-        (length,) = struct.unpack(">I", png[at : at + 4])
-        kind, data = png[at + 4 : at + 8], png[at + 8 : at + 8 + length]
-        (checksum,) = struct.unpack(">I", png[at + 8 + length : at + 12 + length])
-        assert checksum == zlib.crc32(kind + data)
-        parts[kind], at = data, at + 12 + length
-    width, height, *rest = struct.unpack(">IIBBBBB", parts[b"IHDR"])
-    assert rest == [8, 2, 0, 0, 0] and list(parts)[-1] == b"IEND"
-    rows = np.frombuffer(zlib.decompress(parts[b"IDAT"]), dtype=np.uint8).reshape(height, 1 + 3 * width)
-    assert (rows[:, 0] == 2).all()
-    return np.cumsum(rows[:, 1:], axis=0, dtype=np.uint8).reshape(height, width, 3)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (7, 5, 3), (48, 64, 3)])

@@ -263,14 +263,18 @@ def test_killed_at_any_time_leaves_files_that_open(tmp_path):
     old = (tmp_path / "old" / "scene.usdc").read_bytes()
     dice = random.Random(1)
     stopped = []
-    for attempt, told in enumerate([1, N_KILLED_FRAMES + 1, *dice.sample(range(2, N_KILLED_FRAMES), 4)]):
+    closing = [N_KILLED_FRAMES + 1] * 2  # with an earlier scene.usdc and without
+    for attempt, told in enumerate([1, *closing, *dice.sample(range(2, N_KILLED_FRAMES), 3)]):
         folder = tmp_path / str(attempt)
         folder.mkdir()
-        (folder / "scene.usdc").write_bytes(old)
+        before = old if attempt % 2 else None  # without an earlier scene.usdc there is the complete one or none
+        if before:
+            (folder / "scene.usdc").write_bytes(before)
         done = run_and_kill(folder, told, dice.uniform(0.0, 0.02))
         stopped.append(len(done))
         chunks = sorted((folder / "chunks").glob("*.usdc"))
-        if (folder / "scene.usdc").read_bytes() != old:
+        found = (folder / "scene.usdc").read_bytes() if (folder / "scene.usdc").exists() else None
+        if found != before:
             assert check_frames(folder / "scene.usdc", given) == N_KILLED_FRAMES
         else:
             firsts = [int(path.stem[-5:]) for path in chunks]

@@ -3,6 +3,7 @@
 * state is given as copies, in the order of the bodies, and taken only where it is right; reports and stresses are the
   oracle's; a reset and a second simulator repeat every bit;
 * gravity, dt and material numbers take effect at once and compile nothing;
+* a number of steps that is none is refused, and nothing changes;
 * a step that fails names body and vertex and leaves the last good state, from which it can go on;
 * a closed simulator says so, and so does one that is asked for a body it does not have;
 * a law that softens where it is squeezed is told with the first tet that is, once;
@@ -10,6 +11,7 @@
 """
 
 import gc
+import re
 import warnings
 
 import numpy as np
@@ -265,6 +267,15 @@ def test_the_scene_is_a_copy(sim):
         scene.bodies.pop()
         assert other.positions("flyer").shape == (8, 3) and not other.scene.gravity.any()
         assert len(other.scene.body("beam").constraints) == 1
+
+
+def test_numbers_of_steps_that_are_refused(sim):
+    before = sim.positions(), sim.velocities(), sim.time, sim.step_count
+    for n in (-1, 0, 2.5, True, np.True_, "3", float("nan"), None):
+        with pytest.raises(ts.SimulationError, match=f"^n must be an integer of at least 1, not {re.escape(repr(n))}$"):
+            sim.advance(n)
+    assert all(np.array_equal(a, b) for a, b in zip(before, (sim.positions(), sim.velocities(), sim.time, sim.step_count)))
+    assert sim.advance(np.int32(2)).steps == sim.step_count == (2 if sim.settings.explicit else 1)
 
 
 def test_a_failing_step(sim, beam):

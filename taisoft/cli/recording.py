@@ -20,40 +20,43 @@ from taisoft.view.plots import Plots
 
 
 class Observers:
-    """Hands every frame to its members; the first that cannot write asks the run to end, and the sentence is kept.
+    """Hands every frame to its members; the first that cannot write asks the run to end, and all such sentences are kept.
 
-    error: the OutputError, or None; seconds: wall time spent in the members [s]. A member has frame(sim, index) and
-    close().
+    errors: what each OutputError said, each text once; seconds: wall time spent in the members [s]. A member has
+    frame(sim, index) and close().
     """
 
     def __init__(self) -> None:
         self.members: list = []
-        self.error: OutputError | None = None
+        self.errors: list[str] = []
         self.seconds = 0.0
 
     def on_frame(self, sim, index: int, _report) -> None:
         """For Simulator.run. Never raises OutputError: what was computed must still be reported."""
         start = time.perf_counter()
         for member in self.members:
-            if self.error is None:
+            if not self.errors:
                 self.guard(member.frame, sim, index)
         self.seconds += time.perf_counter() - start
 
     def failed(self) -> bool:
-        """True once a member could not write."""
-        return self.error is not None
+        """True once something could not be written."""
+        return bool(self.errors)
 
     def close(self) -> None:
         """Closes the members, last first, each of them whatever the others do."""
         while self.members:
             self.guard(self.members.pop().close)
 
-    def guard(self, write, *arguments) -> None:
-        """write(*arguments); its OutputError is kept, if it is the first, and not raised."""
+    def guard(self, write, *arguments) -> bool:
+        """write(*arguments), and whether it could be written; an OutputError is kept and not raised."""
         try:
             write(*arguments)
         except OutputError as error:
-            self.error = self.error or error
+            if str(error) not in self.errors:
+                self.errors.append(str(error))
+            return False
+        return True
 
 
 class Recording:

@@ -3,7 +3,8 @@
 import os
 import sys
 from argparse import Namespace
-from contextlib import ExitStack, closing
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from taisoft.checkpoint import Checkpoint
@@ -42,7 +43,8 @@ def command(arguments: Namespace) -> int:
             settings = resolve(solver, arguments, Simulator)
             if arguments.out is not None:
                 check_free(arguments.out, arguments.overwrite)
-            sim = Simulator(scene, **settings.simulator | ({"pullable": True} if watched else {}))  # by the mouse
+            with _naming(arguments.scene):
+                sim = Simulator(scene, **settings.simulator | ({"pullable": True} if watched else {}))  # by the mouse
         else:
             saved = read_last_good(arguments.resume)
             kept = saved.settings | ({"fps": saved.notes["fps"]} if "fps" in saved.notes else {})  # frames have numbers
@@ -54,8 +56,18 @@ def command(arguments: Namespace) -> int:
             if watched:
                 return _watch(sim, settings, shown)
             _check_time_left(sim, settings, arguments)
-            check_length(settings.seconds, sim.dt, settings.fps)
+            with _naming(arguments.scene):
+                check_length(settings.seconds, sim.dt, settings.fps)
             return _run(sim, settings, arguments, signals, told, has_window, every, saved, shown)
+
+
+@contextmanager
+def _naming(scene: str) -> Iterator[None]:
+    """Why the scene cannot be simulated as it was asked for is told with its name."""
+    try:
+        yield
+    except (SceneError, SimulationError) as error:
+        raise type(error)(f"{scene}: {error}") from error
 
 
 def _checkpoint_interval(arguments: Namespace) -> float | None:
@@ -152,15 +164,18 @@ def _run(
                 result.problems.append(str(error))
                 result.status = "failed"
         result.problems[:0] = [f"warning: {text}" for text in told]
-        if observers.error is not None:
-            _tell_failed_output(result, observers, signals)
+        _tell_failed_output(result, observers, signals)
         if recording is not None:
-            observers.guard(recording.report, result, sim, settings)
-            if arguments.video and not signals.asked():
-                observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
+            reported = observers.guard(recording.report, result, sim, settings)
+            video = arguments.video and not signals.asked()
+            filmed = not video or observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
+            _tell_failed_output(result, observers, signals)
+            if reported and not filmed:
+                observers.guard(recording.report, result, sim, settings)  # anew, with what became of the video
         print_summary(result, sim, observers, recording)
-    if observers.error is not None:
-        print(f"taisoft: {observers.error}", file=sys.stderr)
+    if observers.failed():
+        for error in observers.errors:
+            print(f"taisoft: {error}", file=sys.stderr)
         return EXIT_OUTPUT
     if signals.number is not None:
         return EXIT_SIGNAL + signals.number
@@ -174,8 +189,9 @@ def _open_window(sim: Simulator, shown: Shown, plots: Plots):
 
 
 def _tell_failed_output(result: RunReport, observers: Observers, signals: Signals) -> None:
-    """The run's report tells of the output that failed: report.json may still fit where a picture did not."""
-    result.problems.append(str(observers.error))
-    result.interrupted = signals.asked()
-    if result.status == "ok":
+    """The run's report tells of all output that failed: report.json may still fit where a picture did not."""
+    result.problems += [error for error in observers.errors if error not in result.problems]
+    if observers.failed():
+        result.interrupted = result.interrupted and signals.asked()
+    if observers.failed() and result.status == "ok":
         result.status = "degraded"

@@ -18,6 +18,7 @@ __all__ = [
 
 LOCK_NAME = "taisoft.lock"
 RESULT_FILES = ("report.json", "steps.csv", "scene.usdc", "checkpoint.npz", "checkpoint.previous.npz", "video.mp4")
+TELLING_FILES = ("report.json", "steps.csv")  # what tells of a run: beside the results of another one they would lie
 RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc"}  # folder -> the files in it that are ours
 
 
@@ -47,10 +48,10 @@ class OutputFolder:
     """A run's folder: created or taken over, checked, and locked until `close`.
 
     path: created where absent; an empty folder, or one with files that are not a run's, is accepted. overwrite: take a
-    folder that holds results: frames and chunks go at once, each other file when its successor is complete. first: of a run
-    that goes on, the number of its first frame; results are accepted, what is before it stays, what comes after goes with
-    `clear`, and other files go only for their successors. Raises OutputError when the folder cannot be written, another
-    process writes to it, or it holds results without overwrite.
+    folder that holds results: report.json, steps.csv, frames and chunks go at once, each other file when its successor is
+    complete. first: of a run that goes on, the number of its first frame; results are accepted, what is before it stays, what
+    comes after goes with `clear`, as report.json does, and other files go only for their successors. Raises OutputError when
+    the folder cannot be written, another process writes to it, or it holds results without overwrite.
     """
 
     def __init__(self, path: str | Path, overwrite: bool = False, first: int | None = None):
@@ -60,6 +61,7 @@ class OutputFolder:
             self._old = check_free(path, overwrite) if first is None else {}
             _clear_parts(self.path)
             if first is None:
+                _remove(self.path, *TELLING_FILES)
                 _clear_frames(self.path, 0)
             _probe(self.path)
         except OSError as error:
@@ -70,8 +72,9 @@ class OutputFolder:
             raise
 
     def clear(self, first: int) -> None:
-        """Remove an earlier run's frames and chunks from that number on. Raises OutputError."""
+        """Remove report.json, and an earlier run's frames and chunks from that number on. Raises OutputError."""
         try:
+            _remove(self.path, "report.json")
             _clear_frames(self.path, first)
         except OSError as error:
             raise OutputError(f"cannot write to the output folder {self.path}: {error.strerror or error}") from error
@@ -170,13 +173,21 @@ def _clear_frames(folder: Path, first: int) -> None:
                 file.unlink()
 
 
+def _remove(folder: Path, *names: str) -> None:
+    """Remove files, where they are there; what is a folder is left for `_probe`."""
+    for name in names:
+        if not (folder / name).is_dir():
+            (folder / name).unlink(missing_ok=True)
+
+
 def _clear_parts(folder: Path) -> None:
-    """Remove what a killed writer left under temporary names."""
+    """Remove what a killed writer left under temporary names: ours, and those that USD gives while it writes ours."""
+    temporary = "[0-9]*-[0-9]*.*"  # see `taisoft.files.part_path`; USD has another ending than .part
     for name, pattern in RESULT_FOLDERS.items():
-        for file in (folder / name).glob(f"{pattern}.*.part"):
+        for file in (folder / name).glob(f"{pattern}.{temporary}"):
             file.unlink()
     for name in RESULT_FILES:
-        for file in folder.glob(f"{name}.*.part"):
+        for file in folder.glob(f"{name}.{temporary}"):
             file.unlink()
 
 

@@ -18,6 +18,7 @@ An obstacle is `/World/<name>` with `surface` and `material`; its points change 
 whose square lies wholly within others is left out. `/View` holds a camera and lights (`usd_view.py`).
 """
 
+import re
 from contextlib import suppress
 from pathlib import Path
 
@@ -278,6 +279,6 @@ def _remove_chunks(chunks: Path) -> None:
 
 
 def _last_line(error: Exception) -> str:
-    """The gist of a USD error, whose text is a list of source locations."""
+    """The gist of a USD error, whose text is a list of source locations, each with what went wrong there in quotes."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else type(error).__name__
+    return re.sub(r"^Error in '.*' at line \d+ in file \S+ : '(.*)'$", r"\1", lines[-1]) if lines else type(error).__name__
