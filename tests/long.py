@@ -63,6 +63,7 @@ LONG = {
         "integrators[symplectic_euler-1]", "integrators[implicit_euler-1]", "integrators[bdf2-2]",
         "integrators[implicit_midpoint-2]", "test_refinement", "test_a_run_that_fails",
     ),
+    "test_crossings": ("test_all_pairs_by_separating_axes[f32-spatial_hash-False]",),
     "test_self_collision": ("test_folded_sheets_against_ipctk[f32]",),
 }
 
