@@ -25,7 +25,7 @@ from taisoft.scene.body import Body
 from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.scene import Material, Scene
 
-KIND, FORMAT = "taisoft checkpoint", 2  # FORMAT grows with every change of what a file holds
+KIND, FORMAT = "taisoft checkpoint", 3  # FORMAT grows with every change of what a file holds
 PARTS = ("settings", "numbers", "marks", "state", "notes")  # of the header, each a table
 
 

@@ -186,9 +186,7 @@ class Simulator(Resuming):
         found = []
         if not report.converged and not self.settings.explicit:
             found.append(
-                f"Newton stopped after {report.newton_iterations} iterations"
-                + (f", at last in {report.parts} parts of the step," if report.parts > 1 else "")
-                + f" at a relative residual of {report.residual:.2e}"
+                f"Newton stopped after {report.newton_iterations} iterations at a relative residual of {report.residual:.2e}"
                 + (f", that of the contacts {report.contact_residual:.2e}" if report.n_contacts else "")
             )
         elif not report.converged:

@@ -255,7 +255,7 @@ def test_newer_files_are_told_from_damaged_ones(saved, tmp_path):
         return np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
 
     text = refusal(changed(saved, tmp_path / "newer.npz", "header", newer))
-    assert "written by taisoft 9.1 in format 99, and taisoft" in text and "reads format 2" in text
+    assert "written by taisoft 9.1 in format 99, and taisoft" in text and "reads format 3" in text
 
 
 def renamed(scene):

@@ -115,6 +115,7 @@ class ImplicitStepper:
 
     def forget(self) -> None:
         """The past is void: the state was set."""
+        self._recovers = True  # whether smaller parts may help; where they did not, not before a step converges again
         self._past = 0  # steps whose state is in the history
         self._beta = self._dt = 0.0  # of the last step
         if self.contact is not None:
@@ -128,7 +129,7 @@ class ImplicitStepper:
     def snapshot(self) -> dict:
         """What the next step rests on beside the world: the history, what the solver keeps, the contacts."""
         x, v = download([self.history.x_now, self.history.v_now])
-        kept = {"past": self._past, "beta": self._beta, "dt": self._dt, "x_now": x, "v_now": v}
+        kept = {"past": self._past, "beta": self._beta, "dt": self._dt, "recovers": self._recovers, "x_now": x, "v_now": v}
         if self.contact is not None:
             kept["contact"] = self.contact.snapshot()
         return kept | {"solver": self.solver.snapshot()}
@@ -137,6 +138,7 @@ class ImplicitStepper:
         """Back to what `snapshot` told. x_before and v_before need not be: a step begins by writing them."""
         upload([(self.history.x_now, kept["x_now"]), (self.history.v_now, kept["v_now"])])
         self._past, self._beta, self._dt = int(kept["past"]), float(kept["beta"]), float(kept["dt"])
+        self._recovers = bool(kept["recovers"])
         if self.contact is not None:
             self.contact.restore(kept["contact"])
         self.solver.restore(kept["solver"])  # after the contacts, whose fields it looks at
@@ -144,8 +146,9 @@ class ImplicitStepper:
     def step(self, dt: float) -> StageResult:
         """One step of dt; on a non-finite result the state is put back and SimulationError raised.
 
-        One that does not converge is done again in smaller parts; with contacts it is cut into parts where bodies close so fast
-        that they could pass each other unseen, and done again where it ended with something newly deep in each other or crossed.
+        One that does not converge is done again in smaller parts, and where these do not help as it was. With contacts it is cut
+        into parts where bodies close so fast that they could pass each other unseen, and done again in smaller ones where it
+        ended with something newly deep in each other or crossed.
         """
         contact, start, parts, kept, given_up = self.contact, self.world.time, 1, None, []
         released = self.world.motion.released()
@@ -157,6 +160,7 @@ class ImplicitStepper:
             # what is deep already needs no shorter steps
             allowed, allowed_crossing = max(SUNK, 1.1 * sinking), max(CROSSED_FAR, 1.1 * contact.crossing)
             kept = self.world.state()
+        least = parts  # that it takes even if it converges
         while True:
             try:
                 result = self._in_parts(start, dt, parts)
@@ -168,7 +172,12 @@ class ImplicitStepper:
                 raise
             deep = contact is not None and (contact.sinking > allowed or contact.crossing > allowed_crossing)
             lost = not (result.converged or self.scheme.one_iteration)
-            if not (deep or lost) or 2 * parts > (MORE_PARTS if deep else RETRIES):
+            if deep and 2 * parts <= MORE_PARTS:
+                least = parts = 2 * parts
+            elif lost and self._recovers and (2 * parts <= RETRIES or parts > least):
+                self._recovers = 2 * parts <= RETRIES
+                parts = 2 * parts if self._recovers else least
+            else:
                 break
             if kept is None:
                 restore(self.world.model, self.history)
@@ -180,8 +189,8 @@ class ImplicitStepper:
             elif contact is not None:
                 contact.start_again()
             given_up.append(result)
-            parts *= 2
         self.parts = parts
+        self._recovers = self._recovers or not lost
         if contact is not None:
             contact.penetration = depth
         return count_all(result, given_up)
