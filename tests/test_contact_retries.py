@@ -45,7 +45,7 @@ def sim(shared_sim):
     return shared_sim
 
 
-def patch_end(sim, monkeypatch, events: dict) -> list:
+def patch_end(sim, monkeypatch, events: dict, tells: str = "sinking") -> list:
     """events: by the number of the call of the step's look at its end, an exception or how deep it tells, in edges."""
     calls, end = [], sim._contact.end
 
@@ -56,14 +56,15 @@ def patch_end(sim, monkeypatch, events: dict) -> list:
         if isinstance(event, Exception):
             raise event
         if event is not None:
-            sim._contact.sinking = event
+            setattr(sim._contact, tells, event)
         return depth
 
     monkeypatch.setattr(sim._contact, "end", told)
     return calls
 
 
-def test_a_step_that_ended_too_deep_is_done_again(sim, monkeypatch):
+@pytest.mark.parametrize("tells, depth", [("sinking", 1.0), ("crossing", 3e-3)])
+def test_a_step_that_ended_too_deep_is_done_again(sim, monkeypatch, tells, depth):
     sim.dt = DT / 2
     halves = [sim.step() for _ in range(2)]
     wanted = sim.positions(), sim.velocities(), sim.contact_force("ground")
@@ -74,13 +75,13 @@ def test_a_step_that_ended_too_deep_is_done_again(sim, monkeypatch):
     coarse = sim.positions()
     assert np.abs(coarse - wanted[0]).max() > 1e-6  # [m]
     sim.reset()
-    calls = patch_end(sim, monkeypatch, {1: 1.0})
+    calls = patch_end(sim, monkeypatch, {1: depth}, tells)
     report = sim.step()
     assert calls == [(DT, DT), (DT / 2, DT / 2), (DT, DT)] and report.max_penetration < 1e-9
     assert np.abs(sim.positions() - wanted[0]).max() < 1e-8 and np.abs(sim.velocities() - wanted[1]).max() < 1e-6
     work = [r.newton_iterations for r in (report, whole, *halves)]
     assert whole.newton_iterations < report.newton_iterations and work[0] > max(work[1:])
-    assert report.converged and sim.step_count == 1 and sim.time == DT
+    assert report.converged and report.parts == 2 and sim.step_count == 1 and sim.time == DT
 
 
 def test_a_try_that_fails_leaves_the_state_before_the_step(sim, monkeypatch):

@@ -125,7 +125,8 @@ def test_folder_with_results_is_refused(tmp_path, result):
 def test_overwriting_removes_what_the_new_run_does_not_replace(tmp_path):
     (tmp_path / "frames").mkdir()
     (tmp_path / "chunks").mkdir()
-    mine, left_over = ("notes.txt", "frames/mine.png"), ("frames/00007.png", "scene.usdc.1-0.part")
+    mine = ("notes.txt", "report.json.2026-11-22.bak", "frames/mine.png")
+    left_over = ("frames/00007.png", "scene.usdc.1-0.part")
     left_over += ("chunks/points_00000.usdc.123-7.part", "chunks/points_00010.usdc.123-8.jtZrXE")  # USD's own
     for name in ("report.json", "scene.usdc", *mine, *left_over):
         (tmp_path / name).write_text("old")
@@ -134,7 +135,7 @@ def test_overwriting_removes_what_the_new_run_does_not_replace(tmp_path):
         assert (tmp_path / "scene.usdc").read_text() == "old"  # until its successor is complete
         write_bytes(tmp_path / "report.json", b"new")
         write_bytes(tmp_path / "report.json", b"newer")
-    assert names(tmp_path) == ["chunks", "frames", "notes.txt", "report.json"]
+    assert names(tmp_path) == ["chunks", "frames", "notes.txt", "report.json", "report.json.2026-11-22.bak"]
     assert (tmp_path / "report.json").read_text() == "newer"
 
 

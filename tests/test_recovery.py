@@ -1,9 +1,10 @@
 """Implicit steps that do not converge:
 
 * one that does in two parts is that of two half steps, and says in how many parts it was taken and what all tries cost;
-* one that does in none ends as if there had been no other try, told as not converged; the next ones are not tried in parts before
-  one converges;
-* nodes that it let go hold on again for the next try; where a try fails, the state is that before the step.
+* one that does in none is done anew as it was, and told as not converged; the next ones are not tried in parts before one
+  converges;
+* nodes that it let go hold on again for the next try; a try in parts that fails is one that does not help; where the step fails,
+  the state is that before it.
 """
 
 import dataclasses
@@ -76,19 +77,26 @@ def test_one_that_never_does_is_told(sim, monkeypatch):
     assert np.abs(sim.positions() - x).max() < 1e-12  # [m], as if there had been no other try
 
 
-def test_a_try_that_fails_leaves_the_state_before_the_step(sim, monkeypatch):
-    before = sim.positions(), sim.velocities()
-    monkeypatch.setattr(implicit, "MAX_NEWTON", 2)
+def failing_at(sim, monkeypatch, call: int, error: BaseException):
+    """Have the solver raise at its call of that number."""
     solve, calls = sim._stepper.solver.solve, []
 
     def failing(*arguments, **named):
         calls.append(arguments)
-        if len(calls) == 3:  # the second part of the second try
-            raise ts.SimulationError("no room")
+        if len(calls) == call:
+            raise error
         return solve(*arguments, **named)
 
     monkeypatch.setattr(sim._stepper.solver, "solve", failing)
-    with pytest.raises(ts.SimulationError, match="no room"):
+
+
+@pytest.mark.parametrize("call, error", [(1, ts.SimulationError("no room")), (3, KeyboardInterrupt())])
+def test_where_a_step_fails_the_state_is_that_before_it(sim, monkeypatch, call, error):
+    """The first try, after nodes were let go, and Ctrl-C in the second part of the second one."""
+    before = sim.positions(), sim.velocities()
+    monkeypatch.setattr(implicit, "MAX_NEWTON", 2)
+    failing_at(sim, monkeypatch, call, error)
+    with pytest.raises(type(error)):
         sim.step()
     assert np.array_equal(sim.positions(), before[0]) and np.array_equal(sim.velocities(), before[1])
     assert sim.time == 0.0 and sim.step_count == 0 and not any(sim._world.motion.released())
@@ -98,3 +106,16 @@ def test_a_try_that_fails_leaves_the_state_before_the_step(sim, monkeypatch):
     sim.reset()
     sim.step()
     assert np.abs(sim.positions() - first).max() < 1e-12  # [m]
+
+
+def test_where_a_try_in_parts_fails_the_step_is_told_as_not_converged(sim, monkeypatch):
+    monkeypatch.setattr(implicit, "MAX_NEWTON", 2)
+    monkeypatch.setattr(implicit, "RETRIES", 1)
+    sim.step()
+    wanted = sim.positions()
+    sim.reset()
+    monkeypatch.setattr(implicit, "RETRIES", 2)
+    failing_at(sim, monkeypatch, 3, ts.SimulationError("spoilt"))
+    report = sim.step()
+    assert not report.converged and report.parts == 1 and np.abs(sim.positions() - wanted).max() < 1e-12  # [m]
+    assert any(sim._world.motion.released())

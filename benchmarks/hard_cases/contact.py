@@ -195,7 +195,8 @@ BUCKLES = "a column of 5 m is higher than the 4.05 m from which a bar of this ma
 C2 = Case(
     "C2", "five cubes on each other", stack,
     tuple(
-        Variant(f"start {seed}", {"dt": 0.025, "integrator": IMPLICIT}, {"seed": seed}, (OK, DEGRADED)) for seed in range(10)
+        Variant(f"start {seed}", {"dt": 0.025, "integrator": IMPLICIT}, {"seed": seed}, (OK, DEGRADED), reference=seed == 0)
+        for seed in range(10)
     ),
     (
         Criterion("height less 4.877 m, mean of 1.5 to 2.5 s [m]", 0.02, ANALYTIC, note=f"not asked at the end: {BUCKLES}"),

@@ -95,7 +95,7 @@ def relate(s: ti.template(), i, u):
         c0, c1, c2 = s.rest[s.triangle[u, 0]], s.rest[s.triangle[u, 1]], s.rest[s.triangle[u, 2]]
         apart = s.rest[i] - (w[0] * c0 + w[1] * c1 + w[2] * c2)
         own = int(distance > ti.cast(THROUGH, ti.f64) * apart.norm())
-        if h < 0.0:
+        if h < 0.0 and (s.rest[i] - c0).dot((c1 - c0).cross(c2 - c0)) < 0.0:  # not across a slot, where it lies before the face
             own = int(distance > through(s, s.body[u], apart.norm()))
         if state == BESIDE or (own == 1 and state == INSIDE):
             state = NONE

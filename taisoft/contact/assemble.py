@@ -1,10 +1,10 @@
 """From contacts that were found to the contact problem: frames, weights, numbers of each pair, warm start.
 
 Where a contact must be at the end of a step, its goal, is a gap of at least `standoff`, a small distance that keeps surfaces
-apart in spite of what linearising the motion misses; OWN times that within a body. A gap above it may close so far. A gap below
-it opens slowly, a true penetration in a few steps, and never faster than strains the softest body by a percent: else bodies
-would fly apart. Where the surfaces meet within the step, restitution asks that they part with e times the speed at which they
-met. The velocity that an impulse must leave is then
+apart in spite of what linearising the motion misses. A gap above it may close so far. A gap below it opens slowly, a true
+penetration in a few steps, and never faster than strains the softest body by a percent: else bodies would fly apart. Parts of
+one body keep OWN times the standoff and are mended OWN times as fast. Where the surfaces meet within the step, restitution asks
+that they part with e times the speed at which they met. The velocity that an impulse must leave is then
     u_n = (gap - goal)/dt + n.(v_a - v_b) >= 0,
 which counts motion once: the gap is that at the start of the step.
 """

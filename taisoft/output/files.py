@@ -5,6 +5,7 @@ lock is free.
 """
 
 import os
+import re
 from contextlib import suppress
 from pathlib import Path
 
@@ -19,6 +20,8 @@ __all__ = [
 LOCK_NAME = "taisoft.lock"
 RESULT_FILES = ("report.json", "steps.csv", "scene.usdc", "checkpoint.npz", "checkpoint.previous.npz", "video.mp4")
 TELLING_FILES = ("report.json", "steps.csv")  # what tells of a run: beside the results of another one they would lie
+# What a writer that was killed leaves: see `taisoft.files.part_path`; USD writes beside that under an ending of its own
+TEMPORARY = re.compile(r"\.\d+-\d+\.part$|\.usdc\.\d+-\d+\.[A-Za-z0-9]{6}$")
 RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc"}  # folder -> the files in it that are ours
 
 
@@ -182,12 +185,10 @@ def _remove(folder: Path, *names: str) -> None:
 
 def _clear_parts(folder: Path) -> None:
     """Remove what a killed writer left under temporary names: ours, and those that USD gives while it writes ours."""
-    temporary = "[0-9]*-[0-9]*.*"  # see `taisoft.files.part_path`; USD has another ending than .part
-    for name, pattern in RESULT_FOLDERS.items():
-        for file in (folder / name).glob(f"{pattern}.{temporary}"):
-            file.unlink()
-    for name in RESULT_FILES:
-        for file in folder.glob(f"{name}.{temporary}"):
+    found = [file for name, pattern in RESULT_FOLDERS.items() for file in (folder / name).glob(f"{pattern}.*")]
+    found += [file for name in RESULT_FILES for file in folder.glob(f"{name}.*")]
+    for file in found:
+        if TEMPORARY.search(file.name):
             file.unlink()
 
 

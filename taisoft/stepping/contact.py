@@ -48,7 +48,7 @@ class ContactStep:
         d = self.detection
         self.standoff = STANDOFF * float(d.edges[: len(scene.bodies)].min())
         if d.margin > 0.0:
-            self.standoff = min(self.standoff, 0.5 * d.margin / OWN)
+            self.standoff = min(self.standoff, 0.5 * d.margin / (OWN if self_collision else 1.0))
         # what follows a path may be changed from outside between two steps, and its path may end with the last one
         self._follows = world.motion.n_moved > 0 or any(o.path is not None for o in scene.obstacles)
         self._shares = FAST[explicit], SLOW[explicit]
@@ -278,7 +278,7 @@ class ContactStep:
         most in it, over what they may."""
         self.search(time, dt)
         told = self._survey(dt)
-        if self.crossing is None:
+        if self.crossing is None or self._follows:
             self.cross()
         return max(float(told[SINKING]), self.crossing), float(told[HASTE])
 

@@ -146,9 +146,10 @@ class ImplicitStepper:
     def step(self, dt: float) -> StageResult:
         """One step of dt; on a non-finite result the state is put back and SimulationError raised.
 
-        One that does not converge is done again in smaller parts, and where these do not help as it was. With contacts it is cut
-        into parts where bodies close so fast that they could pass each other unseen, and done again in smaller ones where it
-        ended with something newly deep in each other or crossed.
+        One that does not converge is done again in smaller parts, and where these do not help in those of before, anew and
+        without the past. With contacts it is cut into parts where bodies close so fast that they could pass each other unseen,
+        and done again in smaller ones where it ended with something newly deep in each other or crossed. Linearly implicit steps
+        have nothing that could converge.
         """
         contact, start, parts, kept, given_up = self.contact, self.world.time, 1, None, []
         released = self.world.motion.released()
@@ -162,16 +163,24 @@ class ImplicitStepper:
             kept = self.world.state()
         least = parts  # that it takes even if it converges
         while True:
+            result, depth, deep, lost = None, 0.0, False, True
             try:
+                if contact is not None:
+                    contact.sinking = sinking
                 result = self._in_parts(start, dt, parts)
-                depth = 0.0 if contact is None else contact.end(start + dt, dt)
-            except BaseException:  # of Ctrl-C, too: the step is abandoned
-                if kept is not None:
-                    self._put_back(*kept, released)
+                lost = not (result.converged or self.scheme.one_iteration)
+                if contact is not None:
+                    depth = contact.end(start + dt, dt)
+                    deep = contact.sinking > allowed or contact.crossing > allowed_crossing
+            except BaseException as error:  # of Ctrl-C, too: the step is abandoned
+                self._put_back(kept, released)
+                recovers = self._recovers
                 self.forget()
-                raise
-            deep = contact is not None and (contact.sinking > allowed or contact.crossing > allowed_crossing)
-            lost = not (result.converged or self.scheme.one_iteration)
+                if parts <= least or not isinstance(error, SimulationError):
+                    raise
+                self._recovers = recovers  # it was only a try
+            if result is not None:
+                given_up.append(result)
             if deep and 2 * parts <= MORE_PARTS:
                 least = parts = 2 * parts
             elif lost and self._recovers and (2 * parts <= RETRIES or parts > least):
@@ -182,18 +191,17 @@ class ImplicitStepper:
             if kept is None:
                 restore(self.world.model, self.history)
                 kept = self.world.state()
-            self._put_back(*kept, released)
+            self._put_back(kept, released)
             self._past = 0
-            if contact is not None and self.scheme.before:  # it tells impacts by contacts that bore nothing in the step before
+            if contact is not None and (lost or self.scheme.before):  # BDF2 tells impacts by what bore nothing in the last step
                 contact.forget()
             elif contact is not None:
                 contact.start_again()
-            given_up.append(result)
         self.parts = parts
         self._recovers = self._recovers or not lost
         if contact is not None:
             contact.penetration = depth
-        return count_all(result, given_up)
+        return count_all(result, given_up[:-1])
 
     def _in_parts(self, start: float, dt: float, parts: int) -> StageResult:
         """A step of dt from a time, in equal parts."""
@@ -212,9 +220,11 @@ class ImplicitStepper:
             self.contact.end_part()
         return merge(results)
 
-    def _put_back(self, x: np.ndarray, v: np.ndarray, released: list[bool]) -> None:
+    def _put_back(self, state: tuple[np.ndarray, np.ndarray] | None, released: list[bool]) -> None:
+        """Back to a state, None where it has been put back, and to what had let go then."""
         world = self.world
-        world.set_state(x, v)
+        if state is not None:
+            world.set_state(*state)
         if world.motion.released() != released:
             world.motion.set_released(released)
             world.upload_constraints()
@@ -234,7 +244,7 @@ class ImplicitStepper:
                 self.world.set_state(*state)
                 break
             self._past = 0
-            result = merge([result, self._try_part(time, dt)])
+            result = count_all(self._try_part(time, dt), [result])
             self._past = min(self._past, past)
         return result
 
