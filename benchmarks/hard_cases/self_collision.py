@@ -158,7 +158,7 @@ S1 = Case(
         Criterion(DEEPEST, 5e-3, PROPOSED, of={"seconds": 5.0}),
     ),
     size=1.0,
-    shortfall="level A is clean; from 600 degrees on (t = 4.2 s) the roll squeezes tets to a tenth of their volume and less, steps "
+    shortfall="level A is clean; from 600 degrees on (4.2 s) the roll squeezes tets to a tenth of their volume and less, steps "
     "do not converge in parts either, tets turn inside out and triangles cross where their layer is. Next: contacts that do not "
     "press a tet further than a bound of its volume, which gives way before it turns inside out.",
 )  # fmt: skip
