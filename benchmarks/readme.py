@@ -20,6 +20,7 @@ from taisoft.output.files import write_bytes
 from taisoft.output.tables import markdown
 
 from .document import RESULTS
+from .hard_cases import CASES
 from .order_cases import HANGING
 from .order_table import DEFAULT_DEGREE, GOAL
 from .reference_cases.record import label
@@ -94,6 +95,20 @@ def peers(results: Path) -> str:
     return f"{compare_table(shown)}\n\nMeasured on: {where}."
 
 
+def collision(results: Path) -> str:
+    """A whole search for contacts by scene, by proximity and by distance fields."""
+    numbers = newest(results, "collision")
+    rows = {(row["setup"], row["geometry"]): row for row in numbers["scenes"] + numbers["piles"] if not row["failure"]}
+    lines = []
+    for (setup, geometry), row in rows.items():
+        other = rows.get((setup, "distance_field"))
+        if geometry == "proximity" and other is not None:
+            times = [f"{1e3 * median(one['whole']):.3g}" for one in (row, other)]
+            lines.append((setup, *[f"{row[name]:,}" for name in ("tets", "triangles", "pairs", "contacts")], *times))
+    headings = ("scene", "tets", "triangles", "pairs of near ones", "contacts", "proximity [ms]", "distance fields [ms]")
+    return f"{markdown(headings, lines, left=(0,))}\n\nMeasured on: {measured_on(numbers)}."
+
+
 def scaling(results: Path) -> str:
     """Time and memory a tet on the smallest and the largest mesh, and how the time grows between them."""
     numbers = newest(results, "scaling")
@@ -110,8 +125,23 @@ def scaling(results: Path) -> str:
     return f"{markdown(headings, lines, left=(0,))}\n\nMeasured on: {measured_on(numbers)}."
 
 
+def hard(results: Path) -> str:
+    """The hard cases: how many variants keep all their limits, and what the others miss."""
+    numbers = newest(results, "hard")
+    lines = []
+    for case in CASES:
+        own = [row for row in numbers["rows"] if row["case"] == case.id]
+        ran = [row for row in own if row["run"] is not None]
+        missed = [v["quantity"] for row in ran for v in row["verdicts"] if v["passed"] is False]
+        seconds = sum(row["run"]["seconds"] for row in ran)
+        kept = f"{sum(row['passed'] for row in ran)} of {len(own)}"
+        lines.append((case.id, case.name, kept, f"{seconds:.3g}", "; ".join(dict.fromkeys(missed))))
+    table = markdown(("case", "", "variants that keep all limits", "wall [s]", "missed by others"), lines, left=(0, 1, 4))
+    return f"{table}\n\nMeasured on: {numbers['processor']}, {numbers['cores']} cores, {numbers['arch']}, {numbers['date'][:10]}."
+
+
 TABLES: dict[str, Callable[[Path], str]] = {  # by marker
-    "order_errors": order_errors, "order_times": order_times, "peers": peers, "scaling": scaling,
+    "order_errors": order_errors, "order_times": order_times, "peers": peers, "scaling": scaling, "collision": collision, "hard": hard,
 }  # fmt: skip
 
 
