@@ -1,6 +1,6 @@
 """The falling beam of exact_path.py in taisoft: its scene, its steps, its tip's path, its memory.
 
-Below model.PARALLEL_FROM tets taisoft steps on one thread of the CPU, and so does MuJoCo: one core against one.
+Below model.PARALLEL_FROM tets or PARALLEL_THREADS threads taisoft steps on one thread of the CPU, and so does MuJoCo.
 """
 
 import math

@@ -141,7 +141,8 @@ def hard(results: Path) -> str:
 
 
 TABLES: dict[str, Callable[[Path], str]] = {  # by marker
-    "order_errors": order_errors, "order_times": order_times, "peers": peers, "scaling": scaling, "collision": collision, "hard": hard,
+    "order_errors": order_errors, "order_times": order_times, "peers": peers, "scaling": scaling,
+    "collision": collision, "hard": hard,
 }  # fmt: skip
 
 

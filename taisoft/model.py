@@ -19,11 +19,13 @@ from taisoft.fields import FieldArena
 from taisoft.mass import MassMatrix, lumped_masses, upload_mass_matrix, weight_masses
 from taisoft.materials import LAWS
 from taisoft.node_graph import PAIRS, NodeGraph, node_graph
-from taisoft.runtime import Runtime
+from taisoft.runtime import Runtime, threads
 from taisoft.scene.scene import Body, Material, Scene
 from taisoft.transfer import download
 
-PARALLEL_FROM = 100_000  # points from which parallel loops beat one serial kernel on the CPU (50 us to wake the threads)
+# Points, and threads of the CPU, from which parallel loops are taken instead of one serial kernel: the compiler does not put
+# their work side by side in vectors. With two threads they took 3.4 times as long (213,000 tets, `taisoft bench scaling`)
+PARALLEL_FROM, PARALLEL_THREADS = 100_000, 8
 MATRIX_BLOCKS = {1: 6, 2: 45 + 6}  # 3x3 blocks per tet in the buffer of an assembly: node pairs, and what they come from
 
 
@@ -220,7 +222,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     for k in range(len(scene.bodies)):
         block_body[layout.block_start[k] : layout.block_start[k] + -(-layout.n_tets[k] // lanes)] = k
     work = sum((g.last - g.first) * lanes * g.n_points for g in groups)
-    serial = runtime.arch == "cpu" and work < PARALLEL_FROM
+    serial = runtime.arch == "cpu" and (work < PARALLEL_FROM or threads() < PARALLEL_THREADS)
     chunks = 1 if serial else (64 if runtime.arch == "cpu" else 4096)
     damped = on["mass_damping"] or on["stiffness_damping"]
     n_bodies = len(scene.bodies)

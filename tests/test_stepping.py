@@ -123,6 +123,7 @@ def test_a_change_makes_bdf2_start_anew(implicit, change):
 @pytest.mark.parametrize("integrator", [*EXPLICIT, "implicit_euler"])
 def test_parallel_kernels(integrator, monkeypatch):
     monkeypatch.setattr("taisoft.model.PARALLEL_FROM", 0)
+    monkeypatch.setattr("taisoft.model.PARALLEL_THREADS", 0)
     settings = {"newton_tolerance": 1e-13, "linear_tolerance": 1e-13} if integrator == "implicit_euler" else {}
     with simulator(driven_scene(mass_damping=3.0, order=2), integrator, **settings) as sim:
         assert not sim._world.model.serial
