@@ -38,6 +38,7 @@ from benchmarks.contact_runs import (
     to_impulses,
 )  # fmt: skip
 from benchmarks.contact_table import CONTACTS, PILE, STEP_SCENE, count_table, find_limits
+from benchmarks.report_parts import phases
 from taisoft.contact.graph import node_graph
 from taisoft.contact.solve import SOLVERS
 from taisoft.errors import OutputError
@@ -138,6 +139,10 @@ def test_a_step_in_parts(sim):
     assert cost.solver == SERIAL and len(cost.whole) == 5 and cost.problems == []
     assert min(cost.contacts) > 0 and max(cost.sweeps) > 0 and cost.residual <= GOAL
     assert set(cost.parts) == {*PARTS, REST} and all(len(x) == 5 and min(x) > 0 for x in cost.parts.values())
+    watch = Stopwatch()
+    with phases.watched(watch, sim):  # of the report: those of the search apart
+        sim.step()
+    assert {*PARTS, *phases.CALLS} <= set(watch.spent) and min(watch.spent.values()) >= 0.0
 
 
 def test_a_call_inside_another_counts_once(monkeypatch):

@@ -18,7 +18,7 @@ from taisoft.timing import summarise
 
 from ..collision_runs import PHASES
 from ..contact_captured import clock, patched
-from ..contact_runs import PARTS, REST, SETTINGS, Stopwatch, to_first_impulse
+from ..contact_runs import PARTS, REST, SETTINGS, Stopwatch, explicit_places, to_first_impulse
 from .page import COLOURS, Claim, Extent, Part, new_figure, plot_png
 
 SCENE = "sheet_and_cube"
@@ -68,7 +68,7 @@ def watched(watch: Stopwatch, sim: ts.Simulator) -> Iterator[None]:
     detection = sim._contact.detection
     with ExitStack() as stack:
         if sim.settings.explicit:
-            stack.enter_context(watch.on(sim))
+            stack.enter_context(watch.on(explicit_places(sim)))
         else:
             stack.enter_context(patched(detection, "find", watch.timed(detection.find, SEARCH)))
         for phase, name in CALLS.items():
