@@ -278,9 +278,13 @@ class ContactStep:
         most in it, over what they may."""
         self.search(time, dt)
         told = self._survey(dt)
+        return float(told[SINKING]), float(told[HASTE])
+
+    def crossing_before(self) -> float:
+        """How deep triangles cross where a step begins that has been looked at, over the finer side's mean surface edge."""
         if self.crossing is None or self._follows:
             self.cross()
-        return max(float(told[SINKING]), self.crossing), float(told[HASTE])
+        return self.crossing
 
     def _survey(self, dt: float) -> np.ndarray:
         d = self.detection

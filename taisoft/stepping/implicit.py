@@ -158,8 +158,10 @@ class ImplicitStepper:
             parts = max(1, math.ceil(haste - 1e-9))
             if parts > MAX_PARTS:
                 raise SimulationError(f"step {self.world.step_count + 1}: {contact.too_fast(start, dt)}")
+            crossing = contact.crossing_before()
+            sinking = max(sinking, crossing)
             # what is deep already needs no shorter steps
-            allowed, allowed_crossing = max(SUNK, 1.1 * sinking), max(CROSSED_FAR, 1.1 * contact.crossing)
+            allowed, allowed_crossing = max(SUNK, 1.1 * sinking), max(CROSSED_FAR, 1.1 * crossing)
             kept = self.world.state()
         least = parts  # that it takes even if it converges
         while True:
