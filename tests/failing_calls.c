@@ -1,8 +1,8 @@
 /* Preloaded into a process: system calls fail as a broken disk's do, and the clock jumps.
 
 FAIL_CALL: fsync, rename, write or, as of a disk that was mounted anew to be read only, change: opening for writing, rename and
-unlink. FAIL_NAME: what the file's path must hold, or several texts with | between them, one of which it must hold. JUMP: seconds by which each reading of the clock
-goes on or back. Both are looked up at each call, so that a process can change them. */
+unlink. FAIL_NAME: what the file's path must hold, or several texts with | between them, one of which it must hold. JUMP: seconds
+by which each reading of the clock goes on or back. Both are looked up at each call, so that a process can change them. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
@@ -45,44 +45,31 @@ int fsync(int descriptor) {
     return ((int (*)(int))dlsym(RTLD_NEXT, "fsync"))(descriptor);
 }
 
-static int open_as(const char *name, const char *path, int flags, mode_t mode) {
-    if ((flags & O_ACCMODE) != O_RDONLY && is_read_only(path)) return -1;
-    return ((int (*)(const char *, int, ...))dlsym(RTLD_NEXT, name))(path, flags, mode);
-}
+#define NEXT(name, type) ((type)dlsym(RTLD_NEXT, name))
 
-int open(const char *path, int flags, ...) {
-    va_list rest;
-    va_start(rest, flags);
-    mode_t mode = flags & (O_CREAT | O_TMPFILE) ? va_arg(rest, mode_t) : 0;
-    va_end(rest);
-    return open_as("open", path, flags, mode);
-}
-
-int open64(const char *path, int flags, ...) {
-    va_list rest;
-    va_start(rest, flags);
-    mode_t mode = flags & (O_CREAT | O_TMPFILE) ? va_arg(rest, mode_t) : 0;
-    va_end(rest);
-    return open_as("open64", path, flags, mode);
-}
-
-FILE *fopen(const char *path, const char *mode) {
-    if (strpbrk(mode, "wa+") && is_read_only(path)) return NULL;
-    return ((FILE *(*)(const char *, const char *))dlsym(RTLD_NEXT, "fopen"))(path, mode);
-}
-
-FILE *fopen64(const char *path, const char *mode) {
-    if (strpbrk(mode, "wa+") && is_read_only(path)) return NULL;
-    return ((FILE *(*)(const char *, const char *))dlsym(RTLD_NEXT, "fopen64"))(path, mode);
-}
-
-int mkstemp(char *path) {
-    return is_read_only(path) ? -1 : ((int (*)(char *))dlsym(RTLD_NEXT, "mkstemp"))(path);
-}
-
-int mkstemp64(char *path) {
-    return is_read_only(path) ? -1 : ((int (*)(char *))dlsym(RTLD_NEXT, "mkstemp64"))(path);
-}
+/* Each has a second name, for files beyond 2 GB. */
+#define OPENS(name)                                                                     \
+    int name(const char *path, int flags, ...) {                                        \
+        va_list rest;                                                                   \
+        va_start(rest, flags);                                                          \
+        mode_t mode = flags & (O_CREAT | O_TMPFILE) ? va_arg(rest, mode_t) : 0;         \
+        va_end(rest);                                                                   \
+        if ((flags & O_ACCMODE) != O_RDONLY && is_read_only(path)) return -1;           \
+        return NEXT(#name, int (*)(const char *, int, ...))(path, flags, mode);         \
+    }
+#define FOPENS(name)                                                                    \
+    FILE *name(const char *path, const char *mode) {                                    \
+        if (strpbrk(mode, "wa+") && is_read_only(path)) return NULL;                    \
+        return NEXT(#name, FILE *(*)(const char *, const char *))(path, mode);          \
+    }
+#define MKSTEMPS(name)                                                                  \
+    int name(char *path) { return is_read_only(path) ? -1 : NEXT(#name, int (*)(char *))(path); }
+OPENS(open)
+OPENS(open64)
+FOPENS(fopen)
+FOPENS(fopen64)
+MKSTEMPS(mkstemp)
+MKSTEMPS(mkstemp64)
 
 int unlink(const char *path) {
     if (is_read_only(path)) return -1;

@@ -11,6 +11,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from retries import assert_is_before_first_step, assert_steps_as_new, state_of
 
 import taisoft as ts
 from taisoft.stepping import implicit
@@ -93,19 +94,14 @@ def failing_at(sim, monkeypatch, call: int, error: BaseException):
 @pytest.mark.parametrize("call, error", [(1, ts.SimulationError("no room")), (3, KeyboardInterrupt())])
 def test_where_a_step_fails_the_state_is_that_before_it(sim, monkeypatch, call, error):
     """The first try, after nodes were let go, and Ctrl-C in the second part of the second one."""
-    before = sim.positions(), sim.velocities()
+    before = state_of(sim)
     monkeypatch.setattr(implicit, "MAX_NEWTON", 2)
     failing_at(sim, monkeypatch, call, error)
     with pytest.raises(type(error)):
         sim.step()
-    assert np.array_equal(sim.positions(), before[0]) and np.array_equal(sim.velocities(), before[1])
-    assert sim.time == 0.0 and sim.step_count == 0 and not any(sim._world.motion.released())
+    assert_is_before_first_step(sim, before)
     monkeypatch.undo()
-    sim.step()
-    first = sim.positions()
-    sim.reset()
-    sim.step()
-    assert np.abs(sim.positions() - first).max() < 1e-12  # [m]
+    assert_steps_as_new(sim, 1e-12)
 
 
 def test_where_a_try_in_parts_fails_the_step_is_told_as_not_converged(sim, monkeypatch):
