@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from command import BEAM, write
 from long import LONG, is_long
+from taichi._lib import core
 
 from taisoft import runtime
 
@@ -29,6 +30,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     elif not (len(long) == len(items) and any("::" in name for name in config.args)):  # what is named one by one is meant
         items[:] = [item for item in items if not is_long(item.nodeid)]
         config.hook.pytest_deselected(items=long)
+    no_gpu = pytest.mark.skip(reason="this machine has no NVIDIA GPU")
+    for item in items:
+        if item.get_closest_marker("cuda") and not core.with_cuda():
+            item.add_marker(no_gpu)
     places = {f"test_{name}": k for k, name in enumerate(SLOW)}
     items.sort(key=lambda item: places.get(item.path.stem, len(SLOW)))
 

@@ -10,9 +10,9 @@ from taisoft.runtime import Runtime, open_runtime
 
 
 @contextmanager
-def opened(precision: str) -> Iterator[Runtime]:
-    """A CPU runtime of that precision, for a while."""
-    machine = open_runtime("cpu", precision, "a test")
+def opened(precision: str, arch: str = "cpu") -> Iterator[Runtime]:
+    """A runtime of that precision, for a while."""
+    machine = open_runtime(arch, precision, "a test")
     try:
         yield machine
     finally:

@@ -5,6 +5,7 @@ integrator, a second scene, or a coarser case of the same problem.
 """
 
 LONG = {
+    "test_arch": ("[cpu-",),
     "test_fuzz": ("[10000-",),
     "test_determinism": ("[cube_implicit]", "[cubes_"),
     "test_faults": (

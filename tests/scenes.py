@@ -125,9 +125,9 @@ class Rig:
 
 
 @contextmanager
-def built(scene: ts.Scene, precision: str, chunks: int = 7) -> Iterator[Rig]:
+def built(scene: ts.Scene, precision: str, chunks: int = 7, arch: str = "cpu") -> Iterator[Rig]:
     """The arrays of a scene; the parallel model adds its sums up in `chunks` parts."""
-    with opened(precision) as machine:
+    with opened(precision, arch) as machine:
         arena = FieldArena()
         try:
             on = make_plan(scene, explicit=False, multistep=False).on

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import taichi as ti
 from lanes import opened
+from taichi._lib import core
 
 from taisoft import runtime
 from taisoft.errors import SimulationError
@@ -56,13 +57,7 @@ def test_a_foreign_initialisation_is_replaced():
         assert ti.cfg.default_fp == ti.f32 and not ti.cfg.cfg_optimization and not ti.cfg.fast_math
 
 
-def has_cuda() -> bool:
-    from taichi._lib import core
-
-    return core.with_cuda()
-
-
-@pytest.mark.skipif(has_cuda(), reason="this machine has CUDA")
+@pytest.mark.skipif(core.with_cuda(), reason="this machine has CUDA")
 def test_cuda_where_there_is_none(capfd):
     with pytest.raises(SimulationError, match="^arch 'cuda' is not to be had on this machine"):
         open_runtime("cuda", "f32")

@@ -1,0 +1,160 @@
+"""First look at a GPU: tests, works, solvers, sizes and repeatability on one page, in under eight minutes.
+
+taisoft bench cuda_check [--arch cuda|cpu] [--budget SECONDS] [--quick] [--part NAME] [--out DIR]
+
+Each part runs in a process of its own with a time limit, and prints every number as soon as it is known. What a part found
+before it failed or ran out of time stays on the page, and the next part starts in any case. DIR/cuda-check.md and .json are
+written again after every part. Parts: tests marked `cuda`; the works W1 to W4, on the GPU and on the CPU of the same machine;
+coloured against serial Gauss-Seidel; steps of one and four million tets; how far reruns differ. Compiling is timed apart.
+Exit status: 0, or 1 where a part failed or did not end. benchmarks/cuda_check.sh installs what this needs from wheels first.
+"""
+
+import argparse
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from taisoft.output.files import make_folder, write_bytes
+from taisoft.output.report import json_text
+
+from .cuda_parts import JOBS, RESULT, parse_result, run_job
+from .cuda_table import part_text
+from .document import header
+
+ROOT = Path(__file__).resolve().parent.parent
+BUDGET = 470.0  # seconds for all parts: ten less than eight minutes
+LAST_LINES = 15  # of what a failed process printed
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the page. seconds: its time limit; time that earlier parts leave is added to the later ones."""
+
+    name: str
+    title: str
+    command: tuple[str, ...]
+    seconds: float
+
+
+@dataclass
+class Outcome:
+    """What a part's process did. ended: "ok", "failed" or "out of time"; found: its results in order; tail: its last lines."""
+
+    part: Part
+    ended: str = ""
+    seconds: float = 0.0
+    found: list[dict] = field(default_factory=list)
+    tail: str = ""
+
+
+def make_parts(arch: str, quick: bool) -> list[Part]:
+    """All parts, the most important first."""
+    child = (sys.executable, "-m", "taisoft", "bench", "cuda_check", "--arch", arch, *(("--quick",) if quick else ()), "--job")
+    pytest = (sys.executable, "-m", "pytest", "-v", "--tb=short", "-p", "no:cacheprovider", "-m", "cuda", "tests/test_arch.py")
+    return [
+        Part("tests", "Tests marked cuda", pytest, 150.0),
+        *(Part(name, title, (*child, name), seconds) for name, (title, seconds, _) in JOBS.items()),
+    ]
+
+
+def carry_out(part: Part, limit: float) -> Outcome:
+    """Run a part for at most `limit` seconds; its whole process group ends with it."""
+    outcome, start = Outcome(part), time.monotonic()
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": path, "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(
+        part.command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
+        env=environment, cwd=ROOT, start_new_session=True,
+    )  # fmt: skip
+    try:
+        printed, _ = process.communicate(timeout=limit)
+        outcome.ended = "ok" if process.returncode == 0 else "failed"
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        printed, _ = process.communicate()
+        outcome.ended = "out of time"
+    outcome.seconds = time.monotonic() - start
+    lines = printed.splitlines()
+    outcome.found = [found for line in lines if (found := parse_result(line)) is not None]
+    if part.name == "tests":
+        outcome.found = [found for line in lines if (found := parse_test(line)) is not None]
+    if outcome.ended != "ok":
+        rest = [line for line in lines if not line.startswith(RESULT)]
+        status = f" with status {process.returncode}" if outcome.ended == "failed" else f" after {limit:.0f} s"
+        outcome.tail = "\n".join([f"{outcome.ended}{status}", *rest[-LAST_LINES:]])
+    return outcome
+
+
+def parse_test(line: str) -> dict | None:
+    """The test and its result in a line of `pytest -v`, None in any other line."""
+    match = re.match(r"\S+?::(.+) (PASSED|FAILED|ERROR|SKIPPED|XFAIL)\b", line)
+    return {"test": match[1], "result": match[2].lower()} if match else None
+
+
+def gpu_name() -> str:
+    """Name, memory and driver of the GPU as nvidia-smi prints them; "no nvidia-smi" without it."""
+    if shutil.which("nvidia-smi") is None:
+        return "no nvidia-smi"
+    query = ("nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader")
+    try:
+        done = subprocess.run(query, capture_output=True, text=True, timeout=20, check=False)
+    except subprocess.TimeoutExpired:
+        return "nvidia-smi does not answer"
+    return "; ".join((done.stdout or done.stderr).strip().splitlines()[:4])
+
+
+def write_page(folder: Path, head: str, numbers: dict, outcomes: list[Outcome], waiting: list[Part]) -> None:
+    """The page and its numbers as far as they are known."""
+    parts = [head, *(part_text(o.part.title, o.part.name, o.ended, o.seconds, o.found, o.tail) for o in outcomes)]
+    if waiting:
+        parts.append("Not yet run: " + ", ".join(part.name for part in waiting) + ".")
+    write_bytes(folder / "cuda-check.md", ("\n\n".join(parts) + "\n").encode())
+    write_bytes(folder / "cuda-check.json", json_text(numbers | {"parts": [asdict(o) for o in outcomes]}).encode())
+
+
+def check(parts: list[Part], budget: float, folder: Path, arch: str) -> list[Outcome]:
+    """Carry out the parts within `budget` seconds, writing the page after each. Raises OutputError."""
+    text, numbers = header("GPU check", f"arch {arch}", gpu_name(), packages=("taichi", "numpy", "scipy", "meshio"))
+    numbers |= {"arch": arch, "gpu": gpu_name()}
+    end, outcomes = time.monotonic() + budget, []
+    for k, part in enumerate(parts):
+        later = sum(other.seconds for other in parts[k + 1 :])
+        limit = max(end - time.monotonic() - later, min(part.seconds, end - time.monotonic()))
+        if limit < 1.0:
+            outcomes.append(Outcome(part, "out of time", tail="no time was left to start it"))
+        else:
+            print(f"{part.name}: at most {limit:.0f} s", file=sys.stderr, flush=True)
+            outcomes.append(carry_out(part, limit))
+        print(f"{part.name}: {outcomes[-1].ended}, {outcomes[-1].seconds:.0f} s", file=sys.stderr, flush=True)
+        write_page(folder, text, numbers, outcomes, parts[k + 1 :])
+    return outcomes
+
+
+def main(argv=None) -> int:
+    """Check and write the page. Raises OutputError."""
+    first, _, rest = __doc__.partition("\n")
+    parser = argparse.ArgumentParser(prog="taisoft bench cuda_check", description=first, epilog=rest.partition("\n\n")[2])
+    parser.add_argument("--arch", choices=("cuda", "cpu"), default="cuda", help="cpu checks the checking itself")
+    parser.add_argument("--budget", type=float, default=BUDGET, metavar="SECONDS", help=f"for all parts (default {BUDGET:.0f})")
+    parser.add_argument("--quick", action="store_true", help="small sizes")
+    parser.add_argument("--part", action="append", choices=["tests", *JOBS], help="only this part; may be repeated")
+    parser.add_argument("--out", type=Path, default=Path("out/cuda_check"), metavar="DIR", help="default out/cuda_check")
+    parser.add_argument("--job", choices=JOBS, help=argparse.SUPPRESS)  # how this command runs one part
+    options = parser.parse_args(argv)
+    if options.job:
+        run_job(options.job, options.arch, options.quick)
+        return 0
+    parts = [part for part in make_parts(options.arch, options.quick) if options.part is None or part.name in options.part]
+    outcomes = check(parts, options.budget, make_folder(options.out), options.arch)
+    print((options.out / "cuda-check.md").read_text())
+    return 0 if all(outcome.ended == "ok" for outcome in outcomes) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,144 @@
+"""What `cuda_check.py` measures, each part in a process of its own, which prints a result as soon as it has it."""
+
+import json
+from collections.abc import Callable, Iterator
+from time import perf_counter
+
+import numpy as np
+
+import taisoft as ts
+from taisoft import simulator
+from taisoft.errors import TaisoftError
+from taisoft.runtime import open_runtime
+from taisoft.study.stretch import advance, warm_up
+
+from .contact_captured import patched
+from .contact_crossover import measure_crossover
+from .elasticity_beam import MARGIN, beam_scene
+from .programs import own
+from .programs.session import Setting
+from .scaling_runs import cubes_on_ground
+from .works.judge import judge
+from .works.references import MUJOCO, TAISOFT
+from .works.scenes import WORKS, Work
+
+RESULT = "result: "  # before what a part found, among what else it prints
+EXPLICIT_STEPS = {"W1 12x3x3": 3, "W1 24x6x6": 5, "W1 48x12x12": 11, "W2": 3, "W3": 2, "W4": 19}  # in 10 ms, all of them stable
+TIMED_STEPS, IMPLICIT_STEPS = 200, 3
+SMALL = 4  # cells across the beam whose stable step is scaled to the larger ones
+PLATES, QUICK_PLATES = (8, 32, 64, 128, 192), (4,)
+SIZES, QUICK_SIZES = (37, 58), (6,)  # cells across a beam of 20 n^3 tets: 1.0 and 3.9 million
+RERUNS = 3
+
+
+def parse_result(line: str) -> dict | None:
+    """What a line of a part's output found, None for any other line."""
+    return json.loads(line.removeprefix(RESULT)) if line.startswith(RESULT) else None
+
+
+def run_job(name: str, arch: str, quick: bool) -> None:
+    """Print the results of a part."""
+    for found in JOBS[name][2](arch, quick):
+        print(RESULT + json.dumps(found), flush=True)
+
+
+def works(arch: str, quick: bool) -> Iterator[dict]:
+    """Time and error of the works, explicit and implicit, on `arch` and on the CPU of the same machine."""
+    chosen = [work for work in WORKS if work.key in (("W1 12x3x3",) if quick else EXPLICIT_STEPS)]
+    for work in chosen:
+        model = MUJOCO if work.cells is not None else TAISOFT
+        for method, steps in (("velocity_verlet", EXPLICIT_STEPS[work.key]), ("implicit_euler", 1)):
+            for where in dict.fromkeys((arch, "cpu")):
+                setting = Setting(own.NAME, model, method, steps, {"precision": "f32", "arch": where})
+                told = f"{method}, {1e3 * setting.dt:.3g} ms"
+                yield {"work": work.key, "tets": work.tets, "setting": told, "arch": where} | _timed(work, setting)
+
+
+def _timed(work: Work, setting: Setting) -> dict:
+    """Time, error and verdict of one setting, or why there is none."""
+    try:
+        session = own.start(work, setting)
+        try:
+            positions, _ = session.run(follow=True)
+            _, seconds = session.run(follow=False)
+        finally:
+            session.close()
+        verdict = judge(work, setting.model, positions)
+    except TaisoftError as error:
+        return {"failure": str(error)}
+    return {
+        "seconds": seconds / work.seconds, "build_seconds": session.build_seconds, "error": verdict.error,
+        "stands": verdict.stands, "inverted": verdict.inverted, "unconverged": session.unconverged,
+    }  # fmt: skip
+
+
+def sweeps(arch: str, quick: bool) -> Iterator[dict]:
+    """Coloured against serial Gauss-Seidel on two plates, the numbers of contacts rising."""
+    for n in QUICK_PLATES if quick else PLATES:
+        runtime = open_runtime(arch, "f32", "the check of solvers")
+        try:
+            (point,) = measure_crossover((n,), runtime)
+        finally:
+            runtime.close()
+        yield {"contacts": point.contacts, "colours": point.colours} | {
+            f"{name}_{what}": value
+            for name, one in (("serial", point.serial), ("coloured", point.coloured))
+            for what, value in (("ms", 1e3 * one.median), ("sweeps", one.sweeps), ("residual", one.residual))
+        }
+
+
+def sizes(arch: str, quick: bool) -> Iterator[dict]:
+    """Explicit and implicit steps of large beams."""
+    with ts.Simulator(beam_scene((4 * SMALL, SMALL, SMALL), "SNH"), dt=1e-6, integrator="velocity_verlet", arch=arch) as sim:
+        limit = sim.stable_dt
+    for n in QUICK_SIZES if quick else SIZES:
+        for integrator, dt in (("velocity_verlet", 0.8 * MARGIN * limit * SMALL / n), ("bdf2", 0.01)):
+            yield {"tets": 20 * n**3, "integrator": integrator} | _timed_size(n, integrator, dt, arch)
+
+
+def _timed_size(n: int, integrator: str, dt: float, arch: str) -> dict:
+    start = perf_counter()
+    try:
+        # the highest frequency of millions of tets takes minutes on the host: the step is scaled from the small beam's
+        with patched(simulator.Simulator, "_check_stability", lambda self, dt: None):
+            sim = ts.Simulator(beam_scene((4 * n, n, n), "SNH"), dt=dt, integrator=integrator, arch=arch)
+        with sim:
+            build = perf_counter() - start - sim.compile_seconds
+            warm_up(sim)
+            stretch = advance(sim, TIMED_STEPS if integrator == "velocity_verlet" else IMPLICIT_STEPS)
+            return {
+                "step_ms": 1e3 * stretch.seconds / stretch.steps, "steps": stretch.steps, "linear": stretch.linear_iterations,
+                "newton": stretch.newton_iterations, "unconverged": stretch.unconverged, "inverted": stretch.inverted,
+                "build_seconds": build, "compile_seconds": sim.compile_seconds,
+                "field_bytes": sum(sim.field_bytes.values()),
+            }  # fmt: skip
+    except TaisoftError as error:
+        return {"failure": str(error)}
+
+
+def reruns(arch: str, quick: bool) -> Iterator[dict]:
+    """How far runs of the same scene end from the first one, relative to its excursion."""
+    for name, build, integrator, dt, seconds in (
+        ("hanging beam", lambda: beam_scene((12, 3, 3), "SNH"), "velocity_verlet", 0.002, 1.0),
+        ("hanging beam", lambda: beam_scene((12, 3, 3), "SNH"), "bdf2", 0.01, 0.5),
+        ("two cubes on the ground", lambda: cubes_on_ground(640), "symplectic_euler", 5e-4, 0.2),
+        ("two cubes on the ground", lambda: cubes_on_ground(640), "implicit_euler", 0.005, 0.2),
+    )[: 1 if quick else None]:
+        ends, start = [], None
+        with ts.Simulator(build(), dt=dt, integrator=integrator, arch=arch, allow_unstable=True) as sim:
+            for _ in range(RERUNS):
+                sim.reset()
+                start = sim.positions()
+                advance(sim, round(seconds / dt))
+                ends.append(sim.positions())
+        excursion = float(np.abs(ends[0] - start).max())
+        spread = max(float(np.abs(end - ends[0]).max()) for end in ends[1:])
+        yield {"scene": name, "integrator": integrator, "reruns": RERUNS, "spread": spread / excursion}
+
+
+JOBS: dict[str, tuple[str, float, Callable[[str, bool], Iterator[dict]]]] = {  # title, time limit [s], what is measured
+    "works": ("Works W1 to W4", 120.0, works),
+    "sweeps": ("Coloured against serial Gauss-Seidel", 60.0, sweeps),
+    "sizes": ("One and four million tets", 90.0, sizes),
+    "reruns": ("Repeatability", 50.0, reruns),
+}
