@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/ready
 DEMO_OUT := out/hanging_beam
 
-.PHONY: demo test test-long lint clean
+.PHONY: demo test test-long figures lint clean
 
 demo: $(READY)
 	$(BIN)/taisoft run hanging_beam --headless --out $(DEMO_OUT) --overwrite
@@ -21,6 +21,11 @@ test: $(READY)
 
 test-long: $(READY)
 	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --long
+
+# about three hours; the comparison needs the other programs
+figures: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,peers]'
+	$(BIN)/taisoft bench figures
 
 lint: $(READY)
 	$(BIN)/ruff check .

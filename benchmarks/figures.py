@@ -1,0 +1,89 @@
+"""Every measured page and figure in one go, then README's tables.
+
+taisoft bench figures [--only NAME] [--quick] [--results DIR] [--logs DIR]
+
+Runs the benchmarks one after the other, each in a process of its own, and writes their pages into benchmarks/results, named
+after the machine; what they print goes to DIR/NAME.log. A benchmark that fails or misses a limit does not stop the next one.
+The machine should do nothing else meanwhile: the table tells the load at each start. The whole takes about three hours on two
+cores, and its parts can be made one by one. Exit status: 0, or 1 where a benchmark ended with another status.
+"""
+
+import argparse
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from taisoft.output.files import make_folder
+from taisoft.output.tables import markdown
+from taisoft.timing import load_average, machine
+
+from .document import RESULTS, load_text
+from .elasticity_table import slug
+
+# name -> what of it is written: a page with numbers (json), a picture beside it (png), or a folder of both (folder)
+WRITES = {
+    "references": ("json",), "elasticity": ("json",), "collision": ("json", "png"), "contact": ("json", "png"),
+    "order": ("json", "png"), "scaling": ("json", "png"), "peers": ("json",), "hard": ("json",), "report": ("folder",),
+}  # fmt: skip
+OPTIONS = {"json": ("--out", ".json"), "png": ("--plot", ".png"), "folder": ("--out", "")}
+NO_QUICK = ("references",)
+
+
+@dataclass
+class Ended:
+    """How a benchmark ended. load: of the machine when it began."""
+
+    name: str
+    status: int
+    seconds: float
+    load: float | None
+
+
+def command(name: str, quick: bool, results: Path) -> list[str]:
+    """The command line of a benchmark, its files named after the machine."""
+    where = machine()
+    stem = f"{name}-{slug(where['processor'])}-{where['cores']}-cores"
+    files = [part for kind in WRITES[name] for part in (OPTIONS[kind][0], str(results / (stem + OPTIONS[kind][1])))]
+    return [sys.executable, "-m", "taisoft", "bench", name, *(["--quick"] if quick and name not in NO_QUICK else []), *files]
+
+
+def make(names: Iterable[str], quick: bool, results: Path, logs: Path) -> list[Ended]:
+    """Run the benchmarks, telling each as it ends."""
+    ended = []
+    for name in names:
+        load, start = load_average(), time.monotonic()
+        with open(logs / f"{name}.log", "wb") as log:
+            done = subprocess.run(
+                command(name, quick, results), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, check=False
+            )
+        ended.append(Ended(name, done.returncode, time.monotonic() - start, load))
+        print(f"{name}: status {done.returncode}, {ended[-1].seconds:.0f} s", file=sys.stderr, flush=True)
+    return ended
+
+
+def main(argv=None) -> int:
+    """Make them. Raises OutputError."""
+    first, _, rest = __doc__.partition("\n")
+    parser = argparse.ArgumentParser(prog="taisoft bench figures", description=first, epilog=rest.partition("\n\n")[2])
+    parser.add_argument("--only", action="append", choices=WRITES, metavar="NAME", help=f"one of {', '.join(WRITES)}; repeatable")
+    parser.add_argument("--quick", action="store_true", help="small cases; give --results too, since README takes no quick ones")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="default benchmarks/results")
+    parser.add_argument("--logs", type=Path, default=Path("out/figures"), metavar="DIR", help="default out/figures")
+    options = parser.parse_args(argv)
+    if options.quick and options.results == RESULTS:
+        parser.error("--quick needs --results: benchmarks/results holds whole results only")
+    results, logs = make_folder(options.results).resolve(), make_folder(options.logs)
+    ended = make(options.only or WRITES, options.quick, results, logs)
+    if results == RESULTS:
+        done = subprocess.run([sys.executable, "-m", "taisoft", "bench", "readme"], stdin=subprocess.DEVNULL, check=False)
+        ended.append(Ended("readme", done.returncode, 0.0, load_average()))
+    rows = [(one.name, str(one.status), f"{one.seconds:.0f}", load_text(one.load)) for one in ended]
+    print(markdown(("benchmark", "exit status", "seconds", "load at its start"), rows, left=(0,)))
+    return 0 if all(one.status == 0 for one in ended) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
