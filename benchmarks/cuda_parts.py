@@ -10,6 +10,7 @@ import taisoft as ts
 from taisoft import simulator
 from taisoft.errors import TaisoftError
 from taisoft.runtime import open_runtime
+from taisoft.scene.scene import Scene
 from taisoft.study.stretch import advance, warm_up
 
 from .contact_captured import patched
@@ -91,17 +92,19 @@ def sizes(arch: str, quick: bool) -> Iterator[dict]:
     """Explicit and implicit steps of large beams."""
     with ts.Simulator(beam_scene((4 * SMALL, SMALL, SMALL), "SNH"), dt=1e-6, integrator="velocity_verlet", arch=arch) as sim:
         limit = sim.stable_dt
-    for n in QUICK_SIZES if quick else SIZES:
-        for integrator, dt in (("velocity_verlet", 0.8 * MARGIN * limit * SMALL / n), ("bdf2", 0.01)):
-            yield {"tets": 20 * n**3, "integrator": integrator} | _timed_size(n, integrator, dt, arch)
+    scenes = {n: beam_scene((4 * n, n, n), "SNH") for n in (QUICK_SIZES if quick else SIZES)}
+    for integrator in ("velocity_verlet", "bdf2"):
+        for n, scene in scenes.items():
+            dt = 0.01 if integrator == "bdf2" else 0.8 * MARGIN * limit * SMALL / n
+            yield {"tets": 20 * n**3, "integrator": integrator} | _timed_size(scene, integrator, dt, arch)
 
 
-def _timed_size(n: int, integrator: str, dt: float, arch: str) -> dict:
+def _timed_size(scene: Scene, integrator: str, dt: float, arch: str) -> dict:
     start = perf_counter()
     try:
         # the highest frequency of millions of tets takes minutes on the host: the step is scaled from the small beam's
         with patched(simulator.Simulator, "_check_stability", lambda self, dt: None):
-            sim = ts.Simulator(beam_scene((4 * n, n, n), "SNH"), dt=dt, integrator=integrator, arch=arch)
+            sim = ts.Simulator(scene, dt=dt, integrator=integrator, arch=arch)
         with sim:
             build = perf_counter() - start - sim.compile_seconds
             warm_up(sim)
