@@ -11,12 +11,15 @@ import taichi as ti
 from taisoft.elements.lanes import (
     add_forces,
     broadcast,
+    deformation_gradient,
     differences,
     gather,
     gradient_at,
     law_constants,
     no_forces,
+    position_differences,
     rest_gradients,
+    rest_gradients_of_F,
     store_forces,
     volumes,
     weight_at,
@@ -35,7 +38,7 @@ def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
 
     Returns the least J = det F over each tet's quadrature points.
     """
-    X = differences(m, g, m.x, b, m.real)
+    X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
     M = rest_gradients(m, b, m.real)
     p = law_constants(m, b, m.real)
     S = no_forces(m, g)
@@ -44,7 +47,7 @@ def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
         V = differences(m, g, m.v, b, m.real)
         c = broadcast(m.damping[m.block_body[b], 1], m.lanes)
         for q in range(g.n_points):
-            F = gradient_at(m, g, X, M, q, m.real)
+            F = deformation_gradient(m, g, X, N, q)
             dF = gradient_at(m, g, V, M, q, m.real)
             K = prepare_projected(g.law, F, p)
             D = dpk1_projected(K, dF)
@@ -54,7 +57,7 @@ def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
             lowest = ti.min(lowest, determinant(F))
     else:
         for q in range(g.n_points):
-            F = gradient_at(m, g, X, M, q, m.real)
+            F = deformation_gradient(m, g, X, N, q)
             P = g.law.pk1(F, p)
             add_forces(m, g, S, P, M, q)
             lowest = ti.min(lowest, determinant(F))
@@ -85,13 +88,13 @@ def force_differential(m: ti.template(), dx: ti.template(), df: ti.template()):
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
         for b in range(g.first, g.last):
-            X = differences(m, g, m.x, b, m.real)
+            X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
             dX = differences(m, g, dx, b, m.real)
             M = rest_gradients(m, b, m.real)
             p = law_constants(m, b, m.real)
             S = no_forces(m, g)
             for q in range(g.n_points):
-                F = gradient_at(m, g, X, M, q, m.real)
+                F = deformation_gradient(m, g, X, N, q)
                 dF = gradient_at(m, g, dX, M, q, m.real)
                 K = g.law.prepare(F, p)
                 dP = g.law.dpk1(F, K, dF)

@@ -26,6 +26,9 @@ from taisoft.transfer import download
 # Points, and threads of the CPU, from which parallel loops are taken instead of one serial kernel: the compiler does not put
 # their work side by side in vectors. With two threads they took 3.4 times as long (213,000 tets, `taisoft bench scaling`)
 PARALLEL_FROM, PARALLEL_THREADS = 100_000, 8
+# |Dm| |Dm^-1| from which F is formed in f64: in f32 its rounding, that times 6e-8, would be a strain above 6e-6. Regular tets
+# have 3, those of a sheet whose cells are 30 times as wide as thick about 60
+ILL_CONDITIONED = 100.0
 MATRIX_BLOCKS = {1: 6, 2: 45 + 6}  # 3x3 blocks per tet in the buffer of an assembly: node pairs, and what they come from
 
 
@@ -50,6 +53,7 @@ class Model:
     """Fields and compile-time constants that kernels take as one template argument."""
 
     real: Any  # Taichi type of everything but positions
+    strain_real: Any  # Taichi type in which the deformation gradient is formed
     lanes: int
     serial: bool  # loops run on one thread
     n_nodes: int
@@ -172,6 +176,14 @@ def _packed_tets(scene: Scene, layout: Layout, groups: tuple[Group, ...], lanes:
     return nodes, Dm_inv, volume
 
 
+def _worst_condition(nodes, Dm_inv: np.ndarray, layout: Layout) -> float:
+    """The largest |Dm| |Dm^-1| of a tet, in Frobenius' norm: how many roundings of F = Ds Dm^-1 cancel."""
+    corners = np.concatenate([own[:, :4] for own in nodes])
+    x = layout.rest[corners]
+    squares = ((x[:, 1:] - x[:, :1]) ** 2).sum(axis=(1, 2)) * (Dm_inv**2).sum(axis=(1, 2))
+    return float(np.sqrt(squares.max()))
+
+
 def _gather_table(nodes, groups: tuple[Group, ...], real: np.ndarray, n_nodes: int, lanes: int):
     """CSR from node to the corner-buffer entries of its tets, in block order."""
     ids, entries = [], []
@@ -224,6 +236,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     work = sum((g.last - g.first) * lanes * g.n_points for g in groups)
     serial = runtime.arch == "cpu" and (work < PARALLEL_FROM or threads() < PARALLEL_THREADS)
     chunks = 1 if serial else (64 if runtime.arch == "cpu" else 4096)
+    strain_real = ti.f64 if real == ti.f32 and _worst_condition(nodes, Dm_inv, layout) > ILL_CONDITIONED else real
     damped = on["mass_damping"] or on["stiffness_damping"]
     n_bodies = len(scene.bodies)
     node_body = np.repeat(np.arange(n_bodies, dtype=np.int32), np.diff(layout.node_start))
@@ -231,15 +244,16 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     flat_nodes = np.concatenate([lane_layout(own, lanes).reshape(-1) for own in nodes])
     rules = tuple(reference.quadrature(d) for d in sorted({b.quadrature_degree for b in scene.bodies if b.order == 2}))
     table = _rule_table(rules) if rules else None
+    rest_lanes = lane_layout(Dm_inv.reshape(-1, 9), lanes).astype(npr if strain_real == real else np.float64)
     with arena.group():
         mass = arena.field("mass", real, n_nodes, lumped_masses(scene).astype(npr))
         model = Model(
-            real=real, lanes=lanes, serial=serial, n_nodes=n_nodes, n_blocks=n_blocks, groups=groups,
+            real=real, strain_real=strain_real, lanes=lanes, serial=serial, n_nodes=n_nodes, n_blocks=n_blocks, groups=groups,
             x=arena.vectors("x", ti.f64, n_nodes, layout.rest),
             v=arena.vectors("v", real, n_nodes, velocity.astype(npr)),
             nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
             rules=rules, points=arena.field("points", ti.f64, (len(table), 28), table) if rules else None,
-            Dm_inv=arena.field("Dm_inv", real, (n_blocks, 9, lanes), lane_layout(Dm_inv.reshape(-1, 9), lanes).astype(npr)),
+            Dm_inv=arena.field("Dm_inv", strain_real, (n_blocks, 9, lanes), rest_lanes),
             volume=arena.field("volume", real, (n_blocks, lanes), volume.reshape(n_blocks, lanes).astype(npr)),
             block_body=arena.field("block_body", ti.i32, n_blocks, block_body),
             law_constants=arena.field(

@@ -85,6 +85,28 @@ def gradient_at(m: ti.template(), g: ti.template(), E, M, q, real: ti.template()
 
 
 @ti.func
+def rest_gradients_of_F(m: ti.template(), b):
+    """Dm^-1 of the tets of block b in the precision in which F is formed, which is f64 where a mesh has slivers."""
+    return rest_gradients(m, b, m.strain_real)
+
+
+@ti.func
+def position_differences(m: ti.template(), g: ti.template(), b):
+    """`differences` of the positions in the precision in which F is formed."""
+    return differences(m, g, m.x, b, m.strain_real)
+
+
+@ti.func
+def deformation_gradient(m: ti.template(), g: ti.template(), X, N, q):
+    """F at quadrature point q, rounded to `m.real` once it is formed. X: `position_differences`; N: `rest_gradients_of_F`."""
+    if ti.static(m.strain_real == m.real):
+        return gradient_at(m, g, X, N, q, m.real)
+    else:
+        F = gradient_at(m, g, X, N, q, m.strain_real)
+        return [ti.cast(F[k], m.real) for k in ti.static(range(9))]
+
+
+@ti.func
 def edges_times(D, M):
     """D M with D by columns: entry 3 c + r."""
     return [

@@ -8,7 +8,15 @@ so each point's six A_kl go to a scratch part of the buffer, and what they give 
 import numpy as np
 import taichi as ti
 
-from taisoft.elements.lanes import broadcast, differences, gradient_at, law_constants, rest_gradients, volumes
+from taisoft.elements.lanes import (
+    broadcast,
+    deformation_gradient,
+    law_constants,
+    position_differences,
+    rest_gradients,
+    rest_gradients_of_F,
+    volumes,
+)
 from taisoft.elements.reference import Quadrature, shape_derivatives
 from taisoft.materials.projection import dpk1_projected, prepare_projected
 from taisoft.model import MATRIX_BLOCKS
@@ -42,7 +50,7 @@ def pair_terms(rules: list[Quadrature]) -> tuple[np.ndarray, np.ndarray, np.ndar
 @ti.func
 def element_blocks(m: ti.template(), g: ti.template(), A: ti.template(), b, projected: ti.template()):
     """K_ab of the node pairs of block b of group g into A.element."""
-    X = differences(m, g, m.x, b, m.real)
+    X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
     p = law_constants(m, b, m.real)
     M = rest_gradients(m, b, m.real)
     V = volumes(m, b, m.real)
@@ -51,7 +59,7 @@ def element_blocks(m: ti.template(), g: ti.template(), A: ti.template(), b, proj
         for k in range(N_PAIRS * 9):
             A.element[base + k] = broadcast(ti.cast(0.0, m.real), m.lanes)
     for q in range(g.n_points):
-        F = gradient_at(m, g, X, M, q, m.real)
+        F = deformation_gradient(m, g, X, N, q)
         at = base + (N_PAIRS * 9 if ti.static(g.order == 2) else 0)
         if ti.static(projected):
             S = prepare_projected(g.law, F, p)
