@@ -34,12 +34,17 @@ def header(title: str, *how: str, packages: tuple[str, ...] = ("taichi", "numpy"
     """What is measured where and how, as text and as data."""
     found = machine() | {"date": datetime.now().isoformat(timespec="minutes")}
     used = {"taisoft": ts.__version__, **versions(*packages)}
-    text = (
-        f"# {title}\n\n{', '.join([found['processor'], str(found['cores']) + ' cores', *how])}, "
-        f"load {load_text(found['load'])} at the start; {found['date']}\n"
-        + ", ".join(f"{name} {version or 'absent'}" for name, version in used.items())
+    numbers = found | {"versions": used}
+    return header_text(title, numbers, *how), numbers
+
+
+def header_text(title: str, numbers: dict, *how: str) -> str:
+    """What stored numbers tell of where and how they were measured."""
+    return (
+        f"# {title}\n\n{', '.join([numbers['processor'], str(numbers['cores']) + ' cores', *how])}, "
+        f"load {load_text(numbers['load'])} at the start; {numbers['date']}\n"
+        + ", ".join(f"{name} {version or 'absent'}" for name, version in numbers["versions"].items())
     )
-    return text, found | {"versions": used}
 
 
 def load_text(value: float | None) -> str:

@@ -1,16 +1,21 @@
-"""Hard cases, each against its limits: 26 settings that break solvers, run for their time.
+"""Hard cases: 26 settings that break solvers, and how many of their variants are solved.
 
 taisoft bench hard [--case ID] [--quick] [--references] [--arch cpu|cuda] [--budget SECONDS] [--keep DIR] [--out [FILE.json]]
+taisoft bench hard --judge FILE.json
 
-A case is run in all its variants: laws, integrators, precisions, starts. Each is a process of its own, so that its peak memory
-is its own; wall time is that of its steps without compiling, the time of a step is the median. A limit is measured, analytic
-or proposed; of a proposed one that an honest baseline replaces the table tells both. Error: the largest distance of a node, at
-about 20 times of the run, to the same run in f64 with an eighth of the step, over the case's size; "-" where that run would
-take long (--references runs them all) or has no shape to compare. --keep holds finished runs in DIR, and the same command goes
-on from there. Exit status: 0 all limits met, 1 some not, or some not run.
+A case is run in all its variants: laws, integrators, precisions, starts. Each has an end that it must come to, by the catalogue
+and by physics: ok, degraded by what the setting itself brings about, refused before a step is done, or stopped later. Solved is
+what ended so and kept all its limits. Each variant is a process of its own, so that its peak memory is its own; wall time is
+that of its steps without compiling, the time of a step is the median. A limit is measured, analytic or proposed; of a proposed
+one that an honest baseline replaces the table tells both. Error: the largest distance of a node, at about 20 times of the run,
+to the same run in f64 with an eighth of the step, over the case's size; "-" where that run would take long (--references runs
+them all) or has no shape to compare. --keep holds finished runs in DIR, and the same command goes on from there. --judge runs
+nothing: it holds stored results against what is asked today, and writes FILE.json and its page anew. Exit status: 0 all asked
+variants are solved, 1 some are not, or were not run.
 """
 
 import argparse
+import json
 import sys
 import time
 from contextlib import ExitStack, closing
@@ -18,17 +23,20 @@ from pathlib import Path
 
 from taisoft.cli.signals import Signals
 from taisoft.cli.study_child import serve
+from taisoft.errors import OutputError
 from taisoft.output.files import FolderLock, make_folder, write_bytes
 from taisoft.output.report import json_text
 from taisoft.study.store import NoStore, Store
 from taisoft.timing import load_average
 
-from .document import RESULTS, Document, check_out, default_out, header
+from .document import RESULTS, Document, check_out, default_out, header, header_text
 from .hard_cases import CASES
-from .hard_runs import Row, answer, measure
-from .hard_table import notes, summary, table
+from .hard_runs import Row, answer, measure, stored
+from .hard_score import faults
+from .hard_table import page
 
 DAY = 86_400.0  # [s]
+TITLE = "Hard cases"
 
 
 def chosen(case: str | None, quick: bool) -> list[Row]:
@@ -41,7 +49,7 @@ def chosen(case: str | None, quick: bool) -> list[Row]:
 
 def measured(rows: list[Row], options: argparse.Namespace, document: Document) -> dict:
     """Run the rows and print what is found. Returns the numbers. Raises OutputError."""
-    text, numbers = header("Hard cases", f"arch {options.arch}")
+    text, numbers = header(TITLE, f"arch {options.arch}")
     document.add(text)
     end = time.monotonic() + options.budget
     with Signals("ending; runs that are finished are kept") as signals, ExitStack() as stack:
@@ -52,13 +60,24 @@ def measured(rows: list[Row], options: argparse.Namespace, document: Document) -
             store = Store(folder)
         signals.run_began()
         measure(rows, options.arch, options.references, store, lambda: end - time.monotonic(), signals.asked, _tell)
-    document.add(table(rows))
-    for told in (notes(rows), "\n".join(store.damaged), summary(rows)):
-        if told:
-            document.add(told)
+    for told in (*page(rows), *store.damaged):
+        document.add(told)
     return numbers | {
         "arch": options.arch, "quick": options.quick, "load_at_the_end": load_average(), "rows": [row.data() for row in rows],
     }  # fmt: skip
+
+
+def judged(path: Path, document: Document) -> tuple[list[Row], dict]:
+    """Stored results, held against what is asked today. Returns the rows and the numbers. Raises OutputError."""
+    try:
+        numbers = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{path} cannot be read: {error}") from error
+    rows = stored(numbers)
+    document.add(header_text(TITLE, numbers, f"arch {numbers['arch']}"))
+    for told in page(rows):
+        document.add(told)
+    return rows, numbers | {"rows": [row.data() for row in rows]}
 
 
 def _tell(text: str) -> None:
@@ -79,19 +98,26 @@ def main(argv=None) -> int:
         "--out", type=Path, nargs="?", const=RESULTS, metavar="FILE.json",
         help="write FILE.json and FILE.md too; without a name into benchmarks/results, named after the machine",
     )  # fmt: skip
+    parser.add_argument("--judge", type=Path, metavar="FILE.json", help="judge stored results anew instead; goes alone")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)  # how this command runs one variant
     options = parser.parse_args(argv)
     if options.child:
         serve(answer)
-    out = default_out(options.arch, "hard") if options.out == RESULTS else options.out
+    if options.judge is not None and options != argparse.Namespace(**vars(parser.parse_args([])) | {"judge": options.judge}):
+        parser.error("--judge goes alone")
+    out = options.judge or (default_out(options.arch, "hard") if options.out == RESULTS else options.out)
     check_out(out, ".json")
-    document, rows = Document(), chosen(options.case, options.quick)
-    numbers = measured(rows, options, document)
+    document = Document()
+    if options.judge is not None:
+        rows, numbers = judged(options.judge, document)
+    else:
+        rows = chosen(options.case, options.quick)
+        numbers = measured(rows, options, document)
     if out is not None:
         write_bytes(out, json_text(numbers).encode())
         write_bytes(out.with_suffix(".md"), document.text().encode())
         print(f"written: {out} and {out.with_suffix('.md').name}")
-    return 0 if all(row.passed for row in rows) else 1
+    return 1 if any(faults(row) for row in rows) else 0
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 import hashlib
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,12 @@ from taisoft.study.workers import LocalPlace, carry_out
 from taisoft.timing import machine, usable_cores
 
 from .hard_cases import CASES
-from .hard_cases.record import FAILED, Case, Variant, Verdict, judge
+from .hard_cases.record import DEGRADED, OK, Case, Variant, Verdict, judge
 from .hard_cases.session import FINER, Session
+from .hard_score import column, faults
 
 CHILD = (sys.executable, "-m", "taisoft", "bench", "hard", "--child")
+ANSWERED = (OK, DEGRADED)  # ends of runs that came to their ends
 CHEAP_SECONDS = 60.0  # of a reference, guessed: a longer one is run only when asked for
 
 
@@ -24,7 +26,8 @@ CHEAP_SECONDS = 60.0  # of a reference, guessed: a longer one is run only when a
 class Row:
     """A variant of a case, what came of it, and what came of its reference, each None where it was not run.
 
-    left_out, reference_left_out: why there is no record of it.
+    left_out, reference_left_out: why there is no record of it. error: largest distance to the reference run over the case's
+    size, where both came to their ends.
     """
 
     case: Case
@@ -33,22 +36,20 @@ class Row:
     reference: dict | None = None
     left_out: str = ""
     reference_left_out: str = ""
+    error: float | None = None
     verdicts: list[Verdict] = field(default_factory=list)
 
-    @property
-    def passed(self) -> bool:
-        """Whether it was run and every limit is met."""
-        return self.record is not None and all(verdict.passed is not False for verdict in self.verdicts)
+    def judge(self) -> None:
+        """Fill the verdicts."""
+        self.verdicts = [] if self.record is None else judge(self.case, self.variant, self.record)
 
-    @property
-    def error(self) -> float | None:
-        """Largest distance to the reference run over the case's size, where both came to their ends."""
-        if self.record is None or self.reference is None or self.reference["status"] == FAILED:
-            return None
+    def compare(self) -> None:
+        """Fill the error, from the points of both runs."""
+        if self.record is None or self.reference is None or self.reference["status"] not in ANSWERED:
+            return
         own, finer = unpack(self.record["points"]), unpack(self.reference["points"])
-        if own.shape != finer.shape or not len(own):
-            return None
-        return float(np.linalg.norm(own - finer, axis=1).max() / self.case.size)
+        if own.shape == finer.shape and len(own):
+            self.error = float(np.linalg.norm(own - finer, axis=1).max() / self.case.size)
 
     def data(self) -> dict:
         """As plain data, without points."""
@@ -57,11 +58,26 @@ class Row:
             return record and {key: value for key, value in record.items() if key != "points"}
 
         return {
-            "case": self.case.id, "variant": self.variant.name, "settings": self.variant.settings, "passed": self.passed,
+            "case": self.case.id, "variant": self.variant.name, "settings": self.variant.settings,
+            "must": asdict(self.variant.must), "column": column(self), "solved": not faults(self),
             "run": bare(self.record), "reference": bare(self.reference), "error": self.error, "left_out": self.left_out,
             "reference_left_out": self.reference_left_out,
             "verdicts": [verdict.record() for verdict in self.verdicts],
         }  # fmt: skip
+
+
+def stored(numbers: dict) -> list[Row]:
+    """All variants, with what stored results tell of them, judged anew."""
+    known = {(row["case"], row["variant"]): row for row in numbers["rows"]}
+    absent = {"run": None, "reference": None, "left_out": "not in the stored results", "reference_left_out": "", "error": None}
+    rows = []
+    for case in CASES:
+        for variant in case.variants:
+            one = known.get((case.id, variant.name), absent)
+            row = Row(case, variant, one["run"], one["reference"], one["left_out"], one["reference_left_out"], one["error"])
+            row.judge()
+            rows.append(row)
+    return rows
 
 
 def find(case: str, variant: str) -> tuple[Case, Variant]:
@@ -98,13 +114,13 @@ def measure(
     _carry_out(rows, arch, 1, store, seconds_left, asked, tell)
     finer = [
         row for row in rows
-        if row.record and row.variant.reference and row.record["status"] != FAILED
+        if row.record and row.variant.reference and row.record["status"] in ANSWERED
         and (references or 2.0 * FINER * row.record["seconds"] <= CHEAP_SECONDS)
     ]  # fmt: skip
     _carry_out(finer, arch, FINER, store, seconds_left, asked, tell)
     for row in rows:
-        if row.record is not None:
-            row.verdicts = judge(row.case, row.variant, row.record)
+        row.compare()
+        row.judge()
 
 
 def _carry_out(rows: Iterable[Row], arch, finer, store, seconds_left, asked, tell) -> None:

@@ -1,11 +1,13 @@
-"""The table of the hard cases: a row a number, in Markdown."""
+"""The page of the hard cases, in Markdown: the scoreboard, what is not solved, how each must end, and every number."""
 
 from collections.abc import Iterable
 
 from taisoft.output.tables import markdown
 
-from .hard_cases.record import PROPOSED, Case, Verdict
+from .hard_cases import GROUPS
+from .hard_cases.record import PROPOSED, Case, Must, Verdict
 from .hard_runs import Row
+from .hard_score import ALL, RULE, cells, faults, headline, how_solved, shown_columns, tally
 
 HEADINGS = (
     "case", "variant", "run", "quantity", "measured", "limit", "basis", "", "steps", "wall [s]", "step [ms]", "peak [MB]",
@@ -54,20 +56,66 @@ def row_lines(row: Row) -> list[tuple[str, ...]]:
     return lines
 
 
-def table(rows: Iterable[Row]) -> str:
+def page(rows: list[Row]) -> list[str]:
+    """All parts in their order."""
+    parts = [scoreboard(rows)]
+    sections = {"Not solved": unsolved, "How each must end": ends, "Every number": details, "Notes": notes}
+    for title, made in sections.items():
+        text = made(rows)
+        if text:
+            parts.append(f"## {title}\n\n{text}")
+    return parts
+
+
+def scoreboard(rows: list[Row]) -> str:
+    """The headline, and the counts of each group of cases and of all."""
+    shown = shown_columns(rows)
+    groups = {name: [row for row in rows if row.case in cases] for name, cases in GROUPS.items()}
+    lines = [(name, *cells(tally(own), shown)) for name, own in groups.items() if own]
+    table = markdown(("cases", *shown), [*lines, (ALL, *cells(tally(rows), shown))], left=(0,))
+    proposed = sum(verdict.basis == PROPOSED for row in rows for verdict in row.verdicts)
+    told = f"{RULE} {how_solved(rows)} Of the limits {proposed} are proposed, not measured elsewhere or analytic."
+    return f"{headline(rows)}\n\n{told}\n\n{table}"
+
+
+def unsolved(rows: Iterable[Row]) -> str:
+    """Each variant that is not solved, with its cause and the next idea."""
+    groups: dict[str, dict[str, list[str]]] = {}  # names of variants, by case and by why they are not solved
+    for row in rows:
+        if faults(row):
+            shortfalls = row.case.shortfalls_of(row.variant) if row.record is not None else []
+            why = [f"{'; '.join(faults(row))}.", *(f"Cause: {s.cause}. Next: {s.next_idea}." for s in shortfalls)]
+            case = groups.setdefault(f"{row.case.id}, {row.case.name}", {})
+            case.setdefault(" ".join(why), []).append(row.variant.name)
+    return "\n\n".join(
+        f"{case}\n\n" + "\n".join(f"* {'; '.join(names)}: {why}" for why, names in own.items()) for case, own in groups.items()
+    )
+
+
+def ends(rows: Iterable[Row]) -> str:
+    """How the variants of each case must end, and why."""
+    groups: dict[tuple[str, Must], list[str]] = {}
+    for row in rows:
+        groups.setdefault((row.case.id, row.variant.must), []).append(row.variant.name)
+    several = {case for case, _ in groups if sum(case == other for other, _ in groups) > 1}
+    return "\n".join(
+        f"* {case}: {must.text}: {must.reason}.{' Asked of: ' + '; '.join(names) + '.' if case in several else ''}"
+        for (case, must), names in groups.items()
+    )
+
+
+def details(rows: Iterable[Row]) -> str:
     """All rows."""
     return markdown(HEADINGS, [line for row in rows for line in row_lines(row)], LEFT)
 
 
 def notes(rows: list[Row]) -> str:
-    """What is to be known of limits that were replaced, of ends that are not ok, and of limits that are not met."""
+    """What is to be known of limits that were replaced, and what runs tell of their ends."""
     cases: dict[str, Case] = {row.case.id: row.case for row in rows}
     parts = []
     for case in cases.values():
         own = [row for row in rows if row.case is case]
         lines = [f"* limit on \"{c.quantity}\" ({c.basis}): {c.note}." for c in case.criteria if c.note]
-        if case.shortfall and not all(row.passed for row in own):
-            lines.append(f"* Not met: {case.shortfall}")
         for row in own:
             told = row.record["problems"] if row.record else []
             lines += [f"* {row.variant.name}: {text}" for text in told[:3]]
@@ -83,16 +131,3 @@ def reference_trouble(row: Row) -> str:
     if row.reference is not None and row.error is None:
         return f"{row.reference['status']}, " + ("; ".join(row.reference["problems"][:1]) or "at other times")
     return row.reference_left_out
-
-
-def summary(rows: list[Row]) -> str:
-    """How many variants meet their limits, and which do not."""
-    failed = [row for row in rows if row.record is not None and not row.passed]
-    missing = [row for row in rows if row.record is None]
-    proposed = sum(v.basis == PROPOSED for row in rows for v in row.verdicts)
-    good = len(rows) - len(failed) - len(missing)
-    text = f"{good} of {len(rows)} variants meet all their limits ({proposed} limits are proposed)"
-    for what, some in (("not met", failed), ("not run", missing)):
-        if some:
-            text += f"; {what}: " + ", ".join(f"{row.case.id} {row.variant.name}" for row in some)
-    return text + "."

@@ -21,6 +21,8 @@ from taisoft.output.tables import markdown
 
 from .document import RESULTS
 from .hard_cases import CASES
+from .hard_runs import Row, stored
+from .hard_score import ALL, cells, faults, headline, how_solved, shown_columns, tally
 from .order_cases import HANGING
 from .order_table import DEFAULT_DEGREE, GOAL
 from .reference_cases.record import label
@@ -126,18 +128,24 @@ def scaling(results: Path) -> str:
 
 
 def hard(results: Path) -> str:
-    """The hard cases: how many variants keep all their limits, and what the others miss."""
+    """The hard cases: how many variants are solved, how they ended, and why the others are not solved."""
     numbers = newest(results, "hard")
+    rows = stored(numbers)
+    shown = shown_columns(rows)
+
+    def line(name: str, title: str, own: list[Row]) -> tuple[str, ...]:
+        seconds = sum(row.record["seconds"] for row in own if row.record is not None)
+        return name, title, *cells(tally(own), shown), f"{seconds:.3g}"
+
     lines = []
     for case in CASES:
-        own = [row for row in numbers["rows"] if row["case"] == case.id]
-        ran = [row for row in own if row["run"] is not None]
-        missed = [v["quantity"] for row in ran for v in row["verdicts"] if v["passed"] is False]
-        seconds = sum(row["run"]["seconds"] for row in ran)
-        kept = f"{sum(row['passed'] for row in ran)} of {len(own)}"
-        lines.append((case.id, case.name, kept, f"{seconds:.3g}", "; ".join(dict.fromkeys(missed))))
-    table = markdown(("case", "", "variants that keep all limits", "wall [s]", "missed by others"), lines, left=(0, 1, 4))
-    return f"{table}\n\nMeasured on: {numbers['processor']}, {numbers['cores']} cores, {numbers['arch']}, {numbers['date'][:10]}."
+        own = [row for row in rows if row.case is case]
+        why = dict.fromkeys(fault for row in own for fault in faults(row))
+        lines.append((*line(case.id, case.name, own), "; ".join(why)))
+    headings = ("case", "", *shown, "wall [s]", "not solved because of")
+    table = markdown(headings, [*lines, (*line("", ALL, rows), "")], left=(0, 1, len(headings) - 1))
+    where = f"{numbers['processor']}, {numbers['cores']} cores, {numbers['arch']}, {numbers['date'][:10]}"
+    return f"{headline(rows)} {how_solved(rows)}\n\n{table}\n\nMeasured on: {where}."
 
 
 TABLES: dict[str, Callable[[Path], str]] = {  # by marker

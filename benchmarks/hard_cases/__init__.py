@@ -3,5 +3,9 @@
 from . import contact, geometry, long_run, material, ratios, scale, self_collision, time_step
 from .record import Case
 
-GROUPS = (material, time_step, ratios, contact, self_collision, geometry, scale, long_run)
-CASES: tuple[Case, ...] = tuple(case for group in GROUPS for case in group.CASES)
+GROUPS: dict[str, tuple[Case, ...]] = {  # by the catalogue's names
+    "material": material.CASES, "time step": time_step.CASES, "ratios": ratios.CASES, "contact & friction": contact.CASES,
+    "self-collision": self_collision.CASES, "degenerate geometry": geometry.CASES, "extremes of scale": scale.CASES,
+    "long run": long_run.CASES,
+}  # fmt: skip
+CASES: tuple[Case, ...] = tuple(case for cases in GROUPS.values() for case in cases)

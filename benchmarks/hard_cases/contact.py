@@ -4,7 +4,7 @@ import numpy as np
 
 import taisoft as ts
 
-from .record import ANALYTIC, DEGRADED, OK, PROPOSED, Case, Criterion, Variant
+from .record import ANALYTIC, OK, PROPOSED, Case, Criterion, Must, Shortfall, Variant
 from .session import Session
 from .shapes import COR, DOWN, SNH, cube, split, turned, voxels
 
@@ -178,9 +178,10 @@ def aligned(session: Session, over: str) -> dict[str, float]:
 
 
 STEP = {"dt": 0.005, "integrator": IMPLICIT}
+SLIDES = Must(OK, "Coulomb's law says which cube stays and how fast the others slide")
 C1 = Case(
     "C1", "a cube on a slope", slope,
-    tuple(Variant(f"friction {mu}", {"dt": 0.01, "integrator": IMPLICIT}, {"friction": mu}) for mu in (0.51, 0.49, 0.0)),
+    tuple(Variant(f"friction {mu}", {"dt": 0.01, "integrator": IMPLICIT}, {"friction": mu}, SLIDES) for mu in (0.51, 0.49, 0.0)),
     (
         Criterion("way [m]", 1e-3, PROPOSED, of={"friction": 0.51}),
         Criterion("way over 0.1755 m, less 1", 0.1, ANALYTIC, of={"friction": 0.49}),
@@ -192,10 +193,11 @@ C1 = Case(
 )  # fmt: skip
 
 BUCKLES = "a column of 5 m is higher than the 4.05 m from which a bar of this material buckles under its own weight"
+STANDS = Must(OK, "the stack stands, squeezed by 2.5 % of its height; all ten starts must")
 C2 = Case(
     "C2", "five cubes on each other", stack,
     tuple(
-        Variant(f"start {seed}", {"dt": 0.025, "integrator": IMPLICIT}, {"seed": seed}, (OK, DEGRADED), reference=seed == 0)
+        Variant(f"start {seed}", {"dt": 0.025, "integrator": IMPLICIT}, {"seed": seed}, STANDS, reference=seed == 0)
         for seed in range(10)
     ),
     (
@@ -207,9 +209,11 @@ C2 = Case(
 )  # fmt: skip
 
 A, B = {"part": "spike"}, {"part": "inner edges"}
+WEDGED = Must(OK, "the spike slides into the hole along its rims; sharp features make normals ambiguous, not absent")
+GLIDES = Must(OK, "a flat mesh is a plane: a cube without friction slides on as it came")
 C3 = Case(
     "C3", "spike in a hole; inner edges", spiked,
-    (Variant("spike", STEP, A, (OK, DEGRADED)), Variant("inner edges", STEP, B)),
+    (Variant("spike", STEP, A, WEDGED), Variant("inner edges", STEP, B, GLIDES)),
     (
         Criterion("numbers that are not finite at the end", 0.0, PROPOSED, of=A),
         Criterion(DEEPEST, 1e-3, PROPOSED, of=A),
@@ -223,18 +227,35 @@ C3 = Case(
         Criterion("hop [m]", 1e-3, PROPOSED, of=B),
         Criterion("loss of speed", 0.01, PROPOSED, of=B),
     ),
-    size=0.1, quick=("inner edges",),
+    size=0.1, shortfalls=(
+        Shortfall(
+            "rounding: in 5 steps of 400 the contact laws stop at a residual of 3e-4 to 8e-4, where 1e-4 is asked; with f64 all "
+            "steps converge, to 1e-6",
+            "a floor for the rounding of the contact residual, as the equations of motion have one, or that residual in f64",
+            of=A,
+        ),
+    ),
+    quick=("inner edges",),
 )  # fmt: skip
 
+TOUCHES = Must(OK, "where several contact normals are equally right, each of them gives an answer")
 C4 = Case(
     "C4", "features that meet exactly", aligned,
-    tuple(Variant(over, STEP, {"over": over}, (OK, DEGRADED)) for over in (*PLACES, "parallel edges")),
+    tuple(Variant(over, STEP, {"over": over}, TOUCHES) for over in (*PLACES, "parallel edges")),
     (
         Criterion("length of a normal, less 1, most", 1e-5, PROPOSED),
         Criterion(DEEPEST, 1e-3, PROPOSED),
         Criterion("pairs of triangles that cut each other at the end", 0.0, PROPOSED),
     ),
-    size=0.1, quick=("corner",),
+    size=0.1, shortfalls=(
+        Shortfall(
+            "multipliers stall: the 20 to 43 contacts between the cubes end at a residual of up to 2e-4, f32 asks 1e-4, and "
+            "no lower in f64; why is not known",
+            "a second-order step on the multipliers once it is settled which contacts press and which slide",
+            of={"over": "parallel edges"},
+        ),
+    ),
+    quick=("corner",),
 )  # fmt: skip
 
 CASES = (C1, C2, C3, C4)

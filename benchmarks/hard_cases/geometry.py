@@ -8,7 +8,7 @@ import taisoft as ts
 from taisoft.cli.info import describe
 
 from ..reference_cases.record import face, nearest
-from .record import DEGRADED, MEASURED, OK, PROPOSED, Case, Criterion, Variant
+from .record import MEASURED, OK, PROPOSED, REFUSED, Case, Criterion, Must, Shortfall, Variant
 from .session import Session, refusal
 from .shapes import COR, DOWN, SNH, box
 
@@ -53,6 +53,8 @@ def slivers(session: Session, law: str, s: float) -> dict[str, float]:
     if settings["integrator"] == EXPLICIT and s < 1.0:
         limit = LIMITS[s] * np.sqrt(DENSITY / 1000.0)
         said = refusal(lambda: session.simulator(sliver_scene(law, s)))
+        if said:
+            session.refuse(said)
         with session.simulator(sliver_scene(law, s), dt=0.5 * limit) as sim:
             estimate = sim.stable_dt
         return numbers | {"refused": float("stability limit" in said), "estimated limit, off by": abs(estimate / limit - 1.0)}
@@ -110,11 +112,14 @@ def knives(session: Session) -> dict[str, float]:
 
 NAMED = "volume of the tet that the load report names as worst, over s times the mean"
 SI = 2e-3 / np.sqrt(10.0)
+BENDS = Must(OK, "a few flat tets change neither the bar nor how it bends, and an implicit step has a solution for them too")
+TOO_LONG = Must(REFUSED, "this dt is 0.9 of the explicit limit without slivers, which these lower by 8 and by 83 times")
 G1 = Case(
     "G1", "slivers", slivers,
     tuple(
         Variant(
-            f"s {s:g}, {law}, {kind}", {"dt": dt, "integrator": kind}, {"law": law, "s": s}, (OK, DEGRADED),
+            f"s {s:g}, {law}, {kind}", {"dt": dt, "integrator": kind}, {"law": law, "s": s},
+            TOO_LONG if kind == EXPLICIT and s < 1.0 else BENDS,
             reference=kind == IMPLICIT or s == 1.0,
         )
         for law in (COR, SNH) for kind, dt in ((IMPLICIT, 0.01), (EXPLICIT, SI)) for s in LIMITS
@@ -125,12 +130,23 @@ G1 = Case(
         Criterion("refused", 1.0, MEASURED, at_least=True, of={"integrator": EXPLICIT, "s": (1e-2, 1e-4)}),
         Criterion("estimated limit, off by", 0.2, MEASURED, of={"integrator": EXPLICIT, "s": (1e-2, 1e-4)}),
     ),
-    size=LENGTH, quick=(f"s 0.0001, {SNH}, {EXPLICIT}",),
+    size=LENGTH,
+    shortfalls=(
+        Shortfall(
+            "rounding: f32 forces in slivers round to more than what is asked (a relative residual of 0.9 in every step at "
+            "s 0.0001, of 0.04 in one at s 0.01), though the tip is right within 1e-4 of the bar; with f64 all steps converge, "
+            "at s 0.0001 in a tenth of the time",
+            "forces of bad tets in f64, or a floor of the residual that follows their rounding",
+            of={"integrator": IMPLICIT, "s": (1e-2, 1e-4)},
+        ),
+    ),
+    quick=(f"s 0.0001, {SNH}, {EXPLICIT}",),
 )  # fmt: skip
 
+HANGS = Must(OK, "the edges of the knives bear the mat, which hangs over them; the catalogue lets thin obstacles be refused")
 G2 = Case(
     "G2", "mat on knives", knives,
-    (Variant(SNH, {"dt": 0.01, "integrator": IMPLICIT}, ends=(OK, DEGRADED)),),
+    (Variant(SNH, {"dt": 0.01, "integrator": IMPLICIT}, {}, HANGS),),
     (
         Criterion(
             "deepest of the contacts after any step [m]", 2e-3, PROPOSED,

@@ -6,13 +6,13 @@ import taisoft as ts
 from taisoft.scene.key_frames import KeyFrames
 
 from ..reference_cases.record import face
-from .record import ANALYTIC, DEGRADED, FAILED, MEASURED, OK, PROPOSED, Case, Criterion, Variant
+from .record import ANALYTIC, DEGRADED, INVERTED, MEASURED, OK, PROPOSED, STOPPED, Case, Criterion, Must, Shortfall, Variant
 from .session import Session
 from .shapes import COR, SNH, SVK, WEIGHTLESS, box, cube, rest_at_last
 
 LAWS = (COR, SNH)
 SHAPE = "shape error at the end, over L"
-INVERTED = "inverted tets at the end"
+INVERTED_LAST = "inverted tets at the end"
 SMALLEST = "smallest volume ratio at the end"
 STARTS = ("plane", "mirrored", "random")
 
@@ -52,7 +52,7 @@ def squeeze(session: Session, law: str) -> dict[str, float]:
         "largest displacement at the end [m]": way,
         "smallest volume ratio of all steps": min(report.min_volume_ratio for report in session.reports),
         "warnings of softening that name step and tet": float(len(told)),
-        "run is ok though tets are inverted at the end": float(session.status == OK and found[INVERTED] > 0.0),
+        "run is ok though tets are inverted at the end": float(session.status == OK and found[INVERTED_LAST] > 0.0),
     }
 
 
@@ -70,70 +70,110 @@ def draw_and_twist(session: Session, law: str) -> dict[str, float]:
         return rest_at_last(sim, 0.5) | {"steps that did not converge": float(session.unconverged)}
 
 
-def _recovery(law: str, kind: str, start: str, dt: float, **more) -> Variant:
+def _recovery(law: str, kind: str, start: str, dt: float, must: Must) -> Variant:
     name = f"{start}, {law}, {kind}, dt {dt:g} s"
     settings, parameters = {"dt": dt, "integrator": kind}, {"law": law, "start": start, "steps": round(14.0 / dt)}
-    return Variant(name, settings, parameters, **({"ends": (OK, DEGRADED), "reference": start != "random"} | more))
+    return Variant(name, settings, parameters, must, reference=start != "random")
 
 
 IMPLICIT, EXPLICIT = "implicit_euler", "symplectic_euler"
 FINITE = Criterion("numbers that are not finite in the last state", 0.0, ANALYTIC)
 
+RECOVERS = Must(
+    OK, "tets start flat or inside out, and count as inverted until they have turned; the law drives them back to the cube's "
+    "shape (measured), which it must have at the end", (INVERTED,),
+)  # fmt: skip
+STAYS = Must(
+    DEGRADED, "the energy of St. Venant-Kirchhoff is blind to reflections: a mirrored cube is at rest, and a flat one stays "
+    "flat; the run must tell of the inverted tets", (INVERTED,),
+)  # fmt: skip
+DIVERGES = Must(
+    STOPPED, "neo-Hookean stiffens with stretch, so that a tenth of the limit at rest is beyond that of these stretches: the "
+    "catalogue's reference is no longer finite in step 10, and no frame may be written of that", (INVERTED,),
+)  # fmt: skip
+
 M1 = Case(
     "M1", "collapsed to a plane; mirrored", recover,
     tuple(
-        _recovery(law, kind, start, dt, ends=(DEGRADED, FAILED) if law == SVK else (OK, DEGRADED))
+        _recovery(law, kind, start, dt, STAYS if law == SVK else RECOVERS)
         for law in (*LAWS, SVK) for kind, dt in ((IMPLICIT, 0.02), (EXPLICIT, 1e-3)) for start in STARTS[:2]
     ),
     (
         Criterion(SHAPE, 1e-3, MEASURED, of={"law": LAWS}),
         Criterion(SMALLEST, 0.99, MEASURED, at_least=True, of={"law": LAWS}),
-        Criterion(INVERTED, 0.0, MEASURED, of={"law": LAWS}),
+        Criterion(INVERTED_LAST, 0.0, MEASURED, of={"law": LAWS}),
         FINITE,
     ),
-    size=1.0, quick=(f"mirrored, {COR}, {EXPLICIT}, dt 0.001 s",),
+    size=1.0,
+    shortfalls=(
+        Shortfall(
+            "the first step starts where the polar rotation of every tet is not unique and forces jump (its two least singular "
+            "values, signed, add up to nothing), and Newton's method ends at its cap, in f64 and in parts too",
+            "bound the twist modes of the matrix where the rotation is not unique (their eigenvalues: Smith et al. 2019)",
+            of={"law": COR, "integrator": IMPLICIT, "start": "mirrored"},
+        ),
+    ),
+    quick=(f"mirrored, {COR}, {EXPLICIT}, dt 0.001 s",),
 )  # fmt: skip
 
+NOT_ASKED = "the catalogue speaks of neo-Hookean alone; corotational does not stiffen with stretch, and must recover"
 M2 = Case(
     "M2", "random vertices", recover,
     tuple(
-        _recovery(law, kind, "random", dt, ends=ends)
-        for law in LAWS
-        for kind, dt, ends in (
-            (IMPLICIT, 0.01, (OK, DEGRADED)), (EXPLICIT, 2.2e-4, (OK, DEGRADED)), (EXPLICIT, 1.12e-3, (OK, DEGRADED, FAILED)),
-        )
+        _recovery(law, kind, "random", dt, DIVERGES if (law, dt) == (SNH, 1.12e-3) else RECOVERS)
+        for law in LAWS for kind, dt in ((IMPLICIT, 0.01), (EXPLICIT, 2.2e-4), (EXPLICIT, 1.12e-3))
     ),
     (
         Criterion(SHAPE, 1e-3, PROPOSED, of={"integrator": IMPLICIT}),
-        Criterion(INVERTED, 0.0, PROPOSED, of={"integrator": IMPLICIT}),
+        Criterion(INVERTED_LAST, 0.0, PROPOSED, of={"integrator": IMPLICIT}),
         Criterion(SHAPE, 1e-3, MEASURED, of={"dt": 2.2e-4}),
-        Criterion(INVERTED, 0.0, MEASURED, of={"dt": 2.2e-4}),
+        Criterion(INVERTED_LAST, 0.0, MEASURED, of={"dt": 2.2e-4}),
+        Criterion(SHAPE, 1e-3, PROPOSED, of={"dt": 1.12e-3, "law": COR}, note=f"for dt 0.00112 s {NOT_ASKED}"),
+        Criterion(INVERTED_LAST, 0.0, PROPOSED, of={"dt": 1.12e-3, "law": COR}, note=f"for dt 0.00112 s {NOT_ASKED}"),
         FINITE,
     ),
     size=1.0, quick=(f"random, {SNH}, {EXPLICIT}, dt 0.00112 s",),
 )  # fmt: skip
 
+BEARS = Must(OK, "both laws stay stiff when squeezed to half: the cube has an upright shape all the way, and its rest at the end")
+SNAPS = Must(
+    OK, "St. Venant-Kirchhoff softens below a stretch of 0.577, so that tets may snap through when squeezed to half; the run "
+    "must tell of that", (INVERTED,),
+)  # fmt: skip
 M3 = Case(
     "M3", "squeezed past a stretch of 0.577", squeeze,
     tuple(
-        Variant(law, {"dt": 0.01, "integrator": IMPLICIT}, {"law": law}, ends=(OK, DEGRADED) if law == SVK else (OK,))
+        Variant(law, {"dt": 0.01, "integrator": IMPLICIT}, {"law": law}, SNAPS if law == SVK else BEARS)
         for law in (SVK, *LAWS)
     ),
     (
         Criterion("smallest volume ratio of all steps", 0.05, PROPOSED, at_least=True, of={"law": LAWS}),
         Criterion("largest displacement at the end [m]", 1e-4, PROPOSED, of={"law": LAWS}),
-        Criterion(INVERTED, 0.0, PROPOSED, of={"law": LAWS}),
+        Criterion(INVERTED_LAST, 0.0, PROPOSED, of={"law": LAWS}),
         Criterion("warnings of softening that name step and tet", 1.0, ANALYTIC, at_least=True, of={"law": SVK}),
         Criterion("run is ok though tets are inverted at the end", 0.0, ANALYTIC, of={"law": SVK}),
     ),
     size=0.1,
 )  # fmt: skip
 
+RECOILS = Must(
+    OK, "drawn to a stretch of 4 the bar holds more than twice the energy that flattens a tet (per volume 85 against 32 kPa in "
+    "neo-Hookean), so that tets may turn inside out when it is let go; none may be at the end", (INVERTED,),
+)  # fmt: skip
 M4 = Case(
     "M4", "stretch of 4, a full turn, release", draw_and_twist,
-    tuple(Variant(law, {"dt": 0.01, "integrator": IMPLICIT}, {"law": law}, ends=(OK, DEGRADED)) for law in LAWS),
-    (Criterion(INVERTED, 0.0, PROPOSED), Criterion(SHAPE, 5e-3, PROPOSED)),
-    size=0.5,
+    tuple(Variant(law, {"dt": 0.01, "integrator": IMPLICIT}, {"law": law}, RECOILS) for law in LAWS),
+    (Criterion(INVERTED_LAST, 0.0, PROPOSED), Criterion(SHAPE, 5e-3, PROPOSED)),
+    size=0.5, shortfalls=(
+        Shortfall(
+            "corotational thins in proportion to stretch: with Poisson's ratio 0.4 no width is left at a stretch of 3.5, "
+            "where the rotation flips; the energy has a kink there, and from there on its minimum, in which up to 345 of 540 "
+            "tets sit: no step can drive their forces to zero, in f64 neither",
+            "count a step as converged at a kink, where zero lies between the forces of its two sides; warn as for the "
+            "softening of St. Venant-Kirchhoff",
+            of={"law": COR},
+        ),
+    ),
 )  # fmt: skip
 
 CASES = (M1, M2, M3, M4)

@@ -6,7 +6,7 @@ import numpy as np
 
 import taisoft as ts
 
-from .record import ANALYTIC, DEGRADED, FAILED, OK, PROPOSED, Case, Criterion, Variant
+from .record import ANALYTIC, INVERTED, OK, PROPOSED, Case, Criterion, Must, Shortfall, Variant
 from .session import Session
 from .shapes import DOWN, SNH, G, box, cube, turned
 
@@ -86,28 +86,45 @@ def static_thickness(mesh: ts.TetMesh, soft: ts.Material, inside: np.ndarray) ->
 
 
 A, B = {"level": "A"}, {"level": "B"}
+BEARS = Must(OK, "the lower cube bears 0.1 MPa, a hundredth of its stiffness")
+CRUSHED = Must(
+    OK, "the weight asks 9.8 MPa of the lower cube, whose law bears 2.1 MPa at most: it is crushed, its tets may turn inside "
+    "out, and the plane bears the upper cube; the catalogue lets it fail, but there is an answer", (INVERTED,),
+)  # fmt: skip
 R1 = Case(
     "R1", "mass ratio of 1e4", masses,
     (
-        Variant("A", {"dt": 0.025, "integrator": IMPLICIT}, A),
-        Variant("B", {"dt": 0.025, "integrator": IMPLICIT}, B, (OK, DEGRADED, FAILED)),
+        Variant("A", {"dt": 0.025, "integrator": IMPLICIT}, A, BEARS),
+        Variant("B", {"dt": 0.025, "integrator": IMPLICIT}, B, CRUSHED),
     ),
     (
         Criterion("force on the plane over the weight, less 1, most of the last 0.5 s", 0.01, ANALYTIC, of=A),
         Criterion("deepest penetration after any step [m]", 5e-4, PROPOSED, of=A),
         Criterion("deepest penetration after any step [m]", 2e-3, PROPOSED, of=B),
         Criterion("numbers that are not finite in the last state", 0.0, PROPOSED),
-        Criterion("longest step over the median", 10.0, PROPOSED),
+        Criterion("longest step over the median", 10.0, PROPOSED, cost=True),
     ),
     size=0.1,
-    shortfall="the step of the impact takes some hundred multipliers and Newton iterations, one at rest a single one: the ratio "
-    "tells of cheap steps at rest as much as of the dear one. Next: start the multipliers of new contacts from the impulses of a "
-    "rigid impact.",
+    shortfalls=(
+        Shortfall(
+            "the step of the impact takes some hundred multipliers and Newton iterations, one at rest a single one: the ratio "
+            "tells of cheap steps at rest as much as of the dear one",
+            "start the multipliers of new contacts from the impulses of a rigid impact",
+            of=A,
+        ),
+        Shortfall(
+            "a step is cut into parts by the speed that it begins with; the crushed cube reaches more than twice that within the "
+            "step, so that bodies could pass each other unseen, and the run is stopped",
+            "do such a step again in the parts that its highest speed asks for",
+            of=B,
+        ),
+    ),
 )  # fmt: skip
 
+LIES = Must(OK, "the soft slab bears its own weight, a twentieth of its stiffness, and comes to lie on the stiff one")
 R2 = Case(
     "R2", "stiffness ratio of 1e4", stiffnesses,
-    (Variant("neo-Hookean", {"dt": 0.025, "integrator": IMPLICIT}, ends=(OK, DEGRADED)),),
+    (Variant("neo-Hookean", {"dt": 0.025, "integrator": IMPLICIT}, {}, LIES),),
     (
         Criterion("deepest penetration after any step [m]", 2e-3, PROPOSED),
         Criterion("thickness of the soft slab over that by statics, less 1", 0.02, ANALYTIC),
@@ -116,6 +133,14 @@ R2 = Case(
         ),
     ),
     size=1.0,
+    shortfalls=(
+        Shortfall(
+            "in two steps between 0.2 and 0.3 s, as the slab lands with some 550 contacts, Newton's method ends at its cap of "
+            "400 iterations, in two and four parts too, and leaves a relative residual of 0.03 to 0.05; with f64 every step goes "
+            "below what f32 asks (1.4e-6, its contacts 3e-5), so that rounding has a part in it",
+            "the contact forces and their residual in f64",
+        ),
+    ),
 )  # fmt: skip
 
 CASES = (R1, R2)

@@ -1,7 +1,8 @@
 """What a hard case is: variants of one setting, the function that runs it and measures, and the numbers that it must keep to.
 
 A case is data beside one function. The function gets a `Session` (`session.py`) and a variant's parameters, runs, and returns
-numbers by their quantity; the criteria say which of them have a limit, and of which variants.
+numbers by their quantity; the criteria say which of them have a limit, and of which variants. Each variant says how it must
+end, and why: by the catalogue and by physics, never by what came out.
 """
 
 import math
@@ -10,7 +11,42 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 MEASURED, ANALYTIC, PROPOSED = "measured", "analytic", "proposed"  # what a limit rests on
-OK, DEGRADED, FAILED = "ok", "degraded", "failed"  # how a run ends
+# How a variant ends. Refused: an error before a simulator's first step is done. Stopped: an error in a later step.
+OK, DEGRADED, REFUSED, STOPPED = "ok", "degraded", "refused", "stopped"
+FAILED = "failed"  # what a RunReport calls both
+
+# What degrades a run.
+UNCONVERGED, INVERTED, DROPPED = "unconverged steps", "inverted tets", "dropped contacts"
+PENETRATION, OVERLAP, INTERRUPTED = "penetration", "overlap at the end", "interruption"
+END = "end of the run"  # the quantity of a variant's first verdict
+
+
+@dataclass(frozen=True)
+class Must:
+    """How a variant must end: OK, DEGRADED, REFUSED or STOPPED. reason: why, in one line.
+
+    causes: what may degrade the run, because the setting itself brings it about. With OK and causes, both an ok end and one
+    that only they degrade count. Nothing else may have gone wrong in a run that is refused or stopped either.
+    """
+
+    end: str
+    reason: str
+    causes: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """As words."""
+        by = f"{DEGRADED} by {' and '.join(self.causes)}"
+        return self.end if not self.causes or self.end in (REFUSED, STOPPED) else f"ok, or {by}" if self.end == OK else by
+
+    def met(self, record: dict) -> bool:
+        """Whether a record ends so."""
+        status, causes = record["status"], set(record["causes"])
+        if not causes <= set(self.causes):
+            return False
+        if status == DEGRADED:
+            return self.end in (OK, DEGRADED) and bool(causes)  # a run that cannot say what degraded it is not excused
+        return status == self.end and not (status == OK and causes)
 
 
 @dataclass(frozen=True)
@@ -19,7 +55,8 @@ class Criterion:
 
     quantity: by which the case's function tells it. basis: one of MEASURED, ANALYTIC, PROPOSED. at_least: a lower limit.
     asked: the limit that the catalogue proposes, where another, an honest baseline, replaces it. note: what that is and why.
-    of: the parameters and settings of the variants that it is asked of, by name; empty for all.
+    of: the parameters and settings of the variants that it is asked of, by name; empty for all. cost: a limit on time, memory
+    or iterations; a run that misses it is not solved, but its answer is not wrong.
     """
 
     quantity: str
@@ -29,6 +66,7 @@ class Criterion:
     asked: float | None = None
     note: str = ""
     of: dict[str, Any] = field(default_factory=dict)
+    cost: bool = False
 
     def met(self, value: float) -> bool:
         """Whether a value keeps the limit; one that is not a number never does."""
@@ -39,19 +77,28 @@ class Criterion:
 class Variant:
     """One run of a case. settings: arguments of ts.Simulator; parameters: of the case's function.
 
-    ends: how it may end. reference: whether its shape can be held against that of a run in f64 with an eighth of the step.
+    must: how it must end. reference: whether its shape can be held against that of a run in f64 with an eighth of the step.
     """
 
     name: str
     settings: dict[str, Any]
-    parameters: dict[str, Any] = field(default_factory=dict)
-    ends: tuple[str, ...] = (OK,)
+    parameters: dict[str, Any]
+    must: Must
     reference: bool = True
 
 
 @dataclass(frozen=True)
+class Shortfall:
+    """Why variants of a case are not solved, and what to try next. of: which variants, as in Criterion."""
+
+    cause: str
+    next_idea: str
+    of: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Case:
-    """A hard case. size [m]: what errors are divided by. shortfall: of limits that are not met, the cause and the next idea."""
+    """A hard case. size [m]: what errors are divided by. shortfalls: of variants that are not solved."""
 
     id: str
     name: str
@@ -59,13 +106,16 @@ class Case:
     variants: tuple[Variant, ...]
     criteria: tuple[Criterion, ...]
     size: float
-    shortfall: str = ""
-    quick: tuple[str, ...] = ()  # variants that are cheap and meet their limits
+    shortfalls: tuple[Shortfall, ...] = ()
+    quick: tuple[str, ...] = ()  # variants that are cheap and solved
 
     def criteria_of(self, variant: Variant) -> list[Criterion]:
         """What is asked of one variant."""
-        own = variant.settings | variant.parameters
-        return [c for c in self.criteria if all(own[key] in _several(value) for key, value in c.of.items())]
+        return [c for c in self.criteria if _concerns(c.of, variant)]
+
+    def shortfalls_of(self, variant: Variant) -> list[Shortfall]:
+        """Why one variant is not solved."""
+        return [s for s in self.shortfalls if _concerns(s.of, variant)]
 
 
 @dataclass(frozen=True)
@@ -79,6 +129,7 @@ class Verdict:
     basis: str = ""
     asked: float | None = None
     passed: bool | None = None  # None where there is no limit
+    cost: bool = False
 
     def record(self) -> dict:
         """As plain data."""
@@ -87,17 +138,20 @@ class Verdict:
 
 def judge(case: Case, variant: Variant, record: dict) -> list[Verdict]:
     """What a record says of a variant's criteria: its end first, then what has a limit, then what is only told."""
-    ends, status = " or ".join(variant.ends), record["status"]
-    verdicts = [Verdict("end of the run", status, ends, passed=status in variant.ends)]
+    causes = " and ".join(record["causes"]) if record["status"] == DEGRADED else ""
+    ended = f"{record['status']} by {causes}" if causes else record["status"]
+    verdicts = [Verdict(END, ended, variant.must.text, passed=variant.must.met(record))]
     numbers = record["numbers"]
     criteria = case.criteria_of(variant)
     for c in criteria:
         value = numbers.get(c.quantity)  # null for what is not finite, absent in a run that could not be made
         met = value is not None and c.met(value)
-        verdicts.append(Verdict(c.quantity, value, c.limit, c.at_least, c.basis, c.asked, met))
+        verdicts.append(Verdict(c.quantity, value, c.limit, c.at_least, c.basis, c.asked, met, c.cost))
     judged = {c.quantity for c in criteria}
     return verdicts + [Verdict(name, value) for name, value in numbers.items() if name not in judged]
 
 
-def _several(value) -> tuple:
-    return value if isinstance(value, tuple) else (value,)
+def _concerns(of: dict[str, Any], variant: Variant) -> bool:
+    """Whether a variant has one of the values asked for under every name."""
+    own = variant.settings | variant.parameters
+    return all(own[key] in (value if isinstance(value, tuple) else (value,)) for key, value in of.items())

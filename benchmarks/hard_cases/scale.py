@@ -6,7 +6,7 @@ import taisoft as ts
 from taisoft.errors import SimulationError
 
 from ..reference_cases.record import face
-from .record import ANALYTIC, DEGRADED, FAILED, OK, PROPOSED, Case, Criterion, Variant
+from .record import ANALYTIC, OK, PROPOSED, REFUSED, STOPPED, Case, Criterion, Must, Shortfall, Variant
 from .session import Session
 from .shapes import COR, DOWN, SNH, WEIGHTLESS, box, cube
 
@@ -107,34 +107,38 @@ def bin_scene(**capacities) -> ts.Scene:
 
 
 def flood(session: Session, capacities: dict, broad_phase: str) -> dict[str, float]:
-    """X3: cubes fall into a bin, with buffers for 64 pairs and contacts, beside a run with room enough."""
+    """X3: cubes fall into a bin, with buffers for 64 pairs and contacts, beside a run with room enough where they may grow."""
 
     def run(**given) -> tuple[np.ndarray, dict]:
         with session.simulator(bin_scene(broad_phase=broad_phase, **given)) as sim:
-            session.go(sim, 200, follow=not given)
+            session.go(sim, 200, follow=False)
             return sim.positions(), sim.buffer_growths
 
-    ample, _ = run()
-    before = len(session.problems)
-    small, grown = np.full_like(ample, np.nan), {}
+    small, grown = None, {}
     try:
         small, grown = run(**capacities)
-    except SimulationError as error:  # it is refused before the first step
-        session.tell(FAILED, [str(error)])
-    told = " ".join(session.problems[before:])
-    return {
-        "off the run with room enough [m]": np.abs(small - ample).max(),
+    except SimulationError as error:
+        session.refuse(str(error))
+    sentences = " ".join(session.problems)
+    numbers = {
         "buffers that grew": float(len(grown)),
-        "sentences with needed and available counts": float("entries are needed" in told and "max_capacity allows" in told),
+        "sentences with needed and available counts": float(
+            "entries are needed" in sentences and "max_capacity allows" in sentences
+        ),
         "dropped contacts": float(sum(report.dropped_contacts for report in session.reports)),
     }
+    if small is not None and "max_capacity" not in capacities:
+        numbers["off the run with room enough [m]"] = np.abs(small - run()[0]).max()
+    return numbers
 
 
+SCALES_EXACTLY = Must(OK, "lengths and times scale together, so that every size has the same answer")
 X1 = Case(
     "X1", "the same problem at 1 um, 1 mm, 1 m, 1 km", scales,
     tuple(
         Variant(
             f"{law}, {kind}, {precision}", {"dt": dt, "integrator": kind, "precision": precision}, {"law": law, "steps": steps},
+            SCALES_EXACTLY,
         )
         for law in (COR, SNH)
         for kind, dt, steps in ((IMPLICIT, 5e-3, 100), (EXPLICIT, 1e-3, 500))
@@ -143,21 +147,23 @@ X1 = Case(
     (
         Criterion("tip off that at 1 m, over L, most", 1e-4, ANALYTIC, of={"precision": "f32"}),
         Criterion("tip off that at 1 m, over L, most", 1e-9, ANALYTIC, of={"precision": "f64"}),
-        Criterion("iterations over those at 1 m, less 1", 0.2, ANALYTIC),
+        Criterion("iterations over those at 1 m, less 1", 0.2, ANALYTIC, cost=True),
     ),
     size=0.5, quick=(f"{COR}, {EXPLICIT}, f64",),
 )  # fmt: skip
 
 FLYING, SPOILT = {"spoilt": False}, {"spoilt": True}
+FLIES = Must(OK, "a fast body far away is a body as any other, and nothing to the one at rest")
+POISONED = Must(STOPPED, "no answer follows from NaN: the step that meets it must end the run and name the body")
 X2 = Case(
     "X2", "the one that flies away", flyer,
     (
-        Variant("1e4 m/s", {"dt": 0.01, "integrator": IMPLICIT}, FLYING),
-        Variant("NaN at step 50", {"dt": 0.01, "integrator": IMPLICIT}, SPOILT, (FAILED,), reference=False),
+        Variant("1e4 m/s", {"dt": 0.01, "integrator": IMPLICIT}, FLYING, FLIES),
+        Variant("NaN at step 50", {"dt": 0.01, "integrator": IMPLICIT}, SPOILT, POISONED, reference=False),
     ),
     (
         Criterion("A's path off that without B [m]", 1e-7, PROPOSED),
-        Criterion("growth of memory", 0.1, PROPOSED, of=FLYING),
+        Criterion("growth of memory", 0.1, PROPOSED, of=FLYING, cost=True),
         Criterion("steps", 50.0, ANALYTIC, of=SPOILT),
         Criterion("sentences that name body 'B'", 1.0, ANALYTIC, at_least=True, of=SPOILT),
     ),
@@ -165,13 +171,15 @@ X2 = Case(
 )  # fmt: skip
 
 GROWING, FORBIDDEN = {"initial_capacity": 64}, {"initial_capacity": 64, "max_capacity": 64}
+GROWS = Must(OK, "with memory that may grow the cubes fall as in buffers with room enough")
+FULL = Must(REFUSED, "the cubes' pairs at the start are more than the 64 that max_capacity allows; none of them may be dropped")
 X3 = Case(
     "X3", "contact flood with a small buffer", flood,
     tuple(
         Variant(
-            f"{what}, {phase}", {"dt": 0.01, "integrator": IMPLICIT}, {"capacities": given, "broad_phase": phase}, ends, False
+            f"{what}, {phase}", {"dt": 0.01, "integrator": IMPLICIT}, {"capacities": given, "broad_phase": phase}, must, False
         )
-        for what, given, ends in (("64, growing", GROWING, (OK, DEGRADED)), ("64 at most", FORBIDDEN, (FAILED,)))
+        for what, given, must in (("64, growing", GROWING, GROWS), ("64 at most", FORBIDDEN, FULL))
         for phase in ("bvh", "spatial_hash")
     ),
     (
@@ -180,7 +188,14 @@ X3 = Case(
         Criterion("sentences with needed and available counts", 1.0, PROPOSED, at_least=True, of={"capacities": FORBIDDEN}),
         Criterion("dropped contacts", 0.0, ANALYTIC),
     ),
-    size=0.05,
+    size=0.05, shortfalls=(
+        Shortfall(
+            "multipliers stall: in one step, with 472 contacts, the contact laws end at a residual of 1.25e-4, where f32 asks "
+            "1e-4, and no lower in f64; memory has no part in it, the run with room enough does the same",
+            "a second-order step on the multipliers once it is settled which contacts press and which slide",
+            of={"capacities": GROWING},
+        ),
+    ),
 )  # fmt: skip
 
 CASES = (X1, X2, X3)

@@ -14,11 +14,25 @@ from taisoft.errors import TaisoftError
 from taisoft.output.report import peak_memory
 from taisoft.records import RunReport, StepReport
 
-from .record import DEGRADED, FAILED, OK, Case, Variant
+from .record import (
+    DEGRADED,
+    DROPPED,
+    FAILED,
+    INTERRUPTED,
+    INVERTED,
+    OK,
+    OVERLAP,
+    PENETRATION,
+    REFUSED,
+    STOPPED,
+    UNCONVERGED,
+    Case,
+    Variant,
+)
 
 FINER = 8  # steps of a reference for one of the run
 FRAMES = 20  # of a run that are kept, at most about
-WORST = (OK, DEGRADED, FAILED)
+WORST = (OK, DEGRADED, REFUSED, STOPPED)
 
 Look = Callable[[ts.Simulator, int, StepReport | None], None]
 
@@ -32,6 +46,7 @@ class Session:
     def __init__(self, case: Case, variant: Variant, arch: str, finer: int = 1):
         self.case, self.variant, self.arch, self.finer = case, variant, arch, finer
         self.status = OK
+        self.causes: set[str] = set()  # what degraded its runs
         self.problems: list[str] = []
         self._warned: list[warnings.WarningMessage] = []
         self.steps = 0
@@ -69,8 +84,14 @@ class Session:
         result = sim.run(steps * dt, frame, fps=1.0 / (every * dt), on_step=step)
         self.steps += result.steps
         self.reports += result.step_reports
-        self.tell(result.status, result.problems)
+        self.causes |= causes_of(sim, result)
+        failed = STOPPED if sim.step_count else REFUSED  # the simulator's first step is done, or not
+        self.tell(failed if result.status == FAILED else result.status, result.problems)
         return result
+
+    def refuse(self, sentence: str) -> None:
+        """What was asked of a simulator was refused."""
+        self.tell(REFUSED, [sentence])
 
     def tell(self, status: str, problems: list[str]) -> None:
         """How something ended; the worst counts."""
@@ -101,9 +122,10 @@ class Session:
                 numbers = self.case.run(self, **self.variant.parameters)
             except TaisoftError as error:
                 numbers = {}
-                self.tell(FAILED, [str(error)])
+                self.refuse(str(error))
         return {
-            "status": self.status, "problems": list(dict.fromkeys(self.problems)), "warnings": list(dict.fromkeys(self.warnings)),
+            "status": self.status, "causes": sorted(self.causes),
+            "problems": list(dict.fromkeys(self.problems)), "warnings": list(dict.fromkeys(self.warnings)),
             "numbers": {name: float(value) for name, value in numbers.items()},
             "steps": self.steps, "seconds": self.seconds, "total_seconds": time.perf_counter() - start,
             "step_seconds": float(np.median(self.step_seconds)) if self.step_seconds else None,
@@ -114,6 +136,23 @@ class Session:
             "unconverged": self.unconverged, "peak_memory_bytes": peak_memory(),
             "points": np.concatenate(self.path) if self.path else np.empty((0, 3)),
         }  # fmt: skip
+
+
+def causes_of(sim: ts.Simulator, result: RunReport) -> set[str]:
+    """What degraded a run."""
+    steps = result.step_reports
+    found = {
+        UNCONVERGED: any(not step.converged for step in steps), INVERTED: any(step.n_inverted for step in steps),
+        DROPPED: any(step.dropped_contacts for step in steps), PENETRATION: any(step.deep for step in steps),
+        INTERRUPTED: result.interrupted,
+        OVERLAP: result.status == DEGRADED and sim.touches and overlapping(sim),
+    }  # fmt: skip
+    return {cause for cause, so in found.items() if so}
+
+
+def overlapping(sim: ts.Simulator) -> bool:
+    """Whether two bodies overlap by more than a run may end with."""
+    return any(found.depth > sim.contact_limit(found.name_a, found.name_b) for found in sim.overlaps())
 
 
 def refusal(make: Callable[[], ts.Simulator]) -> str:

@@ -1,0 +1,144 @@
+"""The scoreboard of the hard cases:
+
+* solved is what ended as it must with all limits kept; a refusal, a stop or a degraded end where there is an answer is not;
+* wrong is an ok end that must not be one, that hides something, or that misses a limit on its answer, not on its cost;
+* the headline is the sum over the groups and over the cases; what was not run is asked, and not solved;
+* stored results are judged by what is asked today: their verdicts, their page and README's table; what is not solved has a cause.
+"""
+
+import json
+
+import pytest
+
+from benchmarks import hard, readme
+from benchmarks.document import RESULTS
+from benchmarks.hard_cases import CASES, GROUPS
+from benchmarks.hard_cases.record import (
+    DEGRADED,
+    INVERTED,
+    OK,
+    PROPOSED,
+    REFUSED,
+    STOPPED,
+    UNCONVERGED,
+    Case,
+    Criterion,
+    Must,
+    Variant,
+)
+from benchmarks.hard_runs import Row, stored
+from benchmarks.hard_score import ASKED, COLUMNS, NOT_RUN, SOLVED, WRONG, column, faults, headline, tally
+from benchmarks.hard_table import scoreboard
+from taisoft.errors import OutputError
+
+ANSWER, COST = Criterion("off by", 1.0, PROPOSED), Criterion("seconds", 1.0, PROPOSED, cost=True)
+PLAIN, INSIDE_OUT, ALWAYS = Must(OK, "why"), Must(OK, "why", (INVERTED,)), Must(DEGRADED, "why", (INVERTED,))
+REFUSES, STOPS = Must(REFUSED, "why"), Must(STOPPED, "why", (INVERTED,))
+KEPT, OFF, SLOW = {"off by": 0.5, "seconds": 0.5}, {"off by": 2.0, "seconds": 0.5}, {"off by": 0.5, "seconds": 2.0}
+BOTH = [INVERTED, UNCONVERGED]
+
+
+def row_of(must: Must, status: str | None, causes=(), numbers=KEPT) -> Row:
+    variant = Variant("first", {}, {}, must)
+    record = {"status": status, "causes": list(causes), "numbers": numbers, "problems": []}
+    row = Row(Case("Z1", "", None, (variant,), (ANSWER, COST), size=1.0), variant, record if status else None)
+    row.judge()
+    return row
+
+
+@pytest.mark.parametrize(
+    "must, status, causes, numbers, where, why",
+    [
+        (PLAIN, OK, [], KEPT, OK, []),
+        (PLAIN, DEGRADED, [UNCONVERGED], KEPT, DEGRADED, [UNCONVERGED]),  # though all its limits are kept
+        (PLAIN, DEGRADED, [INVERTED], KEPT, DEGRADED, [INVERTED]),
+        (PLAIN, DEGRADED, [], KEPT, DEGRADED, ["degraded, must be ok"]),
+        (PLAIN, REFUSED, [], KEPT, REFUSED, ["refused, must be ok"]),
+        (PLAIN, STOPPED, [], KEPT, STOPPED, ["stopped, must be ok"]),
+        (PLAIN, STOPPED, [INVERTED], {}, STOPPED, ["stopped, must be ok", "off by", "seconds"]),
+        (PLAIN, None, [], {}, NOT_RUN, [NOT_RUN]),
+        (PLAIN, OK, [], OFF, WRONG, ["off by"]),
+        (PLAIN, OK, [], {}, WRONG, ["off by", "seconds"]),
+        (PLAIN, OK, [], SLOW, OK, ["seconds"]),  # its answer stands
+        (PLAIN, OK, [UNCONVERGED], KEPT, WRONG, [UNCONVERGED]),  # it hides that
+        (INSIDE_OUT, OK, [], KEPT, OK, []),
+        (INSIDE_OUT, OK, [INVERTED], KEPT, WRONG, ["ok, must be ok, or degraded by inverted tets"]),
+        (INSIDE_OUT, DEGRADED, [INVERTED], KEPT, DEGRADED, []),
+        (INSIDE_OUT, DEGRADED, [INVERTED], OFF, DEGRADED, ["off by"]),
+        (INSIDE_OUT, DEGRADED, BOTH, KEPT, DEGRADED, [UNCONVERGED]),  # the start does not explain that
+        (INSIDE_OUT, STOPPED, [INVERTED], KEPT, STOPPED, ["stopped, must be ok, or degraded by inverted tets"]),
+        (ALWAYS, DEGRADED, [INVERTED], KEPT, DEGRADED, []),
+        (ALWAYS, OK, [], KEPT, WRONG, ["ok, must be degraded by inverted tets"]),
+        (REFUSES, REFUSED, [], KEPT, REFUSED, []),
+        (REFUSES, STOPPED, [], KEPT, STOPPED, ["stopped, must be refused"]),
+        (REFUSES, OK, [], KEPT, WRONG, ["ok, must be refused"]),
+        (REFUSES, REFUSED, [UNCONVERGED], KEPT, REFUSED, [UNCONVERGED]),
+        (STOPS, STOPPED, [INVERTED], KEPT, STOPPED, []),
+        (STOPS, STOPPED, [], OFF, STOPPED, ["off by"]),
+        (STOPS, DEGRADED, [INVERTED], KEPT, DEGRADED, ["degraded, must be stopped"]),
+        (STOPS, OK, [], KEPT, WRONG, ["ok, must be stopped"]),
+    ],
+)
+def test_solved_or_not(must, status, causes, numbers, where, why):
+    row = row_of(must, status, causes, numbers)
+    assert (column(row), faults(row)) == (where, why)
+    assert row.data()["solved"] == (not why) and row.data()["column"] == where
+
+
+def table_numbers(text: str, wanted: str) -> list[int]:
+    """A column of the only Markdown table in a text."""
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
+    place = lines[0].index(wanted)
+    return [int(line[place] or 0) for line in lines[2:]]
+
+
+@pytest.fixture(scope="module")
+def results() -> dict:
+    """The stored results that README tells of."""
+    return readme.newest(RESULTS, "hard")
+
+
+def test_the_headline_is_the_sum(results):
+    rows = stored(results)
+    counts = tally(rows)
+    assert counts[ASKED] == len(rows) == sum(len(case.variants) for case in CASES) == sum(counts[name] for name in COLUMNS)
+    assert counts[SOLVED] == sum(row["solved"] for row in results["rows"]) and str(counts[SOLVED]) in headline(rows)
+    assert [case for cases in GROUPS.values() for case in cases] == list(CASES)
+    for text in (scoreboard(rows), readme.hard(RESULTS)):
+        assert headline(rows) in text and (NOT_RUN in text) == bool(counts[NOT_RUN])
+        for name in (ASKED, SOLVED, *COLUMNS[:-1]):
+            *lines, last = table_numbers(text, name)
+            assert sum(lines) == last == counts[name]
+
+
+def test_what_was_not_run_is_asked_and_not_solved(results):
+    before = tally(stored(results))
+    dropped = next(row for row in results["rows"] if row["solved"])
+    rows = stored(results | {"rows": [row for row in results["rows"] if row is not dropped]})
+    assert tally(rows) == before | {SOLVED: before[SOLVED] - 1, NOT_RUN: 1, dropped["column"]: before[dropped["column"]] - 1}
+    assert NOT_RUN in scoreboard(rows)
+
+
+def test_every_stored_variant_that_is_not_solved_has_a_cause(results):
+    unexplained = [row for row in stored(results) if faults(row) and row.record and not row.case.shortfalls_of(row.variant)]
+    assert [(row.case.id, row.variant.name) for row in unexplained] == []
+
+
+def test_stored_results_are_judged_anew(results, tmp_path, capsys):
+    page = next(path for path in RESULTS.glob("hard-*.md") if results["date"] in path.read_text(encoding="utf-8"))
+    again = tmp_path / "hard.json"
+    again.write_text(json.dumps(results | {"rows": [row | {"solved": None} for row in results["rows"]]}))
+    solved = all(not faults(row) for row in stored(results))
+    assert hard.main(["--judge", str(again)]) == (0 if solved else 1)
+    why = f"`taisoft bench hard --judge {page.with_suffix('.json')}` writes it anew"
+    same = json.loads(again.read_text())["rows"] == results["rows"]
+    assert same, why
+    same = again.with_suffix(".md").read_text(encoding="utf-8") == page.read_text(encoding="utf-8")
+    assert same, why
+    capsys.readouterr()
+    again.write_text("{")
+    with pytest.raises(OutputError, match="hard.json cannot be read"):
+        hard.main(["--judge", str(again)])
+    with pytest.raises(SystemExit):
+        hard.main(["--judge", str(again), "--quick"])
+    assert "--judge goes alone" in capsys.readouterr().err
