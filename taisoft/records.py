@@ -55,3 +55,5 @@ class RunReport:
     compile_seconds: float = 0.0
     interrupted: bool = False  # a signal ended the run early
     step_reports: list[StepReport] = field(default_factory=list)
+    dt: float | None = None  # [s] of its steps
+    dt_requested: float | None = None  # [s] that the simulator had, where the run changed it to fit the frames

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 FrameCallback = Callable[["Simulator", int, StepReport | None], None]
 StepCallback = Callable[[StepReport, float], None]
+NEAR = 1e-6  # of dt: a divisor of the frame time this near is what was meant, written with six or seven digits
+ROUNDING = 1e-9  # of the frame time, by which dt times the steps may miss it
 MOST_STEPS = 2.0**52  # of a run: beyond, the time of a float64 stands still
 
 
@@ -24,10 +26,10 @@ def run(
     """Step until `seconds` [s] from now, to the nearest step; frames at fps, or after every step when fps is None.
 
     on_frame(sim, index, report): called for frame 0 (the start, report None) and after every frame. stop: asked between
-    steps; True ends the run. dt is lowered once to the next divisor of 1/fps, and that is reported. resumed: seconds and
-    frames count from time 0, not from now; the first frame is `first_frame`. on_step(report, seconds): called after every
-    implicit step and every batch of explicit ones with its wall time, less that of compiling. Never raises for a failed or
-    interrupted run: status and problems say it. Raises SimulationError for bad arguments.
+    steps; True ends the run. dt is lowered once to the next divisor of 1/fps, or rounded to one that is within NEAR of it, and
+    the report tells. resumed: seconds and frames count from time 0, not from now; the first frame is `first_frame`.
+    on_step(report, seconds): called after every implicit step and every batch of explicit ones with its wall time, less that of
+    compiling. Never raises for a failed or interrupted run: status and problems say it. Raises SimulationError for bad arguments.
     """
     seconds = check_positive("seconds", seconds, "s")
     fps = None if fps is None else check_positive("fps", fps, "1/s")
@@ -87,31 +89,51 @@ def check_length(seconds: float, dt: float, fps: float | None) -> None:
 
 def first_frame(sim: "Simulator", fps: float | None) -> int:
     """Number of the first frame of a resumed run: that of the present state, or where it lies between two the next."""
-    n, dt = _fitting(sim.dt, fps)
+    n, dt = _fitting(sim.dt, fps, sim)
     return -(-round(sim.time / dt) // n)
 
 
-def _fitting(dt: float, fps: float | None) -> tuple[int, float]:
-    """Steps per frame, and the largest dt up to this one that makes them a frame."""
+def _fitting(dt: float, fps: float | None, sim: "Simulator | None" = None) -> tuple[int, float]:
+    """Steps per frame, and the dt that makes them a frame: the divisor of 1/fps within NEAR of this dt, unless that is not stable
+    in this simulator, else the largest one below it."""
     if fps is None:
         return 1, dt
     frame = 1.0 / fps
     if not frame <= MOST_STEPS * dt:  # a run that long is refused, see `check_length`
         return 1, dt
-    n = max(1, math.ceil(frame / dt - 1e-9))
-    return n, dt if abs(n * dt - frame) <= 1e-9 * frame else frame / n
+    n = max(1, round(frame / dt))
+    if abs(n * dt - frame) <= ROUNDING * frame:
+        return n, dt
+    if abs(n * dt - frame) > NEAR * frame or (frame / n > dt and sim is not None and not _may_take(sim, frame / n)):
+        n = max(1, math.ceil(frame / dt))
+    return n, frame / n
+
+
+def _may_take(sim: "Simulator", dt: float) -> bool:
+    """Whether a simulator does not refuse a dt [s] for its stability."""
+    return not sim.settings.explicit or sim.settings.allow_unstable or dt <= sim.stable_dt
 
 
 def _fit_dt(sim: "Simulator", fps: float | None, report: RunReport) -> int:
-    """Steps per frame; lowers dt to a divisor of the frame time where it is none."""
-    n, dt = _fitting(sim.dt, fps)
+    """Steps per frame; sets dt to a divisor of the frame time where it is none, and tells."""
+    n, dt = _fitting(sim.dt, fps, sim)
     if dt != sim.dt:
-        old = sim.dt
-        sim.dt = dt
-        report.problems.append(
-            f"note: dt lowered from {old:.6g} s to {sim.dt:.6g} s, so that {n} steps make a frame of 1/{fps:g} s"
-        )
+        report.dt_requested, sim.dt = sim.dt, dt
+    report.dt = sim.dt
+    if report.dt_requested is not None:
+        report.problems.append(f"note: {dt_sentence(report)}, so that {n} steps make a frame of 1/{fps:g} s")
     return n
+
+
+def dt_sentence(report: RunReport) -> str:
+    """How a run changed the dt that it was given, in a few words; "" where it did not."""
+    if report.dt_requested is None:
+        return ""
+    before, after = report.dt_requested, report.dt
+    done = "rounded" if abs(after - before) <= 1.01 * NEAR * before else "lowered"
+    texts = ((f"{before:.{digits}g}", f"{after:.{digits}g}") for digits in (6, 9, 17))
+    old, new = next(pair for pair in texts if pair[0] != pair[1])
+    return f"dt {done} from {old} s to {new} s"
 
 
 def _advance_to(

@@ -27,7 +27,9 @@ def test_a_run_writes_its_results_and_tells_them(beam, tmp_path, capsys):
     assert run(beam, "--out", out, "--set", "solver.dt=0.004") == 0
     record = report(out)
     assert record["status"] == "ok" and record["sim_seconds"] == pytest.approx(0.1)
-    assert any("dt lowered from 0.004 s" in problem for problem in record["problems"])
+    lowered = "dt lowered from 0.004 s to 0.0037037 s"
+    assert [problem for problem in record["problems"] if problem.startswith(f"note: {lowered}, so that 9 steps make a frame")]
+    assert record["dt_requested"] == 0.004 and record["dt"] == pytest.approx(1 / 270)
     expected = {"integrator": "symplectic_euler", "fps": 30, "seconds": 0.1, "allow_unstable": False}
     assert expected.items() <= record["settings"].items()
     assert record["settings"]["dt"] == pytest.approx(1 / 270)  # the dt that was used, not the one asked for
@@ -35,7 +37,8 @@ def test_a_run_writes_its_results_and_tells_them(beam, tmp_path, capsys):
     assert sorted(path.name for path in (out / "frames").iterdir()) == [f"{i:05d}.png" for i in range(4)]
     assert len((out / "steps.csv").read_text().splitlines()) == 4 and (out / "scene.usdc").stat().st_size > 0
     shown = capsys.readouterr().out
-    for word in ("fixed_nodes", "status   ok", "min J", "kinetic", "report.json", "(4 pictures"):
+    assert shown.count("dt lowered") == 1
+    for word in ("fixed_nodes", f"\n\nstatus   ok; {lowered}\n", "min J", "kinetic", "report.json", "(4 pictures"):
         assert word in shown
     assert len(shown.splitlines()) < 40  # one screen
 

@@ -1,7 +1,8 @@
 """A run, told by a stand-in whose steps cost nothing, and by two real simulators:
 
 * frames come at fps or after every step, frame 0 first, and the run ends at `seconds` to the nearest step;
-* dt is lowered once, to the next divisor of the frame time, and that is reported; a dt that divides it stays;
+* dt is lowered once, to the next divisor of the frame time, or rounded to one that is within 1e-6, and that is reported; a dt
+  that divides it stays;
 * whoever asks is told of every implicit step and every batch, as it was, with its time but not that of compiling;
 * explicit batches give a report a frame with the extremes of their sub-steps, implicit steps a report each;
 * stop and Ctrl-C end it as interrupted, at the last whole step; a failure ends it as failed; neither raises;
@@ -16,7 +17,7 @@ from scenes import cube, element, rubber
 
 import taisoft as ts
 from taisoft.records import StepReport
-from taisoft.running import run
+from taisoft.running import first_frame, run
 
 
 class StandIn:
@@ -91,6 +92,33 @@ def test_dt_is_lowered_to_a_divisor_of_the_frame(dt, lowered, per_frame):
     expected = [] if dt == lowered else [f"note: dt lowered from {dt:g} s to {lowered:.6g} s, so that "]
     assert len(result.problems) == len(expected) and result.status == "ok"
     assert all(problem.startswith(words) for problem, words in zip(result.problems, expected))
+
+
+@pytest.mark.parametrize("dt, per_frame, words", [
+    (0.00833333, 2, "rounded from 0.00833333 s to 0.00833333333 s"), (0.0083332, 3, "lowered from 0.0083332 s to 0.00555556 s"),
+    (0.01666666, 1, "rounded from 0.01666666 s to 0.0166666667 s"),
+    (0.01666667, 1, "rounded from 0.01666667 s to 0.0166666667 s"),
+    (0.0166668, 1, "lowered from 0.0166668 s to 0.0166667 s"), (0.0166667, 1, "lowered from 0.0166667 s to 0.0166666667 s"),
+    (1 / 120, 2, None),
+])  # fmt: skip
+@pytest.mark.parametrize("explicit", [False, True])
+def test_a_dt_that_was_written_with_few_digits(dt, per_frame, words, explicit):
+    sim = StandIn(explicit, dt=dt)
+    sim.settings.allow_unstable, sim.stable_dt = False, 1.0
+    result, seen = frames(sim, 0.1)
+    assert sim.dt == result.dt == pytest.approx(1 / 60 / per_frame, rel=1e-15) and len(seen) == 7 and result.status == "ok"
+    assert result.dt_requested == (None if words is None else dt)
+    assert result.problems == ([] if words is None else [f"note: dt {words}, so that {per_frame} steps make a frame of 1/60 s"])
+
+
+def test_rounding_does_not_make_a_step_unstable():
+    """Up to a dt that an explicit integrator would refuse; where that only warns, it is rounded."""
+    for allowed, per_frame in ((False, 3), (True, 2)):
+        sim = StandIn(True, dt=0.00833333)
+        sim.settings.allow_unstable, sim.stable_dt = allowed, 0.00833333
+        frames(sim, 0.1)
+        assert sim.dt == pytest.approx(1 / 60 / per_frame, rel=1e-15)
+        assert first_frame(sim, 60) == 6
 
 
 def test_a_second_run_goes_on():

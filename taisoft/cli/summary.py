@@ -4,6 +4,7 @@ import textwrap
 
 from taisoft.cli.recording import Observers, Recording
 from taisoft.records import RunReport
+from taisoft.running import dt_sentence
 
 WIDTH = 118
 PROBLEMS_SHOWN = 5
@@ -27,13 +28,16 @@ def print_state(sim) -> None:
 
 
 def print_summary(result: RunReport, sim, observers: Observers, recording: Recording | None) -> None:
-    """Status, problems, time, smallest volume ratio, energies, files."""
+    """Status and a changed dt, problems, time, smallest volume ratio, energies, files."""
     print()
-    _line("status", result.status + (", ended early by a signal" if result.interrupted else ""))
-    for problem in result.problems[:PROBLEMS_SHOWN]:
+    changed = dt_sentence(result)
+    early = ", ended early by a signal" if result.interrupted else ""
+    _line("status", f"{result.status}{early}{changed and '; ' + changed}")
+    problems = [problem for problem in result.problems if not (changed and problem.startswith(f"note: {changed}"))]
+    for problem in problems[:PROBLEMS_SHOWN]:
         _line("problem", problem)
-    if len(result.problems) > PROBLEMS_SHOWN:
-        _line("", f"and {len(result.problems) - PROBLEMS_SHOWN} more problems")
+    if len(problems) > PROBLEMS_SHOWN:
+        _line("", f"and {len(problems) - PROBLEMS_SHOWN} more problems")
     print_state(sim)
     wall, output = result.wall_seconds, observers.seconds
     _line("wall", f"{wall:.2f} s, {output:.2f} s of them for output; and {result.compile_seconds:.2f} s to compile")
