@@ -31,12 +31,12 @@ class StateAccess:
     @property
     def time(self) -> float:
         """Simulated time [s]."""
-        return self._open_world().time
+        return self._kept_world().time
 
     @property
     def step_count(self) -> int:
         """Steps of dt taken."""
-        return self._open_world().step_count
+        return self._kept_world().step_count
 
     def positions(self, body: str | None = None) -> np.ndarray:
         """(n_nodes, 3) float64 copy [m]; of all bodies, concatenated in the order added, without a name."""
@@ -265,6 +265,13 @@ class StateAccess:
             self._stepper.numbers_changed()
 
     def _open_world(self) -> World:
+        """The world, with memory on the device."""
+        world = self._kept_world()
+        self._runtime.check()
+        return world
+
+    def _kept_world(self) -> World:
+        """The world, for what the host knows."""
         if self._world is None:
             raise SimulationError("the simulator is closed")
         return self._world

@@ -97,10 +97,11 @@ class FieldArena:
         )
 
     def release(self) -> None:
-        """Give the memory back to Taichi."""
+        """Give the memory back to Taichi, where it was not initialised anew since, which has freed it."""
         while self._trees:
             tree, fields = self._trees.pop()
             removed(fields)
-            tree.destroy()
-            trees["open"] = max(0, trees["open"] - 1)
+            if tree.prog is impl.get_runtime().prog:
+                tree.destroy()
+                trees["open"] -= 1
         self.bytes.clear()

@@ -18,18 +18,13 @@ from taichi.types import ndarray_type, primitive_types
 
 
 class Launch:
-    """A kernel compiled for certain templates and types of arrays."""
+    """A kernel compiled for certain templates and types of arrays, to be used only while Taichi is not initialised anew."""
 
     def __init__(self, kernel, compiled, setters: list[tuple[int, tuple[int], int]], templates: tuple):
         self._kernel, self._compiled, self._setters = kernel, compiled, setters
         self._templates = templates  # held, so that no other object gets the address by which they are known
         self._program = impl.get_runtime().prog
         self._data = self._program.compile_kernel(self._program.config(), self._program.get_device_caps(), compiled)
-
-    @property
-    def valid(self) -> bool:
-        """Whether Taichi has not been initialised anew since, by whom ever."""
-        return impl.get_runtime().prog is self._program
 
     def __call__(self, arguments: tuple):
         """Launch with these arguments, templates included. Returns what the kernel returns."""

@@ -31,6 +31,7 @@ POOL = 2**30  # bytes of address space that Taichi asks for at a time on the CPU
 launches: Counter[str] = Counter()  # kernel name -> launches so far in this process
 _open: list["Runtime"] = []  # simulators that hold the runtime now
 _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
+_program = None  # Taichi's own state, of that initialisation
 _clock = {"compile": 0.0}
 _known: list[dict] = []  # launches of each kernel
 trees = {"open": 0}  # of field memory, see `taisoft.fields`
@@ -50,6 +51,11 @@ class Runtime:
         self.eps = float(np.finfo(self.np_real).eps)
         self.lanes = 4 if arch == "cpu" else 1
         self.owner = ""
+        self._program = _program
+
+    def check(self) -> None:
+        """Raises SimulationError where Taichi was initialised anew since, by whomever: all fields and kernels are gone."""
+        check_program(self._program)
 
     def close(self) -> None:
         """Release the claim; Taichi itself stays up until another kind is asked for."""
@@ -57,24 +63,36 @@ class Runtime:
             _open.remove(self)
 
 
+def check_program(program) -> None:
+    """Raises SimulationError unless Taichi's state is this one: with another one, old fields and kernels end the process."""
+    if impl.get_runtime().prog is not program:
+        raise SimulationError(
+            "Taichi was initialised anew in this process, by ti.init or ti.reset, which frees all memory of open simulators: "
+            "close this one and make a new one"
+        )
+
+
 def open_runtime(arch: str, precision: str, owner: str = "a simulator") -> Runtime:
     """Claim Taichi with this arch and precision, initialising it where needed.
 
-    Raises SimulationError when the names are unknown, another kind is in use, or the arch cannot be had.
+    Raises SimulationError when the names are unknown, another kind is in use, or the arch cannot be had. What held Taichi before
+    another initialisation in this process (a user's own ti.init) holds nothing any more.
     """
     global _kind
     if arch not in ARCHS:
         raise SimulationError(f"arch '{arch}' is unknown: it must be one of {', '.join(ARCHS)}")
     if precision not in PRECISIONS:
         raise SimulationError(f"precision '{precision}' is unknown: it must be one of {', '.join(PRECISIONS)}")
+    if impl.get_runtime().prog is not _program:
+        _open.clear()
+        _kind = None
     kind = (arch, precision)
     if _open and _kind != kind:
         raise SimulationError(
             f"{_open[0].owner} is open with arch '{_kind[0]}' and precision '{_kind[1]}', and one process holds one kind at "
             f"a time: close it before asking for '{arch}' and '{precision}'"
         )
-    # another initialisation in this process (a user's own ti.init) shows in the configuration and is replaced
-    if _kind != kind or ti.cfg.default_fp != PRECISIONS[precision] or ti.cfg.cfg_optimization:
+    if _kind != kind:
         _kind = None  # a failed initialisation leaves no kind
         _initialise(arch, precision)
         _kind = kind
@@ -98,6 +116,7 @@ def _cache_folder() -> str:
 
 
 def _initialise(arch: str, precision: str) -> None:
+    global _program
     try:
         os.getcwd()
     except FileNotFoundError:
@@ -115,6 +134,7 @@ def _initialise(arch: str, precision: str) -> None:
             )  # fmt: skip
     except RuntimeError as error:
         raise SimulationError(f"Taichi does not start: {(str(error).splitlines() or ['no reason given'])[0]}") from None
+    _program = impl.get_runtime().prog
     trees["open"] = 0
     for known in _known:  # they hold the Taichi that was
         known.clear()
@@ -163,6 +183,7 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
 
     @functools.wraps(function)
     def launch(*arguments):
+        check_program(_program)
         launches[function.__name__] += 1
         if len(arguments) != n_arguments or not all(arguments[k].flags.c_contiguous for k in arrays):
             return compiled(*arguments)  # which says what is wrong with them
@@ -172,8 +193,7 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
             if ready is None:
                 with _eliminating(cse):
                     return compiled(*arguments)
-            if ready.valid:
-                return ready(arguments)
+            return ready(arguments)
         start = time.perf_counter()
         with _eliminating(cse):
             result = compiled(*arguments)

@@ -11,8 +11,7 @@ import numpy as np
 import taichi as ti
 from taichi.lang import impl
 
-from taisoft.errors import SimulationError
-from taisoft.runtime import kernel
+from taisoft.runtime import check_program, kernel
 
 MOST = 2**26  # entries in one launch, which are held once more as f64: half a GB
 DTYPES = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u8: np.uint8}  # each exact in f64
@@ -31,8 +30,7 @@ class _Tree:
     @property
     def start(self) -> int:
         """Its address. Raises SimulationError where it is no more."""
-        if impl.get_runtime().prog is not self._program:
-            raise SimulationError("Taichi was initialised anew in this process, which frees all memory of open simulators")
+        check_program(self._program)
         if self._start is None:
             first = self._first()
             self._start = _address(first, (0,) * len(first.shape)) - _offset(first)
