@@ -4,29 +4,50 @@ import warnings
 
 import numpy as np
 
+from taisoft.attributes import Guarded, SimulationAttributeError, thawed
 from taisoft.collision.contacts import Contacts, no_contacts
 from taisoft.collision.overlap import Overlap, find_overlaps
 from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
 from taisoft.errors import SceneError, SimulationError
-from taisoft.model import changed_material
 from taisoft.records import Energies
+from taisoft.scene.changes import CHANGEABLE, changed_material
 from taisoft.settings import Settings, check_dt
 from taisoft.stability import stable_dt
 from taisoft.stepping.contact import ContactStep
-from taisoft.stepping.pull import Grip, Pull
 from taisoft.stepping.world import World
 from taisoft.transfer import array_of, upload
 
+_REBUILT = (
+    "integrator", "contact_solver", "self_collision", "allow_unstable", "newton_tolerance", "linear_tolerance",
+    "contact_tolerance", "pullable",
+)  # fmt: skip
+INSTEAD = {  # of assigning to an attribute of a simulator, or to one that it might be thought to have
+    **{name: f"call sim.set_material(body, {name}=...)" for name in CHANGEABLE},
+    **{name: f"call sim.set_contact(name_a, name_b, {name}=...)" for name in ("friction", "restitution")},
+    **{name: f"call sim.set_state({name}=...)" for name in ("positions", "velocities")},
+    **{name: f"call sim.rebuild({name}=...)" for name in _REBUILT},
+    **dict.fromkeys(("force", "forces"), "call sim.set_force(body, index, value)"),
+    **dict.fromkeys(("traction", "tractions"), "call sim.set_traction(body, index, value)"),
+    **dict.fromkeys(("time", "step_count"), "call sim.reset() to go back to the start"),
+    **dict.fromkeys(("arch", "precision"), "make a new Simulator"),
+    "gravity": "call sim.set_gravity(gravity)", "material": "call sim.set_material(body, young=...)",
+    "scene": "make a new Simulator of the other scene", "settings": "call sim.rebuild(integrator=...)",
+    "plan": "it follows from the scene and the settings", "stable_dt": "it follows from the scene; set sim.dt",
+    "pulled": "call sim.pull(...) or sim.release()",
+}  # fmt: skip
 
-class StateAccess:
+
+class StateAccess(Guarded):
     """State, results and run-time data of a world; `Simulator` adds building and stepping."""
 
+    _error = SimulationAttributeError
+    _read_only = frozenset(("settings", "scene", "plan"))
+    _instead = INSTEAD
     settings: Settings
     _world: World | None = None
     _contact: ContactStep | None
     _idle_detection: Detection | None
-    _pull: Pull | None = None
 
     @property
     def time(self) -> float:
@@ -85,7 +106,9 @@ class StateAccess:
         self, name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None
     ) -> None:
         """Change the friction or restitution of a pair of bodies, or of a body and an obstacle; as `Scene.set_contact`."""
-        self._open_world().scene.set_contact(name_a, name_b, friction=friction, restitution=restitution)
+        scene = self._open_world().scene
+        with thawed(scene):
+            scene.set_contact(name_a, name_b, friction=friction, restitution=restitution)
         if self._contact is not None:
             self._contact.numbers_changed()
 
@@ -194,7 +217,7 @@ class StateAccess:
         if value == self._dt:
             return
         if self.settings.explicit:
-            self._check_stability(value)
+            self._check_stability(value, stacklevel=4)
         self._time_base = (self.time, self.step_count)
         self._dt = value
 
@@ -208,7 +231,8 @@ class StateAccess:
     def set_gravity(self, gravity) -> None:
         """Change gravity (3,) [m/s^2]."""
         self._open_world()
-        self.scene.gravity = gravity
+        with thawed(self.scene):
+            self.scene.gravity = gravity
         self._load_gravity()
         self._stepper.numbers_changed()
 
@@ -226,43 +250,13 @@ class StateAccess:
             if self.settings.explicit:
                 self._check_stability(self._dt)
         except SimulationError:
-            self.scene.bodies[k].material, self._stable_dt = old, old_limit
+            with thawed(self.scene.bodies[k]):
+                self.scene.bodies[k].material, self._stable_dt = old, old_limit
             raise
         world.upload_material("density" in numbers)
+        if "density" in numbers:  # a total force is spread by mass: the shares stay, but for their rounding
+            self._upload_loads()
         self._stepper.numbers_changed()
-
-    def pull(self, body: str, nodes, weights, target, stiffness: float) -> None:
-        """Pull a point of a body towards target (3,) [m] by a damped spring, in place of what was pulled before.
-
-        The point is the mean of nodes (k,) by weights (k,), which are made to sum to 1; stiffness [N/m]. The force is taken at
-        the start of every step; stiffness and force are limited as `taisoft.stepping.pull` says, and `pulled` tells both. Raises
-        SimulationError unless the Simulator was made with pullable=True, SceneError for what is no point of the body.
-        """
-        self._open_world()
-        if self._pull is None:
-            raise SimulationError("bodies can be pulled only where the Simulator was made with pullable=True")
-        self._pull.take(self._index(body), nodes, weights, target, stiffness)
-
-    def release(self) -> None:
-        """End the pull; does nothing where nothing is pulled."""
-        self._open_world()
-        if self._pull is not None and self._pull.let_go():
-            self._loads_changed()
-
-    @property
-    def pullable(self) -> bool:
-        """Whether `pull` can be called."""
-        return self._pull is not None
-
-    @property
-    def pulled(self) -> Grip | None:
-        """What is pulled now, with the point [m] and the force [N] of the last step's start; None where nothing is."""
-        return self._pull.grip if self._pull is not None else None
-
-    def _loads_changed(self) -> None:
-        """Explicit steps may rest on an acceleration with the old ones."""
-        if self.settings.explicit:
-            self._stepper.numbers_changed()
 
     def _open_world(self) -> World:
         """The world, with memory on the device."""
@@ -276,7 +270,7 @@ class StateAccess:
             raise SimulationError("the simulator is closed")
         return self._world
 
-    def _check_stability(self, dt: float) -> None:
+    def _check_stability(self, dt: float, stacklevel: int = 3) -> None:
         limit = self.stable_dt
         if dt <= limit:
             return
@@ -285,7 +279,7 @@ class StateAccess:
             raise SimulationError(
                 f"{text}: take a smaller dt (0.9 of the limit is {0.9 * limit:.3g} s) or allow_unstable=True"
             )
-        warnings.warn(text, stacklevel=3)
+        warnings.warn(text, stacklevel=stacklevel)
 
     def _index(self, body: str) -> int:
         return self.scene.bodies.index(self.scene.body(body))

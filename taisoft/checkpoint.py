@@ -3,9 +3,9 @@
 A file holds arrays without pickled objects; `header`, a JSON text: versions, the Simulator's settings, numbers that may change
 while it runs, every number of the state that is no array, and a digest of each part of the scene; and `sha256` over all else.
 What lives between steps each class tells by `snapshot` and takes back by `restore`; here it is only flattened, its names joined
-by slashes. Meshes, constraints, loads and paths are not in the file: they come from the scene that is given, whose digests must
-be those of the scene that was saved. On the machine, with the versions and the number of threads that wrote it, a run goes on
-bitwise as if it had not been interrupted.
+by slashes. Meshes, constraints, where loads act, and paths are not in the file: they come from the scene that is given, whose
+digests must be those of the scene that was saved. On the machine, with the versions and the number of threads that wrote it, a
+run goes on bitwise as if it had not been interrupted.
 """
 
 import dataclasses
@@ -19,13 +19,15 @@ from pathlib import Path
 import numpy as np
 
 from taisoft import __version__
+from taisoft.attributes import thawed
 from taisoft.errors import SceneError, SimulationError
 from taisoft.files import replacing
 from taisoft.scene.body import Body
+from taisoft.scene.changes import LOADS, changed_load
 from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.scene import Material, Scene
 
-KIND, FORMAT = "taisoft checkpoint", 3  # FORMAT grows with every change of what a file holds
+KIND, FORMAT = "taisoft checkpoint", 4  # FORMAT grows with every change of what a file holds
 PARTS = ("settings", "numbers", "marks", "state", "notes")  # of the header, each a table
 
 
@@ -84,12 +86,24 @@ def check_scene(saved: Checkpoint, scene: Scene, features: dict[str, bool]) -> N
 
 
 def take_numbers(saved: Checkpoint, scene: Scene) -> None:
-    """Give a scene the gravity, materials and pairs of a checkpoint. Raises SceneError for numbers outside the rules."""
-    scene.gravity = saved.numbers["gravity"]
-    for body, material in zip(scene.bodies, saved.numbers["materials"]):
-        body.material = Material(**material)
-    scene.contact_pairs.clear()
-    scene.contact_pairs.update((frozenset(names), (a, b)) for names, a, b in saved.numbers["pairs"])
+    """Give a scene the gravity, materials, pairs and loads of a checkpoint. Raises SceneError for numbers outside the rules."""
+    with thawed(scene, *scene.bodies):
+        scene.gravity = saved.numbers["gravity"]
+        for body, material in zip(scene.bodies, saved.numbers["materials"]):
+            body.material = Material(**material)
+        scene.contact_pairs = {frozenset(names): (a, b) for names, a, b in saved.numbers["pairs"]}
+        for k, body in enumerate(scene.bodies):
+            for kind, name in LOADS.items():
+                for i in range(len(getattr(body, name))):
+                    changed_load(body, kind, i, saved.state["loads"][str(k)][kind][str(i)])
+
+
+def load_values(scene: Scene) -> dict:
+    """Values of all loads of a scene, which may change while it runs, as part of a checkpoint's state."""
+    return {
+        str(k): {kind: {str(i): load.value for i, load in enumerate(getattr(body, name))} for kind, name in LOADS.items()}
+        for k, body in enumerate(scene.bodies)
+    }
 
 
 def scene_marks(scene: Scene, features: dict[str, bool]) -> dict[str, str]:
@@ -115,7 +129,8 @@ def scene_marks(scene: Scene, features: dict[str, bool]) -> dict[str, str]:
 
 def scene_digest(scene: Scene) -> str:
     """A digest of all that can be compared of a scene: its parts as a checkpoint compares them, and its numbers."""
-    return _digest([json.dumps(scene_marks(scene, {})), json.dumps(_numbers(scene)), scene.allow_initial_overlap])
+    loads = [load.value for body in scene.bodies for name in LOADS.values() for load in getattr(body, name)]
+    return _digest([json.dumps(scene_marks(scene, {})), json.dumps(_numbers(scene)), scene.allow_initial_overlap, *loads])
 
 
 def _body_parts(body: Body) -> dict[str, list]:
@@ -126,8 +141,8 @@ def _body_parts(body: Body) -> dict[str, list]:
         "start": [body.position, body.velocity],
         "constraints": [x for c in body.constraints for x in (c.nodes, c.axes, *_path_parts(c.path))],
         "loads": [
-            *(x for t in body.tractions for x in ("traction", t.triangles, t.value)),
-            *(x for f in body.forces for x in ("force", f.nodes, f.value)),
+            *(x for t in body.tractions for x in ("traction", t.triangles)),
+            *(x for f in body.forces for x in ("force", f.nodes)),
         ],
     }
 
@@ -142,7 +157,7 @@ def _path_parts(path: Callable | None) -> list:
 
 
 def _numbers(scene: Scene) -> dict:
-    """Of a scene, what may change while it runs."""
+    """Of a scene, what may change while it runs, but for its loads."""
     pairs = [[sorted(names), *numbers] for names, numbers in scene.contact_pairs.items()]
     materials = [dataclasses.asdict(body.material) for body in scene.bodies]
     return {"gravity": scene.gravity.tolist(), "materials": materials, "pairs": pairs}

@@ -6,7 +6,6 @@ quadrature and law (a kernel runs one group's blocks in one loop), and a body's 
 last tet of volume 0.
 """
 
-import difflib
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,13 +13,12 @@ import numpy as np
 import taichi as ti
 
 from taisoft.elements import reference
-from taisoft.errors import SceneError
 from taisoft.fields import FieldArena
 from taisoft.mass import MassMatrix, lumped_masses, upload_mass_matrix, weight_masses
 from taisoft.materials import LAWS
 from taisoft.node_graph import PAIRS, NodeGraph, node_graph
 from taisoft.runtime import Runtime, threads
-from taisoft.scene.scene import Body, Material, Scene
+from taisoft.scene.scene import Material, Scene
 from taisoft.transfer import download
 
 # Points, and threads of the CPU, from which parallel loops are taken instead of one serial kernel: the compiler does not put
@@ -295,26 +293,3 @@ def _build_mass_matrix(scene: Scene, model: Model, arena: FieldArena, npr: type)
 def damping_table(scene: Scene) -> np.ndarray:
     """Mass damping [1/s] and stiffness damping [s] per body (n_bodies, 2)."""
     return np.array([[b.material.mass_damping, b.material.stiffness_damping] for b in scene.bodies])
-
-
-CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping")
-
-
-def changed_material(body: Body, numbers: dict[str, float], on: dict[str, bool]) -> None:
-    """Give a body a material with new numbers; the law, and damping that is compiled out, cannot change while it runs."""
-    for name, value in numbers.items():
-        if name not in CHANGEABLE:
-            near = difflib.get_close_matches(name, CHANGEABLE, 1)
-            hint = f" (did you mean {near[0]}?)" if near else ""
-            raise SceneError(f"body '{body.name}': {name} cannot change while it runs{hint}; {', '.join(CHANGEABLE)} can")
-        if name in on and not on[name] and value != 0.0:
-            raise SceneError(
-                f"body '{body.name}': {name} was 0 everywhere at the start and is not modelled; "
-                "start with a small value to change it later"
-            )
-    try:
-        body.material = replace(body.material, **numbers)
-    except SceneError as error:
-        raise SceneError(f"body '{body.name}': {error}") from None
-    if "poisson" in numbers:
-        body.tell_locking()

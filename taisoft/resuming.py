@@ -4,14 +4,15 @@ import dataclasses
 from pathlib import Path
 from typing import Self
 
-from taisoft.access import StateAccess
-from taisoft.checkpoint import Checkpoint, check_scene, read_checkpoint, take_numbers, write_checkpoint
+from taisoft.attributes import thawed
+from taisoft.checkpoint import Checkpoint, check_scene, load_values, read_checkpoint, take_numbers, write_checkpoint
 from taisoft.errors import SceneError, SimulationError
+from taisoft.loading import Loading
 from taisoft.scene.scene import Scene
 from taisoft.settings import Settings, check_dt, plan_of
 
 
-class Resuming(StateAccess):
+class Resuming(Loading):
     """Checkpoints of a simulator; `Simulator` adds building and stepping."""
 
     def save_checkpoint(self, path: str | Path, notes: dict | None = None) -> None:
@@ -27,18 +28,18 @@ class Resuming(StateAccess):
         if bad is not None:
             raise SimulationError(f"no checkpoint is made of such a state: {bad}")
         own = {"dt": self._dt, "time_base": start, "count_base": count}
-        state = own | {"world": world.snapshot(), "stepper": self._stepper.snapshot()}
+        state = own | {"world": world.snapshot(), "stepper": self._stepper.snapshot(), "loads": load_values(self.scene)}
         write_checkpoint(path, dataclasses.asdict(self.settings), self.scene, self.plan.on, state, notes or {})
 
     @classmethod
     def load_checkpoint(cls, path: str | Path, scene: Scene, arch: str | None = None) -> Self:
         """A simulator that goes on from a checkpoint of the same scene, with its settings and its numbers.
 
-        scene: gives what the file does not hold: meshes, constraints, loads, obstacles, and paths; functions of time alone
-        are not compared. arch: another one than the checkpoint's; steps go on bitwise with its own only. Nothing else of the
-        settings can be changed here; dt, gravity, materials and contact pairs can be later, as in any simulator. Initial
-        overlaps are not looked for. Raises SimulationError for a file that cannot be used and SceneError for another
-        scene, both naming the file.
+        scene: gives what the file does not hold: meshes, constraints, where loads act, obstacles, and paths; functions of time
+        alone are not compared. It is frozen as by a new Simulator. arch: another one than the checkpoint's; steps go on bitwise
+        with its own only. Nothing else of the settings can be changed here; dt, gravity, materials, loads and contact pairs can
+        be later, as in any simulator. Initial overlaps are not looked for. Raises SimulationError for a file that cannot be used
+        and SceneError for another scene, both naming the file.
         """
         return cls.from_checkpoint(read_checkpoint(path), scene, arch)
 
@@ -55,7 +56,8 @@ class Resuming(StateAccess):
         start.allow_initial_overlap = True  # where bodies start is not where they are
         sim = cls(start, **settings)
         try:
-            sim.scene.allow_initial_overlap = scene.allow_initial_overlap
+            with thawed(sim.scene):
+                sim.scene.allow_initial_overlap = scene.allow_initial_overlap
             sim._restore(saved)
         except (KeyError, TypeError, ValueError) as error:  # a right checksum does not make it fit
             sim.close()
@@ -63,6 +65,7 @@ class Resuming(StateAccess):
         except BaseException:
             sim.close()
             raise
+        scene.freeze()
         return sim
 
     def _restore(self, saved: Checkpoint) -> None:
@@ -70,6 +73,7 @@ class Resuming(StateAccess):
         take_numbers(saved, self.scene)
         self._load_gravity()
         world.upload_material(density=True)
+        self._upload_loads()
         if self._contact is not None:
             self._contact.numbers_changed()
         self._stable_dt = None

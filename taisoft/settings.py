@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.attributes import guarded_record
 from taisoft.contact.solve import SOLVERS
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
@@ -16,6 +17,7 @@ EXPLICIT_CONTACT = tuple(SOLVERS)
 IMPLICIT_CONTACT = ("augmented_lagrangian",)
 
 
+@guarded_record("settings", "call sim.rebuild({name}=...)")
 @dataclass(frozen=True)
 class Settings:
     """What a Simulator was asked for; tolerances are relative, None is adaptive."""

@@ -7,6 +7,7 @@ import weakref
 import numpy as np
 
 from taisoft import runtime
+from taisoft.attributes import thawed
 from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import find_softened, measure
 from taisoft.errors import SceneError, SimulationError, no_memory
@@ -37,6 +38,7 @@ def _release(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:
 class Simulator(Resuming):
     """A scene being simulated, as it was when this was made. SI units; positions are float64 in either precision.
 
+    The scene is frozen: what a simulator can change while it runs are its own numbers, by its set_ methods and dt.
     dt [s]; integrator: one of taisoft.stepping.INTEGRATORS; newton_tolerance, linear_tolerance: relative, None is adaptive.
     An explicit integrator refuses a dt above `stable_dt` unless allow_unstable, which only warns. pullable: `pull` is wanted.
     Raises SceneError for a scene that cannot be simulated, SimulationError for settings that cannot be met.
@@ -52,8 +54,8 @@ class Simulator(Resuming):
             scene, dt, integrator, contact_solver, self_collision, precision, arch, allow_unstable, newton_tolerance,
             linear_tolerance, contact_tolerance, pullable,
         )  # fmt: skip
-        self.scene = scene.snapshot()  # what a user changes later, here or there, stays there
-        scene = self.scene
+        self.scene = scene.snapshot()  # numbers that change while it runs are not those of the user's scene
+        given, scene = scene, self.scene
         self._dt = self.settings.dt
         self._stable_dt: float | None = None
         self._owned = []  # what has memory of its own to give back
@@ -93,6 +95,9 @@ class Simulator(Resuming):
         if self._contact is not None:
             self._stepper.contact_tolerance = contact_tolerance or self._stepper.contact_tolerance
         self._release = weakref.finalize(self, _release, self._arena, self._runtime, self._owned)
+        for one in (given, scene):
+            one.freeze()
+        self._seal(Simulator.__init__)
 
     def _refuse_overlap(self) -> None:
         found = self.deepest_overlap()
@@ -209,7 +214,7 @@ class Simulator(Resuming):
         return run(self, seconds, on_frame, fps, stop, resumed, on_step)
 
     def reset(self) -> None:
-        """Back to the scene's start; numbers changed while it ran (dt, gravity, materials) stay."""
+        """Back to the scene's start; numbers changed while it ran (dt, gravity, materials, loads) stay."""
         self._open_world().restart()
         self.release()
         self._time_base = (0.0, 0)
@@ -225,7 +230,8 @@ class Simulator(Resuming):
         kept, start = self._open_world().snapshot(), self.scene.snapshot()
         start.allow_initial_overlap = True  # where bodies start is not where they are
         new = Simulator(start, **(dataclasses.asdict(self.settings) | {"dt": self._dt} | changes))
-        new.scene.allow_initial_overlap = self.scene.allow_initial_overlap
+        with thawed(new.scene):
+            new.scene.allow_initial_overlap = self.scene.allow_initial_overlap
         new._world.restore(kept)
         new._stepper.forget()
         new._time_base = self.time, self.step_count

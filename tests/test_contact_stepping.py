@@ -24,10 +24,14 @@ IMPLICIT = ("implicit_euler", "linearly_implicit_euler", "bdf2")
 G = -GRAVITY[1]
 
 
-def opened(integrator: str, place: Stage) -> ts.Simulator:
+class OnStage(ts.Simulator):
+    place: Stage | None = None
+
+
+def opened(integrator: str, place: Stage) -> OnStage:
     tight = {"newton_tolerance": 1e-10} if integrator == "bdf2" else {}
     settings = {"precision": "f64", "contact_tolerance": 1e-8, **tight}
-    return ts.Simulator(scene(place), dt=DT[integrator], integrator=integrator, **settings)
+    return OnStage(scene(place), dt=DT[integrator], integrator=integrator, **settings)
 
 
 @pytest.fixture(scope="module", params=DT)

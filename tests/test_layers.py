@@ -20,6 +20,7 @@ FILES = sorted(path for path in PACKAGE.rglob("*.py"))
 # Modules under taisoft/, left to right; those of one group may import one another unless FOREIGN says otherwise.
 ORDER = (
     ("errors", "records", "files", "memory", "timing"),
+    ("attributes",),
     ("launching",),
     ("runtime",),
     ("transfer",),
@@ -33,7 +34,7 @@ ORDER = (
     ("linear",),
     ("collision", "contact"),
     ("stepping",),
-    ("simulator", "access", "settings", "running", "static", "checkpoint", "resuming"),
+    ("simulator", "access", "settings", "running", "static", "checkpoint", "loading", "resuming"),
     ("output", "view"),
     ("study",),
     ("cli",),
@@ -42,7 +43,7 @@ ORDER = (
 LEVEL = {name: level for level, group in enumerate(ORDER) for name in group}
 FOREIGN = {("mesh", "scene"), ("collision", "contact"), ("contact", "collision")}  # (importer, imported) of one group
 
-WITHOUT_TAICHI = {"errors", "records", "files", "memory", "timing", "mesh", "scene"}
+WITHOUT_TAICHI = {"errors", "records", "files", "memory", "timing", "attributes", "mesh", "scene"}
 FAULTY = {"ti.svd", "ti.sym_eig", "ti.polar_decompose"}
 FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "yaml.load"} | FAULTY
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "shelve", "marshal", "yaml"}

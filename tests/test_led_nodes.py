@@ -24,6 +24,10 @@ def test_a_path_that_comes_back():
             sim.step()
 
 
+class Led(ts.Simulator):
+    paths: dict | None = None
+
+
 @pytest.fixture(scope="module", params=["velocity_verlet", "bdf2"])
 def sim(request):
     """Of a body of each order, whose led ends go along sim.paths["now"]; one simulator serves all implicit schemes."""
@@ -33,7 +37,7 @@ def sim(request):
         body = scene.add_body(cube(cells=(2, 1, 1)), rubber(), velocity=SPEED, order=order, position=(0, 0, 3 * order))
         body.move(lambda X: X[:, 0] < -0.49, lambda t: paths["now"](t))
     tight = {} if request.param == "velocity_verlet" else {"linear_tolerance": 1e-12, "newton_tolerance": 1e-11}
-    with ts.Simulator(scene, dt=1e-4, integrator=request.param, precision="f64", **tight) as made:
+    with Led(scene, dt=1e-4, integrator=request.param, precision="f64", **tight) as made:
         made.paths = paths
         yield made
 

@@ -16,7 +16,8 @@ import taisoft as ts
 from taisoft import elasticity
 from taisoft.fields import FieldArena
 from taisoft.mass import lumped_masses, mass_matrix, weight_masses
-from taisoft.model import body_loads, build_model, changed_material
+from taisoft.model import body_loads, build_model
+from taisoft.scene.changes import changed_material
 from taisoft.scene.plan import make_plan
 
 

@@ -37,8 +37,9 @@ def test_the_state_is_carried_over_and_the_next_step_is_that_of_a_new_simulator(
         sim.rebuild(integrator="bdf2", dt=0.01)
         assert_same(told(sim), before)
         assert sim.settings.integrator == "bdf2" and sim.dt == 0.01 and runtime.trees["open"] <= trees + 1
-        scene.gravity, scene.bodies[0].material = sim.scene.gravity, sim.scene.bodies[0].material
-        with ts.Simulator(scene, dt=0.01, integrator="bdf2") as other:
+        same = scene.snapshot()
+        same.gravity, same.bodies[0].material = sim.scene.gravity, sim.scene.bodies[0].material
+        with ts.Simulator(same, dt=0.01, integrator="bdf2") as other:
             other.set_state(positions=before[0], velocities=before[1])
             other.step()
             expected = other.positions(), other.velocities()

@@ -256,17 +256,13 @@ def test_changes_that_are_refused(sim):
 
 @once
 def test_the_scene_is_a_copy(sim):
-    """What changes while it runs does not change the user's scene, nor the other way round."""
+    """What changes while it runs does not change the user's scene; that this cannot change then is held by test_frozen."""
     scene = pair()
     with ts.Simulator(scene, DT, "symplectic_euler", precision="f64") as other:
         other.set_gravity((0, 0, 0))
         other.set_material("beam", young=2e4)
         assert scene.gravity[1] == -9.81 and scene.body("beam").material.young == 1e5
-        scene.gravity = (0, 9.81, 0)
-        scene.body("beam").fix([10])
-        scene.bodies.pop()
-        assert other.positions("flyer").shape == (8, 3) and not other.scene.gravity.any()
-        assert len(other.scene.body("beam").constraints) == 1
+        assert not other.scene.gravity.any() and other.scene.body("beam").material.young == 2e4
 
 
 def test_numbers_of_steps_that_are_refused(sim):

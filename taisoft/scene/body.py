@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.attributes import Guarded, guarded_record
 from taisoft.errors import SceneError
 from taisoft.mesh.nodes import Nodes, make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
@@ -17,8 +18,12 @@ from taisoft.scene.material import Material
 NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock: they bend far too little
 QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # of polynomials integrated exactly, by order; the first is the default
 _FREE, _FIXED, _MOVED = 0, 1, 2
+ANOTHER = "change a copy, scene.snapshot(), and make a new Simulator of it"
+_SET_FORCE = f"call sim.set_force(body, index, value) for one that is there; else {ANOTHER}"
+_SET_TRACTION = f"call sim.set_traction(body, index, value) for one that is there; else {ANOTHER}"
 
 
+@guarded_record("constraint", "add another one by body.fix or body.move")
 @dataclass(frozen=True, eq=False)
 class Constraint:
     """Nodes held along some axes: at their start, or at their start plus a displacement that depends on time."""
@@ -28,7 +33,11 @@ class Constraint:
     path: Callable | None = None  # t [s] -> displacement (3,) or (k,3) [m], None once released; no path: they stay
     where: Callable | None = None  # what chose the nodes, where that was a function: on another mesh it can choose again
 
+    def __post_init__(self):
+        _make_read_only(self.nodes, self.axes)
 
+
+@guarded_record("traction", "call sim.set_traction(body, index, value) in a simulation")
 @dataclass(frozen=True, eq=False)
 class Traction:
     """A dead load on surface triangles."""
@@ -36,7 +45,11 @@ class Traction:
     triangles: np.ndarray  # (k,) int64 rows of mesh.surface
     value: np.ndarray  # (3,) force per reference area [Pa]
 
+    def __post_init__(self):
+        _make_read_only(self.triangles, self.value)
 
+
+@guarded_record("force", "call sim.set_force(body, index, value) in a simulation")
 @dataclass(frozen=True, eq=False)
 class NodalForce:
     """A dead load on nodes: a total spread over them by their lumped mass, or one force for each."""
@@ -45,8 +58,11 @@ class NodalForce:
     value: np.ndarray  # (3,) total force, or (k,3) one a node [N]
     where: Callable | None = None  # as of a Constraint
 
+    def __post_init__(self):
+        _make_read_only(self.nodes, self.value)
 
-class Body:
+
+class Body(Guarded):
     """One elastic body of a scene; made by `Scene.add_body`.
 
     name, mesh, material. position: (3,) [m], where the body starts: its nodes begin at rest_positions + position.
@@ -55,6 +71,13 @@ class Body:
     of its edges. constraints, tractions, forces: lists of `Constraint`, `Traction`, `NodalForce`. collision: one of HIT_BY.
     A Poisson's ratio above 0.49 is told with a UserWarning for order 1, whose tets are far too stiff there.
     """
+
+    _otherwise_late = ANOTHER
+    _instead_late = {
+        "material": "call sim.set_material(body, young=...)", "position": "call sim.set_state(positions=..., body=...)",
+        "velocity": "call sim.set_state(velocities=..., body=...)", "add_force": _SET_FORCE, "forces": _SET_FORCE,
+        "add_traction": _SET_TRACTION, "tractions": _SET_TRACTION,
+    }  # fmt: skip
 
     def __init__(
         self, name: str, mesh: TetMesh, material: Material, position, velocity, order: int, quadrature_degree: int | None,
@@ -81,6 +104,10 @@ class Body:
         self.tractions: list[Traction] = []
         self.forces: list[NodalForce] = []
         self._held = np.full((self.n_nodes, 3), _FREE, dtype=np.int8)  # what holds each node along each axis
+        self._seal(Body.__init__)
+
+    def _said(self) -> str:
+        return f"body {self.name!r}"
 
     @property
     def rest_positions(self) -> np.ndarray:
@@ -126,6 +153,7 @@ class Body:
         where: node ids, a bool mask (n,), or a callable that gets the rest positions (n,3) and returns such a mask.
         axes: the directions held, such as "y" or "xz". Raises SceneError when no node is chosen or one is moved.
         """
+        self._check_open("fix")
         what = f"body {self.name!r}: fix"
         nodes = checks.selection(where, self.rest_positions, what, "node")
         return self._hold(Constraint(nodes, checks.axes(axes, what), where=_function(where)), _FIXED, what)
@@ -138,6 +166,7 @@ class Body:
         `KeyFrames`, whose pivot is a place where the body starts. axes: the directions led. Raises SceneError when no node is
         chosen, one is held already, or the path is not of this kind.
         """
+        self._check_open("move")
         what = f"body {self.name!r}: move"
         nodes = checks.selection(where, self.rest_positions, what, "node", repeats=False)
         mask = checks.axes(axes, what)
@@ -161,6 +190,7 @@ class Body:
         and returns such a mask. traction: (3,) [Pa]. Raises SceneError when no triangle is chosen or a number is not
         finite.
         """
+        self._check_open("add_traction")
         what = f"body {self.name!r}: add_traction"
         centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
         triangles = checks.selection(where, centroids, what, "surface triangle")
@@ -174,6 +204,7 @@ class Body:
         where: as for `fix`; a node chosen twice counts once. force: (3,) the total, or (k,3) in the order of the chosen
         nodes [N]. Raises SceneError when no node is chosen or numbers are not finite.
         """
+        self._check_open("add_force")
         what = f"body {self.name!r}: add_force"
         nodes = checks.selection(where, self.rest_positions, what, "node")
         load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,), (len(nodes), 3))), _function(where))
@@ -197,3 +228,9 @@ class Body:
 
 def _function(where) -> Callable | None:
     return where if callable(where) else None
+
+
+def _make_read_only(*arrays: np.ndarray) -> None:
+    """Of a record that cannot change, and that copies of a scene share."""
+    for array in arrays:
+        array.setflags(write=False)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.attributes import guarded_record
 from taisoft.errors import MeshError, SceneError
 from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
 from taisoft.mesh.nodes import Nodes
@@ -20,6 +21,7 @@ HIT_BY = ("auto", "distance_field", "proximity")
 SHARP = 60.0  # [degrees] between the normals of neighbours above which a convex edge is sharp
 
 
+@guarded_record("collision settings", "give scene.collision new CollisionSettings({name}=...) before a Simulator takes the scene")
 @dataclass(frozen=True)
 class CollisionSettings:
     """Numbers of the search for contacts. Raises SceneError for those outside the rules below."""

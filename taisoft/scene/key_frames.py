@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from taisoft.attributes import guarded_record
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 
@@ -16,6 +17,7 @@ MOST = 1e6  # [rad] of a rotation vector's entry; above, angles lose their digit
 PARALLEL = 1e-12  # sine of the angle between two axes below which they count as one
 
 
+@guarded_record("key frames", "make new KeyFrames")
 @dataclass(frozen=True, eq=False)
 class KeyFrames:
     """A path for `Body.move` and `Scene.add_obstacle`; called with t [s], it gives (translation (3,) [m], rotation (3,3)).

@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass
 
+from taisoft.attributes import guarded_record
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 
 LAWS = ("st_venant_kirchhoff", "corotational", "stable_neo_hookean")
 
 
+@guarded_record("material", "make another one by dataclasses.replace, or call sim.set_material(body, {name}=...) in a simulation")
 @dataclass(frozen=True)
 class Material:
     """An elastic material with damping and surface numbers. Raises SceneError for numbers outside the rules below."""

@@ -11,6 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from taisoft.attributes import guarded_record
 from taisoft.errors import MeshError, SceneError
 from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
 from taisoft.mesh.shapes import box_mesh
@@ -19,6 +20,7 @@ from taisoft.scene.key_frames import KeyFrames
 
 DEGENERATE = 1e-9  # a triangle's least height below this times its longest edge counts as none
 UNIT = 8 * np.finfo(np.float64).eps  # a squared length this near to 1 is left as it is: a normal read back stays the same
+MAKE_ANOTHER = "make another shape; what moves is an obstacle, by its path"
 RIGID = 1e-6  # largest entry of R^T R - I that a path's rotation may have
 
 
@@ -59,6 +61,7 @@ class Shape:
         return value
 
 
+@guarded_record("half-space", MAKE_ANOTHER)
 @dataclass(frozen=True, eq=False)
 class HalfSpace(Shape):
     """All points x with (x - point) . normal <= 0. Raises SceneError for a normal without length."""
@@ -82,6 +85,7 @@ class HalfSpace(Shape):
         return _axes(self.normal, 1)
 
 
+@guarded_record("sphere", MAKE_ANOTHER)
 @dataclass(frozen=True, eq=False)
 class Sphere(Shape):
     """A ball. Raises SceneError unless its radius is above 0."""
@@ -100,6 +104,7 @@ class Sphere(Shape):
         return np.array([self.radius, 0.0, 0.0])
 
 
+@guarded_record("box", MAKE_ANOTHER)
 @dataclass(frozen=True, eq=False)
 class Box(Shape):
     """A box along the axes. Raises SceneError unless its half extents are above 0."""
@@ -124,6 +129,7 @@ class Box(Shape):
         return self.center + self.half_extents * corners, triangles.copy()
 
 
+@guarded_record("capsule", MAKE_ANOTHER)
 @dataclass(frozen=True, eq=False)
 class Capsule(Shape):
     """All points within a radius of the segment from a to b. Raises SceneError unless the radius is above 0 and a is not b."""
@@ -153,6 +159,7 @@ class Capsule(Shape):
         return np.array([0.5 * float(np.linalg.norm(self.b - self.a)), self.radius, 0.0])
 
 
+@guarded_record("mesh obstacle", MAKE_ANOTHER)
 @dataclass(frozen=True, eq=False)
 class MeshObstacle(Shape):
     """Triangles whose normals point out of the solid; they need not close, and normals inward make a hollow.
@@ -246,6 +253,9 @@ def surface_numbers(friction, restitution, what: str) -> tuple[float, float]:
     )
 
 
+@guarded_record(
+    "obstacle", "scene.set_contact sets friction and restitution of a pair, sim.set_contact in a simulation, and a path moves it"
+)
 @dataclass(frozen=True, eq=False)
 class Obstacle:
     """A shape in a scene; made by `Scene.add_obstacle`.

@@ -7,6 +7,7 @@ whole has the edge; where only its two ends are, nothing tells, and that is refu
 triangles. Forces given one for each node stay point forces.
 """
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -27,7 +28,7 @@ def refined(scene: Scene) -> Scene:
 
 def with_order(scene: Scene, order: int) -> Scene:
     """The scene with all bodies of order 1 or 2. Raises SceneError as `refined` does."""
-    return _with_bodies(scene, [body if body.order == order else _of_order(body, order) for body in scene.bodies])
+    return _with_bodies(scene, [copy.copy(body) if body.order == order else _of_order(body, order) for body in scene.bodies])
 
 
 def _with_bodies(scene: Scene, bodies: list[Body]) -> Scene:

@@ -10,10 +10,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from taisoft.attributes import Guarded
 from taisoft.errors import SceneError
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
-from taisoft.scene.body import Body, Constraint, NodalForce, Traction
+from taisoft.scene.body import ANOTHER, Body, Constraint, NodalForce, Traction
 from taisoft.scene.collision import CollisionSettings
 from taisoft.scene.material import LAWS, Material
 from taisoft.scene.obstacles import Obstacle, Shape, surface_numbers
@@ -21,12 +22,18 @@ from taisoft.scene.obstacles import Obstacle, Shape, surface_numbers
 __all__ = ["LAWS", "Body", "Constraint", "Material", "NodalForce", "Scene", "Traction"]
 
 
-class Scene:
+class Scene(Guarded):
     """What is simulated: gravity, bodies and obstacles. SI units, y up.
 
     contact_pairs: {frozenset of two names, or of one for a body with itself: (friction, restitution)}, each a number or
-    None where the default of `contact_numbers` holds.
+    None where the default of `contact_numbers` holds. A Simulator that takes a scene freezes it, see `freeze`.
     """
+
+    _otherwise_late = ANOTHER
+    _instead_late = {
+        "gravity": "call sim.set_gravity(gravity)", "set_contact": "call sim.set_contact(name_a, name_b, friction=...)",
+        "contact_pairs": "call sim.set_contact(name_a, name_b, friction=...)",
+    }  # fmt: skip
 
     def __init__(self, gravity=(0.0, -9.81, 0.0)):
         """gravity: (3,) [m/s^2]. Raises SceneError unless it is three finite numbers."""
@@ -37,6 +44,7 @@ class Scene:
         self.collision = CollisionSettings()
         self.allow_initial_overlap = False
         self.contact_forces = True
+        self._seal(Scene.__init__)
 
     @property
     def gravity(self) -> np.ndarray:
@@ -92,17 +100,16 @@ class Scene:
         return f"Scene(gravity={tuple(self.gravity.tolist())}, {names})"
 
     def snapshot(self) -> "Scene":
-        """A copy whose bodies, materials, constraints, loads and pairs can change apart from this one's; meshes are shared."""
-        twin = Scene(self.gravity)
-        for body in self.bodies:
-            other = copy.copy(body)
-            other.constraints, other.tractions, other.forces = list(body.constraints), list(body.tractions), list(body.forces)
-            other._held = body._held.copy()
-            twin.bodies.append(other)
-        twin.obstacles, twin.contact_pairs = list(self.obstacles), dict(self.contact_pairs)
-        twin.collision, twin.contact_forces = self.collision, self.contact_forces
-        twin.allow_initial_overlap = self.allow_initial_overlap
+        """A copy that can change apart from this one, with its bodies, even where this one is frozen; meshes are shared."""
+        twin = copy.copy(self)
+        twin.bodies = [copy.copy(body) for body in self.bodies]
         return twin
+
+    def freeze(self) -> None:
+        """Refuse every later change of the scene and its bodies, which would have no effect: a Simulator that takes the scene
+        calls this. `snapshot` gives a copy that can change."""
+        for one in (self, *self.bodies):
+            one._freeze()
 
     def add_body(
         self,
@@ -122,6 +129,7 @@ class Scene:
         every edge. quadrature_degree: None for the default, for order 2 four points (2) or fourteen (4). collision: by what
         others hit it, "proximity", which is also "auto", or "distance_field". Raises SceneError.
         """
+        self._check_open("add_body")
         name = self._free_name(name, "body")
         body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision)
         self.bodies.append(body)
@@ -136,6 +144,7 @@ class Scene:
         callable t [s] -> (translation (3,) [m], rotation (3,3) about the shape's pivot), which is called once here, for t = 0;
         or `KeyFrames`. Raises SceneError.
         """
+        self._check_open("add_obstacle")
         obstacle = Obstacle(shape, self._free_name(name, "obstacle"), friction, restitution, path)
         self.obstacles.append(obstacle)
         return obstacle
@@ -156,6 +165,7 @@ class Scene:
         A number left out stays as it was. Raises SceneError for names that do not exist, two obstacles, numbers outside
         the rules, or no number at all.
         """
+        self._check_open("set_contact")
         pair = self._pair(name_a, name_b)
         what = f"scene: contact of {name_a!r} and {name_b!r}"
         if friction is None and restitution is None:

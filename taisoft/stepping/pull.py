@@ -15,10 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from taisoft.errors import SceneError
-from taisoft.model import body_loads
 from taisoft.scene import checks
 from taisoft.stepping.world import World
-from taisoft.transfer import array_of, upload
+from taisoft.transfer import array_of
 
 SOFT = 0.5
 STRAIN = 0.25
@@ -53,7 +52,6 @@ class Pull:
 
     def __init__(self, world: World):
         self._world = world
-        self._loads = body_loads(world.scene)  # of the scene itself
         self.grip: Grip | None = None
 
     def take(self, body: int, nodes, weights, target, stiffness) -> None:
@@ -72,7 +70,7 @@ class Pull:
         mass = 1.0 / float((weights**2 / masses[nodes]).sum())
         area = (mass / own.material.density) ** (2 / 3)
         strongest = min(STRAIN * own.material.young * area, HEAVY * EARTH * float(masses[layout.nodes(body)].sum()))
-        self._put(None)  # the nodes may be others
+        self._world.upload_loads()  # the nodes may be others
         self.grip = Grip(own.name, nodes, weights, target, stiffness, mass, strongest, target, np.zeros(3))
         self.grip.point = weights @ self._world.state()[0][nodes]
 
@@ -86,19 +84,19 @@ class Pull:
         force = k * (grip.target - grip.point) - c * (grip.weights @ v[grip.nodes].astype(np.float64))
         size = float(np.linalg.norm(force))
         grip.force = force * min(1.0, grip.strongest / size) if size > 0.0 else force
-        self._put(grip)
+        self.upload()
 
     def let_go(self) -> bool:
         """The scene's own loads alone; False where nothing was pulled."""
         if self.grip is None:
             return False
         self.grip = None
-        self._put(None)
+        self.upload()
         return True
 
-    def _put(self, grip: Grip | None) -> None:
-        loads = self._loads
-        if grip is not None:
-            loads = loads.copy()
-            np.add.at(loads, grip.nodes, np.outer(grip.weights, grip.force))
-        upload([(self._world.model.loads, loads)])
+    def upload(self) -> None:
+        """The scene's loads to the device, and the pull's force where something is pulled."""
+        if self.grip is None:
+            self._world.upload_loads()
+        else:
+            self._world.upload_loads(self.grip.nodes, np.outer(self.grip.weights, self.grip.force))

@@ -6,7 +6,7 @@ import numpy as np
 
 from taisoft.fields import FieldArena
 from taisoft.mass import lumped_masses, upload_mass_matrix, weight_masses
-from taisoft.model import Layout, Model, damping_table, material_table
+from taisoft.model import Layout, Model, body_loads, damping_table, material_table
 from taisoft.runtime import Runtime
 from taisoft.scene.scene import Scene
 from taisoft.stepping.motion import Motion
@@ -26,6 +26,7 @@ class World:
     time: float = 0.0
     step_count: int = 0
     releases: int = 0  # times that led nodes were let go: what steppers know of the past then no longer holds
+    loads: np.ndarray | None = None  # (n_nodes, 3) [N] of the scene's tractions and forces; None: not known, or changed since
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities of all nodes, as they are held."""
@@ -72,6 +73,18 @@ class World:
         upload(numbers)
         if density and m.consistent:
             upload_mass_matrix(self.scene, m.mass_matrix)
+
+    def upload_loads(self, nodes: np.ndarray | None = None, forces: np.ndarray | None = None) -> None:
+        """The scene's loads to the device, with more forces (k, 3) [N] on nodes (k,) added to them where these are given."""
+        if not self.model.loaded:
+            return
+        if self.loads is None:
+            self.loads = body_loads(self.scene)
+        loads = self.loads
+        if nodes is not None:
+            loads = loads.copy()
+            np.add.at(loads, nodes, forces)
+        upload([(self.model.loads, loads)])
 
     def _rest_velocities(self) -> np.ndarray:
         """Initial velocities with 0 on constrained axes (n_nodes, 3)."""

@@ -36,12 +36,10 @@ class Layers:
         points = np.concatenate([body.rest_positions + body.position for body in scene.bodies])
         self._size = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
         self._peak = 0.0  # [N s]
-        pulls = [(body, t, n) for body, n in zip(scene.bodies, starts) for t in body.tractions]
-        most = max((float(np.linalg.norm(t.value)) for _, t, _ in pulls), default=0.0) or 1.0
-        self._arrows = []  # nodes of the corners (k,3), and the arrow (3,) [m]
-        for body, t, n in pulls:
-            chosen = t.triangles[:: -(-len(t.triangles) // MAX_ARROWS)]
-            self._arrows.append((body.mesh.surface[chosen] + n, ARROW * self._size / most * t.value))
+        self._loaded = [  # for each traction, nodes of the corners (k,3)
+            body.mesh.surface[t.triangles[:: -(-len(t.triangles) // MAX_ARROWS)]] + n
+            for body, n in zip(scene.bodies, starts) for t in body.tractions
+        ]  # fmt: skip
 
     @property
     def has_lines(self) -> bool:
@@ -53,7 +51,11 @@ class Layers:
         x = sim.positions()
         marks = self._contact_lines(sim) if self.shown["contacts"] else []
         if self.shown["tractions"]:
-            marks += [(_arrows(x[corners].mean(axis=1), arrow, camera), TRACTION_COLOUR) for corners, arrow in self._arrows]
+            tractions = [t.value for body in sim.scene.bodies for t in body.tractions]  # as they are now
+            longest = max((float(np.linalg.norm(t)) for t in tractions), default=0.0) or 1.0
+            for corners, traction in zip(self._loaded, tractions):
+                arrow = ARROW * self._size / longest * traction
+                marks.append((_arrows(x[corners].mean(axis=1), arrow, camera), TRACTION_COLOUR))
         marks = [(camera.nearer(ends, IN_FRONT), colour) for ends, colour in marks]
         if self.shown["wires"]:  # last: what is too much goes
             marks.append((camera.nearer(x[self._edges].reshape(-1, 3), ON_SURFACE), WIRE_COLOUR))

@@ -1,0 +1,256 @@
+"""What may be assigned to, and when:
+
+* an unknown attribute of a scene, a body, a material, a shape, an obstacle, settings or a simulator is refused with the nearest
+  one that there is, and a read-only one with the call to use; reading, copies and replaced methods are as everywhere;
+* a Simulator that takes a scene freezes it: every later change of it, or of its bodies, is refused with the call to use, in the
+  simulator's own copy too; a construction that fails, statics and modes freeze nothing, and a second Simulator can be made;
+* a snapshot, a copy and a pickle of a frozen scene can change; what a simulator changes itself still works.
+"""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from scenes import cube, rubber
+
+import taisoft as ts
+from taisoft import simulator
+from taisoft.errors import SceneError, SimulationError
+from taisoft.scene.refine import with_order
+
+DT = 1e-4
+
+
+def loaded() -> ts.Scene:
+    """A body with all that a body can have, a second one, and an obstacle."""
+    scene = ts.Scene()
+    scene.contact_forces = False  # they would take long to compile
+    body = scene.add_body(cube(), rubber(), name="block", velocity=np.zeros((8, 3)))
+    body.fix([0])
+    body.move([1], lambda t: (0, 0, 0))
+    body.add_force([6, 7], (1, 0, 0))
+    body.add_traction([0], (0, 1, 0))
+    scene.add_body(cube((3, 0, 0)), rubber(), name="other")
+    scene.add_obstacle(ts.Sphere((0, -9, 0), 1.0), name="ball")
+    scene.set_contact("block", "ball", friction=0.3)
+    return scene
+
+
+# --- unknown and read-only attributes ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("what, name, words", [
+    (lambda s: s, "gravty", "^scene has no attribute 'gravty'; did you mean 'gravity'[?]$"),
+    (lambda s: s, "zzz", "^scene has no attribute 'zzz'$"),
+    (lambda s: s, "_hidden", "^scene has no attribute '_hidden'$"),
+    (lambda s: s.body("block"), "materal", "^body 'block' has no attribute 'materal'; did you mean 'material'[?]$"),
+    (lambda s: s.body("block").material, "youngs", "^material has no attribute 'youngs'; did you mean 'young'[?]$"),
+    (lambda s: s.body("block").material, "young", "^material: young cannot change: .*sim.set_material.body, young=...."),
+    (lambda s: s.obstacle("ball"), "fricton", "^obstacle 'ball' has no attribute 'fricton'; did you mean 'friction'[?]$"),
+    (lambda s: s.obstacle("ball"), "friction", "^obstacle 'ball': friction cannot change: .*scene.set_contact"),
+    (lambda s: s.obstacle("ball").shape, "radios", "^sphere has no attribute 'radios'; did you mean 'radius'[?]$"),
+    (lambda s: s.obstacle("ball").shape, "radius", "^sphere: radius cannot change: make another shape"),
+    (lambda s: s.collision, "margn", "^collision settings has no attribute 'margn'; did you mean 'margin'[?]$"),
+    (lambda s: s.collision, "margin", "^collision settings: margin cannot change: .*CollisionSettings.margin=...."),
+    (lambda s: s.body("block").forces[0], "value", "^force: value cannot change: call sim.set_force"),
+    (lambda s: s.body("block").tractions[0], "value", "^traction: value cannot change: call sim.set_traction"),
+])  # fmt: skip
+def test_attributes_of_scenes(what, name, words):
+    one = what(loaded())
+    before = dict(one.__dict__)
+    with pytest.raises(SceneError, match=words) as caught:
+        setattr(one, name, 1.0)
+    assert isinstance(caught.value, AttributeError) and one.__dict__ == before
+
+
+def test_every_shape_refuses():
+    shapes = [
+        ts.HalfSpace((0, 0, 0), (0, 1, 0)), ts.Sphere((0, 0, 0), 1), ts.Box((0, 0, 0), (1, 1, 1)),
+        ts.Capsule((0, 0, 0), (1, 0, 0), 1), ts.MeshObstacle(np.eye(3), [(0, 1, 2)]), ts.KeyFrames([0], [(0, 0, 0)]),
+    ]  # fmt: skip
+    for shape in shapes:
+        with pytest.raises(SceneError, match="has no attribute 'colour'$"):
+            shape.colour = 1
+
+
+def test_reading_is_as_everywhere():
+    scene = loaded()
+    assert not hasattr(scene, "gravty") and getattr(scene, "gravty", 7) == 7 and hasattr(scene.bodies[0], "material")
+    with pytest.raises(AttributeError, match="object has no attribute 'gravty'"):
+        _ = scene.gravty
+
+    class Mine(ts.Scene):
+        def __init__(self):
+            super().__init__()
+            self.colours = {}  # a subclass may have more
+
+    assert Mine().colours == {}
+
+
+# --- a frozen scene ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def taken():
+    """A scene, the simulator that took it, and an unchanged copy."""
+    scene = loaded()
+    before = copy.deepcopy(scene)
+    with ts.Simulator(scene, DT, "symplectic_euler", precision="f64") as sim:
+        yield scene, sim, before
+
+
+LATE = {
+    "gravity": (lambda s: setattr(s, "gravity", (0, 0, 0)), "call sim.set_gravity"),
+    "collision": (lambda s: setattr(s, "collision", ts.CollisionSettings()), "scene.snapshot"),
+    "allow_initial_overlap": (lambda s: setattr(s, "allow_initial_overlap", True), "make a new Simulator"),
+    "contact_forces": (lambda s: setattr(s, "contact_forces", True), "make a new Simulator"),
+    "add_body": (lambda s: s.add_body(cube((0, 5, 0)), rubber()), "scene.snapshot"),
+    "add_obstacle": (lambda s: s.add_obstacle(ts.Sphere((0, -20, 0), 1)), "scene.snapshot"),
+    "set_contact": (lambda s: s.set_contact("block", "ball", friction=1), "call sim.set_contact"),
+    "contact_pairs": (lambda s: s.contact_pairs.clear(), "call sim.set_contact"),
+    "bodies": (lambda s: s.bodies.pop(), "scene.snapshot"),
+    "obstacles": (lambda s: setattr(s, "obstacles", []), "scene.snapshot"),
+    "material": (lambda s: setattr(s.body("block"), "material", rubber()), "call sim.set_material"),
+    "position": (lambda s: setattr(s.body("block"), "position", np.zeros(3)), "call sim.set_state"),
+    "velocity": (lambda s: setattr(s.body("block"), "velocity", np.zeros(3)), "call sim.set_state"),
+    "name": (lambda s: setattr(s.body("block"), "name", "b"), "scene.snapshot"),
+    "fix": (lambda s: s.body("block").fix([3]), "scene.snapshot"),
+    "move": (lambda s: s.body("block").move([3], lambda t: (0, 0, 0)), "scene.snapshot"),
+    "add_force": (lambda s: s.body("block").add_force([3], (0, 0, 0)), "call sim.set_force"),
+    "add_traction": (lambda s: s.body("block").add_traction([3], (0, 0, 0)), "call sim.set_traction"),
+    "forces": (lambda s: s.body("block").forces.append(1), "call sim.set_force"),
+    "tractions": (lambda s: s.body("block").tractions.__setitem__(0, 1), "call sim.set_traction"),
+    "constraints": (lambda s: s.body("block").constraints.clear(), "scene.snapshot"),
+    "mesh": (lambda s: delattr(s.body("block"), "mesh"), "scene.snapshot"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LATE)
+def test_late_changes(taken, name):
+    scene, sim, before = taken
+    change, instead = LATE[name]
+    words = f"^(scene|body 'block'): {name} cannot (change|be called) any more, since a Simulator has .*{instead}"
+    for one in (scene, sim.scene):
+        with pytest.raises(SceneError, match=words):
+            change(one)
+        assert one.gravity.tolist() == before.gravity.tolist() and one.contact_pairs == before.contact_pairs
+        assert [b.name for b in one.bodies] == ["block", "other"] and len(one.body("block").forces) == 1
+    change(before.snapshot())  # which was not taken
+    change(scene.snapshot())
+
+
+def test_arrays_of_a_frozen_scene(taken):
+    scene, _, before = taken
+    body = scene.body("block")
+    arrays = scene.gravity, body.position, body.velocity, body.forces[0].value, body.tractions[0].value, body.constraints[0].nodes
+    for array in (*arrays, body.rest_positions, body.mesh.vertices):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+    before.snapshot().gravity[1] = 0.0
+
+
+def test_an_unknown_attribute_is_unknown_late_too(taken):
+    with pytest.raises(SceneError, match="^scene has no attribute 'gravty'"):
+        taken[0].gravty = 1
+
+
+def test_copies_can_change(taken):
+    scene = taken[0]
+    straight = scene.snapshot()
+    straight.body("block").constraints[1:] = []  # a pickle takes no lambda
+    for twin in (scene.snapshot(), copy.copy(scene), copy.deepcopy(scene), pickle.loads(pickle.dumps(straight))):
+        twin.gravity = (0, -1, 0)
+        twin.add_obstacle(ts.Sphere((0, -20, 0), 1))
+        twin.set_contact("block", "ball", friction=0.9)
+        twin.bodies.pop()
+    for twin in (scene.snapshot(), copy.deepcopy(scene)):
+        twin.body("block").add_force([3], (0, 0, 0))
+        twin.body("block").velocity[0] = 1.0
+    assert scene.gravity[1] == -9.81 and len(scene.bodies) == 2 and len(scene.body("block").forces) == 1
+    same = with_order(scene, 1)
+    same.bodies[0].add_force([3], (0, 0, 0))
+
+
+def test_what_the_simulator_changes(taken):
+    scene, sim, _ = taken
+    sim.set_gravity((0, -1, 0))
+    sim.set_material("block", young=2e4)
+    sim.set_contact("block", "ball", friction=0.1)
+    sim.set_force("block", 0, (2, 0, 0))
+    assert (sim.scene.gravity[1], sim.scene.body("block").material.young) == (-1, 2e4)
+    assert sim.scene.contact_numbers("block", "ball")[0] == 0.1 and sim.scene.body("block").forces[0].value[0] == 2
+    assert (scene.gravity[1], scene.body("block").material.young) == (-9.81, 1e5)
+    for call in (
+        lambda: sim.set_gravity("down"), lambda: sim.set_contact("block", "ball", friction=-1),
+        lambda: sim.set_material("block", young=1e13),  # not stable
+    ):  # fmt: skip
+        with pytest.raises((SceneError, SimulationError)):
+            call()
+        assert sim.scene.body("block").material.young == 2e4
+        with pytest.raises(SceneError, match="cannot change any more"):
+            sim.scene.gravity = (0, 0, 0)
+    with pytest.raises(ValueError, match="read-only"):
+        sim.scene.gravity[1] = 0.0
+
+
+def test_only_a_simulator_that_was_made_freezes(taken, tmp_path, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("late")
+
+    scene = loaded()
+    for settings in ({"integrator": "nope"}, {"dt": 1.0, "integrator": "symplectic_euler", "precision": "f64"}):
+        with pytest.raises(SimulationError):
+            ts.Simulator(scene, **settings)
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="late"):
+        patch.setattr(simulator, "make_stepper", fail)
+        ts.Simulator(scene, DT, "symplectic_euler", precision="f64")
+    held = ts.Scene()
+    held.add_body(cube(), rubber()).fix(lambda X: X[:, 0] < 0)
+    ts.solve_static(held)
+    ts.modes(held, 1)
+    for one in (scene, held):
+        one.gravity[1] = -1.0
+        one.bodies[0].fix([5])
+    saved, first = tmp_path / "c.npz", taken[1]
+    first.save_checkpoint(saved)
+    with ts.Simulator(taken[0], DT, "symplectic_euler", precision="f64") as second:  # of a frozen scene
+        assert second.scene.gravity[1] == -9.81
+    again = loaded()
+    with ts.Simulator.load_checkpoint(saved, again) as loaded_one, pytest.raises(SceneError, match="sim.set_gravity"):
+        assert loaded_one.scene.gravity[1] == first.scene.gravity[1]
+        again.gravity = (0, 0, 0)
+
+
+@pytest.mark.parametrize("name, words", [
+    ("dtt", "^simulator has no attribute 'dtt'; did you mean 'dt'[?]$"),
+    ("gravity", "^simulator has no attribute 'gravity': call sim.set_gravity.gravity.$"),
+    ("gravty", "^simulator has no attribute 'gravty'; did you mean 'gravity'[?] .call sim.set_gravity.gravity..$"),
+    ("young", "^simulator has no attribute 'young': call sim.set_material.body, young=....$"),
+    ("friction", "^simulator has no attribute 'friction': call sim.set_contact"),
+    ("integrator", "^simulator has no attribute 'integrator': call sim.rebuild.integrator=....$"),
+    ("positions", "^simulator: positions is a method and cannot be set: call sim.set_state"),
+    ("step", "^simulator: step is a method and cannot be set$"),
+    ("time", "^simulator: time cannot be set: call sim.reset"),
+    ("stable_dt", "^simulator: stable_dt cannot be set: .*set sim.dt"),
+    ("compile_seconds", "^simulator: compile_seconds cannot be set: it is read-only$"),
+    ("scene", "^simulator: scene cannot be set: make a new Simulator"),
+    ("settings", "^simulator: settings cannot be set: call sim.rebuild"),
+    ("plan", "^simulator: plan cannot be set: it follows"),
+])  # fmt: skip
+def test_attributes_of_a_simulator(taken, name, words):
+    sim = taken[1]
+    with pytest.raises(SimulationError, match=words) as caught:
+        setattr(sim, name, 1.0)
+    assert isinstance(caught.value, AttributeError)
+    sim.dt = sim.dt
+    with pytest.raises(SceneError, match="^settings: dt cannot change: call sim.rebuild.dt=....$"):
+        sim.settings.dt = 1.0
+
+
+def test_a_method_may_be_replaced(taken, monkeypatch):
+    sim = taken[1]
+    with monkeypatch.context() as patch:
+        patch.setattr(sim, "step", lambda: "stepped")
+        assert sim.step() == "stepped"
+    assert sim.step.__func__ is ts.Simulator.step
