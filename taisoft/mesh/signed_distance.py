@@ -25,6 +25,7 @@ from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
 
 PAIRS = 1 << 19  # of blocks and triangles that are looked at together at most, about 100 bytes each
 _SLACK = 1e-9  # of the size, by which bounds are loosened against rounding
+_PAIRS_AT = 1 << 15  # the same for scattered points
 _BLOCK = 64  # points whose exact distances are found together, before it is asked whether others can lie deeper
 
 
@@ -66,16 +67,23 @@ class _PointSearch:
 
     def signed(self, rows: np.ndarray) -> np.ndarray:
         """Signed distances [m] of some of the points."""
-        surface, points, result = self.surface, self.points[rows], np.zeros(len(rows))
+        surface = self.surface
+        if not len(rows):
+            return np.zeros(0)
         # a triangle can be nearer only if its centroid is within the bound and its own radius
         reach = (1.0 + _SLACK) * (self.upper[rows] + surface.radius.max())
-        for k, candidates in enumerate(self.tree.query_ball_point(points, reach) if len(rows) else ()):
-            triangle = np.sort(candidates)
-            squared, offset, feature = surface.nearest(np.repeat(points[k : k + 1], len(triangle), axis=0), triangle)
-            best = np.argmin(squared)
-            side = surface.sides(offset[best : best + 1], triangle[best : best + 1], feature[best : best + 1])[0]
-            result[k] = np.copysign(np.sqrt(squared[best]), side if side != 0.0 else 1.0)
-        return result
+        near = self.tree.query_ball_point(self.points[rows], reach, return_sorted=True)
+        counts = np.array([len(candidates) for candidates in near])
+        result = []
+        for some in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(np.cumsum(counts) // _PAIRS_AT)) + 1):
+            starts = np.concatenate([[0], np.cumsum(counts[some])[:-1]])
+            row, triangle = np.repeat(rows[some], counts[some]), np.concatenate(near[some]).astype(np.int64)
+            squared, offset, feature = surface.nearest(self.points[row], triangle)
+            equal = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, starts), counts[some]))
+            best = equal[np.searchsorted(equal, starts)]  # of equally near triangles the first
+            inside = surface.sides(offset[best], triangle[best], feature[best]) < 0.0
+            result.append(np.where(inside, -1.0, 1.0) * np.sqrt(squared[best]))
+        return np.concatenate(result)
 
 
 class _Surface:

@@ -7,6 +7,8 @@ triangles without area do not disturb it. Weak: every point looks at every trian
 
 import numpy as np
 
+from taisoft.mesh.triangle_queries import distances
+
 _PAIRS = 1 << 16  # of points and triangles that are looked at together, about 500 bytes each
 
 
@@ -23,14 +25,18 @@ def solid_depths(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     corners: (t,3,3) [m] of its triangles, normals outward. A surface that is inside out as a whole bounds a hollow.
     """
     depth = np.zeros(len(points))
-    outside = 0.5 if _volume(corners) >= 0.0 else -0.5
     step = max(_PAIRS // max(len(corners), 1), 1)
     for first in range(0, len(points), step):
         some = points[first : first + step]
-        inside = np.flatnonzero(winding_numbers(corners, some) > outside)
+        inside = np.flatnonzero(are_inside(corners, some))
         if len(inside):
             depth[first + inside] = distances(corners, some[inside])
     return depth
+
+
+def are_inside(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(p,) bool: whether points (p,3) lie inside the solid, see `solid_depths`."""
+    return winding_numbers(corners, points) > (0.5 if _volume(corners) >= 0.0 else -0.5)
 
 
 def winding_numbers(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -40,23 +46,6 @@ def winding_numbers(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     volume = np.einsum("ptx,ptx->pt", a, np.cross(b, c))
     ab, bc, ca = (np.einsum("ptx,ptx->pt", x, y) for x, y in ((a, b), (b, c), (c, a)))
     return np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum(axis=1) / (2.0 * np.pi)
-
-
-def distances(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(p,) distances [m] of points (p,3) from triangles with corners (t,3,3)."""
-    edges = np.roll(corners, -1, axis=1) - corners
-    squared = np.einsum("tkx,tkx->tk", edges, edges)
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    length = np.linalg.norm(normal, axis=1)
-    normal /= np.where(length > 0.0, length, 1.0)[:, None]
-    inward = np.cross(normal[:, None], edges)
-    d = points[:, None, None] - corners[None]  # (p,t,3,3), from each corner
-    along = np.einsum("ptkx,tkx->ptk", d, edges) / np.where(squared > 0.0, squared, 1.0)
-    offset = d - np.clip(along, 0.0, 1.0)[..., None] * edges
-    beside = np.sqrt(np.einsum("ptkx,ptkx->ptk", offset, offset)).min(axis=2)
-    above = (np.einsum("ptkx,tkx->ptk", d, inward) >= 0.0).all(axis=2) & (length > 0.0)
-    height = np.abs(np.einsum("ptx,tx->pt", d[:, :, 0], normal))
-    return np.where(above, height, beside).min(axis=1)
 
 
 def _volume(corners: np.ndarray) -> float:
