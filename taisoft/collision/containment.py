@@ -88,6 +88,9 @@ class Containment:
         counts = self._n_parts[self._solid]
         self._owner = np.concatenate([np.repeat(self._solid, counts), np.array([k for _, k, _ in self._round], dtype=np.int64)])
         self._own_part = np.concatenate([*(np.arange(n) for n in counts), np.zeros(len(self._round), dtype=np.int64)])
+        own, other = self._owner[:, None], self._solid
+        self._may_hold = (self._soft[own] | self._soft[other]) & self._closed[other]  # (points, solid): whether it is asked
+        self._may_hold &= (own != other) | (self._self & (self._n_parts[other] > 1))
         self._clear: dict[tuple[int, int], _Clear] = {}
         self._ready = True
 
@@ -117,23 +120,25 @@ class Containment:
 
     def _points(self, x: np.ndarray, nodes: np.ndarray, frames: list[np.ndarray] | None) -> np.ndarray:
         """(n,3) [m] the inner points: of bodies, of obstacles with triangles, of round ones."""
-        corners = x[self._topology.triangle[self._triangles]]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        middles = [frames[0][[i for i, _, _ in self._round]]] if self._round else []
-        return np.concatenate([nodes[self._nodes].mean(axis=1), corners.mean(axis=1) - self._behind[:, None] * normal, *middles])
+        points = [0.25 * nodes[self._nodes].sum(axis=1)]
+        if len(self._triangles):
+            corners = x[self._topology.triangle[self._triangles]]
+            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            points.append(corners.mean(axis=1) - self._behind[:, None] * normal)
+        if frames is not None:
+            points.append(frames[0][[i for i, _, _ in self._round]])
+        return np.concatenate(points)
 
     def _pairs(self, points: np.ndarray, x: np.ndarray) -> np.ndarray:
         """(k,2) an inner point and a collider that it may lie inside: in its box."""
         starts = self._topology.vertex_first[self._solid]
-        lo, hi = (extreme.reduceat(x, starts) for extreme in (np.minimum, np.maximum))
-        k, b = np.nonzero((lo[:, 0] <= points[:, :1]) & (points[:, :1] <= hi[:, 0]))  # most lie beside it along the first axis
-        within = ((lo[b, 1:] <= points[k, 1:]) & (points[k, 1:] <= hi[b, 1:])).all(axis=1)
-        k, b = k[within], self._solid[b[within]]
-        own = self._owner[k]
-        wanted = (self._soft[own] | self._soft[b]) & self._closed[b]
-        wanted &= (own != b) | (self._self & (self._n_parts[b] > 1))
-        return np.stack([k[wanted], b[wanted]], axis=1)
+        lo, hi = np.minimum.reduceat(x, starts).T, np.maximum.reduceat(x, starts).T
+        boxed = self._may_hold.copy()
+        for p, low, high in zip(points.T[:, :, None], lo, hi):
+            boxed &= (low <= p) & (p <= high)
+        k, b = np.nonzero(boxed)
+        return np.stack([k, self._solid[b]], axis=1)
 
     def _look(self, k: int, b: int, point: np.ndarray, x: np.ndarray) -> Inside | None:
         """Inner point k in collider b, None where it lies outside."""
