@@ -131,8 +131,9 @@ class StateAccess(Guarded):
     def deepest_overlap(self) -> Overlap | None:
         """Which two overlap deepest in the present state, and how deep [m]; None where nothing overlaps.
 
-        Slow, and unlike `StepReport.max_penetration` it also sees what has gone too deep for the search for contacts. The depth
-        is that of the deepest vertex, crossing edge or face, or of a sphere's, box's or capsule's middle, inside the other.
+        Slow, and unlike `StepReport.max_penetration` it looks at all pairs, whether or not their surfaces meet. The depth is that
+        of the deepest vertex, node, middle of a tet, or cut of a triangle into a tet of either inside the other; a body is as
+        deep in a sphere or a capsule as it comes near its middle or axis.
         """
         return next(iter(self.overlaps()), None)
 

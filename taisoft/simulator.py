@@ -203,6 +203,10 @@ class Simulator(Resuming):
                 f"bodies are {report.max_penetration:.3g} m deep in each other or in obstacles"
                 + (f", {report.crossings} pairs of surface triangles cross" if report.crossings else "")
             )
+            found += [
+                f"'{a}' and '{b}' overlap by {depth:.3g} m" if a != b else f"parts of '{a}' overlap by {depth:.3g} m"
+                for a, b, depth in self._contact.inside
+            ]
         if report.n_inverted:
             found.append(f"{report.n_inverted} tets are inverted")
         return found

@@ -1,8 +1,9 @@
 """What overlaps at the start is refused, and told with both names and its depth:
 
 * two bodies, a body and every kind of obstacle; one wholly inside another; a ball's face over a sphere; edges that cross, and
-  a rod through a sheet, where no vertex lies inside;
+  a rod through a sheet or a capsule, where no vertex lies inside; doubles and others whose surfaces coincide;
 * the depth is the exact one; bodies that lie flush, and those deeper by less than 1e-6 of their size, are allowed;
+* where it is allowed, every step and the end of a run tell what lies inside what, although nothing touches;
 * signed distances at points are those of a grid and those of brute force.
 """
 
@@ -25,13 +26,20 @@ OBSTACLES = {
 }
 
 
+def parts() -> ts.TetMesh:
+    """Two cubes in one mesh, beside each other."""
+    one = ts.box_mesh((1, 1, 1), (1, 1, 1))
+    vertices = np.concatenate([one.vertices, one.vertices + (2.0, 0, 0)])
+    return ts.TetMesh(vertices, np.concatenate([one.tets, one.tets + one.n_verts]))
+
+
 def scene() -> ts.Scene:
     """Bodies apart, and one obstacle of each kind; the tests put bodies where they overlap."""
     made = ts.Scene(gravity=(0, 0, 0))
     for k, (name, mesh) in enumerate((
         ("cube", ts.box_mesh((1, 1, 1), (1, 1, 1))), ("small", ts.box_mesh((1, 1, 1), (0.2, 0.2, 0.2))),
         ("big", ts.box_mesh((3, 3, 3), (2, 2, 2))), ("sheet", ts.sheet_mesh((2, 2), (2.0, 0.05, 2.0))),
-        ("rod", ts.box_mesh((1, 1, 1), (0.02, 2.0, 0.02))), ("ball", ts.ball_mesh(0.5, 4)),
+        ("rod", ts.box_mesh((1, 1, 1), (0.02, 2.0, 0.02))), ("ball", ts.ball_mesh(0.5, 4)), ("parts", parts()),
     )):  # fmt: skip
         made.add_body(mesh, SOFT, name=name, position=FAR + (5.0 * k, 0, 0))
     for name, shape in OBSTACLES.items():
@@ -41,7 +49,7 @@ def scene() -> ts.Scene:
 
 @pytest.fixture(scope="module")
 def made():
-    with ts.Simulator(scene(), dt=1e-4, integrator="symplectic_euler", precision="f64") as sim:
+    with ts.Simulator(scene(), dt=1e-4, integrator="symplectic_euler", precision="f64", self_collision=True) as sim:
         yield sim, sim.positions()
 
 
@@ -117,20 +125,15 @@ def test_a_corner_beside_a_vertex(sim, depth):
     reach = (0.4 - depth) / np.sqrt(3)
     put(sim, "big", OBSTACLES["sphere"].center + np.array([1.0, 1.0, 1.0]) - reach)
     names, found = overlap(sim)
-    assert names == {"big", "sphere"} and found == pytest.approx(reach, rel=1e-9)
+    assert names == {"big", "sphere"} and found == pytest.approx(0.4, rel=1e-9)
 
 
-@pytest.mark.parametrize("name", ["sphere", "box", "capsule", "mesh"])
-def test_a_body_wholly_inside_an_obstacle(sim, name):
-    at = OBSTACLES[name].pivot + (0.0, 0.01, 0.0)
-    put(sim, "small", at)
-    x = sim.positions("small") - OBSTACLES[name].pivot
-    inside = {
-        "sphere": 0.4 - np.linalg.norm(x, axis=1), "box": (np.array([0.5, 0.3, 0.4]) - np.abs(x)).min(axis=1),
-        "capsule": 0.3 - np.linalg.norm(x[:, :2], axis=1), "mesh": (0.5 - np.abs(x)).min(axis=1),
-    }  # fmt: skip
+@pytest.mark.parametrize("name, depth", [("sphere", 0.4), ("box", 0.29), ("capsule", 0.3), ("mesh", 0.49)])
+def test_a_body_wholly_inside_an_obstacle(sim, name, depth):
+    """Its middle lies deepest, 0.01 m above that of the obstacle; of a sphere and a capsule the middle lies in the body."""
+    put(sim, "small", OBSTACLES[name].pivot + (0.0, 0.01, 0.0))
     names, found = overlap(sim)
-    assert names == {"small", name} and found == pytest.approx(inside[name].max(), rel=1e-9)
+    assert names == {"small", name} and found == pytest.approx(depth, rel=1e-9)
 
 
 def test_a_face_over_a_sphere(sim):
@@ -164,6 +167,14 @@ def test_a_rod_through_a_sheet(sim):
     assert names == {"sheet", "rod"}
 
 
+@pytest.mark.parametrize("at, depth", [((0.0, 0.0, 0.3), 0.3), ((0.1, 0.0, 0.3), 0.21)])
+def test_a_rod_through_a_capsule(sim, at, depth):
+    """Across its axis, which is the deepest, and beside it."""
+    put(sim, "rod", OBSTACLES["capsule"].pivot + np.array(at))
+    names, found = overlap(sim)
+    assert names == {"rod", "capsule"} and found == pytest.approx(depth, rel=1e-9)
+
+
 def test_flush_bodies_are_allowed(sim):
     """Faces on faces, an edge along an edge, a face on every obstacle; and less than 1e-6 of the size."""
     put(sim, "big", (0, 0, 0))
@@ -178,16 +189,52 @@ def test_flush_bodies_are_allowed(sim):
         assert overlap(sim)[1] == pytest.approx(1e-5, rel=1e-3)
 
 
-def two(depth: float) -> ts.Scene:
+def problems(sim) -> tuple[list[str], list[str]]:
+    """What two steps and the end of their run tell, and what the first of them does."""
+    report = sim.run(2 * sim.dt, fps=None)
+    assert all(r.deep == bool(r.problems) and (r.max_penetration > 0.01) == bool(r.problems) for r in report.step_reports)
+    assert (report.status == "ok") == (not report.problems)
+    return report.problems, [text.split(": ", 1)[1] for text in report.step_reports[0].problems]
+
+
+def test_steps_tell_what_lies_inside_what(sim):
+    """Nothing touches there, and no triangles cross."""
+    start = sim.positions()
+    assert problems(sim) == ([], [])
+    cases = [("small", "big", (0.3, 0.1, 0.2)), ("cube", "mesh", OBSTACLES["mesh"].pivot)]  # inside, and a double
+    cases += [("small", name, OBSTACLES[name].pivot + (0.0, 0.01, 0.0)) for name in ("sphere", "box", "capsule", "mesh")]
+    cases += [("big", name, OBSTACLES[name].pivot) for name in ("sphere", "box", "capsule", "mesh")]
+    for inner, outer, at in cases:
+        sim.set_state(start, np.zeros_like(start))
+        if outer == "big":
+            put(sim, "big", (0, 0, 0))
+        put(sim, inner, at)
+        at_end, at_first = problems(sim)
+        told = [f"'{a}' and '{b}' overlap by" for a, b in ((inner, outer), (outer, inner))]
+        assert any(text.startswith(tuple(told)) for text in at_first)
+        assert any(text.startswith(tuple(f"at the end {one}" for one in told)) for text in at_end)
+    sim.set_state(start, np.zeros_like(start))
+    x = sim.positions("parts")
+    for scale, shift in ((1.0, 0.0), (0.1, 0.2)):  # one part the double of the other, and inside it
+        x[8:] = x[8:].mean(axis=0) + scale * (x[:8] - x[:8].mean(axis=0))
+        sim.set_state(x + np.repeat([[0.0], [1.0]], 8, axis=0) * (x[:8].mean(axis=0) - x[8:].mean(axis=0) + shift), body="parts")
+        at_end, at_first = problems(sim)
+        assert any(text.startswith("parts of 'parts' overlap by") for text in at_first) and len(at_end) == 1
+    sim.set_state(start, np.zeros_like(start))
+
+
+def two(depth: float, step: float = 0.1) -> ts.Scene:
     made = ts.Scene(gravity=(0, 0, 0))
     for k in range(2):
-        made.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), SOFT, name=("lower", "upper")[k], position=(0.1 * k, (1 - depth) * k, 0))
+        at = (step * k, (1 - depth) * k, 0)
+        made.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), SOFT, name=("lower", "upper")[k], position=at)
     return made
 
 
 def test_a_simulator_refuses_it():
-    with pytest.raises(ts.SceneError, match=r"^'lower' and 'upper' overlap at the start, 0.125 m deep: move them apart, or set "):
-        ts.Simulator(two(0.125), dt=1e-4, integrator="symplectic_euler", precision="f64")
+    """Two bodies with nothing but their names to tell them apart."""
+    with pytest.raises(ts.SceneError, match=r"^'lower' and 'upper' overlap at the start, 0.5 m deep: move them apart, or set "):
+        ts.Simulator(two(1.0, 0.0), dt=1e-4, integrator="symplectic_euler", precision="f64")
 
 
 def test_without_contact_forces_bodies_pass_through_each_other():

@@ -22,6 +22,7 @@ from taisoft.collision.colliders import (
     obstacle_frame,
 )
 from taisoft.collision.contacts import KINDS, Contacts, contact_fields, gather
+from taisoft.collision.containment import Containment, Inside
 from taisoft.collision.crossings import find_crossings
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.proximity import find_proximity
@@ -120,6 +121,7 @@ class Detection:
         self._reduction_arena = FieldArena()
         self._reduction: ReductionFields | None = None
         self._intersections: Intersections | None = None
+        self._containment = Containment(scene, self.topology, layout, self._rest, self._analytic, self_collision)
         self._placed = False  # whether obstacles have been placed
         self._looked: Trees | Candidates | None = None  # where the last search looked
         self.counts = Counts(triangles=s.n_triangles)
@@ -325,6 +327,10 @@ class Detection:
             if not row.grow_if_full():
                 break
         return told
+
+    def contained(self) -> list[Inside]:
+        """Parts of colliders that lie inside others where the last search found them, see `Containment`."""
+        return self._containment.find(self.surface, self.model.x, self.shapes)
 
     def _buffers(self) -> list[Buffer]:
         return [self.buffer, *((self._row, *self.broad.buffers) if self._rows else ())]

@@ -25,6 +25,8 @@ from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
 
 PAIRS = 1 << 19  # of blocks and triangles that are looked at together at most, about 100 bytes each
 _SLACK = 1e-9  # of the size, by which bounds are loosened against rounding
+_PAIRS_AT = 1 << 15  # the same for scattered points
+_BLOCK = 64  # points whose exact distances are found together, before it is asked whether others can lie deeper
 
 
 def signed_distances(vertices: np.ndarray, triangles: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
@@ -38,22 +40,50 @@ def signed_distances(vertices: np.ndarray, triangles: np.ndarray, axes: list[np.
 
 def signed_distances_at(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(k,) float64 [m] at points (k,3), negative inside; the surface as in `signed_distances`."""
-    surface = _Surface(vertices, triangles)
-    result = np.zeros(len(points))
-    if not len(points):
-        return result
-    tree = cKDTree(surface.centroid)
-    _, first = tree.query(points)
-    upper = np.sqrt(surface.nearest(points, first)[0])
-    # a triangle can be nearer only if its centroid is within the bound and its own radius
-    near = tree.query_ball_point(points, (1.0 + _SLACK) * (upper + surface.radius.max()))
-    for k, candidates in enumerate(near):
-        triangle = np.sort(candidates)
-        squared, offset, feature = surface.nearest(np.repeat(points[k : k + 1], len(triangle), axis=0), triangle)
-        best = np.argmin(squared)
-        side = surface.sides(offset[best : best + 1], triangle[best : best + 1], feature[best : best + 1])[0]
-        result[k] = np.copysign(np.sqrt(squared[best]), side if side != 0.0 else 1.0)
-    return result
+    search = _PointSearch(_Surface(vertices, triangles), points)
+    return search.signed(np.arange(len(points)))
+
+
+def greatest_depth(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> float:
+    """How deep [m] the deepest of points (k,3) lies inside, 0 where none does; the surface as in `signed_distances`."""
+    search = _PointSearch(_Surface(vertices, triangles), points)
+    order = np.argsort(-search.upper, kind="stable")
+    deepest = 0.0
+    for first in range(0, len(order), _BLOCK):
+        some = order[first : first + _BLOCK]
+        if search.upper[some[0]] <= deepest:  # no other can lie deeper
+            break
+        deepest = max(deepest, -float(search.signed(some).min()))
+    return deepest
+
+
+class _PointSearch:
+    """Points (k,3) near a surface. upper: (k,) [m], at least their distances."""
+
+    def __init__(self, surface: "_Surface", points: np.ndarray):
+        self.surface, self.points, self.tree = surface, points, cKDTree(surface.centroid)
+        first = self.tree.query(points)[1].astype(np.int64) if len(points) else np.zeros(0, dtype=np.int64)
+        self.upper = np.sqrt(surface.nearest(points, first)[0])
+
+    def signed(self, rows: np.ndarray) -> np.ndarray:
+        """Signed distances [m] of some of the points."""
+        surface = self.surface
+        if not len(rows):
+            return np.zeros(0)
+        # a triangle can be nearer only if its centroid is within the bound and its own radius
+        reach = (1.0 + _SLACK) * (self.upper[rows] + surface.radius.max())
+        near = self.tree.query_ball_point(self.points[rows], reach, return_sorted=True)
+        counts = np.array([len(candidates) for candidates in near])
+        result = []
+        for some in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(np.cumsum(counts) // _PAIRS_AT)) + 1):
+            starts = np.concatenate([[0], np.cumsum(counts[some])[:-1]])
+            row, triangle = np.repeat(rows[some], counts[some]), np.concatenate(near[some]).astype(np.int64)
+            squared, offset, feature = surface.nearest(self.points[row], triangle)
+            equal = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, starts), counts[some]))
+            best = equal[np.searchsorted(equal, starts)]  # of equally near triangles the first
+            inside = surface.sides(offset[best], triangle[best], feature[best]) < 0.0
+            result.append(np.where(inside, -1.0, 1.0) * np.sqrt(squared[best]))
+        return np.concatenate(result)
 
 
 class _Surface:

@@ -67,6 +67,7 @@ class ContactStep:
         self._depth = 0.0  # the deepest penetration found there [m]
         self.crossing: float | None = None  # how deep triangles cross, over the finer side's edge, where somebody looked
         self.crossings = 0  # pairs of triangles that cross at the end of the last step
+        self.inside: list[tuple[str, str, float]] = []  # who lies inside whom then, and how deep [m]
         self._explicit = explicit
         self._last_time = 0.0
         self.penetration = self.sinking = 0.0  # at the end of the last step [m], and over the finer side's mean surface edge
@@ -99,7 +100,7 @@ class ContactStep:
         self._searched = self._ended = None
         self.problem.count[0] = 0
         self._last_time = self.penetration = self.sinking = self._span = 0.0
-        self._sum, self.crossing, self.crossings = None, None, 0
+        self._sum, self.crossing, self.crossings, self.inside = None, None, 0, []
 
     def _rows(self) -> dict:
         """Fields of the last step's contacts: what the next step starts from, and what `contacts` tells."""
@@ -136,7 +137,7 @@ class ContactStep:
         self._last_time, self._share, self._span = (float(kept[name]) for name in ("last_time", "share", "span"))
         self._sum, self.penetration, self.sinking = kept["sum"], float(kept["penetration"]), float(kept["sinking"])
         self.met, self.dropped = bool(kept["met"]), int(kept["dropped"])
-        self.crossing, self.crossings = None, 0
+        self.crossing, self.crossings, self.inside = None, 0, []
         self._searched = self._ended = None
         self._indexed = True  # so that the next step lists its contacts by nodes, however few
 
@@ -252,11 +253,20 @@ class ContactStep:
         return depth
 
     def cross(self) -> tuple[float, float]:
-        """How deep triangles cross where the last search found them [m], and over the finer side's mean surface edge; counts
-        them as `crossings`."""
-        told = self.detection.crossings()
-        self.crossing, self.crossings = float(told[DEPTH_OVER_EDGE]), int(told[CROSSINGS])
-        return float(told[CROSSING_DEPTH]), self.crossing
+        """How deep triangles cross, or colliders lie inside each other, where the last search found them [m], and over the finer
+        side's mean surface edge. Counts crossings as `crossings`, lists the others as `inside`."""
+        told, edges = self.detection.crossings(), self.detection.edges
+        depth, crossing, inside = float(told[CROSSING_DEPTH]), float(told[DEPTH_OVER_EDGE]), {}
+        for one in self.detection.contained():
+            pair = min(one.a, one.b), max(one.a, one.b)
+            inside[pair] = max(inside.get(pair, 0.0), one.depth)
+            # a part that is thinner than an edge counts as deep where its middle is half as deep in the other as in itself
+            scale = min(edges[one.a], edges[one.b], 0.5 * one.room / SUNK if one.room > 0.0 else np.inf)
+            depth, crossing = max(depth, one.depth), max(crossing, one.depth / scale)
+        names = [c.name for c in self.detection.scene.colliders]
+        self.inside = [(names[a], names[b], deep) for (a, b), deep in inside.items()]
+        self.crossing, self.crossings = crossing, int(told[CROSSINGS])
+        return depth, crossing
 
     def went_astray(self, x_start) -> bool:
         """Whether the surface went where nobody had looked since x_start; keeps its way for `search_way`."""

@@ -1,0 +1,168 @@
+"""Which parts of colliders lie inside another collider, step after step, where no surfaces need to cross.
+
+Contacts and crossings are found where surfaces meet. A body wholly inside another has none, and neither has its exact double.
+Therefore every connected part of a collider has an inner point, see `taisoft.mesh.inner_points`. The few that lie in another
+collider's box are tested by winding numbers, and again only when something has moved by the distance that was between them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taisoft.collision.analytic import AnalyticObstacles
+from taisoft.collision.surface import Surface, Topology
+from taisoft.mesh.inner_points import inner_depths, inner_tets, parts_of
+from taisoft.mesh.winding import are_inside, distances, is_closed
+from taisoft.model import Layout
+from taisoft.scene.body import Body
+from taisoft.scene.obstacles import Capsule, Obstacle, Sphere
+from taisoft.scene.scene import Scene
+from taisoft.transfer import download
+
+
+@dataclass(frozen=True)
+class Inside:
+    """Collider a has a part inside collider b; of one body, a part of it in another.
+
+    depth: of the part's inner point in b [m]. room: of that point in the part itself, at rest [m].
+    """
+
+    a: int
+    b: int
+    depth: float
+    room: float
+
+
+@dataclass(frozen=True)
+class _Clear:
+    """A point (3,) that lay a distance [m] outside of a surface with vertices x (v,3)."""
+
+    point: np.ndarray
+    x: np.ndarray
+    distance: float
+
+    def holds(self, point: np.ndarray, x: np.ndarray) -> bool:
+        """Whether the point cannot have come inside since."""
+        moved = np.abs(x - self.x - (point - self.point)).max()
+        return bool(np.sqrt(3.0) * moved < self.distance)
+
+
+class Containment:
+    """Inner points of a scene's colliders, and which of them lie inside other colliders."""
+
+    def __init__(
+        self, scene: Scene, topology: Topology, layout: Layout, rest: np.ndarray, analytic: list[tuple[int, Obstacle]],
+        self_collision: bool,
+    ):  # fmt: skip
+        """rest: (v,3) [m] vertices of the surfaces. analytic: colliders and obstacles in the order of `AnalyticObstacles`."""
+        self._scene, self._topology, self._layout, self._rest, self._self = scene, topology, layout, rest, self_collision
+        self._round = [(i, k, o.shape) for i, (k, o) in enumerate(analytic) if isinstance(o.shape, (Sphere, Capsule))]
+        self._solid = np.flatnonzero(np.diff(topology.first))  # colliders with triangles
+        parts = sum(b.mesh.n_components for b in scene.bodies) if self_collision else 0
+        self._wanted = len(self._solid) + len(self._round) > 1 or parts > 1
+        self._ready = False
+
+    def _prepare(self) -> None:
+        """Find the inner points; at the first look, since many scenes are never stepped."""
+        topology, colliders, n_bodies = self._topology, self._scene.colliders, len(self._scene.bodies)
+        self._soft = np.arange(len(colliders)) < n_bodies
+        self._part = np.zeros(len(topology.triangle), dtype=np.int64)  # of each triangle, counted from 0 in each collider
+        self._closed, self._n_parts = np.zeros(len(colliders), dtype=bool), np.zeros(len(colliders), dtype=np.int64)
+        nodes, triangles, behind, room = [np.zeros((0, 4), dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [np.zeros(0)], []
+        for k in self._solid:
+            first, last = topology.first[k : k + 2]
+            own = topology.triangle[first:last]
+            self._closed[k] = is_closed(own)
+            if k < n_bodies:
+                best, rooms = self._inner_tets(colliders[k], slice(first, last))
+                nodes.append(self._layout.node_start[k] + colliders[k].nodes.tets[best])
+            else:
+                self._part[first:last] = parts_of(own)
+                best, depths, rooms = inner_depths(self._rest, own, self._part[first:last])
+                triangles.append(first + best)
+                behind.append(depths)
+            self._n_parts[k] = len(best)
+            room.append(rooms)
+        self._nodes, self._triangles, self._behind = (np.concatenate(x) for x in (nodes, triangles, behind))
+        self._room = np.concatenate([*room, [shape.radius for _, _, shape in self._round]])
+        counts = self._n_parts[self._solid]
+        self._owner = np.concatenate([np.repeat(self._solid, counts), np.array([k for _, k, _ in self._round], dtype=np.int64)])
+        self._own_part = np.concatenate([*(np.arange(n) for n in counts), np.zeros(len(self._round), dtype=np.int64)])
+        own, other = self._owner[:, None], self._solid
+        self._may_hold = (self._soft[own] | self._soft[other]) & self._closed[other]  # (points, solid): whether it is asked
+        self._may_hold &= (own != other) | (self._self & (self._n_parts[other] > 1))
+        self._clear: dict[tuple[int, int], _Clear] = {}
+        self._ready = True
+
+    def _inner_tets(self, body: Body, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        """`inner_tets` of a body at rest, whose triangles are these rows."""
+        tets = body.nodes.tets
+        parts = parts_of(tets) if body.mesh.n_components > 1 else np.zeros(len(tets), dtype=np.int64)
+        of_node = np.zeros(body.n_nodes, dtype=np.int64)
+        of_node[tets] = parts[:, None]
+        self._part[rows] = of_node[body.nodes.surface[:, 0]]
+        return inner_tets(body.rest_positions, tets, parts)
+
+    def find(self, surface: Surface, x_nodes, shapes: AnalyticObstacles) -> list[Inside]:
+        """What lies inside what. surface, shapes: where the last search found them; x_nodes: field of the model's nodes [m]."""
+        if not self._wanted:
+            return []
+        if not self._ready:
+            self._prepare()
+        x, nodes = download([surface.x, x_nodes])
+        frames = download([shapes.origin, shapes.rotation]) if self._round else None
+        points = self._points(x, nodes, frames)
+        found = [one for k, b in self._pairs(points, x) if (one := self._look(int(k), int(b), points[k], x)) is not None]
+        for i, b, shape in self._round:
+            depth = _round_depths(shape, (points[: len(self._nodes)] - frames[0][i]) @ frames[1][3 * i : 3 * i + 3])
+            found += [Inside(int(self._owner[k]), b, float(depth[k]), float(self._room[k])) for k in np.flatnonzero(depth > 0.0)]
+        return found
+
+    def _points(self, x: np.ndarray, nodes: np.ndarray, frames: list[np.ndarray] | None) -> np.ndarray:
+        """(n,3) [m] the inner points: of bodies, of obstacles with triangles, of round ones."""
+        points = [0.25 * nodes[self._nodes].sum(axis=1)]
+        if len(self._triangles):
+            corners = x[self._topology.triangle[self._triangles]]
+            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            points.append(corners.mean(axis=1) - self._behind[:, None] * normal)
+        if frames is not None:
+            points.append(frames[0][[i for i, _, _ in self._round]])
+        return np.concatenate(points)
+
+    def _pairs(self, points: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """(k,2) an inner point and a collider that it may lie inside: in its box."""
+        starts = self._topology.vertex_first[self._solid]
+        lo, hi = np.minimum.reduceat(x, starts).T, np.maximum.reduceat(x, starts).T
+        boxed = self._may_hold.copy()
+        for p, low, high in zip(points.T[:, :, None], lo, hi):
+            boxed &= (low <= p) & (p <= high)
+        k, b = np.nonzero(boxed)
+        return np.stack([k, self._solid[b]], axis=1)
+
+    def _look(self, k: int, b: int, point: np.ndarray, x: np.ndarray) -> Inside | None:
+        """Inner point k in collider b, None where it lies outside."""
+        topology, own = self._topology, int(self._owner[k])
+        mine = x[topology.vertex_first[b] : topology.vertex_first[b + 1]]
+        known = self._clear.get((k, b))
+        if known is not None and known.holds(point, mine):
+            return None
+        first, last = topology.first[b : b + 2]
+        corners = x[topology.triangle[first:last]]
+        if own == b:
+            corners = corners[self._part[first:last] != self._own_part[k]]
+        distance = float(distances(corners, point[None])[0])
+        if are_inside(corners, point[None])[0]:
+            self._clear.pop((k, b), None)
+            return Inside(own, b, distance, float(self._room[k]))
+        self._clear[k, b] = _Clear(point, mine.copy(), distance)
+        return None
+
+
+def _round_depths(shape: Sphere | Capsule, points: np.ndarray) -> np.ndarray:
+    """How deep (n,) [m] points (n,3) in its frame lie in a sphere or a capsule; below 0 outside."""
+    along = np.zeros(len(points))
+    if isinstance(shape, Capsule):
+        half = shape.size()[0]
+        along = np.clip(points[:, 0], -half, half)
+    return shape.radius - np.linalg.norm(points - along[:, None] * np.array([1.0, 0.0, 0.0]), axis=1)
