@@ -4,7 +4,7 @@ Where a contact must be at the end of a step, its goal, is a gap of at least `st
 apart in spite of what linearising the motion misses. A gap above it may close so far. A gap below it opens slowly, a true
 penetration in a few steps, and never faster than strains the softest body by a percent: else bodies would fly apart. Parts of
 one body keep OWN times the standoff and are mended OWN times as fast. Where the surfaces meet within the step, restitution asks
-that they part with e times the speed at which they met. The velocity that an impulse must leave is then
+for more (`restitution`). The velocity that an impulse must leave is then
     u_n = (gap - goal)/dt + n.(v_a - v_b) >= 0,
 which counts motion once: the gap is that at the start of the step.
 """
@@ -37,6 +37,9 @@ class FoundContacts:
     carry: Any  # 3-vectors f64: way of an obstacle at the contact in the step [m]
     approach: Any  # f64: normal velocity at the start of the step, negative where surfaces come nearer [m/s]
     restitution: Any  # f64
+    leave: Any  # f64: normal velocity that an impact leaves at least, set where a step has one [m/s]
+    rise: Any  # f64: how far the gap opens at least in the step, 0 without restitution [m]
+    struck: Any  # 3-vectors f64: impulse of the impact before the step [N s]
     body: Any  # 2-vectors i32: colliders
     feature: Any  # 3-vectors i32
     before_feature: Any  # 3-vectors i32: the step before
@@ -70,7 +73,7 @@ def build_found(arena: FieldArena, problem: ContactProblem) -> FoundContacts:
 
     return FoundContacts(
         problem, n_slots, vectors("point"), numbers("gap"), vectors("carry"), numbers("approach"), numbers("restitution"),
-        vectors("body", ti.i32, 2), vectors("feature", ti.i32),
+        numbers("leave"), numbers("rise"), vectors("struck"), vectors("body", ti.i32, 2), vectors("feature", ti.i32),
         vectors("before_feature", ti.i32), vectors("before_point"), vectors("before_impulse"),
         arena.field("found_slot", ti.i32, n_slots),
     )  # fmt: skip
@@ -236,6 +239,7 @@ def fill(
         for j in range(k):
             v += p.weight[c, j] * ti.cast(m.v[p.node[c, j]], ti.f64)
         f.approach[c] = normal.dot(v)
+        f.rise[c], f.struck[c] = 0.0, dvec(0.0)
         p.r[c] = prox(to_frame(p, c, warm * _warm_impulse(f, c)), friction)
 
 
@@ -246,21 +250,25 @@ def _own(f: ti.template(), c):
 
 
 @ti.func
-def short_of_goal(f: ti.template(), c, dt, common_standoff, fast, slow, fastest):
+def standoff_of(f: ti.template(), c, common):
+    """Standoff of contact c [m]; common: that of contacts between bodies."""
+    return _own(f, c) * common
+
+
+@ti.func
+def short_of_goal(f: ti.template(), c, dt, common_standoff, fast, slow, fastest, rise):
     """gap - goal of contact c [m].
 
-    common_standoff [m]: of contacts between bodies.
-
+    common_standoff [m]: of contacts between bodies. rise: how far restitution opens the gap in the step, or 0 [m].
     fast, slow: shares of a penetration and of a missing standoff that the step mends; fastest: speed of that at most [m/s].
     """
-    gap, own = f.gap[c], _own(f, c)
-    standoff = own * common_standoff
+    gap, own, standoff = f.gap[c], _own(f, c), standoff_of(f, c, common_standoff)
     goal = standoff
     if gap < standoff:
         above = ti.max(gap, 0.0)
         goal = gap + ti.min(own * (slow * (standoff - above) + fast * (above - gap)), fastest * dt)
-    if f.restitution[c] > 0.0 and f.approach[c] < 0.0 and gap - standoff + dt * f.approach[c] < 0.0:
-        goal = ti.max(goal, gap - dt * f.restitution[c] * f.approach[c])
+    if rise > 0.0:
+        goal = ti.max(goal, gap + rise)
     return gap - goal
 
 
@@ -272,7 +280,7 @@ def find_impact(f: ti.template(), dt: ti.f64, standoff: ti.f64) -> ti.i32:
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
-            if p.r[c][0] == 0.0 and f.approach[c] < 0.0 and f.gap[c] - _own(f, c) * standoff + dt * f.approach[c] < 0.0:
+            if p.r[c][0] == 0.0 and f.approach[c] < 0.0 and f.gap[c] - standoff_of(f, c, standoff) + dt * f.approach[c] < 0.0:
                 found = 1
     return found
 

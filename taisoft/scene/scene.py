@@ -177,6 +177,12 @@ class Scene(Guarded):
         asked = (friction is not None, restitution is not None)
         self.contact_pairs[pair] = tuple(new if use else old for new, use, old in zip(given, asked, before))
 
+    @property
+    def bounces(self) -> bool:
+        """Whether any two have a restitution."""
+        own = [self.surface_of(c.name).restitution for c in self.colliders]
+        return any(e > 0.0 for e in own) or any(e for _, e in self.contact_pairs.values())
+
     def contact_numbers(self, name_a: str, name_b: str) -> tuple[float, float]:
         """(friction, restitution) between two: as set, else the frictions' geometric mean and the larger restitution."""
         friction, restitution = self.contact_pairs.get(self._pair(name_a, name_b), (None, None))

@@ -21,6 +21,7 @@ from taisoft.contact.assemble import (
     upload_pair_numbers,
 )  # fmt: skip
 from taisoft.contact.problem import NODES, build_node_problem, index_nodes
+from taisoft.contact.restitution import find_rebounds
 from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
 from taisoft.stepping.tunnelling import DEPTH, HASTE, SINKING, SPEED, WHICH, find_way, survey
@@ -61,6 +62,9 @@ class ContactStep:
             self._way = self._own_arena.vectors("way", ti.f64, m.n_nodes)
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
+        self._bounces = scene.bounces
+        self.flight = np.zeros(len(scene.colliders))  # sum of dt^2 over the steps since each last touched anything [s^2]
+        self._flight_gravity = scene.gravity.copy()
         self._told = np.zeros(5)
         self._searched: tuple[float, float] | None = None  # time and dt of the search that is at hand
         self._ended: tuple[float, float] | None = None  # those of the end that was looked at, until the next part begins
@@ -101,13 +105,14 @@ class ContactStep:
         self.problem.count[0] = 0
         self._last_time = self.penetration = self.sinking = self._span = 0.0
         self._sum, self.crossing, self.crossings, self.inside = None, None, 0, []
+        self.flight[:] = 0.0
 
     def _rows(self) -> dict:
         """Fields of the last step's contacts: what the next step starts from, and what `contacts` tells."""
         p, f = self.problem, self.found
         return {
             "normal": p.normal, "tangent": p.tangent, "r": p.r, "node": p.node, "weight": p.weight, "arity": p.arity,
-            "point": f.point, "gap": f.gap, "body": f.body, "feature": f.feature,
+            "point": f.point, "gap": f.gap, "body": f.body, "feature": f.feature, "struck": f.struck,
         }  # fmt: skip
 
     def snapshot(self) -> dict:
@@ -119,7 +124,7 @@ class ContactStep:
         return {
             "capacity": self.problem.capacity, "last_time": self._last_time, "share": self._share, "span": self._span,
             "sum": self._sum, "penetration": self.penetration, "sinking": self.sinking, "met": self.met, "dropped": self.dropped,
-            "rows": dict(zip(rows, download(list(rows.values()), self.n_contacts))),
+            "flight": self.flight.copy(), "rows": dict(zip(rows, download(list(rows.values()), self.n_contacts))),
         }  # fmt: skip
 
     def restore(self, kept: dict) -> None:
@@ -137,6 +142,7 @@ class ContactStep:
         self._last_time, self._share, self._span = (float(kept[name]) for name in ("last_time", "share", "span"))
         self._sum, self.penetration, self.sinking = kept["sum"], float(kept["penetration"]), float(kept["sinking"])
         self.met, self.dropped = bool(kept["met"]), int(kept["dropped"])
+        self.flight = np.array(kept["flight"], dtype=float)
         self.crossing, self.crossings, self.inside = None, 0, []
         self._searched = self._ended = None
         self._indexed = True  # so that the next step lists its contacts by nodes, however few
@@ -153,6 +159,7 @@ class ContactStep:
 
     def numbers_changed(self) -> None:
         """Friction or restitution changed."""
+        self._bounces = self.world.scene.bounces
         if not upload_pair_numbers(self.numbers, self.world.scene):
             arena = FieldArena()
             self.numbers = build_pair_numbers(arena, self.world.scene)
@@ -197,6 +204,32 @@ class ContactStep:
         """Whether surfaces that bore nothing so far come together in a step of dt that has begun; `met` keeps it."""
         self.met = bool(find_impact(self.found, dt, self.standoff))
         return self.met
+
+    def rebounds(self, dt: float) -> bool:
+        """Whether surfaces are thrown back in an implicit step of dt that has begun; `met` keeps it."""
+        scene = self.world.scene
+        if not self._bounces or self.n_contacts == 0:
+            return False
+        if (self._flight_gravity != scene.gravity).any():  # what another gravity took is not known
+            self._flight_gravity = scene.gravity.copy()
+            self.flight[:] = 0.0
+        found = find_rebounds(self.found, self.world.model.gravity, self.flight, dt, self.standoff) > 0
+        self.met = self.met or found
+        return found
+
+    def count_flight(self, dt: float, lossy: bool) -> None:
+        """A part of dt has ended. lossy: whether flights lose energy in it, as implicit Euler's do."""
+        if not self._bounces:
+            return
+        scene, first = self.world.scene, self.world.layout.node_start[:-1]
+        added, f, p = dt**2 if lossy else 0.0, self.found, self.problem
+        self.flight += np.where(self.flight > 0.0, added, dt**2)
+        r, struck, body = download([p.r, f.struck, f.body], self.n_contacts)
+        self.flight[body[(r != 0.0).any(axis=1)]] = 0.0
+        self.flight[body[(struck != 0.0).any(axis=1)]] = dt**2
+        constrained = np.logical_or.reduceat(self.world.motion.constrained().any(axis=1), first)
+        self.flight[: len(scene.bodies)][constrained] = 0.0
+        self.flight[len(scene.bodies) :] = 0.0
 
     def start_step(self, dt: float, parts: int) -> None:
         """A step of dt begins that is taken in parts."""
@@ -318,10 +351,11 @@ class ContactStep:
         """The contacts of the last step with their impulses."""
         f, p = self.found, self.problem
         n = p.count[0]
-        normal, tangent, r, point, gap, body, feature, node, weight, arity = download(
-            [p.normal, p.tangent, p.r, f.point, f.gap, f.body, f.feature, p.node, p.weight, p.arity], n
+        normal, tangent, r, struck, point, gap, body, feature, node, weight, arity = download(
+            [p.normal, p.tangent, p.r, f.struck, f.point, f.gap, f.body, f.feature, p.node, p.weight, p.arity], n
         )
-        impulse = (r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)) / self._share
+        r = r / self._share + struck
+        impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
         return self.detection.record(point, normal, gap, impulse, body, feature, *_sides(node, weight, arity))
 
     @property

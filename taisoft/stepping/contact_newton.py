@@ -19,6 +19,7 @@ from taisoft.fields import FieldArena
 from taisoft.model import Model
 from taisoft.stepping.contact import ContactStep
 from taisoft.stepping.contact_stage import (
+    IMPACT,
     SHARE,
     STAY,
     STEP,
@@ -29,7 +30,8 @@ from taisoft.stepping.contact_stage import (
     keep_diagonal,
     keep_linear,
 )
-from taisoft.stepping.newton import MAX_FORCING, SLOW, StageResult, StageSolver, _forcing, stalled
+from taisoft.stepping.impact import SPREAD, apply_impact, begin_impact, holding_work, let_go, measure_impact, start_from
+from taisoft.stepping.newton import MAX_FORCING, SLOW, StageResult, StageSolver, _forcing, count_all, merge, stalled
 from taisoft.stepping.stage import begin_stage, form_residual
 from taisoft.transfer import array_of, upload
 
@@ -140,6 +142,38 @@ class ContactStageSolver(StageSolver):
             r, scale = self._evaluate(c, beta, SHARE, share)
         r, scale = self._evaluate(c, beta, SHARE, 0.0)
         return r, scale, False
+
+    # --- restitution ------------------------------------------------------------------------------------------------
+
+    def solve_bouncing(
+        self, dt: float, tolerance: float, contact_tolerance: float, max_newton: int, linear_tolerance: float | None, linear: bool
+    ) -> StageResult:
+        """A step of implicit Euler in which surfaces meet with restitution: the impact, then the stage; arguments as there."""
+        m, w, tau, out = self.model, self.work, SPREAD * dt, np.zeros(2)
+        self._fit()
+        self._form_system(1.0, tau, True)
+        find_factors(self.contact.problem)
+        begin_impact(m, w, self._k, tau, self._norms)
+        self._linear, self._dt, self._stiffness, self._weighed = IMPACT, dt, STIFFNESS, None
+        impact = self._iterate(1.0, tau, tolerance, contact_tolerance, max_newton, linear_tolerance, True)
+        measure_impact(m, w, self._k, tau, out)
+        slope, curvature = out
+        gain = slope + 0.5 * curvature
+        share = 1.0 if gain <= 0.0 else max(0.0, -2.0 * slope / curvature)
+        slack = -share * (slope + 0.5 * share * curvature)
+        apply_impact(m, w, self._k, share)
+        if share < 1.0:
+            let_go(self.contact.found)
+        results = [impact]
+        while True:
+            start_from(m, w, float(linear))
+            results.append(
+                self.solve_stage(1.0, dt, dt, tolerance, contact_tolerance, max_newton, linear_tolerance, linear)
+            )
+            work = holding_work(self._k, dt)
+            if work <= slack:
+                return count_all(merge([impact, results[-1]]), results[1:-1])
+            let_go(self.contact.found)
 
     # --- the loop -------------------------------------------------------------------------------------------------
 

@@ -22,9 +22,11 @@ from taisoft.linear.coupling import Coupling, build_coupling
 from taisoft.linear.pcg import dot64, total
 from taisoft.model import Model
 from taisoft.runtime import kernel
+from taisoft.stepping.impact import impact_residual
 from taisoft.stepping.stage import place_node, residual_parts, set_change, squares
 
 STAY, STILL, STEP, SHARE = range(4)  # what `evaluate` does before it looks
+IMPACT = 2  # a stage that is linear: the impact before a step, see `impact`
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +59,11 @@ class StageContacts:
 
 
 @ti.func
-def _set_out(s: ti.template(), k: ti.template(), c, beta, dt, standoff, fast, slow, fastest):
-    """The impulse of contact c becomes its multiplier, and the disk opens as far as that says; what x does not change."""
+def _set_out(s: ti.template(), k: ti.template(), c, beta, dt, standoff, fast, slow, fastest, impact: ti.template()):
+    """The impulse of contact c becomes its multiplier, and the disk opens as far as that says; what x does not change.
+
+    impact: whether the contact's velocity must be `leave`, whatever its gap.
+    """
     p, f, w = ti.static((k.problem, k.found, k.work))
     w.multiplier[c] = p.r[c]
     w.radius[c] = p.friction[c] * p.r[c][0]
@@ -67,7 +72,11 @@ def _set_out(s: ti.template(), k: ti.template(), c, beta, dt, standoff, fast, sl
         i = p.node[c, j]
         lag += p.weight[c, j] * (k.x_start[i] - s.x_hat[i])
     w.lag[c] = lag
-    w.short[c] = short_of_goal(f, c, dt, standoff, fast, slow, fastest) - p.normal[c].dot(f.carry[c])
+    if ti.static(impact):
+        w.short[c] = -beta * f.leave[c] - (beta / dt) * p.normal[c].dot(f.carry[c])
+    else:
+        goal = short_of_goal(f, c, dt, standoff, fast, slow, fastest, f.rise[c])
+        w.short[c] = goal - p.normal[c].dot(f.carry[c])
 
 
 @ti.func
@@ -156,7 +165,7 @@ def evaluate(
 
     how: STAY; STEP: base = x, then the whole step y of pcg; SHARE: base + share y. STILL: as STAY, where the elastic forces of
     this x are known. multiply: whether the impulses are made the multipliers first, and the disks opened as far as these say.
-    linear: of the stage linearised at k.x_linear. stiffness: R over the r-factors.
+    linear: of the stage linearised at k.x_linear, or IMPACT. stiffness: R over the r-factors.
     norms: as `form_residual` tells, impulses in r; of a linear stage only those of r. scalars 13: r.y at the start of a step,
     12: at its end.
     """
@@ -186,7 +195,7 @@ def evaluate(
     ti.loop_config(serialize=p.serial)
     for n in range(p.count[0]):
         if multiply == 1:
-            _set_out(s, k, n, beta, dt, standoff, fast, slow, fastest)
+            _set_out(s, k, n, beta, dt, standoff, fast, slow, fastest, linear == IMPACT)
         _press(m, k, n, beta, stiffness)
     ti.loop_config(serialize=m.serial)
     for chunk in range(m.chunks):
@@ -196,7 +205,9 @@ def evaluate(
             free, impulse = m.free[i], ti.cast(_push_on(k, i), m.real)
             zero = ti.Vector([0.0, 0.0, 0.0], m.real)
             r, inertia, f, external = zero, zero, zero, zero
-            if ti.static(linear):
+            if ti.static(linear == IMPACT):
+                r = impact_residual(m, A, k, i, beta)
+            elif ti.static(linear):
                 r = _linear_residual(m, A, k, i)
             else:
                 r, inertia, f, external = residual_parts(m, s, i, beta)

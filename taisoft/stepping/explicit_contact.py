@@ -9,6 +9,7 @@ import taichi as ti
 from taisoft.contact.assemble import short_of_goal
 from taisoft.contact.problem import impulse_on, to_frame
 from taisoft.contact.prox import dvec
+from taisoft.contact.restitution import explicit_rise
 from taisoft.elasticity import element_force
 from taisoft.runtime import kernel
 from taisoft.stepping.explicit import (
@@ -81,7 +82,8 @@ def set_free_velocities(
         for j in range(p.arity[c]):
             v += p.weight[c, j] * ti.cast(m.v[p.node[c, j]], ti.f64)
         b = to_frame(p, c, v)
-        p.b[c] = dvec(b[0] + short_of_goal(f, c, dt, standoff, fast, slow, fastest) / dt, b[1], b[2])
+        rise = explicit_rise(f, c, dt, standoff, b[0])
+        p.b[c] = dvec(b[0] + short_of_goal(f, c, dt, standoff, fast, slow, fastest, rise) / dt, b[1], b[2])
 
 
 @ti.func

@@ -162,7 +162,7 @@ class ImplicitStepper:
             sinking = max(sinking, crossing)
             # what is deep already needs no shorter steps
             allowed, allowed_crossing = max(SUNK, 1.1 * sinking), max(CROSSED_FAR, 1.1 * crossing)
-            kept = self.world.state()
+            kept, flight = self.world.state(), contact.flight.copy()
         least = parts  # that it takes even if it converges
         while True:
             result, depth, deep, lost = None, 0.0, False, True
@@ -199,6 +199,8 @@ class ImplicitStepper:
                 contact.forget()
             elif contact is not None:
                 contact.start_again()
+            if contact is not None:
+                contact.flight[:] = flight
         self.parts = parts
         self._recovers = self._recovers or not lost
         if contact is not None:
@@ -220,6 +222,7 @@ class ImplicitStepper:
                     )
             results.append(self._part(start + k * part, part))
             self.contact.end_part()
+            self.contact.count_flight(part, self._lossy)
         return merge(results)
 
     def _put_back(self, state: tuple[np.ndarray, np.ndarray] | None, released: list[bool]) -> None:
@@ -253,7 +256,7 @@ class ImplicitStepper:
     def _try_part(self, time: float, dt: float) -> StageResult:
         """A step of dt from a time with the contacts of one search."""
         world, m, h, w = self.world, self.world.model, self.history, self.solver.work
-        releases = world.releases
+        releases, bounces = world.releases, False
         target = world.next_target(time + dt)
         if world.releases != releases or dt != self._dt:
             self._past = 0
@@ -262,10 +265,12 @@ class ImplicitStepper:
                 self.solver.forget_factors()
             self.contact.begin(time, dt)
             # no scheme looks back through an impact: it would take the jump for an acceleration
-            if self.scheme.before and self.contact.meets(dt):
+            meets = self.scheme.before and self.contact.meets(dt)
+            if (bounces := self.contact.rebounds(dt)) or meets:
                 self._past = 0
         self._dt = dt
         scheme = self.scheme if self._past > 0 or self.scheme.start is None else self.scheme.start
+        self._lossy = scheme.before == 0.0
         if target is not None:
             if scheme.midpoint:
                 target = 0.5 * (target + array_of(m.x)[world.motion.moved])
@@ -281,7 +286,7 @@ class ImplicitStepper:
         multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)
         begin_step(m, w, h, multistep, scheme.now, scheme.before, still, along)
         try:
-            result = self._solve(scheme, dt)
+            result = self._solve(scheme, dt, bounces)
         except BaseException:  # Ctrl-C: the step is abandoned
             restore(m, h)
             self.forget()
@@ -298,13 +303,17 @@ class ImplicitStepper:
             self._past = 0
         return result
 
-    def _solve(self, scheme: Scheme, dt: float) -> StageResult:
-        """The stage, with contacts or without."""
+    def _solve(self, scheme: Scheme, dt: float, bounces: bool) -> StageResult:
+        """The stage, with contacts or without. bounces: whether any are thrown back."""
         most = 1 if scheme.one_iteration else MAX_NEWTON
         # led nodes change their velocity once a step, not twice within the midpoint's half step
         share = 0.5 if scheme.midpoint else 1.0
         if self.contact is None:
             return self.solver.solve(1.0, self._beta, self.tolerance, most, self.linear_tolerance, led_share=share)
+        if bounces:
+            return self.solver.solve_bouncing(
+                dt, self.tolerance, self.contact_tolerance, MAX_CONTACT_NEWTON, self.linear_tolerance, scheme.one_iteration
+            )
         return self.solver.solve_stage(
             1.0, self._beta, dt, self.tolerance, self.contact_tolerance, MAX_CONTACT_NEWTON, self.linear_tolerance,
             scheme.one_iteration, share,
