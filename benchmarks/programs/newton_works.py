@@ -23,9 +23,10 @@ from .session import Setting, sampled
 NAME, MODEL = "Newton", NEWTON
 EXPLICIT_MODEL = TAISOFT  # semi_implicit has the law and the masses of taisoft's stable neo-Hookean
 RADIUS = 1e-3  # m
-# Steps in 10 ms: the fewest that semi_implicit bears for 1 s, and finer; by tets and Young's modulus [Pa].
-STABLE_STEPS = {(540, 1e6): 2, (4320, 1e6): 5, (34560, 1e6): 11, (540, 1e8): 20, (540, 1e9): 62}
-FINER = (1, 2, 4)
+# Steps of semi_implicit in 10 ms, by tets and Young's modulus [Pa]: about the fewest that last for 1 s, and finer.
+STEPS = {
+    (540, 1e6): (2, 3, 5, 10), (4320, 1e6): (5, 10, 20), (34560, 1e6): (9, 18), (540, 1e8): (20, 40), (540, 1e9): (62, 124),
+}  # fmt: skip
 # semi_implicit on the ground: steps in 10 ms, then what GROUND names. Stiffer springs and larger slopes need shorter steps.
 GROUND = ("stiffness", "damping", "slope", "radius")
 ON_GROUND = ((8, 5e4, 10.0, 20.0, 3e-3), (12, 7e4, 10.0, 30.0, 3e-3), (16, 1e5, 20.0, 40.0, 3e-3), (32, 2e5, 120.0, 100.0, 1e-3))
@@ -67,8 +68,7 @@ def settings(work: Work, arch: str = "cpu") -> list[Setting]:
 
 def _explicit(work: Work) -> list[Setting]:
     if work.cells is not None:
-        least, finer = STABLE_STEPS[work.tets, work.bodies[0].young], FINER if work.tets < 10_000 else FINER[:2]
-        return [Setting(NAME, EXPLICIT_MODEL, "semi_implicit", k * least) for k in finer]
+        return [Setting(NAME, EXPLICIT_MODEL, "semi_implicit", n) for n in STEPS[work.tets, work.bodies[0].young]]
     if not work.ground or len(work.bodies) > 1:
         return []
     return [
