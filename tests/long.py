@@ -35,7 +35,7 @@ LONG = {
     ),
     "test_tunnelling": ("[symplectic_euler-",),
     "test_bench_collision": ("test_films_and_broad_phases",),
-    "test_bench_peers": ("test_peers_fall_alike", "test_explicit_steps_come_to_the_exact_path"),
+    "test_bench_peers": ("test_peers_fall_alike", "test_newtons_explicit_steps", "test_explicit_steps_come_to_the_exact_path"),
     "test_bench_scaling": (
         "_kind[explicit, one", "_kind[implicit", "_kind[search]", "_kind[explicit contact]", "test_a_child_answers",
     ),

@@ -1,10 +1,10 @@
 """The works on which programs are held against each other:
 
-* the laws in NumPy are those of small strains, those that taisoft has too give taisoft's stress, and no rotation stresses any;
 * the laws in NumPy are those of small strains, those that taisoft has too give its stress, and no rotation stresses any;
 * a verdict flips where a body falls, leans, turns inside out or sinks in; errors are distances over what the work says;
 * the comparison takes the fastest that is good enough, and says where nothing is;
-* taisoft's adapter gives the positions of its simulator; the others', where they are installed, start where the work does.
+* taisoft's adapter gives the positions of its simulator; the others', where they are installed, start where the work does;
+* every program is given its implicit and its explicit methods, and its own laws; what was tried besides is on the page.
 """
 
 import importlib
@@ -18,7 +18,7 @@ import taisoft as ts
 from benchmarks import peers
 from benchmarks.programs import own
 from benchmarks.programs.session import Setting
-from benchmarks.works import judge, references, scenes
+from benchmarks.works import judge, references, runs, scenes
 from benchmarks.works.references import MODELS, NEWTON, PYBULLET, TAISOFT
 from benchmarks.works.runs import Row, fastest_standing, fastest_within, measure
 from benchmarks.works.semi_discrete import LAWS, SemiDiscrete
@@ -184,6 +184,29 @@ def test_rows_are_measured_and_judged(capsys):
     assert rows[-1].failure == "it is broken" and rows[-1].timing is None and "it is broken" in run_table(rows)
 
 
+@pytest.mark.parametrize("seconds, build_seconds, rounds", [(9.0, 19.0, 3), (11.0, 1.0, 1), (1.0, 21.0, 1)])
+def test_what_takes_long_is_measured_in_one_round(seconds, build_seconds, rounds, monkeypatch):
+    monkeypatch.setattr(runs, "judge", lambda work, model, positions: judge.Verdict(0))
+
+    class Slow:
+        NAME, build_time = "slow", build_seconds
+        settings = staticmethod(lambda work, arch: [Setting("slow", TAISOFT, "none", 1)])
+        start = classmethod(lambda cls, work, setting: cls())
+
+        def __init__(self):
+            self.build_seconds, self.unconverged = self.build_time, 0
+
+        def run(self, follow):
+            return (still(small_drop()) if follow else None), seconds
+
+        def close(self):
+            pass
+
+    work = replace(small_drop(), seconds=1.0)
+    (row,) = measure(work, [Slow], 3)
+    assert len(row.rounds) == rounds and all(one[0] == seconds for one in row.rounds)
+
+
 def test_works_that_are_not_measured_again_are_kept(tmp_path, monkeypatch, capsys):
     first, second = small_drop(), replace(small_drop(), key="second")
     seconds = {"small": 1.0, "second": 1.0}
@@ -214,6 +237,8 @@ def test_works_that_are_not_measured_again_are_kept(tmp_path, monkeypatch, capsy
     numbers = json.loads(out.read_text())
     assert [row["rounds"][0][0] for row in numbers["runs"]] == pytest.approx([1.0, 3.0]) and not numbers["quick"]
     text = out.with_suffix(".md").read_text()
+    assert "| ppf-contact-solver | all " in text and "## What else was tried" in text
+    assert {one["program"] for one in numbers["tried"]["settings"]} >= {"MuJoCo", "PyBullet", "Newton", "ppf-contact-solver"}
     assert "0 of 1 times agree" in text and "## small" in text and "| second: taisoft, SNH, still" in text
     assert peers.main(["--work", "small", "--rounds", "1", "--out", str(tmp_path / "new.json")]) == 0
     assert json.loads((tmp_path / "new.json").read_text())["quick"] and not (tmp_path / "new.png").exists()
@@ -241,17 +266,77 @@ def test_taisoft_does_a_work():
     assert judge.judge(work, TAISOFT, positions).stands
 
 
-@pytest.mark.parametrize(
-    "name, model", [("pybullet_soft", PYBULLET), ("newton_vbd", NEWTON), ("mujoco_works", references.MUJOCO)]
-)
-def test_peers_fall_alike(name, model):
+def adapter(name: str):
     program = importlib.import_module(f"benchmarks.programs.{name}")
     if program.problem():
         pytest.skip(program.problem())
-    work = small_drop()
-    setting = next(one for one in program.settings(work))
-    session = program.start(work, setting)
-    positions, _ = session.run(follow=True)
-    session.close()
-    assert program.MODEL == model and np.array_equal(positions[0], work.start)
-    assert positions[3, :, 1].mean() == pytest.approx(0.51 - 0.5 * 9.81 * 0.03**2, abs=1.6e-3)  # half a step of 10 ms of the fall
+    return program
+
+
+def test_mujoco_has_both_contacts_and_both_laws_at_several_steps():
+    from benchmarks.programs import mujoco_works
+
+    for work in scenes.WORKS:
+        found = mujoco_works.settings(work)
+        implicit = [one for one in found if one.method == "discrete"]
+        assert {one.model for one in implicit} == {mujoco_works.MODEL, mujoco_works.NEO_HOOKEAN}
+        assert any(one.method == "euler_staggered" for one in found)
+        for contact in ("passive", "solref") if work.touches else ():
+            alike = [one for one in implicit if one.model == mujoco_works.NEO_HOOKEAN and contact in one.options]
+            assert len({one.dt for one in alike}) >= 2
+        assert len({str(one) + str(one.model) + str(one.dt) for one in found}) == len(found)
+
+
+@pytest.mark.parametrize("neo_hookean", [False, True])
+def test_mujocos_forces_are_those_of_its_law(neo_hookean):
+    program = adapter("mujoco_works")
+    mujoco = program.import_mujoco()
+    work, model = small_drop(), program.NEO_HOOKEAN if neo_hookean else program.MODEL
+    session = program.start(work, Setting("MuJoCo", model, "discrete", 4, {"passive": True, "radius": 1e-4}))
+    data, body = mujoco.MjData(session.model), work.bodies[0]
+    u = 0.1 * np.random.default_rng(6).standard_normal(work.start.shape)
+    u[:, 1] += 1.0  # above the ground
+    data.qpos[:] = u.ravel()
+    mujoco.mj_forward(session.model, data)
+    exact = SemiDiscrete(body.mesh, model.law, body.young, 0.3, 1000.0, work.gravity, ~body.fixed)
+    expected = exact.elastic_force(u.T).T.ravel()
+    assert np.abs(expected).max() > 1e3  # N: something is active
+    assert np.abs(data.qfrc_passive - expected).max() < 1e-10 * np.abs(expected).max()
+    assert session.model.flex_passive[0] == 1 and session.model.opt.solver == mujoco.mjtSolver.mjSOL_CG
+
+
+def test_mujoco_refuses_implicit_elasticity_elsewhere_than_in_discrete_steps():
+    program = adapter("mujoco_works")
+    work = scenes.hanging_beam((12, 3, 3))
+    (setting,) = (one for one in program.settings(work) if one.method == "implicitfast")
+    with pytest.raises(Exception, match="flex elasticity is no longer integrated implicitly"):
+        program.start(work, setting).run(follow=False)
+
+
+@pytest.mark.parametrize(
+    "name, model", [("pybullet_soft", PYBULLET), ("newton_works", NEWTON), ("mujoco_works", references.MUJOCO)]
+)
+def test_peers_fall_alike(name, model):
+    program, work = adapter(name), small_drop()
+    kinds = {(one.method, one.model, "passive" in one.options): one for one in program.settings(work) if "ipc" not in one.options}
+    assert program.MODEL == model and model in {one.model for one in kinds.values()}
+    for setting in kinds.values():
+        session = program.start(work, setting)
+        positions, _ = session.run(follow=True)
+        again, _ = session.run(follow=True)
+        session.close()
+        assert np.array_equal(positions[0], work.start) and np.array_equal(positions, again)
+        fallen = 0.51 - 0.5 * 9.81 * 0.03**2
+        assert positions[3, :, 1].mean() == pytest.approx(fallen, abs=1.6e-3)  # half a step of 10 ms of the fall
+
+
+def test_newtons_explicit_steps_are_of_second_order():
+    program = adapter("newton_works")
+    work = replace(scenes.hanging_beam((12, 3, 3)), seconds=0.3)
+    reference, mass = references.load(work, program.EXPLICIT_MODEL), references.masses(work, program.EXPLICIT_MODEL)
+    errors = []
+    for steps in (3, 6):
+        session = program.start(work, Setting("Newton", program.EXPLICIT_MODEL, "semi_implicit", steps))
+        path = references.observed(work, session.run(follow=True)[0], mass)
+        errors.append(np.linalg.norm(path - reference.path[: len(path)], axis=1).max())
+    assert errors[0] < 1e-4 and np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.3)

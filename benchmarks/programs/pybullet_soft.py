@@ -39,7 +39,7 @@ def problem() -> str:
 
 def settings(work: Work, arch: str = "cpu") -> list[Setting]:
     """Steps from about the largest that lasts on; with several bodies two strengths of repulsion."""
-    steps = {"W2": (3, 4, 8, 16), "W3": (3, 4, 8, 16), "W4": (20, 40)}.get(work.key, (4, 8))
+    steps = {"W2": (3, 4, 8, 16), "W3": (6, 8), "W4": (20,)}.get(work.key, (4, 8))
     if work.cells is not None:
         tets, young = work.tets, work.bodies[0].young
         steps = {540: (2, 4, 8), 4320: (5, 10), 34560: (11,)}[tets] if young == 1e6 else {1e8: (20,), 1e9: (62,)}[young]

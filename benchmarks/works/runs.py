@@ -19,7 +19,7 @@ from .judge import Verdict, judge
 from .references import MODELS
 from .scenes import Work
 
-ENOUGH_SECONDS = 20.0  # a run of so much wall time is not repeated
+ENOUGH_SECONDS, ENOUGH_BUILDING = 10.0, 20.0  # wall time of a run, and of building for one, from which on it is not repeated
 
 
 @dataclass
@@ -85,8 +85,7 @@ def measure(work: Work, programs: Iterable[ModuleType], rounds: int, arch: str =
     rows = [Row(work, setting, date=date) for setting in settings]
     for number in range(rounds):
         for row in rows:
-            slow = row.rounds and row.rounds[0][0] * work.seconds > ENOUGH_SECONDS
-            if row.failure or slow:
+            if row.failure or (row.rounds and is_dear(row.rounds[0][0] * work.seconds, row.build_seconds[0])):
                 continue
             told = f"{work.key}, round {number + 1} of {rounds}: {row.setting.program} {row.setting}"
             print(told, file=sys.stderr, flush=True)
@@ -94,6 +93,11 @@ def measure(work: Work, programs: Iterable[ModuleType], rounds: int, arch: str =
             if positions is not None:
                 row.verdict = judge(work, row.setting.model, positions)
     return rows
+
+
+def is_dear(seconds: float, build_seconds: float) -> bool:
+    """Whether a run of so long [s] is not repeated."""
+    return seconds > ENOUGH_SECONDS or build_seconds > ENOUGH_BUILDING
 
 
 def _round(row: Row, program: ModuleType) -> np.ndarray | None:
@@ -106,7 +110,7 @@ def _round(row: Row, program: ModuleType) -> np.ndarray | None:
             if row.verdict is None:
                 positions, seconds = session.run(follow=True)
                 row.unconverged = session.unconverged
-                if seconds > ENOUGH_SECONDS:
+                if is_dear(seconds, session.build_seconds):
                     row.rounds.append([seconds / row.work.seconds])
                     return positions
             row.rounds.append(list(repeat_short(lambda: session.run(follow=False)[1] / row.work.seconds)))

@@ -1,10 +1,13 @@
 """Tables of the works: all runs of one, and the programs beside each other at equal error."""
 
+from collections.abc import Iterable
+
 from taisoft.output.tables import markdown, percent, spread_of
 
 from ..elasticity_runs import time_ratio
 from ..elasticity_table import Limit
 from ..programs import own
+from ..programs.tried import Tried
 from .runs import Row, fastest_standing, fastest_within
 from .scenes import Work
 
@@ -130,6 +133,12 @@ def implicit_table(works: list[list[Row]]) -> str:
         for rows in works for row in rows if row.work.stiff and row.setting.steps == 1
     ]  # fmt: skip
     return markdown(("work", "program", "setting", "law", "error", "s/sim. s", ""), lines, left=(0, 1, 2, 3, 6))
+
+
+def tried_table(tried: Iterable[Tried]) -> str:
+    """What is not among the settings, and why."""
+    lines = [(one.program, one.work, one.what, one.came_out) for one in tried]
+    return markdown(("program", "work", "tried", "came out"), lines, left=(0, 1, 2, 3))
 
 
 def _limits_of_drop(work: Work, ours: list[Row]) -> list[Limit]:
