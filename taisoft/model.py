@@ -301,7 +301,10 @@ CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping"
 
 
 def changed_material(body: Body, numbers: dict[str, float], on: dict[str, bool]) -> None:
-    """Give a body a material with new numbers; the law, and damping that is compiled out, cannot change while it runs."""
+    """Give a body a material with new numbers; the law, and damping that is compiled out, cannot change while it runs.
+
+    A warning names the line of the caller's caller.
+    """
     for name, value in numbers.items():
         if name not in CHANGEABLE:
             near = difflib.get_close_matches(name, CHANGEABLE, 1)
@@ -317,4 +320,4 @@ def changed_material(body: Body, numbers: dict[str, float], on: dict[str, bool])
     except SceneError as error:
         raise SceneError(f"body '{body.name}': {error}") from None
     if "poisson" in numbers:
-        body.tell_locking()
+        body.tell_locking(stacklevel=3)

@@ -458,7 +458,7 @@ def test_a_poor_machine(tmp_path, shim):
     """A clock that jumps by days, a locale with decimal commas, a user without a home, and caches that cannot be written."""
     ts.write_mesh(tmp_path / "beam.msh", ts.box_mesh((4, 1, 1), (4.5, 1.25, 1)))
     assert "-2.25" in (tmp_path / "beam.msh").read_text()  # a text with decimal points
-    path = write(tmp_path / "beam.py", BEAM.replace("ts.box_mesh((4, 1, 1), (4, 1, 1))", 'ts.read_mesh(__file__[:-2] + "msh")'))
+    path = write(tmp_path / "beam.py", BEAM.replace("ts.box_mesh((4, 1, 1), (4, 2, 2))", 'ts.read_mesh(__file__[:-2] + "msh")'))
     assert run(path, "--out", tmp_path / "rich") == 0
     (tmp_path / "file").write_text("no folder")
     commas = german(tmp_path)

@@ -33,7 +33,7 @@ def test_a_run_of_a_scene_file_is_that_of_the_scene(tmp_path, beam):
         ("young = 1e5", "young = -1", "bodies.beam.material.young must be greater than 0 Pa"),
         ("symplectic_euler", "simplectic_euler", "did you mean 'symplectic_euler'?"),
         ("seconds = 0.1", "seconds = 0.1\ndtt = 1", "solver.dtt is not known (did you mean dt?)"),
-        ('shape = "box", cells = [4, 1, 1], size = [4, 1, 1]', 'file = "../a.msh"', "must lie inside"),
+        ('shape = "box", cells = [4, 1, 1], size = [4, 2, 2]', 'file = "../a.msh"', "must lie inside"),
     ],
 )
 def test_bad_scene_files_leave_no_output(tmp_path, capsys, old, new, told):
