@@ -53,7 +53,7 @@ def test_allow_outside_is_an_option(tmp_path, capsys):
     assert main(["scene", str(path), "--out", str(out)]) == 2
     assert "--allow-outside" in capsys.readouterr().err and not out.exists()
     assert main(["scene", str(path), "--out", str(out), "--allow-outside"]) == 0
-    assert capsys.readouterr().out.split() == [str(out), str(tmp_path / "b_mesh0.msh")]
+    assert capsys.readouterr().out.splitlines() == [str(out), str(tmp_path / "b_mesh0.msh")]
     assert main(["scene", str(path), "--out", str(out), "--allow-outside"]) == 3
 
 
