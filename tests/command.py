@@ -18,7 +18,7 @@ solver = {"dt": 1 / 240, "integrator": "symplectic_euler", "seconds": 0.1, "fps"
 
 def build():
     scene = ts.Scene()
-    body = scene.add_body(ts.box_mesh((4, 1, 1), (4, 1, 1)), ts.Material(young=1e5), name="beam")
+    body = scene.add_body(ts.box_mesh((4, 1, 1), (4, 2, 2)), ts.Material(young=1e5), name="beam")
     body.fix(lambda X: X[:, 0] < -1.99)
     return scene
 '''

@@ -206,7 +206,7 @@ def test_one_step_more_than_there_can_be(tmp_path, capsys):
         sim.run(1e30, fps=None)
 
 
-PLATE = {"mesh": 'shape = "box", cells = [9, 1, 9], size = [9, 1, 9]', "more": GROUND.replace("-2", "-0.49"),
+PLATE = {"mesh": 'shape = "box", cells = [9, 1, 9], size = [9, 4, 9]', "more": GROUND.replace("-2", "-1.99"),
          "solver": 'dt = 0.01\nintegrator = "symplectic_euler"'}  # fmt: skip
 SMALL_BUFFERS = "[collision]\ninitial_capacity = 64\n"
 

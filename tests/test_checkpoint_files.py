@@ -10,6 +10,7 @@
 import json
 import os
 import pickle
+import re
 import tracemalloc
 import zipfile
 
@@ -105,15 +106,16 @@ def test_a_file_cut_off_gives_way_to_the_previous_one(two, share):
     assert read_last_good(path).state["time"] == 2.0
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
-    told = rf"^{path} is (no checkpoint of taisoft, or )?damaged.*; going on from the previous checkpoint instead, {previous}$"
+    name, other = re.escape(str(path)), re.escape(str(previous))
+    told = rf"^{name} is (no checkpoint of taisoft, or )?damaged.*; going on from the previous checkpoint instead, {other}$"
     with pytest.warns(UserWarning, match=told):
         found = read_last_good(path)
     assert found.state["time"] == 1.0 and found.path == previous
     previous.write_bytes(b"x")
-    with pytest.raises(ts.SimulationError, match=rf"^{path} .*damaged.*; nor can the previous one be used: {previous} is no"):
+    with pytest.raises(ts.SimulationError, match=rf"^{name} .*damaged.*; nor can the previous one be used: {other} is no"):
         read_last_good(path)
     previous.unlink()
-    with pytest.raises(ts.SimulationError, match=rf"^{path} is .*damaged"):
+    with pytest.raises(ts.SimulationError, match=rf"^{name} is .*damaged"):
         read_last_good(path)
 
 

@@ -39,7 +39,7 @@ class FakeSimulator:
         ("import not_there_at_all\n", "line 1: ModuleNotFoundError"),
         ("raise SystemExit(0)\n", "line 1: SystemExit: 0"),
         (BEAM.replace("young=1e5", "young=-1"), "line 9: material: young must be greater than 0"),
-        (BEAM.replace("(4, 1, 1), (4, 1, 1)", "(4, 0, 1), (4, 1, 1)"), "line 9: "),
+        (BEAM.replace("(4, 1, 1), (4, 2, 2)", "(4, 0, 1), (4, 2, 2)"), "line 9: "),
         (BEAM.replace("solver = {", "solver = 3, {"), "solver must be a dict"),
         (BEAM.replace('"dt"', '"dtt"'), "'dtt' (did you mean dt?)"),
         (BEAM.replace("1 / 240", "0.0"), "dt must be greater than 0 s, not 0.0"),

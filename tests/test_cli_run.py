@@ -206,7 +206,7 @@ def test_second_signal_leaves_at_once(tmp_path):
             if "a second signal leaves at once" in line:
                 break
         process.send_signal(signal.SIGTERM)
-        process.communicate(timeout=10)
+        process.communicate(timeout=50)  # of the 60 s that it would hang
     finally:
         process.kill()
     assert process.returncode == 143

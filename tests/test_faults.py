@@ -45,6 +45,11 @@ def python(code: str, *arguments, **environment) -> subprocess.CompletedProcess:
     return subprocess.run(command, env=given, capture_output=True, text=True, timeout=300, check=False)
 
 
+def complaints(told: str) -> list[str]:
+    """The lines of stderr but for the one that machines without a Vulkan driver get with pictures."""
+    return [line for line in told.splitlines() if not line.startswith("taisoft: pictures are drawn in software: ")]
+
+
 @pytest.fixture(scope="module")
 def shim(tmp_path_factory) -> Path:
     """The library of failing calls."""
@@ -52,6 +57,8 @@ def shim(tmp_path_factory) -> Path:
     if compiler is None or not sys.platform.startswith("linux"):
         pytest.skip("there is no C compiler, or nothing can be preloaded here")
     path = tmp_path_factory.mktemp("shim") / "failing_calls.so"
+    if re.search(r"[\s:]", str(path)):
+        pytest.skip("the loader preloads nothing from a folder with a blank or a colon in its name")
     subprocess.run([compiler, "-shared", "-fPIC", "-o", path, ROOT / "tests" / "failing_calls.c", "-ldl"], check=True)
     return path
 
@@ -94,10 +101,10 @@ def test_a_disk_that_fails(beam, tmp_path, shim, which):
         folder = tmp_path / str(k)
         reason = "No space left on device" if call == "write" else "Input/output error"
         assert status == 3, (call, name, out, err)
-        failed, told = name.split("|"), err.splitlines()
+        failed, told = name.split("|"), complaints(err)
         assert len(told) == len(failed), err  # a sentence for each
         for one, line in zip(failed, told):
-            assert re.match(rf"taisoft: cannot write {folder}/\S*{one}\S*.*: {reason}", line), err
+            assert re.match(rf"taisoft: cannot write {re.escape(str(folder))}/\S*{one}\S*.*: {reason}", line), err
         assert not list(folder.rglob("*.part")) and not list(folder.glob("*.lock"))
         assert not any(list(folder.rglob(one)) for one in failed) and "status   degraded" in out and not re.search(r"\bok\b", out)
         if name in ("report.json", "steps.csv"):
@@ -131,10 +138,10 @@ def test_a_disk_that_is_full(beam, tmp_path, capsys, kind):
         status = run(beam, "--out", disk / "out", "--seconds", "0.5")
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         told = capsys.readouterr().err
-        assert status == 3 and re.search(rf"taisoft: cannot write {disk}/out/\S+ \(\d+ bytes.*: .+", told), told
+        assert status == 3 and re.search(rf"taisoft: cannot write {re.escape(str(disk))}/out/\S+ \(\d+ bytes.*: .+", told), told
         files = [path for path in (disk / "out").rglob("*") if path.is_file()]
         assert not [path for path in files if path.suffix == ".part" or path.stat().st_size == 0]
-        lost = set(re.findall(rf"cannot write {disk}/out/(\w+\.\w+)", told))
+        lost = set(re.findall(rf"cannot write {re.escape(str(disk))}/out/(\w+\.\w+)", told))
         if "checkpoint.npz" not in lost:
             read_checkpoint(disk / "out" / "checkpoint.npz")
         if not lost & {"report.json", "steps.csv"}:
@@ -179,7 +186,7 @@ def test_a_folder_that_is_taken_away(tmp_path, capsys):
     path, out = write(tmp_path / "scene.py", BEAM.replace("\n    return scene\n", TAKEN)), tmp_path / "out"
     assert run(path, "--out", out) == 3
     captured = capsys.readouterr()
-    assert re.search(rf"taisoft: cannot write {out}/\S+.*: Not a directory", captured.err), captured.err
+    assert re.search(rf"taisoft: cannot write {re.escape(str(out))}/\S+.*: Not a directory", captured.err), captured.err
     assert "status   degraded" in captured.out
     kept = sorted(str(file.relative_to(tmp_path / "taken")) for file in (tmp_path / "taken").rglob("*.*"))
     assert kept[:2] == ["frames/00000.png", "frames/00001.png"] and "report.json" not in kept
@@ -204,10 +211,11 @@ def test_a_disk_that_becomes_read_only(tmp_path, shim):
     arguments = ("run", path, "--headless", "--out", out, "--checkpoint-every", "0.03")
     done = python(code, *arguments, LD_PRELOAD=str(shim), FAIL_CALL="change", LATER=f"{out}/")
     assert done.returncode == 3 and "status   degraded" in done.stdout, done.stdout + done.stderr
-    told = done.stderr.splitlines()
-    usd = r"\(\d+ bytes of new frames\): Unable to open \S+ for write"  # it does not say why
-    assert all(re.match(rf"taisoft: cannot write {out}/(.*: Read-only file system|\S+ {usd})$", line) for line in told), told
-    lost = [re.search(r"cannot write \S+/([\w.]+)", line)[1] for line in told]
+    told = complaints(done.stderr)
+    usd = r"\(\d+ bytes of new frames\): Unable to open .+ for write"  # it does not say why
+    start = f"taisoft: cannot write {out}/"
+    assert all(line.startswith(start) and re.search(rf"(: Read-only file system| {usd})$", line) for line in told), told
+    lost = [re.match(r"(?:\w+/)?([\w.]+)", line.removeprefix(start))[1] for line in told]
     assert set(lost) == {"00002.png", "points_00002.usdc", "checkpoint.previous.npz", "steps.csv"} and len(lost) == 4
     assert [path.name for path in sorted((out / "frames").iterdir())] == ["00000.png", "00001.png"]
     assert read_checkpoint(out / "checkpoint.npz").state["world"]["time"] == pytest.approx(1 / 30)
@@ -349,7 +357,7 @@ def test_too_little_memory(tmp_path, more, needed):
     done = python(SHORT_OF_MEMORY, more, write(tmp_path / "scene.py", HUNGRY), tmp_path / "out")
     assert done.returncode == 2, done.stdout + done.stderr
     told = re.match(
-        r"taisoft: \S+/scene\.py: not enough memory .*: (\d+) bytes \(.*\) are needed.*, available: (\d+) bytes", done.stderr
+        r"taisoft: .+/scene\.py: not enough memory .*: (\d+) bytes \(.*\) are needed.*, available: (\d+) bytes", done.stderr
     )
     assert told and needed in told[0] and int(told[1]) > int(told[2]) and done.stderr.count("\n") == 1, done.stderr
     assert not (tmp_path / "out").exists()
@@ -458,7 +466,7 @@ def test_a_poor_machine(tmp_path, shim):
     """A clock that jumps by days, a locale with decimal commas, a user without a home, and caches that cannot be written."""
     ts.write_mesh(tmp_path / "beam.msh", ts.box_mesh((4, 1, 1), (4.5, 1.25, 1)))
     assert "-2.25" in (tmp_path / "beam.msh").read_text()  # a text with decimal points
-    path = write(tmp_path / "beam.py", BEAM.replace("ts.box_mesh((4, 1, 1), (4, 1, 1))", 'ts.read_mesh(__file__[:-2] + "msh")'))
+    path = write(tmp_path / "beam.py", BEAM.replace("ts.box_mesh((4, 1, 1), (4, 2, 2))", 'ts.read_mesh(__file__[:-2] + "msh")'))
     assert run(path, "--out", tmp_path / "rich") == 0
     (tmp_path / "file").write_text("no folder")
     commas = german(tmp_path)

@@ -308,15 +308,15 @@ def test_absurd_counts_are_refused_at_once(tmp_path, ending, count):
     data = path.read_bytes()
     assert re.search(rb"\b1[02]\b", data)  # 12 vertices, 10 tets
     path.write_bytes(re.sub(rb"\b1[02]\b", str(count).encode(), data, count=2))
-    start = time.perf_counter()
+    start = time.process_time()  # of this process alone, however busy the machine is
     with pytest.raises(MeshError, match="^" + re.escape(str(path))):
         read_mesh(path)
-    assert time.perf_counter() - start < 2.0
+    assert time.process_time() - start < 2.0
 
 
 def check_survives(path: Path) -> None:
     """A broken file gives a mesh that satisfies the rules, or a MeshError in one line that names the file."""
-    start = time.perf_counter()
+    start = time.process_time()
     try:
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             mesh = read_mesh(path)
@@ -325,7 +325,7 @@ def check_survives(path: Path) -> None:
     else:
         assert (mesh.volumes > 0).all() and np.isfinite(mesh.vertices).all()
     assert printed.getvalue() == ""
-    assert time.perf_counter() - start < 5.0
+    assert time.process_time() - start < 5.0
 
 
 MANY = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -33,7 +33,7 @@ def test_a_run_of_a_scene_file_is_that_of_the_scene(tmp_path, beam):
         ("young = 1e5", "young = -1", "bodies.beam.material.young must be greater than 0 Pa"),
         ("symplectic_euler", "simplectic_euler", "did you mean 'symplectic_euler'?"),
         ("seconds = 0.1", "seconds = 0.1\ndtt = 1", "solver.dtt is not known (did you mean dt?)"),
-        ('shape = "box", cells = [4, 1, 1], size = [4, 1, 1]', 'file = "../a.msh"', "must lie inside"),
+        ('shape = "box", cells = [4, 1, 1], size = [4, 2, 2]', 'file = "../a.msh"', "must lie inside"),
     ],
 )
 def test_bad_scene_files_leave_no_output(tmp_path, capsys, old, new, told):
@@ -53,7 +53,7 @@ def test_allow_outside_is_an_option(tmp_path, capsys):
     assert main(["scene", str(path), "--out", str(out)]) == 2
     assert "--allow-outside" in capsys.readouterr().err and not out.exists()
     assert main(["scene", str(path), "--out", str(out), "--allow-outside"]) == 0
-    assert capsys.readouterr().out.split() == [str(out), str(tmp_path / "b_mesh0.msh")]
+    assert capsys.readouterr().out.splitlines() == [str(out), str(tmp_path / "b_mesh0.msh")]
     assert main(["scene", str(path), "--out", str(out), "--allow-outside"]) == 3
 
 

@@ -149,9 +149,9 @@ def test_ball_refuses(radius, cells, rule):
 
 @pytest.mark.parametrize("cells", [(1000, 1000, 1000), (10**9, 1, 1), (10**9, 10**9, 10**9), (10**30, 1, 1)])
 def test_a_mesh_too_large_is_refused_at_once(cells):
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(MeshError, match="tets"):
         box_mesh(cells, (1, 1, 1))
     with pytest.raises(MeshError, match="ball_mesh.*tets"):
         ball_mesh(1.0, 2 * cells[0])
-    assert time.perf_counter() - start < 1.0  # nothing of that size was built
+    assert time.process_time() - start < 1.0  # nothing of that size was built

@@ -80,7 +80,7 @@ fps = 30
 
 [bodies.beam]
 material = {{ young = 1e5 }}
-mesh = {{ shape = "box", cells = [4, 1, 1], size = [4, 1, 1] }}
+mesh = {{ shape = "box", cells = [4, 1, 1], size = [4, 2, 2] }}
 
 [[bodies.beam.fix]]
 nodes = {{ half_space = {{ point = [-1.99, 0, 0], normal = [1, 0, 0] }} }}

@@ -9,11 +9,15 @@ import io
 import math
 import re
 import sys
+import tempfile
+from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
 
 import meshio
 import numpy as np
+from meshio import _common as meshio_messages
+from meshio._helpers import _filetypes_from_path, reader_map
 
 from taisoft.errors import MeshError
 from taisoft.mesh.content import one_line
@@ -99,6 +103,17 @@ for _name, _module in list(sys.modules.items()):
         _module.np = _CountingNumpy()
 
 
+class _Console(meshio_messages.Console):
+    """Where meshio prints: nowhere inside the fence. It takes what a file holds for markup, which may be an error."""
+
+    def print(self, *objects, **options) -> None:
+        if _most.get() == math.inf:
+            super().print(*objects, **options)
+
+
+meshio_messages.Console = _Console
+
+
 def read_fenced(file: Path, name: str, data: bytes, kind: str = "mesh") -> meshio.Mesh:
     """What meshio reads from a file. name: the file, for messages; data: its content; kind: "mesh" or "surface".
 
@@ -107,17 +122,34 @@ def read_fenced(file: Path, name: str, data: bytes, kind: str = "mesh") -> meshi
     printed, bound = io.StringIO(), _most.set(PER_BYTE * len(data) + 4096)
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), np.errstate(all="ignore"):
-            return _call(file, file.suffix.lower(), data)
+            with _unmarked(file, data) as plain:
+                return _call(plain, file.suffix.lower(), data)
     except ImportError as error:
         raise MeshError(f"{name}: files {file.suffix!r} need the Python package {error.name or error}") from error
     except MemoryError as error:
         raise MeshError(f"{name}: not a supported {kind}: it asks for more memory than it can fill") from error
     except (Exception, SystemExit) as error:
-        # Before meshio ends the program it prints why.
-        said = f"{type(error).__name__}: {error}" if isinstance(error, Exception) else printed.getvalue()
-        raise MeshError(f"{name}: not a supported {kind} ({one_line(_without_content(said, data))})") from error
+        raise MeshError(f"{name}: not a supported {kind} ({_cause(error, data)})") from error
     finally:
         _most.reset(bound)
+
+
+@contextlib.contextmanager
+def _unmarked(file: Path, data: bytes) -> Iterator[Path]:
+    """The file, or where its content is data after a byte-order mark, which only XML readers know, a copy of data."""
+    if data.startswith(b"<") or file.stat().st_size == len(data):
+        yield file
+        return
+    with tempfile.TemporaryDirectory(prefix="taisoft-") as folder:
+        copy = Path(folder) / file.name
+        copy.write_bytes(data)
+        yield copy
+
+
+def _cause(error: BaseException, data: bytes) -> str:
+    """What a reader says of a file, in one line, without the file's name, which messages start with."""
+    text = str(error) if isinstance(error, meshio.ReadError) else f"{type(error).__name__}: {error}"
+    return one_line(_without_content(text, data)) or "its structure is broken"
 
 
 def _without_content(said: str, data: bytes) -> str:
@@ -132,11 +164,26 @@ def _call(file: Path, ending: str, data: bytes) -> meshio.Mesh:
     file_format = _WAITING.get(ending)
     if ending == ".msh":
         if data.lstrip()[:1] != b"(":
-            return meshio.read(file, file_format="gmsh")
+            return _read(file, ["gmsh"])
         file_format = "ansys"
     if file_format is None:
-        return meshio.read(file)
+        return _read(file, _filetypes_from_path(file))
     with _Ending(io.FileIO(file)) as stream:
         if file_format in _OF_TEXT:
-            return meshio.read(_EndingText(stream, encoding="utf-8"), file_format=file_format)
+            with _EndingText(stream, encoding="utf-8") as text:
+                return meshio.read(text, file_format=file_format)
         return meshio.read(stream, file_format=file_format)
+
+
+def _read(file: Path, formats: list[str]) -> meshio.Mesh:
+    """The mesh in the first of the formats that fits. Raises what the last reader does.
+
+    As `meshio.read`, which would print the readers' reasons, broken at a terminal's width, and end the program.
+    """
+    readers = [reader_map[name] for name in formats if name in reader_map]
+    if not readers:
+        raise meshio.ReadError(f"such files can only be written: {', '.join(formats)}")
+    for reader in readers[:-1]:
+        with contextlib.suppress(meshio.ReadError):
+            return reader(str(file))
+    return readers[-1](str(file))

@@ -10,6 +10,7 @@ from taisoft.attributes import Guarded, guarded_record
 from taisoft.errors import SceneError
 from taisoft.mesh.nodes import Nodes, make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.mesh.thickness import coarse_bending
 from taisoft.scene import checks
 from taisoft.scene.collision import HIT_BY
 from taisoft.scene.key_frames import KeyFrames
@@ -69,7 +70,7 @@ class Body(Guarded):
     velocity: (3,) or (n,3) [m/s], of the start. order: 1 or 2, of the elements' shape functions; quadrature_degree: of
     polynomials that their quadrature integrates exactly. nodes: `Nodes`, the mesh's vertices and for order 2 the middles
     of its edges. constraints, tractions, forces: lists of `Constraint`, `Traction`, `NodalForce`. collision: one of HIT_BY.
-    A Poisson's ratio above 0.49 is told with a UserWarning for order 1, whose tets are far too stiff there.
+    `tell_locking` and `warn_bending` warn of tets of order 1 where they are far too stiff; `Scene.add_body` calls both.
     """
 
     _otherwise_late = ANOTHER
@@ -95,7 +96,6 @@ class Body(Guarded):
         degrees = QUADRATURE_DEGREES[self.order]
         degree = degrees[0] if quadrature_degree is None else quadrature_degree
         self.quadrature_degree = checks.whole(degree, f"{what}: quadrature_degree of order {self.order}", degrees)
-        self.tell_locking()
         self.nodes: Nodes = make_nodes(mesh, self.order)
         self.position = checks.array(position, f"{what}: position", ((3,),))
         self.velocity = checks.array(velocity, f"{what}: velocity", ((3,), (self.n_nodes, 3)))
@@ -137,14 +137,25 @@ class Body(Guarded):
         kind = f"{self.mesh.n_tets} tets of order {self.order}"
         return f"Body({self.name!r}, {self.n_nodes} nodes, {kind}, {self.material.law})"
 
-    def tell_locking(self) -> None:
-        """Warn of linear tets where they lock."""
+    def tell_locking(self, stacklevel: int) -> None:
+        """Warn of linear tets where they lock: above a Poisson's ratio of 0.49. stacklevel: 1 is the caller's line."""
         poisson = self.material.poisson
         if self.order == 1 and poisson > NEARLY_INCOMPRESSIBLE:
             warnings.warn(
                 f"body {self.name!r}: poisson = {poisson:g} is above {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend "
                 "far too little: order=2 locks less",
-                UserWarning, stacklevel=5,
+                UserWarning, stacklevel=stacklevel + 1,
+            )  # fmt: skip
+
+    def warn_bending(self, stacklevel: int) -> None:
+        """Warn of linear tets where the body is too thin in tets to bend as it should. stacklevel: as of `tell_locking`."""
+        if self.order == 1 and (found := coarse_bending(self.mesh)) is not None:
+            layers = max(1, round(found.layers))
+            times = float(f"{found.stiffness:.1g}")  # the estimate is good to about its first digit
+            warnings.warn(
+                f"body {self.name!r}: about {layers} linear {'tet lies' if layers == 1 else 'tets lie'} through its thickness, "
+                f"and it bends about {times:.0f} times too stiffly: order=2 bends right",
+                UserWarning, stacklevel=stacklevel + 1,
             )  # fmt: skip
 
     def fix(self, where, axes: str = "xyz") -> Constraint:

@@ -15,7 +15,10 @@ LOADS = {"force": "forces", "traction": "tractions"}  # what a load is called, a
 
 
 def changed_material(body: Body, numbers: dict[str, float], on: dict[str, bool]) -> None:
-    """Give a body a material with new numbers; the law, and damping that is compiled out, cannot change while it runs."""
+    """Give a body a material with new numbers; the law, and damping that is compiled out, cannot change while it runs.
+
+    A warning names the line of the caller's caller.
+    """
     for name, value in numbers.items():
         if name not in CHANGEABLE:
             near = difflib.get_close_matches(name, CHANGEABLE, 1)
@@ -33,7 +36,7 @@ def changed_material(body: Body, numbers: dict[str, float], on: dict[str, bool])
     with thawed(body):
         body.material = material
     if "poisson" in numbers:
-        body.tell_locking()
+        body.tell_locking(stacklevel=3)
 
 
 def changed_load(body: Body, kind: str, index: int, value) -> None:

@@ -127,12 +127,16 @@ class Scene(Guarded):
         mesh: its shape at rest. name: unique, "body0" and so on where left out. position: (3,) [m], shift of the start.
         velocity: (3,) for all nodes or (n,3) [m/s]. order: 1, linear tets, or 2, quadratic ones with nodes in the middle of
         every edge. quadrature_degree: None for the default, for order 2 four points (2) or fourteen (4). collision: by what
-        others hit it, "proximity", which is also "auto", or "distance_field". Raises SceneError.
+        others hit it, "proximity", which is also "auto", or "distance_field". Warns where tets of order 1 are far too stiff:
+        at a Poisson's ratio above 0.49, or where so few lie through a thin body that it bends at most half as far as it should.
+        Raises SceneError.
         """
         self._check_open("add_body")
         name = self._free_name(name, "body")
         body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision)
         self.bodies.append(body)
+        body.tell_locking(stacklevel=2)
+        body.warn_bending(stacklevel=2)
         return body
 
     def add_obstacle(

@@ -18,7 +18,7 @@ from taisoft.scene import checks
 BARE = re.compile(r"[A-Za-z0-9_-]+")  # keys that TOML takes without quotes
 LARGEST = 2**63  # whole numbers of TOML are below
 SURROGATES = {chr(code) for code in range(0xD800, 0xE000)}  # no characters, and no escape can stand for them
-LONGEST = 400  # characters of an error's text, which may repeat a whole list
+LONGEST = 400  # characters of an error's text, which may repeat a whole list, besides those of the file's folder
 SHOWN = 40  # characters of a value in a message
 
 
@@ -138,7 +138,8 @@ class Table:
             text = str(error)
             for start in said:
                 text = text.removeprefix(start)
-            text = text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+            most = LONGEST + len(str(self.file.parent))
+            text = text if len(text) <= most else f"{text[:most]}..."
             key = re.match(r"\w+", text)
             if key and key[0] in self.known:
                 place = joined(self.place, key[0]) + text[key.end() :]

@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.errors import SceneError
+from taisoft.mesh.content import UTF16, utf16_head
 from taisoft.mesh.files import WRITERS, read_mesh
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.mesh.tet_mesh import TetMesh
@@ -92,7 +93,10 @@ def _solver(**values) -> dict:
 def _parsed(file: Path) -> dict:
     """The file's tables. Raises SceneError for what cannot be read or is no TOML, with the line."""
     try:
-        text = file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
+        data = file.read_bytes()
+        if utf16_head(data):
+            raise SceneError(f"{file}: {UTF16}")
+        text = data.decode("utf-8-sig").replace("\r\n", "\n")
     except (OSError, ValueError) as error:
         if isinstance(error, UnicodeDecodeError):
             raise SceneError(f"{file}: byte {error.start} is not UTF-8 text") from None

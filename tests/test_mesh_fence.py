@@ -1,0 +1,68 @@
+"""Messages of broken mesh files, whatever the terminal and the folder:
+
+* they start with the file's true name, and end with what the reader says, in one line, without the name again;
+* what a reader would print as markup is no error.
+"""
+
+import re
+
+import pytest
+from test_mesh_files import MESH, same, write_by_meshio
+
+import taisoft as ts
+
+LONG = "a folder with a [bold]long[/bold] name " * 5  # of 195 characters; what is in brackets is markup to rich
+
+
+@pytest.fixture
+def narrow(tmp_path, monkeypatch):
+    """A folder whose name is longer than a terminal is wide."""
+    monkeypatch.setenv("COLUMNS", "20")
+    folder = tmp_path / LONG
+    folder.mkdir(parents=True)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "name, said",
+    [
+        ("a b.vtk", "not a supported mesh (Illegal VTK header)"),
+        ("[red]a[/blue] b.mesh", "not a supported mesh (Unknown keyword ....)"),
+        (":smile: a.msh", "not a supported mesh (its structure is broken)"),
+        ("a.vtu", "not a supported mesh (its structure is broken)"),
+        ("a.vol", "not a supported mesh (RuntimeError: Not a valid Netgen mesh)"),
+        ("a.svg", "not a supported mesh (such files can only be written: svg)"),
+        ("a.mdpa", "no tetrahedra; no elements found"),
+    ],
+)
+def test_messages_give_the_true_name_and_one_cause(narrow, name, said):
+    path = narrow / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("passphrase\nof three lines\n\n")
+    with pytest.raises(ts.MeshError, match=f"^{re.escape(f'{path}: {said}')}$"):
+        ts.read_mesh(path)
+
+
+def test_messages_of_surfaces(narrow):
+    (narrow / "a b.ply").write_text("passphrase")
+    with pytest.raises(ts.MeshError, match=f"^{re.escape(f'{narrow}/a b.ply: not a supported surface (Expected ply)')}$"):
+        ts.read_surface(narrow / "a b.ply")
+
+
+def test_messages_of_scene_files(narrow):
+    """They are cut off where they repeat what a file holds, but not for a long folder."""
+    folder = narrow / LONG
+    folder.mkdir(parents=True)
+    (folder / "a b.vtk").write_text("passphrase")
+    (folder / "scene.toml").write_text("[bodies.a]\nmaterial = {}\nmesh = { file = 'a b.vtk' }\n")
+    with pytest.raises(ts.MeshError) as caught:
+        ts.read_scene(folder / "scene.toml")
+    said = "not a supported mesh (Illegal VTK header)"
+    assert str(caught.value) == f"{folder}/scene.toml: bodies.a.mesh: {folder}/a b.vtk: {said}"
+
+
+def test_markup_in_what_a_reader_prints_is_no_error(tmp_path, capfd):
+    path = write_by_meshio(tmp_path / "part.su2", [("tetra", MESH.tets)])
+    path.write_text(path.read_text() + "[/red] :smile:\n")
+    capfd.readouterr()
+    assert same(ts.read_mesh(path)) and capfd.readouterr() == ("", "")
