@@ -17,7 +17,7 @@ from taisoft.model import Layout
 from taisoft.scene.body import Body
 from taisoft.scene.obstacles import Capsule, Obstacle, Sphere
 from taisoft.scene.scene import Scene
-from taisoft.transfer import download
+from taisoft.transfer import array_of, download
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,7 @@ class Containment:
         self._solid = np.flatnonzero(np.diff(topology.first))  # colliders with triangles
         parts = sum(b.mesh.n_components for b in scene.bodies) if self_collision else 0
         self._wanted = len(self._solid) + len(self._round) > 1 or parts > 1
+        self._alone = len(self._solid) == 1 and not self_collision
         self._ready = False
 
     def _prepare(self) -> None:
@@ -109,16 +110,25 @@ class Containment:
             return []
         if not self._ready:
             self._prepare()
-        x, nodes = download([surface.x, x_nodes])
+        nodes, lo, hi = download([x_nodes, surface.body_lo, surface.body_hi])
+        x = array_of(surface.x) if len(self._triangles) or self._alone else None
+        if self._alone:  # the search keeps boxes of colliders only where two have triangles
+            lo, hi = x.min(axis=0, keepdims=True), x.max(axis=0, keepdims=True)
         frames = download([shapes.origin, shapes.rotation]) if self._round else None
         points = self._points(x, nodes, frames)
-        found = [one for k, b in self._pairs(points, x) if (one := self._look(int(k), int(b), points[k], x)) is not None]
+        boxed = (lo[self._solid] <= points[:, None]) & (points[:, None] <= hi[self._solid])
+        boxed = boxed.all(axis=2) & self._may_hold
+        found = []
+        if boxed.any():
+            x = array_of(surface.x)
+            looks = (self._look(int(k), int(self._solid[b]), points[k], x) for k, b in np.argwhere(boxed))
+            found += [one for one in looks if one is not None]
         for i, b, shape in self._round:
             depth = _round_depths(shape, (points[: len(self._nodes)] - frames[0][i]) @ frames[1][3 * i : 3 * i + 3])
             found += [Inside(int(self._owner[k]), b, float(depth[k]), float(self._room[k])) for k in np.flatnonzero(depth > 0.0)]
         return found
 
-    def _points(self, x: np.ndarray, nodes: np.ndarray, frames: list[np.ndarray] | None) -> np.ndarray:
+    def _points(self, x: np.ndarray | None, nodes: np.ndarray, frames: list[np.ndarray] | None) -> np.ndarray:
         """(n,3) [m] the inner points: of bodies, of obstacles with triangles, of round ones."""
         points = [0.25 * nodes[self._nodes].sum(axis=1)]
         if len(self._triangles):
@@ -128,17 +138,7 @@ class Containment:
             points.append(corners.mean(axis=1) - self._behind[:, None] * normal)
         if frames is not None:
             points.append(frames[0][[i for i, _, _ in self._round]])
-        return np.concatenate(points)
-
-    def _pairs(self, points: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """(k,2) an inner point and a collider that it may lie inside: in its box."""
-        starts = self._topology.vertex_first[self._solid]
-        lo, hi = np.minimum.reduceat(x, starts).T, np.maximum.reduceat(x, starts).T
-        boxed = self._may_hold.copy()
-        for p, low, high in zip(points.T[:, :, None], lo, hi):
-            boxed &= (low <= p) & (p <= high)
-        k, b = np.nonzero(boxed)
-        return np.stack([k, self._solid[b]], axis=1)
+        return np.concatenate(points) if len(points) > 1 else points[0]
 
     def _look(self, k: int, b: int, point: np.ndarray, x: np.ndarray) -> Inside | None:
         """Inner point k in collider b, None where it lies outside."""
