@@ -1,4 +1,4 @@
-"""The falling beam, taisoft beside MuJoCo: cost of a step, time and error of whole runs, memory.
+"""The falling beam, taisoft beside MuJoCo: cost of a step, alone and in sim.run, time and error of whole runs, memory.
 
 taisoft bench elasticity [--arch cpu|cuda] [--quick] [--no-peers] [--out [FILE.json]]
 
@@ -25,6 +25,7 @@ from taisoft.timing import Timing, load_average
 from .document import RESULTS, Document, check_out, default_out, header, load_text
 from .elasticity_beam import measure_memory, n_tets
 from .elasticity_cost import Cost, cost_limits, cost_table, measure_costs
+from .elasticity_frames import frame_limits, frame_table, measure_frames
 from .elasticity_runs import MUJOCO, TAISOFT, Row, make_rows, measure_rows, time_ratio
 from .elasticity_table import Limit, limit_table
 from .exact_path import MESHES, SECONDS
@@ -191,6 +192,11 @@ def measure(extent: Extent, arch: str, peers: bool, document: Document) -> dict:
             found = measure_costs(cells, precision, arch, extent.repeats)
             document.add(cost_table(found))
             costs += found
+    document.add("## Steps in a run, 60 frames a second, beside the steps alone, stable neo-Hookean, f32")
+    frames = []
+    for found in measure_frames(extent.meshes, arch, extent.repeats):
+        document.add(frame_table(found))
+        frames += found
     document.add(f"## Runs over {extent.seconds:g} s, St. Venant-Kirchhoff, taisoft in f32, MuJoCo in f64")
     runs: list[Row] = []
     for cells, rounds in zip(extent.meshes, extent.rounds):
@@ -202,14 +208,15 @@ def measure(extent: Extent, arch: str, peers: bool, document: Document) -> dict:
         runs += rows
     document.add("## Memory, f32")
     document.add(memory_table(memory))
-    limits = cost_limits(costs) + run_limits(runs) + memory_limits(memory)
+    limits = cost_limits(costs) + frame_limits(frames) + run_limits(runs) + memory_limits(memory)
     document.add("## Limits")
     document.add(limit_table(limits))
     load = load_average()
     document.add(f"Load at the end: {load_text(load)}")
     return numbers | {
         "load_at_the_end": load, "mujoco_left_out": problem, "cost": [x.record() for x in costs],
-        "runs": [x.record() for x in runs], "memory": memory, "limits": [x.record() for x in limits],
+        "frames": [x.record() for x in frames], "runs": [x.record() for x in runs], "memory": memory,
+        "limits": [x.record() for x in limits],
     }  # fmt: skip
 
 

@@ -86,7 +86,8 @@ class StateAccess(Guarded):
         """Energies of the present state [J]."""
         model = self._open_world().model
         measure(model)
-        return Energies(kinetic=model.scalars[3], elastic=model.scalars[0], gravity=model.scalars[4])
+        elastic, _, _, kinetic, gravity = array_of(model.scalars)[:5].tolist()
+        return Energies(kinetic=kinetic, elastic=elastic, gravity=gravity)
 
     def reactions(self, body: str | None = None) -> np.ndarray:
         """(n_nodes, 3) force of the constraint on each fixed or moved node in the last step [N], else 0."""

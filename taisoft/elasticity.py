@@ -30,6 +30,7 @@ from taisoft.math3 import determinant, matmul_nt, matmul_tn
 from taisoft.runtime import kernel
 
 HUGE = 1e30  # above any volume ratio
+NO_TET = 2**31 - 1  # above any number of a tet
 
 
 @ti.func
@@ -114,6 +115,33 @@ def gather_forces(m: ti.template(), f: ti.template()):
 
 
 @ti.func
+def element_state(m: ti.template(), g: ti.template(), b):
+    """Of block b of group g, per lane and in f64: elastic energy [J], least J over the quadrature points, and, where the law
+    softens below a stretch s, whether the tet is squeezed below it at one of them (1 or 0).
+
+    It is where F^T F - s^2 I is not positive definite, which its leading minors tell.
+    """
+    X = differences(m, g, m.x, b, ti.f64)
+    M = rest_gradients(m, b, ti.f64)
+    p = law_constants(m, b, ti.f64)
+    V = volumes(m, b, ti.f64)
+    energy = broadcast(ti.cast(0.0, ti.f64), m.lanes)
+    lowest = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
+    minor = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
+    for q in range(g.n_points):
+        F = gradient_at(m, g, X, M, q, ti.f64)
+        energy += weight_at(m, g, q, ti.f64) * V * g.law.psi(F, p)
+        lowest = ti.min(lowest, determinant(F))
+        if ti.static(g.law.SOFTENS_BELOW > 0.0):
+            C = matmul_tn(F, F)
+            square = ti.static(g.law.SOFTENS_BELOW**2)
+            D = [C[k] - (square if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
+            minor = ti.min(minor, D[0], D[0] * D[4] - D[1] * D[3], determinant(D))
+    one = broadcast(ti.cast(1, ti.i32), m.lanes)
+    return energy, lowest, ti.select(minor <= 0.0, one, one - 1)
+
+
+@ti.func
 def _lane_sum(values):
     total = values[0]
     for q in ti.static(range(1, values.n)):
@@ -133,26 +161,26 @@ def _lane_min(values):
 def measure(m: ti.template()):
     """Energies and volume ratios of the present state, in f64 with sums in a fixed order.
 
-    scalars 0..4: elastic [J], smallest J, number of inverted tets, kinetic [J], gravity [J].
+    scalars 0..4: elastic [J], smallest J, number of inverted tets, kinetic [J], gravity [J]; 10: the first tet, counted by
+    blocks and lanes, that is squeezed so far that its law softens, NO_TET where there is none.
     """
     ti.loop_config(serialize=m.serial)
     for c in range(m.chunks):
         energy = broadcast(ti.cast(0.0, ti.f64), m.lanes)
         lowest = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
         inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
+        none = broadcast(ti.cast(NO_TET, ti.i32), m.lanes)
+        squeezed = none
         size = (m.n_blocks + m.chunks - 1) // m.chunks
         for g in ti.static(m.groups):
-            for b in range(ti.max(g.first, c * size), ti.min(g.last, (c + 1) * size)):
-                X = differences(m, g, m.x, b, ti.f64)
-                M = rest_gradients(m, b, ti.f64)
-                p = law_constants(m, b, ti.f64)
-                J = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
-                for q in range(g.n_points):
-                    F = gradient_at(m, g, X, M, q, ti.f64)
-                    energy += weight_at(m, g, q, ti.f64) * volumes(m, b, ti.f64) * g.law.psi(F, p)
-                    J = ti.min(J, determinant(F))
+            for k in range(ti.max(g.first, c * size), ti.min(g.last, (c + 1) * size)):
+                b = k & m.block_mask  # changes nothing: see `Model.block_mask`
+                psi, J, soft = element_state(m, g, b)
+                energy += psi
                 lowest = ti.min(lowest, J)
                 inverted += count_inverted(m, b, J)
+                tets = ti.Vector([b * m.lanes + q for q in ti.static(range(m.lanes))])
+                squeezed = ti.min(squeezed, ti.select(soft == 1, tets, none))
         m.partial[c, 0] = _lane_sum(energy)
         m.partial[c, 1] = _lane_min(lowest)
         m.partial[c, 2] = ti.cast(_lane_sum(inverted), ti.f64)
@@ -162,38 +190,18 @@ def measure(m: ti.template()):
             kinetic += 0.5 * ti.cast(m.v[i], ti.f64).dot(mass_times(m, i, m.v))
             gravity -= ti.cast(m.weight[i], ti.f64) * ti.cast(m.gravity[0], ti.f64).dot(m.x[i])
         m.partial[c, 3], m.partial[c, 4] = kinetic, gravity
+        m.partial[c, 5] = ti.cast(_lane_min(squeezed), ti.f64)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        for k in ti.static(range(5)):
+        for k, at in ti.static(((0, 0), (1, 1), (2, 2), (3, 3), (4, 4), (5, 10))):
             total = m.partial[0, k]
             for c in range(1, m.chunks):
                 value = m.partial[c, k]
-                if ti.static(k == 1):
+                if ti.static(k == 1 or k == 5):
                     total = ti.min(total, value)
                 else:
                     total += value
-            m.scalars[k] = total
-
-
-@kernel
-def find_softened(m: ti.template(), found: ti.types.ndarray()):
-    """found (1,) int32: made the first tet, counted by blocks and lanes, that is squeezed below the stretch s where its law
-    softens, if it comes before what is there: F^T F - s^2 I is not positive definite, which its leading minors tell."""
-    for g in ti.static(m.groups):
-        if ti.static(g.law.SOFTENS_BELOW > 0.0):
-            ti.loop_config(serialize=m.serial)
-            for b in range(g.first, g.last):
-                X = differences(m, g, m.x, b, m.real)
-                M = rest_gradients(m, b, m.real)
-                for q in range(g.n_points):
-                    F = gradient_at(m, g, X, M, q, m.real)
-                    C = matmul_tn(F, F)
-                    square = ti.static(g.law.SOFTENS_BELOW**2)
-                    D = [C[k] - (square if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
-                    least = ti.min(D[0], D[0] * D[4] - D[1] * D[3], determinant(D))
-                    for l in ti.static(range(m.lanes)):
-                        if least[l] <= 0.0:
-                            ti.atomic_min(found[0], b * m.lanes + l)
+            m.scalars[at] = total
 
 
 @kernel

@@ -24,6 +24,8 @@ from taisoft.transfer import download
 # Points, and threads of the CPU, from which parallel loops are taken instead of one serial kernel: the compiler does not put
 # their work side by side in vectors. With two threads they took 3.4 times as long (213,000 tets, `taisoft bench scaling`)
 PARALLEL_FROM, PARALLEL_THREADS = 100_000, 8
+# Partial sums of a parallel loop. Taichi gives a loop of few iterations, 128 at least, to one thread of the CPU
+CHUNKS = {"cpu": 1024, "cuda": 4096}
 # |Dm| |Dm^-1| from which F is formed in f64: in f32 its rounding, that times 6e-8, would be a strain above 6e-6. Regular tets
 # have 3, those of a sheet whose cells are 30 times as wide as thick about 60
 ILL_CONDITIONED = 100.0
@@ -84,6 +86,12 @@ class Model:
     scalars: Any  # (16) f64: what a kernel tells the host
     partial: Any  # (chunks, 8) f64: partial sums, added in a fixed order
     chunks: int
+
+    @property
+    def block_mask(self) -> int:
+        """Bits of a block's number. In loops whose bounds it does not know the compiler handles the lanes of a block side by side
+        only where it can tell that no index into element data overflows, which `b & block_mask` shows."""
+        return 2 ** self.n_blocks.bit_length() - 1
 
 
 @dataclass(frozen=True)
@@ -233,7 +241,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         block_body[layout.block_start[k] : layout.block_start[k] + -(-layout.n_tets[k] // lanes)] = k
     work = sum((g.last - g.first) * lanes * g.n_points for g in groups)
     serial = runtime.arch == "cpu" and (work < PARALLEL_FROM or threads() < PARALLEL_THREADS)
-    chunks = 1 if serial else (64 if runtime.arch == "cpu" else 4096)
+    chunks = 1 if serial else CHUNKS[runtime.arch]
     strain_real = ti.f64 if real == ti.f32 and _worst_condition(nodes, Dm_inv, layout) > ILL_CONDITIONED else real
     damped = on["mass_damping"] or on["stiffness_damping"]
     n_bodies = len(scene.bodies)

@@ -185,7 +185,7 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
     def launch(*arguments):
         check_program(_program)
         launches[function.__name__] += 1
-        if len(arguments) != n_arguments or not all(arguments[k].flags.c_contiguous for k in arrays):
+        if len(arguments) != n_arguments or (arrays and not all(arguments[k].flags.c_contiguous for k in arrays)):
             return compiled(*arguments)  # which says what is wrong with them
         key = tuple([_trait(arguments[k]) for k in templates] + [(arguments[k].dtype, arguments[k].ndim) for k in arrays])
         if key in known:

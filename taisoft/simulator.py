@@ -9,7 +9,7 @@ import numpy as np
 from taisoft import runtime
 from taisoft.attributes import thawed
 from taisoft.collision.pipeline import Detection
-from taisoft.elasticity import find_softened, measure
+from taisoft.elasticity import NO_TET, measure
 from taisoft.errors import SceneError, SimulationError, no_memory
 from taisoft.fields import FieldArena
 from taisoft.materials import LAWS
@@ -25,6 +25,7 @@ from taisoft.stepping.contact import SUNK, ContactStep
 from taisoft.stepping.motion import Motion
 from taisoft.stepping.pull import Pull, batch
 from taisoft.stepping.world import World
+from taisoft.transfer import array_of
 
 
 def _release(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:
@@ -170,13 +171,11 @@ class Simulator(Resuming):
 
     def _tell_softened(self) -> None:
         """Warn, once, of the first tet that is squeezed so far that its law softens."""
-        layout, none = self._world.layout, np.iinfo(np.int32).max
-        found = np.array([none], dtype=np.int32)
-        find_softened(self._world.model, found)
-        if found[0] == none:
+        layout, first = self._world.layout, int(array_of(self._world.model.scalars)[10])
+        if first == NO_TET:
             return
         self._softens = False
-        place = found[0] - layout.block_start * self._runtime.lanes
+        place = first - layout.block_start * self._runtime.lanes
         k = int(np.flatnonzero((place >= 0) & (place < layout.n_tets))[0])
         body = self.scene.bodies[k]
         law = LAWS[body.material.law]
@@ -253,7 +252,7 @@ class Simulator(Resuming):
 
     def _report(self) -> StepReport:
         measure(self._world.model)
-        elastic, lowest, inverted, kinetic, gravity = (self._world.model.scalars[k] for k in range(5))
+        elastic, lowest, inverted, kinetic, gravity = array_of(self._world.model.scalars)[:5].tolist()
         return StepReport(
             time=self.time,
             min_volume_ratio=lowest,

@@ -136,7 +136,7 @@ class StaticSolver:
     def _good(self, result: StageResult) -> bool:
         """Nothing inverted, and the residual where it should be, or where it can be."""
         measure(self.world.model)
-        return (result.converged or result.at_rounding) and self.world.model.scalars[2] == 0.0
+        return (result.converged or result.at_rounding) and array_of(self.world.model.scalars)[2] == 0.0
 
     def _attempt(self, x: np.ndarray, share: float, tolerance: float, max_newton: int = MAX_NEWTON) -> StageResult:
         """Solve with a share of the load, from x."""

@@ -161,8 +161,10 @@ def upload(pairs: list[tuple]) -> None:
 
 def download(fields: list, rows: int | None = None) -> list[np.ndarray]:
     """The fields as arrays, of their first `rows` rows if that is given."""
-    if all(field in _places for field in fields):
-        return [_places[field].view(field)[:rows].copy() for field in fields]
+    places = [_places.get(field) for field in fields]
+    if None not in places:
+        views = [place.view(field) for place, field in zip(places, fields)]
+        return [view.copy() if rows is None else view[:rows].copy() for view in views]
     counts = [field.shape[0] if rows is None else rows for field in fields]
     shapes = [_array_shape(field)[1:] for field in fields]
     sizes = [n * int(np.prod(shape, dtype=np.int64)) for n, shape in zip(counts, shapes)]

@@ -17,6 +17,7 @@ import taisoft as ts
 from benchmarks import document, elasticity, elasticity_runs
 from benchmarks.elasticity_beam import beam_scene, follow_tip, measure_memory, steps_within_limit
 from benchmarks.elasticity_cost import Cost, cost_limits, cost_table, measure_costs
+from benchmarks.elasticity_frames import Frames, frame_limits, frame_table, measure_frames
 from benchmarks.elasticity_runs import Row, lasting_steps, make_rows, measure_rows, time_ratio
 from benchmarks.elasticity_table import Limit, slug
 from benchmarks.exact_path import SAMPLE, FallingBeam, load_exact
@@ -110,6 +111,17 @@ def test_costs_are_compared_sample_by_sample():
     assert row[1:6] == ["540", "f32", "velocity_verlet", "COR", "24.00"] and row[9] == "4.00"
 
 
+def test_steps_in_a_run_beside_those_alone():
+    rows = [
+        Frames(540, "velocity_verlet", 84, [11e-6, 22e-6, 5.5e-6], [10e-6, 20e-6, 5e-6]),
+        Frames(540, "implicit_euler", 1, [2e-3], [1e-3]),
+    ]
+    row = [cell.strip() for cell in frame_table(rows).splitlines()[2].split("|")]
+    assert row[1:9] == ["540", "velocity_verlet", "84", "10.00", "11.00", "1.100", "0.0%", "84"]
+    (limit,) = frame_limits(rows)  # the median of each round's ratio: a slow round hits both
+    assert limit.value == pytest.approx(1.1) and limit.spread == pytest.approx(0) and not limit.met
+
+
 def test_limits_by_tets_and_precision():
     large = [Cost(34_560, "SNH", "velocity_verlet", precision, 0.5, [345.6e-6]) for precision in ("f32", "f64")]
     (limit,) = cost_limits(large)
@@ -176,6 +188,7 @@ def tiny(monkeypatch):
     rows = (("taisoft", "velocity_verlet", 4), ("MuJoCo", "euler", 2))
     monkeypatch.setattr(elasticity, "QUICK", TINY)
     monkeypatch.setattr(elasticity, "measure_costs", lambda *a: measure_costs(*a, ("SVK",), ("velocity_verlet",)))
+    monkeypatch.setattr(elasticity, "measure_frames", lambda *a: measure_frames(*a, ("velocity_verlet",)))
     monkeypatch.setattr(elasticity, "measure_memory", lambda *a: measure_memory(*a, integrators=("velocity_verlet",)))
     monkeypatch.setattr(
         elasticity,
@@ -201,6 +214,9 @@ def test_the_whole_with_a_peer(tiny, lent, tmp_path, monkeypatch, capsys):
     assert theirs["rounds"] == [[4.0], [4.0]] and theirs["error"] == 0.02 and theirs["build_seconds"] == [0.25, 0.25]
     (cost,) = numbers["cost"]
     assert cost["tets"] == 540 and len(cost["samples"]) == 2 and cost["step_seconds"]["minimum"] > 0
+    (frames,) = numbers["frames"]
+    assert (frames["tets"], frames["steps"], len(frames["run"]), len(frames["alone"])) == (540, 84, 2, 2)
+    assert frames["ratio"]["minimum"] > 0
     assert numbers["arch"] == "cpu" and numbers["quick"] is True and numbers["mujoco_left_out"] is None
     assert numbers["memory"][1]["bytes_per_tet"] == pytest.approx(144, rel=0.2)
     shown, kept = capsys.readouterr().out, (tmp_path / "new" / "e.md").read_text()
@@ -221,6 +237,7 @@ def test_the_whole_without_a_peer(tiny, monkeypatch, capsys):
 
     monkeypatch.setattr(elasticity, "run_mujoco", absent)
     monkeypatch.setattr(elasticity, "QUICK", replace(TINY, precisions=()))
+    monkeypatch.setattr(elasticity, "measure_frames", lambda *a: [])
     monkeypatch.setattr(elasticity, "measure_memory", lambda *a: [])
     assert elasticity.main(["--quick"]) == 0
     shown = capsys.readouterr().out

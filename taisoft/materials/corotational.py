@@ -14,6 +14,7 @@ from taisoft.math3 import cofactor, cross, ddot, determinant, dot, matmul, matmu
 
 NAME = "corotational"
 SOFTENS_BELOW = 0.0
+POINT_SECONDS = 60e-9  # of an explicit step per quadrature point on one core
 EXTRA_STEPS = 8  # of Halley beyond the two that moderate strain needs
 SETTLED = 1e-5  # relative change whose cube is below rounding: the next step would change nothing
 SVD_BELOW = 0.04  # relative size of the denominator under which the closed form loses more than about a digit

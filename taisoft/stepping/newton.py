@@ -173,7 +173,8 @@ class StageSolver:
     def _objective(self, c: float, beta: float) -> float:
         m = self.model
         measure(m)
-        energy = m.scalars[0] + m.scalars[4]
+        scalars = array_of(m.scalars)
+        energy = float(scalars[0] + scalars[4])
         if c == 0.0 and not m.loaded and not m.damped:  # no other terms
             return energy
         stage_terms(m, self.work, c, beta)

@@ -7,12 +7,13 @@ import numpy as np
 import taichi as ti
 
 from taisoft.errors import SimulationError
+from taisoft.model import Model
 from taisoft.stepping import explicit
 from taisoft.stepping.world import World
 from taisoft.transfer import array_of, upload
 
-LAUNCH_SECONDS = 0.1  # aim for one launch, so that Ctrl-C is heard
-SECONDS_PER_POINT = 60e-9  # of one sub-step, the slowest seen (corotational with stiffness damping): sizes a launch
+LAUNCH_SECONDS = 0.1  # of one launch at most, roughly, so that Ctrl-C is heard
+DAMPING_POINT_SECONDS = 800e-9  # that stiffness damping adds to a law's POINT_SECONDS: it projects the stiffness of each point
 MAX_BATCH = 4096
 TARGET_BYTES_PER_TET = 200  # memory that the targets of a batch may take
 
@@ -44,6 +45,14 @@ class SubstepResult:
     n_inverted: int
 
 
+def largest_batch(m: Model) -> int:
+    """Sub-steps that one launch may take. It rests on the scene alone, not on the clock: where a batch ends shows in the last
+    digit of the report's extremes."""
+    damping = DAMPING_POINT_SECONDS if m.stiffness_damping else 0.0
+    seconds = sum((g.last - g.first) * m.lanes * g.n_points * (g.law.POINT_SECONDS + damping) for g in m.groups)
+    return max(1, min(MAX_BATCH, int(LAUNCH_SECONDS / seconds)))
+
+
 class ExplicitStepper:
     """Takes sub-steps of symplectic Euler or velocity Verlet over a world."""
 
@@ -51,8 +60,7 @@ class ExplicitStepper:
         self.world = world
         m, arena, motion = world.model, world.arena, world.motion
         n_tets = int(world.layout.n_tets.sum())
-        n_points = sum((g.last - g.first) * m.lanes * g.n_points for g in m.groups)
-        self.max_batch = max(1, min(MAX_BATCH, int(LAUNCH_SECONDS / (SECONDS_PER_POINT * n_points))))
+        self.max_batch = largest_batch(m)
         n_moved, n_held = motion.n_moved, len(motion.held)
         self.rows = max(1, min(self.max_batch, TARGET_BYTES_PER_TET * n_tets // (24 * max(1, n_moved))))
 
@@ -155,7 +163,8 @@ class ExplicitStepper:
         else:
             self._launch_parallel(n, dt)
         self.stale = False
-        return SubstepResult(int(m.scalars[5]), m.scalars[6], int(m.scalars[7]))
+        done, lowest, inverted = array_of(m.scalars)[5:8].tolist()
+        return SubstepResult(int(done), lowest, int(inverted))
 
     def _launch_parallel(self, n: int, dt: float) -> None:
         m, s = self.world.model, self.work

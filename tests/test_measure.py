@@ -1,0 +1,98 @@
+"""What a report measures, and what that adds to a run:
+
+* energies, volume ratios and the first tet that its law softens are the oracle's for all laws and orders, added up in one part
+  or in several;
+* a frame of explicit steps is one launch of the steps and one of the measurement, an implicit step is measured once, and a
+  frame's report tells of the state at its end;
+* a launch holds as many sub-steps as its length allows, which what a law and its damping take decides.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from oracle import Oracle
+from scenes import COR, SNH, SVK, built, cube, mixed_scene, rubber
+
+import taisoft as ts
+from taisoft import runtime
+from taisoft.elasticity import NO_TET, measure
+from taisoft.materials import LAWS
+from taisoft.stepping.substeps import LAUNCH_SECONDS, MAX_BATCH, largest_batch
+
+LARGE = 34_560  # tets of the largest mesh whose runs are timed, `taisoft bench elasticity`
+
+
+def first_squeezed(rig, x) -> int:
+    """Number, by blocks and lanes, of the first tet squeezed at a point below the stretch where its law softens."""
+    found = [NO_TET]
+    for k, part in enumerate(rig.oracle.parts):
+        stretch = np.linalg.svd(rig.oracle.gradients(x, part), compute_uv=False)[:, -1].reshape(-1, part.points).min(axis=1)
+        tets = np.flatnonzero(stretch < LAWS[part.material.law].SOFTENS_BELOW)
+        found += [int(rig.layout.block_start[k] * rig.model.lanes + tet) for tet in tets]
+    return min(found)
+
+
+@pytest.mark.parametrize("laws, precision", [((SVK, SNH, SNH, COR), "f64"), ((SVK, SNH, COR, SVK), "f32")])
+def test_energies_of_all_laws(laws, precision):
+    """Those of order 2 and 1 that the tests of the elastic operator leave out; in f64 in one part, in f32 in seven."""
+    with built(mixed_scene(laws, order="both"), precision) as rig:
+        m, rng, seen = rig.model if precision == "f64" else rig.parallel, np.random.default_rng(3), set()
+        for squeeze, noise in ((1.0, 0.02), (0.75, 0.03), (0.7, 0.2)):
+            x = rig.oracle.rest * [1.0, squeeze, 1.0] + noise * rng.standard_normal(rig.oracle.rest.shape)  # [m]
+            v = rng.standard_normal(x.shape).astype(rig.machine.np_real)
+            m.x.from_numpy(x)
+            m.v.from_numpy(v)
+            measure(m)
+            elastic, lowest, inverted, kinetic, gravity = m.scalars.to_numpy()[:5]
+            low, count = rig.oracle.volume_ratios(x)
+            # The rest shape, masses and gravity are stored in the model's precision. A strain of 0.02 is formed from numbers of
+            # about 1, so that it, and twice as much its energy, loses a factor of 50
+            assert elastic == pytest.approx(rig.oracle.energy(x), rel=100 * rig.eps)
+            expected = low, rig.oracle.kinetic(v.astype(float), False), rig.oracle.weight(x, False)
+            assert (lowest, kinetic, gravity) == pytest.approx(expected, rel=10 * rig.eps, abs=10 * rig.eps)
+            assert inverted == count and m.scalars[10] == first_squeezed(rig, x)
+            seen.add((int(m.scalars[10]), bool(inverted)))
+        assert len(seen) == 3 and (NO_TET, False) in seen and any(turned for _, turned in seen)
+
+
+def launches(sim: ts.Simulator, seconds: float, **arguments) -> dict[str, int]:
+    """Kernel -> launches in a run."""
+    before = dict(runtime.launches)
+    assert sim.run(seconds, **arguments).status == "ok"
+    return {name: n - before.get(name, 0) for name, n in runtime.launches.items() if n > before.get(name, 0)}
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_euler"])
+def test_a_frame_is_measured_once(integrator):
+    scene, frames = ts.Scene(), []
+    scene.add_body(cube(), rubber(SVK), name="block", velocity=(1.0, 0.0, 0.0)).fix([0, 1, 2])
+
+    def on_frame(sim, index, report):
+        if index:
+            frames.append((report, sim.positions(), sim.velocities()))
+
+    with ts.Simulator(scene, 0.002, integrator, precision="f64") as sim:
+        counts, oracle = launches(sim, 0.15, on_frame=on_frame, fps=20), Oracle(scene)  # 25 steps a frame
+        explicit = sim.settings.explicit
+    assert len(frames) == 3 and counts["measure"] == (3 if explicit else 75)
+    if explicit:
+        assert counts == {"advance_serial": 3, "measure": 3}
+    for report, x, v in frames:
+        expected = oracle.kinetic(v, explicit), oracle.energy(x), oracle.weight(x, explicit)
+        assert (report.kinetic, report.elastic, report.gravity) == pytest.approx(expected)
+
+
+def model_of(law: str, tets: int, damped: bool = False) -> SimpleNamespace:
+    """As much of a model as tells how long its sub-steps take."""
+    group = SimpleNamespace(law=LAWS[law], first=0, last=tets // 4, n_points=1)
+    return SimpleNamespace(groups=(group,), lanes=4, stiffness_damping=damped)
+
+
+def test_launches_are_long_enough_and_not_too_long():
+    assert largest_batch(model_of(SNH, 4)) == MAX_BATCH
+    assert largest_batch(model_of(SNH, LARGE)) >= 84  # a frame of the largest mesh that is timed
+    assert largest_batch(model_of(COR, LARGE)) < largest_batch(model_of(SVK, LARGE))
+    assert largest_batch(model_of(SNH, 10**8)) == 1
+    # what a damped point took at the least, which is the most that a launch of them may hold: 436 ns
+    assert largest_batch(model_of(SNH, LARGE, damped=True)) <= LAUNCH_SECONDS / (436e-9 * LARGE)
