@@ -44,6 +44,7 @@ FLAT = 0.5  # of the slope at its start: a step that ends on a steeper rise has 
 TRIES = 12  # of a step's length
 KEPT = 3  # Newton steps that a matrix serves at least: most of what changes is what touches
 MAX_MULTIPLIERS = 200
+IMPACT_TOLERANCE = 1e-3  # of the contact laws' residual in an impact: what it leaves undone the step after it does
 
 
 class ContactStageSolver(StageSolver):
@@ -155,7 +156,9 @@ class ContactStageSolver(StageSolver):
         find_factors(self.contact.problem)
         begin_impact(m, w, self._k, tau, self._norms)
         self._linear, self._dt, self._stiffness, self._weighed = IMPACT, dt, STIFFNESS, None
-        impact = self._iterate(1.0, tau, tolerance, contact_tolerance, max_newton, linear_tolerance, True)
+        impact = self._iterate(
+            1.0, tau, tolerance, max(contact_tolerance, IMPACT_TOLERANCE), max_newton, linear_tolerance, True
+        )
         measure_impact(m, w, self._k, tau, out)
         slope, curvature = out
         gain = slope + 0.5 * curvature
@@ -212,7 +215,8 @@ class ContactStageSolver(StageSolver):
         needs_projection, forcing, previous, goal, least = False, MAX_FORCING, 0.0, PROGRESS * r, r
         converged = rounding = False
         while True:
-            near = r <= max(tolerance * scale, goal) or rounding
+            lawful = self._linear == IMPACT and state[RESIDUAL] <= contact_tolerance  # only the momenta are left to balance
+            near = r <= (tolerance * scale if lawful else max(tolerance * scale, goal)) or rounding
             if near:  # the multiplier has done what it can
                 contact_residual = state[RESIDUAL]
                 enough = r <= tolerance * scale or rounding or r <= floor
