@@ -20,6 +20,7 @@ pytest.importorskip("distributed")
 from taisoft.cli import main
 from taisoft.study.cluster import cluster_places, connect
 from taisoft.study.workers import CUT, SPENT, carry_out
+from taisoft.timing import usable_cores
 
 SLOW = "import os, time\n\n\ndef build():\n    open({file!r}, 'a').write(f'{{os.getpid()}}\\n')\n    time.sleep(300)\n"
 
@@ -38,6 +39,8 @@ def dask(stack: ExitStack, *arguments) -> subprocess.Popen:
 @pytest.fixture
 def cluster(tmp_path):
     """(address, worker processes) of a scheduler and two workers on 127.0.0.1."""
+    if len(usable_cores()) < 2:
+        pytest.skip("two workers need a core each")
     with ExitStack() as stack:
         scheduler = dask(stack, "dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show")
         address = next(m[1] for line in scheduler.stderr if (m := re.search(r"(tcp://127\.0\.0\.1:\d+)", line)))
