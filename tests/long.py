@@ -27,6 +27,7 @@ LONG = {
     ),
     "test_contact_stepping": ("test_rest[bdf2-", "test_rest[velocity_verlet-"),
     "test_simulator": ("[symplectic_euler-2]",),
+    "test_restitution": ("test_ten_seconds", "test_single_precision", "test_explicit_steps"),
     "test_rebuild": ("test_another_contact_solver",),
     "test_static": ("test_equilibrium[1]",),
     "test_checkpoint": (

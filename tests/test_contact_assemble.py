@@ -14,6 +14,7 @@ from rotations import rotation
 import taisoft as ts
 from taisoft.contact.assemble import OWN, _warm_impulse, build_found, keep_impulses, short_of_goal
 from taisoft.contact.problem import build_node_problem, fill_field
+from taisoft.contact.restitution import explicit_rise
 from taisoft.fields import FieldArena
 from taisoft.runtime import kernel, open_runtime
 
@@ -166,10 +167,13 @@ def test_warm_start(begun):
 
 @kernel
 def find_goals(
-    f: ti.template(), dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64, out: ti.types.ndarray()
+    f: ti.template(), dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64, force: ti.f64,
+    out: ti.types.ndarray(),
 ):  # fmt: skip
+    """force: what the explicit step's forces change the velocity by [m/s]."""
     for c in range(f.problem.count[0]):
-        out[c] = short_of_goal(f, c, dt, standoff, fast, slow, fastest)
+        rise = explicit_rise(f, c, dt, standoff, f.approach[c] + force)
+        out[c] = short_of_goal(f, c, dt, standoff, fast, slow, fastest, rise)
 
 
 @kernel
@@ -211,10 +215,14 @@ def test_how_far_a_contact_is_from_its_goal(found, fast, slow):
     found.problem.count[0] = len(cases)
     out = np.zeros(len(cases))
     fill_field(found.body, np.tile([0, 1], (len(cases), 1)))
-    find_goals(found, dt, h, fast, slow, fastest, out)
+    find_goals(found, dt, h, fast, slow, fastest, 0.0, out)
     assert np.abs(out - expected).max() < 1e-15
+    find_goals(found, dt, h, fast, slow, fastest, -0.2, out)  # pressed on: what the forces take is not given back
+    less = np.where((restitution > 0) & (expected == -dt * restitution * np.abs(approach)), 0.2 * dt, 0.0)
+    later = np.array([k == 6 for k in range(len(cases))])  # these forces make it meet
+    assert np.abs(out - np.where(later, -(0.35 - 0.2) * dt, expected + less)).max() < 1e-15 and (less > 0).sum() == 3
     fill_field(found.body, np.ones((len(cases), 2), dtype=int))  # of a body with itself: the same with other numbers
-    find_goals(found, dt, h / OWN, fast / OWN, slow / OWN, fastest, out)
+    find_goals(found, dt, h / OWN, fast / OWN, slow / OWN, fastest, 0.0, out)
     assert np.abs(out - expected).max() < 1e-15
 
 

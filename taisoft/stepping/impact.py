@@ -1,22 +1,23 @@
 """The impact before an implicit step in which surfaces meet with restitution: a jump of the velocity at x_n.
 
     (M + tau^2 K)(v+ - v_n) = J^T p,   u = J v+ - leave,   tau = SPREAD dt,
-with Signorini's and Coulomb's laws between p and u; `leave` is the speed with which a contact must part (`contact.restitution`).
-With M alone the nodes at the contact would turn round and the body behind them go on: it would vibrate, and implicit Euler takes
-the energy of vibrations whose period is not many steps. tau^2 K keeps these out: a motion of frequency w takes 1 / (1 + (w tau)^2)
-of its part of the impulse. With w tau = 1, implicit Euler loses 1 - 1/e of the energy in a period, which is what SPREAD = 2 pi
-says. A body that waves cross within the step is thrown back as a whole; a soft one, or short steps, at its contacts alone, and
-its elasticity does the rest.
+with Signorini's and Coulomb's laws between p and u; `leave` is the speed with which a contact must part
+(`contact.restitution`). With M alone the nodes at the contact would turn round and the body behind them go on: it would
+vibrate, and implicit Euler takes the energy of vibrations whose period is not many steps. tau^2 K keeps these out: a motion
+of frequency w takes 1 / (1 + (w tau)^2) of its part of the impulse. With w tau = 1, implicit Euler loses 1 - 1/e of the
+energy in a period, which is what SPREAD = 2 pi says. A body that waves cross within the step is thrown back as a whole; a
+soft one, or short steps, at its contacts alone, and its elasticity does the rest.
 
 No energy may come of it. The kinetic energy changes by
     E(s) = s (D.M v_n + p.u_fixed) + s^2 D.M D / 2 <= s sum p_n max(0, leave - |u_n|) / 2,   D = v+ - v_n,
-u_fixed what obstacles and prescribed nodes add to u_n, whose work is theirs; the right side is what implicit Euler lost before and
-may get back. Newton's law breaks this where friction turns the slip round (Kane's paradox), or where bodies vibrate: then the
-jump is scaled down by s < 1. What is left of it, the slack, is what tau^2 K took. In the step after it contacts are held to their
-way, so that the body behind them, which lags, is pushed on; that work must not exceed the slack, else the step is done again without.
+u_fixed what obstacles and prescribed nodes add to u_n, whose work is theirs; the right side is what implicit Euler lost
+before and may get back. Newton's law breaks this where friction turns the slip round (Kane's paradox), or where bodies
+vibrate: then the jump is scaled down by s < 1. What is left of it, the slack, is what tau^2 K took. In the step after it
+contacts are held to their way, so that the body behind them, which lags, is pushed on; that work must not exceed the slack,
+else the step is done again without.
 
-Weak: within tau the impulse reaches further than sound does. Bodies in between, which waves cross in some steps, are thrown back
-lower than e says. Held nodes are walls: what hangs on them takes the blow.
+Weak: within tau the impulse reaches further than sound does. Bodies in between, which waves cross in some steps, are thrown
+back lower than e says. Held nodes are walls: what hangs on them takes the blow.
 """
 
 import math
