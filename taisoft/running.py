@@ -66,6 +66,12 @@ def run(
     report.compile_seconds = sim.compile_seconds - compiled
     report.wall_seconds = time.perf_counter() - clock - report.compile_seconds
     _judge(report)
+    end = seconds if resumed else start_time + seconds
+    if report.status != "failed" and not report.interrupted and abs(sim.time - end) > (1.0 + ROUNDING) * max(sim.dt, report.dt):
+        report.problems.append(
+            f"the run was to end at t = {end:.6g} s and ended at t = {sim.time:.6g} s, since dt or the state changed meanwhile"
+        )
+        report.status = "degraded"
     if report.steps and report.status != "failed":
         try:
             _judge_end(sim, report)

@@ -11,6 +11,7 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
 from taisoft.scene.plan import Plan, make_plan
 from taisoft.scene.scene import Scene
+from taisoft.scene.solver import MAX_TOLERANCE
 from taisoft.stepping import EXPLICIT, INTEGRATORS, SCHEMES
 
 EXPLICIT_CONTACT = tuple(SOLVERS)
@@ -69,8 +70,9 @@ def check_count(name: str, value) -> int:
 def _check_tolerance(name: str, value) -> None:
     if value is None:
         return
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < 1.0:
-        raise SimulationError(f"{name} = {value!r}: it must lie between 0 and 1, or be None for the adaptive one")
+    below = MAX_TOLERANCE.get(name, 1.0)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < below:
+        raise SimulationError(f"{name} = {value!r}: it must lie between 0 and {below:g}, or be None for the adaptive one")
 
 
 def contact_solvers(integrator: str) -> tuple[str, ...]:

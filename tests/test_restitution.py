@@ -3,7 +3,8 @@
 * a cube that falls on a plane returns to the height that its restitution promises, again and again, and comes to rest where that
   is below 1; a step's length, the height of the fall and a slope do not change that;
 * energy is never created: not by falls, nor by spins with friction, nor by vibrations, nor by a throw, nor in explicit steps;
-* two that meet part with the restitution's share of their speed, and keep their momentum; a plane that moves gives twice its speed.
+* two that meet part with the restitution's share of their speed, and keep their momentum; a plane that moves gives twice its
+  speed.
 Energies are told over that at the start, of which the ground is the zero.
 """
 

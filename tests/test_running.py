@@ -317,3 +317,21 @@ def test_the_end_is_judged(end, status):
     assert result.status == status and result.interrupted == isinstance(end, KeyboardInterrupt)
     told = {"ok": "", "degraded": "the run was interrupted" if result.interrupted else "'left' and 'right' overlap by 0.02 m"}
     assert told.get(status, "lost") in " ".join(result.problems)
+
+
+@pytest.mark.parametrize("change", ["dt", "steps"])
+def test_a_run_that_ends_elsewhere_is_not_ok(change):
+    """What on_frame does to dt, or by steps of its own, may end a run early: it says so."""
+
+    def on_frame(sim, index, report):
+        if change == "dt" and index == 2:
+            sim.dt = sim.dt / 4
+        if change == "steps" and index == 2:
+            sim.step()
+            sim.step()
+
+    scene = ts.Scene(gravity=(0, -9.81, 0))
+    scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), ts.Material(young=1e5), name="cube")
+    with ts.Simulator(scene, dt=1 / 60) as sim:
+        result = sim.run(0.2, on_frame)
+    assert result.status == "degraded" and any("was to end at t = 0.2 s" in problem for problem in result.problems)

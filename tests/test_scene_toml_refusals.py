@@ -34,7 +34,7 @@ BAD = [
     ("dt = 0.01", 'arch = "gpu"', "solver.arch must be one of cpu, cuda, not 'gpu'"),
     ('"implicit_euler"', "[1]", "solver.integrator must be a text, not [1]"),
     ("1e-4", "0", "solver.newton_tolerance must be greater than 0"),
-    ("1e-4", "1", "solver.newton_tolerance must be below 1"),
+    ("1e-4", "1", "solver.newton_tolerance must be below 0.1"),
     ("[0, -9.81, 0]", "[0, -9.81]", "gravity must have shape (3,), not (2,)"),
     ("[0, -9.81, 0]", '"down"', "gravity must be numbers of shape (3,)"),
     ("[0, -9.81, 0]", '[0, "-9.81", 0]', "gravity[1] must be a number, not '-9.81'"),

@@ -6,14 +6,17 @@ Names of integrators and contact solvers, and what fits what, are checked by the
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 
+MAX_TOLERANCE = {"newton_tolerance": 0.1}  # a residual as large as a tenth of the forces is no solution; others: below 1
+
 
 def _positive(value, key: str) -> None:
     checks.number(value, key, above=0.0)
 
 
 def _tolerance(value, key: str) -> None:
-    if value is not None and checks.number(value, key, above=0.0) >= 1.0:
-        raise SceneError(f"{key} must be below 1, not {value!r}")
+    below = MAX_TOLERANCE.get(key.rpartition(".")[2], 1.0)
+    if value is not None and checks.number(value, key, above=0.0) >= below:
+        raise SceneError(f"{key} must be below {below:g}, not {value!r}")
 
 
 def _text(value, key: str) -> None:
