@@ -332,6 +332,6 @@ def test_a_run_that_ends_elsewhere_is_not_ok(change):
 
     scene = ts.Scene(gravity=(0, -9.81, 0))
     scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), ts.Material(young=1e5), name="cube")
-    with ts.Simulator(scene, dt=1 / 60) as sim:
+    with ts.Simulator(scene, dt=1 / 60, precision="f64") as sim:
         result = sim.run(0.2, on_frame)
     assert result.status == "degraded" and any("was to end at t = 0.2 s" in problem for problem in result.problems)
