@@ -149,6 +149,9 @@ class Simulator(Resuming):
             report = self._report()
             report.newton_iterations, report.linear_iterations = result.newton_iterations, result.linear_iterations
             report.residual, report.converged, report.parts = result.residual, result.converged, self._stepper.parts
+            worst, name = self._stepper.unbalanced
+            if name:
+                report.residual, report.converged = max(report.residual, worst), False
         if self._contact is not None:
             report.contact_iterations, report.contact_residual = result.contact_iterations, result.contact_residual
             report.n_contacts, report.max_penetration = self._contact.n_contacts, self._contact.penetration
@@ -193,6 +196,9 @@ class Simulator(Resuming):
                 f"Newton stopped after {report.newton_iterations} iterations at a relative residual of {report.residual:.2e}"
                 + (f", that of the contacts {report.contact_residual:.2e}" if report.n_contacts else "")
             )
+            if self._stepper.unbalanced[1]:
+                worst, name = self._stepper.unbalanced
+                found.append(f"forces on body '{name}' are unbalanced by {worst:.2g} of their size, beside larger ones on others")
         elif not report.converged:
             found.append(f"the contact solver stopped at a residual of {report.contact_residual:.2e}")
         if report.dropped_contacts:

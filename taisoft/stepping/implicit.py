@@ -11,6 +11,7 @@ import taichi as ti
 
 from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
+from taisoft.stepping.body_balance import LIMIT, BodyBalance
 from taisoft.stepping.contact import CROSSED_FAR, SUNK, TOLERANCE, ContactStep
 from taisoft.stepping.contact_newton import ContactStageSolver
 from taisoft.stepping.newton import StageResult, StageSolver, count_all, merge
@@ -23,6 +24,7 @@ MAX_PARTS = 32  # of a step in which bodies close fast
 HASTE = 2.0  # a part may close so many times what a step may: its speed was not known when the step was cut
 SEARCHES = 3  # along the way that a step took, where it left the one that was expected
 MORE_PARTS = 16  # of a step that ended with a new deep penetration, or with triangles that newly cross
+TIGHTER = 0.1  # of the tolerance that would just do where a body's forces did not balance
 RETRIES = 4  # parts at most of a step that did not converge
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
@@ -111,6 +113,8 @@ class ImplicitStepper:
         self.contact_tolerance = TOLERANCE[world.runtime.precision]
         self.linear_tolerance: float | None = None
         self.parts = 1  # that the last step was taken in
+        self._balance = BodyBalance(world.scene, world.layout) if len(world.scene.bodies) > 1 else None
+        self.unbalanced: tuple[float, str] = (0.0, "")  # the worst relative residual of a body in the last step beyond LIMIT
         self.forget()
 
     def forget(self) -> None:
@@ -166,6 +170,7 @@ class ImplicitStepper:
         least = parts  # that it takes even if it converges
         while True:
             result, depth, deep, lost = None, 0.0, False, True
+            self.unbalanced = (0.0, "")
             try:
                 if contact is not None:
                     contact.sinking = sinking
@@ -286,7 +291,7 @@ class ImplicitStepper:
         multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)
         begin_step(m, w, h, multistep, scheme.now, scheme.before, still, along)
         try:
-            result = self._solve(scheme, dt, bounces)
+            result = self._solve_balanced(scheme, dt, bounces)
         except BaseException:  # Ctrl-C: the step is abandoned
             restore(m, h)
             self.forget()
@@ -303,19 +308,33 @@ class ImplicitStepper:
             self._past = 0
         return result
 
-    def _solve(self, scheme: Scheme, dt: float, bounces: bool) -> StageResult:
+    def _solve_balanced(self, scheme: Scheme, dt: float, bounces: bool) -> StageResult:
+        """The stage; again and more tightly where it left a body's forces unbalanced beside larger ones."""
+        result = self._solve(scheme, dt, bounces, self.tolerance)
+        if self._balance is None or not (result.converged and np.isfinite(result.residual)):
+            return result
+        worst, name = self._balance.worst(self.solver, self._beta)
+        if worst > LIMIT and not (bounces or scheme.one_iteration):
+            tighter = self.tolerance * LIMIT / min(worst, 1.0) * TIGHTER
+            result = count_all(self._solve(scheme, dt, bounces, tighter), [result])
+            worst, name = self._balance.worst(self.solver, self._beta)
+        if worst > LIMIT:
+            self.unbalanced = max(self.unbalanced, (worst, name))
+        return result
+
+    def _solve(self, scheme: Scheme, dt: float, bounces: bool, tolerance: float) -> StageResult:
         """The stage, with contacts or without. bounces: whether any are thrown back."""
         most = 1 if scheme.one_iteration else MAX_NEWTON
         # led nodes change their velocity once a step, not twice within the midpoint's half step
         share = 0.5 if scheme.midpoint else 1.0
         if self.contact is None:
-            return self.solver.solve(1.0, self._beta, self.tolerance, most, self.linear_tolerance, led_share=share)
+            return self.solver.solve(1.0, self._beta, tolerance, most, self.linear_tolerance, led_share=share)
         if bounces:
             return self.solver.solve_bouncing(
-                dt, self.tolerance, self.contact_tolerance, MAX_CONTACT_NEWTON, self.linear_tolerance, scheme.one_iteration
+                dt, tolerance, self.contact_tolerance, MAX_CONTACT_NEWTON, self.linear_tolerance, scheme.one_iteration
             )
         return self.solver.solve_stage(
-            1.0, self._beta, dt, self.tolerance, self.contact_tolerance, MAX_CONTACT_NEWTON, self.linear_tolerance,
+            1.0, self._beta, dt, tolerance, self.contact_tolerance, MAX_CONTACT_NEWTON, self.linear_tolerance,
             scheme.one_iteration, share,
         )  # fmt: skip
 

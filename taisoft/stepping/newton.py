@@ -133,8 +133,11 @@ class StageSolver:
                 g[group.first : group.last] *= steepest if group.order == 2 else 1.0
         largest = float(np.abs(x).max())
         strain = self.eps + np.finfo(np.float64).eps * largest * g  # of F, and of the f64 positions it is formed from
-        self.rounding_force = float(np.sqrt(((stiff[:, None] * volume * g * strain) ** 2).sum()))
+        squares = (stiff[:, None] * volume * g * strain) ** 2
+        self.rounding_force = float(np.sqrt(squares.sum()))
+        self.rounding_by_body = np.sqrt(np.bincount(body, squares.sum(axis=1)))
         # and of v = (x - x_hat) / beta: |M| times the rounding of x, to be divided by beta
+        self.rounding_of_x = 4.0 * float(np.finfo(np.float64).eps) * largest
         self.rounding_mass = float(np.linalg.norm(mass) * 4.0 * np.finfo(np.float64).eps * largest)
 
     def snapshot(self) -> dict:

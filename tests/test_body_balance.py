@@ -1,0 +1,45 @@
+"""A light body beside a heavy one moves as it does alone, though its forces are below the tolerance of the whole scene; where a
+step cannot do that, it says so and does not count as converged."""
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.stepping import implicit
+
+DT, STEPS, G = 1 / 60, 15, 9.81
+
+
+@pytest.fixture
+def scene() -> ts.Scene:
+    """A cube of 1 m that hangs, and one of 4 cm that falls beside it; they do not touch."""
+    made = ts.Scene(gravity=(0, -G, 0))
+    made.contact_forces = False
+    rubber = ts.Material(young=1e6, density=1000.0)
+    made.add_body(ts.box_mesh((2, 2, 2), (1, 1, 1)), rubber, name="big").fix(lambda X: X[:, 1] > 0.49)
+    made.add_body(ts.box_mesh((1, 1, 1), (0.04,) * 3), rubber, name="small", position=(3, 0, 0))
+    return made
+
+
+def test_a_light_body_falls_beside_a_heavy_one(scene, monkeypatch):
+    with ts.Simulator(scene, dt=DT) as sim:
+        for _ in range(200):  # until the heavy one hangs nearly still
+            sim.set_state(velocities=np.zeros_like(sim.velocities("big")), body="big")
+            sim.step()
+        rest = sim.positions("big")
+        start = scene.body("small").rest_positions + (3, 0, 0)
+        for crippled in (False, True):
+            sim.set_state(positions=rest, velocities=np.zeros_like(rest), body="big")
+            sim.set_state(positions=start, velocities=np.zeros_like(start), body="small")
+            if crippled:  # without the second solve
+                monkeypatch.setattr(implicit, "TIGHTER", 1e9)
+            reports = [sim.step() for _ in range(STEPS)]
+            speed = sim.velocities("small")[:, 1].mean()
+            if not crippled:
+                assert all(report.converged for report in reports)
+                assert speed == pytest.approx(-G * STEPS * DT, rel=1e-2)
+            else:
+                assert speed > -0.9 * G * STEPS * DT
+                bad = [report for report in reports if not report.converged]
+                assert bad and all(report.residual > implicit.LIMIT for report in bad)
+                assert any("forces on body 'small' are unbalanced" in text for report in bad for text in report.problems)
