@@ -1,7 +1,8 @@
 """The works on which programs are held against each other:
 
 * the laws in NumPy are those of small strains, those that taisoft has too give its stress, and no rotation stresses any;
-* a verdict flips where a body falls, leans, turns inside out or sinks in; errors are distances over what the work says;
+* a verdict flips where a body falls, leans, hangs in the air, turns inside out or sinks in;
+* errors are distances over what the work says;
 * the comparison takes the fastest that is good enough, and says where nothing is;
 * taisoft's adapter gives the positions of its simulator; the others', where they are installed, start where the work does;
 * every program is given its implicit and its explicit methods, and its own laws; what was tried besides is on the page.
@@ -113,6 +114,18 @@ def test_verdicts_flip():
     mirrored[2, nodes["cube 2"], 0] *= -1
     verdict = judge.judge(work, TAISOFT, mirrored)
     assert verdict.inverted == work.bodies[2].mesh.n_tets and not verdict.stands
+
+
+@pytest.mark.parametrize("work", [work for work in scenes.WORKS if work.kind == "stand"], ids=lambda work: work.key)
+def test_what_hangs_in_the_air_does_not_stand(work):
+    last = list(work.slices().values())[-1]
+    falling = still(work, 21)
+    t = np.arange(21) * 0.01
+    falling[:, last, 1] -= 0.5 * work.gravity * t[:, None] ** 2
+    assert judge.free_fall(work, falling) == pytest.approx(1.0)
+    assert judge.free_fall(work, still(work, 21)) == 0.0 and judge.free_fall(work, still(work)) is None
+    verdict = judge.Verdict(0, free_fall=1.1)
+    assert verdict.stands and not replace(verdict, free_fall=0.7).stands and not replace(verdict, free_fall=1.3).stands
 
 
 def made_row(work: scenes.Work, program: str, seconds: float, error: float | None = None, inverted: int = 0) -> Row:

@@ -50,6 +50,8 @@ TRIED: tuple[Tried, ...] = (
           "the same path; 1.3 times the time in W4, up to 4 times in W1"),
     Tried("Newton", "W2", "semi_implicit: stiffness and damping for steps of 2.5 to 0.3 ms, radius 0.1 to 3 mm, 33 settings",
           "the best are among the rows; stiffer contact than the lightest node bears at a dt diverges"),
+    Tried("Newton", "W3, W4", "vbd, stiffness 1e5 and 1e6, gap 1 mm, 1 to 20 sweeps", "bodies hang in the air: steps are cut"),
+    Tried("Newton", "W4", "vbd, 4 times 5 sweeps in 10 ms, gap 15 mm", "does as with 10 ms, not faster"),
     Tried("Newton", "W2", "vbd, 4 times 5 sweeps in 10 ms, stiffness 1e6", "an error of 9.3 %"),
     Tried("ppf-contact-solver", "all", "pip index versions and pip download of ppf-contact-solver and of ppf-cts",
           "no matching distribution: it is not on PyPI, so it is left out"),

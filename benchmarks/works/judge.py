@@ -15,6 +15,7 @@ from .semi_discrete import inverted
 
 SHALLOW = 0.01  # of an edge: what a body may sink in
 LEAN = 0.1  # of a width: how far a centre may be off the axis
+FREE = 0.2  # of a free fall: how far the way may be off; implicit Euler's steps of 10 ms are 7 %
 LEAST = 0.2  # of a height at rest: how far a centre is above what bears it, at least
 
 
@@ -23,7 +24,8 @@ class Verdict:
     """error: None where no path is known; good_to: of the reference. inverted: the most tets in one sample.
 
     penetration: the deepest in any sample [m], None where nothing can touch; edge: the least of the bodies' mean surface edges
-    [m]. fell: when it no longer stood [s], None where it always did, or need not.
+    [m]. fell: when it no longer stood [s], None where it always did, or need not. free_fall: the way of the last body while
+    nothing has reached it, over that of a free fall, None where that is not judged.
     """
 
     inverted: int
@@ -32,12 +34,14 @@ class Verdict:
     penetration: float | None = None
     edge: float | None = None
     fell: float | None = None
+    free_fall: float | None = None
 
     @property
     def stands(self) -> bool:
-        """Neither fell, nor turned a tet inside out, nor sank in by 1 % of an edge, where anything can."""
+        """Neither fell, nor hung in the air, nor turned a tet inside out, nor sank in by 1 % of an edge, where anything can."""
         shallow = self.penetration is None or self.penetration <= SHALLOW * self.edge
-        return self.fell is None and self.inverted == 0 and shallow
+        free = self.free_fall is None or abs(self.free_fall - 1.0) <= FREE
+        return self.fell is None and self.inverted == 0 and shallow and free
 
 
 def judge(work: Work, model: references.Model, positions: np.ndarray) -> Verdict:
@@ -53,7 +57,16 @@ def judge(work: Work, model: references.Model, positions: np.ndarray) -> Verdict
     if work.kind == "stand":
         fallen = [k for k, x in enumerate(positions) if not _stands(work, x)]
         verdict.fell = fallen[0] * SAMPLE if fallen else None
+    verdict.free_fall = free_fall(work, positions)
     return verdict
+
+
+def free_fall(work: Work, positions: np.ndarray) -> float | None:
+    """How far the last body has come by `free_until`, over g t^2 / 2; None where that is not judged, or not followed so long."""
+    if work.free_until is None or round(work.free_until / SAMPLE) >= len(positions):
+        return None
+    height = positions[:, list(work.slices().values())[-1], 1].mean(axis=1)
+    return float((height[0] - height[round(work.free_until / SAMPLE)]) / (0.5 * work.gravity * work.free_until**2))
 
 
 def _inverted(work: Work, x: np.ndarray) -> int:

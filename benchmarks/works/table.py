@@ -19,7 +19,7 @@ W2_ERROR, W2_SECONDS = 0.005, 0.4
 def run_table(rows: list[Row]) -> str:
     """A row a setting, with the failures below."""
     work = rows[0].work
-    path = ("error", "good to") if work.kind == "path" else ("stands", "fell at [s]")
+    path = ("error", "good to") if work.kind == "path" else ("stands", "fell at [s]", "free fall")
     contact = ("penetration [mm]", "over an edge") if work.touches else ()
     headings = (
         "program", "law", "setting", "dt [ms]", "s/sim. s", "spread", *path, *contact, "inverted tets", "unconverged",
@@ -37,7 +37,8 @@ def _line(row: Row) -> tuple[str, ...]:
     if row.work.kind == "path":
         found: tuple[str, ...] = _percent(verdict.error), _percent(verdict.good_to)
     else:
-        found = ("yes" if row.stood else "no"), "-" if verdict.fell is None else f"{verdict.fell:.2f}"
+        fall = "-" if verdict.free_fall is None else f"{verdict.free_fall:.2f}"
+        found = "yes" if row.stood else "no", "-" if verdict.fell is None else f"{verdict.fell:.2f}", fall
     if row.work.touches:
         found += (f"{1e3 * verdict.penetration:.3g}", _percent(verdict.penetration / verdict.edge))
     return (
