@@ -309,12 +309,15 @@ class ImplicitStepper:
         return result
 
     def _solve_balanced(self, scheme: Scheme, dt: float, bounces: bool) -> StageResult:
-        """The stage; again and more tightly where it left a body's forces unbalanced beside larger ones."""
+        """The stage; again and more tightly where it left a body's forces unbalanced beside larger ones.
+
+        Not of linearly implicit steps, whose residual is that of the linearised stage.
+        """
         result = self._solve(scheme, dt, bounces, self.tolerance)
-        if self._balance is None or not (result.converged and np.isfinite(result.residual)):
+        if self._balance is None or scheme.one_iteration or not (result.converged and np.isfinite(result.residual)):
             return result
         worst, name = self._balance.worst(self.solver, self._beta)
-        if worst > LIMIT and not (bounces or scheme.one_iteration):
+        if worst > LIMIT and not bounces:
             tighter = self.tolerance * LIMIT / min(worst, 1.0) * TIGHTER
             result = count_all(self._solve(scheme, dt, bounces, tighter), [result])
             worst, name = self._balance.worst(self.solver, self._beta)
