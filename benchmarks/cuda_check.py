@@ -120,8 +120,9 @@ def write_page(folder: Path, head: str, numbers: dict, outcomes: list[Outcome], 
 
 def check(parts: list[Part], budget: float, folder: Path, arch: str) -> list[Outcome]:
     """Carry out the parts within `budget` seconds, writing the page after each. Raises OutputError."""
-    text, numbers = header("GPU check", f"arch {arch}", gpu_name(), packages=("taichi", "numpy", "scipy", "meshio"))
-    numbers |= {"arch": arch, "gpu": gpu_name()}
+    gpu = gpu_name()
+    text, numbers = header("GPU check", f"arch {arch}", gpu, packages=("taichi", "numpy", "scipy", "meshio"))
+    numbers |= {"arch": arch, "gpu": gpu}
     end, outcomes = time.monotonic() + budget, []
     for k, part in enumerate(parts):
         later = sum(other.seconds for other in parts[k + 1 :])

@@ -18,12 +18,12 @@ from .contact_crossover import measure_crossover
 from .elasticity_beam import MARGIN, beam_scene
 from .programs import own
 from .programs.session import Setting
+from .scaling import RESULT
 from .scaling_runs import cubes_on_ground
 from .works.judge import judge
 from .works.references import MUJOCO, TAISOFT
 from .works.scenes import WORKS, Work
 
-RESULT = "result: "  # before what a part found, among what else it prints
 EXPLICIT_STEPS = {"W1 12x3x3": 3, "W1 24x6x6": 5, "W1 48x12x12": 11, "W2": 3, "W3": 2, "W4": 19}  # in 10 ms, all of them stable
 TIMED_STEPS, IMPLICIT_STEPS = 200, 3
 SMALL = 4  # cells across the beam whose stable step is scaled to the larger ones
@@ -51,8 +51,8 @@ def works(arch: str, quick: bool) -> Iterator[dict]:
         for method, steps in (("velocity_verlet", EXPLICIT_STEPS[work.key]), ("implicit_euler", 1)):
             for where in dict.fromkeys((arch, "cpu")):
                 setting = Setting(own.NAME, model, method, steps, {"precision": "f32", "arch": where})
-                told = f"{method}, {1e3 * setting.dt:.3g} ms"
-                yield {"work": work.key, "tets": work.tets, "setting": told, "arch": where} | _timed(work, setting)
+                named = {"work": work.key, "tets": work.tets, "setting": f"{method}, {1e3 * setting.dt:.3g} ms", "arch": where}
+                yield named | _timed(work, setting)
 
 
 def _timed(work: Work, setting: Setting) -> dict:

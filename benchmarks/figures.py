@@ -18,10 +18,9 @@ from pathlib import Path
 
 from taisoft.output.files import make_folder
 from taisoft.output.tables import markdown
-from taisoft.timing import load_average, machine
+from taisoft.timing import load_average
 
-from .document import RESULTS, load_text
-from .elasticity_table import slug
+from .document import RESULTS, default_out, load_text
 
 # name -> what of it is written: a page with numbers (json), a picture beside it (png), or a folder of both (folder)
 WRITES = {
@@ -44,9 +43,8 @@ class Ended:
 
 def command(name: str, quick: bool, results: Path) -> list[str]:
     """The command line of a benchmark, its files named after the machine."""
-    where = machine()
-    stem = f"{name}-{slug(where['processor'])}-{where['cores']}-cores"
-    files = [part for kind in WRITES[name] for part in (OPTIONS[kind][0], str(results / (stem + OPTIONS[kind][1])))]
+    outputs = [(option, default_out("cpu", name, suffix)) for option, suffix in (OPTIONS[kind] for kind in WRITES[name])]
+    files = [part for option, path in outputs for part in (option, str(results / path.name))]
     return [sys.executable, "-m", "taisoft", "bench", name, *(["--quick"] if quick and name not in NO_QUICK else []), *files]
 
 

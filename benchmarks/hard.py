@@ -60,8 +60,8 @@ def measured(rows: list[Row], options: argparse.Namespace, document: Document) -
             store = Store(folder)
         signals.run_began()
         measure(rows, options.arch, options.references, store, lambda: end - time.monotonic(), signals.asked, _tell)
-    for told in (*page(rows), *store.damaged):
-        document.add(told)
+    for text in (*page(rows), *store.damaged):
+        document.add(text)
     return numbers | {
         "arch": options.arch, "quick": options.quick, "load_at_the_end": load_average(), "rows": [row.data() for row in rows],
     }  # fmt: skip
@@ -75,8 +75,8 @@ def judged(path: Path, document: Document) -> tuple[list[Row], dict]:
         raise OutputError(f"{path} cannot be read: {error}") from error
     rows = stored(numbers)
     document.add(header_text(TITLE, numbers, f"arch {numbers['arch']}"))
-    for told in page(rows):
-        document.add(told)
+    for text in page(rows):
+        document.add(text)
     return rows, numbers | {"rows": [row.data() for row in rows]}
 
 

@@ -43,3 +43,19 @@ def test_a_light_body_falls_beside_a_heavy_one(scene, monkeypatch):
                 bad = [report for report in reports if not report.converged]
                 assert bad and all(report.residual > implicit.LIMIT for report in bad)
                 assert any("forces on body 'small' are unbalanced" in text for report in bad for text in report.problems)
+
+
+def test_a_checkpoint_holds_what_rounding_is_judged_by(scene, tmp_path):
+    """It tells of the state where numbers last changed, not of that which is loaded."""
+
+    def rounding(sim) -> list[float]:
+        return [sim._stepper.solver.rounding_of_x, *sim._stepper.solver.rounding_by_body]
+
+    with ts.Simulator(scene, dt=DT) as sim:
+        start = rounding(sim)
+        sim.set_state(positions=sim.positions("small") + 100.0, body="small")
+        sim.set_gravity((0, -G, 0))
+        kept = rounding(sim)
+        sim.save_checkpoint(tmp_path / "c.npz")
+    with ts.Simulator.load_checkpoint(tmp_path / "c.npz", scene) as sim:
+        assert rounding(sim) == kept != start

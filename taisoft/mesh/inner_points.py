@@ -1,11 +1,9 @@
 """A point well inside each connected part of a solid, given by elements it follows when the solid deforms or moves."""
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from taisoft.mesh.half_edges import normals_and_heights
-from taisoft.mesh.topology import TET_FACES
+from taisoft.mesh.topology import TET_FACES, connected_pieces
 from taisoft.mesh.triangle_queries import distances, nearest_hit
 
 EQUAL = 1e-9  # by so much smaller an element counts as equally large: of equal ones the first is taken, whatever rounding says
@@ -15,9 +13,7 @@ def parts_of(elements: np.ndarray) -> np.ndarray:
     """(m,) the connected part of each element (m,k), numbered from 0; elements that share a vertex are of one part."""
     used, corner = np.unique(elements, return_inverse=True)
     corner = corner.reshape(elements.shape)
-    ends = np.repeat(corner[:, 0], elements.shape[1] - 1), corner[:, 1:].reshape(-1)
-    graph = coo_matrix((np.ones(len(ends[0]), dtype=np.int8), ends), shape=(len(used), len(used)))
-    return connected_components(graph, directed=False)[1][corner[:, 0]]
+    return connected_pieces(corner, len(used))[1][corner[:, 0]]
 
 
 def inner_tets(vertices: np.ndarray, tets: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from taisoft.errors import MeshError
 from taisoft.mesh.quality import edge_lengths, mean_ratio
-from taisoft.mesh.topology import Faces, count_components, first_repeated_tet, joint_edges, joint_vertices
+from taisoft.mesh.topology import Faces, connected_pieces, first_repeated_tet, joint_edges, joint_vertices
 
 DEGENERATE = 1e-9  # a tet's volume below this times its longest edge cubed counts as none
 NEARLY_FLAT = 0.02  # mean ratio below which a tet is told; grids and common meshers stay above
@@ -54,7 +54,7 @@ class TetMesh:
         rows = faces.surface()
         self.surface = faces.triangles[rows]
         self.surface_tets = rows // 4
-        self.n_components = count_components(self.tets, self.n_verts)
+        self.n_components = int(connected_pieces(self.tets, self.n_verts)[0])
         self._tell_flat()
         self._tell_joints(faces)
         self._tell_coincident()

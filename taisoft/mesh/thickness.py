@@ -16,11 +16,9 @@ from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from taisoft.mesh.tet_mesh import TetMesh
-from taisoft.mesh.topology import TET_FACES, Faces
+from taisoft.mesh.topology import TET_FACES, Faces, connected_pieces
 
 LAYERS, LENGTH = 1.5, 1.4  # of the estimate above
 MOST_RAYS = 20_000  # of a larger surface every second triangle has one, or every third, ...
@@ -109,9 +107,7 @@ def _leaves(corners: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.
 
 def _lengths(mesh: TetMesh) -> np.ndarray:
     """For each surface triangle the length [m] of its piece: of a box with the same largest second moment of volume."""
-    pairs = (np.repeat(mesh.tets[:, 0], 3), mesh.tets[:, 1:].ravel())
-    graph = coo_matrix((np.ones(3 * mesh.n_tets, dtype=np.int8), pairs), shape=(mesh.n_verts, mesh.n_verts))
-    piece = connected_components(graph, directed=False)[1] if mesh.n_components > 1 else np.zeros(mesh.n_verts, dtype=int)
+    piece = connected_pieces(mesh.tets, mesh.n_verts)[1] if mesh.n_components > 1 else np.zeros(mesh.n_verts, dtype=int)
     of_tet, tets = piece[mesh.tets[:, 0]], mesh.tets.T
     volume = np.bincount(of_tet, mesh.volumes)
     # The integral of a function of degree 2 over a tet: 4/5 of its volume times the value in the middle, 1/20 at each corner.

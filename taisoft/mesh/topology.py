@@ -61,11 +61,14 @@ def first_repeated_tet(tets: np.ndarray) -> tuple[int, int] | None:
     return a, b
 
 
-def count_components(tets: np.ndarray, n_verts: int) -> int:
-    """Number of pieces; tets belong to one piece when they share a vertex. Every vertex must belong to a tet."""
-    rows = np.repeat(tets[:, 0], 3)
-    graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, tets[:, 1:].ravel())), shape=(n_verts, n_verts))
-    return int(connected_components(graph, directed=False)[0])
+def connected_pieces(elements: np.ndarray, n_verts: int) -> tuple[int, np.ndarray]:
+    """Number of pieces of elements (m,k), tets or triangles, and the piece of each vertex (n_verts,).
+
+    Elements belong to one piece when they share a vertex; a vertex without an element is a piece of its own.
+    """
+    rows = np.repeat(elements[:, 0], elements.shape[1] - 1)
+    graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, elements[:, 1:].ravel())), shape=(n_verts, n_verts))
+    return connected_components(graph, directed=False)
 
 
 def triangle_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -138,17 +138,19 @@ class StageSolver:
         self.rounding_by_body = np.sqrt(np.bincount(body, squares.sum(axis=1)))
         # and of v = (x - x_hat) / beta: |M| times the rounding of x, to be divided by beta
         self.rounding_of_x = 4.0 * float(np.finfo(np.float64).eps) * largest
-        self.rounding_mass = float(np.linalg.norm(mass) * 4.0 * np.finfo(np.float64).eps * largest)
+        self.rounding_mass = float(np.linalg.norm(mass) * self.rounding_of_x)
 
     def snapshot(self) -> dict:
         """What lives between stages: the rounding, which tells of the state where numbers last changed, and the reactions."""
         return {
-            "rounding_force": self.rounding_force, "rounding_mass": self.rounding_mass, "residual": array_of(self.work.residual),
+            "rounding_force": self.rounding_force, "rounding_mass": self.rounding_mass, "rounding_of_x": self.rounding_of_x,
+            "rounding_by_body": self.rounding_by_body, "residual": array_of(self.work.residual),
         }  # fmt: skip
 
     def restore(self, kept: dict) -> None:
         """Back to what `snapshot` told."""
         self.rounding_force, self.rounding_mass = float(kept["rounding_force"]), float(kept["rounding_mass"])
+        self.rounding_of_x, self.rounding_by_body = float(kept["rounding_of_x"]), np.array(kept["rounding_by_body"])
         upload([(self.work.residual, kept["residual"])])
 
     def held_residual(self) -> np.ndarray:
