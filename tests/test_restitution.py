@@ -36,11 +36,8 @@ def opened(integrator: str = "bdf2", cells: int = 4, precision: str = "f64", law
     scene = ts.Scene(gravity=(0, -G, 0))
     scene.add_body(ts.box_mesh((cells,) * 3, (SIDE,) * 3), rubber(law), name="cube", position=(0, SIDE / 2 + HEIGHT, 0))
     scene.add_body(ts.box_mesh((2,) * 3, (SIDE,) * 3), rubber(law), name="other", position=(50, 0.5 * SIDE, 0))
-    lift = Lift()
-    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground", path=lift)
-    sim = ts.Simulator(scene, dt=dt, integrator=integrator, precision=precision)
-    sim.lift = lift
-    return sim
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground", path=Lift())
+    return ts.Simulator(scene, dt=dt, integrator=integrator, precision=precision)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +55,7 @@ def sim(shared_sim, monkeypatch):
 
 
 def restart(sim) -> None:
-    sim.lift.speed = 0.0
+    sim.scene.obstacle("ground").path.speed = 0.0
     sim.dt = DT
     sim.set_gravity((0, -G, 0))
     for other in ("ground", "other"):
@@ -190,7 +187,7 @@ def test_two_that_meet(sim, restitution):
 def test_a_plane_that_moves(sim):
     sim.set_gravity((0, 0, 0))
     sim.set_contact("cube", "ground", restitution=1.0)
-    sim.lift.speed = 1.0
+    sim.scene.obstacle("ground").path.speed = 1.0
     place(sim, 0.02)
     sim.set_state(positions=sim.positions("other") + (0, 5.0, 0), body="other")
     _, heights = go(sim, 0.1)

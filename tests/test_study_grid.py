@@ -105,7 +105,7 @@ def test_comma_lists(key, text, values):
         ("order", "3", "--order must be 1 or 2, not 3"),
         ("refine", "0.5", "--refine must be 0 or 1"),
         ("precision", "f16", "precision must be one of f32, f64"),
-        ("newton_tolerance", "2", "must be below 1"),
+        ("newton_tolerance", "2", "must be below 0.1"),
     ],
 )
 def test_lists_that_are_refused(key, text, told):
