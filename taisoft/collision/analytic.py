@@ -1,6 +1,7 @@
 """Contacts with analytic obstacles: their exact distance, from the vertices and triangles of the soft bodies.
 
-Every vertex near the obstacle is a contact where its surface sticks out towards it; a triangle adds its deepest point where that
+Every vertex near the obstacle is a contact where its surface sticks out towards it, and every one that is below a half-space or
+comes below it in the step: nothing may be there, be it turned inside out. A triangle adds its deepest point where that
 lies deeper than its corners, as under a ball. A triangle is passed over when phi at its centre, less its radius and its
 way in the step, is above the margin: phi grows by at most 1 per metre.
 """
@@ -127,6 +128,8 @@ def _touch(s: ti.template(), o: ti.template(), t, k, margin, out: ti.template(),
                 good = 0
                 if j < 3:
                     good = sticks_out(s, s.triangle[t, j], n)
+                    if kind == shapes.HALF_SPACE and value + ti.min(move.dot(g), 0.0) < 0.0:
+                        good = 1
                 else:
                     good = deeper_inside(s, t, w, n, x)
                 if good == 1 and j < 3:

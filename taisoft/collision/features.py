@@ -13,6 +13,7 @@ BY_FIELD, BY_FACES, BY_EDGES = 0, 1, 2  # how a collider is hit; a box by its ed
 CORNER_SLACK, EDGE_SLACK = 0.25, 0.05  # sines
 FLAT = 0.99985  # cosine of 1 degree: edges that turn by less are blunt, meet sharp ones only, and sink by < 0.5 % of an edge
 LEVEL = 0.9998  # cosine of 1 degree: edges that are hollow by less count as flat
+ROUNDING = 1e-9  # cosine below which an edge is square to a direction but for rounding: mirrored bodies have many that are
 SMOOTH = 0.5  # cosine of 60 degrees: the same for bodies hit by a distance field, which sees blunt edges itself
 
 
@@ -81,7 +82,8 @@ def nearest_of_ring(s: ti.template(), i, d):
     good = 1
     k = s.around_start[i]
     while good == 1 and k < s.around_start[i + 1]:
-        if (s.x[s.around[k]] - x).dot(d) > 0.0:
+        e = s.x[s.around[k]] - x
+        if e.dot(d) > ti.cast(ROUNDING, ti.f64) * e.norm() * d.norm():
             good = 0
         k += 1
     return good

@@ -11,6 +11,7 @@ import taichi as ti
 
 from taisoft.collision.contacts import VERTEX_FACE, write_contact
 from taisoft.collision.features import (
+    ROUNDING,
     corner,
     edge_normal,
     moved,
@@ -80,7 +81,8 @@ def relate(s: ti.template(), i, u):
             if (s.owns[u] >> (3 + k)) & 1 == 0:
                 state = NONE
             elif v >= 0:
-                if d.dot(s.x[opposite(s, v, s.triangle[u, k], s.triangle[u, (k + 1) % 3])] - s.x[s.triangle[u, k]]) > 0.0:
+                e = s.x[opposite(s, v, s.triangle[u, k], s.triangle[u, (k + 1) % 3])] - s.x[s.triangle[u, k]]
+                if d.dot(e) > ti.cast(ROUNDING, ti.f64) * distance * e.norm():
                     state = NONE
             if distance > ti.cast(TINY, ti.f64) * size:
                 n = d / distance

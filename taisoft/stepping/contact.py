@@ -8,7 +8,7 @@ import numpy as np
 import taichi as ti
 
 from taisoft.collision.contacts import Contacts
-from taisoft.collision.crossings import CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
+from taisoft.collision.crossings import CROSSED, CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.collision.pipeline import Detection
 from taisoft.contact.assemble import (
     OWN,
@@ -24,13 +24,13 @@ from taisoft.contact.problem import NODES, build_node_problem, index_nodes
 from taisoft.contact.restitution import find_rebounds
 from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
-from taisoft.stepping.tunnelling import DEPTH, HASTE, SINKING, SPEED, WHICH, find_way, survey
+from taisoft.stepping.tunnelling import CLOSEST, DEPTH, HASTE, SINKING, SPEED, WHICH, find_way, survey
 from taisoft.stepping.world import World
 from taisoft.transfer import array_of, download, upload
 
 STANDOFF = 2e-3  # of the finest body's mean surface edge: gap that contacts keep, so that surfaces do not cross in curved motion
 SUNK = 0.02  # of the finer side's mean surface edge: penetration that is told as a problem
-CROSSED_FAR = 2e-3  # of the same: depth of crossing triangles after which an implicit step is done again in smaller parts
+CROSSED_FAR = CROSSED  # of the same: depth of crossing triangles after which an implicit step is done again in smaller parts
 SANK = 1e-3  # of the same: penetration after which the way of an implicit part is searched
 FAST = {True: 0.05, False: 0.2}  # share of a penetration that an explicit, an implicit step mends
 SLOW = {True: 0.005, False: 0.02}  # share of a missing standoff
@@ -53,7 +53,7 @@ class ContactStep:
         # what follows a path may be changed from outside between two steps, and its path may end with the last one
         self._follows = world.motion.n_moved > 0 or any(o.path is not None for o in scene.obstacles)
         self._shares = FAST[explicit], SLOW[explicit]
-        self._portion = 1.0  # of a step that its parts are
+        self._portion = 1.0  # of the step that the present part is
         self.goal = self._goal()
         self._arena = FieldArena()
         self._make_room(2 * d.surface.n_triangles + SPARE)
@@ -67,6 +67,7 @@ class ContactStep:
         self._flight_gravity = scene.gravity.copy()
         self._told = np.zeros(5)
         self._searched: tuple[float, float] | None = None  # time and dt of the search that is at hand
+        self._swept = 0.0  # dt of the last search, at hand or not
         self._ended: tuple[float, float] | None = None  # those of the end that was looked at, until the next part begins
         self._depth = 0.0  # the deepest penetration found there [m]
         self.crossing: float | None = None  # how deep triangles cross, over the finer side's edge, where somebody looked
@@ -75,7 +76,7 @@ class ContactStep:
         self._explicit = explicit
         self._last_time = 0.0
         self.penetration = self.sinking = 0.0  # at the end of the last step [m], and over the finer side's mean surface edge
-        self._sum: np.ndarray | None = None  # (n_colliders, 3) impulses over the parts of the last step, if it had several
+        self._sum: np.ndarray | None = None  # (n_colliders, 3) [N s] over the parts of the last step, if it had several
         self._span = 0.0  # of the last step [s]
         self._share = 1.0
         self.met = False  # whether surfaces came together in the last step
@@ -147,9 +148,11 @@ class ContactStep:
         self._searched = self._ended = None
         self._indexed = True  # so that the next step lists its contacts by nodes, however few
 
-    def start_again(self) -> None:
-        """The state of the step's start was set back; the impulses found so far are where the next try begins."""
+    def start_again(self, anew: bool) -> None:
+        """A part's start was set back; the impulses found so far are where the next try begins, unless it is to begin anew."""
         self._searched = self._ended = None
+        if anew:
+            self.problem.count[0], self._last_time = 0, 0.0
 
     def _goal(self) -> tuple[float, float, float, float]:
         """Standoff [m], shares of a penetration and of a missing standoff that a part mends, speed of that at most [m/s]."""
@@ -174,7 +177,7 @@ class ContactStep:
             moved = world.motion.moved
             led = (moved, world.motion.places(time + dt) - array_of(world.model.x)[moved]) if len(moved) else None
             d.find(time, dt, led)
-            self._searched = (time, dt)
+            self._searched, self._swept = (time, dt), dt
         return d.counts.contacts
 
     def begin(self, time: float, dt: float) -> int:
@@ -231,15 +234,18 @@ class ContactStep:
         self.flight[: len(scene.bodies)][constrained] = 0.0
         self.flight[len(scene.bodies) :] = 0.0
 
-    def start_step(self, dt: float, parts: int) -> None:
-        """A step of dt begins that is taken in parts."""
-        self._portion, self._span, self.dropped = 1.0 / parts, dt, 0
-        self._sum = np.zeros((len(self.world.scene.colliders), 3)) if parts > 1 else None
+    def start_step(self, dt: float) -> None:
+        """A step of dt begins."""
+        self._portion, self._span, self.dropped, self._sum = 1.0, dt, 0, None
+
+    def start_part(self, dt: float) -> None:
+        """A part of dt of the step begins, or is begun anew with another length."""
+        self._portion = dt / self._span
 
     def end_part(self) -> None:
         """Count the impulses of a part."""
-        if self._sum is not None:
-            self._sum += self._impulses()
+        if self._portion < 1.0:
+            self._sum = self._impulses() + (0.0 if self._sum is None else self._sum)
 
     def force(self, collider: int) -> np.ndarray:
         """Mean (3,) of the contact forces on a collider over the last step [N]."""
@@ -310,7 +316,7 @@ class ContactStep:
         """Search along the way that was found, from the state at the start; whether that finds contacts not known so far."""
         self._searched = self._ended = None
         self.detection.find(time, dt, way=self._way)
-        self._searched = (time, dt)
+        self._searched, self._swept = (time, dt), dt
         known = set(map(tuple, download([self.found.feature], self.n_contacts)[0].tolist()))
         kept = download([self.detection.kept], self.detection.counts.contacts)[0]
         found = array_of(self.detection.buffer.data.feature)[kept]
@@ -323,6 +329,10 @@ class ContactStep:
         told = self._survey(dt)
         return float(told[SINKING]), float(told[HASTE])
 
+    def ratio_along_way(self) -> float:
+        """How far contacts closed at most along the way that `search_way` searched, over what they may."""
+        return float(self._survey(self._swept)[HASTE])
+
     def crossing_before(self) -> float:
         """How deep triangles cross where a step begins that has been looked at, over the finer side's mean surface edge."""
         if self.crossing is None or self._follows:
@@ -334,17 +344,18 @@ class ContactStep:
         survey(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts, dt, self._told)
         return self._told
 
-    def too_fast(self, time: float, dt: float) -> str:
-        """A sentence that names who closes too fast, how fast, how thick the thinner one is, and a dt that would do."""
-        self.search(time, dt)
-        told, d = self._survey(dt), self.detection
+    def too_fast(self, dt: float, parts: int = 1) -> str:
+        """A sentence that names who closes too fast for a step of dt, as the last search found it, how fast, how thick the
+        thinner one is, and a dt that would do. parts: that a step is cut into at most."""
+        told, d = self._survey(self._swept), self.detection
         a, b = d.buffer.data.body[d.kept[int(told[WHICH])]]
         names = [d.scene.colliders[k].name for k in (a, b)]
-        thin = float(min(d.thickness[a], d.thickness[b]))
+        thin, speed = float(min(d.thickness[a], d.thickness[b])), float(told[SPEED])
+        cut = f"even cut into {parts} parts " if parts > 1 else ""
         return (
-            f"'{names[0]}' and '{names[1]}' close at {told[SPEED]:.3g} m/s, {told[SPEED] * dt:.3g} m in a step of {dt:.3g} s, "
-            f"and the thinner of them is {thin:.3g} m thick, so they could pass each other unseen: take dt <= "
-            f"{dt / told[HASTE]:.3g} s"
+            f"'{names[0]}' and '{names[1]}' close at {speed:.3g} m/s, {speed * dt:.3g} m in a step of {dt:.3g} s, "
+            f"and the thinner of them is {thin:.3g} m thick, so {cut}they could pass each other unseen: take dt <= "
+            f"{parts * CLOSEST * thin / speed:.3g} s"
         )
 
     def contacts(self) -> Contacts:

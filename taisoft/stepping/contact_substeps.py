@@ -77,7 +77,7 @@ class ContactExplicitStepper(ExplicitStepper):
             targets = world.next_targets(start + dt * np.arange(1, n + 1))
             self.stale = self.stale or world.releases != releases
             n = len(targets)
-        self.contact.start_step(dt, 1)
+        self.contact.start_step(dt)
         sinking = 0.0
         try:
             while done < n:
@@ -115,7 +115,7 @@ class ContactExplicitStepper(ExplicitStepper):
         """One sub-step, the step-th, from a time; returns what the contacts' solver did, None where there are none."""
         m, s, contact = self.world.model, self.work, self.contact
         if contact.look(time, dt)[1] > 1.0:
-            raise SimulationError(f"step {step}: {contact.too_fast(time, dt)}")
+            raise SimulationError(f"step {step}: {contact.too_fast(dt)}")
         if s.verlet and self.stale:
             find_acceleration(m, s)
         self.stale = False

@@ -3,7 +3,6 @@
 An integrator is a `Scheme`: how x_hat, v_hat and beta come from the past, and whether the stage is the step's middle.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,20 +11,16 @@ import taichi as ti
 from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
 from taisoft.stepping.body_balance import LIMIT, BodyBalance
-from taisoft.stepping.contact import CROSSED_FAR, SUNK, TOLERANCE, ContactStep
+from taisoft.stepping.contact import TOLERANCE, ContactStep
 from taisoft.stepping.contact_newton import ContactStageSolver
 from taisoft.stepping.newton import StageResult, StageSolver, count_all, merge
+from taisoft.stepping.substepping import RETRIES, Substepping
 from taisoft.stepping.world import World
 from taisoft.transfer import array_of, download, upload
 
 MAX_NEWTON = 50  # a step that needs more is reported as not converged
 MAX_CONTACT_NEWTON = 400  # with contacts, over all multipliers
-MAX_PARTS = 32  # of a step in which bodies close fast
-HASTE = 2.0  # a part may close so many times what a step may: its speed was not known when the step was cut
-SEARCHES = 3  # along the way that a step took, where it left the one that was expected
-MORE_PARTS = 16  # of a step that ended with a new deep penetration, or with triangles that newly cross
 TIGHTER = 0.1  # of the tolerance that would just do where a body's forces did not balance
-RETRIES = 4  # parts at most of a step that did not converge
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
 
@@ -115,6 +110,7 @@ class ImplicitStepper:
         self.parts = 1  # that the last step was taken in
         self._balance = BodyBalance(world.scene, world.layout) if len(world.scene.bodies) > 1 else None
         self.unbalanced: tuple[float, str] = (0.0, "")  # the worst relative residual of a body in the last step beyond LIMIT
+        self._substepping = None if contact is None else Substepping(self)
         self.forget()
 
     def forget(self) -> None:
@@ -151,84 +147,50 @@ class ImplicitStepper:
         """One step of dt; on a non-finite result the state is put back and SimulationError raised.
 
         One that does not converge is done again in smaller parts, and where these do not help in those of before, anew and
-        without the past. With contacts it is cut into parts where bodies close so fast that they could pass each other unseen,
-        and done again in smaller ones where it ended with something newly deep in each other or crossed. Linearly implicit steps
-        have nothing that could converge.
+        without the past. With contacts `Substepping` cuts it further. Linearly implicit steps have nothing that could converge.
         """
         contact, start, parts, kept, given_up = self.contact, self.world.time, 1, None, []
         released = self.world.motion.released()
         if contact is not None:
-            sinking, haste = contact.look(start, dt)
-            parts = max(1, math.ceil(haste - 1e-9))
-            if parts > MAX_PARTS:
-                raise SimulationError(f"step {self.world.step_count + 1}: {contact.too_fast(start, dt)}")
-            crossing = contact.crossing_before()
-            sinking = max(sinking, crossing)
-            # what is deep already needs no shorter steps
-            allowed, allowed_crossing = max(SUNK, 1.1 * sinking), max(CROSSED_FAR, 1.1 * crossing)
             kept, flight = self.world.state(), contact.flight.copy()
-        least = parts  # that it takes even if it converges
         while True:
-            result, depth, deep, lost = None, 0.0, False, True
+            result, lost, taken = None, True, parts
             self.unbalanced = (0.0, "")
             try:
-                if contact is not None:
-                    contact.sinking = sinking
-                result = self._in_parts(start, dt, parts)
+                done = self._in_parts(start, dt, parts)
+                result, taken = merge(done), len(done)
                 lost = not (result.converged or self.scheme.one_iteration)
-                if contact is not None:
-                    depth = contact.end(start + dt, dt)
-                    deep = contact.sinking > allowed or contact.crossing > allowed_crossing
             except BaseException as error:  # of Ctrl-C, too: the step is abandoned
                 self._put_back(kept, released)
                 recovers = self._recovers
                 self.forget()
-                if parts <= least or not isinstance(error, SimulationError):
+                if parts == 1 or not isinstance(error, SimulationError):
                     raise
                 self._recovers = recovers  # it was only a try
             if result is not None:
                 given_up.append(result)
-            if deep and 2 * parts <= MORE_PARTS:
-                least = parts = 2 * parts
-            elif lost and self._recovers and (2 * parts <= RETRIES or parts > least):
-                self._recovers = 2 * parts <= RETRIES
-                parts = 2 * parts if self._recovers else least
-            else:
+            if not (lost and self._recovers and (taken < RETRIES or parts > 1)):
                 break
+            self._recovers = taken < RETRIES
+            parts = min(2 * taken, RETRIES) if self._recovers else 1
             if kept is None:
                 restore(self.world.model, self.history)
                 kept = self.world.state()
             self._put_back(kept, released)
             self._past = 0
-            if contact is not None and (lost or self.scheme.before):  # BDF2 tells impacts by what bore nothing in the last step
-                contact.forget()
-            elif contact is not None:
-                contact.start_again()
             if contact is not None:
+                contact.forget()
                 contact.flight[:] = flight
-        self.parts = parts
+        self.parts = taken
         self._recovers = self._recovers or not lost
-        if contact is not None:
-            contact.penetration = depth
         return count_all(result, given_up[:-1])
 
-    def _in_parts(self, start: float, dt: float, parts: int) -> StageResult:
-        """A step of dt from a time, in equal parts."""
-        part, results = dt / parts, []
-        if self.contact is None:
-            return merge([self._part(start + k * part, part) for k in range(parts)])
-        self.contact.start_step(dt, parts)
-        for k in range(parts):
-            if k:
-                self.contact.end(start + k * part, part)
-                if self.contact.look(start + k * part, part)[1] > HASTE:
-                    raise SimulationError(
-                        f"step {self.world.step_count + 1}: {self.contact.too_fast(start + k * part, part)}"
-                    )
-            results.append(self._part(start + k * part, part))
-            self.contact.end_part()
-            self.contact.count_flight(part, self._lossy)
-        return merge(results)
+    def _in_parts(self, start: float, dt: float, parts: int) -> list[StageResult]:
+        """A step of dt from a time, in equal parts; with contacts in shorter ones where they must be."""
+        if self.contact is not None:
+            return self._substepping.step(start, dt, parts, self._recovers and not self.scheme.one_iteration)
+        part = dt / parts
+        return [self.take(start + k * part, part) for k in range(parts)]
 
     def _put_back(self, state: tuple[np.ndarray, np.ndarray] | None, released: list[bool]) -> None:
         """Back to a state, None where it has been put back, and to what had let go then."""
@@ -241,24 +203,26 @@ class ImplicitStepper:
             if self.contact is not None:
                 self.solver.forget_factors()
 
-    def _part(self, time: float, dt: float) -> StageResult:
-        """A step of dt from a time, in one piece; again, where it led to contacts that had not been found."""
-        contact, before = self.contact, self.contact.sinking if self.contact is not None else 0.0
-        result, m, h = self._try_part(time, dt), self.world.model, self.history
-        for _ in range(SEARCHES):
-            if contact is None or not (contact.went_astray(h.x_now) or contact.sank(time + dt, dt, before)):
-                break
-            state, past = self.world.state(), self._past
-            restore(m, h)
-            if not contact.search_way(time, dt):
-                self.world.set_state(*state)
-                break
-            self._past = 0
-            result = count_all(self._try_part(time, dt), [result])
-            self._past = min(self._past, past)
+    def back(self) -> None:
+        """Back to where the last part began."""
+        restore(self.world.model, self.history)
+
+    def retry(self, time: float, dt: float) -> StageResult:
+        """The part that was just taken back, with other contacts."""
+        past, self._past = self._past, 0
+        result = self.take(time, dt)
+        self._past = min(self._past, past)
         return result
 
-    def _try_part(self, time: float, dt: float) -> StageResult:
+    def undo(self, released: list[bool], anew: bool) -> None:
+        """Back to where the last part began and to what had let go then, for one of another length; anew: without impulses."""
+        self.back()
+        self._put_back(None, released)
+        self._past = 0
+        # BDF2 tells impacts by what bore nothing in the last step
+        self.contact.start_again(anew or self.scheme.before > 0.0)
+
+    def take(self, time: float, dt: float) -> StageResult:
         """A step of dt from a time with the contacts of one search."""
         world, m, h, w = self.world, self.world.model, self.history, self.solver.work
         releases, bounces = world.releases, False
@@ -275,7 +239,7 @@ class ImplicitStepper:
                 self._past = 0
         self._dt = dt
         scheme = self.scheme if self._past > 0 or self.scheme.start is None else self.scheme.start
-        self._lossy = scheme.before == 0.0
+        self.lossy = scheme.before == 0.0
         if target is not None:
             if scheme.midpoint:
                 target = 0.5 * (target + array_of(m.x)[world.motion.moved])

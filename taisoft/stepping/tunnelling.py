@@ -1,4 +1,16 @@
-"""How far contacts close in a step, against how far they may before things could pass each other unseen."""
+"""How far contacts close in a step, against how far they may before things could pass each other unseen.
+
+Two sides that close by no more than half the thinner one's thickness cannot change sides unseen: even if their contact were
+lost, the next search would find them in each other, by less than half of it. Two sides with a larger gap between them may move
+relative to each other, in whatever direction, by that gap: they can touch nothing before it is used up, since theirs is the
+least distance near there (conservative advancement: Mirtich 1996). A contact's ratio is the smaller of
+    closing / (thickness / 2)   and   |relative motion| / max(gap, thickness / 2),
+and a step in which no contact's ratio exceeds 1 is short enough. Weak where a surface stands out behind what is nearest now: it
+is a contact of its own only if its distance has a local minimum there.
+"""
+
+import math
+from collections.abc import Callable
 
 import taichi as ti
 
@@ -8,6 +20,8 @@ from taisoft.runtime import kernel
 
 CLOSEST = 0.5  # of the thinner side's thickness: how far a contact may close in one step
 DEPTH, HASTE, SPEED, WHICH, SINKING = range(5)  # places in what `survey` tells
+GROWTH = 2.0  # a part is at most so many times as long as the one before: after an impact what it set off is followed
+ROUNDING = 1e-9  # of a number of parts
 
 
 @kernel
@@ -15,8 +29,8 @@ def survey(
     s: ti.template(), o: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32, dt: ti.f64,
     told: ti.types.ndarray(),
 ):  # fmt: skip
-    """told (5,): deepest penetration [m]; the most that a contact closes in the coming step, over what it may; the speed of
-    that [m/s]; its number among the kept; the deepest penetration over the finer side's mean surface edge."""
+    """told (5,): deepest penetration [m]; the largest ratio of a contact in the coming step (see above); the speed at which that
+    one closes [m/s]; its number among the kept; the deepest penetration over the finer side's mean surface edge."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         depth, haste, speed, which = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), -1
@@ -37,8 +51,10 @@ def survey(
                     way -= found.weights_b[at][j] * s.move[found.nodes_b[at][j]]
             closing = -way.dot(found.normal[at])
             allowed = CLOSEST * ti.min(s.thickness[a], s.thickness[b])
-            if s.thickness[b] < ti.math.inf and closing > haste * allowed:
-                haste, speed, which = closing / allowed, closing / dt, c
+            if s.thickness[b] < ti.math.inf and closing > 0.0:
+                ratio = ti.min(closing / allowed, way.norm() / ti.max(found.gap[at], allowed))
+                if ratio > haste:
+                    haste, speed, which = ratio, closing / dt, c
         told[0], told[1], told[2], told[3], told[4] = depth, haste, speed, which, sinking
 
 
@@ -60,3 +76,23 @@ def find_way(m: ti.template(), s: ti.template(), x_start: ti.template(), way: ti
                     share = ti.min(ti.max(d.dot(known) / square, 0.0), 1.0)
                 most = ti.max(most, (d - share * known).norm())
     return most
+
+
+def next_length(ratio: Callable[[float], float], left: float, length: float, longest: float, may_grow: bool) -> float:
+    """How long [s] the next part of a step is: what is left of it, cut equally, so that no contact's ratio exceeds 1.
+
+    ratio: of a part of so many seconds from here; length: of the part before; longest: no part is longer; may_grow: whether the
+    part may be longer than the one before.
+    """
+    length = left / _count(left / length)
+    found = ratio(length)
+    if may_grow and GROWTH * found <= 1.0 and length < min(left, longest) * (1.0 - ROUNDING):
+        # as the search found it: of a longer part it may find more
+        length = left / _count(left / min(GROWTH * length, longest))
+        found = ratio(length)
+    return left / _count(left / length * max(found, 1.0))
+
+
+def _count(parts: float) -> int:
+    """So many equal parts, or a few more to make it a whole number."""
+    return max(1, math.ceil(parts * (1.0 - ROUNDING)))

@@ -1,0 +1,131 @@
+"""A step with contacts in substeps, each so short that nothing passes unseen: what cuts a step, and where cutting ends.
+
+Before a substep: while contacts close fast it is as short as `tunnelling` asks. After it: it is undone and cut in half where it
+led to motion much faster than was known when it was cut, to contacts that no search along its way settled, to something newly
+deep or crossed, or, if it was short, where it did not converge. So a short event, an impact or a snap, takes short substeps
+while it lasts and no longer.
+
+No substep is shorter than the step over MAX_PARTS. What closes too fast even for that is refused; what ends deep, unsettled or
+not converged all the same, or after UNDONE others were undone, is kept and reported.
+"""
+
+from enum import Enum, auto
+from typing import TYPE_CHECKING
+
+from taisoft.errors import SimulationError
+from taisoft.stepping.contact import CROSSED_FAR, SUNK
+from taisoft.stepping.newton import StageResult, count_all
+from taisoft.stepping.tunnelling import next_length
+
+if TYPE_CHECKING:
+    from taisoft.stepping.implicit import ImplicitStepper
+
+MAX_PARTS = 256  # of a step
+HASTE = 2.0  # a substep may close so many times what was allowed: its speed was not known when the step was cut
+SEARCHES = 3  # along the way that a substep took, where it left the one that was expected
+UNDONE = 16  # substeps of a step that are undone for other reasons than speed: each costs a few solves
+WORSE = 1.1  # what is deep already needs no shorter substeps before it is so many times as deep
+RETRIES = 4  # equal parts at most of a step that is done again since it did not converge; only shorter substeps are cut for that
+LOSSES = 2  # times in a row that one is cut for that: where it does not help, more does not either
+
+
+class Fault(Enum):
+    """Why a substep is undone."""
+
+    FAST = auto()  # things could have passed each other
+    UNSETTLED = auto()  # each way that it was tried along had contacts that were not known
+    DEEP = auto()  # it ended in something newly deep, or crossed
+    LOST = auto()  # it did not converge
+
+
+class Substepping:
+    """Takes the steps of an implicit stepper with contacts in substeps."""
+
+    def __init__(self, stepper: "ImplicitStepper"):
+        self._stepper, self._contact = stepper, stepper.contact
+        self._deepest = self._most_crossed = 0.0  # over the finer side's mean surface edge: no deeper counts as newly deep
+
+    def step(self, start: float, dt: float, parts: int, recovers: bool) -> list[StageResult]:
+        """A step of dt from a time, in equal parts or in more and shorter ones; `contact.end` has looked at its end.
+
+        recovers: whether short substeps that did not converge are cut. Raises SimulationError where things close too fast.
+        """
+        contact, stepper = self._contact, self._stepper
+        shortest, longest = (1.0 - 1e-6) * dt / MAX_PARTS, dt / parts
+        results, left, length, spare = [], dt, longest, UNDONE
+        undone, losses = [], 0  # of the substep that is tried
+        self._begin(start, dt)
+        while True:
+            time = start + (dt - left)
+            length = next_length(
+                lambda part, time=time: contact.look(time, part)[1], left, length, longest, bool(results) and not undone
+            )  # fmt: skip
+            if length < shortest:
+                self._refuse(dt)
+            contact.start_part(length)
+            sinking, released, last = contact.sinking, stepper.world.motion.released(), length > left - shortest
+            may_cut = spare > 0 and length >= 2.0 * shortest
+            result, fault = self._take(time, length)
+            if fault == Fault.FAST and length < 2.0 * shortest:
+                self._refuse(dt)
+            if fault != Fault.FAST and not (fault and may_cut):
+                contact.penetration = contact.end(time + length, dt if last else length)
+                fault = self._judge(result, recovers and length < min(longest, dt / RETRIES) and losses < LOSSES)
+            if fault == Fault.FAST or (fault and may_cut):
+                spare, losses = spare - (fault != Fault.FAST), losses + (fault == Fault.LOST)
+                undone.append(result)
+                stepper.undo(released, anew=fault == Fault.LOST)
+                contact.sinking, length = sinking, 0.5 * length
+                continue
+            # what is deep now is deep already for the next
+            self._allow(contact.sinking, contact.crossing)
+            contact.end_part()
+            contact.count_flight(length, stepper.lossy)
+            results.append(count_all(result, undone))
+            if last:
+                return results
+            left, undone, losses = left - length, [], 0
+
+    def _begin(self, start: float, dt: float) -> None:
+        """Look at the start of a step; what is deep there already needs no shorter substeps."""
+        contact = self._contact
+        sinking, _ = contact.look(start, dt)
+        crossing = contact.crossing_before()
+        contact.sinking = max(sinking, crossing)
+        self._deepest, self._most_crossed = SUNK, CROSSED_FAR
+        self._allow(contact.sinking, crossing)
+        contact.start_step(dt)
+
+    def _allow(self, sinking: float, crossing: float) -> None:
+        """No deeper than that, or not much, counts as newly deep or crossed."""
+        self._deepest = max(self._deepest, WORSE * sinking)
+        self._most_crossed = max(self._most_crossed, WORSE * crossing)
+
+    def _judge(self, result: StageResult, may_be_lost: bool) -> Fault | None:
+        """What is wrong with a substep whose end has been looked at."""
+        contact = self._contact
+        if contact.sinking > self._deepest or contact.crossing > self._most_crossed:
+            return Fault.DEEP
+        return Fault.LOST if may_be_lost and not result.converged else None
+
+    def _refuse(self, dt: float) -> None:
+        number = self._stepper.world.step_count + 1
+        raise SimulationError(f"step {number}: {self._contact.too_fast(dt, MAX_PARTS)}")
+
+    def _take(self, time: float, dt: float) -> tuple[StageResult, Fault | None]:
+        """A substep of dt from a time; again, where it led to contacts that had not been found. Leaves its end as the state."""
+        contact, stepper, before = self._contact, self._stepper, self._contact.sinking
+        world, result = stepper.world, stepper.take(time, dt)
+        for tries in range(SEARCHES + 1):
+            if not (contact.went_astray(stepper.history.x_now) or contact.sank(time + dt, dt, before)):
+                break
+            state = world.state()
+            stepper.back()
+            new = contact.search_way(time, dt)
+            if not new or tries == SEARCHES:
+                world.set_state(*state)
+                if contact.ratio_along_way() > HASTE:
+                    return result, Fault.FAST
+                return result, Fault.UNSETTLED if new else None
+            result = count_all(stepper.retry(time, dt), [result])
+        return result, None
