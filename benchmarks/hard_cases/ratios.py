@@ -113,9 +113,9 @@ R1 = Case(
             of=A,
         ),
         Shortfall(
-            "a step is cut into parts by the speed that it begins with; the crushed cube reaches more than twice that within the "
-            "step, so that bodies could pass each other unseen, and the run is stopped",
-            "do such a step again in the parts that its highest speed asks for",
+            "the impact that crushes the soft cube is cut into many short substeps, each with its own Newton iterations, as it "
+            "must be; a step at rest is one",
+            "fewer Newton iterations for a substep with contacts",
             of=B,
         ),
     ),
