@@ -83,7 +83,7 @@ def test_only_what_is_near_is_cut(sim):
         pytest.skip("explicit steps have no parts")
     shoot(sim, 20.0)
     parts = [sim.step().parts for _ in range(2)]
-    assert 2 < max(parts) < 20 < 0.5 * 20.0 * sim.dt / THICK
+    assert 2 < max(parts) < 20 < 20.0 * sim.dt / (0.5 * THICK)
     shoot(sim, 20.0)
     sim.set_state(positions=sim.positions("shot") + (0, 1.0, 0), body="shot")
     assert sim.step().parts == 1
@@ -136,18 +136,18 @@ def test_a_plane_is_thick_enough(sim):
 
 def test_every_vertex_that_comes_below_a_plane_has_a_contact(sim):
     """The upper corners of a cube are pressed down through the lower ones, and below the plane."""
-    x = sim.positions("faller") - (0, 2.96, 0)
+    x = sim.positions("faller") - (0, 2.97, 0)
     top = x[:, 1] > x[:, 1].mean()
     v = np.where(top[:, None], [0.0, -0.1 / sim.dt, 0.0], 0.0)
     sim.set_state(x, 0.01 * v, body="faller")
     assert (sim.detect_contacts().body_b == "plane").sum() == 4  # on their way they do not come so far
     sim.set_state(x, v, body="faller")
     c = sim.detect_contacts()
-    assert (c.body_b == "plane").sum() == 8 and c.gap.max() == pytest.approx(0.065)
+    assert (c.body_b == "plane").sum() == 8 and c.gap.max() == pytest.approx(0.055)
     x[top, 1] -= 0.1
     sim.set_state(x, 0.0 * v, body="faller")
     c = sim.detect_contacts()
-    assert c.gap.min() == pytest.approx(-0.035) and (c.gap < 0).sum() == 4
+    assert c.gap.min() == pytest.approx(-0.045) and (c.gap < 0).sum() == 4
 
 
 def test_a_vertex_over_the_rim_of_its_mirror_image_has_a_contact(sim):
