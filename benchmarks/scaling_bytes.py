@@ -98,8 +98,7 @@ def measure_copy(arch: str, n_bytes: int = COPY_BYTES) -> list[Copy]:
     """The best of several copies by NumPy and by a kernel, on one thread and on all; on CUDA by a kernel alone."""
     runtime, arena = open_runtime(arch, "f32", "the benchmark of scaling"), FieldArena()
     try:
-        with arena.group():
-            source, target = (arena.vectors(name, ti.f32, n_bytes // (4 * WIDTH), n=WIDTH) for name in ("source", "target"))
+        source, target = (arena.vectors(name, ti.f32, n_bytes // (4 * WIDTH), n=WIDTH) for name in ("source", "target"))
         if arch == "cuda":
             return [Copy("Taichi", threads(), _best(n_bytes, lambda: copy_field(source, target, 0)))]
         a, b, n = np.zeros(n_bytes // 4, np.float32), np.ones(n_bytes // 4, np.float32), threads()

@@ -79,7 +79,8 @@ def elastic_forces(m: ti.template()):
     """Fill the corner buffer from x; returns nothing, nodes gather."""
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for b in range(g.first, g.last):
+        for number in range(g.first, g.last):
+            b = number & g.mask
             element_force(m, g, False, b)
 
 
@@ -88,7 +89,8 @@ def force_differential(m: ti.template(), dx: ti.template(), df: ti.template()):
     """df = (df/dx)(x) dx, matrix-free: (n_nodes) 3-vectors [m] to [N]."""
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for b in range(g.first, g.last):
+        for number in range(g.first, g.last):
+            b = number & g.mask
             X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
             dX = differences(m, g, dx, b, m.real)
             M = rest_gradients(m, b, m.real)
@@ -174,7 +176,7 @@ def measure(m: ti.template()):
         size = (m.n_blocks + m.chunks - 1) // m.chunks
         for g in ti.static(m.groups):
             for k in range(ti.max(g.first, c * size), ti.min(g.last, (c + 1) * size)):
-                b = k & m.block_mask  # changes nothing: see `Model.block_mask`
+                b = k & g.mask
                 psi, J, soft = element_state(m, g, b)
                 energy += psi
                 lowest = ti.min(lowest, J)
@@ -209,7 +211,8 @@ def cauchy_stress(m: ti.template(), sigma: ti.types.ndarray()):
     """Mean of sigma = P F^T / J over the deformed tet, (n_blocks * lanes, 9) [Pa]; not finite where a tet is flat."""
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for b in range(g.first, g.last):
+        for number in range(g.first, g.last):
+            b = number & g.mask
             X = differences(m, g, m.x, b, ti.f64)
             M = rest_gradients(m, b, ti.f64)
             p = law_constants(m, b, ti.f64)

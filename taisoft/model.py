@@ -1,9 +1,9 @@
 """Model: the arrays of a scene. One structure of arrays over all bodies, elements in blocks of SIMD lanes.
 
-Topology, rest shape and law are constant (a kernel is compiled for them); gravity, material numbers, loads and
-constraint masks are run-time data. Nodes keep the order of the bodies and of their meshes. Tets are grouped by order,
-quadrature and law (a kernel runs one group's blocks in one loop), and a body's last block is padded with copies of its
-last tet of volume 0.
+Laws, orders, flags and precision are structure, which kernels are compiled for; topology, rest shape and sizes are constant but
+run-time data, as are gravity, material numbers, loads and constraint masks. Nodes keep the order of the bodies and of their
+meshes. Tets are grouped by order, quadrature and law (a kernel runs one group's blocks in one loop), and a body's last block is
+padded with copies of its last tet of volume 0.
 """
 
 from dataclasses import dataclass, replace
@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from taisoft.arrays import Count
 from taisoft.elements import reference
+from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
 from taisoft.mass import MassMatrix, lumped_masses, upload_mass_matrix, weight_masses
 from taisoft.materials import LAWS
@@ -29,35 +31,42 @@ CHUNKS = {"cpu": 1024, "cuda": 4096}
 # |Dm| |Dm^-1| from which F is formed in f64: in f32 its rounding, that times 6e-8, would be a strain above 6e-6. Regular tets
 # have 3, those of a sheet whose cells are 30 times as wide as thick about 60
 ILL_CONDITIONED = 100.0
+BLOCK_MASKS = {1: 2**23 - 1, 2: 2**20 - 1}  # by order: `build_model` refuses more blocks
 MATRIX_BLOCKS = {1: 6, 2: 45 + 6}  # 3x3 blocks per tet in the buffer of an assembly: node pairs, and what they come from
 
 
 @dataclass(frozen=True)
 class Group:
-    """Blocks of one kind of element and law, and where their parts of the flat arrays begin; all known to the compiler."""
+    """Blocks of one kind of element and law, and where their parts of the flat arrays begin."""
 
     law: Any  # module of taisoft.materials
     order: int
     n_nodes: int  # of an element
     n_points: int
-    first: int  # block
-    last: int  # one past its last block
-    nodes_at: int  # in Model.nodes
-    corner_at: int  # in Model.corner
-    matrix_at: int  # in the buffer of an assembly
-    points_at: int  # row of Model.points
+    first: Count  # block
+    last: Count  # one past its last block
+    nodes_at: Count  # in Model.nodes
+    corner_at: Count  # in Model.corner
+    matrix_at: Count  # in the buffer of an assembly
+    points_at: Count  # row of Model.points
+
+    @property
+    def mask(self) -> int:
+        """Bits of a block's number. The compiler handles the lanes of a block side by side only where it can tell that no index
+        into element data overflows, which `b & g.mask` shows: for any b that there is, it is b."""
+        return BLOCK_MASKS[self.order]
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Fields and compile-time constants that kernels take as one template argument."""
+    """Arrays, their sizes (`Count`) and structure, which kernels take as one template argument."""
 
     real: Any  # Taichi type of everything but positions
     strain_real: Any  # Taichi type in which the deformation gradient is formed
     lanes: int
     serial: bool  # loops run on one thread
-    n_nodes: int
-    n_blocks: int
+    n_nodes: Count
+    n_blocks: Count
     groups: tuple  # of Group
     x: Any  # (n_nodes) 3-vectors f64: positions [m]
     v: Any  # (n_nodes) 3-vectors: velocities [m/s]
@@ -68,7 +77,9 @@ class Model:
     volume: Any  # (n_blocks, lanes) [m^3]
     block_body: Any  # (n_blocks) i32
     law_constants: Any  # (n_bodies, 4)
-    corner: Any  # forces of each tet on its nodes [N], per block (node, axis, lane)
+    corner: Any  # forces of each tet on its nodes [N], per block (node, axis, lane): a `Lanes` buffer,
+    corner_at: Count  # where it begins,
+    corner_mask: int  # and the bits of an index into it
     gather_start: Any  # (n_nodes + 1) i32: rows of gather_entry
     gather_entry: Any  # i32: base index into corner of each node of each tet
     mass: Any  # (n_nodes) lumped mass [kg]
@@ -86,12 +97,6 @@ class Model:
     scalars: Any  # (16) f64: what a kernel tells the host
     partial: Any  # (chunks, 8) f64: partial sums, added in a fixed order
     chunks: int
-
-    @property
-    def block_mask(self) -> int:
-        """Bits of a block's number. In loops whose bounds it does not know the compiler handles the lanes of a block side by side
-        only where it can tell that no index into element data overflows, which `b & block_mask` shows."""
-        return 2 ** self.n_blocks.bit_length() - 1
 
 
 @dataclass(frozen=True)
@@ -234,6 +239,9 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     lanes, real, npr = runtime.lanes, runtime.real, runtime.np_real
     layout, groups = _layout(scene, lanes)
     n_nodes, n_blocks = len(layout.rest), groups[-1].last
+    for g in groups:
+        if g.last > g.mask:
+            raise SimulationError(f"{n_blocks * lanes} tets are too many: at most {g.mask * lanes} of order {g.order} fit")
     nodes, Dm_inv, volume = _packed_tets(scene, layout, groups, lanes)
     start, entry = _gather_table(nodes, groups, volume > 0, n_nodes, lanes)
     block_body = np.zeros(n_blocks, dtype=np.int32)
@@ -251,36 +259,36 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     rules = tuple(reference.quadrature(d) for d in sorted({b.quadrature_degree for b in scene.bodies if b.order == 2}))
     table = _rule_table(rules) if rules else None
     rest_lanes = lane_layout(Dm_inv.reshape(-1, 9), lanes).astype(npr if strain_real == real else np.float64)
-    with arena.group():
-        mass = arena.field("mass", real, n_nodes, lumped_masses(scene).astype(npr))
-        model = Model(
-            real=real, strain_real=strain_real, lanes=lanes, serial=serial, n_nodes=n_nodes, n_blocks=n_blocks, groups=groups,
-            x=arena.vectors("x", ti.f64, n_nodes, layout.rest),
-            v=arena.vectors("v", real, n_nodes, velocity.astype(npr)),
-            nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
-            rules=rules, points=arena.field("points", ti.f64, (len(table), 28), table) if rules else None,
-            Dm_inv=arena.field("Dm_inv", strain_real, (n_blocks, 9, lanes), rest_lanes),
-            volume=arena.field("volume", real, (n_blocks, lanes), volume.reshape(n_blocks, lanes).astype(npr)),
-            block_body=arena.field("block_body", ti.i32, n_blocks, block_body),
-            law_constants=arena.field(
-                "law_constants", ti.f64, (n_bodies, 4), material_table([b.material for b in scene.bodies])
-            ),
-            corner=arena.field("corner", real, 3 * len(flat_nodes)),
-            gather_start=arena.field("gather_start", ti.i32, n_nodes + 1, start),
-            gather_entry=arena.field("gather_entry", ti.i32, len(entry), entry),
-            mass=mass,
-            weight=arena.field("weight", real, n_nodes, weight_masses(scene).astype(npr)) if on["consistent_weight"] else mass,
-            mass_matrix=None,
-            free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
-            gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),
-            loads=arena.vectors("loads", real, n_nodes, body_loads(scene).astype(npr)) if on["loads"] else None,
-            node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
-            damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
-            consistent=on["consistent_mass"], loaded=on["loads"], damped=damped, stiffness_damping=on["stiffness_damping"],
-            scalars=arena.field("scalars", ti.f64, 16),
-            partial=arena.field("partial", ti.f64, (chunks, 8)),
-            chunks=chunks,
-        )  # fmt: skip
+    mass = arena.field("mass", real, n_nodes, lumped_masses(scene).astype(npr))
+    corner = arena.lanes("corner", real, 3 * len(flat_nodes))
+    model = Model(
+        real=real, strain_real=strain_real, lanes=lanes, serial=serial, n_nodes=n_nodes, n_blocks=n_blocks, groups=groups,
+        x=arena.vectors("x", ti.f64, n_nodes, layout.rest),
+        v=arena.vectors("v", real, n_nodes, velocity.astype(npr)),
+        nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
+        rules=rules, points=arena.field("points", ti.f64, (len(table), 28), table) if rules else None,
+        Dm_inv=arena.field("Dm_inv", strain_real, (n_blocks, 9, lanes), rest_lanes),
+        volume=arena.field("volume", real, (n_blocks, lanes), volume.reshape(n_blocks, lanes).astype(npr)),
+        block_body=arena.field("block_body", ti.i32, n_blocks, block_body),
+        law_constants=arena.field(
+            "law_constants", ti.f64, (n_bodies, 4), material_table([b.material for b in scene.bodies])
+        ),
+        corner=corner.memory, corner_at=corner.at, corner_mask=corner.mask,
+        gather_start=arena.field("gather_start", ti.i32, n_nodes + 1, start),
+        gather_entry=arena.field("gather_entry", ti.i32, len(entry), entry),
+        mass=mass,
+        weight=arena.field("weight", real, n_nodes, weight_masses(scene).astype(npr)) if on["consistent_weight"] else mass,
+        mass_matrix=None,
+        free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
+        gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),
+        loads=arena.vectors("loads", real, n_nodes, body_loads(scene).astype(npr)) if on["loads"] else None,
+        node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
+        damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
+        consistent=on["consistent_mass"], loaded=on["loads"], damped=damped, stiffness_damping=on["stiffness_damping"],
+        scalars=arena.field("scalars", ti.f64, 16),
+        partial=arena.field("partial", ti.f64, (chunks, 8)),
+        chunks=chunks,
+    )  # fmt: skip
     if on["consistent_mass"]:
         model = replace(model, mass_matrix=_build_mass_matrix(scene, model, arena, npr))
     return model, layout

@@ -63,8 +63,8 @@ def run(
         _interrupt(report)
     report.steps = sim.step_count - start_count
     report.sim_seconds = sim.time - start_time
-    report.compile_seconds = sim.compile_seconds - compiled
-    report.wall_seconds = time.perf_counter() - clock - report.compile_seconds
+    report.wall_seconds = time.perf_counter() - clock - (sim.compile_seconds - compiled)
+    report.compile_seconds = sim._take_compile_seconds()
     _judge(report)
     end = seconds if resumed else start_time + seconds
     if report.status != "failed" and not report.interrupted and abs(sim.time - end) > (1.0 + ROUNDING) * max(sim.dt, report.dt):

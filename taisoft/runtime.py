@@ -9,18 +9,20 @@ import contextlib
 import functools
 import io
 import os
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 
 import numpy as np
 import taichi as ti
-from taichi.lang import impl, kernel_impl
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+from taichi.lang import impl
 
+from taisoft import tracing  # noqa: F401  before anything is decorated
 from taisoft.errors import SimulationError
 from taisoft.files import cache_folders
-from taisoft.launching import Launch, places_of, prepare
+from taisoft.lane_pool import LanePool
+from taisoft.launching import Kernels
 from taisoft.memory import address_space, told
 from taisoft.timing import usable_cores
 
@@ -32,9 +34,10 @@ launches: Counter[str] = Counter()  # kernel name -> launches so far in this pro
 _open: list["Runtime"] = []  # simulators that hold the runtime now
 _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
 _program = None  # Taichi's own state, of that initialisation
-_clock = {"compile": 0.0}
-_known: list[dict] = []  # launches of each kernel
-trees = {"open": 0}  # of field memory, see `taisoft.fields`
+_clock = {"compile": 0.0, "kernels": 0}
+_known: list[Kernels] = []
+_pool: LanePool | None = None
+_is_cold = False  # no kernel was in the cache on disk when Taichi started
 
 
 class Runtime:
@@ -116,12 +119,14 @@ def _cache_folder() -> str:
 
 
 def _initialise(arch: str, precision: str) -> None:
-    global _program
+    global _program, _pool, _is_cold
+    clock = time.perf_counter()
     try:
         os.getcwd()
     except FileNotFoundError:
         raise SimulationError("the working folder no longer exists: change to one that does") from None
     folder = _cache_folder()
+    _is_cold = not any(name.endswith(".tic") for name in os.listdir(folder))
     room = address_space()
     if arch == "cpu" and room is not None and room < POOL:
         raise SimulationError(f"not enough memory to start Taichi: {told(POOL)} are needed at once, available: {told(room)}")
@@ -135,26 +140,18 @@ def _initialise(arch: str, precision: str) -> None:
     except RuntimeError as error:
         raise SimulationError(f"Taichi does not start: {(str(error).splitlines() or ['no reason given'])[0]}") from None
     _program = impl.get_runtime().prog
-    trees["open"] = 0
     for known in _known:  # they hold the Taichi that was
-        known.clear()
+        known.forget()
+    _pool = LanePool(PRECISIONS[precision]) if arch == "cpu" else None
+    _clock["compile"] += time.perf_counter() - clock
     obtained = "cuda" if ti.cfg.arch == ti.cuda else "cpu"
     if obtained != arch:
         raise SimulationError(f"arch '{arch}' is not to be had on this machine (Taichi fell back to '{obtained}')")
 
 
-def _position(context: ASTTransformerContext, node) -> str:
-    """File, line and function of a syntax node, for Taichi's messages."""
-    return f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}:\n'
-
-
-# Taichi formats an excerpt of the source for every syntax node it visits, which takes three quarters of the time between
-# a kernel's first call and its compilation; without the excerpt its messages still name file, line and function. This
-# rests on 1.7.4, the version that taisoft asks for; a test holds what the messages say.
-ASTTransformerContext.get_pos_info = _position
-# It also reads a function's source anew at each of its calls in a kernel, which takes longer than building the call.
-kernel_impl.getsourcefile = functools.cache(kernel_impl.getsourcefile)
-kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
+def lane_pool() -> LanePool | None:
+    """Of the Taichi that is up now; None on CUDA, where threads take the part of lanes."""
+    return _pool
 
 
 def threads() -> int:
@@ -176,33 +173,38 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
     """
     if function is None:
         return functools.partial(kernel, cse=cse)
-    compiled = ti.kernel(function)
-    n_arguments, templates, arrays = places_of(compiled)
-    known: dict[tuple, Launch | None] = {}  # by what the compiled code depends on; None: Taichi launches it
-    _known.append(known)
+    kernels = Kernels(function)
+    _known.append(kernels)
 
     @functools.wraps(function)
     def launch(*arguments):
         check_program(_program)
         launches[function.__name__] += 1
-        if len(arguments) != n_arguments or (arrays and not all(arguments[k].flags.c_contiguous for k in arrays)):
-            return compiled(*arguments)  # which says what is wrong with them
-        key = tuple([_trait(arguments[k]) for k in templates] + [(arguments[k].dtype, arguments[k].ndim) for k in arrays])
-        if key in known:
-            ready = known[key]
-            if ready is None:
-                with _eliminating(cse):
-                    return compiled(*arguments)
-            return ready(arguments)
-        start = time.perf_counter()
+        ready = kernels.find(arguments)
+        if ready is not None:
+            return ready[0].launch(ready[1], arguments)
+        start, before = time.perf_counter(), kernels.n_compiled
+        if _is_cold:
+            _tell_of_compiling()
         with _eliminating(cse):
-            result = compiled(*arguments)
+            compiled, context, _ = kernels.prepare(arguments)
+            result = compiled.launch(context, arguments)  # which loads the code where it is new
+        if kernels.n_compiled > before:
             ti.sync()
-            known[key] = prepare(compiled, arguments)
-        _clock["compile"] += time.perf_counter() - start
+            _clock["compile"] += time.perf_counter() - start
+            _clock["kernels"] += kernels.n_compiled - before
         return result
 
     return launch
+
+
+def _tell_of_compiling() -> None:
+    """Say once that kernels are compiled, and on a terminal how many have been."""
+    count, text = _clock["kernels"], "taisoft: compiling kernels (first run on this machine, about 20 s)"
+    if sys.stderr.isatty():
+        print(f"\r{text}: {count + 1}", end="", file=sys.stderr, flush=True)
+    elif count == 0:
+        print(text, file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
@@ -220,13 +222,11 @@ def _eliminating(cse: bool) -> Iterator[None]:
         config.opt_level = level
 
 
-def _trait(template):
-    """What code depends on in a template: a number's value (Taichi takes True for 1), of anything else which one it is."""
-    if isinstance(template, tuple):
-        return tuple([_trait(one) for one in template])
-    return template if isinstance(template, (int, float, str)) else (None, id(template))
+def n_compiled() -> int:
+    """How many kernels have been compiled so far in this process, each structure counted."""
+    return _clock["kernels"]
 
 
 def compile_clock() -> float:
-    """Seconds spent so far in first launches (tracing, compiling, and that first run)."""
+    """Seconds spent so far on starting Taichi and in first launches (tracing, compiling, and that first run)."""
     return _clock["compile"]

@@ -69,8 +69,8 @@ class Simulator(Resuming):
         for text in scale_warnings(scene):
             warnings.warn(text, UserWarning, stacklevel=2)
         self.plan = plan_of(scene, integrator, self_collision, pullable)
+        self._compiled_before = self._compiled_told = runtime.compile_clock()
         self._runtime = runtime.open_runtime(arch, precision, f"the simulator of {[b.name for b in scene.bodies]}")
-        self._compiled_before = runtime.compile_clock()
         self._arena = FieldArena()
         try:
             model, layout = build_model(scene, self._runtime, self._arena, self.plan.on)
@@ -167,6 +167,7 @@ class Simulator(Resuming):
 
     def _failure(self, error: SimulationError) -> SimulationError:
         """The error of a step with the step's number; where the state that it began with was spoilt, with the place."""
+        self._runtime.check()  # says so itself
         where, step = self._world.find_unfinite(), f"step {self.step_count + 1}: "
         if where is not None:
             return SimulationError(f"{step}{where} at its start")
@@ -233,8 +234,8 @@ class Simulator(Resuming):
         """Go on from the present state with other settings, arguments of this class; arch and precision cannot change.
 
         Positions, velocities, time, count of steps, let-go nodes and changed numbers stay as they are. What the integrator knew
-        of earlier steps is forgotten, as by `set_state`, and a pull ends. Memory is held twice meanwhile, and the next step
-        compiles anew. Raises SimulationError where the settings cannot be met; this simulator is then as it was.
+        of earlier steps is forgotten, as by `set_state`, and a pull ends. Memory is held twice meanwhile.
+        Raises SimulationError where the settings cannot be met; this simulator is then as it was.
         """
         kept, start = self._open_world().snapshot(), self.scene.snapshot()
         start.allow_initial_overlap = True  # where bodies start is not where they are
@@ -244,7 +245,7 @@ class Simulator(Resuming):
         new._world.restore(kept)
         new._stepper.forget()
         new._time_base = self.time, self.step_count
-        new._compiled_before = self._compiled_before
+        new._compiled_before, new._compiled_told = self._compiled_before, self._compiled_told
         self._release()
         _, give_back, owned, _ = new._release.detach()
         self.__dict__.update(new.__dict__)
@@ -272,8 +273,14 @@ class Simulator(Resuming):
 
     @property
     def compile_seconds(self) -> float:
-        """Seconds spent compiling kernels since this simulator was made."""
+        """Seconds spent starting Taichi and compiling kernels for this simulator, its construction included."""
         return runtime.compile_clock() - self._compiled_before
+
+    def _take_compile_seconds(self) -> float:
+        """Those that no run has reported yet."""
+        now = runtime.compile_clock()
+        told, self._compiled_told = now - self._compiled_told, now
+        return told
 
     @property
     def field_bytes(self) -> dict[str, int]:

@@ -352,7 +352,7 @@ def build():
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells how much is in use")
-@pytest.mark.parametrize("more, needed", [(3 * 10**8, "start Taichi: 1073741824 bytes"), (4 * 10**9, "the field '")])
+@pytest.mark.parametrize("more, needed", [(3 * 10**8, "start Taichi: 1073741824 bytes"), (4 * 10**9, "the array '")])
 def test_too_little_memory(tmp_path, more, needed):
     done = python(SHORT_OF_MEMORY, more, write(tmp_path / "scene.py", HUNGRY), tmp_path / "out")
     assert done.returncode == 2, done.stdout + done.stderr
@@ -366,7 +366,7 @@ def test_too_little_memory(tmp_path, more, needed):
 def test_too_little_memory_for_the_fields(monkeypatch):
     monkeypatch.setattr(fields, "SMALL", 0)
     monkeypatch.setattr(fields, "available_memory", lambda: 17)
-    with pytest.raises(ts.SimulationError, match=r"not enough memory for the field '\w+' and \d+ made with it: .*: 17 bytes"):
+    with pytest.raises(ts.SimulationError, match=r"not enough memory for the array '\w+': .*: 17 bytes"):
         ts.Simulator(small_scene(), 0.01, "symplectic_euler")
     monkeypatch.undo()
     with ts.Simulator(small_scene(), 0.01, "symplectic_euler") as sim:  # nothing is left behind

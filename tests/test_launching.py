@@ -1,11 +1,16 @@
-"""Launches of kernels that have run before, which go round most of Taichi's launch:
+"""Kernels over records of arrays:
 
-* they do what Taichi's do, with other numbers, arrays and returned values;
-* what the code depends on brings other code: templates by value or by which they are, types and dimensions of arrays;
-* what Taichi refuses is refused; after Taichi was initialised anew nothing old is launched.
+* one compiled kernel serves every record of one structure, whatever its sizes; what the code depends on brings other code: types,
+  extents but the first, flags, which optional arrays there are, numbers that are not counts, modules;
+* a kernel sees records as they are: nested, in tuples, with properties and methods, in arrays of several dimensions;
+* what is left of a record is nothing: neither it nor its arrays outlive it;
+* Taichi's own way of launching gives the same; what it refuses is refused; after a new ti.init nothing old is launched.
 """
 
-from types import SimpleNamespace
+import gc
+import weakref
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,106 +18,190 @@ import taichi as ti
 from lanes import opened
 
 from taisoft import launching, runtime
+from taisoft.arrays import Count
 from taisoft.fields import FieldArena
+from taisoft.materials import corotational, stable_neo_hookean
 from taisoft.runtime import kernel
 
 
-@pytest.fixture
-def machine():
-    with opened("f32") as made:
+@pytest.fixture(params=[False, True], ids=["quick", "public"])
+def machine(request, monkeypatch):
+    monkeypatch.setattr(launching, "PUBLIC", request.param)
+    runtime._kind = None  # what was compiled the other way goes
+    with opened("f64") as made:
         yield made
+    runtime._kind = None
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part of a record."""
+
+    first: Count
+    weight: Any  # f64
+    power: int  # known to the compiler
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What kernels take."""
+
+    n: Count
+    x: Any  # 3-vectors
+    table: Any  # (n, 2, 3)
+    extra: Any  # f64, or None
+    parts: tuple
+    flag: bool
+    unused: Any = None
+
+    @property
+    def has_extra(self) -> bool:
+        """Whether there is more."""
+        return self.extra is not None
+
+    @ti.func
+    def length(self, i):
+        """Of an entry."""
+        return self.x[i].norm()
+
+
+def make(arena: FieldArena, n: int, flag: bool = True, extra: bool = False, power: int = 2, unused: Any = None) -> Record:
+    tag = len(arena.bytes)
+    x, table = np.arange(3.0 * n).reshape(n, 3), np.arange(6.0 * n).reshape(n, 2, 3)
+    parts = tuple(
+        Part(k, arena.field(f"weight {k} {tag}", ti.f64, n, np.full(n, k + 1.0)), power) for k in range(2)
+    )
+    more = arena.field(f"extra {tag}", ti.f64, n, np.full(n, 0.5)) if extra else None
+    x, table = arena.vectors(f"x {tag}", ti.f64, n, x), arena.field(f"table {tag}", ti.f64, (n, 2, 3), table)
+    return Record(n, x, table, more, parts, flag, unused)
+
+
+@ti.func
+def weighted(p: ti.template(), i):
+    """Of a part."""
+    return p.weight[i] ** p.power + p.first
 
 
 @kernel
-def combine(x: ti.template(), n: ti.template(), a: ti.f64, k: ti.i32, out: ti.types.ndarray()) -> ti.types.vector(2, ti.f64):
-    for i in range(out.shape[0]):
-        out[i] = a * x[i] + k + n
-    return ti.Vector([a, 2.0 * k])
+def evaluate(r: ti.template(), scale: ti.f64, out: ti.types.ndarray()) -> ti.f64:
+    last = ti.cast(0.0, ti.f64)
+    ti.loop_config(serialize=True)
+    for i in range(r.n):
+        value = r.length(i) + r.table[i, 1, 2]
+        for p in ti.static(r.parts):
+            value += weighted(p, i)
+        if ti.static(r.flag):
+            value *= scale
+        if ti.static(r.has_extra):
+            value += r.extra[i]
+        r.x[i][2] += 1.0
+        out[i] = value
+        last = value
+    return last
 
 
-def count_slow(monkeypatch) -> SimpleNamespace:
-    """Counts the launches that Taichi makes."""
-    seen, before = SimpleNamespace(n=0), launching.prepare
-
-    def prepare(*arguments):
-        seen.n += 1
-        return before(*arguments)
-
-    monkeypatch.setattr(runtime, "prepare", prepare)
-    return seen
+def wanted(r: Record, scale: float) -> np.ndarray:
+    x, table = r.x.to_numpy(), r.table.to_numpy()
+    value = np.linalg.norm(x, axis=1) + table[:, 1, 2]
+    value += sum(p.weight.to_numpy() ** p.power + p.first for p in r.parts)
+    return (scale if r.flag else 1.0) * value + (0.0 if r.extra is None else 0.5)
 
 
-def test_other_numbers_and_arrays(machine, monkeypatch):
-    arena = FieldArena()
-    x = arena.field("x", ti.f64, 5, np.arange(5.0))
-    slow = count_slow(monkeypatch)
-    for a, k, dtype in ((1.0, 2, "f8"), (np.float32(0.5), np.int64(-7), "f8"), (3, 1, "f8"), (2.5, 0, "f4")):
-        out = np.zeros(4, dtype=dtype)
-        returned = combine(x, 10, a, k, out)
-        assert np.array_equal(out, a * np.arange(4) + k + 10) and list(returned) == [a, 2 * k]
-    assert slow.n == 2  # of either type of array
-    before = runtime.launches["combine"]
-    combine(x, 10, 1.0, 0, out)
-    assert slow.n == 2 and runtime.launches["combine"] == before + 1
+def check(r: Record, scale: float = 3.0) -> None:
+    out, right, x = np.zeros(r.n), wanted(r, scale), r.x.to_numpy()
+    last = evaluate(r, scale, out)
+    assert out == pytest.approx(right, rel=1e-14) and last == out[-1]
+    assert np.array_equal(r.x.to_numpy(), x + (0.0, 0.0, 1.0))
+
+
+def test_sizes_and_records_share_code(machine):
+    arena, before = FieldArena(), runtime.n_compiled()
+    for n in (3, 1, 50):
+        record = make(arena, n)
+        check(record)
+        check(record, 0.5)
+    assert runtime.n_compiled() == before + 1
+    check(make(arena, 4, unused=("nobody", "names this")))
+    assert runtime.n_compiled() == before + 1
     arena.release()
 
 
-def test_other_templates(machine):
-    arena = FieldArena()
-    fields = [arena.field(f"x{k}", ti.f64, 3, np.full(3, float(k))) for k in range(3)]
-    for _ in range(2):
-        for k, field in enumerate(fields):
+def test_structure_brings_other_code(machine):
+    arena, before = FieldArena(), runtime.n_compiled()
+    for k, changes in enumerate(({}, {"flag": False}, {"extra": True}, {"power": 3}, {"extra": True, "power": 3})):
+        check(make(arena, 5, **changes))
+        assert runtime.n_compiled() == before + k + 1
+    arena.release()
+
+
+@kernel
+def combine(x: ti.template(), law: ti.template(), n: ti.template(), a: ti.f64, k: ti.i32, out: ti.types.ndarray()):
+    for i in range(out.shape[0]):
+        out[i] = a * x[i] + k + n + ti.static(law.SOFTENS_BELOW)
+
+
+def test_arrays_modules_and_constants(machine):
+    arena, before = FieldArena(), runtime.n_compiled()
+    arrays = [arena.field(f"x{k}", ti.f64, 3 + k, np.arange(3.0 + k)) for k in range(2)]
+    single = arena.field("y", ti.f32, 4, np.arange(4.0))
+    for x in (*arrays, single):
+        for law in (corotational, stable_neo_hookean):
             for n in (1, 2, 1.5):
                 out = np.zeros(3)
-                combine(field, n, 1.0, 0, out)
-                assert np.array_equal(out, np.full(3, k + float(n)))
+                combine(x, law, n, 2.0, np.int64(-7), out)
+                assert out.tolist() == [2.0 * k - 7 + n + law.SOFTENS_BELOW for k in range(3)]
+    assert runtime.n_compiled() == before + 2 * 2 * 3
+    combine(single, corotational, 1, 1.0, 0, np.zeros(2, dtype=np.float32))  # another type of array
+    assert runtime.n_compiled() == before + 13
     arena.release()
 
 
-def test_what_taichi_refuses(machine):
+def test_what_is_refused(machine):
     arena = FieldArena()
     x, out = arena.field("x", ti.f64, 5), np.zeros(4)
     for _ in range(2):
-        combine(x, 0, 1.0, 1, out)
+        combine(x, corotational, 0, 1.0, 1, out)
     with pytest.raises(TypeError):
-        combine(x, 0, 1.0, 1.5, out)
+        combine(x, corotational, 0, 1.0, 1.5, out)
     with pytest.raises(TypeError):
-        combine(x, 0, "3.5", 1, out)
+        combine(x, corotational, 0, "3.5", 1, out)
     with pytest.raises(ValueError, match="contiguous"):
-        combine(x, 0, 1.0, 1, np.zeros(8)[::2])
-    for wrong in ((x, 0, 1.0, 1), (x, 0, 1.0, 1, out, out)):
-        with pytest.raises(Exception, match="argument|missing"):
+        combine(x, corotational, 0, 1.0, 1, np.zeros(8)[::2])
+    for wrong in ((x, corotational, 0, 1.0, 1), (x, corotational, 0, 1.0, 1, out, out)):
+        with pytest.raises(TypeError, match="takes 6 arguments, not"):
             combine(*wrong)
     arena.release()
 
 
-def test_a_new_taichi_has_nothing_old(monkeypatch):
-    slow = count_slow(monkeypatch)
-    for n in (1, 2):
+def test_nothing_of_a_record_is_kept(machine):
+    arena = FieldArena()
+    record = make(arena, 4)
+    check(record)
+    gone = [weakref.ref(one) for one in (record, record.x, record.parts[0].weight)]
+    ready = sum(len(known._ready) for known in runtime._known)
+    arena.release()
+    del record
+    gc.collect()
+    assert not any(ref() for ref in gone)
+    if not launching.PUBLIC:
+        assert sum(len(known._ready) for known in runtime._known) < ready
+
+
+def test_a_new_taichi_has_nothing_old():
+    for _ in range(2):
         with opened("f64"):
-            arena = FieldArena()
-            x, out = arena.field("x", ti.f64, 2), np.zeros(2)
-            x.fill(1.0)
+            arena, before = FieldArena(), runtime.n_compiled()
             for _ in range(3):
-                combine(x, 0, 2.0, 0, out)
-            assert np.array_equal(out, [2.0, 2.0]) and slow.n == n
+                check(make(arena, 4))
+            assert runtime.n_compiled() == before + 1
             arena.release()
         runtime._kind = None  # the next one initialises
-        assert any(known for known in runtime._known)
-    with opened("f64"):
-        assert not any(known for known in runtime._known)
 
 
-def test_fields_of_others_may_go(machine):
-    """Taichi then forgets its compiled kernels."""
-    arena, other, out = FieldArena(), FieldArena(), np.zeros(2)
-    x = arena.field("x", ti.f64, 2, np.array([3.0, 4.0]))
-    y = other.field("y", ti.f64, 2)
-    for n in range(6):
-        if n == 3:
-            other.release()
-        combine(x, 0, 1.0, n, out)
-        assert np.array_equal(out, [3.0 + n, 4.0 + n])
-        if n < 3:
-            combine(y, 0, 1.0, n, out)
-    arena.release()
+def test_masks_do_not_change_indices(machine):
+    """The largest index that 31 bits can count is not changed, and the next array size is refused."""
+    from taisoft.arrays import index_mask
+
+    for n, extents in ((0, ()), (2, ()), (3, ()), (12, ()), (0, (9, 4)), (3, (3,))):
+        numbers, mask = max(n, 1) * int(np.prod(extents, initial=1)), index_mask(n, extents)
+        assert (mask + 1) & mask == 0 and (mask + 1) * numbers <= 2**31 < 2 * (mask + 1) * numbers * 2

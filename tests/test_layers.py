@@ -21,6 +21,7 @@ FILES = sorted(path for path in PACKAGE.rglob("*.py"))
 ORDER = (
     ("errors", "records", "files", "memory", "timing"),
     ("attributes",),
+    ("tracing", "arrays", "lane_pool"),
     ("launching",),
     ("runtime",),
     ("transfer",),
@@ -41,6 +42,7 @@ ORDER = (
     ("__main__",),
 )
 LEVEL = {name: level for level, group in enumerate(ORDER) for name in group}
+OWN_TEXT = {("launching.py", "compile"), ("launching.py", "exec")}  # it makes kernels from their own source
 FOREIGN = {("mesh", "scene"), ("collision", "contact"), ("contact", "collision")}  # (importer, imported) of one group
 
 WITHOUT_TAICHI = {"errors", "records", "files", "memory", "timing", "attributes", "mesh", "scene"}
@@ -121,7 +123,7 @@ def test_nothing_runs_text_or_starts_a_shell(path):
     modules = {name.split(".")[0] for name in imports(path)}
     assert not modules & FORBIDDEN_MODULES
     for name, line, node in calls(path):
-        assert name not in FORBIDDEN_CALLS, f"line {line} calls {name}"
+        assert name not in FORBIDDEN_CALLS or (path.name, name) in OWN_TEXT, f"line {line} calls {name}"
         for keyword in node.keywords:
             is_false = isinstance(keyword.value, ast.Constant) and keyword.value.value is False
             assert keyword.arg not in ("shell", "allow_pickle") or is_false, f"line {line}: {keyword.arg} is not False"

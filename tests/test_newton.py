@@ -111,7 +111,7 @@ def test_wild_states(sim, kind, monkeypatch):
 def test_statics_end_at_the_rounding_of_the_forces(sim):
     """A tolerance that no arithmetic can meet: not converged, and the reason is told."""
     solver, model = sim._stepper.solver, sim._world.model
-    solver.work.x_hat.copy_from(model.x)
+    solver.work.x_hat.from_numpy(model.x.to_numpy())
     model.v.fill(0.0)
     result = solver.solve(0.0, 1.0, 1e-18, 100, by_energy=True)
     assert not result.converged and result.at_rounding and 1e-18 < result.residual < 1e-11

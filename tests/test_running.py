@@ -28,6 +28,9 @@ class StandIn:
         self.dt, self.step_count, self.time, self.compile_seconds = dt, 0, 0.0, 0.0
         self.events, self.largest_batch = events or {}, largest_batch
 
+    def _take_compile_seconds(self) -> float:
+        return self.compile_seconds
+
     def advance(self, n: int) -> StepReport:
         n = min(n, self.largest_batch) if self.settings.explicit else 1
         report = StepReport(time=0.0, steps=0)

@@ -72,6 +72,10 @@ def _parser() -> argparse.ArgumentParser:
     doctor_parser = commands.add_parser("doctor", help="what this machine offers, and how to get what is missing")
     doctor_parser.set_defaults(command="doctor")
 
+    warm = commands.add_parser("warm", help="compile the kernels of common scenes ahead")
+    warm.add_argument("--precision", choices=("f32", "f64"), default="f32", help="of the scenes (default f32)")
+    warm.set_defaults(command="warm")
+
     bench_parser = commands.add_parser("bench", help="run a benchmark; without a name, list them", add_help=False)
     bench_parser.add_argument("name", metavar="NAME", nargs="?", help="the benchmark's name")
     bench_parser.add_argument("rest", nargs=argparse.REMAINDER, help="arguments of the benchmark itself")

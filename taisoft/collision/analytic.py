@@ -11,6 +11,7 @@ from typing import Any
 
 import taichi as ti
 
+from taisoft.arrays import Count
 from taisoft.collision import shapes
 from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import FACE_FIELD, VERTEX_FIELD, write_contact
@@ -27,7 +28,7 @@ DEEPER = 1e-5  # of a triangle's size: by so much its deepest point must lie bel
 class AnalyticObstacles:
     """Where the analytic obstacles are: world = rotation @ local + origin."""
 
-    count: int
+    count: Count
     body: Any  # (count) i32: collider
     kind: Any  # (count) i32
     size: Any  # (count) 3-vectors f64
@@ -35,6 +36,11 @@ class AnalyticObstacles:
     rotation: Any  # (3 count) 3-vectors f64 by rows: now
     next_origin: Any  # at the end of the step
     next_rotation: Any
+
+    @property
+    def any(self) -> bool:
+        """Whether there are some."""
+        return self.body is not None
 
     @ti.func
     def sample(self, k, p):

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from taisoft.arrays import Count
 from taisoft.collision.candidates import Buffer, Candidates, PairRows, pairs, sum_parts
 from taisoft.collision.surface import Surface, Topology, dvec, may_touch
 from taisoft.collision.trees import TreeTables, build_trees
@@ -42,9 +43,9 @@ class Trees:
 
     slabs: int  # k / 2
     directions: tuple[tuple[int, int, int], ...]
-    n_chunks: int
-    n_top: int
-    levels: int  # entries of a stack
+    n_chunks: Count
+    n_top: Count
+    levels: Count  # entries of a stack
     parts: int
     link: Any  # i32
     root: Any  # i32

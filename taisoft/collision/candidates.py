@@ -40,9 +40,8 @@ class Buffer:
 
     def __init__(self, name: str, make: Callable, capacity: int, most: int | None, chunks: int, arena: FieldArena):
         self.name, self._make, self.most, self.chunks = name, make, most, chunks
-        with arena.group():
-            self.count = arena.field(f"{name}_count", ti.i32, 2)
-            self.used = arena.field(f"{name}_used", ti.i32, chunks)
+        self.count = arena.field(f"{name}_count", ti.i32, 2)
+        self.used = arena.field(f"{name}_used", ti.i32, chunks)
         self.growths = 0
         self._arena: FieldArena | None = None
         self._allocate(capacity)
@@ -52,8 +51,7 @@ class Buffer:
         if self.most is not None:
             part = max(min(part, self.most // self.chunks), 1)
         arena = FieldArena()
-        with arena.group():
-            data = self._make(arena, part * self.chunks)  # may fail for want of memory: what was there then stays
+        data = self._make(arena, part * self.chunks)  # may fail for want of memory: what was there then stays
         if self._arena is not None:
             self._arena.release()
         self._arena, self.data, self.part = arena, data, part
@@ -203,8 +201,7 @@ class PairRows:
     def __init__(self, surface: Surface, arena: FieldArena, capacity: int, most: int | None):
         n = max(surface.n_triangles, 1)
         self.surface = surface
-        with arena.group():
-            self.start, self.end = arena.field("pair_rows_start", ti.i32, n), arena.field("pair_rows_end", ti.i32, n)
+        self.start, self.end = arena.field("pair_rows_start", ti.i32, n), arena.field("pair_rows_end", ti.i32, n)
         self.rows = Buffer("candidate_rows", entries, capacity, most, 1, arena)
 
     def from_pairs(self, found: Buffer) -> Candidates:

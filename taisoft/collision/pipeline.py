@@ -100,18 +100,17 @@ class Detection:
         self._analytic = [(len(bodies) + k, o) for k, o in enumerate(obstacles) if not isinstance(o.shape, MeshObstacle)]
         ways = [BY_FACES if b.hit_by == "proximity" else BY_FIELD for b in bodies]
         ways += [BY_FACES if isinstance(o.shape, MeshObstacle) else BY_EDGES for o in obstacles]
-        with arena.group():
-            self.surface: Surface = build_surface(
-                self.topology, self._rest, soft, soft & self_collision, self.thickness, self.edges, runtime, arena, serial
-            )
-            s = self.surface
-            self.broad = self._make_broad(runtime) if self._rows else None
-            self._way = arena.field("contact_way", ti.i32, len(ways), np.array(ways, dtype=np.int32))
-            self._sharp = arena.field("surface_sharp", ti.i32, max(s.n_triangles, 1))
-            self._unmapped = arena.field("unmapped", ti.i32, 1)
-            self._crossed = arena.vectors("crossed", ti.f64, s.chunks)
-            self._fields = self._make_fields(grids, runtime) if any(grids) else None
-            self.shapes = self._make_shapes() if self._analytic else NO_SHAPES
+        self.surface: Surface = build_surface(
+            self.topology, self._rest, soft, soft & self_collision, self.thickness, self.edges, runtime, arena, serial
+        )
+        s = self.surface
+        self.broad = self._make_broad(runtime) if self._rows else None
+        self._way = arena.field("contact_way", ti.i32, len(ways), np.array(ways, dtype=np.int32))
+        self._sharp = arena.field("surface_sharp", ti.i32, max(s.n_triangles, 1))
+        self._unmapped = arena.field("unmapped", ti.i32, 1)
+        self._crossed = arena.vectors("crossed", ti.f64, s.chunks)
+        self._fields = self._make_fields(grids, runtime) if any(grids) else None
+        self.shapes = self._make_shapes() if self._analytic else NO_SHAPES
         self._led = None  # how far vertices are led, where they ever are
         row = min(int(np.diff(self.topology.first).max(initial=1)), LONGEST_ROW) * s.chunks
         limits = (settings.initial_capacity or row, settings.max_capacity)
@@ -228,8 +227,7 @@ class Detection:
         b = self.buffer
         if self._reduction is None or self._reduction.place.shape[0] != b.capacity:
             arena = FieldArena()
-            with arena.group():
-                self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.light, self.surface.light_spread)
+            self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.light, self.surface.light_spread)
             self._reduction_arena.release()
             self._reduction_arena = arena
         reduce_contacts(self._reduction, b.data, b.used, b.part, MERGED * self.edge, REDUCTION_CELL * self.edge)

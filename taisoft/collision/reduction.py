@@ -12,6 +12,7 @@ from typing import Any
 
 import taichi as ti
 
+from taisoft.arrays import Count
 from taisoft.collision.contacts import ContactFields
 from taisoft.collision.surface import ivec
 from taisoft.fields import FieldArena
@@ -26,7 +27,7 @@ FOUND, LEFT, UNDECIDED, MASK = 0, 1, 2, 3  # places in the count; MASK: buckets 
 class ReductionFields:
     """Work space. The first count[LEFT] of `kept` are the contacts' places in the buffer, in its order."""
 
-    buckets: int  # a power of two; as many are used as there are contacts
+    buckets: Count  # a power of two; as many are used as there are contacts
     chunks: int
     serial: bool
     spread: int  # as of the surface

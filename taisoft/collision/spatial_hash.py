@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from taisoft.arrays import Count
 from taisoft.collision.candidates import Buffer, Candidates, entries, sort_row, sum_parts
 from taisoft.collision.surface import ACTIVE, Surface, boxes_overlap, ivec, may_touch, part_first
 from taisoft.fields import FieldArena
@@ -224,8 +225,10 @@ def find_rows(
 class Grid:
     """Fields of the grid."""
 
-    size: tuple[int, int, int]  # cells along each axis
-    n_cells: int
+    nx: Count  # cells along each axis
+    ny: Count
+    nz: Count
+    n_cells: Count
     cell_start: Any  # (n_cells) i32: members of each cell
     cell_end: Any
     scan: Any  # (SCAN) i32: sums of the parts of the scan
@@ -236,6 +239,11 @@ class Grid:
     start: Any  # (n_triangles) i32: rows
     end: Any
 
+    @property
+    def size(self) -> tuple[int, int, int]:
+        """Cells along each axis."""
+        return self.nx, self.ny, self.nz
+
 
 def _make_grid(size: tuple[int, int, int], n: int, arena: FieldArena) -> Grid:
     """Allocate the grid for n triangles."""
@@ -245,7 +253,7 @@ def _make_grid(size: tuple[int, int, int], n: int, arena: FieldArena) -> Grid:
         return arena.field(f"hash_{name}", ti.i32, count)
 
     return Grid(
-        size, cells, ints("cell_start", cells), ints("cell_end", cells), ints("scan", SCAN),
+        *size, cells, ints("cell_start", cells), ints("cell_end", cells), ints("scan", SCAN),
         arena.vectors("hash_first_cell", ti.i32, n), arena.vectors("hash_cell_count", ti.i32, n), ints("large", n),
         ints("count", 2), ints("start", n), ints("end", n),
     )  # fmt: skip

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from taisoft.arrays import Count
 from taisoft.fields import FieldArena
 from taisoft.runtime import Runtime
 
@@ -53,9 +54,9 @@ class Topology:
 class Surface:
     """Fields of the triangles, for kernels; `Topology` says what the tables hold."""
 
-    n_triangles: int
-    n_verts: int
-    n_bodies: int  # colliders, with those that have no faces
+    n_triangles: Count
+    n_verts: Count
+    n_bodies: Count  # colliders, with those that have no faces
     serial: bool  # whether one thread does it all
     light: bool  # whether one thread does the loops that do little at a turn
     chunks: int

@@ -3,11 +3,9 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from taichi.lang import impl
 
 from taisoft.contact import augmented_lagrangian, host
 from taisoft.contact.colouring import store
@@ -23,8 +21,6 @@ from taisoft.transfer import array_of
 METHODS = (*SOLVERS, "augmented_lagrangian", "auto")
 SWEEPS = 100  # of Gauss-Seidel, before "auto" goes on with an augmented Lagrangian
 BELOW = 0.999  # of the tolerance, which the kernels are asked for: their sums round otherwise than NumPy's
-# Kernels are compiled for the fields they are given: one problem serves all calls that fit in. Fields end with the runtime.
-_held: list[tuple[Any, ContactProblem]] = []
 
 
 @dataclass(frozen=True)
@@ -131,29 +127,9 @@ def _problem(W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray) -> 
     runtime = open_runtime(arch, precision, "solve_contact_problem")
     try:
         W = W.tobsr((3, 3))
-        p = _room(len(mu), len(W.indices), arch == "cpu")
+        p = build_matrix_problem(FieldArena(), len(mu), len(W.indices), arch == "cpu")
         fill_field(p.r, r)
         fill_matrix_problem(p, W, b, mu)
         yield p
     finally:
         runtime.close()
-
-
-def _room(n: int, n_blocks: int, serial: bool) -> ContactProblem:
-    """A problem that has room for n contacts and so many blocks."""
-    program = impl.get_runtime().prog
-    if _held and _held[0][0] is not program:
-        _held.clear()
-    if _held:
-        p = _held[0][1]
-        if p.serial == serial and n <= p.capacity and n_blocks <= p.column.shape[0]:
-            return p
-        n, n_blocks = max(n, p.capacity), max(n_blocks, p.column.shape[0])
-    p = build_matrix_problem(FieldArena(), _power(n, 64), _power(n_blocks, 1024), serial)
-    _held[:] = [(program, p)]
-    return p
-
-
-def _power(n: int, least: int) -> int:
-    """The least power of two that is not below n."""
-    return max(least, 1 << (n - 1).bit_length())

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from taisoft.arrays import Count
 from taisoft.contact.problem import ContactProblem, to_frame, to_world
 from taisoft.contact.prox import dvec, prox, tangents
 from taisoft.fields import FieldArena
@@ -31,7 +32,7 @@ class FoundContacts:
     """What a step keeps of each contact besides the problem itself; rows as in the problem."""
 
     problem: ContactProblem
-    n_slots: int  # of the table, a power of two
+    n_slots: Count  # of the table, a power of two
     point: Any  # 3-vectors f64 [m]
     gap: Any  # f64 [m]
     carry: Any  # 3-vectors f64: way of an obstacle at the contact in the step [m]
@@ -83,12 +84,11 @@ def build_pair_numbers(arena: FieldArena, scene: Scene) -> PairNumbers:
     """The scene's numbers, with room for pairs that are set later."""
     n = len(scene.colliders)
     capacity = 2 * len(scene.contact_pairs) + 64
-    with arena.group():
-        numbers = PairNumbers(
-            arena.field("collider_friction", ti.f64, n), arena.field("collider_restitution", ti.f64, n),
-            arena.field("n_contact_pairs", ti.i32, 1), arena.vectors("contact_pair", ti.i32, capacity, n=2),
-            arena.field("pair_friction", ti.f64, capacity), arena.field("pair_restitution", ti.f64, capacity),
-        )  # fmt: skip
+    numbers = PairNumbers(
+        arena.field("collider_friction", ti.f64, n), arena.field("collider_restitution", ti.f64, n),
+        arena.field("n_contact_pairs", ti.i32, 1), arena.vectors("contact_pair", ti.i32, capacity, n=2),
+        arena.field("pair_friction", ti.f64, capacity), arena.field("pair_restitution", ti.f64, capacity),
+    )  # fmt: skip
     upload_pair_numbers(numbers, scene)
     return numbers
 
@@ -231,7 +231,7 @@ def fill(
         for j in ti.static(range(3)):
             k = _take(f, s, c, k, found.nodes_b[at][j], found.weights_b[at][j], -1.0)
         p.arity[c] = k
-        if ti.static(o.count > 0):
+        if ti.static(o.any):
             if found.nodes_b[at][0] < 0:
                 f.carry[c] = carried(o, b, point - 0.5 * gap * normal)
         p.order[c] = c

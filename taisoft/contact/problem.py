@@ -17,6 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
+from taisoft.arrays import Count
 from taisoft.contact.prox import dvec, prox, scaled
 from taisoft.fields import FieldArena
 from taisoft.runtime import kernel
@@ -32,10 +33,10 @@ PARTS = 256  # of a sum over the contacts, so that it does not depend on threads
 class ContactProblem:
     """Fields of up to `capacity` contacts; the first count[0] hold. What a form does not need is None."""
 
-    capacity: int
+    capacity: Count
     serial: bool  # loops run on one thread
     matrix: bool  # the form of W
-    n_nodes: int
+    n_nodes: Count
     count: Any  # (2) i32: contacts, colours
     friction: Any  # f64
     b: Any  # 3-vectors [m/s]: u without impulses; (normal, t1, t2)

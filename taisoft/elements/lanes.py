@@ -142,10 +142,24 @@ def add_forces(m: ti.template(), g: ti.template(), S: ti.template(), P, M, q):
 
 
 @ti.func
+def load_lanes(m: ti.template(), source: ti.template(), at):
+    """The vector of lanes that begins at entry `at * lanes`."""
+    return ti.Vector([source[at * m.lanes + q] for q in ti.static(range(m.lanes))])
+
+
+@ti.func
+def store_lanes(m: ti.template(), out: ti.template(), at, values):
+    """Write a vector of lanes, which begins at entry `at * lanes`; lane by lane keeps it SIMD."""
+    for q in ti.static(range(m.lanes)):
+        out[at * m.lanes + q] = values[q]
+
+
+@ti.func
 def store_forces(m: ti.template(), g: ti.template(), b, S):
     """Write the nodal forces -V S [N] of block b to the corner buffer, lane by lane (which keeps it SIMD)."""
     V = -volumes(m, b, m.real)
-    base = g.corner_at + (b - g.first) * (3 * g.n_nodes * m.lanes)
+    # so that the compiler sees that no index overflows, and handles the lanes side by side
+    base = (m.corner_at + g.corner_at + (b - g.first) * (3 * g.n_nodes * m.lanes)) & m.corner_mask
     for i in ti.static(range(3)):
         total = broadcast(ti.cast(0.0, m.real), m.lanes)
         for a in ti.static(range(1, g.n_nodes)):
@@ -162,6 +176,6 @@ def gather(m: ti.template(), i):
     """Sum of the corner forces at node i, in a fixed order."""
     f = ti.Vector([0.0, 0.0, 0.0], m.real)
     for k in range(m.gather_start[i], m.gather_start[i + 1]):
-        e = m.gather_entry[k]
+        e = (m.corner_at + m.gather_entry[k]) & m.corner_mask
         f += ti.Vector([m.corner[e], m.corner[e + m.lanes], m.corner[e + 2 * m.lanes]])
     return f

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
+from taisoft.arrays import Count
 from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
 from taisoft.linear.element_blocks import element_blocks, pair_terms
@@ -29,13 +30,15 @@ BLOCK = 12
 class BlockCsr:
     """A symmetric matrix of 3x3 blocks with the model's node graph as pattern."""
 
-    n_edges: int
+    n_edges: Count
     row_start: Any  # (n_nodes + 1) i32
     row_upper: Any  # (n_nodes) i32: where a row's columns pass the diagonal
     column: Any  # (2 n_edges) i32, ascending in each row, no diagonal
     value: Any  # (2 n_edges) 12-vectors: blocks as below
     diagonal: Any  # (n_nodes) 12-vectors
-    element: Any  # K_ab of each tet, per block of tets (pair, entry), vectors of lanes
+    element: Any  # K_ab of each tet, per block of tets (pair, entry, lane): a `Lanes` buffer,
+    element_at: Count  # where it begins, in vectors of lanes,
+    element_mask: int  # and the bits of such a number
     edge_start: Any  # (n_edges + 1) i32: rows of edge_entry
     edge_entry: Any  # i32: lanes times the first entry in element, plus the lane
     edge_upper: Any  # (n_edges) i32: where K_ij lies in value / 9
@@ -54,37 +57,37 @@ def build_block_csr(model: Model, arena: FieldArena, real, prefix: str = "stiffn
     order = np.argsort(graph.pair, kind="stable")
     edge_start = np.concatenate([[0], np.cumsum(np.bincount(graph.pair, minlength=n_edges))])
     size = sum((g.last - g.first) * MATRIX_BLOCKS[g.order] * 9 for g in model.groups)
+    element = arena.lanes(f"{prefix}_element", real, size * model.lanes)
     terms = {"term_start": None, "term_pair": None, "term_factor": None}
 
     def ints(name: str, data: np.ndarray):
         return arena.field(f"{prefix}_{name}", ti.i32, data.shape, data.astype(np.int32))
 
-    with arena.group():
-        if model.points is not None:
-            start, pairs, factors = pair_terms(model.rules)
-            factors = arena.field(
-                f"{prefix}_term_factor", real, factors.shape, factors.astype(np.float32 if real == ti.f32 else np.float64)
-            )
-            terms = {"term_start": ints("term_start", start), "term_pair": ints("term_pair", pairs), "term_factor": factors}
-        return BlockCsr(
-            n_edges=n_edges, row_start=ints("row_start", graph.row_start), row_upper=ints("row_upper", graph.row_upper),
-            column=ints("column", graph.column), value=arena.vectors(f"{prefix}_value", real, 2 * n_edges, n=BLOCK),
-            diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
-            element=arena.vectors(f"{prefix}_element", real, size, n=model.lanes),
-            edge_start=ints("edge_start", edge_start), edge_entry=ints("edge_entry", base[order]),
-            edge_upper=ints("edge_upper", graph.upper), edge_lower=ints("edge_lower", graph.lower),
-            **terms,
-        )  # fmt: skip
+    if model.points is not None:
+        start, pairs, factors = pair_terms(model.rules)
+        factors = arena.field(
+            f"{prefix}_term_factor", real, factors.shape, factors.astype(np.float32 if real == ti.f32 else np.float64)
+        )
+        terms = {"term_start": ints("term_start", start), "term_pair": ints("term_pair", pairs), "term_factor": factors}
+    return BlockCsr(
+        n_edges=n_edges, row_start=ints("row_start", graph.row_start), row_upper=ints("row_upper", graph.row_upper),
+        column=ints("column", graph.column), value=arena.vectors(f"{prefix}_value", real, 2 * n_edges, n=BLOCK),
+        diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
+        element=element.memory, element_at=element.at // model.lanes,
+        element_mask=element.mask // model.lanes,
+        edge_start=ints("edge_start", edge_start), edge_entry=ints("edge_entry", base[order]),
+        edge_upper=ints("edge_upper", graph.upper), edge_lower=ints("edge_lower", graph.lower),
+        **terms,
+    )  # fmt: skip
 
 
 def sibling(matrix: BlockCsr, model: Model, arena: FieldArena, real, prefix: str) -> BlockCsr:
     """A second matrix with the same pattern and element buffer, its own values."""
-    with arena.group():
-        return replace(
-            matrix,
-            value=arena.vectors(f"{prefix}_value", real, 2 * matrix.n_edges, n=BLOCK),
-            diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
-        )
+    return replace(
+        matrix,
+        value=arena.vectors(f"{prefix}_value", real, 2 * matrix.n_edges, n=BLOCK),
+        diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
+    )
 
 
 @kernel
@@ -92,7 +95,8 @@ def assemble(m: ti.template(), A: ti.template(), projected: ti.template()):
     """A = K(x) over all nodes [N/m], unprojected or with every element's part made positive semi-definite."""
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for b in range(g.first, g.last):
+        for number in range(g.first, g.last):
+            b = number & g.mask
             element_blocks(m, g, A, b, projected)
     ti.loop_config(serialize=m.serial)
     for e in range(A.n_edges):
@@ -110,11 +114,10 @@ def gather_edge(m: ti.template(), A: ti.template(), e):
     """Sum the element blocks of one edge and write K_ij and K_ji."""
     s = ti.Vector([0.0 for _ in ti.static(range(BLOCK))], m.real)
     for k in range(A.edge_start[e], A.edge_start[e + 1]):
-        # lanes are a power of two; signed division would have to mind the sign
-        at, lane = A.edge_entry[k] >> ti.static(m.lanes.bit_length() - 1), A.edge_entry[k] & (m.lanes - 1)
+        at = (A.element_at * m.lanes + A.edge_entry[k]) & (A.element_mask * m.lanes + m.lanes - 1)
         for r in ti.static(range(3)):
             for c in ti.static(range(3)):
-                s[4 * c + r] += A.element[at + (3 * r + c)][lane]
+                s[4 * c + r] += A.element[at + (3 * r + c) * m.lanes]
     A.value[A.edge_upper[e]] = s
     for r in ti.static(range(3)):
         for c in ti.static(range(3)):

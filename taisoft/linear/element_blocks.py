@@ -12,9 +12,11 @@ from taisoft.elements.lanes import (
     broadcast,
     deformation_gradient,
     law_constants,
+    load_lanes,
     position_differences,
     rest_gradients,
     rest_gradients_of_F,
+    store_lanes,
     volumes,
 )
 from taisoft.elements.reference import Quadrature, shape_derivatives
@@ -54,10 +56,10 @@ def element_blocks(m: ti.template(), g: ti.template(), A: ti.template(), b, proj
     p = law_constants(m, b, m.real)
     M = rest_gradients(m, b, m.real)
     V = volumes(m, b, m.real)
-    base = g.matrix_at + (b - g.first) * (MATRIX_BLOCKS[g.order] * 9)
+    base = (A.element_at + g.matrix_at + (b - g.first) * (MATRIX_BLOCKS[g.order] * 9)) & A.element_mask  # see `LanePool`
     if ti.static(g.order == 2):
         for k in range(N_PAIRS * 9):
-            A.element[base + k] = broadcast(ti.cast(0.0, m.real), m.lanes)
+            store_lanes(m, A.element, base + k, broadcast(ti.cast(0.0, m.real), m.lanes))
     for q in range(g.n_points):
         F = deformation_gradient(m, g, X, N, q)
         at = base + (N_PAIRS * 9 if ti.static(g.order == 2) else 0)
@@ -66,28 +68,28 @@ def element_blocks(m: ti.template(), g: ti.template(), A: ti.template(), b, proj
             projected_blocks(m, A, at, S, M, V)
         else:
             S = g.law.prepare(F, p)
-            exact_blocks(A, g.law, at, F, S, M, V)
+            exact_blocks(m, A, g.law, at, F, S, M, V)
         if ti.static(g.order == 2):
-            spread_terms(A, base, at, g.points_at + q)
+            spread_terms(m, A, base, at, g.points_at + q)
 
 
 @ti.func
-def spread_terms(A: ti.template(), base, at, row):
+def spread_terms(m: ti.template(), A: ti.template(), base, at, row):
     """Add the scratch blocks A_kl of quadrature point `row` to the node pairs of a quadratic tet."""
     for n in range(6):
-        B = [A.element[at + (9 * n + e)] for e in ti.static(range(9))]
+        B = [load_lanes(m, A.element, at + (9 * n + e)) for e in ti.static(range(9))]
         for u in range(A.term_start[2 * n], A.term_start[2 * n + 1]):
             w, to = A.term_factor[row, u], base + 9 * A.term_pair[u]
             for e in ti.static(range(9)):
-                A.element[to + e] += w * B[e]
+                store_lanes(m, A.element, to + e, load_lanes(m, A.element, to + e) + w * B[e])
         for u in range(A.term_start[2 * n + 1], A.term_start[2 * n + 2]):
             w, to = A.term_factor[row, u], base + 9 * A.term_pair[u]
             for e in ti.static(range(9)):
-                A.element[to + e] += w * B[3 * (e % 3) + e // 3]
+                store_lanes(m, A.element, to + e, load_lanes(m, A.element, to + e) + w * B[3 * (e % 3) + e // 3])
 
 
 @ti.func
-def exact_blocks(A: ti.template(), law: ti.template(), base, F, S, M, V):
+def exact_blocks(m: ti.template(), A: ti.template(), law: ti.template(), base, F, S, M, V):
     """K_ab of the corner pairs by the law's closed form, from `base` on.
 
     Corners 1, 2, 3 have the gradients g of M's rows; K_0b is minus the sum over a of K_ab.
@@ -98,12 +100,12 @@ def exact_blocks(A: ti.template(), law: ti.template(), base, F, S, M, V):
     K21, K31, K32 = law.block(F, S, g[0], g[1]), law.block(F, S, g[0], g[2]), law.block(F, S, g[1], g[2])
     for i in ti.static(range(3)):
         for k in ti.static(range(3)):
-            A.element[base + (3 * i + k)] = -V * (K11[3 * i + k] + K21[3 * i + k] + K31[3 * i + k])
-            A.element[base + (9 * 1 + 3 * i + k)] = -V * (K21[3 * k + i] + K22[3 * i + k] + K32[3 * i + k])
-            A.element[base + (9 * 2 + 3 * i + k)] = -V * (K31[3 * k + i] + K32[3 * k + i] + K33[3 * i + k])
-            A.element[base + (9 * 3 + 3 * i + k)] = V * K21[3 * k + i]
-            A.element[base + (9 * 4 + 3 * i + k)] = V * K31[3 * k + i]
-            A.element[base + (9 * 5 + 3 * i + k)] = V * K32[3 * k + i]
+            store_lanes(m, A.element, base + (3 * i + k), -V * (K11[3 * i + k] + K21[3 * i + k] + K31[3 * i + k]))
+            store_lanes(m, A.element, base + (9 * 1 + 3 * i + k), -V * (K21[3 * k + i] + K22[3 * i + k] + K32[3 * i + k]))
+            store_lanes(m, A.element, base + (9 * 2 + 3 * i + k), -V * (K31[3 * k + i] + K32[3 * k + i] + K33[3 * i + k]))
+            store_lanes(m, A.element, base + (9 * 3 + 3 * i + k), V * K21[3 * k + i])
+            store_lanes(m, A.element, base + (9 * 4 + 3 * i + k), V * K31[3 * k + i])
+            store_lanes(m, A.element, base + (9 * 5 + 3 * i + k), V * K32[3 * k + i])
 
 
 @ti.func
@@ -115,11 +117,11 @@ def projected_blocks(m: ti.template(), A: ti.template(), base, S, M, V):
             on = [ti.select(k == r, ti.cast(1.0, m.real), ti.cast(0.0, m.real)) for r in ti.static(range(3))]
             D = [on[r] * M[3 * a + c] for r in ti.static(range(3)) for c in ti.static(range(3))]
             T = dpk1_projected(S, D)
-            store_column(A, base, a, k, T, M, V)
+            store_column(m, A, base, a, k, T, M, V)
 
 
 @ti.func
-def store_column(A: ti.template(), base, a: ti.template(), k, T, M, V):
+def store_column(m: ti.template(), A: ti.template(), base, a: ti.template(), k, T, M, V):
     """Column k of the blocks between corner a + 1 and the others: rows r of K_(c+1)(a+1) as row k of K_(a+1)(c+1)."""
     for r in ti.static(range(3)):
         g = [
@@ -128,8 +130,8 @@ def store_column(A: ti.template(), base, a: ti.template(), k, T, M, V):
         ]
         g0 = -(g[0] + g[1] + g[2])
         # pair (0, a + 1) is number a: entry (r, k) of K_0a
-        A.element[base + (9 * a + 3 * r + k)] = g0
+        store_lanes(m, A.element, base + (9 * a + 3 * r + k), g0)
         for c in ti.static(range(3)):
             if ti.static(c > a):
                 # pair (a + 1, c + 1) is number a + c + 2: K_(c+1)(a+1)[r, k] is K_(a+1)(c+1)[k, r]
-                A.element[base + (9 * (a + c + 2) + 3 * k + r)] = g[c]
+                store_lanes(m, A.element, base + (9 * (a + c + 2) + 3 * k + r), g[c])

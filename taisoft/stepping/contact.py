@@ -58,8 +58,7 @@ class ContactStep:
         self._arena = FieldArena()
         self._make_room(2 * d.surface.n_triangles + SPARE)
         self._own_arena = FieldArena()
-        with self._own_arena.group():
-            self._way = self._own_arena.vectors("way", ti.f64, m.n_nodes)
+        self._way = self._own_arena.vectors("way", ti.f64, m.n_nodes)
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self._bounces = scene.bounces
@@ -84,9 +83,8 @@ class ContactStep:
 
     def _make_room(self, capacity: int) -> None:
         arena, m = FieldArena(), self.world.model
-        with arena.group():
-            problem = build_node_problem(arena, capacity, m.n_nodes, m.serial)
-            self.found = build_found(arena, problem)
+        problem = build_node_problem(arena, capacity, m.n_nodes, m.serial)
+        self.found = build_found(arena, problem)
         self._arena.release()
         self._arena, self._last_time, self._indexed = arena, 0.0, False
 

@@ -96,8 +96,7 @@ class ContactStageSolver(StageSolver):
         """Room for the contacts of this step."""
         if self._k is None or self._k.found is not self.contact.found:
             arena = FieldArena()
-            with arena.group():
-                self._k = build_stage_contacts(arena, self.model, self.contact.found, self._x_start)
+            self._k = build_stage_contacts(arena, self.model, self.contact.found, self._x_start)
             self._arena.release()
             self._arena, self._weighed, self.coupling = arena, None, self._k.coupling
 

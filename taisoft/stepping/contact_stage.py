@@ -189,7 +189,8 @@ def evaluate(
     if ti.static(not linear):
         for g in ti.static(m.groups):
             ti.loop_config(serialize=m.serial)
-            for b in range(g.first, g.last):
+            for number in range(g.first, g.last):
+                b = number & g.mask
                 if how != STILL:
                     element_force(m, g, False, b)
     ti.loop_config(serialize=p.serial)

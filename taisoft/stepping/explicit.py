@@ -157,24 +157,26 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
         if ti.static(s.verlet):
             if restart != 0:
                 for g in ti.static(m.groups):
-                    for b in range(g.first, g.last):
+                    for number in range(g.first, g.last):
+                        b = number & g.mask
                         element_force(m, g, m.stiffness_damping, b)
                 for i in range(m.n_nodes):
                     s.acceleration[i] = acceleration(m, i)
         while done < n and going:
-            if ti.static(s.n_held > 0):
+            if ti.static(s.holds):
                 if done == n - 1:
                     keep_held(m, s)
-            if ti.static(s.n_moved > 0):
+            if ti.static(s.leads):
                 remember(m, s)
             if ti.static(s.verlet):
                 for i in range(m.n_nodes):
                     verlet_move(m, s, i, dt, verlet_half(m, s, i, dt))
-                if ti.static(s.n_moved > 0):
+                if ti.static(s.leads):
                     lead(m, s, done, dt64)
             inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
             for g in ti.static(m.groups):
-                for b in range(g.first, g.last):
+                for number in range(g.first, g.last):
+                    b = number & g.mask
                     J = element_force(m, g, m.stiffness_damping, b)
                     lowest = ti.min(lowest, J)
                     inverted += count_inverted(m, b, J)
@@ -184,9 +186,9 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
                     total += verlet_kick(m, s, i, dt)
                 else:
                     total += euler_node(m, i, dt)
-            if ti.static(s.n_moved > 0):
+            if ti.static(s.leads):
                 lead(m, s, done, dt64)
-            if ti.static(s.n_held > 0):
+            if ti.static(s.holds):
                 if done == n - 1:
                     react(m, s, dt)
             count = 0
@@ -226,7 +228,8 @@ def tell_volumes(m: ti.template(), b, J):
 def elements_parallel(m: ti.template()):
     """One sub-step's element loop over threads; scalars 6, 9: smallest J so far, inverted tets of this sub-step."""
     for g in ti.static(m.groups):
-        for b in range(g.first, g.last):
+        for number in range(g.first, g.last):
+            b = number & g.mask
             tell_volumes(m, b, element_force(m, g, m.stiffness_damping, b))
 
 
@@ -240,17 +243,17 @@ def restart_parallel(m: ti.template(), s: ti.template()):
 @kernel
 def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64):
     """What comes before a sub-step's element loop."""
-    if ti.static(s.n_held > 0):
+    if ti.static(s.holds):
         for k in range(s.n_held):
             s.held_velocity[k] = m.v[s.held[k]]
-    if ti.static(s.n_moved > 0):
+    if ti.static(s.leads):
         for k in range(s.n_moved):
             s.before[k] = m.x[s.moved[k]]
     if ti.static(s.verlet):
         for i in range(m.n_nodes):
             dt = ti.cast(dt64, m.real)
             verlet_move(m, s, i, dt, verlet_half(m, s, i, dt))
-        if ti.static(s.n_moved > 0):
+        if ti.static(s.leads):
             ti.loop_config(serialize=True)
             for _ in range(1):
                 lead(m, s, row, dt64)
@@ -268,11 +271,11 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
             v = euler_node(m, i, dt)
         if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
             m.scalars[8] = 1.0
-    if ti.static(s.n_moved > 0):
+    if ti.static(s.leads):
         ti.loop_config(serialize=True)
         for _ in range(1):
             lead(m, s, row, dt64)
-    if ti.static(s.n_held > 0):
+    if ti.static(s.holds):
         ti.loop_config(serialize=True)
         for _ in range(1):
             react(m, s, ti.cast(dt64, m.real))

@@ -50,9 +50,9 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
                 tell_volumes(m, b, J)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        if ti.static(s.n_held > 0):
+        if ti.static(s.holds):
             keep_held(m, s)
-        if ti.static(s.n_moved > 0):
+        if ti.static(s.leads):
             remember(m, s)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -61,7 +61,7 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
             m.v[i] = verlet_half(m, s, i, dt)
         else:
             m.v[i] = euler_velocity(m, i, dt)
-    if ti.static(s.n_moved > 0):
+    if ti.static(s.leads):
         ti.loop_config(serialize=True)
         for _ in range(1):
             lead_velocities(m, s, 0, dt64)
@@ -89,7 +89,7 @@ def set_free_velocities(
 @ti.func
 def close_substep(m: ti.template(), s: ti.template(), p: ti.template(), dt64, touched):
     """Reactions, and the counters of the sub-step: scalars 7, most inverted tets."""
-    if ti.static(s.n_held > 0):
+    if ti.static(s.holds):
         react(m, s, ti.cast(dt64, m.real))
         subtract_contacts(m, s, p, dt64, touched)
     m.scalars[7] = ti.max(m.scalars[7], m.scalars[9])
@@ -124,7 +124,7 @@ def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, tou
         else:
             m.v[i] = v
             m.x[i] = m.x[i] + ti.cast(dt * v, ti.f64)
-    if ti.static(s.n_moved > 0):
+    if ti.static(s.leads):
         ti.loop_config(serialize=True)
         for _ in range(1):
             lead_positions(m, s, 0)
@@ -147,7 +147,7 @@ def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti
         v = verlet_kick(m, s, i, ti.cast(dt64, m.real))
         if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
             m.scalars[8] = 1.0
-    if ti.static(s.n_moved > 0):
+    if ti.static(s.leads):
         ti.loop_config(serialize=True)
         for _ in range(1):
             lead_velocities(m, s, 0, dt64)

@@ -96,12 +96,11 @@ class ImplicitStepper:
     def __init__(self, world: World, scheme: Scheme, contact: ContactStep | None = None):
         self.world, self.scheme, self.contact = world, scheme, contact
         m, arena = world.model, world.arena
-        with arena.group():
-            self.history = History(
-                arena.vectors("x_now", ti.f64, m.n_nodes), arena.vectors("v_now", m.real, m.n_nodes),
-                arena.vectors("v_before", m.real, m.n_nodes),
-                arena.vectors("x_before", ti.f64, m.n_nodes) if scheme.before else None,
-            )  # fmt: skip
+        self.history = History(
+            arena.vectors("x_now", ti.f64, m.n_nodes), arena.vectors("v_now", m.real, m.n_nodes),
+            arena.vectors("v_before", m.real, m.n_nodes),
+            arena.vectors("x_before", ti.f64, m.n_nodes) if scheme.before else None,
+        )  # fmt: skip
         common = m, arena, world.runtime.eps, world.motion.moved
         self.solver = StageSolver(*common) if contact is None else ContactStageSolver(*common, contact, self.history.x_now)
         self.tolerance = DEFAULT_TOLERANCE[world.runtime.precision]

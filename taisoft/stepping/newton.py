@@ -97,17 +97,16 @@ class StageSolver:
             block_csr.sibling(self.matrix, model, arena, model.real, "damping") if model.stiffness_damping else None
         )
         n, k = model.n_nodes, len(moved)
-        with arena.group():
-            self.pcg = pcg.build_pcg(model, arena)
-            self.work = StageWork(
-                x_hat=arena.vectors("x_hat", ti.f64, n), v_hat=arena.vectors("v_hat", model.real, n),
-                base=arena.vectors("x_base", ti.f64, n), residual=arena.vectors("residual", model.real, n),
-                moved=arena.field("stage_moved", ti.i32, k, moved.astype(np.int32)) if k else None,
-                moved_axes=arena.vectors("stage_moved_axes", ti.i32, k) if k else None,
-                targets=arena.vectors("stage_targets", ti.f64, k) if k else None,
-                led_acceleration=arena.vectors("led_acceleration", ti.f64, k) if k and model.consistent else None,
-                n_moved=k, change=arena.vectors("change", ti.f64, n), damper=self.damper,
-            )  # fmt: skip
+        self.pcg = pcg.build_pcg(model, arena)
+        self.work = StageWork(
+            x_hat=arena.vectors("x_hat", ti.f64, n), v_hat=arena.vectors("v_hat", model.real, n),
+            base=arena.vectors("x_base", ti.f64, n), residual=arena.vectors("residual", model.real, n),
+            moved=arena.field("stage_moved", ti.i32, k, moved.astype(np.int32)) if k else None,
+            moved_axes=arena.vectors("stage_moved_axes", ti.i32, k) if k else None,
+            targets=arena.vectors("stage_targets", ti.f64, k) if k else None,
+            led_acceleration=arena.vectors("led_acceleration", ti.f64, k) if k and model.consistent else None,
+            n_moved=k, change=arena.vectors("change", ti.f64, n), damper=self.damper,
+        )  # fmt: skip
         self.coupling = NO_COUPLING  # what the system holds beside the matrix
         self._norms = np.zeros(5)
         self.update_material()

@@ -5,6 +5,7 @@ from typing import Any
 
 import taichi as ti
 
+from taisoft.arrays import Count
 from taisoft.elasticity import element_force
 from taisoft.elements.lanes import gather
 from taisoft.linear.block_csr import row_times
@@ -25,9 +26,14 @@ class StageWork:
     moved_axes: Any  # (n_moved, 3) i32
     targets: Any  # (n_moved) f64 3-vectors
     led_acceleration: Any  # (n_moved) f64 3-vectors, only with a consistent mass
-    n_moved: int
+    n_moved: Count
     change: Any  # f64: what the mass is multiplied by
     damper: Any  # BlockCsr or None
+
+    @property
+    def leads(self) -> bool:
+        """Whether nodes are led."""
+        return self.moved is not None
 
 
 @ti.func
@@ -47,7 +53,7 @@ def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, led_share: ti.
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         m.x[i] = w.x_hat[i] + beta * ti.cast(m.v[i], ti.f64)
-    if ti.static(w.n_moved > 0):
+    if ti.static(w.leads):
         ti.loop_config(serialize=True)
         for k in range(w.n_moved):
             i = w.moved[k]
@@ -102,7 +108,8 @@ def form_residual(
     """
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for b in range(g.first, g.last):
+        for number in range(g.first, g.last):
+            b = number & g.mask
             element_force(m, g, False, b)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):

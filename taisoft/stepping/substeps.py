@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from taisoft.arrays import Count
 from taisoft.errors import SimulationError
 from taisoft.model import Model
 from taisoft.stepping import explicit
@@ -23,8 +24,8 @@ class SubstepWork:
     """Fields of the explicit steps; what a scene does not need is None."""
 
     verlet: bool
-    n_moved: int
-    n_held: int
+    n_moved: Count
+    n_held: Count
     acceleration: Any  # (n_nodes) 3-vectors, Verlet
     half_velocity: Any  # (n_nodes) 3-vectors, Verlet with stiffness damping
     moved: Any  # (n_moved) i32
@@ -34,6 +35,16 @@ class SubstepWork:
     held: Any  # (n_held) i32
     held_velocity: Any  # (n_held) 3-vectors
     reaction: Any  # (n_held) 3-vectors [N]
+
+    @property
+    def leads(self) -> bool:
+        """Whether nodes are moved."""
+        return self.moved is not None
+
+    @property
+    def holds(self) -> bool:
+        """Whether nodes are held."""
+        return self.held is not None
 
 
 @dataclass(frozen=True)

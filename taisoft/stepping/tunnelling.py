@@ -41,7 +41,7 @@ def survey(
             a, b = found.body[at][0], found.body[at][1]
             sinking = ti.max(sinking, -found.gap[at] / ti.min(s.edge[a], s.edge[b]))
             way = dvec(0.0)
-            if ti.static(o.count > 0):
+            if ti.static(o.any):
                 if found.nodes_b[at][0] < 0:
                     way -= carried(o, b, found.point[at])
             for j in ti.static(range(3)):

@@ -19,10 +19,9 @@ import taichi as ti
 from taichi._lib import core
 
 from taisoft.errors import OutputError
-from taisoft.fields import FieldArena
 from taisoft.output.camera import Camera
 from taisoft.runtime import open_kind, open_runtime
-from taisoft.transfer import upload
+from taisoft.view.gui_fields import GuiFields, move
 from taisoft.view.shading import lit_colours
 from taisoft.view.surfaces import Surfaces
 
@@ -95,17 +94,17 @@ class Canvas:
         owner = "a window" if visible else "a picture renderer"
         self._runtime = open_runtime(arch, precision, owner=owner)
         _holder.append(owner)
-        self._fields = FieldArena()
+        self._fields = GuiFields()
         self._surfaces, self._line_width = surfaces, line_width
         n = len(surfaces.colours)
-        self._x = self._fields.vectors("picture positions", ti.f32, n)
-        self._normals = self._fields.vectors("picture normals", ti.f32, n, np.tile(np.float32([0, 1, 0]), (n, 1)))
-        self._colours = self._fields.vectors("picture colours", ti.f32, n)
+        self._x = self._fields.vectors(ti.f32, n)
+        self._normals = self._fields.vectors(ti.f32, n, np.tile(np.float32([0, 1, 0]), (n, 1)))
+        self._colours = self._fields.vectors(ti.f32, n)
         triangles = surfaces.triangles.ravel()
-        self._ends = self._fields.vectors("picture lines", ti.f32, 2 * n_segments) if n_segments else None
-        self._end_colours = self._fields.vectors("picture line colours", ti.f32, 2 * n_segments) if n_segments else None
+        self._ends = self._fields.vectors(ti.f32, 2 * n_segments) if n_segments else None
+        self._end_colours = self._fields.vectors(ti.f32, 2 * n_segments) if n_segments else None
         self._has_drawn_lines = False
-        self._indices = self._fields.field("picture triangles", ti.i32, len(triangles), triangles)
+        self._indices = self._fields.field(ti.i32, triangles)
         self._flat: tuple | None = None  # fields of what is drawn over the picture, once something is
         self._flat_ends: np.ndarray | None = None  # what they hold
         self.window = self._canvas = self._scene = None
@@ -129,7 +128,7 @@ class Canvas:
         """
         colours = lit_colours(x, normals, self._surfaces.colours if base is None else base, camera)
         # relative to the target: single precision would blur a scene far from the origin
-        upload([(self._x, x - camera.target), (self._colours, colours)])
+        move([(self._x, x - camera.target), (self._colours, colours)])
         eye = ti.ui.Camera()
         eye.position(*(camera.position - camera.target))
         eye.lookat(0.0, 0.0, 0.0)
@@ -158,7 +157,7 @@ class Canvas:
         self._has_drawn_lines = True
         all_ends, all_colours = np.zeros((self._ends.shape[0], 3)), np.zeros((self._ends.shape[0], 3))
         all_ends[:n], all_colours[:n] = ends[:n] - camera.target, colours[:n]
-        upload([(self._ends, all_ends), (self._end_colours, all_colours)])
+        move([(self._ends, all_ends), (self._end_colours, all_colours)])
         self._scene.lines(self._ends, self._line_width, per_vertex_color=self._end_colours, vertex_count=max(n, 2))
 
     def draw_over(
@@ -172,8 +171,8 @@ class Canvas:
         if self._flat is None:
             make = self._fields.vectors
             self._flat = (
-                make("flat boxes", ti.f32, 6 * most[0], n=2), make("flat lines", ti.f32, 2 * most[1], n=2),
-                make("flat line colours", ti.f32, 2 * most[1]),
+                make(ti.f32, 6 * most[0], n=2), make(ti.f32, 2 * most[1], n=2),
+                make(ti.f32, 2 * most[1]),
             )  # fmt: skip
         if self._flat_ends is not ends:
             self._move_over(boxes, ends, colours, most)
@@ -190,7 +189,7 @@ class Canvas:
         corners = [(left, bottom), (right, bottom), (right, top), (left, bottom), (right, top), (left, top)]
         arrays[0][: 6 * len(boxes)] = np.array(corners).transpose(2, 0, 1).reshape(-1, 2)
         arrays[1][: len(ends)], arrays[2][: len(ends)] = ends, colours
-        upload(list(zip(self._flat, arrays)))
+        move(list(zip(self._flat, arrays)))
 
     def pixels(self, left: int, top: int, right: int, bottom: int) -> np.ndarray:
         """That part of the drawn picture, uint8 (bottom - top, right - left, 3), first row on top."""

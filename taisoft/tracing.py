@@ -1,0 +1,72 @@
+"""Quicker tracing: what Taichi finds out anew at each decoration and at each call of a function in a kernel, found once.
+
+Taichi asks of every decorated function whether it stands in a class, through Python's source tools; it reads, wraps and splits a
+function's source at each of its calls in a kernel; and for every syntax node it formats an excerpt of the source for messages
+that are seldom needed. Together that takes longer than building the code. Without the excerpts messages still name file, line and
+function. This rests on 1.7.4, the version that taisoft asks for; with any other, or with TAISOFT_PLAIN_TRACING set, Taichi stays
+as it is, and kernels are the same.
+"""
+
+import ast
+import functools
+import linecache
+import os
+import sys
+import textwrap
+from collections.abc import Callable
+
+import taichi as ti
+from taichi.lang import kernel_impl
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+
+
+def _inside_class(level_of_class_stackframe: int) -> bool:
+    """Whether the decorator that asks is used in the body of a class, which runs with a name of its own."""
+    return "__qualname__" in sys._getframe(level_of_class_stackframe - 1).f_locals
+
+
+@functools.cache
+def _ends(file: str) -> dict[int, int]:
+    """First line of each function in a file, decorators counted, to its last one."""
+    found = {}
+    for node in ast.walk(ast.parse("".join(linecache.getlines(file)))):
+        if isinstance(node, ast.FunctionDef):
+            found[min([node.lineno, *[one.lineno for one in node.decorator_list]])] = node.end_lineno
+    return found
+
+
+@functools.cache
+def _source(function: Callable) -> tuple[str, list[str], int, str]:
+    """File, lines, number of the first, and their text without the indentation that all share."""
+    file, first = function.__code__.co_filename, function.__code__.co_firstlineno
+    lines = linecache.getlines(file)[first - 1 : _ends(file)[first]]
+    return file, lines, first, textwrap.dedent("".join(lines))
+
+
+def _tree_and_context(
+    self, excluded_parameters=(), is_kernel=True, arg_features=None, args=None, ast_builder=None, is_real_function=False
+):  # fmt: skip
+    """The function's syntax, which tracing writes into, and what else it needs; as Taichi's own."""
+    file, lines, first, text = _source(self.func)
+    tree = ast.parse(text)
+    tree.body[0].decorator_list = []
+    names = kernel_impl._get_global_vars(self.func)
+    if is_kernel or is_real_function:
+        for k in self.template_slot_locations:
+            names[self.arguments[k].name] = args[k]
+    return tree, ASTTransformerContext(
+        excluded_parameters=excluded_parameters, is_kernel=is_kernel, func=self, arg_features=arg_features, global_vars=names,
+        argument_data=args, src=lines, start_lineno=first, file=file, ast_builder=ast_builder, is_real_function=is_real_function,
+    )  # fmt: skip
+
+
+def _position(context: ASTTransformerContext, node) -> str:
+    """File, line and function of a syntax node, for Taichi's messages. What `launching` generates lies where its source does."""
+    file, line = context.file.partition("#")[0], node.lineno + context.lineno_offset
+    return f'File "{file}", line {line}, in {context.func.func.__name__}:\n'
+
+
+if ti.__version__ == (1, 7, 4) and not os.environ.get("TAISOFT_PLAIN_TRACING"):
+    kernel_impl._inside_class = _inside_class
+    kernel_impl._get_tree_and_ctx = _tree_and_context
+    ASTTransformerContext.get_pos_info = _position

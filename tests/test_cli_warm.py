@@ -1,0 +1,36 @@
+"""`taisoft warm`: scenes of every kind step once, a line each; then their like, of any size, find all kernels in the cache."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.cli import main, warm
+from taisoft.runtime import _cache_folder
+
+
+def compiled_files() -> set[str]:
+    return {path.name for path in Path(_cache_folder()).glob("*.tic")}
+
+
+def test_warm(monkeypatch, capsys):
+    monkeypatch.setattr(warm, "LAWS", ("stable_neo_hookean",))
+    assert main(["warm"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 * 3 + 2 and lines[-2].startswith("statics") and lines[-1].endswith(" s")
+    before = compiled_files()
+    made = ts.Scene()
+    rubber = ts.Material(law="stable_neo_hookean", young=2e5, poisson=0.2, density=900.0)
+    made.add_body(ts.box_mesh((4, 3, 2), (0.3, 0.2, 0.1)), rubber, position=(0, 0.0501, 0))
+    made.add_obstacle(ts.HalfSpace((0, -0.05, 0), (0, 1, 0)))
+    with ts.Simulator(made, dt=2e-3, integrator="implicit_euler") as sim:
+        sim.advance(2)
+        assert np.isfinite(sim.positions()).all() and compiled_files() == before
+
+
+@pytest.mark.parametrize("contacts", warm.CONTACTS)
+def test_scenes_have_what_they_say(contacts):
+    made = warm.scene("corotational", contacts)
+    counts = {"no contacts": (1, 0), "a half-space": (1, 1), "two bodies": (2, 0)}
+    assert (len(made.bodies), len(made.obstacles)) == counts[contacts]
