@@ -36,7 +36,7 @@ def cube(cells: int) -> ts.Scene:
 
 
 SCENES = {
-    "beam": (beam, {"dt": 1e-3, "integrator": "symplectic_euler"}),
+    "beam": (beam, {"dt": 2e-4, "integrator": "symplectic_euler"}),
     "cube": (cube, {"dt": 2e-3, "integrator": "implicit_euler"}),
 }
 
