@@ -13,8 +13,6 @@ is not met. --quick has small meshes, few rounds and frames, and no limit. The w
 import argparse
 import sys
 
-from taisoft.output.files import write_bytes
-from taisoft.output.report import json_text
 from taisoft.runtime import Runtime, open_runtime
 from taisoft.timing import load_average
 
@@ -108,9 +106,7 @@ def main(argv=None) -> int:
         numbers |= {"arch": options.arch, "precision": options.precision, "quick": options.quick}
         numbers |= {"load_at_the_end": load_average()} | records
         numbers["limits"] = [limit.record() for limit in limits]
-        write_bytes(options.out, json_text(numbers).encode())
-        write_bytes(options.out.with_suffix(".md"), document.text().encode())
-        print(f"written: {options.out} and {options.out.with_suffix('.md').name}")
+        document.write(options.out, numbers)
     if options.plot:
         draw(found, options.plot)
         print(f"written: {options.plot}")

@@ -14,8 +14,6 @@ The whole takes about six minutes on two cores.
 import argparse
 import sys
 
-from taisoft.output.files import write_bytes
-from taisoft.output.report import json_text
 from taisoft.runtime import compile_clock, open_runtime
 from taisoft.timing import load_average
 
@@ -115,9 +113,7 @@ def main(argv=None) -> int:
     if options.out:
         numbers |= {name: [x.record() for x in some] for name, some in found.items()}
         numbers["limits"] = [limit.record() for limit in limits]
-        write_bytes(options.out, json_text(numbers).encode())
-        write_bytes(options.out.with_suffix(".md"), document.text().encode())
-        print(f"written: {options.out} and {options.out.with_suffix('.md').name}")
+        document.write(options.out, numbers)
     if options.plot:
         draw(found, snapshots, options.plot)
         print(f"written: {options.plot}")

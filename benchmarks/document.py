@@ -6,7 +6,8 @@ from pathlib import Path
 
 import taisoft as ts
 from taisoft.errors import OutputError
-from taisoft.output.files import make_folder
+from taisoft.output.files import make_folder, write_bytes
+from taisoft.output.report import json_text
 from taisoft.timing import machine, versions
 
 from .elasticity_table import slug
@@ -28,6 +29,12 @@ class Document:
     def text(self) -> str:
         """All parts."""
         return "\n\n".join(self.parts) + "\n"
+
+    def write(self, out: Path, numbers: dict) -> None:
+        """The numbers into `out`, a .json file, and the page beside it. Raises OutputError where they cannot be written."""
+        write_bytes(out, json_text(numbers).encode())
+        write_bytes(out.with_suffix(".md"), self.text().encode())
+        print(f"written: {out} and {out.with_suffix('.md').name}")
 
 
 def header(title: str, *how: str, packages: tuple[str, ...] = ("taichi", "numpy", "scipy")) -> tuple[str, dict]:

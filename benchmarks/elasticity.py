@@ -17,8 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from taisoft.errors import SimulationError
-from taisoft.output.files import write_bytes
-from taisoft.output.report import json_text
 from taisoft.output.tables import markdown, percent, spread_of
 from taisoft.timing import Timing, load_average
 
@@ -239,9 +237,7 @@ def main(argv=None) -> int:
     document = Document()
     numbers = measure(QUICK if options.quick else FULL, options.arch, not options.no_peers, document)
     if out is not None:
-        write_bytes(out, json_text(numbers | {"quick": options.quick}).encode())
-        write_bytes(out.with_suffix(".md"), document.text().encode())
-        print(f"written: {out} and {out.with_suffix('.md').name}")
+        document.write(out, numbers | {"quick": options.quick})
     return 0
 
 

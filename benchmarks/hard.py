@@ -24,8 +24,7 @@ from pathlib import Path
 from taisoft.cli.signals import Signals
 from taisoft.cli.study_child import serve
 from taisoft.errors import OutputError
-from taisoft.output.files import FolderLock, make_folder, write_bytes
-from taisoft.output.report import json_text
+from taisoft.output.files import FolderLock, make_folder
 from taisoft.study.store import NoStore, Store
 from taisoft.timing import load_average
 
@@ -114,9 +113,7 @@ def main(argv=None) -> int:
         rows = chosen(options.case, options.quick)
         numbers = measured(rows, options, document)
     if out is not None:
-        write_bytes(out, json_text(numbers).encode())
-        write_bytes(out.with_suffix(".md"), document.text().encode())
-        print(f"written: {out} and {out.with_suffix('.md').name}")
+        document.write(out, numbers)
     return 1 if any(faults(row) for row in rows) else 0
 
 

@@ -17,9 +17,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from taisoft.output.files import write_bytes
 from taisoft.output.plot import require_matplotlib
-from taisoft.output.report import json_text
 from taisoft.runtime import open_runtime
 from taisoft.timing import load_average
 
@@ -105,9 +103,7 @@ def main(argv=None) -> int:
     document = Document()
     numbers, found = measure([c for c in CASES if name in (None, c.name)], options.quick, options.arch, document)
     if options.out:
-        write_bytes(options.out, json_text(numbers).encode())
-        write_bytes(options.out.with_suffix(".md"), document.text().encode())
-        print(f"written: {options.out} and {options.out.with_suffix('.md').name}")
+        document.write(options.out, numbers)
     if options.plot:
         draw(found, options.plot)
         print(f"written: {options.plot}")

@@ -23,8 +23,6 @@ from pathlib import Path
 
 import taisoft
 from taisoft.errors import SimulationError
-from taisoft.output.files import write_bytes
-from taisoft.output.report import json_text
 from taisoft.timing import load_average
 
 from .again import again_text, earlier_numbers, plain
@@ -123,9 +121,7 @@ def main(argv=None) -> int:
     document.add(again_text(earlier_numbers(options.out), times, numbers))
     numbers |= {"load_at_the_end": load_average(), "times": plain(times)}
     if options.out:
-        write_bytes(options.out, json_text(numbers).encode())
-        write_bytes(options.out.with_suffix(".md"), document.text().encode())
-        print(f"written: {options.out} and {options.out.with_suffix('.md').name}")
+        document.write(options.out, numbers)
     if options.plot:
         draw(rows, copies, options.plot)
         print(f"written: {options.plot}")

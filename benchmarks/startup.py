@@ -24,8 +24,6 @@ import numpy as np
 
 import taisoft
 from taisoft.errors import SimulationError
-from taisoft.output.files import write_bytes
-from taisoft.output.report import json_text
 from taisoft.output.tables import markdown
 from taisoft.timing import load_average
 
@@ -165,9 +163,7 @@ def main(argv=None) -> int:
         document.add("## Limits\n\n" + limit_table(limits))
     if options.out:
         numbers |= {"quick": options.quick, "load_at_the_end": load_average(), "limits": [limit.record() for limit in limits]}
-        write_bytes(options.out, json_text(numbers | found).encode())
-        write_bytes(options.out.with_suffix(".md"), document.text().encode())
-        print(f"written: {options.out} and {options.out.with_suffix('.md').name}")
+        document.write(options.out, numbers | found)
     return 0 if all(limit.met for limit in limits) else 1
 
 
