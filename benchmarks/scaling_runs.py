@@ -161,8 +161,8 @@ def repeat_elements(m: ti.template(), n: ti.i32):
         low = broadcast(ti.cast(HUGE, m.real), m.lanes)
         for _k in range(n):
             for g in ti.static(m.groups):
-                for number in range(g.first, g.last):
-                    low = ti.min(low, element_force(m, g, False, number & g.mask))
+                for b in range(g.first, g.last):
+                    low = ti.min(low, element_force(m, g, False, b))
         m.scalars[6] = low[0]
 
 

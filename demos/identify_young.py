@@ -4,8 +4,8 @@
 SAG below the clamp. `identify` compares static equilibria, each in some hundredths of a second once their kernels are compiled: a
 kernel serves every mesh and every material number.
 
-The measured sag is that of E = 3 MPa on this mesh, so `check` knows what must come out; the run shows that the beam, let go from
-its straight shape, comes to rest there.
+The measured sag is that of E = 3 MPa on this mesh, so `check` knows what must come out; the run shows that the beam, released
+from its straight shape, comes to rest there.
 """
 
 import numpy as np

@@ -16,7 +16,7 @@ from taisoft.settings import Settings, check_dt
 from taisoft.stability import stable_dt
 from taisoft.stepping.contact import ContactStep
 from taisoft.stepping.world import World
-from taisoft.transfer import array_of, upload
+from taisoft.transfer import upload
 
 _REBUILT = (
     "integrator", "contact_solver", "self_collision", "allow_unstable", "newton_tolerance", "linear_tolerance",
@@ -86,7 +86,7 @@ class StateAccess(Guarded):
         """Energies of the present state [J]."""
         model = self._open_world().model
         measure(model)
-        elastic, _, _, kinetic, gravity = array_of(model.scalars)[:5].tolist()
+        elastic, _, _, kinetic, gravity = model.scalars.to_numpy()[:5].tolist()
         return Energies(kinetic=kinetic, elastic=elastic, gravity=gravity)
 
     def reactions(self, body: str | None = None) -> np.ndarray:
@@ -190,7 +190,7 @@ class StateAccess(Guarded):
         _, force = self._tangent_fields()
         elastic_forces(world.model)
         gather_forces(world.model, force)
-        return array_of(force).astype(np.float64)
+        return force.to_numpy().astype(np.float64)
 
     def force_differential(self, displacement: np.ndarray) -> np.ndarray:
         """Change of the elastic forces (n_nodes, 3) [N] along a displacement (n_nodes, 3) [m] of all bodies: (df/dx) dx."""
@@ -199,7 +199,7 @@ class StateAccess(Guarded):
         dx, df = self._tangent_fields()
         upload([(dx, np.asarray(displacement))])
         force_differential(world.model, dx, df)
-        return array_of(df).astype(np.float64)
+        return df.to_numpy().astype(np.float64)
 
     def _tangent_fields(self) -> tuple:
         """Two fields of (n_nodes) 3-vectors, allocated when first asked for."""

@@ -31,12 +31,16 @@ class Array:
 
     def __init__(self, dtype, shape: tuple[int, ...], n: int, on_host: bool):
         self.dtype, self.n, self.shape = dtype, n, shape
-        whole = (*shape, n) if n else shape
-        self.host = np.empty(whole, dtype=DTYPES[dtype]) if on_host else None
+        self.host = np.empty(self.whole, dtype=DTYPES[dtype]) if on_host else None
         if on_host:
             self.host.fill(0)  # written, so that the next array is held against what memory is left
         # scalars only: Taichi never frees arrays of vectors
-        self.device = None if on_host else ti.ndarray(dtype, (int(np.prod(whole, dtype=np.int64)),))
+        self.device = None if on_host else ti.ndarray(dtype, (math.prod(self.whole),))
+
+    @property
+    def whole(self) -> tuple[int, ...]:
+        """Shape of all its numbers."""
+        return (*self.shape, self.n) if self.n else self.shape
 
     @property
     def structure(self) -> tuple:
@@ -47,14 +51,17 @@ class Array:
         """A copy of the array, or of its first rows."""
         if self.host is not None:
             return (self.host if rows is None else self.host[:rows]).copy()
-        whole = self.device.to_numpy().reshape((*self.shape, self.n) if self.n else self.shape)
+        whole = self.device.to_numpy().reshape(self.whole)
         return whole if rows is None else whole[:rows].copy()
+
+    def check(self, data: np.ndarray) -> None:
+        """Raises ValueError unless data has the array's shape."""
+        if data.shape != self.whole:
+            raise ValueError(f"an array of shape {self.whole} cannot take one of shape {data.shape}")
 
     def from_numpy(self, data: np.ndarray) -> None:
         """Take numbers of the array's shape. Raises ValueError for any other, before anything is written."""
-        wanted = (*self.shape, self.n) if self.n else self.shape
-        if data.shape != wanted:
-            raise ValueError(f"an array of shape {wanted} cannot take one of shape {data.shape}")
+        self.check(data)
         if self.host is not None:
             np.copyto(self.host, data, casting="unsafe")
         else:

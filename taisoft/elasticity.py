@@ -79,8 +79,7 @@ def elastic_forces(m: ti.template()):
     """Fill the corner buffer from x; returns nothing, nodes gather."""
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for number in range(g.first, g.last):
-            b = number & g.mask
+        for b in range(g.first, g.last):
             element_force(m, g, False, b)
 
 
@@ -89,8 +88,7 @@ def force_differential(m: ti.template(), dx: ti.template(), df: ti.template()):
     """df = (df/dx)(x) dx, matrix-free: (n_nodes) 3-vectors [m] to [N]."""
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for number in range(g.first, g.last):
-            b = number & g.mask
+        for b in range(g.first, g.last):
             X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
             dX = differences(m, g, dx, b, m.real)
             M = rest_gradients(m, b, m.real)
@@ -175,8 +173,7 @@ def measure(m: ti.template()):
         squeezed = none
         size = (m.n_blocks + m.chunks - 1) // m.chunks
         for g in ti.static(m.groups):
-            for k in range(ti.max(g.first, c * size), ti.min(g.last, (c + 1) * size)):
-                b = k & g.mask
+            for b in range(ti.max(g.first, c * size), ti.min(g.last, (c + 1) * size)):
                 psi, J, soft = element_state(m, g, b)
                 energy += psi
                 lowest = ti.min(lowest, J)
@@ -211,8 +208,7 @@ def cauchy_stress(m: ti.template(), sigma: ti.types.ndarray()):
     """Mean of sigma = P F^T / J over the deformed tet, (n_blocks * lanes, 9) [Pa]; not finite where a tet is flat."""
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for number in range(g.first, g.last):
-            b = number & g.mask
+        for b in range(g.first, g.last):
             X = differences(m, g, m.x, b, ti.f64)
             M = rest_gradients(m, b, ti.f64)
             p = law_constants(m, b, ti.f64)

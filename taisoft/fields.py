@@ -4,11 +4,10 @@ import math
 
 import numpy as np
 import taichi as ti
-from taichi.lang import impl
 
 from taisoft.arrays import DTYPES, Array, index_mask
 from taisoft.errors import SimulationError
-from taisoft.lane_pool import OWN_MASK, Lanes, own_field
+from taisoft.lane_pool import OWN_MASK, Lanes, free, own_field
 from taisoft.memory import available_memory, told
 from taisoft.runtime import lane_pool
 
@@ -20,7 +19,6 @@ class FieldArena:
 
     def __init__(self) -> None:
         self.bytes: dict[str, int] = {}
-        self._arrays: list[Array] = []
         self._lanes: list[Lanes] = []
         self._trees: list = []  # of fields
 
@@ -61,7 +59,6 @@ class FieldArena:
         if data is not None:
             array.from_numpy(data)
         self.bytes[name] = needed
-        self._arrays.append(array)
         return array
 
     def _ask_for(self, name: str, dtype, count: int, most: int) -> int:
@@ -80,11 +77,7 @@ class FieldArena:
         return f"not enough memory for the array '{name}': {told(needed)} are needed, available: {told(free)}"
 
     def release(self) -> None:
-        """Let go of the arrays; their memory is free once nobody else holds them."""
-        self._arrays.clear()
+        """Free the lane buffers. An array's memory is free once nothing refers to it."""
         self._lanes.clear()
-        while self._trees:
-            tree = self._trees.pop()
-            if tree.prog is impl.get_runtime().prog:  # else it was freed when Taichi was initialised anew
-                tree.destroy()
+        free(self._trees)
         self.bytes.clear()

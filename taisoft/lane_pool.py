@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import taichi as ti
+from taichi.lang import impl
 
 ENTRIES = 2**24  # of the pool: enough for the forces and the stiffness of 250,000 linear tets
 OWN_MASK = 2**30 - 1  # of indices into a field of its own: so many entries at most
@@ -32,9 +33,7 @@ class LanePool:
 
     def __init__(self, dtype):
         self.memory = ti.field(dtype)
-        builder = ti.FieldsBuilder()
-        builder.dense(ti.i, ENTRIES).place(self.memory)
-        builder.finalize()
+        place(self.memory, ENTRIES)
         self._taken: dict[int, int] = {}  # first entry -> one past the last
 
     def take(self, count: int) -> Lanes | None:
@@ -55,6 +54,20 @@ class LanePool:
 
 def own_field(dtype, count: int) -> tuple[Lanes, Any]:
     """A buffer with a field of its own, and the tree to destroy when it is no longer needed."""
-    memory, builder = ti.field(dtype), ti.FieldsBuilder()
-    builder.dense(ti.i, count).place(memory)
-    return Lanes(memory, 0, count, OWN_MASK), builder.finalize()
+    memory = ti.field(dtype)
+    return Lanes(memory, 0, count, OWN_MASK), place(memory, count)
+
+
+def place(field: Any, count: int) -> Any:
+    """Give a field memory for so many entries. Returns its tree: Taichi frees only whole trees of fields."""
+    builder = ti.FieldsBuilder()
+    builder.dense(ti.i, count).place(field)
+    return builder.finalize()
+
+
+def free(trees: list) -> None:
+    """Destroy and forget trees, but those that were freed when Taichi was initialised anew since."""
+    while trees:
+        tree = trees.pop()
+        if tree.prog is impl.get_runtime().prog:
+            tree.destroy()

@@ -10,11 +10,12 @@ A launch through Taichi looks every argument's type up; one that is known by its
 context that is made once. This rests on 1.7.4, the version that taisoft asks for.
 """
 
+import ast
 import dataclasses
 import inspect
+import itertools
 import linecache
 import operator
-import textwrap
 import types
 import weakref
 from collections.abc import Callable, Iterator
@@ -28,6 +29,7 @@ from taichi.lang.kernel_impl import Kernel, template
 from taichi.types import ndarray_type, primitive_types
 
 from taisoft.arrays import DTYPES, Array, Count, View
+from taisoft.tracing import source_of
 
 RECORD, ARRAY, COUNT, TUPLE, CONSTANT = range(5)
 REAL, WHOLE, HOST_ARRAY = range(3)
@@ -160,15 +162,16 @@ def _annotation(structure: tuple) -> Any:
 # --- source -------------------------------------------------------------------------------------------------------------
 
 
+_numbers = itertools.count()  # of what is generated
+
+
 def generate(function: Callable, structures: dict[str, tuple]) -> Callable:
     """The function with its templates, by name, replaced by their leaves.
 
     Its lines stand where the original's do, in a file of another name that exists in Python's cache of lines alone.
     """
-    import ast
-
-    lines, first = inspect.getsourcelines(function)
-    tree = ast.parse(textwrap.dedent("".join(lines))).body[0]
+    file, _, first, source = source_of(function)
+    tree = ast.parse(source).body[0]
     body = tree.body[1:] if isinstance(tree.body[0], ast.Expr) and isinstance(tree.body[0].value, ast.Constant) else tree.body
     scope = {**function.__globals__, **inspect.getclosurevars(function).nonlocals}
     parameters, handles = [], []
@@ -191,10 +194,9 @@ def generate(function: Callable, structures: dict[str, tuple]) -> Callable:
     head = f"def {function.__name__}({', '.join(parameters)}){returned}:\n"
     if structures:
         head += f"    {', '.join(structures)}, = _static(_records({', '.join(handles)}))\n"
-    dedented = textwrap.dedent("".join(lines)).splitlines(keepends=True)
     start = first - 1 + body[0].lineno - 1 - head.count("\n")  # lines before the head
-    text = "\n" * start + head + "".join(dedented[body[0].lineno - 1 :])
-    name = f"{inspect.getsourcefile(function)}#{function.__name__}-{len(linecache.cache)}"
+    text = "\n" * start + head + "".join(source.splitlines(keepends=True)[body[0].lineno - 1 :])
+    name = f"{file}#{function.__name__}-{next(_numbers)}"
     linecache.cache[name] = (len(text), None, text.splitlines(keepends=True), name)
     exec(compile(text, name, "exec"), scope)
     made = scope[function.__name__]

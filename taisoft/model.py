@@ -14,7 +14,6 @@ import taichi as ti
 
 from taisoft.arrays import Count
 from taisoft.elements import reference
-from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
 from taisoft.mass import MassMatrix, lumped_masses, upload_mass_matrix, weight_masses
 from taisoft.materials import LAWS
@@ -31,7 +30,6 @@ CHUNKS = {"cpu": 1024, "cuda": 4096}
 # |Dm| |Dm^-1| from which F is formed in f64: in f32 its rounding, that times 6e-8, would be a strain above 6e-6. Regular tets
 # have 3, those of a sheet whose cells are 30 times as wide as thick about 60
 ILL_CONDITIONED = 100.0
-BLOCK_MASKS = {1: 2**23 - 1, 2: 2**20 - 1}  # by order: `build_model` refuses more blocks
 MATRIX_BLOCKS = {1: 6, 2: 45 + 6}  # 3x3 blocks per tet in the buffer of an assembly: node pairs, and what they come from
 
 
@@ -49,12 +47,6 @@ class Group:
     corner_at: Count  # in Model.corner
     matrix_at: Count  # in the buffer of an assembly
     points_at: Count  # row of Model.points
-
-    @property
-    def mask(self) -> int:
-        """Bits of a block's number. The compiler handles the lanes of a block side by side only where it can tell that no index
-        into element data overflows, which `b & g.mask` shows: for any b that there is, it is b."""
-        return BLOCK_MASKS[self.order]
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,9 +231,6 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     lanes, real, npr = runtime.lanes, runtime.real, runtime.np_real
     layout, groups = _layout(scene, lanes)
     n_nodes, n_blocks = len(layout.rest), groups[-1].last
-    for g in groups:
-        if g.last > g.mask:
-            raise SimulationError(f"{n_blocks * lanes} tets are too many: at most {g.mask * lanes} of order {g.order} fit")
     nodes, Dm_inv, volume = _packed_tets(scene, layout, groups, lanes)
     start, entry = _gather_table(nodes, groups, volume > 0, n_nodes, lanes)
     block_body = np.zeros(n_blocks, dtype=np.int32)

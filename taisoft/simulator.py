@@ -25,7 +25,6 @@ from taisoft.stepping.contact import SUNK, ContactStep
 from taisoft.stepping.motion import Motion
 from taisoft.stepping.pull import Pull, batch
 from taisoft.stepping.world import World
-from taisoft.transfer import array_of
 
 
 def _release(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:
@@ -69,7 +68,7 @@ class Simulator(Resuming):
         for text in scale_warnings(scene):
             warnings.warn(text, UserWarning, stacklevel=2)
         self.plan = plan_of(scene, integrator, self_collision, pullable)
-        self._compiled_before = self._compiled_told = runtime.compile_clock()
+        self._compiled_before = self._compile_reported = runtime.compile_clock()
         self._runtime = runtime.open_runtime(arch, precision, f"the simulator of {[b.name for b in scene.bodies]}")
         self._arena = FieldArena()
         try:
@@ -175,7 +174,7 @@ class Simulator(Resuming):
 
     def _tell_softened(self) -> None:
         """Warn, once, of the first tet that is squeezed so far that its law softens."""
-        layout, first = self._world.layout, int(array_of(self._world.model.scalars)[10])
+        layout, first = self._world.layout, int(self._world.model.scalars.to_numpy()[10])
         if first == NO_TET:
             return
         self._softens = False
@@ -245,7 +244,7 @@ class Simulator(Resuming):
         new._world.restore(kept)
         new._stepper.forget()
         new._time_base = self.time, self.step_count
-        new._compiled_before, new._compiled_told = self._compiled_before, self._compiled_told
+        new._compiled_before, new._compile_reported = self._compiled_before, self._compile_reported
         self._release()
         _, give_back, owned, _ = new._release.detach()
         self.__dict__.update(new.__dict__)
@@ -259,7 +258,7 @@ class Simulator(Resuming):
 
     def _report(self) -> StepReport:
         measure(self._world.model)
-        elastic, lowest, inverted, kinetic, gravity = array_of(self._world.model.scalars)[:5].tolist()
+        elastic, lowest, inverted, kinetic, gravity = self._world.model.scalars.to_numpy()[:5].tolist()
         return StepReport(
             time=self.time,
             min_volume_ratio=lowest,
@@ -279,8 +278,8 @@ class Simulator(Resuming):
     def _take_compile_seconds(self) -> float:
         """Those that no run has reported yet."""
         now = runtime.compile_clock()
-        told, self._compiled_told = now - self._compiled_told, now
-        return told
+        seconds, self._compile_reported = now - self._compile_reported, now
+        return seconds
 
     @property
     def field_bytes(self) -> dict[str, int]:

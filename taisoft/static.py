@@ -14,7 +14,7 @@ from taisoft.scene.scene import Scene
 from taisoft.stepping.motion import Motion
 from taisoft.stepping.newton import StageResult, StageSolver
 from taisoft.stepping.world import World
-from taisoft.transfer import array_of, upload
+from taisoft.transfer import upload
 
 MAX_NEWTON = 100
 SMALLEST_LOAD_STEP = 1.0 / 256.0
@@ -113,7 +113,7 @@ class StaticSolver:
         self.target = self.world.next_target(time)
         self.world.upload_constraints()
         self.gravity = np.array(scene.gravity, dtype=np.float64)
-        self.loads = array_of(model.loads) if model.loaded else None
+        self.loads = model.loads.to_numpy() if model.loaded else None
 
     def solve(self) -> StaticResult:
         """The whole load at once; failing that, in steps that halve on failure and grow on success."""
@@ -126,7 +126,7 @@ class StaticSolver:
                 goal = min(1.0, done + share)
                 result = self._attempt(x, goal, self.tolerance if goal == 1.0 else max(self.tolerance, 1e-3))
                 if self._good(result):
-                    done, share, steps, x = goal, 1.5 * share, steps + 1, array_of(self.world.model.x)
+                    done, share, steps, x = goal, 1.5 * share, steps + 1, self.world.model.x.to_numpy()
                 else:
                     share *= 0.5
             if done < 1.0:  # the state of the last good share, judged by all of the load
@@ -136,7 +136,7 @@ class StaticSolver:
     def _good(self, result: StageResult) -> bool:
         """Nothing inverted, and the residual where it should be, or where it can be."""
         measure(self.world.model)
-        return (result.converged or result.at_rounding) and array_of(self.world.model.scalars)[2] == 0.0
+        return (result.converged or result.at_rounding) and self.world.model.scalars.to_numpy()[2] == 0.0
 
     def _attempt(self, x: np.ndarray, share: float, tolerance: float, max_newton: int = MAX_NEWTON) -> StageResult:
         """Solve with a share of the load, from x."""
@@ -156,12 +156,12 @@ class StaticSolver:
     def _answer(self, result: StageResult, steps: int, load: float) -> StaticResult:
         world = self.world
         measure(world.model)
-        s = array_of(world.model.scalars)
+        s = world.model.scalars.to_numpy()
         if not np.isfinite(result.residual):
             raise SimulationError(f"solve_static: {world.find_unfinite() or 'the residual is not finite'}")
         return StaticResult(
             converged=result.converged and load == 1.0, load=load, at_rounding=result.at_rounding,
             residual=result.residual, iterations=self.newton, linear_iterations=self.linear, load_steps=steps,
             elastic=float(s[0]), n_inverted=int(s[2]), _scene=world.scene, _layout=world.layout,
-            _positions=array_of(world.model.x), _reactions=self.solver.held_residual(),
+            _positions=world.model.x.to_numpy(), _reactions=self.solver.held_residual(),
         )  # fmt: skip

@@ -36,7 +36,7 @@ def _ends(file: str) -> dict[int, int]:
 
 
 @functools.cache
-def _source(function: Callable) -> tuple[str, list[str], int, str]:
+def source_of(function: Callable) -> tuple[str, list[str], int, str]:
     """File, lines, number of the first, and their text without the indentation that all share."""
     file, first = function.__code__.co_filename, function.__code__.co_firstlineno
     lines = linecache.getlines(file)[first - 1 : _ends(file)[first]]
@@ -47,7 +47,7 @@ def _tree_and_context(
     self, excluded_parameters=(), is_kernel=True, arg_features=None, args=None, ast_builder=None, is_real_function=False
 ):  # fmt: skip
     """The function's syntax, which tracing writes into, and what else it needs; as Taichi's own."""
-    file, lines, first, text = _source(self.func)
+    file, lines, first, text = source_of(self.func)
     tree = ast.parse(text)
     tree.body[0].decorator_list = []
     names = kernel_impl._get_global_vars(self.func)

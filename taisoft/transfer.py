@@ -8,9 +8,7 @@ from taisoft.arrays import Array
 def upload(pairs: list[tuple[Array, np.ndarray]]) -> None:
     """pairs: an array, and numbers of its shape. Raises ValueError for another shape, before anything is written."""
     for array, data in pairs:
-        wanted = (*array.shape, array.n) if array.n else array.shape
-        if data.shape != wanted:
-            raise ValueError(f"an array of shape {wanted} cannot take one of shape {data.shape}")
+        array.check(data)
     for array, data in pairs:
         array.from_numpy(data)
 
@@ -18,8 +16,3 @@ def upload(pairs: list[tuple[Array, np.ndarray]]) -> None:
 def download(arrays: list[Array], rows: int | None = None) -> list[np.ndarray]:
     """Copies, of the first `rows` rows if that is given."""
     return [array.to_numpy(rows) for array in arrays]
-
-
-def array_of(array: Array, rows: int | None = None) -> np.ndarray:
-    """One of `download`."""
-    return array.to_numpy(rows)

@@ -18,7 +18,7 @@ from taisoft.arrays import DTYPES
 from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
 from taisoft.runtime import kernel
-from taisoft.transfer import array_of, download, upload
+from taisoft.transfer import download, upload
 
 SHAPES = [(7,), (5, 3), (4, 3, 2)]  # of scalars
 
@@ -85,9 +85,9 @@ def test_everything_comes_back(arrays):
     upload(list(zip(arrays, data)))
     assert same(download(arrays), data)
     assert same(download(arrays[:5], 3), [one[:3] for one in data[:5]])
-    read = array_of(arrays[0])
+    read = arrays[0].to_numpy()
     read[:] = 0
-    assert same([array_of(arrays[0])], data[:1])
+    assert same([arrays[0].to_numpy()], data[:1])
 
 
 def test_numbers_are_rounded(arrays):
@@ -110,11 +110,11 @@ def test_what_does_not_fit_is_refused(arrays):
 def test_entries_on_the_host(arrays):
     vector = next(array for array in arrays if array.dtype == ti.f64 and array.n == 3)
     vector[2] = 1.0, 2.0, 3.0
-    assert vector[2].tolist() == [1.0, 2.0, 3.0] and array_of(vector)[2].tolist() == [1.0, 2.0, 3.0]
+    assert vector[2].tolist() == [1.0, 2.0, 3.0] and vector.to_numpy()[2].tolist() == [1.0, 2.0, 3.0]
     scalar = next(array for array in arrays if array.dtype == ti.i32 and array.shape == (7,))
     scalar.fill(4)
     scalar[1] = 5
-    assert type(scalar[1]) is int and array_of(scalar).tolist() == [4, 5, 4, 4, 4, 4, 4]
+    assert type(scalar[1]) is int and scalar.to_numpy().tolist() == [4, 5, 4, 4, 4, 4, 4]
 
 
 @kernel

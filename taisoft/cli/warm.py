@@ -24,8 +24,8 @@ def command(arguments: Namespace) -> int:
     start, before = time.perf_counter(), n_compiled()
     for law, (integrator, dt), contacts in itertools.product(LAWS, INTEGRATORS.items(), CONTACTS):
         what = f"{law}, {integrator}, {contacts}"
-        _tell(what, _simulate, scene(law, contacts), integrator, dt, arguments.precision)
-    _tell("statics", ts.solve_static, scene(LAWS[0], CONTACTS[0]))
+        _report(what, _simulate, scene(law, contacts), integrator, dt, arguments.precision)
+    _report("statics", ts.solve_static, scene(LAWS[0], CONTACTS[0]))
     print(f"{n_compiled() - before} kernels in {time.perf_counter() - start:.0f} s")
     return 0
 
@@ -50,7 +50,7 @@ def _simulate(made: ts.Scene, integrator: str, dt: float, precision: str) -> Non
         sim.energies()
 
 
-def _tell(what: str, do: Callable, *arguments: Any) -> None:
+def _report(what: str, do: Callable, *arguments: Any) -> None:
     start, before = time.perf_counter(), n_compiled()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of scenes that nobody looks at

@@ -17,7 +17,7 @@ from taisoft.model import Layout
 from taisoft.scene.body import Body
 from taisoft.scene.obstacles import Capsule, Obstacle, Sphere
 from taisoft.scene.scene import Scene
-from taisoft.transfer import array_of, download
+from taisoft.transfer import download
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class Containment:
         if not self._ready:
             self._prepare()
         nodes, lo, hi = download([x_nodes, surface.body_lo, surface.body_hi])
-        x = array_of(surface.x) if len(self._triangles) or self._alone else None
+        x = surface.x.to_numpy() if len(self._triangles) or self._alone else None
         if self._alone:  # the search keeps boxes of colliders only where two have triangles
             lo, hi = x.min(axis=0, keepdims=True), x.max(axis=0, keepdims=True)
         frames = download([shapes.origin, shapes.rotation]) if self._round else None
@@ -120,7 +120,7 @@ class Containment:
         boxed = boxed.all(axis=2) & self._may_hold
         found = []
         if boxed.any():
-            x = array_of(surface.x)
+            x = surface.x.to_numpy()
             looks = (self._look(int(k), int(self._solid[b]), points[k], x) for k, b in np.argwhere(boxed))
             found += [one for one in looks if one is not None]
         for i, b, shape in self._round:

@@ -16,7 +16,6 @@ from taisoft.errors import SceneError
 from taisoft.fields import FieldArena
 from taisoft.runtime import open_kind, open_runtime
 from taisoft.scene.checks import array, choice, number
-from taisoft.transfer import array_of
 
 METHODS = (*SOLVERS, "augmented_lagrangian", "auto")
 SWEEPS = 100  # of Gauss-Seidel, before "auto" goes on with an augmented Lagrangian
@@ -105,7 +104,7 @@ def _run(
         if method == "coloured_gauss_seidel":
             store(p, colour_greedy(matrix_graph(W)))
         found = solve(p, method, BELOW * tolerance, most, every=1, history=True)
-        return array_of(p.r, len(mu)), found.history
+        return p.r.to_numpy(len(mu)), found.history
 
 
 def _auto(

@@ -13,7 +13,6 @@ from taisoft.contact.graph import UNCOLOURED, colour_greedy, colour_random, grou
 from taisoft.contact.problem import NODES, ContactProblem, fill_field, index_nodes
 from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
-from taisoft.transfer import array_of
 
 BITS = 30  # colours that are looked at in one go
 
@@ -141,11 +140,11 @@ def graph_of(p: ContactProblem) -> sp.csr_matrix:
     """Adjacency of the contacts that a problem holds, brought to the host."""
     k = int(p.count[0])
     if not p.matrix:
-        return node_graph(array_of(p.node, k), array_of(p.arity, k), array_of(p.inverse_mass))
-    start = array_of(p.row_start, k + 1)
+        return node_graph(p.node.to_numpy(k), p.arity.to_numpy(k), p.inverse_mass.to_numpy())
+    start = p.row_start.to_numpy(k + 1)
     n = int(start[-1])
-    blocks = array_of(p.block, n).reshape(-1, 3, 3)
-    return matrix_graph(sp.bsr_matrix((blocks, array_of(p.column, n), start), shape=(3 * k, 3 * k)))
+    blocks = p.block.to_numpy(n).reshape(-1, 3, 3)
+    return matrix_graph(sp.bsr_matrix((blocks, p.column.to_numpy(n), start), shape=(3 * k, 3 * k)))
 
 
 def store(p: ContactProblem, colour: np.ndarray) -> None:

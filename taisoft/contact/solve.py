@@ -8,7 +8,6 @@ from taisoft.contact import coloured_gauss_seidel, gauss_seidel, hybrid, jacobi
 from taisoft.contact.problem import GOOD, HISTORY, LOOKS, RESIDUAL, SWEEPS, ContactProblem, find_velocities
 from taisoft.contact.sweeps import run_parallel, run_serial
 from taisoft.runtime import kernel
-from taisoft.transfer import array_of
 
 VISITS = 1_000_000  # contacts visited in a launch: about 0.1 s, so that Ctrl-C is heard
 EVERY = 5  # sweeps between two looks at the residual, which costs as much as a sweep
@@ -54,7 +53,7 @@ def solve(
         left, first = left - n, 0
         residual = float(p.state[RESIDUAL])
         if history:
-            told += array_of(p.history, int(p.state[LOOKS])).tolist()
+            told += p.history.to_numpy(int(p.state[LOOKS])).tolist()
         if left == 0 or residual <= tolerance:
             break
     good = float(p.state[GOOD])

@@ -95,8 +95,7 @@ def assemble(m: ti.template(), A: ti.template(), projected: ti.template()):
     """A = K(x) over all nodes [N/m], unprojected or with every element's part made positive semi-definite."""
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for number in range(g.first, g.last):
-            b = number & g.mask
+        for b in range(g.first, g.last):
             element_blocks(m, g, A, b, projected)
     ti.loop_config(serialize=m.serial)
     for e in range(A.n_edges):

@@ -14,7 +14,7 @@ import numpy as np
 from taisoft.elasticity import gather_forces
 from taisoft.model import Layout
 from taisoft.scene.scene import Scene
-from taisoft.transfer import array_of, download
+from taisoft.transfer import download
 
 if TYPE_CHECKING:
     from taisoft.stepping.newton import StageSolver
@@ -36,7 +36,7 @@ class BodyBalance:
         gather_forces(m, solver.pcg.q)
         fields = [w.residual, m.v, w.v_hat, solver.pcg.q, m.free, m.mass, m.weight, *([m.loads] if m.loaded else [])]
         residual, v, v_hat, elastic, free, mass, weight, *loads = (a.astype(np.float64) for a in download(fields))
-        external = weight[:, None] * array_of(m.gravity)[0] + (loads[0] if loads else 0.0)
+        external = weight[:, None] * m.gravity.to_numpy()[0] + (loads[0] if loads else 0.0)
         r, inertia, elastic, external, masses = (
             np.sqrt(np.add.reduceat(((free * a) ** 2).sum(axis=1), self._start))
             for a in (residual, mass[:, None] * (v - v_hat), elastic, external, mass[:, None] * np.ones(3))

@@ -26,7 +26,7 @@ from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
 from taisoft.stepping.tunnelling import CLOSEST, DEPTH, HASTE, SINKING, SPEED, WHICH, find_way, survey
 from taisoft.stepping.world import World
-from taisoft.transfer import array_of, download, upload
+from taisoft.transfer import download, upload
 
 STANDOFF = 2e-3  # of the finest body's mean surface edge: gap that contacts keep, so that surfaces do not cross in curved motion
 SUNK = 0.02  # of the finer side's mean surface edge: penetration that is told as a problem
@@ -173,7 +173,7 @@ class ContactStep:
         if known is None or known[1] != dt or abs(known[0] - time) > 1e-6 * dt:
             self._searched = None
             moved = world.motion.moved
-            led = (moved, world.motion.places(time + dt) - array_of(world.model.x)[moved]) if len(moved) else None
+            led = (moved, world.motion.places(time + dt) - world.model.x.to_numpy()[moved]) if len(moved) else None
             d.find(time, dt, led)
             self._searched, self._swept = (time, dt), dt
         return d.counts.contacts
@@ -317,7 +317,7 @@ class ContactStep:
         self._searched, self._swept = (time, dt), dt
         known = set(map(tuple, download([self.found.feature], self.n_contacts)[0].tolist()))
         kept = download([self.detection.kept], self.detection.counts.contacts)[0]
-        found = array_of(self.detection.buffer.data.feature)[kept]
+        found = self.detection.buffer.data.feature.to_numpy()[kept]
         return not known.issuperset(map(tuple, found.tolist()))
 
     def look(self, time: float, dt: float) -> tuple[float, float]:

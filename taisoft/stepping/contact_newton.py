@@ -33,7 +33,7 @@ from taisoft.stepping.contact_stage import (
 from taisoft.stepping.impact import SPREAD, apply_impact, begin_impact, holding_work, let_go, measure_impact, start_from
 from taisoft.stepping.newton import MAX_FORCING, SLOW, StageResult, StageSolver, _forcing, count_all, merge, stalled
 from taisoft.stepping.stage import begin_stage, form_residual
-from taisoft.transfer import array_of, upload
+from taisoft.transfer import upload
 
 # R over the r-factors at the start of a stage, at least and at most. A larger one means fewer multipliers but more and harder
 # Newton steps: it doubles after a multiplier that took one, and is halved after one that took many.
@@ -79,7 +79,7 @@ class ContactStageSolver(StageSolver):
 
     def snapshot(self) -> dict:
         """As without contacts, and the masses of the matrix that the next stage's r-factors rest on."""
-        masses = array_of(self.contact.problem.inverse_mass) if self._weighed else None
+        masses = self.contact.problem.inverse_mass.to_numpy() if self._weighed else None
         return super().snapshot() | {"weighed": self._weighed, "inverse_mass": masses}
 
     def restore(self, kept: dict) -> None:

@@ -189,8 +189,7 @@ def evaluate(
     if ti.static(not linear):
         for g in ti.static(m.groups):
             ti.loop_config(serialize=m.serial)
-            for number in range(g.first, g.last):
-                b = number & g.mask
+            for b in range(g.first, g.last):
                 if how != STILL:
                     element_force(m, g, False, b)
     ti.loop_config(serialize=p.serial)

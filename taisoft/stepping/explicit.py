@@ -157,8 +157,7 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
         if ti.static(s.verlet):
             if restart != 0:
                 for g in ti.static(m.groups):
-                    for number in range(g.first, g.last):
-                        b = number & g.mask
+                    for b in range(g.first, g.last):
                         element_force(m, g, m.stiffness_damping, b)
                 for i in range(m.n_nodes):
                     s.acceleration[i] = acceleration(m, i)
@@ -175,8 +174,7 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
                     lead(m, s, done, dt64)
             inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
             for g in ti.static(m.groups):
-                for number in range(g.first, g.last):
-                    b = number & g.mask
+                for b in range(g.first, g.last):
                     J = element_force(m, g, m.stiffness_damping, b)
                     lowest = ti.min(lowest, J)
                     inverted += count_inverted(m, b, J)
@@ -228,8 +226,7 @@ def tell_volumes(m: ti.template(), b, J):
 def elements_parallel(m: ti.template()):
     """One sub-step's element loop over threads; scalars 6, 9: smallest J so far, inverted tets of this sub-step."""
     for g in ti.static(m.groups):
-        for number in range(g.first, g.last):
-            b = number & g.mask
+        for b in range(g.first, g.last):
             tell_volumes(m, b, element_force(m, g, m.stiffness_damping, b))
 
 

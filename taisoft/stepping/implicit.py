@@ -16,7 +16,7 @@ from taisoft.stepping.contact_newton import ContactStageSolver
 from taisoft.stepping.newton import StageResult, StageSolver, count_all, merge
 from taisoft.stepping.substepping import RETRIES, Substepping
 from taisoft.stepping.world import World
-from taisoft.transfer import array_of, download, upload
+from taisoft.transfer import download, upload
 
 MAX_NEWTON = 50  # a step that needs more is reported as not converged
 MAX_CONTACT_NEWTON = 400  # with contacts, over all multipliers
@@ -241,7 +241,7 @@ class ImplicitStepper:
         self.lossy = scheme.before == 0.0
         if target is not None:
             if scheme.midpoint:
-                target = 0.5 * (target + array_of(m.x)[world.motion.moved])
+                target = 0.5 * (target + m.x.to_numpy()[world.motion.moved])
             led = [(w.moved_axes, world.motion.moved_axes()), (w.targets, target)]
             if m.consistent:
                 led.append((w.led_acceleration, world.motion.accelerations(time, dt, self.scheme.before == 0.0)))
@@ -262,7 +262,7 @@ class ImplicitStepper:
         if scheme.midpoint:
             finish_midpoint(m, h)
         if not np.isfinite(result.residual):  # a NaN anywhere in x or v reaches the residual
-            where = world.find_unfinite(array_of(self.solver.work.residual)) or "the residual is not finite"
+            where = world.find_unfinite(self.solver.work.residual.to_numpy()) or "the residual is not finite"
             restore(m, h)
             self.forget()
             raise SimulationError(f"step {world.step_count + 1}: {where}")

@@ -26,7 +26,7 @@ from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.coupling import NO_COUPLING
 from taisoft.model import Model
 from taisoft.stepping.stage import StageWork, begin_stage, form_residual, stage_terms, start_step, try_step
-from taisoft.transfer import array_of, download, upload
+from taisoft.transfer import download, upload
 
 MAX_BACKTRACKS = 30  # halvings: below 1e-9 of a step nothing but rounding is left
 SLOW = 0.2  # a step that leaves more of |r| than this asks for a new matrix
@@ -127,7 +127,7 @@ class StageSolver:
         stiff = np.abs(constants[:, :2]).sum(axis=1)[body]
         g = np.sqrt((Dm_inv**2).sum(axis=1))
         if m.points is not None:  # the gradients of quadratic shape functions are larger
-            steepest = float(np.abs(array_of(m.points)[:, 1:]).max())
+            steepest = float(np.abs(m.points.to_numpy()[:, 1:]).max())
             for group in m.groups:
                 g[group.first : group.last] *= steepest if group.order == 2 else 1.0
         largest = float(np.abs(x).max())
@@ -143,7 +143,7 @@ class StageSolver:
         """What lives between stages: the rounding, which tells of the state where numbers last changed, and the reactions."""
         return {
             "rounding_force": self.rounding_force, "rounding_mass": self.rounding_mass, "rounding_of_x": self.rounding_of_x,
-            "rounding_by_body": self.rounding_by_body, "residual": array_of(self.work.residual),
+            "rounding_by_body": self.rounding_by_body, "residual": self.work.residual.to_numpy(),
         }  # fmt: skip
 
     def restore(self, kept: dict) -> None:
@@ -177,7 +177,7 @@ class StageSolver:
     def _objective(self, c: float, beta: float) -> float:
         m = self.model
         measure(m)
-        scalars = array_of(m.scalars)
+        scalars = m.scalars.to_numpy()
         energy = float(scalars[0] + scalars[4])
         if c == 0.0 and not m.loaded and not m.damped:  # no other terms
             return energy

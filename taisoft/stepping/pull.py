@@ -17,7 +17,6 @@ import numpy as np
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 from taisoft.stepping.world import World
-from taisoft.transfer import array_of
 
 SOFT = 0.5
 STRAIN = 0.25
@@ -66,7 +65,7 @@ class Pull:
         target = checks.array(target, f"body '{own.name}': the target of a pull", ((3,),))
         stiffness = checks.number(stiffness, "the stiffness of a pull", above=0.0, unit="N/m")
         nodes, weights = nodes + layout.node_start[body], weights / weights.sum()
-        masses = array_of(self._world.model.mass).astype(np.float64)
+        masses = self._world.model.mass.to_numpy().astype(np.float64)
         mass = 1.0 / float((weights**2 / masses[nodes]).sum())
         area = (mass / own.material.density) ** (2 / 3)
         strongest = min(STRAIN * own.material.young * area, HEAVY * EARTH * float(masses[layout.nodes(body)].sum()))

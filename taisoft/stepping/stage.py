@@ -108,8 +108,7 @@ def form_residual(
     """
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for number in range(g.first, g.last):
-            b = number & g.mask
+        for b in range(g.first, g.last):
             element_force(m, g, False, b)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):

@@ -11,7 +11,7 @@ from taisoft.errors import SimulationError
 from taisoft.model import Model
 from taisoft.stepping import explicit
 from taisoft.stepping.world import World
-from taisoft.transfer import array_of, upload
+from taisoft.transfer import upload
 
 LAUNCH_SECONDS = 0.1  # of one launch at most, roughly, so that Ctrl-C is heard
 DAMPING_POINT_SECONDS = 800e-9  # that stiffness damping adds to a law's POINT_SECONDS: it projects the stiffness of each point
@@ -111,7 +111,7 @@ class ExplicitStepper:
 
         Verlet's acceleration was found with a velocity of the middle, so it is kept, not found again.
         """
-        return {"stale": self.stale} | {name: array_of(field) for name, field in self._kept_fields().items()}
+        return {"stale": self.stale} | {name: field.to_numpy() for name, field in self._kept_fields().items()}
 
     def restore(self, kept: dict) -> None:
         """Back to what `snapshot` told."""
@@ -174,7 +174,7 @@ class ExplicitStepper:
         else:
             self._launch_parallel(n, dt)
         self.stale = False
-        done, lowest, inverted = array_of(m.scalars)[5:8].tolist()
+        done, lowest, inverted = m.scalars.to_numpy()[5:8].tolist()
         return SubstepResult(int(done), lowest, int(inverted))
 
     def _launch_parallel(self, n: int, dt: float) -> None:
@@ -201,5 +201,5 @@ class ExplicitStepper:
         """(n_nodes, 3) force of the constraints in the last sub-step [N]."""
         out = np.zeros((self.world.model.n_nodes, 3))
         if self.work.n_held:
-            out[self.world.motion.held] = array_of(self.work.reaction)
+            out[self.world.motion.held] = self.work.reaction.to_numpy()
         return out

@@ -1,10 +1,10 @@
-"""Taichi fields for its renderer, which draws nothing else. Released together: Taichi frees only whole trees of fields."""
+"""Taichi fields for its renderer, which draws nothing else, released together."""
 
 import numpy as np
 import taichi as ti
-from taichi.lang import impl
 
 from taisoft.arrays import DTYPES
+from taisoft.lane_pool import free, place
 
 
 class GuiFields:
@@ -22,19 +22,14 @@ class GuiFields:
         return self._place(ti.Vector.field(n, dtype), data, count)
 
     def _place(self, field, data: np.ndarray | None, count: int | None = None):
-        builder = ti.FieldsBuilder()
-        builder.dense(ti.i, len(data) if count is None else count).place(field)
-        self._trees.append(builder.finalize())
+        self._trees.append(place(field, len(data) if count is None else count))
         if data is not None:
             move([(field, data)])
         return field
 
     def release(self) -> None:
-        """Free the fields, where Taichi was not initialised anew since, which has freed them."""
-        while self._trees:
-            tree = self._trees.pop()
-            if tree.prog is impl.get_runtime().prog:
-                tree.destroy()
+        """Free the fields."""
+        free(self._trees)
 
 
 def move(pairs: list[tuple]) -> None:
