@@ -26,6 +26,7 @@ from taisoft.elements.lanes import broadcast
 from taisoft.linear import block_csr, pcg
 from taisoft.output.report import peak_memory
 from taisoft.runtime import compile_clock, kernel, open_runtime, threads
+from taisoft.scalars import LOWEST_J
 from taisoft.scene.scene import Scene
 from taisoft.stepping import contact_newton, newton
 from taisoft.study.stretch import advance, warm_up
@@ -155,7 +156,7 @@ def explicit(row: Row, size: int) -> None:
 
 @kernel
 def repeat_elements(m: ti.template(), n: ti.i32):
-    """The element loop of an explicit step n times on one thread; scalars 6: the least J of a lane."""
+    """The element loop of an explicit step n times on one thread; scalars: LOWEST_J of a lane."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         low = broadcast(ti.cast(HUGE, m.real), m.lanes)
@@ -163,7 +164,7 @@ def repeat_elements(m: ti.template(), n: ti.i32):
             for g in ti.static(m.groups):
                 for b in range(g.first, g.last):
                     low = ti.min(low, element_force(m, g, False, b))
-        m.scalars[6] = low[0]
+        m.scalars[LOWEST_J] = low[0]
 
 
 def _element_seconds(sim: ts.Simulator, n: int) -> float:

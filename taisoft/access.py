@@ -11,6 +11,7 @@ from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
 from taisoft.errors import SceneError, SimulationError
 from taisoft.records import Energies
+from taisoft.scalars import ELASTIC, GRAVITY, KINETIC
 from taisoft.scene.changes import CHANGEABLE, changed_material
 from taisoft.settings import Settings, check_dt
 from taisoft.stability import stable_dt
@@ -86,8 +87,8 @@ class StateAccess(Guarded):
         """Energies of the present state [J]."""
         model = self._open_world().model
         measure(model)
-        elastic, _, _, kinetic, gravity = model.scalars.to_numpy()[:5].tolist()
-        return Energies(kinetic=kinetic, elastic=elastic, gravity=gravity)
+        scalars = model.scalars.to_numpy().tolist()
+        return Energies(kinetic=scalars[KINETIC], elastic=scalars[ELASTIC], gravity=scalars[GRAVITY])
 
     def reactions(self, body: str | None = None) -> np.ndarray:
         """(n_nodes, 3) force of the constraint on each fixed or moved node in the last step [N], else 0."""

@@ -19,6 +19,7 @@ from taisoft.mass import MassMatrix, lumped_masses, upload_mass_matrix, weight_m
 from taisoft.materials import LAWS
 from taisoft.node_graph import PAIRS, NodeGraph, node_graph
 from taisoft.runtime import Runtime, threads
+from taisoft.scalars import N_COLUMNS, N_SCALARS
 from taisoft.scene.scene import Material, Scene
 from taisoft.transfer import download
 
@@ -86,8 +87,8 @@ class Model:
     loaded: bool
     damped: bool
     stiffness_damping: bool
-    scalars: Any  # (16) f64: what a kernel tells the host
-    partial: Any  # (chunks, 8) f64: partial sums, added in a fixed order
+    scalars: Any  # (N_SCALARS) f64: what kernels leave for the host, each in its place
+    partial: Any  # (chunks, N_COLUMNS) f64: partial sums, added in a fixed order
     chunks: int
 
 
@@ -274,8 +275,8 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
         damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
         consistent=on["consistent_mass"], loaded=on["loads"], damped=damped, stiffness_damping=on["stiffness_damping"],
-        scalars=arena.field("scalars", ti.f64, 16),
-        partial=arena.field("partial", ti.f64, (chunks, 8)),
+        scalars=arena.field("scalars", ti.f64, N_SCALARS),
+        partial=arena.field("partial", ti.f64, (chunks, N_COLUMNS)),
         chunks=chunks,
     )  # fmt: skip
     if on["consistent_mass"]:

@@ -17,6 +17,7 @@ from taisoft.model import build_model
 from taisoft.records import RunReport, StepReport
 from taisoft.resuming import Resuming
 from taisoft.running import run
+from taisoft.scalars import FIRST_SOFTENED, GRAVITY
 from taisoft.scene.scene import Scene
 from taisoft.settings import check_count, check_settings, plan_of
 from taisoft.stability import scale_warnings
@@ -174,7 +175,7 @@ class Simulator(Resuming):
 
     def _tell_softened(self) -> None:
         """Warn, once, of the first tet that is squeezed so far that its law softens."""
-        layout, first = self._world.layout, int(self._world.model.scalars.to_numpy()[10])
+        layout, first = self._world.layout, int(self._world.model.scalars[FIRST_SOFTENED])
         if first == NO_TET:
             return
         self._softens = False
@@ -258,7 +259,7 @@ class Simulator(Resuming):
 
     def _report(self) -> StepReport:
         measure(self._world.model)
-        elastic, lowest, inverted, kinetic, gravity = self._world.model.scalars.to_numpy()[:5].tolist()
+        elastic, lowest, inverted, kinetic, gravity = self._world.model.scalars.to_numpy()[: GRAVITY + 1].tolist()
         return StepReport(
             time=self.time,
             min_volume_ratio=lowest,

@@ -9,6 +9,7 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.fields import FieldArena
 from taisoft.model import Layout, build_model
 from taisoft.runtime import Runtime, open_kind, open_runtime
+from taisoft.scalars import ELASTIC, N_INVERTED
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
 from taisoft.stepping.motion import Motion
@@ -136,7 +137,7 @@ class StaticSolver:
     def _good(self, result: StageResult) -> bool:
         """Nothing inverted, and the residual where it should be, or where it can be."""
         measure(self.world.model)
-        return (result.converged or result.at_rounding) and self.world.model.scalars.to_numpy()[2] == 0.0
+        return (result.converged or result.at_rounding) and self.world.model.scalars[N_INVERTED] == 0.0
 
     def _attempt(self, x: np.ndarray, share: float, tolerance: float, max_newton: int = MAX_NEWTON) -> StageResult:
         """Solve with a share of the load, from x."""
@@ -156,12 +157,12 @@ class StaticSolver:
     def _answer(self, result: StageResult, steps: int, load: float) -> StaticResult:
         world = self.world
         measure(world.model)
-        s = world.model.scalars.to_numpy()
+        scalars = world.model.scalars.to_numpy()
         if not np.isfinite(result.residual):
             raise SimulationError(f"solve_static: {world.find_unfinite() or 'the residual is not finite'}")
         return StaticResult(
             converged=result.converged and load == 1.0, load=load, at_rounding=result.at_rounding,
             residual=result.residual, iterations=self.newton, linear_iterations=self.linear, load_steps=steps,
-            elastic=float(s[0]), n_inverted=int(s[2]), _scene=world.scene, _layout=world.layout,
+            elastic=float(scalars[ELASTIC]), n_inverted=int(scalars[N_INVERTED]), _scene=world.scene, _layout=world.layout,
             _positions=world.model.x.to_numpy(), _reactions=self.solver.held_residual(),
         )  # fmt: skip

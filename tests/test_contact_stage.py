@@ -23,6 +23,7 @@ from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import to_scipy, unpacked
 from taisoft.linear.coupling import add_pulls, clear_pulls, gather_pulls, prepare_terms, pull_with_all
 from taisoft.runtime import kernel
+from taisoft.scalars import END_SLOPE, START_SLOPE
 from taisoft.stepping import contact_stage
 from taisoft.stepping.contact_stage import SHARE, STAY, STEP, STILL
 from taisoft.stepping.newton import StageSolver
@@ -244,7 +245,7 @@ def test_residual_of_a_stage(rig, pressed, threads):
         if how == STEP:
             slope = (rig.free * before * y).sum()
             size = np.linalg.norm(before.astype(float)) * np.linalg.norm(y.astype(float))
-            assert m.scalars[13] == pytest.approx(slope, abs=10 * rig.close * size)
+            assert m.scalars[START_SLOPE] == pytest.approx(slope, abs=10 * rig.close * size)
         told = np.zeros(5)
         form_residual(m, work, cg, 1.0, BETA, told)
         expected = work.residual.to_numpy() - (rig.J.T @ r.ravel()).reshape(-1, 3)
@@ -254,7 +255,7 @@ def test_residual_of_a_stage(rig, pressed, threads):
         wanted = [((rig.free * expected) ** 2).sum(), *told[1:4], (((1 - rig.free) * expected) ** 2).sum()]
         assert norms == pytest.approx(wanted, rel=100 * rig.close) and norms[4] > 0
         slope, size = (rig.free * expected * y).sum(), np.linalg.norm(expected) * np.linalg.norm(y.astype(float))
-        assert m.scalars[12] == pytest.approx(slope, abs=100 * rig.close * size)
+        assert m.scalars[END_SLOPE] == pytest.approx(slope, abs=100 * rig.close * size)
 
 
 def test_a_linearised_stage_is_linear(rig):

@@ -16,6 +16,7 @@ from scenes import SNH, SVK, built, mixed_scene
 
 from taisoft import elasticity
 from taisoft.linear import block_csr
+from taisoft.scalars import ELASTIC, GRAVITY, MIN_J, N_INVERTED
 
 SQUEEZE = np.array([[0.6, 0.1, 0.0], [-0.15, 1.2, 0.05], [0.0, 0.1, 0.7]])
 
@@ -70,7 +71,7 @@ def test_energies_and_volume_ratios(rig, squeezed):
     rig.model.scalars.fill(-1.0)
     elasticity.measure(rig.model)
     # sums are in f64, but the rest shape, masses and gravity are stored in the model's precision
-    assert rig.model.scalars.to_numpy()[:5] == pytest.approx(expected, rel=10 * rig.eps, abs=10 * rig.eps)
+    assert rig.model.scalars.to_numpy()[: GRAVITY + 1] == pytest.approx(expected, rel=10 * rig.eps, abs=10 * rig.eps)
 
 
 def test_forces(rig, squeezed):
@@ -91,7 +92,7 @@ def test_no_force_at_rest(rig, where):
     largest = max(part.material.young for part in rig.oracle.parts)  # times about 1 m^2: the force of a strain of 1
     rounding = rig.eps + (1e-11 if where == "far" else 0.0)
     assert np.abs(force).max() < 10 * rounding * largest
-    assert rig.model.scalars[0] < 10 * rounding * largest and rig.model.scalars[2] == 0  # [J], inverted tets
+    assert rig.model.scalars[ELASTIC] < 10 * rounding * largest and rig.model.scalars[N_INVERTED] == 0  # [J], inverted tets
 
 
 def test_forces_are_minus_the_gradient_of_the_energy(rig, squeezed):
@@ -101,7 +102,7 @@ def test_forces_are_minus_the_gradient_of_the_energy(rig, squeezed):
     for step in (h, -h):
         rig.model.x.from_numpy(squeezed + step * way)
         elasticity.measure(rig.model)
-        energies.append(rig.model.scalars[0])
+        energies.append(rig.model.scalars[ELASTIC])
     slope = (energies[0] - energies[1]) / (2 * h)
     assert abs(slope) > 1e4  # [N]
     assert -np.sum(elastic_force(rig, squeezed) * way) == pytest.approx(slope, rel=1e-7 + 30 * rig.eps)
@@ -117,7 +118,7 @@ def test_a_tet_inverted_at_one_point_is_inverted(rig):
     assert count == (J <= 0).any(axis=1).sum() > 0 and (J <= 0).sum(axis=1).max() == 1
     rig.model.x.from_numpy(x)
     elasticity.measure(rig.model)
-    assert rig.model.scalars[1] == pytest.approx(low, abs=10 * rig.eps) and rig.model.scalars[2] == count
+    assert rig.model.scalars[MIN_J] == pytest.approx(low, abs=10 * rig.eps) and rig.model.scalars[N_INVERTED] == count
 
 
 def test_force_differential(rig, squeezed):

@@ -18,6 +18,7 @@ import taisoft as ts
 from taisoft import runtime
 from taisoft.elasticity import NO_TET, measure
 from taisoft.materials import LAWS
+from taisoft.scalars import FIRST_SOFTENED, GRAVITY
 from taisoft.stepping.substeps import LAUNCH_SECONDS, MAX_BATCH, largest_batch
 
 LARGE = 34_560  # tets of the largest mesh whose runs are timed, `taisoft bench elasticity`
@@ -44,15 +45,15 @@ def test_energies_of_all_laws(laws, precision):
             m.x.from_numpy(x)
             m.v.from_numpy(v)
             measure(m)
-            elastic, lowest, inverted, kinetic, gravity = m.scalars.to_numpy()[:5]
+            elastic, lowest, inverted, kinetic, gravity = m.scalars.to_numpy()[: GRAVITY + 1]
             low, count = rig.oracle.volume_ratios(x)
             # The rest shape, masses and gravity are stored in the model's precision. A strain of 0.02 is formed from numbers of
             # about 1, so that it, and twice as much its energy, loses a factor of 50
             assert elastic == pytest.approx(rig.oracle.energy(x), rel=100 * rig.eps)
             expected = low, rig.oracle.kinetic(v.astype(float), False), rig.oracle.weight(x, False)
             assert (lowest, kinetic, gravity) == pytest.approx(expected, rel=10 * rig.eps, abs=10 * rig.eps)
-            assert inverted == count and m.scalars[10] == first_squeezed(rig, x)
-            seen.add((int(m.scalars[10]), bool(inverted)))
+            assert inverted == count and m.scalars[FIRST_SOFTENED] == first_squeezed(rig, x)
+            seen.add((int(m.scalars[FIRST_SOFTENED]), bool(inverted)))
         assert len(seen) == 3 and (NO_TET, False) in seen and any(turned for _, turned in seen)
 
 

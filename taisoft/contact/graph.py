@@ -8,7 +8,6 @@ a W that is given as a matrix, an edge is a block off the diagonal that is not z
 `colouring` colours in kernels.
 """
 
-import networkx as nx
 import numpy as np
 import scipy.sparse as sp
 
@@ -52,6 +51,8 @@ def _without_loops(joined: sp.spmatrix) -> sp.csr_matrix:
 
 def colour_greedy(graph: sp.csr_matrix, strategy: str = "largest_first") -> np.ndarray:
     """Colours (k,) from 0 by networkx.greedy_color."""
+    import networkx as nx  # a tenth of a second, which few scenes need
+
     colours = nx.greedy_color(nx.from_scipy_sparse_array(graph), strategy=strategy)
     return np.array([colours[c] for c in range(graph.shape[0])], dtype=np.int32)
 

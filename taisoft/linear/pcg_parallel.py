@@ -18,6 +18,7 @@ from taisoft.linear.pcg import (
     total,
 )  # fmt: skip
 from taisoft.runtime import kernel
+from taisoft.scalars import OTHER_SUM, SUM
 
 
 @kernel
@@ -35,10 +36,10 @@ def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()
             w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
             w.r[i], w.z[i], w.p[i] = r, z, z
             s += dot64(r, z)
-        m.partial[c, 6] = s
+        m.partial[c, SUM] = s
     ti.loop_config(serialize=True)
     for _ in range(1):
-        rz = total(m, 6)
+        rz = total(m, SUM)
         w.state[RZ], w.state[RZ_START], w.state[COUNT], w.state[STOP] = rz, rz, 0.0, RUNNING
 
 
@@ -71,11 +72,11 @@ def iterate_once(m: ti.template(), A: ti.template(), coupling: ti.template(), w:
                 q = m.free[i] * product
                 w.q[i] = q
                 s += dot64(w.p[i], q)
-        m.partial[c, 6] = s
+        m.partial[c, SUM] = s
     ti.loop_config(serialize=True)
     for _ in range(1):
         if w.state[STOP] == RUNNING:
-            curvature = total(m, 6)
+            curvature = total(m, SUM)
             if w.state[RZ] <= tolerance * tolerance * w.state[RZ_START]:
                 w.state[STOP] = CONVERGED
             elif not curvature > 0.0:
@@ -93,11 +94,11 @@ def iterate_once(m: ti.template(), A: ti.template(), coupling: ti.template(), w:
                 z = block_times(w.inverse[i], r)
                 w.r[i], w.z[i] = r, z
                 s += dot64(r, z)
-        m.partial[c, 7] = s
+        m.partial[c, OTHER_SUM] = s
     ti.loop_config(serialize=True)
     for _ in range(1):
         if w.state[STOP] == RUNNING:
-            rz = total(m, 7)
+            rz = total(m, OTHER_SUM)
             w.state[STEP] = rz / w.state[RZ]
             w.state[RZ] = rz
             w.state[COUNT] = w.state[COUNT] + 1.0

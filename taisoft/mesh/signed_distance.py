@@ -16,9 +16,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from taisoft.errors import MeshError
 from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
@@ -61,7 +61,7 @@ class _PointSearch:
     """Points (k,3) near a surface. upper: (k,) [m], at least their distances."""
 
     def __init__(self, surface: "_Surface", points: np.ndarray):
-        self.surface, self.points, self.tree = surface, points, cKDTree(surface.centroid)
+        self.surface, self.points, self.tree = surface, points, scipy.spatial.cKDTree(surface.centroid)
         first = self.tree.query(points)[1].astype(np.int64) if len(points) else np.zeros(0, dtype=np.int64)
         self.upper = np.sqrt(surface.nearest(points, first)[0])
 
@@ -197,7 +197,7 @@ class _Search:
         self._triangle = np.empty(len(points), dtype=np.int64)
         self._squared = np.empty(len(points))
         self._slack = _SLACK * float(np.linalg.norm(points[-1] - points[0]))
-        tree = cKDTree(surface.centroid)
+        tree = scipy.spatial.cKDTree(surface.centroid)
         for some in self._chunks(len(points)):
             self._triangle[some] = tree.query(points[some])[1]
             self._squared[some] = surface.nearest(points[some], self._triangle[some])[0]

@@ -6,7 +6,7 @@ only touches, flush or along an edge, cuts 0 deep. Tets may be inverted.
 """
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from taisoft.mesh.topology import EDGES, TET_FACES
 
@@ -35,7 +35,7 @@ def _near_boxes(lo_a: np.ndarray, hi_a: np.ndarray, lo_b: np.ndarray, hi_b: np.n
     scale = np.floor(np.log2(np.maximum(reach_b, np.finfo(float).tiny)))
     for one in np.unique(scale):
         rows = np.flatnonzero(scale == one)
-        tree, reach = cKDTree(middle_b[rows]), reach_b[rows].max()
+        tree, reach = scipy.spatial.cKDTree(middle_b[rows]), reach_b[rows].max()
         for first in range(0, len(middle_a), _PAIRS):
             some = slice(first, first + _PAIRS)
             lists = tree.query_ball_point(middle_a[some], (1.0 + 1e-9) * (reach_a[some] + reach))

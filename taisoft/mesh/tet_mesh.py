@@ -9,9 +9,9 @@ sharing a face are not looked for.
 import warnings
 
 import numpy as np
+import scipy
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from taisoft.errors import MeshError
 from taisoft.mesh.quality import edge_lengths, mean_ratio
@@ -250,7 +250,7 @@ def merge_labels(points: np.ndarray, tolerance: float) -> np.ndarray:
     distinct, labels = np.unique(points + 0.0, axis=0, return_inverse=True)  # + 0.0 makes -0.0 equal to 0.0
     labels = labels.ravel()
     if tolerance > 0:
-        pairs = cKDTree(distinct).query_pairs(tolerance, output_type="ndarray")
+        pairs = scipy.spatial.cKDTree(distinct).query_pairs(tolerance, output_type="ndarray")
         n = len(distinct)
         graph = coo_matrix((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
         labels = connected_components(graph, directed=False)[1][labels]

@@ -7,7 +7,7 @@ angles, so that full turns count; else by the shortest turn from one to the othe
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from taisoft.attributes import guarded_record
 from taisoft.errors import SceneError
@@ -72,9 +72,10 @@ class KeyFrames:
             translation += share * (self.translations[i + 1] - self.translations[i])
         if self.rotations is None:
             return translation, np.eye(3)
-        rotation = Rotation.from_rotvec(self.rotations[i].copy())  # scipy wants to write
+        from_rotvec = scipy.spatial.transform.Rotation.from_rotvec
+        rotation = from_rotvec(self.rotations[i].copy())  # scipy wants to write
         if share > 0.0:
-            rotation = rotation * Rotation.from_rotvec(share * self._turns[i])
+            rotation = rotation * from_rotvec(share * self._turns[i])
         return translation, rotation.as_matrix()
 
     def of_nodes(self, starts: np.ndarray) -> "NodePath":
@@ -125,7 +126,8 @@ def _turns(rotations: np.ndarray) -> np.ndarray:
     a, b = rotations[:-1], rotations[1:]
     if not len(a):
         return a.copy()
-    shortest = (Rotation.from_rotvec(a).inv() * Rotation.from_rotvec(b)).as_rotvec()
+    from_rotvec = scipy.spatial.transform.Rotation.from_rotvec
+    shortest = (from_rotvec(a).inv() * from_rotvec(b)).as_rotvec()
     lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     one_axis = np.linalg.norm(np.cross(a, b), axis=1) <= PARALLEL * lengths  # no rotation has every axis
     return np.where(one_axis[:, None], b - a, shortest)

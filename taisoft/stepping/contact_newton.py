@@ -17,6 +17,7 @@ import numpy as np
 from taisoft.contact.problem import RESIDUAL, find_factors
 from taisoft.fields import FieldArena
 from taisoft.model import Model
+from taisoft.scalars import END_SLOPE, START_SLOPE
 from taisoft.stepping.contact import ContactStep
 from taisoft.stepping.contact_stage import (
     IMPACT,
@@ -123,10 +124,10 @@ class ContactStageSolver(StageSolver):
         """
         scalars = self.model.scalars
         r, scale = self._evaluate(c, beta, STEP)
-        slope = scalars[13]
+        slope = scalars[START_SLOPE]
         share, low, at_low, high, at_high = 1.0, 0.0, slope, 1.0, math.inf
         for _ in range(TRIES):
-            rise = scalars[12]
+            rise = scalars[END_SLOPE]
             too_far = not rise <= -FLAT * slope  # also where it is not a number
             far_enough = share >= 0.4 * high or rise >= FLAT * slope
             if r < enough or (slope < 0.0 and not too_far and far_enough):

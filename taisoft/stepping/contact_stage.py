@@ -22,6 +22,7 @@ from taisoft.linear.coupling import Coupling, build_coupling
 from taisoft.linear.pcg import dot64, total
 from taisoft.model import Model
 from taisoft.runtime import kernel
+from taisoft.scalars import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.stepping.impact import impact_residual
 from taisoft.stepping.stage import place_node, residual_parts, set_change, squares
 
@@ -166,8 +167,7 @@ def evaluate(
     how: STAY; STEP: base = x, then the whole step y of pcg; SHARE: base + share y. STILL: as STAY, where the elastic forces of
     this x are known. multiply: whether the impulses are made the multipliers first, and the disks opened as far as these say.
     linear: of the stage linearised at k.x_linear, or IMPACT. stiffness: R over the r-factors.
-    norms: as `form_residual` tells, impulses in r; of a linear stage only those of r. scalars 13: r.y at the start of a step,
-    12: at its end.
+    norms: as `form_residual` tells, impulses in r; of a linear stage only those of r. scalars: START_SLOPE of a step, END_SLOPE.
     """
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
@@ -185,7 +185,7 @@ def evaluate(
                 k.change[i] = ti.cast((m.x[i] - k.x_linear[i]) / beta, m.real)
             else:
                 set_change(m, s, i, c, beta)
-        m.partial[chunk, 6] = slope
+        m.partial[chunk, OTHER_SUM] = slope
     if ti.static(not linear):
         for g in ti.static(m.groups):
             ti.loop_config(serialize=m.serial)
@@ -216,17 +216,17 @@ def evaluate(
             pcg.rhs[i] = -free * r
             sums += squares(r, inertia, f, external, free)
             slope += dot64(free * r, pcg.y[i])
-        for j in ti.static(range(5)):
+        for j in ti.static(range(N_NORMS)):
             m.partial[chunk, j] = sums[j]
-        m.partial[chunk, 5] = slope
+        m.partial[chunk, SUM] = slope
     ti.loop_config(serialize=True)
     for _ in range(1):
         _sum_residual(k)
-        for j in ti.static((0, 4) if linear else range(5)):
+        for j in ti.static((0, 4) if linear else range(N_NORMS)):
             norms[j] = total(m, j)
-        m.scalars[12] = total(m, 5)
+        m.scalars[END_SLOPE] = total(m, SUM)
         if how == STEP:
-            m.scalars[13] = total(m, 6)
+            m.scalars[START_SLOPE] = total(m, OTHER_SUM)
 
 
 @kernel

@@ -10,6 +10,7 @@ from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.problem import find_factors
 from taisoft.contact.solve import SolveResult, solve
 from taisoft.errors import SimulationError
+from taisoft.scalars import FAILED, LOWEST_J, MOST_INVERTED
 from taisoft.stepping import explicit
 from taisoft.stepping.contact import TOLERANCE, ContactStep
 from taisoft.stepping.explicit_contact import find_acceleration, finish_verlet, keep_state, move, predict, set_free_velocities
@@ -99,7 +100,7 @@ class ContactExplicitStepper(ExplicitStepper):
             raise
         self.contact.penetration, self.contact.sinking = depth, sinking
         return ContactSubstepResult(
-            n, m.scalars[6], int(m.scalars[7]), sum(r.iterations for r in results if r),
+            n, m.scalars[LOWEST_J], int(m.scalars[MOST_INVERTED]), sum(r.iterations for r in results if r),
             max((r.residual for r in results if r), default=0.0), all(r.converged for r in results if r),
         )  # fmt: skip
 
@@ -132,6 +133,6 @@ class ContactExplicitStepper(ExplicitStepper):
         move(m, s, contact.problem, dt, int(n > 0))
         if s.verlet:
             finish_verlet(m, s, contact.problem, dt, int(n > 0))
-        if m.scalars[8] != 0.0:
+        if m.scalars[FAILED] != 0.0:
             raise SimulationError(f"step {step}: {self._fault()}")
         return result

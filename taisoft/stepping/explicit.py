@@ -12,6 +12,7 @@ import taichi as ti
 from taisoft.elasticity import HUGE, count_inverted, element_force
 from taisoft.elements.lanes import broadcast, gather
 from taisoft.runtime import kernel
+from taisoft.scalars import FAILED, INVERTED_NOW, LOWEST_J, MOST_INVERTED, STEPS_DONE
 
 EXPLODED = 1e9  # size of a negative J beyond which a motion has diverged: inside out, stretched a thousandfold along every axis
 
@@ -143,7 +144,7 @@ def keep_held(m: ti.template(), s: ti.template()):
 
 @kernel
 def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, restart: ti.i32):
-    """n sub-steps of dt on one thread. scalars 5..7: sub-steps done, smallest J, most inverted tets in a sub-step.
+    """n sub-steps of dt on one thread. scalars: STEPS_DONE, LOWEST_J, MOST_INVERTED.
 
     Stops after the sub-step in which a velocity stops being finite, or that met an exploded tet. restart: Verlet's acceleration
     is stale.
@@ -198,7 +199,8 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
                 low = ti.min(low, lowest[q])
             going = low > -EXPLODED and not unfinite(ti.cast(total[0] + total[1] + total[2], ti.f64))
             done += 1
-        m.scalars[5], m.scalars[6], m.scalars[7] = done - (0 if going else 1), low, most
+        m.scalars[STEPS_DONE] = done - (0 if going else 1)
+        m.scalars[LOWEST_J], m.scalars[MOST_INVERTED] = low, most
 
 
 @kernel
@@ -211,20 +213,20 @@ def set_targets(s: ti.template(), rows: ti.types.ndarray()):
 
 @ti.func
 def tell_volumes(m: ti.template(), b, J):
-    """Of block b: smallest J and inverted tets into scalars 6 and 9; scalars 8: 1 where one has exploded."""
+    """Of block b: scalars LOWEST_J, INVERTED_NOW; FAILED where a tet has exploded."""
     bad = count_inverted(m, b, J)
     low, count = J[0], bad[0]
     for q in ti.static(range(1, m.lanes)):
         low, count = ti.min(low, J[q]), count + bad[q]
-    ti.atomic_min(m.scalars[6], ti.cast(low, ti.f64))
-    ti.atomic_add(m.scalars[9], ti.cast(count, ti.f64))
+    ti.atomic_min(m.scalars[LOWEST_J], ti.cast(low, ti.f64))
+    ti.atomic_add(m.scalars[INVERTED_NOW], ti.cast(count, ti.f64))
     if not low > -EXPLODED:
-        m.scalars[8] = 1.0
+        m.scalars[FAILED] = 1.0
 
 
 @kernel
 def elements_parallel(m: ti.template()):
-    """One sub-step's element loop over threads; scalars 6, 9: smallest J so far, inverted tets of this sub-step."""
+    """One sub-step's element loop over threads; scalars: LOWEST_J, INVERTED_NOW, FAILED."""
     for g in ti.static(m.groups):
         for b in range(g.first, g.last):
             tell_volumes(m, b, element_force(m, g, m.stiffness_damping, b))
@@ -258,7 +260,7 @@ def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
 
 @kernel
 def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64):
-    """What comes after a sub-step's element loop; scalars 5, 7, 8: good sub-steps, most inverted tets, whether one failed."""
+    """What comes after a sub-step's element loop; scalars: STEPS_DONE, MOST_INVERTED, FAILED."""
     for i in range(m.n_nodes):
         dt = ti.cast(dt64, m.real)
         v = ti.Vector([0.0, 0.0, 0.0], m.real)
@@ -267,7 +269,7 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
         else:
             v = euler_node(m, i, dt)
         if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
-            m.scalars[8] = 1.0
+            m.scalars[FAILED] = 1.0
     if ti.static(s.leads):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -278,10 +280,10 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
             react(m, s, ti.cast(dt64, m.real))
     ti.loop_config(serialize=True)
     for _ in range(1):
-        m.scalars[7] = ti.max(m.scalars[7], m.scalars[9])
-        m.scalars[9] = 0.0
-        if m.scalars[8] == 0.0:
-            m.scalars[5] = m.scalars[5] + 1.0
+        m.scalars[MOST_INVERTED] = ti.max(m.scalars[MOST_INVERTED], m.scalars[INVERTED_NOW])
+        m.scalars[INVERTED_NOW] = 0.0
+        if m.scalars[FAILED] == 0.0:
+            m.scalars[STEPS_DONE] = m.scalars[STEPS_DONE] + 1.0
 
 
 @kernel
@@ -289,4 +291,5 @@ def begin_parallel(m: ti.template()):
     """Counters of a batch of parallel sub-steps."""
     ti.loop_config(serialize=True)
     for _ in range(1):
-        m.scalars[5], m.scalars[6], m.scalars[7], m.scalars[8], m.scalars[9] = 0.0, HUGE, 0.0, 0.0, 0.0
+        m.scalars[STEPS_DONE], m.scalars[LOWEST_J], m.scalars[FAILED] = 0.0, HUGE, 0.0
+        m.scalars[MOST_INVERTED], m.scalars[INVERTED_NOW] = 0.0, 0.0

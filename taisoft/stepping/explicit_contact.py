@@ -12,6 +12,7 @@ from taisoft.contact.prox import dvec
 from taisoft.contact.restitution import explicit_rise
 from taisoft.elasticity import element_force
 from taisoft.runtime import kernel
+from taisoft.scalars import FAILED, INVERTED_NOW, MOST_INVERTED
 from taisoft.stepping.explicit import (
     acceleration,
     euler_velocity,
@@ -38,7 +39,7 @@ def keep_state(m: ti.template(), g: ti.template()):
 
 @kernel
 def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
-    """v* of every node. scalars 6, 9: smallest J so far, inverted tets.
+    """v* of every node. scalars: LOWEST_J, INVERTED_NOW.
 
     Verlet rests on the acceleration of the state, Euler finds the forces here.
     """
@@ -88,12 +89,12 @@ def set_free_velocities(
 
 @ti.func
 def close_substep(m: ti.template(), s: ti.template(), p: ti.template(), dt64, touched):
-    """Reactions, and the counters of the sub-step: scalars 7, most inverted tets."""
+    """Reactions, and the counters of the sub-step: MOST_INVERTED."""
     if ti.static(s.holds):
         react(m, s, ti.cast(dt64, m.real))
         subtract_contacts(m, s, p, dt64, touched)
-    m.scalars[7] = ti.max(m.scalars[7], m.scalars[9])
-    m.scalars[9] = 0.0
+    m.scalars[MOST_INVERTED] = ti.max(m.scalars[MOST_INVERTED], m.scalars[INVERTED_NOW])
+    m.scalars[INVERTED_NOW] = 0.0
 
 
 @ti.func
@@ -107,7 +108,7 @@ def subtract_contacts(m: ti.template(), s: ti.template(), p: ti.template(), dt64
 
 @kernel
 def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, touched: ti.i32):
-    """Impulses onto v, then x. touched: 1 where there are contacts. scalars 8: 1 where a velocity is no longer finite.
+    """Impulses onto v, then x. touched: 1 where there are contacts. scalars: FAILED.
 
     With Verlet `finish_verlet` follows.
     """
@@ -118,7 +119,7 @@ def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, tou
         if touched == 1:
             v += ti.cast(p.inverse_mass[i] * impulse_on(p, i), m.real)
         if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
-            m.scalars[8] = 1.0
+            m.scalars[FAILED] = 1.0
         if ti.static(s.verlet):
             verlet_move(m, s, i, dt, v)
         else:
@@ -146,7 +147,7 @@ def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti
     for i in range(m.n_nodes):
         v = verlet_kick(m, s, i, ti.cast(dt64, m.real))
         if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
-            m.scalars[8] = 1.0
+            m.scalars[FAILED] = 1.0
     if ti.static(s.leads):
         ti.loop_config(serialize=True)
         for _ in range(1):

@@ -30,6 +30,7 @@ from taisoft.linear.block_csr import block_times
 from taisoft.linear.pcg import total
 from taisoft.mass import mass_times
 from taisoft.runtime import kernel
+from taisoft.scalars import OTHER_SUM, SUM
 
 SPREAD = 2.0 * math.pi  # tau / dt
 
@@ -97,10 +98,10 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
             d = mass_times(m, i, s.change)
             slope += d.dot(ti.cast(s.v_hat[i], ti.f64))
             curvature += d.dot(s.change[i])
-        m.partial[chunk, 5], m.partial[chunk, 6] = slope, curvature
+        m.partial[chunk, SUM], m.partial[chunk, OTHER_SUM] = slope, curvature
     ti.loop_config(serialize=True)
     for _ in range(1):
-        slope = total(m, 5)
+        slope = total(m, SUM)
         for c in range(p.count[0]):
             fixed = -(SPREAD / tau) * f.carry[c]
             for j in range(p.arity[c]):
@@ -109,7 +110,7 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
             slope += to_world(p, c, p.r[c]).dot(fixed)
             if f.rise[c] > 0.0:
                 slope -= 0.5 * p.r[c][0] * ti.max(0.0, f.leave[c] + f.approach[c])
-        out[0], out[1] = slope, total(m, 6)
+        out[0], out[1] = slope, total(m, OTHER_SUM)
 
 
 @kernel

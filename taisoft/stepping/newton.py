@@ -25,6 +25,7 @@ from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.coupling import NO_COUPLING
 from taisoft.model import Model
+from taisoft.scalars import ELASTIC, GRAVITY, POTENTIAL, START_SLOPE
 from taisoft.stepping.stage import StageWork, begin_stage, form_residual, stage_terms, start_step, try_step
 from taisoft.transfer import download, upload
 
@@ -178,11 +179,11 @@ class StageSolver:
         m = self.model
         measure(m)
         scalars = m.scalars.to_numpy()
-        energy = float(scalars[0] + scalars[4])
+        energy = float(scalars[ELASTIC] + scalars[GRAVITY])
         if c == 0.0 and not m.loaded and not m.damped:  # no other terms
             return energy
         stage_terms(m, self.work, c, beta)
-        return energy + m.scalars[14]
+        return energy + m.scalars[POTENTIAL]
 
     def _form_system(self, c: float, beta: float, projected: bool) -> None:
         block_csr.assemble(self.model, self.matrix, projected)
@@ -269,7 +270,7 @@ class StageSolver:
             try_step(m, w, y, 0.0, beta)
             start = self._objective(c, beta)
             try_step(m, w, y, 1.0, beta)
-        share, slope = 1.0, m.scalars[13]
+        share, slope = 1.0, m.scalars[START_SLOPE]
         # Phi's own rounding: the elastic terms of f32 forces are only good to eps, so tiny rises are not rises
         slack = 10.0 * np.finfo(np.float64).eps * abs(start)
         unseen = UNSEEN * abs(start)

@@ -12,6 +12,7 @@ from taisoft.linear.block_csr import row_times
 from taisoft.linear.pcg import dot64, total
 from taisoft.mass import mass_times
 from taisoft.runtime import kernel
+from taisoft.scalars import N_NORMS, OTHER_SUM, POTENTIAL, START_SLOPE, SUM
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,11 +123,11 @@ def form_residual(
             w.residual[i] = r
             p.rhs[i] = -m.free[i] * r
             s += squares(r, inertia, f, external, m.free[i])
-        for j in ti.static(range(5)):
+        for j in ti.static(range(N_NORMS)):
             m.partial[k, j] = s[j]
     ti.loop_config(serialize=True)  # a sum outside of any loop would be a loop of its own over threads, 50 us and more
     for _ in range(1):
-        for j in ti.static(range(5)):
+        for j in ti.static(range(N_NORMS)):
             norms[j] = total(m, j)
 
 
@@ -153,7 +154,7 @@ def try_step(m: ti.template(), w: ti.template(), y: ti.template(), share: ti.f64
 
 @kernel
 def start_step(m: ti.template(), w: ti.template(), y: ti.template(), beta: ti.f64):
-    """base = x, then the whole step y; scalars 13: slope r.y (its sign: negative is downhill)."""
+    """base = x, then the whole step y; scalars: START_SLOPE."""
     ti.loop_config(serialize=m.serial)
     for k in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
@@ -162,26 +163,26 @@ def start_step(m: ti.template(), w: ti.template(), y: ti.template(), beta: ti.f6
             s += dot64(m.free[i] * w.residual[i], y[i])
             w.base[i] = m.x[i]
             place_node(m, w, y, i, 1.0, beta)
-        m.partial[k, 5] = s
+        m.partial[k, SUM] = s
     ti.loop_config(serialize=True)
     for _ in range(1):
-        m.scalars[13] = total(m, 5)
+        m.scalars[START_SLOPE] = total(m, SUM)
 
 
 @kernel
 def stage_terms(m: ti.template(), w: ti.template(), c: ti.f64, beta: ti.f64):
-    """Inertia, loads and damping terms of Phi, in f64: scalars 14."""
+    """Inertia, loads and damping terms of Phi, in f64. scalars: POTENTIAL."""
     if ti.static(m.damped):
         ti.loop_config(serialize=m.serial)
         for i in range(m.n_nodes):
             w.change[i] = stage_velocity(m, w, i, beta)
         ti.loop_config(serialize=m.serial)
         for k in range(m.chunks):
-            m.partial[k, 6] = 0.0
+            m.partial[k, OTHER_SUM] = 0.0
             size = (m.n_nodes + m.chunks - 1) // m.chunks
             for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
                 a = ti.cast(m.damping[m.node_body[i], 0], ti.f64)
-                m.partial[k, 6] += 0.5 * beta * a * w.change[i].dot(mass_times(m, i, w.change))
+                m.partial[k, OTHER_SUM] += 0.5 * beta * a * w.change[i].dot(mass_times(m, i, w.change))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         w.change[i] = stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64)
@@ -190,14 +191,14 @@ def stage_terms(m: ti.template(), w: ti.template(), c: ti.f64, beta: ti.f64):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         s = ti.cast(0.0, ti.f64)
         if ti.static(m.damped):
-            s += m.partial[k, 6]
+            s += m.partial[k, OTHER_SUM]
         for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
             s += 0.5 * c * w.change[i].dot(mass_times(m, i, w.change))
             if ti.static(m.loaded):
                 s -= ti.cast(m.loads[i], ti.f64).dot(m.x[i])
             if ti.static(m.stiffness_damping):
                 s += 0.5 * beta * m.damping[m.node_body[i], 1] * dot64(m.v[i], row_times(m, w.damper, i, m.v))
-        m.partial[k, 5] = s
+        m.partial[k, SUM] = s
     ti.loop_config(serialize=True)
     for _ in range(1):
-        m.scalars[14] = total(m, 5)
+        m.scalars[POTENTIAL] = total(m, SUM)
