@@ -29,6 +29,7 @@ from taisoft.timing import usable_cores
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
 POOL = 2**30  # bytes of address space that Taichi asks for at a time on the CPU
+CACHE = 2**30  # bytes of kernels on disk, above which Taichi removes the oldest; its own limit holds but some 450
 
 launches: Counter[str] = Counter()  # kernel name -> launches so far in this process
 _open: list["Runtime"] = []  # simulators that hold the runtime now
@@ -135,6 +136,7 @@ def _initialise(arch: str, precision: str) -> None:
             ti.init(
                 arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
                 fast_math=False, offline_cache=True, offline_cache_file_path=folder, log_level=ti.ERROR, random_seed=0,
+                offline_cache_max_size_of_files=CACHE,
                 cpu_max_num_threads=len(usable_cores()),  # Taichi would count the cores that it may not use, too
             )  # fmt: skip
     except RuntimeError as error:

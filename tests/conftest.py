@@ -14,7 +14,8 @@ SLOW = (
     "references", "demos", "contact_stepping", "stepping", "cli_run", "bench_collision", "bvh", "simulator", "self_collision",
     "checkpoint", "static", "spatial_hash", "elasticity", "detection_runs",
 )  # files by time, slowest first
-_compiled = [0.0]  # compile clock when Taichi was last set back [s]
+WRITE_AFTER = 10.0  # [s] of compiling after which kernels are worth writing for the other processes that share the files
+_compiled = [0.0, None]  # compile clock when Taichi was last set back [s]; the file of the last test
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -35,7 +36,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if item.get_closest_marker("cuda") and not core.with_cuda():
             item.add_marker(no_gpu)
     places = {f"test_{name}": k for k, name in enumerate(SLOW)}
-    items.sort(key=lambda item: places.get(item.path.stem, len(SLOW)))
+    # by precision within a file: another one makes Taichi forget all kernels
+    items.sort(key=lambda item: (places.get(item.path.stem, len(SLOW)), str(item.path), "f64" in item.name))
 
 
 def _refuse_parts_of_nothing(names: list[str]) -> None:
@@ -47,14 +49,12 @@ def _refuse_parts_of_nothing(names: list[str]) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Let the next simulator initialise Taichi anew where earlier tests have compiled and hold nothing any more.
+    """Let the first simulator of a file initialise Taichi anew where the files before compiled for long.
 
-    The key of a kernel in the cache on disk holds the running numbers of its fields. Numbers that start anew let a scene
-    of an earlier test, process or run be found there, whatever ran before: compiling takes several times as long.
+    Taichi writes kernels to the cache on disk when it ends, and looks for those of other processes when it starts.
     """
-    if getattr(item.module, "KEEPS_TAICHI", False):  # its kernels have no fields
-        return
-    if runtime.open_kind() is None and runtime.compile_clock() > _compiled[0]:
+    is_new, _compiled[1] = item.path != _compiled[1], item.path
+    if is_new and runtime.open_kind() is None and runtime.compile_clock() > _compiled[0] + WRITE_AFTER:
         runtime._kind = None
         _compiled[0] = runtime.compile_clock()
 

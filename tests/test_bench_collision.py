@@ -102,7 +102,7 @@ def test_a_search_is_measured_in_phases(runtime):
     assert row.failure == "" and (row.tets, row.triangles) == (80, 96)
     assert 0 < row.active <= 96 and row.pairs > 0 and row.found >= row.contacts > 0
     assert len(row.whole) == 3 and set(row.phases) == set(PHASES) and all(min(x) > 0 for x in row.phases.values())
-    assert row.same and len(row.quadratic) == 3 and row.first > row.compile_seconds > 0 and row.field_bytes > 0
+    assert row.same and len(row.quadratic) == 3 and row.first > row.compile_seconds >= 0 and row.field_bytes > 0
 
 
 def test_a_search_in_phases_is_the_search(runtime):

@@ -21,7 +21,7 @@ FILES = sorted(path for path in PACKAGE.rglob("*.py"))
 ORDER = (
     ("errors", "records", "files", "memory", "timing"),
     ("attributes",),
-    ("tracing", "arrays", "lane_pool"),
+    ("tracing", "arrays", "lane_pool", "scalars"),
     ("launching",),
     ("runtime",),
     ("transfer",),

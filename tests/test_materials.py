@@ -23,7 +23,6 @@ from taisoft.materials.evaluate import evaluate_differential
 from taisoft.runtime import kernel
 
 YOUNG, POISSON = 3e5, 0.35  # [Pa]; not round, so that mu, lambda and their multiples all differ
-KEEPS_TAICHI = True
 each_law = pytest.mark.parametrize("law", LAWS)
 
 
