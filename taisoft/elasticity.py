@@ -158,7 +158,7 @@ def _lane_min(values):
     return low
 
 
-@kernel
+@kernel(cse=False)
 def measure(m: ti.template()):
     """Energies and volume ratios of the present state, in f64 with sums in a fixed order.
 

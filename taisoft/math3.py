@@ -7,10 +7,12 @@ which LLVM turns into SIMD instructions. A list is never assigned twice: each re
 
 import taichi as ti
 
+from taisoft.tracing import arithmetic
+
 PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
-@ti.func
+@arithmetic
 def matmul(A, B):
     """A B."""
     return [
@@ -20,7 +22,7 @@ def matmul(A, B):
     ]
 
 
-@ti.func
+@arithmetic
 def matmul_nt(A, B):
     """A B^T."""
     return [
@@ -30,7 +32,7 @@ def matmul_nt(A, B):
     ]
 
 
-@ti.func
+@arithmetic
 def matmul_tn(A, B):
     """A^T B."""
     return [
@@ -40,25 +42,25 @@ def matmul_tn(A, B):
     ]
 
 
-@ti.func
+@arithmetic
 def transform(A, x):
     """A x."""
     return [A[3 * i] * x[0] + A[3 * i + 1] * x[1] + A[3 * i + 2] * x[2] for i in ti.static(range(3))]
 
 
-@ti.func
+@arithmetic
 def dot(a, b):
     """a . b of two 3-vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@ti.func
+@arithmetic
 def cross(a, b):
     """a x b of two 3-vectors."""
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
-@ti.func
+@arithmetic
 def cofactor(F):
     """Cofactor matrix, dJ/dF."""
     return [
@@ -74,7 +76,7 @@ def cofactor(F):
     ]
 
 
-@ti.func
+@arithmetic
 def cofactor_differential(F, D):
     """Change of the cofactor matrix of F along D (the cofactor is quadratic in F)."""
     return [
@@ -90,13 +92,13 @@ def cofactor_differential(F, D):
     ]
 
 
-@ti.func
+@arithmetic
 def determinant(F):
     """det F, by the same products as the cofactor so that both share their work."""
     return F[0] * (F[4] * F[8] - F[5] * F[7]) + F[1] * (F[5] * F[6] - F[3] * F[8]) + F[2] * (F[3] * F[7] - F[4] * F[6])
 
 
-@ti.func
+@arithmetic
 def ddot(A, B):
     """A : B, the sum of the products of the entries."""
     return (
@@ -106,7 +108,7 @@ def ddot(A, B):
     )  # fmt: skip
 
 
-@ti.func
+@arithmetic
 def _jacobi_angle(app, aqq, apq):
     """(cosine, sine) of the rotation that makes the off-diagonal apq of a symmetric 2x2 vanish."""
     small = abs(apq) <= 1e-30
@@ -167,7 +169,7 @@ def _sort_columns(A: ti.template(), V: ti.template(), p: ti.template(), q: ti.te
         V[3 * r + p], V[3 * r + q] = vp, vq
 
 
-@ti.func
+@arithmetic
 def _left_frame(A):
     """Orthonormal frame (as a rotation) of A's nearly orthogonal, sorted columns, and their signed lengths."""
     s0 = ti.sqrt(A[0] * A[0] + A[3] * A[3] + A[6] * A[6])

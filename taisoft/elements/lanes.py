@@ -7,6 +7,8 @@ For order 1 c_a are the unit vectors, one point is enough, and nothing but Ds Dm
 
 import taichi as ti
 
+from taisoft.tracing import arithmetic
+
 
 @ti.func
 def broadcast(value, lanes: ti.template()):
@@ -106,7 +108,7 @@ def deformation_gradient(m: ti.template(), g: ti.template(), X, N, q):
         return [ti.cast(F[k], m.real) for k in ti.static(range(9))]
 
 
-@ti.func
+@arithmetic
 def edges_times(D, M):
     """D M with D by columns: entry 3 c + r."""
     return [

@@ -11,6 +11,7 @@ rotation is taken from the signed SVD instead. Weak: R is not unique there, so t
 import taichi as ti
 
 from taisoft.math3 import cofactor, cross, ddot, determinant, dot, matmul, matmul_nt, matmul_tn, signed_svd, transform
+from taisoft.tracing import arithmetic
 
 NAME = "corotational"
 SOFTENS_BELOW = 0.0
@@ -31,7 +32,7 @@ def _svd_rotation(F):
     return matmul_nt(U, V)
 
 
-@ti.func
+@arithmetic
 def _halley(f, Ic, J, c0):
     """Change of f by one Halley step (third order, and from above the largest root never past it)."""
     value = f * (f * (f * f - 2.0 * Ic) - 8.0 * J) + c0
@@ -113,7 +114,7 @@ def prepare(F, p):
     return R + [inverse * C[k] for k in ti.static(range(9))] + [p[0], p[1], p[1] * (t - 3.0) - 2.0 * p[0]]
 
 
-@ti.func
+@arithmetic
 def dpk1(F, S, D):
     """Differential of the stress along D [Pa], with S = prepare(F, p).
 
@@ -133,7 +134,7 @@ def dpk1(F, S, D):
     return [2.0 * S[18] * D[k] + t * R[k] + dR[k] for k in ti.static(range(9))]
 
 
-@ti.func
+@arithmetic
 def block(F, S, ga, gb):
     """(d/dx_k of) (P g_b)_i for a displacement field with gradient e_k (x) g_a: the nine entries (i, k) [Pa/m^2]."""
     R = [S[k] for k in ti.static(range(9))]
@@ -155,7 +156,7 @@ def block(F, S, ga, gb):
     ]
 
 
-@ti.func
+@arithmetic
 def hessian_eigen(s, p):
     """Second derivatives in the SVD frame: the 3x3 block over the stretches s (nine entries), and the eigenvalues of
     the symmetric and of the antisymmetric mode of the pairs (0,1), (0,2), (1,2). All [Pa]."""

@@ -9,6 +9,7 @@ modes; the 3x3 block is clamped numerically.
 import taichi as ti
 
 from taisoft.math3 import clamp_symmetric, matmul, matmul_nt, matmul_tn, signed_svd
+from taisoft.tracing import arithmetic
 
 
 @ti.func
@@ -22,7 +23,7 @@ def prepare_projected(law: ti.template(), F, p):
     return U + V + B + even + odd
 
 
-@ti.func
+@arithmetic
 def dpk1_projected(S, D):
     """Stress differential [Pa] along D of the projected second derivative, S = prepare_projected(law, F, p)."""
     U = [S[k] for k in ti.static(range(9))]

@@ -9,6 +9,7 @@ reflection): squeezed bodies collapse.
 import taichi as ti
 
 from taisoft.math3 import ddot, dot, matmul, matmul_nt, matmul_tn, transform
+from taisoft.tracing import arithmetic
 
 NAME = "st_venant_kirchhoff"
 SOFTENS_BELOW = 0.6  # stretch told with a warning, a little before 1/sqrt(3)
@@ -20,7 +21,7 @@ def constants(mu: float, lam: float) -> tuple[float, float, float, float]:
     return mu, lam, 0.0, 0.0
 
 
-@ti.func
+@arithmetic
 def _green_strain(F):
     """E = (F^T F - I)/2, formed from H = F - I so that small strains keep their digits."""
     H = [F[k] - (1.0 if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
@@ -30,14 +31,14 @@ def _green_strain(F):
     ]
 
 
-@ti.func
+@arithmetic
 def _second_pk(E, p):
     """S = 2 mu E + lambda tr(E) I [Pa]."""
     t = p[1] * (E[0] + E[4] + E[8])
     return [2.0 * p[0] * E[k] + (t if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
 
 
-@ti.func
+@arithmetic
 def psi(F, p):
     """Energy density [Pa], 0 at rest."""
     E = _green_strain(F)
@@ -45,7 +46,7 @@ def psi(F, p):
     return p[0] * ddot(E, E) + 0.5 * p[1] * t * t
 
 
-@ti.func
+@arithmetic
 def pk1(F, p):
     """First Piola-Kirchhoff stress [Pa]; any F is valid. Written as mu F C + (lambda/2 (tr C - 3) - mu) F, C = F^T F."""
     C = matmul_tn(F, F)
@@ -54,14 +55,14 @@ def pk1(F, p):
     return [p[0] * FC[k] + t * F[k] for k in ti.static(range(9))]
 
 
-@ti.func
+@arithmetic
 def prepare(F, p):
     """What `dpk1` and `block` need of F: the second Piola-Kirchhoff stress, the Lamé parameters, mu F F^T."""
     B = matmul_nt(F, F)
     return _second_pk(_green_strain(F), p) + [p[0], p[1]] + [p[0] * B[k] for k in ti.static(range(9))]
 
 
-@ti.func
+@arithmetic
 def dpk1(F, S, D):
     """Differential of the stress along D [Pa], with S = prepare(F, p): D S + F dS."""
     B = matmul_tn(F, D)
@@ -75,7 +76,7 @@ def dpk1(F, S, D):
     return [first[k] + second[k] for k in ti.static(range(9))]
 
 
-@ti.func
+@arithmetic
 def block(F, S, ga, gb):
     """(d/dx_k of) (P g_b)_i for a displacement field with gradient e_k (x) g_a: the nine entries (i, k) [Pa/m^2]."""
     Fa, Fb = transform(F, ga), transform(F, gb)
@@ -89,7 +90,7 @@ def block(F, S, ga, gb):
     ]
 
 
-@ti.func
+@arithmetic
 def hessian_eigen(s, p):
     """Second derivatives in the SVD frame: the 3x3 block over the stretches s (nine entries), and the eigenvalues of
     the symmetric and of the antisymmetric mode of the pairs (0,1), (0,2), (1,2). All [Pa]."""

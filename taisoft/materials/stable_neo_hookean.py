@@ -10,6 +10,7 @@ rubber; stress-free states exist only where the log term is kept (as here).
 import taichi as ti
 
 from taisoft.math3 import cofactor, cofactor_differential, cross, ddot, dot, transform
+from taisoft.tracing import arithmetic
 
 NAME = "stable_neo_hookean"
 SOFTENS_BELOW = 0.0
@@ -23,7 +24,7 @@ def constants(mu: float, lam: float) -> tuple[float, float, float, float]:
     return m, l, alpha, l * (1.0 - alpha)
 
 
-@ti.func
+@arithmetic
 def psi(F, p):
     """Energy density [Pa], 0 at rest.
 
@@ -42,7 +43,7 @@ def psi(F, p):
     return 0.5 * p[0] * (d - log1p) + 0.5 * p[1] * e * e + p[3] * e
 
 
-@ti.func
+@arithmetic
 def pk1(F, p):
     """First Piola-Kirchhoff stress [Pa]; any F is valid. Source: the paper's eq. 18."""
     G = cofactor(F)
@@ -52,7 +53,7 @@ def pk1(F, p):
     return [a * F[k] + b * G[k] for k in ti.static(range(9))]
 
 
-@ti.func
+@arithmetic
 def prepare(F, p):
     """What `dpk1` needs of F: its cofactor and the factors of the four terms."""
     G = cofactor(F)
@@ -61,7 +62,7 @@ def prepare(F, p):
     return G + [p[0] - p[0] * q, 2.0 * p[0] * q * q, p[1], p[1] * (J - p[2])]
 
 
-@ti.func
+@arithmetic
 def dpk1(F, S, D):
     """Differential of the stress along D [Pa], with S = prepare(F, p)."""
     FD = S[10] * ddot(F, D)
@@ -70,7 +71,7 @@ def dpk1(F, S, D):
     return [S[9] * D[k] + FD * F[k] + GD * S[k] + S[12] * C[k] for k in ti.static(range(9))]
 
 
-@ti.func
+@arithmetic
 def block(F, S, ga, gb):
     """(d/dx_k of) (P g_b)_i for a displacement field with gradient e_k (x) g_a: the nine entries (i, k) [Pa/m^2]."""
     Fa, Fb, Ga, Gb = transform(F, ga), transform(F, gb), transform(S, ga), transform(S, gb)
@@ -86,7 +87,7 @@ def block(F, S, ga, gb):
     ]  # fmt: skip
 
 
-@ti.func
+@arithmetic
 def hessian_eigen(s, p):
     """Second derivatives in the SVD frame: the 3x3 block over the stretches s (nine entries), and the eigenvalues of
     the symmetric and of the antisymmetric mode of the pairs (0,1), (0,2), (1,2). All [Pa]."""
