@@ -21,6 +21,8 @@ from taichi.lang import impl, kernel_impl
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 from taichi.lang.expr import Expr
 
+QUICK = ti.__version__ == (1, 7, 4) and not os.environ.get("TAISOFT_PLAIN_TRACING")
+
 
 def _inside_class(level_of_class_stackframe: int) -> bool:
     """Whether the decorator that asks is used in the body of a class, which runs with a name of its own."""
@@ -69,11 +71,19 @@ def _position(context: ASTTransformerContext, node) -> str:
 
 
 class _Keep(ast.NodeTransformer):
-    """`x = f` becomes `x = _keep(f)`."""
+    """`x = f` becomes `x = _keep(f)`; what Python would decide while tracing, unless by `ti.static`, raises TypeError."""
 
     def visit_Assign(self, node: ast.Assign) -> ast.Assign:
+        self.generic_visit(node)
         node.value = ast.Call(ast.Name("_keep", ast.Load()), [node.value], [])
         return node
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        decides = getattr(node, "test", None) or (node.iter if isinstance(node, (ast.For, ast.comprehension)) else None)
+        is_static = isinstance(decides, ast.Call) and ast.unparse(decides.func) == "ti.static"
+        if isinstance(node, (ast.BoolOp, ast.AugAssign)) or (decides is not None and not is_static):
+            raise TypeError(f"an arithmetic function cannot hold '{ast.unparse(node)}'")
+        return super().generic_visit(node)
 
 
 def _argument(value: Any) -> Any:
@@ -81,6 +91,19 @@ def _argument(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_argument(one) for one in value]
     return value if not isinstance(value, Expr) or value.ptr.is_lvalue() else impl.expr_init(value)
+
+
+@functools.cache
+def _as_python(function: Callable) -> Callable:
+    """The function, which makes a variable of the kernel of each value that it gives a name."""
+    _, _, first, text = source_of(function)
+    tree = ast.parse("def _make(_keep):\n    pass")
+    own = _Keep().visit(ast.increment_lineno(ast.parse(text), first - 1).body[0])
+    own.decorator_list = []
+    tree.body[0].body = [own, ast.Return(ast.Name(own.name, ast.Load()))]
+    made: dict[str, Callable] = {}
+    exec(compile(ast.fix_missing_locations(tree), function.__code__.co_filename, "exec"), function.__globals__, made)
+    return made["_make"](impl.expr_init)
 
 
 def arithmetic(function: Callable) -> Callable:
@@ -91,24 +114,15 @@ def arithmetic(function: Callable) -> Callable:
     """
     if not QUICK:
         return ti.func(function)
-    _, _, first, text = source_of(function)
-    tree = ast.parse("def _make(_keep):\n    pass")
-    own = _Keep().visit(ast.increment_lineno(ast.parse(text), first - 1).body[0])
-    own.decorator_list = []
-    tree.body[0].body = [own, ast.Return(ast.Name(own.name, ast.Load()))]
-    made: dict[str, Callable] = {}
-    exec(compile(ast.fix_missing_locations(tree), function.__code__.co_filename, "exec"), function.__globals__, made)
-    run = made["_make"](impl.expr_init)
 
     @functools.wraps(function)
     def build(*arguments):
-        return run(*[_argument(one) for one in arguments])
+        return _as_python(function)(*[_argument(one) for one in arguments])
 
     build._is_taichi_function = False  # that it is there says that Taichi need not warn, and False that it is not traced
     return build
 
 
-QUICK = ti.__version__ == (1, 7, 4) and not os.environ.get("TAISOFT_PLAIN_TRACING")
 if QUICK:
     kernel_impl._inside_class = _inside_class
     kernel_impl._get_tree_and_ctx = _tree_and_context

@@ -42,7 +42,7 @@ ORDER = (
     ("__main__",),
 )
 LEVEL = {name: level for level, group in enumerate(ORDER) for name in group}
-OWN_TEXT = {("launching.py", "compile"), ("launching.py", "exec")}  # it makes kernels from their own source
+OWN_TEXT = {(file, call) for file in ("launching.py", "tracing.py") for call in ("compile", "exec")}  # of functions' own source
 FOREIGN = {("mesh", "scene"), ("collision", "contact"), ("contact", "collision")}  # (importer, imported) of one group
 
 WITHOUT_TAICHI = {"errors", "records", "files", "memory", "timing", "attributes", "mesh", "scene"}
