@@ -5,9 +5,11 @@ taisoft bench startup [--quick] [--baseline FOLDER] [--out FILE.json]
 A beam of 540 tets in explicit steps, and a cube of 320 tets on a block in implicit steps with contacts, each to its tenth step:
 cold (a new process, an empty cache of kernels), warm (a new process, the same cache), and warm with another mesh size. In one
 process: the first simulator, a second one of the same structure, and one of another size. Also three static solves of the beam,
-nine that find Young's modulus from a sag, and the memory that twenty simulators leave behind. Times are wall and CPU seconds,
-those of a whole process with Python's start; a warm one is the median over rounds. --baseline: another version's folder, measured
-in the same run with its own cache; the limits compare with it. Exit status: 0, or 1 where a limit is not met or a process failed.
+nine that find Young's modulus from a sag, what changes of an open simulator cost, and the memory that twenty simulators leave
+behind. Times are wall and CPU seconds, those of a whole process with Python's start; a warm one is the median over rounds.
+--baseline: another version's folder, measured in the same run with its own cache; the limits compare with it, those of how fast
+kernels are (a beam of 34,560 tets) by the median over rounds that alternate. Exit status: 0, or 1 where a limit is not met or a
+process failed.
 """
 
 import argparse
@@ -33,6 +35,8 @@ from .elasticity_table import Limit, limit_table
 CHILD = Path(__file__).with_name("startup_child.py")
 SIZES = {"beam": (3, 6), "cube": (4, 6)}  # cells, and those of another size
 ROUNDS, TIMES = 3, 20
+SPEED_CELLS, SPEED_ROUNDS = 12, 5
+SLOWER = {"symplectic_euler step": 1.2, "implicit_euler step": 1.25, "energies": 1.15}  # than the baseline, at most
 HERE = Path(taisoft.__file__).resolve().parents[1]
 
 
@@ -77,6 +81,17 @@ def measure(version: Version, quick: bool) -> dict:
     print(f"{version.folder.name}: statics", file=sys.stderr, flush=True)
     found["statics"] = version.run("statics", 3)[0]
     found["identify"] = version.run("identify", 3)[0]
+    found["settings"] = version.run("settings", 4)[0]
+    return found
+
+
+def measure_speed(versions: list[Version], quick: bool) -> list[dict[str, list[float]]]:
+    """Of each version, times [s] by round: the versions take turns, since the machine's speed changes."""
+    found: list[dict[str, list[float]]] = [{what: [] for what in SLOWER} for _ in versions]
+    for _ in range(1 if quick else SPEED_ROUNDS):
+        for version, times in zip(versions, found):
+            for what, seconds in version.run("speed", 2 if quick else SPEED_CELLS)[0].items():
+                times[what].append(seconds)
     return found
 
 
@@ -103,6 +118,25 @@ def table(found: dict[str, dict]) -> str:
 def cell(times: dict) -> str:
     """Wall and CPU seconds."""
     return f"{times['wall']:.3g} ({times['cpu']:.3g})"
+
+
+def settings_table(found: dict[str, dict]) -> str:
+    """What changes of an open simulator cost."""
+    versions = list(found.values())
+    rows = [(what, *[f"{1e3 * one['settings'][what]:.2f}" for one in versions]) for what in versions[0]["settings"]]
+    return markdown(("cube with contacts, wall [ms]", *found), rows, left=(0,))
+
+
+def speed_table(found: dict[str, dict]) -> str:
+    """How fast kernels are, with the range over rounds."""
+    rows = []
+    for what in SLOWER:
+        cells = []
+        for one in found.values():
+            times = 1e3 * np.array(one["speed"][what])
+            cells.append(f"{np.median(times):.3g} ({times.min():.3g} to {times.max():.3g})")
+        rows.append((what, *cells))
+    return markdown(("beam, wall [ms]", *found), rows, left=(0,))
 
 
 def count_table(found: dict[str, dict]) -> str:
@@ -137,6 +171,9 @@ def find_limits(now: dict, old: dict | None) -> list[Limit]:
         ratio = now["statics"]["1"]["wall"] / old["statics"]["1"]["wall"]
         limits.append(Limit("second static solve over the baseline's", ratio, 0.15))
         limits.append(Limit("nine static solves over the baseline's", now["identify"]["wall"] / old["identify"]["wall"], 0.1))
+        for what, most in SLOWER.items():
+            ratios = np.array(now["speed"][what]) / np.array(old["speed"][what])
+            limits.append(Limit(f"{what} over the baseline's", float(np.median(ratios)), most))
     return limits
 
 
@@ -151,13 +188,16 @@ def main(argv=None) -> int:
     check_out(options.out, ".json")
     document, (text, numbers) = Document(), header("Start-up", "arch cpu")
     document.add(text)
-    found = {}
     with tempfile.TemporaryDirectory() as caches:
-        for label, folder in (("baseline", options.baseline), ("this version", HERE)):
-            if folder is not None:
-                found[label] = measure(Version(folder.resolve(), Path(caches) / label.replace(" ", "_")), options.quick)
+        folders = {label: folder for label, folder in (("baseline", options.baseline), ("this version", HERE)) if folder}
+        versions = {label: Version(one.resolve(), Path(caches) / label.replace(" ", "_")) for label, one in folders.items()}
+        found = {label: measure(version, options.quick) for label, version in versions.items()}
+        for one, speed in zip(found.values(), measure_speed(list(versions.values()), options.quick)):
+            one["speed"] = speed
     document.add("## Waiting\n\n" + table(found))
     document.add("## Counts\n\n" + count_table(found))
+    document.add("## Changes\n\n" + settings_table(found))
+    document.add("## Speed\n\n" + speed_table(found))
     limits = [] if options.quick else find_limits(found["this version"], found.get("baseline"))
     if limits:
         document.add("## Limits\n\n" + limit_table(limits))

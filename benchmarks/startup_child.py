@@ -119,7 +119,41 @@ def identify(cells: int) -> dict:
     return timed(search)
 
 
-TASKS = {"first": first, "again": again, "grow": grow, "statics": statics, "identify": identify}
+def settings(cells: int) -> dict:
+    """What changes of an open simulator cost, medians, and a new simulator beside them."""
+    name = "cube"
+    build, arguments = SCENES[name]
+    simulate(name, cells, 2)
+    with ts.Simulator(build(cells), **arguments) as sim:
+        sim.advance(2)
+        x, v = sim.positions(), sim.velocities()
+        changes = {
+            "set_gravity": lambda: sim.set_gravity((0.0, -9.8, 0.0)),
+            "set_contact": lambda: sim.set_contact("cube", "ground", friction=0.3),
+            "set_state": lambda: sim.set_state(x, v),
+            "reset": sim.reset,
+            "set_material": lambda: sim.set_material("cube", young=2e6),
+        }
+        found = {what: float(np.median([timed(change)["wall"] for _ in range(9)])) for what, change in changes.items()}
+    return found | {"a new Simulator": timed(lambda: ts.Simulator(build(cells), **arguments).close())["wall"]}
+
+
+def speed(cells: int) -> dict:
+    """Seconds of an explicit step, an implicit one, and one measurement of energies of a beam: medians."""
+    def median(do: Callable) -> float:
+        do()
+        return float(np.median([timed(do)["wall"] for _ in range(9)]))
+
+    steps = 20
+    with ts.Simulator(beam(cells), dt=2e-5, integrator="symplectic_euler") as sim:
+        found = {"symplectic_euler step": median(lambda: sim.advance(steps)) / steps, "energies": median(sim.energies)}
+    with ts.Simulator(beam(cells), dt=5e-3, integrator="implicit_euler") as sim:
+        return found | {"implicit_euler step": median(lambda: sim.advance(1))}
+
+
+TASKS = {
+    "first": first, "again": again, "grow": grow, "statics": statics, "identify": identify, "settings": settings, "speed": speed,
+}  # fmt: skip
 
 if __name__ == "__main__":
     arguments = [int(word) if word.isdigit() else word for word in sys.argv[2:]]

@@ -32,7 +32,7 @@ LONG = {
     "test_static": ("test_equilibrium[1]",),
     "test_checkpoint": (
         "contacts[bdf2-f32", "contacts[velocity_verlet-f64", "contacts[symplectic_euler-f64", "contacts[implicit_",
-        "contacts[linearly_",
+        "contacts[linearly_", "another_process[100]",
     ),
     "test_tunnelling": ("[symplectic_euler-",),
     "test_bench_collision": ("test_films_and_broad_phases",),

@@ -45,17 +45,23 @@ def numbers(seconds: float, compiled: int) -> dict:
         "cold": times, "warm": times, "warm, other size": times, "new files": 0, "memory": {"start": 300.0, "end": 301.0},
         "one process": {"first": times, "second": times, "other size": times},
     }  # fmt: skip
-    return {"beam": one, "cube": one, "statics": {str(k): times for k in range(3)}, "identify": times}
+    return {
+        "beam": one, "cube": one, "statics": {str(k): times for k in range(3)}, "identify": times,
+        "settings": {"reset": 1e-3 * seconds},
+    }  # fmt: skip
 
 
 def test_the_page(monkeypatch, tmp_path, capsys):
     found = {ROOT: numbers(0.5, 0), tmp_path: numbers(10.0, 3)}
     monkeypatch.setattr(startup, "measure", lambda version, quick: found[version.folder])
+    monkeypatch.setattr(
+        startup, "measure_speed", lambda versions, quick: [dict.fromkeys(startup.SLOWER, [1e-3, 1.1e-3, 2e-3])] * len(versions)
+    )
     out = tmp_path / "page.json"
     assert startup.main(["--baseline", str(tmp_path), "--out", str(out)]) == 0
     page = out.with_suffix(".md").read_text()
     assert "| beam, cold " in page and "10 (10)" in page and "0.5 (0.5)" in page and "NOT met" not in page
-    assert len(json.loads(out.read_text())["limits"]) == 15 and page.strip() in capsys.readouterr().out
+    assert len(json.loads(out.read_text())["limits"]) == 18 and page.strip() in capsys.readouterr().out
     found[ROOT] = numbers(2.0, 1)
     assert startup.main(["--baseline", str(tmp_path)]) == 1
     assert "NOT met" in capsys.readouterr().out

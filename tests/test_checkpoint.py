@@ -146,8 +146,9 @@ def test_going_on_with_contacts(tmp_path, integrator, precision, settings):
         assert_every_part_counts(loaded, path, {"stepper/contact/rows/r": lambda r: 0 * r}, told[:3])
 
 
-def test_cubes_go_on_in_another_process(tmp_path):
-    """Case L3: bodies lie on a floor and on each other, 100 steps to a checkpoint, 100 after it."""
+@pytest.mark.parametrize("steps", [20, 100])
+def test_cubes_go_on_in_another_process(steps, tmp_path):
+    """Case L3: bodies lie on a floor and on each other, 100 steps to a checkpoint, and some after it."""
     path, result = tmp_path / "checkpoint.npz", tmp_path / "result.npz"
     with ts.Simulator(cubes(), **CUBES) as sim:
         follow(sim, 60)
@@ -157,7 +158,7 @@ def test_cubes_go_on_in_another_process(tmp_path):
         contacts = sim.contacts()
         pressed = contacts.impulse.any(axis=1)
         assert {"floor", "top"} <= set(contacts.body_b[pressed]) | set(contacts.body_a[pressed])
-        told = follow(sim, 100)
+        told = follow(sim, steps)
         spoilt = {"inverse_mass": lambda m: 2 * m, "weighed": lambda w: None}
         assert_every_part_counts(
             sim, path,
@@ -167,7 +168,7 @@ def test_cubes_go_on_in_another_process(tmp_path):
         )  # fmt: skip
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     script = Path(__file__).with_name("checkpoint_scenes.py")
-    subprocess.run([sys.executable, script, path, "100", result], env=environment, check=True)
+    subprocess.run([sys.executable, script, path, str(steps), result], env=environment, check=True)
     with np.load(result) as other:
         assert np.array_equal(other["time"], [t for t, *_ in told])
         assert np.array_equal(other["x"], [x for _, x, *_ in told])
