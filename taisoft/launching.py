@@ -7,7 +7,7 @@ record is put together again around those arguments, so the kernel's source read
 A record may hold others, and tuples of them. Only what a kernel and the functions it calls name is taken from a record.
 
 A launch through Taichi looks every argument's type up; one that is known by its records needs only numbers and addresses in a
-context that is made once. This rests on 1.7.4, the version that taisoft asks for.
+context that is made once. This rests on 1.7.4, the version that taisoft asks for: see `tracing`.
 """
 
 import ast
@@ -29,11 +29,11 @@ from taichi.lang.kernel_impl import Kernel, template
 from taichi.types import ndarray_type, primitive_types
 
 from taisoft.arrays import DTYPES, Array, Count, View
-from taisoft.tracing import source_of
+from taisoft.tracing import QUICK, source_of
 
 RECORD, ARRAY, COUNT, TUPLE, CONSTANT = range(5)
 REAL, WHOLE, HOST_ARRAY = range(3)
-PUBLIC = False  # launch through Taichi's public interface alone, which takes 20 us and more, and at most 64 arguments
+PUBLIC = not QUICK  # launch through Taichi's public interface alone, which takes 20 us and more, and at most 64 arguments
 
 
 # --- what of a record a kernel names ------------------------------------------------------------------------------------
@@ -255,7 +255,7 @@ class Compiled:
     def launch(self, context: Any, arguments: tuple) -> Any:
         """Launch; returns what the kernel returns. context: of `context`, None where it must be made anew."""
         if self._public is not None:
-            return self._public(*self._flattened(arguments))
+            return self._launch_publicly(arguments)
         if context is None:
             context = self.context(arguments)
         for at, slot, kind in self._setters:
@@ -276,15 +276,21 @@ class Compiled:
         values = [self._kernel.construct_kernel_ret(context, kind, (i,)) for i, kind in enumerate(returned)]
         return values[0] if len(values) == 1 else values
 
-
-    def _flattened(self, arguments: tuple) -> Iterator[Any]:
-        """All arguments as Taichi's own launch takes them."""
+    def _launch_publicly(self, arguments: tuple) -> Any:
+        """As Taichi's own launch takes it. What lies on a device travels: Taichi takes scalars there for no vectors."""
+        flat, copies = [], {}
         for argument, structure in zip(arguments, self.structures):
-            if structure is None:
-                yield argument
-                continue
-            for leaf in leaves_of(argument, structure):
-                yield leaf.host.reshape((-1, leaf.n) if leaf.n else -1) if isinstance(leaf, Array) else leaf
+            for leaf in [argument] if structure is None else leaves_of(argument, structure):
+                if isinstance(leaf, Array):
+                    if leaf.host is None and id(leaf) not in copies:
+                        copies[id(leaf)] = leaf, leaf.to_numpy()
+                    host = copies[id(leaf)][1] if leaf.host is None else leaf.host
+                    leaf = host.reshape((-1, leaf.n) if leaf.n else -1)
+                flat.append(leaf)
+        returned = self._public(*flat)
+        for leaf, host in copies.values():
+            leaf.from_numpy(host)
+        return returned
 
 
 def _setter(annotation: Any) -> int:

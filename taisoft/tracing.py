@@ -4,7 +4,7 @@ Taichi asks of every decorated function whether it stands in a class, through Py
 function's source at each of its calls in a kernel; and for every syntax node it formats an excerpt of the source for messages
 that are seldom needed. Together that takes longer than building the code. Without the excerpts messages still name file, line and
 function. Functions of nothing but arithmetic need no tracing at all: see `arithmetic`. This rests on 1.7.4, the version that
-taisoft asks for; with any other, or with TAISOFT_PLAIN_TRACING set, Taichi stays as it is, and results are the same.
+taisoft asks for; with any other, or with TAISOFT_PUBLIC_TAICHI set, Taichi stays as it is, and results are the same.
 """
 
 import ast
@@ -21,7 +21,7 @@ from taichi.lang import impl, kernel_impl
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 from taichi.lang.expr import Expr
 
-QUICK = ti.__version__ == (1, 7, 4) and not os.environ.get("TAISOFT_PLAIN_TRACING")
+QUICK = ti.__version__ == (1, 7, 4) and not os.environ.get("TAISOFT_PUBLIC_TAICHI")
 
 
 def _inside_class(level_of_class_stackframe: int) -> bool:

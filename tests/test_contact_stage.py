@@ -25,7 +25,7 @@ from taisoft.linear.coupling import add_pulls, clear_pulls, gather_pulls, prepar
 from taisoft.runtime import kernel
 from taisoft.scalars import END_SLOPE, START_SLOPE
 from taisoft.stepping import contact_stage
-from taisoft.stepping.contact_stage import SHARE, STAY, STEP, STILL
+from taisoft.stepping.contact_stage import SHARE, STAY, STEP
 from taisoft.stepping.newton import StageSolver
 from taisoft.stepping.stage import form_residual
 
@@ -121,12 +121,15 @@ def press(rig, x: np.ndarray) -> np.ndarray:
     return rig.p.r.to_numpy()[:K]
 
 
-def evaluate(rig, how: int = STAY, share: float = 1.0, multiply: bool = False, linear: bool = False, m=None) -> np.ndarray:
-    """The norms that it tells. m: the model, by default that on one thread."""
-    norms, s = np.zeros(5), rig.solver
-    contact_stage.evaluate(
-        m or rig.m, rig.work, s.matrix, rig.k, s.pcg, linear, how, share, int(multiply), 1.0, BETA, DT, *GOAL, STIFFNESS, norms
-    )
+def evaluate(
+    rig, how: int | None = STAY, share: float = 1.0, multiply: bool = False, linear: bool = False, m=None
+) -> np.ndarray:
+    """The norms of the residual. how: None to stay without asking for the forces. m: the model, by default that on one thread."""
+    norms, s, m = np.zeros(5), rig.solver, m or rig.m
+    if how is not None:
+        contact_stage.move(m, rig.work, rig.k, s.pcg, linear, how, share, 1.0, BETA)
+    contact_stage.press(m, rig.work, rig.k, False, int(multiply), BETA, DT, *GOAL, STIFFNESS)
+    contact_stage.form_pressed_residual(m, rig.work, s.matrix, rig.k, s.pcg, linear, BETA, norms)
     return norms
 
 
@@ -237,8 +240,8 @@ def test_residual_of_a_stage(rig, pressed, threads):
     cg.y.from_numpy(y)
     work.residual.from_numpy(before)
     m.x.from_numpy(rig.x)
-    for how, share in ((STEP, 1.0), (SHARE, 0.4), (STILL, 0.4)):
-        norms = evaluate(rig, how, share, multiply=how == STILL, m=m)
+    for how, share in ((STEP, 1.0), (SHARE, 0.4), (None, 0.4)):
+        norms = evaluate(rig, how, share, multiply=how is None, m=m)
         got, rhs, r = work.residual.to_numpy(), cg.rhs.to_numpy(), rig.p.r.to_numpy()[:K]
         assert np.abs(m.x.to_numpy() - rig.x - share * BETA * y.astype(float)).max() < 1e-15
         assert np.abs(m.v.to_numpy() - (m.x.to_numpy() - rig.x_hat) / BETA).max() < 10 * rig.close * np.abs(m.v.to_numpy()).max()

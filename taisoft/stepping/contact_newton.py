@@ -24,12 +24,13 @@ from taisoft.stepping.contact_stage import (
     SHARE,
     STAY,
     STEP,
-    STILL,
     StageContacts,
     build_stage_contacts,
-    evaluate,
+    form_pressed_residual,
     keep_diagonal,
     keep_linear,
+    move,
+    press,
 )
 from taisoft.stepping.impact import SPREAD, apply_impact, begin_impact, holding_work, let_go, measure_impact, start_from
 from taisoft.stepping.newton import MAX_FORCING, SLOW, StageResult, StageSolver, _forcing, count_all, merge, stalled
@@ -104,12 +105,14 @@ class ContactStageSolver(StageSolver):
     # --- what contacts add to the parts of a Newton step ----------------------------------------------------------
 
     def _evaluate(
-        self, c: float, beta: float, how: int = STAY, share: float = 1.0, multiply: bool = False
+        self, c: float, beta: float, how: int | None = STAY, share: float = 1.0, multiply: bool = False
     ) -> tuple[float, float]:
-        evaluate(
-            self.model, self.work, self.matrix, self._k, self.pcg, self._linear, how, share, int(multiply), c, beta, self._dt,
-            *self.contact.goal, self._stiffness, self._norms,
-        )  # fmt: skip
+        """(|r|, scale) where `move` goes; None: x is where it was, and so are the elastic forces. multiply: as `press`."""
+        m, w, k = self.model, self.work, self._k
+        if how is not None:
+            move(m, w, k, self.pcg, self._linear, how, share, c, beta)
+        press(m, w, k, self._linear == IMPACT, int(multiply), beta, self._dt, *self.contact.goal, self._stiffness)
+        form_pressed_residual(m, w, self.matrix, k, self.pcg, self._linear, beta, self._norms)
         return self._sizes(c, beta)
 
     def _form_system(self, c: float, beta: float, projected: bool) -> None:
@@ -231,7 +234,7 @@ class ContactStageSolver(StageSolver):
                 elif taken >= MANY:
                     self._stiffness = max(SOFTEST, 0.5 * self._stiffness)
                 taken = 0
-                r, scale = self._evaluate(c, beta, STILL, multiply=True)
+                r, scale = self._evaluate(c, beta, None, multiply=True)
                 goal, least, previous, rounding = PROGRESS * r, r, 0.0, False
                 continue
             if newton >= max_newton:

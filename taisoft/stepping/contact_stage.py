@@ -26,7 +26,7 @@ from taisoft.scalars import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.stepping.impact import impact_residual
 from taisoft.stepping.stage import place_node, residual_parts, set_change, squares
 
-STAY, STILL, STEP, SHARE = range(4)  # what `evaluate` does before it looks
+STAY, STEP, SHARE = range(3)  # where `move` goes
 IMPACT = 2  # a stage that is linear: the impact before a step, see `impact`
 
 
@@ -157,19 +157,15 @@ def _linear_residual(m: ti.template(), A: ti.template(), k: ti.template(), i):
 
 
 @kernel
-def evaluate(
-    m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), pcg: ti.template(), linear: ti.template(),
-    how: ti.i32, share: ti.f64, multiply: ti.i32, c: ti.f64, beta: ti.f64, dt: ti.f64, standoff: ti.f64, fast: ti.f64,
-    slow: ti.f64, fastest: ti.f64, stiffness: ti.f64, norms: ti.types.ndarray(),
+def move(
+    m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.template(), linear: ti.template(), how: ti.i32, share: ti.f64,
+    c: ti.f64, beta: ti.f64,
 ):  # fmt: skip
-    """Go where `how` says, and find contacts, residual, and -r as CG's right side there.
+    """Go where `how` says, and find the elastic forces there.
 
-    how: STAY; STEP: base = x, then the whole step y of pcg; SHARE: base + share y. STILL: as STAY, where the elastic forces of
-    this x are known. multiply: whether the impulses are made the multipliers first, and the disks opened as far as these say.
-    linear: of the stage linearised at k.x_linear, or IMPACT. stiffness: R over the r-factors.
-    norms: as `form_residual` tells, impulses in r; of a linear stage only those of r. scalars: START_SLOPE of a step, END_SLOPE.
+    how: STAY; STEP: base = x, then the whole step y of pcg; SHARE: base + share y. linear: of the stage linearised at k.x_linear,
+    or IMPACT. scalars: START_SLOPE of a step.
     """
-    (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for chunk in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
@@ -178,7 +174,7 @@ def evaluate(
             if how == STEP:
                 slope += dot64(m.free[i] * s.residual[i], pcg.y[i])
                 s.base[i] = m.x[i]
-            if how == STEP or how == SHARE:
+            if how != STAY:
                 place_node(m, s, pcg.y, i, share, beta)
             k.way[i] = m.x[i] - k.x_start[i]
             if ti.static(linear):
@@ -190,13 +186,43 @@ def evaluate(
         for g in ti.static(m.groups):
             ti.loop_config(serialize=m.serial)
             for b in range(g.first, g.last):
-                if how != STILL:
-                    element_force(m, g, False, b)
+                element_force(m, g, False, b)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        if how == STEP:
+            m.scalars[START_SLOPE] = total(m, OTHER_SUM)
+
+
+@kernel
+def press(
+    m: ti.template(), s: ti.template(), k: ti.template(), impact: ti.template(), multiply: ti.i32, beta: ti.f64, dt: ti.f64,
+    standoff: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64, stiffness: ti.f64,
+):  # fmt: skip
+    """Find the impulses of all contacts where `move` has gone, their blocks of the matrix, and the residual of their laws.
+
+    impact: as `_set_out`. multiply: whether the impulses are made the multipliers first, and the disks opened as far as these
+    say. stiffness: R over the r-factors.
+    """
+    (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=p.serial)
     for n in range(p.count[0]):
         if multiply == 1:
-            _set_out(s, k, n, beta, dt, standoff, fast, slow, fastest, linear == IMPACT)
+            _set_out(s, k, n, beta, dt, standoff, fast, slow, fastest, impact)
         _press(m, k, n, beta, stiffness)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        _sum_residual(k)
+
+
+@kernel
+def form_pressed_residual(
+    m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), pcg: ti.template(), linear: ti.template(),
+    beta: ti.f64, norms: ti.types.ndarray(),
+):  # fmt: skip
+    """Residual, and -r as CG's right side, from what `move` and `press` have found.
+
+    linear: as `move`. norms: as `form_residual` tells, impulses in r; of a linear stage only those of r. scalars: END_SLOPE.
+    """
     ti.loop_config(serialize=m.serial)
     for chunk in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
@@ -221,12 +247,9 @@ def evaluate(
         m.partial[chunk, SUM] = slope
     ti.loop_config(serialize=True)
     for _ in range(1):
-        _sum_residual(k)
         for j in ti.static((0, 4) if linear else range(N_NORMS)):
             norms[j] = total(m, j)
         m.scalars[END_SLOPE] = total(m, SUM)
-        if how == STEP:
-            m.scalars[START_SLOPE] = total(m, OTHER_SUM)
 
 
 @kernel
