@@ -74,6 +74,12 @@ class Array:
         else:
             self.device.fill(value)
 
+    def release(self) -> None:
+        """Give the memory back: the array then has no entries."""
+        self.shape = (0, *self.shape[1:])
+        self.host = np.empty(self.whole, dtype=DTYPES[self.dtype]) if self.host is not None else None
+        self.device = None
+
     def __getitem__(self, at):
         """One entry, on the host."""
         entry = (self.host if self.host is not None else self.to_numpy())[at]

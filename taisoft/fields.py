@@ -1,13 +1,14 @@
 """The arrays of a simulator: made and counted by name, refused where they do not fit into memory, released together."""
 
 import math
+import weakref
 
 import numpy as np
 import taichi as ti
 
 from taisoft.arrays import DTYPES, Array, index_mask
 from taisoft.errors import SimulationError
-from taisoft.lane_pool import OWN_MASK, Lanes, free, own_field
+from taisoft.lane_pool import OWN_MASK, Lanes
 from taisoft.memory import available_memory, told
 from taisoft.runtime import lane_pool
 
@@ -20,7 +21,7 @@ class FieldArena:
     def __init__(self) -> None:
         self.bytes: dict[str, int] = {}
         self._lanes: list[Lanes] = []
-        self._trees: list = []  # of fields
+        self._arrays: weakref.WeakSet[Array] = weakref.WeakSet()
 
     def field(self, name: str, dtype, shape: tuple[int, ...] | int, data: np.ndarray | None = None) -> Array:
         """Scalars, filled from data when given (else zero)."""
@@ -36,13 +37,10 @@ class FieldArena:
         if pool is None:
             return Lanes(self.field(name, dtype, count), 0, count, OWN_MASK)
         needed = self._ask_for(name, dtype, count, OWN_MASK)
-        lanes = pool.take(count)
-        if lanes is None:
-            try:
-                lanes, tree = own_field(dtype, count)
-            except RuntimeError:
-                raise SimulationError(self._no_memory(name, needed, available_memory())) from None
-            self._trees.append(tree)
+        try:
+            lanes = pool.take(count)
+        except RuntimeError:
+            raise SimulationError(self._no_memory(name, needed, available_memory())) from None
         self.bytes[name] = needed
         self._lanes.append(lanes)
         return lanes
@@ -59,6 +57,7 @@ class FieldArena:
         if data is not None:
             array.from_numpy(data)
         self.bytes[name] = needed
+        self._arrays.add(array)
         return array
 
     def _ask_for(self, name: str, dtype, count: int, most: int) -> int:
@@ -77,7 +76,9 @@ class FieldArena:
         return f"not enough memory for the array '{name}': {told(needed)} are needed, available: {told(free)}"
 
     def release(self) -> None:
-        """Free the lane buffers. An array's memory is free once nothing refers to it."""
+        """Free all memory, also that of arrays that somebody still refers to: kernels must not be launched with them."""
         self._lanes.clear()
-        free(self._trees)
+        for array in self._arrays:
+            array.release()
+        self._arrays.clear()
         self.bytes.clear()

@@ -387,6 +387,6 @@ class Kernels:
 
 def _token(argument: Any) -> Any:
     """By which an argument is known again: which record or array it is, of a constant its value."""
-    if isinstance(argument, (bool, int, float, str, tuple)) or argument is None:
-        return argument
+    if isinstance(argument, (bool, int, float, str, tuple)):
+        return argument, type(argument)  # 1, 1.0 and True are equal
     return id(argument), type(argument)

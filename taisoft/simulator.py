@@ -199,7 +199,7 @@ class Simulator(Resuming):
             )
             if self._stepper.unbalanced[1]:
                 worst, name = self._stepper.unbalanced
-                found.append(f"forces on body '{name}' are unbalanced by {worst:.2g} of their size, beside larger ones on others")
+                found.append(f"forces on {name} are unbalanced by {worst:.2g} of their size, beside larger ones on others")
         elif not report.converged:
             found.append(f"the contact solver stopped at a residual of {report.contact_residual:.2e}")
         if report.dropped_contacts:
@@ -284,7 +284,8 @@ class Simulator(Resuming):
 
     @property
     def field_bytes(self) -> dict[str, int]:
-        """Bytes of every allocated field by name."""
+        """Bytes of every allocated array by name."""
+        self._kept_world()
         searched = self._contact or self._idle_detection
         return self._arena.bytes | (searched.field_bytes if searched else {}) | self._stepper.field_bytes
 
@@ -295,7 +296,7 @@ class Simulator(Resuming):
         return {name: n for name, n in searched.counts.growths.items() if n} if searched is not None else {}
 
     def close(self) -> None:
-        """Release the fields and the runtime; a closed simulator cannot be used."""
+        """Give memory and runtime back; a closed simulator cannot be used."""
         if self._world is not None:
             self._release()
             self._world = None

@@ -23,6 +23,9 @@ from taichi.lang.expr import Expr
 
 QUICK = ti.__version__ == (1, 7, 4) and not os.environ.get("TAISOFT_PUBLIC_TAICHI")
 
+ORDERS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE, ast.Eq, ast.NotEq)  # comparisons that Taichi's expressions know
+DECIDING = ("max", "min", "bool", "int", "float", "round", "any", "all", "sorted")  # Python's own ask what a number is
+
 
 def _inside_class(level_of_class_stackframe: int) -> bool:
     """Whether the decorator that asks is used in the body of a class, which runs with a name of its own."""
@@ -78,10 +81,19 @@ class _Keep(ast.NodeTransformer):
         node.value = ast.Call(ast.Name("_keep", ast.Load()), [node.value], [])
         return node
 
+    def visit_Call(self, node: ast.Call) -> ast.Call:
+        if ast.unparse(node.func) == "ti.static":  # Python's own, as in any kernel
+            return node
+        if isinstance(node.func, ast.Name) and node.func.id in DECIDING:
+            raise TypeError(f"an arithmetic function cannot hold '{ast.unparse(node)}'")
+        return self.generic_visit(node)
+
     def generic_visit(self, node: ast.AST) -> ast.AST:
         decides = getattr(node, "test", None) or (node.iter if isinstance(node, (ast.For, ast.comprehension)) else None)
         is_static = isinstance(decides, ast.Call) and ast.unparse(decides.func) == "ti.static"
-        if isinstance(node, (ast.BoolOp, ast.AugAssign)) or (decides is not None and not is_static):
+        is_chain = isinstance(node, ast.Compare) and (len(node.ops) > 1 or not isinstance(node.ops[0], ORDERS))
+        is_not = isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not)
+        if isinstance(node, (ast.BoolOp, ast.AugAssign)) or is_chain or is_not or (decides is not None and not is_static):
             raise TypeError(f"an arithmetic function cannot hold '{ast.unparse(node)}'")
         return super().generic_visit(node)
 

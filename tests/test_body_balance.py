@@ -45,6 +45,28 @@ def test_a_light_body_falls_beside_a_heavy_one(scene, monkeypatch):
                 assert any("forces on body 'small' are unbalanced" in text for report in bad for text in report.problems)
 
 
+@pytest.mark.parametrize("integrator, young, pull", [("implicit_euler", 2e11, 2e9), ("linearly_implicit_euler", 2e9, 4e8)])
+@pytest.mark.parametrize("connected", [False, True], ids=["bodies", "pieces"])
+def test_a_free_cube_falls_beside_one_that_is_pulled(integrator, young, pull, connected):
+    """Two bodies, or two pieces of one mesh; the pull is many times the weight."""
+    cube, steel = ts.box_mesh((2, 2, 2), (1, 1, 1)), ts.Material(young=young, density=1000.0)
+    made = ts.Scene(gravity=(0, -G, 0))
+    if connected:
+        apart = np.vstack([cube.vertices, cube.vertices + (5, 0, 0)]), np.vstack([cube.tets, cube.tets + cube.n_verts])
+        body = made.add_body(ts.TetMesh(*apart), steel)
+    else:
+        body = made.add_body(cube, steel)
+        made.add_body(cube, steel, position=(5, 0, 0))
+        made.contact_forces = False
+    body.fix(lambda X: X[:, 0] < -0.49)
+    body.add_force(lambda X: (X[:, 0] > 0.49) & (X[:, 0] < 1), (pull, 0, 0))
+    with ts.Simulator(made, dt=0.01, integrator=integrator) as sim:
+        for _ in range(30):
+            assert sim.step().converged
+        speed = sim.velocities()[-cube.n_verts :].mean(axis=0)
+    assert speed == pytest.approx((0.0, -G * 0.3, 0.0), abs=0.015 * G * 0.3)
+
+
 def test_a_checkpoint_holds_what_rounding_is_judged_by(scene, tmp_path):
     """It tells of the state where numbers last changed, not of that which is loaded."""
 

@@ -13,7 +13,7 @@ import pytest
 import taichi as ti
 from lanes import opened
 
-from taisoft import lane_pool
+from taisoft import lane_pool, runtime
 from taisoft.arrays import DTYPES
 from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
@@ -160,3 +160,48 @@ def test_a_lane_buffer_beyond_the_pool():
         write_lanes(large.memory, lane_pool.ENTRIES - 3, 4, 2.0)
         assert sum_lanes(large.memory, 0, large.count) == 8.0
         arena.release()
+
+
+def test_large_lane_buffers_share_fields(monkeypatch):
+    """So kernels compiled for one serve the next. Two at a time have two; a larger one takes the place of those that lie idle."""
+    with opened("f32"):
+        monkeypatch.setattr(lane_pool, "ENTRIES", 0)
+        arenas = [FieldArena() for _ in range(3)]
+
+        def take(k: int, count: int):
+            memory = arenas[k].lanes("large", ti.f32, count).memory
+            write_lanes(memory, count - 4, 4, float(k + 1))
+            return memory
+
+        def release(k: int) -> None:
+            arenas[k].release()
+            gc.collect()
+
+        first = take(0, 1000)
+        before = runtime.n_compiled()
+        second = take(1, 1000)
+        assert second is not first and runtime.n_compiled() == before + 1
+        release(0)
+        assert take(2, 900) is first and runtime.n_compiled() == before + 1
+        for k in (1, 2):
+            release(k)
+        third = take(0, 5000)
+        assert third is not first and third is not second
+        release(0)
+        assert take(1, 1000) is third
+        release(1)
+
+
+def test_a_lane_buffer_has_a_quarter_to_spare_at_most():
+    for count in [*range(1, 300), 2**24 + 1, 1_234_567_891]:
+        assert count <= lane_pool.size_class(count) <= max(1.25 * count, count + 1)
+    assert len({lane_pool.size_class(k) for k in range(1, 2**16)}) <= 4 * 17
+
+
+def test_released_arrays_give_their_memory_back():
+    """Also those that somebody still refers to."""
+    with opened("f64"):
+        arena = FieldArena()
+        held = [arena.field("a", ti.f64, 1000), arena.vectors("b", ti.f32, 1000, n=2)]
+        arena.release()
+        assert [one.to_numpy().shape for one in held] == [(0,), (0, 2)] and arena.bytes == {}

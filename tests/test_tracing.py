@@ -125,7 +125,27 @@ def both(x):
     return x > 0.0 and x < 1.0
 
 
-@pytest.mark.parametrize("function", [branches, chooses, loops, adds, both])
+def between(x):
+    return 0.0 < x < 1.0
+
+
+def negates(x):
+    return not (x > 0.0)
+
+
+def larger(x):
+    return max(x, 0.5)
+
+
+def belongs(x):
+    return x in (0.0, 1.0)
+
+
+def rounds(x):
+    return ti.sqrt(float(x))
+
+
+@pytest.mark.parametrize("function", [branches, chooses, loops, adds, both, between, negates, larger, belongs, rounds])
 def test_what_python_would_decide_is_refused(function):
     with pytest.raises(TypeError, match="^an arithmetic function cannot hold "):
         tracing._as_python(function)

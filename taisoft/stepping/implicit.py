@@ -107,7 +107,8 @@ class ImplicitStepper:
         self.contact_tolerance = TOLERANCE[world.runtime.precision]
         self.linear_tolerance: float | None = None
         self.parts = 1  # that the last step was taken in
-        self._balance = BodyBalance(world.scene, world.layout) if len(world.scene.bodies) > 1 else None
+        balance = BodyBalance(world.scene)
+        self._balance = balance if balance.n_pieces > 1 else None
         self.unbalanced: tuple[float, str] = (0.0, "")  # the worst relative residual of a body in the last step beyond LIMIT
         self._substepping = None if contact is None else Substepping(self)
         self.forget()
@@ -251,8 +252,7 @@ class ImplicitStepper:
             self.contact.acts(scheme.share)
         self.solver.assemble_damper()
         along = (0.5 if scheme.midpoint else 1.0) if self._past > 1 and not scheme.one_iteration else 0.0
-        multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)
-        begin_step(m, w, h, multistep, scheme.now, scheme.before, still, along)
+        self._begin(scheme, along)
         try:
             result = self._solve_balanced(scheme, dt, bounces)
         except BaseException:  # Ctrl-C: the step is abandoned
@@ -271,19 +271,24 @@ class ImplicitStepper:
             self._past = 0
         return result
 
-    def _solve_balanced(self, scheme: Scheme, dt: float, bounces: bool) -> StageResult:
-        """The stage; again and more tightly where it left a body's forces unbalanced beside larger ones.
+    def _begin(self, scheme: Scheme, along: float) -> None:
+        """The stage starts, from the present state."""
+        multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)
+        begin_step(self.world.model, self.solver.work, self.history, multistep, scheme.now, scheme.before, still, along)
 
-        Not of linearly implicit steps, whose residual is that of the linearised stage.
-        """
-        result = self._solve(scheme, dt, bounces, self.tolerance)
-        if self._balance is None or scheme.one_iteration or not (result.converged and np.isfinite(result.residual)):
+    def _solve_balanced(self, scheme: Scheme, dt: float, bounces: bool) -> StageResult:
+        """The stage; again and more tightly where it left a piece's forces unbalanced beside larger ones."""
+        result, linear = self._solve(scheme, dt, bounces, self.tolerance), scheme.one_iteration
+        if self._balance is None or not (result.converged and np.isfinite(result.residual)):
             return result
-        worst, name = self._balance.worst(self.solver, self._beta)
+        worst, name = self._balance.worst(self.solver, self._beta, linear)
         if worst > LIMIT and not bounces:
+            if linear:  # from where it was linearised
+                self.back()
+                self._begin(scheme, 0.0)
             tighter = self.tolerance * LIMIT / min(worst, 1.0) * TIGHTER
             result = count_all(self._solve(scheme, dt, bounces, tighter), [result])
-            worst, name = self._balance.worst(self.solver, self._beta)
+            worst, name = self._balance.worst(self.solver, self._beta, linear)
         if worst > LIMIT:
             self.unbalanced = max(self.unbalanced, (worst, name))
         return result
