@@ -3,7 +3,8 @@
 * they are counted in bytes, named once, released together, and too large ones refused before they are made;
 * every type and number of dimensions comes back as it was, NaN and infinities too; what is read is a copy; the first rows alone;
 * what would not fit is refused before anything is written;
-* lane buffers are ranges of one field that do not overlap, free again when released; one that is too large has its own.
+* lane buffers are ranges of one field that do not overlap, free again when released; those too large for it share others;
+* what is released takes no memory, even where somebody still refers to it.
 """
 
 import gc
@@ -164,6 +165,7 @@ def test_a_lane_buffer_beyond_the_pool():
 
 def test_large_lane_buffers_share_fields(monkeypatch):
     """So kernels compiled for one serve the next. Two at a time have two; a larger one takes the place of those that lie idle."""
+    runtime._kind = None  # a new Taichi, whose pool has none yet
     with opened("f32"):
         monkeypatch.setattr(lane_pool, "ENTRIES", 0)
         arenas = [FieldArena() for _ in range(3)]
