@@ -11,7 +11,6 @@ import ctypes
 import functools
 import os
 import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +20,9 @@ from taichi._lib import core
 from taisoft.errors import OutputError
 from taisoft.output.camera import Camera
 from taisoft.runtime import open_kind, open_runtime
-from taisoft.view.gui_fields import GuiFields, move
 from taisoft.view.shading import lit_colours
 from taisoft.view.surfaces import Surfaces
+from taisoft.view.vertex_buffer import VertexBuffer, draw_flat_lines, draw_flat_triangles, draw_lines, draw_mesh
 
 LINE_WIDTH = 2.0  # pixels
 FLAT_WIDTH = 0.002  # of lines over the picture, in units of its height
@@ -94,19 +93,14 @@ class Canvas:
         owner = "a window" if visible else "a picture renderer"
         self._runtime = open_runtime(arch, precision, owner=owner)
         _holder.append(owner)
-        self._fields = GuiFields()
         self._surfaces, self._line_width = surfaces, line_width
-        n = len(surfaces.colours)
-        self._x = self._fields.vectors(ti.f32, n)
-        self._normals = self._fields.vectors(ti.f32, n, np.tile(np.float32([0, 1, 0]), (n, 1)))
-        self._colours = self._fields.vectors(ti.f32, n)
-        triangles = surfaces.triangles.ravel()
-        self._ends = self._fields.vectors(ti.f32, 2 * n_segments) if n_segments else None
-        self._end_colours = self._fields.vectors(ti.f32, 2 * n_segments) if n_segments else None
-        self._has_drawn_lines = False
-        self._indices = self._fields.field(ti.i32, triangles)
-        self._flat: tuple | None = None  # fields of what is drawn over the picture, once something is
-        self._flat_ends: np.ndarray | None = None  # what they hold
+        self._vertices = VertexBuffer(len(surfaces.colours))
+        self._vertices.normals[:] = 0.0, 1.0, 0.0  # of no effect: the colours are lit already
+        self._indices = np.ascontiguousarray(surfaces.triangles.ravel(), dtype=np.int32)
+        self._ends = VertexBuffer(2 * n_segments)
+        self._boxes: VertexBuffer | None = None  # drawn over the picture, as `_strokes`; None until something is
+        self._strokes: VertexBuffer | None = None
+        self._flat_ends: np.ndarray | None = None  # what `_strokes` holds
         self.window = self._canvas = self._scene = None
         self._litter = _panel_file_to_come()
         try:
@@ -128,7 +122,7 @@ class Canvas:
         """
         colours = lit_colours(x, normals, self._surfaces.colours if base is None else base, camera)
         # relative to the target: single precision would blur a scene far from the origin
-        move([(self._x, x - camera.target), (self._colours, colours)])
+        self._vertices.x[:], self._vertices.colours[:] = x - camera.target, colours
         eye = ti.ui.Camera()
         eye.position(*(camera.position - camera.target))
         eye.lookat(0.0, 0.0, 0.0)
@@ -140,25 +134,17 @@ class Canvas:
         self._canvas.set_background_color(background)
         self._scene.set_camera(eye)
         self._scene.ambient_light((1.0, 1.0, 1.0))  # the colours are lit already
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Taichi's own copy kernel warns of f64 literals where the runtime is f64
-            self._scene.mesh(
-                self._x, indices=self._indices, normals=self._normals, per_vertex_color=self._colours, two_sided=True
-            )
-            if self._ends is not None:
-                self._draw_lines(camera, *(lines or (np.empty((0, 3)), np.empty((0, 3)))))
-            self._canvas.scene(self._scene)
+        draw_mesh(self._scene, self._vertices, self._indices)
+        if lines is not None:
+            self._draw_lines(camera, *lines)
+        self._canvas.scene(self._scene)
 
     def _draw_lines(self, camera: Camera, ends: np.ndarray, colours: np.ndarray) -> None:
-        """With none to draw, in the first picture, a line without length, so that Taichi compiles its copying then."""
-        n = min(len(ends), self._ends.shape[0])
-        if n == 0 and self._has_drawn_lines:
+        n = min(len(ends), len(self._ends))
+        if n == 0:
             return
-        self._has_drawn_lines = True
-        all_ends, all_colours = np.zeros((self._ends.shape[0], 3)), np.zeros((self._ends.shape[0], 3))
-        all_ends[:n], all_colours[:n] = ends[:n] - camera.target, colours[:n]
-        move([(self._ends, all_ends), (self._end_colours, all_colours)])
-        self._scene.lines(self._ends, self._line_width, per_vertex_color=self._end_colours, vertex_count=max(n, 2))
+        self._ends.x[:n], self._ends.colours[:n] = ends[:n] - camera.target, colours[:n]
+        draw_lines(self._scene, self._ends, self._line_width, n)
 
     def draw_over(
         self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray, most: tuple[int, int], box_colour: tuple
@@ -166,30 +152,23 @@ class Canvas:
         """Draw boxes (k,4), left, bottom, right, top, and lines, ends (2n,2) of colours (2n,3), over the picture.
 
         All in [0, 1] from its lower left corner; most: how many boxes and lines there can be, the same in every call. Arrays that
-        are those of the last call are not moved again.
+        are those of the last call are not copied again.
         """
-        if self._flat is None:
-            make = self._fields.vectors
-            self._flat = (
-                make(ti.f32, 6 * most[0], n=2), make(ti.f32, 2 * most[1], n=2),
-                make(ti.f32, 2 * most[1]),
-            )  # fmt: skip
+        if self._boxes is None:
+            self._boxes, self._strokes = VertexBuffer(6 * most[0]), VertexBuffer(2 * most[1])
         if self._flat_ends is not ends:
-            self._move_over(boxes, ends, colours, most)
+            self._move_over(boxes, ends, colours)
             self._flat_ends = ends
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # as in `draw`
-            self._canvas.triangles(self._flat[0], color=box_colour)
-            self._canvas.lines(self._flat[1], FLAT_WIDTH, per_vertex_color=self._flat[2])
+        draw_flat_triangles(self._canvas, self._boxes, box_colour)
+        draw_flat_lines(self._canvas, self._strokes, FLAT_WIDTH)
 
-    def _move_over(self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray, most: tuple[int, int]) -> None:
-        """What `draw_over` draws to the device; the rest are boxes and lines without size."""
-        arrays = [np.zeros((6 * most[0], 2)), np.zeros((2 * most[1], 2)), np.zeros((2 * most[1], 3))]
+    def _move_over(self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray) -> None:
+        """Take over what `draw_over` draws; the rest are boxes and lines without size."""
         left, bottom, right, top = boxes.T
         corners = [(left, bottom), (right, bottom), (right, top), (left, bottom), (right, top), (left, top)]
-        arrays[0][: 6 * len(boxes)] = np.array(corners).transpose(2, 0, 1).reshape(-1, 2)
-        arrays[1][: len(ends)], arrays[2][: len(ends)] = ends, colours
-        move(list(zip(self._flat, arrays)))
+        self._boxes.x[:], self._strokes.x[:] = 0.0, 0.0
+        self._boxes.x[: 6 * len(boxes), :2] = np.array(corners).transpose(2, 0, 1).reshape(-1, 2)
+        self._strokes.x[: len(ends), :2], self._strokes.colours[: len(ends)] = ends, colours
 
     def pixels(self, left: int, top: int, right: int, bottom: int) -> np.ndarray:
         """That part of the drawn picture, uint8 (bottom - top, right - left, 3), first row on top."""
@@ -199,7 +178,7 @@ class Canvas:
         return part.astype(np.uint8).transpose(1, 0, 2)[::-1]
 
     def close(self) -> None:
-        """Destroy the window, free the fields, release the runtime; a second call does nothing."""
+        """Destroy the window, release the runtime; a second call does nothing."""
         if self._runtime is None:
             return
         if self.window is not None:
@@ -208,7 +187,6 @@ class Canvas:
             with contextlib.suppress(OSError):  # a folder that has become read-only keeps it, and no harm is done
                 self._litter.unlink(missing_ok=True)
         self.window = self._canvas = self._scene = None
-        self._fields.release()
         self._runtime.close()
         self._runtime = None
         _holder.clear()

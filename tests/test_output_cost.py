@@ -1,0 +1,77 @@
+"""What output costs a run:
+
+* pictures compile no kernel of their own, so a run of another mesh adds none to the cache on disk;
+* compiling inside an observer counts as compile time, and not as time for output, which is part of the run's wall time.
+"""
+
+from types import SimpleNamespace
+
+import pytest
+from command import BEAM, child, write
+from test_running import StandIn
+from test_view import PROLOGUE, needs_vulkan, run_child
+
+from taisoft.cli.recording import Observers
+from taisoft.cli.summary import print_summary
+from taisoft.records import Energies
+from taisoft.running import run
+
+DRAW = PROLOGUE + """
+import numpy as np
+from taisoft.output.camera import Camera
+from taisoft.view.ggui import Canvas
+from taisoft.view.surfaces import Surfaces
+camera, surfaces = Camera.framing(sim.positions()), Surfaces(scene)
+canvas = Canvas(surfaces, (64, 36), visible=False, n_segments=3)
+one = np.ones((2, 3))
+canvas.draw(*surfaces.of_bodies(sim), camera, (1.0, 1.0, 1.0), lines=(sim.positions()[:2], one))
+canvas.draw_over(np.array([[0.1, 0.1, 0.3, 0.2]]), one[:, :2], one, (2, 5), (0.9, 0.9, 0.9))
+print(canvas.pixels(0, 0, 64, 36).std() > 5)
+canvas.close()
+"""
+
+
+def kernels(cache) -> set[str]:
+    """Names of the compiled kernels in a cache folder."""
+    return {path.name for path in cache.glob("taisoft/kernels/*.tic")}
+
+
+@needs_vulkan
+def test_pictures_of_another_mesh_add_no_kernels(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    found = []
+    for cells in ("(4, 1, 1)", "(5, 1, 1)", "(9, 3, 2)"):
+        scene = write(tmp_path / f"scene{len(found)}.py", BEAM.replace("(4, 1, 1)", cells))
+        process = child("run", scene, "--headless", "--no-usd", "--layers", "wires", "--out", tmp_path / scene.stem)
+        _, error = process.communicate(timeout=120)
+        assert process.returncode == 0, error
+        assert (tmp_path / scene.stem / "frames/00003.png").is_file() and "in software" not in error
+        found.append(kernels(tmp_path / "cache"))
+    assert found[0] and found[1] == found[2] == found[0]
+
+
+@needs_vulkan
+def test_drawing_compiles_nothing(tmp_path):
+    """Surfaces, lines, and boxes and lines over the picture."""
+    out, _ = run_child(DRAW, XDG_CACHE_HOME=str(tmp_path))
+    assert out.split()[-1] == "True", "it has drawn"
+    assert (tmp_path / "taisoft/kernels").is_dir() and kernels(tmp_path) == set()
+
+
+def test_compiling_in_an_observer_is_no_output(monkeypatch, capsys):
+    sim, now, observers = StandIn(explicit=False, dt=0.01), [0.0], Observers()
+
+    def frame(sim, index):
+        now[0] += 2.5
+        if index == 0:  # as a kernel that is launched for the first time there
+            now[0] += 10.0
+            sim.compile_seconds += 10.0
+
+    observers.members.append(SimpleNamespace(frame=frame, close=lambda: None))
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    result = run(sim, 0.2, observers.on_frame, fps=10)
+    assert observers.seconds == pytest.approx(7.5) and result.wall_seconds == pytest.approx(7.5)
+    assert result.compile_seconds == pytest.approx(10.0)
+    sim.energies = lambda: Energies(0.0, 0.0, 0.0)
+    print_summary(result, sim, observers, None)
+    assert "7.50 s, 7.50 s of them for output; and 10.00 s to compile" in capsys.readouterr().out
