@@ -214,7 +214,6 @@ class Compiled:
         """structures: of the templates, None for other parameters. examples: host arrays among the arguments, else None."""
         self.structures = structures
         made = generate(function, {n: s for n, s in zip(names, structures) if s is not None})
-        self._kernel = Kernel(made, AutodiffMode.NONE)
         self._setters, dummies = [], []  # of the other parameters: (place among the arguments, slot, kind)
         self._leaves: list[tuple[int, int]] = []  # (slot, place among the arguments) of each template's first leaf
         slot = 0
@@ -231,6 +230,7 @@ class Compiled:
         self._public = ti.kernel(made) if PUBLIC else None
         if PUBLIC:
             return
+        self._kernel = Kernel(made, AutodiffMode.NONE)
         key = self._kernel.ensure_compiled(*dummies)
         self._cpp = self._kernel.compiled_kernels[key]
         program = self._program = impl.get_runtime().prog

@@ -23,8 +23,8 @@ from taisoft.scalars import N_COLUMNS, N_SCALARS
 from taisoft.scene.scene import Material, Scene
 from taisoft.transfer import download
 
-# Points, and threads of the CPU, from which parallel loops are taken instead of one serial kernel: the compiler does not put
-# their work side by side in vectors. With two threads they took 3.4 times as long (213,000 tets, `taisoft bench scaling`)
+# Points, and threads of the CPU, from which parallel loops are taken instead of one serial kernel. With two threads they took 3.4
+# times as long (213,000 tets, `taisoft bench scaling`)
 PARALLEL_FROM, PARALLEL_THREADS = 100_000, 8
 # Partial sums of a parallel loop. Taichi gives a loop of few iterations, 128 at least, to one thread of the CPU
 CHUNKS = {"cpu": 1024, "cuda": 4096}
