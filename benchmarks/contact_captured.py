@@ -13,10 +13,10 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.contact import host
+from taisoft.contact import SOLVERS, host
 from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.problem import NODES, ContactProblem
-from taisoft.contact.solve import SOLVERS, solve
+from taisoft.contact.solve import solve
 from taisoft.stepping import contact_substeps
 from taisoft.stepping.contact_substeps import MAX_SWEEPS
 

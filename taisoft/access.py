@@ -1,13 +1,11 @@
 """What a simulator shows of its state and lets a user change while it runs."""
 
 import warnings
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taisoft.attributes import Guarded, SimulationAttributeError, thawed
-from taisoft.collision.contacts import Contacts, no_contacts
-from taisoft.collision.overlap import Overlap, find_overlaps
-from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
 from taisoft.errors import SceneError, SimulationError
 from taisoft.records import Energies
@@ -15,9 +13,14 @@ from taisoft.scalars import ELASTIC, GRAVITY, KINETIC
 from taisoft.scene.changes import CHANGEABLE, changed_material
 from taisoft.settings import Settings, check_dt
 from taisoft.stability import stable_dt
-from taisoft.stepping.contact import ContactStep
 from taisoft.stepping.world import World
 from taisoft.transfer import upload
+
+if TYPE_CHECKING:
+    from taisoft.collision.contacts import Contacts
+    from taisoft.collision.overlap import Overlap
+    from taisoft.collision.pipeline import Detection
+    from taisoft.stepping.contact import ContactStep
 
 _REBUILT = (
     "integrator", "contact_solver", "self_collision", "allow_unstable", "newton_tolerance", "linear_tolerance",
@@ -47,8 +50,8 @@ class StateAccess(Guarded):
     _instead = INSTEAD
     settings: Settings
     _world: World | None = None
-    _contact: ContactStep | None
-    _idle_detection: Detection | None
+    _contact: "ContactStep | None"
+    _idle_detection: "Detection | None"
 
     @property
     def time(self) -> float:
@@ -95,7 +98,7 @@ class StateAccess(Guarded):
         self._open_world()
         return self._stepper.reactions()[self._slice(body)]
 
-    def detect_contacts(self) -> Contacts:
+    def detect_contacts(self) -> "Contacts":
         """The contacts of the present state swept by dt v, impulses 0; no step.
 
         How it is done is the scene's (`Scene.collision`, each body's `collision`), and by what each is hit the plan tells. Memory
@@ -114,13 +117,17 @@ class StateAccess(Guarded):
         if self._contact is not None:
             self._contact.numbers_changed()
 
-    def contacts(self) -> Contacts:
+    def contacts(self) -> "Contacts":
         """The contacts that the last step began with, gaps those of its start, and the impulses that it gave them [N s].
 
         Where a step was cut into parts, of its last part. Empty before the first step, and where nothing can touch.
         """
         self._open_world()
-        return self._contact.contacts() if self._contact is not None else no_contacts()
+        if self._contact is not None:
+            return self._contact.contacts()
+        from taisoft.collision.contacts import no_contacts
+
+        return no_contacts()
 
     def contact_force(self, name: str) -> np.ndarray:
         """Sum (3,) of the contact forces on a body or an obstacle over the last step [N]."""
@@ -130,7 +137,7 @@ class StateAccess(Guarded):
             return np.zeros(3)
         return self._contact.force([c.name for c in scene.colliders].index(name))
 
-    def deepest_overlap(self) -> Overlap | None:
+    def deepest_overlap(self) -> "Overlap | None":
         """Which two overlap deepest in the present state, and how deep [m]; None where nothing overlaps.
 
         Slow, and unlike `StepReport.max_penetration` it looks at all pairs, whether or not their surfaces meet. The depth is that
@@ -139,8 +146,10 @@ class StateAccess(Guarded):
         """
         return next(iter(self.overlaps()), None)
 
-    def overlaps(self) -> list[Overlap]:
+    def overlaps(self) -> "list[Overlap]":
         """All pairs that overlap in the present state, as `deepest_overlap`; the deepest, by the smaller one's size, first."""
+        from taisoft.collision.overlap import find_overlaps
+
         return find_overlaps(self._find_contacts(0.0))
 
     def intersecting_triangles(self) -> list[tuple[str, int, str, int]]:
@@ -157,13 +166,15 @@ class StateAccess(Guarded):
             (colliders[a].name, int(t - first[a]), colliders[b].name, int(u - first[b])) for (t, u), (a, b) in zip(pairs, owner)
         ]
 
-    def _find_contacts(self, dt: float) -> Detection:
+    def _find_contacts(self, dt: float) -> "Detection":
         """The contacts of the present state swept by dt [s]; with 0 no path is asked for a later time."""
         world = self._open_world()
         if self._contact is not None:
             self._contact.search(world.time, dt)
             return self._contact.detection
         if self._idle_detection is None:
+            from taisoft.collision.pipeline import Detection
+
             itself = self.settings.self_collision
             self._idle_detection = Detection(world.scene, world.model, world.layout, self._runtime, itself)
             self._owned.append(self._idle_detection)
@@ -171,7 +182,7 @@ class StateAccess(Guarded):
         return self._idle_detection
 
     @property
-    def _detection(self) -> Detection | None:
+    def _detection(self) -> "Detection | None":
         """What finds the contacts; None where it was not needed yet."""
         return self._contact.detection if self._contact is not None else self._idle_detection
 

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from taisoft.attributes import guarded_record
-from taisoft.contact.solve import SOLVERS
+from taisoft.contact import SOLVERS
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
 from taisoft.scene.plan import Plan, make_plan
 from taisoft.scene.scene import Scene
 from taisoft.scene.solver import MAX_TOLERANCE
-from taisoft.stepping import EXPLICIT, INTEGRATORS, SCHEMES
+from taisoft.stepping import EXPLICIT, INTEGRATORS, scheme_of
 
-EXPLICIT_CONTACT = tuple(SOLVERS)
+EXPLICIT_CONTACT = SOLVERS
 IMPLICIT_CONTACT = ("augmented_lagrangian",)
 
 
@@ -43,8 +43,8 @@ class Settings:
 
 def plan_of(scene: Scene, integrator: str, self_collision: bool, pullable: bool) -> Plan:
     """The plan of a scene under an integrator."""
-    scheme = SCHEMES.get(integrator)
-    return make_plan(scene, integrator in EXPLICIT, scheme is not None and scheme.before > 0.0, self_collision, pullable)
+    explicit = integrator in EXPLICIT
+    return make_plan(scene, explicit, not explicit and scheme_of(integrator).before > 0.0, self_collision, pullable)
 
 
 def check_dt(dt) -> float:

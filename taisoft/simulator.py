@@ -3,12 +3,12 @@
 import dataclasses
 import warnings
 import weakref
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taisoft import runtime
 from taisoft.attributes import thawed
-from taisoft.collision.pipeline import Detection
 from taisoft.elasticity import NO_TET, measure
 from taisoft.errors import SceneError, SimulationError, no_memory
 from taisoft.fields import FieldArena
@@ -22,10 +22,12 @@ from taisoft.scene.scene import Scene
 from taisoft.settings import check_count, check_settings, plan_of
 from taisoft.stability import scale_warnings
 from taisoft.stepping import make_stepper
-from taisoft.stepping.contact import SUNK, ContactStep
 from taisoft.stepping.motion import Motion
 from taisoft.stepping.pull import Pull, batch
 from taisoft.stepping.world import World
+
+if TYPE_CHECKING:
+    pass
 
 
 def _release(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:
@@ -60,8 +62,8 @@ class Simulator(Resuming):
         self._dt = self.settings.dt
         self._stable_dt: float | None = None
         self._owned = []  # what has memory of its own to give back
-        self._contact: ContactStep | None = None
-        self._idle_detection: Detection | None = None  # of a scene without contact forces, once asked for
+        self._contact = None
+        self._idle_detection = None  # of a scene without contact forces, once asked for
         self._softens = any(LAWS[b.material.law].SOFTENS_BELOW for b in scene.bodies)  # and it was not told yet
         self._tangent = None  # fields of force_differential, once asked for
         if self.settings.explicit:
@@ -77,6 +79,8 @@ class Simulator(Resuming):
             self._world = World(scene, self._runtime, self._arena, model, layout, Motion(scene, layout))
             touching = self.plan.on["contact_forces"]
             if touching:
+                from taisoft.stepping.contact import ContactStep
+
                 self._contact = ContactStep(self._world, self_collision, self.settings.explicit)
                 self._owned.append(self._contact)
             self._pull = Pull(self._world) if pullable else None
@@ -115,8 +119,8 @@ class Simulator(Resuming):
 
     def contact_limit(self, a: str, b: str) -> float:
         """Penetration [m] of two colliders, by name, above which a step counts as deep, where contact forces are modelled."""
-        edges = dict(zip((c.name for c in self.scene.colliders), self._contact.detection.edges))
-        return SUNK * float(min(edges[a], edges[b]))
+        names = [c.name for c in self.scene.colliders]
+        return self._contact.deep_from(names.index(a), names.index(b))
 
     # --- stepping -------------------------------------------------------------------------------------------------
 
@@ -158,7 +162,7 @@ class Simulator(Resuming):
             report.dropped_contacts = self._contact.dropped
             if self.settings.explicit:
                 report.converged = result.contacts_converged
-            report.deep, report.crossings = int(self._contact.sinking > SUNK), self._contact.crossings
+            report.deep, report.crossings = int(self._contact.is_deep), self._contact.crossings
         report.steps = self.step_count - start
         if self._softens:
             self._tell_softened()

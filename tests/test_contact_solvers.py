@@ -21,11 +21,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import taisoft as ts
-from taisoft.contact import augmented_lagrangian
+from taisoft.contact import SOLVERS, augmented_lagrangian
 from taisoft.contact.api import METHODS
 from taisoft.contact.colouring import colour_contacts, store
 from taisoft.contact.graph import colour_greedy, matrix_graph
-from taisoft.contact.solve import SOLVERS, solve
+from taisoft.contact.solve import solve
 
 REFERENCES = ("cube_rest_4", "cube_slide_4", "cube_spin_slide_4", "cube_tip_mu1p5", "cube_wedge_groove", "nodal_20_mu0p7",
               "nodal_3_mu0p5", "nodal_8_mu0p3", "nodal_8_mu1")  # fmt: skip

@@ -17,7 +17,7 @@ from rotations import rotation
 
 import taisoft as ts
 from taisoft.settings import EXPLICIT_CONTACT
-from taisoft.stepping import SCHEMES
+from taisoft.stepping import scheme_of
 
 DT = {"bdf2": 0.01, "symplectic_euler": 1e-3, "velocity_verlet": 1e-3}  # [s]; one for all implicit schemes
 IMPLICIT = ("implicit_euler", "linearly_implicit_euler", "bdf2")
@@ -49,7 +49,7 @@ def sim(shared_sim, monkeypatch):
     place.Q, place.T, place.motion = np.eye(3), np.zeros(3), still
     shared_sim.set_gravity(GRAVITY)
     if not shared_sim.settings.explicit:
-        monkeypatch.setattr(shared_sim._stepper, "scheme", SCHEMES["implicit_euler"])
+        monkeypatch.setattr(shared_sim._stepper, "scheme", scheme_of("implicit_euler"))
     shared_sim.reset()
     return shared_sim
 
@@ -61,7 +61,7 @@ def each(sim, request, monkeypatch):
         if request.param != IMPLICIT[0]:
             pytest.skip("an explicit integrator is what it is")
     else:
-        monkeypatch.setattr(sim._stepper, "scheme", SCHEMES[request.param])
+        monkeypatch.setattr(sim._stepper, "scheme", scheme_of(request.param))
     return sim
 
 

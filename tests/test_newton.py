@@ -11,7 +11,7 @@ from scenes import cube, element, rubber
 
 import taisoft as ts
 from taisoft.scalars import MIN_J
-from taisoft.stepping import SCHEMES, implicit
+from taisoft.stepping import implicit, scheme_of
 
 
 def beam(order: int, **settings) -> ts.Simulator:
@@ -73,7 +73,7 @@ def test_stopping_early_is_told(sim, monkeypatch):
 
 
 def test_linearly_implicit_steps_are_one_iteration(sim):
-    sim._stepper.scheme = SCHEMES["linearly_implicit_euler"]
+    sim._stepper.scheme = scheme_of("linearly_implicit_euler")
     sim.set_state(velocities=np.random.default_rng(0).standard_normal(sim.positions().shape))
     report = sim.step()
     assert report.newton_iterations == 1 and report.converged and report.residual > 1e-6

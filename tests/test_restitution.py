@@ -13,7 +13,7 @@ import pytest
 from rotations import rotation
 
 import taisoft as ts
-from taisoft.stepping import SCHEMES
+from taisoft.stepping import scheme_of
 
 SIDE, HEIGHT, DT, G = 0.1, 0.1, 5e-3, 9.81  # [m], [m], [s], [m/s^2]
 CREATED = 0.005  # of the energy at the start, at most
@@ -49,7 +49,7 @@ def shared_sim():
 @pytest.fixture
 def sim(shared_sim, monkeypatch):
     """The simulator at its start, its steps those of implicit Euler; nothing holds on or bounces."""
-    monkeypatch.setattr(shared_sim._stepper, "scheme", SCHEMES["implicit_euler"])
+    monkeypatch.setattr(shared_sim._stepper, "scheme", scheme_of("implicit_euler"))
     restart(shared_sim)
     return shared_sim
 
@@ -110,7 +110,7 @@ def test_single_precision():
     "scheme, friction", [("implicit_euler", 0.0), ("implicit_euler", 0.5), ("linearly_implicit_euler", 0.5), ("bdf2", 0.5)]
 )
 def test_returns_to_its_height(sim, monkeypatch, scheme, friction):
-    monkeypatch.setattr(sim._stepper, "scheme", SCHEMES[scheme])
+    monkeypatch.setattr(sim._stepper, "scheme", scheme_of(scheme))
     sim.set_contact("cube", "ground", friction=friction, restitution=1.0)
     energies, heights = go(sim, 0.7)
     assert created(energies, G * HEIGHT) < CREATED

@@ -20,7 +20,7 @@ from scenes import driven_scene, mixed_scene
 
 import taisoft as ts
 from taisoft import stepping
-from taisoft.stepping import SCHEMES
+from taisoft.stepping import IMPLICIT, scheme_of
 
 DAMPED = {"mass_damping": 3.0, "stiffness_damping": 0.004}
 EXPLICIT = ("symplectic_euler", "velocity_verlet")
@@ -88,9 +88,9 @@ def test_batches_end_where_nodes_are_released(explicit):
     assert np.abs(explicit.velocities() - single[1]).max() < 1e-11
 
 
-@pytest.mark.parametrize("method", SCHEMES)
+@pytest.mark.parametrize("method", IMPLICIT)
 def test_implicit_steps_are_the_oracles(implicit, method, monkeypatch):
-    monkeypatch.setattr(implicit._stepper, "scheme", SCHEMES[method])
+    monkeypatch.setattr(implicit._stepper, "scheme", scheme_of(method))
     oracle = follow(implicit, method, 9, 1e-8)
     assert len(oracle.led) == 1  # two of the three led nodes have been released
 
@@ -153,7 +153,7 @@ def test_parallel_kernels(integrator, monkeypatch):
 
 def test_the_residual_is_the_gradient_of_the_objective(implicit, monkeypatch):
     """Of the function that backtracking lowers, inertia, loads and both kinds of damping included."""
-    monkeypatch.setattr(implicit._stepper, "scheme", SCHEMES["implicit_euler"])
+    monkeypatch.setattr(implicit._stepper, "scheme", scheme_of("implicit_euler"))
     implicit.reset()
     implicit.step()
     model, solver, beta = implicit._world.model, implicit._stepper.solver, implicit._stepper._beta
@@ -207,7 +207,7 @@ def test_momentum_of_explicit_steps(explicit):
 
 
 def test_momentum_of_implicit_steps(implicit, monkeypatch):
-    monkeypatch.setattr(implicit._stepper, "scheme", SCHEMES["implicit_euler"])
+    monkeypatch.setattr(implicit._stepper, "scheme", scheme_of("implicit_euler"))
     check_momentum(implicit, 1)
 
 
@@ -266,19 +266,22 @@ def test_a_free_body_in_explicit_steps(explicit):
     check_momentum_of_a_free_body(explicit, explicit.settings.integrator)
 
 
-@pytest.mark.parametrize("method", SCHEMES)
+@pytest.mark.parametrize("method", IMPLICIT)
 def test_a_free_body_in_implicit_steps(implicit, method, monkeypatch):
-    monkeypatch.setattr(implicit._stepper, "scheme", SCHEMES[method])
+    monkeypatch.setattr(implicit._stepper, "scheme", scheme_of(method))
     check_free_fall(implicit, method)
     check_momentum_of_a_free_body(implicit, method)
 
 
 def test_names_mean_what_they_should(monkeypatch):
     monkeypatch.setattr(stepping, "ExplicitStepper", lambda world, verlet: verlet)
-    monkeypatch.setattr(stepping, "ContactExplicitStepper", lambda world, verlet, contact, method: (verlet, contact, method))
-    monkeypatch.setattr(stepping, "ImplicitStepper", lambda world, scheme, contact: (scheme, contact))
+    for name, built in (
+        ("contact_substeps.ContactExplicitStepper", lambda world, verlet, contact, method: (verlet, contact, method)),
+        ("implicit.ImplicitStepper", lambda world, scheme, contact: (scheme, contact)),
+    ):
+        monkeypatch.setattr(f"taisoft.stepping.{name}", built)
     assert [stepping.make_stepper(None, name, None, "auto") for name in EXPLICIT] == [False, True]
     touching = [stepping.make_stepper(None, name, "contact", "jacobi") for name in EXPLICIT]
     assert touching == [(False, "contact", "jacobi"), (True, "contact", "jacobi")]
-    assert set(SCHEMES) == {"linearly_implicit_euler", "implicit_euler", "bdf2", "implicit_midpoint"}
-    assert all(stepping.make_stepper(None, name, "contact", "auto") == (SCHEMES[name], "contact") for name in SCHEMES)
+    assert set(IMPLICIT) == {"linearly_implicit_euler", "implicit_euler", "bdf2", "implicit_midpoint"}
+    assert all(stepping.make_stepper(None, name, "contact", "auto") == (scheme_of(name), "contact") for name in IMPLICIT)

@@ -1,17 +1,18 @@
 """Solvers by name, and one way to run any of them."""
 
 from dataclasses import dataclass, field
+from importlib import import_module
 
 import taichi as ti
 
-from taisoft.contact import coloured_gauss_seidel, gauss_seidel, hybrid, jacobi
+from taisoft.contact import SOLVERS, gauss_seidel
 from taisoft.contact.problem import GOOD, HISTORY, LOOKS, RESIDUAL, SWEEPS, ContactProblem, find_velocities
 from taisoft.contact.sweeps import run_parallel, run_serial
 from taisoft.runtime import kernel
 
 VISITS = 1_000_000  # contacts visited in a launch: about 0.1 s, so that Ctrl-C is heard
 EVERY = 5  # sweeps between two looks at the residual, which costs as much as a sweep
-SOLVERS = {"gauss_seidel": gauss_seidel, "jacobi": jacobi, "hybrid": hybrid, "coloured_gauss_seidel": coloured_gauss_seidel}
+RULES = {name: import_module(f"taisoft.contact.{name}") for name in SOLVERS}
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ def solve(
     max_iterations: sweeps. every: sweeps between looks. history: whether the result tells the residual of each look. momentum:
     False for the plain method.
     """
-    rule = SOLVERS[method]
+    rule = RULES[method]
     # Gauss-Seidel has no parallel form: on a problem with parallel loops it runs on one thread all the same
     run = run_serial if p.serial or rule is gauss_seidel else run_parallel
     batch = max(1, min(HISTORY - 1, VISITS // max(1, int(p.count[0])) // every)) * every

@@ -22,6 +22,7 @@ NEARLY_FLAT = 0.02  # mean ratio below which a tet is told; grids and common mes
 LARGEST_COORDINATE = float(np.finfo(np.float32).max)  # [m], forces may be computed in 32 bits
 FAR = 1e5  # distance from the origin over size, above which a mesh is told to lie far away
 COINCIDENT = 1e-9  # vertices nearer than this times the mesh's diagonal count as coincident
+DIRECTION = np.array([0.56071, 0.64493, 0.51922])  # along which the vertices of regular grids do not coincide; not longer than 1
 LISTED = 20  # indices named in a message at most
 
 
@@ -249,7 +250,7 @@ def merge_labels(points: np.ndarray, tolerance: float) -> np.ndarray:
     # Equal points first: thousands in one place would make as many pairs as their number squared.
     distinct, labels = np.unique(points + 0.0, axis=0, return_inverse=True)  # + 0.0 makes -0.0 equal to 0.0
     labels = labels.ravel()
-    if tolerance > 0:
+    if tolerance > 0 and _may_be_near(distinct, tolerance):
         pairs = scipy.spatial.cKDTree(distinct).query_pairs(tolerance, output_type="ndarray")
         n = len(distinct)
         graph = coo_matrix((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
@@ -258,6 +259,16 @@ def merge_labels(points: np.ndarray, tolerance: float) -> np.ndarray:
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
     return rank[inverse.ravel()]
+
+
+def _may_be_near(points: np.ndarray, tolerance: float) -> bool:
+    """Whether two of distinct points can be at most `tolerance` apart: False where their places along one direction are not.
+
+    Most meshes have no such vertices, and building a tree takes longer than this.
+    """
+    along = np.sort(points @ DIRECTION)
+    rounding = 8.0 * np.finfo(np.float64).eps * float(np.abs(points).max(initial=0.0))
+    return bool((np.diff(along) <= tolerance + rounding).any())
 
 
 def _listed(indices: np.ndarray) -> str:

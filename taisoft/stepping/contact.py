@@ -289,6 +289,15 @@ class ContactStep:
         self._depth, self._ended = depth, (time, dt)
         return depth
 
+    @property
+    def is_deep(self) -> bool:
+        """Whether the last step ended with a deep penetration."""
+        return self.sinking > SUNK
+
+    def deep_from(self, a: int, b: int) -> float:
+        """Penetration [m] of two colliders above which a step counts as deep."""
+        return SUNK * float(min(self.detection.edges[a], self.detection.edges[b]))
+
     def cross(self) -> tuple[float, float]:
         """How deep triangles cross, or colliders lie inside each other, where the last search found them [m], and over the finer
         side's mean surface edge. Counts crossings as `crossings`, lists the others as `inside`."""
