@@ -12,13 +12,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from taisoft.errors import SceneError, SimulationError
+from taisoft.errors import MeshError, SceneError, SimulationError
 
 _NOTHING = object()
 
 
 class SceneAttributeError(SceneError, AttributeError):
     """An attribute of a scene, or of a part of one, that does not exist or cannot change."""
+
+
+class MeshAttributeError(MeshError, AttributeError):
+    """An attribute of a mesh that does not exist or cannot change."""
 
 
 class SimulationAttributeError(SimulationError, AttributeError):
@@ -37,6 +41,7 @@ class Guarded:
     _instead_late: ClassVar[dict[str, str]] = {}
     _otherwise_late: ClassVar[str] = ""  # for what _instead_late leaves out
     _read_only: ClassVar[frozenset[str]] = frozenset()  # attributes that only the class itself sets
+    _contents: ClassVar[dict[str, str]] = {}  # lists and dicts that nothing is put into by hand, and the call that does it
     _sealed = False
     _frozen = False
 
@@ -46,15 +51,21 @@ class Guarded:
 
     def _seal(self, init: Callable) -> None:
         """From now on the attributes are known. init: the caller's; a subclass with another one may add attributes after it."""
+        self._guard_contents()
         if type(self).__init__ is init:
             self.__dict__["_sealed"] = True
 
+    def _guard_contents(self) -> None:
+        for name, instead in self._contents.items():
+            value = self.__dict__[name]
+            held = self.__dict__[name] = FrozenDict(value) if isinstance(value, dict) else GuardedList(value)
+            held._refusal = self._error(f"{self._said()}: {name} cannot be changed by hand: {instead}")
+
     def _freeze(self) -> None:
         """Refuse changes from now on, also of lists, dicts and arrays."""
-        frozen = {list: FrozenList, dict: FrozenDict}
         for name, value in self.__dict__.items():
-            if type(value) in frozen:
-                held = self.__dict__[name] = frozen[type(value)](value)
+            if isinstance(value, (list, dict)):
+                held = self.__dict__[name] = FrozenDict(value) if isinstance(value, dict) else FrozenList(value)
                 held._refusal = self._late(name)
             elif isinstance(value, np.ndarray):
                 value.setflags(write=False)
@@ -77,6 +88,10 @@ class Guarded:
         """For copies and pickles: they have lists, dicts and arrays of their own, and those of a frozen object can change."""
         return {name: _own(value) for name, value in self.__dict__.items() if name != "_frozen"}
 
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state)
+        self._guard_contents()
+
     def __setattr__(self, name: str, value) -> None:
         if self._frozen and not name.startswith("_") and name in _public(self):
             raise self._late(name)
@@ -87,6 +102,8 @@ class Guarded:
     def __delattr__(self, name: str) -> None:
         if self._frozen:
             raise self._late(name)
+        if self._sealed and name in _public(self) and _declared(type(self), name) is _NOTHING:  # a replaced method may go
+            raise self._error(f"{self._said()}: {name} cannot be deleted: {self._rule(name)}")
         object.__delattr__(self, name)
 
     def _check(self, name: str, value) -> None:
@@ -94,33 +111,42 @@ class Guarded:
         declared = _declared(type(self), name)
         if declared is _NOTHING and name not in self.__dict__:
             raise self._error(unknown(self._said(), name, _public(self), self._instead))
-        settable = declared.fset is not None if isinstance(declared, property) else name not in self._read_only
+        kept = self._read_only | self._contents.keys()
+        settable = declared.fset is not None if isinstance(declared, property) else name not in kept
         if not settable:
-            raise self._error(f"{self._said()}: {name} cannot be set: {self._instead.get(name, 'it is read-only')}")
+            raise self._error(f"{self._said()}: {name} cannot be set: {self._rule(name)}")
         if callable(declared) and not callable(value):
             hint = f": {self._instead[name]}" if name in self._instead else ""
             raise self._error(f"{self._said()}: {name} is a method and cannot be set{hint}")
 
+    def _rule(self, name: str) -> str:
+        """What to do instead of setting what is there but cannot be set."""
+        return self._instead.get(name) or self._contents.get(name, "it is read-only")
+
 
 @contextmanager
 def thawed(*items: Guarded) -> Iterator[None]:
-    """What is frozen can change meanwhile: for a simulator, which changes the numbers of its own copy of the scene."""
-    frozen = [one for one in items if one._frozen]
-    for one in frozen:
+    """What is frozen or read-only can be set meanwhile: for a simulator, which changes the numbers of its own copy of the scene,
+    and for copies that are put together anew."""
+    before = [(one, one._sealed, one._frozen) for one in items]
+    for one in items:
         for name, value in one.__dict__.items():
-            if isinstance(value, (FrozenList, FrozenDict)):
+            if isinstance(value, (GuardedList, FrozenDict)):
                 one.__dict__[name] = _own(value)
-        one.__dict__["_frozen"] = False
+        one.__dict__.update(_sealed=False, _frozen=False)
     try:
         yield
     finally:
-        for one in frozen:
-            one._freeze()
+        for one, sealed, frozen in before:
+            one.__dict__["_sealed"] = sealed
+            one._guard_contents()
+            if frozen:
+                one._freeze()
 
 
-def guarded_record(what: str, instead: str) -> Callable[[type], type]:
+def guarded_record(what: str, instead: str, error: type[Exception] = SceneAttributeError) -> Callable[[type], type]:
     """A decorator of a frozen dataclass. what: what messages call it, with its name if it has one; instead: what to do instead of
-    changing an attribute, with {name} for the attribute."""
+    changing an attribute, with {name} for the attribute. Arrays of its copies and pickles are read-only as its own are."""
 
     def guard(cls: type) -> type:
         def refuse(self, name: str, value=None) -> None:
@@ -128,12 +154,18 @@ def guarded_record(what: str, instead: str) -> Callable[[type], type]:
             said = what if own is None else f"{what} {own!r}"
             known = _public(self)
             if name in known:
-                raise SceneAttributeError(f"{said}: {name} cannot change: {instead.format(name=name)}")
+                raise error(f"{said}: {name} cannot change: {instead.format(name=name)}")
             if type(self) is cls:
-                raise SceneAttributeError(unknown(said, name, known, {}))
+                raise error(unknown(said, name, known, {}))
             object.__setattr__(self, name, value)  # a subclass's own
 
-        cls.__setattr__, cls.__delattr__ = refuse, refuse
+        def set_state(self, state: dict) -> None:
+            self.__dict__.update(state)
+            for value in state.values():
+                if isinstance(value, np.ndarray):
+                    value.setflags(write=False)
+
+        cls.__setattr__, cls.__delattr__, cls.__setstate__ = refuse, refuse, set_state
         return cls
 
     return guard
@@ -150,13 +182,17 @@ def unknown(what: str, name: str, known: set[str], instead: dict[str, str]) -> s
     return f"{what} has no attribute {name!r}; did you mean {near[0]!r}?{hint}"
 
 
-class FrozenList(list):
-    """A list of a frozen object. Copies and pickles are plain lists."""
+class GuardedList(list):
+    """A list that only its owner adds to; items may be taken out of it. Copies and pickles are plain lists."""
 
     _refusal: Exception
 
     def __reduce_ex__(self, _protocol):
         return list, (list(self),)
+
+
+class FrozenList(GuardedList):
+    """A list of a frozen object, which nobody changes."""
 
 
 class FrozenDict(dict):
@@ -172,8 +208,9 @@ def _refuse(self, *_, **__) -> None:
     raise type(self._refusal)(*self._refusal.args)
 
 
-for _name in ("__setitem__", "__delitem__", "__iadd__", "__imul__", "append", "clear", "extend", "insert", "pop", "remove",
-              "reverse", "sort"):  # fmt: skip
+for _name in ("__setitem__", "__iadd__", "__imul__", "append", "extend", "insert"):
+    setattr(GuardedList, _name, _refuse)
+for _name in ("__delitem__", "clear", "pop", "remove", "reverse", "sort"):
     setattr(FrozenList, _name, _refuse)
 for _name in ("__setitem__", "__delitem__", "__ior__", "clear", "pop", "popitem", "setdefault", "update"):
     setattr(FrozenDict, _name, _refuse)

@@ -1,11 +1,12 @@
 """Checkpoints: all that the next step rests on, in one `.npz` file that is whole or absent.
 
 A file holds arrays without pickled objects; `header`, a JSON text: versions, the Simulator's settings, numbers that may change
-while it runs, every number of the state that is no array, and a digest of each part of the scene; and `sha256` over all else.
-What lives between steps each class tells by `snapshot` and takes back by `restore`; here it is only flattened, its names joined
-by slashes. Meshes, constraints, where loads act, and paths are not in the file: they come from the scene that is given, whose
-digests must be those of the scene that was saved. On the machine, with the versions and the number of threads that wrote it, a
-run goes on bitwise as if it had not been interrupted.
+while it runs, as they are and as they were at the start, every number of the state that is no array, and a digest of each part
+of the scene; and `sha256` over all else. What lives between steps each class tells by `snapshot` and takes back by `restore`;
+here it is only flattened, its names joined by slashes. Meshes, constraints, where loads act, and paths are not in the file: they
+come from the scene that is given, whose digests must be those of the scene that was saved, and its numbers those of the start,
+since others would be ignored. On the machine, with the versions and the number of threads that wrote it, a run goes on bitwise
+as if it had not been interrupted.
 """
 
 import dataclasses
@@ -25,33 +26,39 @@ from taisoft.files import replacing
 from taisoft.scene.body import Body
 from taisoft.scene.changes import LOADS, changed_load
 from taisoft.scene.key_frames import NodePath, ShapePath
+from taisoft.scene.numbers import Numbers, numbers_differ, scene_numbers
 from taisoft.scene.scene import Material, Scene
 
-KIND, FORMAT = "taisoft checkpoint", 4  # FORMAT grows with every change of what a file holds
-PARTS = ("settings", "numbers", "marks", "state", "notes")  # of the header, each a table
+KIND, FORMAT = "taisoft checkpoint", 5  # FORMAT grows with every change of what a file holds
+PARTS = ("settings", "numbers", "start", "marks", "state", "notes")  # of the header, each a table
+FEATURES = "the features that it needs"  # the last mark: of the plan, which follows from parts and numbers
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """A file's content. settings: arguments of Simulator; numbers: of the scene, that may change while it runs; marks: digests
-    of the scene's parts by name; state: nested dict of numbers and arrays; notes: plain data of whoever wrote it."""
+    """A file's content. settings: arguments of Simulator; numbers: of the scene, that may change while it runs; start: those, and
+    values of loads, of the scene that the run began with; marks: digests of the scene's parts by name; state: nested dict of
+    numbers and arrays; notes: plain data of whoever wrote it."""
 
     path: Path
     settings: dict
     numbers: dict
+    start: Numbers
     marks: dict[str, str]
     state: dict
     notes: dict
 
 
 def write_checkpoint(
-    path: str | Path, settings: dict, scene: Scene, features: dict[str, bool], state: dict, notes: dict
-) -> None:
-    """Write the state of a simulation of a scene. features: of its plan; notes: see Checkpoint. Raises OutputError."""
+    path: str | Path, settings: dict, scene: Scene, features: dict[str, bool], state: dict, notes: dict,
+    start: Scene | None = None,
+) -> None:  # fmt: skip
+    """Write the state of a simulation of a scene. features: of its plan; notes: see Checkpoint; start: the scene as the run began
+    with it, where its numbers may have changed since. Raises OutputError."""
     plain, arrays = _flat(state)
     header = {
         "kind": KIND, "format": FORMAT, "taisoft": __version__, "settings": settings, "numbers": _numbers(scene),
-        "marks": scene_marks(scene, features), "state": plain, "notes": notes,
+        "start": scene_numbers(start or scene), "marks": scene_marks(scene, features), "state": plain, "notes": notes,
     }  # fmt: skip
     text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     with replacing(path) as part, open(part, "wb") as file:
@@ -68,11 +75,11 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         for folder in folders:
             place = place.setdefault(folder, {})
         place[last] = value
-    return Checkpoint(Path(path), header["settings"], header["numbers"], header["marks"], state, header["notes"])
+    return Checkpoint(Path(path), state=state, **{name: header[name] for name in PARTS if name != "state"})
 
 
 def check_scene(saved: Checkpoint, scene: Scene, features: dict[str, bool]) -> None:
-    """Raises SceneError unless the scene is the one that was saved, but for what a checkpoint holds itself and for paths."""
+    """Raises SceneError unless the scene is the one that the saved run began with, but for paths."""
     marks = scene_marks(scene, features)
     for kinds in ("bodies", "obstacles"):
         if marks[kinds] != saved.marks.get(kinds):
@@ -80,9 +87,17 @@ def check_scene(saved: Checkpoint, scene: Scene, features: dict[str, bool]) -> N
                 f"{saved.path} is a checkpoint of another scene: its {kinds} are {saved.marks.get(kinds)}, those of this scene "
                 f"{marks[kinds]}"
             )
-    for name in marks | saved.marks:
-        if marks.get(name) != saved.marks.get(name):
-            raise SceneError(f"{saved.path} is a checkpoint of another scene, which differs in {name}")
+    differing = [name for name in marks | saved.marks if marks.get(name) != saved.marks.get(name)]
+    if differing and differing[0] != FEATURES:
+        raise SceneError(f"{saved.path} is a checkpoint of another scene, which differs in {differing[0]}")
+    found = numbers_differ(saved.start, scene_numbers(scene))
+    if found:
+        raise SceneError(
+            f"{saved.path} is a checkpoint of another scene: {found}; give the scene as it was, since a run goes on with its own "
+            "numbers, which the simulator's set_ methods change, or begin a new run"
+        )
+    if differing:
+        raise SceneError(f"{saved.path} is a checkpoint of another scene, which differs in {FEATURES}")
 
 
 def take_numbers(saved: Checkpoint, scene: Scene) -> None:
@@ -123,7 +138,7 @@ def scene_marks(scene: Scene, features: dict[str, bool]) -> dict[str, str]:
         )
     marks["collision settings"] = _digest([json.dumps(dataclasses.asdict(scene.collision)), scene.contact_forces])
     # damping that was 0 at the start is compiled out, and so on
-    marks["the features that it needs"] = _digest([json.dumps(features)])
+    marks[FEATURES] = _digest([json.dumps(features)])
     return marks
 
 

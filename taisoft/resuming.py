@@ -15,6 +15,8 @@ from taisoft.settings import Settings, check_dt, plan_of
 class Resuming(Loading):
     """Checkpoints of a simulator; `Simulator` adds building and stepping."""
 
+    _given: Scene  # as the run began with it, frozen
+
     def save_checkpoint(self, path: str | Path, notes: dict | None = None) -> None:
         """Write all that the next step rests on to a file, whole or not at all; see `taisoft/checkpoint.py`.
 
@@ -29,14 +31,15 @@ class Resuming(Loading):
             raise SimulationError(f"no checkpoint is made of such a state: {bad}")
         own = {"dt": self._dt, "time_base": start, "count_base": count}
         state = own | {"world": world.snapshot(), "stepper": self._stepper.snapshot(), "loads": load_values(self.scene)}
-        write_checkpoint(path, dataclasses.asdict(self.settings), self.scene, self.plan.on, state, notes or {})
+        write_checkpoint(path, dataclasses.asdict(self.settings), self.scene, self.plan.on, state, notes or {}, self._given)
 
     @classmethod
     def load_checkpoint(cls, path: str | Path, scene: Scene, arch: str | None = None) -> Self:
         """A simulator that goes on from a checkpoint of the same scene, with its settings and its numbers.
 
         scene: gives what the file does not hold: meshes, constraints, where loads act, obstacles, and paths; functions of time
-        alone are not compared. It is frozen as by a new Simulator. arch: another one than the checkpoint's; steps go on bitwise
+        alone are not compared. Its numbers must be those that the run began with; it goes on with those it had when it was
+        saved. It is frozen as by a new Simulator. arch: another one than the checkpoint's; steps go on bitwise
         with its own only. Nothing else of the settings can be changed here; dt, gravity, materials, loads and contact pairs can
         be later, as in any simulator. Initial overlaps are not looked for. Raises SimulationError for a file that cannot be used
         and SceneError for another scene, both naming the file.

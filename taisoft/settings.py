@@ -107,6 +107,7 @@ def check_settings(
         raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
     if not scene.bodies:
         raise SceneError("the scene holds no body")
+    scene.check()
     if integrator not in INTEGRATORS:
         near = difflib.get_close_matches(str(integrator), INTEGRATORS, 1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""

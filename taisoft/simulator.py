@@ -58,7 +58,7 @@ class Simulator(Resuming):
             linear_tolerance, contact_tolerance, pullable,
         )  # fmt: skip
         self.scene = scene.snapshot()  # numbers that change while it runs are not those of the user's scene
-        given, scene = scene, self.scene
+        self._given, scene = scene, self.scene
         self._dt = self.settings.dt
         self._stable_dt: float | None = None
         self._owned = []  # what has memory of its own to give back
@@ -100,7 +100,7 @@ class Simulator(Resuming):
         if self._contact is not None:
             self._stepper.contact_tolerance = contact_tolerance or self._stepper.contact_tolerance
         self._release = weakref.finalize(self, _release, self._arena, self._runtime, self._owned)
-        for one in (given, scene):
+        for one in (self._given, scene):
             one.freeze()
         self._seal(Simulator.__init__)
 
@@ -248,7 +248,7 @@ class Simulator(Resuming):
             new.scene.allow_initial_overlap = self.scene.allow_initial_overlap
         new._world.restore(kept)
         new._stepper.forget()
-        new._time_base = self.time, self.step_count
+        new._time_base, new._given = (self.time, self.step_count), self._given
         new._compiled_before, new._compile_reported = self._compiled_before, self._compile_reported
         self._release()
         _, give_back, owned, _ = new._release.detach()

@@ -23,7 +23,8 @@ SMALLEST_LOAD_STEP = 1.0 / 256.0
 
 @dataclass(frozen=True)
 class StaticResult:
-    """A state of equilibrium, or the nearest that was found; residual: |force on free axes| / |applied load|.
+    """A state of equilibrium, or the nearest that was found; residual: |force on free axes| / |applied load|, without any load
+    over the constraint forces, and 0 where these too are nothing but rounding.
 
     load: share of the whole load that equilibrium was found for; below 1 the state is that of the last, failed attempt.
     at_rounding: the residual is down at the rounding of the forces, so no tolerance below it can be met.
@@ -83,6 +84,7 @@ def solve_static(
 def _check(scene: Scene, tolerance: float) -> None:
     if not isinstance(scene, Scene) or not scene.bodies:
         raise SceneError("solve_static needs a Scene that holds a body")
+    scene.check()
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 0.0 < tolerance < 1.0:
         raise SceneError(f"tolerance = {tolerance!r}: it must lie between 0 and 1")
     if scene.obstacles and scene.contact_forces:
@@ -154,6 +156,12 @@ class StaticSolver:
         self.linear += result.linear_iterations
         return result
 
+    def _residual(self, result: StageResult) -> float:
+        """As solved for; but rounding over rounding, where neither a load nor a constraint exerts a force, tells nothing."""
+        loaded = self.gravity.any() or (self.loads is not None and self.loads.any())
+        idle = not loaded and np.linalg.norm(self.solver.held_residual()) <= self.solver.rounding_force
+        return 0.0 if idle and result.converged else result.residual
+
     def _answer(self, result: StageResult, steps: int, load: float) -> StaticResult:
         world = self.world
         measure(world.model)
@@ -162,7 +170,7 @@ class StaticSolver:
             raise SimulationError(f"solve_static: {world.find_unfinite() or 'the residual is not finite'}")
         return StaticResult(
             converged=result.converged and load == 1.0, load=load, at_rounding=result.at_rounding,
-            residual=result.residual, iterations=self.newton, linear_iterations=self.linear, load_steps=steps,
+            residual=self._residual(result), iterations=self.newton, linear_iterations=self.linear, load_steps=steps,
             elastic=float(scalars[ELASTIC]), n_inverted=int(scalars[N_INVERTED]), _scene=world.scene, _layout=world.layout,
             _positions=world.model.x.to_numpy(), _reactions=self.solver.held_residual(),
         )  # fmt: skip

@@ -4,6 +4,7 @@
 * nothing in a file is run: pickled objects are refused;
 * sizes are checked before room is made for them;
 * a file that cannot be read gives way to the one before it, which is told; the one before is of the same run;
+* numbers that differ from those the run began with are refused by name and value, also where they are those of now;
 * key frames are compared, and what is left out of a scene or called otherwise, whatever characters its name has.
 """
 
@@ -16,7 +17,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from scenes import driven_scene
+from scenes import cube, driven_scene
 
 import taisoft as ts
 from taisoft import checkpoint
@@ -37,7 +38,7 @@ def saved(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("key", ["state", "settings", "notes"])
+@pytest.mark.parametrize("key", ["state", "settings", "notes", "start"])
 @pytest.mark.parametrize("change", [{}, {"is": []}])
 def test_what_a_header_lacks_is_told(saved, key, change):
     with np.load(saved) as file:
@@ -62,6 +63,47 @@ def test_scenes_are_compared(saved):
     for other in (scene(2.0), scene(1.0, "wall:right"), driven_scene()):
         with pytest.raises(ts.SceneError, match="is a checkpoint of another scene"):
             checkpoint.check_scene(read, other, {})
+
+
+def with_numbers(gravity=-9.81, force=(1.0, 2.0, 3.0), friction=0.3, **material) -> ts.Scene:
+    made = ts.Scene(gravity=(0, gravity, 0))
+    body = made.add_body(cube(), ts.Material(**material), name="a/b")
+    body.add_force([0, 1], [force, (4.0, 5.0, 6.0)])
+    made.add_obstacle(ts.Sphere((0, 9, 0), 0.1), name="ball")
+    made.set_contact("a/b", "ball", friction=friction)
+    return made
+
+
+NUMBERS = {
+    "gravity": (-1.0, "gravity is [0.0, -1.0, 0.0] in this scene and was [0.0, -9.81, 0.0] at the start"),
+    "force": ((1.0, 2.0, 3.5), "body 'a/b': force 0, row 0 is [1.0, 2.0, 3.5] in this scene and was [1.0, 2.0, 3.0] at"),
+    "friction": (0.4, "contact of 'a/b' and 'ball': friction is 0.4 in this scene and was 0.3 at the start"),
+    "young": (2e6, "body 'a/b': young is 2000000.0 in this scene and was 1000000.0 at the start"),
+    "poisson": (0.2, "body 'a/b': poisson is 0.2 in this scene and was 0.3 at the start"),
+    "density": (999.0, "body 'a/b': density is 999.0 in this scene and was 1000.0 at the start"),
+    "stiffness_damping": (0.1, "body 'a/b': stiffness_damping is 0.1 in this scene and was 0.0 at the start"),
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_numbers_are_compared_with_those_of_the_start(tmp_path, name):
+    path, (value, told) = tmp_path / "a.npz", NUMBERS[name]
+    now = with_numbers(gravity=-5.0, young=3e6)  # changed while it ran
+    checkpoint.write_checkpoint(path, {}, now, {}, {"x": np.zeros(3)}, {}, with_numbers())
+    read = checkpoint.read_checkpoint(path)
+    checkpoint.check_scene(read, with_numbers(), {})
+    for other in (with_numbers(**{name: value}), now):
+        with pytest.raises(ts.SceneError, match="is a checkpoint of another scene") as caught:
+            checkpoint.check_scene(read, other, {})
+        assert str(path) in str(caught.value) and (other is now or told in str(caught.value))
+
+
+def test_files_of_the_format_before_are_refused(saved, monkeypatch):
+    monkeypatch.setattr(checkpoint, "FORMAT", 4)
+    checkpoint.write_checkpoint(saved, {}, scene(1.0), {}, {"x": np.zeros(3)}, {})
+    monkeypatch.undo()
+    with pytest.raises(ts.SimulationError, match="in format 4, and taisoft .* reads format 5"):
+        checkpoint.read_checkpoint(saved)
 
 
 class Canary:

@@ -23,7 +23,7 @@ def scene(name: str) -> ts.Scene:
     """One cube on the floor; or cubes that fall on it and on one another, two hit by distance fields, one by proximity."""
     made = cubes()
     if name == "cube":
-        made.bodies[1:] = []
+        del made.bodies[1:]
         return made
     for body, way in zip(made.bodies, ("proximity", "distance_field", "distance_field")):
         body.collision = way

@@ -1,7 +1,7 @@
 """Forces and tractions that change while a simulator runs:
 
 * explicit and implicit steps follow, bit by bit as in a simulator whose scene had them from the start, from zero too;
-* they survive a reset, a rebuild and a checkpoint, of which the scene's own values are no part, and add up with a pull;
+* they survive a reset, a rebuild and a checkpoint, whose scene must have the values of the start, and add up with a pull;
 * a change of the density leaves total forces what they are; the user's scene stays what it was;
 * a load that is not there, an index or a value outside the rules is refused in a sentence, and nothing changes.
 """
@@ -11,6 +11,7 @@ import pytest
 from scenes import rubber
 
 import taisoft as ts
+from taisoft.checkpoint import read_checkpoint
 from taisoft.errors import SceneError
 from taisoft.output.camera import Camera
 from taisoft.runtime import compile_clock
@@ -78,11 +79,14 @@ def test_checkpoints_and_rebuilt_simulators_have_them(sims, tmp_path):
     sim.reset()
     path(sim, 3)
     sim.save_checkpoint(tmp_path / "c.npz")
-    other = [(9.0, 9.0, 9.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]  # the file's values count
-    with ts.Simulator.load_checkpoint(tmp_path / "c.npz", beam(other)) as loaded:
+    with pytest.raises(SceneError, match="body 'beam': force 0 is .0.0, -20.0, 5.0. in this scene and was .0.0, 0.0, 0.0. at"):
+        ts.Simulator.load_checkpoint(tmp_path / "c.npz", beam(NEXT))
+    with ts.Simulator.load_checkpoint(tmp_path / "c.npz", beam()) as loaded:
         assert np.array_equal(path(loaded, 3), expected[3:])
         assert loaded.scene.body("beam").forces[0].value.tolist() == list(NEXT[0])
         loaded.rebuild(dt=loaded.dt)
+        loaded.save_checkpoint(tmp_path / "d.npz")  # of a run that still began as it did
+        assert read_checkpoint(tmp_path / "d.npz").start == read_checkpoint(tmp_path / "c.npz").start
         loaded.reset()
         assert np.array_equal(path(loaded), expected)
 

@@ -101,6 +101,18 @@ def test_led_nodes():
         result.positions("blok")
 
 
+@pytest.mark.parametrize("push", [0.0, 1.0])
+def test_where_no_force_acts_the_residual_is_zero(push):
+    """A path that is 0 at t = 0, or moves the whole body: rounding over rounding is no residual."""
+    scene = ts.Scene(gravity=(0, 0, 0))
+    block = scene.add_body(ts.box_mesh((3, 2, 2), (1, 1, 1)), rubber(), name="block", position=(1.0, 1.0, 0.3))
+    block.move(lambda X: np.abs(X[:, 0]) > 0.49, lambda t: (0.1 * t, 0.0, 0.0))
+    scene.add_body(cube((4, 0, 0)), rubber(SVK), name="idle").fix([0, 1, 2])
+    result = ts.solve_static(scene, time=push)
+    assert result.converged and result.residual == 0.0 and result.load == 1.0
+    assert result.positions("block") == pytest.approx(block.rest_positions + (1.0 + 0.1 * push, 1.0, 0.3), abs=1e-12)
+
+
 def test_small_strains_whose_energy_is_rounding():
     """A step that only undoes a stretch lowers the energy by less than its rounding; 60 such steps were taken once."""
     scene = ts.Scene(gravity=(0, 0, 0))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.attributes import MeshAttributeError, guarded_record
 from taisoft.errors import MeshError
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import EDGES, distinct_edges
@@ -32,6 +33,7 @@ for _k, (_a, _b) in enumerate(EDGES):
     _MIDDLE[_a, _b] = _MIDDLE[_b, _a] = 4 + _k
 
 
+@guarded_record("nodes", "they follow from the mesh and the order; add another body", MeshAttributeError)
 @dataclass(frozen=True, eq=False)
 class Nodes:
     """Nodes of a body and how they are joined, all read-only.

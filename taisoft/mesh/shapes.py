@@ -10,6 +10,7 @@ from numbers import Integral
 
 import numpy as np
 
+from taisoft.attributes import thawed
 from taisoft.errors import MeshError
 from taisoft.mesh.tet_mesh import TetMesh
 
@@ -86,7 +87,11 @@ def ball_mesh(radius: float, cells: int, center=(0.0, 0.0, 0.0)) -> TetMesh:
 def _made(recipe: dict, vertices: np.ndarray, tets: np.ndarray) -> TetMesh:
     """The mesh of vertices (n,3) and tets, four indices each, which knows how it was made."""
     mesh = TetMesh(vertices, tets.reshape(-1, 4))
-    mesh.recipe = recipe
+    for value in recipe.values():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+    with thawed(mesh):
+        mesh.recipe = recipe
     return mesh
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from taisoft.attributes import MeshAttributeError, guarded_record
 from taisoft.errors import MeshError
 from taisoft.mesh.content import one_line, read_content
 from taisoft.mesh.fence import read_fenced
@@ -19,9 +20,11 @@ from taisoft.mesh.topology import triangle_edges
 FORMATS = (".obj", ".stl", ".ply", ".off")
 HEAD = re.compile(r"(?:ST)?C?N?OFF(\d*)$")  # of .off; some programs leave no blank before the counts
 INWARD = "all triangles look inward; flip the normals"
+MAKE_ANOTHER = "make a new one, such as ts.SurfaceMesh(0.9 * surface.vertices, surface.triangles)"
 FLAT = 1e-12  # a triangle's area below this times its longest edge squared counts as none
 
 
+@guarded_record("surface", MAKE_ANOTHER, MeshAttributeError)
 @dataclass(frozen=True, eq=False)
 class SurfaceMesh:
     """Triangles in space, checked and read-only.

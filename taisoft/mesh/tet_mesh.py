@@ -13,6 +13,7 @@ import scipy
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from taisoft.attributes import Guarded, MeshAttributeError
 from taisoft.errors import MeshError
 from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.topology import Faces, connected_pieces, first_repeated_tet, joint_edges, joint_vertices
@@ -26,8 +27,8 @@ DIRECTION = np.array([0.56071, 0.64493, 0.51922])  # along which the vertices of
 LISTED = 20  # indices named in a message at most
 
 
-class TetMesh:
-    """Tetrahedra in space, checked and read-only.
+class TetMesh(Guarded):
+    """Tetrahedra in space, checked and read-only: another shape is another mesh, such as TetMesh(0.9 * old.vertices, old.tets).
 
     vertices: (n,3) float64 [m]. tets: (m,4) int64, every det(x1-x0, x2-x0, x3-x0) > 0. volumes: (m,) [m^3].
     surface: (t,3) int64, the faces that belong to one tet, normals outward; surface_tets: (t,) int64, the tet of each.
@@ -35,6 +36,8 @@ class TetMesh:
     warnings: list of str, what was told but not refused; each is also issued as a UserWarning. recipe: of a mesh from
     `box_mesh` and its like the shape's name and arguments, which make the same arrays again, else None.
     """
+
+    _error = MeshAttributeError
 
     def __init__(
         self, vertices, tets, fix_orientation: bool = False, *, source: str | None = None, notes: tuple[str, ...] = ()
@@ -62,8 +65,21 @@ class TetMesh:
         self._tell_distance()
         for note in notes:
             self._tell(note)
-        for array in (self.vertices, self.tets, self.volumes, self.surface, self.surface_tets, self.flipped):
-            array.setflags(write=False)
+        self._freeze()
+        self._seal(TetMesh.__init__)
+
+    def _said(self) -> str:
+        return f"mesh of {self.source}" if self.source else "mesh"
+
+    def _late(self, name: str) -> MeshAttributeError:
+        """Frozen from the start: volumes and surface follow from vertices and tets."""
+        return self._error(
+            f"{self._said()}: {name} cannot change: make a new mesh, such as ts.TetMesh(0.9 * mesh.vertices, mesh.tets)"
+        )
+
+    def __setstate__(self, state: dict) -> None:
+        super().__setstate__(state)
+        self._freeze()  # copies and pickles too
 
     @property
     def n_verts(self) -> int:
@@ -87,7 +103,7 @@ class TetMesh:
                 f"its strains are good to {np.finfo(np.float64).eps * distance / size:.0e} at best; centre it for more"
             )
 
-    def _error(self, text: str) -> MeshError:
+    def _broken(self, text: str) -> MeshError:
         return MeshError(f"{self.source}: {text}" if self.source else text)
 
     def _tell(self, text: str) -> None:
@@ -98,41 +114,41 @@ class TetMesh:
         """(n,3) float64 copy, every coordinate finite."""
         array = self._as_array(vertices, "vertices", "fiu", "numbers")
         if array.size == 0:
-            raise self._error("the mesh has no vertices")
+            raise self._broken("the mesh has no vertices")
         if array.ndim != 2 or array.shape[1] != 3:
-            raise self._error(f"vertices must have shape (n, 3), not {array.shape}")
+            raise self._broken(f"vertices must have shape (n, 3), not {array.shape}")
         array = np.array(array, dtype=np.float64, order="C")
         bad = np.argwhere(~np.isfinite(array))
         if len(bad):
-            raise self._error(f"vertex {bad[0, 0]} coordinate {bad[0, 1]} is not finite")
+            raise self._broken(f"vertex {bad[0, 0]} coordinate {bad[0, 1]} is not finite")
         bad = np.argwhere(np.abs(array) > LARGEST_COORDINATE)
         if len(bad):
             value = array[tuple(bad[0])]
-            raise self._error(f"vertex {bad[0, 0]} coordinate {bad[0, 1]} is {value:g} m, too large for a 32-bit float")
+            raise self._broken(f"vertex {bad[0, 0]} coordinate {bad[0, 1]} is {value:g} m, too large for a 32-bit float")
         return array
 
     def _checked_tets(self, tets) -> np.ndarray:
         """(m,4) int64 copy: indices exist, no tet names a vertex twice or is given twice, no vertex is left over."""
         array = self._as_array(tets, "tets", "iu", "integers")
         if array.size == 0:
-            raise self._error("the mesh has no tetrahedra")
+            raise self._broken("the mesh has no tetrahedra")
         if array.ndim != 2 or array.shape[1] != 4:
-            raise self._error(f"tets must have shape (m, 4), not {array.shape}")
+            raise self._broken(f"tets must have shape (m, 4), not {array.shape}")
         self._check_indices(array)
         array = np.array(array, dtype=np.int64, order="C")
         corners = np.sort(array, axis=1)
         twice = (corners[:, 1:] == corners[:, :-1]).any(axis=1)
         if twice.any():
             e = int(np.argmax(twice))
-            raise self._error(f"tet {e} names a vertex twice: {tuple(array[e].tolist())}")
+            raise self._broken(f"tet {e} names a vertex twice: {tuple(array[e].tolist())}")
         pair = first_repeated_tet(array)
         if pair:
             corners = tuple(array[pair[0]].tolist())
-            raise self._error(f"tets {pair[0]} and {pair[1]} have the same four vertices {corners}")
+            raise self._broken(f"tets {pair[0]} and {pair[1]} have the same four vertices {corners}")
         used = np.zeros(self.n_verts, dtype=bool)
         used[array] = True
         if not used.all():
-            raise self._error(
+            raise self._broken(
                 f"vertex {int(np.argmin(used))} belongs to no tet and would have no mass "
                 f"({int((~used).sum())} such vertices)"
             )
@@ -142,9 +158,9 @@ class TetMesh:
         try:
             array = np.asarray(values)
         except (ValueError, TypeError, OverflowError) as error:
-            raise self._error(f"{what} must be an array of {kinds_said} ({error})") from error
+            raise self._broken(f"{what} must be an array of {kinds_said} ({error})") from error
         if array.size and array.dtype.kind not in kinds:
-            raise self._error(f"{what} must be {kinds_said}, not of type {array.dtype}")
+            raise self._broken(f"{what} must be {kinds_said}, not of type {array.dtype}")
         return array
 
     def _check_indices(self, tets: np.ndarray) -> None:
@@ -156,7 +172,7 @@ class TetMesh:
         hint = ""
         if tets.min() == 1 and tets.max() == n:
             hint = f"; all indices are 1 to {n}: they seem to count from 1, subtract 1"
-        raise self._error(f"tet {e}: vertex {vertex} does not exist ({n} vertices, counted from 0){hint}")
+        raise self._broken(f"tet {e}: vertex {vertex} does not exist ({n} vertices, counted from 0){hint}")
 
     def _oriented_volumes(self, fix_orientation: bool) -> np.ndarray:
         """(m,) volumes [m^3], all positive; sets `flipped` and turns those tets round."""
@@ -166,7 +182,7 @@ class TetMesh:
         flat = ~(np.abs(volumes) > DEGENERATE * longest**3)  # also true for lengths too small to cube
         if flat.any():
             e = int(np.argmax(flat))
-            raise self._error(
+            raise self._broken(
                 f"tet {e} has no volume: {abs(volumes[e]):.3g} m^3 with a longest edge of {longest[e]:.3g} m "
                 f"({int(flat.sum())} such tets; the volume must exceed {DEGENERATE:g} longest edge^3)"
             )
@@ -175,7 +191,7 @@ class TetMesh:
         if len(inverted) == self.n_tets:
             self._tell(f"all {self.n_tets} tets are inverted (a mirrored mesh?); all have been flipped")
         elif len(inverted) and not fix_orientation:
-            raise self._error(
+            raise self._broken(
                 f"{len(inverted)} of {self.n_tets} tets are inverted, the first is tet {inverted[0]}; "
                 "fix_orientation=True flips and lists them"
             )
@@ -193,7 +209,7 @@ class TetMesh:
             rows = faces.order[start : start + faces.counts[crowded[0]]]
             owners = np.sort(rows // 4)
             corners = tuple(np.sort(faces.triangles[rows[0]]).tolist())
-            raise self._error(
+            raise self._broken(
                 f"face {corners} is shared by {len(rows)} tets ({_listed(owners)}); a face may have two at most"
             )
         # Two outward faces of neighbours on opposite sides run in opposite senses; in the same sense, the tets overlap.

@@ -19,6 +19,7 @@ from taisoft.scene.material import Material
 NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock: they bend far too little
 QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # of polynomials integrated exactly, by order; the first is the default
 _FREE, _FIXED, _MOVED = 0, 1, 2
+_READ_ONLY = ("name", "mesh", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes")  # what all else rests on
 ANOTHER = "change a copy, scene.snapshot(), and make a new Simulator of it"
 _SET_FORCE = f"call sim.set_force(body, index, value) for one that is there; else {ANOTHER}"
 _SET_TRACTION = f"call sim.set_traction(body, index, value) for one that is there; else {ANOTHER}"
@@ -69,10 +70,16 @@ class Body(Guarded):
     name, mesh, material. position: (3,) [m], where the body starts: its nodes begin at rest_positions + position.
     velocity: (3,) or (n,3) [m/s], of the start. order: 1 or 2, of the elements' shape functions; quadrature_degree: of
     polynomials that their quadrature integrates exactly. nodes: `Nodes`, the mesh's vertices and for order 2 the middles
-    of its edges. constraints, tractions, forces: lists of `Constraint`, `Traction`, `NodalForce`. collision: one of HIT_BY.
+    of its edges. constraints, tractions, forces: lists of `Constraint`, `Traction`, `NodalForce`, which can be taken out but are
+    added by calls only. collision: one of HIT_BY. Only material, position, velocity and collision can be set, each checked.
     `tell_locking` and `warn_bending` warn of tets of order 1 where they are far too stiff; `Scene.add_body` calls both.
     """
 
+    _read_only = frozenset(_READ_ONLY)
+    _instead = dict.fromkeys(_READ_ONLY, "add another body by scene.add_body") | {"hit_by": "set body.collision"}
+    _contents = {
+        "constraints": "call body.fix or body.move", "tractions": "call body.add_traction", "forces": "call body.add_force",
+    }  # fmt: skip
     _otherwise_late = ANOTHER
     _instead_late = {
         "material": "call sim.set_material(body, young=...)", "position": "call sim.set_state(positions=..., body=...)",
@@ -87,8 +94,6 @@ class Body(Guarded):
         what = f"body {name!r}"
         if not isinstance(mesh, TetMesh):
             raise SceneError(f"{what}: mesh must be a TetMesh, not {type(mesh).__name__}")
-        if not isinstance(material, Material):
-            raise SceneError(f"{what}: material must be a Material, not {type(material).__name__}")
         self.name = name
         self.mesh = mesh
         self.material = material
@@ -97,13 +102,12 @@ class Body(Guarded):
         degree = degrees[0] if quadrature_degree is None else quadrature_degree
         self.quadrature_degree = checks.whole(degree, f"{what}: quadrature_degree of order {self.order}", degrees)
         self.nodes: Nodes = make_nodes(mesh, self.order)
-        self.position = checks.array(position, f"{what}: position", ((3,),))
-        self.velocity = checks.array(velocity, f"{what}: velocity", ((3,), (self.n_nodes, 3)))
+        self.position = position
+        self.velocity = velocity
         self.collision = collision
         self.constraints: list[Constraint] = []
         self.tractions: list[Traction] = []
         self.forces: list[NodalForce] = []
-        self._held = np.full((self.n_nodes, 3), _FREE, dtype=np.int8)  # what holds each node along each axis
         self._seal(Body.__init__)
 
     def _said(self) -> str:
@@ -118,6 +122,42 @@ class Body(Guarded):
     def n_nodes(self) -> int:
         """Number of nodes."""
         return len(self.nodes.positions)
+
+    @property
+    def material(self) -> Material:
+        """What the body is made of; setting it raises SceneError for what is no Material, and warns as `tell_locking` does."""
+        return self._material
+
+    @material.setter
+    def material(self, value: Material) -> None:
+        if not isinstance(value, Material):
+            raise SceneError(f"body {self.name!r}: material must be a Material, not {type(value).__name__}")
+        self._material = value
+        if self._sealed:  # add_body and the simulator warn themselves
+            self.tell_locking(stacklevel=3)
+
+    @property
+    def position(self) -> np.ndarray:
+        """(3,) [m], shift of the start; setting it raises SceneError unless it is three finite numbers."""
+        return self._position
+
+    @position.setter
+    def position(self, value) -> None:
+        self._position = checks.array(value, f"body {self.name!r}: position", ((3,),))
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """(3,) or (n,3) [m/s], of the start; setting it raises SceneError unless it is finite and of one of these shapes."""
+        return self._velocity
+
+    @velocity.setter
+    def velocity(self, value) -> None:
+        self._velocity = checks.array(value, f"body {self.name!r}: velocity", ((3,), (self.n_nodes, 3)))
+
+    def check(self) -> None:
+        """Raises SceneError for what was written into the arrays of position and velocity and could not have been set."""
+        checks.array(self.position, f"body {self.name!r}: position", ((3,),))
+        checks.array(self.velocity, f"body {self.name!r}: velocity", ((3,), (self.n_nodes, 3)))
 
     @property
     def collision(self) -> str:
@@ -206,7 +246,7 @@ class Body(Guarded):
         centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
         triangles = checks.selection(where, centroids, what, "surface triangle")
         load = Traction(triangles, checks.array(traction, f"{what}: traction", ((3,),)))
-        self.tractions.append(load)
+        list.append(self.tractions, load)
         return load
 
     def add_force(self, where, force) -> NodalForce:
@@ -219,21 +259,22 @@ class Body(Guarded):
         what = f"body {self.name!r}: add_force"
         nodes = checks.selection(where, self.rest_positions, what, "node")
         load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,), (len(nodes), 3))), _function(where))
-        self.forces.append(load)
+        list.append(self.forces, load)
         return load
 
     def _hold(self, constraint: Constraint, kind: int, what: str) -> Constraint:
         """Add a constraint unless it contradicts an earlier one: only two fixes of one node and axis agree."""
-        at = np.ix_(constraint.nodes, np.flatnonzero(constraint.axes))
-        before = self._held[at]
+        held = np.full((self.n_nodes, 3), _FREE, dtype=np.int8)  # what holds each node along each axis
+        for one in self.constraints:
+            held[np.ix_(one.nodes, one.axes)] = _FIXED if one.path is None else _MOVED
+        before = held[np.ix_(constraint.nodes, constraint.axes)]
         clash = np.argwhere((before != _FREE) if kind == _MOVED else (before == _MOVED))
         if len(clash):
             row, column = clash[0]
             axis = "xyz"[np.flatnonzero(constraint.axes)[column]]
             done = "fixed" if before[row, column] == _FIXED else "moved"
             raise SceneError(f"{what}: node {constraint.nodes[row]} is already {done} along {axis}")
-        self._held[at] = kind
-        self.constraints.append(constraint)
+        list.append(self.constraints, constraint)
         return constraint
 
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
@@ -33,7 +34,8 @@ def with_order(scene: Scene, order: int) -> Scene:
 
 def _with_bodies(scene: Scene, bodies: list[Body]) -> Scene:
     twin = scene.snapshot()
-    twin.bodies = bodies
+    with thawed(twin):
+        twin.bodies = bodies
     return twin
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from taisoft.attributes import Guarded
+from taisoft.attributes import Guarded, thawed
 from taisoft.errors import SceneError
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
@@ -26,9 +26,14 @@ class Scene(Guarded):
     """What is simulated: gravity, bodies and obstacles. SI units, y up.
 
     contact_pairs: {frozenset of two names, or of one for a body with itself: (friction, restitution)}, each a number or
-    None where the default of `contact_numbers` holds. A Simulator that takes a scene freezes it, see `freeze`.
+    None where the default of `contact_numbers` holds; read-only, `set_contact` adds to it. Bodies and obstacles can be taken out
+    of their lists, and are added by calls only. A Simulator that takes a scene freezes it, see `freeze`.
     """
 
+    _contents = {
+        "bodies": "call scene.add_body", "obstacles": "call scene.add_obstacle",
+        "contact_pairs": "call scene.set_contact(name_a, name_b, friction=...)",
+    }  # fmt: skip
     _otherwise_late = ANOTHER
     _instead_late = {
         "gravity": "call sim.set_gravity(gravity)", "set_contact": "call sim.set_contact(name_a, name_b, friction=...)",
@@ -102,8 +107,15 @@ class Scene(Guarded):
     def snapshot(self) -> "Scene":
         """A copy that can change apart from this one, with its bodies, even where this one is frozen; meshes are shared."""
         twin = copy.copy(self)
-        twin.bodies = [copy.copy(body) for body in self.bodies]
+        with thawed(twin):
+            twin.bodies = [copy.copy(body) for body in self.bodies]
         return twin
+
+    def check(self) -> None:
+        """Raises SceneError for what was written into arrays of numbers, such as gravity's, and could not have been set."""
+        checks.array(self.gravity, "scene: gravity", ((3,),))
+        for body in self.bodies:
+            body.check()
 
     def freeze(self) -> None:
         """Refuse every later change of the scene and its bodies, which would have no effect: a Simulator that takes the scene
@@ -134,7 +146,7 @@ class Scene(Guarded):
         self._check_open("add_body")
         name = self._free_name(name, "body")
         body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision)
-        self.bodies.append(body)
+        list.append(self.bodies, body)
         body.tell_locking(stacklevel=2)
         body.warn_bending(stacklevel=2)
         return body
@@ -150,7 +162,7 @@ class Scene(Guarded):
         """
         self._check_open("add_obstacle")
         obstacle = Obstacle(shape, self._free_name(name, "obstacle"), friction, restitution, path)
-        self.obstacles.append(obstacle)
+        list.append(self.obstacles, obstacle)
         return obstacle
 
     def body(self, name: str) -> Body:
@@ -179,7 +191,8 @@ class Scene(Guarded):
             0.0 if friction is None else friction, 0.0 if restitution is None else restitution, what
         )
         asked = (friction is not None, restitution is not None)
-        self.contact_pairs[pair] = tuple(new if use else old for new, use, old in zip(given, asked, before))
+        numbers = tuple(new if use else old for new, use, old in zip(given, asked, before))
+        dict.__setitem__(self.contact_pairs, pair, numbers)
 
     @property
     def bounces(self) -> bool:

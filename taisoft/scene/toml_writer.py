@@ -65,7 +65,8 @@ def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh])
         materials.setdefault(body.material, f"material{len(materials)}")
     collision = dataclasses.asdict(scene.collision)
     order = [one.name for one in scene.colliders]
-    pairs = sorted(sorted(order.index(name) for name in pair) for pair in scene.contact_pairs)
+    there = (pair for pair in scene.contact_pairs if pair <= set(order))  # bodies may have been taken out of the scene since
+    pairs = sorted(sorted(order.index(name) for name in pair) for pair in there)
     contacts = []
     for pair in pairs:
         names = [order[pair[0]], order[pair[-1]]]
