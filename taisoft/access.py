@@ -72,7 +72,7 @@ class StateAccess(Guarded):
         return self._open_world().state()[1][self._slice(body)].astype(np.float64)
 
     def set_state(self, positions=None, velocities=None, body: str | None = None) -> None:
-        """Set positions [m] and velocities [m/s], (n_nodes, 3) each; velocities of constrained axes become 0."""
+        """Set positions [m] and velocities [m/s], (n_nodes, 3) each; constrained axes stop. Copies arrays; compiles nothing."""
         world, rows = self._open_world(), self._slice(body)
         for name, value in (("positions", positions), ("velocities", velocities)):
             if value is not None:
@@ -243,7 +243,7 @@ class StateAccess(Guarded):
         return self._stable_dt
 
     def set_gravity(self, gravity) -> None:
-        """Change gravity (3,) [m/s^2]."""
+        """Change gravity (3,) [m/s^2]. Copies it, recomputes the rounding floor of the residual; compiles nothing."""
         self._open_world()
         with thawed(self.scene):
             self.scene.gravity = gravity
@@ -255,7 +255,10 @@ class StateAccess(Guarded):
         upload([(self._world.model.gravity, self.scene.gravity[None])])
 
     def set_material(self, body: str, **numbers) -> None:
-        """Change numbers of a body's material (young, poisson, density, mass_damping, stiffness_damping); law stays."""
+        """Change numbers of a body's material (young, poisson, density, mass_damping, stiffness_damping); law stays.
+
+        Copies arrays, recomputes the rounding floor of the residual and the limit of a stable dt; compiles nothing.
+        """
         world, k = self._open_world(), self._index(body)
         old, old_limit = self.scene.bodies[k].material, self._stable_dt
         changed_material(self.scene.bodies[k], numbers, self.plan.on)

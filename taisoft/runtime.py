@@ -9,7 +9,6 @@ import contextlib
 import functools
 import io
 import os
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -18,7 +17,7 @@ import numpy as np
 import taichi as ti
 from taichi.lang import impl
 
-from taisoft import tracing  # noqa: F401  before anything is decorated
+from taisoft import compile_message, tracing  # noqa: F401  tracing before anything is decorated
 from taisoft.errors import SimulationError
 from taisoft.files import cache_folders
 from taisoft.lane_pool import LanePool
@@ -38,7 +37,6 @@ _program = None  # Taichi's own state, of that initialisation
 _clock = {"compile": 0.0, "kernels": 0}
 _known: list[Kernels] = []
 _pool: LanePool | None = None
-_is_cold = False  # no kernel was in the cache on disk when Taichi started
 
 
 class Runtime:
@@ -120,14 +118,13 @@ def _cache_folder() -> str:
 
 
 def _initialise(arch: str, precision: str) -> None:
-    global _program, _pool, _is_cold
+    global _program, _pool
     clock = time.perf_counter()
     try:
         os.getcwd()
     except FileNotFoundError:
         raise SimulationError("the working folder no longer exists: change to one that does") from None
     folder = _cache_folder()
-    _is_cold = not any(name.endswith(".tic") for name in os.listdir(folder))
     room = address_space()
     if arch == "cpu" and room is not None and room < POOL:
         raise SimulationError(f"not enough memory to start Taichi: {told(POOL)} are needed at once, available: {told(room)}")
@@ -185,28 +182,24 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
         ready = kernels.find(arguments)
         if ready is not None:
             return ready[0].launch(ready[1], arguments)
-        start, before = time.perf_counter(), kernels.n_compiled
-        if _is_cold:
-            _tell_of_compiling()
+        start, compiler, before = time.perf_counter(), _compiler_clock(), kernels.n_compiled
         with _eliminating(cse):
             compiled, context, _ = kernels.prepare(arguments)
             result = compiled.launch(context, arguments)  # which loads the code where it is new
         if kernels.n_compiled > before:
             ti.sync()
-            _clock["compile"] += time.perf_counter() - start
+            seconds = time.perf_counter() - start
+            _clock["compile"] += seconds
             _clock["kernels"] += kernels.n_compiled - before
+            compile_message.show(_compiler_clock() - compiler, seconds, _clock["kernels"])
         return result
 
     return launch
 
 
-def _tell_of_compiling() -> None:
-    """Say once that kernels are compiled, and on a terminal how many have been."""
-    count, text = _clock["kernels"], "taisoft: compiling kernels (first run on this machine, about 20 s)"
-    if sys.stderr.isatty():
-        print(f"\r{text}: {count + 1}", end="", file=sys.stderr, flush=True)
-    elif count == 0:
-        print(text, file=sys.stderr, flush=True)
+def _compiler_clock() -> float:
+    """Seconds that Taichi's compiler has taken so far, those in which it loads kernels from disk included."""
+    return _program.get_total_compilation_time() if _program is not None else 0.0
 
 
 @contextlib.contextmanager

@@ -228,7 +228,7 @@ class Simulator(Resuming):
         return run(self, seconds, on_frame, fps, stop, resumed, on_step)
 
     def reset(self) -> None:
-        """Back to the scene's start; numbers changed while it ran (dt, gravity, materials, loads) stay."""
+        """Back to the scene's start; changed numbers (dt, gravity, materials, loads) stay. Copies arrays; compiles nothing."""
         self._open_world().restart()
         self.release()
         self._time_base = (0.0, 0)

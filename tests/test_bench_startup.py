@@ -6,9 +6,6 @@
 """
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -67,13 +64,3 @@ def test_the_page(monkeypatch, tmp_path, capsys):
     assert "NOT met" in capsys.readouterr().out
     assert startup.main(["--quick"]) == 0
     assert "## Limits" not in capsys.readouterr().out
-
-
-def test_a_first_run_says_so(tmp_path):
-    code = "import sys; sys.path.insert(0, 'benchmarks'); import startup_child as c; c.simulate('beam', 1, 1)"
-    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
-    told = []
-    for _ in range(2):
-        done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=ROOT, capture_output=True, text=True, check=True)
-        told.append(done.stderr.count("taisoft: compiling kernels (first run on this machine, about 20 s)\n"))
-    assert told == [1, 0] and list(tmp_path.rglob("*.tic"))

@@ -1,35 +1,120 @@
-"""`taisoft warm`: scenes of every kind step, a line each; their like, of any size, need no other kernel."""
+"""`taisoft warm`: scenes of every kind step, a line each; their like, of any size, need no other kernel.
+
+* after it, demos of the structures that it compiled add no kernel to the cache on disk and say nothing of compiling;
+* each demo's structure is in its table, so a new demo is covered or fails here;
+* each scene of the table has what its structure says;
+* simulations and statics are in the precision that was asked for, without one each in its own default.
+"""
+
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+from command import ROOT
 
 import taisoft as ts
-from taisoft.cli import main, warm
+from taisoft.cli import main, warm, warm_scenes
+from taisoft.cli.scene_file import load_scene, shipped_files
+from taisoft.cli.warm_scenes import EXPLICIT, Structure, build, static_structures, structures
+from taisoft.collision.surface import SERIAL_BELOW
+from taisoft.elements.reference import inverse_rest_edges
+from taisoft.model import ILL_CONDITIONED
 from taisoft.runtime import n_compiled
+from taisoft.scene.obstacles import MeshObstacle
+from taisoft.settings import plan_of
+
+DEMOS = {
+    "hanging_beam": Structure("velocity_verlet", held=True),
+    "twisting_bar": Structure("implicit_euler", held=True, moved=True, mass_damping=True),
+}
 
 
-def test_warm(monkeypatch, capsys):
-    monkeypatch.setattr(warm, "LAWS", ("stable_neo_hookean",))
-    assert main(["warm"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 2 * 3 + 2 and lines[-2].startswith("statics") and lines[-1].endswith(" s")
+def key(scene: ts.Scene, integrator: str, **solver) -> tuple:
+    """What kernels are compiled for, as far as scenes differ in it."""
+    on = {name for name, is_on in plan_of(scene, integrator, solver.get("self_collision", False), False).on.items() if is_on}
+    if integrator not in EXPLICIT:
+        on.discard("fixed_nodes")  # a mask of numbers there
+    groups = sorted({(b.order, b.quadrature_degree, b.material.law) for b in scene.bodies})
+    analytic = any(not isinstance(o.shape, MeshObstacle) for o in scene.obstacles)
+    surfaces = [o.shape.surface() for o in scene.obstacles]
+    counts = [len(b.nodes.surface) for b in scene.bodies] + [len(s[1]) for s in surfaces if s is not None]
+    touches = "contact_forces" in on
+    return (
+        integrator, tuple(sorted(on)), tuple(groups), any(is_thin(b) for b in scene.bodies), touches and analytic,
+        touches and len(counts) > 1, touches and sum(counts) >= SERIAL_BELOW, solver.get("contact_solver", "auto"),
+    )  # fmt: skip
+
+
+def is_thin(body) -> bool:
+    X, tets = body.mesh.vertices, body.mesh.tets
+    edges = ((X[tets[:, 1:]] - X[tets[:, :1]]) ** 2).sum(axis=(1, 2))
+    return bool((edges * (inverse_rest_edges(X, tets)[0] ** 2).sum(axis=(1, 2))).max() > ILL_CONDITIONED**2)
+
+
+@pytest.fixture(scope="module")
+def covered() -> set:
+    return {key(build(structure), structure.integrator) for structure in structures()}
+
+
+@pytest.mark.parametrize("name", shipped_files("demos"))
+def test_every_demo_is_in_the_table(name, covered):
+    scene, solver = load_scene(name)
+    assert key(scene, **{"integrator": "implicit_euler"} | solver) in covered, "add its Structure to warm_scenes.structures"
+
+
+def test_demos_compile_nothing_afterwards(tmp_path):
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
+    code = (
+        "import test_cli_warm as t\nfrom taisoft.cli import main, warm_scenes\n"
+        "warm_scenes.structures, warm_scenes.static_structures = t.DEMOS.values, tuple\nmain(['warm'])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert len(done.stdout.splitlines()) == len(DEMOS) + 1 and done.stderr == ""
+    before = set(tmp_path.rglob("*.tic"))
+    assert len(before) > 5
+    for name in DEMOS:
+        command = [sys.executable, "-m", "taisoft", "run", name, "--headless", "--seconds", "0.1", "--no-frames"]
+        command += ["--out", str(tmp_path / name)]  # with a scene.usdc
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        assert set(tmp_path.rglob("*.tic")) == before, name
+        assert "compiling" not in done.stderr
 
 
 def test_scenes_of_other_sizes_need_no_other_kernel():
-    integrator = "implicit_euler"
-    warm._simulate(warm.scene("stable_neo_hookean", "a half-space"), integrator, warm.INTEGRATORS[integrator], "f32")
+    warm.simulate(Structure("implicit_euler", obstacles=("half-space",)), "f32")
     before = n_compiled()
     made = ts.Scene()
     rubber = ts.Material(law="stable_neo_hookean", young=2e5, poisson=0.2, density=900.0)
     made.add_body(ts.box_mesh((4, 3, 2), (0.3, 0.2, 0.1)), rubber, position=(0, 0.0501, 0))
     made.add_obstacle(ts.HalfSpace((0, -0.05, 0), (0, 1, 0)))
-    with ts.Simulator(made, dt=2e-3, integrator=integrator) as sim:
+    with ts.Simulator(made, dt=2e-3, integrator="implicit_euler") as sim:
         sim.advance(2)
         assert np.isfinite(sim.positions()).all() and n_compiled() == before
 
 
-@pytest.mark.parametrize("contacts", warm.CONTACTS)
-def test_scenes_have_what_they_say(contacts):
-    made = warm.scene("corotational", contacts)
-    counts = {"no contacts": (1, 0), "a half-space": (1, 1), "two bodies": (2, 0)}
-    assert (len(made.bodies), len(made.obstacles)) == counts[contacts]
+@pytest.mark.parametrize("structure", dict.fromkeys([*structures(), *static_structures()]), ids=str)
+def test_scenes_have_what_they_say(structure):
+    scene = build(structure)
+    on = plan_of(scene, structure.integrator or "implicit_euler", False, False).on
+    for name, feature in (
+        ("held", "fixed_nodes"), ("moved", "moving_nodes"), ("loaded", "loads"), ("mass_damping", "mass_damping"),
+        ("stiffness_damping", "stiffness_damping"),
+    ):  # fmt: skip
+        assert on[feature] == getattr(structure, name), feature
+    assert [b.order for b in scene.bodies] == list(structure.orders) and on[f"law:{structure.law}"]
+    assert [o.name for o in scene.obstacles] == list(structure.obstacles)
+    assert is_thin(scene.bodies[0]) == structure.thin
+    assert (len(scene.bodies[0].nodes.surface) > SERIAL_BELOW) == structure.fine
+
+
+@pytest.mark.parametrize("asked, simulated, static", [(None, "f32", "f64"), ("f32", "f32", "f32"), ("f64", "f64", "f64")])
+def test_precisions(asked, simulated, static, monkeypatch, capsys):
+    structure, found = Structure("implicit_euler", held=True), []
+    monkeypatch.setattr(warm_scenes, "structures", lambda: [structure])
+    monkeypatch.setattr(warm_scenes, "static_structures", lambda: [structure])
+    monkeypatch.setattr(warm, "simulate", lambda structure, precision: found.append(precision))
+    monkeypatch.setattr(warm, "solve", lambda structure, precision: found.append(precision))
+    assert main(["warm", *(["--precision", asked] if asked else [])]) == 0
+    assert found == [simulated, static] and f"statics in {static}" in capsys.readouterr().out

@@ -1,53 +1,57 @@
-"""`taisoft warm`: compiles the kernels of common scenes ahead, so that later runs find them in the cache on disk.
+"""`taisoft warm`: compiles the kernels of common scenes ahead, so that later runs find them in the cache on disk."""
 
-A kernel depends on laws, orders, integrators, contacts and precision, on neither meshes nor numbers: tiny scenes do.
-"""
-
-import itertools
 import time
 import warnings
 from argparse import Namespace
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 import taisoft as ts
+from taisoft import compile_message
+from taisoft.cli import warm_scenes
+from taisoft.cli.warm_scenes import EXPLICIT, Structure
 from taisoft.runtime import n_compiled
 
-EXPLICIT, IMPLICIT = "symplectic_euler", "implicit_euler"
-INTEGRATORS = {EXPLICIT: 1e-5, IMPLICIT: 1e-3}  # name -> dt [s]
-LAWS = ("stable_neo_hookean", "corotational", "st_venant_kirchhoff")
-CONTACTS = ("no contacts", "a half-space", "two bodies")
+STEPS = {True: (1e-5, 200), False: (1e-2, 10)}  # of explicit and implicit integrators: dt [s], and how many
+LONG = 1.0  # [s]
+HEAVY = (0.0, -500.0, 0.0)  # [m/s^2]
+SQUEEZE = np.array([0.3, 1.0, 1.0])  # of positions
 
 
 def command(arguments: Namespace) -> int:
-    """Compiles, one line for each kind of scene, and returns 0."""
+    """Compiles, one line for each structure, and returns 0. Without --precision simulations are in f32, statics in f64."""
     start, before = time.perf_counter(), n_compiled()
-    for law, (integrator, dt), contacts in itertools.product(LAWS, INTEGRATORS.items(), CONTACTS):
-        what = f"{law}, {integrator}, {contacts}"
-        _report(what, _simulate, scene(law, contacts), integrator, dt, arguments.precision)
-    _report("statics", ts.solve_static, scene(LAWS[0], CONTACTS[0]))
+    with compile_message.silenced():
+        for structure in dict.fromkeys(warm_scenes.structures()):  # laws and integrators share some
+            _report(str(structure), simulate, structure, arguments.precision or "f32")
+        for structure in warm_scenes.static_structures():
+            precision = arguments.precision or "f64"
+            _report(f"statics in {precision}, {structure}", solve, structure, precision)
     print(f"{n_compiled() - before} kernels in {time.perf_counter() - start:.0f} s")
     return 0
 
 
-def scene(law: str, contacts: str) -> ts.Scene:
-    """A cube that is held or touches something."""
-    made, cube = ts.Scene(), ts.box_mesh((2, 2, 2), (0.1, 0.1, 0.1))
-    material = ts.Material(law=law, young=1e5, poisson=0.3, density=1000.0)
-    body = made.add_body(cube, material, name="cube", position=(0.0, 0.0501, 0.0))
-    if contacts == "no contacts":
-        body.fix(lambda X: X[:, 1] < -0.049)
-    elif contacts == "a half-space":
-        made.add_obstacle(ts.HalfSpace((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), name="ground")
-    else:
-        made.add_body(cube, material, name="other", position=(0.0, -0.0501, 0.0)).fix(lambda X: X[:, 1] < -0.049)
-    return made
-
-
-def _simulate(made: ts.Scene, integrator: str, dt: float, precision: str) -> None:
-    with ts.Simulator(made, dt=dt, integrator=integrator, precision=precision) as sim:
-        sim.advance(3)
+def simulate(structure: Structure, precision: str) -> None:
+    """A few steps, and what a run with --out writes of them."""
+    dt, count = STEPS[structure.integrator in EXPLICIT]
+    with ts.Simulator(warm_scenes.build(structure), dt=dt, integrator=structure.integrator, precision=precision) as sim:
+        while sim.step_count < count:
+            sim.advance(count - sim.step_count)
+        if not sim.touches and structure.integrator not in EXPLICIT:
+            sim.dt = LONG  # so long that inertia does not hide the stiffness
+            sim.set_state(SQUEEZE * sim.positions())  # where the stiffness must be projected and the line search has work
+            sim.step()
         sim.energies()
+        sim.stress()
+
+
+def solve(structure: Structure, precision: str) -> None:
+    """The static state under a load so large that the line search has work."""
+    scene = warm_scenes.build(structure)
+    scene.gravity = HEAVY
+    ts.solve_static(scene, precision=precision)
 
 
 def _report(what: str, do: Callable, *arguments: Any) -> None:
@@ -55,4 +59,4 @@ def _report(what: str, do: Callable, *arguments: Any) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of scenes that nobody looks at
         do(*arguments)
-    print(f"{what:<60} {n_compiled() - before:3d} kernels {time.perf_counter() - start:6.1f} s", flush=True)
+    print(f"{what:<90} {n_compiled() - before:3d} kernels {time.perf_counter() - start:6.1f} s", flush=True)

@@ -1,0 +1,85 @@
+"""The message that kernels are being compiled, on stderr:
+
+* a first run says so once, on a line of its own, on a terminal (where a progress bar follows) and elsewhere, and a second run
+  does not; kernels of another version in the cache change nothing;
+* a kernel that is loaded, however slowly, is not told; long compiling is told again every few seconds;
+* without stderr, or with one that is closed, nothing happens.
+"""
+
+import io
+import os
+import pty
+import subprocess
+import sys
+
+import pytest
+from command import ROOT
+
+from taisoft import compile_message
+from taisoft.compile_message import LINE_EVERY, MESSAGE
+
+RUN = ("-m", "taisoft", "run", "hanging_beam", "--headless", "--no-frames", "--no-usd", "--seconds", "0.1")
+
+
+def stderr_of_run(terminal: bool, environment: dict) -> str:
+    if not terminal:
+        return subprocess.run([sys.executable, *RUN], env=environment, capture_output=True, text=True, check=True).stderr
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen([sys.executable, *RUN], env=environment, stdin=theirs, stdout=theirs, stderr=theirs)
+    os.close(theirs)
+    parts = []
+    try:
+        while part := os.read(ours, 4096):
+            parts.append(part)
+    except OSError:  # Linux's end of a terminal
+        pass
+    finally:
+        os.close(ours)
+    assert process.wait() == 0
+    return b"".join(parts).decode()
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_first_run_says_so(terminal, tmp_path):
+    kernels = tmp_path / "taisoft" / "kernels"
+    kernels.mkdir(parents=True)
+    (kernels / "Told.tic").touch()
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    first, second = (stderr_of_run(terminal, environment) for _ in range(2))
+    assert [line for line in first.splitlines() if "compiling" in line] == [MESSAGE]
+    assert "taisoft:" not in second
+    assert not terminal or "hanging_beam" in first  # the bar
+
+
+@pytest.fixture
+def fresh(monkeypatch) -> None:
+    """As in a process that has told nothing yet."""
+    monkeypatch.setattr(compile_message, "_last_line", None)
+
+
+def test_what_is_told_when(fresh, monkeypatch, capsys):
+    clock = [0.0]
+    monkeypatch.setattr(compile_message.time, "perf_counter", lambda: clock[0])
+    compile_message.show(compiler=0.02, launch=0.1, n_compiled=1)  # loaded
+    compile_message.show(compiler=0.3, launch=2.0, n_compiled=2)  # loaded on a slow machine
+    assert capsys.readouterr().err == ""
+    for n, now in ((3, 0.0), (4, 0.9 * LINE_EVERY), (5, 1.1 * LINE_EVERY), (6, 1.2 * LINE_EVERY)):
+        clock[0] = now
+        compile_message.show(compiler=0.5, launch=0.6, n_compiled=n)
+    assert capsys.readouterr().err == f"{MESSAGE}\ntaisoft: 5 kernels so far\n"
+
+
+def test_silenced(fresh, capsys):
+    with compile_message.silenced():
+        compile_message.show(compiler=0.5, launch=0.6, n_compiled=1)
+    assert capsys.readouterr().err == ""
+    compile_message.show(compiler=0.5, launch=0.6, n_compiled=2)
+    assert capsys.readouterr().err == f"{MESSAGE}\n"
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_no_stderr(there, fresh, monkeypatch):
+    closed = io.StringIO()
+    closed.close()
+    monkeypatch.setattr(sys, "stderr", closed if there else None)
+    compile_message.show(compiler=0.5, launch=0.6, n_compiled=1)
