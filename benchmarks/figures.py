@@ -26,6 +26,7 @@ from .document import RESULTS, default_out, load_text
 WRITES = {
     "references": ("json",), "elasticity": ("json",), "collision": ("json", "png"), "contact": ("json", "png"),
     "order": ("json", "png"), "scaling": ("json", "png"), "peers": ("json",), "hard": ("json",), "report": ("folder",),
+    "startup": ("json",),
 }  # fmt: skip
 OPTIONS = {"json": ("--out", ".json"), "png": ("--plot", ".png"), "folder": ("--out", "")}
 NO_QUICK = ("references",)

@@ -3,6 +3,7 @@
 python startup_child.py TASK [NUMBER ...]; prints one line of JSON. Times are of this process, in seconds.
 """
 
+import gc
 import json
 import os
 import sys
@@ -17,27 +18,43 @@ import taisoft as ts
 RUBBER = {"law": "stable_neo_hookean", "young": 1e6, "poisson": 0.3, "density": 1000.0}
 
 
-def beam(cells: int) -> ts.Scene:
+def beam(cells: int, young: float = RUBBER["young"]) -> ts.Scene:
     """A beam clamped at one end: 4 cells x cells x cells cells."""
     scene = ts.Scene()
-    bar = scene.add_body(ts.box_mesh((4 * cells, cells, cells), (1.2, 0.3, 0.3)), ts.Material(**RUBBER), name="beam")
+    material = ts.Material(**(RUBBER | {"young": young}))
+    bar = scene.add_body(ts.box_mesh((4 * cells, cells, cells), (1.2, 0.3, 0.3)), material, name="beam")
     bar.fix(lambda X: X[:, 0] < -0.599)
     return scene
 
 
 def cube(cells: int) -> ts.Scene:
-    """A cube that falls onto a box."""
+    """A cube that falls onto a block."""
+    return on_block("cube", (cells, cells, cells), (0.1, 0.1, 0.1))
+
+
+def sheet(cells: int) -> ts.Scene:
+    """A thick sheet that falls onto a block: cells x 1 x cells cells."""
+    return on_block("sheet", (cells, 1, cells), (0.3, 0.02, 0.3))
+
+
+def on_block(name: str, cells: tuple[int, int, int], size: tuple[float, float, float]) -> ts.Scene:
+    """A box 0.5 mm above a block that is held."""
     scene = ts.Scene()
-    mesh = ts.box_mesh((cells, cells, cells), (0.1, 0.1, 0.1))
-    scene.add_body(mesh, ts.Material(**RUBBER), name="cube", position=(0.0, 0.0505, 0.0))
+    scene.add_body(ts.box_mesh(cells, size), ts.Material(**RUBBER), name=name, position=(0.0, 0.5 * size[1] + 5e-4, 0.0))
     ground = ts.box_mesh((2, 1, 2), (0.4, 0.05, 0.4))
     scene.add_body(ground, ts.Material(**RUBBER), name="ground", position=(0.0, -0.025, 0.0)).fix(lambda X: X[:, 1] < 0.0)
     return scene
 
 
+def triangles(cells: int) -> str:
+    """The size of both surfaces of `sheet`."""
+    return f"{4 * cells * (cells + 2) + 32:,} triangles"
+
+
 SCENES = {
     "beam": (beam, {"dt": 2e-4, "integrator": "symplectic_euler"}),
     "cube": (cube, {"dt": 2e-3, "integrator": "implicit_euler"}),
+    "sheet": (sheet, {"dt": 2e-3, "integrator": "implicit_euler"}),
 }
 
 
@@ -58,7 +75,11 @@ def compiled() -> int | None:
 
 
 def memory() -> float:
-    """Resident memory [MB]."""
+    """Resident memory of this process [MB]: pages in RAM, with those that Taichi and the allocator keep for reuse.
+
+    Cycles of objects are collected first, or their memory would count until Python happens to look at them.
+    """
+    gc.collect()
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
@@ -66,7 +87,14 @@ def simulate(name: str, cells: int, steps: int = 10) -> None:
     """A simulator, and its first steps."""
     build, settings = SCENES[name]
     with ts.Simulator(build(cells), **settings) as sim:
-        sim.advance(steps)
+        walk(sim, steps)
+
+
+def walk(sim: ts.Simulator, steps: int) -> None:
+    """So many steps: `advance` takes implicit ones one at a time, and may take fewer explicit ones than asked for."""
+    last = sim.step_count + steps
+    while sim.step_count < last:
+        sim.advance(last - sim.step_count)
 
 
 def first(name: str, cells: int) -> dict:
@@ -80,18 +108,47 @@ def again(name: str, cells: int, larger: int) -> dict:
     for label, n in (("first", cells), ("second", cells), ("other size", larger)):
         before = compiled()
         found[label] = timed(lambda n=n: simulate(name, n))
-        found[label]["compiled"] = None if before is None else compiled() - before
+        found[label]["compiled"] = since(before)
+    return found
+
+
+def since(before: int | None) -> int | None:
+    """Kernels compiled since `compiled` said `before`."""
+    return None if before is None else compiled() - before
+
+
+def surfaces(*sizes: int) -> dict:
+    """Kernels that sheets of ascending sizes compile, one after the other in one process."""
+    found = {}
+    for cells in sizes:
+        before = compiled()
+        if before is not None:  # else nothing would be learnt
+            simulate("sheet", cells, 3)
+        found[triangles(cells)] = since(before)
     return found
 
 
 def grow(name: str, cells: int, times: int) -> dict:
-    """Memory after the second of some simulators, and after the last."""
+    """Memory after the second of some simulators, and after the last. times: simulators between."""
     simulate(name, cells, 3)
     simulate(name, cells, 3)
     start = memory()
     for _ in range(times):
         simulate(name, cells, 3)
-    return {"start": start, "end": memory()}
+    return {"start": start, "end": memory(), "times": times}
+
+
+def keep(cells: int, times: int) -> dict:
+    """The same of simulators of a cube that are closed while something still refers to them."""
+    build, arguments = SCENES["cube"]
+    kept, start = [], 0.0
+    for _ in range(2 + times):
+        if len(kept) == 2:
+            start = memory()
+        with ts.Simulator(build(cells), **arguments) as sim:
+            sim.advance(1)
+        kept.append(sim)
+    return {"start": start, "end": memory(), "times": times}
 
 
 def statics(cells: int) -> dict:
@@ -102,12 +159,7 @@ def statics(cells: int) -> dict:
 def identify(cells: int) -> dict:
     """Young's modulus from a sag: nine static solves, by bisection of the logarithm."""
     def sag(young: float) -> float:
-        scene = ts.Scene()
-        material = ts.Material(**(RUBBER | {"young": young}))
-        scene.add_body(ts.box_mesh((4 * cells, cells, cells), (1.2, 0.3, 0.3)), material, name="beam").fix(
-            lambda X: X[:, 0] < -0.599
-        )
-        return ts.solve_static(scene).positions()[:, 1].min()
+        return ts.solve_static(beam(cells, young)).positions()[:, 1].min()
 
     def search() -> None:
         wanted, low, high = sag(3e6), 6.0, 7.0
@@ -125,7 +177,7 @@ def settings(cells: int) -> dict:
     build, arguments = SCENES[name]
     simulate(name, cells, 2)
     with ts.Simulator(build(cells), **arguments) as sim:
-        sim.advance(2)
+        walk(sim, 2)
         x, v = sim.positions(), sim.velocities()
         changes = {
             "set_gravity": lambda: sim.set_gravity((0.0, -9.8, 0.0)),
@@ -138,21 +190,47 @@ def settings(cells: int) -> dict:
     return found | {"a new Simulator": timed(lambda: ts.Simulator(build(cells), **arguments).close())["wall"]}
 
 
-def speed(cells: int) -> dict:
-    """Seconds of an explicit step, an implicit one, and one measurement of energies of a beam: medians."""
-    def median(do: Callable) -> float:
-        do()
-        return float(np.median([timed(do)["wall"] for _ in range(9)]))
-
+def speed(cells: int, small: int, large: int) -> dict:
+    """Seconds, medians: steps, energies and a force differential of a beam, searches and contact steps of two sheets."""
     steps = 20
     with ts.Simulator(beam(cells), dt=2e-5, integrator="symplectic_euler") as sim:
-        found = {"symplectic_euler step": median(lambda: sim.advance(steps)) / steps, "energies": median(sim.energies)}
+        dx = 1e-3 * np.sin(sim.positions())
+        found = {
+            "symplectic_euler step": often(lambda: walk(sim, steps)) / steps,
+            "energies": often(sim.energies),
+            "force differential": often(lambda: sim.force_differential(dx)),
+        }
     with ts.Simulator(beam(cells), dt=5e-3, integrator="implicit_euler") as sim:
-        return found | {"implicit_euler step": median(lambda: sim.advance(1))}
+        found["implicit_euler step"] = often(lambda: sim.advance(1))
+    return found | landing(small) | landing(large)
+
+
+def landing(cells: int) -> dict[str, float]:
+    """Seconds of a search for contacts, and of a step while a sheet lands.
+
+    Seven steps from the start, the last three with impacts: an impact multiplies rounding, and later steps of two versions
+    would need another number of iterations each.
+    """
+    steps = 7
+    build, arguments = SCENES["sheet"]
+    with ts.Simulator(build(cells), **arguments) as sim:
+        seconds = often(lambda: walk(sim, steps), before=sim.reset) / steps
+        assert len(sim.detect_contacts()) >= (cells + 1) ** 2
+        return {f"search, {triangles(cells)}": often(sim.detect_contacts), f"contact step, {triangles(cells)}": seconds}
+
+
+def often(do: Callable, before: Callable = lambda: None) -> float:
+    """Median of the seconds of nine calls, after one that compiles. before: done each time, not timed."""
+    seconds = []
+    for _ in range(10):
+        before()
+        seconds.append(timed(do)["wall"])
+    return float(np.median(seconds[1:]))
 
 
 TASKS = {
-    "first": first, "again": again, "grow": grow, "statics": statics, "identify": identify, "settings": settings, "speed": speed,
+    "first": first, "again": again, "surfaces": surfaces, "grow": grow, "keep": keep, "statics": statics, "identify": identify,
+    "settings": settings, "speed": speed,
 }  # fmt: skip
 
 if __name__ == "__main__":

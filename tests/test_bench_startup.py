@@ -1,6 +1,8 @@
 """`taisoft bench startup`, and what it measures:
 
 * a first simulator compiles, a second one and one of another size compile nothing, nor does a process with another mesh size;
+* so does a larger surface, unless another form of the search takes over; memory is measured over as many simulators as asked for;
+* versions take turns, at another mesh size each round; what is timed has the names of the limits;
 * the page tells waiting, counts and limits; a child that fails is named;
 * a first run on a machine says so once; `taisoft warm` leaves kernels in the cache.
 """
@@ -10,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import startup
+from benchmarks import startup, startup_child, startup_table
 from taisoft.errors import SimulationError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -31,34 +33,92 @@ def test_nothing_compiles_twice(version, name, cells, other):
     assert before and version.files() == before
 
 
+@pytest.mark.filterwarnings("ignore:body")  # too few tets through the thickness, on purpose
+def test_a_step_is_a_step():
+    with startup_child.ts.Simulator(startup_child.cube(1), **startup_child.SCENES["cube"][1]) as sim:
+        startup_child.walk(sim, 3)
+        assert sim.step_count == 3
+
+
+def test_a_larger_surface(version):
+    few, again, many, more = version.run("surfaces", *startup.TASKS["surfaces"][0])[0].items()
+    assert (few[0], many[0]) == ("224 triangles", startup_table.CROSSING) and few[1] > many[1] > 0 == again[1] == more[1]
+
+
+def test_memory_of_simulators(version):
+    for task in (("grow", "cube", 1, 1), ("keep", 1, 1)):
+        found = version.run(*task)[0]
+        assert found["times"] == 1 and 0 < found["start"] < 2 * found["end"]
+
+
+def test_speed(version, monkeypatch):
+    monkeypatch.setattr(startup, "SPEED_SHEETS", (2, 3))
+    labels = {f"{what}, {startup_child.triangles(n)}" for what in ("search", "contact step") for n in (2, 3)}
+    wanted = {name for name in startup_table.SLOWER if "triangles" not in name} | labels
+    monkeypatch.setattr(startup, "SLOWER", wanted)
+    (found,) = startup.measure_speed([version], quick=True)
+    assert found.keys() == wanted and all(len(seconds) == 1 and seconds[0] > 0 for seconds in found.values())
+
+
+@pytest.mark.filterwarnings("ignore:body")  # too few tets through the thickness, on purpose
+def test_sheets_have_the_sizes_of_the_limits():
+    for cells in startup.SPEED_SHEETS:
+        assert f"search, {startup_child.triangles(cells)}" in startup_table.SLOWER
+        scene = startup_child.sheet(cells)
+        assert startup_child.triangles(cells) == f"{sum(len(body.nodes.surface) for body in scene.bodies):,} triangles"
+
+
+class Recorded:
+    """A version that notes its tasks, of seconds that double from task to task."""
+
+    def __init__(self, name: str, tasks: list):
+        self.name, self.tasks = name, tasks
+
+    def run(self, *task):
+        self.tasks.append((self.name, *task))
+        return {}, {"wall": 2.0 ** len(self.tasks), "cpu": 1.0}
+
+    def files(self):
+        return {len(self.tasks)} if self.name == "old" else set()
+
+
+def test_versions_take_turns():
+    tasks: list = []
+    new, old = startup.measure_waiting([Recorded("new", tasks), Recorded("old", tasks)], "cube", quick=False)
+    firsts = [(task[0], task[3]) for task in tasks if task[1] == "first"]
+    assert firsts == [(name, n) for n in (4, 4, 5, 4, 6, 4, 7) for name in ("new", "old")]
+    assert new["new files"] == [0, 0, 0] and old["new files"] == [1, 1, 1]
+    assert startup_table.ratio(*(one[startup_table.OTHER]["walls"] for one in (new, old))) == 0.5
+
+
 def test_a_child_that_fails(version):
     with pytest.raises(SimulationError, match="task first nobody 1 ended with status 1: KeyError: 'nobody'"):
         version.run("first", "nobody", 1)
 
 
 def numbers(seconds: float, compiled: int) -> dict:
-    times = {"wall": seconds, "cpu": seconds, "compiled": compiled}
+    times = {"wall": seconds, "cpu": seconds, "walls": [seconds] * 3, "compiled": compiled}
+    memory = {"start": 300.0, "end": 301.0, "times": 4}
     one = {
-        "cold": times, "warm": times, "warm, other size": times, "new files": 0, "memory": {"start": 300.0, "end": 301.0},
+        "cold": times, "warm": times, "warm, other size": times, "new files": [0, compiled], "memory": memory,
         "one process": {"first": times, "second": times, "other size": times},
     }  # fmt: skip
     return {
         "beam": one, "cube": one, "statics": {str(k): times for k in range(3)}, "identify": times,
-        "settings": {"reset": 1e-3 * seconds},
+        "settings": {"reset": 1e-3 * seconds}, "surfaces": {"224 triangles": 9, "284 triangles": compiled}, "keep": memory,
+        "speed": dict.fromkeys(startup.SLOWER, [1e-3, 1.1e-3, 2e-3]),
     }  # fmt: skip
 
 
 def test_the_page(monkeypatch, tmp_path, capsys):
     found = {ROOT: numbers(0.5, 0), tmp_path: numbers(10.0, 3)}
-    monkeypatch.setattr(startup, "measure", lambda version, quick: found[version.folder])
-    monkeypatch.setattr(
-        startup, "measure_speed", lambda versions, quick: [dict.fromkeys(startup.SLOWER, [1e-3, 1.1e-3, 2e-3])] * len(versions)
-    )
+    monkeypatch.setattr(startup, "measure", lambda versions, quick: [found[version.folder] for version in versions])
     out = tmp_path / "page.json"
     assert startup.main(["--baseline", str(tmp_path), "--out", str(out)]) == 0
     page = out.with_suffix(".md").read_text()
     assert "| beam, cold " in page and "10 (10)" in page and "0.5 (0.5)" in page and "NOT met" not in page
-    assert len(json.loads(out.read_text())["limits"]) == 18 and page.strip() in capsys.readouterr().out
+    assert "over 4 simulators" in page and page.strip() in capsys.readouterr().out
+    assert len(json.loads(out.read_text())["limits"]) == 25
     found[ROOT] = numbers(2.0, 1)
     assert startup.main(["--baseline", str(tmp_path)]) == 1
     assert "NOT met" in capsys.readouterr().out
