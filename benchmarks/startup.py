@@ -11,7 +11,7 @@ resident memory that twenty simulators leave behind, and four closed ones of a c
 Times are wall and CPU seconds, those of a whole process with Python's start; a warm one is the median over rounds.
 --baseline: another version's folder, measured in turns in the same run with its own cache; the limits compare with it, those of
 warm processes and of how fast kernels are (a beam of 34,560 tets, sheets that land) by the median of the ratio over rounds. It
-takes six minutes then. Exit status: 0, or 1 where a limit is not met or a process failed.
+takes about eight minutes then. Exit status: 0, or 1 where a limit is not met or a process failed.
 """
 
 import argparse
