@@ -9,7 +9,7 @@ from taisoft.attributes import Guarded, SimulationAttributeError, thawed
 from taisoft.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
 from taisoft.errors import SceneError, SimulationError
 from taisoft.records import Energies
-from taisoft.scalars import ELASTIC, GRAVITY, KINETIC
+from taisoft.scalars import ELASTIC, GRAVITY, KINETIC, LOADS
 from taisoft.scene.changes import CHANGEABLE, changed_material
 from taisoft.settings import Settings, check_dt
 from taisoft.stability import stable_dt
@@ -49,6 +49,7 @@ class StateAccess(Guarded):
     _read_only = frozenset(("settings", "scene", "plan"))
     _instead = INSTEAD
     settings: Settings
+    _changes: int = 0  # of the state and of numbers, from outside: the energy then jumps
     _world: World | None = None
     _contact: "ContactStep | None"
     _idle_detection: "Detection | None"
@@ -84,6 +85,7 @@ class StateAccess(Guarded):
             v[rows] = velocities
             v[world.motion.constrained()] = 0.0
         world.set_state(x, v)
+        self._changes += 1
         self._stepper.forget()
 
     def energies(self) -> Energies:
@@ -91,7 +93,7 @@ class StateAccess(Guarded):
         model = self._open_world().model
         measure(model)
         scalars = model.scalars.to_numpy().tolist()
-        return Energies(kinetic=scalars[KINETIC], elastic=scalars[ELASTIC], gravity=scalars[GRAVITY])
+        return Energies(scalars[KINETIC], scalars[ELASTIC], scalars[GRAVITY], scalars[LOADS])
 
     def reactions(self, body: str | None = None) -> np.ndarray:
         """(n_nodes, 3) force of the constraint on each fixed or moved node in the last step [N], else 0."""
@@ -114,6 +116,7 @@ class StateAccess(Guarded):
         scene = self._open_world().scene
         with thawed(scene):
             scene.set_contact(name_a, name_b, friction=friction, restitution=restitution)
+        self._changes += 1
         if self._contact is not None:
             self._contact.numbers_changed()
 
@@ -233,6 +236,7 @@ class StateAccess(Guarded):
         if self.settings.explicit:
             self._check_stability(value, stacklevel=4)
         self._time_base = (self.time, self.step_count)
+        self._changes += 1
         self._dt = value
 
     @property
@@ -248,6 +252,7 @@ class StateAccess(Guarded):
         with thawed(self.scene):
             self.scene.gravity = gravity
         self._load_gravity()
+        self._changes += 1
         self._stepper.numbers_changed()
 
     def _load_gravity(self) -> None:
@@ -270,6 +275,7 @@ class StateAccess(Guarded):
             with thawed(self.scene.bodies[k]):
                 self.scene.bodies[k].material, self._stable_dt = old, old_limit
             raise
+        self._changes += 1
         world.upload_material("density" in numbers)
         if "density" in numbers:  # a total force is spread by mass: the shares stay, but for their rounding
             self._upload_loads()

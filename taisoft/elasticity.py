@@ -28,7 +28,7 @@ from taisoft.mass import mass_times
 from taisoft.materials.projection import dpk1_projected, prepare_projected
 from taisoft.math3 import determinant, matmul_nt, matmul_tn
 from taisoft.runtime import kernel
-from taisoft.scalars import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, MIN_J, N_INVERTED
+from taisoft.scalars import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, LOADS, MIN_J, N_INVERTED
 
 HUGE = 1e30  # above any volume ratio
 NO_TET = 2**31 - 1  # above any number of a tet
@@ -162,7 +162,7 @@ def _lane_min(values):
 def measure(m: ti.template()):
     """Energies and volume ratios of the present state, in f64 with sums in a fixed order.
 
-    scalars: ELASTIC, MIN_J, N_INVERTED, KINETIC, GRAVITY, and FIRST_SOFTENED, NO_TET where there is none.
+    scalars: ELASTIC, MIN_J, N_INVERTED, KINETIC, GRAVITY, LOADS, and FIRST_SOFTENED, NO_TET where there is none.
     """
     ti.loop_config(serialize=m.serial)
     for c in range(m.chunks):
@@ -183,16 +183,18 @@ def measure(m: ti.template()):
         m.partial[c, ELASTIC] = _lane_sum(energy)
         m.partial[c, MIN_J] = _lane_min(lowest)
         m.partial[c, N_INVERTED] = ti.cast(_lane_sum(inverted), ti.f64)
-        kinetic, gravity = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        kinetic, gravity, loads = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         size_n = (m.n_nodes + m.chunks - 1) // m.chunks
         for i in range(c * size_n, ti.min(m.n_nodes, (c + 1) * size_n)):
             kinetic += 0.5 * ti.cast(m.v[i], ti.f64).dot(mass_times(m, i, m.v))
             gravity -= ti.cast(m.weight[i], ti.f64) * ti.cast(m.gravity[0], ti.f64).dot(m.x[i])
-        m.partial[c, KINETIC], m.partial[c, GRAVITY] = kinetic, gravity
+            if ti.static(m.loaded):
+                loads -= ti.cast(m.loads[i], ti.f64).dot(m.x[i])
+        m.partial[c, KINETIC], m.partial[c, GRAVITY], m.partial[c, LOADS] = kinetic, gravity, loads
         m.partial[c, FIRST_SOFTENED] = ti.cast(_lane_min(squeezed), ti.f64)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        for k in ti.static((ELASTIC, MIN_J, N_INVERTED, KINETIC, GRAVITY, FIRST_SOFTENED)):
+        for k in ti.static((ELASTIC, MIN_J, N_INVERTED, KINETIC, GRAVITY, LOADS, FIRST_SOFTENED)):
             total = m.partial[0, k]
             for c in range(1, m.chunks):
                 value = m.partial[c, k]

@@ -29,6 +29,7 @@ class Loading(StateAccess):
     def _set_load(self, kind: str, body: str, index: int, value) -> None:
         self._open_world()
         changed_load(self.scene.bodies[self._index(body)], kind, index, value)
+        self._changes += 1
         self._upload_loads()
         self._loads_changed()
 
@@ -56,6 +57,7 @@ class Loading(StateAccess):
         """End the pull; does nothing where nothing is pulled."""
         self._open_world()
         if self._pull is not None and self._pull.let_go():
+            self._changes += 1
             self._loads_changed()
 
     @property
@@ -67,6 +69,12 @@ class Loading(StateAccess):
     def pulled(self) -> Grip | None:
         """What is pulled now, with the point [m] and the force [N] of the last step's start; None where nothing is."""
         return self._pull.grip if self._pull is not None else None
+
+    @property
+    def _driven(self) -> bool:
+        """Whether something else than the scene's own forces does work now: a pull, led nodes, obstacles that move."""
+        moving = self._contact is not None and any(obstacle.path is not None for obstacle in self.scene.obstacles)
+        return moving or self.pulled is not None or not all(self._kept_world().motion.released())
 
     def _loads_changed(self) -> None:
         """Explicit steps may rest on an acceleration with the old ones."""

@@ -5,15 +5,16 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Energies:
-    """Energies of a state [J]; elastic is 0 at rest, gravity is -sum m g.x, 0 at the origin."""
+    """Energies of a state [J]; elastic is 0 at rest, gravity is -sum m g.x and loads -sum f.x, 0 at the origin."""
 
     kinetic: float
     elastic: float
     gravity: float
+    loads: float = 0.0  # of forces and tractions, and of a pull as it is now
 
     @property
     def total(self) -> float:
-        """Kinetic + elastic + gravity [J]."""
+        """Kinetic + elastic + gravity [J], without loads."""
         return self.kinetic + self.elastic + self.gravity
 
 
@@ -39,6 +40,7 @@ class StepReport:
     kinetic: float = 0.0  # [J]
     elastic: float = 0.0  # [J]
     gravity: float = 0.0  # [J]
+    loads: float = 0.0  # [J] of dead loads: -sum f.x
     converged: bool = True
     problems: list[str] = field(default_factory=list)
 

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from taisoft.energy_check import EnergyCheck
 from taisoft.errors import SimulationError, no_memory
 from taisoft.records import RunReport, StepReport
 from taisoft.settings import check_positive
@@ -42,14 +43,16 @@ def run(
     start_count, start_time = sim.step_count, sim.time
     behind = round(sim.time / sim.dt) if resumed else 0  # steps of this dt
     zero = start_count - behind
+    energy: EnergyCheck | None = None
     try:
+        energy = EnergyCheck(sim)
         frame, over = divmod(behind, steps_per_frame)
         if on_frame is not None and not over:
             on_frame(sim, frame, None)
         while sim.step_count - zero < total and not report.interrupted:
             frame += 1
             goal = min(total, frame * steps_per_frame)
-            merged = _advance_to(sim, zero + goal, stop, report, on_step)
+            merged = _advance_to(sim, zero + goal, stop, report, on_step, energy)
             if merged is None:
                 break
             if sim.settings.explicit:
@@ -66,6 +69,8 @@ def run(
     report.wall_seconds = time.perf_counter() - clock - (sim.compile_seconds - compiled)
     report.compile_seconds = sim._take_compile_seconds()
     _judge(report)
+    if energy is not None:
+        energy.judge(report)
     end = seconds if resumed else start_time + seconds
     if report.status != "failed" and not report.interrupted and abs(sim.time - end) > (1.0 + ROUNDING) * max(sim.dt, report.dt):
         report.problems.append(
@@ -143,7 +148,7 @@ def dt_sentence(report: RunReport) -> str:
 
 
 def _advance_to(
-    sim: "Simulator", goal: int, stop, report: RunReport, on_step: StepCallback | None
+    sim: "Simulator", goal: int, stop, report: RunReport, on_step: StepCallback | None, energy: EnergyCheck
 ) -> StepReport | None:
     """Step up to a step count. Explicit batches are merged into one report; implicit steps are listed one by one.
 
@@ -154,7 +159,9 @@ def _advance_to(
         if stop is not None and stop():
             _interrupt(report)
             break
+        energy.before_step()
         one = timed_advance(sim, goal - sim.step_count, on_step)
+        energy.after_step(one)
         if sim.settings.explicit:
             merged = one if merged is None else _merge(merged, one)
         else:

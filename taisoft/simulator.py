@@ -17,7 +17,7 @@ from taisoft.model import build_model
 from taisoft.records import RunReport, StepReport
 from taisoft.resuming import Resuming
 from taisoft.running import run
-from taisoft.scalars import FIRST_SOFTENED, GRAVITY
+from taisoft.scalars import FIRST_SOFTENED, LOADS
 from taisoft.scene.scene import Scene
 from taisoft.settings import check_count, check_settings, plan_of
 from taisoft.stability import scale_warnings
@@ -231,6 +231,7 @@ class Simulator(Resuming):
         """Back to the scene's start; changed numbers (dt, gravity, materials, loads) stay. Copies arrays; compiles nothing."""
         self._open_world().restart()
         self.release()
+        self._changes += 1
         self._time_base = (0.0, 0)
         self._stepper.forget()
 
@@ -250,6 +251,7 @@ class Simulator(Resuming):
         new._stepper.forget()
         new._time_base, new._given = (self.time, self.step_count), self._given
         new._compiled_before, new._compile_reported = self._compiled_before, self._compile_reported
+        new._changes = self._changes + 1
         self._release()
         _, give_back, owned, _ = new._release.detach()
         self.__dict__.update(new.__dict__)
@@ -263,7 +265,7 @@ class Simulator(Resuming):
 
     def _report(self) -> StepReport:
         measure(self._world.model)
-        elastic, lowest, inverted, kinetic, gravity = self._world.model.scalars.to_numpy()[: GRAVITY + 1].tolist()
+        elastic, lowest, inverted, kinetic, gravity, _, loads = self._world.model.scalars.to_numpy()[: LOADS + 1].tolist()
         return StepReport(
             time=self.time,
             min_volume_ratio=lowest,
@@ -271,6 +273,7 @@ class Simulator(Resuming):
             kinetic=kinetic,
             elastic=elastic,
             gravity=gravity,
+            loads=loads,
         )
 
     # --- life ---------------------------------------------------------------------------------------------------------

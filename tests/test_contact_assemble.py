@@ -168,11 +168,11 @@ def test_warm_start(begun):
 @kernel
 def find_goals(
     f: ti.template(), dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64, force: ti.f64,
-    out: ti.types.ndarray(),
+    kicked: ti.f64, out: ti.types.ndarray(),
 ):  # fmt: skip
-    """force: what the explicit step's forces change the velocity by [m/s]."""
+    """force: what the explicit step's forces change the velocity by [m/s], a share `kicked` of it before the impact."""
     for c in range(f.problem.count[0]):
-        rise = explicit_rise(f, c, dt, standoff, f.approach[c] + force)
+        rise = explicit_rise(f, c, dt, standoff, f.approach[c] + force, kicked)
         out[c] = short_of_goal(f, c, dt, standoff, fast, slow, fastest, rise)
 
 
@@ -215,14 +215,17 @@ def test_how_far_a_contact_is_from_its_goal(found, fast, slow):
     found.problem.count[0] = len(cases)
     out = np.zeros(len(cases))
     fill_field(found.body, np.tile([0, 1], (len(cases), 1)))
-    find_goals(found, dt, h, fast, slow, fastest, 0.0, out)
+    find_goals(found, dt, h, fast, slow, fastest, 0.0, 0.0, out)
     assert np.abs(out - expected).max() < 1e-15
-    find_goals(found, dt, h, fast, slow, fastest, -0.2, out)  # pressed on: what the forces take is not given back
+    find_goals(found, dt, h, fast, slow, fastest, -0.2, 0.0, out)  # pressed on: what the forces take is not given back
     less = np.where((restitution > 0) & (expected == -dt * restitution * np.abs(approach)), 0.2 * dt, 0.0)
     later = np.array([k == 6 for k in range(len(cases))])  # these forces make it meet
     assert np.abs(out - np.where(later, -(0.35 - 0.2) * dt, expected + less)).max() < 1e-15 and (less > 0).sum() == 3
+    find_goals(found, dt, h, fast, slow, fastest, -0.2, 0.5, out)  # half of it comes before the impact, and is thrown back, too
+    back = np.where(less > 0, (0.1 - 0.1 * restitution) * dt, 0.0)
+    assert np.abs(out - np.where(later, -(0.4 - 0.1) * dt, expected + back)).max() < 1e-15
     fill_field(found.body, np.ones((len(cases), 2), dtype=int))  # of a body with itself: the same with other numbers
-    find_goals(found, dt, h / OWN, fast / OWN, slow / OWN, fastest, 0.0, out)
+    find_goals(found, dt, h / OWN, fast / OWN, slow / OWN, fastest, 0.0, 0.0, out)
     assert np.abs(out - expected).max() < 1e-15
 
 

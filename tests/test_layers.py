@@ -35,7 +35,7 @@ ORDER = (
     ("linear",),
     ("collision", "contact"),
     ("stepping",),
-    ("simulator", "access", "settings", "running", "static", "checkpoint", "loading", "resuming"),
+    ("simulator", "access", "settings", "energy_check", "running", "static", "checkpoint", "loading", "resuming"),
     ("output", "view"),
     ("study",),
     ("cli",),

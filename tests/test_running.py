@@ -16,7 +16,7 @@ import pytest
 from scenes import cube, element, rubber
 
 import taisoft as ts
-from taisoft.records import StepReport
+from taisoft.records import Energies, StepReport
 from taisoft.running import first_frame, run
 
 
@@ -24,9 +24,13 @@ class StandIn:
     """Counts steps; `events` maps a step to what happens in it: an exception, or fields of its report."""
 
     def __init__(self, explicit: bool, dt: float = 0.01, events=None, largest_batch: int = 4):
-        self.settings, self.touches = SimpleNamespace(explicit=explicit), False
+        self.settings, self.touches = SimpleNamespace(explicit=explicit, integrator="symplectic_euler"), False
         self.dt, self.step_count, self.time, self.compile_seconds = dt, 0, 0.0, 0.0
         self.events, self.largest_batch = events or {}, largest_batch
+        self.scene, self.stable_dt, self._driven, self._changes = ts.Scene(), 1.0, False, 0
+
+    def energies(self) -> Energies:
+        return Energies(0.0, 0.0, 0.0)
 
     def _take_compile_seconds(self) -> float:
         return self.compile_seconds

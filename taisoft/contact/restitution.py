@@ -4,8 +4,11 @@ Newton's law, u+ = -e u-, is an event between two velocities at one place. A ste
 left that gravity still closes, and x moves with the velocity after the impact from there. Taken literally, the law then lifts the
 bodies by what they did not fall: energy comes from nowhere. So
 
-* explicit steps apply the law to the velocity at the start, and let the forces of the step act on the velocity after it:
-      u >= -e u_n + (u* - u_n),   u* the velocity that the step would reach without impulses;
+* explicit steps apply the law to the velocity of the time that x_n belongs to, and let what is left of the step's forces act on
+  the velocity after it:
+      u >= -e u_s + (u* - u_s),   u* the velocity that the step would reach without impulses.
+  In velocity Verlet u_s = u_n. In symplectic Euler v_n belongs to t_n - dt/2 (it is the leapfrog scheme), so u_s = (u_n + u*)/2.
+  With e = 1 the velocity turns round at x_n, which leaves the energy that the scheme keeps, even in v_s, as it is;
 * implicit steps have an impact first (`taisoft.stepping.impact`), that leaves contacts with the speed w,
       w^2 = e^2 (u_n^2 + L + 2 a room) - 2 a room,
   room the gap less the standoff, a >= 0 the acceleration with which gravity closes it: e^2 of the energy that the surfaces would
@@ -26,9 +29,12 @@ NEGLIGIBLE_RISE = 0.01  # of the standoff: a rebound that opens less in a step i
 
 
 @ti.func
-def explicit_rise(f: ti.template(), c, dt, common_standoff, free):
-    """How far contact c must open in an explicit step for its restitution [m], 0 without; free: u* along the normal [m/s]."""
-    rise, u = ti.cast(0.0, ti.f64), f.approach[c]
+def explicit_rise(f: ti.template(), c, dt, common_standoff, free, kicked):
+    """How far contact c must open in an explicit step for its restitution [m], 0 without; free: u* along the normal [m/s].
+
+    kicked: share of the step's change of the velocity, u* - u_n, that comes before the impact.
+    """
+    rise, u = ti.cast(0.0, ti.f64), (1.0 - kicked) * f.approach[c] + kicked * free
     if f.restitution[c] > 0.0 and u < 0.0 and f.gap[c] - standoff_of(f, c, common_standoff) + dt * free < 0.0:
         rise = ti.max(0.0, dt * (free - u - f.restitution[c] * u))
     return rise

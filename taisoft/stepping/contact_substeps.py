@@ -125,7 +125,7 @@ class ContactExplicitStepper(ExplicitStepper):
         result = None
         if n:
             p = contact.problem
-            set_free_velocities(m, contact.found, dt, *contact.goal)
+            set_free_velocities(m, s, contact.found, dt, *contact.goal)
             find_factors(p)
             if self.method == "coloured_gauss_seidel":
                 colour_contacts(p)

@@ -70,9 +70,11 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
 
 @kernel
 def set_free_velocities(
-    m: ti.template(), f: ti.template(), dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64
+    m: ti.template(), s: ti.template(), f: ti.template(), dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64,
+    fastest: ti.f64,
 ):  # fmt: skip
     """b of every contact from v*, and the inverse masses."""
+    kicked = ti.static(0.0 if s.verlet else 0.5)
     (p,) = ti.static((f.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -83,7 +85,7 @@ def set_free_velocities(
         for j in range(p.arity[c]):
             v += p.weight[c, j] * ti.cast(m.v[p.node[c, j]], ti.f64)
         b = to_frame(p, c, v)
-        rise = explicit_rise(f, c, dt, standoff, b[0])
+        rise = explicit_rise(f, c, dt, standoff, b[0], kicked)
         p.b[c] = dvec(b[0] + short_of_goal(f, c, dt, standoff, fast, slow, fastest, rise) / dt, b[1], b[2])
 
 
