@@ -40,6 +40,8 @@ def run(
     clock = time.perf_counter()
     steps_per_frame = _fit_dt(sim, fps, report)
     total = max(1, round(seconds / sim.dt))
+    if not resumed and seconds < 0.5 * sim.dt:
+        report.problems.append(f"note: {seconds:.6g} s are less than half a step: one of {sim.dt:.6g} s is taken")
     start_count, start_time = sim.step_count, sim.time
     behind = round(sim.time / sim.dt) if resumed else 0  # steps of this dt
     zero = start_count - behind
