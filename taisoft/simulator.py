@@ -306,7 +306,7 @@ class Simulator(Resuming):
         """Give memory and runtime back; a closed simulator cannot be used."""
         if self._world is not None:
             self._release()
-            self._world = None
+            self._world = self._stepper = self._contact = self._idle_detection = self._tangent = self._pull = None
 
     def __enter__(self) -> "Simulator":
         return self
