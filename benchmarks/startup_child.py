@@ -139,13 +139,13 @@ def grow(name: str, cells: int, times: int) -> dict:
 
 
 def keep(cells: int, times: int) -> dict:
-    """The same of simulators of a cube that are closed while something still refers to them."""
+    """The same of simulators of one cube that are closed while something still refers to them."""
     build, arguments = SCENES["cube"]
-    kept, start = [], 0.0
+    scene, kept, start = build(cells), [], 0.0
     for _ in range(2 + times):
         if len(kept) == 2:
             start = memory()
-        with ts.Simulator(build(cells), **arguments) as sim:
+        with ts.Simulator(scene, **arguments) as sim:
             sim.advance(1)
         kept.append(sim)
     return {"start": start, "end": memory(), "times": times}
