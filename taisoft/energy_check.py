@@ -4,7 +4,7 @@ friction only take from it.
 From a state on that nothing feeds, their sum E may not rise. A rise is judged by the energy that the motion can hold: kinetic and
 elastic energy at the start, and the most that gravity and loads have given off since. The start is set anew where
 something else feeds energy in: nodes on paths, obstacles that move, a pull, a change from outside, an overlap that is mended.
-Bodies that touch at the start may open to the standoff of contacts, too.
+Bodies that touch at the start may open to the contact offset, too.
 
 Explicit steps keep another energy, H, that of a linear motion of frequencies w <= 2 q / dt, q = dt / stable_dt:
     velocity Verlet:   H = E - |f dt/2|^2 / 2m,   between E - q^2 U and E;
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 CREATED = 0.1  # of the energy that the motion can hold: a larger rise is reported
 STRAIN, LIFT = 1e-4, 1e-2  # bodies at rest hold the energy of this strain, and of a lift by this share of their size: rounding
-OPENED = 2.0  # times the standoff by which contacts squeeze and lift bodies that touch at the start: from two sides
+OPENED = 2.0  # times the contact offset by which contacts squeeze and lift bodies that touch at the start: from two sides
 
 
 class EnergyCheck:

@@ -72,7 +72,7 @@ class Loading(StateAccess):
 
     @property
     def _driven(self) -> bool:
-        """Whether something else than the scene's own forces does work now: a pull, led nodes, obstacles that move."""
+        """Whether something else than the scene's own forces does work now: a drag, prescribed nodes, obstacles that move."""
         moving = self._contact is not None and any(obstacle.path is not None for obstacle in self.scene.obstacles)
         return moving or self.pulled is not None or not all(self._kept_world().motion.released())
 

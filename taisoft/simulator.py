@@ -3,7 +3,6 @@
 import dataclasses
 import warnings
 import weakref
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,9 +24,6 @@ from taisoft.stepping import make_stepper
 from taisoft.stepping.motion import Motion
 from taisoft.stepping.pull import Pull, batch
 from taisoft.stepping.world import World
-
-if TYPE_CHECKING:
-    pass
 
 
 def _release(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:

@@ -11,8 +11,9 @@ import numpy as np
 import taisoft as ts
 from taisoft import compile_message
 from taisoft.cli import warm_scenes
-from taisoft.cli.warm_scenes import EXPLICIT, Structure
+from taisoft.cli.warm_scenes import Structure
 from taisoft.runtime import n_compiled
+from taisoft.stepping import EXPLICIT
 
 STEPS = {True: (1e-5, 200), False: (1e-2, 10)}  # of explicit and implicit integrators: dt [s], and how many
 LONG = 1.0  # [s]

@@ -14,9 +14,9 @@ from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene.key_frames import KeyFrames
 from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle
 from taisoft.scene.scene import LAWS, Material, Scene
+from taisoft.stepping import EXPLICIT
 
-EXPLICIT = ("symplectic_euler", "velocity_verlet")
-IMPLICIT = ("implicit_euler", "bdf2")
+IMPLICIT = ("implicit_euler", "bdf2")  # of those, the common ones
 STATIC = ""  # in place of an integrator
 SIZE = 0.1  # [m] of a cube
 SPEED = 2.0  # [m/s] of what falls: so hard that the steps of a collision are tried again

@@ -125,7 +125,7 @@ class Body(Guarded):
 
     @property
     def material(self) -> Material:
-        """What the body is made of; setting it raises SceneError for what is no Material, and warns as `tell_locking` does."""
+        """What the body is made of; setting it raises SceneError for what is no Material, and warns where linear tets lock."""
         return self._material
 
     @material.setter
@@ -143,7 +143,7 @@ class Body(Guarded):
 
     @position.setter
     def position(self, value) -> None:
-        self._position = checks.array(value, f"body {self.name!r}: position", ((3,),))
+        self._position = self._checked_position(value)
 
     @property
     def velocity(self) -> np.ndarray:
@@ -152,12 +152,18 @@ class Body(Guarded):
 
     @velocity.setter
     def velocity(self, value) -> None:
-        self._velocity = checks.array(value, f"body {self.name!r}: velocity", ((3,), (self.n_nodes, 3)))
+        self._velocity = self._checked_velocity(value)
+
+    def _checked_position(self, value) -> np.ndarray:
+        return checks.array(value, f"body {self.name!r}: position", ((3,),))
+
+    def _checked_velocity(self, value) -> np.ndarray:
+        return checks.array(value, f"body {self.name!r}: velocity", ((3,), (self.n_nodes, 3)))
 
     def check(self) -> None:
         """Raises SceneError for what was written into the arrays of position and velocity and could not have been set."""
-        checks.array(self.position, f"body {self.name!r}: position", ((3,),))
-        checks.array(self.velocity, f"body {self.name!r}: velocity", ((3,), (self.n_nodes, 3)))
+        self._checked_position(self.position)
+        self._checked_velocity(self.velocity)
 
     @property
     def collision(self) -> str:
