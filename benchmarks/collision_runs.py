@@ -155,7 +155,7 @@ class Rig:
     def place(self, share: float) -> None:
         """Put the nodes where the motion has them, `share` of the film done."""
         x = start(self.scene) if self.setup.motion is None else self.setup.motion(self.scene, share)
-        self.model.x.from_numpy(x)
+        self.model.state.x.from_numpy(x)
 
     def search(self) -> None:
         """A whole search."""

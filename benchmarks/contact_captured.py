@@ -17,8 +17,8 @@ from taisoft.contact import SOLVERS, host
 from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.problem import NODES, ContactProblem
 from taisoft.contact.solve import solve
-from taisoft.stepping import contact_substeps
-from taisoft.stepping.contact_substeps import MAX_SWEEPS
+from taisoft.dynamics import contact_substeps
+from taisoft.dynamics.contact_substeps import MAX_SWEEPS
 
 GOAL = 1e-4  # residual, that of explicit steps in f32
 SERIAL, COLOURED = "gauss_seidel", "coloured_gauss_seidel"

@@ -15,7 +15,7 @@ import numpy as np
 import taisoft as ts
 from taisoft.cli.scene_file import load_scene
 from taisoft.contact.problem import ContactProblem
-from taisoft.stepping import contact_substeps
+from taisoft.dynamics import contact_substeps
 
 from .contact_captured import GOAL, Outcome, Solvers, clock, make_judge, patched, shown
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 
 import taisoft as ts
+from taisoft.dynamics import EXPLICIT
 from taisoft.output.tables import markdown, percent, spread_of
-from taisoft.stepping import EXPLICIT
 from taisoft.study.stretch import advance, warm_up
 from taisoft.timing import Timing, summarise
 

@@ -13,9 +13,9 @@ from time import perf_counter
 import numpy as np
 
 import taisoft as ts
+from taisoft.dynamics import EXPLICIT
 from taisoft.errors import SimulationError
 from taisoft.scene.scene import Scene
-from taisoft.stepping import EXPLICIT
 from taisoft.study.stretch import Stretch, advance, warm_up
 from taisoft.timing import Timing, summarise
 

@@ -21,6 +21,7 @@ import taichi as ti
 
 import taisoft as ts
 from taisoft import model, simulator
+from taisoft.dynamics import stage_system
 from taisoft.elasticity import HUGE, elastic_forces, element_force
 from taisoft.elements.lanes import broadcast
 from taisoft.linear import block_csr, pcg
@@ -28,7 +29,6 @@ from taisoft.output.report import peak_memory
 from taisoft.runtime import compile_clock, kernel, open_runtime, threads
 from taisoft.scalars import LOWEST_J
 from taisoft.scene.scene import Scene
-from taisoft.stepping import contact_newton, newton
 from taisoft.study.stretch import advance, warm_up
 from taisoft.timing import Timing, summarise
 
@@ -164,7 +164,7 @@ def repeat_elements(m: ti.template(), n: ti.i32):
             for g in ti.static(m.groups):
                 for b in range(g.first, g.last):
                     low = ti.min(low, element_force(m, g, False, b))
-        m.scalars[LOWEST_J] = low[0]
+        m.state.scalars[LOWEST_J] = low[0]
 
 
 def _element_seconds(sim: ts.Simulator, n: int) -> float:
@@ -204,14 +204,14 @@ def implicit_contact(row: Row, size: int) -> None:
 def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
     """Where the parts of the simulator's implicit steps are called, for `Stopwatch.on`."""
     places = [
-        ("residual", newton, "form_residual"), ("residual", contact_newton, "form_residual"),
-        ("residual", contact_newton, "evaluate"), ("matrix", block_csr, "assemble"), ("matrix", block_csr, "to_system"),
-        ("matrix", contact_newton, "keep_diagonal"), ("linear solve", pcg, "solve"), ("report", simulator, "measure"),
+        ("residual", stage_system, "move"), ("residual", stage_system, "press"), ("residual", stage_system, "form_residual"),
+        ("matrix", block_csr, "assemble"), ("matrix", block_csr, "to_system"), ("matrix", stage_system, "keep_diagonal"),
+        ("linear solve", pcg, "solve"), ("report", simulator, "measure"),
     ]  # fmt: skip
     contact = sim._contact
     if contact is not None:
         places += [("search", contact.detection, "find"), ("search", contact, "_survey"), ("problem", contact, "begin")]
-        places.append(("problem", contact_newton, "find_factors"))
+        places.append(("problem", stage_system, "find_factors"))
     return places
 
 
@@ -219,7 +219,7 @@ def _end_implicit(row: Row, sim: ts.Simulator, watch: Stopwatch) -> None:
     """Bytes of an implicit step: those of its residuals, matrices and iterations of CG without what contacts add."""
     fields, steps = sim.field_bytes, len(row.samples)
     row.field_bytes = group_bytes(sim)
-    residuals, matrices = watch.calls["form_residual"] + watch.calls["evaluate"], watch.calls["assemble"]
+    residuals, matrices = watch.calls["form_residual"], watch.calls["assemble"]
     row.counts |= {"residuals": residuals / steps, "matrices": matrices / steps}
     row.moved = (
         row.counts["residuals"] * floor_bytes(("elements", "residual"), fields)

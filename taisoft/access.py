@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taisoft.attributes import Guarded, SimulationAttributeError, thawed
+from taisoft.dynamics.world import World
 from taisoft.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
 from taisoft.errors import SceneError, SimulationError
 from taisoft.records import Energies
@@ -13,14 +14,13 @@ from taisoft.scalars import ELASTIC, GRAVITY, KINETIC, LOADS
 from taisoft.scene.changes import CHANGEABLE, changed_material
 from taisoft.settings import Settings, check_dt
 from taisoft.stability import stable_dt
-from taisoft.stepping.world import World
 from taisoft.transfer import upload
 
 if TYPE_CHECKING:
     from taisoft.collision.contacts import Contacts
     from taisoft.collision.overlap import Overlap
     from taisoft.collision.pipeline import Detection
-    from taisoft.stepping.contact import ContactStep
+    from taisoft.dynamics.contact import ContactStep
 
 _REBUILT = (
     "integrator", "contact_solver", "self_collision", "allow_unstable", "newton_tolerance", "linear_tolerance",
@@ -92,7 +92,7 @@ class StateAccess(Guarded):
         """Energies of the present state [J]."""
         model = self._open_world().model
         measure(model)
-        scalars = model.scalars.to_numpy().tolist()
+        scalars = model.state.scalars.to_numpy().tolist()
         return Energies(scalars[KINETIC], scalars[ELASTIC], scalars[GRAVITY], scalars[LOADS])
 
     def reactions(self, body: str | None = None) -> np.ndarray:

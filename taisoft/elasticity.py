@@ -36,7 +36,7 @@ NO_TET = 2**31 - 1  # above any number of a tet
 
 @ti.func
 def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
-    """Corner forces of block b of group g from x (and from v, where the stiffness damping -c K(x) v is on).
+    """Nodal forces of block b of group g from x (and from v, where the stiffness damping -c K(x) v is on).
 
     Returns the least J = det F over each tet's quadrature points.
     """
@@ -46,7 +46,7 @@ def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
     S = no_forces(m, g)
     lowest = broadcast(ti.cast(HUGE, m.real), m.lanes)
     if ti.static(damped):
-        V = differences(m, g, m.v, b, m.real)
+        V = differences(m, g, m.state.v, b, m.real)
         c = broadcast(m.damping[m.block_body[b], 1], m.lanes)
         for q in range(g.n_points):
             F = deformation_gradient(m, g, X, N, q)
@@ -77,7 +77,7 @@ def count_inverted(m: ti.template(), b, J):
 
 @kernel
 def elastic_forces(m: ti.template()):
-    """Fill the corner buffer from x; returns nothing, nodes gather."""
+    """Fill the buffer of tets' forces from x; returns nothing, nodes gather."""
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
         for b in range(g.first, g.last):
@@ -109,7 +109,7 @@ def force_differential(m: ti.template(), dx: ti.template(), df: ti.template()):
 
 @kernel
 def gather_forces(m: ti.template(), f: ti.template()):
-    """f = sum of corner forces (n_nodes) [N]."""
+    """f = sum of the tets' forces (n_nodes) [N]."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         f[i] = gather(m, i)
@@ -122,7 +122,7 @@ def element_state(m: ti.template(), g: ti.template(), b):
 
     It is where F^T F - s^2 I is not positive definite, which its leading minors tell.
     """
-    X = differences(m, g, m.x, b, ti.f64)
+    X = differences(m, g, m.state.x, b, ti.f64)
     M = rest_gradients(m, b, ti.f64)
     p = law_constants(m, b, ti.f64)
     V = volumes(m, b, ti.f64)
@@ -180,29 +180,29 @@ def measure(m: ti.template()):
                 inverted += count_inverted(m, b, J)
                 tets = ti.Vector([b * m.lanes + q for q in ti.static(range(m.lanes))])
                 squeezed = ti.min(squeezed, ti.select(soft == 1, tets, none))
-        m.partial[c, ELASTIC] = _lane_sum(energy)
-        m.partial[c, MIN_J] = _lane_min(lowest)
-        m.partial[c, N_INVERTED] = ti.cast(_lane_sum(inverted), ti.f64)
+        m.state.partial[c, ELASTIC] = _lane_sum(energy)
+        m.state.partial[c, MIN_J] = _lane_min(lowest)
+        m.state.partial[c, N_INVERTED] = ti.cast(_lane_sum(inverted), ti.f64)
         kinetic, gravity, loads = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         size_n = (m.n_nodes + m.chunks - 1) // m.chunks
         for i in range(c * size_n, ti.min(m.n_nodes, (c + 1) * size_n)):
-            kinetic += 0.5 * ti.cast(m.v[i], ti.f64).dot(mass_times(m, i, m.v))
-            gravity -= ti.cast(m.weight[i], ti.f64) * ti.cast(m.gravity[0], ti.f64).dot(m.x[i])
+            kinetic += 0.5 * ti.cast(m.state.v[i], ti.f64).dot(mass_times(m, i, m.state.v))
+            gravity -= ti.cast(m.weight[i], ti.f64) * ti.cast(m.gravity[0], ti.f64).dot(m.state.x[i])
             if ti.static(m.loaded):
-                loads -= ti.cast(m.loads[i], ti.f64).dot(m.x[i])
-        m.partial[c, KINETIC], m.partial[c, GRAVITY], m.partial[c, LOADS] = kinetic, gravity, loads
-        m.partial[c, FIRST_SOFTENED] = ti.cast(_lane_min(squeezed), ti.f64)
+                loads -= ti.cast(m.loads[i], ti.f64).dot(m.state.x[i])
+        m.state.partial[c, KINETIC], m.state.partial[c, GRAVITY], m.state.partial[c, LOADS] = kinetic, gravity, loads
+        m.state.partial[c, FIRST_SOFTENED] = ti.cast(_lane_min(squeezed), ti.f64)
     ti.loop_config(serialize=True)
     for _ in range(1):
         for k in ti.static((ELASTIC, MIN_J, N_INVERTED, KINETIC, GRAVITY, LOADS, FIRST_SOFTENED)):
-            total = m.partial[0, k]
+            total = m.state.partial[0, k]
             for c in range(1, m.chunks):
-                value = m.partial[c, k]
+                value = m.state.partial[c, k]
                 if ti.static(k == MIN_J or k == FIRST_SOFTENED):
                     total = ti.min(total, value)
                 else:
                     total += value
-            m.scalars[k] = total
+            m.state.scalars[k] = total
 
 
 @kernel
@@ -211,7 +211,7 @@ def cauchy_stress(m: ti.template(), sigma: ti.types.ndarray()):
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
         for b in range(g.first, g.last):
-            X = differences(m, g, m.x, b, ti.f64)
+            X = differences(m, g, m.state.x, b, ti.f64)
             M = rest_gradients(m, b, ti.f64)
             p = law_constants(m, b, ti.f64)
             size = broadcast(ti.cast(0.0, ti.f64), m.lanes)  # sum of w_q J_q: the deformed volume over the rest volume

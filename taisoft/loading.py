@@ -1,9 +1,9 @@
 """Loads that change while a simulator runs: forces and tractions of the scene, and a pull, whose force is added to them."""
 
 from taisoft.access import StateAccess
+from taisoft.dynamics.pull import Grip, Pull
 from taisoft.errors import SimulationError
 from taisoft.scene.changes import changed_load
-from taisoft.stepping.pull import Grip, Pull
 
 
 class Loading(StateAccess):
@@ -45,7 +45,7 @@ class Loading(StateAccess):
         """Pull a point of a body towards target (3,) [m] by a damped spring, in place of what was pulled before.
 
         The point is the mean of nodes (k,) by weights (k,), which are made to sum to 1; stiffness [N/m]. The force is taken at
-        the start of every step; stiffness and force are limited as `taisoft.stepping.pull` says, and `pulled` tells both. Raises
+        the start of every step; stiffness and force are limited as `taisoft.dynamics.pull` says, and `pulled` tells both. Raises
         SimulationError unless the Simulator was made with pullable=True, SceneError for what is no point of the body.
         """
         self._open_world()

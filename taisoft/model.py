@@ -1,4 +1,4 @@
-"""Model: the arrays of a scene. One structure of arrays over all bodies, elements in blocks of SIMD lanes.
+"""Model: the arrays of a scene, beside its `State`. One structure of arrays over all bodies, elements in blocks of SIMD lanes.
 
 Laws, orders, flags and precision are structure, which kernels are compiled for; topology, rest shape and sizes are constant but
 run-time data, as are gravity, material numbers, loads and constraint masks. Nodes keep the order of the bodies and of their
@@ -19,8 +19,8 @@ from taisoft.mass import MassMatrix, lumped_masses, upload_mass_matrix, weight_m
 from taisoft.materials import LAWS
 from taisoft.node_graph import PAIRS, NodeGraph, node_graph
 from taisoft.runtime import Runtime, threads
-from taisoft.scalars import N_COLUMNS, N_SCALARS
 from taisoft.scene.scene import Material, Scene
+from taisoft.state import State, build_state
 from taisoft.transfer import download
 
 # Points, and threads of the CPU, from which parallel loops are taken instead of one serial kernel. With two threads they took 3.4
@@ -45,14 +45,14 @@ class Group:
     first: Count  # block
     last: Count  # one past its last block
     nodes_at: Count  # in Model.nodes
-    corner_at: Count  # in Model.corner
+    force_at: Count  # in State.element_force
     matrix_at: Count  # in the buffer of an assembly
     points_at: Count  # row of Model.points
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Arrays, their sizes (`Count`) and structure, which kernels take as one template argument."""
+    """Constant arrays, their sizes (`Count`) and structure, and the state: what kernels take as one template argument."""
 
     real: Any  # Taichi type of everything but positions
     strain_real: Any  # Taichi type in which the deformation gradient is formed
@@ -61,8 +61,7 @@ class Model:
     n_nodes: Count
     n_blocks: Count
     groups: tuple  # of Group
-    x: Any  # (n_nodes) 3-vectors f64: positions [m]
-    v: Any  # (n_nodes) 3-vectors: velocities [m/s]
+    state: State  # what moves
     nodes: Any  # i32: nodes of each tet, per block (node, lane); they ascend, corners before middles
     rules: tuple  # reference.Quadrature of the groups of order 2, one after the other
     points: Any  # (points, 28), or None: of these rules, the weight and dN_a/d(l_1, l_2, l_3) of nodes 1 to 9
@@ -70,11 +69,8 @@ class Model:
     volume: Any  # (n_blocks, lanes) [m^3]
     block_body: Any  # (n_blocks) i32
     law_constants: Any  # (n_bodies, 4)
-    corner: Any  # forces of each tet on its nodes [N], per block (node, axis, lane): a `Lanes` buffer,
-    corner_at: Count  # where it begins,
-    corner_mask: int  # and the bits of an index into it
     gather_start: Any  # (n_nodes + 1) i32: rows of gather_entry
-    gather_entry: Any  # i32: base index into corner of each node of each tet
+    gather_entry: Any  # i32: base index into State.element_force of each node of each tet
     mass: Any  # (n_nodes) lumped mass [kg]
     weight: Any  # (n_nodes) what gravity pulls at [kg]: the lumped mass, or int rho N_a dV
     mass_matrix: Any  # MassMatrix, or None: consistent mass
@@ -87,9 +83,7 @@ class Model:
     loaded: bool
     damped: bool
     stiffness_damping: bool
-    scalars: Any  # (N_SCALARS) f64: what kernels leave for the host, each in its place
-    partial: Any  # (chunks, N_COLUMNS) f64: partial sums, added in a fixed order
-    chunks: int
+    chunks: int  # parts of a loop, each with its partial sums
 
 
 @dataclass(frozen=True)
@@ -113,7 +107,7 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
     block_start = np.zeros(len(bodies), dtype=np.int64)
     kinds = sorted({(b.order, b.quadrature_degree, list(LAWS).index(b.material.law)) for b in bodies})
     rules = sorted({degree for order, degree, _ in kinds if order == 2})
-    groups, block, nodes_at, corner_at, matrix_at = [], 0, 0, 0, 0
+    groups, block, nodes_at, force_at, matrix_at = [], 0, 0, 0, 0
     for order, degree, law in kinds:
         first = block
         for k, body in enumerate(bodies):
@@ -125,11 +119,11 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
         groups.append(
             Group(
                 list(LAWS.values())[law], order, n_nodes, len(reference.quadrature(degree).weights), first, block,
-                nodes_at, corner_at, matrix_at, points_at,
+                nodes_at, force_at, matrix_at, points_at,
             )
         )  # fmt: skip
         nodes_at += count * n_nodes
-        corner_at += count * n_nodes * 3
+        force_at += count * n_nodes * 3
         matrix_at += (block - first) * MATRIX_BLOCKS[order] * 9
     rest = np.concatenate([b.rest_positions + b.position for b in bodies])
     node_start = np.concatenate([[0], np.cumsum([b.n_nodes for b in bodies])])
@@ -189,13 +183,13 @@ def _worst_condition(nodes, Dm_inv: np.ndarray, layout: Layout) -> float:
 
 
 def _gather_table(nodes, groups: tuple[Group, ...], real: np.ndarray, n_nodes: int, lanes: int):
-    """CSR from node to the corner-buffer entries of its tets, in block order."""
+    """CSR from node to the entries of the force buffer of its tets, in block order."""
     ids, entries = [], []
     for own, g in zip(nodes, groups):
         lane = np.flatnonzero(real[g.first * lanes : g.last * lanes])
         base = (lane // lanes)[:, None] * (3 * g.n_nodes * lanes) + (lane % lanes)[:, None]
         ids.append(own[lane].reshape(-1))
-        entries.append((g.corner_at + base + 3 * lanes * np.arange(g.n_nodes)).reshape(-1))
+        entries.append((g.force_at + base + 3 * lanes * np.arange(g.n_nodes)).reshape(-1))
     node, entry = np.concatenate(ids), np.concatenate(entries)
     order = np.argsort(node, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=n_nodes))])
@@ -250,11 +244,9 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     table = _rule_table(rules) if rules else None
     rest_lanes = lane_layout(Dm_inv.reshape(-1, 9), lanes).astype(npr if strain_real == real else np.float64)
     mass = arena.field("mass", real, n_nodes, lumped_masses(scene).astype(npr))
-    corner = arena.lanes("corner", real, 3 * len(flat_nodes))
     model = Model(
         real=real, strain_real=strain_real, lanes=lanes, serial=serial, n_nodes=n_nodes, n_blocks=n_blocks, groups=groups,
-        x=arena.vectors("x", ti.f64, n_nodes, layout.rest),
-        v=arena.vectors("v", real, n_nodes, velocity.astype(npr)),
+        state=build_state(arena, runtime, layout.rest, velocity, 3 * len(flat_nodes), chunks),
         nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
         rules=rules, points=arena.field("points", ti.f64, (len(table), 28), table) if rules else None,
         Dm_inv=arena.field("Dm_inv", strain_real, (n_blocks, 9, lanes), rest_lanes),
@@ -263,7 +255,6 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         law_constants=arena.field(
             "law_constants", ti.f64, (n_bodies, 4), material_table([b.material for b in scene.bodies])
         ),
-        corner=corner.memory, corner_at=corner.at, corner_mask=corner.mask,
         gather_start=arena.field("gather_start", ti.i32, n_nodes + 1, start),
         gather_entry=arena.field("gather_entry", ti.i32, len(entry), entry),
         mass=mass,
@@ -275,8 +266,6 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
         damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
         consistent=on["consistent_mass"], loaded=on["loads"], damped=damped, stiffness_damping=on["stiffness_damping"],
-        scalars=arena.field("scalars", ti.f64, N_SCALARS),
-        partial=arena.field("partial", ti.f64, (chunks, N_COLUMNS)),
         chunks=chunks,
     )  # fmt: skip
     if on["consistent_mass"]:

@@ -1,4 +1,4 @@
-"""Single numbers that kernels leave for the host: places in `Model.scalars`, and columns of the sums in `Model.partial`."""
+"""Single numbers that kernels leave for the host: places in `State.scalars`, and columns of the sums in `State.partial`."""
 
 (
     ELASTIC, MIN_J, N_INVERTED, KINETIC, GRAVITY,  # of a state: energies [J], smallest J = det F, inverted tets
@@ -8,8 +8,9 @@
     FAILED,  # of a batch of sub-steps: 1 where a velocity is not finite or a tet has exploded
     START_SLOPE, END_SLOPE,  # r.y where a Newton step begins and where it ends: negative is downhill
     POTENTIAL,  # of an implicit step's objective: inertia, loads and damping
-) = range(15)  # fmt: skip
-N_SCALARS = 15
+    CONTACT_POTENTIAL,  # of the same: contacts
+) = range(16)  # fmt: skip
+N_SCALARS = 16
 
 N_NORMS = 5  # first columns: what a residual is measured by
 SUM, OTHER_SUM, N_COLUMNS = 5, 6, 8  # further columns; `measure` uses those of its scalars

@@ -7,12 +7,12 @@ import numpy as np
 
 from taisoft.attributes import guarded_record
 from taisoft.contact import SOLVERS
+from taisoft.dynamics import EXPLICIT, INTEGRATORS, scheme_of
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
 from taisoft.scene.plan import Plan, make_plan
 from taisoft.scene.scene import Scene
 from taisoft.scene.solver import MAX_TOLERANCE
-from taisoft.stepping import EXPLICIT, INTEGRATORS, scheme_of
 
 EXPLICIT_CONTACT = SOLVERS
 IMPLICIT_CONTACT = ("augmented_lagrangian",)

@@ -8,6 +8,10 @@ import numpy as np
 
 from taisoft import runtime
 from taisoft.attributes import thawed
+from taisoft.dynamics import make_stepper
+from taisoft.dynamics.motion import Motion
+from taisoft.dynamics.pull import Pull, batch
+from taisoft.dynamics.world import World
 from taisoft.elasticity import NO_TET, measure
 from taisoft.errors import SceneError, SimulationError, no_memory
 from taisoft.fields import FieldArena
@@ -20,10 +24,6 @@ from taisoft.scalars import FIRST_SOFTENED, LOADS
 from taisoft.scene.scene import Scene
 from taisoft.settings import check_count, check_settings, plan_of
 from taisoft.stability import scale_warnings
-from taisoft.stepping import make_stepper
-from taisoft.stepping.motion import Motion
-from taisoft.stepping.pull import Pull, batch
-from taisoft.stepping.world import World
 
 
 def _release(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:
@@ -38,7 +38,7 @@ class Simulator(Resuming):
     """A scene being simulated, as it was when this was made. SI units; positions are float64 in either precision.
 
     The scene is frozen: what a simulator can change while it runs are its own numbers, by its set_ methods and dt.
-    dt [s]; integrator: one of taisoft.stepping.INTEGRATORS; newton_tolerance, linear_tolerance: relative, None is adaptive.
+    dt [s]; integrator: one of taisoft.dynamics.INTEGRATORS; newton_tolerance, linear_tolerance: relative, None is adaptive.
     An explicit integrator refuses a dt above `stable_dt` unless allow_unstable, which only warns. pullable: `pull` is wanted.
     Raises SceneError for a scene that cannot be simulated, SimulationError for settings that cannot be met.
     """
@@ -75,7 +75,7 @@ class Simulator(Resuming):
             self._world = World(scene, self._runtime, self._arena, model, layout, Motion(scene, layout))
             touching = self.plan.on["contact_forces"]
             if touching:
-                from taisoft.stepping.contact import ContactStep
+                from taisoft.dynamics.contact import ContactStep
 
                 self._contact = ContactStep(self._world, self_collision, self.settings.explicit)
                 self._owned.append(self._contact)
@@ -175,7 +175,7 @@ class Simulator(Resuming):
 
     def _tell_softened(self) -> None:
         """Warn, once, of the first tet that is squeezed so far that its law softens."""
-        layout, first = self._world.layout, int(self._world.model.scalars[FIRST_SOFTENED])
+        layout, first = self._world.layout, int(self._world.model.state.scalars[FIRST_SOFTENED])
         if first == NO_TET:
             return
         self._softens = False
@@ -261,7 +261,7 @@ class Simulator(Resuming):
 
     def _report(self) -> StepReport:
         measure(self._world.model)
-        elastic, lowest, inverted, kinetic, gravity, _, loads = self._world.model.scalars.to_numpy()[: LOADS + 1].tolist()
+        elastic, lowest, inverted, kinetic, gravity, _, loads = self._world.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
         return StepReport(
             time=self.time,
             min_volume_ratio=lowest,

@@ -105,7 +105,7 @@ def _euler_matrix(z: float, drag: float, viscous: float) -> np.ndarray:
 
 
 def _verlet_matrix(z: float, drag: float, viscous: float) -> np.ndarray:
-    """One velocity Verlet step of (x, dt v, dt^2 a), as in stepping/explicit.py."""
+    """One velocity Verlet step of (x, dt v, dt^2 a), as in dynamics/explicit.py."""
     decay = np.exp(-0.5 * drag)
     half = np.array([0.0, decay, 0.5])
     x = np.array([1.0, 0.0, 0.0]) + half

@@ -4,6 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.dynamics.motion import Motion
+from taisoft.dynamics.newton import StageResult, solve
+from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.dynamics.world import World
 from taisoft.elasticity import measure
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fields import FieldArena
@@ -12,9 +16,6 @@ from taisoft.runtime import Runtime, open_kind, open_runtime
 from taisoft.scalars import ELASTIC, N_INVERTED
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
-from taisoft.stepping.motion import Motion
-from taisoft.stepping.newton import StageResult, StageSolver
-from taisoft.stepping.world import World
 from taisoft.transfer import upload
 
 MAX_NEWTON = 100
@@ -111,7 +112,7 @@ class StaticSolver:
             {**plan.on, "mass_damping": False, "stiffness_damping": False, "consistent_mass": False},
         )  # fmt: skip
         self.world = World(scene, runtime, arena, model, layout, Motion(scene, layout))
-        self.solver = StageSolver(model, arena, runtime.eps, self.world.motion.moved)
+        self.solver = StageSystem(model, arena, runtime.eps, self.world.motion.moved)
         self.tolerance = tolerance
         self.target = self.world.next_target(time)
         self.world.upload_constraints()
@@ -129,7 +130,7 @@ class StaticSolver:
                 goal = min(1.0, done + share)
                 result = self._attempt(x, goal, self.tolerance if goal == 1.0 else max(self.tolerance, 1e-3))
                 if self._good(result):
-                    done, share, steps, x = goal, 1.5 * share, steps + 1, self.world.model.x.to_numpy()
+                    done, share, steps, x = goal, 1.5 * share, steps + 1, self.world.model.state.x.to_numpy()
                 else:
                     share *= 0.5
             if done < 1.0:  # the state of the last good share, judged by all of the load
@@ -139,19 +140,19 @@ class StaticSolver:
     def _good(self, result: StageResult) -> bool:
         """Nothing inverted, and the residual where it should be, or where it can be."""
         measure(self.world.model)
-        return (result.converged or result.at_rounding) and self.world.model.scalars[N_INVERTED] == 0.0
+        return (result.converged or result.at_rounding) and self.world.model.state.scalars[N_INVERTED] == 0.0
 
     def _attempt(self, x: np.ndarray, share: float, tolerance: float, max_newton: int = MAX_NEWTON) -> StageResult:
         """Solve with a share of the load, from x."""
         m, w = self.world.model, self.solver.work
-        start = [(m.gravity, share * self.gravity[None]), (w.x_hat, x), (m.x, x), (m.v, np.zeros_like(x))]
+        start = [(m.gravity, share * self.gravity[None]), (w.x_hat, x), (m.state.x, x), (m.state.v, np.zeros_like(x))]
         if self.loads is not None:
             start.append((m.loads, share * self.loads))
         if self.target is not None:
             rest = self.world.layout.rest[self.world.motion.moved]
             start += [(w.targets, rest + share * (self.target - rest)), (w.moved_axes, self.world.motion.moved_axes())]
         upload(start)
-        result = self.solver.solve(0.0, 1.0, tolerance, max_newton, by_energy=True)
+        result = solve(self.solver, Stage(0.0, 1.0, 1.0, tolerance, max_newton=max_newton))
         self.newton += result.newton_iterations
         self.linear += result.linear_iterations
         return result
@@ -159,18 +160,18 @@ class StaticSolver:
     def _residual(self, result: StageResult) -> float:
         """As solved for; but rounding over rounding, where neither a load nor a constraint exerts a force, tells nothing."""
         loaded = self.gravity.any() or (self.loads is not None and self.loads.any())
-        idle = not loaded and np.linalg.norm(self.solver.held_residual()) <= self.solver.rounding_force
+        idle = not loaded and np.linalg.norm(self.solver.held_residual()) <= self.solver.rounding.force
         return 0.0 if idle and result.converged else result.residual
 
     def _answer(self, result: StageResult, steps: int, load: float) -> StaticResult:
         world = self.world
         measure(world.model)
-        scalars = world.model.scalars.to_numpy()
+        scalars = world.model.state.scalars.to_numpy()
         if not np.isfinite(result.residual):
             raise SimulationError(f"solve_static: {world.find_unfinite() or 'the residual is not finite'}")
         return StaticResult(
             converged=result.converged and load == 1.0, load=load, at_rounding=result.at_rounding,
             residual=self._residual(result), iterations=self.newton, linear_iterations=self.linear, load_steps=steps,
             elastic=float(scalars[ELASTIC]), n_inverted=int(scalars[N_INVERTED]), _scene=world.scene, _layout=world.layout,
-            _positions=world.model.x.to_numpy(), _reactions=self.solver.held_residual(),
+            _positions=world.model.state.x.to_numpy(), _reactions=self.solver.held_residual(),
         )  # fmt: skip

@@ -132,8 +132,8 @@ def built(scene: ts.Scene, precision: str, chunks: int = 7, arch: str = "cpu") -
         try:
             on = make_plan(scene, explicit=False, multistep=False).on
             model, layout = build_model(scene, machine, arena, on)
-            partial = arena.field("partial_parallel", ti.f64, (chunks, model.partial.shape[1]))
-            parallel = replace(model, serial=False, chunks=chunks, partial=partial)
+            partial = arena.field("partial_parallel", ti.f64, (chunks, model.state.partial.shape[1]))
+            parallel = replace(model, serial=False, chunks=chunks, state=replace(model.state, partial=partial))
             yield Rig(scene, machine, arena, model, parallel, layout, Oracle(scene))
         finally:
             arena.release()

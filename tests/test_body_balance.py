@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.stepping import implicit
+from taisoft.dynamics import implicit
 
 DT, STEPS, G = 1 / 60, 15, 9.81
 

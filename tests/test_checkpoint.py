@@ -26,8 +26,8 @@ from scenes import RELEASE, driven_scene
 import taisoft as ts
 from taisoft import runtime
 from taisoft.checkpoint import read_checkpoint
+from taisoft.dynamics import EXPLICIT
 from taisoft.errors import OutputError, SceneError, SimulationError
-from taisoft.stepping import EXPLICIT
 
 
 def assert_same(a: list, b: list) -> None:

@@ -166,7 +166,7 @@ def test_the_scene_of_the_readme_runs(tmp_path):
 
 
 def test_the_readme_names_every_integrator():
-    from taisoft.stepping import INTEGRATORS
+    from taisoft.dynamics import INTEGRATORS
 
     rows = re.findall(r"^\| `(\w+)` \|", (ROOT / "README.md").read_text(), re.MULTILINE)
     assert sorted(rows) == sorted(INTEGRATORS)

@@ -19,12 +19,12 @@ from taisoft.cli import main, warm, warm_scenes
 from taisoft.cli.scene_file import load_scene, shipped_files
 from taisoft.cli.warm_scenes import Structure, build, static_structures, structures
 from taisoft.collision.surface import SERIAL_BELOW
+from taisoft.dynamics import EXPLICIT
 from taisoft.elements.reference import inverse_rest_edges
 from taisoft.model import ILL_CONDITIONED
 from taisoft.runtime import n_compiled
 from taisoft.scene.obstacles import MeshObstacle
 from taisoft.settings import plan_of
-from taisoft.stepping import EXPLICIT
 
 DEMOS = {
     "hanging_beam": Structure("velocity_verlet", held=True),

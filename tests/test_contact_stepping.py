@@ -16,8 +16,8 @@ from contact_scenes import FRICTION, GRAVITY, MASS, Stage, scene, sliding, still
 from rotations import rotation
 
 import taisoft as ts
+from taisoft.dynamics import scheme_of
 from taisoft.settings import EXPLICIT_CONTACT
-from taisoft.stepping import scheme_of
 
 DT = {"bdf2": 0.01, "symplectic_euler": 1e-3, "velocity_verlet": 1e-3}  # [s]; one for all implicit schemes
 IMPLICIT = ("implicit_euler", "linearly_implicit_euler", "bdf2")

@@ -115,7 +115,7 @@ class TestZoo:
 
     def test_what_is_not_finite_is_refused(self, still):
         sim, _, start, _ = still
-        for field, where in ((sim._world.model.x, "brick"), (sim._world.model.v, "egg")):
+        for field, where in ((sim._world.model.state.x, "brick"), (sim._world.model.state.v, "egg")):
             for value in (np.nan, np.inf):
                 before = field.to_numpy()
                 whole, rows = before.copy(), sim._slice(where)

@@ -40,14 +40,14 @@ def squeezed(rig):
     """A compressed, sheared and noisy state with an inverted tet and tets of negative curvature; returns x."""
     rng = np.random.default_rng(11)
     x = rig.oracle.rest @ SQUEEZE.T + 0.12 * rng.standard_normal(rig.oracle.rest.shape)  # [m]
-    rig.model.x.from_numpy(x)
-    rig.model.v.from_numpy(rng.standard_normal(x.shape).astype(rig.machine.np_real))
+    rig.model.state.x.from_numpy(x)
+    rig.model.state.v.from_numpy(rng.standard_normal(x.shape).astype(rig.machine.np_real))
     return x
 
 
 def elastic_force(rig, x) -> np.ndarray:
     """As float64."""
-    rig.model.x.from_numpy(x)
+    rig.model.state.x.from_numpy(x)
     elasticity.elastic_forces(rig.model)
     elasticity.gather_forces(rig.model, rig.force)
     return rig.force.to_numpy().astype(np.float64)
@@ -65,17 +65,17 @@ def test_the_squeezed_state_is_a_hard_one(rig, squeezed):
 
 
 def test_energies_and_volume_ratios(rig, squeezed):
-    v = rig.model.v.to_numpy().astype(np.float64)
+    v = rig.model.state.v.to_numpy().astype(np.float64)
     of_mass = rig.oracle.kinetic(v, explicit=False), rig.oracle.weight(squeezed, explicit=False)
     expected = (rig.oracle.energy(squeezed), *rig.oracle.volume_ratios(squeezed), *of_mass)
-    rig.model.scalars.fill(-1.0)
+    rig.model.state.scalars.fill(-1.0)
     elasticity.measure(rig.model)
     # sums are in f64, but the rest shape, masses and gravity are stored in the model's precision
-    assert rig.model.scalars.to_numpy()[: GRAVITY + 1] == pytest.approx(expected, rel=10 * rig.eps, abs=10 * rig.eps)
+    assert rig.model.state.scalars.to_numpy()[: GRAVITY + 1] == pytest.approx(expected, rel=10 * rig.eps, abs=10 * rig.eps)
 
 
 def test_forces(rig, squeezed):
-    rig.model.corner.fill(np.nan)  # what is read must have been written
+    rig.model.state.element_force.fill(np.nan)  # what is read must have been written
     close(rig, elastic_force(rig, squeezed), rig.oracle.force(squeezed), 30)
 
 
@@ -92,7 +92,8 @@ def test_no_force_at_rest(rig, where):
     largest = max(part.material.young for part in rig.oracle.parts)  # times about 1 m^2: the force of a strain of 1
     rounding = rig.eps + (1e-11 if where == "far" else 0.0)
     assert np.abs(force).max() < 10 * rounding * largest
-    assert rig.model.scalars[ELASTIC] < 10 * rounding * largest and rig.model.scalars[N_INVERTED] == 0  # [J], inverted tets
+    scalars = rig.model.state.scalars
+    assert scalars[ELASTIC] < 10 * rounding * largest and scalars[N_INVERTED] == 0  # [J], inverted tets
 
 
 def test_forces_are_minus_the_gradient_of_the_energy(rig, squeezed):
@@ -100,9 +101,9 @@ def test_forces_are_minus_the_gradient_of_the_energy(rig, squeezed):
     way, h, energies = np.random.default_rng(4).standard_normal(squeezed.shape), 1e-5, []
     elastic_force(rig, squeezed)
     for step in (h, -h):
-        rig.model.x.from_numpy(squeezed + step * way)
+        rig.model.state.x.from_numpy(squeezed + step * way)
         elasticity.measure(rig.model)
-        energies.append(rig.model.scalars[ELASTIC])
+        energies.append(rig.model.state.scalars[ELASTIC])
     slope = (energies[0] - energies[1]) / (2 * h)
     assert abs(slope) > 1e4  # [N]
     assert -np.sum(elastic_force(rig, squeezed) * way) == pytest.approx(slope, rel=1e-7 + 30 * rig.eps)
@@ -116,9 +117,9 @@ def test_a_tet_inverted_at_one_point_is_inverted(rig):
     J = np.linalg.det(rig.oracle.gradients(x, part)).reshape(-1, part.points)
     low, count = rig.oracle.volume_ratios(x)
     assert count == (J <= 0).any(axis=1).sum() > 0 and (J <= 0).sum(axis=1).max() == 1
-    rig.model.x.from_numpy(x)
+    rig.model.state.x.from_numpy(x)
     elasticity.measure(rig.model)
-    assert rig.model.scalars[MIN_J] == pytest.approx(low, abs=10 * rig.eps) and rig.model.scalars[N_INVERTED] == count
+    assert rig.model.state.scalars[MIN_J] == pytest.approx(low, abs=10 * rig.eps) and rig.model.state.scalars[N_INVERTED] == count
 
 
 def test_force_differential(rig, squeezed):
@@ -205,7 +206,7 @@ def test_parallel_kernels_are_reproducible(rig, squeezed):
         elasticity.elastic_forces(rig.model)
         elasticity.gather_forces(rig.model, rig.force)
         elasticity.measure(rig.model)
-        fields = (rig.matrix.value, rig.matrix.diagonal, rig.force, rig.model.scalars)
+        fields = (rig.matrix.value, rig.matrix.diagonal, rig.force, rig.model.state.scalars)
         return [field.to_numpy() for field in fields]
 
     first = numbers()

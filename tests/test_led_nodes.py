@@ -10,7 +10,7 @@ import pytest
 from scenes import cube, rubber
 
 import taisoft as ts
-from taisoft.stepping import IMPLICIT, scheme_of
+from taisoft.dynamics import IMPLICIT, scheme_of
 
 SPEED = np.array([2.0, 0.0, -1.0])  # [m/s]
 

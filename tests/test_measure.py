@@ -16,10 +16,10 @@ from scenes import COR, SNH, SVK, built, cube, mixed_scene, rubber
 
 import taisoft as ts
 from taisoft import runtime
+from taisoft.dynamics.substeps import LAUNCH_SECONDS, MAX_BATCH, largest_batch
 from taisoft.elasticity import NO_TET, measure
 from taisoft.materials import LAWS
 from taisoft.scalars import FIRST_SOFTENED, GRAVITY
-from taisoft.stepping.substeps import LAUNCH_SECONDS, MAX_BATCH, largest_batch
 
 LARGE = 34_560  # tets of the largest mesh whose runs are timed, `taisoft bench elasticity`
 
@@ -42,18 +42,18 @@ def test_energies_of_all_laws(laws, precision):
         for squeeze, noise in ((1.0, 0.02), (0.75, 0.03), (0.7, 0.2)):
             x = rig.oracle.rest * [1.0, squeeze, 1.0] + noise * rng.standard_normal(rig.oracle.rest.shape)  # [m]
             v = rng.standard_normal(x.shape).astype(rig.machine.np_real)
-            m.x.from_numpy(x)
-            m.v.from_numpy(v)
+            m.state.x.from_numpy(x)
+            m.state.v.from_numpy(v)
             measure(m)
-            elastic, lowest, inverted, kinetic, gravity = m.scalars.to_numpy()[: GRAVITY + 1]
+            elastic, lowest, inverted, kinetic, gravity = m.state.scalars.to_numpy()[: GRAVITY + 1]
             low, count = rig.oracle.volume_ratios(x)
             # The rest shape, masses and gravity are stored in the model's precision. A strain of 0.02 is formed from numbers of
             # about 1, so that it, and twice as much its energy, loses a factor of 50
             assert elastic == pytest.approx(rig.oracle.energy(x), rel=100 * rig.eps)
             expected = low, rig.oracle.kinetic(v.astype(float), False), rig.oracle.weight(x, False)
             assert (lowest, kinetic, gravity) == pytest.approx(expected, rel=10 * rig.eps, abs=10 * rig.eps)
-            assert inverted == count and m.scalars[FIRST_SOFTENED] == first_squeezed(rig, x)
-            seen.add((int(m.scalars[FIRST_SOFTENED]), bool(inverted)))
+            assert inverted == count and m.state.scalars[FIRST_SOFTENED] == first_squeezed(rig, x)
+            seen.add((int(m.state.scalars[FIRST_SOFTENED]), bool(inverted)))
         assert len(seen) == 3 and (NO_TET, False) in seen and any(turned for _, turned in seen)
 
 

@@ -92,7 +92,7 @@ def test_every_node_of_a_tet_is_gathered_once(rig):
         for at in np.ndindex(elements(rig, g).shape):
             block, lane, node = at
             if volume[g.first + block, lane] > 0:
-                place = g.corner_at + ((block * g.n_nodes + node) * 3) * lanes + lane
+                place = g.force_at + ((block * g.n_nodes + node) * 3) * lanes + lane
                 expected[place] = elements(rig, g)[at]
     found = {e: node for node in range(rig.model.n_nodes) for e in entry[start[node] : start[node + 1]]}
     assert found == expected and len(entry) == len(expected)
@@ -123,7 +123,7 @@ def test_one_lane_gives_the_same_forces(rig):
         model, _ = build_model(rig.scene, rig.machine, arena, make_plan(rig.scene, True, False).on)
         assert model.n_blocks == 26
         force = arena.vectors("force", model.real, model.n_nodes)
-        model.x.from_numpy(x)
+        model.state.x.from_numpy(x)
         elasticity.elastic_forces(model)
         elasticity.gather_forces(model, force)
         expected = rig.oracle.force(x)

@@ -13,7 +13,7 @@ import pytest
 from scenes import cube, element, rubber
 
 import taisoft as ts
-from taisoft.stepping.motion import Motion
+from taisoft.dynamics.motion import Motion
 
 both_orders = pytest.mark.parametrize("order, n", [(1, 8), (2, 26)])  # of the second body, and its number of nodes
 

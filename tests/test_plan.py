@@ -10,8 +10,8 @@ from scenes import cube, driven_scene, mixed_scene, rubber
 
 import taisoft as ts
 from taisoft import runtime
+from taisoft.dynamics import EXPLICIT
 from taisoft.scene.plan import make_plan
-from taisoft.stepping import EXPLICIT
 
 LOADS, DAMPING, LED = {"loads"}, {"damping", "node_body"}, {"moved", "moved_axes", "targets", "moved_before"}
 HELD, VERLET, BOTH = {"held", "held_velocity", "reaction"}, {"acceleration"}, {"half_velocity"}

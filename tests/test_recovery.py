@@ -14,7 +14,7 @@ import pytest
 from retries import assert_is_before_first_step, assert_steps_as_new, state_of
 
 import taisoft as ts
-from taisoft.stepping import implicit
+from taisoft.dynamics import implicit
 
 DT = 0.05  # [s]
 LEAD = 0.04  # [s]

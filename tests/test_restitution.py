@@ -13,7 +13,7 @@ import pytest
 from rotations import rotation
 
 import taisoft as ts
-from taisoft.stepping import scheme_of
+from taisoft.dynamics import scheme_of
 
 SIDE, HEIGHT, DT, G = 0.1, 0.1, 5e-3, 9.81  # [m], [m], [s], [m/s^2]
 CREATED = 0.005  # of the energy at the start, at most

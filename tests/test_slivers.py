@@ -40,7 +40,7 @@ def test_forces_are_the_oracles(scene):
         assert rig.model.strain_real == ti.f64 and rig.model.Dm_inv.dtype == ti.f64
         rng, force = np.random.default_rng(3), rig.vectors("force")
         x = rig.oracle.rest @ rotation((1, 2, 3), 0.8).T + 1e-6 * rng.standard_normal(rig.oracle.rest.shape) + (3.0, -2.0, 1.0)
-        rig.model.x.from_numpy(x)
+        rig.model.state.x.from_numpy(x)
         elasticity.elastic_forces(rig.model)
         elasticity.gather_forces(rig.model, force)
         # strains of 1e-6 over flat tets are some 1 % of stress; a rounding of F in f32 would be a tenth of that

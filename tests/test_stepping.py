@@ -19,8 +19,8 @@ from oracle import Oracle
 from scenes import driven_scene, mixed_scene
 
 import taisoft as ts
-from taisoft import stepping
-from taisoft.stepping import IMPLICIT, scheme_of
+from taisoft import dynamics
+from taisoft.dynamics import IMPLICIT, scheme_of
 
 DAMPED = {"mass_damping": 3.0, "stiffness_damping": 0.004}
 EXPLICIT = ("symplectic_euler", "velocity_verlet")
@@ -152,28 +152,28 @@ def test_parallel_kernels(integrator, monkeypatch):
 
 
 def test_the_residual_is_the_gradient_of_the_objective(implicit, monkeypatch):
-    """Of the function that backtracking lowers, inertia, loads and both kinds of damping included."""
+    """Of the function that Newton lowers, inertia, loads and both kinds of damping included."""
     monkeypatch.setattr(implicit._stepper, "scheme", scheme_of("implicit_euler"))
     implicit.reset()
     implicit.step()
     model, solver, beta = implicit._world.model, implicit._stepper.solver, implicit._stepper._beta
     free, x_hat = model.free.to_numpy(), solver.work.x_hat.to_numpy()
     rng = np.random.default_rng(4)
-    base = model.v.to_numpy() + 5.0 * free * rng.standard_normal(x_hat.shape)
-    fixed_x = model.x.to_numpy()
+    base = model.state.v.to_numpy() + 5.0 * free * rng.standard_normal(x_hat.shape)
+    fixed_x = model.state.x.to_numpy()
 
     def put(v):
-        model.v.from_numpy(v)
-        model.x.from_numpy(np.where(free > 0, x_hat + beta * v, fixed_x))
+        model.state.v.from_numpy(v)
+        model.state.x.from_numpy(np.where(free > 0, x_hat + beta * v, fixed_x))
 
     put(base)
-    solver._evaluate(1.0, beta)
+    solver.evaluate()
     gradient = solver.work.residual.to_numpy()
     way = free * (rng.standard_normal(x_hat.shape) + gradient / np.abs(gradient * free).max())
     slope, values, h = np.sum(gradient * way), [], 1e-3  # [m/s]
     for step in (h, -h):
         put(base + step * way)
-        values.append(solver._objective(1.0, beta))
+        values.append(solver.merit())
     assert abs(slope) > 100.0  # [J s/m]
     assert (values[0] - values[1]) / (2 * h) == pytest.approx(slope, rel=1e-6)
 
@@ -274,14 +274,14 @@ def test_a_free_body_in_implicit_steps(implicit, method, monkeypatch):
 
 
 def test_names_mean_what_they_should(monkeypatch):
-    monkeypatch.setattr(stepping, "ExplicitStepper", lambda world, verlet: verlet)
+    monkeypatch.setattr(dynamics, "ExplicitStepper", lambda world, verlet: verlet)
     for name, built in (
         ("contact_substeps.ContactExplicitStepper", lambda world, verlet, contact, method: (verlet, contact, method)),
         ("implicit.ImplicitStepper", lambda world, scheme, contact: (scheme, contact)),
     ):
-        monkeypatch.setattr(f"taisoft.stepping.{name}", built)
-    assert [stepping.make_stepper(None, name, None, "auto") for name in EXPLICIT] == [False, True]
-    touching = [stepping.make_stepper(None, name, "contact", "jacobi") for name in EXPLICIT]
+        monkeypatch.setattr(f"taisoft.dynamics.{name}", built)
+    assert [dynamics.make_stepper(None, name, None, "auto") for name in EXPLICIT] == [False, True]
+    touching = [dynamics.make_stepper(None, name, "contact", "jacobi") for name in EXPLICIT]
     assert touching == [(False, "contact", "jacobi"), (True, "contact", "jacobi")]
     assert set(IMPLICIT) == {"linearly_implicit_euler", "implicit_euler", "bdf2", "implicit_midpoint"}
-    assert all(stepping.make_stepper(None, name, "contact", "auto") == (scheme_of(name), "contact") for name in IMPLICIT)
+    assert all(dynamics.make_stepper(None, name, "contact", "auto") == (scheme_of(name), "contact") for name in IMPLICIT)

@@ -11,9 +11,9 @@ from functools import partial
 import numpy as np
 
 import taisoft as ts
+from taisoft.dynamics import EXPLICIT, INTEGRATORS
 from taisoft.errors import SimulationError
 from taisoft.mass import lumped_masses
-from taisoft.stepping import EXPLICIT, INTEGRATORS
 
 from .record import LAWS, Case, Check, face, label, material, near, nearest, order, scene, small, told
 

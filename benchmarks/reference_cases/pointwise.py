@@ -5,8 +5,8 @@ from functools import partial
 import numpy as np
 
 import taisoft as ts
+from taisoft.dynamics import EXPLICIT, INTEGRATORS
 from taisoft.mass import lumped_masses
-from taisoft.stepping import EXPLICIT, INTEGRATORS
 
 from .record import GRAVITY, LAWS, Case, deformation_gradients, face, label, material, near, scene, small, worst
 

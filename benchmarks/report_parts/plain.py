@@ -71,7 +71,7 @@ class PlainPoints:
 
     def find(self, pairs: np.ndarray) -> list[tuple[int, int, np.ndarray, float]]:
         """(triangle, the other, weights (3,), signed distance [m]) of each whose deepest point is nearer than the margin."""
-        x, margin, found = self._rig.model.x.to_numpy(), self._rig.detection.margin, []
+        x, margin, found = self._rig.model.state.x.to_numpy(), self._rig.detection.margin, []
         surface = x[self._rig.detection.topology.node]
         for pair in pairs:
             for t, u in (pair, pair[::-1]):

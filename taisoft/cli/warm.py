@@ -12,8 +12,8 @@ import taisoft as ts
 from taisoft import compile_message
 from taisoft.cli import warm_scenes
 from taisoft.cli.warm_scenes import Structure
+from taisoft.dynamics import EXPLICIT
 from taisoft.runtime import n_compiled
-from taisoft.stepping import EXPLICIT
 
 STEPS = {True: (1e-5, 200), False: (1e-2, 10)}  # of explicit and implicit integrators: dt [s], and how many
 LONG = 1.0  # [s]

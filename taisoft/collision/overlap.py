@@ -55,7 +55,7 @@ def find_overlaps(detection: Detection) -> list[Overlap]:
 def _solids(detection: Detection) -> list[Solid]:
     """The colliders where the last search found them; obstacles have no tets."""
     topology, start = detection.topology, detection.layout.node_start
-    x, nodes = download([detection.surface.x, detection.model.x])
+    x, nodes = download([detection.surface.x, detection.model.state.x])
     solids = []
     for k, collider in enumerate(detection.scene.colliders):
         used, triangles = np.unique(topology.triangle[topology.first[k] : topology.first[k + 1]], return_inverse=True)

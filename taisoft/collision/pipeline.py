@@ -151,7 +151,7 @@ class Detection:
 
     def _make_fields(self, grids: list[SdfGrid | None], runtime: Runtime) -> DistanceFields:
         return build_fields(
-            self.scene.bodies, grids, self.model.x, self.topology.first, self.layout.node_start, runtime.real,
+            self.scene.bodies, grids, self.model.state.x, self.topology.first, self.layout.node_start, runtime.real,
             runtime.np_real, self._arena,
         )  # fmt: skip
 
@@ -190,8 +190,8 @@ class Detection:
         s, m = self.surface, self.model
         self._place_obstacles(time, dt)
         leads = led is not None and len(led[0]) > 0
-        v, span = (m.v, dt) if way is None else (way, 1.0)
-        update_surface(s, m.x, v, leads, self._lead(*led) if leads else s.move, span, self.reach, self._rows)
+        v, span = (m.state.v, dt) if way is None else (way, 1.0)
+        update_surface(s, m.state.x, v, leads, self._lead(*led) if leads else s.move, span, self.reach, self._rows)
         if s.count[UNFINITE]:
             raise SimulationError(self._unfinite())
 
@@ -328,7 +328,7 @@ class Detection:
 
     def contained(self) -> list[Inside]:
         """Parts of colliders that lie inside others where the last search found them, see `Containment`."""
-        return self._containment.find(self.surface, self.model.x, self.shapes)
+        return self._containment.find(self.surface, self.model.state.x, self.shapes)
 
     def _buffers(self) -> list[Buffer]:
         return [self.buffer, *((self._row, *self.broad.buffers) if self._rows else ())]

@@ -237,7 +237,7 @@ def fill(
         p.order[c] = c
         v = -f.carry[c] / dt
         for j in range(k):
-            v += p.weight[c, j] * ti.cast(m.v[p.node[c, j]], ti.f64)
+            v += p.weight[c, j] * ti.cast(m.state.v[p.node[c, j]], ti.f64)
         f.approach[c] = normal.dot(v)
         f.rise[c], f.struck[c] = 0.0, dvec(0.0)
         p.r[c] = prox(to_frame(p, c, warm * _warm_impulse(f, c)), friction)

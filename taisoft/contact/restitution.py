@@ -9,7 +9,7 @@ bodies by what they did not fall: energy comes from nowhere. So
       u >= -e u_s + (u* - u_s),   u* the velocity that the step would reach without impulses.
   In velocity Verlet u_s = u_n. In symplectic Euler v_n belongs to t_n - dt/2 (it is the leapfrog scheme), so u_s = (u_n + u*)/2.
   With e = 1 the velocity turns round at x_n, which leaves the energy that the scheme keeps, even in v_s, as it is;
-* implicit steps have an impact first (`taisoft.stepping.impact`), that leaves contacts with the speed w,
+* implicit steps have an impact first (`taisoft.dynamics.impact`), that leaves contacts with the speed w,
       w^2 = e^2 (u_n^2 + L + 2 a room) - 2 a room,
   room the gap less the standoff, a >= 0 the acceleration with which gravity closes it: e^2 of the energy that the surfaces would
   meet with, less what the room is worth, so that bodies rise to e^2 of the height of their fall. L = a^2 sum dt^2 over the steps

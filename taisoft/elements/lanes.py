@@ -95,7 +95,7 @@ def rest_gradients_of_F(m: ti.template(), b):
 @ti.func
 def position_differences(m: ti.template(), g: ti.template(), b):
     """`differences` of the positions in the precision in which F is formed."""
-    return differences(m, g, m.x, b, m.strain_real)
+    return differences(m, g, m.state.x, b, m.strain_real)
 
 
 @ti.func
@@ -158,26 +158,26 @@ def store_lanes(m: ti.template(), out: ti.template(), at, values):
 
 @ti.func
 def store_forces(m: ti.template(), g: ti.template(), b, S):
-    """Write the nodal forces -V S [N] of block b to the corner buffer, lane by lane (which keeps it SIMD)."""
+    """Write the nodal forces -V S [N] of block b to `State.element_force`, lane by lane (which keeps it SIMD)."""
     V = -volumes(m, b, m.real)
     # so that the compiler sees that no index overflows, and handles the lanes side by side
-    base = (m.corner_at + g.corner_at + (b - g.first) * (3 * g.n_nodes * m.lanes)) & m.corner_mask
+    base = (m.state.element_force_at + g.force_at + (b - g.first) * (3 * g.n_nodes * m.lanes)) & m.state.element_force_mask
     for i in ti.static(range(3)):
         total = broadcast(ti.cast(0.0, m.real), m.lanes)
         for a in ti.static(range(1, g.n_nodes)):
             f = V * S[3 * a - 3 + i]
             total += f
             for q in ti.static(range(m.lanes)):
-                m.corner[base + ((3 * a + i) * m.lanes + q)] = f[q]
+                m.state.element_force[base + ((3 * a + i) * m.lanes + q)] = f[q]
         for q in ti.static(range(m.lanes)):
-            m.corner[base + (i * m.lanes + q)] = -total[q]
+            m.state.element_force[base + (i * m.lanes + q)] = -total[q]
 
 
 @ti.func
 def gather(m: ti.template(), i):
-    """Sum of the corner forces at node i, in a fixed order."""
+    """Sum of the tets' forces on node i, in a fixed order."""
     f = ti.Vector([0.0, 0.0, 0.0], m.real)
     for k in range(m.gather_start[i], m.gather_start[i + 1]):
-        e = (m.corner_at + m.gather_entry[k]) & m.corner_mask
-        f += ti.Vector([m.corner[e], m.corner[e + m.lanes], m.corner[e + 2 * m.lanes]])
+        e = (m.state.element_force_at + m.gather_entry[k]) & m.state.element_force_mask
+        f += ti.Vector([m.state.element_force[e], m.state.element_force[e + m.lanes], m.state.element_force[e + 2 * m.lanes]])
     return f

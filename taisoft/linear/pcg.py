@@ -4,8 +4,10 @@ Serial, in one kernel launch (a launch an iteration would cost more than the ite
 preconditioner, two to three times fewer iterations than block-Jacobi, at the price of one product by Eisenstat's trick.
 Parallel, for many tets and on CUDA: block-Jacobi, whose residual is read every few iterations.
 Vectors are in the model's precision, sums in f64 and in a fixed order. Both stop on sqrt(r.z) relative to the start, z the
-preconditioned residual, and on negative curvature (p.Ap <= 0), which is reported: the caller then asks for a projected
-matrix.
+preconditioned residual, and on a direction p of negative curvature (p.Ap <= 0), which is reported: y is then the iterate so far
+plus min(r.z / |p.Ap|, FARTHEST) p, a direction along which a function with this gradient and this second derivative falls.
+Diagonal blocks that are not positive definite are replaced by the sums of their rows' absolute values in the preconditioner,
+which is positive definite then.
 """
 
 from dataclasses import dataclass
@@ -21,7 +23,9 @@ from taisoft.model import Model
 SERIAL_WORK = 40_000_000  # block products per launch: about 0.2 s, so that Ctrl-C is heard
 PARALLEL_BATCH = 8  # iterations between two looks at the residual
 RZ, RZ_START, STEP, COUNT, STOP = range(5)  # places in `state`
-RUNNING, CONVERGED, NEGATIVE = range(3)
+RUNNING, CONVERGED, NEGATIVE, LEAVING = range(4)  # LEAVING: within an iteration that has met negative curvature
+SINGULAR = 1e-12  # determinant over the product of the diagonal, below which a block counts as singular
+FARTHEST = 10.0  # steps along a direction of negative curvature: the caller's line search goes on from there
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +38,9 @@ class PcgWork:
     z: Any  # preconditioned residual; serial: (D + L)^T p
     p: Any  # direction
     q: Any  # A p; serial: (D + L)^-1 of it
-    inverse: Any  # (n_nodes) 12-vectors: inverse diagonal blocks, 0 on constrained axes
+    block: Any  # (n_nodes) 12-vectors: P, the diagonal blocks D of A, or what stands for them in the preconditioner
+    inverse: Any  # (n_nodes) 12-vectors: of these, 0 on constrained axes
+    mirror: Any  # (n_nodes) 12-vectors: 2 P - D; serial only
     state: Any  # (5) f64
 
 
@@ -44,15 +50,15 @@ class LinearResult:
 
     iterations: int
     converged: bool
-    negative: bool  # negative curvature was met; y holds the iterate before it
+    negative: bool  # negative curvature was met
 
 
 def build_pcg(model: Model, arena: FieldArena) -> PcgWork:
     """Allocate the vectors of a solve."""
     names = ("rhs", "y", "r", "z", "p", "q")
     vectors = {name: arena.vectors(f"pcg_{name}", model.real, model.n_nodes) for name in names}
-    inverse = arena.vectors("pcg_inverse", model.real, model.n_nodes, n=BLOCK)
-    return PcgWork(**vectors, inverse=inverse, state=arena.field("pcg_state", ti.f64, 5))
+    blocks = {name: arena.vectors(f"pcg_{name}", model.real, model.n_nodes, n=BLOCK) for name in ("block", "inverse", "mirror")}
+    return PcgWork(**vectors, **blocks, state=arena.field("pcg_state", ti.f64, 5))
 
 
 def solve(
@@ -74,27 +80,29 @@ def solve(
 
 
 @ti.func
-def inverse_block(m: ti.template(), block, free):
-    """Inverse (12) of a diagonal block over the free axes, 0 on the others."""
-    inverse = ti.Vector([0.0 for _ in ti.static(range(BLOCK))], m.real)
+def precondition(m: ti.template(), w: ti.template(), i, D):
+    """P of node i, its inverse over the free axes, and 2 P - D, from the diagonal block D (12)."""
+    free, P = m.free[i], D
     B = ti.Matrix.zero(ti.f64, 3, 3)  # in f64, so that blocks much stiffer one way than another are inverted too
     for r in ti.static(range(3)):
         for c in ti.static(range(3)):
             both = free[r] * free[c]
-            B[r, c] = both * block[4 * c + r] + (1.0 - both if ti.static(r == c) else 0.0)
-    det = B.determinant()
-    solid = B[0, 0] > 0.0 and B[1, 1] > 0.0 and B[2, 2] > 0.0 and det > 1e-12 * B[0, 0] * B[1, 1] * B[2, 2]
-    if solid:
-        C = B.inverse()
+            B[r, c] = both * D[4 * c + r] + (1.0 - both if ti.static(r == c) else 0.0)
+    minor = B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
+    det, size = B.determinant(), B[0, 0] * B[1, 1] * B[2, 2]
+    if not (B[0, 0] > 0.0 and minor > 0.0 and det > SINGULAR * size):
+        P = ti.Vector([0.0 for _ in ti.static(range(BLOCK))], m.real)
         for r in ti.static(range(3)):
+            d = ti.max(abs(B[r, 0]) + abs(B[r, 1]) + abs(B[r, 2]), 1e-30)
             for c in ti.static(range(3)):
-                inverse[4 * c + r] = free[r] * free[c] * ti.cast(C[r, c], m.real)
-    else:
-        # a nearly singular or indefinite block (unprojected, compressed): its diagonal still preconditions
-        for r in ti.static(range(3)):
-            d = abs(B[r, r])
-            inverse[5 * r] = free[r] * ti.cast(ti.select(d > 0.0, 1.0 / ti.max(d, 1e-30), 1.0), m.real)
-    return inverse
+                B[r, c] = d if ti.static(r == c) else 0.0
+            P[5 * r] = ti.cast(d, m.real)
+    C = B.inverse()
+    for r in ti.static(range(3)):
+        for c in ti.static(range(3)):
+            w.inverse[i][4 * c + r] = free[r] * free[c] * ti.cast(C[r, c], m.real)
+    w.block[i] = P
+    w.mirror[i] = 2.0 * P - D
 
 
 @ti.func
@@ -108,5 +116,5 @@ def total(m: ti.template(), column: ti.template()):
     """Sum of a column of the partial sums, in order."""
     s = ti.cast(0.0, ti.f64)
     for c in range(m.chunks):
-        s += m.partial[c, column]
+        s += m.state.partial[c, column]
     return s

@@ -7,6 +7,8 @@ from taisoft.linear.coupling import gather_pulls, prepare_terms, pull_with_all
 from taisoft.linear.pcg import (
     CONVERGED,
     COUNT,
+    FARTHEST,
+    LEAVING,
     NEGATIVE,
     RUNNING,
     RZ,
@@ -14,7 +16,7 @@ from taisoft.linear.pcg import (
     STEP,
     STOP,
     dot64,
-    inverse_block,
+    precondition,
     total,
 )  # fmt: skip
 from taisoft.runtime import kernel
@@ -30,13 +32,13 @@ def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()
         for i in range(c * size, ti.min(m.n_nodes, (c + 1) * size)):
             if ti.static(k.width > 0):
                 A.diagonal[i] = prepare_terms(m, k, i)
-            w.inverse[i] = inverse_block(m, A.diagonal[i], m.free[i])
+            precondition(m, w, i, A.diagonal[i])
             r = m.free[i] * w.rhs[i]
             z = block_times(w.inverse[i], r)
             w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
             w.r[i], w.z[i], w.p[i] = r, z, z
             s += dot64(r, z)
-        m.partial[c, SUM] = s
+        m.state.partial[c, SUM] = s
     ti.loop_config(serialize=True)
     for _ in range(1):
         rz = total(m, SUM)
@@ -72,7 +74,7 @@ def iterate_once(m: ti.template(), A: ti.template(), coupling: ti.template(), w:
                 q = m.free[i] * product
                 w.q[i] = q
                 s += dot64(w.p[i], q)
-        m.partial[c, SUM] = s
+        m.state.partial[c, SUM] = s
     ti.loop_config(serialize=True)
     for _ in range(1):
         if w.state[STOP] == RUNNING:
@@ -80,7 +82,9 @@ def iterate_once(m: ti.template(), A: ti.template(), coupling: ti.template(), w:
             if w.state[RZ] <= tolerance * tolerance * w.state[RZ_START]:
                 w.state[STOP] = CONVERGED
             elif not curvature > 0.0:
-                w.state[STOP] = NEGATIVE
+                w.state[STOP], w.state[STEP] = LEAVING, FARTHEST
+                if curvature < 0.0:
+                    w.state[STEP] = ti.min(w.state[RZ] / -curvature, FARTHEST)
             else:
                 w.state[STEP] = w.state[RZ] / curvature
     for c in range(m.chunks):
@@ -94,7 +98,7 @@ def iterate_once(m: ti.template(), A: ti.template(), coupling: ti.template(), w:
                 z = block_times(w.inverse[i], r)
                 w.r[i], w.z[i] = r, z
                 s += dot64(r, z)
-        m.partial[c, OTHER_SUM] = s
+        m.state.partial[c, OTHER_SUM] = s
     ti.loop_config(serialize=True)
     for _ in range(1):
         if w.state[STOP] == RUNNING:
@@ -107,3 +111,9 @@ def iterate_once(m: ti.template(), A: ti.template(), coupling: ti.template(), w:
     for i in range(m.n_nodes):
         if w.state[STOP] == RUNNING:
             w.p[i] = w.z[i] + ti.cast(w.state[STEP], m.real) * w.p[i]
+        elif w.state[STOP] == LEAVING:
+            w.y[i] = w.y[i] + ti.cast(w.state[STEP], m.real) * w.p[i]
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        if w.state[STOP] == LEAVING:
+            w.state[STOP] = NEGATIVE

@@ -1,37 +1,38 @@
 """CG with symmetric Gauss-Seidel on one thread, all iterations in one launch.
 
-With A = L + D + L^T and the preconditioner M = (D + L) D^-1 (D + L)^T, the vectors kept are s = (D + L)^-1 r and
-t = (D + L)^T p. Since A p = (D + L) p + t - D p, one backward and one forward sweep make an iteration:
-    p = (D + L)^-T t,   q = (D + L)^-1 A p = p + (D + L)^-1 (t - D p),   p.Ap = t.q,   r.z = s.D s.
+With A = L + D + L^T, P positive definite, D where that is, and the preconditioner M = (P + L) P^-1 (P + L)^T, the vectors kept
+are s = (P + L)^-1 r and t = (P + L)^T p. Since A p = (P + L) p + t - (2 P - D) p, one backward and one forward sweep make an
+iteration:
+    p = (P + L)^-T t,   q = (P + L)^-1 A p = p + (P + L)^-1 (t - (2 P - D) p),   p.Ap = t.q,   r.z = s.P s.
 Source: Eisenstat, "Efficient Implementation of a Class of Preconditioned Conjugate Gradient Methods", SIAM J. Sci. Stat.
-Comput. 2(1), 1981. D^-1 holds the inverse of the blocks that could be inverted, so M stays symmetric in any case.
+Comput. 2(1), 1981.
 """
 
 import taichi as ti
 
 from taisoft.linear.block_csr import block_times, part_times, part_times_backward
 from taisoft.linear.coupling import add_pulls, clear_pulls, gather_pulls, prepare_terms
-from taisoft.linear.pcg import CONVERGED, COUNT, NEGATIVE, RUNNING, RZ, RZ_START, STEP, STOP, dot64, inverse_block
+from taisoft.linear.pcg import CONVERGED, COUNT, FARTHEST, NEGATIVE, RUNNING, RZ, RZ_START, STEP, STOP, dot64, precondition
 from taisoft.runtime import kernel
 
 
 @ti.func
 def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()):
-    """y = 0, s = (D + L)^-1 rhs, t = D s; the diagonal and its inverse on the way."""
+    """y = 0, s = (P + L)^-1 rhs, t = P s; the diagonal and what P is on the way."""
     rz = ti.cast(0.0, ti.f64)
     if ti.static(k.width > 0):
         clear_pulls(m, k)
     for i in range(m.n_nodes):
         if ti.static(k.width > 0):
             A.diagonal[i] = prepare_terms(m, k, i)
-        w.inverse[i] = inverse_block(m, A.diagonal[i], m.free[i])
+        precondition(m, w, i, A.diagonal[i])
         below = part_times(m, A, A.row_start[i], A.row_upper[i], w.r)
         if ti.static(k.width > 0):
             below += gather_pulls(m, k, i)
         s = block_times(w.inverse[i], w.rhs[i] - below)
         if ti.static(k.width > 0):
             add_pulls(m, k, i, s)
-        t = block_times(A.diagonal[i], s)
+        t = block_times(w.block[i], s)
         w.r[i], w.q[i] = s, t
         w.z[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
         w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
@@ -58,16 +59,14 @@ def iterate_kernel(
             start(m, A, coupling, w)
         rz, along, stop, k = w.state[RZ], w.state[STEP], ti.cast(RUNNING, ti.i32), 0
         limit = tolerance * tolerance * w.state[RZ_START]
-        if rz < 0.0:
-            stop = NEGATIVE
-        elif rz <= limit:
+        if rz <= limit:
             stop = CONVERGED
         while k < n and stop == RUNNING:
             if ti.static(coupling.width > 0):
                 clear_pulls(m, coupling)
             for back in range(m.n_nodes):
                 i = m.n_nodes - 1 - back
-                t = w.q[i] + ti.cast(along, m.real) * w.z[i]  # w.q holds D s of the last update
+                t = w.q[i] + ti.cast(along, m.real) * w.z[i]  # w.q holds P s of the last update
                 w.z[i] = t
                 above = part_times_backward(m, A, A.row_upper[i], A.row_start[i + 1], w.p)
                 if ti.static(coupling.width > 0):
@@ -80,18 +79,21 @@ def iterate_kernel(
                 clear_pulls(m, coupling)
             curvature = ti.cast(0.0, ti.f64)
             for i in range(m.n_nodes):
-                # now w.q holds (D + L)^-1 (t - D p), as the rows below need it
+                # now w.q holds (P + L)^-1 (t - (2 P - D) p), as the rows below need it
                 p, t = w.p[i], w.z[i]
                 below = part_times(m, A, A.row_start[i], A.row_upper[i], w.q)
                 if ti.static(coupling.width > 0):
                     below += gather_pulls(m, coupling, i)
-                s = block_times(w.inverse[i], t - block_times(A.diagonal[i], p) - below)
+                s = block_times(w.inverse[i], t - block_times(w.mirror[i], p) - below)
                 if ti.static(coupling.width > 0):
                     add_pulls(m, coupling, i, s)
                 w.q[i] = s
                 curvature += dot64(t, p + s)
             if not curvature > 0.0:
                 stop = NEGATIVE
+                far = ti.cast(ti.min(rz, -FARTHEST * curvature) / -curvature if curvature < 0.0 else FARTHEST, m.real)
+                for i in range(m.n_nodes):
+                    w.y[i] = w.y[i] + far * w.p[i]
             else:
                 step, next_rz = ti.cast(rz / curvature, m.real), ti.cast(0.0, ti.f64)
                 for i in range(m.n_nodes):
@@ -99,15 +101,13 @@ def iterate_kernel(
                     w.y[i] = w.y[i] + step * p
                     s = w.r[i] - step * (p + w.q[i])
                     w.r[i] = s
-                    t = block_times(A.diagonal[i], s)
+                    t = block_times(w.block[i], s)
                     w.q[i] = t
                     next_rz += dot64(s, t)
                 along = next_rz / rz
                 rz = next_rz
                 k += 1
-                if rz < 0.0:
-                    stop = NEGATIVE
-                elif rz <= limit:
+                if rz <= limit:
                     stop = CONVERGED
         w.state[RZ], w.state[STEP], w.state[STOP] = rz, along, stop
         w.state[COUNT] = w.state[COUNT] + k

@@ -10,11 +10,11 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict
 
+from taisoft.dynamics import EXPLICIT, INTEGRATORS
 from taisoft.errors import SceneError, TaisoftError
 from taisoft.scene.scene import Scene
 from taisoft.settings import check_settings
 from taisoft.stability import stable_dt
-from taisoft.stepping import EXPLICIT, INTEGRATORS
 from taisoft.study.grid import AXES, Setting, cases, complete, expand, frame_time, mesh_name
 
 FINER = 8  # the study's smallest dt over the reference's

@@ -10,10 +10,10 @@ import textwrap
 
 import numpy as np
 
+from taisoft.dynamics import EXPLICIT, INTEGRATORS
 from taisoft.errors import SimulationError, TaisoftError
 from taisoft.settings import contact_solvers
 from taisoft.stability import stable_dt
-from taisoft.stepping import EXPLICIT, INTEGRATORS
 from taisoft.view.colouring import TITLES, Colouring
 from taisoft.view.layers import Layers
 from taisoft.view.plots import PLOTS, Plots

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.dynamics.pull import EARTH
 from taisoft.output.camera import Camera
-from taisoft.stepping.pull import EARTH
 
 PATCH = 0.1  # radius in units of the diagonal of the body's bounding box at rest
 LEAST = 4  # nodes; with fewer in the patch the triangle's corners alone are pulled

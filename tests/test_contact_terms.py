@@ -19,15 +19,15 @@ from scenes import built, cube, rubber
 import taisoft as ts
 from taisoft.contact.assemble import build_found
 from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, find_factors, index_nodes
+from taisoft.dynamics import contact_terms
+from taisoft.dynamics.contact_terms import NO_CONTACTS
+from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, LINEARISED, STAY, STEP, form_residual, move
+from taisoft.dynamics.stage_system import StageSystem
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import to_scipy, unpacked
 from taisoft.linear.coupling import add_pulls, clear_pulls, gather_pulls, prepare_terms, pull_with_all
 from taisoft.runtime import kernel
 from taisoft.scalars import END_SLOPE, START_SLOPE
-from taisoft.stepping import contact_stage
-from taisoft.stepping.contact_stage import SHARE, STAY, STEP
-from taisoft.stepping.newton import StageSolver
-from taisoft.stepping.stage import form_residual
 
 K, BETA, DT = 24, 0.002, 0.003  # contacts; [s]
 GOAL = 1e-3, 0.2, 0.02, 0.05  # standoff [m], shares that a step mends, speed of that at most [m/s]
@@ -76,8 +76,8 @@ def rig(request):
         arity[::5] = (contacts.weight[::5] > 0).sum(axis=1)  # against an obstacle
         p = build_node_problem(arena, K + 3, m.n_nodes, True)
         f = build_found(arena, p)
-        solver = StageSolver(m, arena, made.machine.eps, np.zeros(0, dtype=int))
-        k = contact_stage.build_stage_contacts(arena, m, f, arena.vectors("x_start", ti.f64, m.n_nodes))
+        solver = StageSystem(m, arena, made.machine.eps, np.zeros(0, dtype=int))
+        k = contact_terms.build_stage_contacts(arena, m, f, arena.vectors("x_start", ti.f64, m.n_nodes))
         for name in ("node", "weight", "normal", "tangent"):
             fill_field(getattr(p, name), getattr(contacts, name))
         carry = np.where((np.arange(K) % 5 == 0)[:, None], 1e-3 * rng.standard_normal((K, 3)), 0.0)
@@ -90,7 +90,7 @@ def rig(request):
         index_nodes(p)
         block_csr.assemble(m, solver.matrix, False)
         block_csr.to_system(m, solver.matrix, solver.matrix, 1.0, BETA)
-        contact_stage.keep_diagonal(m, solver.matrix, k)
+        contact_terms.keep_diagonal(m, solver.matrix, k)
         find_factors(p)
         A = to_scipy(m, solver.matrix).toarray()
         found = oracle.NodeContacts(
@@ -115,21 +115,21 @@ def rig(request):
 
 def press(rig, x: np.ndarray) -> np.ndarray:
     """The impulses (K,3) at x (n,3); what they were before must not count."""
-    rig.m.x.from_numpy(x)
+    rig.m.state.x.from_numpy(x)
     rig.p.r.fill(np.nan)
     evaluate(rig)
     return rig.p.r.to_numpy()[:K]
 
 
 def evaluate(
-    rig, how: int | None = STAY, share: float = 1.0, multiply: bool = False, linear: bool = False, m=None
+    rig, how: int | None = STAY, share: float = 1.0, multiply: bool = False, kind: int = ELASTIC_STAGE, m=None
 ) -> np.ndarray:
     """The norms of the residual. how: None to stay without asking for the forces. m: the model, by default that on one thread."""
     norms, s, m = np.zeros(5), rig.solver, m or rig.m
     if how is not None:
-        contact_stage.move(m, rig.work, rig.k, s.pcg, linear, how, share, 1.0, BETA)
-    contact_stage.press(m, rig.work, rig.k, False, int(multiply), BETA, DT, *GOAL, STIFFNESS)
-    contact_stage.form_pressed_residual(m, rig.work, s.matrix, rig.k, s.pcg, linear, BETA, norms)
+        move(m, rig.work, rig.k, s.pcg, kind, how, share, 1.0, BETA)
+    contact_terms.press(m, rig.work, rig.k, False, int(multiply), BETA, DT, *GOAL, STIFFNESS)
+    form_residual(m, rig.work, s.matrix, rig.k, s.pcg, kind, BETA, norms)
     return norms
 
 
@@ -239,18 +239,20 @@ def test_residual_of_a_stage(rig, pressed, threads):
     before = rng.standard_normal(rig.x.shape).astype(real)
     cg.y.from_numpy(y)
     work.residual.from_numpy(before)
-    m.x.from_numpy(rig.x)
-    for how, share in ((STEP, 1.0), (SHARE, 0.4), (None, 0.4)):
+    m.state.x.from_numpy(rig.x)
+    for how, share in ((STEP, 1.0), (AGAIN, 0.4), (None, 0.4)):
         norms = evaluate(rig, how, share, multiply=how is None, m=m)
         got, rhs, r = work.residual.to_numpy(), cg.rhs.to_numpy(), rig.p.r.to_numpy()[:K]
-        assert np.abs(m.x.to_numpy() - rig.x - share * BETA * y.astype(float)).max() < 1e-15
-        assert np.abs(m.v.to_numpy() - (m.x.to_numpy() - rig.x_hat) / BETA).max() < 10 * rig.close * np.abs(m.v.to_numpy()).max()
+        assert np.abs(m.state.x.to_numpy() - rig.x - share * BETA * y.astype(float)).max() < 1e-15
+        v = m.state.v.to_numpy()
+        assert np.abs(v - (m.state.x.to_numpy() - rig.x_hat) / BETA).max() < 10 * rig.close * np.abs(v).max()
         if how == STEP:
             slope = (rig.free * before * y).sum()
             size = np.linalg.norm(before.astype(float)) * np.linalg.norm(y.astype(float))
-            assert m.scalars[START_SLOPE] == pytest.approx(slope, abs=10 * rig.close * size)
-        told = np.zeros(5)
-        form_residual(m, work, cg, 1.0, BETA, told)
+            assert m.state.scalars[START_SLOPE] == pytest.approx(slope, abs=10 * rig.close * size)
+        told, end = np.zeros(5), m.state.scalars[END_SLOPE]
+        move(m, work, NO_CONTACTS, cg, ELASTIC_STAGE, STAY, 0.0, 1.0, BETA)
+        form_residual(m, work, rig.solver.matrix, NO_CONTACTS, cg, ELASTIC_STAGE, BETA, told)
         expected = work.residual.to_numpy() - (rig.J.T @ r.ravel()).reshape(-1, 3)
         assert np.abs(expected - work.residual.to_numpy()).max() > 0.1 * np.abs(expected).max()  # the impulses do count
         close = 10 * rig.close * np.abs(expected).max()
@@ -258,21 +260,29 @@ def test_residual_of_a_stage(rig, pressed, threads):
         wanted = [((rig.free * expected) ** 2).sum(), *told[1:4], (((1 - rig.free) * expected) ** 2).sum()]
         assert norms == pytest.approx(wanted, rel=100 * rig.close) and norms[4] > 0
         slope, size = (rig.free * expected * y).sum(), np.linalg.norm(expected) * np.linalg.norm(y.astype(float))
-        assert m.scalars[END_SLOPE] == pytest.approx(slope, abs=100 * rig.close * size)
+        assert end == pytest.approx(slope, abs=100 * rig.close * size)
 
 
 def test_a_linearised_stage_is_linear(rig):
-    m, rng = rig.m, np.random.default_rng(7)
-    before = (1e-2 * rng.standard_normal(rig.x.shape)).astype(rig.made.machine.np_real)
-    rig.work.residual.from_numpy(before)
-    m.x.from_numpy(rig.start)
-    contact_stage.keep_linear(m, rig.work, rig.k)
-    m.x.from_numpy(rig.x)
-    norms = evaluate(rig, linear=True)
+    """The impulses of where it is linearised do not stay in it."""
+    m = rig.m
+    m.state.x.from_numpy(rig.start)
+    evaluate(rig)
+    there = rig.p.r.to_numpy()[:K]
+    before = rig.work.residual.to_numpy() + (rig.J.T @ there.ravel()).reshape(-1, 3)
+    contact_terms.keep_linear(m, rig.work, rig.k)
+    m.state.x.from_numpy(rig.x)
+    norms = evaluate(rig, kind=LINEARISED)
     r = rig.p.r.to_numpy()[:K]
     expected = before + (rig.A @ (rig.x - rig.start).ravel() / BETA - rig.J.T @ r.ravel()).reshape(-1, 3)
     assert np.abs(rig.work.residual.to_numpy() - expected).max() < 10 * rig.close * np.abs(expected).max()
     assert norms[0] == pytest.approx(((rig.free * expected) ** 2).sum(), rel=100 * rig.close)
+    for taken, impulses in ((1, r), (0, there)):
+        contact_terms.leave_linear(m, rig.work, rig.k, rig.solver.pcg, taken)
+        assert np.array_equal(rig.p.r.to_numpy()[:K], impulses)
+    assert np.array_equal(rig.work.base.to_numpy(), rig.start)
+    way = rig.solver.pcg.y.to_numpy() - rig.free * (rig.x - rig.start) / BETA
+    assert np.abs(way).max() < 10 * rig.close * np.abs(rig.x - rig.start).max() / BETA
 
 
 def test_without_friction_nothing_resists_along_the_surface(rig):
@@ -281,7 +291,7 @@ def test_without_friction_nothing_resists_along_the_surface(rig):
     multiplier = np.zeros((K, 3))
     multiplier[:, 0] = 1e3
     fill_field(rig.p.r, multiplier)
-    rig.m.x.from_numpy(rig.x)
+    rig.m.state.x.from_numpy(rig.x)
     evaluate(rig, multiply=True)
     smooth = np.flatnonzero((rig.friction == 0) & ~rig.carry.any(axis=1))
     blocks, n = unpacked(rig.k.work.block.to_numpy()[:K]), rig.frame[:, 0]

@@ -8,18 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
+from taisoft.dynamics.body_balance import LIMIT, BodyBalance
+from taisoft.dynamics.contact import TOLERANCE, ContactStep
+from taisoft.dynamics.impact import solve_bouncing
+from taisoft.dynamics.newton import StageResult, count_all, merge, solve
+from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.dynamics.substepping import RETRIES, Substepping
+from taisoft.dynamics.world import World
 from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
-from taisoft.stepping.body_balance import LIMIT, BodyBalance
-from taisoft.stepping.contact import TOLERANCE, ContactStep
-from taisoft.stepping.contact_newton import ContactStageSolver
-from taisoft.stepping.newton import StageResult, StageSolver, count_all, merge
-from taisoft.stepping.substepping import RETRIES, Substepping
-from taisoft.stepping.world import World
 from taisoft.transfer import download, upload
 
-MAX_NEWTON = 50  # a step that needs more is reported as not converged
-MAX_CONTACT_NEWTON = 400  # with contacts, over all multipliers
+MAX_NEWTON = 50  # a step that needs more is cut in parts, or reported as not converged
 TIGHTER = 0.1  # of the tolerance that would just do where a body's forces did not balance
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
@@ -51,15 +51,15 @@ def begin_step(
         if ti.static(multistep):
             h.x_before[i] = h.x_now[i]
         h.v_before[i] = h.v_now[i]
-        h.x_now[i] = m.x[i]
-        h.v_now[i] = m.v[i]
+        h.x_now[i] = m.state.x[i]
+        h.v_now[i] = m.state.v[i]
         w.x_hat[i] = h.x_now[i]
         w.v_hat[i] = h.v_now[i]
         if ti.static(multistep):
             w.x_hat[i] = now * h.x_now[i] - before * h.x_before[i]
             w.v_hat[i] = ti.cast(now, m.real) * h.v_now[i] - ti.cast(before, m.real) * h.v_before[i]
         v = ti.cast(1.0 - still, m.real) * h.v_now[i] + ti.cast(along, m.real) * (h.v_now[i] - h.v_before[i])
-        m.v[i] = m.free[i] * v
+        m.state.v[i] = m.free[i] * v
 
 
 @kernel
@@ -67,8 +67,8 @@ def finish_midpoint(m: ti.template(), h: ti.template()):
     """The stage was the middle: x = 2 x_m - x_n, v = 2 v_m - v_n."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        m.x[i] = 2.0 * m.x[i] - h.x_now[i]
-        m.v[i] = m.v[i] + m.free[i] * (m.v[i] - h.v_now[i])
+        m.state.x[i] = 2.0 * m.state.x[i] - h.x_now[i]
+        m.state.v[i] = m.state.v[i] + m.free[i] * (m.state.v[i] - h.v_now[i])
 
 
 @kernel
@@ -76,8 +76,8 @@ def restore(m: ti.template(), h: ti.template()):
     """Back to state n."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        m.x[i] = h.x_now[i]
-        m.v[i] = h.v_now[i]
+        m.state.x[i] = h.x_now[i]
+        m.state.v[i] = h.v_now[i]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +101,7 @@ class ImplicitStepper:
             arena.vectors("v_before", m.real, m.n_nodes),
             arena.vectors("x_before", ti.f64, m.n_nodes) if scheme.before else None,
         )  # fmt: skip
-        common = m, arena, world.runtime.eps, world.motion.moved
-        self.solver = StageSolver(*common) if contact is None else ContactStageSolver(*common, contact, self.history.x_now)
+        self.solver = StageSystem(m, arena, world.runtime.eps, world.motion.moved, contact, self.history.x_now)
         self.tolerance = DEFAULT_TOLERANCE[world.runtime.precision]
         self.contact_tolerance = TOLERANCE[world.runtime.precision]
         self.linear_tolerance: float | None = None
@@ -124,7 +123,7 @@ class ImplicitStepper:
 
     def numbers_changed(self) -> None:
         """Gravity or material numbers changed."""
-        self.solver.update_material()
+        self.solver.numbers_changed()
 
     def snapshot(self) -> dict:
         """What the next step rests on beside the world: the history, what the solver keeps, the contacts."""
@@ -242,7 +241,7 @@ class ImplicitStepper:
         self.lossy = scheme.before == 0.0
         if target is not None:
             if scheme.midpoint:
-                target = 0.5 * (target + m.x.to_numpy()[world.motion.moved])
+                target = 0.5 * (target + m.state.x.to_numpy()[world.motion.moved])
             led = [(w.moved_axes, world.motion.moved_axes()), (w.targets, target)]
             if m.consistent:
                 led.append((w.led_acceleration, world.motion.accelerations(time, dt, self.scheme.before == 0.0)))
@@ -294,20 +293,13 @@ class ImplicitStepper:
         return result
 
     def _solve(self, scheme: Scheme, dt: float, bounces: bool, tolerance: float) -> StageResult:
-        """The stage, with contacts or without. bounces: whether any are thrown back."""
-        most = 1 if scheme.one_iteration else MAX_NEWTON
-        # led nodes change their velocity once a step, not twice within the midpoint's half step
-        share = 0.5 if scheme.midpoint else 1.0
-        if self.contact is None:
-            return self.solver.solve(1.0, self._beta, tolerance, most, self.linear_tolerance, led_share=share)
-        if bounces:
-            return self.solver.solve_bouncing(
-                dt, tolerance, self.contact_tolerance, MAX_CONTACT_NEWTON, self.linear_tolerance, scheme.one_iteration
-            )
-        return self.solver.solve_stage(
-            1.0, self._beta, dt, tolerance, self.contact_tolerance, MAX_CONTACT_NEWTON, self.linear_tolerance,
-            scheme.one_iteration, share,
+        """The stage. bounces: whether any contacts are thrown back."""
+        stage = Stage(
+            1.0, self._beta, dt, tolerance, self.contact_tolerance, MAX_NEWTON, self.linear_tolerance, scheme.one_iteration,
+            # prescribed nodes change their velocity once a step, not twice within the midpoint's half step
+            0.5 if scheme.midpoint else 1.0,
         )  # fmt: skip
+        return solve_bouncing(self.solver, stage) if bounces else solve(self.solver, stage)
 
     def reactions(self) -> np.ndarray:
         """(n_nodes, 3) force of the constraints in the last step [N]."""

@@ -6,13 +6,12 @@ from typing import Any
 import taichi as ti
 
 from taisoft.arrays import Count
-from taisoft.elasticity import element_force
 from taisoft.elements.lanes import gather
 from taisoft.linear.block_csr import row_times
 from taisoft.linear.pcg import dot64, total
 from taisoft.mass import mass_times
 from taisoft.runtime import kernel
-from taisoft.scalars import N_NORMS, OTHER_SUM, POTENTIAL, START_SLOPE, SUM
+from taisoft.scalars import OTHER_SUM, POTENTIAL, SUM
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +39,7 @@ class StageWork:
 @ti.func
 def stage_velocity(m: ti.template(), w: ti.template(), i, beta):
     """(x - x_hat) / beta of node i in f64: an f32 velocity would make neighbours' positions differ by its rounding."""
-    return (m.x[i] - w.x_hat[i]) / beta
+    return (m.state.x[i] - w.x_hat[i]) / beta
 
 
 @kernel
@@ -53,7 +52,7 @@ def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, led_share: ti.
     """
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        m.x[i] = w.x_hat[i] + beta * ti.cast(m.v[i], ti.f64)
+        m.state.x[i] = w.x_hat[i] + beta * ti.cast(m.state.v[i], ti.f64)
     if ti.static(w.leads):
         ti.loop_config(serialize=True)
         for k in range(w.n_moved):
@@ -65,8 +64,8 @@ def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, led_share: ti.
                         w.v_hat[i][a] = ti.cast(v - beta * w.led_acceleration[k][a], m.real)
                     else:
                         w.v_hat[i][a] = ti.cast(v - led_share * (v - ti.cast(w.v_hat[i][a], ti.f64)), m.real)
-                    m.v[i][a] = ti.cast(v, m.real)
-                    m.x[i][a] = w.targets[k][a]
+                    m.state.v[i][a] = ti.cast(v, m.real)
+                    m.state.x[i][a] = w.targets[k][a]
 
 
 @ti.func
@@ -74,7 +73,7 @@ def set_change(m: ti.template(), w: ti.template(), i, c, beta):
     """What the mass of node i is multiplied by."""
     change = c * (stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64))
     if ti.static(m.damped):
-        change += beta * ti.cast(m.damping[m.node_body[i], 0], ti.f64) * ti.cast(m.v[i], ti.f64)
+        change += beta * ti.cast(m.damping[m.node_body[i], 0], ti.f64) * ti.cast(m.state.v[i], ti.f64)
     w.change[i] = change
 
 
@@ -87,7 +86,7 @@ def residual_parts(m: ti.template(), w: ti.template(), i, beta):
         external += m.loads[i]
     drag = ti.Vector([0.0, 0.0, 0.0], m.real)
     if ti.static(m.stiffness_damping):
-        drag += m.damping[m.node_body[i], 1] * row_times(m, w.damper, i, m.v)
+        drag += m.damping[m.node_body[i], 1] * row_times(m, w.damper, i, m.state.v)
     inertia = ti.cast(mass_times(m, i, w.change), m.real)
     return inertia - ti.cast(beta, m.real) * (f + external - drag), inertia, f, external
 
@@ -98,39 +97,6 @@ def squares(r, inertia, f, external, free):
     return ti.Vector([norm2(free * r), norm2(free * inertia), norm2(free * f), norm2(free * external), norm2((1.0 - free) * r)])
 
 
-@kernel
-def form_residual(
-    m: ti.template(), w: ti.template(), p: ti.template(), c: ti.f64, beta: ti.f64, norms: ti.types.ndarray()
-):
-    """Elastic forces and residual at the present x and v, -r as CG's right side.
-
-    norms (5,), an array of the host (it is told sooner than by a returned vector): |r|^2, |inertia and mass damping|^2,
-    |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on the others.
-    """
-    for g in ti.static(m.groups):
-        ti.loop_config(serialize=m.serial)
-        for b in range(g.first, g.last):
-            element_force(m, g, False, b)
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        set_change(m, w, i, c, beta)
-    ti.loop_config(serialize=m.serial)
-    for k in range(m.chunks):
-        size = (m.n_nodes + m.chunks - 1) // m.chunks
-        s = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64)
-        for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
-            r, inertia, f, external = residual_parts(m, w, i, beta)
-            w.residual[i] = r
-            p.rhs[i] = -m.free[i] * r
-            s += squares(r, inertia, f, external, m.free[i])
-        for j in ti.static(range(N_NORMS)):
-            m.partial[k, j] = s[j]
-    ti.loop_config(serialize=True)  # a sum outside of any loop would be a loop of its own over threads, 50 us and more
-    for _ in range(1):
-        for j in ti.static(range(N_NORMS)):
-            norms[j] = total(m, j)
-
-
 @ti.func
 def norm2(a):
     b = ti.cast(a, ti.f64)
@@ -138,35 +104,31 @@ def norm2(a):
 
 
 @ti.func
-def place_node(m: ti.template(), w: ti.template(), y: ti.template(), i, share, beta):
-    """Node i at base + share beta y, v accordingly."""
-    m.x[i] = w.base[i] + share * beta * ti.cast(y[i], ti.f64)
-    m.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
+def place_node(m: ti.template(), w: ti.template(), y: ti.template(), i, step_length, beta):
+    """Node i at base + step_length beta y, v accordingly; y is 0 on constrained axes."""
+    m.state.x[i] = w.base[i] + step_length * beta * ti.cast(y[i], ti.f64)
+    m.state.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
 
 
 @kernel
-def try_step(m: ti.template(), w: ti.template(), y: ti.template(), share: ti.f64, beta: ti.f64):
-    """x = base + share beta y, v accordingly; y is 0 on constrained axes."""
+def stand_still(m: ti.template(), w: ti.template(), x_start: ti.template(), beta: ti.f64):
+    """The first iterate becomes the state at the step's start, on the free axes; base = the one of before."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        place_node(m, w, y, i, share, beta)
+        w.base[i] = m.state.x[i]
+        for a in ti.static(range(3)):
+            if m.free[i][a] != 0.0:
+                m.state.x[i][a] = x_start[i][a]
+        m.state.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
 
 
 @kernel
-def start_step(m: ti.template(), w: ti.template(), y: ti.template(), beta: ti.f64):
-    """base = x, then the whole step y; scalars: START_SLOPE."""
+def go_back(m: ti.template(), w: ti.template(), beta: ti.f64):
+    """The first iterate becomes base."""
     ti.loop_config(serialize=m.serial)
-    for k in range(m.chunks):
-        size = (m.n_nodes + m.chunks - 1) // m.chunks
-        s = ti.cast(0.0, ti.f64)
-        for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
-            s += dot64(m.free[i] * w.residual[i], y[i])
-            w.base[i] = m.x[i]
-            place_node(m, w, y, i, 1.0, beta)
-        m.partial[k, SUM] = s
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        m.scalars[START_SLOPE] = total(m, SUM)
+    for i in range(m.n_nodes):
+        m.state.x[i] = w.base[i]
+        m.state.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
 
 
 @kernel
@@ -178,11 +140,11 @@ def stage_terms(m: ti.template(), w: ti.template(), c: ti.f64, beta: ti.f64):
             w.change[i] = stage_velocity(m, w, i, beta)
         ti.loop_config(serialize=m.serial)
         for k in range(m.chunks):
-            m.partial[k, OTHER_SUM] = 0.0
+            m.state.partial[k, OTHER_SUM] = 0.0
             size = (m.n_nodes + m.chunks - 1) // m.chunks
             for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
                 a = ti.cast(m.damping[m.node_body[i], 0], ti.f64)
-                m.partial[k, OTHER_SUM] += 0.5 * beta * a * w.change[i].dot(mass_times(m, i, w.change))
+                m.state.partial[k, OTHER_SUM] += 0.5 * beta * a * w.change[i].dot(mass_times(m, i, w.change))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         w.change[i] = stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64)
@@ -191,14 +153,14 @@ def stage_terms(m: ti.template(), w: ti.template(), c: ti.f64, beta: ti.f64):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         s = ti.cast(0.0, ti.f64)
         if ti.static(m.damped):
-            s += m.partial[k, OTHER_SUM]
+            s += m.state.partial[k, OTHER_SUM]
         for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
             s += 0.5 * c * w.change[i].dot(mass_times(m, i, w.change))
             if ti.static(m.loaded):
-                s -= ti.cast(m.loads[i], ti.f64).dot(m.x[i])
+                s -= ti.cast(m.loads[i], ti.f64).dot(m.state.x[i])
             if ti.static(m.stiffness_damping):
-                s += 0.5 * beta * m.damping[m.node_body[i], 1] * dot64(m.v[i], row_times(m, w.damper, i, m.v))
-        m.partial[k, SUM] = s
+                s += 0.5 * beta * m.damping[m.node_body[i], 1] * dot64(m.state.v[i], row_times(m, w.damper, i, m.state.v))
+        m.state.partial[k, SUM] = s
     ti.loop_config(serialize=True)
     for _ in range(1):
-        m.scalars[POTENTIAL] = total(m, SUM)
+        m.state.scalars[POTENTIAL] = total(m, SUM)

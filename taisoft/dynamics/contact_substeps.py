@@ -9,13 +9,13 @@ import taichi as ti
 from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.problem import find_factors
 from taisoft.contact.solve import SolveResult, solve
+from taisoft.dynamics import explicit
+from taisoft.dynamics.contact import TOLERANCE, ContactStep
+from taisoft.dynamics.explicit_contact import find_acceleration, finish_verlet, keep_state, move, predict, set_free_velocities
+from taisoft.dynamics.substeps import ExplicitStepper, SubstepResult
+from taisoft.dynamics.world import World
 from taisoft.errors import SimulationError
 from taisoft.scalars import FAILED, LOWEST_J, MOST_INVERTED
-from taisoft.stepping import explicit
-from taisoft.stepping.contact import TOLERANCE, ContactStep
-from taisoft.stepping.explicit_contact import find_acceleration, finish_verlet, keep_state, move, predict, set_free_velocities
-from taisoft.stepping.substeps import ExplicitStepper, SubstepResult
-from taisoft.stepping.world import World
 from taisoft.transfer import download
 
 MAX_SWEEPS = 1000  # of a contact solve; one that needs more is reported as not converged
@@ -100,7 +100,7 @@ class ContactExplicitStepper(ExplicitStepper):
             raise
         self.contact.penetration, self.contact.sinking = depth, sinking
         return ContactSubstepResult(
-            n, m.scalars[LOWEST_J], int(m.scalars[MOST_INVERTED]), sum(r.iterations for r in results if r),
+            n, m.state.scalars[LOWEST_J], int(m.state.scalars[MOST_INVERTED]), sum(r.iterations for r in results if r),
             max((r.residual for r in results if r), default=0.0), all(r.converged for r in results if r),
         )  # fmt: skip
 
@@ -133,6 +133,6 @@ class ContactExplicitStepper(ExplicitStepper):
         move(m, s, contact.problem, dt, int(n > 0))
         if s.verlet:
             finish_verlet(m, s, contact.problem, dt, int(n > 0))
-        if m.scalars[FAILED] != 0.0:
+        if m.state.scalars[FAILED] != 0.0:
             raise SimulationError(f"step {step}: {self._fault()}")
         return result

@@ -37,24 +37,24 @@ def acceleration(m: ti.template(), i):
 def euler_velocity(m: ti.template(), i, dt):
     """The velocity that Euler's step reaches."""
     a = acceleration(m, i)
-    v = m.v[i] + dt * a
+    v = m.state.v[i] + dt * a
     if ti.static(m.damped):
-        v -= dt * m.damping[m.node_body[i], 0] * m.v[i]
+        v -= dt * m.damping[m.node_body[i], 0] * m.state.v[i]
     return v
 
 
 @ti.func
 def euler_node(m: ti.template(), i, dt):
     v = euler_velocity(m, i, dt)
-    m.v[i] = v
-    m.x[i] = m.x[i] + ti.cast(dt * v, ti.f64)
+    m.state.v[i] = v
+    m.state.x[i] = m.state.x[i] + ti.cast(dt * v, ti.f64)
     return v
 
 
 @ti.func
 def verlet_half(m: ti.template(), s: ti.template(), i, dt):
     """The velocity after the first half kick."""
-    v = m.v[i]
+    v = m.state.v[i]
     if ti.static(m.damped):
         v *= ti.exp(-0.5 * dt * m.damping[m.node_body[i], 0])
     return v + 0.5 * dt * s.acceleration[i]
@@ -63,26 +63,26 @@ def verlet_half(m: ti.template(), s: ti.template(), i, dt):
 @ti.func
 def verlet_move(m: ti.template(), s: ti.template(), i, dt, half):
     """Drift by the velocity of the middle; where stiffness damping is on, v is then extrapolated to the force's time."""
-    m.x[i] = m.x[i] + ti.cast(dt * half, ti.f64)
+    m.state.x[i] = m.state.x[i] + ti.cast(dt * half, ti.f64)
     if ti.static(m.stiffness_damping):
         s.half_velocity[i] = half
-        m.v[i] = half + 0.5 * dt * s.acceleration[i]
+        m.state.v[i] = half + 0.5 * dt * s.acceleration[i]
     else:
-        m.v[i] = half
+        m.state.v[i] = half
 
 
 @ti.func
 def verlet_kick(m: ti.template(), s: ti.template(), i, dt):
     """Second half kick."""
     a = acceleration(m, i)
-    half = m.v[i]
+    half = m.state.v[i]
     if ti.static(m.stiffness_damping):
         half = s.half_velocity[i]
     v = half + 0.5 * dt * a
     if ti.static(m.damped):
         v *= ti.exp(-0.5 * dt * m.damping[m.node_body[i], 0])
     s.acceleration[i] = a
-    m.v[i] = v
+    m.state.v[i] = v
     return v
 
 
@@ -100,7 +100,7 @@ def lead_velocities(m: ti.template(), s: ti.template(), row, dt):
         i = s.moved[k]
         for a in ti.static(range(3)):
             if s.moved_axes[k][a] != 0:
-                m.v[i][a] = ti.cast((s.targets[row * s.n_moved + k][a] - s.before[k][a]) / dt, m.real)
+                m.state.v[i][a] = ti.cast((s.targets[row * s.n_moved + k][a] - s.before[k][a]) / dt, m.real)
 
 
 @ti.func
@@ -110,13 +110,13 @@ def lead_positions(m: ti.template(), s: ti.template(), row):
         i = s.moved[k]
         for a in ti.static(range(3)):
             if s.moved_axes[k][a] != 0:
-                m.x[i][a] = s.targets[row * s.n_moved + k][a]
+                m.state.x[i][a] = s.targets[row * s.n_moved + k][a]
 
 
 @ti.func
 def remember(m: ti.template(), s: ti.template()):
     for k in range(s.n_moved):
-        s.before[k] = m.x[s.moved[k]]
+        s.before[k] = m.state.x[s.moved[k]]
 
 
 @ti.func
@@ -129,17 +129,17 @@ def react(m: ti.template(), s: ti.template(), dt):
             f += m.loads[i]
         mass = m.mass[i]
         if ti.static(m.damped):
-            v = m.v[i]
+            v = m.state.v[i]
             if ti.static(not s.verlet):
                 v = s.held_velocity[k]
             f -= m.damping[m.node_body[i], 0] * mass * v
-        s.reaction[k] = (1.0 - m.free[i]) * (mass * (m.v[i] - s.held_velocity[k]) / dt - f - mass * m.gravity[0])
+        s.reaction[k] = (1.0 - m.free[i]) * (mass * (m.state.v[i] - s.held_velocity[k]) / dt - f - mass * m.gravity[0])
 
 
 @ti.func
 def keep_held(m: ti.template(), s: ti.template()):
     for k in range(s.n_held):
-        s.held_velocity[k] = m.v[s.held[k]]
+        s.held_velocity[k] = m.state.v[s.held[k]]
 
 
 @kernel
@@ -199,8 +199,8 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
                 low = ti.min(low, lowest[q])
             going = low > -EXPLODED and not unfinite(ti.cast(total[0] + total[1] + total[2], ti.f64))
             done += 1
-        m.scalars[STEPS_DONE] = done - (0 if going else 1)
-        m.scalars[LOWEST_J], m.scalars[MOST_INVERTED] = low, most
+        m.state.scalars[STEPS_DONE] = done - (0 if going else 1)
+        m.state.scalars[LOWEST_J], m.state.scalars[MOST_INVERTED] = low, most
 
 
 @kernel
@@ -218,10 +218,10 @@ def tell_volumes(m: ti.template(), b, J):
     low, count = J[0], bad[0]
     for q in ti.static(range(1, m.lanes)):
         low, count = ti.min(low, J[q]), count + bad[q]
-    ti.atomic_min(m.scalars[LOWEST_J], ti.cast(low, ti.f64))
-    ti.atomic_add(m.scalars[INVERTED_NOW], ti.cast(count, ti.f64))
+    ti.atomic_min(m.state.scalars[LOWEST_J], ti.cast(low, ti.f64))
+    ti.atomic_add(m.state.scalars[INVERTED_NOW], ti.cast(count, ti.f64))
     if not low > -EXPLODED:
-        m.scalars[FAILED] = 1.0
+        m.state.scalars[FAILED] = 1.0
 
 
 @kernel
@@ -234,7 +234,7 @@ def elements_parallel(m: ti.template()):
 
 @kernel
 def restart_parallel(m: ti.template(), s: ti.template()):
-    """Verlet's acceleration from the corner buffer."""
+    """Verlet's acceleration from the tets' forces."""
     for i in range(m.n_nodes):
         s.acceleration[i] = acceleration(m, i)
 
@@ -244,10 +244,10 @@ def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
     """What comes before a sub-step's element loop."""
     if ti.static(s.holds):
         for k in range(s.n_held):
-            s.held_velocity[k] = m.v[s.held[k]]
+            s.held_velocity[k] = m.state.v[s.held[k]]
     if ti.static(s.leads):
         for k in range(s.n_moved):
-            s.before[k] = m.x[s.moved[k]]
+            s.before[k] = m.state.x[s.moved[k]]
     if ti.static(s.verlet):
         for i in range(m.n_nodes):
             dt = ti.cast(dt64, m.real)
@@ -269,7 +269,7 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
         else:
             v = euler_node(m, i, dt)
         if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
-            m.scalars[FAILED] = 1.0
+            m.state.scalars[FAILED] = 1.0
     if ti.static(s.leads):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -280,10 +280,10 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
             react(m, s, ti.cast(dt64, m.real))
     ti.loop_config(serialize=True)
     for _ in range(1):
-        m.scalars[MOST_INVERTED] = ti.max(m.scalars[MOST_INVERTED], m.scalars[INVERTED_NOW])
-        m.scalars[INVERTED_NOW] = 0.0
-        if m.scalars[FAILED] == 0.0:
-            m.scalars[STEPS_DONE] = m.scalars[STEPS_DONE] + 1.0
+        m.state.scalars[MOST_INVERTED] = ti.max(m.state.scalars[MOST_INVERTED], m.state.scalars[INVERTED_NOW])
+        m.state.scalars[INVERTED_NOW] = 0.0
+        if m.state.scalars[FAILED] == 0.0:
+            m.state.scalars[STEPS_DONE] = m.state.scalars[STEPS_DONE] + 1.0
 
 
 @kernel
@@ -291,5 +291,5 @@ def begin_parallel(m: ti.template()):
     """Counters of a batch of parallel sub-steps."""
     ti.loop_config(serialize=True)
     for _ in range(1):
-        m.scalars[STEPS_DONE], m.scalars[LOWEST_J], m.scalars[FAILED] = 0.0, HUGE, 0.0
-        m.scalars[MOST_INVERTED], m.scalars[INVERTED_NOW] = 0.0, 0.0
+        m.state.scalars[STEPS_DONE], m.state.scalars[LOWEST_J], m.state.scalars[FAILED] = 0.0, HUGE, 0.0
+        m.state.scalars[MOST_INVERTED], m.state.scalars[INVERTED_NOW] = 0.0, 0.0

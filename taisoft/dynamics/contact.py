@@ -22,10 +22,10 @@ from taisoft.contact.assemble import (
 )  # fmt: skip
 from taisoft.contact.problem import NODES, build_node_problem, index_nodes
 from taisoft.contact.restitution import find_rebounds
+from taisoft.dynamics.tunnelling import CLOSEST, DEPTH, HASTE, SINKING, SPEED, WHICH, find_way, survey
+from taisoft.dynamics.world import World
 from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
-from taisoft.stepping.tunnelling import CLOSEST, DEPTH, HASTE, SINKING, SPEED, WHICH, find_way, survey
-from taisoft.stepping.world import World
 from taisoft.transfer import download, upload
 
 STANDOFF = 2e-3  # of the finest body's mean surface edge: gap that contacts keep, so that surfaces do not cross in curved motion
@@ -173,7 +173,7 @@ class ContactStep:
         if known is None or known[1] != dt or abs(known[0] - time) > 1e-6 * dt:
             self._searched = None
             moved = world.motion.moved
-            led = (moved, world.motion.places(time + dt) - world.model.x.to_numpy()[moved]) if len(moved) else None
+            led = (moved, world.motion.places(time + dt) - world.model.state.x.to_numpy()[moved]) if len(moved) else None
             d.find(time, dt, led)
             self._searched, self._swept = (time, dt), dt
         return d.counts.contacts

@@ -12,13 +12,13 @@ not converged all the same, or after UNDONE others were undone, is kept and repo
 from enum import Enum, auto
 from typing import TYPE_CHECKING
 
+from taisoft.dynamics.contact import CROSSED_FAR, SUNK
+from taisoft.dynamics.newton import StageResult, count_all
+from taisoft.dynamics.tunnelling import next_length
 from taisoft.errors import SimulationError
-from taisoft.stepping.contact import CROSSED_FAR, SUNK
-from taisoft.stepping.newton import StageResult, count_all
-from taisoft.stepping.tunnelling import next_length
 
 if TYPE_CHECKING:
-    from taisoft.stepping.implicit import ImplicitStepper
+    from taisoft.dynamics.implicit import ImplicitStepper
 
 MAX_PARTS = 256  # of a step
 HASTE = 2.0  # a substep may close so many times what was allowed: its speed was not known when the step was cut

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.dynamics.motion import Motion
 from taisoft.fields import FieldArena
 from taisoft.mass import lumped_masses, upload_mass_matrix, weight_masses
 from taisoft.model import Layout, Model, body_loads, damping_table, material_table
 from taisoft.runtime import Runtime
 from taisoft.scene.scene import Scene
-from taisoft.stepping.motion import Motion
 from taisoft.transfer import download, upload
 
 
@@ -30,12 +30,12 @@ class World:
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities of all nodes, as they are held."""
-        x, v = download([self.model.x, self.model.v])
+        x, v = download([self.model.state.x, self.model.state.v])
         return x, v
 
     def set_state(self, x: np.ndarray, v: np.ndarray) -> None:
         """Positions [m] and velocities [m/s] of all nodes (n_nodes, 3)."""
-        upload([(self.model.x, x), (self.model.v, v)])
+        upload([(self.model.state.x, x), (self.model.state.v, v)])
 
     def snapshot(self) -> dict:
         """What the next step rests on, for a checkpoint; see `taisoft/checkpoint.py`."""

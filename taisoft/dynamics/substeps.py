@@ -7,11 +7,11 @@ import numpy as np
 import taichi as ti
 
 from taisoft.arrays import Count
+from taisoft.dynamics import explicit
+from taisoft.dynamics.world import World
 from taisoft.errors import SimulationError
 from taisoft.model import Model
 from taisoft.scalars import LOWEST_J, MOST_INVERTED, STEPS_DONE
-from taisoft.stepping import explicit
-from taisoft.stepping.world import World
 from taisoft.transfer import upload
 
 LAUNCH_SECONDS = 0.1  # of one launch at most, roughly, so that Ctrl-C is heard
@@ -156,7 +156,7 @@ class ExplicitStepper:
 
     def _fault(self) -> str:
         """What ended the last sub-step, whose state is at hand."""
-        lowest = self.world.model.scalars[LOWEST_J]
+        lowest = self.world.model.state.scalars[LOWEST_J]
         exploded = f"a tet is inside out by {-lowest:.1e} times its volume: the motion has diverged, and a smaller dt is needed"
         return self.world.find_unfinite() or (exploded if lowest <= -explicit.EXPLODED else "a velocity is no longer finite")
 
@@ -175,7 +175,7 @@ class ExplicitStepper:
         else:
             self._launch_parallel(n, dt)
         self.stale = False
-        done, lowest, inverted = m.scalars.to_numpy()[STEPS_DONE : MOST_INVERTED + 1].tolist()
+        done, lowest, inverted = m.state.scalars.to_numpy()[STEPS_DONE : MOST_INVERTED + 1].tolist()
         return SubstepResult(int(done), lowest, int(inverted))
 
     def _launch_parallel(self, n: int, dt: float) -> None:

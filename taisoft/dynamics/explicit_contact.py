@@ -10,10 +10,7 @@ from taisoft.contact.assemble import short_of_goal
 from taisoft.contact.problem import impulse_on, to_frame
 from taisoft.contact.prox import dvec
 from taisoft.contact.restitution import explicit_rise
-from taisoft.elasticity import element_force
-from taisoft.runtime import kernel
-from taisoft.scalars import FAILED, INVERTED_NOW, MOST_INVERTED
-from taisoft.stepping.explicit import (
+from taisoft.dynamics.explicit import (
     acceleration,
     euler_velocity,
     keep_held,
@@ -27,6 +24,9 @@ from taisoft.stepping.explicit import (
     verlet_kick,
     verlet_move,
 )  # fmt: skip
+from taisoft.elasticity import element_force
+from taisoft.runtime import kernel
+from taisoft.scalars import FAILED, INVERTED_NOW, MOST_INVERTED
 
 
 @kernel
@@ -34,7 +34,7 @@ def keep_state(m: ti.template(), g: ti.template()):
     """The state before a sub-step, in case it fails."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        g.x[i], g.v[i] = m.x[i], m.v[i]
+        g.x[i], g.v[i] = m.state.x[i], m.state.v[i]
 
 
 @kernel
@@ -59,9 +59,9 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
     for i in range(m.n_nodes):
         dt = ti.cast(dt64, m.real)
         if ti.static(s.verlet):
-            m.v[i] = verlet_half(m, s, i, dt)
+            m.state.v[i] = verlet_half(m, s, i, dt)
         else:
-            m.v[i] = euler_velocity(m, i, dt)
+            m.state.v[i] = euler_velocity(m, i, dt)
     if ti.static(s.leads):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -83,7 +83,7 @@ def set_free_velocities(
     for c in range(p.count[0]):
         v = -f.carry[c] / dt
         for j in range(p.arity[c]):
-            v += p.weight[c, j] * ti.cast(m.v[p.node[c, j]], ti.f64)
+            v += p.weight[c, j] * ti.cast(m.state.v[p.node[c, j]], ti.f64)
         b = to_frame(p, c, v)
         rise = explicit_rise(f, c, dt, standoff, b[0], kicked)
         p.b[c] = dvec(b[0] + short_of_goal(f, c, dt, standoff, fast, slow, fastest, rise) / dt, b[1], b[2])
@@ -95,8 +95,8 @@ def close_substep(m: ti.template(), s: ti.template(), p: ti.template(), dt64, to
     if ti.static(s.holds):
         react(m, s, ti.cast(dt64, m.real))
         subtract_contacts(m, s, p, dt64, touched)
-    m.scalars[MOST_INVERTED] = ti.max(m.scalars[MOST_INVERTED], m.scalars[INVERTED_NOW])
-    m.scalars[INVERTED_NOW] = 0.0
+    m.state.scalars[MOST_INVERTED] = ti.max(m.state.scalars[MOST_INVERTED], m.state.scalars[INVERTED_NOW])
+    m.state.scalars[INVERTED_NOW] = 0.0
 
 
 @ti.func
@@ -117,16 +117,16 @@ def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, tou
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         dt = ti.cast(dt64, m.real)
-        v = m.v[i]
+        v = m.state.v[i]
         if touched == 1:
             v += ti.cast(p.inverse_mass[i] * impulse_on(p, i), m.real)
         if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
-            m.scalars[FAILED] = 1.0
+            m.state.scalars[FAILED] = 1.0
         if ti.static(s.verlet):
             verlet_move(m, s, i, dt, v)
         else:
-            m.v[i] = v
-            m.x[i] = m.x[i] + ti.cast(dt * v, ti.f64)
+            m.state.v[i] = v
+            m.state.x[i] = m.state.x[i] + ti.cast(dt * v, ti.f64)
     if ti.static(s.leads):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -149,7 +149,7 @@ def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti
     for i in range(m.n_nodes):
         v = verlet_kick(m, s, i, ti.cast(dt64, m.real))
         if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
-            m.scalars[FAILED] = 1.0
+            m.state.scalars[FAILED] = 1.0
     if ti.static(s.leads):
         ti.loop_config(serialize=True)
         for _ in range(1):

@@ -3,6 +3,6 @@
 Second order, symplectic, no numerical damping; stiff modes ring rather than die out.
 """
 
-from taisoft.stepping.implicit import Scheme
+from taisoft.dynamics.implicit import Scheme
 
 SCHEME = Scheme(share=0.5, midpoint=True)

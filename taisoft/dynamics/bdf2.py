@@ -5,7 +5,7 @@ fully. Constant dt; the first step, and the first after a change of dt or state,
 single error of dt^2 keeps the order, and which stays stable from wild states.
 """
 
-from taisoft.stepping import implicit_euler
-from taisoft.stepping.implicit import Scheme
+from taisoft.dynamics import implicit_euler
+from taisoft.dynamics.implicit import Scheme
 
 SCHEME = Scheme(share=2.0 / 3.0, now=4.0 / 3.0, before=1.0 / 3.0, start=implicit_euler.SCHEME)

@@ -6,12 +6,12 @@ What a simulator does not need is not imported: kernels take time to decorate.
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from taisoft.stepping.substeps import ExplicitStepper
-from taisoft.stepping.world import World
+from taisoft.dynamics.substeps import ExplicitStepper
+from taisoft.dynamics.world import World
 
 if TYPE_CHECKING:
-    from taisoft.stepping.contact import ContactStep
-    from taisoft.stepping.implicit import ImplicitStepper, Scheme
+    from taisoft.dynamics.contact import ContactStep
+    from taisoft.dynamics.implicit import ImplicitStepper, Scheme
 
 EXPLICIT = ("symplectic_euler", "velocity_verlet")
 IMPLICIT = ("linearly_implicit_euler", "implicit_euler", "bdf2", "implicit_midpoint")
@@ -20,7 +20,7 @@ INTEGRATORS = (*EXPLICIT, *IMPLICIT)
 
 def scheme_of(integrator: str) -> "Scheme":
     """The scheme of an implicit integrator."""
-    return import_module(f"taisoft.stepping.{integrator}").SCHEME
+    return import_module(f"taisoft.dynamics.{integrator}").SCHEME
 
 
 def make_stepper(
@@ -31,7 +31,7 @@ def make_stepper(
     method: contact solver of explicit steps; "auto" is serial Gauss-Seidel on the CPU, and the coloured one on CUDA.
     """
     if integrator in IMPLICIT:
-        from taisoft.stepping.implicit import ImplicitStepper
+        from taisoft.dynamics.implicit import ImplicitStepper
 
         return ImplicitStepper(world, scheme_of(integrator), contact)
     verlet = integrator == "velocity_verlet"
@@ -39,6 +39,6 @@ def make_stepper(
         return ExplicitStepper(world, verlet)
     if method == "auto":
         method = "gauss_seidel" if world.runtime.arch == "cpu" else "coloured_gauss_seidel"
-    from taisoft.stepping.contact_substeps import ContactExplicitStepper
+    from taisoft.dynamics.contact_substeps import ContactExplicitStepper
 
     return ContactExplicitStepper(world, verlet, contact, method)

@@ -21,7 +21,10 @@ back lower than e says. Held nodes are walls: what hangs on them takes the blow.
 """
 
 import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
+import numpy as np
 import taichi as ti
 
 from taisoft.contact.problem import to_world
@@ -32,7 +35,12 @@ from taisoft.mass import mass_times
 from taisoft.runtime import kernel
 from taisoft.scalars import OTHER_SUM, SUM
 
+if TYPE_CHECKING:
+    from taisoft.dynamics.newton import StageResult
+    from taisoft.dynamics.stage_system import Stage, StageSystem
+
 SPREAD = 2.0 * math.pi  # tau / dt
+TOLERANCE = 1e-3  # of the contact laws' residual in an impact: what it leaves undone the step after it does
 
 
 @ti.func
@@ -45,13 +53,13 @@ def impact_residual(m: ti.template(), A: ti.template(), k: ti.template(), i, tau
     inertia = ti.cast(1.0, m.real)
     if ti.static(m.damped):
         inertia += ti.cast(tau, m.real) * m.damping[m.node_body[i], 0]
-    own, mass = (m.x[i] - k.x_linear[i]) / tau, m.mass[i]
+    own, mass = (m.state.x[i] - k.x_linear[i]) / tau, m.mass[i]
     if ti.static(m.consistent):
         mass = m.mass_matrix.diagonal[i]
     r = ti.Vector([0.0, 0.0, 0.0], m.real)
     for at in range(A.row_start[i], A.row_start[i + 1]):
         j = A.column[at]
-        r += block_times(A.value[at], ti.cast((m.x[j] - k.x_linear[j]) / tau - own, m.real))
+        r += block_times(A.value[at], ti.cast((m.state.x[j] - k.x_linear[j]) / tau - own, m.real))
         if ti.static(m.consistent):
             mass += m.mass_matrix.value[at]
     return r + inertia * mass * ti.cast(own, m.real)
@@ -66,9 +74,9 @@ def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f
     p, f = ti.static((k.problem, k.found))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        m.x[i] = k.x_start[i] + tau * ti.cast(s.v_hat[i], ti.f64)
+        m.state.x[i] = k.x_start[i] + tau * ti.cast(s.v_hat[i], ti.f64)
         s.x_hat[i] = k.x_start[i]
-        k.x_linear[i] = m.x[i]
+        k.x_linear[i] = m.state.x[i]
     ti.loop_config(serialize=True)
     for _ in range(1):
         speed, mass = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
@@ -89,7 +97,7 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
     p, f = ti.static((k.problem, k.found))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        s.change[i] = (m.x[i] - k.x_linear[i]) / tau
+        s.change[i] = (m.state.x[i] - k.x_linear[i]) / tau
     ti.loop_config(serialize=m.serial)
     for chunk in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
@@ -98,7 +106,7 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
             d = mass_times(m, i, s.change)
             slope += d.dot(ti.cast(s.v_hat[i], ti.f64))
             curvature += d.dot(s.change[i])
-        m.partial[chunk, SUM], m.partial[chunk, OTHER_SUM] = slope, curvature
+        m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
     ti.loop_config(serialize=True)
     for _ in range(1):
         slope = total(m, SUM)
@@ -119,7 +127,7 @@ def apply_impact(m: ti.template(), s: ti.template(), k: ti.template(), share: ti
     p, f = ti.static((k.problem, k.found))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        m.x[i] = k.x_start[i]
+        m.state.x[i] = k.x_start[i]
         s.v_hat[i] += ti.cast(share * s.change[i], m.real)
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
@@ -133,8 +141,8 @@ def start_from(m: ti.template(), s: ti.template(), still: ti.f64):
     """The first iterate of a step that begins with an impact: v_hat, or 0 where it is linearised at x_n (still = 1)."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        m.x[i] = s.x_hat[i]
-        m.v[i] = ti.cast(1.0 - still, m.real) * m.free[i] * s.v_hat[i]
+        m.state.x[i] = s.x_hat[i]
+        m.state.v[i] = ti.cast(1.0 - still, m.real) * m.free[i] * s.v_hat[i]
 
 
 @kernel
@@ -160,3 +168,29 @@ def let_go(f: ti.template()):
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         f.rise[c] = 0.0
+
+
+def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":
+    """A step of implicit Euler in which surfaces meet with restitution: the impact, then the stage."""
+    from taisoft.dynamics.newton import Newton, count_all, merge, solve
+
+    m, w, tau, out = system.model, system.work, SPREAD * stage.dt, np.zeros(2)
+    blow = replace(stage, beta=tau, contact_tolerance=max(stage.contact_tolerance, TOLERANCE), linearised=True)
+    k = system.begin_impact(blow)
+    begin_impact(m, w, k, tau, system.norms)
+    impact = Newton(system, blow).run(*system.evaluate(new_multipliers=True), fresh=True)
+    measure_impact(m, w, k, tau, out)
+    slope, curvature = out
+    gain = slope + 0.5 * curvature
+    share = 1.0 if gain <= 0.0 else max(0.0, -2.0 * slope / curvature)
+    slack = -share * (slope + 0.5 * share * curvature)
+    apply_impact(m, w, k, share)
+    if share < 1.0:
+        let_go(k.found)
+    results = [impact]
+    while True:
+        start_from(m, w, float(stage.linearised))
+        results.append(solve(system, replace(stage, beta=stage.dt, prescribed_share=1.0)))
+        if holding_work(k, stage.dt) <= slack:
+            return count_all(merge([impact, results[-1]]), results[1:-1])
+        let_go(k.found)

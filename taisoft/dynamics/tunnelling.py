@@ -63,7 +63,7 @@ def find_way(m: ti.template(), s: ti.template(), x_start: ti.template(), way: ti
     """way (n_nodes) [m] since x_start; returns by how much a vertex of the surface left the straight way that was searched."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        way[i] = m.x[i] - x_start[i]
+        way[i] = m.state.x[i] - x_start[i]
     most = ti.cast(0.0, ti.f64)
     ti.loop_config(serialize=True)
     for _ in range(1):

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.dynamics.world import World
 from taisoft.errors import SceneError
 from taisoft.scene import checks
-from taisoft.stepping.world import World
 
 SOFT = 0.5
 STRAIN = 0.25

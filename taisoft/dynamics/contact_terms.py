@@ -15,19 +15,12 @@ import taichi as ti
 from taisoft.contact.assemble import FoundContacts, short_of_goal
 from taisoft.contact.problem import CHANGED, NODES, RESIDUAL, SIZE, residual_of
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
-from taisoft.elasticity import element_force
 from taisoft.fields import FieldArena
-from taisoft.linear.block_csr import BLOCK, block_times, part_times
-from taisoft.linear.coupling import Coupling, build_coupling
-from taisoft.linear.pcg import dot64, total
+from taisoft.linear.block_csr import BLOCK
+from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
 from taisoft.model import Model
 from taisoft.runtime import kernel
-from taisoft.scalars import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
-from taisoft.stepping.impact import impact_residual
-from taisoft.stepping.stage import place_node, residual_parts, set_change, squares
-
-STAY, STEP, SHARE = range(3)  # where `move` goes
-IMPACT = 2  # a stage that is linear: the impact before a step, see `impact`
+from taisoft.scalars import CONTACT_POTENTIAL
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +31,9 @@ class ContactStageWork:
     radius: Any  # (capacity) f64: rho [N s]
     lag: Any  # (capacity) 3-vectors f64: what J makes of x_start - x_hat, less the way of an obstacle [m]
     short: Any  # (capacity) f64: gap - goal at the start, less the way of an obstacle along the normal [m]
+    kept: Any  # (capacity) 3-vectors f64: impulses where the stage was linearised [N s]
     push: Any  # (capacity) 3-vectors f64: the impulse in the world [N s]
-    misfit: Any  # (capacity) 2-vectors f64: of the natural map
+    misfit: Any  # (capacity) 3-vectors f64: of the natural map, and psi_c [J]
     block: Any  # (capacity) 12-vectors: J^T D J is made of weights times this
     active: Any  # (capacity) i32: 1 where the block is not 0
 
@@ -57,6 +51,14 @@ class StageContacts:
     x_linear: Any  # (n_nodes) 3-vectors f64: where a linearly implicit stage was linearised; the next two, too
     residual_linear: Any  # (n_nodes) 3-vectors
     change: Any  # (n_nodes) 3-vectors [m/s]
+
+    @property
+    def any(self) -> bool:
+        """Whether there can be contacts."""
+        return self.problem is not None
+
+
+NO_CONTACTS = StageContacts(None, None, None, NO_COUPLING, *[None] * 5)
 
 
 @ti.func
@@ -123,11 +125,16 @@ def _press(m: ti.template(), k: ti.template(), c, beta, stiffness):
             w.block[c][4 * j + i] = ti.cast(Dn * n[i] * n[j] + along * e[i] * e[j] + across * g[i] * g[j], m.real)
     w.active[c] = int(Dn > 0.0 or along > 0.0 or across > 0.0)
     d = r - prox(r - scaled(p.factor[c], u), p.friction[c])
-    w.misfit[c][0], w.misfit[c][1] = d.dot(d), r.dot(r)
+    psi = ti.cast(0.0, ti.f64)
+    if Rn > 0.0:
+        psi += 0.5 * ti.max(z[0], 0.0) ** 2 / Rn
+    if Rt > 0.0:
+        psi += ti.select(size > rho, rho * (size - 0.5 * rho), 0.5 * size * size) / Rt
+    w.misfit[c] = dvec(d.dot(d), r.dot(r), psi)
 
 
 @ti.func
-def _push_on(k: ti.template(), i):
+def impulse_on_node(k: ti.template(), i):
     """(J^T r) of node i [N s]; as `impulse_on`, which has no impulses in the world at hand."""
     p, w = ti.static((k.problem, k.work))
     d = dvec(0.0)
@@ -138,59 +145,17 @@ def _push_on(k: ti.template(), i):
 
 
 @ti.func
-def _sum_residual(k: ti.template()):
-    """Residual of the laws over all contacts."""
+def _sum_residual(m: ti.template(), k: ti.template()):
+    """Residual of the laws over all contacts. scalars: CONTACT_POTENTIAL."""
     p, w = ti.static((k.problem, k.work))
-    changed, size = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    changed, size, psi = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     for c in range(p.count[0]):
         changed += w.misfit[c][0]
         size += w.misfit[c][1]
+        psi += w.misfit[c][2]
+    m.state.scalars[CONTACT_POTENTIAL] = psi
     p.state[CHANGED], p.state[SIZE] = changed, size
     p.state[RESIDUAL] = residual_of(changed, size)
-
-
-@ti.func
-def _linear_residual(m: ti.template(), A: ti.template(), k: ti.template(), i):
-    """Row i of the residual without contacts of the stage that was linearised: that of then, and A times the change of v."""
-    off = part_times(m, A, A.row_start[i], A.row_start[i + 1], k.change)
-    return k.residual_linear[i] + block_times(k.coupling.base[i], k.change[i]) + off
-
-
-@kernel
-def move(
-    m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.template(), linear: ti.template(), how: ti.i32, share: ti.f64,
-    c: ti.f64, beta: ti.f64,
-):  # fmt: skip
-    """Go where `how` says, and find the elastic forces there.
-
-    how: STAY; STEP: base = x, then the whole step y of pcg; SHARE: base + share y. linear: of the stage linearised at k.x_linear,
-    or IMPACT. scalars: START_SLOPE of a step.
-    """
-    ti.loop_config(serialize=m.serial)
-    for chunk in range(m.chunks):
-        size = (m.n_nodes + m.chunks - 1) // m.chunks
-        slope = ti.cast(0.0, ti.f64)
-        for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
-            if how == STEP:
-                slope += dot64(m.free[i] * s.residual[i], pcg.y[i])
-                s.base[i] = m.x[i]
-            if how != STAY:
-                place_node(m, s, pcg.y, i, share, beta)
-            k.way[i] = m.x[i] - k.x_start[i]
-            if ti.static(linear):
-                k.change[i] = ti.cast((m.x[i] - k.x_linear[i]) / beta, m.real)
-            else:
-                set_change(m, s, i, c, beta)
-        m.partial[chunk, OTHER_SUM] = slope
-    if ti.static(not linear):
-        for g in ti.static(m.groups):
-            ti.loop_config(serialize=m.serial)
-            for b in range(g.first, g.last):
-                element_force(m, g, False, b)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        if how == STEP:
-            m.scalars[START_SLOPE] = total(m, OTHER_SUM)
 
 
 @kernel
@@ -211,45 +176,7 @@ def press(
         _press(m, k, n, beta, stiffness)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        _sum_residual(k)
-
-
-@kernel
-def form_pressed_residual(
-    m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), pcg: ti.template(), linear: ti.template(),
-    beta: ti.f64, norms: ti.types.ndarray(),
-):  # fmt: skip
-    """Residual, and -r as CG's right side, from what `move` and `press` have found.
-
-    linear: as `move`. norms: as `form_residual` tells, impulses in r; of a linear stage only those of r. scalars: END_SLOPE.
-    """
-    ti.loop_config(serialize=m.serial)
-    for chunk in range(m.chunks):
-        size = (m.n_nodes + m.chunks - 1) // m.chunks
-        sums, slope = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)
-        for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
-            free, impulse = m.free[i], ti.cast(_push_on(k, i), m.real)
-            zero = ti.Vector([0.0, 0.0, 0.0], m.real)
-            r, inertia, f, external = zero, zero, zero, zero
-            if ti.static(linear == IMPACT):
-                r = impact_residual(m, A, k, i, beta)
-            elif ti.static(linear):
-                r = _linear_residual(m, A, k, i)
-            else:
-                r, inertia, f, external = residual_parts(m, s, i, beta)
-            r -= impulse
-            s.residual[i] = r
-            pcg.rhs[i] = -free * r
-            sums += squares(r, inertia, f, external, free)
-            slope += dot64(free * r, pcg.y[i])
-        for j in ti.static(range(N_NORMS)):
-            m.partial[chunk, j] = sums[j]
-        m.partial[chunk, SUM] = slope
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        for j in ti.static((0, 4) if linear else range(N_NORMS)):
-            norms[j] = total(m, j)
-        m.scalars[END_SLOPE] = total(m, SUM)
+        _sum_residual(m, k)
 
 
 @kernel
@@ -266,11 +193,32 @@ def keep_diagonal(m: ti.template(), A: ti.template(), k: ti.template()):
 
 @kernel
 def keep_linear(m: ti.template(), s: ti.template(), k: ti.template()):
-    """The stage is linearised here: x and the residual without contacts."""
+    """The stage is linearised here: x, the residual without contacts, and the impulses."""
+    p, w = ti.static((k.problem, k.work))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        k.x_linear[i] = m.x[i]
-        k.residual_linear[i] = s.residual[i]
+        k.x_linear[i] = m.state.x[i]
+        k.residual_linear[i] = s.residual[i] + ti.cast(impulse_on_node(k, i), m.real)
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        w.kept[c] = p.r[c]
+
+
+@kernel
+def leave_linear(m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.template(), taken: ti.i32):
+    """Back to where the stage was linearised, with the way from there as y, and the impulses of here as the multipliers.
+
+    taken: 0 where what was found is dropped: the impulses are those of then.
+    """
+    p, w = ti.static((k.problem, k.work))
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        pcg.y[i] = m.free[i] * k.change[i]
+        s.base[i] = k.x_linear[i]
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        if taken == 0:
+            p.r[c] = w.kept[c]
 
 
 def build_stage_contacts(arena: FieldArena, model: Model, found: FoundContacts, x_start: Any) -> StageContacts:
@@ -279,7 +227,8 @@ def build_stage_contacts(arena: FieldArena, model: Model, found: FoundContacts, 
     work = ContactStageWork(
         arena.vectors("multiplier", ti.f64, p.capacity), arena.field("friction_radius", ti.f64, p.capacity),
         arena.vectors("contact_lag", ti.f64, p.capacity), arena.field("contact_short", ti.f64, p.capacity),
-        arena.vectors("contact_push", ti.f64, p.capacity), arena.vectors("contact_misfit", ti.f64, p.capacity, n=2),
+        arena.vectors("contact_kept", ti.f64, p.capacity),
+        arena.vectors("contact_push", ti.f64, p.capacity), arena.vectors("contact_misfit", ti.f64, p.capacity),
         arena.vectors("contact_block", real, p.capacity, n=BLOCK), arena.field("contact_active", ti.i32, p.capacity),
     )  # fmt: skip
     coupling = build_coupling(

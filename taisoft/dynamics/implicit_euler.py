@@ -3,6 +3,6 @@
 First order; stable for every dt; damps a mode of frequency w by 1/sqrt(1 + (w dt)^2) a step.
 """
 
-from taisoft.stepping.implicit import Scheme
+from taisoft.dynamics.implicit import Scheme
 
 SCHEME = Scheme(share=1.0)

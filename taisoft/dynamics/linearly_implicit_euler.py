@@ -4,6 +4,6 @@ Source: Baraff, Witkin, "Large Steps in Cloth Simulation", SIGGRAPH 1998, eq. 6.
 strongly bent bodies lose accuracy, and angular momentum is not kept.
 """
 
-from taisoft.stepping.implicit import Scheme
+from taisoft.dynamics.implicit import Scheme
 
 SCHEME = Scheme(share=1.0, one_iteration=True)

@@ -19,7 +19,7 @@ from taisoft.scene.scene import Scene
 from taisoft.transfer import download
 
 if TYPE_CHECKING:
-    from taisoft.stepping.newton import StageSolver
+    from taisoft.dynamics.stage_system import StageSystem
 
 LIMIT = 0.01  # of the forces on a body: a residual beyond is a wrong motion
 ROUNDING = 4.0  # times the floor of a body, as of the whole scene in `newton`
@@ -45,14 +45,14 @@ class BodyBalance:
         """How many there are."""
         return len(self._names)
 
-    def worst(self, solver: "StageSolver", beta: float, linear: bool) -> tuple[float, str]:
+    def worst(self, solver: "StageSystem", beta: float, linear: bool) -> tuple[float, str]:
         """The largest relative residual of a piece in the stage just solved, and which it is; 0 where all are rounding.
 
         linear: only of what moves pieces as a whole.
         """
         m, w = solver.model, solver.work
         gather_forces(m, solver.pcg.q)
-        fields = [w.residual, m.v, w.v_hat, solver.pcg.q, m.free, m.mass, m.weight, *([m.loads] if m.loaded else [])]
+        fields = [w.residual, m.state.v, w.v_hat, solver.pcg.q, m.free, m.mass, m.weight, *([m.loads] if m.loaded else [])]
         residual, v, v_hat, elastic, free, mass, weight, *loads = (a.astype(np.float64) for a in download(fields))
         external = weight[:, None] * m.gravity.to_numpy()[0] + (loads[0] if loads else 0.0)
         r, inertia, momentum, elastic, external, masses = (
@@ -62,8 +62,8 @@ class BodyBalance:
             )
         )  # fmt: skip
         scale = inertia + beta * (elastic + external)
-        floor = beta * solver.rounding_by_body[self._body] + masses * solver.rounding_of_x / beta
-        mean_floor = solver.eps * (momentum + beta * elastic) + masses * solver.rounding_of_x / beta
+        floor = beta * solver.rounding.force_by_body[self._body] + masses * solver.rounding.position / beta
+        mean_floor = solver.rounding.eps * (momentum + beta * elastic) + masses * solver.rounding.position / beta
         mean = self._mean(residual, free)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.where(mean > ROUNDING * mean_floor, mean / scale, 0.0)

@@ -1,0 +1,253 @@
+"""Steps with contacts, captured and taken again: what a process of `taisoft bench contact --capture` and `--replay` does.
+
+python contact_states.py capture SCENE FILE: runs a scene of SCENES and keeps the states before every fifth step and before the
+ten steps that took most Newton iterations: positions, velocities, the past, contacts and impulses.
+python contact_states.py replay FILE PRECISION TOLERANCE [REFERENCE]: solves the stage of each of them, without substeps, and in
+halves where that does not converge. REFERENCE: where positions are kept, or, where they are there, what they are compared with.
+Each prints lines of JSON. Nothing here is newer than version 0.1, so that both can be measured on the same states.
+"""
+
+import json
+import os
+import pickle
+import runpy
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+import taisoft as ts
+
+ROOT = Path(ts.__file__).resolve().parents[1]
+MESHES = Path(os.environ.get("TAISOFT_MESHES", Path(__file__).resolve().parents[2] / "shared" / "meshes"))
+EVERY, SLOWEST = 5, 10
+MOST_HALVES = 16
+DOWN, GROUND = (0.0, -9.81, 0.0), ts.HalfSpace((0, 0, 0), (0, 1, 0))
+IMPLICIT = {"integrator": "implicit_euler"}
+
+
+def figure(name: str, height: float) -> ts.TetMesh:
+    """A mesh of shared/meshes, a metre long, above y = height."""
+    mesh = ts.read_mesh(MESHES / name)
+    x = mesh.vertices - mesh.vertices.mean(axis=0)
+    x = x / np.ptp(x, axis=0).max()
+    return ts.TetMesh(x + [0.0, height - x[:, 1].min(), 0.0], mesh.tets)
+
+
+def rubber(**changes) -> ts.Material:
+    """Of the real meshes."""
+    return ts.Material(**({"young": 2e5, "poisson": 0.4, "density": 1000.0, "friction": 0.5} | changes))
+
+
+def on_ground(name: str) -> ts.Scene:
+    """Just before it lands with 1 m/s."""
+    scene = ts.Scene(gravity=DOWN)
+    scene.add_body(figure(name, 0.01), rubber(), name="figure", velocity=(0, -1, 0))
+    scene.add_obstacle(GROUND, name="ground", friction=0.5)
+    return scene
+
+
+def on_box(name: str) -> ts.Scene:
+    """Just before it lands on a box that is smaller."""
+    scene = ts.Scene(gravity=DOWN)
+    scene.add_body(figure(name, 0.01), rubber(), name="figure", velocity=(0, -1, 0))
+    scene.add_obstacle(ts.Box((0, -0.2, 0), (0.25, 0.2, 0.25)), name="box", friction=0.5)
+    return scene
+
+
+def on_another(name: str) -> ts.Scene:
+    """One falls on another, a little aside, on the ground."""
+    scene = ts.Scene(gravity=DOWN)
+    below = figure(name, 0.001)
+    scene.add_body(below, rubber(), name="below")
+    above = figure(name, below.vertices[:, 1].max() + 0.01)
+    scene.add_body(above, rubber(), name="above", position=(0.05, 0.0, 0.03), velocity=(0, -1, 0))
+    scene.add_obstacle(GROUND, name="ground", friction=0.5)
+    return scene
+
+
+def cloth() -> ts.Scene:
+    """A cloth of 2 mm falls on a sphere."""
+    scene = ts.Scene(gravity=DOWN)
+    material = ts.Material(young=1e5, poisson=0.3, density=500.0, friction=0.3)
+    scene.add_body(ts.sheet_mesh((20, 20), (0.5, 0.002, 0.5)), material, name="cloth", position=(0, 0.102, 0))
+    scene.add_obstacle(ts.Sphere((0, 0, 0), 0.1), name="sphere", friction=0.3)
+    return scene
+
+
+def mat() -> ts.Scene:
+    """A mat whose ends turn against each other, from no twist."""
+    scene = ts.Scene(gravity=(0, 0, 0))
+    mesh = ts.box_mesh((20, 20, 1), (1.0, 1.0, 0.02))
+    x = mesh.vertices + np.random.default_rng(0).uniform(-1e-4, 1e-4, mesh.n_verts)[:, None] * [0.0, 0.0, 1.0]
+    body = scene.add_body(
+        ts.TetMesh(x, mesh.tets), ts.Material(young=2e4, poisson=0.4, density=1000.0, friction=0.3), name="mat"
+    )
+    turn = np.array([np.radians(90.0) * 4.0, 0.0, 0.0])
+    for side in (-1.0, 1.0):
+        body.move(
+            lambda X, side=side: side * X[:, 0] > 0.499, ts.KeyFrames([0.0, 4.0], rotations=[np.zeros(3), side * turn])
+        )
+    return scene
+
+
+def gripper() -> ts.Scene:
+    """Two plates close on a ball and lift it."""
+    scene = ts.Scene(gravity=DOWN)
+    soft = ts.Material(young=1e5, poisson=0.4, density=1000.0, friction=0.8)
+    scene.add_body(ts.ball_mesh(0.1, 8), soft, name="ball", position=(0, 0.101, 0))
+    scene.add_obstacle(GROUND, name="ground", friction=0.5)
+    for name, side in (("left", -1.0), ("right", 1.0)):
+        way = [(0, 0, 0), (-side * 0.03, 0, 0), (-side * 0.03, 0.1, 0)]
+        path = ts.KeyFrames([0.0, 0.4, 1.0], way, smooth=True)
+        scene.add_obstacle(ts.Box((side * 0.115, 0.12, 0), (0.01, 0.06, 0.06)), name=name, friction=0.8, path=path)
+    return scene
+
+
+def slabs() -> ts.Scene:
+    """A soft slab on one ten thousand times as stiff."""
+    scene, mesh = ts.Scene(gravity=DOWN), ts.box_mesh((12, 1, 12), (1.0, 0.05, 1.0))
+    c = np.sqrt(0.5)
+    turned = ts.TetMesh(mesh.vertices @ np.array([[c, 0, c], [0, 1, 0], [-c, 0, c]]).T, mesh.tets)
+    for name, one, young, height in (("lower", mesh, 1e8, 0.025), ("upper", turned, 1e4, 0.085)):
+        scene.add_body(one, rubber(young=young, density=1500.0, friction=0.1), name=name, position=(0, height, 0))
+    scene.add_obstacle(GROUND, name="plane", friction=0.1)
+    return scene
+
+
+def demo(name: str) -> ts.Scene:
+    """A demo's scene."""
+    return runpy.run_path(str(ROOT / "demos" / f"{name}.py"))["build"]()
+
+
+# name: (scene, settings, steps, steps before the first that counts)
+SCENES: dict[str, tuple[Callable[[], ts.Scene], dict, int, int]] = {
+    "bunny on ground": (lambda: on_ground("bunny.msh"), IMPLICIT | {"dt": 0.01}, 40, 0),
+    "bunny on box": (lambda: on_box("bunny.msh"), IMPLICIT | {"dt": 0.01}, 40, 0),
+    "bunny on bunny": (lambda: on_another("bunny.msh"), IMPLICIT | {"dt": 0.01}, 40, 0),
+    "Armadillo on ground": (lambda: on_ground("Armadillo13K.msh"), IMPLICIT | {"dt": 0.01}, 40, 0),
+    "Armadillo on box": (lambda: on_box("Armadillo13K.msh"), IMPLICIT | {"dt": 0.01}, 40, 0),
+    "Armadillo on Armadillo": (lambda: on_another("Armadillo13K.msh"), IMPLICIT | {"dt": 0.01}, 20, 0),
+    "cloth on sphere": (cloth, {"integrator": "bdf2", "dt": 1 / 120}, 60, 0),
+    "cube pile": (lambda: demo("cube_pile"), IMPLICIT | {"dt": 0.01}, 60, 15),
+    "twisted mat": (mat, IMPLICIT | {"dt": 0.02, "self_collision": True}, 60, 100),
+    "squeeze": (lambda: demo("squeeze"), IMPLICIT | {"dt": 0.01}, 60, 40),
+    "gripper": (gripper, {"integrator": "bdf2", "dt": 0.01}, 60, 20),
+    "soft on stiff": (slabs, IMPLICIT | {"dt": 1 / 120}, 60, 0),
+}
+
+
+def kept_of(sim: ts.Simulator) -> dict:
+    """All that the next step rests on."""
+    return {"world": sim._world.snapshot(), "stepper": sim._stepper.snapshot()}
+
+
+def capture(name: str, file: Path) -> None:
+    """Run a scene and keep its states."""
+    build, settings, steps, before = SCENES[name]
+    found = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        sim = ts.Simulator(build(), **settings, precision="f32")
+    with sim:
+        if before:
+            sim.advance(before)
+        for k in range(steps):
+            kept = kept_of(sim)
+            report = sim.advance(1)
+            found.append((report.newton_iterations, k, kept))
+    slow = {k for _, k, _ in sorted(found, key=lambda one: -one[0])[:SLOWEST]}
+    states = [{"step": before + k, "kept": kept, "captured": n} for n, k, kept in found if k % EVERY == 0 or k in slow]
+    file.write_bytes(pickle.dumps({"scene": name, "states": states}))
+    print(json.dumps({"scene": name, "states": len(states), "newton": sum(n for n, _, _ in found)}))
+
+
+def replay(file: Path, precision: str, tolerance: float, reference: Path | None) -> None:
+    """Solve each state's stage."""
+    data = pickle.loads(file.read_bytes())
+    build, settings, _, _ = SCENES[data["scene"]]
+    known = pickle.loads(reference.read_bytes()) if reference and reference.exists() else None
+    ends = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        sim = ts.Simulator(build(), **settings, precision=precision)
+    with sim:
+        scale = float(np.mean([edge(body.mesh) for body in sim.scene.bodies]))
+        sim._stepper.tolerance = sim._stepper.contact_tolerance = tolerance
+        for k, state in enumerate(data["states"]):
+            row, x = solve(sim, state["kept"], sim.dt)
+            row |= {"scene": data["scene"], "step": state["step"], "captured": state["captured"]}
+            if known is not None:
+                row["error"] = float(np.abs(x - known[k]).max() / scale)
+            ends.append(x)
+            print(json.dumps(row), flush=True)
+    if reference and known is None:
+        reference.write_bytes(pickle.dumps(ends))
+
+
+def edge(mesh: ts.TetMesh) -> float:
+    """Mean edge of a mesh's surface [m]."""
+    p = mesh.vertices[mesh.surface]
+    return float(np.linalg.norm(p - np.roll(p, 1, axis=1), axis=2).mean())
+
+
+def solve(sim: ts.Simulator, kept: dict, dt: float) -> tuple[dict, np.ndarray]:
+    """A stage of dt from a state, in halves where it does not converge; and the positions it ends with."""
+    stepper, world = sim._stepper, sim._world
+    take = getattr(stepper, "take", None) or stepper._try_part
+    halves, newton, linear, first, seconds = 1, 0, 0, None, 0.0
+    while True:
+        world.restore(kept["world"])
+        stepper.restore(fitting(kept["stepper"], stepper.snapshot()))
+        done, begin = [], time.perf_counter()
+        for part in range(halves):
+            try:
+                done.append(take(world.time + part * dt / halves, dt / halves))
+            except ts.SimulationError:
+                done.append(None)
+            if done[-1] is None or not done[-1].converged:
+                break
+        seconds += time.perf_counter() - begin
+        newton += sum(r.newton_iterations for r in done if r)
+        linear += sum(r.linear_iterations for r in done if r)
+        first = first or done[0]
+        good = done[-1] is not None and done[-1].converged
+        if good or halves >= MOST_HALVES:
+            break
+        halves *= 2
+    stage = first or done[-1]
+    row = {
+        "newton": stage.newton_iterations if stage else 0, "linear": stage.linear_iterations if stage else 0,
+        "all newton": newton, "all linear": linear, "halves": halves, "converged": good,
+        "seconds": seconds, "residual": done[-1].residual if done[-1] else None,
+        "contact residual": done[-1].contact_residual if done[-1] else None,
+        "contacts": int(stepper.contact.n_contacts),
+    }  # fmt: skip
+    return row, sim.positions()
+
+
+def fitting(kept: dict, own: dict) -> dict:
+    """What was kept, as the version that is to take it keeps it: what it does not find there stays its own."""
+    found = {}
+    for name, value in own.items():
+        if name == "rows":  # contacts; one that was not kept is of no impact
+            rows = kept[name]
+            found[name] = {key: rows.get(key, np.zeros_like(rows["r"])) for key in value}
+        else:
+            found[name] = fitting(kept[name], value) if isinstance(value, dict) and name in kept else kept.get(name, value)
+    return found
+
+
+def main(task: str, *rest: str) -> None:
+    """One task."""
+    if task == "capture":
+        capture(rest[0], Path(rest[1]))
+    else:
+        replay(Path(rest[0]), rest[1], float(rest[2]), Path(rest[3]) if len(rest) > 3 else None)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

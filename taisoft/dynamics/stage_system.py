@@ -1,0 +1,270 @@
+"""One implicit stage as a system of equations: its fields, its residual, its matrix, and what contacts add to them.
+
+Unknown v (with x = x_hat + beta v), residual on the free axes
+    r(v) = c M (v - v_hat) - beta (f_el(x) + f_loads + M g - a M v - b K_d v) - J^T p,
+matrix c M + beta a M + beta^2 K(x) + beta b K_d + J^T D J: without contacts the gradient and second derivative of
+    Phi(v) = c/2 |v - v_hat|^2_M + psi(x) - loads.x - M g.x + beta/2 v.(a M + b K_d) v,
+with them of the augmented Lagrangian, see `contact_terms`. c = 1 for a time step, 0 for statics (v is then a displacement).
+K is unprojected.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import taichi as ti
+
+from taisoft.contact.problem import RESIDUAL, find_factors
+from taisoft.dynamics.contact_terms import (
+    NO_CONTACTS,
+    StageContacts,
+    build_stage_contacts,
+    keep_diagonal,
+    keep_linear,
+    leave_linear,
+    press,
+)
+from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STAY, form_residual, move
+from taisoft.dynamics.rounding import RoundingFloor
+from taisoft.dynamics.stage import StageWork, begin_stage, go_back, stage_terms, stand_still
+from taisoft.elasticity import measure
+from taisoft.fields import FieldArena
+from taisoft.linear import block_csr, pcg
+from taisoft.linear.block_csr import BlockCsr
+from taisoft.model import Model
+from taisoft.scalars import CONTACT_POTENTIAL, ELASTIC, END_SLOPE, GRAVITY, POTENTIAL, START_SLOPE
+from taisoft.transfer import download, upload
+
+if TYPE_CHECKING:
+    from taisoft.dynamics.contact import ContactStep
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What is to be solved. tolerance: |r| over scale; contact_tolerance: the residual of the contact laws."""
+
+    c: float  # 1: a time step; 0: statics
+    beta: float  # [s]
+    dt: float  # [s] of the step
+    tolerance: float
+    contact_tolerance: float = math.inf
+    max_newton: int = 50
+    linear_tolerance: float | None = None  # of every linear solve; None: adaptive
+    linearised: bool = False  # elastic forces are linear from the first iterate on
+    prescribed_share: float = 1.0  # see `begin_stage`
+
+
+class StageSystem:
+    """Owns the matrix and the vectors of implicit stages over one model, and of their contacts."""
+
+    def __init__(
+        self, model: Model, arena: FieldArena, eps: float, prescribed: np.ndarray,
+        contact: "ContactStep | None" = None, x_start: Any = None,
+    ):  # fmt: skip
+        """prescribed: nodes that follow a path. x_start: (n_nodes) 3-vectors f64, positions at the start of the step."""
+        self.model, self.contact, self.x_start = model, contact, x_start
+        self.matrix: BlockCsr = block_csr.build_block_csr(model, arena, model.real)
+        self.damper = (
+            block_csr.sibling(self.matrix, model, arena, model.real, "damping") if model.stiffness_damping else None
+        )
+        n, k = model.n_nodes, len(prescribed)
+        self.pcg = pcg.build_pcg(model, arena)
+        self.work = StageWork(
+            x_hat=arena.vectors("x_hat", ti.f64, n), v_hat=arena.vectors("v_hat", model.real, n),
+            base=arena.vectors("x_base", ti.f64, n), residual=arena.vectors("residual", model.real, n),
+            moved=arena.field("stage_moved", ti.i32, k, prescribed.astype(np.int32)) if k else None,
+            moved_axes=arena.vectors("stage_moved_axes", ti.i32, k) if k else None,
+            targets=arena.vectors("stage_targets", ti.f64, k) if k else None,
+            led_acceleration=arena.vectors("led_acceleration", ti.f64, k) if k and model.consistent else None,
+            n_moved=k, change=arena.vectors("change", ti.f64, n), damper=self.damper,
+        )  # fmt: skip
+        self.rounding = RoundingFloor(model, eps)
+        self.kind = ELASTIC_STAGE
+        self.r_scale = 1.0  # R over the r-factors
+        self._contact_arena = FieldArena()
+        self._room: StageContacts | None = None  # for the contacts of this step
+        self._k = NO_CONTACTS  # what the present stage has
+        self._weighed: tuple[float, float] | None = None  # c and beta of the matrix that the r-factors rest on
+        self.norms = np.zeros(5)  # what `form_residual` tells
+
+    # --- its life -------------------------------------------------------------------------------------------------
+
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """Bytes by name of the fields that grow with the contacts."""
+        return self._contact_arena.bytes
+
+    def release(self) -> None:
+        """Give their memory back."""
+        self._contact_arena.release()
+
+    def numbers_changed(self) -> None:
+        """Gravity or material numbers changed."""
+        self.rounding.measure()
+        self.forget_factors()
+
+    def forget_factors(self) -> None:
+        """The r-factors rest on a matrix of other numbers or other free axes."""
+        self._weighed = None
+
+    def snapshot(self) -> dict:
+        """What lives between stages: the rounding, the reactions, and the masses that the next stage's r-factors rest on."""
+        masses = self.contact.problem.inverse_mass.to_numpy() if self._weighed else None
+        return self.rounding.snapshot() | {
+            "residual": self.work.residual.to_numpy(), "weighed": self._weighed, "inverse_mass": masses,
+        }  # fmt: skip
+
+    def restore(self, kept: dict) -> None:
+        """Back to what `snapshot` told; the contacts have been restored."""
+        self.rounding.restore(kept)
+        upload([(self.work.residual, kept["residual"])])
+        self._weighed = None
+        if kept["weighed"] is not None:
+            self._fit()
+            upload([(self.contact.problem.inverse_mass, kept["inverse_mass"])])
+            c, beta = kept["weighed"]
+            self._weighed = float(c), float(beta)
+
+    def _fit(self) -> None:
+        """Room for the contacts of this step."""
+        if self._room is None or self._room.found is not self.contact.found:
+            arena = FieldArena()
+            self._room = build_stage_contacts(arena, self.model, self.contact.found, self.x_start)
+            self._contact_arena.release()
+            self._contact_arena, self._weighed = arena, None
+
+    # --- a stage --------------------------------------------------------------------------------------------------
+
+    @property
+    def n_contacts(self) -> int:
+        """Contacts of the present stage."""
+        return int(self._k.problem.count[0]) if self._k.any else 0
+
+    @property
+    def contact_residual(self) -> float:
+        """Of the contact laws, where the residual was last formed."""
+        return float(self._k.problem.state[RESIDUAL]) if self._k.any else 0.0
+
+    @property
+    def slopes(self) -> tuple[float, float]:
+        """(r.y where the step began, r.y where it has led): negative is downhill."""
+        scalars = self.model.state.scalars
+        return scalars[START_SLOPE], scalars[END_SLOPE]
+
+    def begin(self, stage: Stage) -> bool:
+        """Take up a stage at its first iterate; whether its matrix has been formed on the way."""
+        m, w, fresh = self.model, self.work, False
+        self._stage, self.kind = stage, ELASTIC_STAGE
+        self._k = self._contacts()
+        begin_stage(m, w, stage.beta, stage.prescribed_share)
+        if not self._k.any:
+            self._weighed = None
+            return False
+        if self._weighed != (stage.c, stage.beta) or stage.linearised:
+            self.form_matrix()
+            self._weighed, fresh = (stage.c, stage.beta), True
+        find_factors(self._k.problem)
+        return fresh
+
+    def begin_impact(self, stage: Stage) -> StageContacts:
+        """Take up the impact before a step; the matrix is formed."""
+        self._stage, self._weighed = stage, None
+        self._k = self._contacts()
+        self.form_matrix(projected=True)
+        find_factors(self._k.problem)
+        self.kind = IMPACT
+        return self._k
+
+    def _contacts(self) -> StageContacts:
+        if self.contact is None or self.contact.n_contacts == 0:
+            return NO_CONTACTS
+        self._fit()
+        return self._room
+
+    def evaluate(self, how: int | None = STAY, step_length: float = 1.0, new_multipliers: bool = False) -> tuple[float, float]:
+        """(|r|, scale) where `move` goes; None: x is where it was, and so are the elastic forces.
+
+        new_multipliers: the impulses are made the multipliers first, and the friction disks opened as far as these say.
+        """
+        m, w, k, stage = self.model, self.work, self._k, self._stage
+        if how is not None:
+            move(m, w, k, self.pcg, self.kind, how, step_length, stage.c, stage.beta)
+        if k.any:
+            impact = self.kind == IMPACT
+            press(m, w, k, impact, int(new_multipliers), stage.beta, stage.dt, *self.contact.goal, self.r_scale)
+        form_residual(m, w, self.matrix, k, self.pcg, self.kind, stage.beta, self.norms)
+        return self._sizes(stage.c, stage.beta)
+
+    def linearise(self) -> None:
+        """From here on elastic forces are linear, by the matrix at hand."""
+        keep_linear(self.model, self.work, self._k)
+        self.kind = LINEARISED
+
+    def leave_linear(self, taken: bool = True) -> tuple[float, float]:
+        """Back to where the stage was linearised: (|r|, scale) there. y is the way that was found since.
+
+        taken: the impulses found are the multipliers now; otherwise they are those of then.
+        """
+        leave_linear(self.model, self.work, self._k, self.pcg, int(taken))
+        self.kind = ELASTIC_STAGE
+        return self.evaluate(AGAIN, 0.0, new_multipliers=True)
+
+    def _sizes(self, c: float, beta: float) -> tuple[float, float]:
+        """(|r|, scale) from the norms that the residual's kernel told."""
+        r, inertia, elastic, external, held = (math.sqrt(square) for square in self.norms)
+        if c == 0.0:
+            return r, beta * external if external > 0.0 else held
+        return r, inertia + beta * (elastic + external)
+
+    def merit(self) -> float:
+        """Phi where the residual was last formed, with the contacts' part [J]."""
+        m, stage = self.model, self._stage
+        measure(m)
+        stage_terms(m, self.work, stage.c, stage.beta)
+        scalars = m.state.scalars.to_numpy()
+        contacts = scalars[CONTACT_POTENTIAL] if self._k.any else 0.0
+        return float(scalars[ELASTIC] + scalars[GRAVITY] + scalars[POTENTIAL] + contacts)
+
+    def stand_still(self, new_multipliers: bool = False) -> tuple[float, float]:
+        """(|r|, scale) with the state at the step's start as the first iterate."""
+        stand_still(self.model, self.work, self.x_start, self._stage.beta)
+        return self.evaluate(new_multipliers=new_multipliers)
+
+    def go_back(self) -> tuple[float, float]:
+        """(|r|, scale) with the first iterate of before."""
+        go_back(self.model, self.work, self._stage.beta)
+        return self.evaluate()
+
+    def form_matrix(self, projected: bool = False) -> None:
+        """The matrix where the stage stands, without J^T D J, which the linear solve adds."""
+        m, stage = self.model, self._stage
+        block_csr.assemble(m, self.matrix, projected)
+        block_csr.to_system(m, self.matrix, self.damper or self.matrix, stage.c, stage.beta)
+        if self._k.any:
+            keep_diagonal(m, self.matrix, self._k)
+
+    def direction(self, tolerance: float) -> pcg.LinearResult:
+        """y of pcg from -r."""
+        m = self.model
+        return pcg.solve(m, self.matrix, self.pcg, tolerance, max(1000, 30 * m.n_nodes), self._k.coupling)
+
+    # --- what others ask -------------------------------------------------------------------------------------------
+
+    def assemble_damper(self) -> None:
+        """K_d = projected K at the present x, for the step that begins."""
+        if self.damper is not None:
+            block_csr.assemble(self.model, self.damper, True)
+
+    def linear_residual(self) -> float:
+        """|rhs - A y| / |rhs| as it really is: in f32 CG's own residual can fall while the true one stays."""
+        block_csr.multiply(self.model, self.matrix, self.pcg.y, self.pcg.q)
+        rhs, free, q = download([self.pcg.rhs, self.model.free, self.pcg.q])
+        rhs = rhs.astype(np.float64)
+        size = float(np.linalg.norm(rhs))
+        return float(np.linalg.norm(rhs - free * q)) / size if size > 0.0 else 0.0
+
+    def held_residual(self) -> np.ndarray:
+        """(n_nodes, 3) residual on the constrained axes, 0 on free ones."""
+        free, residual = download([self.model.free, self.work.residual])
+        return (1.0 - free.astype(np.float64)) * residual
