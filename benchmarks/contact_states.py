@@ -86,10 +86,10 @@ def mat() -> ts.Scene:
     body = scene.add_body(
         ts.TetMesh(x, mesh.tets), ts.Material(young=2e4, poisson=0.4, density=1000.0, friction=0.3), name="mat"
     )
-    turn = np.array([np.radians(90.0) * 4.0, 0.0, 0.0])
+    turn = np.array([np.radians(90.0) * 8.0, 0.0, 0.0])
     for side in (-1.0, 1.0):
         body.move(
-            lambda X, side=side: side * X[:, 0] > 0.499, ts.KeyFrames([0.0, 4.0], rotations=[np.zeros(3), side * turn])
+            lambda X, side=side: side * X[:, 0] > 0.499, ts.KeyFrames([0.0, 8.0], rotations=[np.zeros(3), side * turn])
         )
     return scene
 
@@ -133,7 +133,7 @@ SCENES: dict[str, tuple[Callable[[], ts.Scene], dict, int, int]] = {
     "Armadillo on Armadillo": (lambda: on_another("Armadillo13K.msh"), IMPLICIT | {"dt": 0.01}, 20, 0),
     "cloth on sphere": (cloth, {"integrator": "bdf2", "dt": 1 / 120}, 60, 0),
     "cube pile": (lambda: demo("cube_pile"), IMPLICIT | {"dt": 0.01}, 60, 15),
-    "twisted mat": (mat, IMPLICIT | {"dt": 0.02, "self_collision": True}, 60, 100),
+    "twisted mat": (mat, IMPLICIT | {"dt": 0.02, "self_collision": True}, 60, 200),
     "squeeze": (lambda: demo("squeeze"), IMPLICIT | {"dt": 0.01}, 60, 40),
     "gripper": (gripper, {"integrator": "bdf2", "dt": 0.01}, 60, 20),
     "soft on stiff": (slabs, IMPLICIT | {"dt": 1 / 120}, 60, 0),

@@ -9,8 +9,9 @@
     START_SLOPE, END_SLOPE,  # r.y where a Newton step begins and where it ends: negative is downhill
     POTENTIAL,  # of an implicit step's objective: inertia, loads and damping
     CONTACT_POTENTIAL,  # of the same: contacts
-) = range(16)  # fmt: skip
-N_SCALARS = 16
+    STEP_LENGTH,  # that a linearised stage's step has taken
+) = range(17)  # fmt: skip
+N_SCALARS = 17
 
 N_NORMS = 5  # first columns: what a residual is measured by
 SUM, OTHER_SUM, N_COLUMNS = 5, 6, 8  # further columns; `measure` uses those of its scalars

@@ -19,15 +19,15 @@ from scenes import built, cube, rubber
 import taisoft as ts
 from taisoft.contact.assemble import build_found
 from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, find_factors, index_nodes
-from taisoft.dynamics import contact_terms
+from taisoft.dynamics import contact_terms, linearised
 from taisoft.dynamics.contact_terms import NO_CONTACTS
-from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, LINEARISED, STAY, STEP, form_residual, move
+from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, STAY, STEP, form_residual, move
 from taisoft.dynamics.stage_system import StageSystem
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import to_scipy, unpacked
 from taisoft.linear.coupling import add_pulls, clear_pulls, gather_pulls, prepare_terms, pull_with_all
 from taisoft.runtime import kernel
-from taisoft.scalars import END_SLOPE, START_SLOPE
+from taisoft.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
 
 K, BETA, DT = 24, 0.002, 0.003  # contacts; [s]
 GOAL = 1e-3, 0.2, 0.02, 0.05  # standoff [m], shares that a step mends, speed of that at most [m/s]
@@ -263,26 +263,37 @@ def test_residual_of_a_stage(rig, pressed, threads):
         assert end == pytest.approx(slope, abs=100 * rig.close * size)
 
 
-def test_a_linearised_stage_is_linear(rig):
-    """The impulses of where it is linearised do not stay in it."""
-    m = rig.m
+@pytest.mark.parametrize("threads", ["one", "all"])
+def test_a_linearised_stage_is_linear(rig, threads):
+    """It goes along y to where the slope vanishes; the impulses of where it was linearised do not stay in it."""
+    m = rig.m if threads == "one" else rig.made.parallel
+    rng, work, cg = np.random.default_rng(7), rig.work, rig.solver.pcg
     m.state.x.from_numpy(rig.start)
-    evaluate(rig)
-    there = rig.p.r.to_numpy()[:K]
-    before = rig.work.residual.to_numpy() + (rig.J.T @ there.ravel()).reshape(-1, 3)
-    contact_terms.keep_linear(m, rig.work, rig.k)
-    m.state.x.from_numpy(rig.x)
-    norms = evaluate(rig, kind=LINEARISED)
-    r = rig.p.r.to_numpy()[:K]
-    expected = before + (rig.A @ (rig.x - rig.start).ravel() / BETA - rig.J.T @ r.ravel()).reshape(-1, 3)
-    assert np.abs(rig.work.residual.to_numpy() - expected).max() < 10 * rig.close * np.abs(expected).max()
-    assert norms[0] == pytest.approx(((rig.free * expected) ** 2).sum(), rel=100 * rig.close)
-    for taken, impulses in ((1, r), (0, there)):
-        contact_terms.leave_linear(m, rig.work, rig.k, rig.solver.pcg, taken)
-        assert np.array_equal(rig.p.r.to_numpy()[:K], impulses)
-    assert np.array_equal(rig.work.base.to_numpy(), rig.start)
-    way = rig.solver.pcg.y.to_numpy() - rig.free * (rig.x - rig.start) / BETA
-    assert np.abs(way).max() < 10 * rig.close * np.abs(rig.x - rig.start).max() / BETA
+    evaluate(rig, m=m)
+    there, at_start = rig.p.r.to_numpy()[:K], work.residual.to_numpy()
+    before = at_start + (rig.J.T @ there.ravel()).reshape(-1, 3)
+    linearised.keep_linear(m, work, rig.k)
+    y = np.linalg.solve(rig.A + 1e6 * np.diag(1 - rig.free.ravel()), -(rig.free * at_start).ravel()).reshape(-1, 3) * rig.free
+    y += 0.1 * np.abs(y).max() * rig.free * rng.standard_normal(y.shape)
+    cg.y.from_numpy(y.astype(rig.made.machine.np_real))
+    norms = np.zeros(5)
+    linearised.advance(m, work, rig.solver.matrix, rig.k, cg, BETA, STIFFNESS, norms)
+    r, length = rig.p.r.to_numpy()[:K], m.state.scalars[STEP_LENGTH]
+    assert length > 0.0 and np.abs(r - there).max() > 0.01 * np.abs(r).max()
+    assert np.abs(m.state.x.to_numpy() - rig.start - length * BETA * y).max() < rig.close * np.abs(length * BETA * y).max()
+    expected = before + (length * rig.A @ y.ravel() - rig.J.T @ r.ravel()).reshape(-1, 3)
+    size = np.abs(rig.A @ y.ravel()).max() * length + np.abs(expected).max()
+    assert np.abs(work.residual.to_numpy() - expected).max() < 100 * rig.close * size
+    assert norms[0] == pytest.approx(((rig.free * expected) ** 2).sum(), rel=1e3 * rig.close)
+    start, end = (rig.free * at_start * y).sum(), (rig.free * expected * y).sum()
+    close = 100 * rig.close * size * np.abs(y).sum()
+    assert m.state.scalars[START_SLOPE] == pytest.approx(start, abs=close)
+    assert m.state.scalars[END_SLOPE] == pytest.approx(end, abs=close) and abs(end) <= 0.05 * abs(start) + close
+    linearised.leave_linear(m, work, rig.k, cg, 1, BETA)
+    assert np.array_equal(rig.p.r.to_numpy()[:K], r) and np.array_equal(work.base.to_numpy(), rig.start)
+    assert np.abs(cg.y.to_numpy() - length * y).max() < 10 * rig.close * np.abs(length * y).max()
+    linearised.leave_linear(m, work, rig.k, cg, 0, BETA)
+    assert np.array_equal(rig.p.r.to_numpy()[:K], there)
 
 
 def test_without_friction_nothing_resists_along_the_surface(rig):

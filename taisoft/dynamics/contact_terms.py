@@ -29,11 +29,13 @@ class ContactStageWork:
 
     multiplier: Any  # (capacity) 3-vectors f64: lambda [N s]
     radius: Any  # (capacity) f64: rho [N s]
-    lag: Any  # (capacity) 3-vectors f64: what J makes of x_start - x_hat, less the way of an obstacle [m]
-    short: Any  # (capacity) f64: gap - goal at the start, less the way of an obstacle along the normal [m]
+    tangential_offset: Any  # (capacity) 3-vectors f64: J (x_start - x_hat), less the displacement of an obstacle [m]
+    gap_minus_target: Any  # (capacity) f64: gap - target at the start, less the displacement of an obstacle along the normal [m]
+    velocity: Any  # (capacity) 3-vectors f64: u where a step begins [m/s]
+    rate: Any  # (capacity) 3-vectors f64: of u along the step [m/s]
     kept: Any  # (capacity) 3-vectors f64: impulses where the stage was linearised [N s]
-    push: Any  # (capacity) 3-vectors f64: the impulse in the world [N s]
-    misfit: Any  # (capacity) 3-vectors f64: of the natural map, and psi_c [J]
+    world_impulse: Any  # (capacity) 3-vectors f64: the impulse in the world [N s]
+    prox_residual: Any  # (capacity) 3-vectors f64: of the natural map, and psi_c [J]
     block: Any  # (capacity) 12-vectors: J^T D J is made of weights times this
     active: Any  # (capacity) i32: 1 where the block is not 0
 
@@ -47,10 +49,9 @@ class StageContacts:
     work: ContactStageWork
     coupling: Coupling  # of J^T D J
     x_start: Any  # (n_nodes) 3-vectors f64: where the gaps were taken [m]
-    way: Any  # (n_nodes) 3-vectors f64: from there [m]
-    x_linear: Any  # (n_nodes) 3-vectors f64: where a linearly implicit stage was linearised; the next two, too
-    residual_linear: Any  # (n_nodes) 3-vectors
-    change: Any  # (n_nodes) 3-vectors [m/s]
+    displacement: Any  # (n_nodes) 3-vectors f64: from there [m]
+    x_linear: Any  # (n_nodes) 3-vectors f64: where a stage was linearised [m]
+    residual_linear: Any  # (n_nodes) 3-vectors: without contacts, of a linearised stage [N s]
 
     @property
     def any(self) -> bool:
@@ -58,7 +59,7 @@ class StageContacts:
         return self.problem is not None
 
 
-NO_CONTACTS = StageContacts(None, None, None, NO_COUPLING, *[None] * 5)
+NO_CONTACTS = StageContacts(None, None, None, NO_COUPLING, *[None] * 4)
 
 
 @ti.func
@@ -70,41 +71,54 @@ def _set_out(s: ti.template(), k: ti.template(), c, beta, dt, standoff, fast, sl
     p, f, w = ti.static((k.problem, k.found, k.work))
     w.multiplier[c] = p.r[c]
     w.radius[c] = p.friction[c] * p.r[c][0]
-    lag = -(beta / dt) * f.carry[c]
+    offset = -(beta / dt) * f.carry[c]
     for j in range(p.arity[c]):
         i = p.node[c, j]
-        lag += p.weight[c, j] * (k.x_start[i] - s.x_hat[i])
-    w.lag[c] = lag
+        offset += p.weight[c, j] * (k.x_start[i] - s.x_hat[i])
+    w.tangential_offset[c] = offset
     if ti.static(impact):
-        w.short[c] = -beta * f.leave[c] - (beta / dt) * p.normal[c].dot(f.carry[c])
+        w.gap_minus_target[c] = -beta * f.leave[c] - (beta / dt) * p.normal[c].dot(f.carry[c])
     else:
         goal = short_of_goal(f, c, dt, standoff, fast, slow, fastest, f.rise[c])
-        w.short[c] = goal - p.normal[c].dot(f.carry[c])
+        w.gap_minus_target[c] = goal - p.normal[c].dot(f.carry[c])
 
 
 @ti.func
-def _stage_velocity_of(k: ti.template(), c, beta):
+def stage_velocity_of(k: ti.template(), c, beta):
     """u of contact c at the present x: (normal, t1, t2) [m/s]."""
     p, w = ti.static((k.problem, k.work))
-    way = dvec(0.0)
+    displacement = dvec(0.0)
     for j in range(p.arity[c]):
-        way += p.weight[c, j] * k.way[p.node[c, j]]
-    n, t, v = p.normal[c], p.tangent[c], way + w.lag[c]
-    return dvec(w.short[c] + n.dot(way), t.dot(v), n.cross(t).dot(v)) / beta
+        displacement += p.weight[c, j] * k.displacement[p.node[c, j]]
+    n, t, v = p.normal[c], p.tangent[c], displacement + w.tangential_offset[c]
+    return dvec(w.gap_minus_target[c] + n.dot(displacement), t.dot(v), n.cross(t).dot(v)) / beta
 
 
 @ti.func
-def _press(m: ti.template(), k: ti.template(), c, beta, stiffness):
+def unprojected(k: ti.template(), c, u, r_scale):
+    """z = lambda - R u of contact c."""
+    R = r_scale * k.problem.factor[c]
+    return k.work.multiplier[c] - dvec(R[0] * u[0], R[1] * u[1], R[1] * u[2])
+
+
+@ti.func
+def impulse_at(k: ti.template(), c, z):
+    """p = prox(z), with the friction disk frozen; 0 where nothing can move the contact."""
+    p = into_disk(dvec(ti.max(z[0], 0.0), z[1], z[2]), k.work.radius[c])
+    if k.problem.factor[c][0] == 0.0:
+        p = dvec(0.0)
+    return p
+
+
+@ti.func
+def press_contact(m: ti.template(), k: ti.template(), c, beta, r_scale):
     """Impulse p.r of contact c at the present x, its block of the matrix, and its part in the laws' residual."""
     p, w = ti.static((k.problem, k.work))
-    u = _stage_velocity_of(k, c, beta)
-    Rn, Rt = stiffness * p.factor[c][0], stiffness * p.factor[c][1]
-    z = w.multiplier[c] - dvec(Rn * u[0], Rt * u[1], Rt * u[2])
-    rho = w.radius[c]
+    u = stage_velocity_of(k, c, beta)
+    Rn, Rt = r_scale * p.factor[c][0], r_scale * p.factor[c][1]
+    z, rho = unprojected(k, c, u, r_scale), w.radius[c]
     size = ti.sqrt(z[1] * z[1] + z[2] * z[2])
-    r = into_disk(dvec(ti.max(z[0], 0.0), z[1], z[2]), rho)
-    if Rn == 0.0:  # nothing can move it
-        r = dvec(0.0)
+    r = impulse_at(k, c, z)
     p.r[c] = r
     # D in the contact's frame, then in the world
     Dn = ti.select(z[0] > 0.0, Rn, 0.0)
@@ -115,7 +129,7 @@ def _press(m: ti.template(), k: ti.template(), c, beta, stiffness):
             across = Rt * rho / size
     n, t1 = p.normal[c], p.tangent[c]
     t2 = n.cross(t1)
-    w.push[c] = r[0] * n + r[1] * t1 + r[2] * t2
+    w.world_impulse[c] = r[0] * n + r[1] * t1 + r[2] * t2
     e = t1
     if size > 0.0:
         e = (z[1] * t1 + z[2] * t2) / size
@@ -130,7 +144,7 @@ def _press(m: ti.template(), k: ti.template(), c, beta, stiffness):
         psi += 0.5 * ti.max(z[0], 0.0) ** 2 / Rn
     if Rt > 0.0:
         psi += ti.select(size > rho, rho * (size - 0.5 * rho), 0.5 * size * size) / Rt
-    w.misfit[c] = dvec(d.dot(d), r.dot(r), psi)
+    w.prox_residual[c] = dvec(d.dot(d), r.dot(r), psi)
 
 
 @ti.func
@@ -140,19 +154,19 @@ def impulse_on_node(k: ti.template(), i):
     d = dvec(0.0)
     for e in range(p.entry_start[i], p.entry_start[i + 1]):
         c, own = p.entry[e] // NODES, p.entry[e] % NODES
-        d += p.weight[c, own] * w.push[c]
+        d += p.weight[c, own] * w.world_impulse[c]
     return d
 
 
 @ti.func
-def _sum_residual(m: ti.template(), k: ti.template()):
+def sum_residual(m: ti.template(), k: ti.template()):
     """Residual of the laws over all contacts. scalars: CONTACT_POTENTIAL."""
     p, w = ti.static((k.problem, k.work))
     changed, size, psi = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     for c in range(p.count[0]):
-        changed += w.misfit[c][0]
-        size += w.misfit[c][1]
-        psi += w.misfit[c][2]
+        changed += w.prox_residual[c][0]
+        size += w.prox_residual[c][1]
+        psi += w.prox_residual[c][2]
     m.state.scalars[CONTACT_POTENTIAL] = psi
     p.state[CHANGED], p.state[SIZE] = changed, size
     p.state[RESIDUAL] = residual_of(changed, size)
@@ -160,23 +174,23 @@ def _sum_residual(m: ti.template(), k: ti.template()):
 
 @kernel
 def press(
-    m: ti.template(), s: ti.template(), k: ti.template(), impact: ti.template(), multiply: ti.i32, beta: ti.f64, dt: ti.f64,
-    standoff: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64, stiffness: ti.f64,
+    m: ti.template(), s: ti.template(), k: ti.template(), impact: ti.template(), new_multipliers: ti.i32, beta: ti.f64,
+    dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64, r_scale: ti.f64,
 ):  # fmt: skip
-    """Find the impulses of all contacts where `move` has gone, their blocks of the matrix, and the residual of their laws.
+    """Find the impulses of all contacts at the present x, their blocks of the matrix, and the residual of their laws.
 
-    impact: as `_set_out`. multiply: whether the impulses are made the multipliers first, and the disks opened as far as these
-    say. stiffness: R over the r-factors.
+    impact: as `_set_out`. new_multipliers: whether the impulses are made the multipliers first, and the disks opened as far as
+    these say. r_scale: R over the r-factors.
     """
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=p.serial)
     for n in range(p.count[0]):
-        if multiply == 1:
+        if new_multipliers == 1:
             _set_out(s, k, n, beta, dt, standoff, fast, slow, fastest, impact)
-        _press(m, k, n, beta, stiffness)
+        press_contact(m, k, n, beta, r_scale)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        _sum_residual(m, k)
+        sum_residual(m, k)
 
 
 @kernel
@@ -187,38 +201,9 @@ def keep_diagonal(m: ti.template(), A: ti.template(), k: ti.template()):
     for i in range(m.n_nodes):
         k.coupling.base[i] = A.diagonal[i]
         for a in ti.static(range(3)):
-            d = ti.cast(A.diagonal[i][5 * a], ti.f64)
-            p.inverse_mass[i][a] = ti.select(d > 0.0, ti.cast(m.free[i][a], ti.f64) / d, 0.0)
-
-
-@kernel
-def keep_linear(m: ti.template(), s: ti.template(), k: ti.template()):
-    """The stage is linearised here: x, the residual without contacts, and the impulses."""
-    p, w = ti.static((k.problem, k.work))
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        k.x_linear[i] = m.state.x[i]
-        k.residual_linear[i] = s.residual[i] + ti.cast(impulse_on_node(k, i), m.real)
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        w.kept[c] = p.r[c]
-
-
-@kernel
-def leave_linear(m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.template(), taken: ti.i32):
-    """Back to where the stage was linearised, with the way from there as y, and the impulses of here as the multipliers.
-
-    taken: 0 where what was found is dropped: the impulses are those of then.
-    """
-    p, w = ti.static((k.problem, k.work))
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        pcg.y[i] = m.free[i] * k.change[i]
-        s.base[i] = k.x_linear[i]
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        if taken == 0:
-            p.r[c] = w.kept[c]
+            # an entry can be negative where tets are strongly compressed
+            d = ti.max(ti.abs(ti.cast(A.diagonal[i][5 * a], ti.f64)), ti.cast(m.mass[i], ti.f64))
+            p.inverse_mass[i][a] = ti.cast(m.free[i][a], ti.f64) / d
 
 
 def build_stage_contacts(arena: FieldArena, model: Model, found: FoundContacts, x_start: Any) -> StageContacts:
@@ -226,9 +211,11 @@ def build_stage_contacts(arena: FieldArena, model: Model, found: FoundContacts, 
     p, n, real = found.problem, model.n_nodes, model.real
     work = ContactStageWork(
         arena.vectors("multiplier", ti.f64, p.capacity), arena.field("friction_radius", ti.f64, p.capacity),
-        arena.vectors("contact_lag", ti.f64, p.capacity), arena.field("contact_short", ti.f64, p.capacity),
-        arena.vectors("contact_kept", ti.f64, p.capacity),
-        arena.vectors("contact_push", ti.f64, p.capacity), arena.vectors("contact_misfit", ti.f64, p.capacity),
+        arena.vectors("contact_tangential_offset", ti.f64, p.capacity),
+        arena.field("contact_gap_minus_target", ti.f64, p.capacity),
+        arena.vectors("contact_velocity", ti.f64, p.capacity),
+        arena.vectors("contact_rate", ti.f64, p.capacity), arena.vectors("contact_kept", ti.f64, p.capacity),
+        arena.vectors("contact_world_impulse", ti.f64, p.capacity), arena.vectors("contact_prox_residual", ti.f64, p.capacity),
         arena.vectors("contact_block", real, p.capacity, n=BLOCK), arena.field("contact_active", ti.i32, p.capacity),
     )  # fmt: skip
     coupling = build_coupling(
@@ -236,6 +223,6 @@ def build_stage_contacts(arena: FieldArena, model: Model, found: FoundContacts, 
         arena.vectors("base_diagonal", real, n, n=BLOCK),
     )  # fmt: skip
     return StageContacts(
-        p, found, work, coupling, x_start, arena.vectors("contact_way", ti.f64, n),
-        arena.vectors("x_linear", ti.f64, n), arena.vectors("residual_linear", real, n), arena.vectors("linear_change", real, n),
+        p, found, work, coupling, x_start, arena.vectors("contact_displacement", ti.f64, n),
+        arena.vectors("x_linear", ti.f64, n), arena.vectors("residual_linear", real, n),
     )  # fmt: skip

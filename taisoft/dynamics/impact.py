@@ -154,9 +154,9 @@ def holding_work(k: ti.template(), beta: ti.f64) -> ti.f64:
     for _ in range(1):
         for c in range(p.count[0]):
             if f.rise[c] > 0.0:
-                way = w.lag[c]
+                way = w.tangential_offset[c]
                 for j in range(p.arity[c]):
-                    way += p.weight[c, j] * k.way[p.node[c, j]]
+                    way += p.weight[c, j] * k.displacement[p.node[c, j]]
                 work += p.r[c][0] * p.normal[c].dot(way) / beta
     return work
 

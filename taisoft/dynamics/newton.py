@@ -21,7 +21,7 @@ more than that of a strain, and ends the stage as converged, its residual told a
 import math
 from dataclasses import dataclass, replace
 
-from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, STEP
+from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STEP
 from taisoft.dynamics.stage_system import Stage, StageSystem
 
 ROUNDING = 4.0  # times the floor: what rounding may leave, as strains grow (up to 2.8 times was seen, in a thin sheet)
@@ -177,7 +177,10 @@ class Newton:
         self.previous, self.negative = self.r, self.negative or answer.negative
         if self.inner and answer.negative:
             return False
-        self.r, self.scale, moved = search(system, self._enough(answer.negative))
+        if system.kind == LINEARISED:
+            (self.r, self.scale), moved = system.advance(), True
+        else:
+            self.r, self.scale, moved = search(system, self._enough(answer.negative))
         self.least = min(self.least, self.r)
         # statics go on down to the floor
         low = self.r <= (ROUNDING if self.stage.c > 0.0 else 1.0) * self.floor
@@ -265,8 +268,11 @@ class ContactNewton:
                 self.newton, self.linear = self.newton + steps.newton - 1, self.linear + steps.linear
                 self.r, self.scale, moved = steps.r, steps.scale, steps.newton > 0
             else:
-                system.leave_linear()
-                self.r, self.scale, moved = search(system, FALL * least)
+                self.r, self.scale = system.leave_linear()
+                moved = self.r < FALL * least
+                if not moved:  # also where it is not a number
+                    system.evaluate(AGAIN, 0.0)
+                    self.r, self.scale, moved = search(system, FALL * least)
             least = min(least, self.r)
             self.rounding = self.r <= ROUNDING * self.floor and self.r > 0.5 * previous
             if not moved:

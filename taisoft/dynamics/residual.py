@@ -1,7 +1,7 @@
 """The residual of an implicit stage where a Newton step leads: `move` goes there and finds the elastic forces,
 `contact_terms.press` the impulses of contacts, `form_residual` adds all up.
 
-A linearised stage has elastic forces that are linear from where it was linearised on, so its residual is a matrix's product.
+A linearised stage moves by `linearised.advance` instead, which keeps its residual without contacts.
 """
 
 import taichi as ti
@@ -10,7 +10,6 @@ from taisoft.dynamics.contact_terms import impulse_on_node
 from taisoft.dynamics.impact import impact_residual
 from taisoft.dynamics.stage import place_node, residual_parts, set_change, squares
 from taisoft.elasticity import element_force
-from taisoft.linear.block_csr import block_times, part_times
 from taisoft.linear.pcg import dot64, total
 from taisoft.runtime import kernel
 from taisoft.scalars import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
@@ -39,11 +38,9 @@ def move(
             if how != STAY:
                 place_node(m, s, pcg.y, i, step_length, beta)
             if ti.static(k.any):
-                k.way[i] = m.state.x[i] - k.x_start[i]
+                k.displacement[i] = m.state.x[i] - k.x_start[i]
             if ti.static(kind == ELASTIC_STAGE):
                 set_change(m, s, i, c, beta)
-            else:
-                k.change[i] = ti.cast((m.state.x[i] - k.x_linear[i]) / beta, m.real)
         m.state.partial[chunk, OTHER_SUM] = slope
     if ti.static(kind == ELASTIC_STAGE):
         for g in ti.static(m.groups):
@@ -54,13 +51,6 @@ def move(
     for _ in range(1):
         if how == STEP:
             m.state.scalars[START_SLOPE] = total(m, OTHER_SUM)
-
-
-@ti.func
-def _linear_residual(m: ti.template(), A: ti.template(), k: ti.template(), i):
-    """Row i of the residual without contacts of the stage that was linearised: that of then, and A times the change of v."""
-    off = part_times(m, A, A.row_start[i], A.row_start[i + 1], k.change)
-    return k.residual_linear[i] + block_times(k.coupling.base[i], k.change[i]) + off
 
 
 @kernel
@@ -85,7 +75,7 @@ def form_residual(
             if ti.static(kind == IMPACT):
                 r = impact_residual(m, A, k, i, beta)
             elif ti.static(kind == LINEARISED):
-                r = _linear_residual(m, A, k, i)
+                r = k.residual_linear[i]
             else:
                 r, inertia, f, external = residual_parts(m, s, i, beta)
             if ti.static(k.any):

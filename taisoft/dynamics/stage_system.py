@@ -16,15 +16,8 @@ import numpy as np
 import taichi as ti
 
 from taisoft.contact.problem import RESIDUAL, find_factors
-from taisoft.dynamics.contact_terms import (
-    NO_CONTACTS,
-    StageContacts,
-    build_stage_contacts,
-    keep_diagonal,
-    keep_linear,
-    leave_linear,
-    press,
-)
+from taisoft.dynamics.contact_terms import NO_CONTACTS, StageContacts, build_stage_contacts, keep_diagonal, press
+from taisoft.dynamics.linearised import advance, keep_linear, leave_linear
 from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STAY, form_residual, move
 from taisoft.dynamics.rounding import RoundingFloor
 from taisoft.dynamics.stage import StageWork, begin_stage, go_back, stage_terms, stand_still
@@ -201,14 +194,20 @@ class StageSystem:
         keep_linear(self.model, self.work, self._k)
         self.kind = LINEARISED
 
-    def leave_linear(self, taken: bool = True) -> tuple[float, float]:
-        """Back to where the stage was linearised: (|r|, scale) there. y is the way that was found since.
+    def advance(self) -> tuple[float, float]:
+        """(|r|, scale) where the slope along y vanishes, of a linearised stage."""
+        stage = self._stage
+        advance(self.model, self.work, self.matrix, self._k, self.pcg, stage.beta, self.r_scale, self.norms)
+        return self._sizes(stage.c, stage.beta)
 
-        taken: the impulses found are the multipliers now; otherwise they are those of then.
+    def leave_linear(self, taken: bool = True) -> tuple[float, float]:
+        """Elastic forces are themselves again: (|r|, scale), y the way since the stage was linearised, base where that was.
+
+        taken: the state is what was found, its impulses the multipliers; otherwise state and multipliers are those of then.
         """
-        leave_linear(self.model, self.work, self._k, self.pcg, int(taken))
+        leave_linear(self.model, self.work, self._k, self.pcg, int(taken), self._stage.beta)
         self.kind = ELASTIC_STAGE
-        return self.evaluate(AGAIN, 0.0, new_multipliers=True)
+        return self.evaluate(AGAIN, float(taken), new_multipliers=True)
 
     def _sizes(self, c: float, beta: float) -> tuple[float, float]:
         """(|r|, scale) from the norms that the residual's kernel told."""

@@ -1,0 +1,154 @@
+"""A stage whose elastic forces are linear: its contact problem on a fixed matrix, which needs no elements.
+
+The residual without contacts is r_lin = r_0 + A s, s the change of v since. Along a direction e the slope of the augmented
+Lagrangian is
+    e.r_lin + a e.A e - sum_c (J e)_c . prox(lambda - R (u + a J e))_c,
+for which two sums over nodes do: its root needs the contacts alone.
+"""
+
+import taichi as ti
+
+from taisoft.contact.prox import dvec
+from taisoft.dynamics.contact_terms import (
+    impulse_at,
+    impulse_on_node,
+    press_contact,
+    stage_velocity_of,
+    sum_residual,
+    unprojected,
+)
+from taisoft.dynamics.stage import place_node, squares
+from taisoft.linear.block_csr import block_times, part_times
+from taisoft.linear.pcg import dot64, total
+from taisoft.runtime import kernel
+from taisoft.scalars import END_SLOPE, OTHER_SUM, START_SLOPE, STEP_LENGTH, SUM
+
+ROOT, TRIES, LONGEST = 0.05, 40, 1e3  # of the slope at the start: what is root enough; trial lengths; the longest
+
+
+@kernel
+def keep_linear(m: ti.template(), s: ti.template(), k: ti.template()):
+    """The stage is linear from here on: x, the residual without contacts, the impulses; no change so far."""
+    p, w = ti.static((k.problem, k.work))
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        k.x_linear[i] = m.state.x[i]
+        k.residual_linear[i] = s.residual[i] + ti.cast(impulse_on_node(k, i), m.real)
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        w.kept[c] = p.r[c]
+
+
+@kernel
+def leave_linear(m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.template(), taken: ti.i32, beta: ti.f64):
+    """The way from where the stage was linearised as y, from base.
+
+    taken: 0 where what was found is dropped: the impulses are those of then.
+    """
+    p, w = ti.static((k.problem, k.work))
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        pcg.y[i] = ti.cast((m.state.x[i] - k.x_linear[i]) / beta, m.real)
+        s.base[i] = k.x_linear[i]
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        if taken == 0:
+            p.r[c] = w.kept[c]
+
+
+@ti.func
+def _slope(k: ti.template(), at_rest, curvature, a, r_scale):
+    """Of the augmented Lagrangian at step length a; at_rest: e.r_lin."""
+    p, w = ti.static((k.problem, k.work))
+    slope = at_rest + a * curvature
+    for c in range(p.count[0]):
+        z = unprojected(k, c, w.velocity[c] + a * w.rate[c], r_scale)
+        slope -= w.rate[c].dot(impulse_at(k, c, z))
+    return slope
+
+
+@ti.func
+def _step_length(k: ti.template(), at_rest, curvature, start, r_scale):
+    """(a, slope there): the root of the slope, which rises where the matrix is positive definite, by the Illinois method."""
+    a, low, at_low, high, at_high = 1.0, 0.0, start, -1.0, 0.0
+    slope = _slope(k, at_rest, curvature, a, r_scale)
+    tries = 0
+    while ti.abs(slope) > ROOT * ti.abs(start) and tries < TRIES and a < LONGEST:
+        if slope > 0.0:
+            high, at_high = a, slope
+            at_low *= 0.5 if tries > 1 else 1.0
+        else:
+            low, at_low = a, slope
+            at_high *= 0.5 if tries > 1 else 1.0
+        if high < 0.0:
+            a *= 2.0
+        else:
+            a = low + (high - low) * ti.min(ti.max(at_low / (at_low - at_high), 0.01), 0.99)
+        slope = _slope(k, at_rest, curvature, a, r_scale)
+        tries += 1
+    return a, slope
+
+
+@kernel
+def advance(
+    m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), pcg: ti.template(), beta: ti.f64, r_scale: ti.f64,
+    norms: ti.types.ndarray(),
+):  # fmt: skip
+    """Go along y of pcg to where the slope vanishes: x, v, impulses, blocks, residual, and -r as CG's right side there.
+
+    norms (5,): |r|^2 on the free axes, and in the last place on the others. scalars: START_SLOPE, END_SLOPE, STEP_LENGTH.
+    """
+    p, w = ti.static((k.problem, k.work))
+    ti.loop_config(serialize=m.serial)
+    for chunk in range(m.chunks):
+        size = (m.n_nodes + m.chunks - 1) // m.chunks
+        slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
+            y = pcg.y[i]
+            q = block_times(k.coupling.base[i], y) + part_times(m, A, A.row_start[i], A.row_start[i + 1], pcg.y)
+            pcg.q[i] = q
+            s.base[i] = m.state.x[i]
+            slope += dot64(m.free[i] * s.residual[i], y)
+            curvature += dot64(y, q)
+        m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        w.velocity[c] = stage_velocity_of(k, c, beta)
+        d, n, t = dvec(0.0), p.normal[c], p.tangent[c]
+        for j in range(p.arity[c]):
+            d += p.weight[c, j] * ti.cast(pcg.y[p.node[c, j]], ti.f64)
+        w.rate[c] = dvec(n.dot(d), t.dot(d), n.cross(t).dot(d))
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        start = total(m, SUM)
+        at_rest = start
+        for c in range(p.count[0]):
+            at_rest += w.rate[c].dot(p.r[c])
+        a, slope = _step_length(k, at_rest, total(m, OTHER_SUM), start, r_scale)
+        m.state.scalars[START_SLOPE], m.state.scalars[END_SLOPE], m.state.scalars[STEP_LENGTH] = start, slope, a
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        a = m.state.scalars[STEP_LENGTH]
+        place_node(m, s, pcg.y, i, a, beta)
+        k.displacement[i] = m.state.x[i] - k.x_start[i]
+        k.residual_linear[i] += ti.cast(a, m.real) * pcg.q[i]
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        press_contact(m, k, c, beta, r_scale)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        sum_residual(m, k)
+    ti.loop_config(serialize=m.serial)
+    for chunk in range(m.chunks):
+        size = (m.n_nodes + m.chunks - 1) // m.chunks
+        sums = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64)
+        zero = ti.Vector([0.0, 0.0, 0.0], m.real)
+        for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
+            r = k.residual_linear[i] - ti.cast(impulse_on_node(k, i), m.real)
+            s.residual[i] = r
+            pcg.rhs[i] = -m.free[i] * r
+            sums += squares(r, zero, zero, zero, m.free[i])
+        m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = sums[0], sums[4]
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        norms[0], norms[4] = total(m, SUM), total(m, OTHER_SUM)
