@@ -1,6 +1,8 @@
 """Contact: solvers beside each other on the problems of whole scenes, colourings, the cost of steps, problems of rigid scenes.
 
 taisoft bench contact [--quick] [--arch cpu|cuda] [--out FILE.json] [--plot FILE.png]
+taisoft bench contact --capture DIR [--baseline FOLDER] [--only SCENE] [--quick]
+taisoft bench contact --replay DIR [--baseline FOLDER] [--only SCENE] [--out FILE.json]
 
 Scenes are demos, in f32; figures named are those of the report. Of each frame of an explicit run the contact problem is taken
 where its solve would begin, and solved to a residual of 1e-4 by every solver, in turns, from the impulses of the step before and
@@ -9,10 +11,17 @@ CPU, or, where that is said, on all. A number is a median, its range in brackets
 over the median. Compiling is apart. Exit status: 0, or 1 where a limit is not met. --quick has one scene, few frames, and no
 limit.
 The whole takes about six minutes on two cores.
+
+--capture runs twelve scenes and keeps the states before every fifth of their implicit steps and before the ten slowest; --replay
+solves each of them again, in f32 and f64, to 1e-4, and in halves where that does not converge, and compares with the same step
+solved to 1e-8 (errors over the mean surface edge). --baseline: another version's folder, which captures the states, or solves
+them beside this one. N: Newton iterations of the first try, which are assemblies of the matrix; launches and ms: of all tries.
+Scenes whose meshes are not there are left out. Capturing takes about ten minutes, replaying ten a version.
 """
 
 import argparse
 import sys
+from pathlib import Path
 
 from taisoft.runtime import compile_clock, open_runtime
 from taisoft.timing import load_average
@@ -22,7 +31,9 @@ from .contact_captured import GOAL, Solvers
 from .contact_colours import QUICK_SEEDS, SEEDS, colour_all, colour_table
 from .contact_crossover import QUICK_SIZES, SIZES, crossover_table, crossover_text, measure_crossover
 from .contact_plot import Snapshot, draw, take_snapshot
+from .contact_replay import capture, replay
 from .contact_runs import measure_film, measure_run, measure_step, open_explicit, open_scene, to_impulses
+from .contact_states import SCENES
 from .contact_table import (
     PILE,
     PILE_SECONDS,
@@ -37,7 +48,7 @@ from .document import Document, header
 from .elasticity_table import limit_table
 from .order import parse_options
 
-SCENES = ("cube_on_box", "two_cubes_two_boxes")  # figures 20 and 19
+DEMOS = ("cube_on_box", "two_cubes_two_boxes")  # figures 20 and 19
 FRAMES, QUICK_FRAMES = 90, 6
 STEPS, QUICK_STEPS = 400, 40
 RUN_SECONDS, QUICK_RUN_SECONDS = 2.0, 0.4
@@ -47,7 +58,7 @@ QUICK_PROBLEMS, REPEATS = ("Rover1039", "Rover4396"), 3
 def measure(quick: bool, arch: str, document: Document) -> tuple[dict, list[Snapshot]]:
     """Everything, printed as it comes, by name; and what is drawn of the scenes."""
     found: dict = {"films": [], "steps": [], "runs": [], "colourings": []}
-    snapshots = [_explicit(name, quick, arch, found) for name in SCENES[: 1 if quick else None]]
+    snapshots = [_explicit(name, quick, arch, found) for name in DEMOS[: 1 if quick else None]]
     document.add(f"## Explicit steps (figs. 19, 20)\n\n{count_table(found['films'])}\n\n{solver_table(found['films'])}")
     document.add(f"## The whole explicit step\n\n{step_table(found['steps'])}")
     for name, seconds in [(s.scene, QUICK_RUN_SECONDS if quick else RUN_SECONDS) for s in snapshots]:
@@ -94,12 +105,32 @@ def _problems(quick: bool, document: Document) -> list[contact_problems.Row]:
     return rows
 
 
+def replay_states(options: argparse.Namespace) -> int:
+    """Solve captured states again, and compare. Exit status."""
+    document, (text, numbers) = Document(), header("Captured steps with contacts", options.arch)
+    document.add(text)
+    found, limits = replay(options.replay, options.baseline, options.only, document)
+    if options.out:
+        document.write(options.out, numbers | {"rows": found, "limits": [limit.record() for limit in limits]})
+    return 0 if all(limit.met for limit in limits) else 1
+
+
 def main(argv=None) -> int:
     """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
     first, _, rest = __doc__.partition("\n")
     parser = argparse.ArgumentParser(prog="taisoft bench contact", description=first, epilog=rest.partition("\n\n")[2])
     parser.add_argument("--quick", action="store_true", help="one scene, few frames and sizes, no limit")
+    parser.add_argument("--capture", type=Path, metavar="DIR", help="keep states of implicit steps with contacts")
+    parser.add_argument("--replay", type=Path, metavar="DIR", help="solve such states again")
+    parser.add_argument("--baseline", type=Path, metavar="FOLDER", help="another version")
+    parser.add_argument("--only", action="append", metavar="SCENE", choices=SCENES, help="repeatable")
     options = parse_options(parser, argv, "the report's figures 19 and 20")
+    if options.capture:
+        for line in capture(options.capture, options.baseline, options.only, options.quick):
+            print(line, flush=True)
+        return 0
+    if options.replay:
+        return replay_states(options)
     document, (text, numbers) = Document(), header("Contact", options.arch, "f32")
     document.add(text)
     compiled = compile_clock()

@@ -1,14 +1,13 @@
 """Steps with contacts, captured and taken again: what a process of `taisoft bench contact --capture` and `--replay` does.
 
-python contact_states.py capture SCENE FILE: runs a scene of SCENES and keeps the states before every fifth step and before the
-ten steps that took most Newton iterations: positions, velocities, the past, contacts and impulses.
+python contact_states.py capture SCENE FILE [quick]: runs a scene of SCENES and keeps the states before every fifth step and
+before the ten steps that took most Newton iterations: positions, velocities, the past, contacts and impulses.
 python contact_states.py replay FILE PRECISION TOLERANCE [REFERENCE]: solves the stage of each of them, without substeps, and in
 halves where that does not converge. REFERENCE: where positions are kept, or, where they are there, what they are compared with.
 Each prints lines of JSON. Nothing here is newer than version 0.1, so that both can be measured on the same states.
 """
 
 import json
-import os
 import pickle
 import runpy
 import sys
@@ -20,10 +19,11 @@ from pathlib import Path
 import numpy as np
 
 import taisoft as ts
+from taisoft.runtime import compile_clock, launches
 
 ROOT = Path(ts.__file__).resolve().parents[1]
-MESHES = Path(os.environ.get("TAISOFT_MESHES", Path(__file__).resolve().parents[2] / "shared" / "meshes"))
-EVERY, SLOWEST = 5, 10
+MESHES = Path(__file__).resolve().parents[2] / "shared" / "meshes"
+EVERY, SLOWEST, QUICK_STEPS = 5, 10, 3
 MOST_HALVES = 16
 DOWN, GROUND = (0.0, -9.81, 0.0), ts.HalfSpace((0, 0, 0), (0, 1, 0))
 IMPLICIT = {"integrator": "implicit_euler"}
@@ -140,15 +140,21 @@ SCENES: dict[str, tuple[Callable[[], ts.Scene], dict, int, int]] = {
 }
 
 
+def can_build(name: str) -> bool:
+    """Whether the mesh that a scene needs is here."""
+    mesh = {"bunny": "bunny.msh", "Armadillo": "Armadillo13K.msh"}.get(name.split()[0])
+    return mesh is None or (MESHES / mesh).is_file()
+
+
 def kept_of(sim: ts.Simulator) -> dict:
     """All that the next step rests on."""
     return {"world": sim._world.snapshot(), "stepper": sim._stepper.snapshot()}
 
 
-def capture(name: str, file: Path) -> None:
-    """Run a scene and keep its states."""
+def capture(name: str, file: Path, quick: bool) -> None:
+    """Run a scene and keep its states. quick: of its first steps alone."""
     build, settings, steps, before = SCENES[name]
-    found = []
+    steps, found = QUICK_STEPS if quick else steps, []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         sim = ts.Simulator(build(), **settings, precision="f32")
@@ -198,11 +204,11 @@ def solve(sim: ts.Simulator, kept: dict, dt: float) -> tuple[dict, np.ndarray]:
     """A stage of dt from a state, in halves where it does not converge; and the positions it ends with."""
     stepper, world = sim._stepper, sim._world
     take = getattr(stepper, "take", None) or stepper._try_part
-    halves, newton, linear, first, seconds = 1, 0, 0, None, 0.0
+    halves, newton, linear, first, seconds, launched = 1, 0, 0, None, 0.0, 0
     while True:
         world.restore(kept["world"])
         stepper.restore(fitting(kept["stepper"], stepper.snapshot()))
-        done, begin = [], time.perf_counter()
+        done, begin, compiled, before = [], time.perf_counter(), compile_clock(), launches.total()
         for part in range(halves):
             try:
                 done.append(take(world.time + part * dt / halves, dt / halves))
@@ -210,7 +216,8 @@ def solve(sim: ts.Simulator, kept: dict, dt: float) -> tuple[dict, np.ndarray]:
                 done.append(None)
             if done[-1] is None or not done[-1].converged:
                 break
-        seconds += time.perf_counter() - begin
+        seconds += time.perf_counter() - begin - (compile_clock() - compiled)
+        launched += launches.total() - before
         newton += sum(r.newton_iterations for r in done if r)
         linear += sum(r.linear_iterations for r in done if r)
         first = first or done[0]
@@ -222,7 +229,7 @@ def solve(sim: ts.Simulator, kept: dict, dt: float) -> tuple[dict, np.ndarray]:
     row = {
         "newton": stage.newton_iterations if stage else 0, "linear": stage.linear_iterations if stage else 0,
         "all newton": newton, "all linear": linear, "halves": halves, "converged": good,
-        "seconds": seconds, "residual": done[-1].residual if done[-1] else None,
+        "seconds": seconds, "launches": launched, "residual": done[-1].residual if done[-1] else None,
         "contact residual": done[-1].contact_residual if done[-1] else None,
         "contacts": int(stepper.contact.n_contacts),
     }  # fmt: skip
@@ -244,7 +251,7 @@ def fitting(kept: dict, own: dict) -> dict:
 def main(task: str, *rest: str) -> None:
     """One task."""
     if task == "capture":
-        capture(rest[0], Path(rest[1]))
+        capture(rest[0], Path(rest[1]), rest[2:] == ("quick",))
     else:
         replay(Path(rest[0]), rest[1], float(rest[2]), Path(rest[3]) if len(rest) > 3 else None)
 

@@ -4,8 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.motion import Motion
-from taisoft.dynamics.newton import StageResult, solve
+from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.stage_result import StageResult
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.world import World
 from taisoft.elasticity import measure
@@ -112,7 +114,7 @@ class StaticSolver:
             {**plan.on, "mass_damping": False, "stiffness_damping": False, "consistent_mass": False},
         )  # fmt: skip
         self.world = World(scene, runtime, arena, model, layout, Motion(scene, layout))
-        self.solver = StageSystem(model, arena, runtime.eps, self.world.motion.moved)
+        self.solver = StageSystem(model, arena, runtime.eps, self.world.motion.moved, NoContacts())
         self.tolerance = tolerance
         self.target = self.world.next_target(time)
         self.world.upload_constraints()

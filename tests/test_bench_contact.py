@@ -231,7 +231,7 @@ def test_a_run_is_told_with_its_iterations(sim, monkeypatch):
 def test_scenes_are_opened_with_their_own_settings(monkeypatch):
     opened = []
     monkeypatch.setattr(contact_runs.ts, "Simulator", lambda scene, **settings: opened.append((scene, settings)))
-    for name in (*contact.SCENES, PILE):
+    for name in (*contact.DEMOS, PILE):
         open_scene(name, "cpu")
         scene, settings = opened[-1]
         assert settings["integrator"] == "implicit_euler" and settings["precision"] == "f32" and "seconds" not in settings
@@ -319,3 +319,21 @@ def test_files_that_cannot_be_written_are_refused_first(monkeypatch, tmp_path):
     monkeypatch.setattr(contact, "measure", lambda *arguments: pytest.fail("measured"))
     with pytest.raises(OutputError, match=r"the name must end in \.json"):
         contact.main(["--out", str(tmp_path / "a.txt")])
+
+
+def test_captured_states_are_solved_again(tmp_path, capsys):
+    """Two small scenes; the version beside itself takes the same iterations."""
+    scenes = ["gripper", "cloth on sphere"]
+    only = [word for name in scenes for word in ("--only", name)]
+    assert contact.main(["--capture", str(tmp_path), "--quick", *only]) == 0
+    assert {file.stem for file in tmp_path.glob("*.pkl")} == set(scenes)
+    out = tmp_path / "replay.json"
+    status = contact.main(["--replay", str(tmp_path), "--only", "gripper", "--out", str(out)])
+    numbers = json.loads(out.read_text())
+    assert status == (0 if all(limit["met"] for limit in numbers["limits"]) else 1)
+    for precision in ("f32", "f64"):
+        rows = numbers["rows"][f"this version, {precision}"]
+        assert [row["step"] for row in rows] == [20, 21, 22] and all(row["converged"] for row in rows)
+        assert all(row["residual"] <= 1e-4 and row["contact residual"] <= 1e-4 for row in rows)
+        assert all(0 < row["newton"] <= row["linear"] and 0.0 < row["error"] < 0.1 and row["launches"] > 5 for row in rows)
+    assert "## Limits" in capsys.readouterr().out

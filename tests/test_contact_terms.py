@@ -21,6 +21,7 @@ from taisoft.contact.assemble import build_found
 from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, find_factors, index_nodes
 from taisoft.dynamics import contact_terms, linearised
 from taisoft.dynamics.contact_terms import NO_CONTACTS
+from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, STAY, STEP, form_residual, move
 from taisoft.dynamics.stage_system import StageSystem
 from taisoft.linear import block_csr, pcg
@@ -76,7 +77,7 @@ def rig(request):
         arity[::5] = (contacts.weight[::5] > 0).sum(axis=1)  # against an obstacle
         p = build_node_problem(arena, K + 3, m.n_nodes, True)
         f = build_found(arena, p)
-        solver = StageSystem(m, arena, made.machine.eps, np.zeros(0, dtype=int))
+        solver = StageSystem(m, arena, made.machine.eps, np.zeros(0, dtype=int), NoContacts())
         k = contact_terms.build_stage_contacts(arena, m, f, arena.vectors("x_start", ti.f64, m.n_nodes))
         for name in ("node", "weight", "normal", "tangent"):
             fill_field(getattr(p, name), getattr(contacts, name))

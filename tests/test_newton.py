@@ -11,7 +11,7 @@ from scenes import cube, element, rubber
 
 import taisoft as ts
 from taisoft.dynamics import implicit, scheme_of
-from taisoft.dynamics.newton import solve
+from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.scalars import MIN_J
 

@@ -14,7 +14,7 @@ import pytest
 from retries import assert_is_before_first_step, assert_steps_as_new, state_of
 
 import taisoft as ts
-from taisoft.dynamics import implicit
+from taisoft.dynamics import implicit, substepping
 
 DT = 0.05  # [s]
 LEAD = 0.04  # [s]
@@ -46,13 +46,13 @@ def test_a_step_that_does_not_converge_is_taken_in_parts(sim, monkeypatch):
     whole = sim.step()
     assert whole.parts == 1 and np.abs(sim.positions() - wanted[0]).max() > 1e-3  # [m]
     sim.reset()
-    solve, results = sim._stepper.solver.solve, []
+    solve, results = implicit.solve, []
 
     def stopping(*arguments, **named):
         results.append(solve(*arguments, **named))
         return dataclasses.replace(results[-1], converged=len(results) > 1)
 
-    monkeypatch.setattr(sim._stepper.solver, "solve", stopping)
+    monkeypatch.setattr(implicit, "solve", stopping)
     report = sim.step()
     assert report.converged and report.parts == 2 and sim.step_count == 1 and sim.time == DT
     assert report.newton_iterations == sum(r.newton_iterations for r in (whole, *halves))
@@ -73,14 +73,14 @@ def test_one_that_never_does_is_told(sim, monkeypatch):
     monkeypatch.setattr(implicit, "MAX_NEWTON", 2)
     assert sim.step().newton_iterations == 16
     sim.reset()
-    monkeypatch.setattr(implicit, "RETRIES", 1)
+    monkeypatch.setattr(substepping, "RETRIES", 1)
     sim.step()
     assert np.abs(sim.positions() - x).max() < 1e-12  # [m], as if there had been no other try
 
 
-def failing_at(sim, monkeypatch, call: int, error: BaseException):
+def failing_at(monkeypatch, call: int, error: BaseException):
     """Have the solver raise at its call of that number."""
-    solve, calls = sim._stepper.solver.solve, []
+    solve, calls = implicit.solve, []
 
     def failing(*arguments, **named):
         calls.append(arguments)
@@ -88,7 +88,7 @@ def failing_at(sim, monkeypatch, call: int, error: BaseException):
             raise error
         return solve(*arguments, **named)
 
-    monkeypatch.setattr(sim._stepper.solver, "solve", failing)
+    monkeypatch.setattr(implicit, "solve", failing)
 
 
 @pytest.mark.parametrize("call, error", [(1, ts.SimulationError("no room")), (3, KeyboardInterrupt())])
@@ -96,7 +96,7 @@ def test_where_a_step_fails_the_state_is_that_before_it(sim, monkeypatch, call, 
     """The first try, after nodes were let go, and Ctrl-C in the second part of the second one."""
     before = state_of(sim)
     monkeypatch.setattr(implicit, "MAX_NEWTON", 2)
-    failing_at(sim, monkeypatch, call, error)
+    failing_at(monkeypatch, call, error)
     with pytest.raises(type(error)):
         sim.step()
     assert_is_before_first_step(sim, before)
@@ -106,12 +106,12 @@ def test_where_a_step_fails_the_state_is_that_before_it(sim, monkeypatch, call, 
 
 def test_where_a_try_in_parts_fails_the_step_is_told_as_not_converged(sim, monkeypatch):
     monkeypatch.setattr(implicit, "MAX_NEWTON", 2)
-    monkeypatch.setattr(implicit, "RETRIES", 1)
+    monkeypatch.setattr(substepping, "RETRIES", 1)
     sim.step()
     wanted = sim.positions()
     sim.reset()
-    monkeypatch.setattr(implicit, "RETRIES", 2)
-    failing_at(sim, monkeypatch, 3, ts.SimulationError("spoilt"))
+    monkeypatch.setattr(substepping, "RETRIES", 2)
+    failing_at(monkeypatch, 3, ts.SimulationError("spoilt"))
     report = sim.step()
     assert not report.converged and report.parts == 1 and np.abs(sim.positions() - wanted).max() < 1e-12  # [m]
     assert any(sim._world.motion.released())

@@ -286,7 +286,7 @@ def test_real_ctrl_c(block, monkeypatch):
     block.dt = 0.004
     block.advance(1)
     before = block.positions(), block.velocities()
-    worker, name = (block._stepper, "_launch") if block.settings.explicit else (block._stepper.solver, "_advance")
+    worker, name = (block._stepper, "_launch") if block.settings.explicit else (block._stepper.solver, "form_matrix")
     working = getattr(worker, name)
 
     def interrupted(*arguments):

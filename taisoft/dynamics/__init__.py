@@ -32,8 +32,9 @@ def make_stepper(
     """
     if integrator in IMPLICIT:
         from taisoft.dynamics.implicit import ImplicitStepper
+        from taisoft.dynamics.no_contacts import NoContacts
 
-        return ImplicitStepper(world, scheme_of(integrator), contact)
+        return ImplicitStepper(world, scheme_of(integrator), contact or NoContacts())
     verlet = integrator == "velocity_verlet"
     if contact is None:
         return ExplicitStepper(world, verlet)

@@ -42,6 +42,8 @@ SPARE = 1024  # contacts beyond two a triangle that there is room for at first
 class ContactStep:
     """Finds the contacts of each step and keeps their problem. explicit: the kind of steps."""
 
+    idle = False  # see `NoContacts`
+
     def __init__(self, world: World, self_collision: bool, explicit: bool):
         self.world = world
         m, scene = world.model, world.scene

@@ -36,7 +36,7 @@ from taisoft.runtime import kernel
 from taisoft.scalars import OTHER_SUM, SUM
 
 if TYPE_CHECKING:
-    from taisoft.dynamics.newton import StageResult
+    from taisoft.dynamics.stage_result import StageResult
     from taisoft.dynamics.stage_system import Stage, StageSystem
 
 SPREAD = 2.0 * math.pi  # tau / dt
@@ -172,7 +172,9 @@ def let_go(f: ti.template()):
 
 def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":
     """A step of implicit Euler in which surfaces meet with restitution: the impact, then the stage."""
-    from taisoft.dynamics.newton import Newton, count_all, merge, solve
+    from taisoft.dynamics.contact_newton import solve
+    from taisoft.dynamics.newton import Newton
+    from taisoft.dynamics.stage_result import count_all, merge
 
     m, w, tau, out = system.model, system.work, SPREAD * stage.dt, np.zeros(2)
     blow = replace(stage, beta=tau, contact_tolerance=max(stage.contact_tolerance, TOLERANCE), linearised=True)

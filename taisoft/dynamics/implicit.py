@@ -10,10 +10,12 @@ import taichi as ti
 
 from taisoft.dynamics.body_balance import LIMIT, BodyBalance
 from taisoft.dynamics.contact import TOLERANCE, ContactStep
+from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.impact import solve_bouncing
-from taisoft.dynamics.newton import StageResult, count_all, merge, solve
+from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.stage_result import StageResult, count_all
 from taisoft.dynamics.stage_system import Stage, StageSystem
-from taisoft.dynamics.substepping import RETRIES, Substepping
+from taisoft.dynamics.substepping import Substepping
 from taisoft.dynamics.world import World
 from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
@@ -91,9 +93,9 @@ class History:
 
 
 class ImplicitStepper:
-    """Takes steps of one scheme over a world; contact: its contacts, where it can have any."""
+    """Takes steps of one scheme over a world and its contacts."""
 
-    def __init__(self, world: World, scheme: Scheme, contact: ContactStep | None = None):
+    def __init__(self, world: World, scheme: Scheme, contact: ContactStep | NoContacts):
         self.world, self.scheme, self.contact = world, scheme, contact
         m, arena = world.model, world.arena
         self.history = History(
@@ -105,21 +107,20 @@ class ImplicitStepper:
         self.tolerance = DEFAULT_TOLERANCE[world.runtime.precision]
         self.contact_tolerance = TOLERANCE[world.runtime.precision]
         self.linear_tolerance: float | None = None
-        self.parts = 1  # that the last step was taken in
         balance = BodyBalance(world.scene)
         self._balance = balance if balance.n_pieces > 1 else None
         self.unbalanced: tuple[float, str] = (0.0, "")  # the worst relative residual of a body in the last step beyond LIMIT
-        self._substepping = None if contact is None else Substepping(self)
+        self._substepping = Substepping(self)
+        self._mark = None, [], contact.flight  # see `mark`
         self.forget()
 
     def forget(self) -> None:
         """The past is void: the state was set."""
-        self._recovers = True  # whether smaller parts may help; where they did not, not before a step converges again
+        self._substepping.recovers = True
         self._past = 0  # steps whose state is in the history
         self._beta = self._dt = 0.0  # of the last step
-        if self.contact is not None:
-            self.contact.forget()
-            self.solver.forget_factors()
+        self.contact.forget()
+        self.solver.forget_factors()
 
     def numbers_changed(self) -> None:
         """Gravity or material numbers changed."""
@@ -128,68 +129,49 @@ class ImplicitStepper:
     def snapshot(self) -> dict:
         """What the next step rests on beside the world: the history, what the solver keeps, the contacts."""
         x, v = download([self.history.x_now, self.history.v_now])
-        kept = {"past": self._past, "beta": self._beta, "dt": self._dt, "recovers": self._recovers, "x_now": x, "v_now": v}
-        if self.contact is not None:
-            kept["contact"] = self.contact.snapshot()
-        return kept | {"solver": self.solver.snapshot()}
+        return {
+            "past": self._past, "beta": self._beta, "dt": self._dt, "recovers": self._substepping.recovers,
+            "x_now": x, "v_now": v, "contact": self.contact.snapshot(), "solver": self.solver.snapshot(),
+        }  # fmt: skip
 
     def restore(self, kept: dict) -> None:
         """Back to what `snapshot` told. x_before and v_before need not be: a step begins by writing them."""
         upload([(self.history.x_now, kept["x_now"]), (self.history.v_now, kept["v_now"])])
         self._past, self._beta, self._dt = int(kept["past"]), float(kept["beta"]), float(kept["dt"])
-        self._recovers = bool(kept["recovers"])
-        if self.contact is not None:
-            self.contact.restore(kept["contact"])
+        self._substepping.recovers = bool(kept["recovers"])
+        self.contact.restore(kept["contact"])
         self.solver.restore(kept["solver"])  # after the contacts, whose fields it looks at
 
     def step(self, dt: float) -> StageResult:
-        """One step of dt; on a non-finite result the state is put back and SimulationError raised.
+        """One step of dt, see `Substepping.step`."""
+        self.unbalanced = (0.0, "")
+        return self._substepping.step(self.world.time, dt)
 
-        One that does not converge is done again in smaller parts, and where these do not help in those of before, anew and
-        without the past. With contacts `Substepping` cuts it further. Linearly implicit steps have nothing that could converge.
-        """
-        contact, start, parts, kept, given_up = self.contact, self.world.time, 1, None, []
-        released = self.world.motion.released()
-        if contact is not None:
-            kept, flight = self.world.state(), contact.flight.copy()
-        while True:
-            result, lost, taken = None, True, parts
-            self.unbalanced = (0.0, "")
-            try:
-                done = self._in_parts(start, dt, parts)
-                result, taken = merge(done), len(done)
-                lost = not (result.converged or self.scheme.one_iteration)
-            except BaseException as error:  # of Ctrl-C, too: the step is abandoned
-                self._put_back(kept, released)
-                recovers = self._recovers
-                self.forget()
-                if parts == 1 or not isinstance(error, SimulationError):
-                    raise
-                self._recovers = recovers  # it was only a try
-            if result is not None:
-                given_up.append(result)
-            if not (lost and self._recovers and (taken < RETRIES or parts > 1)):
-                break
-            self._recovers = taken < RETRIES
-            parts = min(2 * taken, RETRIES) if self._recovers else 1
-            if kept is None:
-                restore(self.world.model, self.history)
-                kept = self.world.state()
-            self._put_back(kept, released)
-            self._past = 0
-            if contact is not None:
-                contact.forget()
-                contact.flight[:] = flight
-        self.parts = taken
-        self._recovers = self._recovers or not lost
-        return count_all(result, given_up[:-1])
+    @property
+    def parts(self) -> int:
+        """Substeps that the last step was taken in."""
+        return self._substepping.parts
 
-    def _in_parts(self, start: float, dt: float, parts: int) -> list[StageResult]:
-        """A step of dt from a time, in equal parts; with contacts in shorter ones where they must be."""
-        if self.contact is not None:
-            return self._substepping.step(start, dt, parts, self._recovers and not self.scheme.one_iteration)
-        part = dt / parts
-        return [self.take(start + k * part, part) for k in range(parts)]
+    @property
+    def is_linear(self) -> bool:
+        """Whether steps are linearised, so that there is nothing that could converge."""
+        return self.scheme.one_iteration
+
+    def mark(self) -> None:
+        """A step begins: it may be undone."""
+        self._mark = None if self.contact.idle else self.world.state(), self.world.motion.released(), self.contact.flight.copy()
+
+    def return_to_mark(self, taken_back: bool = False) -> None:
+        """Back to the step's start, without the past. taken_back: whether the only substep so far has been."""
+        state, released, flight = self._mark
+        if state is None and not taken_back:
+            restore(self.world.model, self.history)
+            state = self.world.state()
+            self._mark = state, released, flight
+        self._put_back(state, released)
+        self._past = 0
+        self.contact.forget()
+        self.contact.flight[:] = flight
 
     def _put_back(self, state: tuple[np.ndarray, np.ndarray] | None, released: list[bool]) -> None:
         """Back to a state, None where it has been put back, and to what had let go then."""
@@ -199,8 +181,7 @@ class ImplicitStepper:
         if world.motion.released() != released:
             world.motion.set_released(released)
             world.upload_constraints()
-            if self.contact is not None:
-                self.solver.forget_factors()
+            self.solver.forget_factors()
 
     def back(self) -> None:
         """Back to where the last part began."""
@@ -224,18 +205,17 @@ class ImplicitStepper:
     def take(self, time: float, dt: float) -> StageResult:
         """A step of dt from a time with the contacts of one search."""
         world, m, h, w = self.world, self.world.model, self.history, self.solver.work
-        releases, bounces = world.releases, False
+        releases = world.releases
         target = world.next_target(time + dt)
         if world.releases != releases or dt != self._dt:
             self._past = 0
-        if self.contact is not None:
-            if world.releases != releases:
-                self.solver.forget_factors()
-            self.contact.begin(time, dt)
-            # no scheme looks back through an impact: it would take the jump for an acceleration
-            meets = self.scheme.before and self.contact.meets(dt)
-            if (bounces := self.contact.rebounds(dt)) or meets:
-                self._past = 0
+        if world.releases != releases:
+            self.solver.forget_factors()
+        self.contact.begin(time, dt)
+        # no scheme looks back through an impact: it would take the jump for an acceleration
+        meets = self.scheme.before and self.contact.meets(dt)
+        if (bounces := self.contact.rebounds(dt)) or meets:
+            self._past = 0
         self._dt = dt
         scheme = self.scheme if self._past > 0 or self.scheme.start is None else self.scheme.start
         self.lossy = scheme.before == 0.0
@@ -247,8 +227,7 @@ class ImplicitStepper:
                 led.append((w.led_acceleration, world.motion.accelerations(time, dt, self.scheme.before == 0.0)))
             upload(led)
         self._beta = scheme.share * dt
-        if self.contact is not None:
-            self.contact.acts(scheme.share)
+        self.contact.acts(scheme.share)
         self.solver.assemble_damper()
         along = (0.5 if scheme.midpoint else 1.0) if self._past > 1 and not scheme.one_iteration else 0.0
         self._begin(scheme, along)
@@ -266,7 +245,7 @@ class ImplicitStepper:
             self.forget()
             raise SimulationError(f"step {world.step_count + 1}: {where}")
         self._past += 1
-        if self.contact is not None and self.contact.met:
+        if self.contact.met:
             self._past = 0
         return result
 

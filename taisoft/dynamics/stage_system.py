@@ -31,6 +31,7 @@ from taisoft.transfer import download, upload
 
 if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep
+    from taisoft.dynamics.no_contacts import NoContacts
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class StageSystem:
 
     def __init__(
         self, model: Model, arena: FieldArena, eps: float, prescribed: np.ndarray,
-        contact: "ContactStep | None" = None, x_start: Any = None,
+        contact: "ContactStep | NoContacts", x_start: Any = None,
     ):  # fmt: skip
         """prescribed: nodes that follow a path. x_start: (n_nodes) 3-vectors f64, positions at the start of the step."""
         self.model, self.contact, self.x_start = model, contact, x_start
@@ -170,7 +171,7 @@ class StageSystem:
         return self._k
 
     def _contacts(self) -> StageContacts:
-        if self.contact is None or self.contact.n_contacts == 0:
+        if self.contact.n_contacts == 0:
             return NO_CONTACTS
         self._fit()
         return self._room

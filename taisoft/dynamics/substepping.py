@@ -1,4 +1,6 @@
-"""A step with contacts in substeps, each so short that nothing passes unseen: what cuts a step, and where cutting ends.
+"""A step in substeps: what cuts it, and where cutting ends.
+
+One that does not converge is done again in equal substeps. With contacts each is so short, besides, that nothing passes unseen.
 
 Before a substep: while contacts close fast it is as short as `tunnelling` asks. After it: it is undone and cut in half where it
 led to motion much faster than was known when it was cut, to contacts that no search along its way settled, to something newly
@@ -13,7 +15,7 @@ from enum import Enum, auto
 from typing import TYPE_CHECKING
 
 from taisoft.dynamics.contact import CROSSED_FAR, SUNK
-from taisoft.dynamics.newton import StageResult, count_all
+from taisoft.dynamics.stage_result import StageResult, count_all, merge
 from taisoft.dynamics.tunnelling import next_length
 from taisoft.errors import SimulationError
 
@@ -39,18 +41,57 @@ class Fault(Enum):
 
 
 class Substepping:
-    """Takes the steps of an implicit stepper with contacts in substeps."""
+    """Wraps the plain steps of an implicit stepper: retries, substeps, and what undoes them.
+
+    The stepper takes one substep after the other (`take`), back and again with other contacts (`back`, `retry`), or from where it
+    began with another length (`undo`); `mark` and `return_to_mark` keep a step's start and go back to it.
+    """
 
     def __init__(self, stepper: "ImplicitStepper"):
         self._stepper, self._contact = stepper, stepper.contact
         self._deepest = self._most_crossed = 0.0  # over the finer side's mean surface edge: no deeper counts as newly deep
+        self.parts = 1  # that the last step was taken in
+        self.recovers = True  # whether shorter substeps may help; where they did not, not before a step converges again
 
-    def step(self, start: float, dt: float, parts: int, recovers: bool) -> list[StageResult]:
+    def step(self, start: float, dt: float) -> StageResult:
+        """One step of dt from a time [s].
+
+        One that does not converge is done again in equal substeps, and where these do not help in those of before, anew and
+        without the past. Linearly implicit steps have nothing that could converge. Where a step fails, it is abandoned: the state
+        is that before it. Raises SimulationError.
+        """
+        stepper, parts, given_up = self._stepper, 1, []
+        stepper.mark()
+        while True:
+            result, lost, taken = None, True, parts
+            try:
+                done = self._in_parts(start, dt, parts)
+                result, taken = merge(done), len(done)
+                lost = not (result.converged or stepper.is_linear)
+            except BaseException as error:  # of Ctrl-C, too
+                stepper.return_to_mark(taken_back=True)
+                recovers = self.recovers
+                stepper.forget()
+                if parts == 1 or not isinstance(error, SimulationError):
+                    raise
+                self.recovers = recovers  # it was only a try
+            if result is not None:
+                given_up.append(result)
+            if not (lost and self.recovers and (taken < RETRIES or parts > 1)):
+                break
+            self.recovers = taken < RETRIES
+            parts = min(2 * taken, RETRIES) if self.recovers else 1
+            stepper.return_to_mark()
+        self.parts = taken
+        self.recovers = self.recovers or not lost
+        return count_all(result, given_up[:-1])
+
+    def _in_parts(self, start: float, dt: float, parts: int) -> list[StageResult]:
         """A step of dt from a time, in equal parts or in more and shorter ones; `contact.end` has looked at its end.
 
-        recovers: whether short substeps that did not converge are cut. Raises SimulationError where things close too fast.
+        Raises SimulationError where things close too fast.
         """
-        contact, stepper = self._contact, self._stepper
+        contact, stepper, recovers = self._contact, self._stepper, self.recovers and not self._stepper.is_linear
         shortest, longest = (1.0 - 1e-6) * dt / MAX_PARTS, dt / parts
         results, left, length, spare = [], dt, longest, UNDONE
         undone, losses = [], 0  # of the substep that is tried

@@ -1,0 +1,207 @@
+"""What cuts a step in substeps and undoes them, round a plain step that is faked: a point that moves by its time.
+
+* a step that converges is one substep; one that does not is tried in 2 and 4, then as it was, and not again before one converges;
+* substeps are as short as what closes asks for, cover the step without a gap, and grow again after an event;
+* one that ends deep, or is fast where nobody had looked, is undone and halved; after UNDONE of them the step goes on;
+* what closes too fast for the shortest is refused, and an error leaves the state before the step.
+"""
+
+import numpy as np
+import pytest
+
+from taisoft.dynamics.stage_result import StageResult
+from taisoft.dynamics.substepping import MAX_PARTS, UNDONE, Substepping
+from taisoft.errors import SimulationError
+
+DT = 0.1  # [s]
+
+
+class Plain:
+    """A stepper and its contacts at once: x is the time that it has stepped to. Its answers are set by the tests."""
+
+    idle, is_linear, lossy, met, n_contacts = False, False, True, False, 0
+
+    def __init__(self):
+        self.contact = self.world = self.motion = self.history = self
+        self.x_now, self.step_count, self.flight = None, 4, np.zeros(0)
+        self.x, self.marked = 0.0, 0.0
+        self.taken: list[tuple[float, float]] = []
+        self.kept: list[tuple[float, float]] = []
+        self.sinking = self.crossing = self.penetration = 0.0
+        self.converges = lambda time, dt: True
+        self.closing = lambda time, dt: 0.0
+        self.depth = lambda time, dt: 0.0
+        self.astray = lambda time, dt: False
+
+    # the stepper
+
+    def mark(self):
+        self.marked = self.x
+
+    def return_to_mark(self, taken_back=False):
+        self.x, self.kept = self.marked, []
+
+    def forget(self):
+        self.forgotten = True
+
+    def take(self, time, dt):
+        assert time == pytest.approx(self.x)
+        self.taken.append((time, dt))
+        self.start, self.x = self.x, time + dt
+        self.kept.append((time, dt))
+        good = self.converges(time, dt)
+        return StageResult(3, 10, 1e-6 if good else 0.1, good, False)
+
+    def back(self):
+        self.x = self.start
+        self.kept.pop()
+
+    retry = take
+
+    def undo(self, released, anew):
+        self.back()
+
+    # its world and contacts
+
+    def state(self):
+        return self.x, self.kept[-1]
+
+    def set_state(self, x, last):
+        self.x = x
+        self.kept.append(last)
+
+    def released(self):
+        return []
+
+    def look(self, time, dt):
+        return 0.0, self.closing(time, dt)
+
+    def crossing_before(self):
+        return 0.0
+
+    def went_astray(self, x_now):
+        return self.astray(*self.kept[-1])
+
+    def sank(self, time, dt, before):
+        return False
+
+    def search_way(self, time, dt):
+        return False
+
+    def ratio_along_way(self):
+        return 10.0
+
+    def end(self, time, dt):
+        self.sinking = self.depth(*self.kept[-1])
+        return self.sinking
+
+    def too_fast(self, dt, parts):
+        return "they close at 1 m/s"
+
+    def _nothing(self, *_):
+        pass
+
+    start_step = start_part = end_part = count_flight = _nothing
+
+
+@pytest.fixture
+def plain():
+    return Plain()
+
+
+def covers(plain, dt: float = DT) -> bool:
+    """Whether the substeps that count follow each other and make the step."""
+    starts = np.array([time for time, _ in plain.kept])
+    lengths = np.array([length for _, length in plain.kept])
+    return bool(np.allclose(starts, np.cumsum(lengths) - lengths) and np.isclose(lengths.sum(), dt))
+
+
+def test_one_that_converges(plain):
+    wrapped = Substepping(plain)
+    result = wrapped.step(0.0, DT)
+    assert plain.taken == [(0.0, DT)] and wrapped.parts == 1 and result.converged and result.newton_iterations == 3
+
+
+def test_one_that_converges_in_two(plain):
+    plain.converges = lambda time, dt: dt <= 0.5 * DT
+    wrapped = Substepping(plain)
+    result = wrapped.step(0.0, DT)
+    assert [dt for _, dt in plain.taken] == pytest.approx([DT, DT / 2, DT / 2]) and covers(plain)
+    assert wrapped.parts == 2 and result.converged and result.newton_iterations == 9 and wrapped.recovers
+
+
+def test_one_that_never_converges(plain):
+    plain.converges = lambda time, dt: False
+    wrapped = Substepping(plain)
+    result = wrapped.step(0.0, DT)
+    assert [dt for _, dt in plain.taken] == pytest.approx([DT, *[DT / 2] * 2, *[DT / 4] * 4, DT])
+    assert wrapped.parts == 1 and not result.converged and not wrapped.recovers and plain.kept == [(0.0, DT)]
+    plain.x, plain.taken = 0.0, []
+    wrapped.step(0.0, DT)
+    assert len(plain.taken) == 1  # substeps did not help in the step before
+    plain.x, plain.converges = 0.0, lambda time, dt: True
+    wrapped.step(0.0, DT)
+    assert wrapped.recovers
+
+
+def test_linear_steps_are_not_tried_again(plain):
+    plain.is_linear, plain.converges = True, lambda time, dt: False
+    assert not Substepping(plain).step(0.0, DT).converged and len(plain.taken) == 1
+
+
+def test_what_closes_fast_takes_short_substeps(plain):
+    """Fast between 0.04 and 0.06 s; before and after it substeps are longer."""
+    plain.closing = lambda time, dt: 50.0 * dt / DT if time < 0.06 and time + dt > 0.04 else 0.0
+    wrapped = Substepping(plain)
+    wrapped.step(0.0, DT)
+    lengths = np.array([dt for _, dt in plain.kept])
+    assert covers(plain) and wrapped.parts == len(lengths) > 5
+    fast = [dt for time, dt in plain.kept if 0.04 <= time < 0.06]
+    assert max(fast) <= DT / 50 * 1.001 and lengths.max() > 3 * max(fast)
+
+
+def test_what_closes_too_fast_is_refused(plain):
+    plain.closing = lambda time, dt: 2.0 * MAX_PARTS * dt / DT if time > 0.049 else 1.9 * dt / DT
+    with pytest.raises(SimulationError, match="step 5: they close at 1 m/s"):
+        Substepping(plain).step(0.0, DT)
+    assert plain.x == 0.0
+
+
+def test_one_that_ends_deep_is_halved(plain):
+    plain.depth = lambda time, dt: 1.0 if dt > DT / 8 else 0.0
+    wrapped = Substepping(plain)
+    wrapped.step(0.0, DT)
+    assert covers(plain) and max(dt for _, dt in plain.kept) <= DT / 8 * 1.001 and len(plain.taken) > len(plain.kept)
+
+
+def test_after_so_many_undone_it_goes_on(plain):
+    plain.depth = lambda time, dt: 1.0 + time  # deeper and deeper
+    Substepping(plain).step(0.0, DT)
+    assert covers(plain) and 0 < len(plain.taken) - len(plain.kept) <= UNDONE and plain.sinking > 1.0
+
+
+def test_one_that_was_faster_than_seen_is_halved(plain):
+    plain.astray = lambda time, dt: dt > DT / 4
+    Substepping(plain).step(0.0, DT)
+    assert covers(plain) and max(dt for _, dt in plain.kept) <= DT / 4 * 1.001
+
+
+def test_an_error_leaves_the_state_before(plain):
+    def fails(time, dt):
+        raise KeyboardInterrupt
+
+    plain.converges = fails
+    with pytest.raises(KeyboardInterrupt):
+        Substepping(plain).step(0.0, DT)
+    assert plain.x == 0.0 and plain.forgotten
+
+
+def test_an_error_in_a_try_is_one_that_does_not_help(plain):
+    def fails(time, dt):
+        if dt < DT and time > 0.0:
+            raise SimulationError("spoilt")
+        return False
+
+    plain.converges = fails
+    result = Substepping(plain).step(0.0, DT)
+    assert not result.converged and plain.kept == [(0.0, DT)]
