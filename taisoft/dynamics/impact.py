@@ -185,7 +185,7 @@ def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":
     slope, curvature = out
     gain = slope + 0.5 * curvature
     share = 1.0 if gain <= 0.0 else max(0.0, -2.0 * slope / curvature)
-    slack = -share * (slope + 0.5 * share * curvature)
+    slack = max(0.0, -share * (slope + 0.5 * share * curvature))  # 0, but for rounding, where the jump is scaled down
     apply_impact(m, w, k, share)
     if share < 1.0:
         let_go(k.found)
