@@ -21,11 +21,11 @@ from taisoft.runtime import kernel, open_runtime, threads
 from .collision_runs import clock
 
 ELEMENTS = ("x", "nodes", "Dm_inv", "volume", "block_body")
-GATHER = ("corner", "gather_start", "gather_entry", "mass", "free")
+GATHER = ("element_force", "gather_start", "gather_entry", "mass", "free")
 LOOPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # reads, writes
     # an explicit step
     "drift": (("x", "v", "acceleration"), ("x", "v")),
-    "elements": (ELEMENTS, ("corner",)),
+    "elements": (ELEMENTS, ("element_force",)),
     "nodes": ((*GATHER, "v"), ("v", "acceleration")),
     "update": ((*GATHER, "x", "v"), ("x", "v")),
     # an implicit one

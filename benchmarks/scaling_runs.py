@@ -22,8 +22,9 @@ import taichi as ti
 import taisoft as ts
 from taisoft import model, simulator
 from taisoft.dynamics import stage_system
-from taisoft.elasticity import HUGE, elastic_forces, element_force
+from taisoft.elasticity import elastic_forces
 from taisoft.elements.lanes import broadcast
+from taisoft.fem.terms.elasticity import HUGE, element_force
 from taisoft.linear import block_csr, pcg
 from taisoft.output.report import peak_memory
 from taisoft.runtime import compile_clock, kernel, open_runtime, threads

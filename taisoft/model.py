@@ -14,6 +14,7 @@ import taichi as ti
 
 from taisoft.arrays import Count
 from taisoft.elements import reference
+from taisoft.fem.terms import terms_of
 from taisoft.fields import FieldArena
 from taisoft.mass import MassMatrix, lumped_masses, upload_mass_matrix, weight_masses
 from taisoft.materials import LAWS
@@ -62,6 +63,7 @@ class Model:
     n_blocks: Count
     groups: tuple  # of Group
     state: State  # what moves
+    terms: tuple  # modules of fem.terms
     nodes: Any  # i32: nodes of each tet, per block (node, lane); they ascend, corners before middles
     rules: tuple  # reference.Quadrature of the groups of order 2, one after the other
     points: Any  # (points, 28), or None: of these rules, the weight and dN_a/d(l_1, l_2, l_3) of nodes 1 to 9
@@ -246,7 +248,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     mass = arena.field("mass", real, n_nodes, lumped_masses(scene).astype(npr))
     model = Model(
         real=real, strain_real=strain_real, lanes=lanes, serial=serial, n_nodes=n_nodes, n_blocks=n_blocks, groups=groups,
-        state=build_state(arena, runtime, layout.rest, velocity, 3 * len(flat_nodes), chunks),
+        terms=terms_of(on), state=build_state(arena, runtime, layout.rest, velocity, 3 * len(flat_nodes), chunks),
         nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
         rules=rules, points=arena.field("points", ti.f64, (len(table), 28), table) if rules else None,
         Dm_inv=arena.field("Dm_inv", strain_real, (n_blocks, 9, lanes), rest_lanes),

@@ -29,6 +29,7 @@ ORDER = (
     ("mesh", "scene"),
     ("math3",),
     ("materials", "elements", "node_graph"),
+    ("fem",),
     ("mass", "state"),
     ("model",),
     ("elasticity", "stability"),

@@ -157,7 +157,7 @@ def test_an_implicit_step_assembles_what_it_needs():
         sim.set_gravity((0, 0, 0))
         still = launched(sim, 2)
         # at rest there is nothing to solve: a residual says so
-        assert still.keys() == {"begin_step", "begin_stage", "form_residual", "measure"} and set(still.values()) == {2}
+        assert still.keys() == {"begin_step", "begin_stage", "move", "form_residual", "measure"} and set(still.values()) == {2}
         sim.set_gravity((0, -9.81, 0))
         sim.set_state(velocities=0.1 * sim.positions())
         falling = launched(sim, 2)

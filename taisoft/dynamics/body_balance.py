@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from taisoft.dynamics.stage_system import StageSystem
 
 LIMIT = 0.01  # of the forces on a body: a residual beyond is a wrong motion
+UNFELT = 1e-9  # of a piece's momentum and forces: what a step may lose of its momentum, whatever changed that
 ROUNDING = 4.0  # times the floor of a body, as of the whole scene in `newton`
 
 
@@ -63,7 +64,7 @@ class BodyBalance:
         )  # fmt: skip
         scale = inertia + beta * (elastic + external)
         floor = beta * solver.rounding.force_by_body[self._body] + masses * solver.rounding.position / beta
-        mean_floor = solver.rounding.eps * (momentum + beta * elastic) + masses * solver.rounding.position / beta
+        mean_floor = max(solver.rounding.eps, UNFELT) * (momentum + beta * elastic) + masses * solver.rounding.position / beta
         mean = self._mean(residual, free)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.where(mean > ROUNDING * mean_floor, mean / scale, 0.0)

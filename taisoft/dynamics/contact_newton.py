@@ -77,7 +77,7 @@ class ContactNewton:
 
     def _done(self) -> bool:
         enough = self.r <= self.stage.tolerance * self.scale or self.rounding or self.r <= self.floor
-        return enough and self.system.contact_residual <= self.stage.contact_tolerance
+        return enough and self.system.laws_hold(self.stage.contact_tolerance, self.floor)
 
     def _solve_contacts(self) -> Newton:
         """The contact problem on the matrix at hand, to a share of what the stage has left."""
@@ -85,12 +85,11 @@ class ContactNewton:
         system.linearise()
         enough = max(SHARE * self.r, LEAST_SHARE * stage.tolerance * self.scale)
         law = max(LAW_SHARE * system.contact_residual, LEAST_SHARE * stage.contact_tolerance)
-        inner = Newton(
-            system, replace(
-                stage, tolerance=enough / self.scale, contact_tolerance=law, linear_tolerance=FORCING,
-                max_newton=SOLVES,
-            ), inner=True,
+        problem = replace(
+            stage, tolerance=enough / self.scale if self.scale > 0.0 else 0.0, contact_tolerance=law, linear_tolerance=FORCING,
+            max_newton=SOLVES,
         )  # fmt: skip
+        inner = Newton(system, problem, inner=True)
         inner.run(self.r, self.scale, fresh=True)
         self.linear, self.multipliers = self.linear + inner.linear, self.multipliers + inner.multipliers
         system.r_scale = R_SCALE

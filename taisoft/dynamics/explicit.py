@@ -9,12 +9,11 @@ A small mesh runs all its sub-steps in one serial kernel; a large one takes two 
 
 import taichi as ti
 
-from taisoft.elasticity import HUGE, count_inverted, element_force
-from taisoft.elements.lanes import broadcast, gather
+from taisoft.elements.lanes import broadcast
+from taisoft.fem.terms import elasticity, mass_damping
+from taisoft.fem.terms.elasticity import EXPLODED, HUGE
 from taisoft.runtime import kernel
 from taisoft.scalars import FAILED, INVERTED_NOW, LOWEST_J, MOST_INVERTED, STEPS_DONE
-
-EXPLODED = 1e9  # size of a negative J beyond which a motion has diverged: inside out, stretched a thousandfold along every axis
 
 
 @ti.func
@@ -26,11 +25,14 @@ def unfinite(value):
 
 @ti.func
 def acceleration(m: ti.template(), i):
-    """Elastic (and stiffness damping) force, loads and gravity on node i [m/s^2]; 0 on constrained axes."""
-    f = gather(m, i)
-    if ti.static(m.loaded):
-        f += m.loads[i]
-    return m.free[i] * (f / m.mass[i] + m.gravity[0])
+    """Of node i [m/s^2] by all terms, stiffness damping included; 0 on constrained axes."""
+    f, a = ti.Vector([0.0, 0.0, 0.0], m.real), ti.Vector([0.0, 0.0, 0.0], m.real)
+    for term in ti.static(m.terms):
+        if ti.static(term.ACCELERATION):
+            a += term.acceleration(m, i)
+        else:
+            f += term.force(m, i)
+    return m.free[i] * (f / m.mass[i] + a)
 
 
 @ti.func
@@ -39,7 +41,7 @@ def euler_velocity(m: ti.template(), i, dt):
     a = acceleration(m, i)
     v = m.state.v[i] + dt * a
     if ti.static(m.damped):
-        v -= dt * m.damping[m.node_body[i], 0] * m.state.v[i]
+        v -= dt * mass_damping.rate(m, i) * m.state.v[i]
     return v
 
 
@@ -56,7 +58,7 @@ def verlet_half(m: ti.template(), s: ti.template(), i, dt):
     """The velocity after the first half kick."""
     v = m.state.v[i]
     if ti.static(m.damped):
-        v *= ti.exp(-0.5 * dt * m.damping[m.node_body[i], 0])
+        v *= mass_damping.decay(m, i, 0.5 * dt)
     return v + 0.5 * dt * s.acceleration[i]
 
 
@@ -80,7 +82,7 @@ def verlet_kick(m: ti.template(), s: ti.template(), i, dt):
         half = s.half_velocity[i]
     v = half + 0.5 * dt * a
     if ti.static(m.damped):
-        v *= ti.exp(-0.5 * dt * m.damping[m.node_body[i], 0])
+        v *= mass_damping.decay(m, i, 0.5 * dt)
     s.acceleration[i] = a
     m.state.v[i] = v
     return v
@@ -124,16 +126,18 @@ def react(m: ti.template(), s: ti.template(), dt):
     """Constraint force on held nodes: m (v_new - v_old)/dt - f, with v_old kept in `held_velocity` [N]."""
     for k in range(s.n_held):
         i = s.held[k]
-        f = gather(m, i)
-        if ti.static(m.loaded):
-            f += m.loads[i]
-        mass = m.mass[i]
+        f, mass = ti.Vector([0.0, 0.0, 0.0], m.real), m.mass[i]
+        for term in ti.static(m.terms):
+            if ti.static(term.ACCELERATION):
+                f += mass * term.acceleration(m, i)
+            else:
+                f += term.force(m, i)
         if ti.static(m.damped):
             v = m.state.v[i]
             if ti.static(not s.verlet):
                 v = s.held_velocity[k]
-            f -= m.damping[m.node_body[i], 0] * mass * v
-        s.reaction[k] = (1.0 - m.free[i]) * (mass * (m.state.v[i] - s.held_velocity[k]) / dt - f - mass * m.gravity[0])
+            f += mass_damping.force(m, i, v)
+        s.reaction[k] = (1.0 - m.free[i]) * (mass * (m.state.v[i] - s.held_velocity[k]) / dt - f)
 
 
 @ti.func
@@ -157,9 +161,7 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
         low, most = ti.cast(HUGE, m.real), 0
         if ti.static(s.verlet):
             if restart != 0:
-                for g in ti.static(m.groups):
-                    for b in range(g.first, g.last):
-                        element_force(m, g, m.stiffness_damping, b)
+                elasticity.sum_elements_serially(m)
                 for i in range(m.n_nodes):
                     s.acceleration[i] = acceleration(m, i)
         while done < n and going:
@@ -173,12 +175,8 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
                     verlet_move(m, s, i, dt, verlet_half(m, s, i, dt))
                 if ti.static(s.leads):
                     lead(m, s, done, dt64)
-            inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
-            for g in ti.static(m.groups):
-                for b in range(g.first, g.last):
-                    J = element_force(m, g, m.stiffness_damping, b)
-                    lowest = ti.min(lowest, J)
-                    inverted += count_inverted(m, b, J)
+            lowest_now, inverted = elasticity.sum_elements_serially(m)
+            lowest = ti.min(lowest, lowest_now)
             total = ti.Vector([0.0, 0.0, 0.0], m.real)
             for i in range(m.n_nodes):
                 if ti.static(s.verlet):
@@ -211,25 +209,10 @@ def set_targets(s: ti.template(), rows: ti.types.ndarray()):
             s.targets[k][a] = rows[k, a]
 
 
-@ti.func
-def tell_volumes(m: ti.template(), b, J):
-    """Of block b: scalars LOWEST_J, INVERTED_NOW; FAILED where a tet has exploded."""
-    bad = count_inverted(m, b, J)
-    low, count = J[0], bad[0]
-    for q in ti.static(range(1, m.lanes)):
-        low, count = ti.min(low, J[q]), count + bad[q]
-    ti.atomic_min(m.state.scalars[LOWEST_J], ti.cast(low, ti.f64))
-    ti.atomic_add(m.state.scalars[INVERTED_NOW], ti.cast(count, ti.f64))
-    if not low > -EXPLODED:
-        m.state.scalars[FAILED] = 1.0
-
-
 @kernel
 def elements_parallel(m: ti.template()):
     """One sub-step's element loop over threads; scalars: LOWEST_J, INVERTED_NOW, FAILED."""
-    for g in ti.static(m.groups):
-        for b in range(g.first, g.last):
-            tell_volumes(m, b, element_force(m, g, m.stiffness_damping, b))
+    elasticity.sum_elements_with_damping(m)
 
 
 @kernel

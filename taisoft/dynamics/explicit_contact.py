@@ -18,13 +18,12 @@ from taisoft.dynamics.explicit import (
     lead_velocities,
     react,
     remember,
-    tell_volumes,
     unfinite,
     verlet_half,
     verlet_kick,
     verlet_move,
 )  # fmt: skip
-from taisoft.elasticity import element_force
+from taisoft.fem.terms import elasticity
 from taisoft.runtime import kernel
 from taisoft.scalars import FAILED, INVERTED_NOW, MOST_INVERTED
 
@@ -44,11 +43,7 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
     Verlet rests on the acceleration of the state, Euler finds the forces here.
     """
     if ti.static(not s.verlet):
-        for k in ti.static(m.groups):
-            ti.loop_config(serialize=m.serial)
-            for b in range(k.first, k.last):
-                J = element_force(m, k, m.stiffness_damping, b)
-                tell_volumes(m, b, J)
+        elasticity.sum_elements_with_damping(m)
     ti.loop_config(serialize=True)
     for _ in range(1):
         if ti.static(s.holds):
@@ -140,11 +135,7 @@ def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, tou
 @kernel
 def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, touched: ti.i32):
     """Forces at the new positions and the second half kick; scalars as in `predict` and `move`."""
-    for k in ti.static(m.groups):
-        ti.loop_config(serialize=m.serial)
-        for b in range(k.first, k.last):
-            J = element_force(m, k, m.stiffness_damping, b)
-            tell_volumes(m, b, J)
+    elasticity.sum_elements_with_damping(m)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         v = verlet_kick(m, s, i, ti.cast(dt64, m.real))
@@ -162,10 +153,7 @@ def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti
 @kernel
 def find_acceleration(m: ti.template(), s: ti.template()):
     """Verlet's acceleration of the present state."""
-    for k in ti.static(m.groups):
-        ti.loop_config(serialize=m.serial)
-        for b in range(k.first, k.last):
-            element_force(m, k, m.stiffness_damping, b)
+    elasticity.sum_elements_with_damping(m)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         s.acceleration[i] = acceleration(m, i)

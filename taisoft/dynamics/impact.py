@@ -29,6 +29,7 @@ import taichi as ti
 
 from taisoft.contact.problem import to_world
 from taisoft.contact.prox import dvec
+from taisoft.fem.terms import mass_damping
 from taisoft.linear.block_csr import block_times
 from taisoft.linear.pcg import total
 from taisoft.mass import mass_times
@@ -52,7 +53,7 @@ def impact_residual(m: ti.template(), A: ti.template(), k: ti.template(), i, tau
     """
     inertia = ti.cast(1.0, m.real)
     if ti.static(m.damped):
-        inertia += ti.cast(tau, m.real) * m.damping[m.node_body[i], 0]
+        inertia += ti.cast(tau, m.real) * mass_damping.rate(m, i)
     own, mass = (m.state.x[i] - k.x_linear[i]) / tau, m.mass[i]
     if ti.static(m.consistent):
         mass = m.mass_matrix.diagonal[i]

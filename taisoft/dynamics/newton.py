@@ -75,7 +75,7 @@ class Newton:
         """Whether the multipliers have done what they can."""
         enough = self.stage.tolerance * self.scale
         # in an impact whose laws hold only the momenta are left to balance
-        lawful = self.system.kind == IMPACT and self.system.contact_residual <= self.stage.contact_tolerance
+        lawful = self.system.kind == IMPACT and self.system.laws_hold(self.stage.contact_tolerance, self.floor)
         return self.r <= (max(enough, self.goal) if self.touching and not lawful else enough) or self.rounding
 
     def _done(self) -> bool:
@@ -85,7 +85,7 @@ class Newton:
             # statics without any load have nothing to compare the rounding with
             if not (self.rounding and (stage.c > 0.0 or self.scale <= self.floor)):
                 return False
-        return self.system.contact_residual <= stage.contact_tolerance
+        return self.system.laws_hold(stage.contact_tolerance, self.floor)
 
     def _multiply(self) -> bool:
         """Take the impulses as new multipliers; False where that has been done too often."""

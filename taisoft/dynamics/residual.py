@@ -9,7 +9,7 @@ import taichi as ti
 from taisoft.dynamics.contact_terms import impulse_on_node
 from taisoft.dynamics.impact import impact_residual
 from taisoft.dynamics.stage import place_node, residual_parts, set_change, squares
-from taisoft.elasticity import element_force
+from taisoft.fem.terms import elasticity
 from taisoft.linear.pcg import dot64, total
 from taisoft.runtime import kernel
 from taisoft.scalars import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
@@ -43,10 +43,7 @@ def move(
                 set_change(m, s, i, c, beta)
         m.state.partial[chunk, OTHER_SUM] = slope
     if ti.static(kind == ELASTIC_STAGE):
-        for g in ti.static(m.groups):
-            ti.loop_config(serialize=m.serial)
-            for b in range(g.first, g.last):
-                element_force(m, g, False, b)
+        elasticity.sum_elements(m)
     ti.loop_config(serialize=True)
     for _ in range(1):
         if how == STEP:

@@ -6,9 +6,9 @@ from typing import Any
 import taichi as ti
 
 from taisoft.arrays import Count
-from taisoft.elements.lanes import gather
+from taisoft.fem.terms import dead_loads, mass_damping, stiffness_damping
 from taisoft.linear.block_csr import row_times
-from taisoft.linear.pcg import dot64, total
+from taisoft.linear.pcg import total
 from taisoft.mass import mass_times
 from taisoft.runtime import kernel
 from taisoft.scalars import OTHER_SUM, POTENTIAL, SUM
@@ -73,22 +73,24 @@ def set_change(m: ti.template(), w: ti.template(), i, c, beta):
     """What the mass of node i is multiplied by."""
     change = c * (stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64))
     if ti.static(m.damped):
-        change += beta * ti.cast(m.damping[m.node_body[i], 0], ti.f64) * ti.cast(m.state.v[i], ti.f64)
+        change += beta * ti.cast(mass_damping.rate(m, i), ti.f64) * ti.cast(m.state.v[i], ti.f64)
     w.change[i] = change
 
 
 @ti.func
 def residual_parts(m: ti.template(), w: ti.template(), i, beta):
-    """(r, inertia and mass damping, f_el, f_ext) of node i, without contacts; `set_change` and the elements went before."""
-    f = gather(m, i)
-    external = m.weight[i] * m.gravity[0]
-    if ti.static(m.loaded):
-        external += m.loads[i]
-    drag = ti.Vector([0.0, 0.0, 0.0], m.real)
+    """(r, inertia and mass damping, own forces, loads) of node i, without contacts; `set_change` and the elements went before."""
+    zero = ti.Vector([0.0, 0.0, 0.0], m.real)
+    own, loads, damping = zero, zero, zero
+    for term in ti.static(m.terms):
+        if ti.static(term.LOAD):
+            loads += term.force(m, i)
+        else:
+            own += term.force(m, i)
     if ti.static(m.stiffness_damping):
-        drag += m.damping[m.node_body[i], 1] * row_times(m, w.damper, i, m.state.v)
+        damping += stiffness_damping.force(m, i, row_times(m, w.damper, i, m.state.v))
     inertia = ti.cast(mass_times(m, i, w.change), m.real)
-    return inertia - ti.cast(beta, m.real) * (f + external - drag), inertia, f, external
+    return inertia - ti.cast(beta, m.real) * (own + loads + damping), inertia, own, loads
 
 
 @ti.func
@@ -143,7 +145,7 @@ def stage_terms(m: ti.template(), w: ti.template(), c: ti.f64, beta: ti.f64):
             m.state.partial[k, OTHER_SUM] = 0.0
             size = (m.n_nodes + m.chunks - 1) // m.chunks
             for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
-                a = ti.cast(m.damping[m.node_body[i], 0], ti.f64)
+                a = ti.cast(mass_damping.rate(m, i), ti.f64)
                 m.state.partial[k, OTHER_SUM] += 0.5 * beta * a * w.change[i].dot(mass_times(m, i, w.change))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -157,9 +159,9 @@ def stage_terms(m: ti.template(), w: ti.template(), c: ti.f64, beta: ti.f64):
         for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
             s += 0.5 * c * w.change[i].dot(mass_times(m, i, w.change))
             if ti.static(m.loaded):
-                s -= ti.cast(m.loads[i], ti.f64).dot(m.state.x[i])
+                s += dead_loads.energy(m, i)
             if ti.static(m.stiffness_damping):
-                s += 0.5 * beta * m.damping[m.node_body[i], 1] * dot64(m.state.v[i], row_times(m, w.damper, i, m.state.v))
+                s += 0.5 * beta * stiffness_damping.power(m, i, row_times(m, w.damper, i, m.state.v))
         m.state.partial[k, SUM] = s
     ti.loop_config(serialize=True)
     for _ in range(1):

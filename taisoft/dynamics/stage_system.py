@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import taichi as ti
 
-from taisoft.contact.problem import RESIDUAL, find_factors
+from taisoft.contact.problem import CHANGED, RESIDUAL, find_factors
 from taisoft.dynamics.contact_terms import NO_CONTACTS, StageContacts, build_stage_contacts, keep_diagonal, press
 from taisoft.dynamics.linearised import advance, keep_linear, leave_linear
 from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STAY, form_residual, move
@@ -139,6 +139,13 @@ class StageSystem:
     def contact_residual(self) -> float:
         """Of the contact laws, where the residual was last formed."""
         return float(self._k.problem.state[RESIDUAL]) if self._k.any else 0.0
+
+    def laws_hold(self, tolerance: float, floor: float) -> bool:
+        """Whether the residual of the contact laws is within a tolerance, or its impulses within a floor [N s]."""
+        if not self._k.any:
+            return True
+        state = self._k.problem.state
+        return bool(state[RESIDUAL] <= tolerance or state[CHANGED] <= floor**2)
 
     @property
     def slopes(self) -> tuple[float, float]:

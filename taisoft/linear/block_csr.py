@@ -15,6 +15,7 @@ import taichi as ti
 
 from taisoft.arrays import Count
 from taisoft.errors import SimulationError
+from taisoft.fem.terms import mass_damping, stiffness_damping
 from taisoft.fields import FieldArena
 from taisoft.linear.element_blocks import element_blocks, pair_terms
 from taisoft.model import MATRIX_BLOCKS, Model, model_graph
@@ -130,8 +131,8 @@ def to_system(m: ti.template(), A: ti.template(), damper: ti.template(), c: ti.f
     for i in range(m.n_nodes):
         k, inertia, drag = ti.cast(beta * beta, m.real), ti.cast(c, m.real), ti.cast(0.0, m.real)
         if ti.static(m.damped):
-            inertia += ti.cast(beta, m.real) * m.damping[m.node_body[i], 0]
-            drag = ti.cast(beta, m.real) * m.damping[m.node_body[i], 1]
+            inertia += ti.cast(beta, m.real) * mass_damping.rate(m, i)
+            drag = ti.cast(beta, m.real) * stiffness_damping.rate(m, i)
         mass = m.mass[i]
         if ti.static(m.consistent):
             mass = m.mass_matrix.diagonal[i]

@@ -1,0 +1,17 @@
+"""Dead loads: tractions and nodal forces that keep their direction and size, f_a = F_a, psi = -sum_a F_a.x_a."""
+
+import taichi as ti
+
+SWITCH, LOAD, ACCELERATION = "loads", True, False
+
+
+@ti.func
+def force(m: ti.template(), i):
+    """On node i [N]."""
+    return m.loads[i]
+
+
+@ti.func
+def energy(m: ti.template(), i):
+    """Node i's part of the potential [J]."""
+    return -ti.cast(m.loads[i], ti.f64).dot(m.state.x[i])

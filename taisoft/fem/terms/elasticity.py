@@ -1,0 +1,149 @@
+"""Elasticity: f_a = -sum_e V sum_q w_q P(F_q) grad N_a, psi = sum_e V sum_q w_q psi(F_q).
+
+Each tet writes the forces on its nodes to a buffer, each node gathers them in a fixed order, so the result does not depend on
+threads. Its blocks -df/dx are those of `linear.element_blocks`, its differential is `elasticity.force_differential`.
+"""
+
+import taichi as ti
+
+from taisoft.elements.lanes import (
+    add_forces,
+    broadcast,
+    deformation_gradient,
+    differences,
+    gather,
+    gradient_at,
+    law_constants,
+    no_forces,
+    position_differences,
+    rest_gradients,
+    rest_gradients_of_F,
+    store_forces,
+    volumes,
+    weight_at,
+)
+from taisoft.materials.projection import dpk1_projected, prepare_projected
+from taisoft.math3 import determinant, matmul_tn
+from taisoft.scalars import FAILED, INVERTED_NOW, LOWEST_J
+
+SWITCH, LOAD, ACCELERATION = None, False, False
+HUGE = 1e30  # above any volume ratio
+EXPLODED = 1e9  # size of a negative J beyond which a motion has diverged: inside out, stretched a thousandfold along every axis
+
+
+@ti.func
+def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
+    """Nodal forces of block b of group g from x (and from v, where the stiffness damping -c K(x) v is on).
+
+    Returns the least J = det F over each tet's quadrature points.
+    """
+    X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
+    M = rest_gradients(m, b, m.real)
+    p = law_constants(m, b, m.real)
+    S = no_forces(m, g)
+    lowest = broadcast(ti.cast(HUGE, m.real), m.lanes)
+    if ti.static(damped):
+        V = differences(m, g, m.state.v, b, m.real)
+        c = broadcast(m.damping[m.block_body[b], 1], m.lanes)
+        for q in range(g.n_points):
+            F = deformation_gradient(m, g, X, N, q)
+            dF = gradient_at(m, g, V, M, q, m.real)
+            K = prepare_projected(g.law, F, p)
+            D = dpk1_projected(K, dF)
+            P = g.law.pk1(F, p)
+            Q = [P[k] + c * D[k] for k in ti.static(range(9))]
+            add_forces(m, g, S, Q, M, q)
+            lowest = ti.min(lowest, determinant(F))
+    else:
+        for q in range(g.n_points):
+            F = deformation_gradient(m, g, X, N, q)
+            P = g.law.pk1(F, p)
+            add_forces(m, g, S, P, M, q)
+            lowest = ti.min(lowest, determinant(F))
+    store_forces(m, g, b, S)
+    return lowest
+
+
+@ti.func
+def force(m: ti.template(), i):
+    """On node i, once `element_force` has run over all blocks [N]."""
+    return gather(m, i)
+
+
+@ti.func
+def count_inverted(m: ti.template(), b, J):
+    """Per lane, 1 where a real tet has J <= 0 (padding lanes have no volume)."""
+    V = volumes(m, b, m.real)
+    zero = broadcast(ti.cast(0, ti.i32), m.lanes)
+    return ti.select((J <= 0.0) & (V > 0.0), zero + 1, zero)
+
+
+@ti.func
+def report_volumes(m: ti.template(), b, J):
+    """Of block b: scalars LOWEST_J, INVERTED_NOW; FAILED where a tet has exploded."""
+    bad = count_inverted(m, b, J)
+    low, count = J[0], bad[0]
+    for q in ti.static(range(1, m.lanes)):
+        low, count = ti.min(low, J[q]), count + bad[q]
+    ti.atomic_min(m.state.scalars[LOWEST_J], ti.cast(low, ti.f64))
+    ti.atomic_add(m.state.scalars[INVERTED_NOW], ti.cast(count, ti.f64))
+    if not low > -EXPLODED:
+        m.state.scalars[FAILED] = 1.0
+
+
+@ti.func
+def sum_elements(m: ti.template()):
+    """`element_force` over all blocks, as loops of a kernel."""
+    for g in ti.static(m.groups):
+        ti.loop_config(serialize=m.serial)
+        for b in range(g.first, g.last):
+            element_force(m, g, False, b)
+
+
+@ti.func
+def sum_elements_with_damping(m: ti.template()):
+    """As `sum_elements`, with stiffness damping where that is on. scalars: LOWEST_J, INVERTED_NOW, FAILED."""
+    for g in ti.static(m.groups):
+        ti.loop_config(serialize=m.serial)
+        for b in range(g.first, g.last):
+            report_volumes(m, b, element_force(m, g, m.stiffness_damping, b))
+
+
+@ti.func
+def sum_elements_serially(m: ti.template()):
+    """The same within a loop on one thread: returns the least J and the number of inverted tets, per lane."""
+    lowest = broadcast(ti.cast(HUGE, m.real), m.lanes)
+    inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
+    for g in ti.static(m.groups):
+        for b in range(g.first, g.last):
+            J = element_force(m, g, m.stiffness_damping, b)
+            lowest = ti.min(lowest, J)
+            inverted += count_inverted(m, b, J)
+    return lowest, inverted
+
+
+@ti.func
+def element_energy(m: ti.template(), g: ti.template(), b):
+    """Of block b of group g, per lane and in f64: elastic energy [J], least J over the quadrature points, and, where the law
+    softens below a stretch s, whether the tet is squeezed below it at one of them (1 or 0).
+
+    It is where F^T F - s^2 I is not positive definite, which its leading minors tell.
+    """
+    X = differences(m, g, m.state.x, b, ti.f64)
+    M = rest_gradients(m, b, ti.f64)
+    p = law_constants(m, b, ti.f64)
+    V = volumes(m, b, ti.f64)
+    energy = broadcast(ti.cast(0.0, ti.f64), m.lanes)
+    lowest = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
+    minor = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
+    for q in range(g.n_points):
+        F = gradient_at(m, g, X, M, q, ti.f64)
+        energy += weight_at(m, g, q, ti.f64) * V * g.law.psi(F, p)
+        lowest = ti.min(lowest, determinant(F))
+        if ti.static(g.law.SOFTENS_BELOW > 0.0):
+            C = matmul_tn(F, F)
+            square = ti.static(g.law.SOFTENS_BELOW**2)
+            D = [C[k] - (square if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
+            minor = ti.min(minor, D[0], D[0] * D[4] - D[1] * D[3], determinant(D))
+    one = broadcast(ti.cast(1, ti.i32), m.lanes)
+    return energy, lowest, ti.select(minor <= 0.0, one, one - 1)

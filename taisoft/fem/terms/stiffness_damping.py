@@ -1,0 +1,25 @@
+"""Stiffness damping: f = -b K_d v, b [s] of the node's body, K_d the projected stiffness.
+
+Explicit steps take K_d at the present x inside the element loop (`elasticity.element_force`), implicit ones an assembled matrix
+of the step's start.
+"""
+
+import taichi as ti
+
+
+@ti.func
+def rate(m: ti.template(), i):
+    """b of node i [s]."""
+    return m.damping[m.node_body[i], 1]
+
+
+@ti.func
+def force(m: ti.template(), i, Kv):
+    """On node i [N]. Kv: its row of K_d v [N/s]."""
+    return -rate(m, i) * Kv
+
+
+@ti.func
+def power(m: ti.template(), i, Kv):
+    """Node i's part of v.(b K_d) v [W], in f64."""
+    return rate(m, i) * ti.cast(m.state.v[i], ti.f64).dot(ti.cast(Kv, ti.f64))
