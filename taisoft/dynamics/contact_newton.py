@@ -76,7 +76,8 @@ class ContactNewton:
         return moving if system.merit() <= still else system.stand_still()
 
     def _done(self) -> bool:
-        enough = self.r <= self.stage.tolerance * self.scale or self.rounding or self.r <= self.floor
+        low = self.newton > 0 and self.r <= self.floor  # at the start what is low may still be all of a light body's forces
+        enough = self.r <= self.stage.tolerance * self.scale or self.rounding or low
         return enough and self.system.laws_hold(self.stage.contact_tolerance, self.floor)
 
     def _solve_contacts(self) -> Newton:
