@@ -159,8 +159,8 @@ def capture(name: str, file: Path, quick: bool) -> None:
         warnings.simplefilter("ignore")
         sim = ts.Simulator(build(), **settings, precision="f32")
     with sim:
-        if before:
-            sim.advance(before)
+        while sim.step_count < before:
+            sim.advance(before - sim.step_count)
         for k in range(steps):
             kept = kept_of(sim)
             report = sim.advance(1)

@@ -7,11 +7,9 @@
     STEPS_DONE, LOWEST_J, MOST_INVERTED, INVERTED_NOW,  # of a batch of sub-steps, and of the present one
     FAILED,  # of a batch of sub-steps: 1 where a velocity is not finite or a tet has exploded
     START_SLOPE, END_SLOPE,  # r.y where a Newton step begins and where it ends: negative is downhill
-    POTENTIAL,  # of an implicit step's objective: inertia, loads and damping
-    CONTACT_POTENTIAL,  # of the same: contacts
     STEP_LENGTH,  # that a linearised stage's step has taken
-) = range(17)  # fmt: skip
-N_SCALARS = 17
+) = range(15)  # fmt: skip
+N_SCALARS = 15
 
 N_NORMS = 5  # first columns: what a residual is measured by
 SUM, OTHER_SUM, N_COLUMNS = 5, 6, 8  # further columns; `measure` uses those of its scalars

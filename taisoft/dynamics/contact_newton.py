@@ -18,6 +18,7 @@ SOLVES, FORCING = 60, 0.3  # linear solves of one frictional problem, and their 
 SHARE, LAW_SHARE = 0.1, 0.1  # of what the stage has left of |r| and of the laws' residual: what such a problem is solved to,
 LEAST_SHARE = 0.3  # or this share of the tolerances
 FALLBACK = 6  # steps on the true stage
+HIDING = 10.0  # times the floor of |r|: where the motion of a whole body may be what is left of it
 
 
 class ContactNewton:
@@ -27,12 +28,13 @@ class ContactNewton:
         self.system, self.stage = system, stage
         self.floor = system.rounding.of_stage(stage.c, stage.beta)
         self.newton = self.linear = self.multipliers = 0
-        self.rounding = False
+        self.rounding = self.tight = False
 
     def run(self, fresh: bool) -> StageResult:
         """From the first iterate on. fresh: the matrix is formed there."""
         system, stage = self.system, self.stage
-        self.r, self.scale = self._start()
+        system.r_scale = R_SCALE
+        self.r, self.scale = system.evaluate(new_multipliers=True)
         least = self.r
         while not self._done() and self.newton < stage.max_newton and math.isfinite(self.r):
             if not fresh:
@@ -54,7 +56,7 @@ class ContactNewton:
                     system.evaluate(AGAIN, 0.0)
                     self.r, self.scale, moved = search(system, FALL * least)
             least = min(least, self.r)
-            self.rounding = self.r <= ROUNDING * self.floor and self.r > 0.5 * previous
+            self.rounding = self.r <= ROUNDING * self.floor and self.r > 0.5 * previous and self.tight
             if not moved:
                 break
         return StageResult(
@@ -62,18 +64,6 @@ class ContactNewton:
             self._done() and math.isfinite(self.r), self.rounding or self.r <= self.floor, self.multipliers,
             system.contact_residual,
         )  # fmt: skip
-
-    def _start(self) -> tuple[float, float]:
-        """(|r|, scale) at the first iterate: that of lower merit of the one at hand and the state at the start.
-
-        An impact is nearer to the state before it, flight to where the velocity leads.
-        """
-        system = self.system
-        system.r_scale = R_SCALE
-        system.stand_still(new_multipliers=True)
-        still = system.merit()
-        moving = system.go_back()
-        return moving if system.merit() <= still else system.stand_still()
 
     def _done(self) -> bool:
         enough = self.r <= self.stage.tolerance * self.scale or self.rounding
@@ -86,10 +76,10 @@ class ContactNewton:
         enough = max(SHARE * self.r, LEAST_SHARE * stage.tolerance * self.scale)
         law = max(LAW_SHARE * system.contact_residual, LEAST_SHARE * stage.contact_tolerance)
         # where the rounding of stiff stress hides the motion of a whole body in |r|, only tight solves get that motion right
-        hidden = self.floor > stage.tolerance * self.scale
+        self.tight = self.r <= HIDING * self.floor
         problem = replace(
             stage, tolerance=enough / self.scale if self.scale > 0.0 else 0.0, contact_tolerance=law, max_newton=SOLVES,
-            linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if hidden else FORCING),
+            linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
         )  # fmt: skip
         inner = Newton(system, problem, inner=True)
         inner.run(self.r, self.scale, fresh=True)

@@ -20,7 +20,6 @@ from taisoft.linear.block_csr import BLOCK
 from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
 from taisoft.model import Model
 from taisoft.runtime import kernel
-from taisoft.scalars import CONTACT_POTENTIAL
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +34,7 @@ class ContactStageWork:
     rate: Any  # (capacity) 3-vectors f64: of u along the step [m/s]
     kept: Any  # (capacity) 3-vectors f64: impulses where the stage was linearised [N s]
     world_impulse: Any  # (capacity) 3-vectors f64: the impulse in the world [N s]
-    prox_residual: Any  # (capacity) 3-vectors f64: of the natural map, and psi_c [J]
+    prox_residual: Any  # (capacity) 2-vectors f64: of the natural map, and of the impulse, squared
     block: Any  # (capacity) 12-vectors: J^T D J is made of weights times this
     active: Any  # (capacity) i32: 1 where the block is not 0
 
@@ -139,12 +138,7 @@ def press_contact(m: ti.template(), k: ti.template(), c, beta, r_scale):
             w.block[c][4 * j + i] = ti.cast(Dn * n[i] * n[j] + along * e[i] * e[j] + across * g[i] * g[j], m.real)
     w.active[c] = int(Dn > 0.0 or along > 0.0 or across > 0.0)
     d = r - prox(r - scaled(p.factor[c], u), p.friction[c])
-    psi = ti.cast(0.0, ti.f64)
-    if Rn > 0.0:
-        psi += 0.5 * ti.max(z[0], 0.0) ** 2 / Rn
-    if Rt > 0.0:
-        psi += ti.select(size > rho, rho * (size - 0.5 * rho), 0.5 * size * size) / Rt
-    w.prox_residual[c] = dvec(d.dot(d), r.dot(r), psi)
+    w.prox_residual[c] = ti.Vector([d.dot(d), r.dot(r)], ti.f64)
 
 
 @ti.func
@@ -159,15 +153,13 @@ def impulse_on_node(k: ti.template(), i):
 
 
 @ti.func
-def sum_residual(m: ti.template(), k: ti.template()):
-    """Residual of the laws over all contacts. scalars: CONTACT_POTENTIAL."""
+def sum_residual(k: ti.template()):
+    """Residual of the laws over all contacts."""
     p, w = ti.static((k.problem, k.work))
-    changed, size, psi = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    changed, size = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     for c in range(p.count[0]):
         changed += w.prox_residual[c][0]
         size += w.prox_residual[c][1]
-        psi += w.prox_residual[c][2]
-    m.state.scalars[CONTACT_POTENTIAL] = psi
     p.state[CHANGED], p.state[SIZE] = changed, size
     p.state[RESIDUAL] = residual_of(changed, size)
 
@@ -190,7 +182,7 @@ def press(
         press_contact(m, k, n, beta, r_scale)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        sum_residual(m, k)
+        sum_residual(k)
 
 
 @kernel
@@ -215,7 +207,8 @@ def build_stage_contacts(arena: FieldArena, model: Model, found: FoundContacts, 
         arena.field("contact_gap_minus_target", ti.f64, p.capacity),
         arena.vectors("contact_velocity", ti.f64, p.capacity),
         arena.vectors("contact_rate", ti.f64, p.capacity), arena.vectors("contact_kept", ti.f64, p.capacity),
-        arena.vectors("contact_world_impulse", ti.f64, p.capacity), arena.vectors("contact_prox_residual", ti.f64, p.capacity),
+        arena.vectors("contact_world_impulse", ti.f64, p.capacity),
+        arena.vectors("contact_prox_residual", ti.f64, p.capacity, n=2),
         arena.vectors("contact_block", real, p.capacity, n=BLOCK), arena.field("contact_active", ti.i32, p.capacity),
     )  # fmt: skip
     coupling = build_coupling(

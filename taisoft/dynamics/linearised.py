@@ -137,7 +137,7 @@ def advance(
         press_contact(m, k, c, beta, r_scale)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        sum_residual(m, k)
+        sum_residual(k)
     ti.loop_config(serialize=m.serial)
     for chunk in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks

@@ -6,12 +6,10 @@ from typing import Any
 import taichi as ti
 
 from taisoft.arrays import Count
-from taisoft.fem.terms import dead_loads, mass_damping, stiffness_damping
+from taisoft.fem.terms import mass_damping, stiffness_damping
 from taisoft.linear.block_csr import row_times
-from taisoft.linear.pcg import total
 from taisoft.mass import mass_times
 from taisoft.runtime import kernel
-from taisoft.scalars import OTHER_SUM, POTENTIAL, SUM
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,59 +108,3 @@ def place_node(m: ti.template(), w: ti.template(), y: ti.template(), i, step_len
     """Node i at base + step_length beta y, v accordingly; y is 0 on constrained axes."""
     m.state.x[i] = w.base[i] + step_length * beta * ti.cast(y[i], ti.f64)
     m.state.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
-
-
-@kernel
-def stand_still(m: ti.template(), w: ti.template(), x_start: ti.template(), beta: ti.f64):
-    """The first iterate becomes the state at the step's start, on the free axes; base = the one of before."""
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        w.base[i] = m.state.x[i]
-        for a in ti.static(range(3)):
-            if m.free[i][a] != 0.0:
-                m.state.x[i][a] = x_start[i][a]
-        m.state.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
-
-
-@kernel
-def go_back(m: ti.template(), w: ti.template(), beta: ti.f64):
-    """The first iterate becomes base."""
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        m.state.x[i] = w.base[i]
-        m.state.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
-
-
-@kernel
-def stage_terms(m: ti.template(), w: ti.template(), c: ti.f64, beta: ti.f64):
-    """Inertia, loads and damping terms of Phi, in f64. scalars: POTENTIAL."""
-    if ti.static(m.damped):
-        ti.loop_config(serialize=m.serial)
-        for i in range(m.n_nodes):
-            w.change[i] = stage_velocity(m, w, i, beta)
-        ti.loop_config(serialize=m.serial)
-        for k in range(m.chunks):
-            m.state.partial[k, OTHER_SUM] = 0.0
-            size = (m.n_nodes + m.chunks - 1) // m.chunks
-            for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
-                a = ti.cast(mass_damping.rate(m, i), ti.f64)
-                m.state.partial[k, OTHER_SUM] += 0.5 * beta * a * w.change[i].dot(mass_times(m, i, w.change))
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        w.change[i] = stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64)
-    ti.loop_config(serialize=m.serial)
-    for k in range(m.chunks):
-        size = (m.n_nodes + m.chunks - 1) // m.chunks
-        s = ti.cast(0.0, ti.f64)
-        if ti.static(m.damped):
-            s += m.state.partial[k, OTHER_SUM]
-        for i in range(k * size, ti.min(m.n_nodes, (k + 1) * size)):
-            s += 0.5 * c * w.change[i].dot(mass_times(m, i, w.change))
-            if ti.static(m.loaded):
-                s += dead_loads.energy(m, i)
-            if ti.static(m.stiffness_damping):
-                s += 0.5 * beta * stiffness_damping.power(m, i, row_times(m, w.damper, i, m.state.v))
-        m.state.partial[k, SUM] = s
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        m.state.scalars[POTENTIAL] = total(m, SUM)

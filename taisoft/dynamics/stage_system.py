@@ -20,13 +20,12 @@ from taisoft.dynamics.contact_terms import NO_CONTACTS, StageContacts, build_sta
 from taisoft.dynamics.linearised import advance, keep_linear, leave_linear
 from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STAY, form_residual, move
 from taisoft.dynamics.rounding import RoundingFloor
-from taisoft.dynamics.stage import StageWork, begin_stage, go_back, stage_terms, stand_still
-from taisoft.elasticity import measure
+from taisoft.dynamics.stage import StageWork, begin_stage
 from taisoft.fields import FieldArena
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.model import Model
-from taisoft.scalars import CONTACT_POTENTIAL, ELASTIC, END_SLOPE, GRAVITY, POTENTIAL, START_SLOPE
+from taisoft.scalars import END_SLOPE, START_SLOPE
 from taisoft.transfer import download, upload
 
 if TYPE_CHECKING:
@@ -223,25 +222,6 @@ class StageSystem:
         if c == 0.0:
             return r, beta * external if external > 0.0 else held
         return r, inertia + beta * (elastic + external)
-
-    def merit(self) -> float:
-        """Phi where the residual was last formed, with the contacts' part [J]."""
-        m, stage = self.model, self._stage
-        measure(m)
-        stage_terms(m, self.work, stage.c, stage.beta)
-        scalars = m.state.scalars.to_numpy()
-        contacts = scalars[CONTACT_POTENTIAL] if self._k.any else 0.0
-        return float(scalars[ELASTIC] + scalars[GRAVITY] + scalars[POTENTIAL] + contacts)
-
-    def stand_still(self, new_multipliers: bool = False) -> tuple[float, float]:
-        """(|r|, scale) with the state at the step's start as the first iterate."""
-        stand_still(self.model, self.work, self.x_start, self._stage.beta)
-        return self.evaluate(new_multipliers=new_multipliers)
-
-    def go_back(self) -> tuple[float, float]:
-        """(|r|, scale) with the first iterate of before."""
-        go_back(self.model, self.work, self._stage.beta)
-        return self.evaluate()
 
     def form_matrix(self, projected: bool = False) -> None:
         """The matrix where the stage stands, without J^T D J, which the linear solve adds."""

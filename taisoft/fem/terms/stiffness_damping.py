@@ -17,9 +17,3 @@ def rate(m: ti.template(), i):
 def force(m: ti.template(), i, Kv):
     """On node i [N]. Kv: its row of K_d v [N/s]."""
     return -rate(m, i) * Kv
-
-
-@ti.func
-def power(m: ti.template(), i, Kv):
-    """Node i's part of v.(b K_d) v [W], in f64."""
-    return rate(m, i) * ti.cast(m.state.v[i], ti.f64).dot(ti.cast(Kv, ti.f64))
