@@ -1,0 +1,119 @@
+"""Every term's force on states at random, of both orders, in f64 on one thread and in parts, against its own energy and laws:
+
+* the force is minus the energy's derivative by finite differences, node by node and axis by axis;
+* a body's own forces neither push nor turn it as a whole, and follow a rotation of the state; loads do not depend on the state;
+* dampers take power, never give it, and none where nothing moves.
+"""
+
+import numpy as np
+import pytest
+import taichi as ti
+from rotations import rotation
+from scenes import built, driven_scene
+
+from taisoft.elasticity import elastic_forces, measure
+from taisoft.fem.terms import TERMS, dead_loads, elasticity, gravity, mass_damping, stiffness_damping
+from taisoft.linear import block_csr
+from taisoft.linear.block_csr import row_times
+from taisoft.model import damping_table
+from taisoft.runtime import kernel
+from taisoft.scalars import ELASTIC, GRAVITY, LOADS
+
+ENERGY = {elasticity: ELASTIC, gravity: GRAVITY, dead_loads: LOADS}  # where `measure` leaves it
+H = 1e-6  # [m]
+
+
+@kernel
+def force_of(m: ti.template(), term: ti.template(), out: ti.template()):
+    """The force of a term on every node."""
+    ti.loop_config(serialize=True)
+    for i in range(m.n_nodes):
+        out[i] = term.force(m, i)
+
+
+@kernel
+def damping_of(m: ti.template(), damper: ti.template(), mass: ti.template(), stiffness: ti.template()):
+    """Forces of both dampers on every node."""
+    ti.loop_config(serialize=True)
+    for i in range(m.n_nodes):
+        mass[i] = mass_damping.force(m, i, m.state.v[i])
+        stiffness[i] = stiffness_damping.force(m, i, row_times(m, damper, i, m.state.v))
+
+
+@pytest.fixture(scope="module", params=[1, 2])
+def rig(request):
+    with built(driven_scene(mass_damping=3.0, stiffness_damping=0.004, order=request.param), "f64") as made:
+        rng = np.random.default_rng(5)
+        made.x = made.oracle.rest + 0.02 * rng.standard_normal(made.oracle.rest.shape)
+        made.outs = [made.vectors(f"term_{k}") for k in range(2)]
+        yield made
+
+
+def forces(rig, term, x: np.ndarray) -> np.ndarray:
+    rig.model.state.x.from_numpy(x)
+    elastic_forces(rig.model)
+    force_of(rig.model, term, rig.outs[0])
+    return rig.outs[0].to_numpy()
+
+
+def energy(rig, term, x: np.ndarray, model=None) -> float:
+    model = model or rig.model
+    model.state.x.from_numpy(x)
+    measure(model)
+    return model.state.scalars[ENERGY[term]]
+
+
+def test_a_scene_has_the_terms_it_needs(rig):
+    assert set(rig.model.terms) == set(TERMS) and set(ENERGY) == set(TERMS)
+
+
+@pytest.mark.parametrize("term", TERMS, ids=lambda term: term.__name__.rpartition(".")[2])
+def test_the_force_is_the_slope_of_the_energy(rig, term):
+    f = forces(rig, term, rig.x)
+    assert np.abs(f).max() > 1.0  # [N]
+    rng = np.random.default_rng(6)
+    for node, axis in zip(rng.integers(0, len(rig.x), 12), rng.integers(0, 3, 12)):
+        step = np.zeros_like(rig.x)
+        step[node, axis] = H
+        for model in (rig.model, rig.parallel):
+            slope = (energy(rig, term, rig.x + step, model) - energy(rig, term, rig.x - step, model)) / (2 * H)
+            assert -slope == pytest.approx(f[node, axis], rel=1e-5, abs=1e-6 * np.abs(f).max())
+
+
+@pytest.mark.parametrize("term", TERMS, ids=lambda term: term.__name__.rpartition(".")[2])
+def test_rigid_motions(rig, term):
+    f, R = forces(rig, term, rig.x), rotation((1.0, -2.0, 0.5), 0.7)
+    moved = forces(rig, term, rig.x @ R.T + (0.3, -0.2, 0.1))
+    if term.LOAD:
+        assert np.array_equal(moved, f)
+        return
+    close = 1e-10 * np.abs(f).max()
+    assert np.abs(moved - f @ R.T).max() < close
+    start = rig.layout.node_start
+    for first, last in zip(start[:-1], start[1:]):
+        own, x = f[first:last], rig.x[first:last]
+        assert np.abs(own.sum(axis=0)).max() < 100 * close and np.abs(np.cross(x, own).sum(axis=0)).max() < 100 * close
+
+
+def test_gravity_is_an_acceleration_too(rig):
+    f, weight = forces(rig, gravity, rig.x), rig.model.weight.to_numpy()
+    assert gravity.ACCELERATION and np.abs(f - weight[:, None] * rig.model.gravity.to_numpy()[0]).max() < 1e-12
+
+
+def test_dampers_take_power(rig):
+    m, rng = rig.model, np.random.default_rng(7)
+    matrix = block_csr.build_block_csr(m, rig.arena, m.real, "test_damper")
+    rates = np.repeat(damping_table(rig.scene)[:, 0], [body.n_nodes for body in rig.scene.bodies])
+    drag = rates * m.mass.to_numpy()
+    m.state.x.from_numpy(rig.x)
+    block_csr.assemble(m, matrix, True)
+    for v in (rng.standard_normal(rig.x.shape), np.zeros_like(rig.x), np.tile([1.0, 2.0, 3.0], (len(rig.x), 1))):
+        m.state.v.from_numpy(v)
+        damping_of(m, matrix, *rig.outs)
+        mass, stiffness = (out.to_numpy() for out in rig.outs)
+        assert np.abs(mass + drag[:, None] * v).max() <= 1e-12 * np.abs(mass).max()
+        power = float(np.sum(stiffness * v))
+        if np.ptp(v, axis=0).max() > 0.0:
+            assert power < -1.0  # [W]
+        else:  # nothing deforms
+            assert np.abs(stiffness).max() < 1e-6
