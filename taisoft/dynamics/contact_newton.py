@@ -17,6 +17,7 @@ from taisoft.dynamics.stage_system import Stage, StageSystem
 SOLVES, FORCING = 60, 0.3  # linear solves of one frictional problem, and their tolerance
 SHARE, LAW_SHARE = 0.1, 0.1  # of what the stage has left of |r| and of the laws' residual: what such a problem is solved to,
 LEAST_SHARE = 0.3  # or this share of the tolerances
+LINEARISED_SOLVES = 400  # linear solves of a linearised stage
 FALLBACK = 6  # steps on the true stage
 HIDING = 10.0  # times the floor of |r|: where the motion of a whole body may be what is left of it
 
@@ -94,8 +95,20 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
     if system.n_contacts == 0:
         newton = Newton(system, stage)
         return newton.run_once() if stage.linearised else newton.run(*system.evaluate(), fresh)
-    if stage.linearised:
-        r, scale = system.evaluate(new_multipliers=True)
+    return solve_linearised(system, stage) if stage.linearised else ContactNewton(system, stage).run(fresh)
+
+
+def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
+    """The frictional problem alone, at the present state; of a projected matrix where its own is indefinite."""
+    problem, linear = replace(stage, max_newton=LINEARISED_SOLVES), 0
+    r, scale = system.evaluate(new_multipliers=True)
+    for projected in (False, True):
         system.linearise()
-        return Newton(system, stage).run(r, scale, True)
-    return ContactNewton(system, stage).run(fresh)
+        newton = Newton(system, problem, inner=True)
+        result = newton.run(r, scale, fresh=True)
+        linear += newton.linear
+        if not newton.negative or projected:
+            break
+        r, scale = system.leave_linear(taken=False)
+        system.form_matrix(projected=True)
+    return replace(result, linear_iterations=linear)

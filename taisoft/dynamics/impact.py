@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from taisoft.dynamics.stage_system import Stage, StageSystem
 
 SPREAD = 2.0 * math.pi  # tau / dt
+SOLVES = 400  # linear solves of an impact
 TOLERANCE = 1e-3  # of the contact laws' residual in an impact: what it leaves undone the step after it does
 
 
@@ -178,7 +179,7 @@ def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":
     from taisoft.dynamics.stage_result import count_all, merge
 
     m, w, tau, out = system.model, system.work, SPREAD * stage.dt, np.zeros(2)
-    blow = replace(stage, beta=tau, contact_tolerance=max(stage.contact_tolerance, TOLERANCE), linearised=True)
+    blow = replace(stage, beta=tau, contact_tolerance=max(stage.contact_tolerance, TOLERANCE), max_newton=SOLVES)
     k = system.begin_impact(blow)
     begin_impact(m, w, k, tau, system.norms)
     impact = Newton(system, blow).run(*system.evaluate(new_multipliers=True), fresh=True)

@@ -6,7 +6,8 @@ choice 2).
 
 Contacts make an augmented Lagrangian of the stage: per multiplier lambda it is minimised with the friction disks frozen, down to
 PROGRESS times what the multiplier left; then lambda = prox(lambda - R u), and the disks open as far as its normal parts say.
-R doubles after a multiplier that took one step, and is halved after one that took many.
+R doubles after a multiplier that took one step, and is halved after one that took many, or that left more of the laws' residual:
+with a large R each multiplier nearly solves the problem with frozen disks, a fixed-point iteration that need not converge.
 Source: Alart and Curnier 1991 for the laws as a prox; the loop is that of the method of multipliers.
 
 Convergence: |r| <= tolerance * scale, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes, impulses in r, and
@@ -31,6 +32,7 @@ SERVES = {False: 1, True: 3}  # which serves at least so many; with contacts mos
 FALL = 0.9  # with contacts, share of the least |r| so far below which a step needs no look at its slope
 PROGRESS = 0.3  # share of what a new multiplier left of |r| that the Newton steps bring it down to
 R_SCALE, SOFTEST, STIFFEST, MANY = 1.0, 0.3, 100.0, 5  # R over the r-factors at first and its bounds; steps that are many
+RISEN_LAW, STEADY = 1.2, 4.0  # times the laws' residual of before: R is too large, unless it is below that
 MAX_MULTIPLIERS = 200
 
 
@@ -47,7 +49,7 @@ class Newton:
         """From the present state, whose (|r|, scale) is given. fresh: the matrix is formed there."""
         system, served = self.system, 0
         self.r, self.scale, self.touching = r, scale, system.n_contacts > 0
-        system.r_scale = R_SCALE
+        system.r_scale, self.law = R_SCALE, math.inf  # the laws' residual when the multipliers were last renewed
         self._aim()
         while True:
             if self._near():
@@ -92,11 +94,14 @@ class Newton:
         if not self.touching or self.multipliers >= MAX_MULTIPLIERS:
             return False
         system = self.system
-        if self.taken <= 1:
+        law = system.contact_residual
+        if law > RISEN_LAW * self.law and system.r_scale > STEADY:  # friction disks and normal impulses drive each other up
+            system.r_scale *= 0.5
+        elif self.taken <= 1:
             system.r_scale = min(STIFFEST, 2.0 * system.r_scale)
         elif self.taken >= MANY:
             system.r_scale = max(SOFTEST, 0.5 * system.r_scale)
-        self.multipliers, self.rounding = self.multipliers + 1, False
+        self.law, self.multipliers, self.rounding = law, self.multipliers + 1, False
         self.r, self.scale = system.evaluate(None, new_multipliers=True)
         self._aim()
         return True
