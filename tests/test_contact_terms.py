@@ -223,6 +223,16 @@ def test_conjugate_gradients(rig, dense, method):
     assert result.converged and np.abs(work.y.to_numpy().ravel() - y).max() < 1e3 * tolerance * np.abs(y).max()
     without = np.linalg.solve(rig.A[np.ix_(on, on)], rhs.ravel()[on].astype(float))
     assert np.abs(without - y[on]).max() > 0.1 * np.abs(y).max()  # contacts do count
+    blocks = rig.k.work.block.to_numpy()
+    try:  # other blocks of the same contacts beside the same matrix: rows without contacts are prepared already
+        rig.k.work.block.from_numpy((3.0 * blocks).astype(blocks.dtype))
+        y[on] = np.linalg.solve((rig.A + 3.0 * dense)[np.ix_(on, on)], rhs.ravel()[on].astype(float))
+        fresh = pcg.solve(m, matrix, work, tolerance, 2000, rig.k.coupling), work.y.to_numpy()
+        again = pcg.solve(m, matrix, work, tolerance, 2000, rig.k.coupling, same_matrix=True), work.y.to_numpy()
+        assert fresh[0] == again[0] and np.array_equal(fresh[1], again[1])
+        assert np.abs(again[1].ravel() - y).max() < 1e3 * tolerance * np.abs(y).max()
+    finally:
+        rig.k.work.block.from_numpy(blocks)
 
 
 def test_factors_rest_on_the_diagonal(rig):

@@ -78,6 +78,7 @@ class StageSystem:
         self._contact_arena = FieldArena()
         self._room: StageContacts | None = None  # for the contacts of this step
         self._k = NO_CONTACTS  # what the present stage has
+        self._same_matrix = False  # as in the last linear solve of this stage
         self._weighed: tuple[float, float] | None = None  # c and beta of the matrix that the r-factors rest on
         self.norms = np.zeros(5)  # what `form_residual` tells
 
@@ -155,7 +156,7 @@ class StageSystem:
     def begin(self, stage: Stage) -> bool:
         """Take up a stage at its first iterate; whether its matrix has been formed on the way."""
         m, w, fresh = self.model, self.work, False
-        self._stage, self.kind = stage, ELASTIC_STAGE
+        self._stage, self.kind, self._same_matrix = stage, ELASTIC_STAGE, False
         self._k = self._contacts()
         begin_stage(m, w, stage.beta, stage.prescribed_share)
         if not self._k.any:
@@ -228,13 +229,17 @@ class StageSystem:
         m, stage = self.model, self._stage
         block_csr.assemble(m, self.matrix, projected)
         block_csr.to_system(m, self.matrix, self.damper or self.matrix, stage.c, stage.beta)
+        self._same_matrix = False
         if self._k.any:
             keep_diagonal(m, self.matrix, self._k)
 
     def direction(self, tolerance: float) -> pcg.LinearResult:
         """y of pcg from -r."""
         m = self.model
-        return pcg.solve(m, self.matrix, self.pcg, tolerance, max(1000, 30 * m.n_nodes), self._k.coupling)
+        limit = max(1000, 30 * m.n_nodes)
+        answer = pcg.solve(m, self.matrix, self.pcg, tolerance, limit, self._k.coupling, self._same_matrix)
+        self._same_matrix = True
+        return answer
 
     # --- what others ask -------------------------------------------------------------------------------------------
 

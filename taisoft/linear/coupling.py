@@ -50,6 +50,12 @@ def build_coupling(
 
 
 @ti.func
+def has_terms(k: ti.template(), i):
+    """Whether any term holds node i."""
+    return k.entry_start[i] < k.entry_start[i + 1]
+
+
+@ti.func
 def prepare_terms(m: ti.template(), k: ti.template(), i):
     """List the active terms of node i. Returns the diagonal block of the whole matrix."""
     total, n = k.base[i], 0

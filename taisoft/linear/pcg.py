@@ -62,11 +62,13 @@ def build_pcg(model: Model, arena: FieldArena) -> PcgWork:
 
 
 def solve(
-    m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int, coupling: Coupling = NO_COUPLING
-) -> LinearResult:
+    m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int, coupling: Coupling = NO_COUPLING,
+    same_matrix: bool = False,
+) -> LinearResult:  # fmt: skip
     """Fill w.y from w.rhs. tolerance: sqrt(r.z) relative to the start.
 
     coupling: terms beside A, whose own diagonal is then in coupling.base; A.diagonal is set to that of both.
+    same_matrix: A is that of the last solve, terms are between the same nodes: rows without terms keep their preconditioner.
     """
     from taisoft.linear import pcg_parallel, pcg_serial
 
@@ -74,7 +76,7 @@ def solve(
     batch = max(1, SERIAL_WORK // (2 * A.n_edges + m.n_nodes)) if m.serial else PARALLEL_BATCH
     done = 0
     while True:
-        done, stop = method.iterate(m, A, coupling, w, min(batch, max_iterations - done), tolerance, done == 0)
+        done, stop = method.iterate(m, A, coupling, w, min(batch, max_iterations - done), tolerance, done == 0, same_matrix)
         if stop != RUNNING or done >= max_iterations:
             return LinearResult(done, stop == CONVERGED, stop == NEGATIVE)
 

@@ -3,7 +3,7 @@
 import taichi as ti
 
 from taisoft.linear.block_csr import block_times, part_times, row_times
-from taisoft.linear.coupling import gather_pulls, prepare_terms, pull_with_all
+from taisoft.linear.coupling import gather_pulls, has_terms, prepare_terms, pull_with_all
 from taisoft.linear.pcg import (
     CONVERGED,
     COUNT,
@@ -24,15 +24,18 @@ from taisoft.scalars import OTHER_SUM, SUM
 
 
 @kernel
-def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()):
+def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), same_matrix: ti.i32):
     """y = 0, r = rhs, z = p = B r; the diagonal and its inverse B on the way."""
     for c in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         s = ti.cast(0.0, ti.f64)
         for i in range(c * size, ti.min(m.n_nodes, (c + 1) * size)):
             if ti.static(k.width > 0):
-                A.diagonal[i] = prepare_terms(m, k, i)
-            precondition(m, w, i, A.diagonal[i])
+                if same_matrix == 0 or has_terms(k, i):
+                    A.diagonal[i] = prepare_terms(m, k, i)
+                    precondition(m, w, i, A.diagonal[i])
+            else:
+                precondition(m, w, i, A.diagonal[i])
             r = m.free[i] * w.rhs[i]
             z = block_times(w.inverse[i], r)
             w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
@@ -45,10 +48,10 @@ def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()
         w.state[RZ], w.state[RZ_START], w.state[COUNT], w.state[STOP] = rz, rz, 0.0, RUNNING
 
 
-def iterate(m, A, coupling, w, n: int, tolerance: float, begin: bool) -> tuple[int, int]:
+def iterate(m, A, coupling, w, n: int, tolerance: float, begin: bool, same_matrix: bool) -> tuple[int, int]:
     """Up to n iterations, from y = 0 where the solve begins; returns the iterations so far and how it stands."""
     if begin:
-        start(m, A, coupling, w)
+        start(m, A, coupling, w, int(same_matrix))
     for _ in range(n):
         iterate_once(m, A, coupling, w, tolerance)
     return int(w.state[COUNT]), int(w.state[STOP])

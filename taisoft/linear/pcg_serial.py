@@ -11,21 +11,24 @@ Comput. 2(1), 1981.
 import taichi as ti
 
 from taisoft.linear.block_csr import block_times, part_times, part_times_backward
-from taisoft.linear.coupling import add_pulls, clear_pulls, gather_pulls, prepare_terms
+from taisoft.linear.coupling import add_pulls, clear_pulls, gather_pulls, has_terms, prepare_terms
 from taisoft.linear.pcg import CONVERGED, COUNT, FARTHEST, NEGATIVE, RUNNING, RZ, RZ_START, STEP, STOP, dot64, precondition
 from taisoft.runtime import kernel
 
 
 @ti.func
-def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()):
+def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), same_matrix):
     """y = 0, s = (P + L)^-1 rhs, t = P s; the diagonal and what P is on the way."""
     rz = ti.cast(0.0, ti.f64)
     if ti.static(k.width > 0):
         clear_pulls(m, k)
     for i in range(m.n_nodes):
         if ti.static(k.width > 0):
-            A.diagonal[i] = prepare_terms(m, k, i)
-        precondition(m, w, i, A.diagonal[i])
+            if same_matrix == 0 or has_terms(k, i):
+                A.diagonal[i] = prepare_terms(m, k, i)
+                precondition(m, w, i, A.diagonal[i])
+        else:
+            precondition(m, w, i, A.diagonal[i])
         below = part_times(m, A, A.row_start[i], A.row_upper[i], w.r)
         if ti.static(k.width > 0):
             below += gather_pulls(m, k, i)
@@ -41,22 +44,22 @@ def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()
     w.state[COUNT], w.state[STOP] = 0.0, RUNNING
 
 
-def iterate(m, A, k, w, n: int, tolerance: float, begin: bool) -> tuple[int, int]:
+def iterate(m, A, k, w, n: int, tolerance: float, begin: bool, same_matrix: bool) -> tuple[int, int]:
     """Up to n iterations, from y = 0 where the solve begins; returns the iterations so far and how it stands."""
-    count, stop = iterate_kernel(m, A, k, w, n, tolerance, int(begin))
+    count, stop = iterate_kernel(m, A, k, w, n, tolerance, int(begin), int(same_matrix))
     return int(count), int(stop)
 
 
 @kernel
 def iterate_kernel(
     m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), n: ti.i32, tolerance: ti.f64,
-    begin: ti.i32,
+    begin: ti.i32, same_matrix: ti.i32,
 ) -> ti.types.vector(2, ti.f64):
     """The iterations in one launch: (count, stop)."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         if begin != 0:
-            start(m, A, coupling, w)
+            start(m, A, coupling, w, same_matrix)
         rz, along, stop, k = w.state[RZ], w.state[STEP], ti.cast(RUNNING, ti.i32), 0
         limit = tolerance * tolerance * w.state[RZ_START]
         if rz <= limit:
