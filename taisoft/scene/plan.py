@@ -69,7 +69,7 @@ def make_plan(
     )
     plan.add("past_states", multistep, "the integrator looks back two steps", "a one-step integrator")
     plan.add(
-        "inversion_handling", not explicit, "the stiffness of tets with negative curvature is projected when a solve meets it",
+        "inversion_handling", not explicit, "directions of negative curvature lead out of inverted tets",
         "explicit steps need forces only, which every law gives for inverted tets too",
     )  # fmt: skip
     _add_collision(plan, scene, self_collision)
