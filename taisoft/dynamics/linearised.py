@@ -17,7 +17,7 @@ from taisoft.dynamics.contact_terms import (
     sum_residual,
     unprojected,
 )
-from taisoft.dynamics.stage import place_node, squares
+from taisoft.dynamics.stage import place_node
 from taisoft.linear.block_csr import block_times, part_times
 from taisoft.linear.pcg import dot64, total
 from taisoft.runtime import kernel
@@ -89,6 +89,47 @@ def _step_length(k: ti.template(), at_rest, curvature, start, r_scale):
     return a, slope
 
 
+@ti.func
+def begin_node(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), pcg: ti.template(), i):
+    """(r.y, y.A y) of node i, whose row of A y is kept; base = x."""
+    y = pcg.y[i]
+    q = block_times(k.coupling.base[i], y) + part_times(m, A, A.row_start[i], A.row_start[i + 1], pcg.y)
+    pcg.q[i] = q
+    s.base[i] = m.state.x[i]
+    return dot64(m.free[i] * s.residual[i], y), dot64(y, q)
+
+
+@ti.func
+def begin_contact(k: ti.template(), pcg: ti.template(), c, beta):
+    """u of contact c and its rate along y; returns p.rate."""
+    p, w = ti.static((k.problem, k.work))
+    w.velocity[c] = stage_velocity_of(k, c, beta)
+    d, n, t = dvec(0.0), p.normal[c], p.tangent[c]
+    for j in range(p.arity[c]):
+        d += p.weight[c, j] * ti.cast(pcg.y[p.node[c, j]], ti.f64)
+    rate = dvec(n.dot(d), t.dot(d), n.cross(t).dot(d))
+    w.rate[c] = rate
+    return rate.dot(p.r[c])
+
+
+@ti.func
+def go_along(m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.template(), i, a, beta):
+    """Node i goes a y, and with it the residual without contacts."""
+    place_node(m, s, pcg.y, i, a, beta)
+    k.displacement[i] = m.state.x[i] - k.x_start[i]
+    k.residual_linear[i] += ti.cast(a, m.real) * pcg.q[i]
+
+
+@ti.func
+def pressed_residual(m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.template(), i):
+    """Residual of node i with impulses, and -r as CG's right side; returns |r|^2 on its free axes, and on the others."""
+    r = k.residual_linear[i] - ti.cast(impulse_on_node(k, i), m.real)
+    s.residual[i] = r
+    pcg.rhs[i] = -m.free[i] * r
+    own, held = m.free[i] * r, (1.0 - m.free[i]) * r
+    return dot64(own, own), dot64(held, held)
+
+
 @kernel
 def advance(
     m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), pcg: ti.template(), beta: ti.f64, r_scale: ti.f64,
@@ -104,20 +145,13 @@ def advance(
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
-            y = pcg.y[i]
-            q = block_times(k.coupling.base[i], y) + part_times(m, A, A.row_start[i], A.row_start[i + 1], pcg.y)
-            pcg.q[i] = q
-            s.base[i] = m.state.x[i]
-            slope += dot64(m.free[i] * s.residual[i], y)
-            curvature += dot64(y, q)
+            own_slope, own_curvature = begin_node(m, s, A, k, pcg, i)
+            slope += own_slope
+            curvature += own_curvature
         m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        w.velocity[c] = stage_velocity_of(k, c, beta)
-        d, n, t = dvec(0.0), p.normal[c], p.tangent[c]
-        for j in range(p.arity[c]):
-            d += p.weight[c, j] * ti.cast(pcg.y[p.node[c, j]], ti.f64)
-        w.rate[c] = dvec(n.dot(d), t.dot(d), n.cross(t).dot(d))
+        begin_contact(k, pcg, c, beta)
     ti.loop_config(serialize=True)
     for _ in range(1):
         start = total(m, SUM)
@@ -128,10 +162,7 @@ def advance(
         m.state.scalars[START_SLOPE], m.state.scalars[END_SLOPE], m.state.scalars[STEP_LENGTH] = start, slope, a
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        a = m.state.scalars[STEP_LENGTH]
-        place_node(m, s, pcg.y, i, a, beta)
-        k.displacement[i] = m.state.x[i] - k.x_start[i]
-        k.residual_linear[i] += ti.cast(a, m.real) * pcg.q[i]
+        go_along(m, s, k, pcg, i, m.state.scalars[STEP_LENGTH], beta)
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         press_contact(m, k, c, beta, r_scale)
@@ -141,14 +172,12 @@ def advance(
     ti.loop_config(serialize=m.serial)
     for chunk in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
-        sums = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64)
-        zero = ti.Vector([0.0, 0.0, 0.0], m.real)
+        free, held = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
-            r = k.residual_linear[i] - ti.cast(impulse_on_node(k, i), m.real)
-            s.residual[i] = r
-            pcg.rhs[i] = -m.free[i] * r
-            sums += squares(r, zero, zero, zero, m.free[i])
-        m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = sums[0], sums[4]
+            own, other = pressed_residual(m, s, k, pcg, i)
+            free += own
+            held += other
+        m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = free, held
     ti.loop_config(serialize=True)
     for _ in range(1):
         norms[0], norms[4] = total(m, SUM), total(m, OTHER_SUM)

@@ -50,6 +50,65 @@ def iterate(m, A, k, w, n: int, tolerance: float, begin: bool, same_matrix: bool
     return int(count), int(stop)
 
 
+@ti.func
+def iterations(m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), n, tolerance):
+    """Up to n iterations from where the solve stands: how many, and how it stands then."""
+    rz, along, stop, k = w.state[RZ], w.state[STEP], ti.cast(RUNNING, ti.i32), 0
+    limit = tolerance * tolerance * w.state[RZ_START]
+    if rz <= limit:
+        stop = CONVERGED
+    while k < n and stop == RUNNING:
+        if ti.static(coupling.width > 0):
+            clear_pulls(m, coupling)
+        for back in range(m.n_nodes):
+            i = m.n_nodes - 1 - back
+            t = w.q[i] + ti.cast(along, m.real) * w.z[i]  # w.q holds P s of the last update
+            w.z[i] = t
+            above = part_times_backward(m, A, A.row_upper[i], A.row_start[i + 1], w.p)
+            if ti.static(coupling.width > 0):
+                above += gather_pulls(m, coupling, i)
+            p = block_times(w.inverse[i], t - above)
+            w.p[i] = p
+            if ti.static(coupling.width > 0):
+                add_pulls(m, coupling, i, p)
+        if ti.static(coupling.width > 0):
+            clear_pulls(m, coupling)
+        curvature = ti.cast(0.0, ti.f64)
+        for i in range(m.n_nodes):
+            # now w.q holds (P + L)^-1 (t - (2 P - D) p), as the rows below need it
+            p, t = w.p[i], w.z[i]
+            below = part_times(m, A, A.row_start[i], A.row_upper[i], w.q)
+            if ti.static(coupling.width > 0):
+                below += gather_pulls(m, coupling, i)
+            s = block_times(w.inverse[i], t - block_times(w.mirror[i], p) - below)
+            if ti.static(coupling.width > 0):
+                add_pulls(m, coupling, i, s)
+            w.q[i] = s
+            curvature += dot64(t, p + s)
+        if not curvature > 0.0:
+            stop = NEGATIVE
+            far = ti.cast(ti.min(rz, -FARTHEST * curvature) / -curvature if curvature < 0.0 else FARTHEST, m.real)
+            for i in range(m.n_nodes):
+                w.y[i] = w.y[i] + far * w.p[i]
+        else:
+            step, next_rz = ti.cast(rz / curvature, m.real), ti.cast(0.0, ti.f64)
+            for i in range(m.n_nodes):
+                p = w.p[i]
+                w.y[i] = w.y[i] + step * p
+                s = w.r[i] - step * (p + w.q[i])
+                w.r[i] = s
+                t = block_times(w.block[i], s)
+                w.q[i] = t
+                next_rz += dot64(s, t)
+            along = next_rz / rz
+            rz = next_rz
+            k += 1
+            if rz <= limit:
+                stop = CONVERGED
+    w.state[RZ], w.state[STEP], w.state[STOP] = rz, along, stop
+    return k, stop
+
+
 @kernel
 def iterate_kernel(
     m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), n: ti.i32, tolerance: ti.f64,
@@ -60,58 +119,6 @@ def iterate_kernel(
     for _ in range(1):
         if begin != 0:
             start(m, A, coupling, w, same_matrix)
-        rz, along, stop, k = w.state[RZ], w.state[STEP], ti.cast(RUNNING, ti.i32), 0
-        limit = tolerance * tolerance * w.state[RZ_START]
-        if rz <= limit:
-            stop = CONVERGED
-        while k < n and stop == RUNNING:
-            if ti.static(coupling.width > 0):
-                clear_pulls(m, coupling)
-            for back in range(m.n_nodes):
-                i = m.n_nodes - 1 - back
-                t = w.q[i] + ti.cast(along, m.real) * w.z[i]  # w.q holds P s of the last update
-                w.z[i] = t
-                above = part_times_backward(m, A, A.row_upper[i], A.row_start[i + 1], w.p)
-                if ti.static(coupling.width > 0):
-                    above += gather_pulls(m, coupling, i)
-                p = block_times(w.inverse[i], t - above)
-                w.p[i] = p
-                if ti.static(coupling.width > 0):
-                    add_pulls(m, coupling, i, p)
-            if ti.static(coupling.width > 0):
-                clear_pulls(m, coupling)
-            curvature = ti.cast(0.0, ti.f64)
-            for i in range(m.n_nodes):
-                # now w.q holds (P + L)^-1 (t - (2 P - D) p), as the rows below need it
-                p, t = w.p[i], w.z[i]
-                below = part_times(m, A, A.row_start[i], A.row_upper[i], w.q)
-                if ti.static(coupling.width > 0):
-                    below += gather_pulls(m, coupling, i)
-                s = block_times(w.inverse[i], t - block_times(w.mirror[i], p) - below)
-                if ti.static(coupling.width > 0):
-                    add_pulls(m, coupling, i, s)
-                w.q[i] = s
-                curvature += dot64(t, p + s)
-            if not curvature > 0.0:
-                stop = NEGATIVE
-                far = ti.cast(ti.min(rz, -FARTHEST * curvature) / -curvature if curvature < 0.0 else FARTHEST, m.real)
-                for i in range(m.n_nodes):
-                    w.y[i] = w.y[i] + far * w.p[i]
-            else:
-                step, next_rz = ti.cast(rz / curvature, m.real), ti.cast(0.0, ti.f64)
-                for i in range(m.n_nodes):
-                    p = w.p[i]
-                    w.y[i] = w.y[i] + step * p
-                    s = w.r[i] - step * (p + w.q[i])
-                    w.r[i] = s
-                    t = block_times(w.block[i], s)
-                    w.q[i] = t
-                    next_rz += dot64(s, t)
-                along = next_rz / rz
-                rz = next_rz
-                k += 1
-                if rz <= limit:
-                    stop = CONVERGED
-        w.state[RZ], w.state[STEP], w.state[STOP] = rz, along, stop
+        k, _stop = iterations(m, A, coupling, w, n, tolerance)
         w.state[COUNT] = w.state[COUNT] + k
     return ti.Vector([w.state[COUNT], w.state[STOP]])
