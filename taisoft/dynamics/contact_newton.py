@@ -6,20 +6,45 @@ found as multipliers. Where the matrix is indefinite, a few steps minimise the t
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+from taisoft.dynamics.frictional import INDEFINITE, LINEAR, MULTIPLIERS, NORM, R_SCALE, ROUNDING, SOLVED, VERDICT
+from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
 from taisoft.dynamics.line_search import search
-from taisoft.dynamics.newton import FALL, R_SCALE, ROUNDING, Newton
+from taisoft.dynamics.newton import FALL, Newton
 from taisoft.dynamics.residual import AGAIN
 from taisoft.dynamics.stage_result import StageResult
 from taisoft.dynamics.stage_system import Stage, StageSystem
 
-SOLVES, FORCING = 60, 0.3  # linear solves of one frictional problem, and their tolerance
+SOLVES, FORCING = 20, 0.3  # linear solves of one frictional problem, and their tolerance
 SHARE, LAW_SHARE = 0.1, 0.1  # of what the stage has left of |r| and of the laws' residual: what such a problem is solved to,
 LEAST_SHARE = 0.3  # or this share of the tolerances
-LINEARISED_SOLVES = 400  # linear solves of a linearised stage
+LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # linear solves of a linearised stage, and their tolerance
 FALLBACK = 6  # steps on the true stage
-HIDING = 10.0  # times the floor of |r|: where the motion of a whole body may be what is left of it
+HIDING = 4.0  # times the floor of |r|: where the motion of a whole body may be what is left of it
+
+
+@dataclass(frozen=True)
+class Frictional:
+    """What a solve of a linearised stage did. negative: its matrix is indefinite."""
+
+    solves: int
+    linear: int
+    multipliers: int
+    negative: bool
+    converged: bool
+    r: float
+
+
+def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) -> Frictional:
+    """Solve a linearised stage from (|r|, scale), on one thread in one launch."""
+    if not system.model.serial:
+        newton = Newton(system, problem, inner=True)
+        result = newton.run(r, scale, fresh=True)
+        return Frictional(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
+    loop = system.solve_frictional(problem, r, system.rounding.of_stage(problem.c, problem.beta))
+    counts = (int(loop[place]) for place in (SOLVES_DONE, LINEAR, MULTIPLIERS))
+    return Frictional(*counts, loop[VERDICT] == INDEFINITE, loop[VERDICT] == SOLVED, float(loop[NORM]))
 
 
 class ContactNewton:
@@ -70,7 +95,7 @@ class ContactNewton:
         enough = self.r <= self.stage.tolerance * self.scale or self.rounding
         return enough and self.system.laws_hold(self.stage.contact_tolerance, self.floor)
 
-    def _solve_contacts(self) -> Newton:
+    def _solve_contacts(self) -> "Frictional":
         """The contact problem on the matrix at hand, to a share of what the stage has left."""
         system, stage = self.system, self.stage
         system.linearise()
@@ -82,8 +107,7 @@ class ContactNewton:
             stage, tolerance=enough / self.scale if self.scale > 0.0 else 0.0, contact_tolerance=law, max_newton=SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
         )  # fmt: skip
-        inner = Newton(system, problem, inner=True)
-        inner.run(self.r, self.scale, fresh=True)
+        inner = solve_linear(system, problem, self.r, self.scale)
         self.linear, self.multipliers = self.linear + inner.linear, self.multipliers + inner.multipliers
         system.r_scale = R_SCALE
         return inner
@@ -100,15 +124,17 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
 
 def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
     """The frictional problem alone, at the present state; of a projected matrix where its own is indefinite."""
-    problem, linear = replace(stage, max_newton=LINEARISED_SOLVES), 0
+    tolerance = stage.linear_tolerance or LINEARISED_FORCING
+    problem, linear = replace(stage, max_newton=LINEARISED_SOLVES, linear_tolerance=tolerance), 0
     r, scale = system.evaluate(new_multipliers=True)
     for projected in (False, True):
         system.linearise()
-        newton = Newton(system, problem, inner=True)
-        result = newton.run(r, scale, fresh=True)
-        linear += newton.linear
-        if not newton.negative or projected:
+        found = solve_linear(system, problem, r, scale)
+        linear += found.linear
+        if not found.negative or projected:
             break
         r, scale = system.leave_linear(taken=False)
         system.form_matrix(projected=True)
-    return replace(result, linear_iterations=linear)
+    low = found.r <= system.rounding.of_stage(stage.c, stage.beta)
+    residual = found.r / scale if scale > 0.0 else found.r
+    return StageResult(found.solves, linear, residual, found.converged, low, found.multipliers, system.contact_residual)

@@ -62,7 +62,7 @@ NO_CONTACTS = StageContacts(None, None, None, NO_COUPLING, *[None] * 4)
 
 
 @ti.func
-def _set_out(s: ti.template(), k: ti.template(), c, beta, dt, standoff, fast, slow, fastest, impact: ti.template()):
+def set_multiplier(s: ti.template(), k: ti.template(), c, beta, dt, standoff, fast, slow, fastest, impact: ti.template()):
     """The impulse of contact c becomes its multiplier, and the disk opens as far as that says; what x does not change.
 
     impact: whether the contact's velocity must be `leave`, whatever its gap.
@@ -171,14 +171,14 @@ def press(
 ):  # fmt: skip
     """Find the impulses of all contacts at the present x, their blocks of the matrix, and the residual of their laws.
 
-    impact: as `_set_out`. new_multipliers: whether the impulses are made the multipliers first, and the disks opened as far as
-    these say. r_scale: R over the r-factors.
+    impact: as `set_multiplier`. new_multipliers: whether the impulses are made the multipliers first, and the disks opened as
+    far as these say. r_scale: R over the r-factors.
     """
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=p.serial)
     for n in range(p.count[0]):
         if new_multipliers == 1:
-            _set_out(s, k, n, beta, dt, standoff, fast, slow, fastest, impact)
+            set_multiplier(s, k, n, beta, dt, standoff, fast, slow, fastest, impact)
         press_contact(m, k, n, beta, r_scale)
     ti.loop_config(serialize=True)
     for _ in range(1):

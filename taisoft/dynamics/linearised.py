@@ -68,7 +68,7 @@ def _slope(k: ti.template(), at_rest, curvature, a, r_scale):
 
 
 @ti.func
-def _step_length(k: ti.template(), at_rest, curvature, start, r_scale):
+def step_length(k: ti.template(), at_rest, curvature, start, r_scale):
     """(a, slope there): the root of the slope, which rises where the matrix is positive definite, by the Illinois method."""
     a, low, at_low, high, at_high = 1.0, 0.0, start, -1.0, 0.0
     slope = _slope(k, at_rest, curvature, a, r_scale)
@@ -158,7 +158,7 @@ def advance(
         at_rest = start
         for c in range(p.count[0]):
             at_rest += w.rate[c].dot(p.r[c])
-        a, slope = _step_length(k, at_rest, total(m, OTHER_SUM), start, r_scale)
+        a, slope = step_length(k, at_rest, total(m, OTHER_SUM), start, r_scale)
         m.state.scalars[START_SLOPE], m.state.scalars[END_SLOPE], m.state.scalars[STEP_LENGTH] = start, slope, a
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):

@@ -19,21 +19,27 @@ more than that of a strain, and ends the stage as converged, its residual told a
 
 import math
 
+from taisoft.dynamics.frictional import (
+    MANY,
+    MAX_MULTIPLIERS,
+    PROGRESS,
+    R_SCALE,
+    RISEN_LAW,
+    ROUNDING,
+    SOFTEST,
+    STEADY,
+    STIFFEST,
+)
 from taisoft.dynamics.line_search import search
 from taisoft.dynamics.residual import ELASTIC_STAGE, IMPACT, LINEARISED, STEP
 from taisoft.dynamics.stage_result import StageResult
 from taisoft.dynamics.stage_system import Stage, StageSystem
 
-ROUNDING = 4.0  # times the floor: what rounding may leave, as strains grow (up to 2.8 times was seen, in a thin sheet)
 LINEAR_LIMIT = 0.01  # true relative residual of a linearly implicit step above which it has failed
 MAX_FORCING, RISEN_FORCING = 0.1, 3e-2  # CG's loosest tolerance, and that after a step that raised |r|
 SLOW = 0.2  # a step that leaves more of |r| than this asks for a new matrix,
 SERVES = {False: 1, True: 3}  # which serves at least so many; with contacts most of what changes is what touches
 FALL = 0.9  # with contacts, share of the least |r| so far below which a step needs no look at its slope
-PROGRESS = 0.3  # share of what a new multiplier left of |r| that the Newton steps bring it down to
-R_SCALE, SOFTEST, STIFFEST, MANY = 1.0, 0.3, 100.0, 5  # R over the r-factors at first and its bounds; steps that are many
-RISEN_LAW, STEADY = 1.2, 4.0  # times the laws' residual of before: R is too large, unless it is below that
-MAX_MULTIPLIERS = 200
 
 
 class Newton:

@@ -16,6 +16,7 @@ import numpy as np
 import taichi as ti
 
 from taisoft.contact.problem import CHANGED, RESIDUAL, find_factors
+from taisoft.dynamics import frictional
 from taisoft.dynamics.contact_terms import NO_CONTACTS, StageContacts, build_stage_contacts, keep_diagonal, press
 from taisoft.dynamics.linearised import advance, keep_linear, leave_linear
 from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STAY, form_residual, move
@@ -74,6 +75,7 @@ class StageSystem:
         )  # fmt: skip
         self.rounding = RoundingFloor(model, eps)
         self.kind = ELASTIC_STAGE
+        self.scale = 0.0  # that |r| is measured by, where it was last formed
         self.r_scale = 1.0  # R over the r-factors
         self._contact_arena = FieldArena()
         self._room: StageContacts | None = None  # for the contacts of this step
@@ -208,6 +210,23 @@ class StageSystem:
         advance(self.model, self.work, self.matrix, self._k, self.pcg, stage.beta, self.r_scale, self.norms)
         return self._sizes(stage.c, stage.beta)
 
+    def solve_frictional(self, problem: Stage, r: float, floor: float) -> np.ndarray:
+        """The loop of a linearised stage from |r| on, in launches that Ctrl-C can come between: see `frictional`."""
+        m, A, loop = self.model, self.matrix, np.zeros(14)
+        loop[[frictional.NORM, frictional.SCALE, frictional.LAW, frictional.GOAL]] = (
+            r, frictional.R_SCALE, math.inf, frictional.PROGRESS * r,
+        )  # fmt: skip
+        budget = max(1, pcg.SERIAL_WORK // (2 * A.n_edges + m.n_nodes))
+        while loop[frictional.VERDICT] == frictional.RUNNING:
+            frictional.solve_frictional(
+                m, self.work, A, self._k, self.pcg, int(self._same_matrix), problem.beta, problem.dt, *self.contact.goal,
+                problem.tolerance * self.scale, problem.contact_tolerance, floor, problem.linear_tolerance, problem.max_newton,
+                max(1000, 30 * m.n_nodes), budget, loop,
+            )  # fmt: skip
+            self._same_matrix = True
+        self.norms[0], self.norms[4] = loop[frictional.NORM] ** 2, loop[frictional.HELD] ** 2
+        return loop
+
     def leave_linear(self, taken: bool = True) -> tuple[float, float]:
         """Elastic forces are themselves again: (|r|, scale), y the way since the stage was linearised, base where that was.
 
@@ -221,8 +240,10 @@ class StageSystem:
         """(|r|, scale) from the norms that the residual's kernel told."""
         r, inertia, elastic, external, held = (math.sqrt(square) for square in self.norms)
         if c == 0.0:
-            return r, beta * external if external > 0.0 else held
-        return r, inertia + beta * (elastic + external)
+            self.scale = beta * external if external > 0.0 else held
+        else:
+            self.scale = inertia + beta * (elastic + external)
+        return r, self.scale
 
     def form_matrix(self, projected: bool = False) -> None:
         """The matrix where the stage stands, without J^T D J, which the linear solve adds."""

@@ -1,0 +1,109 @@
+"""The contact problem of implicit steps, on a cube that lands aslant on the ground and on another cube, in f64:
+
+* the loop in one launch and the one that the host drives find the same step; cut into many launches it is the same bit by bit;
+* a step takes few Newton iterations, also where the matrix is indefinite; impulses keep the laws;
+* a linearised step of an indefinite matrix goes on with a projected one.
+"""
+
+import numpy as np
+import pytest
+from rotations import rotation
+
+import taisoft as ts
+from taisoft.dynamics import contact_newton, scheme_of
+from taisoft.dynamics.contact_newton import Frictional
+from taisoft.dynamics.newton import Newton
+from taisoft.dynamics.stage_system import StageSystem
+from taisoft.linear import pcg
+
+DT = 0.01  # [s]
+
+
+@pytest.fixture(scope="module")
+def shared_sim():
+    scene = ts.Scene(gravity=(1.0, -9.81, 0.0))
+    rubber = ts.Material(young=2e5, poisson=0.4, density=1000.0, friction=0.5)
+    mesh = ts.box_mesh((3, 3, 3), (0.1, 0.1, 0.1))
+    turned = ts.TetMesh(mesh.vertices @ rotation((1.0, 0.2, 0.5), 0.4).T, mesh.tets)
+    scene.add_body(mesh, rubber, name="lower", position=(0, 0.0502, 0))
+    scene.add_body(turned, rubber, name="upper", position=(0.02, 0.185, 0.01), velocity=(0.3, -1.0, 0.0))
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground", friction=0.5)
+    with ts.Simulator(scene, dt=DT, precision="f64", newton_tolerance=1e-10, contact_tolerance=1e-9) as sim:
+        yield sim
+
+
+@pytest.fixture
+def sim(shared_sim, monkeypatch):
+    monkeypatch.setattr(shared_sim._stepper, "scheme", scheme_of("implicit_euler"))
+    shared_sim.reset()
+    return shared_sim
+
+
+def steps(sim, n: int = 6) -> tuple[np.ndarray, list[ts.StepReport]]:
+    sim.reset()
+    reports = [sim.step() for _ in range(n)]
+    return sim.positions(), reports
+
+
+def from_the_host(system, problem, r, scale) -> Frictional:
+    """The loop as it is where loops run on threads."""
+    newton = Newton(system, problem, inner=True)
+    result = newton.run(r, scale, fresh=True)
+    return Frictional(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
+
+
+def test_both_loops_find_the_same_step(sim, monkeypatch):
+    x, reports = steps(sim)
+    whole = [report.newton_iterations for report in reports if report.parts == 1]
+    assert all(report.converged for report in reports) and len(whole) >= 3 and max(whole) <= 10
+    assert max(report.n_contacts for report in reports) > 10
+    monkeypatch.setattr(contact_newton, "solve_linear", from_the_host)
+    host, others = steps(sim)
+    assert all(report.converged for report in others) and np.abs(host - x).max() < 1e-8  # [m]
+
+
+def test_many_launches_are_one(sim, monkeypatch):
+    x, reports = steps(sim)
+    monkeypatch.setattr(pcg, "SERIAL_WORK", 1)  # one iteration a launch
+    again, others = steps(sim)
+    assert np.array_equal(again, x) and [r.linear_iterations for r in others] == [r.linear_iterations for r in reports]
+
+
+def test_laws_hold_where_tets_are_inverted(sim):
+    """The upper cube squeezed flat as it lands: its matrix is indefinite."""
+    x = sim.positions("upper")
+    middle = x.mean(axis=0)
+    sim.set_state(positions=middle + (x - middle) * (1.0, 0.15, 1.0) - (0, 0.05, 0), body="upper")
+    solver, met = sim._stepper.solver, []
+
+    def direction(tolerance):
+        answer = StageSystem.direction(solver, tolerance)
+        met.append(answer.negative)
+        return answer
+
+    solver.direction = direction
+    try:
+        report = sim.step()
+    finally:
+        del solver.direction
+    assert any(met) and report.converged
+    c = sim.contacts()
+    normal = np.einsum("ij,ij->i", c.impulse, c.normal)
+    along = np.linalg.norm(c.impulse - normal[:, None] * c.normal, axis=1)
+    assert (normal >= 0.0).all() and (along <= 0.5 * normal + 1e-9 * normal.max()).all() and normal.max() > 0.0
+
+
+def test_a_linearised_step_of_an_indefinite_matrix(sim, monkeypatch):
+    monkeypatch.setattr(sim._stepper, "scheme", scheme_of("linearly_implicit_euler"))
+    x = sim.positions("upper")
+    middle = x.mean(axis=0)
+    sim.set_state(positions=middle + (x - middle) * (1.0, 0.15, 1.0) - (0, 0.05, 0), body="upper")
+    solver, formed = sim._stepper.solver, []
+
+    def form_matrix(projected=False):
+        formed.append(projected)
+        StageSystem.form_matrix(solver, projected)
+
+    monkeypatch.setattr(solver, "form_matrix", form_matrix)
+    report = sim.step()
+    assert any(formed) and not formed[0] and np.isfinite(sim.positions()).all() and report.contact_residual <= 1e-3
