@@ -29,7 +29,7 @@ from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.numbers import Numbers, numbers_differ, scene_numbers
 from taisoft.scene.scene import Material, Scene
 
-KIND, FORMAT = "taisoft checkpoint", 5  # FORMAT grows with every change of what a file holds
+KIND, FORMAT = "taisoft checkpoint", 6  # FORMAT grows with every change of what a file holds
 PARTS = ("settings", "numbers", "start", "marks", "state", "notes")  # of the header, each a table
 FEATURES = "the features that it needs"  # the last mark: of the plan, which follows from parts and numbers
 

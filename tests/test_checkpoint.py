@@ -159,13 +159,8 @@ def test_cubes_go_on_in_another_process(steps, tmp_path):
         pressed = contacts.impulse.any(axis=1)
         assert {"floor", "top"} <= set(contacts.body_b[pressed]) | set(contacts.body_a[pressed])
         told = follow(sim, steps)
-        spoilt = {"inverse_mass": lambda m: 2 * m, "weighed": lambda w: None}
-        assert_every_part_counts(
-            sim, path,
-            {"stepper/contact/rows/r": lambda r: 0 * r, "stepper/contact/last_time": lambda t: 2 * t}
-            | {f"stepper/solver/{name}": change for name, change in spoilt.items()},
-            told[:3],
-        )  # fmt: skip
+        spoilt = {"stepper/contact/rows/r": lambda r: 0 * r, "stepper/contact/last_time": lambda t: 2 * t}
+        assert_every_part_counts(sim, path, spoilt, told[:3])
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     script = Path(__file__).with_name("checkpoint_scenes.py")
     subprocess.run([sys.executable, script, path, str(steps), result], env=environment, check=True)
@@ -257,7 +252,7 @@ def test_newer_files_are_told_from_damaged_ones(saved, tmp_path):
         return np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
 
     text = refusal(changed(saved, tmp_path / "newer.npz", "header", newer))
-    assert "written by taisoft 9.1 in format 99, and taisoft" in text and "reads format 5" in text
+    assert "written by taisoft 9.1 in format 99, and taisoft" in text and "reads format 6" in text
 
 
 def renamed(scene):

@@ -99,10 +99,10 @@ def test_numbers_are_compared_with_those_of_the_start(tmp_path, name):
 
 
 def test_files_of_the_format_before_are_refused(saved, monkeypatch):
-    monkeypatch.setattr(checkpoint, "FORMAT", 4)
+    monkeypatch.setattr(checkpoint, "FORMAT", 5)
     checkpoint.write_checkpoint(saved, {}, scene(1.0), {}, {"x": np.zeros(3)}, {})
     monkeypatch.undo()
-    with pytest.raises(ts.SimulationError, match="in format 4, and taisoft .* reads format 5"):
+    with pytest.raises(ts.SimulationError, match="in format 5, and taisoft .* reads format 6"):
         checkpoint.read_checkpoint(saved)
 
 

@@ -15,6 +15,7 @@ from taisoft.dynamics.newton import FALL, Newton
 from taisoft.dynamics.residual import AGAIN
 from taisoft.dynamics.stage_result import StageResult
 from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.launching import PUBLIC
 
 SOLVES, FORCING = 20, 0.3  # linear solves of one frictional problem, and their tolerance
 SHARE, LAW_SHARE = 0.1, 0.1  # of what the stage has left of |r| and of the laws' residual: what such a problem is solved to,
@@ -38,7 +39,7 @@ class Frictional:
 
 def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) -> Frictional:
     """Solve a linearised stage from (|r|, scale), on one thread in one launch."""
-    if not system.model.serial:
+    if not system.model.serial or PUBLIC:  # Taichi itself takes no more than 64 arguments
         newton = Newton(system, problem, inner=True)
         result = newton.run(r, scale, fresh=True)
         return Frictional(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
@@ -56,16 +57,15 @@ class ContactNewton:
         self.newton = self.linear = self.multipliers = 0
         self.rounding = self.tight = False
 
-    def run(self, fresh: bool) -> StageResult:
-        """From the first iterate on. fresh: the matrix is formed there."""
+    def run(self) -> StageResult:
+        """From the first iterate on, where the matrix has been formed."""
         system, stage = self.system, self.stage
         system.r_scale = R_SCALE
         self.r, self.scale = system.evaluate(new_multipliers=True)
         least = self.r
         while not self._done() and self.newton < stage.max_newton and math.isfinite(self.r):
-            if not fresh:
+            if self.newton > 0:
                 system.form_matrix()
-            fresh = False
             previous = self.r
             inner = self._solve_contacts()
             self.newton += 1
@@ -115,11 +115,11 @@ class ContactNewton:
 
 def solve(system: StageSystem, stage: Stage) -> StageResult:
     """Solve a stage from the present v. x_hat, v_hat, the targets and the contacts are set by the caller."""
-    fresh = system.begin(stage)
+    system.begin(stage)
     if system.n_contacts == 0:
         newton = Newton(system, stage)
-        return newton.run_once() if stage.linearised else newton.run(*system.evaluate(), fresh)
-    return solve_linearised(system, stage) if stage.linearised else ContactNewton(system, stage).run(fresh)
+        return newton.run_once() if stage.linearised else newton.run(*system.evaluate(), fresh=False)
+    return solve_linearised(system, stage) if stage.linearised else ContactNewton(system, stage).run()
 
 
 def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:

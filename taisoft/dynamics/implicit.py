@@ -120,11 +120,10 @@ class ImplicitStepper:
         self._past = 0  # steps whose state is in the history
         self._beta = self._dt = 0.0  # of the last step
         self.contact.forget()
-        self.solver.forget_factors()
 
     def numbers_changed(self) -> None:
         """Gravity or material numbers changed."""
-        self.solver.numbers_changed()
+        self.solver.rounding.measure()
 
     def snapshot(self) -> dict:
         """What the next step rests on beside the world: the history, what the solver keeps, the contacts."""
@@ -181,7 +180,6 @@ class ImplicitStepper:
         if world.motion.released() != released:
             world.motion.set_released(released)
             world.upload_constraints()
-            self.solver.forget_factors()
 
     def back(self) -> None:
         """Back to where the last part began."""
@@ -209,8 +207,6 @@ class ImplicitStepper:
         target = world.next_target(time + dt)
         if world.releases != releases or dt != self._dt:
             self._past = 0
-        if world.releases != releases:
-            self.solver.forget_factors()
         self.contact.begin(time, dt)
         # no scheme looks back through an impact: it would take the jump for an acceleration
         meets = self.scheme.before and self.contact.meets(dt)

@@ -81,7 +81,6 @@ class StageSystem:
         self._room: StageContacts | None = None  # for the contacts of this step
         self._k = NO_CONTACTS  # what the present stage has
         self._same_matrix = False  # as in the last linear solve of this stage
-        self._weighed: tuple[float, float] | None = None  # c and beta of the matrix that the r-factors rest on
         self.norms = np.zeros(5)  # what `form_residual` tells
 
     # --- its life -------------------------------------------------------------------------------------------------
@@ -95,32 +94,14 @@ class StageSystem:
         """Give their memory back."""
         self._contact_arena.release()
 
-    def numbers_changed(self) -> None:
-        """Gravity or material numbers changed."""
-        self.rounding.measure()
-        self.forget_factors()
-
-    def forget_factors(self) -> None:
-        """The r-factors rest on a matrix of other numbers or other free axes."""
-        self._weighed = None
-
     def snapshot(self) -> dict:
-        """What lives between stages: the rounding, the reactions, and the masses that the next stage's r-factors rest on."""
-        masses = self.contact.problem.inverse_mass.to_numpy() if self._weighed else None
-        return self.rounding.snapshot() | {
-            "residual": self.work.residual.to_numpy(), "weighed": self._weighed, "inverse_mass": masses,
-        }  # fmt: skip
+        """What lives between stages: the rounding and the reactions."""
+        return self.rounding.snapshot() | {"residual": self.work.residual.to_numpy()}
 
     def restore(self, kept: dict) -> None:
-        """Back to what `snapshot` told; the contacts have been restored."""
+        """Back to what `snapshot` told."""
         self.rounding.restore(kept)
         upload([(self.work.residual, kept["residual"])])
-        self._weighed = None
-        if kept["weighed"] is not None:
-            self._fit()
-            upload([(self.contact.problem.inverse_mass, kept["inverse_mass"])])
-            c, beta = kept["weighed"]
-            self._weighed = float(c), float(beta)
 
     def _fit(self) -> None:
         """Room for the contacts of this step."""
@@ -128,7 +109,7 @@ class StageSystem:
             arena = FieldArena()
             self._room = build_stage_contacts(arena, self.model, self.contact.found, self.x_start)
             self._contact_arena.release()
-            self._contact_arena, self._weighed = arena, None
+            self._contact_arena = arena
 
     # --- a stage --------------------------------------------------------------------------------------------------
 
@@ -155,24 +136,18 @@ class StageSystem:
         scalars = self.model.state.scalars
         return scalars[START_SLOPE], scalars[END_SLOPE]
 
-    def begin(self, stage: Stage) -> bool:
-        """Take up a stage at its first iterate; whether its matrix has been formed on the way."""
-        m, w, fresh = self.model, self.work, False
+    def begin(self, stage: Stage) -> None:
+        """Take up a stage at its first iterate; with contacts its matrix is formed, on which the r-factors rest."""
         self._stage, self.kind, self._same_matrix = stage, ELASTIC_STAGE, False
         self._k = self._contacts()
-        begin_stage(m, w, stage.beta, stage.prescribed_share)
-        if not self._k.any:
-            self._weighed = None
-            return False
-        if self._weighed != (stage.c, stage.beta) or stage.linearised:
+        begin_stage(self.model, self.work, stage.beta, stage.prescribed_share)
+        if self._k.any:
             self.form_matrix()
-            self._weighed, fresh = (stage.c, stage.beta), True
-        find_factors(self._k.problem)
-        return fresh
+            find_factors(self._k.problem)
 
     def begin_impact(self, stage: Stage) -> StageContacts:
         """Take up the impact before a step; the matrix is formed."""
-        self._stage, self._weighed = stage, None
+        self._stage = stage
         self._k = self._contacts()
         self.form_matrix(projected=True)
         find_factors(self._k.problem)
