@@ -45,9 +45,9 @@ def steps(sim, n: int = 6) -> tuple[np.ndarray, list[ts.StepReport]]:
     return sim.positions(), reports
 
 
-def from_the_host(system, problem, r, scale) -> Frictional:
+def from_the_host(system, problem, r, scale, stiffest) -> Frictional:
     """The loop as it is where loops run on threads."""
-    newton = Newton(system, problem, inner=True)
+    newton = Newton(system, problem, True, stiffest)
     result = newton.run(r, scale, fresh=True)
     return Frictional(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
 

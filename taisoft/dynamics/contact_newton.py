@@ -8,7 +8,18 @@ found as multipliers. Where the matrix is indefinite, a few steps minimise the t
 import math
 from dataclasses import dataclass, replace
 
-from taisoft.dynamics.frictional import INDEFINITE, LINEAR, MULTIPLIERS, NORM, R_SCALE, ROUNDING, SOLVED, VERDICT
+from taisoft.dynamics.frictional import (
+    INDEFINITE,
+    LINEAR,
+    MULTIPLIERS,
+    NORM,
+    R_SCALE,
+    ROUNDING,
+    SOFTEST,
+    SOLVED,
+    STIFFEST,
+    VERDICT,
+)
 from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
 from taisoft.dynamics.line_search import search
 from taisoft.dynamics.newton import FALL, Newton
@@ -21,6 +32,7 @@ SOLVES, FORCING = 20, 0.3  # linear solves of one frictional problem, and their 
 SHARE, LAW_SHARE = 0.1, 0.1  # of what the stage has left of |r| and of the laws' residual: what such a problem is solved to,
 LEAST_SHARE = 0.3  # or this share of the tolerances
 LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # linear solves of a linearised stage, and their tolerance
+STALLED, PATIENCE = 0.5, 10  # share of |r| that a step leaves which stalls; so many times as many solves after that
 FALLBACK = 6  # steps on the true stage
 HIDING = 4.0  # times the floor of |r|: where the motion of a whole body may be what is left of it
 
@@ -37,13 +49,15 @@ class Frictional:
     r: float
 
 
-def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) -> Frictional:
+def solve_linear(
+    system: StageSystem, problem: Stage, r: float, scale: float, stiffest: float = STIFFEST
+) -> Frictional:
     """Solve a linearised stage from (|r|, scale), on one thread in one launch."""
     if not system.model.serial or PUBLIC:  # Taichi itself takes no more than 64 arguments
-        newton = Newton(system, problem, inner=True)
+        newton = Newton(system, problem, True, stiffest)
         result = newton.run(r, scale, fresh=True)
         return Frictional(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
-    loop = system.solve_frictional(problem, r, system.rounding.of_stage(problem.c, problem.beta))
+    loop = system.solve_frictional(problem, r, system.rounding.of_stage(problem.c, problem.beta), stiffest)
     counts = (int(loop[place]) for place in (SOLVES_DONE, LINEAR, MULTIPLIERS))
     return Frictional(*counts, loop[VERDICT] == INDEFINITE, loop[VERDICT] == SOLVED, float(loop[NORM]))
 
@@ -55,7 +69,7 @@ class ContactNewton:
         self.system, self.stage = system, stage
         self.floor = system.rounding.of_stage(stage.c, stage.beta)
         self.newton = self.linear = self.multipliers = 0
-        self.rounding = self.tight = False
+        self.rounding = self.tight = self.stalls = False
 
     def run(self) -> StageResult:
         """From the first iterate on, where the matrix has been formed."""
@@ -81,6 +95,8 @@ class ContactNewton:
                 if not moved:  # also where it is not a number
                     system.evaluate(AGAIN, 0.0)
                     self.r, self.scale, moved = search(system, FALL * least)
+            # multipliers and friction disks go round and round: softer and longer next time
+            self.stalls = self.stalls or self.r > STALLED * least
             least = min(least, self.r)
             self.rounding = self.r <= ROUNDING * self.floor and self.r > 0.5 * previous and self.tight
             if not moved:
@@ -104,10 +120,11 @@ class ContactNewton:
         # where the rounding of stiff stress hides the motion of a whole body in |r|, only tight solves get that motion right
         self.tight = self.r <= HIDING * self.floor
         problem = replace(
-            stage, tolerance=enough / self.scale if self.scale > 0.0 else 0.0, contact_tolerance=law, max_newton=SOLVES,
+            stage, tolerance=enough / self.scale if self.scale > 0.0 else 0.0, contact_tolerance=law,
+            max_newton=PATIENCE * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
         )  # fmt: skip
-        inner = solve_linear(system, problem, self.r, self.scale)
+        inner = solve_linear(system, problem, self.r, self.scale, SOFTEST if self.stalls else STIFFEST)
         self.linear, self.multipliers = self.linear + inner.linear, self.multipliers + inner.multipliers
         system.r_scale = R_SCALE
         return inner

@@ -29,13 +29,13 @@ RUNNING, SOLVED, GIVEN_UP, INDEFINITE = range(4)
 
 
 @ti.func
-def next_scale(scale, law, before, taken):
+def next_scale(scale, law, before, taken, stiffest):
     """R over the r-factors for new multipliers."""
     new = scale
     if law > RISEN_LAW * before and scale > STEADY:  # friction disks and normal impulses drive each other up
         new = 0.5 * scale
     elif taken <= 1:
-        new = ti.min(STIFFEST, 2.0 * scale)
+        new = ti.min(stiffest, 2.0 * scale)
     elif taken >= MANY:
         new = ti.max(SOFTEST, 0.5 * scale)
     return new
@@ -73,12 +73,14 @@ def _advance(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.templat
 def solve_frictional(
     m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), pcg: ti.template(), same_matrix: ti.i32,
     beta: ti.f64, dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64, enough: ti.f64, lawful: ti.f64,
-    floor: ti.f64, tolerance: ti.f64, solves: ti.i32, longest: ti.i32, budget: ti.i32, loop: ti.types.ndarray(),
+    floor: ti.f64, tolerance: ti.f64, stiffest: ti.f64, solves: ti.i32, longest: ti.i32,
+    budget: ti.i32, loop: ti.types.ndarray(),
 ):  # fmt: skip
     """Go on from where `loop` stands.
 
     enough, floor: |r| [N s] that ends the loop, and what is rounding; lawful: the laws' residual that ends it, too.
-    tolerance: of linear solves; solves: at most so many; longest: iterations of one at most. same_matrix: see `pcg.solve`.
+    tolerance: of linear solves; stiffest: the largest R over the r-factors; solves: at most so many; longest: iterations of one
+    at most. same_matrix: see `pcg.solve`.
     """
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=True)
@@ -95,7 +97,7 @@ def solve_frictional(
                 elif loop[MULTIPLIERS] >= MAX_MULTIPLIERS:
                     verdict = GIVEN_UP
                 else:
-                    scale = next_scale(scale, law, law_before, taken)
+                    scale = next_scale(scale, law, law_before, taken, stiffest)
                     law_before = law
                     for c in range(p.count[0]):
                         set_multiplier(s, k, c, beta, dt, standoff, fast, slow, fastest, False)

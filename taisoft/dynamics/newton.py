@@ -45,8 +45,8 @@ FALL = 0.9  # with contacts, share of the least |r| so far below which a step ne
 class Newton:
     """Newton steps of a stage under multipliers that are renewed; where that is linear, of its contact problem alone."""
 
-    def __init__(self, system: StageSystem, stage: Stage, inner: bool = False):
-        self.system, self.stage, self.inner = system, stage, inner
+    def __init__(self, system: StageSystem, stage: Stage, inner: bool = False, stiffest: float = STIFFEST):
+        self.system, self.stage, self.inner, self.stiffest = system, stage, inner, stiffest
         self.floor = system.rounding.of_stage(stage.c, stage.beta)
         self.newton = self.linear = self.multipliers = 0
         self.rounding = self.negative = False  # nothing but rounding is left of |r|; negative curvature was met
@@ -104,7 +104,7 @@ class Newton:
         if law > RISEN_LAW * self.law and system.r_scale > STEADY:  # friction disks and normal impulses drive each other up
             system.r_scale *= 0.5
         elif self.taken <= 1:
-            system.r_scale = min(STIFFEST, 2.0 * system.r_scale)
+            system.r_scale = min(self.stiffest, 2.0 * system.r_scale)
         elif self.taken >= MANY:
             system.r_scale = max(SOFTEST, 0.5 * system.r_scale)
         self.law, self.multipliers, self.rounding = law, self.multipliers + 1, False

@@ -185,7 +185,7 @@ class StageSystem:
         advance(self.model, self.work, self.matrix, self._k, self.pcg, stage.beta, self.r_scale, self.norms)
         return self._sizes(stage.c, stage.beta)
 
-    def solve_frictional(self, problem: Stage, r: float, floor: float) -> np.ndarray:
+    def solve_frictional(self, problem: Stage, r: float, floor: float, stiffest: float) -> np.ndarray:
         """The loop of a linearised stage from |r| on, in launches that Ctrl-C can come between: see `frictional`."""
         m, A, loop = self.model, self.matrix, np.zeros(14)
         loop[[frictional.NORM, frictional.SCALE, frictional.LAW, frictional.GOAL]] = (
@@ -195,8 +195,8 @@ class StageSystem:
         while loop[frictional.VERDICT] == frictional.RUNNING:
             frictional.solve_frictional(
                 m, self.work, A, self._k, self.pcg, int(self._same_matrix), problem.beta, problem.dt, *self.contact.goal,
-                problem.tolerance * self.scale, problem.contact_tolerance, floor, problem.linear_tolerance, problem.max_newton,
-                max(1000, 30 * m.n_nodes), budget, loop,
+                problem.tolerance * self.scale, problem.contact_tolerance, floor, problem.linear_tolerance, stiffest,
+                problem.max_newton, max(1000, 30 * m.n_nodes), budget, loop,
             )  # fmt: skip
             self._same_matrix = True
         self.norms[0], self.norms[4] = loop[frictional.NORM] ** 2, loop[frictional.HELD] ** 2
