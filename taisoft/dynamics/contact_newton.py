@@ -28,11 +28,11 @@ from taisoft.dynamics.stage_result import StageResult
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.launching import PUBLIC
 
-SOLVES, FORCING = 20, 0.3  # linear solves of one frictional problem, and their tolerance
+SOLVES, FORCING = 60, 0.3  # linear solves of one frictional problem, and their tolerance
 SHARE, LAW_SHARE = 0.1, 0.1  # of what the stage has left of |r| and of the laws' residual: what such a problem is solved to,
 LEAST_SHARE = 0.3  # or this share of the tolerances
 LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # linear solves of a linearised stage, and their tolerance
-STALLED, PATIENCE = 0.5, 10  # share of |r| that a step leaves which stalls; so many times as many solves after that
+STALLED, PATIENCE = 0.9, 10  # share of |r| that a step leaves which stalls; so many times as many solves after that
 FALLBACK = 6  # steps on the true stage
 HIDING = 4.0  # times the floor of |r|: where the motion of a whole body may be what is left of it
 
@@ -76,7 +76,7 @@ class ContactNewton:
         system, stage = self.system, self.stage
         system.r_scale = R_SCALE
         self.r, self.scale = system.evaluate(new_multipliers=True)
-        least = self.r
+        least, stalled = self.r, 0
         while not self._done() and self.newton < stage.max_newton and math.isfinite(self.r):
             if self.newton > 0:
                 system.form_matrix()
@@ -96,7 +96,8 @@ class ContactNewton:
                     system.evaluate(AGAIN, 0.0)
                     self.r, self.scale, moved = search(system, FALL * least)
             # multipliers and friction disks go round and round: softer and longer next time
-            self.stalls = self.stalls or self.r > STALLED * least
+            stalled += self.r > STALLED * least
+            self.stalls = stalled >= 2
             least = min(least, self.r)
             self.rounding = self.r <= ROUNDING * self.floor and self.r > 0.5 * previous and self.tight
             if not moved:
