@@ -28,7 +28,7 @@ from .hard_cases.shapes import SNH, G, box
 from .reference_cases.record import face
 
 # of a reference: share of the step, and what contacts are solved to even in the step in which sliding ends
-FINER = {"dt": 1 / 8, "contact_tolerance": 1e-5}
+FINER = {"dt": 1 / 8, "contact_tolerance": 1e-5, "newton_tolerance": 1e-6}
 ROUNDING = {"f32": 1e-5, "f64": 1e-9}  # what errors may differ by for no better reason than another order of sums
 ANGLE, FRICTION = np.arctan(0.5), 0.3  # of the slope
 METHODS = ("gauss_seidel", "coloured_gauss_seidel", "jacobi", "hybrid", "augmented_lagrangian")
