@@ -88,12 +88,13 @@ def table(rows: list[dict]) -> str:
 
 def cells(name: str, rows: list[dict]) -> tuple[str, ...]:
     """Of one scene. Newton and CG: of the first try, whole; launches and time: of all tries."""
-    newton, errors = np.array([row["newton"] for row in rows]), np.array([row["error"] for row in rows])
+    newton, errors = np.array([row["newton"] for row in rows]), np.array([row["error"] for row in rows if "error" in row])
     return (
         name, str(len(rows)), f"{np.median(newton):.0f}", f"{np.percentile(newton, 90):.0f}", str(newton.max()),
         f"{np.median([row['linear'] for row in rows]):.0f}", f"{np.median([row['launches'] for row in rows]):.0f}",
         str(sum(row["halves"] > 1 for row in rows)), str(sum(not row["converged"] for row in rows)),
-        f"{1e3 * np.median([row['seconds'] for row in rows]):.1f}", f"{np.median(errors):.1e}", f"{errors.max():.1e}",
+        f"{1e3 * np.median([row['seconds'] for row in rows]):.1f}",
+        *([f"{np.median(errors):.1e}", f"{errors.max():.1e}"] if len(errors) else ["-", "-"]),
     )  # fmt: skip
 
 
