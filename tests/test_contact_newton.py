@@ -52,6 +52,21 @@ def from_the_host(system, problem, r, scale, stiffest) -> Frictional:
     return Frictional(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
 
 
+def test_steps_that_count_keep_the_laws_of_light_bodies_too():
+    """A light cube slides on a stiff block, beside whose rounding all its impulses are small. First, before one in f64 opens."""
+    scene = ts.Scene()
+    block = scene.add_body(
+        ts.box_mesh((2, 2, 2), (1.0, 0.5, 1.0)), ts.Material(young=1e8, density=1000.0, friction=0.5), name="block"
+    )
+    block.fix(lambda X: X[:, 1] < 0.0)
+    light = ts.Material(young=1e4, poisson=0.3, density=100.0, friction=0.5)
+    scene.add_body(ts.box_mesh((2, 2, 2), (0.1, 0.1, 0.1)), light, name="light", position=(0, 0.3005, 0), velocity=(0.5, 0, 0))
+    with ts.Simulator(scene, dt=DT, precision="f32") as sim:
+        reports = [sim.step() for _ in range(15)]
+    assert all(report.contact_residual <= 1e-4 for report in reports if report.converged)
+    assert any(report.n_contacts for report in reports)
+
+
 def test_both_loops_find_the_same_step(sim, monkeypatch):
     x, reports = steps(sim)
     whole = [report.newton_iterations for report in reports if report.parts == 1]
@@ -106,4 +121,5 @@ def test_a_linearised_step_of_an_indefinite_matrix(sim, monkeypatch):
 
     monkeypatch.setattr(solver, "form_matrix", form_matrix)
     report = sim.step()
-    assert any(formed) and not formed[0] and np.isfinite(sim.positions()).all() and report.contact_residual <= 1e-3
+    assert any(formed) and not formed[0] and np.isfinite(sim.positions()).all()
+    assert report.contact_residual <= 1e-9 or not report.converged

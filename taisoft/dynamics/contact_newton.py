@@ -85,10 +85,13 @@ class ContactNewton:
             self.newton += 1
             if inner.negative:
                 r, scale = system.leave_linear(taken=False)
-                steps = Newton(system, replace(stage, max_newton=FALLBACK, contact_tolerance=math.inf))
+                only_laws = r <= stage.tolerance * scale  # |r| is fine already
+                laws = stage.contact_tolerance if only_laws else math.inf
+                steps = Newton(system, replace(stage, max_newton=FALLBACK, contact_tolerance=laws))
                 steps.run(r, scale, fresh=True)
                 self.newton, self.linear = self.newton + steps.newton - 1, self.linear + steps.linear
-                self.r, self.scale, moved = steps.r, steps.scale, steps.newton > 0
+                system.r_scale = R_SCALE
+                (self.r, self.scale), moved = system.evaluate(None, new_multipliers=True), steps.newton > 0
             else:
                 self.r, self.scale = system.leave_linear()
                 moved = self.r < FALL * least
@@ -110,7 +113,7 @@ class ContactNewton:
 
     def _done(self) -> bool:
         enough = self.r <= self.stage.tolerance * self.scale or self.rounding
-        return enough and self.system.laws_hold(self.stage.contact_tolerance, self.floor)
+        return enough and self.system.contact_residual <= self.stage.contact_tolerance
 
     def _solve_contacts(self) -> "Frictional":
         """The contact problem on the matrix at hand, to a share of what the stage has left."""

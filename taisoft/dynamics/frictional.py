@@ -7,7 +7,7 @@ loop stands is kept in `loop`, and the next launch goes on.
 
 import taichi as ti
 
-from taisoft.contact.problem import CHANGED, RESIDUAL
+from taisoft.contact.problem import RESIDUAL
 from taisoft.dynamics.contact_terms import press_contact, set_multiplier, sum_residual
 from taisoft.dynamics.linearised import begin_contact, begin_node, go_along, pressed_residual, step_length
 from taisoft.linear import pcg_serial
@@ -92,7 +92,7 @@ def solve_frictional(
             if loop[WITHIN] == 0.0 and (r <= ti.max(enough, goal) or rounding == 1.0):
                 law = p.state[RESIDUAL]
                 low = r <= ti.max(enough, floor) or rounding == 1.0
-                if low and (law <= lawful or p.state[CHANGED] <= floor * floor):
+                if low and law <= lawful:
                     verdict = SOLVED
                 elif loop[MULTIPLIERS] >= MAX_MULTIPLIERS:
                     verdict = GIVEN_UP

@@ -83,7 +83,7 @@ class Newton:
         """Whether the multipliers have done what they can."""
         enough = self.stage.tolerance * self.scale
         # in an impact whose laws hold only the momenta are left to balance
-        lawful = self.system.kind == IMPACT and self.system.laws_hold(self.stage.contact_tolerance, self.floor)
+        lawful = self.system.kind == IMPACT and self.system.contact_residual <= self.stage.contact_tolerance
         return self.r <= (max(enough, self.goal) if self.touching and not lawful else enough) or self.rounding
 
     def _done(self) -> bool:
@@ -93,7 +93,7 @@ class Newton:
             # statics without any load have nothing to compare the rounding with
             if not (self.rounding and (stage.c > 0.0 or self.scale <= self.floor)):
                 return False
-        return self.system.laws_hold(stage.contact_tolerance, self.floor)
+        return self.system.contact_residual <= stage.contact_tolerance
 
     def _multiply(self) -> bool:
         """Take the impulses as new multipliers; False where that has been done too often."""
@@ -171,7 +171,8 @@ class Newton:
         self.r, self.scale = system.evaluate()
         solved = True
         if self.r > self.stage.tolerance * self.scale:
-            tolerance = min(self._linear_tolerance(), self.stage.tolerance)  # nobody corrects a single solve
+            # no later step corrects a single solve
+            tolerance = self.stage.linear_tolerance or min(self._linear_tolerance(), self.stage.tolerance)
             for projected in (False, True):  # of an indefinite matrix there is no least value to go to
                 system.form_matrix(projected)
                 answer = system.direction(tolerance)

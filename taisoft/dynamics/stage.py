@@ -106,5 +106,7 @@ def norm2(a):
 @ti.func
 def place_node(m: ti.template(), w: ti.template(), y: ti.template(), i, step_length, beta):
     """Node i at base + step_length beta y, v accordingly; y is 0 on constrained axes."""
-    m.state.x[i] = w.base[i] + step_length * beta * ti.cast(y[i], ti.f64)
+    m.state.x[i] = w.base[i]
+    if step_length != 0.0:  # back to the base also where y is not a number
+        m.state.x[i] += step_length * beta * ti.cast(y[i], ti.f64)
     m.state.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)

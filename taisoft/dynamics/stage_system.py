@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import taichi as ti
 
-from taisoft.contact.problem import CHANGED, RESIDUAL, find_factors
+from taisoft.contact.problem import RESIDUAL, find_factors
 from taisoft.dynamics import frictional
 from taisoft.dynamics.contact_terms import NO_CONTACTS, StageContacts, build_stage_contacts, keep_diagonal, press
 from taisoft.dynamics.linearised import advance, keep_linear, leave_linear
@@ -123,13 +123,6 @@ class StageSystem:
         """Of the contact laws, where the residual was last formed."""
         return float(self._k.problem.state[RESIDUAL]) if self._k.any else 0.0
 
-    def laws_hold(self, tolerance: float, floor: float) -> bool:
-        """Whether the residual of the contact laws is within a tolerance, or its impulses within a floor [N s]."""
-        if not self._k.any:
-            return True
-        state = self._k.problem.state
-        return bool(state[RESIDUAL] <= tolerance or state[CHANGED] <= floor**2)
-
     @property
     def slopes(self) -> tuple[float, float]:
         """(r.y where the step began, r.y where it has led): negative is downhill."""
@@ -138,7 +131,7 @@ class StageSystem:
 
     def begin(self, stage: Stage) -> None:
         """Take up a stage at its first iterate; with contacts its matrix is formed, on which the r-factors rest."""
-        self._stage, self.kind, self._same_matrix = stage, ELASTIC_STAGE, False
+        self._stage, self.kind, self._same_matrix, self.r_scale = stage, ELASTIC_STAGE, False, frictional.R_SCALE
         self._k = self._contacts()
         begin_stage(self.model, self.work, stage.beta, stage.prescribed_share)
         if self._k.any:
@@ -147,7 +140,7 @@ class StageSystem:
 
     def begin_impact(self, stage: Stage) -> StageContacts:
         """Take up the impact before a step; the matrix is formed."""
-        self._stage = stage
+        self._stage, self.r_scale = stage, frictional.R_SCALE
         self._k = self._contacts()
         self.form_matrix(projected=True)
         find_factors(self._k.problem)
@@ -198,8 +191,8 @@ class StageSystem:
                 problem.tolerance * self.scale, problem.contact_tolerance, floor, problem.linear_tolerance, stiffest,
                 problem.max_newton, max(1000, 30 * m.n_nodes), budget, loop,
             )  # fmt: skip
-            self._same_matrix = True
-        self.norms[0], self.norms[4] = loop[frictional.NORM] ** 2, loop[frictional.HELD] ** 2
+            # a launch may have spent all on multipliers
+            self._same_matrix = self._same_matrix or bool(loop[frictional.SOLVES] or loop[frictional.WITHIN])
         return loop
 
     def leave_linear(self, taken: bool = True) -> tuple[float, float]:
