@@ -1,15 +1,11 @@
 """Captured steps with contacts, solved again by this version and an older one: Newton, CG, launches, time, error."""
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-import taisoft
 from taisoft.errors import SimulationError
 from taisoft.output.files import make_folder
 from taisoft.output.tables import markdown
@@ -17,9 +13,9 @@ from taisoft.output.tables import markdown
 from . import contact_states
 from .document import Document
 from .elasticity_table import Limit, limit_table
+from .versions import HERE, Version
 
 CHILD = Path(__file__).with_name("contact_states.py")
-HERE = Path(taisoft.__file__).resolve().parents[1]
 PRECISIONS, TOLERANCE, EXACT = ("f32", "f64"), 1e-4, 1e-8
 # what this version is held to: median and 90th percentile of Newton iterations, share of states that need halving
 MEDIAN, HIGH, HALVED = 5.0, 12.0, 0.03
@@ -30,18 +26,9 @@ COLUMNS = (
 
 
 def run(folder: Path, *task: str | Path) -> list[dict]:
-    """What a child of a version found. Raises SimulationError where it failed."""
-    paths = {"PYTHONPATH": str(folder)}
-    if folder != HERE:  # with a cache of kernels of its own
-        paths["XDG_CACHE_HOME"] = str(make_folder(Path(folder) / ".cache"))
-    done = subprocess.run(
-        [sys.executable, str(CHILD), *map(str, task)], env=os.environ | paths, stdin=subprocess.DEVNULL, capture_output=True,
-        text=True, check=False,
-    )  # fmt: skip
-    if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
-        raise SimulationError(f"{folder}: {task[0]} {task[1]} ended with status {done.returncode}: {last}")
-    return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    """What a child of a version found, which keeps a cache of kernels of its own. Raises SimulationError where it failed."""
+    version = Version(folder, None if folder == HERE else make_folder(folder / ".cache"))
+    return [json.loads(line) for line in version.run(CHILD, *task) if line.startswith("{")]
 
 
 def capture(folder: Path, baseline: Path | None, only: list[str] | None, quick: bool) -> Iterator[str]:
@@ -52,8 +39,8 @@ def capture(folder: Path, baseline: Path | None, only: list[str] | None, quick: 
             yield f"{name}: left out, its mesh is not here"
             continue
         (folder / f"{name}.exact").unlink(missing_ok=True)
-        told = run(baseline or HERE, "capture", name, folder / f"{name}.pkl", *(["quick"] if quick else []))[-1]
-        yield f"{name}: {told['states']} states; {told['newton']} Newton iterations in its steps"
+        found = run(baseline or HERE, "capture", name, folder / f"{name}.pkl", *(["quick"] if quick else []))[-1]
+        yield f"{name}: {found['states']} states; {found['newton']} Newton iterations in its steps"
 
 
 def replay(folder: Path, baseline: Path | None, only: list[str] | None, document: Document) -> tuple[dict, list[Limit]]:

@@ -16,9 +16,7 @@ takes about eight minutes then. Exit status: 0, or 1 where a limit is not met or
 
 import argparse
 import json
-import os
 import resource
-import subprocess
 import sys
 import tempfile
 import time
@@ -26,13 +24,12 @@ from pathlib import Path
 
 import numpy as np
 
-import taisoft
-from taisoft.errors import SimulationError
 from taisoft.timing import load_average
 
 from .document import Document, check_out, header
 from .elasticity_table import limit_table
 from .startup_table import OTHER, SLOWER, count_table, find_limits, settings_table, speed_table, table
+from .versions import HERE, Version
 
 CHILD = Path(__file__).with_name("startup_child.py")
 SIZES = {"beam": (3, 4, 5, 6), "cube": (4, 5, 6, 7)}  # cells, and those of another size in each round
@@ -43,33 +40,15 @@ TASKS = {
     "statics": ((3,), (3,)), "identify": ((3,), (3,)), "settings": ((4,), (4,)),
     "surfaces": ((6, 7, 21, 22), (6, 7, 21, 22)), "keep": ((22, 4), (6, 2)),
 }  # fmt: skip
-HERE = Path(taisoft.__file__).resolve().parents[1]
 
 
-class Version:
-    """A version of taisoft, run in processes of its own with a cache of kernels of its own."""
-
-    def __init__(self, folder: Path, cache: Path):
-        self.folder, self.cache = folder, cache
-
-    def run(self, *task: str | int) -> tuple[dict, dict]:
-        """What a child found, and wall and CPU seconds of its process. Raises SimulationError where it failed."""
-        paths = {"PYTHONPATH": str(self.folder), "XDG_CACHE_HOME": str(self.cache)}
-        used, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        done = subprocess.run(
-            [sys.executable, str(CHILD), *map(str, task)], env=os.environ | paths, stdin=subprocess.DEVNULL,
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        wall, now = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
-        if done.returncode:
-            last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
-            raise SimulationError(f"{self.folder}: task {' '.join(map(str, task))} ended with status {done.returncode}: {last}")
-        cpu = now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime
-        return json.loads(done.stdout.splitlines()[-1]), {"wall": wall, "cpu": cpu}
-
-    def files(self) -> set[Path]:
-        """What lies in the cache."""
-        return {path for path in self.cache.rglob("*.tic*") if path.is_file()}
+def ask(version: Version, *task: str | int) -> tuple[dict, dict]:
+    """What a child found, and wall and CPU seconds of its process. Raises SimulationError where it failed."""
+    used, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    lines = version.run(CHILD, *task)
+    wall, now = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime
+    return json.loads(lines[-1]), {"wall": wall, "cpu": cpu}
 
 
 def measure(versions: list[Version], quick: bool) -> list[dict]:
@@ -81,7 +60,7 @@ def measure(versions: list[Version], quick: bool) -> list[dict]:
     for what, task in TASKS.items():
         tell(what)
         for own, version in zip(found, versions):
-            own[what] = version.run(what, *task[quick])[0]
+            own[what] = ask(version, what, *task[quick])[0]
     for own, speed in zip(found, measure_speed(versions, quick)):
         own["speed"] = speed
     return found
@@ -94,20 +73,20 @@ def measure_waiting(versions: list[Version], name: str, quick: bool) -> list[dic
     """
     cells, *others = SIZES[name]
     tell(f"{name}, cold")
-    found = [{"cold": version.run("first", name, cells)[1], "warm": [], OTHER: [], "new files": []} for version in versions]
+    found = [{"cold": ask(version, "first", name, cells)[1], "warm": [], OTHER: [], "new files": []} for version in versions]
     for other in others[:1] if quick else others:
         tell(f"{name}, warm, then {other} cells")
         for own, version in zip(found, versions):
-            own["warm"].append(version.run("first", name, cells)[1])
+            own["warm"].append(ask(version, "first", name, cells)[1])
         for own, version in zip(found, versions):
             before = version.files()
-            own[OTHER].append(version.run("first", name, other)[1])
+            own[OTHER].append(ask(version, "first", name, other)[1])
             own["new files"].append(len(version.files() - before))
     tell(f"{name}, one process")
     for own, version in zip(found, versions):
         own |= {what: median(own[what]) for what in ("warm", OTHER)}
-        own["one process"] = version.run("again", name, cells, others[0])[0]
-        own["memory"] = version.run("grow", name, cells, 2 if quick else TIMES)[0]
+        own["one process"] = ask(version, "again", name, cells, others[0])[0]
+        own["memory"] = ask(version, "grow", name, cells, 2 if quick else TIMES)[0]
     return found
 
 
@@ -117,7 +96,7 @@ def measure_speed(versions: list[Version], quick: bool) -> list[dict[str, list[f
     for k in range(1 if quick else SPEED_ROUNDS):
         tell(f"speed, round {k + 1}")
         for version, times in zip(versions, found):
-            for what, seconds in version.run("speed", 2 if quick else SPEED_CELLS, *SPEED_SHEETS)[0].items():
+            for what, seconds in ask(version, "speed", 2 if quick else SPEED_CELLS, *SPEED_SHEETS)[0].items():
                 times[what].append(seconds)
     return found
 

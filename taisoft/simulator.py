@@ -129,7 +129,7 @@ class Simulator(Resuming):
 
         Raises SimulationError as `step` does, and unless n is an integer of at least 1.
         """
-        world, start, n = self._open_world(), self.step_count, check_count("n", n)
+        world, start, n, unbalanced = self._open_world(), self.step_count, check_count("n", n), (0.0, "")
         if self.pulled is not None:
             most = batch(self._dt) if self.settings.explicit else 1
             n = min(n, most)
@@ -149,7 +149,7 @@ class Simulator(Resuming):
             report = self._report()
             report.newton_iterations, report.linear_iterations = result.newton_iterations, result.linear_iterations
             report.residual, report.converged, report.parts = result.residual, result.converged, self._stepper.parts
-            worst, name = self._stepper.unbalanced
+            worst, name = unbalanced = result.unbalanced
             if name:
                 report.residual, report.converged = max(report.residual, worst), False
         if self._contact is not None:
@@ -162,7 +162,7 @@ class Simulator(Resuming):
         report.steps = self.step_count - start
         if self._softens:
             self._tell_softened()
-        report.problems = [f"step {world.step_count}: {what}" for what in self._problems(report)]
+        report.problems = [f"step {world.step_count}: {what}" for what in self._problems(report, unbalanced)]
         return report
 
     def _failure(self, error: SimulationError) -> SimulationError:
@@ -189,16 +189,16 @@ class Simulator(Resuming):
             UserWarning, stacklevel=3,
         )  # fmt: skip
 
-    def _problems(self, report: StepReport) -> list[str]:
-        """What was not as it should be, in sentences."""
+    def _problems(self, report: StepReport, unbalanced: tuple[float, str]) -> list[str]:
+        """What was not as it should be, in sentences. unbalanced: see `StageResult`."""
         found = []
         if not report.converged and not self.settings.explicit:
             found.append(
                 f"Newton stopped after {report.newton_iterations} iterations at a relative residual of {report.residual:.2e}"
                 + (f", that of the contacts {report.contact_residual:.2e}" if report.n_contacts else "")
             )
-            if self._stepper.unbalanced[1]:
-                worst, name = self._stepper.unbalanced
+            if unbalanced[1]:
+                worst, name = unbalanced
                 found.append(f"forces on {name} are unbalanced by {worst:.2g} of their size, beside larger ones on others")
         elif not report.converged:
             found.append(f"the contact solver stopped at a residual of {report.contact_residual:.2e}")

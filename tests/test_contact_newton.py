@@ -1,6 +1,7 @@
 """The contact problem of implicit steps, on a cube that lands aslant on the ground and on another cube, in f64:
 
-* the loop in one launch and the one that the host drives find the same step; cut into many launches it is the same bit by bit;
+* the loop in one launch and the one that the host drives find the same step, as do all loops on threads; cut into many launches
+  it is the same bit by bit;
 * a step takes few Newton iterations, also where the matrix is indefinite; impulses keep the laws;
 * a linearised step of an indefinite matrix goes on with a projected one.
 """
@@ -10,6 +11,7 @@ import pytest
 from rotations import rotation
 
 import taisoft as ts
+from taisoft import model
 from taisoft.dynamics import contact_newton, scheme_of
 from taisoft.dynamics.contact_newton import Frictional
 from taisoft.dynamics.newton import Newton
@@ -19,8 +21,7 @@ from taisoft.linear import pcg
 DT = 0.01  # [s]
 
 
-@pytest.fixture(scope="module")
-def shared_sim():
+def cubes() -> ts.Scene:
     scene = ts.Scene(gravity=(1.0, -9.81, 0.0))
     rubber = ts.Material(young=2e5, poisson=0.4, density=1000.0, friction=0.5)
     mesh = ts.box_mesh((3, 3, 3), (0.1, 0.1, 0.1))
@@ -28,7 +29,16 @@ def shared_sim():
     scene.add_body(mesh, rubber, name="lower", position=(0, 0.0502, 0))
     scene.add_body(turned, rubber, name="upper", position=(0.02, 0.185, 0.01), velocity=(0.3, -1.0, 0.0))
     scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground", friction=0.5)
-    with ts.Simulator(scene, dt=DT, precision="f64", newton_tolerance=1e-10, contact_tolerance=1e-9) as sim:
+    return scene
+
+
+def simulator() -> ts.Simulator:
+    return ts.Simulator(cubes(), dt=DT, precision="f64", newton_tolerance=1e-10, contact_tolerance=1e-9)
+
+
+@pytest.fixture(scope="module")
+def shared_sim():
+    with simulator() as sim:
         yield sim
 
 
@@ -47,7 +57,7 @@ def steps(sim, n: int = 6) -> tuple[np.ndarray, list[ts.StepReport]]:
 
 def from_the_host(system, problem, r, scale, stiffest) -> Frictional:
     """The loop as it is where loops run on threads."""
-    newton = Newton(system, problem, True, stiffest)
+    newton = Newton(system, problem, stiffest)
     result = newton.run(r, scale, fresh=True)
     return Frictional(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
 
@@ -75,6 +85,16 @@ def test_both_loops_find_the_same_step(sim, monkeypatch):
     monkeypatch.setattr(contact_newton, "solve_linear", from_the_host)
     host, others = steps(sim)
     assert all(report.converged for report in others) and np.abs(host - x).max() < 1e-8  # [m]
+
+
+def test_on_threads_it_is_the_same_step(sim, monkeypatch):
+    x, _ = steps(sim)
+    monkeypatch.setattr(model, "PARALLEL_FROM", 0)
+    monkeypatch.setattr(model, "PARALLEL_THREADS", 1)
+    with simulator() as parallel:
+        assert not parallel._world.model.serial
+        other, reports = steps(parallel)
+    assert all(report.converged for report in reports) and np.abs(other - x).max() < 1e-8  # [m]
 
 
 def test_many_launches_are_one(sim, monkeypatch):

@@ -2,7 +2,8 @@
 
 * a step that converges is one substep; one that does not is tried in 2 and 4, then as it was, and not again before one converges;
 * substeps are as short as what closes asks for, cover the step without a gap, and grow again after an event;
-* one that ends deep, or is fast where nobody had looked, is undone and halved; after UNDONE of them the step goes on;
+* one that met contacts which were not known is taken again with them;
+* one that ends deep, is fast where nobody had looked, or whose contacts do not settle, is undone and halved; after UNDONE of them the step goes on;
 * what closes too fast for the shortest is refused, and an error leaves the state before the step.
 """
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from taisoft.dynamics.stage_result import StageResult
-from taisoft.dynamics.substepping import MAX_PARTS, UNDONE, Substepping
+from taisoft.dynamics.substepping import MAX_PARTS, SEARCHES, UNDONE, Substepping
 from taisoft.errors import SimulationError
 
 DT = 0.1  # [s]
@@ -31,7 +32,7 @@ class Plain:
         self.converges = lambda time, dt: True
         self.closing = lambda time, dt: 0.0
         self.depth = lambda time, dt: 0.0
-        self.astray = lambda time, dt: False
+        self.astray = self.new_on_way = lambda time, dt: False
 
     # the stepper
 
@@ -86,7 +87,7 @@ class Plain:
         return False
 
     def search_way(self, time, dt):
-        return False
+        return self.new_on_way(time, dt)
 
     def ratio_along_way(self):
         return 10.0
@@ -184,6 +185,22 @@ def test_one_that_was_faster_than_seen_is_halved(plain):
     plain.astray = lambda time, dt: dt > DT / 4
     Substepping(plain).step(0.0, DT)
     assert covers(plain) and max(dt for _, dt in plain.kept) <= DT / 4 * 1.001
+
+
+def test_one_that_met_what_was_not_known_is_taken_again(plain):
+    plain.astray = lambda time, dt: len(plain.taken) <= 2
+    plain.new_on_way = lambda time, dt: True
+    wrapped = Substepping(plain)
+    result = wrapped.step(0.0, DT)
+    assert plain.taken == [(0.0, DT)] * 3 and plain.kept == [(0.0, DT)]
+    assert wrapped.parts == 1 and result.newton_iterations == 9
+
+
+def test_one_whose_contacts_do_not_settle_is_halved(plain):
+    plain.astray = plain.new_on_way = lambda time, dt: dt > DT / 2
+    Substepping(plain).step(0.0, DT)
+    whole = [dt for _, dt in plain.taken if dt == DT]
+    assert covers(plain) and len(plain.kept) == 2 and len(whole) == SEARCHES + 1
 
 
 def test_an_error_leaves_the_state_before(plain):

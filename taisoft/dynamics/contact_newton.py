@@ -13,7 +13,6 @@ from taisoft.dynamics.frictional import (
     LINEAR,
     MULTIPLIERS,
     NORM,
-    R_SCALE,
     ROUNDING,
     SOFTEST,
     SOLVED,
@@ -24,7 +23,7 @@ from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
 from taisoft.dynamics.line_search import search
 from taisoft.dynamics.newton import FALL, Newton
 from taisoft.dynamics.residual import AGAIN
-from taisoft.dynamics.stage_result import StageResult
+from taisoft.dynamics.stage_result import StageResult, relative
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.launching import PUBLIC
 
@@ -54,7 +53,7 @@ def solve_linear(
 ) -> Frictional:
     """Solve a linearised stage from (|r|, scale), on one thread in one launch."""
     if not system.model.serial or PUBLIC:  # Taichi itself takes no more than 64 arguments
-        newton = Newton(system, problem, True, stiffest)
+        newton = Newton(system, problem, stiffest)
         result = newton.run(r, scale, fresh=True)
         return Frictional(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
     loop = system.solve_frictional(problem, r, system.rounding.of_stage(problem.c, problem.beta), stiffest)
@@ -74,7 +73,6 @@ class ContactNewton:
     def run(self) -> StageResult:
         """From the first iterate on, where the matrix has been formed."""
         system, stage = self.system, self.stage
-        system.r_scale = R_SCALE
         self.r, self.scale = system.evaluate(new_multipliers=True)
         least, stalled = self.r, 0
         while not self._done() and self.newton < stage.max_newton and math.isfinite(self.r):
@@ -90,7 +88,6 @@ class ContactNewton:
                 steps = Newton(system, replace(stage, max_newton=FALLBACK, contact_tolerance=laws))
                 steps.run(r, scale, fresh=True)
                 self.newton, self.linear = self.newton + steps.newton - 1, self.linear + steps.linear
-                system.r_scale = R_SCALE
                 (self.r, self.scale), moved = system.evaluate(None, new_multipliers=True), steps.newton > 0
             else:
                 self.r, self.scale = system.leave_linear()
@@ -106,7 +103,7 @@ class ContactNewton:
             if not moved:
                 break
         return StageResult(
-            self.newton, self.linear, self.r / self.scale if self.scale > 0.0 else self.r,
+            self.newton, self.linear, relative(self.r, self.scale),
             self._done() and math.isfinite(self.r), self.rounding or self.r <= self.floor, self.multipliers,
             system.contact_residual,
         )  # fmt: skip
@@ -130,7 +127,6 @@ class ContactNewton:
         )  # fmt: skip
         inner = solve_linear(system, problem, self.r, self.scale, SOFTEST if self.stalls else STIFFEST)
         self.linear, self.multipliers = self.linear + inner.linear, self.multipliers + inner.multipliers
-        system.r_scale = R_SCALE
         return inner
 
 
@@ -157,5 +153,6 @@ def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
         r, scale = system.leave_linear(taken=False)
         system.form_matrix(projected=True)
     low = found.r <= system.rounding.of_stage(stage.c, stage.beta)
-    residual = found.r / scale if scale > 0.0 else found.r
-    return StageResult(found.solves, linear, residual, found.converged, low, found.multipliers, system.contact_residual)
+    return StageResult(
+        found.solves, linear, relative(found.r, scale), found.converged, low, found.multipliers, system.contact_residual,
+    )  # fmt: skip

@@ -61,25 +61,36 @@ class StageContacts:
 NO_CONTACTS = StageContacts(None, None, None, NO_COUPLING, *[None] * 4)
 
 
-@ti.func
-def set_multiplier(s: ti.template(), k: ti.template(), c, beta, dt, standoff, fast, slow, fastest, impact: ti.template()):
-    """The impulse of contact c becomes its multiplier, and the disk opens as far as that says; what x does not change.
+@kernel
+def begin_contacts(
+    s: ti.template(), k: ti.template(), impact: ti.template(), beta: ti.f64, dt: ti.f64, goal: ti.types.ndarray()
+):  # fmt: skip
+    """What neither x nor the multipliers change in a stage of a step of dt [s].
 
-    impact: whether the contact's velocity must be `leave`, whatever its gap.
+    impact: whether the contacts' velocity must be `leave`, whatever their gap. goal (4,): see `ContactStep.goal`.
     """
     p, f, w = ti.static((k.problem, k.found, k.work))
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        offset = -(beta / dt) * f.carry[c]
+        if ti.static(not impact):  # whose x_hat is x_start
+            for j in range(p.arity[c]):
+                i = p.node[c, j]
+                offset += p.weight[c, j] * (k.x_start[i] - s.x_hat[i])
+        w.tangential_offset[c] = offset
+        if ti.static(impact):
+            w.gap_minus_target[c] = -beta * f.leave[c] - (beta / dt) * p.normal[c].dot(f.carry[c])
+        else:
+            short = short_of_goal(f, c, dt, goal[0], goal[1], goal[2], goal[3], f.rise[c])
+            w.gap_minus_target[c] = short - p.normal[c].dot(f.carry[c])
+
+
+@ti.func
+def set_multiplier(k: ti.template(), c):
+    """The impulse of contact c becomes its multiplier, and the disk opens as far as that says."""
+    p, w = ti.static((k.problem, k.work))
     w.multiplier[c] = p.r[c]
     w.radius[c] = p.friction[c] * p.r[c][0]
-    offset = -(beta / dt) * f.carry[c]
-    for j in range(p.arity[c]):
-        i = p.node[c, j]
-        offset += p.weight[c, j] * (k.x_start[i] - s.x_hat[i])
-    w.tangential_offset[c] = offset
-    if ti.static(impact):
-        w.gap_minus_target[c] = -beta * f.leave[c] - (beta / dt) * p.normal[c].dot(f.carry[c])
-    else:
-        goal = short_of_goal(f, c, dt, standoff, fast, slow, fastest, f.rise[c])
-        w.gap_minus_target[c] = goal - p.normal[c].dot(f.carry[c])
 
 
 @ti.func
@@ -165,20 +176,17 @@ def sum_residual(k: ti.template()):
 
 
 @kernel
-def press(
-    m: ti.template(), s: ti.template(), k: ti.template(), impact: ti.template(), new_multipliers: ti.i32, beta: ti.f64,
-    dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64, r_scale: ti.f64,
-):  # fmt: skip
+def press(m: ti.template(), k: ti.template(), new_multipliers: ti.i32, beta: ti.f64, r_scale: ti.f64):
     """Find the impulses of all contacts at the present x, their blocks of the matrix, and the residual of their laws.
 
-    impact: as `set_multiplier`. new_multipliers: whether the impulses are made the multipliers first, and the disks opened as
+    new_multipliers: whether the impulses are made the multipliers first, and the disks opened as
     far as these say. r_scale: R over the r-factors.
     """
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=p.serial)
     for n in range(p.count[0]):
         if new_multipliers == 1:
-            set_multiplier(s, k, n, beta, dt, standoff, fast, slow, fastest, impact)
+            set_multiplier(k, n)
         press_contact(m, k, n, beta, r_scale)
     ti.loop_config(serialize=True)
     for _ in range(1):

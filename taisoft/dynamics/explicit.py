@@ -24,14 +24,21 @@ def unfinite(value):
 
 
 @ti.func
-def acceleration(m: ti.template(), i):
-    """Of node i [m/s^2] by all terms, stiffness damping included; 0 on constrained axes."""
+def forces(m: ti.template(), i):
+    """(force [N], acceleration [m/s^2]) of node i by all terms, stiffness damping included."""
     f, a = ti.Vector([0.0, 0.0, 0.0], m.real), ti.Vector([0.0, 0.0, 0.0], m.real)
     for term in ti.static(m.terms):
         if ti.static(term.ACCELERATION):
             a += term.acceleration(m, i)
         else:
             f += term.force(m, i)
+    return f, a
+
+
+@ti.func
+def acceleration(m: ti.template(), i):
+    """Of node i [m/s^2]; 0 on constrained axes."""
+    f, a = forces(m, i)
     return m.free[i] * (f / m.mass[i] + a)
 
 
@@ -126,12 +133,9 @@ def react(m: ti.template(), s: ti.template(), dt):
     """Constraint force on held nodes: m (v_new - v_old)/dt - f, with v_old kept in `held_velocity` [N]."""
     for k in range(s.n_held):
         i = s.held[k]
-        f, mass = ti.Vector([0.0, 0.0, 0.0], m.real), m.mass[i]
-        for term in ti.static(m.terms):
-            if ti.static(term.ACCELERATION):
-                f += mass * term.acceleration(m, i)
-            else:
-                f += term.force(m, i)
+        mass = m.mass[i]
+        f, a = forces(m, i)
+        f += mass * a
         if ti.static(m.damped):
             v = m.state.v[i]
             if ti.static(not s.verlet):

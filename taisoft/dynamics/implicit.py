@@ -3,7 +3,7 @@
 An integrator is a `Scheme`: how x_hat, v_hat and beta come from the past, and whether the stage is the step's middle.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import taichi as ti
@@ -109,7 +109,6 @@ class ImplicitStepper:
         self.linear_tolerance: float | None = None
         balance = BodyBalance(world.scene)
         self._balance = balance if balance.n_pieces > 1 else None
-        self.unbalanced: tuple[float, str] = (0.0, "")  # the worst relative residual of a body in the last step beyond LIMIT
         self._substepping = Substepping(self)
         self._mark = None, [], contact.flight  # see `mark`
         self.forget()
@@ -143,7 +142,6 @@ class ImplicitStepper:
 
     def step(self, dt: float) -> StageResult:
         """One step of dt, see `Substepping.step`."""
-        self.unbalanced = (0.0, "")
         return self._substepping.step(self.world.time, dt)
 
     @property
@@ -263,9 +261,7 @@ class ImplicitStepper:
             tighter = self.tolerance * LIMIT / min(worst, 1.0) * TIGHTER
             result = count_all(self._solve(scheme, dt, bounces, tighter), [result])
             worst, name = self._balance.worst(self.solver, self._beta, linear)
-        if worst > LIMIT:
-            self.unbalanced = max(self.unbalanced, (worst, name))
-        return result
+        return replace(result, unbalanced=(worst, name)) if worst > LIMIT else result
 
     def _solve(self, scheme: Scheme, dt: float, bounces: bool, tolerance: float) -> StageResult:
         """The stage. bounces: whether any contacts are thrown back."""

@@ -21,7 +21,7 @@ from taisoft.dynamics.stage import place_node
 from taisoft.linear.block_csr import block_times, part_times
 from taisoft.linear.pcg import dot64, total
 from taisoft.runtime import kernel
-from taisoft.scalars import END_SLOPE, OTHER_SUM, START_SLOPE, STEP_LENGTH, SUM
+from taisoft.scalars import OTHER_SUM, STEP_LENGTH, SUM
 
 ROOT, TRIES, LONGEST = 0.05, 40, 1e3  # of the slope at the start: what is root enough; trial lengths; the longest
 
@@ -40,7 +40,7 @@ def keep_linear(m: ti.template(), s: ti.template(), k: ti.template()):
 
 
 @kernel
-def leave_linear(m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.template(), taken: ti.i32, beta: ti.f64):
+def leave_linear(m: ti.template(), s: ti.template(), k: ti.template(), taken: ti.i32, beta: ti.f64):
     """The way from where the stage was linearised as y, from base.
 
     taken: 0 where what was found is dropped: the impulses are those of then.
@@ -48,7 +48,7 @@ def leave_linear(m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.t
     p, w = ti.static((k.problem, k.work))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        pcg.y[i] = ti.cast((m.state.x[i] - k.x_linear[i]) / beta, m.real)
+        s.pcg.y[i] = ti.cast((m.state.x[i] - k.x_linear[i]) / beta, m.real)
         s.base[i] = k.x_linear[i]
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
@@ -69,7 +69,7 @@ def _slope(k: ti.template(), at_rest, curvature, a, r_scale):
 
 @ti.func
 def step_length(k: ti.template(), at_rest, curvature, start, r_scale):
-    """(a, slope there): the root of the slope, which rises where the matrix is positive definite, by the Illinois method."""
+    """The root of the slope, which rises where the matrix is positive definite, by the Illinois method."""
     a, low, at_low, high, at_high = 1.0, 0.0, start, -1.0, 0.0
     slope = _slope(k, at_rest, curvature, a, r_scale)
     tries = 0
@@ -86,58 +86,58 @@ def step_length(k: ti.template(), at_rest, curvature, start, r_scale):
             a = low + (high - low) * ti.min(ti.max(at_low / (at_low - at_high), 0.01), 0.99)
         slope = _slope(k, at_rest, curvature, a, r_scale)
         tries += 1
-    return a, slope
+    return a
 
 
 @ti.func
-def begin_node(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), pcg: ti.template(), i):
+def begin_node(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), i):
     """(r.y, y.A y) of node i, whose row of A y is kept; base = x."""
-    y = pcg.y[i]
-    q = block_times(k.coupling.base[i], y) + part_times(m, A, A.row_start[i], A.row_start[i + 1], pcg.y)
-    pcg.q[i] = q
+    y = s.pcg.y[i]
+    q = block_times(k.coupling.base[i], y) + part_times(m, A, A.row_start[i], A.row_start[i + 1], s.pcg.y)
+    s.pcg.q[i] = q
     s.base[i] = m.state.x[i]
     return dot64(m.free[i] * s.residual[i], y), dot64(y, q)
 
 
 @ti.func
-def begin_contact(k: ti.template(), pcg: ti.template(), c, beta):
+def begin_contact(s: ti.template(), k: ti.template(), c, beta):
     """u of contact c and its rate along y; returns p.rate."""
     p, w = ti.static((k.problem, k.work))
     w.velocity[c] = stage_velocity_of(k, c, beta)
     d, n, t = dvec(0.0), p.normal[c], p.tangent[c]
     for j in range(p.arity[c]):
-        d += p.weight[c, j] * ti.cast(pcg.y[p.node[c, j]], ti.f64)
+        d += p.weight[c, j] * ti.cast(s.pcg.y[p.node[c, j]], ti.f64)
     rate = dvec(n.dot(d), t.dot(d), n.cross(t).dot(d))
     w.rate[c] = rate
     return rate.dot(p.r[c])
 
 
 @ti.func
-def go_along(m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.template(), i, a, beta):
+def go_along(m: ti.template(), s: ti.template(), k: ti.template(), i, a, beta):
     """Node i goes a y, and with it the residual without contacts."""
-    place_node(m, s, pcg.y, i, a, beta)
+    place_node(m, s, i, a, beta)
     k.displacement[i] = m.state.x[i] - k.x_start[i]
-    k.residual_linear[i] += ti.cast(a, m.real) * pcg.q[i]
+    k.residual_linear[i] += ti.cast(a, m.real) * s.pcg.q[i]
 
 
 @ti.func
-def pressed_residual(m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.template(), i):
-    """Residual of node i with impulses, and -r as CG's right side; returns |r|^2 on its free axes, and on the others."""
+def pressed_residual(m: ti.template(), s: ti.template(), k: ti.template(), i):
+    """Residual of node i with impulses, and -r as CG's right side; returns |r|^2 on its free axes."""
     r = k.residual_linear[i] - ti.cast(impulse_on_node(k, i), m.real)
     s.residual[i] = r
-    pcg.rhs[i] = -m.free[i] * r
-    own, held = m.free[i] * r, (1.0 - m.free[i]) * r
-    return dot64(own, own), dot64(held, held)
+    own = m.free[i] * r
+    s.pcg.rhs[i] = -own
+    return dot64(own, own)
 
 
 @kernel
 def advance(
-    m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), pcg: ti.template(), beta: ti.f64, r_scale: ti.f64,
+    m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64,
     norms: ti.types.ndarray(),
 ):  # fmt: skip
-    """Go along y of pcg to where the slope vanishes: x, v, impulses, blocks, residual, and -r as CG's right side there.
+    """Go along y of s.pcg to where the slope vanishes: x, v, impulses, blocks, residual, and -r as CG's right side there.
 
-    norms (5,): |r|^2 on the free axes, and in the last place on the others. scalars: START_SLOPE, END_SLOPE, STEP_LENGTH.
+    norms (5,): |r|^2 on the free axes alone. scalars: STEP_LENGTH.
     """
     p, w = ti.static((k.problem, k.work))
     ti.loop_config(serialize=m.serial)
@@ -145,24 +145,23 @@ def advance(
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
-            own_slope, own_curvature = begin_node(m, s, A, k, pcg, i)
+            own_slope, own_curvature = begin_node(m, s, A, k, i)
             slope += own_slope
             curvature += own_curvature
         m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        begin_contact(k, pcg, c, beta)
+        begin_contact(s, k, c, beta)
     ti.loop_config(serialize=True)
     for _ in range(1):
         start = total(m, SUM)
         at_rest = start
         for c in range(p.count[0]):
             at_rest += w.rate[c].dot(p.r[c])
-        a, slope = step_length(k, at_rest, total(m, OTHER_SUM), start, r_scale)
-        m.state.scalars[START_SLOPE], m.state.scalars[END_SLOPE], m.state.scalars[STEP_LENGTH] = start, slope, a
+        m.state.scalars[STEP_LENGTH] = step_length(k, at_rest, total(m, OTHER_SUM), start, r_scale)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        go_along(m, s, k, pcg, i, m.state.scalars[STEP_LENGTH], beta)
+        go_along(m, s, k, i, m.state.scalars[STEP_LENGTH], beta)
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         press_contact(m, k, c, beta, r_scale)
@@ -172,12 +171,10 @@ def advance(
     ti.loop_config(serialize=m.serial)
     for chunk in range(m.chunks):
         size = (m.n_nodes + m.chunks - 1) // m.chunks
-        free, held = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        square = ti.cast(0.0, ti.f64)
         for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
-            own, other = pressed_residual(m, s, k, pcg, i)
-            free += own
-            held += other
-        m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = free, held
+            square += pressed_residual(m, s, k, i)
+        m.state.partial[chunk, SUM] = square
     ti.loop_config(serialize=True)
     for _ in range(1):
-        norms[0], norms[4] = total(m, SUM), total(m, OTHER_SUM)
+        norms[0] = total(m, SUM)

@@ -19,20 +19,10 @@ more than that of a strain, and ends the stage as converged, its residual told a
 
 import math
 
-from taisoft.dynamics.frictional import (
-    MANY,
-    MAX_MULTIPLIERS,
-    PROGRESS,
-    R_SCALE,
-    RISEN_LAW,
-    ROUNDING,
-    SOFTEST,
-    STEADY,
-    STIFFEST,
-)
+from taisoft.dynamics.frictional import MAX_MULTIPLIERS, PROGRESS, R_SCALE, ROUNDING, STIFFEST, next_scale
 from taisoft.dynamics.line_search import search
 from taisoft.dynamics.residual import ELASTIC_STAGE, IMPACT, LINEARISED, STEP
-from taisoft.dynamics.stage_result import StageResult
+from taisoft.dynamics.stage_result import StageResult, relative
 from taisoft.dynamics.stage_system import Stage, StageSystem
 
 LINEAR_LIMIT = 0.01  # true relative residual of a linearly implicit step above which it has failed
@@ -45,8 +35,9 @@ FALL = 0.9  # with contacts, share of the least |r| so far below which a step ne
 class Newton:
     """Newton steps of a stage under multipliers that are renewed; where that is linear, of its contact problem alone."""
 
-    def __init__(self, system: StageSystem, stage: Stage, inner: bool = False, stiffest: float = STIFFEST):
-        self.system, self.stage, self.inner, self.stiffest = system, stage, inner, stiffest
+    def __init__(self, system: StageSystem, stage: Stage, stiffest: float = STIFFEST):
+        self.system, self.stage, self.stiffest = system, stage, stiffest
+        self.inner = system.kind == LINEARISED  # an indefinite matrix is then left to the caller
         self.floor = system.rounding.of_stage(stage.c, stage.beta)
         self.newton = self.linear = self.multipliers = 0
         self.rounding = self.negative = False  # nothing but rounding is left of |r|; negative curvature was met
@@ -55,7 +46,7 @@ class Newton:
         """From the present state, whose (|r|, scale) is given. fresh: the matrix is formed there."""
         system, served = self.system, 0
         self.r, self.scale, self.touching = r, scale, system.n_contacts > 0
-        system.r_scale, self.law = R_SCALE, math.inf  # the laws' residual when the multipliers were last renewed
+        self.law = math.inf  # the laws' residual when the multipliers were last renewed
         self._aim()
         while True:
             if self._near():
@@ -73,6 +64,7 @@ class Newton:
             if not math.isfinite(self.r) or not (moved or served > 1) or (self.inner and self.negative):
                 break
             fresh = moved
+        system.r_scale = R_SCALE  # the next solve finds its own
         return self._result(self._near() and self._done())
 
     def _aim(self) -> None:
@@ -101,12 +93,7 @@ class Newton:
             return False
         system = self.system
         law = system.contact_residual
-        if law > RISEN_LAW * self.law and system.r_scale > STEADY:  # friction disks and normal impulses drive each other up
-            system.r_scale *= 0.5
-        elif self.taken <= 1:
-            system.r_scale = min(self.stiffest, 2.0 * system.r_scale)
-        elif self.taken >= MANY:
-            system.r_scale = max(SOFTEST, 0.5 * system.r_scale)
+        system.r_scale = next_scale(system.r_scale, law, self.law, self.taken, self.stiffest)
         self.law, self.multipliers, self.rounding = law, self.multipliers + 1, False
         self.r, self.scale = system.evaluate(None, new_multipliers=True)
         self._aim()
@@ -121,7 +108,7 @@ class Newton:
         self.previous, self.negative = self.r, self.negative or answer.negative
         if self.inner and answer.negative:
             return False
-        if system.kind == LINEARISED:
+        if self.inner:
             (self.r, self.scale), moved = system.advance(), True
         else:
             self.r, self.scale, moved = search(system, self._enough(answer.negative))
@@ -160,7 +147,7 @@ class Newton:
     def _result(self, converged: bool) -> StageResult:
         r, system = self.r, self.system
         return StageResult(
-            self.newton, self.linear, r / self.scale if self.scale > 0.0 else r, converged and math.isfinite(r),
+            self.newton, self.linear, relative(r, self.scale), converged and math.isfinite(r),
             self.rounding or r <= self.floor, self.multipliers, system.contact_residual,
         )  # fmt: skip
 

@@ -20,12 +20,12 @@ ELASTIC_STAGE, LINEARISED, IMPACT = range(3)  # kinds of a stage; IMPACT: see `i
 
 @kernel
 def move(
-    m: ti.template(), s: ti.template(), k: ti.template(), pcg: ti.template(), kind: ti.template(), how: ti.i32,
-    step_length: ti.f64, c: ti.f64, beta: ti.f64,
+    m: ti.template(), s: ti.template(), k: ti.template(), kind: ti.template(), how: ti.i32, step_length: ti.f64, c: ti.f64,
+    beta: ti.f64,
 ):  # fmt: skip
     """Go where `how` says, and find the elastic forces there.
 
-    how: STAY; STEP: base = x, then step_length y, y of pcg; AGAIN: base + step_length y. scalars: START_SLOPE of a STEP.
+    how: STAY; STEP: base = x, then step_length y, y of s.pcg; AGAIN: base + step_length y. scalars: START_SLOPE of a STEP.
     """
     ti.loop_config(serialize=m.serial)
     for chunk in range(m.chunks):
@@ -33,10 +33,10 @@ def move(
         slope = ti.cast(0.0, ti.f64)
         for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
             if how == STEP:
-                slope += dot64(m.free[i] * s.residual[i], pcg.y[i])
+                slope += dot64(m.free[i] * s.residual[i], s.pcg.y[i])
                 s.base[i] = m.state.x[i]
             if how != STAY:
-                place_node(m, s, pcg.y, i, step_length, beta)
+                place_node(m, s, i, step_length, beta)
             if ti.static(k.any):
                 k.displacement[i] = m.state.x[i] - k.x_start[i]
             if ti.static(kind == ELASTIC_STAGE):
@@ -52,8 +52,8 @@ def move(
 
 @kernel
 def form_residual(
-    m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), pcg: ti.template(), kind: ti.template(),
-    beta: ti.f64, norms: ti.types.ndarray(),
+    m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), kind: ti.template(), beta: ti.f64,
+    norms: ti.types.ndarray(),
 ):  # fmt: skip
     """Residual, and -r as CG's right side, from what `move` and `press` have found.
 
@@ -78,9 +78,9 @@ def form_residual(
             if ti.static(k.any):
                 r -= ti.cast(impulse_on_node(k, i), m.real)
             s.residual[i] = r
-            pcg.rhs[i] = -free * r
+            s.pcg.rhs[i] = -free * r
             sums += squares(r, inertia, f, external, free)
-            slope += dot64(free * r, pcg.y[i])
+            slope += dot64(free * r, s.pcg.y[i])
         for j in ti.static(range(N_NORMS)):
             m.state.partial[chunk, j] = sums[j]
         m.state.partial[chunk, SUM] = slope

@@ -1,4 +1,4 @@
-"""Fields and kernels of one implicit stage; `newton` drives them. The formulas stand there."""
+"""Fields and kernels of one implicit stage, whose formulas stand in `stage_system`."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,6 +8,7 @@ import taichi as ti
 from taisoft.arrays import Count
 from taisoft.fem.terms import mass_damping, stiffness_damping
 from taisoft.linear.block_csr import row_times
+from taisoft.linear.pcg import PcgWork
 from taisoft.mass import mass_times
 from taisoft.runtime import kernel
 
@@ -27,6 +28,7 @@ class StageWork:
     n_moved: Count
     change: Any  # f64: what the mass is multiplied by
     damper: Any  # BlockCsr or None
+    pcg: PcgWork  # -r as its right side; y, the change of v that a Newton step makes
 
     @property
     def leads(self) -> bool:
@@ -104,9 +106,9 @@ def norm2(a):
 
 
 @ti.func
-def place_node(m: ti.template(), w: ti.template(), y: ti.template(), i, step_length, beta):
+def place_node(m: ti.template(), w: ti.template(), i, step_length, beta):
     """Node i at base + step_length beta y, v accordingly; y is 0 on constrained axes."""
     m.state.x[i] = w.base[i]
     if step_length != 0.0:  # back to the base also where y is not a number
-        m.state.x[i] += step_length * beta * ti.cast(y[i], ti.f64)
+        m.state.x[i] += step_length * beta * ti.cast(w.pcg.y[i], ti.f64)
     m.state.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)

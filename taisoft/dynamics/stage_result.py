@@ -14,6 +14,12 @@ class StageResult:
     at_rounding: bool  # the residual is at the rounding of the forces
     contact_iterations: int = 0  # multipliers
     contact_residual: float = 0.0
+    unbalanced: tuple[float, str] = (0.0, "")  # worst relative residual of a piece beside others, and which it is
+
+
+def relative(r: float, scale: float) -> float:
+    """|r| over its scale; |r| itself where there is none."""
+    return r / scale if scale > 0.0 else r
 
 
 def merge(results: list[StageResult]) -> StageResult:
@@ -22,6 +28,7 @@ def merge(results: list[StageResult]) -> StageResult:
         sum(r.newton_iterations for r in results), sum(r.linear_iterations for r in results),
         max(r.residual for r in results), all(r.converged for r in results), all(r.at_rounding for r in results),
         sum(r.contact_iterations for r in results), max(r.contact_residual for r in results),
+        max(r.unbalanced for r in results),
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ import taichi as ti
 
 from taisoft.contact.problem import RESIDUAL, find_factors
 from taisoft.dynamics import frictional
-from taisoft.dynamics.contact_terms import NO_CONTACTS, StageContacts, build_stage_contacts, keep_diagonal, press
+from taisoft.dynamics.contact_terms import NO_CONTACTS, StageContacts, begin_contacts, build_stage_contacts, keep_diagonal, press
 from taisoft.dynamics.linearised import advance, keep_linear, leave_linear
 from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STAY, form_residual, move
 from taisoft.dynamics.rounding import RoundingFloor
@@ -63,7 +63,6 @@ class StageSystem:
             block_csr.sibling(self.matrix, model, arena, model.real, "damping") if model.stiffness_damping else None
         )
         n, k = model.n_nodes, len(prescribed)
-        self.pcg = pcg.build_pcg(model, arena)
         self.work = StageWork(
             x_hat=arena.vectors("x_hat", ti.f64, n), v_hat=arena.vectors("v_hat", model.real, n),
             base=arena.vectors("x_base", ti.f64, n), residual=arena.vectors("residual", model.real, n),
@@ -71,7 +70,7 @@ class StageSystem:
             moved_axes=arena.vectors("stage_moved_axes", ti.i32, k) if k else None,
             targets=arena.vectors("stage_targets", ti.f64, k) if k else None,
             led_acceleration=arena.vectors("led_acceleration", ti.f64, k) if k and model.consistent else None,
-            n_moved=k, change=arena.vectors("change", ti.f64, n), damper=self.damper,
+            n_moved=k, change=arena.vectors("change", ti.f64, n), damper=self.damper, pcg=pcg.build_pcg(model, arena),
         )  # fmt: skip
         self.rounding = RoundingFloor(model, eps)
         self.kind = ELASTIC_STAGE
@@ -131,27 +130,23 @@ class StageSystem:
 
     def begin(self, stage: Stage) -> None:
         """Take up a stage at its first iterate; with contacts its matrix is formed, on which the r-factors rest."""
-        self._stage, self.kind, self._same_matrix, self.r_scale = stage, ELASTIC_STAGE, False, frictional.R_SCALE
-        self._k = self._contacts()
         begin_stage(self.model, self.work, stage.beta, stage.prescribed_share)
-        if self._k.any:
-            self.form_matrix()
-            find_factors(self._k.problem)
+        self._begin(stage, ELASTIC_STAGE)
 
     def begin_impact(self, stage: Stage) -> StageContacts:
         """Take up the impact before a step; the matrix is formed."""
-        self._stage, self.r_scale = stage, frictional.R_SCALE
-        self._k = self._contacts()
-        self.form_matrix(projected=True)
-        find_factors(self._k.problem)
-        self.kind = IMPACT
+        self._begin(stage, IMPACT)
         return self._k
 
-    def _contacts(self) -> StageContacts:
+    def _begin(self, stage: Stage, kind: int) -> None:
+        self._stage, self.kind, self.r_scale, self._k = stage, kind, frictional.R_SCALE, NO_CONTACTS
         if self.contact.n_contacts == 0:
-            return NO_CONTACTS
+            return
         self._fit()
-        return self._room
+        self._k, impact = self._room, kind == IMPACT
+        begin_contacts(self.work, self._k, impact, stage.beta, stage.dt, np.array(self.contact.goal))
+        self.form_matrix(projected=impact)
+        find_factors(self._k.problem)
 
     def evaluate(self, how: int | None = STAY, step_length: float = 1.0, new_multipliers: bool = False) -> tuple[float, float]:
         """(|r|, scale) where `move` goes; None: x is where it was, and so are the elastic forces.
@@ -160,11 +155,10 @@ class StageSystem:
         """
         m, w, k, stage = self.model, self.work, self._k, self._stage
         if how is not None:
-            move(m, w, k, self.pcg, self.kind, how, step_length, stage.c, stage.beta)
+            move(m, w, k, self.kind, how, step_length, stage.c, stage.beta)
         if k.any:
-            impact = self.kind == IMPACT
-            press(m, w, k, impact, int(new_multipliers), stage.beta, stage.dt, *self.contact.goal, self.r_scale)
-        form_residual(m, w, self.matrix, k, self.pcg, self.kind, stage.beta, self.norms)
+            press(m, k, int(new_multipliers), stage.beta, self.r_scale)
+        form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
         return self._sizes(stage.c, stage.beta)
 
     def linearise(self) -> None:
@@ -175,24 +169,23 @@ class StageSystem:
     def advance(self) -> tuple[float, float]:
         """(|r|, scale) where the slope along y vanishes, of a linearised stage."""
         stage = self._stage
-        advance(self.model, self.work, self.matrix, self._k, self.pcg, stage.beta, self.r_scale, self.norms)
+        advance(self.model, self.work, self.matrix, self._k, stage.beta, self.r_scale, self.norms)
         return self._sizes(stage.c, stage.beta)
 
     def solve_frictional(self, problem: Stage, r: float, floor: float, stiffest: float) -> np.ndarray:
         """The loop of a linearised stage from |r| on, in launches that Ctrl-C can come between: see `frictional`."""
-        m, A, loop = self.model, self.matrix, np.zeros(14)
-        loop[[frictional.NORM, frictional.SCALE, frictional.LAW, frictional.GOAL]] = (
-            r, frictional.R_SCALE, math.inf, frictional.PROGRESS * r,
+        m, A, loop, limits = self.model, self.matrix, np.zeros(14), np.zeros(8)
+        loop[[frictional.NORM, frictional.SCALE, frictional.LAW, frictional.GOAL, frictional.SAME]] = (
+            r, frictional.R_SCALE, math.inf, frictional.PROGRESS * r, self._same_matrix,
         )  # fmt: skip
-        budget = max(1, pcg.SERIAL_WORK // (2 * A.n_edges + m.n_nodes))
+        # in the order of their places
+        limits[:] = (
+            problem.tolerance * self.scale, floor, problem.contact_tolerance, problem.linear_tolerance, stiffest,
+            problem.max_newton, pcg.most_iterations(m), pcg.batch_of(m, A),
+        )  # fmt: skip
         while loop[frictional.VERDICT] == frictional.RUNNING:
-            frictional.solve_frictional(
-                m, self.work, A, self._k, self.pcg, int(self._same_matrix), problem.beta, problem.dt, *self.contact.goal,
-                problem.tolerance * self.scale, problem.contact_tolerance, floor, problem.linear_tolerance, stiffest,
-                problem.max_newton, max(1000, 30 * m.n_nodes), budget, loop,
-            )  # fmt: skip
-            # a launch may have spent all on multipliers
-            self._same_matrix = self._same_matrix or bool(loop[frictional.SOLVES] or loop[frictional.WITHIN])
+            frictional.solve_frictional(m, self.work, A, self._k, problem.beta, limits, loop)
+        self._same_matrix = bool(loop[frictional.SAME])
         return loop
 
     def leave_linear(self, taken: bool = True) -> tuple[float, float]:
@@ -200,7 +193,7 @@ class StageSystem:
 
         taken: the state is what was found, its impulses the multipliers; otherwise state and multipliers are those of then.
         """
-        leave_linear(self.model, self.work, self._k, self.pcg, int(taken), self._stage.beta)
+        leave_linear(self.model, self.work, self._k, int(taken), self._stage.beta)
         self.kind = ELASTIC_STAGE
         return self.evaluate(AGAIN, float(taken), new_multipliers=True)
 
@@ -224,9 +217,8 @@ class StageSystem:
 
     def direction(self, tolerance: float) -> pcg.LinearResult:
         """y of pcg from -r."""
-        m = self.model
-        limit = max(1000, 30 * m.n_nodes)
-        answer = pcg.solve(m, self.matrix, self.pcg, tolerance, limit, self._k.coupling, self._same_matrix)
+        m, w = self.model, self.work
+        answer = pcg.solve(m, self.matrix, w.pcg, tolerance, pcg.most_iterations(m), self._k.coupling, self._same_matrix)
         self._same_matrix = True
         return answer
 
@@ -239,8 +231,8 @@ class StageSystem:
 
     def linear_residual(self) -> float:
         """|rhs - A y| / |rhs| as it really is: in f32 CG's own residual can fall while the true one stays."""
-        block_csr.multiply(self.model, self.matrix, self.pcg.y, self.pcg.q)
-        rhs, free, q = download([self.pcg.rhs, self.model.free, self.pcg.q])
+        block_csr.multiply(self.model, self.matrix, self.work.pcg.y, self.work.pcg.q)
+        rhs, free, q = download([self.work.pcg.rhs, self.model.free, self.work.pcg.q])
         rhs = rhs.astype(np.float64)
         size = float(np.linalg.norm(rhs))
         return float(np.linalg.norm(rhs - free * q)) / size if size > 0.0 else 0.0

@@ -34,12 +34,12 @@ class PcgWork:
 
     rhs: Any
     y: Any  # the solution
-    r: Any  # residual; serial: (D + L)^-1 of it
-    z: Any  # preconditioned residual; serial: (D + L)^T p
+    r: Any  # residual; serial: (P + L)^-1 of it
+    z: Any  # preconditioned residual; serial: (P + L)^T p
     p: Any  # direction
-    q: Any  # A p; serial: (D + L)^-1 of it
-    block: Any  # (n_nodes) 12-vectors: P, the diagonal blocks D of A, or what stands for them in the preconditioner
-    inverse: Any  # (n_nodes) 12-vectors: of these, 0 on constrained axes
+    q: Any  # A p; serial: (P + L)^-1 of it
+    inverse: Any  # (n_nodes) 12-vectors: of P, the diagonal blocks D of A or what stands for them, 0 on constrained axes
+    block: Any  # (n_nodes) 12-vectors: P; serial only
     mirror: Any  # (n_nodes) 12-vectors: 2 P - D; serial only
     state: Any  # (5) f64
 
@@ -57,8 +57,21 @@ def build_pcg(model: Model, arena: FieldArena) -> PcgWork:
     """Allocate the vectors of a solve."""
     names = ("rhs", "y", "r", "z", "p", "q")
     vectors = {name: arena.vectors(f"pcg_{name}", model.real, model.n_nodes) for name in names}
-    blocks = {name: arena.vectors(f"pcg_{name}", model.real, model.n_nodes, n=BLOCK) for name in ("block", "inverse", "mirror")}
+    blocks = {
+        name: arena.vectors(f"pcg_{name}", model.real, model.n_nodes, n=BLOCK) if model.serial or name == "inverse" else None
+        for name in ("inverse", "block", "mirror")
+    }
     return PcgWork(**vectors, **blocks, state=arena.field("pcg_state", ti.f64, 5))
+
+
+def most_iterations(m: Model) -> int:
+    """After which a solve is given up."""
+    return max(1000, 30 * m.n_nodes)
+
+
+def batch_of(m: Model, A: BlockCsr) -> int:
+    """Iterations of a serial launch."""
+    return max(1, SERIAL_WORK // (2 * A.n_edges + m.n_nodes))
 
 
 def solve(
@@ -73,7 +86,7 @@ def solve(
     from taisoft.linear import pcg_parallel, pcg_serial
 
     method = pcg_serial if m.serial else pcg_parallel
-    batch = max(1, SERIAL_WORK // (2 * A.n_edges + m.n_nodes)) if m.serial else PARALLEL_BATCH
+    batch = batch_of(m, A) if m.serial else PARALLEL_BATCH
     done = 0
     while True:
         done, stop = method.iterate(m, A, coupling, w, min(batch, max_iterations - done), tolerance, done == 0, same_matrix)
@@ -83,7 +96,7 @@ def solve(
 
 @ti.func
 def precondition(m: ti.template(), w: ti.template(), i, D):
-    """P of node i, its inverse over the free axes, and 2 P - D, from the diagonal block D (12)."""
+    """P of node i from its diagonal block D (12): its inverse over the free axes, for Gauss-Seidel itself and 2 P - D, too."""
     free, P = m.free[i], D
     B = ti.Matrix.zero(ti.f64, 3, 3)  # in f64, so that blocks much stiffer one way than another are inverted too
     for r in ti.static(range(3)):
@@ -103,8 +116,9 @@ def precondition(m: ti.template(), w: ti.template(), i, D):
     for r in ti.static(range(3)):
         for c in ti.static(range(3)):
             w.inverse[i][4 * c + r] = free[r] * free[c] * ti.cast(C[r, c], m.real)
-    w.block[i] = P
-    w.mirror[i] = 2.0 * P - D
+    if ti.static(m.serial):
+        w.block[i] = P
+        w.mirror[i] = 2.0 * P - D
 
 
 @ti.func
