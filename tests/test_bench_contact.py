@@ -14,7 +14,7 @@ import contact_oracle as oracle
 import numpy as np
 import pytest
 
-from benchmarks import contact, contact_captured, contact_crossover, contact_runs
+from benchmarks import contact, contact_captured, contact_crossover, contact_drops_table, contact_runs
 from benchmarks.contact_captured import COLOURED, GOAL, SERIAL, Outcome, Solvers, contact_jacobian, patched, shown
 from benchmarks.contact_colours import REPORT, Colouring, colour_all, colour_table, proper
 from benchmarks.contact_crossover import Point, build_plates, crossover_text, find_under, grid, measure_crossover
@@ -337,3 +337,19 @@ def test_captured_states_are_solved_again(tmp_path, capsys):
         assert all(row["residual"] <= 1e-4 and row["contact residual"] <= 1e-4 for row in rows)
         assert all(0 < row["newton"] <= row["linear"] and 0.0 < row["error"] < 0.1 and row["launches"] > 5 for row in rows)
     assert "## Limits" in capsys.readouterr().out
+
+
+def test_bodies_that_fall(tmp_path, capsys):
+    """The first steps of a cube at rest, this version beside itself: the same iterations."""
+    out = tmp_path / "drops.json"
+    here = str(contact_drops_table.HERE)
+    assert contact.main(["--drops", "--quick", "--only", "cube at rest", "--baseline", here, "--out", str(out)]) == 0
+    runs = json.loads(out.read_text())["runs"]
+    this, older = (runs[label]["cube at rest"] for label in ("this", "older"))
+    assert this["newton"] == older["newton"] and len(this["newton"]) == 5 and this["tets"] == 384 and this["unconverged"] == 0
+    assert "| cube at rest | 384" in capsys.readouterr().out
+    whole = {label: {name: own["cube at rest"] | {"seconds": [times] * 5} for name in ("bunny", "cloth")}
+             for label, own, times in (("this", runs["this"], 1.0), ("older", runs["older"], 4.0))}  # fmt: skip
+    met = {limit.what: limit.met for limit in contact_drops_table.limits_of(whole)}
+    assert met["bunny: time of the older version over this one's"] and not met["cloth: time of the older version over this one's"]
+    assert len(met) == 6 and sum(met.values()) == 4
