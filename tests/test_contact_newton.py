@@ -77,6 +77,20 @@ def test_steps_that_count_keep_the_laws_of_light_bodies_too():
     assert any(report.n_contacts for report in reports)
 
 
+def test_impulses_beside_the_rounding_of_a_stiff_body():
+    """A soft slab on one ten thousand times as stiff, in f32: |r| is mostly the rounding of the stiff one's stress."""
+    scene, mesh = ts.Scene(gravity=(0.0, -9.81, 0.0)), ts.box_mesh((8, 1, 8), (1.0, 0.05, 1.0))
+    turned = ts.TetMesh(mesh.vertices @ rotation((0.0, 1.0, 0.0), 0.8).T, mesh.tets)
+    for name, one, young, height in (("lower", mesh, 1e8, 0.0255), ("upper", turned, 1e4, 0.077)):
+        material = ts.Material(young=young, poisson=0.4, density=1500.0, friction=0.1)
+        scene.add_body(one, material, name=name, position=(0, height, 0))
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground", friction=0.1)
+    with ts.Simulator(scene, dt=1 / 120, integrator="implicit_euler", precision="f32") as sim:
+        reports = [sim.step() for _ in range(30)]
+    assert all(report.converged and report.contact_residual <= 1e-4 for report in reports)
+    assert sum(report.newton_iterations for report in reports) <= 10 * len(reports) and reports[-1].n_contacts > 50
+
+
 def test_both_loops_find_the_same_step(sim, monkeypatch):
     x, reports = steps(sim)
     whole = [report.newton_iterations for report in reports if report.parts == 1]

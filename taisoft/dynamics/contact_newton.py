@@ -118,10 +118,12 @@ class ContactNewton:
         system.linearise()
         enough = max(SHARE * self.r, LEAST_SHARE * stage.tolerance * self.scale)
         law = max(LAW_SHARE * system.contact_residual, LEAST_SHARE * stage.contact_tolerance)
-        # where the rounding of stiff stress hides the motion of a whole body in |r|, only tight solves get that motion right
+        # where the rounding of stiff stress hides the motion of a whole body in |r|, only tight solves get that motion right, and
+        # impulses only settle where |r| follows them down
         self.tight = self.r <= HIDING * self.floor
         problem = replace(
             stage, tolerance=enough / self.scale if self.scale > 0.0 else 0.0, contact_tolerance=law,
+            tolerance_of_one=0.0 if self.tight else None,
             max_newton=PATIENCE * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
         )  # fmt: skip

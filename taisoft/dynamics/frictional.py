@@ -19,6 +19,7 @@ ROUNDING = 4.0  # times the floor: what rounding may leave, as strains grow (up 
 PROGRESS = 0.3  # share of what a new multiplier left of |r| that the steps bring it down to
 R_SCALE, SOFTEST, STIFFEST, MANY = 1.0, 0.3, 100.0, 5  # R over the r-factors at first and its bounds; steps that are many
 RISEN_LAW, STEADY = 1.2, 4.0  # times the laws' residual of before: R is too large, unless it is below that
+FALLEN_LAW = 0.8  # times the laws' residual of before: R serves
 MAX_MULTIPLIERS = 200
 
 # places in `loop`: |r|, R over the r-factors, the laws' residual when multipliers were last renewed, what |r| is to come down to
@@ -26,9 +27,10 @@ MAX_MULTIPLIERS = 200
 # within a linear solve, its iterations so far, 1 where the matrix is that of the last solve, how the loop stands
 NORM, SCALE, LAW, GOAL, PREVIOUS, TAKEN, SOLVES, LINEAR, MULTIPLIERS, AT_ROUNDING, WITHIN, OWN, SAME, VERDICT = range(14)
 RUNNING, SOLVED, GIVEN_UP, INDEFINITE = range(4)
-# places in `limits`: |r| [N s] that ends the loop, |r| that is rounding, the laws' residual that ends it, too, tolerance of
-# linear solves, the largest R over the r-factors, linear solves, iterations of one, iterations in a launch
-ENOUGH, FLOOR, LAWFUL, TOLERANCE, LARGEST, MOST_SOLVES, LONGEST, BUDGET = range(8)
+# places in `limits`: |r| [N s] that ends the loop, that ends the steps under one multiplier, that is rounding; the laws' residual
+# that ends the loop, too, tolerance of linear solves, the largest R over the r-factors, linear solves, iterations of one, those
+# in a launch
+ENOUGH, ENOUGH_OF_ONE, FLOOR, LAWFUL, TOLERANCE, LARGEST, MOST_SOLVES, LONGEST, BUDGET = range(9)
 
 
 @ti.pyfunc
@@ -40,10 +42,11 @@ def next_scale(scale, law, before, taken, stiffest):
     new = scale
     if law > RISEN_LAW * before and scale > STEADY:
         new = 0.5 * scale
-    elif taken <= 1:
-        new = ti.min(stiffest, 2.0 * scale)
-    elif taken >= MANY:
-        new = ti.max(SOFTEST, 0.5 * scale)
+    elif law > FALLEN_LAW * before:
+        if taken <= 1:
+            new = ti.min(stiffest, 2.0 * scale)
+        elif taken >= MANY:
+            new = ti.max(SOFTEST, 0.5 * scale)
     return new
 
 
@@ -80,7 +83,7 @@ def solve_frictional(
     m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, limits: ti.types.ndarray(),
     loop: ti.types.ndarray(),
 ):  # fmt: skip
-    """Go on from where `loop` stands; limits (8,)."""
+    """Go on from where `loop` stands; limits (9,)."""
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -89,10 +92,10 @@ def solve_frictional(
         work, budget, longest, verdict = 0, ti.cast(limits[BUDGET], ti.i32), ti.cast(limits[LONGEST], ti.i32), RUNNING
         while verdict == RUNNING and work < budget:
             renewed, moved = False, False
-            if loop[WITHIN] == 0.0 and (r <= ti.max(enough, goal) or rounding == 1.0):
-                law = p.state[RESIDUAL]
-                low = r <= ti.max(enough, floor) or rounding == 1.0
-                if low and law <= limits[LAWFUL]:
+            law = p.state[RESIDUAL]
+            lawful, near = law <= limits[LAWFUL], r <= ti.max(limits[ENOUGH_OF_ONE], goal) or rounding == 1.0
+            if loop[WITHIN] == 0.0 and (near or (lawful and r <= enough)):
+                if lawful and (r <= ti.max(enough, floor) or rounding == 1.0):
                     verdict = SOLVED
                 elif loop[MULTIPLIERS] >= MAX_MULTIPLIERS:
                     verdict = GIVEN_UP

@@ -6,8 +6,10 @@ choice 2).
 
 Contacts make an augmented Lagrangian of the stage: per multiplier lambda it is minimised with the friction disks frozen, down to
 PROGRESS times what the multiplier left; then lambda = prox(lambda - R u), and the disks open as far as its normal parts say.
-R doubles after a multiplier that took one step, and is halved after one that took many, or that left more of the laws' residual:
-with a large R each multiplier nearly solves the problem with frozen disks, a fixed-point iteration that need not converge.
+R stays while the laws' residual falls. Else it doubles after a multiplier that took one step, and is halved after one that took
+many, or that left more of that residual: with a large R each multiplier nearly solves the problem with frozen disks, a
+fixed-point iteration that need not converge. Once |r| is small enough, so are the steps under one multiplier, unless
+`tolerance_of_one` asks them to follow the laws further down.
 Source: Alart and Curnier 1991 for the laws as a prox; the loop is that of the method of multipliers.
 
 Convergence: |r| <= tolerance * scale, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes, impulses in r, and
@@ -74,9 +76,12 @@ class Newton:
     def _near(self) -> bool:
         """Whether the multipliers have done what they can."""
         enough = self.stage.tolerance * self.scale
+        if not self.touching:
+            return self.r <= enough or self.rounding
+        lawful = self.system.contact_residual <= self.stage.contact_tolerance
         # in an impact whose laws hold only the momenta are left to balance
-        lawful = self.system.kind == IMPACT and self.system.contact_residual <= self.stage.contact_tolerance
-        return self.r <= (max(enough, self.goal) if self.touching and not lawful else enough) or self.rounding
+        goal = 0.0 if lawful and self.system.kind == IMPACT else max(self.stage.enough_of_one * self.scale, self.goal)
+        return self.r <= (max(enough, goal) if lawful else goal) or self.rounding
 
     def _done(self) -> bool:
         """Whether the stage has converged."""

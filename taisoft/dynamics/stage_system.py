@@ -47,6 +47,12 @@ class Stage:
     linear_tolerance: float | None = None  # of every linear solve; None: adaptive
     linearised: bool = False  # elastic forces are linear from the first iterate on
     prescribed_share: float = 1.0  # see `begin_stage`
+    tolerance_of_one: float | None = None  # as `tolerance`, of the steps under one multiplier; None: the same
+
+    @property
+    def enough_of_one(self) -> float:
+        """|r| over scale that ends the steps under one multiplier."""
+        return self.tolerance if self.tolerance_of_one is None else self.tolerance_of_one
 
 
 class StageSystem:
@@ -174,14 +180,14 @@ class StageSystem:
 
     def solve_frictional(self, problem: Stage, r: float, floor: float, stiffest: float) -> np.ndarray:
         """The loop of a linearised stage from |r| on, in launches that Ctrl-C can come between: see `frictional`."""
-        m, A, loop, limits = self.model, self.matrix, np.zeros(14), np.zeros(8)
+        m, A, loop, limits = self.model, self.matrix, np.zeros(14), np.zeros(9)
         loop[[frictional.NORM, frictional.SCALE, frictional.LAW, frictional.GOAL, frictional.SAME]] = (
             r, frictional.R_SCALE, math.inf, frictional.PROGRESS * r, self._same_matrix,
         )  # fmt: skip
         # in the order of their places
         limits[:] = (
-            problem.tolerance * self.scale, floor, problem.contact_tolerance, problem.linear_tolerance, stiffest,
-            problem.max_newton, pcg.most_iterations(m), pcg.batch_of(m, A),
+            problem.tolerance * self.scale, problem.enough_of_one * self.scale, floor, problem.contact_tolerance,
+            problem.linear_tolerance, stiffest, problem.max_newton, pcg.most_iterations(m), pcg.batch_of(m, A),
         )  # fmt: skip
         while loop[frictional.VERDICT] == frictional.RUNNING:
             frictional.solve_frictional(m, self.work, A, self._k, problem.beta, limits, loop)
