@@ -347,7 +347,7 @@ def test_bodies_that_fall(tmp_path, capsys):
     runs = json.loads(out.read_text())["runs"]
     this, older = (runs[label]["cube at rest"] for label in ("this", "older"))
     assert this["newton"] == older["newton"] and len(this["newton"]) == 5 and this["tets"] == 384 and this["unconverged"] == 0
-    assert "| cube at rest | 384" in capsys.readouterr().out
+    assert capsys.readouterr().out.count("| cube at rest |") == 2
     whole = {label: {name: own["cube at rest"] | {"seconds": [times] * 5} for name in ("bunny", "cloth")}
              for label, own, times in (("this", runs["this"], 1.0), ("older", runs["older"], 4.0))}  # fmt: skip
     met = {limit.what: limit.met for limit in contact_drops_table.limits_of(whole)}

@@ -2,7 +2,8 @@
 
 The problem on the fixed matrix needs no elements: `Newton` solves it as an augmented Lagrangian, inexactly, from the impulses so
 far. Its way is a direction for the true stage, judged by |r| and else by the slope of the augmented Lagrangian with the impulses
-found as multipliers. Where the matrix is indefinite, a few steps minimise the true stage under multipliers instead.
+found as multipliers. Where the matrix is indefinite, or that leads nowhere, a few steps minimise the true stage under multipliers
+instead.
 """
 
 import math
@@ -81,20 +82,15 @@ class ContactNewton:
             previous = self.r
             inner = self._solve_contacts()
             self.newton += 1
-            if inner.negative:
-                r, scale = system.leave_linear(taken=False)
-                only_laws = r <= stage.tolerance * scale  # |r| is fine already
-                laws = stage.contact_tolerance if only_laws else math.inf
-                steps = Newton(system, replace(stage, max_newton=FALLBACK, contact_tolerance=laws))
-                steps.run(r, scale, fresh=True)
-                self.newton, self.linear = self.newton + steps.newton - 1, self.linear + steps.linear
-                (self.r, self.scale), moved = system.evaluate(None, new_multipliers=True), steps.newton > 0
-            else:
+            moved = False
+            if not inner.negative:
                 self.r, self.scale = system.leave_linear()
                 moved = self.r < FALL * least
                 if not moved:  # also where it is not a number
                     system.evaluate(AGAIN, 0.0)
                     self.r, self.scale, moved = search(system, FALL * least)
+            if not moved:
+                moved = self._fall_back()
             # multipliers and friction disks go round and round: softer and longer next time
             stalled += self.r > STALLED * least
             self.stalls = stalled >= 2
@@ -107,6 +103,18 @@ class ContactNewton:
             self._done() and math.isfinite(self.r), self.rounding or self.r <= self.floor, self.multipliers,
             system.contact_residual,
         )  # fmt: skip
+
+    def _fall_back(self) -> bool:
+        """A few steps on the true stage from where it was linearised; whether there was any."""
+        system, stage = self.system, self.stage
+        r, scale = system.leave_linear(taken=False)
+        only_laws = r <= stage.tolerance * scale  # |r| is fine already
+        laws = stage.contact_tolerance if only_laws else math.inf
+        steps = Newton(system, replace(stage, max_newton=FALLBACK, contact_tolerance=laws))
+        steps.run(r, scale, fresh=True)
+        self.newton, self.linear = self.newton + steps.newton - 1, self.linear + steps.linear
+        self.r, self.scale = system.evaluate(None, new_multipliers=True)
+        return steps.newton > 0
 
     def _done(self) -> bool:
         enough = self.r <= self.stage.tolerance * self.scale or self.rounding
