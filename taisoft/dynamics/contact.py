@@ -66,7 +66,8 @@ class ContactStep:
         self._bounces = scene.bounces
         self.flight = np.zeros(len(scene.colliders))  # sum of dt^2 over the steps since each last touched anything [s^2]
         self._flight_gravity = scene.gravity.copy()
-        self._told = np.zeros(5)
+        self._told = np.zeros(5)  # what `survey` found,
+        self._surveyed: float | None = None  # of the search at hand, for a step of so many seconds
         self._searched: tuple[float, float] | None = None  # time and dt of the search that is at hand
         self._swept = 0.0  # dt of the last search, at hand or not
         self._ended: tuple[float, float] | None = None  # those of the end that was looked at, until the next part begins
@@ -176,9 +177,14 @@ class ContactStep:
             self._searched = None
             moved = world.motion.moved
             led = (moved, world.motion.places(time + dt) - world.model.state.x.to_numpy()[moved]) if len(moved) else None
-            d.find(time, dt, led)
+            self._find(time, dt, led)
             self._searched, self._swept = (time, dt), dt
         return d.counts.contacts
+
+    def _find(self, *arguments, **named) -> None:
+        """`Detection.find`."""
+        self._surveyed = None
+        self.detection.find(*arguments, **named)
 
     def begin(self, time: float, dt: float) -> int:
         """Fill the problem for a step of dt [s] from the state at a time, impulses those of the last step. Returns its size."""
@@ -280,7 +286,7 @@ class ContactStep:
         except SimulationError:
             if not self._follows:
                 raise
-            self.detection.find(time, 0.0)  # a path that ends here: whoever steps on will be told
+            self._find(time, 0.0)  # a path that ends here: whoever steps on will be told
         told = self._survey(dt)
         depth, self.sinking = float(told[DEPTH]), float(told[SINKING])
         if not self._explicit:
@@ -324,7 +330,7 @@ class ContactStep:
     def search_way(self, time: float, dt: float) -> bool:
         """Search along the way that was found, from the state at the start; whether that finds contacts not known so far."""
         self._searched = self._ended = None
-        self.detection.find(time, dt, way=self._way)
+        self._find(time, dt, way=self._way)
         self._searched, self._swept = (time, dt), dt
         known = set(map(tuple, download([self.found.feature], self.n_contacts)[0].tolist()))
         kept = download([self.detection.kept], self.detection.counts.contacts)[0]
@@ -350,7 +356,9 @@ class ContactStep:
 
     def _survey(self, dt: float) -> np.ndarray:
         d = self.detection
-        survey(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts, dt, self._told)
+        if self._surveyed != dt:
+            survey(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts, dt, self._told)
+            self._surveyed = dt
         return self._told
 
     def too_fast(self, dt: float, parts: int = 1) -> str:

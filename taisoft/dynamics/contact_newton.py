@@ -90,7 +90,8 @@ class ContactNewton:
                     system.evaluate(AGAIN, 0.0)
                     self.r, self.scale, moved = search(system, FALL * least)
             if not moved:
-                moved = self._fall_back()
+                # where friction goes round and round, a shorter step helps, and more of these do not
+                moved = self._fall_back() and (inner.negative or self.tight or self.r < FALL * least)
             # multipliers and friction disks go round and round: softer and longer next time
             stalled += self.r > STALLED * least
             self.stalls = stalled >= 2
