@@ -140,8 +140,11 @@ def main(argv=None) -> int:
     parser.add_argument("--replay", type=Path, metavar="DIR", help="solve such states again")
     parser.add_argument("--drops", action="store_true", help="run bodies that fall in implicit steps")
     parser.add_argument("--baseline", type=Path, metavar="FOLDER", help="another version")
-    parser.add_argument("--only", action="append", metavar="SCENE", choices=[*SCENES, *DROPS], help="repeatable")
+    parser.add_argument("--only", action="append", metavar="SCENE", help="one of those scenes alone; repeatable")
     options = parse_options(parser, argv, "the report's figures 19 and 20")
+    known = DROPS if options.drops else SCENES
+    if unknown := [name for name in options.only or () if name not in known]:
+        parser.error(f"argument --only: '{unknown[0]}' is none of {', '.join(known)}")
     if options.capture:
         for line in capture(options.capture, options.baseline, options.only, options.quick):
             print(line, flush=True)

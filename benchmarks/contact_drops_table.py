@@ -6,13 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from taisoft.output.files import make_folder
 from taisoft.output.tables import markdown
 
 from . import contact_drops
 from .document import Document
 from .elasticity_table import Limit, limit_table
-from .versions import HERE, Version
+from .versions import HERE, Version, version_in
 
 CHILD = Path(contact_drops.__file__)
 QUICK_STEPS = 5
@@ -33,7 +32,7 @@ def drops(baseline: Path | None, only: list[str] | None, quick: bool, document: 
     """Run the scenes, versions in turns; a table of all, and limits where there is an older version and the runs are whole."""
     versions = {"this": Version(HERE)}
     if baseline is not None:
-        versions["older"] = Version(baseline, make_folder(baseline / ".cache"))
+        versions["older"] = version_in(baseline)
     found: dict[str, dict[str, dict]] = {label: {} for label in versions}
     for name in only or contact_drops.DROPS:
         if not contact_drops.can_build(name):

@@ -13,7 +13,7 @@ from taisoft.output.tables import markdown
 from . import contact_states
 from .document import Document
 from .elasticity_table import Limit, limit_table
-from .versions import HERE, Version
+from .versions import HERE, version_in
 
 CHILD = Path(__file__).with_name("contact_states.py")
 PRECISIONS, TOLERANCE, EXACT = ("f32", "f64"), 1e-4, 1e-8
@@ -27,8 +27,7 @@ COLUMNS = (
 
 def run(folder: Path, *task: str | Path) -> list[dict]:
     """What a child of a version found, which keeps a cache of kernels of its own. Raises SimulationError where it failed."""
-    version = Version(folder, None if folder == HERE else make_folder(folder / ".cache"))
-    return [json.loads(line) for line in version.run(CHILD, *task) if line.startswith("{")]
+    return [json.loads(line) for line in version_in(folder).run(CHILD, *task) if line.startswith("{")]
 
 
 def capture(folder: Path, baseline: Path | None, only: list[str] | None, quick: bool) -> Iterator[str]:

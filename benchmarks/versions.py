@@ -8,8 +8,15 @@ from pathlib import Path
 
 import taisoft
 from taisoft.errors import SimulationError
+from taisoft.output.files import make_folder
 
 HERE = Path(taisoft.__file__).resolve().parents[1]
+
+
+def version_in(folder: Path) -> "Version":
+    """The version in a folder; another one than this keeps a cache of kernels there."""
+    folder = folder.resolve()
+    return Version(folder, None if folder == HERE else make_folder(folder / ".cache"))
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,8 @@
 * a step that converges is one substep; one that does not is tried in 2 and 4, then as it was, and not again before one converges;
 * substeps are as short as what closes asks for, cover the step without a gap, and grow again after an event;
 * one that met contacts which were not known is taken again with them;
-* one that ends deep, is fast where nobody had looked, or whose contacts do not settle, is undone and
-  halved; after UNDONE of them the step goes on;
+* one that ends deep, is fast where nobody had looked, or whose contacts do not settle, is undone and halved;
+  after UNDONE of them the step goes on;
 * what closes too fast for the shortest is refused, and an error leaves the state before the step.
 """
 

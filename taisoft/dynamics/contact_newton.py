@@ -14,8 +14,8 @@ from taisoft.dynamics.frictional import (
     LINEAR,
     MULTIPLIERS,
     NORM,
+    R_SCALE,
     ROUNDING,
-    SOFTEST,
     SOLVED,
     STIFFEST,
     VERDICT,
@@ -79,10 +79,10 @@ class ContactNewton:
         while not self._done() and self.newton < stage.max_newton and math.isfinite(self.r):
             if self.newton > 0:
                 system.form_matrix()
-            previous = self.r
-            inner = self._solve_contacts()
+            previous, law = self.r, system.contact_residual
+            only_laws = self.r <= stage.tolerance * self.scale  # |r| is fine already
+            inner, moved = self._solve_contacts(), False
             self.newton += 1
-            moved = False
             if not inner.negative:
                 self.r, self.scale = system.leave_linear()
                 moved = self.r < FALL * least
@@ -90,8 +90,10 @@ class ContactNewton:
                     system.evaluate(AGAIN, 0.0)
                     self.r, self.scale, moved = search(system, FALL * least)
             if not moved:
-                # where friction goes round and round, a shorter step helps, and more of these do not
-                moved = self._fall_back() and (inner.negative or self.tight or self.r < FALL * least)
+                moved = self._fall_back()
+                if not (inner.negative or self.tight):
+                    # where friction goes round and round, a shorter step helps, and more of these do not
+                    moved &= self.r < FALL * least or (only_laws and system.contact_residual < FALL * law)
             # multipliers and friction disks go round and round: softer and longer next time
             stalled += self.r > STALLED * least
             self.stalls = stalled >= 2
@@ -113,7 +115,8 @@ class ContactNewton:
         laws = stage.contact_tolerance if only_laws else math.inf
         steps = Newton(system, replace(stage, max_newton=FALLBACK, contact_tolerance=laws))
         steps.run(r, scale, fresh=True)
-        self.newton, self.linear = self.newton + steps.newton - 1, self.linear + steps.linear
+        self.newton += max(0, steps.newton - 1)  # the first is on the matrix at hand
+        self.linear, self.multipliers = self.linear + steps.linear, self.multipliers + steps.multipliers
         self.r, self.scale = system.evaluate(None, new_multipliers=True)
         return steps.newton > 0
 
@@ -136,7 +139,7 @@ class ContactNewton:
             max_newton=PATIENCE * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
         )  # fmt: skip
-        inner = solve_linear(system, problem, self.r, self.scale, SOFTEST if self.stalls else STIFFEST)
+        inner = solve_linear(system, problem, self.r, self.scale, R_SCALE if self.stalls else STIFFEST)
         self.linear, self.multipliers = self.linear + inner.linear, self.multipliers + inner.multipliers
         return inner
 

@@ -179,8 +179,8 @@ def sum_residual(k: ti.template()):
 def press(m: ti.template(), k: ti.template(), new_multipliers: ti.i32, beta: ti.f64, r_scale: ti.f64):
     """Find the impulses of all contacts at the present x, their blocks of the matrix, and the residual of their laws.
 
-    new_multipliers: whether the impulses are made the multipliers first, and the disks opened as
-    far as these say. r_scale: R over the r-factors.
+    new_multipliers: whether the impulses are made the multipliers first, and the disks opened as far as these say.
+    r_scale: R over the r-factors.
     """
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=p.serial)

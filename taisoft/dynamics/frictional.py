@@ -1,8 +1,8 @@
 """The frictional problem of a linearised stage on one thread: multipliers, linear solves and step lengths in one launch.
 
 It is the loop of `newton.Newton` over such a stage, whose docstring says what it does; on threads and on CUDA that one drives the
-same functions from the host. A launch does no more than so many iterations of conjugate gradients, so that Ctrl-C is
-heard; where the loop stands is kept in `loop`, and the next launch goes on.
+same functions from the host. A launch does no more than so many iterations of conjugate gradients, so that Ctrl-C is heard; where
+the loop stands is kept in `loop`, and the next launch goes on.
 """
 
 import taichi as ti
@@ -39,7 +39,7 @@ def next_scale(scale, law, before, taken, stiffest):
 
     taken: steps since. A residual that rises tells that friction disks and normal impulses drive each other up.
     """
-    new = scale
+    new = ti.min(stiffest, scale)
     if law > RISEN_LAW * before and scale > STEADY:
         new = 0.5 * scale
     elif law > FALLEN_LAW * before:
