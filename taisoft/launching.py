@@ -247,7 +247,8 @@ class Compiled:
                     context.set_arg_int((slot + k,), operator.index(leaf))
                 elif leaf.host is not None:
                     host = leaf.host
-                    context.set_arg_external_array_with_shape((slot + k,), host.ctypes.data, host.nbytes, (len(host),), 0)
+                    entries = host.size // max(leaf.n, 1)  # as the kernel counts them; debug mode checks indices by it
+                    context.set_arg_external_array_with_shape((slot + k,), host.ctypes.data, host.nbytes, (entries,), 0)
                 else:
                     context.set_arg_ndarray((slot + k,), leaf.device.arr)
         return context

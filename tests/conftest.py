@@ -25,10 +25,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Without the long ones. Slow files first, so that processes that share the files end at about the same time."""
     long = [item for item in items if is_long(item.nodeid)]
-    if config.getoption("--long"):
-        if config.args == [str(config.rootpath / path) for path in config.getini("testpaths")] or config.args == ["tests"]:
-            _refuse_parts_of_nothing([item.nodeid for item in long])
-    elif not (len(long) == len(items) and any("::" in name for name in config.args)):  # what is named one by one is meant
+    if config.args == [str(config.rootpath / path) for path in config.getini("testpaths")] or config.args == ["tests"]:
+        _refuse_parts_of_nothing([item.nodeid for item in long])
+    named = len(long) == len(items) and any("::" in name for name in config.args)  # what is named one by one is meant
+    if not (named or config.getoption("--long")):
         items[:] = [item for item in items if not is_long(item.nodeid)]
         config.hook.pytest_deselected(items=long)
     no_gpu = pytest.mark.skip(reason="this machine has no NVIDIA GPU")

@@ -56,7 +56,6 @@ LONG = {
     "test_spatial_hash": ("[('f32', False)]",),
     "test_near": ("[('f32', False)",),
     "test_elasticity": ("test_forces[f32]", "test_force_differential[f32]", "test_assembled_stiffness[f32]"),
-    "test_contact_stage": ("f32",),
     "test_reduction": ("f32",),
     "test_frank_wolfe": ("[f32]",),
     "test_study_cli": ("test_interrupted_then_killed",),
