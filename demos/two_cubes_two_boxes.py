@@ -31,10 +31,12 @@ def check(sim: ts.Simulator, result) -> None:
     last = result.step_reports[-1]
     # 0.1 to 0.5 measured, 1 cm/s: contacts of such coarse triangles, 1.5 mm in each other, are other ones in each step
     assert last.kinetic < 1.0, f"kinetic energy is left: {last.kinetic:.3g} J"
+    # that makes forces swing by 4 % and the energy by 1 %
     for side in ("left", "right"):
         force = sim.contact_force(f"{side} cube")
-        assert np.abs(force - (0.0, WEIGHT, 0.0)).max() < 0.05 * WEIGHT, f"the {side} cube is borne with {force} N"  # 0.04 measured
-    assert abs(last.elastic / ENERGY - 1.0) < 0.03, f"the energy is {last.elastic:.2f} J, not {ENERGY} J"  # 0.02 measured
+        assert np.abs(force - (0.0, WEIGHT, 0.0)).max() < 0.05 * WEIGHT, f"the {side} cube is borne with {force} N"
+    elastic = np.mean([report.elastic for report in result.step_reports[-60:]])
+    assert abs(elastic / ENERGY - 1.0) < 0.004, f"the energy is {elastic:.2f} J, not {ENERGY} J"  # 5e-4 measured
     push = sim.contact_force("right box")[0]
     assert 500.0 < push < 700.0, f"the boxes push each other with {push:.0f} N"  # 581 to 609 measured
     deepest = max(report.max_penetration for report in result.step_reports)
