@@ -21,7 +21,7 @@ from taisoft.dynamics.frictional import (
     VERDICT,
 )
 from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
-from taisoft.dynamics.line_search import search
+from taisoft.dynamics.line_search import better_start, search
 from taisoft.dynamics.newton import FALL, Newton
 from taisoft.dynamics.residual import AGAIN
 from taisoft.dynamics.stage_result import StageResult, relative
@@ -74,8 +74,10 @@ class ContactNewton:
     def run(self) -> StageResult:
         """From the first iterate on, where the matrix has been formed."""
         system, stage = self.system, self.stage
-        self.r, self.scale = system.evaluate(new_multipliers=True)
-        least, stalled = self.r, 0
+        self.r, self.scale, moved = better_start(system, *system.evaluate(new_multipliers=True))
+        if moved:
+            system.form_matrix()
+        least, stalled, self.carries = self.r, 0, moved
         while not self._done() and self.newton < stage.max_newton and math.isfinite(self.r):
             if self.newton > 0:
                 system.form_matrix()
@@ -139,7 +141,9 @@ class ContactNewton:
             max_newton=PATIENCE * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
         )  # fmt: skip
-        inner = solve_linear(system, problem, self.r, self.scale, R_SCALE if self.stalls else STIFFEST)
+        r = system.advance()[0] if self.carries else self.r  # along the motion that was not carried on
+        self.carries = False
+        inner = solve_linear(system, problem, r, self.scale, R_SCALE if self.stalls else STIFFEST)
         self.linear, self.multipliers = self.linear + inner.linear, self.multipliers + inner.multipliers
         return inner
 
@@ -149,7 +153,12 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
     system.begin(stage)
     if system.n_contacts == 0:
         newton = Newton(system, stage)
-        return newton.run_once() if stage.linearised else newton.run(*system.evaluate(), fresh=False)
+        if stage.linearised:
+            return newton.run_once()
+        r, scale = system.evaluate()
+        if stage.c > 0.0:
+            r, scale, _ = better_start(system, r, scale)
+        return newton.run(r, scale, fresh=False)
     return solve_linearised(system, stage) if stage.linearised else ContactNewton(system, stage).run()
 
 

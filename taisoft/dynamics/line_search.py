@@ -1,4 +1,4 @@
-"""How far a Newton step goes: by the slope of the merit along it.
+"""Where Newton's method starts, and how far a step goes: by the slope of the merit along it.
 
 Contacts that open and close, and tets that turn, can raise |r| in one step and lower it in the next; the slope tells. A step that
 ends on a steep rise is cut back by secants, one that ends on a steep fall is doubled.
@@ -11,6 +11,23 @@ from taisoft.dynamics.stage_system import StageSystem
 
 FLAT, STEEP = 0.5, 0.3  # of the slope at its start: a rise that is too far; a fall on which a step is doubled
 TRIES, LONGEST = 20, 1024.0  # of a step's length
+FAR = 0.5  # |r| over scale at the first iterate above which another one is tried
+
+
+def better_start(system: StageSystem, r: float, scale: float) -> tuple[float, float, bool]:
+    """From a first iterate of (|r|, scale) to v = 0 where |r| is less there: what holds then, and whether it is there.
+
+    Tets that swing many times in a step, as inverted ones do, are far from the step's end where their motion is carried on.
+    y is the way back to the first iterate then, a good first direction on the matrix of v = 0.
+    """
+    if r <= FAR * scale:
+        return r, scale, False
+    system.aim_at_rest()
+    trial = system.evaluate(STEP)
+    if trial[0] < r or not math.isfinite(r):
+        system.turn_round()
+        return *trial, True
+    return *system.evaluate(AGAIN, 0.0), False
 
 
 def search(system: StageSystem, enough: float) -> tuple[float, float, bool]:

@@ -112,3 +112,19 @@ def place_node(m: ti.template(), w: ti.template(), i, step_length, beta):
     if step_length != 0.0:  # back to the base also where y is not a number
         m.state.x[i] += step_length * beta * ti.cast(w.pcg.y[i], ti.f64)
     m.state.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
+
+
+@kernel
+def aim_at_rest(m: ti.template(), w: ti.template()):
+    """y = -v on the free axes."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        w.pcg.y[i] = -m.free[i] * m.state.v[i]
+
+
+@kernel
+def turn_round(m: ti.template(), w: ti.template()):
+    """y = -y."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        w.pcg.y[i] = -w.pcg.y[i]

@@ -21,7 +21,7 @@ from taisoft.dynamics.contact_terms import NO_CONTACTS, StageContacts, begin_con
 from taisoft.dynamics.linearised import advance, keep_linear, leave_linear
 from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STAY, form_residual, move
 from taisoft.dynamics.rounding import RoundingFloor
-from taisoft.dynamics.stage import StageWork, begin_stage
+from taisoft.dynamics.stage import StageWork, aim_at_rest, begin_stage, turn_round
 from taisoft.fields import FieldArena
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
@@ -166,6 +166,14 @@ class StageSystem:
             press(m, k, int(new_multipliers), stage.beta, self.r_scale)
         form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
         return self._sizes(stage.c, stage.beta)
+
+    def aim_at_rest(self) -> None:
+        """The next direction leads to v = 0."""
+        aim_at_rest(self.model, self.work)
+
+    def turn_round(self) -> None:
+        """The next direction is the opposite of the last."""
+        turn_round(self.model, self.work)
 
     def linearise(self) -> None:
         """From here on elastic forces are linear, by the matrix at hand."""
