@@ -10,6 +10,7 @@ from taisoft import runtime
 from taisoft.attributes import thawed
 from taisoft.dynamics import make_stepper
 from taisoft.dynamics.motion import Motion
+from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.pull import Pull, batch
 from taisoft.dynamics.world import World
 from taisoft.elasticity import NO_TET, measure
@@ -80,7 +81,7 @@ class Simulator(Resuming):
                 self._contact = ContactStep(self._world, self_collision, self.settings.explicit)
                 self._owned.append(self._contact)
             self._pull = Pull(self._world) if pullable else None
-            self._stepper = make_stepper(self._world, integrator, self._contact, contact_solver)
+            self._stepper = make_stepper(self._world, integrator, self._contact or NoContacts(), contact_solver)
             self._owned.append(self._stepper)
             self.reset()
             if touching and not scene.allow_initial_overlap:

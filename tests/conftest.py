@@ -26,7 +26,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Without the long ones. Slow files first, so that processes that share the files end at about the same time."""
     long = [item for item in items if is_long(item.nodeid)]
     if config.args == [str(config.rootpath / path) for path in config.getini("testpaths")] or config.args == ["tests"]:
-        _refuse_parts_of_nothing([item.nodeid for item in long])
+        _refuse_parts_of_nothing(items)
     named = len(long) == len(items) and any("::" in name for name in config.args)  # what is named one by one is meant
     if not (named or config.getoption("--long")):
         items[:] = [item for item in items if not is_long(item.nodeid)]
@@ -40,9 +40,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items.sort(key=lambda item: (places.get(item.path.stem, len(SLOW)), str(item.path), "f64" in item.name))
 
 
-def _refuse_parts_of_nothing(names: list[str]) -> None:
+def _refuse_parts_of_nothing(items: list[pytest.Item]) -> None:
+    names = [item.nodeid for item in items]
+    for file in LONG:
+        if not (Path(__file__).parent / f"{file}.py").is_file():
+            raise pytest.UsageError(f"tests/long.py: there is no {file}.py")
+    collected = {item.path.stem for item in items}  # a file whose libraries are absent is skipped whole
     for file, parts in LONG.items():
-        for part in parts:
+        for part in parts if file in collected else ():
             if not any(f"/{file}.py::" in name and part in name for name in names):
                 raise pytest.UsageError(f"tests/long.py: no test of {file} has '{part}' in its name")
 

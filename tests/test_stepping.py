@@ -11,6 +11,7 @@ both kinds:
 """
 
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from scipy.linalg import block_diag
 import taisoft as ts
 from taisoft import dynamics
 from taisoft.dynamics import IMPLICIT, scheme_of
+from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.elements import reference
 from taisoft.linear.block_csr import to_scipy
 from taisoft.model import damping_table
@@ -297,8 +299,9 @@ def test_names_mean_what_they_should(monkeypatch):
         ("implicit.ImplicitStepper", lambda world, scheme, contact: (scheme, contact)),
     ):
         monkeypatch.setattr(f"taisoft.dynamics.{name}", built)
-    assert [dynamics.make_stepper(None, name, None, "auto") for name in EXPLICIT] == [False, True]
-    touching = [dynamics.make_stepper(None, name, "contact", "jacobi") for name in EXPLICIT]
-    assert touching == [(False, "contact", "jacobi"), (True, "contact", "jacobi")]
+    assert [dynamics.make_stepper(None, name, NoContacts(), "auto") for name in EXPLICIT] == [False, True]
+    contact = SimpleNamespace(idle=False)
+    touching = [dynamics.make_stepper(None, name, contact, "jacobi") for name in EXPLICIT]
+    assert touching == [(False, contact, "jacobi"), (True, contact, "jacobi")]
     assert set(IMPLICIT) == {"linearly_implicit_euler", "implicit_euler", "bdf2", "implicit_midpoint"}
     assert all(dynamics.make_stepper(None, name, "contact", "auto") == (scheme_of(name), "contact") for name in IMPLICIT)

@@ -1,5 +1,6 @@
 """`taisoft warm`: compiles the kernels of common scenes ahead, so that later runs find them in the cache on disk."""
 
+import contextlib
 import time
 import warnings
 from argparse import Namespace
@@ -13,12 +14,14 @@ from taisoft import compile_message
 from taisoft.cli import warm_scenes
 from taisoft.cli.warm_scenes import Structure
 from taisoft.dynamics import EXPLICIT
+from taisoft.errors import SimulationError
 from taisoft.runtime import n_compiled
 
 STEPS = {True: (1e-5, 200), False: (1e-2, 10)}  # of explicit and implicit integrators: dt [s], and how many
 LONG = 1.0  # [s]
 HEAVY = (0.0, -500.0, 0.0)  # [m/s^2]
 SQUEEZE = np.array([0.3, 1.0, 1.0])  # of positions
+WILD = 0.5  # of a body's extent in a step: speed at which nodes fly about
 
 
 def command(arguments: Namespace) -> int:
@@ -44,6 +47,12 @@ def simulate(structure: Structure, precision: str) -> None:
             sim.dt = LONG  # so long that inertia does not hide the stiffness
             sim.set_state(SQUEEZE * sim.positions())  # where the stiffness must be projected and the line search has work
             sim.step()
+        if structure.integrator not in EXPLICIT:
+            x = sim.positions()
+            size = WILD * float(np.ptp(x, axis=0).min()) / sim.dt
+            sim.set_state(velocities=size * np.random.default_rng(0).standard_normal(x.shape))
+            with contextlib.suppress(SimulationError):  # what is refused or ends in no numbers has compiled all the same
+                sim.step()
         sim.energies()
         sim.stress()
 

@@ -12,6 +12,7 @@ from taisoft.dynamics.world import World
 if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep
     from taisoft.dynamics.implicit import ImplicitStepper, Scheme
+    from taisoft.dynamics.no_contacts import NoContacts
 
 EXPLICIT = ("symplectic_euler", "velocity_verlet")
 IMPLICIT = ("linearly_implicit_euler", "implicit_euler", "bdf2", "implicit_midpoint")
@@ -24,19 +25,18 @@ def scheme_of(integrator: str) -> "Scheme":
 
 
 def make_stepper(
-    world: World, integrator: str, contact: "ContactStep | None", method: str
+    world: World, integrator: str, contact: "ContactStep | NoContacts", method: str
 ) -> "ExplicitStepper | ImplicitStepper":
-    """The stepper of an integrator; the names have been checked. contact: None where nothing can touch.
+    """The stepper of an integrator; the names have been checked.
 
     method: contact solver of explicit steps; "auto" is serial Gauss-Seidel on the CPU, and the coloured one on CUDA.
     """
     if integrator in IMPLICIT:
         from taisoft.dynamics.implicit import ImplicitStepper
-        from taisoft.dynamics.no_contacts import NoContacts
 
-        return ImplicitStepper(world, scheme_of(integrator), contact or NoContacts())
+        return ImplicitStepper(world, scheme_of(integrator), contact)
     verlet = integrator == "velocity_verlet"
-    if contact is None:
+    if contact.idle:
         return ExplicitStepper(world, verlet)
     if method == "auto":
         method = "gauss_seidel" if world.runtime.arch == "cpu" else "coloured_gauss_seidel"

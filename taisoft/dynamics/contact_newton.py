@@ -21,7 +21,7 @@ from taisoft.dynamics.frictional import (
     VERDICT,
 )
 from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
-from taisoft.dynamics.line_search import better_start, search
+from taisoft.dynamics.line_search import choose_start, search
 from taisoft.dynamics.newton import FALL, Newton
 from taisoft.dynamics.residual import AGAIN
 from taisoft.dynamics.stage_result import StageResult, relative
@@ -70,14 +70,16 @@ class ContactNewton:
         self.floor = system.rounding.of_stage(stage.c, stage.beta)
         self.newton = self.linear = self.multipliers = 0
         self.rounding = self.tight = self.stalls = False
+        self.has_direction = False  # y is a good first direction on the matrix at hand
 
     def run(self) -> StageResult:
         """From the first iterate on, where the matrix has been formed."""
         system, stage = self.system, self.stage
-        self.r, self.scale, moved = better_start(system, *system.evaluate(new_multipliers=True))
-        if moved:
-            system.form_matrix()
-        least, stalled, self.carries = self.r, 0, moved
+        self.r, self.scale, self.has_direction = choose_start(system, *system.evaluate(new_multipliers=True))
+        if self.has_direction:  # what was formed at the first iterate is void
+            system.form_matrix_and_factors()
+            self.r, self.scale = system.evaluate(None)
+        least, stalled = self.r, 0
         while not self._done() and self.newton < stage.max_newton and math.isfinite(self.r):
             if self.newton > 0:
                 system.form_matrix()
@@ -96,7 +98,7 @@ class ContactNewton:
                 if not (inner.negative or self.tight):
                     # where friction goes round and round, a shorter step helps, and more of these do not
                     moved &= self.r < FALL * least or (only_laws and system.contact_residual < FALL * law)
-            # multipliers and friction disks go round and round: softer and longer next time
+            # multipliers and friction disks go round and round: longer next time, R no larger than usual
             stalled += self.r > STALLED * least
             self.stalls = stalled >= 2
             least = min(least, self.r)
@@ -141,23 +143,35 @@ class ContactNewton:
             max_newton=PATIENCE * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
         )  # fmt: skip
-        r = system.advance()[0] if self.carries else self.r  # along the motion that was not carried on
-        self.carries = False
-        inner = solve_linear(system, problem, r, self.scale, R_SCALE if self.stalls else STIFFEST)
+        inner = solve_linear(system, problem, self._first_residual(), self.scale, R_SCALE if self.stalls else STIFFEST)
         self.linear, self.multipliers = self.linear + inner.linear, self.multipliers + inner.multipliers
         return inner
 
+    def _first_residual(self) -> float:
+        """|r| where a solve begins, of the stage that has just been linearised."""
+        system = self.system
+        if not self.has_direction:
+            return self.r
+        self.has_direction = False
+        r, _ = system.advance()
+        if math.isfinite(r) and system.has_advanced_to_a_root:
+            return r
+        r, _ = system.leave_linear(taken=False)
+        system.linearise()
+        return r
+
 
 def solve(system: StageSystem, stage: Stage) -> StageResult:
-    """Solve a stage from the present v. x_hat, v_hat, the targets and the contacts are set by the caller."""
+    """Solve a stage from the present v, or from v = 0, see `choose_start`.
+
+    x_hat, v_hat, the targets and the contacts are set by the caller.
+    """
     system.begin(stage)
     if system.n_contacts == 0:
         newton = Newton(system, stage)
         if stage.linearised:
             return newton.run_once()
-        r, scale = system.evaluate()
-        if stage.c > 0.0:
-            r, scale, _ = better_start(system, r, scale)
+        r, scale, _ = choose_start(system, *system.evaluate())
         return newton.run(r, scale, fresh=False)
     return solve_linearised(system, stage) if stage.linearised else ContactNewton(system, stage).run()
 

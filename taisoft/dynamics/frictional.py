@@ -39,7 +39,7 @@ def next_scale(scale, law, before, taken, stiffest):
 
     taken: steps since. A residual that rises tells that friction disks and normal impulses drive each other up.
     """
-    new = ti.min(stiffest, scale)
+    new = scale
     if law > RISEN_LAW * before and scale > STEADY:
         new = 0.5 * scale
     elif law > FALLEN_LAW * before:

@@ -14,18 +14,19 @@ TRIES, LONGEST = 20, 1024.0  # of a step's length
 FAR = 0.5  # |r| over scale at the first iterate above which another one is tried
 
 
-def better_start(system: StageSystem, r: float, scale: float) -> tuple[float, float, bool]:
-    """From a first iterate of (|r|, scale) to v = 0 where |r| is less there: what holds then, and whether it is there.
+def choose_start(system: StageSystem, r: float, scale: float) -> tuple[float, float, bool]:
+    """Start from v = 0 if |r| is smaller there than at the first iterate, whose (|r|, scale) is given.
 
-    Tets that swing many times in a step, as inverted ones do, are far from the step's end where their motion is carried on.
-    y is the way back to the first iterate then, a good first direction on the matrix of v = 0.
+    Returns what holds then, and whether it is v = 0; y leads back to the first iterate in that case, which is a good first
+    direction on the matrix formed at v = 0. Tets that swing many times in a step, as inverted ones do, are far from any balance
+    where their motion goes on as it was. Statics keep their start.
     """
-    if r <= FAR * scale:
+    if r <= FAR * scale or system.is_static:
         return r, scale, False
-    system.aim_at_rest()
+    system.set_direction_to_rest()
     trial = system.evaluate(STEP)
     if trial[0] < r or not math.isfinite(r):
-        system.turn_round()
+        system.negate_direction()
         return *trial, True
     return *system.evaluate(AGAIN, 0.0), False
 

@@ -115,7 +115,7 @@ def place_node(m: ti.template(), w: ti.template(), i, step_length, beta):
 
 
 @kernel
-def aim_at_rest(m: ti.template(), w: ti.template()):
+def set_direction_to_rest(m: ti.template(), w: ti.template()):
     """y = -v on the free axes."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -123,7 +123,7 @@ def aim_at_rest(m: ti.template(), w: ti.template()):
 
 
 @kernel
-def turn_round(m: ti.template(), w: ti.template()):
+def negate_direction(m: ti.template(), w: ti.template()):
     """y = -y."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):

@@ -18,15 +18,15 @@ import taichi as ti
 from taisoft.contact.problem import RESIDUAL, find_factors
 from taisoft.dynamics import frictional
 from taisoft.dynamics.contact_terms import NO_CONTACTS, StageContacts, begin_contacts, build_stage_contacts, keep_diagonal, press
-from taisoft.dynamics.linearised import advance, keep_linear, leave_linear
+from taisoft.dynamics.linearised import LONGEST, advance, keep_linear, leave_linear
 from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STAY, form_residual, move
 from taisoft.dynamics.rounding import RoundingFloor
-from taisoft.dynamics.stage import StageWork, aim_at_rest, begin_stage, turn_round
+from taisoft.dynamics.stage import StageWork, begin_stage, negate_direction, set_direction_to_rest
 from taisoft.fields import FieldArena
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.model import Model
-from taisoft.scalars import END_SLOPE, START_SLOPE
+from taisoft.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
 from taisoft.transfer import download, upload
 
 if TYPE_CHECKING:
@@ -124,6 +124,11 @@ class StageSystem:
         return int(self._k.problem.count[0]) if self._k.any else 0
 
     @property
+    def is_static(self) -> bool:
+        """Whether the stage has no inertia."""
+        return self._stage.c == 0.0
+
+    @property
     def contact_residual(self) -> float:
         """Of the contact laws, where the residual was last formed."""
         return float(self._k.problem.state[RESIDUAL]) if self._k.any else 0.0
@@ -151,8 +156,7 @@ class StageSystem:
         self._fit()
         self._k, impact = self._room, kind == IMPACT
         begin_contacts(self.work, self._k, impact, stage.beta, stage.dt, np.array(self.contact.goal))
-        self.form_matrix(projected=impact)
-        find_factors(self._k.problem)
+        self.form_matrix_and_factors(projected=impact)
 
     def evaluate(self, how: int | None = STAY, step_length: float = 1.0, new_multipliers: bool = False) -> tuple[float, float]:
         """(|r|, scale) where `move` goes; None: x is where it was, and so are the elastic forces.
@@ -167,13 +171,13 @@ class StageSystem:
         form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
         return self._sizes(stage.c, stage.beta)
 
-    def aim_at_rest(self) -> None:
-        """The next direction leads to v = 0."""
-        aim_at_rest(self.model, self.work)
+    def set_direction_to_rest(self) -> None:
+        """A whole step along y leads to v = 0."""
+        set_direction_to_rest(self.model, self.work)
 
-    def turn_round(self) -> None:
-        """The next direction is the opposite of the last."""
-        turn_round(self.model, self.work)
+    def negate_direction(self) -> None:
+        """y = -y."""
+        negate_direction(self.model, self.work)
 
     def linearise(self) -> None:
         """From here on elastic forces are linear, by the matrix at hand."""
@@ -185,6 +189,11 @@ class StageSystem:
         stage = self._stage
         advance(self.model, self.work, self.matrix, self._k, stage.beta, self.r_scale, self.norms)
         return self._sizes(stage.c, stage.beta)
+
+    @property
+    def has_advanced_to_a_root(self) -> bool:
+        """Whether the slope vanished somewhere along y: it need not where the matrix is indefinite."""
+        return self.model.state.scalars[STEP_LENGTH] < LONGEST
 
     def solve_frictional(self, problem: Stage, r: float, floor: float, stiffest: float) -> np.ndarray:
         """The loop of a linearised stage from |r| on, in launches that Ctrl-C can come between: see `frictional`."""
@@ -228,6 +237,11 @@ class StageSystem:
         self._same_matrix = False
         if self._k.any:
             keep_diagonal(m, self.matrix, self._k)
+
+    def form_matrix_and_factors(self, projected: bool = False) -> None:
+        """The matrix and the r-factors of the contacts, which stay for the stage."""
+        self.form_matrix(projected)
+        find_factors(self._k.problem)
 
     def direction(self, tolerance: float) -> pcg.LinearResult:
         """y of pcg from -r."""
