@@ -29,6 +29,7 @@ from taisoft.dynamics.stage_system import Stage, StageSystem
 
 LINEAR_LIMIT = 0.01  # true relative residual of a linearly implicit step above which it has failed
 MAX_FORCING, RISEN_FORCING = 0.1, 3e-2  # CG's loosest tolerance, and that after a step that raised |r|
+STATIC_FORCING = 1e-2  # and in statics, where a loose solve leaves a slender body stretched for the next step to mend
 SLOW = 0.2  # a step that leaves more of |r| than this asks for a new matrix,
 SERVES = {False: 1, True: 3}  # which serves at least so many; with contacts most of what changes is what touches
 FALL = 0.9  # with contacts, share of the least |r| so far below which a step needs no look at its slope
@@ -41,6 +42,7 @@ class Newton:
         self.system, self.stage, self.stiffest = system, stage, stiffest
         self.inner = system.kind == LINEARISED  # an indefinite matrix is then left to the caller
         self.floor = system.rounding.of_stage(stage.c, stage.beta)
+        self.loosest = MAX_FORCING if stage.c > 0.0 else STATIC_FORCING
         self.newton = self.linear = self.multipliers = 0
         self.rounding = self.negative = False  # nothing but rounding is left of |r|; negative curvature was met
 
@@ -71,7 +73,7 @@ class Newton:
 
     def _aim(self) -> None:
         """The multipliers are new: what |r| is to be brought down to with them."""
-        self.goal, self.least, self.previous, self.forcing, self.taken = PROGRESS * self.r, self.r, 0.0, MAX_FORCING, 0
+        self.goal, self.least, self.previous, self.forcing, self.taken = PROGRESS * self.r, self.r, 0.0, self.loosest, 0
 
     def _near(self) -> bool:
         """Whether the multipliers have done what they can."""
@@ -138,12 +140,12 @@ class Newton:
             return self.stage.linear_tolerance
         enough = self.stage.tolerance * self.scale
         if self.previous == 0.0:
-            self.forcing = MAX_FORCING
+            self.forcing = self.loosest
         elif self.r > self.previous:
-            self.forcing = RISEN_FORCING
+            self.forcing = min(RISEN_FORCING, self.loosest)
         else:
             wanted, guard = 0.9 * (self.r / self.previous) ** 2, 0.9 * self.forcing**2
-            self.forcing = min(MAX_FORCING, max(wanted, guard if guard > 0.1 else 0.0))
+            self.forcing = min(self.loosest, max(wanted, guard if guard > 0.1 else 0.0))
         # the last solve need not go far below what Newton asks for
         tolerance = max(self.forcing, 0.1 * enough / self.r, 1e-12)
         # where the rounding of stiff stress hides the motion of the whole body in |r|, only a tight solve gets that motion right
