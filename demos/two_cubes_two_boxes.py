@@ -29,9 +29,9 @@ def build() -> ts.Scene:
 def check(sim: ts.Simulator, result) -> None:
     """Both cubes are nearly at rest, each box bears one, and the boxes, which have swollen, push each other apart."""
     last = result.step_reports[-1]
-    # 0.1 to 0.5 measured, 1 cm/s: contacts of such coarse triangles, 1.5 mm in each other, are other ones in each step
+    # 0.1 to 0.5 measured, 1 cm/s: the number of contacts still changes from step to step, at 1.5 mm in each other
     assert last.kinetic < 1.0, f"kinetic energy is left: {last.kinetic:.3g} J"
-    # that makes forces swing by 4 % and the energy by 1 %
+    # forces swing by 4 % and the energy by 1 %
     for side in ("left", "right"):
         force = sim.contact_force(f"{side} cube")
         assert np.abs(force - (0.0, WEIGHT, 0.0)).max() < 0.05 * WEIGHT, f"the {side} cube is borne with {force} N"

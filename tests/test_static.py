@@ -47,6 +47,7 @@ def test_equilibrium(solved):
     oracle = Oracle(scene)
     x = result.positions("beam")
     assert result.converged and result.residual <= 1e-9 and result.n_inverted == 0
+    assert result.load_steps > 1 or scene.bodies[0].order == 1  # whose Newton steps get there at once
     assert 30 < result.iterations < 500 and result.linear_iterations > result.iterations
     assert unbalanced(scene, result) <= 2e-9
     assert result.elastic == pytest.approx(oracle.energy(x)) and result.elastic > 1.0

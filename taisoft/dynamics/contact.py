@@ -286,7 +286,7 @@ class ContactStep:
         except SimulationError:
             if not self._follows:
                 raise
-            self._find(time, 0.0)  # a path that ends here: whoever steps on will be told
+            self._find(time, 0.0)  # a path that ends here; the next step reports it
         told = self._survey(dt)
         depth, self.sinking = float(told[DEPTH]), float(told[SINKING])
         if not self._explicit:
