@@ -14,7 +14,7 @@ import contact_oracle as oracle
 import numpy as np
 import pytest
 
-from benchmarks import contact, contact_captured, contact_crossover, contact_drops_table, contact_runs
+from benchmarks import contact, contact_captured, contact_crossover, contact_drops_table, contact_free_table, contact_runs
 from benchmarks.contact_captured import COLOURED, GOAL, SERIAL, Outcome, Solvers, contact_jacobian, patched, shown
 from benchmarks.contact_colours import REPORT, Colouring, colour_all, colour_table, proper
 from benchmarks.contact_crossover import Point, build_plates, crossover_text, find_under, grid, measure_crossover
@@ -353,3 +353,25 @@ def test_bodies_that_fall(tmp_path, capsys):
     met = {limit.what: limit.met for limit in contact_drops_table.limits_of(whole)}
     assert met["bunny: time of the older version over this one's"] and not met["cloth: time of the older version over this one's"]
     assert len(met) == 6 and sum(met.values()) == 4
+
+
+def test_steps_without_contacts(tmp_path, capsys):
+    """A few steps and static solves, this version beside itself; what one version alone converges in is not told."""
+    out, here = tmp_path / "free.json", str(contact_free_table.HERE)
+    names = ["beam, BDF2", "static beams"]
+    only = [word for name in names for word in ("--only", name)]
+    assert contact.main(["--free", "--quick", *only, "--baseline", here, "--out", str(out)]) == 0
+    runs = json.loads(out.read_text())["runs"]
+    for name in names:
+        (this,), (older,) = (runs[name][label] for label in ("this", "older"))
+        assert this["newton"] == older["newton"] and this["linear"] == older["linear"] and min(this["newton"]) > 0
+        assert this["converged"] == [True] * 3
+    assert capsys.readouterr().out.count("| beam, BDF2") == 2
+    older |= {"converged": [True, False, True], "newton": [1, 1, 1]}
+    own = {"this": [this], "older": [older]}
+    assert contact_free_table.total(own, "this", "newton")[0] == this["newton"][0] + this["newton"][2]
+    limits = {limit.what: limit for limit in contact_free_table.limits_of({"static beams": own})}
+    more = limits["static beams: Newton iterations over the older version's"]
+    assert more.value == (this["newton"][0] + this["newton"][2]) / 2 and not more.met
+    inverted = contact_free_table.limits_of({"inverted beam, BDF2": {"this": [this]}})
+    assert [limit.value for limit in inverted] == [sum(this["newton"]) / 3]
