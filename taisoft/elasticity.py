@@ -28,6 +28,7 @@ from taisoft.mass import mass_times
 from taisoft.math3 import determinant, matmul_nt
 from taisoft.runtime import kernel
 from taisoft.scalars import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, LOADS, MIN_J, N_INVERTED
+from taisoft.subset import EVERYTHING
 
 NO_TET = 2**31 - 1  # above any number of a tet
 
@@ -35,7 +36,7 @@ NO_TET = 2**31 - 1  # above any number of a tet
 @kernel
 def elastic_forces(m: ti.template()):
     """Fill the buffer of tets' forces from x; returns nothing, nodes gather."""
-    elasticity.sum_elements(m)
+    elasticity.sum_elements(m, EVERYTHING)
 
 
 @kernel

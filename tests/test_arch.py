@@ -19,6 +19,7 @@ from taisoft import elasticity
 from taisoft.linear import block_csr
 from taisoft.runtime import open_runtime
 from taisoft.scalars import ELASTIC
+from taisoft.subset import EVERYTHING
 
 GPU = pytest.mark.cuda
 ARCHS = ["cpu", pytest.param("cuda", marks=GPU)]
@@ -46,7 +47,7 @@ def test_operator(arch, precision):
         expected = rig.oracle.force(x)
         assert np.abs(force.to_numpy() - expected).max() < 100 * rig.eps * np.abs(expected).max()
         matrix = block_csr.build_block_csr(rig.model, rig.arena, rig.model.real)
-        block_csr.assemble(rig.model, matrix, False)
+        block_csr.assemble(rig.model, matrix, EVERYTHING, False)
         direction, product = rng.standard_normal(x.shape), rig.vectors("product")
         factor = rig.vectors("factor", direction.astype(rig.machine.np_real))
         block_csr.multiply(rig.model, matrix, factor, product)

@@ -17,6 +17,7 @@ from scenes import SNH, SVK, built, mixed_scene
 from taisoft import elasticity
 from taisoft.linear import block_csr
 from taisoft.scalars import ELASTIC, GRAVITY, MIN_J, N_INVERTED
+from taisoft.subset import EVERYTHING
 
 SQUEEZE = np.array([[0.6, 0.1, 0.0], [-0.15, 1.2, 0.05], [0.0, 0.1, 0.7]])
 
@@ -138,7 +139,7 @@ def test_assembled_stiffness(rig, squeezed):
     exactly = rig.oracle.stiffness(squeezed)
     rig.matrix.value.fill(np.nan)
     rig.matrix.diagonal.fill(np.nan)
-    block_csr.assemble(rig.model, rig.matrix, False)
+    block_csr.assemble(rig.model, rig.matrix, EVERYTHING, False)
     K = block_csr.to_scipy(rig.model, rig.matrix).toarray()
     close(rig, K, exactly, 100)
     close(rig, K, K.T, 20)
@@ -151,7 +152,7 @@ def test_assembled_stiffness(rig, squeezed):
 
 def test_stiffness_by_finite_differences_of_the_forces(rig, squeezed):
     """Of the package's own forces: h^2 of the third derivative of the energy, and the rounding of the forces over h."""
-    block_csr.assemble(rig.model, rig.matrix, False)
+    block_csr.assemble(rig.model, rig.matrix, EVERYTHING, False)
     K = block_csr.to_scipy(rig.model, rig.matrix)
     way, h = np.random.default_rng(7).standard_normal(squeezed.shape), {"f64": 1e-6, "f32": 1e-3}[rig.machine.precision]
     forces = [elastic_force(rig, squeezed + step * way) for step in (h, -h)]
@@ -175,7 +176,7 @@ def test_pattern_is_the_node_graph(rig):
 def test_projected_stiffness(rig, squeezed):
     expected = rig.oracle.stiffness(squeezed, projected=True)
     assert np.abs(expected - rig.oracle.stiffness(squeezed)).max() > 1e4  # [N/m] there is something to project
-    block_csr.assemble(rig.model, rig.matrix, True)
+    block_csr.assemble(rig.model, rig.matrix, EVERYTHING, True)
     K = block_csr.to_scipy(rig.model, rig.matrix).toarray()
     close(rig, K, expected, 100)
     assert np.linalg.eigvalsh((K + K.T) / 2).min() > -20 * rig.eps * np.abs(K).max()
@@ -192,7 +193,7 @@ def test_system(rig):
     for field, values in zip(fields, numbers):
         field.from_numpy(values)
     K, K_d = (block_csr.to_scipy(rig.model, A).toarray() for A in (rig.matrix, rig.damper))
-    block_csr.to_system(rig.model, rig.matrix, rig.damper, c, beta)
+    block_csr.to_system(rig.model, rig.matrix, rig.damper, EVERYTHING, c, beta)
     expected = (c + beta * a) * M + beta**2 * K + beta * b * K_d
     close(rig, block_csr.to_scipy(rig.model, rig.matrix).toarray(), expected, 10)
 
@@ -202,7 +203,7 @@ def test_parallel_kernels_are_reproducible(rig, squeezed):
     assert not rig.model.serial
 
     def numbers():
-        block_csr.assemble(rig.model, rig.matrix, False)
+        block_csr.assemble(rig.model, rig.matrix, EVERYTHING, False)
         elasticity.elastic_forces(rig.model)
         elasticity.gather_forces(rig.model, rig.force)
         elasticity.measure(rig.model)

@@ -18,6 +18,7 @@ from taisoft.linear.block_csr import row_times
 from taisoft.model import damping_table
 from taisoft.runtime import kernel
 from taisoft.scalars import ELASTIC, GRAVITY, LOADS
+from taisoft.subset import EVERYTHING
 
 ENERGY = {elasticity: ELASTIC, gravity: GRAVITY, dead_loads: LOADS}  # where `measure` leaves it
 H = 1e-6  # [m]
@@ -106,7 +107,7 @@ def test_dampers_take_power(rig):
     rates = np.repeat(damping_table(rig.scene)[:, 0], [body.n_nodes for body in rig.scene.bodies])
     drag = rates * m.mass.to_numpy()
     m.state.x.from_numpy(rig.x)
-    block_csr.assemble(m, matrix, True)
+    block_csr.assemble(m, matrix, EVERYTHING, True)
     for v in (rng.standard_normal(rig.x.shape), np.zeros_like(rig.x), np.tile([1.0, 2.0, 3.0], (len(rig.x), 1))):
         m.state.v.from_numpy(v)
         damping_of(m, matrix, *rig.outs)

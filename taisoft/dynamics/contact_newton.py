@@ -2,13 +2,14 @@
 
 The problem on the fixed matrix needs no elements: `Newton` solves it as an augmented Lagrangian, inexactly, from the impulses so
 far. Its way is a direction for the true stage, judged by |r| and else by the slope of the augmented Lagrangian with the impulses
-found as multipliers. Where the matrix is indefinite, or that leads nowhere, a few steps minimise the true stage under multipliers
-instead.
+found as multipliers. Where the matrix is indefinite, a projected one takes its place; where that leads nowhere, a few steps
+minimise the true stage under multipliers instead. What a slow step leaves on few nodes is solved there first (`elimination`).
 """
 
 import math
 from dataclasses import dataclass, replace
 
+from taisoft.dynamics.elimination import eliminate
 from taisoft.dynamics.frictional import (
     INDEFINITE,
     LINEAR,
@@ -22,7 +23,7 @@ from taisoft.dynamics.frictional import (
 )
 from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
 from taisoft.dynamics.line_search import choose_start, search
-from taisoft.dynamics.newton import FALL, Newton
+from taisoft.dynamics.newton import FALL, SLOW_STEP, Newton
 from taisoft.dynamics.residual import AGAIN
 from taisoft.dynamics.stage_result import StageResult, relative
 from taisoft.dynamics.stage_system import Stage, StageSystem
@@ -101,6 +102,8 @@ class ContactNewton:
             # multipliers and friction disks go round and round: longer next time, R no larger than usual
             stalled += self.r > STALLED * least
             self.stalls = stalled >= 2
+            if moved and self.r > SLOW_STEP * previous and not self._done():
+                self._eliminate()
             least = min(least, self.r)
             self.rounding = self.r <= ROUNDING * self.floor and self.r > 0.5 * previous and self.tight
             if not moved:
@@ -124,11 +127,30 @@ class ContactNewton:
         self.r, self.scale = system.evaluate(None, new_multipliers=True)
         return steps.newton > 0
 
+    def _eliminate(self) -> None:
+        """Solve what a slow step left on few nodes."""
+        if self.r <= self.stage.tolerance * self.scale:  # what is left is the contacts'
+            return
+        found = eliminate(self.system, self.stage, self.r)
+        if found is not None:
+            self.linear, self.multipliers = self.linear + found.linear, self.multipliers + found.multipliers
+            self.r, self.scale = self.system.evaluate(None, new_multipliers=True)
+
     def _done(self) -> bool:
         enough = self.r <= self.stage.tolerance * self.scale or self.rounding
         return enough and self.system.contact_residual <= self.stage.contact_tolerance
 
     def _solve_contacts(self) -> "Frictional":
+        """The contact problem on the matrix at hand, where that is indefinite on a projected one."""
+        inner = self._solve_on_matrix()
+        if inner.negative:
+            self.r, self.scale = self.system.leave_linear(taken=False)
+            self.system.form_matrix(projected=True)
+            self.newton += 1
+            inner = self._solve_on_matrix()
+        return inner
+
+    def _solve_on_matrix(self) -> "Frictional":
         """The contact problem on the matrix at hand, to a share of what the stage has left."""
         system, stage = self.system, self.stage
         system.linearise()
@@ -168,7 +190,7 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
     """
     system.begin(stage)
     if system.n_contacts == 0:
-        newton = Newton(system, stage)
+        newton = Newton(system, stage, eliminate=eliminate)
         if stage.linearised:
             return newton.run_once()
         r, scale, _ = choose_start(system, *system.evaluate())

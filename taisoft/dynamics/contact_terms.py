@@ -20,6 +20,7 @@ from taisoft.linear.block_csr import BLOCK
 from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
 from taisoft.model import Model
 from taisoft.runtime import kernel
+from taisoft.subset import n_nodes_of, node_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,11 +195,12 @@ def press(m: ti.template(), k: ti.template(), new_multipliers: ti.i32, beta: ti.
 
 
 @kernel
-def keep_diagonal(m: ti.template(), A: ti.template(), k: ti.template()):
+def keep_diagonal(m: ti.template(), A: ti.template(), k: ti.template(), part: ti.template()):
     """The matrix has been formed: its diagonal without contacts, and the masses that the r-factors rest on, diag(A)^-1."""
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
+    for j in range(n_nodes_of(m, part)):
+        i = node_of(part, j)
         k.coupling.base[i] = A.diagonal[i]
         for a in ti.static(range(3)):
             # an entry can be negative where tets are strongly compressed

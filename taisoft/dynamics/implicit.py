@@ -280,7 +280,7 @@ class ImplicitStepper:
 
     @property
     def field_bytes(self) -> dict[str, int]:
-        """Bytes by name of the fields that grow with the contacts."""
+        """Bytes by name of the solver's fields that come and go."""
         return self.solver.field_bytes
 
     def release(self) -> None:

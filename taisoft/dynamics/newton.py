@@ -2,7 +2,7 @@
 
 A step solves with the unprojected matrix by conjugate gradients; where these meet negative curvature, the direction leads along
 it (`linear.pcg`). How far it goes `line_search` says. CG's tolerance follows Newton's progress (Eisenstat and Walker 1996,
-choice 2).
+choice 2). What a slow step leaves on few nodes is solved there first, see `elimination`.
 
 Contacts make an augmented Lagrangian of the stage: per multiplier lambda it is minimised with the friction disks frozen, down to
 PROGRESS times what the multiplier left; then lambda = prox(lambda - R u), and the disks open as far as its normal parts say.
@@ -20,6 +20,8 @@ more than that of a strain, and ends the stage as converged, its residual told a
 """
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 from taisoft.dynamics.frictional import MAX_MULTIPLIERS, PROGRESS, R_SCALE, ROUNDING, STIFFEST, next_scale
 from taisoft.dynamics.line_search import search
@@ -32,14 +34,19 @@ MAX_FORCING, RISEN_FORCING = 0.1, 3e-2  # CG's loosest tolerance, and that after
 STATIC_FORCING = 1e-2  # and in statics, where a loose solve leaves a slender body stretched for the next step to mend
 SLOW = 0.2  # a step that leaves more of |r| than this asks for a new matrix,
 SERVES = {False: 1, True: 3}  # which serves at least so many; with contacts most of what changes is what touches
+SLOW_STEP = 0.1  # a step that leaves more of |r| asks for elimination
 FALL = 0.9  # with contacts, share of the least |r| so far below which a step needs no look at its slope
 
 
 class Newton:
     """Newton steps of a stage under multipliers that are renewed; where that is linear, of its contact problem alone."""
 
-    def __init__(self, system: StageSystem, stage: Stage, stiffest: float = STIFFEST):
-        self.system, self.stage, self.stiffest = system, stage, stiffest
+    def __init__(
+        self, system: StageSystem, stage: Stage, stiffest: float = STIFFEST,
+        eliminate: "Callable[[StageSystem, Stage, float], Any] | None" = None,
+    ):  # fmt: skip
+        """eliminate: as `elimination.eliminate`, for steps that leave much; None: there is none."""
+        self.system, self.stage, self.stiffest, self.eliminate = system, stage, stiffest, eliminate
         self.inner = system.kind == LINEARISED  # an indefinite matrix is then left to the caller
         self.floor = system.rounding.of_stage(stage.c, stage.beta)
         self.loosest = MAX_FORCING if stage.c > 0.0 else STATIC_FORCING
@@ -67,7 +74,7 @@ class Newton:
             moved = self._step()
             if not math.isfinite(self.r) or not (moved or served > 1) or (self.inner and self.negative):
                 break
-            fresh = moved
+            fresh = moved and not self._eliminate()
         system.r_scale = R_SCALE  # the next solve finds its own
         return self._result(self._near() and self._done())
 
@@ -124,6 +131,18 @@ class Newton:
         low = self.r <= (ROUNDING if self.stage.c > 0.0 else 1.0) * self.floor
         self.rounding = low and self.r > 0.5 * self.previous
         return moved
+
+    def _eliminate(self) -> bool:
+        """Solve what a slow step left on few nodes; whether there was such."""
+        if self.eliminate is None or self.r <= SLOW_STEP * self.previous or self._near():
+            return False
+        found = self.eliminate(self.system, self.stage, self.r)
+        if found is None:
+            return False
+        self.linear += found.linear
+        self.r, self.scale = self.system.evaluate(None)
+        self.least = min(self.least, self.r)
+        return True
 
     def _enough(self, negative: bool) -> float:
         """|r| below which the end of a whole step needs no look at its slope."""

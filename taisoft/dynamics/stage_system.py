@@ -22,11 +22,13 @@ from taisoft.dynamics.linearised import LONGEST, advance, keep_linear, leave_lin
 from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STAY, form_residual, move
 from taisoft.dynamics.rounding import RoundingFloor
 from taisoft.dynamics.stage import StageWork, begin_stage, negate_direction, set_direction_to_rest
+from taisoft.dynamics.subset_lists import SubsetLists
 from taisoft.fields import FieldArena
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.model import Model
 from taisoft.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
+from taisoft.subset import EVERYTHING, Subset
 from taisoft.transfer import download, upload
 
 if TYPE_CHECKING:
@@ -85,6 +87,8 @@ class StageSystem:
         self._contact_arena = FieldArena()
         self._room: StageContacts | None = None  # for the contacts of this step
         self._k = NO_CONTACTS  # what the present stage has
+        self.part: Subset = EVERYTHING  # what moves
+        self._lists: SubsetLists | None = None
         self._same_matrix = False  # as in the last linear solve of this stage
         self.norms = np.zeros(5)  # what `form_residual` tells
 
@@ -92,12 +96,14 @@ class StageSystem:
 
     @property
     def field_bytes(self) -> dict[str, int]:
-        """Bytes by name of the fields that grow with the contacts."""
-        return self._contact_arena.bytes
+        """Bytes by name of the fields that come with contacts and with steps that are hard to solve."""
+        return self._contact_arena.bytes | (self._lists.field_bytes if self._lists else {})
 
     def release(self) -> None:
         """Give their memory back."""
         self._contact_arena.release()
+        if self._lists:
+            self._lists.release()
 
     def snapshot(self) -> dict:
         """What lives between stages: the rounding and the reactions."""
@@ -165,10 +171,10 @@ class StageSystem:
         """
         m, w, k, stage = self.model, self.work, self._k, self._stage
         if how is not None:
-            move(m, w, k, self.kind, how, step_length, stage.c, stage.beta)
+            move(m, w, k, self.part, self.kind, how, step_length, stage.c, stage.beta)
         if k.any:
             press(m, k, int(new_multipliers), stage.beta, self.r_scale)
-        form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
+        form_residual(m, w, self.matrix, k, self.part, self.kind, stage.beta, self.norms)
         return self._sizes(stage.c, stage.beta)
 
     def set_direction_to_rest(self) -> None:
@@ -178,6 +184,20 @@ class StageSystem:
     def negate_direction(self) -> None:
         """y = -y."""
         negate_direction(self.model, self.work)
+
+    @property
+    def lists(self) -> SubsetLists:
+        """What touches each node, made when it is first asked for."""
+        if self._lists is None:
+            self._lists = SubsetLists(self.model, self.matrix)
+        return self._lists
+
+    def restrict(self, nodes: np.ndarray | None) -> None:
+        """From here on nothing but some nodes, ascending, moves and has rows in the matrix, once that is formed; None: all do."""
+        self.part = EVERYTHING if nodes is None else self.lists.subset(nodes)
+        if nodes is not None:
+            for field in (self.work.pcg.p, self.work.pcg.q):
+                field.fill(0.0)
 
     def linearise(self) -> None:
         """From here on elastic forces are linear, by the matrix at hand."""
@@ -232,11 +252,11 @@ class StageSystem:
     def form_matrix(self, projected: bool = False) -> None:
         """The matrix where the stage stands, without J^T D J, which the linear solve adds."""
         m, stage = self.model, self._stage
-        block_csr.assemble(m, self.matrix, projected)
-        block_csr.to_system(m, self.matrix, self.damper or self.matrix, stage.c, stage.beta)
+        block_csr.assemble(m, self.matrix, self.part, projected)
+        block_csr.to_system(m, self.matrix, self.damper or self.matrix, self.part, stage.c, stage.beta)
         self._same_matrix = False
         if self._k.any:
-            keep_diagonal(m, self.matrix, self._k)
+            keep_diagonal(m, self.matrix, self._k, self.part)
 
     def form_matrix_and_factors(self, projected: bool = False) -> None:
         """The matrix and the r-factors of the contacts, which stay for the stage."""
@@ -246,7 +266,9 @@ class StageSystem:
     def direction(self, tolerance: float) -> pcg.LinearResult:
         """y of pcg from -r."""
         m, w = self.model, self.work
-        answer = pcg.solve(m, self.matrix, w.pcg, tolerance, pcg.most_iterations(m), self._k.coupling, self._same_matrix)
+        answer = pcg.solve(
+            m, self.matrix, w.pcg, tolerance, pcg.most_iterations(m), self._k.coupling, self._same_matrix, self.part
+        )  # fmt: skip
         self._same_matrix = True
         return answer
 
@@ -255,7 +277,7 @@ class StageSystem:
     def assemble_damper(self) -> None:
         """K_d = projected K at the present x, for the step that begins."""
         if self.damper is not None:
-            block_csr.assemble(self.model, self.damper, True)
+            block_csr.assemble(self.model, self.damper, EVERYTHING, True)
 
     def linear_residual(self) -> float:
         """|rhs - A y| / |rhs| as it really is: in f32 CG's own residual can fall while the true one stays."""

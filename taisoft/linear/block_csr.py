@@ -20,6 +20,7 @@ from taisoft.fields import FieldArena
 from taisoft.linear.element_blocks import element_blocks, pair_terms
 from taisoft.model import MATRIX_BLOCKS, Model, model_graph
 from taisoft.runtime import kernel
+from taisoft.subset import block_of, edge_of, first_block_of, last_block_of, n_edges_of, n_nodes_of, node_of
 from taisoft.transfer import download
 
 # A block is a 12-vector, column by column with a zero below each, entry (r, c) in place 4 c + r: one address serves for all,
@@ -92,17 +93,18 @@ def sibling(matrix: BlockCsr, model: Model, arena: FieldArena, real, prefix: str
 
 
 @kernel
-def assemble(m: ti.template(), A: ti.template(), projected: ti.template()):
-    """A = K(x) over all nodes [N/m], unprojected or with every element's part made positive semi-definite."""
-    for g in ti.static(m.groups):
+def assemble(m: ti.template(), A: ti.template(), part: ti.template(), projected: ti.template()):
+    """The rows of a part of A = K(x) [N/m], unprojected or with every element's part made positive semi-definite."""
+    for n, g in ti.static(enumerate(m.groups)):
         ti.loop_config(serialize=m.serial)
-        for b in range(g.first, g.last):
-            element_blocks(m, g, A, b, projected)
+        for j in range(first_block_of(g, n, part), last_block_of(g, n, part)):
+            element_blocks(m, g, A, block_of(part, j), projected)
     ti.loop_config(serialize=m.serial)
-    for e in range(A.n_edges):
-        gather_edge(m, A, e)
+    for j in range(n_edges_of(A, part)):
+        gather_edge(m, A, edge_of(part, j))
     ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
+    for j in range(n_nodes_of(m, part)):
+        i = node_of(part, j)
         s = ti.Vector([0.0 for _ in ti.static(range(BLOCK))], m.real)
         for k in range(A.row_start[i], A.row_start[i + 1]):
             s -= A.value[k]
@@ -125,10 +127,12 @@ def gather_edge(m: ti.template(), A: ti.template(), e):
 
 
 @kernel
-def to_system(m: ti.template(), A: ti.template(), damper: ti.template(), c: ti.f64, beta: ti.f64):
-    """A = (c + beta a) M + beta^2 A + beta b K_d in place: a, b the damping of the row's body, K_d the damper's values."""
+def to_system(m: ti.template(), A: ti.template(), damper: ti.template(), part: ti.template(), c: ti.f64, beta: ti.f64):
+    """A = (c + beta a) M + beta^2 A + beta b K_d in place, the rows of a part: a, b the damping of the row's body, K_d the
+    damper's values."""
     ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
+    for j in range(n_nodes_of(m, part)):
+        i = node_of(part, j)
         k, inertia, drag = ti.cast(beta * beta, m.real), ti.cast(c, m.real), ti.cast(0.0, m.real)
         if ti.static(m.damped):
             inertia += ti.cast(beta, m.real) * mass_damping.rate(m, i)

@@ -19,6 +19,7 @@ from taisoft.fields import FieldArena
 from taisoft.linear.block_csr import BLOCK, BlockCsr
 from taisoft.linear.coupling import NO_COUPLING, Coupling
 from taisoft.model import Model
+from taisoft.subset import EVERYTHING, Subset
 
 SERIAL_WORK = 40_000_000  # block products per launch: about 0.2 s, so that Ctrl-C is heard
 PARALLEL_BATCH = 8  # iterations between two looks at the residual
@@ -76,11 +77,12 @@ def batch_of(m: Model, A: BlockCsr) -> int:
 
 def solve(
     m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int, coupling: Coupling = NO_COUPLING,
-    same_matrix: bool = False,
+    same_matrix: bool = False, part: Subset = EVERYTHING,
 ) -> LinearResult:  # fmt: skip
     """Fill w.y from w.rhs. tolerance: sqrt(r.z) relative to the start.
 
     coupling: terms beside A, whose own diagonal is then in coupling.base; A.diagonal is set to that of both.
+    part: the nodes whose rows and unknowns make the system; w.p and w.q are 0 on all others.
     same_matrix: A is that of the last solve, terms are between the same nodes: rows without terms keep their preconditioner.
     """
     from taisoft.linear import pcg_parallel, pcg_serial
@@ -89,7 +91,7 @@ def solve(
     batch = batch_of(m, A) if m.serial else PARALLEL_BATCH
     done = 0
     while True:
-        done, stop = method.iterate(m, A, coupling, w, min(batch, max_iterations - done), tolerance, done == 0, same_matrix)
+        done, stop = method.iterate(m, A, coupling, w, min(batch, max_iterations - done), tolerance, done == 0, same_matrix, part)
         if stop != RUNNING or done >= max_iterations:
             return LinearResult(done, stop == CONVERGED, stop == NEGATIVE)
 

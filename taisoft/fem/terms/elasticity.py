@@ -25,6 +25,7 @@ from taisoft.elements.lanes import (
 from taisoft.materials.projection import dpk1_projected, prepare_projected
 from taisoft.math3 import determinant, matmul_tn
 from taisoft.scalars import FAILED, INVERTED_NOW, LOWEST_J
+from taisoft.subset import block_of, first_block_of, last_block_of
 
 SWITCH, LOAD, ACCELERATION = None, False, False
 HUGE = 1e30  # above any volume ratio
@@ -92,12 +93,12 @@ def report_volumes(m: ti.template(), b, J):
 
 
 @ti.func
-def sum_elements(m: ti.template()):
-    """`element_force` over all blocks, as loops of a kernel."""
-    for g in ti.static(m.groups):
+def sum_elements(m: ti.template(), part: ti.template()):
+    """`element_force` over all blocks of a part, as loops of a kernel."""
+    for n, g in ti.static(enumerate(m.groups)):
         ti.loop_config(serialize=m.serial)
-        for b in range(g.first, g.last):
-            element_force(m, g, False, b)
+        for j in range(first_block_of(g, n, part), last_block_of(g, n, part)):
+            element_force(m, g, False, block_of(part, j))
 
 
 @ti.func

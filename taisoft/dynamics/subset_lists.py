@@ -1,0 +1,58 @@
+"""Lists of some nodes of a stage and of what touches them: fills a `Subset`."""
+
+import numpy as np
+import taichi as ti
+
+from taisoft.fields import FieldArena
+from taisoft.linear.block_csr import BlockCsr
+from taisoft.model import Model
+from taisoft.subset import BLOCKS, EDGES, NODES, Subset
+from taisoft.transfer import download, upload
+
+
+def entries_of(start: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Places of all entries of some rows, one row after the other. start: (n + 1) where rows begin."""
+    counts = start[rows + 1] - start[rows]
+    ends = np.cumsum(counts)
+    return np.arange(counts.sum()) + np.repeat(start[rows] - ends + counts, counts)
+
+
+class SubsetLists:
+    """What touches each node of a model, on the host, and room for a subset of them."""
+
+    def __init__(self, m: Model, A: BlockCsr):
+        self._groups = m.groups
+        self.start, self.column, upper, lower = download([A.row_start, A.column, A.edge_upper, A.edge_lower])
+        self._edge = np.zeros(2 * A.n_edges, dtype=np.int32)  # of each entry of the matrix
+        self._edge[upper] = self._edge[lower] = np.arange(A.n_edges)
+        self._tet_start, entry = download([m.gather_start, m.gather_entry])
+        self._block = np.zeros(len(entry), dtype=np.int32)  # of each tet at each node
+        for g in m.groups:
+            size = 3 * g.n_nodes * m.lanes
+            own = (entry >= g.force_at) & (entry < g.force_at + (g.last - g.first) * size)
+            self._block[own] = g.first + (entry[own] - g.force_at) // size
+        self._arena = FieldArena()
+        count = self._arena.field("subset_count", ti.i32, BLOCKS + len(m.groups) + 1)
+        sizes = {"node": m.n_nodes, "edge": A.n_edges, "block": m.groups[-1].last}
+        self._subset = Subset(count, *(self._arena.field(f"subset_{name}", ti.i32, n) for name, n in sizes.items()))
+
+    def subset(self, nodes: np.ndarray) -> Subset:
+        """Some nodes, ascending, and the edges and blocks that touch them; the same record each time."""
+        s, groups = self._subset, self._groups
+        edges = np.unique(self._edge[entries_of(self.start, nodes)])
+        blocks = np.unique(self._block[entries_of(self._tet_start, nodes)])
+        count = np.zeros(s.count.shape, dtype=np.int32)
+        count[[NODES, EDGES]] = len(nodes), len(edges)
+        count[BLOCKS:] = np.searchsorted(blocks, [g.first for g in groups] + [groups[-1].last])
+        rows = [(field, np.resize(data, field.shape)) for field, data in ((s.node, nodes), (s.edge, edges), (s.block, blocks))]
+        upload([(s.count, count), *rows])
+        return s
+
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """Bytes of the lists by name."""
+        return self._arena.bytes
+
+    def release(self) -> None:
+        """Give their memory back."""
+        self._arena.release()
