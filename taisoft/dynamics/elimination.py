@@ -50,21 +50,24 @@ def choose_nodes(residual: np.ndarray, start: np.ndarray, column: np.ndarray) ->
 
 
 def eliminate(system: StageSystem, stage: Stage, r: float) -> Eliminated | None:
-    """Solve a stage with |r| on the few nodes that hold nearly all of it; None where they are many.
-
-    The state and the elastic forces are then what that led to, the residual has to be formed anew, and the matrix is void.
-    """
+    """Solve a stage with |r| on the few nodes that hold nearly all of it, see `solve_on`; None where they are many."""
     residual, free = download([system.work.residual, system.model.free])
     lists = system.lists
     nodes = choose_nodes(free * residual, lists.start, lists.column)
-    if nodes is None:
-        return None
+    return None if nodes is None else solve_on(system, stage, nodes, LEFT * r)
+
+
+def solve_on(system: StageSystem, stage: Stage, nodes: np.ndarray, left: float) -> Eliminated:
+    """Solve a stage on some nodes, ascending, until their |r| is no more than `left`.
+
+    The state and the elastic forces are then what that led to, the residual has to be formed anew, and the matrix is void.
+    """
     system.restrict(nodes)
     try:
         own, scale = system.evaluate(STAY)
-        enough = LEFT * r / scale if scale > 0.0 else 0.0
-        newton = Newton(system, replace(stage, tolerance=enough, contact_tolerance=math.inf, max_newton=STEPS))
+        tolerance = left / scale if scale > 0.0 else 0.0
+        newton = Newton(system, replace(stage, tolerance=tolerance, contact_tolerance=math.inf, max_newton=STEPS))
         newton.run(own, scale, fresh=False)
     finally:
         system.restrict(None)
-    return Eliminated(math.ceil(newton.linear * len(nodes) / len(free)), newton.multipliers)
+    return Eliminated(math.ceil(newton.linear * len(nodes) / system.model.n_nodes), newton.multipliers)

@@ -11,6 +11,7 @@ import taichi as ti
 from taisoft.dynamics.body_balance import LIMIT, BodyBalance
 from taisoft.dynamics.contact import TOLERANCE, ContactStep
 from taisoft.dynamics.contact_newton import solve
+from taisoft.dynamics.elimination import solve_on
 from taisoft.dynamics.impact import solve_bouncing
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.stage_result import StageResult, count_all
@@ -271,6 +272,11 @@ class ImplicitStepper:
             0.5 if scheme.midpoint else 1.0,
         )  # fmt: skip
         return solve_bouncing(self.solver, stage) if bounces else solve(self.solver, stage)
+
+    def compile_hard_steps(self) -> None:
+        """Take the kernels that only hard steps need through the stage at hand, which leaves no state that is of use."""
+        solve_on(self.solver, self.solver.stage, np.arange(1), 0.0)
+        self.solver.form_matrix(projected=True)
 
     def reactions(self) -> np.ndarray:
         """(n_nodes, 3) force of the constraints in the last step [N]."""

@@ -132,7 +132,7 @@ class StageSystem:
     @property
     def is_static(self) -> bool:
         """Whether the stage has no inertia."""
-        return self._stage.c == 0.0
+        return self.stage.c == 0.0
 
     @property
     def contact_residual(self) -> float:
@@ -156,7 +156,7 @@ class StageSystem:
         return self._k
 
     def _begin(self, stage: Stage, kind: int) -> None:
-        self._stage, self.kind, self.r_scale, self._k = stage, kind, frictional.R_SCALE, NO_CONTACTS
+        self.stage, self.kind, self.r_scale, self._k = stage, kind, frictional.R_SCALE, NO_CONTACTS
         if self.contact.n_contacts == 0:
             return
         self._fit()
@@ -169,7 +169,7 @@ class StageSystem:
 
         new_multipliers: the impulses are made the multipliers first, and the friction disks opened as far as these say.
         """
-        m, w, k, stage = self.model, self.work, self._k, self._stage
+        m, w, k, stage = self.model, self.work, self._k, self.stage
         if how is not None:
             move(m, w, k, self.part, self.kind, how, step_length, stage.c, stage.beta)
         if k.any:
@@ -206,7 +206,7 @@ class StageSystem:
 
     def advance(self) -> tuple[float, float]:
         """(|r|, scale) where the slope along y vanishes, of a linearised stage."""
-        stage = self._stage
+        stage = self.stage
         advance(self.model, self.work, self.matrix, self._k, stage.beta, self.r_scale, self.norms)
         return self._sizes(stage.c, stage.beta)
 
@@ -236,7 +236,7 @@ class StageSystem:
 
         taken: the state is what was found, its impulses the multipliers; otherwise state and multipliers are those of then.
         """
-        leave_linear(self.model, self.work, self._k, int(taken), self._stage.beta)
+        leave_linear(self.model, self.work, self._k, int(taken), self.stage.beta)
         self.kind = ELASTIC_STAGE
         return self.evaluate(AGAIN, float(taken), new_multipliers=True)
 
@@ -251,7 +251,7 @@ class StageSystem:
 
     def form_matrix(self, projected: bool = False) -> None:
         """The matrix where the stage stands, without J^T D J, which the linear solve adds."""
-        m, stage = self.model, self._stage
+        m, stage = self.model, self.stage
         block_csr.assemble(m, self.matrix, self.part, projected)
         block_csr.to_system(m, self.matrix, self.damper or self.matrix, self.part, stage.c, stage.beta)
         self._same_matrix = False
