@@ -133,7 +133,7 @@ class ContactNewton:
             return
         found = eliminate(self.system, self.stage, self.r)
         if found is not None:
-            self.linear, self.multipliers = self.linear + found.linear, self.multipliers + found.multipliers
+            self.linear += found
             self.r, self.scale = self.system.evaluate(None, new_multipliers=True)
 
     def _done(self) -> bool:

@@ -7,7 +7,7 @@ Source: Lanzkron, Rose and Wilkes, "An analysis of approximate nonlinear elimina
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,14 +20,6 @@ from taisoft.transfer import download
 HELD, FEW = 0.99, 0.35  # share of |r|^2 that at most so large a share of the nodes must hold
 RINGS = 2  # of neighbours that are taken with them
 STEPS, LEFT = 32, 0.1  # Newton steps of an elimination, and share of |r| that it is to leave
-
-
-@dataclass(frozen=True)
-class Eliminated:
-    """What an elimination took. linear: iterations of CG, times the share of the nodes; multipliers: as in `StageResult`."""
-
-    linear: int
-    multipliers: int
 
 
 def choose_nodes(residual: np.ndarray, start: np.ndarray, column: np.ndarray) -> np.ndarray | None:
@@ -49,7 +41,7 @@ def choose_nodes(residual: np.ndarray, start: np.ndarray, column: np.ndarray) ->
     return nodes
 
 
-def eliminate(system: StageSystem, stage: Stage, r: float) -> Eliminated | None:
+def eliminate(system: StageSystem, stage: Stage, r: float) -> int | None:
     """Solve a stage with |r| on the few nodes that hold nearly all of it, see `solve_on`; None where they are many."""
     residual, free = download([system.work.residual, system.model.free])
     lists = system.lists
@@ -57,17 +49,17 @@ def eliminate(system: StageSystem, stage: Stage, r: float) -> Eliminated | None:
     return None if nodes is None else solve_on(system, stage, nodes, LEFT * r)
 
 
-def solve_on(system: StageSystem, stage: Stage, nodes: np.ndarray, left: float) -> Eliminated:
-    """Solve a stage on some nodes, ascending, until their |r| is no more than `left`.
+def solve_on(system: StageSystem, stage: Stage, nodes: np.ndarray, left: float) -> int:
+    """Solve a stage on some nodes, ascending, under the multipliers at hand, until their |r| is no more than `left` [N s].
 
-    The state and the elastic forces are then what that led to, the residual has to be formed anew, and the matrix is void.
+    Returns the iterations of CG that took, times the share of the nodes. The state and the elastic forces are then what it led
+    to, the residual has to be formed anew, and the matrix is void.
     """
     system.restrict(nodes)
     try:
-        own, scale = system.evaluate(STAY)
-        tolerance = left / scale if scale > 0.0 else 0.0
-        newton = Newton(system, replace(stage, tolerance=tolerance, contact_tolerance=math.inf, max_newton=STEPS))
-        newton.run(own, scale, fresh=False)
+        own = replace(stage, enough=left, contact_tolerance=math.inf, keeps_multipliers=True, max_newton=STEPS)
+        newton = Newton(system, own)
+        newton.run(*system.evaluate(STAY), fresh=False)
     finally:
         system.restrict(None)
-    return Eliminated(math.ceil(newton.linear * len(nodes) / system.model.n_nodes), newton.multipliers)
+    return math.ceil(newton.linear * len(nodes) / system.model.n_nodes)

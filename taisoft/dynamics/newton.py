@@ -21,7 +21,6 @@ more than that of a strain, and ends the stage as converged, its residual told a
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 from taisoft.dynamics.frictional import MAX_MULTIPLIERS, PROGRESS, R_SCALE, ROUNDING, STIFFEST, next_scale
 from taisoft.dynamics.line_search import search
@@ -43,7 +42,7 @@ class Newton:
 
     def __init__(
         self, system: StageSystem, stage: Stage, stiffest: float = STIFFEST,
-        eliminate: "Callable[[StageSystem, Stage, float], Any] | None" = None,
+        eliminate: "Callable[[StageSystem, Stage, float], int | None] | None" = None,
     ):  # fmt: skip
         """eliminate: as `elimination.eliminate`, for steps that leave much; None: there is none."""
         self.system, self.stage, self.stiffest, self.eliminate = system, stage, stiffest, eliminate
@@ -84,18 +83,22 @@ class Newton:
 
     def _near(self) -> bool:
         """Whether the multipliers have done what they can."""
-        enough = self.stage.tolerance * self.scale
-        if not self.touching:
+        enough = self._target()
+        if not self.touching or self.stage.keeps_multipliers:
             return self.r <= enough or self.rounding
         lawful = self.system.contact_residual <= self.stage.contact_tolerance
         # in an impact whose laws hold only the momenta are left to balance
         goal = 0.0 if lawful and self.system.kind == IMPACT else max(self.stage.enough_of_one * self.scale, self.goal)
         return self.r <= (max(enough, goal) if lawful else goal) or self.rounding
 
+    def _target(self) -> float:
+        """|r| that is small enough."""
+        return max(self.stage.tolerance * self.scale, self.stage.enough)
+
     def _done(self) -> bool:
         """Whether the stage has converged."""
         stage = self.stage
-        if not (self.r <= stage.tolerance * self.scale or (self.touching and self.r <= self.floor)):
+        if not (self.r <= self._target() or (self.touching and self.r <= self.floor)):
             # statics without any load have nothing to compare the rounding with
             if not (self.rounding and (stage.c > 0.0 or self.scale <= self.floor)):
                 return False
@@ -103,7 +106,7 @@ class Newton:
 
     def _multiply(self) -> bool:
         """Take the impulses as new multipliers; False where that has been done too often."""
-        if not self.touching or self.multipliers >= MAX_MULTIPLIERS:
+        if not self.touching or self.stage.keeps_multipliers or self.multipliers >= MAX_MULTIPLIERS:
             return False
         system = self.system
         law = system.contact_residual
@@ -139,7 +142,7 @@ class Newton:
         found = self.eliminate(self.system, self.stage, self.r)
         if found is None:
             return False
-        self.linear += found.linear
+        self.linear += found
         self.r, self.scale = self.system.evaluate(None)
         self.least = min(self.least, self.r)
         return True
@@ -157,7 +160,7 @@ class Newton:
         """
         if self.stage.linear_tolerance is not None:
             return self.stage.linear_tolerance
-        enough = self.stage.tolerance * self.scale
+        enough = self._target()
         if self.previous == 0.0:
             self.forcing = self.loosest
         elif self.r > self.previous:

@@ -50,6 +50,8 @@ class Stage:
     linearised: bool = False  # elastic forces are linear from the first iterate on
     prescribed_share: float = 1.0  # see `begin_stage`
     tolerance_of_one: float | None = None  # as `tolerance`, of the steps under one multiplier; None: the same
+    enough: float = 0.0  # |r| [N s] that ends the stage, too, whatever the scale
+    keeps_multipliers: bool = False  # the multipliers at hand are not renewed
 
     @property
     def enough_of_one(self) -> float:
@@ -157,6 +159,7 @@ class StageSystem:
 
     def _begin(self, stage: Stage, kind: int) -> None:
         self.stage, self.kind, self.r_scale, self._k = stage, kind, frictional.R_SCALE, NO_CONTACTS
+        self.part = EVERYTHING
         if self.contact.n_contacts == 0:
             return
         self._fit()
@@ -193,11 +196,13 @@ class StageSystem:
         return self._lists
 
     def restrict(self, nodes: np.ndarray | None) -> None:
-        """From here on nothing but some nodes, ascending, moves and has rows in the matrix, once that is formed; None: all do."""
-        self.part = EVERYTHING if nodes is None else self.lists.subset(nodes)
+        """Move some nodes alone from here on, ascending: the matrix must be formed anew, and has their rows; None: all nodes."""
+        self.part = EVERYTHING
         if nodes is not None:
-            for field in (self.work.pcg.p, self.work.pcg.q):
+            subset, cg = self.lists.subset(nodes), self.work.pcg
+            for field in (cg.r, cg.p, cg.q):  # rows of the subset reach other nodes, where the solve finds no change
                 field.fill(0.0)
+            self.part = subset
 
     def linearise(self) -> None:
         """From here on elastic forces are linear, by the matrix at hand."""

@@ -82,7 +82,7 @@ def solve(
     """Fill w.y from w.rhs. tolerance: sqrt(r.z) relative to the start.
 
     coupling: terms beside A, whose own diagonal is then in coupling.base; A.diagonal is set to that of both.
-    part: the nodes whose rows and unknowns make the system; w.p and w.q are 0 on all others.
+    part: the nodes whose rows and unknowns make the system; w.r, w.p and w.q are 0 on all others.
     same_matrix: A is that of the last solve, terms are between the same nodes: rows without terms keep their preconditioner.
     """
     from taisoft.linear import pcg_parallel, pcg_serial
