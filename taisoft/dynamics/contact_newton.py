@@ -31,7 +31,9 @@ from taisoft.launching import PUBLIC
 
 SOLVES, FORCING = 60, 0.3  # linear solves of one frictional problem, and their tolerance
 SHARE, LAW_SHARE = 0.1, 0.1  # of what the stage has left of |r| and of the laws' residual: what such a problem is solved to,
-LEAST_SHARE = 0.3  # or this share of the tolerances
+LEAST_SHARE, TIGHT_LAW_SHARE = 0.3, 0.6  # or this share of the tolerances; that of the laws where only rounding is left of |r|
+BALANCE = 0.03  # laws need not hold better than so many times the relative |r| that is asked for: the next matrix undoes that
+SHARE_OF_ONE = 0.3  # of the |r| asked for that ends the steps under one multiplier: new ones at an old |r| overshoot
 LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # linear solves of a linearised stage, and their tolerance
 STALLED, PATIENCE = 0.9, 10  # share of |r| that a step leaves which stalls; so many times as many solves after that
 FALLBACK = 6  # steps on the true stage
@@ -155,13 +157,15 @@ class ContactNewton:
         system, stage = self.system, self.stage
         system.linearise()
         enough = max(SHARE * self.r, LEAST_SHARE * stage.tolerance * self.scale)
-        law = max(LAW_SHARE * system.contact_residual, LEAST_SHARE * stage.contact_tolerance)
+        tolerance = enough / self.scale if self.scale > 0.0 else 0.0
         # where the rounding of stiff stress hides the motion of a whole body in |r|, only tight solves get that motion right, and
         # impulses only settle where |r| follows them down
         self.tight = self.r <= HIDING * self.floor
+        least_law = (TIGHT_LAW_SHARE if self.tight else LEAST_SHARE) * stage.contact_tolerance
         problem = replace(
-            stage, tolerance=enough / self.scale if self.scale > 0.0 else 0.0, contact_tolerance=law,
-            tolerance_of_one=0.0 if self.tight else None,
+            stage, tolerance=tolerance,
+            contact_tolerance=max(LAW_SHARE * system.contact_residual, least_law, BALANCE * tolerance),
+            tolerance_of_one=0.0 if self.tight else SHARE_OF_ONE * tolerance,
             max_newton=PATIENCE * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
         )  # fmt: skip
