@@ -38,6 +38,7 @@ class BlockCsr:
     column: Any  # (2 n_edges) i32, ascending in each row, no diagonal
     value: Any  # (2 n_edges) 12-vectors: blocks as below
     diagonal: Any  # (n_nodes) 12-vectors
+    row_sum: Any  # (1) 4-vector: that of the last row, see `keep_whole`
     element: Any  # K_ab of each tet, per block of tets (pair, entry, lane): a `Lanes` buffer,
     element_at: Count  # where it begins, in vectors of lanes,
     element_mask: int  # and the bits of such a number
@@ -75,6 +76,7 @@ def build_block_csr(model: Model, arena: FieldArena, real, prefix: str = "stiffn
         n_edges=n_edges, row_start=ints("row_start", graph.row_start), row_upper=ints("row_upper", graph.row_upper),
         column=ints("column", graph.column), value=arena.vectors(f"{prefix}_value", real, 2 * n_edges, n=BLOCK),
         diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
+        row_sum=arena.vectors(f"{prefix}_row_sum", real, 1, n=4),
         element=element.memory, element_at=element.at // model.lanes,
         element_mask=element.mask // model.lanes,
         edge_start=ints("edge_start", edge_start), edge_entry=ints("edge_entry", base[order]),
@@ -169,11 +171,22 @@ def block_times(B, x):
 
 
 @ti.func
+def keep_whole(m: ti.template(), A: ti.template(), y):
+    """Store a row's sum, whose last entry nobody reads: else the compiler drops that, and adds three numbers in two operations.
+
+    In one, iterations of conjugate gradients take 0.75 of the time where the matrix lies in the cache, 0.9 where it does not.
+    """
+    if ti.static(m.serial):
+        A.row_sum[0] = y
+
+
+@ti.func
 def part_times(m: ti.template(), A: ti.template(), first, last, x: ti.template()):
     """Sum of the blocks first..last (of one row) times x at their columns."""
     y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
     for k in range(first, last):
         y += padded_times(A.value[k], x[A.column[k]])
+    keep_whole(m, A, y)
     return ti.Vector([y[0], y[1], y[2]])
 
 
@@ -184,6 +197,7 @@ def part_times_backward(m: ti.template(), A: ti.template(), first, last, x: ti.t
     for n in range(last - first):
         k = last - 1 - n
         y += padded_times(A.value[k], x[A.column[k]])
+    keep_whole(m, A, y)
     return ti.Vector([y[0], y[1], y[2]])
 
 
