@@ -22,7 +22,7 @@ from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
 from taisoft.transfer import download, upload
 
-MAX_NEWTON = 50  # a step that needs more is cut in parts, or reported as not converged
+MAX_NEWTON, MAX_NEWTON_WITH_CONTACTS = 50, 25  # a step that needs more is cut in parts, or reported as not converged
 TIGHTER = 0.1  # of the tolerance that would just do where a body's forces did not balance
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
@@ -266,8 +266,9 @@ class ImplicitStepper:
 
     def _solve(self, scheme: Scheme, dt: float, bounces: bool, tolerance: float) -> StageResult:
         """The stage. bounces: whether any contacts are thrown back."""
+        most = MAX_NEWTON if self.contact.n_contacts == 0 else MAX_NEWTON_WITH_CONTACTS
         stage = Stage(
-            1.0, self._beta, dt, tolerance, self.contact_tolerance, MAX_NEWTON, self.linear_tolerance, scheme.one_iteration,
+            1.0, self._beta, dt, tolerance, self.contact_tolerance, most, self.linear_tolerance, scheme.one_iteration,
             # prescribed nodes change their velocity once a step, not twice within the midpoint's half step
             0.5 if scheme.midpoint else 1.0,
         )  # fmt: skip
