@@ -118,6 +118,18 @@ def test_many_launches_are_one(sim, monkeypatch):
     assert np.array_equal(again, x) and [r.linear_iterations for r in others] == [r.linear_iterations for r in reports]
 
 
+def test_a_retry_begins_where_the_last_try_ended(sim):
+    steps(sim, 2)
+    stepper, x_start = sim._stepper, sim.positions()
+    result = stepper.take(sim.time, DT)
+    x, v = sim.positions(), sim.velocities()
+    stepper.back()
+    assert result.converged and np.array_equal(sim.positions(), x_start)
+    again = stepper.retry(sim.time, DT, v)
+    assert again.converged and 2 * again.newton_iterations < result.newton_iterations
+    assert np.abs(sim.positions() - x).max() < 1e-8  # [m]
+
+
 def test_laws_hold_where_tets_are_inverted(sim):
     """The upper cube squeezed flat as it lands: its matrix is indefinite."""
     x = sim.positions("upper")

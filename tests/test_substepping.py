@@ -29,6 +29,7 @@ class Plain:
         self.x, self.marked = 0.0, 0.0
         self.taken: list[tuple[float, float]] = []
         self.kept: list[tuple[float, float]] = []
+        self.starts: list = []  # what retries began with
         self.sinking = self.crossing = self.penetration = 0.0
         self.converges = lambda time, dt: True
         self.closing = lambda time, dt: 0.0
@@ -58,7 +59,9 @@ class Plain:
         self.x = self.start
         self.kept.pop()
 
-    retry = take
+    def retry(self, time, dt, start):
+        self.starts.append(start)
+        return self.take(time, dt)
 
     def undo(self, released, anew):
         self.back()
@@ -194,6 +197,7 @@ def test_one_that_met_what_was_not_known_is_taken_again(plain):
     wrapped = Substepping(plain)
     result = wrapped.step(0.0, DT)
     assert plain.taken == [(0.0, DT)] * 3 and plain.kept == [(0.0, DT)]
+    assert plain.starts == [(0.0, DT)] * 2  # each where the last one ended
     assert wrapped.parts == 1 and result.newton_iterations == 9
 
 

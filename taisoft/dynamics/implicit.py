@@ -184,10 +184,10 @@ class ImplicitStepper:
         """Back to where the last part began."""
         restore(self.world.model, self.history)
 
-    def retry(self, time: float, dt: float) -> StageResult:
-        """The part that was just taken back, with other contacts."""
+    def retry(self, time: float, dt: float, start: np.ndarray) -> StageResult:
+        """The part that was just taken back, with other contacts. start: (n_nodes, 3) [m/s] the velocities it had led to."""
         past, self._past = self._past, 0
-        result = self.take(time, dt)
+        result = self.take(time, dt, start)
         self._past = min(self._past, past)
         return result
 
@@ -199,8 +199,8 @@ class ImplicitStepper:
         # BDF2 tells impacts by what bore nothing in the last step
         self.contact.start_again(anew or self.scheme.before > 0.0)
 
-    def take(self, time: float, dt: float) -> StageResult:
-        """A step of dt from a time with the contacts of one search."""
+    def take(self, time: float, dt: float, start: np.ndarray | None = None) -> StageResult:
+        """A step of dt from a time with the contacts of one search. start: velocities (n_nodes, 3) [m/s] to begin with."""
         world, m, h, w = self.world, self.world.model, self.history, self.solver.work
         releases = world.releases
         target = world.next_target(time + dt)
@@ -226,6 +226,8 @@ class ImplicitStepper:
         self.solver.assemble_damper()
         along = (0.5 if scheme.midpoint else 1.0) if self._past > 1 and not scheme.one_iteration else 0.0
         self._begin(scheme, along)
+        if start is not None and not scheme.one_iteration:  # which is linearised at the step's start
+            upload([(m.state.v, start)])
         try:
             result = self._solve_balanced(scheme, dt, bounces)
         except BaseException:  # Ctrl-C: the step is abandoned

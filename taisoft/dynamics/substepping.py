@@ -168,5 +168,5 @@ class Substepping:
                 if contact.ratio_along_way() > HASTE:
                     return result, Fault.FAST
                 return result, Fault.UNSETTLED if new else None
-            result = count_all(stepper.retry(time, dt), [result])
+            result = count_all(stepper.retry(time, dt, state[1]), [result])
         return result, None
