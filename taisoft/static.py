@@ -76,10 +76,13 @@ def solve_static(
     kind = open_kind()
     arch = kind[0] if kind is not None and kind[1] == precision else arch
     runtime = open_runtime(arch, precision, "solve_static")
-    arena = FieldArena()
+    arena, solver = FieldArena(), None
     try:
-        return StaticSolver(scene, runtime, arena, tolerance, time).solve()
+        solver = StaticSolver(scene, runtime, arena, tolerance, time)
+        return solver.solve()
     finally:
+        if solver is not None:
+            solver.solver.release()
         arena.release()
         runtime.close()
 

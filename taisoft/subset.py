@@ -30,63 +30,63 @@ EVERYTHING = Subset()
 
 
 @ti.func
-def n_nodes_of(m: ti.template(), part: ti.template()):
-    """Nodes of a part."""
+def n_nodes_of(m: ti.template(), subset: ti.template()):
+    """Nodes of a subset."""
     n = m.n_nodes
-    if ti.static(part.some):
-        n = part.count[NODES]
+    if ti.static(subset.some):
+        n = subset.count[NODES]
     return n
 
 
 @ti.func
-def node_of(part: ti.template(), j):
-    """The j-th node of a part."""
+def node_of(subset: ti.template(), j):
+    """The j-th node of a subset."""
     i = j
-    if ti.static(part.some):
-        i = part.node[j]
+    if ti.static(subset.some):
+        i = subset.node[j]
     return i
 
 
 @ti.func
-def n_edges_of(A: ti.template(), part: ti.template()):
-    """Pairs of nodes of a matrix of which one is in a part."""
+def n_edges_of(A: ti.template(), subset: ti.template()):
+    """Pairs of nodes of a matrix of which one is in a subset."""
     n = A.n_edges
-    if ti.static(part.some):
-        n = part.count[EDGES]
+    if ti.static(subset.some):
+        n = subset.count[EDGES]
     return n
 
 
 @ti.func
-def edge_of(part: ti.template(), j):
+def edge_of(subset: ti.template(), j):
     """The j-th of these."""
     e = j
-    if ti.static(part.some):
-        e = part.edge[j]
+    if ti.static(subset.some):
+        e = subset.edge[j]
     return e
 
 
 @ti.func
-def first_block_of(g: ti.template(), n: ti.template(), part: ti.template()):
-    """Where the blocks of g, the n-th group, begin in a part."""
+def first_block_of(g: ti.template(), n: ti.template(), subset: ti.template()):
+    """Where the blocks of g, the n-th group, begin in a subset."""
     first = g.first
-    if ti.static(part.some):
-        first = part.count[BLOCKS + n]
+    if ti.static(subset.some):
+        first = subset.count[BLOCKS + n]
     return first
 
 
 @ti.func
-def last_block_of(g: ti.template(), n: ti.template(), part: ti.template()):
+def last_block_of(g: ti.template(), n: ti.template(), subset: ti.template()):
     """One past the last of these."""
     last = g.last
-    if ti.static(part.some):
-        last = part.count[BLOCKS + n + 1]
+    if ti.static(subset.some):
+        last = subset.count[BLOCKS + n + 1]
     return last
 
 
 @ti.func
-def block_of(part: ti.template(), j):
-    """The j-th block of a part."""
+def block_of(subset: ti.template(), j):
+    """The j-th block of a subset."""
     b = j
-    if ti.static(part.some):
-        b = part.block[j]
+    if ti.static(subset.some):
+        b = subset.block[j]
     return b

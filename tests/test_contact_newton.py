@@ -2,7 +2,8 @@
 
 * the loop in one launch and the one that the host drives find the same step, as do all loops on threads; cut into many launches
   it is the same bit by bit;
-* a step takes few Newton iterations, also where the matrix is indefinite; impulses keep the laws;
+* a step takes few Newton iterations, also where the matrix is indefinite, and ends at its limit of them; impulses keep the laws,
+  also where these are asked for much more tightly than |r|; a retry begins where the last try ended;
 * a linearised step of an indefinite matrix goes on with a projected one.
 """
 
@@ -12,8 +13,8 @@ from rotations import rotation
 
 import taisoft as ts
 from taisoft import model
-from taisoft.dynamics import contact_newton, scheme_of
-from taisoft.dynamics.contact_newton import Frictional
+from taisoft.dynamics import contact_newton, implicit, scheme_of
+from taisoft.dynamics.contact_newton import FALLBACK, Frictional
 from taisoft.dynamics.newton import Newton
 from taisoft.dynamics.stage_system import StageSystem
 from taisoft.linear import pcg
@@ -128,6 +129,22 @@ def test_a_retry_begins_where_the_last_try_ended(sim):
     again = stepper.retry(sim.time, DT, v)
     assert again.converged and 2 * again.newton_iterations < result.newton_iterations
     assert np.abs(sim.positions() - x).max() < 1e-8  # [m]
+
+
+def test_a_stage_ends_at_its_limit(sim, monkeypatch):
+    monkeypatch.setattr(implicit, "MAX_NEWTON_WITH_CONTACTS", 1)
+    steps(sim, 2)
+    result = sim._stepper.take(sim.time, DT)
+    assert not result.converged and 1 <= result.newton_iterations <= 1 + FALLBACK
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-4])
+def test_laws_are_solved_to_their_own_tolerance(tolerance):
+    """Also where that is much below that of |r|."""
+    with ts.Simulator(cubes(), dt=DT, precision="f64", newton_tolerance=tolerance, contact_tolerance=1e-3 * tolerance) as sim:
+        reports = [sim.step() for _ in range(4)]
+    assert max(report.n_contacts for report in reports) > 10
+    assert sum(report.converged for report in reports) >= 3
 
 
 def test_laws_hold_where_tets_are_inverted(sim):

@@ -130,9 +130,9 @@ def evaluate(
     """The norms of the residual. how: None to stay without asking for the forces. m: the model, by default that on one thread."""
     norms, s, m = np.zeros(5), rig.solver, m or rig.m
     if how is not None:
-        move(m, rig.work, rig.k, EVERYTHING, kind, how, share, 1.0, BETA)
+        move(m, rig.work, rig.k, kind, how, share, 1.0, BETA)
     contact_terms.press(m, rig.k, int(multiply), BETA, STIFFNESS)
-    form_residual(m, rig.work, s.matrix, rig.k, EVERYTHING, kind, BETA, norms)
+    form_residual(m, rig.work, s.matrix, rig.k, kind, BETA, norms)
     return norms
 
 
@@ -264,8 +264,8 @@ def test_residual_of_a_stage(rig, pressed, threads):
             size = np.linalg.norm(before.astype(float)) * np.linalg.norm(y.astype(float))
             assert m.state.scalars[START_SLOPE] == pytest.approx(slope, abs=10 * rig.close * size)
         told, end = np.zeros(5), m.state.scalars[END_SLOPE]
-        move(m, work, NO_CONTACTS, EVERYTHING, ELASTIC_STAGE, STAY, 0.0, 1.0, BETA)
-        form_residual(m, work, rig.solver.matrix, NO_CONTACTS, EVERYTHING, ELASTIC_STAGE, BETA, told)
+        move(m, work, NO_CONTACTS, ELASTIC_STAGE, STAY, 0.0, 1.0, BETA)
+        form_residual(m, work, rig.solver.matrix, NO_CONTACTS, ELASTIC_STAGE, BETA, told)
         expected = work.residual.to_numpy() - (rig.J.T @ r.ravel()).reshape(-1, 3)
         assert np.abs(expected - work.residual.to_numpy()).max() > 0.1 * np.abs(expected).max()  # the impulses do count
         close = 10 * rig.close * np.abs(expected).max()

@@ -111,7 +111,7 @@ class ContactNewton:
             if not moved:
                 break
         return StageResult(
-            self.newton, self.linear, relative(self.r, self.scale),
+            round(self.newton), round(self.linear), relative(self.r, self.scale),
             self._done() and math.isfinite(self.r), self.rounding or self.r <= self.floor, self.multipliers,
             system.contact_residual,
         )  # fmt: skip
@@ -135,7 +135,7 @@ class ContactNewton:
             return
         found = eliminate(self.system, self.stage, self.r)
         if found is not None:
-            self.linear += found
+            self.newton, self.linear = self.newton + found.newton, self.linear + found.linear
             self.r, self.scale = self.system.evaluate(None, new_multipliers=True)
 
     def _done(self) -> bool:
@@ -161,10 +161,12 @@ class ContactNewton:
         # where the rounding of stiff stress hides the motion of a whole body in |r|, only tight solves get that motion right, and
         # impulses only settle where |r| follows them down
         self.tight = self.r <= HIDING * self.floor
-        least_law = (TIGHT_LAW_SHARE if self.tight else LEAST_SHARE) * stage.contact_tolerance
+        law = (TIGHT_LAW_SHARE if self.tight else LEAST_SHARE) * stage.contact_tolerance
+        if self.r > stage.tolerance * self.scale:  # else the laws are all that is left
+            law = max(law, BALANCE * tolerance)
         problem = replace(
             stage, tolerance=tolerance,
-            contact_tolerance=max(LAW_SHARE * system.contact_residual, least_law, BALANCE * tolerance),
+            contact_tolerance=max(LAW_SHARE * system.contact_residual, law),
             tolerance_of_one=0.0 if self.tight else SHARE_OF_ONE * tolerance,
             max_newton=PATIENCE * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),

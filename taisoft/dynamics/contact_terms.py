@@ -195,12 +195,12 @@ def press(m: ti.template(), k: ti.template(), new_multipliers: ti.i32, beta: ti.
 
 
 @kernel
-def keep_diagonal(m: ti.template(), A: ti.template(), k: ti.template(), part: ti.template()):
+def keep_diagonal(m: ti.template(), A: ti.template(), k: ti.template(), subset: ti.template()):
     """The matrix has been formed: its diagonal without contacts, and the masses that the r-factors rest on, diag(A)^-1."""
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
-    for j in range(n_nodes_of(m, part)):
-        i = node_of(part, j)
+    for j in range(n_nodes_of(m, subset)):
+        i = node_of(subset, j)
         k.coupling.base[i] = A.diagonal[i]
         for a in ti.static(range(3)):
             # an entry can be negative where tets are strongly compressed

@@ -7,7 +7,7 @@ Source: Lanzkron, Rose and Wilkes, "An analysis of approximate nonlinear elimina
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,9 +17,17 @@ from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.subset_lists import entries_of
 from taisoft.transfer import download
 
-HELD, FEW = 0.99, 0.35  # share of |r|^2 that at most so large a share of the nodes must hold
+CONCENTRATED, FEW = 0.99, 0.35  # share of |r|^2 that at most so large a share of the nodes must hold
 RINGS = 2  # of neighbours that are taken with them
-STEPS, LEFT = 32, 0.1  # Newton steps of an elimination, and share of |r| that it is to leave
+STEPS, REDUCTION = 32, 0.1  # Newton steps of an elimination at most, and share of |r| that it is to leave
+
+
+@dataclass(frozen=True)
+class Eliminated:
+    """Newton and CG iterations of an elimination, each times the share of the nodes."""
+
+    newton: float
+    linear: float
 
 
 def choose_nodes(residual: np.ndarray, start: np.ndarray, column: np.ndarray) -> np.ndarray | None:
@@ -32,7 +40,7 @@ def choose_nodes(residual: np.ndarray, start: np.ndarray, column: np.ndarray) ->
     held = np.cumsum(squares[largest])
     if not 0.0 < held[-1] < math.inf:
         return None
-    n = int(np.searchsorted(held, HELD * held[-1])) + 1
+    n = int(np.searchsorted(held, CONCENTRATED * held[-1])) + 1
     if n > FEW * len(squares):
         return None
     nodes = largest[:n]
@@ -41,25 +49,25 @@ def choose_nodes(residual: np.ndarray, start: np.ndarray, column: np.ndarray) ->
     return nodes
 
 
-def eliminate(system: StageSystem, stage: Stage, r: float) -> int | None:
+def eliminate(system: StageSystem, stage: Stage, r: float) -> Eliminated | None:
     """Solve a stage with |r| on the few nodes that hold nearly all of it, see `solve_on`; None where they are many."""
     residual, free = download([system.work.residual, system.model.free])
     lists = system.lists
     nodes = choose_nodes(free * residual, lists.start, lists.column)
-    return None if nodes is None else solve_on(system, stage, nodes, LEFT * r)
+    return None if nodes is None else solve_on(system, stage, nodes, REDUCTION * r)
 
 
-def solve_on(system: StageSystem, stage: Stage, nodes: np.ndarray, left: float) -> int:
+def solve_on(system: StageSystem, stage: Stage, nodes: np.ndarray, left: float) -> Eliminated:
     """Solve a stage on some nodes, ascending, under the multipliers at hand, until their |r| is no more than `left` [N s].
 
-    Returns the iterations of CG that took, times the share of the nodes. The state and the elastic forces are then what it led
-    to, the residual has to be formed anew, and the matrix is void.
+    The state and the elastic forces are then what that led to, the residual has to be formed anew, and the matrix is void.
     """
     system.restrict(nodes)
     try:
-        own = replace(stage, enough=left, contact_tolerance=math.inf, keeps_multipliers=True, max_newton=STEPS)
+        own = replace(stage, absolute_tolerance=left, contact_tolerance=math.inf, keeps_multipliers=True, max_newton=STEPS)
         newton = Newton(system, own)
         newton.run(*system.evaluate(STAY), fresh=False)
     finally:
         system.restrict(None)
-    return math.ceil(newton.linear * len(nodes) / system.model.n_nodes)
+    share = len(nodes) / system.model.n_nodes
+    return Eliminated(share * newton.newton, share * newton.linear)

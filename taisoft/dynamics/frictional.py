@@ -14,7 +14,6 @@ from taisoft.linear import pcg_serial
 from taisoft.linear.pcg import NEGATIVE
 from taisoft.linear.pcg import RUNNING as UNFINISHED
 from taisoft.runtime import kernel
-from taisoft.subset import EVERYTHING
 
 ROUNDING = 4.0  # times the floor: what rounding may leave, as strains grow (up to 2.8 times was seen, in a thin sheet)
 PROGRESS = 0.3  # share of what a new multiplier left of |r| that the steps bring it down to
@@ -112,11 +111,11 @@ def solve_frictional(
                 verdict = GIVEN_UP
             else:
                 if loop[WITHIN] == 0.0:
-                    pcg_serial.start(m, A, k.coupling, s.pcg, EVERYTHING, ti.cast(loop[SAME], ti.i32))
+                    pcg_serial.start(m, A, k.coupling, s.pcg, ti.cast(loop[SAME], ti.i32))
                     loop[SAME] = 1.0
                     loop[OWN] = 0.0
                 n = ti.min(budget - work, longest - ti.cast(loop[OWN], ti.i32))
-                count, stop = pcg_serial.iterations(m, A, k.coupling, s.pcg, EVERYTHING, n, limits[TOLERANCE])
+                count, stop = pcg_serial.iterations(m, A, k.coupling, s.pcg, n, limits[TOLERANCE])
                 loop[OWN] = loop[OWN] + count
                 loop[LINEAR] = loop[LINEAR] + count
                 work += count + 1

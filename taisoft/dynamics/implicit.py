@@ -278,7 +278,8 @@ class ImplicitStepper:
 
     def compile_hard_steps(self) -> None:
         """Take the kernels that only hard steps need through the stage at hand, which leaves no state that is of use."""
-        solve_on(self.solver, self.solver.stage, np.arange(1), 0.0)
+        free = np.flatnonzero(self.world.model.free.to_numpy().any(axis=1))
+        solve_on(self.solver, replace(self.solver.stage, tolerance=0.0), free[:1], 0.0)
         self.solver.form_matrix(projected=True)
 
     def reactions(self) -> np.ndarray:

@@ -21,6 +21,7 @@ more than that of a strain, and ends the stage as converged, its residual told a
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 from taisoft.dynamics.frictional import MAX_MULTIPLIERS, PROGRESS, R_SCALE, ROUNDING, STIFFEST, next_scale
 from taisoft.dynamics.line_search import search
@@ -42,7 +43,7 @@ class Newton:
 
     def __init__(
         self, system: StageSystem, stage: Stage, stiffest: float = STIFFEST,
-        eliminate: "Callable[[StageSystem, Stage, float], int | None] | None" = None,
+        eliminate: "Callable[[StageSystem, Stage, float], Any] | None" = None,
     ):  # fmt: skip
         """eliminate: as `elimination.eliminate`, for steps that leave much; None: there is none."""
         self.system, self.stage, self.stiffest, self.eliminate = system, stage, stiffest, eliminate
@@ -92,8 +93,7 @@ class Newton:
         return self.r <= (max(enough, goal) if lawful else goal) or self.rounding
 
     def _target(self) -> float:
-        """|r| that is small enough."""
-        return max(self.stage.tolerance * self.scale, self.stage.enough)
+        return max(self.stage.tolerance * self.scale, self.stage.absolute_tolerance)
 
     def _done(self) -> bool:
         """Whether the stage has converged."""
@@ -139,10 +139,9 @@ class Newton:
         """Solve what a slow step left on few nodes; whether there was such."""
         if self.eliminate is None or self.r <= SLOW_STEP * self.previous or self._near():
             return False
-        found = self.eliminate(self.system, self.stage, self.r)
-        if found is None:
+        if (found := self.eliminate(self.system, self.stage, self.r)) is None:
             return False
-        self.linear += found
+        self.newton, self.linear = self.newton + found.newton, self.linear + found.linear
         self.r, self.scale = self.system.evaluate(None)
         self.least = min(self.least, self.r)
         return True
@@ -176,7 +175,7 @@ class Newton:
     def _result(self, converged: bool) -> StageResult:
         r, system = self.r, self.system
         return StageResult(
-            self.newton, self.linear, relative(r, self.scale), converged and math.isfinite(r),
+            round(self.newton), round(self.linear), relative(r, self.scale), converged and math.isfinite(r),
             self.rounding or r <= self.floor, self.multipliers, system.contact_residual,
         )  # fmt: skip
 

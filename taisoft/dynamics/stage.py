@@ -11,6 +11,7 @@ from taisoft.linear.block_csr import row_times
 from taisoft.linear.pcg import PcgWork
 from taisoft.mass import mass_times
 from taisoft.runtime import kernel
+from taisoft.subset import EVERYTHING, Subset
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +30,7 @@ class StageWork:
     change: Any  # f64: what the mass is multiplied by
     damper: Any  # BlockCsr or None
     pcg: PcgWork  # -r as its right side; y, the change of v that a Newton step makes
+    subset: Subset = EVERYTHING  # the nodes that move, also of pcg
 
     @property
     def leads(self) -> bool:

@@ -9,7 +9,7 @@ K is unprojected.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.model import Model
 from taisoft.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
-from taisoft.subset import EVERYTHING, Subset
+from taisoft.subset import EVERYTHING
 from taisoft.transfer import download, upload
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class Stage:
     linearised: bool = False  # elastic forces are linear from the first iterate on
     prescribed_share: float = 1.0  # see `begin_stage`
     tolerance_of_one: float | None = None  # as `tolerance`, of the steps under one multiplier; None: the same
-    enough: float = 0.0  # |r| [N s] that ends the stage, too, whatever the scale
+    absolute_tolerance: float = 0.0  # |r| [N s] that ends the stage, too, whatever the scale
     keeps_multipliers: bool = False  # the multipliers at hand are not renewed
 
     @property
@@ -89,7 +89,7 @@ class StageSystem:
         self._contact_arena = FieldArena()
         self._room: StageContacts | None = None  # for the contacts of this step
         self._k = NO_CONTACTS  # what the present stage has
-        self.part: Subset = EVERYTHING  # what moves
+        self._whole, self._restricted = self.work, None  # what `work` is where all nodes move, and where some do
         self._lists: SubsetLists | None = None
         self._same_matrix = False  # as in the last linear solve of this stage
         self.norms = np.zeros(5)  # what `form_residual` tells
@@ -159,7 +159,7 @@ class StageSystem:
 
     def _begin(self, stage: Stage, kind: int) -> None:
         self.stage, self.kind, self.r_scale, self._k = stage, kind, frictional.R_SCALE, NO_CONTACTS
-        self.part = EVERYTHING
+        self.work = self._whole
         if self.contact.n_contacts == 0:
             return
         self._fit()
@@ -174,10 +174,10 @@ class StageSystem:
         """
         m, w, k, stage = self.model, self.work, self._k, self.stage
         if how is not None:
-            move(m, w, k, self.part, self.kind, how, step_length, stage.c, stage.beta)
+            move(m, w, k, self.kind, how, step_length, stage.c, stage.beta)
         if k.any:
             press(m, k, int(new_multipliers), stage.beta, self.r_scale)
-        form_residual(m, w, self.matrix, k, self.part, self.kind, stage.beta, self.norms)
+        form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
         return self._sizes(stage.c, stage.beta)
 
     def set_direction_to_rest(self) -> None:
@@ -197,12 +197,15 @@ class StageSystem:
 
     def restrict(self, nodes: np.ndarray | None) -> None:
         """Move some nodes alone from here on, ascending: the matrix must be formed anew, and has their rows; None: all nodes."""
-        self.part = EVERYTHING
-        if nodes is not None:
-            subset, cg = self.lists.subset(nodes), self.work.pcg
-            for field in (cg.r, cg.p, cg.q):  # rows of the subset reach other nodes, where the solve finds no change
-                field.fill(0.0)
-            self.part = subset
+        self.work = self._whole
+        if nodes is None:
+            return
+        subset, cg = self.lists.subset(nodes), self.work.pcg
+        for field in (cg.r, cg.p, cg.q):  # rows of the subset reach other nodes, where the solve finds no change
+            field.fill(0.0)
+        if self._restricted is None:
+            self._restricted = replace(self._whole, subset=subset, pcg=replace(cg, subset=subset))
+        self.work = self._restricted
 
     def linearise(self) -> None:
         """From here on elastic forces are linear, by the matrix at hand."""
@@ -256,12 +259,12 @@ class StageSystem:
 
     def form_matrix(self, projected: bool = False) -> None:
         """The matrix where the stage stands, without J^T D J, which the linear solve adds."""
-        m, stage = self.model, self.stage
-        block_csr.assemble(m, self.matrix, self.part, projected)
-        block_csr.to_system(m, self.matrix, self.damper or self.matrix, self.part, stage.c, stage.beta)
+        m, stage, subset = self.model, self.stage, self.work.subset
+        block_csr.assemble(m, self.matrix, subset, projected)
+        block_csr.to_system(m, self.matrix, self.damper or self.matrix, subset, stage.c, stage.beta)
         self._same_matrix = False
         if self._k.any:
-            keep_diagonal(m, self.matrix, self._k, self.part)
+            keep_diagonal(m, self.matrix, self._k, subset)
 
     def form_matrix_and_factors(self, projected: bool = False) -> None:
         """The matrix and the r-factors of the contacts, which stay for the stage."""
@@ -272,7 +275,7 @@ class StageSystem:
         """y of pcg from -r."""
         m, w = self.model, self.work
         answer = pcg.solve(
-            m, self.matrix, w.pcg, tolerance, pcg.most_iterations(m), self._k.coupling, self._same_matrix, self.part
+            m, self.matrix, w.pcg, tolerance, pcg.most_iterations(m), self._k.coupling, self._same_matrix
         )  # fmt: skip
         self._same_matrix = True
         return answer

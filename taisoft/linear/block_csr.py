@@ -38,7 +38,7 @@ class BlockCsr:
     column: Any  # (2 n_edges) i32, ascending in each row, no diagonal
     value: Any  # (2 n_edges) 12-vectors: blocks as below
     diagonal: Any  # (n_nodes) 12-vectors
-    row_sum: Any  # (1) 4-vector: that of the last row, see `keep_whole`
+    row_sum: Any  # (1) 4-vector: that of the last row, see `keep_padding_lane`
     element: Any  # K_ab of each tet, per block of tets (pair, entry, lane): a `Lanes` buffer,
     element_at: Count  # where it begins, in vectors of lanes,
     element_mask: int  # and the bits of such a number
@@ -95,18 +95,18 @@ def sibling(matrix: BlockCsr, model: Model, arena: FieldArena, real, prefix: str
 
 
 @kernel
-def assemble(m: ti.template(), A: ti.template(), part: ti.template(), projected: ti.template()):
-    """The rows of a part of A = K(x) [N/m], unprojected or with every element's part made positive semi-definite."""
+def assemble(m: ti.template(), A: ti.template(), subset: ti.template(), projected: ti.template()):
+    """The rows of a subset of A = K(x) [N/m], unprojected or with every element's part made positive semi-definite."""
     for n, g in ti.static(enumerate(m.groups)):
         ti.loop_config(serialize=m.serial)
-        for j in range(first_block_of(g, n, part), last_block_of(g, n, part)):
-            element_blocks(m, g, A, block_of(part, j), projected)
+        for j in range(first_block_of(g, n, subset), last_block_of(g, n, subset)):
+            element_blocks(m, g, A, block_of(subset, j), projected)
     ti.loop_config(serialize=m.serial)
-    for j in range(n_edges_of(A, part)):
-        gather_edge(m, A, edge_of(part, j))
+    for j in range(n_edges_of(A, subset)):
+        gather_edge(m, A, edge_of(subset, j))
     ti.loop_config(serialize=m.serial)
-    for j in range(n_nodes_of(m, part)):
-        i = node_of(part, j)
+    for j in range(n_nodes_of(m, subset)):
+        i = node_of(subset, j)
         s = ti.Vector([0.0 for _ in ti.static(range(BLOCK))], m.real)
         for k in range(A.row_start[i], A.row_start[i + 1]):
             s -= A.value[k]
@@ -129,12 +129,12 @@ def gather_edge(m: ti.template(), A: ti.template(), e):
 
 
 @kernel
-def to_system(m: ti.template(), A: ti.template(), damper: ti.template(), part: ti.template(), c: ti.f64, beta: ti.f64):
-    """A = (c + beta a) M + beta^2 A + beta b K_d in place, the rows of a part: a, b the damping of the row's body, K_d the
+def to_system(m: ti.template(), A: ti.template(), damper: ti.template(), subset: ti.template(), c: ti.f64, beta: ti.f64):
+    """A = (c + beta a) M + beta^2 A + beta b K_d in place, the rows of a subset: a, b the damping of the row's body, K_d the
     damper's values."""
     ti.loop_config(serialize=m.serial)
-    for j in range(n_nodes_of(m, part)):
-        i = node_of(part, j)
+    for j in range(n_nodes_of(m, subset)):
+        i = node_of(subset, j)
         k, inertia, drag = ti.cast(beta * beta, m.real), ti.cast(c, m.real), ti.cast(0.0, m.real)
         if ti.static(m.damped):
             inertia += ti.cast(beta, m.real) * mass_damping.rate(m, i)
@@ -171,7 +171,7 @@ def block_times(B, x):
 
 
 @ti.func
-def keep_whole(m: ti.template(), A: ti.template(), y):
+def keep_padding_lane(m: ti.template(), A: ti.template(), y):
     """Store a row's sum, whose last entry nobody reads: else the compiler drops that, and adds three numbers in two operations.
 
     In one, iterations of conjugate gradients take 0.75 of the time where the matrix lies in the cache, 0.9 where it does not.
@@ -186,7 +186,7 @@ def part_times(m: ti.template(), A: ti.template(), first, last, x: ti.template()
     y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
     for k in range(first, last):
         y += padded_times(A.value[k], x[A.column[k]])
-    keep_whole(m, A, y)
+    keep_padding_lane(m, A, y)
     return ti.Vector([y[0], y[1], y[2]])
 
 
@@ -197,7 +197,7 @@ def part_times_backward(m: ti.template(), A: ti.template(), first, last, x: ti.t
     for n in range(last - first):
         k = last - 1 - n
         y += padded_times(A.value[k], x[A.column[k]])
-    keep_whole(m, A, y)
+    keep_padding_lane(m, A, y)
     return ti.Vector([y[0], y[1], y[2]])
 
 

@@ -43,6 +43,7 @@ class PcgWork:
     block: Any  # (n_nodes) 12-vectors: P; serial only
     mirror: Any  # (n_nodes) 12-vectors: 2 P - D; serial only
     state: Any  # (5) f64
+    subset: Subset = EVERYTHING  # of the nodes
 
 
 @dataclass(frozen=True)
@@ -77,12 +78,12 @@ def batch_of(m: Model, A: BlockCsr) -> int:
 
 def solve(
     m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int, coupling: Coupling = NO_COUPLING,
-    same_matrix: bool = False, part: Subset = EVERYTHING,
+    same_matrix: bool = False,
 ) -> LinearResult:  # fmt: skip
     """Fill w.y from w.rhs. tolerance: sqrt(r.z) relative to the start.
 
     coupling: terms beside A, whose own diagonal is then in coupling.base; A.diagonal is set to that of both.
-    part: the nodes whose rows and unknowns make the system; w.r, w.p and w.q are 0 on all others.
+    w.subset: the nodes whose rows and unknowns make the system; w.r, w.p and w.q are 0 on all others.
     same_matrix: A is that of the last solve, terms are between the same nodes: rows without terms keep their preconditioner.
     """
     from taisoft.linear import pcg_parallel, pcg_serial
@@ -91,7 +92,7 @@ def solve(
     batch = batch_of(m, A) if m.serial else PARALLEL_BATCH
     done = 0
     while True:
-        done, stop = method.iterate(m, A, coupling, w, min(batch, max_iterations - done), tolerance, done == 0, same_matrix, part)
+        done, stop = method.iterate(m, A, coupling, w, min(batch, max_iterations - done), tolerance, done == 0, same_matrix)
         if stop != RUNNING or done >= max_iterations:
             return LinearResult(done, stop == CONVERGED, stop == NEGATIVE)
 

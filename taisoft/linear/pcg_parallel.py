@@ -21,20 +21,20 @@ from taisoft.linear.pcg import (
 )  # fmt: skip
 from taisoft.runtime import kernel
 from taisoft.scalars import OTHER_SUM, SUM
-from taisoft.subset import EVERYTHING, Subset, n_nodes_of, node_of
+from taisoft.subset import n_nodes_of, node_of
 
 
 @kernel
 def start(
-    m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), part: ti.template(), same_matrix: ti.i32
+    m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), same_matrix: ti.i32
 ):  # fmt: skip
     """y = 0, r = rhs, z = p = B r; the diagonal and its inverse B on the way."""
     for c in range(m.chunks):
-        n = n_nodes_of(m, part)
+        n = n_nodes_of(m, w.subset)
         size = (n + m.chunks - 1) // m.chunks
         s = ti.cast(0.0, ti.f64)
         for at in range(c * size, ti.min(n, (c + 1) * size)):
-            i = node_of(part, at)
+            i = node_of(w.subset, at)
             if ti.static(k.width > 0):
                 if same_matrix == 0 or has_terms(k, i):
                     A.diagonal[i] = prepare_terms(m, k, i)
@@ -54,31 +54,31 @@ def start(
 
 
 def iterate(
-    m, A, coupling, w, n: int, tolerance: float, begin: bool, same_matrix: bool, part: Subset = EVERYTHING
+    m, A, coupling, w, n: int, tolerance: float, begin: bool, same_matrix: bool
 ) -> tuple[int, int]:  # fmt: skip
     """Up to n iterations, from y = 0 where the solve begins; returns the iterations so far and how it stands."""
     if begin:
-        start(m, A, coupling, w, part, int(same_matrix))
+        start(m, A, coupling, w, int(same_matrix))
     for _ in range(n):
-        iterate_once(m, A, coupling, w, part, tolerance)
+        iterate_once(m, A, coupling, w, tolerance)
     return int(w.state[COUNT]), int(w.state[STOP])
 
 
 @kernel
 def iterate_once(
-    m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), part: ti.template(), tolerance: ti.f64
+    m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), tolerance: ti.f64
 ):  # fmt: skip
     """One iteration; does nothing once stopped."""
     if ti.static(coupling.width > 0):
         for c in range(coupling.count[0]):
             pull_with_all(m, coupling, c, w.p)
     for c in range(m.chunks):
-        n = n_nodes_of(m, part)
+        n = n_nodes_of(m, w.subset)
         size = (n + m.chunks - 1) // m.chunks
         s = ti.cast(0.0, ti.f64)
         if w.state[STOP] == RUNNING:
             for at in range(c * size, ti.min(n, (c + 1) * size)):
-                i = node_of(part, at)
+                i = node_of(w.subset, at)
                 product = ti.Vector([0.0, 0.0, 0.0], m.real)
                 if ti.static(coupling.width > 0):
                     product = part_times(m, A, A.row_start[i], A.row_start[i + 1], w.p)
@@ -102,13 +102,13 @@ def iterate_once(
             else:
                 w.state[STEP] = w.state[RZ] / curvature
     for c in range(m.chunks):
-        n = n_nodes_of(m, part)
+        n = n_nodes_of(m, w.subset)
         size = (n + m.chunks - 1) // m.chunks
         s = ti.cast(0.0, ti.f64)
         if w.state[STOP] == RUNNING:
             a = ti.cast(w.state[STEP], m.real)
             for at in range(c * size, ti.min(n, (c + 1) * size)):
-                i = node_of(part, at)
+                i = node_of(w.subset, at)
                 w.y[i] = w.y[i] + a * w.p[i]
                 r = w.r[i] - a * w.q[i]
                 z = block_times(w.inverse[i], r)
@@ -124,8 +124,8 @@ def iterate_once(
             w.state[COUNT] = w.state[COUNT] + 1.0
             if rz <= tolerance * tolerance * w.state[RZ_START]:
                 w.state[STOP] = CONVERGED
-    for at in range(n_nodes_of(m, part)):
-        i = node_of(part, at)
+    for at in range(n_nodes_of(m, w.subset)):
+        i = node_of(w.subset, at)
         if w.state[STOP] == RUNNING:
             w.p[i] = w.z[i] + ti.cast(w.state[STEP], m.real) * w.p[i]
         elif w.state[STOP] == LEAVING:

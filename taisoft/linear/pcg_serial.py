@@ -14,17 +14,17 @@ from taisoft.linear.block_csr import block_times, part_times, part_times_backwar
 from taisoft.linear.coupling import add_pulls, clear_pulls, gather_pulls, has_terms, prepare_terms
 from taisoft.linear.pcg import CONVERGED, COUNT, FARTHEST, NEGATIVE, RUNNING, RZ, RZ_START, STEP, STOP, dot64, precondition
 from taisoft.runtime import kernel
-from taisoft.subset import EVERYTHING, Subset, n_nodes_of, node_of
+from taisoft.subset import n_nodes_of, node_of
 
 
 @ti.func
-def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), part: ti.template(), same_matrix):
+def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), same_matrix):
     """y = 0, s = (P + L)^-1 rhs, t = P s; the diagonal and what P is on the way."""
     rz = ti.cast(0.0, ti.f64)
     if ti.static(k.width > 0):
         clear_pulls(m, k)
-    for j in range(n_nodes_of(m, part)):
-        i = node_of(part, j)
+    for j in range(n_nodes_of(m, w.subset)):
+        i = node_of(w.subset, j)
         if ti.static(k.width > 0):
             if same_matrix == 0 or has_terms(k, i):
                 A.diagonal[i] = prepare_terms(m, k, i)
@@ -47,25 +47,25 @@ def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()
 
 
 def iterate(
-    m, A, k, w, n: int, tolerance: float, begin: bool, same_matrix: bool, part: Subset = EVERYTHING
+    m, A, k, w, n: int, tolerance: float, begin: bool, same_matrix: bool
 ) -> tuple[int, int]:  # fmt: skip
     """Up to n iterations, from y = 0 where the solve begins; returns the iterations so far and how it stands."""
-    count, stop = iterate_kernel(m, A, k, w, part, n, tolerance, int(begin), int(same_matrix))
+    count, stop = iterate_kernel(m, A, k, w, n, tolerance, int(begin), int(same_matrix))
     return int(count), int(stop)
 
 
 @ti.func
-def iterations(m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), part: ti.template(), n, tolerance):
+def iterations(m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), n, tolerance):
     """Up to n iterations from where the solve stands: how many, and how it stands then."""
     rz, along, stop, k = w.state[RZ], w.state[STEP], ti.cast(RUNNING, ti.i32), 0
-    limit, size = tolerance * tolerance * w.state[RZ_START], n_nodes_of(m, part)
+    limit, size = tolerance * tolerance * w.state[RZ_START], n_nodes_of(m, w.subset)
     if rz <= limit:
         stop = CONVERGED
     while k < n and stop == RUNNING:
         if ti.static(coupling.width > 0):
             clear_pulls(m, coupling)
         for back in range(size):
-            i = node_of(part, size - 1 - back)
+            i = node_of(w.subset, size - 1 - back)
             t = w.q[i] + ti.cast(along, m.real) * w.z[i]  # w.q holds P s of the last update
             w.z[i] = t
             above = part_times_backward(m, A, A.row_upper[i], A.row_start[i + 1], w.p)
@@ -79,7 +79,7 @@ def iterations(m: ti.template(), A: ti.template(), coupling: ti.template(), w: t
             clear_pulls(m, coupling)
         curvature = ti.cast(0.0, ti.f64)
         for at in range(size):
-            i = node_of(part, at)
+            i = node_of(w.subset, at)
             # now w.q holds (P + L)^-1 (t - (2 P - D) p), as the rows below need it
             p, t = w.p[i], w.z[i]
             below = part_times(m, A, A.row_start[i], A.row_upper[i], w.q)
@@ -94,12 +94,12 @@ def iterations(m: ti.template(), A: ti.template(), coupling: ti.template(), w: t
             stop = NEGATIVE
             far = ti.cast(ti.min(rz, -FARTHEST * curvature) / -curvature if curvature < 0.0 else FARTHEST, m.real)
             for at in range(size):
-                i = node_of(part, at)
+                i = node_of(w.subset, at)
                 w.y[i] = w.y[i] + far * w.p[i]
         else:
             step, next_rz = ti.cast(rz / curvature, m.real), ti.cast(0.0, ti.f64)
             for at in range(size):
-                i = node_of(part, at)
+                i = node_of(w.subset, at)
                 p = w.p[i]
                 w.y[i] = w.y[i] + step * p
                 s = w.r[i] - step * (p + w.q[i])
@@ -118,14 +118,14 @@ def iterations(m: ti.template(), A: ti.template(), coupling: ti.template(), w: t
 
 @kernel
 def iterate_kernel(
-    m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), part: ti.template(), n: ti.i32,
+    m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), n: ti.i32,
     tolerance: ti.f64, begin: ti.i32, same_matrix: ti.i32,
 ) -> ti.types.vector(2, ti.f64):
     """The iterations in one launch: (count, stop)."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         if begin != 0:
-            start(m, A, coupling, w, part, same_matrix)
-        k, _stop = iterations(m, A, coupling, w, part, n, tolerance)
+            start(m, A, coupling, w, same_matrix)
+        k, _stop = iterations(m, A, coupling, w, n, tolerance)
         w.state[COUNT] = w.state[COUNT] + k
     return ti.Vector([w.state[COUNT], w.state[STOP]])

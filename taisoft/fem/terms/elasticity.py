@@ -93,12 +93,12 @@ def report_volumes(m: ti.template(), b, J):
 
 
 @ti.func
-def sum_elements(m: ti.template(), part: ti.template()):
-    """`element_force` over all blocks of a part, as loops of a kernel."""
+def sum_elements(m: ti.template(), subset: ti.template()):
+    """`element_force` over all blocks of a subset, as loops of a kernel."""
     for n, g in ti.static(enumerate(m.groups)):
         ti.loop_config(serialize=m.serial)
-        for j in range(first_block_of(g, n, part), last_block_of(g, n, part)):
-            element_force(m, g, False, block_of(part, j))
+        for j in range(first_block_of(g, n, subset), last_block_of(g, n, subset)):
+            element_force(m, g, False, block_of(subset, j))
 
 
 @ti.func
