@@ -72,6 +72,7 @@ class ContactNewton:
         self.system, self.stage = system, stage
         self.floor = system.rounding.of_stage(stage.c, stage.beta)
         self.newton = self.linear = self.multipliers = 0
+        self.eliminated = 0.0  # Newton iterations on few nodes, by their share
         self.rounding = self.tight = self.stalls = False
         self.has_direction = False  # y is a good first direction on the matrix at hand
 
@@ -111,7 +112,7 @@ class ContactNewton:
             if not moved:
                 break
         return StageResult(
-            round(self.newton), round(self.linear), relative(self.r, self.scale),
+            self.newton + round(self.eliminated), round(self.linear), relative(self.r, self.scale),
             self._done() and math.isfinite(self.r), self.rounding or self.r <= self.floor, self.multipliers,
             system.contact_residual,
         )  # fmt: skip
@@ -135,7 +136,7 @@ class ContactNewton:
             return
         found = eliminate(self.system, self.stage, self.r)
         if found is not None:
-            self.newton, self.linear = self.newton + found.newton, self.linear + found.linear
+            self.eliminated, self.linear = self.eliminated + found.newton, self.linear + found.linear
             self.r, self.scale = self.system.evaluate(None, new_multipliers=True)
 
     def _done(self) -> bool:

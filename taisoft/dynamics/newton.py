@@ -51,6 +51,7 @@ class Newton:
         self.floor = system.rounding.of_stage(stage.c, stage.beta)
         self.loosest = MAX_FORCING if stage.c > 0.0 else STATIC_FORCING
         self.newton = self.linear = self.multipliers = 0
+        self.eliminated = 0.0  # Newton iterations on few nodes, by their share
         self.rounding = self.negative = False  # nothing but rounding is left of |r|; negative curvature was met
 
     def run(self, r: float, scale: float, fresh: bool) -> StageResult:
@@ -97,19 +98,17 @@ class Newton:
 
     def _done(self) -> bool:
         """Whether the stage has converged."""
-        stage = self.stage
         if not (self.r <= self._target() or (self.touching and self.r <= self.floor)):
             # statics without any load have nothing to compare the rounding with
-            if not (self.rounding and (stage.c > 0.0 or self.scale <= self.floor)):
+            if not (self.rounding and (self.stage.c > 0.0 or self.scale <= self.floor)):
                 return False
-        return self.system.contact_residual <= stage.contact_tolerance
+        return self.system.contact_residual <= self.stage.contact_tolerance
 
     def _multiply(self) -> bool:
         """Take the impulses as new multipliers; False where that has been done too often."""
         if not self.touching or self.stage.keeps_multipliers or self.multipliers >= MAX_MULTIPLIERS:
             return False
-        system = self.system
-        law = system.contact_residual
+        system, law = self.system, self.system.contact_residual
         system.r_scale = next_scale(system.r_scale, law, self.law, self.taken, self.stiffest)
         self.law, self.multipliers, self.rounding = law, self.multipliers + 1, False
         self.r, self.scale = system.evaluate(None, new_multipliers=True)
@@ -141,7 +140,7 @@ class Newton:
             return False
         if (found := self.eliminate(self.system, self.stage, self.r)) is None:
             return False
-        self.newton, self.linear = self.newton + found.newton, self.linear + found.linear
+        self.eliminated, self.linear = self.eliminated + found.newton, self.linear + found.linear
         self.r, self.scale = self.system.evaluate(None)
         self.least = min(self.least, self.r)
         return True
@@ -175,7 +174,7 @@ class Newton:
     def _result(self, converged: bool) -> StageResult:
         r, system = self.r, self.system
         return StageResult(
-            round(self.newton), round(self.linear), relative(r, self.scale), converged and math.isfinite(r),
+            self.newton + round(self.eliminated), round(self.linear), relative(r, self.scale), converged and math.isfinite(r),
             self.rounding or r <= self.floor, self.multipliers, system.contact_residual,
         )  # fmt: skip
 
