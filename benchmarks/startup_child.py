@@ -83,11 +83,13 @@ def memory() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def simulate(name: str, cells: int, steps: int = 10) -> None:
-    """A simulator, and its first steps."""
+def simulate(name: str, cells: int, steps: int = 10, hard: bool = False) -> None:
+    """A simulator, and its first steps. hard: with the kernels of steps that are hard to solve, where a version has such."""
     build, settings = SCENES[name]
     with ts.Simulator(build(cells), **settings) as sim:
         walk(sim, steps)
+        if hard and hasattr(sim._stepper, "compile_hard_steps"):
+            sim._stepper.compile_hard_steps()
 
 
 def walk(sim: ts.Simulator, steps: int) -> None:
@@ -123,7 +125,7 @@ def surfaces(*sizes: int) -> dict:
     for cells in sizes:
         before = compiled()
         if before is not None:  # else nothing would be learnt
-            simulate("sheet", cells, 3)
+            simulate("sheet", cells, 3, hard=True)
         found[triangles(cells)] = since(before)
     return found
 

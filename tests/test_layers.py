@@ -27,7 +27,7 @@ ORDER = (
     ("transfer",),
     ("fields",),
     ("mesh", "scene"),
-    ("math3",),
+    ("math3", "subset"),
     ("materials", "elements", "node_graph"),
     ("fem",),
     ("mass", "state"),
