@@ -25,8 +25,8 @@ class StepReport:
     time: float  # at the end of the step [s]
     steps: int = 1  # sub-steps of size dt that this report covers
     parts: int = 1  # that an implicit step was taken in, more where it did not converge or bodies would have passed each other
-    newton_iterations: int = 0  # with those of tries that were given up; those on few nodes (`dynamics.elimination`) count by
-    linear_iterations: int = 0  # the share of these, these alike
+    newton_iterations: int = 0  # with those of tries that were given up; those on few nodes count by the share of these nodes,
+    linear_iterations: int = 0  # here too, see `dynamics.elimination`
     contact_iterations: int = 0
     residual: float = 0.0  # relative residual of the implicit equations, 0 for explicit steps
     contact_residual: float = 0.0

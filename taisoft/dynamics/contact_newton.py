@@ -88,7 +88,7 @@ class ContactNewton:
             if self.newton > 0:
                 system.form_matrix()
             previous, law = self.r, system.contact_residual
-            only_laws = self.r <= stage.tolerance * self.scale  # |r| is fine already
+            only_laws = self._is_balanced
             inner, moved = self._solve_contacts(), False
             self.newton += 1
             if not inner.negative:
@@ -120,11 +120,10 @@ class ContactNewton:
     def _fall_back(self) -> bool:
         """A few steps on the true stage from where it was linearised; whether there was any."""
         system, stage = self.system, self.stage
-        r, scale = system.leave_linear(taken=False)
-        only_laws = r <= stage.tolerance * scale  # |r| is fine already
-        laws = stage.contact_tolerance if only_laws else math.inf
+        self.r, self.scale = system.leave_linear(taken=False)
+        laws = stage.contact_tolerance if self._is_balanced else math.inf
         steps = Newton(system, replace(stage, max_newton=FALLBACK, contact_tolerance=laws))
-        steps.run(r, scale, fresh=True)
+        steps.run(self.r, self.scale, fresh=True)
         self.newton += max(0, steps.newton - 1)  # the first is on the matrix at hand
         self.linear, self.multipliers = self.linear + steps.linear, self.multipliers + steps.multipliers
         self.r, self.scale = system.evaluate(None, new_multipliers=True)
@@ -132,16 +131,20 @@ class ContactNewton:
 
     def _eliminate(self) -> None:
         """Solve what a slow step left on few nodes."""
-        if self.r <= self.stage.tolerance * self.scale:  # what is left is the contacts'
+        if self._is_balanced:
             return
         found = eliminate(self.system, self.stage, self.r)
         if found is not None:
             self.eliminated, self.linear = self.eliminated + found.newton, self.linear + found.linear
             self.r, self.scale = self.system.evaluate(None, new_multipliers=True)
 
+    @property
+    def _is_balanced(self) -> bool:
+        """Whether |r| is fine, so that the contact laws alone are left."""
+        return self.r <= self.stage.tolerance * self.scale
+
     def _done(self) -> bool:
-        enough = self.r <= self.stage.tolerance * self.scale or self.rounding
-        return enough and self.system.contact_residual <= self.stage.contact_tolerance
+        return (self._is_balanced or self.rounding) and self.system.contact_residual <= self.stage.contact_tolerance
 
     def _solve_contacts(self) -> "Frictional":
         """The contact problem on the matrix at hand, where that is indefinite on a projected one."""
@@ -163,7 +166,7 @@ class ContactNewton:
         # impulses only settle where |r| follows them down
         self.tight = self.r <= HIDING * self.floor
         law = (TIGHT_LAW_SHARE if self.tight else LEAST_SHARE) * stage.contact_tolerance
-        if self.r > stage.tolerance * self.scale:  # else the laws are all that is left
+        if not self._is_balanced:
             law = max(law, BALANCE * tolerance)
         problem = replace(
             stage, tolerance=tolerance,

@@ -159,7 +159,7 @@ class StageSystem:
 
     def _begin(self, stage: Stage, kind: int) -> None:
         self.stage, self.kind, self.r_scale, self._k = stage, kind, frictional.R_SCALE, NO_CONTACTS
-        self.work = self._whole
+        self.restrict(None)
         if self.contact.n_contacts == 0:
             return
         self._fit()
