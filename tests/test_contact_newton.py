@@ -102,6 +102,17 @@ def test_both_loops_find_the_same_step(sim, monkeypatch):
     assert all(report.converged for report in others) and np.abs(host - x).max() < 1e-8  # [m]
 
 
+@pytest.mark.parametrize("loop", ["launch", "host"])
+def test_extrapolated_multipliers_end_where_others_do(sim, monkeypatch, loop):
+    x, reports = steps(sim)
+    monkeypatch.setattr(contact_newton, "SETTLING", 0)
+    if loop == "host":
+        monkeypatch.setattr(contact_newton, "solve_linear", from_the_host)
+    other, others = steps(sim)
+    assert all(report.converged for report in others) and np.abs(other - x).max() < 1e-8  # [m]
+    assert [r.linear_iterations for r in others] != [r.linear_iterations for r in reports]
+
+
 def test_on_threads_it_is_the_same_step(sim, monkeypatch):
     x, _ = steps(sim)
     monkeypatch.setattr(model, "PARALLEL_FROM", 0)

@@ -15,14 +15,13 @@ from taisoft.dynamics.frictional import (
     LINEAR,
     MULTIPLIERS,
     NORM,
-    R_SCALE,
     ROUNDING,
     SOLVED,
-    STIFFEST,
     VERDICT,
 )
 from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
 from taisoft.dynamics.line_search import choose_start, search
+from taisoft.dynamics.multipliers import R_SCALE, SETTLING, STIFFEST
 from taisoft.dynamics.newton import FALL, SLOW_STEP, Newton
 from taisoft.dynamics.residual import AGAIN
 from taisoft.dynamics.stage_result import StageResult, relative
@@ -30,12 +29,13 @@ from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.launching import PUBLIC
 
 SOLVES, FORCING = 60, 0.3  # linear solves of one frictional problem, and their tolerance
+LATER_FORCING = 0.01  # the least tolerance of those after the first, which move a whole body no more
 SHARE, LAW_SHARE = 0.1, 0.1  # of what the stage has left of |r| and of the laws' residual: what such a problem is solved to,
-LEAST_SHARE, TIGHT_LAW_SHARE = 0.3, 0.6  # or this share of the tolerances; that of the laws where only rounding is left of |r|
+LEAST_SHARE, LEAST_LAW_SHARE = 0.3, 0.8  # or these shares of the tolerances: the laws hold as well where the stage is not linear
 BALANCE = 0.03  # laws need not hold better than so many times the relative |r| that is asked for: the next matrix undoes that
 SHARE_OF_ONE = 0.3  # of the |r| asked for that ends the steps under one multiplier: new ones at an old |r| overshoot
 LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # linear solves of a linearised stage, and their tolerance
-STALLED, PATIENCE = 0.9, 10  # share of |r| that a step leaves which stalls; so many times as many solves after that
+STALLED, PATIENCE = 0.9, 3  # share of |r| that a step leaves which stalls; so many times as many solves after that
 FALLBACK = 6  # steps on the true stage
 HIDING = 4.0  # times the floor of |r|: where the motion of a whole body may be what is left of it
 
@@ -165,15 +165,17 @@ class ContactNewton:
         # where the rounding of stiff stress hides the motion of a whole body in |r|, only tight solves get that motion right, and
         # impulses only settle where |r| follows them down
         self.tight = self.r <= HIDING * self.floor
-        law = (TIGHT_LAW_SHARE if self.tight else LEAST_SHARE) * stage.contact_tolerance
+        law = LEAST_LAW_SHARE * stage.contact_tolerance
         if not self._is_balanced:
             law = max(law, BALANCE * tolerance)
         problem = replace(
             stage, tolerance=tolerance,
             contact_tolerance=max(LAW_SHARE * system.contact_residual, law),
             tolerance_of_one=0.0 if self.tight else SHARE_OF_ONE * tolerance,
+            settling=0 if self.tight else SETTLING,
             max_newton=PATIENCE * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
+            later_tolerance=0.0 if stage.linear_tolerance else LATER_FORCING,
         )  # fmt: skip
         inner = solve_linear(system, problem, self._first_residual(), self.scale, R_SCALE if self.stalls else STIFFEST)
         self.linear, self.multipliers = self.linear + inner.linear, self.multipliers + inner.multipliers

@@ -29,6 +29,8 @@ class ContactStageWork:
 
     multiplier: Any  # (capacity) 3-vectors f64: lambda [N s]
     radius: Any  # (capacity) f64: rho [N s]
+    past_impulse: Any  # (2 capacity) 3-vectors f64: impulses of each contact at the last two renewals of multipliers [N s],
+    past_change: Any  # and how far they were from the multipliers that led to them; the last one first
     tangential_offset: Any  # (capacity) 3-vectors f64: J (x_start - x_hat), less the displacement of an obstacle [m]
     gap_minus_target: Any  # (capacity) f64: gap - target at the start, less the displacement of an obstacle along the normal [m]
     velocity: Any  # (capacity) 3-vectors f64: u where a step begins [m/s]
@@ -89,9 +91,14 @@ def begin_contacts(
 @ti.func
 def set_multiplier(k: ti.template(), c):
     """The impulse of contact c becomes its multiplier, and the disk opens as far as that says."""
-    p, w = ti.static((k.problem, k.work))
-    w.multiplier[c] = p.r[c]
-    w.radius[c] = p.friction[c] * p.r[c][0]
+    k.work.multiplier[c] = k.problem.r[c]
+    open_disk(k, c)
+
+
+@ti.func
+def open_disk(k: ti.template(), c):
+    """The friction disk opens as far as the multiplier of contact c says."""
+    k.work.radius[c] = k.problem.friction[c] * k.work.multiplier[c][0]
 
 
 @ti.func
@@ -213,6 +220,7 @@ def build_stage_contacts(arena: FieldArena, model: Model, found: FoundContacts, 
     p, n, real = found.problem, model.n_nodes, model.real
     work = ContactStageWork(
         arena.vectors("multiplier", ti.f64, p.capacity), arena.field("friction_radius", ti.f64, p.capacity),
+        arena.vectors("past_impulse", ti.f64, 2 * p.capacity), arena.vectors("past_change", ti.f64, 2 * p.capacity),
         arena.vectors("contact_tangential_offset", ti.f64, p.capacity),
         arena.field("contact_gap_minus_target", ti.f64, p.capacity),
         arena.vectors("contact_velocity", ti.f64, p.capacity),

@@ -8,8 +8,9 @@ the loop stands is kept in `loop`, and the next launch goes on.
 import taichi as ti
 
 from taisoft.contact.problem import RESIDUAL
-from taisoft.dynamics.contact_terms import press_contact, set_multiplier, sum_residual
+from taisoft.dynamics.contact_terms import press_contact, sum_residual
 from taisoft.dynamics.linearised import begin_contact, begin_node, go_along, pressed_residual, step_length
+from taisoft.dynamics.multipliers import FINER, MAX_MULTIPLIERS, PAST, SETTLED, next_scale, renew
 from taisoft.linear import pcg_serial
 from taisoft.linear.pcg import NEGATIVE
 from taisoft.linear.pcg import RUNNING as UNFINISHED
@@ -17,37 +18,17 @@ from taisoft.runtime import kernel
 
 ROUNDING = 4.0  # times the floor: what rounding may leave, as strains grow (up to 2.8 times was seen, in a thin sheet)
 PROGRESS = 0.3  # share of what a new multiplier left of |r| that the steps bring it down to
-R_SCALE, SOFTEST, STIFFEST, MANY = 1.0, 0.3, 100.0, 5  # R over the r-factors at first and its bounds; steps that are many
-RISEN_LAW, STEADY = 1.2, 4.0  # times the laws' residual of before: R is too large, unless it is below that
-FALLEN_LAW = 0.8  # times the laws' residual of before: R serves
-MAX_MULTIPLIERS = 200
 
 # places in `loop`: |r|, R over the r-factors, the laws' residual when multipliers were last renewed, what |r| is to come down to
 # then, |r| before the last step, steps since; in all: linear solves, their iterations, multipliers; 1 where |r| is rounding, 1
-# within a linear solve, its iterations so far, 1 where the matrix is that of the last solve, how the loop stands
-NORM, SCALE, LAW, GOAL, PREVIOUS, TAKEN, SOLVES, LINEAR, MULTIPLIERS, AT_ROUNDING, WITHIN, OWN, SAME, VERDICT = range(14)
+# within a linear solve, its iterations so far, 1 where the matrix is that of the last solve, how the loop stands, renewals of
+# multipliers that are remembered
+NORM, SCALE, LAW, GOAL, PREVIOUS, TAKEN, SOLVES, LINEAR, MULTIPLIERS, AT_ROUNDING, WITHIN, OWN, SAME, VERDICT, KNOWN = range(15)
 RUNNING, SOLVED, GIVEN_UP, INDEFINITE = range(4)
 # places in `limits`: |r| [N s] that ends the loop, that ends the steps under one multiplier, that is rounding; the laws' residual
 # that ends the loop, too, tolerance of linear solves, the largest R over the r-factors, linear solves, iterations of one, those
-# in a launch
-ENOUGH, ENOUGH_OF_ONE, FLOOR, LAWFUL, TOLERANCE, LARGEST, MOST_SOLVES, LONGEST, BUDGET = range(9)
-
-
-@ti.pyfunc
-def next_scale(scale, law, before, taken, stiffest):
-    """R over the r-factors for new multipliers. law, before: residual of the laws, and where multipliers were last renewed.
-
-    taken: steps since. A residual that rises tells that friction disks and normal impulses drive each other up.
-    """
-    new = scale
-    if law > RISEN_LAW * before and scale > STEADY:
-        new = 0.5 * scale
-    elif law > FALLEN_LAW * before:
-        if taken <= 1:
-            new = ti.min(stiffest, 2.0 * scale)
-        elif taken >= MANY:
-            new = ti.max(SOFTEST, 0.5 * scale)
-    return new
+# in a launch, multipliers before they are extrapolated, the least tolerance of linear solves after the first
+ENOUGH, ENOUGH_OF_ONE, FLOOR, LAWFUL, TOLERANCE, LARGEST, MOST_SOLVES, LONGEST, BUDGET, SETTLING, LATER = range(11)
 
 
 @ti.func
@@ -83,7 +64,7 @@ def solve_frictional(
     m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, limits: ti.types.ndarray(),
     loop: ti.types.ndarray(),
 ):  # fmt: skip
-    """Go on from where `loop` stands; limits (9,)."""
+    """Go on from where `loop` stands; limits (11,)."""
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -93,17 +74,23 @@ def solve_frictional(
         while verdict == RUNNING and work < budget:
             renewed, moved = False, False
             law = p.state[RESIDUAL]
-            lawful, near = law <= limits[LAWFUL], r <= ti.max(limits[ENOUGH_OF_ONE], goal) or rounding == 1.0
+            settling = loop[MULTIPLIERS] >= limits[SETTLING]
+            enough_of_one = limits[ENOUGH_OF_ONE] * (FINER if settling else 1.0)
+            lawful, near = law <= limits[LAWFUL], r <= ti.max(enough_of_one, goal) or rounding == 1.0
             if loop[WITHIN] == 0.0 and (near or (lawful and r <= enough)):
                 if lawful and (r <= ti.max(enough, floor) or rounding == 1.0):
                     verdict = SOLVED
                 elif loop[MULTIPLIERS] >= MAX_MULTIPLIERS:
                     verdict = GIVEN_UP
                 else:
-                    scale = next_scale(scale, law, law_before, taken, limits[LARGEST])
+                    known = 0
+                    if settling:
+                        scale, known = SETTLED, ti.cast(loop[KNOWN], ti.i32)
+                        loop[KNOWN] = ti.min(known + 1, PAST)
+                    else:
+                        scale = next_scale(scale, law, law_before, taken, limits[LARGEST])
+                    renew(k, known)
                     law_before = law
-                    for c in range(p.count[0]):
-                        set_multiplier(k, c)
                     previous, taken, renewed = 0.0, 0.0, True
                     loop[MULTIPLIERS] = loop[MULTIPLIERS] + 1.0
                 work += 1
@@ -115,7 +102,10 @@ def solve_frictional(
                     loop[SAME] = 1.0
                     loop[OWN] = 0.0
                 n = ti.min(budget - work, longest - ti.cast(loop[OWN], ti.i32))
-                count, stop = pcg_serial.iterations(m, A, k.coupling, s.pcg, n, limits[TOLERANCE])
+                tolerance = limits[TOLERANCE]
+                if loop[SOLVES] > 0.0:
+                    tolerance = ti.max(tolerance, limits[LATER])
+                count, stop = pcg_serial.iterations(m, A, k.coupling, s.pcg, n, tolerance)
                 loop[OWN] = loop[OWN] + count
                 loop[LINEAR] = loop[LINEAR] + count
                 work += count + 1

@@ -5,11 +5,8 @@ it (`linear.pcg`). How far it goes `line_search` says. CG's tolerance follows Ne
 choice 2). What a slow step leaves on few nodes is solved there first, see `elimination`.
 
 Contacts make an augmented Lagrangian of the stage: per multiplier lambda it is minimised with the friction disks frozen, down to
-PROGRESS times what the multiplier left; then lambda = prox(lambda - R u), and the disks open as far as its normal parts say.
-R stays while the laws' residual falls. Else it doubles after a multiplier that took one step, and is halved after one that took
-many, or that left more of that residual: with a large R each multiplier nearly solves the problem with frozen disks, a
-fixed-point iteration that need not converge. Once |r| is small enough, so are the steps under one multiplier, unless
-`tolerance_of_one` asks them to follow the laws further down.
+PROGRESS times what the multiplier left; then lambda = prox(lambda - R u), and the disks open as far as its normal parts say, see
+`multipliers`. Once |r| is small enough, so are the steps under one multiplier, unless `tolerance_of_one` asks for more.
 Source: Alart and Curnier 1991 for the laws as a prox; the loop is that of the method of multipliers.
 
 Convergence: |r| <= tolerance * scale, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes, impulses in r, and
@@ -23,8 +20,9 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from taisoft.dynamics.frictional import MAX_MULTIPLIERS, PROGRESS, R_SCALE, ROUNDING, STIFFEST, next_scale
+from taisoft.dynamics.frictional import PROGRESS, ROUNDING
 from taisoft.dynamics.line_search import search
+from taisoft.dynamics.multipliers import FINER, MAX_MULTIPLIERS, PAST, R_SCALE, SETTLED, STIFFEST, next_scale
 from taisoft.dynamics.residual import ELASTIC_STAGE, IMPACT, LINEARISED, STEP
 from taisoft.dynamics.stage_result import StageResult, relative
 from taisoft.dynamics.stage_system import Stage, StageSystem
@@ -50,7 +48,7 @@ class Newton:
         self.inner = system.kind == LINEARISED  # an indefinite matrix is then left to the caller
         self.floor = system.rounding.of_stage(stage.c, stage.beta)
         self.loosest = MAX_FORCING if stage.c > 0.0 else STATIC_FORCING
-        self.newton = self.linear = self.multipliers = 0
+        self.newton = self.linear = self.multipliers = self.known = 0
         self.eliminated = 0.0  # Newton iterations on few nodes, by their share
         self.rounding = self.negative = False  # nothing but rounding is left of |r|; negative curvature was met
 
@@ -90,8 +88,14 @@ class Newton:
             return self.r <= enough or self.rounding
         lawful = self.system.contact_residual <= self.stage.contact_tolerance
         # in an impact whose laws hold only the momenta are left to balance
-        goal = 0.0 if lawful and self.system.kind == IMPACT else max(self.stage.enough_of_one * self.scale, self.goal)
+        of_one = (FINER if self._is_settling else 1.0) * self.stage.enough_of_one * self.scale
+        goal = 0.0 if lawful and self.system.kind == IMPACT else max(of_one, self.goal)
         return self.r <= (max(enough, goal) if lawful else goal) or self.rounding
+
+    @property
+    def _is_settling(self) -> bool:
+        """Whether multipliers are extrapolated."""
+        return self.multipliers >= self.stage.settling
 
     def _target(self) -> float:
         return max(self.stage.tolerance * self.scale, self.stage.absolute_tolerance)
@@ -109,9 +113,13 @@ class Newton:
         if not self.touching or self.stage.keeps_multipliers or self.multipliers >= MAX_MULTIPLIERS:
             return False
         system, law = self.system, self.system.contact_residual
-        system.r_scale = next_scale(system.r_scale, law, self.law, self.taken, self.stiffest)
+        known = self.known
+        if self._is_settling:
+            system.r_scale, self.known = SETTLED, min(known + 1, PAST)
+        else:
+            system.r_scale = next_scale(system.r_scale, law, self.law, self.taken, self.stiffest)
         self.law, self.multipliers, self.rounding = law, self.multipliers + 1, False
-        self.r, self.scale = system.evaluate(None, new_multipliers=True)
+        self.r, self.scale = system.renew_multipliers(known)
         self._aim()
         return True
 
@@ -157,7 +165,7 @@ class Newton:
         A step that bends a slender body raises |r| by stretching it; a loose solve would then only undo that stretch.
         """
         if self.stage.linear_tolerance is not None:
-            return self.stage.linear_tolerance
+            return max(self.stage.linear_tolerance, self.stage.later_tolerance if self.newton > 0 else 0.0)
         enough = self._target()
         if self.previous == 0.0:
             self.forcing = self.loosest

@@ -16,7 +16,7 @@ import numpy as np
 import taichi as ti
 
 from taisoft.contact.problem import RESIDUAL, find_factors
-from taisoft.dynamics import frictional
+from taisoft.dynamics import frictional, multipliers
 from taisoft.dynamics.contact_terms import NO_CONTACTS, StageContacts, begin_contacts, build_stage_contacts, keep_diagonal, press
 from taisoft.dynamics.linearised import LONGEST, advance, keep_linear, leave_linear
 from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STAY, form_residual, move
@@ -51,7 +51,9 @@ class Stage:
     prescribed_share: float = 1.0  # see `begin_stage`
     tolerance_of_one: float | None = None  # as `tolerance`, of the steps under one multiplier; None: the same
     absolute_tolerance: float = 0.0  # |r| [N s] that ends the stage, too, whatever the scale
+    settling: int = multipliers.SETTLING  # multipliers before these are extrapolated
     keeps_multipliers: bool = False  # the multipliers at hand are not renewed
+    later_tolerance: float = 0.0  # the least of linear solves after the first, where linear_tolerance is given
 
     @property
     def enough_of_one(self) -> float:
@@ -158,7 +160,7 @@ class StageSystem:
         return self._k
 
     def _begin(self, stage: Stage, kind: int) -> None:
-        self.stage, self.kind, self.r_scale, self._k = stage, kind, frictional.R_SCALE, NO_CONTACTS
+        self.stage, self.kind, self.r_scale, self._k = stage, kind, multipliers.R_SCALE, NO_CONTACTS
         self.restrict(None)
         if self.contact.n_contacts == 0:
             return
@@ -179,6 +181,11 @@ class StageSystem:
             press(m, k, int(new_multipliers), stage.beta, self.r_scale)
         form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
         return self._sizes(stage.c, stage.beta)
+
+    def renew_multipliers(self, known: int) -> tuple[float, float]:
+        """(|r|, scale) under multipliers extrapolated from so many renewals before."""
+        multipliers.renew_multipliers(self._k, known)
+        return self.evaluate(None)
 
     def set_direction_to_rest(self) -> None:
         """A whole step along y leads to v = 0."""
@@ -225,14 +232,15 @@ class StageSystem:
 
     def solve_frictional(self, problem: Stage, r: float, floor: float, stiffest: float) -> np.ndarray:
         """The loop of a linearised stage from |r| on, in launches that Ctrl-C can come between: see `frictional`."""
-        m, A, loop, limits = self.model, self.matrix, np.zeros(14), np.zeros(9)
+        m, A, loop, limits = self.model, self.matrix, np.zeros(15), np.zeros(11)
         loop[[frictional.NORM, frictional.SCALE, frictional.LAW, frictional.GOAL, frictional.SAME]] = (
-            r, frictional.R_SCALE, math.inf, frictional.PROGRESS * r, self._same_matrix,
+            r, multipliers.R_SCALE, math.inf, frictional.PROGRESS * r, self._same_matrix,
         )  # fmt: skip
         # in the order of their places
         limits[:] = (
             problem.tolerance * self.scale, problem.enough_of_one * self.scale, floor, problem.contact_tolerance,
             problem.linear_tolerance, stiffest, problem.max_newton, pcg.most_iterations(m), pcg.batch_of(m, A),
+            problem.settling, problem.later_tolerance,
         )  # fmt: skip
         while loop[frictional.VERDICT] == frictional.RUNNING:
             frictional.solve_frictional(m, self.work, A, self._k, problem.beta, limits, loop)
