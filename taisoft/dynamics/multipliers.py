@@ -4,6 +4,7 @@ A multiplier becomes the impulse p = prox(lambda - R u) that it led to, and the 
 a fixed-point iteration lambda -> p. R stays while the laws' residual falls. Else it doubles after a multiplier that took one
 step, and is halved after one that took many, or that left more of that residual: with a large R each multiplier nearly solves the
 problem with frozen disks, an iteration that need not converge.
+Source: Alart and Curnier 1991 for the laws as a prox; the loop is that of the method of multipliers.
 
 Most problems need a few multipliers. Where disks and normal impulses go on to change each other by little, it converges as slowly
 as 0.98 to 1. So after SETTLING multipliers, at once where only rounding is left of |r|, R stays, and multipliers are extrapolated

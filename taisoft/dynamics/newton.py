@@ -3,11 +3,8 @@
 A step solves with the unprojected matrix by conjugate gradients; where these meet negative curvature, the direction leads along
 it (`linear.pcg`). How far it goes `line_search` says. CG's tolerance follows Newton's progress (Eisenstat and Walker 1996,
 choice 2). What a slow step leaves on few nodes is solved there first, see `elimination`.
-
-Contacts make an augmented Lagrangian of the stage: per multiplier lambda it is minimised with the friction disks frozen, down to
-PROGRESS times what the multiplier left; then lambda = prox(lambda - R u), and the disks open as far as its normal parts say, see
-`multipliers`. Once |r| is small enough, so are the steps under one multiplier, unless `tolerance_of_one` asks for more.
-Source: Alart and Curnier 1991 for the laws as a prox; the loop is that of the method of multipliers.
+Contacts make an augmented Lagrangian of the stage, minimised per multiplier down to PROGRESS times what that left of |r|, and
+once |r| is small enough not further, unless `tolerance_of_one` asks for it; how multipliers are renewed `multipliers` says.
 
 Convergence: |r| <= tolerance * scale, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes, impulses in r, and
 the residual of the contact laws, |p - prox(p - f u)| / |p| with f = 1 / (J diag(A)^-1 J^T), within its own tolerance. A residual
@@ -88,14 +85,9 @@ class Newton:
             return self.r <= enough or self.rounding
         lawful = self.system.contact_residual <= self.stage.contact_tolerance
         # in an impact whose laws hold only the momenta are left to balance
-        of_one = (FINER if self._is_settling else 1.0) * self.stage.enough_of_one * self.scale
+        of_one = (FINER if self.multipliers >= self.stage.settling else 1.0) * self.stage.enough_of_one * self.scale
         goal = 0.0 if lawful and self.system.kind == IMPACT else max(of_one, self.goal)
         return self.r <= (max(enough, goal) if lawful else goal) or self.rounding
-
-    @property
-    def _is_settling(self) -> bool:
-        """Whether multipliers are extrapolated."""
-        return self.multipliers >= self.stage.settling
 
     def _target(self) -> float:
         return max(self.stage.tolerance * self.scale, self.stage.absolute_tolerance)
@@ -114,7 +106,7 @@ class Newton:
             return False
         system, law = self.system, self.system.contact_residual
         known = self.known
-        if self._is_settling:
+        if self.multipliers >= self.stage.settling:
             system.r_scale, self.known = SETTLED, min(known + 1, PAST)
         else:
             system.r_scale = next_scale(system.r_scale, law, self.law, self.taken, self.stiffest)
