@@ -7,6 +7,8 @@
 * a linearised step of an indefinite matrix goes on with a projected one.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rotations import rotation
@@ -16,7 +18,7 @@ from taisoft import model
 from taisoft.dynamics import contact_newton, implicit, scheme_of
 from taisoft.dynamics.contact_newton import FALLBACK, Frictional
 from taisoft.dynamics.newton import Newton
-from taisoft.dynamics.stage_system import StageSystem
+from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.linear import pcg
 
 DT = 0.01  # [s]
@@ -63,6 +65,11 @@ def from_the_host(system, problem, r, scale, stiffest) -> Frictional:
     return Frictional(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
 
 
+def counts(reports: list[ts.StepReport]) -> list[tuple[int, int, int]]:
+    """Of Newton, CG and multipliers, step by step."""
+    return [(r.newton_iterations, r.linear_iterations, r.contact_iterations) for r in reports]
+
+
 def test_steps_that_count_keep_the_laws_of_light_bodies_too():
     """A light cube slides on a stiff block, beside whose rounding all its impulses are small. First, before one in f64 opens."""
     scene = ts.Scene()
@@ -100,17 +107,49 @@ def test_both_loops_find_the_same_step(sim, monkeypatch):
     monkeypatch.setattr(contact_newton, "solve_linear", from_the_host)
     host, others = steps(sim)
     assert all(report.converged for report in others) and np.abs(host - x).max() < 1e-8  # [m]
+    assert counts(others) == counts(reports)
 
 
-@pytest.mark.parametrize("loop", ["launch", "host"])
-def test_extrapolated_multipliers_end_where_others_do(sim, monkeypatch, loop):
+def test_extrapolated_multipliers_end_where_others_do(sim, monkeypatch):
+    """And sooner; both loops alike."""
     x, reports = steps(sim)
-    monkeypatch.setattr(contact_newton, "SETTLING", 0)
-    if loop == "host":
-        monkeypatch.setattr(contact_newton, "solve_linear", from_the_host)
+    monkeypatch.setattr(contact_newton, "EXTRAPOLATE_AFTER", 0)
     other, others = steps(sim)
     assert all(report.converged for report in others) and np.abs(other - x).max() < 1e-8  # [m]
-    assert [r.linear_iterations for r in others] != [r.linear_iterations for r in reports]
+    assert sum(report.contact_iterations for report in others) < 0.9 * sum(report.contact_iterations for report in reports)
+    monkeypatch.setattr(contact_newton, "solve_linear", from_the_host)
+    assert counts(steps(sim)[1]) == counts(others)
+
+
+def test_solves_after_the_first_are_looser(sim):
+    """Unless their tolerance is the user's."""
+    steps(sim, 2)
+    solver, stage = sim._stepper.solver, Stage(1.0, DT, DT, 1e-6, linear_tolerance=1e-4, later_tolerance=1e-2)
+    newton = Newton(solver, stage)
+    assert newton._linear_tolerance() == 1e-4
+    newton.newton = 1
+    assert newton._linear_tolerance() == 1e-2
+    newton.stage = replace(stage, later_tolerance=0.0)
+    assert newton._linear_tolerance() == 1e-4
+
+
+@pytest.mark.parametrize("given", [None, 1e-5])
+def test_tight_problems_extrapolate_at_once(sim, monkeypatch, given):
+    """And loosen all solves but the first; not where the user says how well they are solved."""
+    problems = []
+
+    def solve(system, problem, r, scale, stiffest):
+        problems.append((system.stage, problem))
+        return from_the_host(system, problem, r, scale, stiffest)
+
+    monkeypatch.setattr(contact_newton, "HIDING", np.inf)  # only rounding, as it were
+    monkeypatch.setattr(contact_newton, "solve_linear", solve)
+    monkeypatch.setattr(sim._stepper, "linear_tolerance", given)
+    steps(sim, 2)
+    assert problems
+    for stage, problem in problems:
+        assert problem.extrapolate_after == 0
+        assert (problem.linear_tolerance, problem.later_tolerance) == ((given, 0.0) if given else (stage.tolerance, 1e-2))
 
 
 def test_on_threads_it_is_the_same_step(sim, monkeypatch):

@@ -17,7 +17,8 @@ import taichi as ti
 from scenes import opened
 
 from taisoft.contact.problem import build_node_problem, fill_field
-from taisoft.dynamics.multipliers import FARTHEST, PAST, SOFTEST, STIFFEST, next_scale, renew_multipliers
+from taisoft.dynamics.contact_terms import PAST
+from taisoft.dynamics.multipliers import FARTHEST, SOFTEST, STIFFEST, extrapolate_multipliers, next_scale
 from taisoft.fields import FieldArena
 
 K = 40
@@ -58,7 +59,7 @@ def rig():
 def renew(rig, impulses: np.ndarray, known: int) -> np.ndarray:
     """The multipliers (K,3) after impulses (K,3)."""
     fill_field(rig.p.r, impulses)
-    renew_multipliers(rig.terms, known)
+    extrapolate_multipliers(rig.terms, known)
     return rig.work.multiplier.to_numpy()[:K]
 
 
@@ -128,23 +129,33 @@ def test_a_change_that_says_nothing_new_is_left_out(rig):
     """One mode alone: the second change is parallel to the first."""
     step, fixed, x = slow(rig, [0.9], 8)
     begin(rig, x)
-    seen = [x]
     x = renew(rig, step(x), 0)
-    for _ in range(2):
+    for known in (1, 2):
         fill_field(rig.work.multiplier, x)  # as if it had not been extrapolated
-        seen.append(x)
         last, x = x, step(x)
-        renewed = renew(rig, x, min(len(seen) - 1, PAST))
+        renewed = renew(rig, x, known)
     assert np.abs(renewed - fixed).max() < 1e-6 < np.abs(x - last).max()
 
 
-def test_an_extrapolation_that_goes_too_far_is_not_taken(rig):
-    """A mode so slow that its end lies more than FARTHEST steps away."""
-    step, _, x = slow(rig, [1.0 - 0.5 / FARTHEST], 9)
+@pytest.mark.parametrize("steps, taken", [(2.0 * FARTHEST, False), (0.9 * FARTHEST, True)])
+def test_an_extrapolation_that_goes_too_far_is_not_taken(rig, steps, taken):
+    """A mode so slow that its end lies so many steps away."""
+    step, fixed, x = slow(rig, [1.0 - 1.0 / steps], 9)
     begin(rig, x)
     x = renew(rig, step(x), 0)
     impulses = step(x)
-    assert np.array_equal(renew(rig, impulses, 1), impulses)
+    renewed = renew(rig, impulses, 1)
+    assert np.abs(renewed - fixed).max() < 1e-6 if taken else np.array_equal(renewed, impulses)
+
+
+def test_neither_is_one_whose_second_part_does(rig):
+    """Two modes, the slower one so slow that the change before the last one takes it too far."""
+    step, _, x = slow(rig, [1.0 - 0.2 / FARTHEST, 0.5], 10)
+    begin(rig, x)
+    for known in (0, 1):
+        x = renew(rig, step(x), known)
+    impulses = step(x)
+    assert np.array_equal(renew(rig, impulses, 2), impulses)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from taisoft.dynamics.frictional import (
 )
 from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
 from taisoft.dynamics.line_search import choose_start, search
-from taisoft.dynamics.multipliers import R_SCALE, SETTLING, STIFFEST
+from taisoft.dynamics.multipliers import EXTRAPOLATE_AFTER, R_SCALE, STIFFEST
 from taisoft.dynamics.newton import FALL, SLOW_STEP, Newton
 from taisoft.dynamics.residual import AGAIN
 from taisoft.dynamics.stage_result import StageResult, relative
@@ -31,7 +31,7 @@ from taisoft.launching import PUBLIC
 SOLVES, FORCING = 60, 0.3  # linear solves of one frictional problem, and their tolerance
 LATER_FORCING = 0.01  # the least tolerance of those after the first, which move a whole body no more
 SHARE, LAW_SHARE = 0.1, 0.1  # of what the stage has left of |r| and of the laws' residual: what such a problem is solved to,
-LEAST_SHARE, LEAST_LAW_SHARE = 0.3, 0.8  # or these shares of the tolerances: the laws hold as well where the stage is not linear
+LEAST_SHARE, LEAST_LAW_SHARE = 0.3, 0.8  # or these of the tolerances: a whole step on the true stage keeps what was reached
 BALANCE = 0.03  # laws need not hold better than so many times the relative |r| that is asked for: the next matrix undoes that
 SHARE_OF_ONE = 0.3  # of the |r| asked for that ends the steps under one multiplier: new ones at an old |r| overshoot
 LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # linear solves of a linearised stage, and their tolerance
@@ -102,7 +102,7 @@ class ContactNewton:
                 if not (inner.negative or self.tight):
                     # where friction goes round and round, a shorter step helps, and more of these do not
                     moved &= self.r < FALL * least or (only_laws and system.contact_residual < FALL * law)
-            # multipliers and friction disks go round and round: longer next time, R no larger than usual
+            # multipliers and friction disks go round and round: longer next time, and R no larger than usual until extrapolation
             stalled += self.r > STALLED * least
             self.stalls = stalled >= 2
             if moved and self.r > SLOW_STEP * previous and not self._done():
@@ -162,8 +162,8 @@ class ContactNewton:
         system.linearise()
         enough = max(SHARE * self.r, LEAST_SHARE * stage.tolerance * self.scale)
         tolerance = enough / self.scale if self.scale > 0.0 else 0.0
-        # where the rounding of stiff stress hides the motion of a whole body in |r|, only tight solves get that motion right, and
-        # impulses only settle where |r| follows them down
+        # where the rounding of stiff stress hides the motion of a whole body in |r|, only a tight solve gets that motion right,
+        # the first, and impulses only settle where |r| follows them down
         self.tight = self.r <= HIDING * self.floor
         law = LEAST_LAW_SHARE * stage.contact_tolerance
         if not self._is_balanced:
@@ -172,7 +172,7 @@ class ContactNewton:
             stage, tolerance=tolerance,
             contact_tolerance=max(LAW_SHARE * system.contact_residual, law),
             tolerance_of_one=0.0 if self.tight else SHARE_OF_ONE * tolerance,
-            settling=0 if self.tight else SETTLING,
+            extrapolate_after=0 if self.tight else EXTRAPOLATE_AFTER,
             max_newton=PATIENCE * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
             later_tolerance=0.0 if stage.linear_tolerance else LATER_FORCING,

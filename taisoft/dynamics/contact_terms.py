@@ -22,6 +22,8 @@ from taisoft.model import Model
 from taisoft.runtime import kernel
 from taisoft.subset import n_nodes_of, node_of
 
+PAST = 2  # renewals of multipliers that are remembered
+
 
 @dataclass(frozen=True, eq=False)
 class ContactStageWork:
@@ -29,8 +31,8 @@ class ContactStageWork:
 
     multiplier: Any  # (capacity) 3-vectors f64: lambda [N s]
     radius: Any  # (capacity) f64: rho [N s]
-    past_impulse: Any  # (2 capacity) 3-vectors f64: impulses of each contact at the last two renewals of multipliers [N s],
-    past_change: Any  # and how far they were from the multipliers that led to them; the last one first
+    past_impulse: Any  # (PAST capacity) 3-vectors f64: impulses at the last renewals of multipliers, latest first [N s]
+    past_change: Any  # (PAST capacity) 3-vectors f64: those less the multipliers that led to them [N s]
     tangential_offset: Any  # (capacity) 3-vectors f64: J (x_start - x_hat), less the displacement of an obstacle [m]
     gap_minus_target: Any  # (capacity) f64: gap - target at the start, less the displacement of an obstacle along the normal [m]
     velocity: Any  # (capacity) 3-vectors f64: u where a step begins [m/s]
@@ -220,7 +222,7 @@ def build_stage_contacts(arena: FieldArena, model: Model, found: FoundContacts, 
     p, n, real = found.problem, model.n_nodes, model.real
     work = ContactStageWork(
         arena.vectors("multiplier", ti.f64, p.capacity), arena.field("friction_radius", ti.f64, p.capacity),
-        arena.vectors("past_impulse", ti.f64, 2 * p.capacity), arena.vectors("past_change", ti.f64, 2 * p.capacity),
+        arena.vectors("past_impulse", ti.f64, PAST * p.capacity), arena.vectors("past_change", ti.f64, PAST * p.capacity),
         arena.vectors("contact_tangential_offset", ti.f64, p.capacity),
         arena.field("contact_gap_minus_target", ti.f64, p.capacity),
         arena.vectors("contact_velocity", ti.f64, p.capacity),

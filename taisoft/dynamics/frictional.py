@@ -8,9 +8,9 @@ the loop stands is kept in `loop`, and the next launch goes on.
 import taichi as ti
 
 from taisoft.contact.problem import RESIDUAL
-from taisoft.dynamics.contact_terms import press_contact, sum_residual
+from taisoft.dynamics.contact_terms import PAST, press_contact, set_multiplier, sum_residual
 from taisoft.dynamics.linearised import begin_contact, begin_node, go_along, pressed_residual, step_length
-from taisoft.dynamics.multipliers import FINER, MAX_MULTIPLIERS, PAST, SETTLED, next_scale, renew
+from taisoft.dynamics.multipliers import FINER, MAX_MULTIPLIERS, R_EXTRAPOLATED, extrapolate, next_scale
 from taisoft.linear import pcg_serial
 from taisoft.linear.pcg import NEGATIVE
 from taisoft.linear.pcg import RUNNING as UNFINISHED
@@ -26,9 +26,9 @@ PROGRESS = 0.3  # share of what a new multiplier left of |r| that the steps brin
 NORM, SCALE, LAW, GOAL, PREVIOUS, TAKEN, SOLVES, LINEAR, MULTIPLIERS, AT_ROUNDING, WITHIN, OWN, SAME, VERDICT, KNOWN = range(15)
 RUNNING, SOLVED, GIVEN_UP, INDEFINITE = range(4)
 # places in `limits`: |r| [N s] that ends the loop, that ends the steps under one multiplier, that is rounding; the laws' residual
-# that ends the loop, too, tolerance of linear solves, the largest R over the r-factors, linear solves, iterations of one, those
-# in a launch, multipliers before they are extrapolated, the least tolerance of linear solves after the first
-ENOUGH, ENOUGH_OF_ONE, FLOOR, LAWFUL, TOLERANCE, LARGEST, MOST_SOLVES, LONGEST, BUDGET, SETTLING, LATER = range(11)
+# that ends the loop, too, tolerance of linear solves, the largest R over the r-factors until multipliers are extrapolated, linear
+# solves, iterations of one, those in a launch, multipliers before they are extrapolated, least tolerance of later solves
+ENOUGH, ENOUGH_OF_ONE, FLOOR, LAWFUL, TOLERANCE, LARGEST, MOST_SOLVES, LONGEST, BUDGET, PLAIN, LATER = range(11)
 
 
 @ti.func
@@ -74,8 +74,8 @@ def solve_frictional(
         while verdict == RUNNING and work < budget:
             renewed, moved = False, False
             law = p.state[RESIDUAL]
-            settling = loop[MULTIPLIERS] >= limits[SETTLING]
-            enough_of_one = limits[ENOUGH_OF_ONE] * (FINER if settling else 1.0)
+            extrapolating = loop[MULTIPLIERS] >= limits[PLAIN]
+            enough_of_one = limits[ENOUGH_OF_ONE] * (FINER if extrapolating else 1.0)
             lawful, near = law <= limits[LAWFUL], r <= ti.max(enough_of_one, goal) or rounding == 1.0
             if loop[WITHIN] == 0.0 and (near or (lawful and r <= enough)):
                 if lawful and (r <= ti.max(enough, floor) or rounding == 1.0):
@@ -83,13 +83,13 @@ def solve_frictional(
                 elif loop[MULTIPLIERS] >= MAX_MULTIPLIERS:
                     verdict = GIVEN_UP
                 else:
-                    known = 0
-                    if settling:
-                        scale, known = SETTLED, ti.cast(loop[KNOWN], ti.i32)
-                        loop[KNOWN] = ti.min(known + 1, PAST)
+                    if extrapolating:
+                        extrapolate(k, ti.cast(loop[KNOWN], ti.i32))
+                        scale, loop[KNOWN] = R_EXTRAPOLATED, ti.min(loop[KNOWN] + 1.0, PAST)
                     else:
                         scale = next_scale(scale, law, law_before, taken, limits[LARGEST])
-                    renew(k, known)
+                        for c in range(p.count[0]):
+                            set_multiplier(k, c)
                     law_before = law
                     previous, taken, renewed = 0.0, 0.0, True
                     loop[MULTIPLIERS] = loop[MULTIPLIERS] + 1.0

@@ -4,7 +4,7 @@ A step solves with the unprojected matrix by conjugate gradients; where these me
 it (`linear.pcg`). How far it goes `line_search` says. CG's tolerance follows Newton's progress (Eisenstat and Walker 1996,
 choice 2). What a slow step leaves on few nodes is solved there first, see `elimination`.
 Contacts make an augmented Lagrangian of the stage, minimised per multiplier down to PROGRESS times what that left of |r|, and
-once |r| is small enough not further, unless `tolerance_of_one` asks for it; how multipliers are renewed `multipliers` says.
+no further than |r| is small enough, unless `tolerance_of_one` or extrapolation ask for more, see `multipliers`.
 
 Convergence: |r| <= tolerance * scale, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes, impulses in r, and
 the residual of the contact laws, |p - prox(p - f u)| / |p| with f = 1 / (J diag(A)^-1 J^T), within its own tolerance. A residual
@@ -19,7 +19,7 @@ from typing import Any
 
 from taisoft.dynamics.frictional import PROGRESS, ROUNDING
 from taisoft.dynamics.line_search import search
-from taisoft.dynamics.multipliers import FINER, MAX_MULTIPLIERS, PAST, R_SCALE, SETTLED, STIFFEST, next_scale
+from taisoft.dynamics.multipliers import FINER, MAX_MULTIPLIERS, PAST, R_EXTRAPOLATED, R_SCALE, STIFFEST, next_scale
 from taisoft.dynamics.residual import ELASTIC_STAGE, IMPACT, LINEARISED, STEP
 from taisoft.dynamics.stage_result import StageResult, relative
 from taisoft.dynamics.stage_system import Stage, StageSystem
@@ -85,7 +85,7 @@ class Newton:
             return self.r <= enough or self.rounding
         lawful = self.system.contact_residual <= self.stage.contact_tolerance
         # in an impact whose laws hold only the momenta are left to balance
-        of_one = (FINER if self.multipliers >= self.stage.settling else 1.0) * self.stage.enough_of_one * self.scale
+        of_one = (FINER if self.multipliers >= self.stage.extrapolate_after else 1.0) * self.stage.enough_of_one * self.scale
         goal = 0.0 if lawful and self.system.kind == IMPACT else max(of_one, self.goal)
         return self.r <= (max(enough, goal) if lawful else goal) or self.rounding
 
@@ -101,17 +101,17 @@ class Newton:
         return self.system.contact_residual <= self.stage.contact_tolerance
 
     def _multiply(self) -> bool:
-        """Take the impulses as new multipliers; False where that has been done too often."""
+        """Renew the multipliers; False where that has been done too often."""
         if not self.touching or self.stage.keeps_multipliers or self.multipliers >= MAX_MULTIPLIERS:
             return False
-        system, law = self.system, self.system.contact_residual
-        known = self.known
-        if self.multipliers >= self.stage.settling:
-            system.r_scale, self.known = SETTLED, min(known + 1, PAST)
+        system, law, extrapolating = self.system, self.system.contact_residual, self.multipliers >= self.stage.extrapolate_after
+        if extrapolating:
+            system.extrapolate_multipliers(self.known)
+            system.r_scale, self.known = R_EXTRAPOLATED, min(self.known + 1, PAST)
         else:
             system.r_scale = next_scale(system.r_scale, law, self.law, self.taken, self.stiffest)
         self.law, self.multipliers, self.rounding = law, self.multipliers + 1, False
-        self.r, self.scale = system.renew_multipliers(known)
+        self.r, self.scale = system.evaluate(None, new_multipliers=not extrapolating)
         self._aim()
         return True
 

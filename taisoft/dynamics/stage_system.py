@@ -51,9 +51,9 @@ class Stage:
     prescribed_share: float = 1.0  # see `begin_stage`
     tolerance_of_one: float | None = None  # as `tolerance`, of the steps under one multiplier; None: the same
     absolute_tolerance: float = 0.0  # |r| [N s] that ends the stage, too, whatever the scale
-    settling: int = multipliers.SETTLING  # multipliers before these are extrapolated
     keeps_multipliers: bool = False  # the multipliers at hand are not renewed
-    later_tolerance: float = 0.0  # the least of linear solves after the first, where linear_tolerance is given
+    extrapolate_after: int = multipliers.EXTRAPOLATE_AFTER  # multipliers
+    later_tolerance: float = 0.0  # lower bound on linear_tolerance after the first solve
 
     @property
     def enough_of_one(self) -> float:
@@ -182,10 +182,9 @@ class StageSystem:
         form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
         return self._sizes(stage.c, stage.beta)
 
-    def renew_multipliers(self, known: int) -> tuple[float, float]:
-        """(|r|, scale) under multipliers extrapolated from so many renewals before."""
-        multipliers.renew_multipliers(self._k, known)
-        return self.evaluate(None)
+    def extrapolate_multipliers(self, known: int) -> None:
+        """Multipliers from the impulses and so many renewals before; impulses and residual are still the old ones."""
+        multipliers.extrapolate_multipliers(self._k, known)
 
     def set_direction_to_rest(self) -> None:
         """A whole step along y leads to v = 0."""
@@ -240,7 +239,7 @@ class StageSystem:
         limits[:] = (
             problem.tolerance * self.scale, problem.enough_of_one * self.scale, floor, problem.contact_tolerance,
             problem.linear_tolerance, stiffest, problem.max_newton, pcg.most_iterations(m), pcg.batch_of(m, A),
-            problem.settling, problem.later_tolerance,
+            problem.extrapolate_after, problem.later_tolerance,
         )  # fmt: skip
         while loop[frictional.VERDICT] == frictional.RUNNING:
             frictional.solve_frictional(m, self.work, A, self._k, problem.beta, limits, loop)
