@@ -15,8 +15,13 @@ from taisoft.runtime import compile_clock
 
 if __package__:
     from .contact_states import DOWN, GROUND, IMPLICIT, MESHES, demo, figure, rubber
+    from .programs.own import make_scene
+    from .works.scenes import WORKS
 else:  # as a program
     from contact_states import DOWN, GROUND, IMPLICIT, MESHES, demo, figure, rubber
+
+    from benchmarks.programs.own import make_scene
+    from benchmarks.works.scenes import WORKS
 
 MESH = {"bar": "bar-2523.msh", "bunny": "bunny.msh", "octocat": "octocat.msh", "Armadillo": "Armadillo13K.msh"}
 
@@ -46,24 +51,9 @@ def ledge() -> ts.Scene:
     return scene
 
 
-def stack() -> ts.Scene:
-    """W3 of the works: three cubes of 1 m fall on each other."""
-    scene, mesh = ts.Scene(gravity=DOWN), ts.box_mesh((6, 6, 6), (1.0, 1.0, 1.0))
-    for k in range(3):
-        scene.add_body(mesh, rubber(young=1e5, poisson=0.3), name=f"cube {k}", position=(0, 0.501 + 1.001 * k, 0))
-    scene.add_obstacle(GROUND, name="ground", friction=0.5)
-    return scene
-
-
-def cube_on_sheet() -> ts.Scene:
-    """W4: a cube of 0.5 m falls on a clamped sheet."""
-    scene = ts.Scene(gravity=DOWN)
-    sheet = ts.box_mesh((20, 2, 10), (4.0, 0.05, 4.0))
-    made = scene.add_body(sheet, rubber(young=1e6, poisson=0.3), name="sheet")
-    made.fix(lambda X: abs(X[:, 0]) > 1.9)
-    cube = ts.box_mesh((4, 4, 4), (0.5, 0.5, 0.5))
-    scene.add_body(cube, rubber(young=1e5, poisson=0.3), name="cube", position=(0, 0.525, 0))
-    return scene
+def work(key: str) -> ts.Scene:
+    """W3 or W4, as `taisoft bench peers` has them."""
+    return make_scene(next(one for one in WORKS if one.key == key))
 
 
 # name: (scene, settings, steps)
@@ -71,10 +61,10 @@ DROPS: dict[str, tuple[Callable[[], ts.Scene], dict, int]] = {
     **{name: (lambda name=name: on_plane(name), IMPLICIT | {"dt": 0.01}, 100) for name in MESH},
     "cloth": (cloth, IMPLICIT | {"dt": 1 / 120}, 120),
     "cube pile": (lambda: demo("cube_pile"), IMPLICIT | {"dt": 0.01, "contact_tolerance": 1e-3}, 200),
-    "stack, Euler": (stack, IMPLICIT | {"dt": 0.01}, 100),
-    "stack, BDF2": (stack, {"integrator": "bdf2", "dt": 0.01}, 100),
-    "cube on sheet, Euler": (cube_on_sheet, IMPLICIT | {"dt": 0.01}, 100),
-    "cube on sheet, BDF2": (cube_on_sheet, {"integrator": "bdf2", "dt": 0.01}, 100),
+    "stack, Euler": (lambda: work("W3"), IMPLICIT | {"dt": 0.01}, 100),
+    "stack, BDF2": (lambda: work("W3"), {"integrator": "bdf2", "dt": 0.01}, 100),
+    "cube on sheet, Euler": (lambda: work("W4"), IMPLICIT | {"dt": 0.01}, 100),
+    "cube on sheet, BDF2": (lambda: work("W4"), {"integrator": "bdf2", "dt": 0.01}, 100),
     "cube at rest": (ledge, IMPLICIT | {"dt": 0.005}, 400),
 }
 

@@ -8,6 +8,7 @@
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -113,7 +114,7 @@ def test_both_loops_find_the_same_step(sim, monkeypatch):
 def test_extrapolated_multipliers_end_where_others_do(sim, monkeypatch):
     """And sooner; both loops alike."""
     x, reports = steps(sim)
-    monkeypatch.setattr(contact_newton, "EXTRAPOLATE_AFTER", 0)
+    monkeypatch.setattr(implicit, "Stage", partial(Stage, extrapolate_after=0))
     other, others = steps(sim)
     assert all(report.converged for report in others) and np.abs(other - x).max() < 1e-8  # [m]
     assert sum(report.contact_iterations for report in others) < 0.9 * sum(report.contact_iterations for report in reports)

@@ -263,14 +263,14 @@ def test_residual_of_a_stage(rig, pressed, threads):
             slope = (rig.free * before * y).sum()
             size = np.linalg.norm(before.astype(float)) * np.linalg.norm(y.astype(float))
             assert m.state.scalars[START_SLOPE] == pytest.approx(slope, abs=10 * rig.close * size)
-        told, end = np.zeros(5), m.state.scalars[END_SLOPE]
+        without, end = np.zeros(5), m.state.scalars[END_SLOPE]
         move(m, work, NO_CONTACTS, ELASTIC_STAGE, STAY, 0.0, 1.0, BETA)
-        form_residual(m, work, rig.solver.matrix, NO_CONTACTS, ELASTIC_STAGE, BETA, told)
+        form_residual(m, work, rig.solver.matrix, NO_CONTACTS, ELASTIC_STAGE, BETA, without)
         expected = work.residual.to_numpy() - (rig.J.T @ r.ravel()).reshape(-1, 3)
         assert np.abs(expected - work.residual.to_numpy()).max() > 0.1 * np.abs(expected).max()  # the impulses do count
         close = 10 * rig.close * np.abs(expected).max()
         assert np.abs(got - expected).max() < close and np.abs(rhs + rig.free * expected).max() < close
-        wanted = [((rig.free * expected) ** 2).sum(), *told[1:4], (((1 - rig.free) * expected) ** 2).sum()]
+        wanted = [((rig.free * expected) ** 2).sum(), *without[1:4], (((1 - rig.free) * expected) ** 2).sum()]
         assert norms == pytest.approx(wanted, rel=100 * rig.close) and norms[4] > 0
         slope, size = (rig.free * expected * y).sum(), np.linalg.norm(expected) * np.linalg.norm(y.astype(float))
         assert end == pytest.approx(slope, abs=100 * rig.close * size)

@@ -103,7 +103,7 @@ def test_an_elimination_moves_its_nodes_alone():
         lists, free = system.lists, system.model.free.to_numpy()
         nodes = choose_nodes(free * system.work.residual.to_numpy(), lists.start, lists.column)
         found = eliminate(system, stage, r)
-        assert found.linear > 0.0 and found.newton > 0.0 and not system.work.subset.some
+        assert found.linear > 0.0 and found.newton > 0.0 and not system.work.pcg.subset.some
         moved = (sim.positions() != before).any(axis=1)
         assert 0 < moved.sum() <= len(nodes) < len(before) and not moved[np.setdiff1d(np.arange(len(before)), nodes)].any()
         left, _ = system.evaluate(None)
@@ -203,7 +203,7 @@ def rows_of(rig, model, nodes) -> tuple[np.ndarray, ...]:
     for field in (system.work.pcg.r, system.work.pcg.p, system.work.pcg.q):
         field.fill(1e3)  # what earlier solves left
     system.restrict(nodes)
-    w, subset = system.work, system.work.subset
+    w, subset = system.work, system.work.pcg.subset
     A, norms = system.matrix, np.zeros(5)
     fields = (w.residual, A.value, A.diagonal, w.pcg.y)
     for field in fields:

@@ -10,18 +10,10 @@ import math
 from dataclasses import dataclass, replace
 
 from taisoft.dynamics.elimination import eliminate
-from taisoft.dynamics.frictional import (
-    INDEFINITE,
-    LINEAR,
-    MULTIPLIERS,
-    NORM,
-    ROUNDING,
-    SOLVED,
-    VERDICT,
-)
+from taisoft.dynamics.frictional import INDEFINITE, LINEAR, MULTIPLIERS, NORM, ROUNDING, SOLVED, VERDICT
 from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
 from taisoft.dynamics.line_search import choose_start, search
-from taisoft.dynamics.multipliers import EXTRAPOLATE_AFTER, R_SCALE, STIFFEST
+from taisoft.dynamics.multipliers import R_SCALE, STIFFEST
 from taisoft.dynamics.newton import FALL, SLOW_STEP, Newton
 from taisoft.dynamics.residual import AGAIN
 from taisoft.dynamics.stage_result import StageResult, relative
@@ -172,7 +164,7 @@ class ContactNewton:
             stage, tolerance=tolerance,
             contact_tolerance=max(LAW_SHARE * system.contact_residual, law),
             tolerance_of_one=0.0 if self.tight else SHARE_OF_ONE * tolerance,
-            extrapolate_after=0 if self.tight else EXTRAPOLATE_AFTER,
+            extrapolate_after=0 if self.tight else stage.extrapolate_after,
             max_newton=PATIENCE * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
             later_tolerance=0.0 if stage.linear_tolerance else LATER_FORCING,

@@ -24,17 +24,17 @@ def move(
     m: ti.template(), s: ti.template(), k: ti.template(), kind: ti.template(), how: ti.i32,
     step_length: ti.f64, c: ti.f64, beta: ti.f64,
 ):  # fmt: skip
-    """Go where `how` says, the nodes of s.subset alone, and find the elastic forces there.
+    """Go where `how` says, the nodes of s.pcg.subset alone, and find the elastic forces there.
 
     how: STAY; STEP: base = x, then step_length y, y of s.pcg; AGAIN: base + step_length y. scalars: START_SLOPE of a STEP.
     """
     ti.loop_config(serialize=m.serial)
     for chunk in range(m.chunks):
-        n = n_nodes_of(m, s.subset)
+        n = n_nodes_of(m, s.pcg.subset)
         size = (n + m.chunks - 1) // m.chunks
         slope = ti.cast(0.0, ti.f64)
         for at in range(chunk * size, ti.min(n, (chunk + 1) * size)):
-            i = node_of(s.subset, at)
+            i = node_of(s.pcg.subset, at)
             if how == STEP:
                 slope += dot64(m.free[i] * s.residual[i], s.pcg.y[i])
                 s.base[i] = m.state.x[i]
@@ -46,7 +46,7 @@ def move(
                 set_change(m, s, i, c, beta)
         m.state.partial[chunk, OTHER_SUM] = slope
     if ti.static(kind == ELASTIC_STAGE):
-        elasticity.sum_elements(m, s.subset)
+        elasticity.sum_elements(m, s.pcg.subset)
     ti.loop_config(serialize=True)
     for _ in range(1):
         if how == STEP:
@@ -58,7 +58,7 @@ def form_residual(
     m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), kind: ti.template(),
     beta: ti.f64, norms: ti.types.ndarray(),
 ):  # fmt: skip
-    """Residual on the nodes of s.subset, and -r as CG's right side, from what `move` and `press` have found.
+    """Residual on the nodes of s.pcg.subset, and -r as CG's right side, from what `move` and `press` have found.
 
     norms (5,), an array of the host (it is told sooner than by a returned vector): |r|^2, |inertia and mass damping|^2,
     |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on the others; of another kind than ELASTIC_STAGE only those of r.
@@ -66,11 +66,11 @@ def form_residual(
     """
     ti.loop_config(serialize=m.serial)
     for chunk in range(m.chunks):
-        n = n_nodes_of(m, s.subset)
+        n = n_nodes_of(m, s.pcg.subset)
         size = (n + m.chunks - 1) // m.chunks
         sums, slope = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)
         for at in range(chunk * size, ti.min(n, (chunk + 1) * size)):
-            i = node_of(s.subset, at)
+            i = node_of(s.pcg.subset, at)
             free = m.free[i]
             zero = ti.Vector([0.0, 0.0, 0.0], m.real)
             r, inertia, f, external = zero, zero, zero, zero

@@ -11,7 +11,6 @@ from taisoft.linear.block_csr import row_times
 from taisoft.linear.pcg import PcgWork
 from taisoft.mass import mass_times
 from taisoft.runtime import kernel
-from taisoft.subset import EVERYTHING, Subset
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +28,7 @@ class StageWork:
     n_moved: Count
     change: Any  # f64: what the mass is multiplied by
     damper: Any  # BlockCsr or None
-    pcg: PcgWork  # -r as its right side; y, the change of v that a Newton step makes
-    subset: Subset = EVERYTHING  # the nodes that move, also of pcg
+    pcg: PcgWork  # -r as its right side; y, the change of v that a Newton step makes; its subset, the nodes that move
 
     @property
     def leads(self) -> bool:

@@ -210,7 +210,7 @@ class StageSystem:
         for field in (cg.r, cg.p, cg.q):  # rows of the subset reach other nodes, where the solve finds no change
             field.fill(0.0)
         if self._restricted is None:
-            self._restricted = replace(self._whole, subset=subset, pcg=replace(cg, subset=subset))
+            self._restricted = replace(self._whole, pcg=replace(cg, subset=subset))
         self.work = self._restricted
 
     def linearise(self) -> None:
@@ -266,7 +266,7 @@ class StageSystem:
 
     def form_matrix(self, projected: bool = False) -> None:
         """The matrix where the stage stands, without J^T D J, which the linear solve adds."""
-        m, stage, subset = self.model, self.stage, self.work.subset
+        m, stage, subset = self.model, self.stage, self.work.pcg.subset
         block_csr.assemble(m, self.matrix, subset, projected)
         block_csr.to_system(m, self.matrix, self.damper or self.matrix, subset, stage.c, stage.beta)
         self._same_matrix = False
