@@ -130,7 +130,7 @@ def test_an_elimination_keeps_the_multipliers():
 
 @pytest.mark.parametrize("ground", [False, True])
 def test_the_step_is_the_same(monkeypatch, ground):
-    """As without eliminations, in fewer iterations of Newton's method, or with contacts in less than half of those of CG."""
+    """As without eliminations, in fewer iterations of Newton's method and of CG, or with contacts in less than half of CG's."""
     made, calls = {}, []
 
     def counted(system, stage, r):
@@ -149,10 +149,8 @@ def test_the_step_is_the_same(monkeypatch, ground):
     (x, report), (x_without, report_without) = made["with"], made["without"]
     assert (report.n_contacts > 0) == ground
     assert np.abs(x - x_without).max() < 1e-7
-    if ground:
-        assert 2 * report.linear_iterations < report_without.linear_iterations
-    else:
-        assert report.newton_iterations < report_without.newton_iterations
+    assert report.linear_iterations < (0.5 if ground else 1.0) * report_without.linear_iterations
+    assert report.newton_iterations < report_without.newton_iterations or ground
 
 
 # --- lists, and kernels on them ---------------------------------------------------------------------------------------------
