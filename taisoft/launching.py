@@ -344,9 +344,14 @@ class Kernels:
         return self._ready.get(self._key(arguments))
 
     def _key(self, arguments: tuple) -> tuple:
-        return tuple(
-            [_token(arguments[k]) for k in self._templates] + [(arguments[k].dtype, arguments[k].ndim) for k in self._arrays]
-        )
+        """By which the arguments are known again: which record or array each is, of a constant its value."""
+        key = [
+            (a, kind) if _is_constant[kind := type(a := arguments[k])] else id(a)  # 1, 1.0 and True are equal
+            for k in self._templates
+        ]
+        for k in self._arrays:
+            key += arguments[k].dtype, arguments[k].ndim
+        return tuple(key)
 
     def prepare(self, arguments: tuple) -> tuple:
         """As `find`, compiling the kernel where it has not been compiled for the structure of these arguments."""
@@ -386,8 +391,12 @@ class Kernels:
         ]
 
 
-def _token(argument: Any) -> Any:
-    """By which an argument is known again: which record or array it is, of a constant its value."""
-    if isinstance(argument, (bool, int, float, str, tuple)):
-        return argument, type(argument)  # 1, 1.0 and True are equal
-    return id(argument), type(argument)
+class _Constants(dict):
+    """Whether an argument of a type is known by its value. A launch asks it of every argument, so it is a look-up."""
+
+    def __missing__(self, kind: type) -> bool:
+        self[kind] = issubclass(kind, (bool, int, float, str, tuple))
+        return self[kind]
+
+
+_is_constant = _Constants()

@@ -59,9 +59,9 @@ def steps(sim, n: int = 6) -> tuple[np.ndarray, list[ts.StepReport]]:
     return sim.positions(), reports
 
 
-def from_the_host(system, problem, r, scale, stiffest) -> Frictional:
+def from_the_host(system, problem, r, scale) -> Frictional:
     """The loop as it is where loops run on threads."""
-    newton = Newton(system, problem, stiffest)
+    newton = Newton(system, problem)
     result = newton.run(r, scale, fresh=True)
     return Frictional(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
 
@@ -139,9 +139,9 @@ def test_tight_problems_extrapolate_at_once(sim, monkeypatch, given):
     """And loosen all solves but the first; not where the user says how well they are solved."""
     problems = []
 
-    def solve(system, problem, r, scale, stiffest):
+    def solve(system, problem, r, scale):
         problems.append((system.stage, problem))
-        return from_the_host(system, problem, r, scale, stiffest)
+        return from_the_host(system, problem, r, scale)
 
     monkeypatch.setattr(contact_newton, "HIDING", np.inf)  # only rounding, as it were
     monkeypatch.setattr(contact_newton, "solve_linear", solve)

@@ -172,4 +172,4 @@ def test_neither_is_one_whose_second_part_does(rig):
     ],
 )
 def test_r_follows_the_laws(scale, law, before, taken, wanted):
-    assert next_scale(scale, law, before, taken, STIFFEST) == wanted
+    assert next_scale(scale, law, before, taken) == wanted

@@ -93,6 +93,7 @@ class Containment:
         self._may_hold = (self._soft[own] | self._soft[other]) & self._closed[other]  # (points, solid): whether it is asked
         self._may_hold &= (own != other) | (self._self & (self._n_parts[other] > 1))
         self._clear: dict[tuple[int, int], _Clear] = {}
+        self._corners = self._behind_them = np.zeros((0, 3))  # of the triangles as they were, and the points behind them
         self._ready = True
 
     def _inner_tets(self, body: Body, rows: slice) -> tuple[np.ndarray, np.ndarray]:
@@ -133,9 +134,11 @@ class Containment:
         points = [0.25 * nodes[self._nodes].sum(axis=1)]
         if len(self._triangles):
             corners = x[self._topology.triangle[self._triangles]]
-            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-            points.append(corners.mean(axis=1) - self._behind[:, None] * normal)
+            if not np.array_equal(corners, self._corners):  # most obstacles stand still
+                normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+                normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+                self._corners, self._behind_them = corners, corners.mean(axis=1) - self._behind[:, None] * normal
+            points.append(self._behind_them)
         if frames is not None:
             points.append(frames[0][[i for i, _, _ in self._round]])
         return np.concatenate(points) if len(points) > 1 else points[0]

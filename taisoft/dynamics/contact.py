@@ -324,8 +324,9 @@ class ContactStep:
 
     def went_astray(self, x_start) -> bool:
         """Whether the surface went where nobody had looked since x_start; keeps its way for `search_way`."""
-        strayed = find_way(self.world.model, self.detection.surface, x_start, self._way)
-        return bool(strayed > 0.5 * self.detection.margin)
+        strayed = np.zeros(1)
+        find_way(self.world.model, self.detection.surface, x_start, self._way, strayed)
+        return bool(strayed[0] > 0.5 * self.detection.margin)
 
     def search_way(self, time: float, dt: float) -> bool:
         """Search along the way that was found, from the state at the start; whether that finds contacts not known so far."""

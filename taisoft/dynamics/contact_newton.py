@@ -13,7 +13,7 @@ from taisoft.dynamics.elimination import eliminate
 from taisoft.dynamics.frictional import INDEFINITE, LINEAR, MULTIPLIERS, NORM, ROUNDING, SOLVED, VERDICT
 from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
 from taisoft.dynamics.line_search import choose_start, search
-from taisoft.dynamics.multipliers import R_SCALE, STIFFEST
+from taisoft.dynamics.multipliers import MAX_MULTIPLIERS
 from taisoft.dynamics.newton import FALL, SLOW_STEP, Newton
 from taisoft.dynamics.residual import AGAIN
 from taisoft.dynamics.stage_result import StageResult, relative
@@ -44,15 +44,13 @@ class Frictional:
     r: float
 
 
-def solve_linear(
-    system: StageSystem, problem: Stage, r: float, scale: float, stiffest: float = STIFFEST
-) -> Frictional:
+def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) -> Frictional:
     """Solve a linearised stage from (|r|, scale), on one thread in one launch."""
     if not system.model.serial or PUBLIC:  # Taichi itself takes no more than 64 arguments
-        newton = Newton(system, problem, stiffest)
+        newton = Newton(system, problem)
         result = newton.run(r, scale, fresh=True)
         return Frictional(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
-    loop = system.solve_frictional(problem, r, system.rounding.of_stage(problem.c, problem.beta), stiffest)
+    loop = system.solve_frictional(problem, r, system.rounding.of_stage(problem.c, problem.beta))
     counts = (int(loop[place]) for place in (SOLVES_DONE, LINEAR, MULTIPLIERS))
     return Frictional(*counts, loop[VERDICT] == INDEFINITE, loop[VERDICT] == SOLVED, float(loop[NORM]))
 
@@ -94,7 +92,7 @@ class ContactNewton:
                 if not (inner.negative or self.tight):
                     # where friction goes round and round, a shorter step helps, and more of these do not
                     moved &= self.r < FALL * least or (only_laws and system.contact_residual < FALL * law)
-            # multipliers and friction disks go round and round: longer next time, and R no larger than usual until extrapolation
+            # where redundant contacts hand impulses on to each other by little, only plain multipliers and a large R lead far
             stalled += self.r > STALLED * least
             self.stalls = stalled >= 2
             if moved and self.r > SLOW_STEP * previous and not self._done():
@@ -164,12 +162,12 @@ class ContactNewton:
             stage, tolerance=tolerance,
             contact_tolerance=max(LAW_SHARE * system.contact_residual, law),
             tolerance_of_one=0.0 if self.tight else SHARE_OF_ONE * tolerance,
-            extrapolate_after=0 if self.tight else stage.extrapolate_after,
+            extrapolate_after=MAX_MULTIPLIERS if self.stalls else 0 if self.tight else stage.extrapolate_after,
             max_newton=PATIENCE * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
             later_tolerance=0.0 if stage.linear_tolerance else LATER_FORCING,
         )  # fmt: skip
-        inner = solve_linear(system, problem, self._first_residual(), self.scale, R_SCALE if self.stalls else STIFFEST)
+        inner = solve_linear(system, problem, self._first_residual(), self.scale)
         self.linear, self.multipliers = self.linear + inner.linear, self.multipliers + inner.multipliers
         return inner
 

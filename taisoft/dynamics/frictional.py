@@ -26,9 +26,9 @@ PROGRESS = 0.3  # share of what a new multiplier left of |r| that the steps brin
 NORM, SCALE, LAW, GOAL, PREVIOUS, TAKEN, SOLVES, LINEAR, MULTIPLIERS, AT_ROUNDING, WITHIN, OWN, SAME, VERDICT, KNOWN = range(15)
 RUNNING, SOLVED, GIVEN_UP, INDEFINITE = range(4)
 # places in `limits`: |r| [N s] that ends the loop, that ends the steps under one multiplier, that is rounding; the laws' residual
-# that ends the loop, too, tolerance of linear solves, the largest R over the r-factors until multipliers are extrapolated, linear
-# solves, iterations of one, those in a launch, multipliers before they are extrapolated, least tolerance of later solves
-ENOUGH, ENOUGH_OF_ONE, FLOOR, LAWFUL, TOLERANCE, LARGEST, MOST_SOLVES, LONGEST, BUDGET, PLAIN, LATER = range(11)
+# that ends the loop, too, tolerance of linear solves; how many of these, iterations of one, those in a launch, multipliers before
+# they are extrapolated; least tolerance of later solves
+ENOUGH, ENOUGH_OF_ONE, FLOOR, LAWFUL, TOLERANCE, MOST_SOLVES, LONGEST, BUDGET, PLAIN, LATER = range(10)
 
 
 @ti.func
@@ -64,7 +64,7 @@ def solve_frictional(
     m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, limits: ti.types.ndarray(),
     loop: ti.types.ndarray(),
 ):  # fmt: skip
-    """Go on from where `loop` stands; limits (11,)."""
+    """Go on from where `loop` stands; limits (10,)."""
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -87,7 +87,7 @@ def solve_frictional(
                         extrapolate(k, ti.cast(loop[KNOWN], ti.i32))
                         scale, loop[KNOWN] = R_EXTRAPOLATED, ti.min(loop[KNOWN] + 1.0, PAST)
                     else:
-                        scale = next_scale(scale, law, law_before, taken, limits[LARGEST])
+                        scale = next_scale(scale, law, law_before, taken)
                         for c in range(p.count[0]):
                             set_multiplier(k, c)
                     law_before = law

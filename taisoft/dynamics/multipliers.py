@@ -31,7 +31,7 @@ PARALLEL = 1e-12  # sine squared between two changes below which one says nothin
 
 
 @ti.pyfunc
-def next_scale(scale, law, before, taken, stiffest):
+def next_scale(scale, law, before, taken):
     """R over the r-factors for new multipliers. law, before: residual of the laws, and where multipliers were last renewed.
 
     taken: steps since. A residual that rises tells that friction disks and normal impulses drive each other up.
@@ -41,7 +41,7 @@ def next_scale(scale, law, before, taken, stiffest):
         new = 0.5 * scale
     elif law > FALLEN_LAW * before:
         if taken <= 1:
-            new = ti.min(stiffest, 2.0 * scale)
+            new = ti.min(STIFFEST, 2.0 * scale)
         elif taken >= MANY:
             new = ti.max(SOFTEST, 0.5 * scale)
     return new

@@ -19,7 +19,7 @@ from typing import Any
 
 from taisoft.dynamics.frictional import PROGRESS, ROUNDING
 from taisoft.dynamics.line_search import search
-from taisoft.dynamics.multipliers import FINER, MAX_MULTIPLIERS, PAST, R_EXTRAPOLATED, R_SCALE, STIFFEST, next_scale
+from taisoft.dynamics.multipliers import FINER, MAX_MULTIPLIERS, PAST, R_EXTRAPOLATED, R_SCALE, next_scale
 from taisoft.dynamics.residual import ELASTIC_STAGE, IMPACT, LINEARISED, STEP
 from taisoft.dynamics.stage_result import StageResult, relative
 from taisoft.dynamics.stage_system import Stage, StageSystem
@@ -37,11 +37,11 @@ class Newton:
     """Newton steps of a stage under multipliers that are renewed; where that is linear, of its contact problem alone."""
 
     def __init__(
-        self, system: StageSystem, stage: Stage, stiffest: float = STIFFEST,
+        self, system: StageSystem, stage: Stage,
         eliminate: "Callable[[StageSystem, Stage, float], Any] | None" = None,
     ):  # fmt: skip
         """eliminate: as `elimination.eliminate`, for steps that leave much; None: there is none."""
-        self.system, self.stage, self.stiffest, self.eliminate = system, stage, stiffest, eliminate
+        self.system, self.stage, self.eliminate = system, stage, eliminate
         self.inner = system.kind == LINEARISED  # an indefinite matrix is then left to the caller
         self.floor = system.rounding.of_stage(stage.c, stage.beta)
         self.loosest = MAX_FORCING if stage.c > 0.0 else STATIC_FORCING
@@ -109,7 +109,7 @@ class Newton:
             system.extrapolate_multipliers(self.known)
             system.r_scale, self.known = R_EXTRAPOLATED, min(self.known + 1, PAST)
         else:
-            system.r_scale = next_scale(system.r_scale, law, self.law, self.taken, self.stiffest)
+            system.r_scale = next_scale(system.r_scale, law, self.law, self.taken)
         self.law, self.multipliers, self.rounding = law, self.multipliers + 1, False
         self.r, self.scale = system.evaluate(None, new_multipliers=not extrapolating)
         self._aim()

@@ -229,16 +229,16 @@ class StageSystem:
         """Whether the slope vanished somewhere along y: it need not where the matrix is indefinite."""
         return self.model.state.scalars[STEP_LENGTH] < LONGEST
 
-    def solve_frictional(self, problem: Stage, r: float, floor: float, stiffest: float) -> np.ndarray:
+    def solve_frictional(self, problem: Stage, r: float, floor: float) -> np.ndarray:
         """The loop of a linearised stage from |r| on, in launches that Ctrl-C can come between: see `frictional`."""
-        m, A, loop, limits = self.model, self.matrix, np.zeros(15), np.zeros(11)
+        m, A, loop, limits = self.model, self.matrix, np.zeros(15), np.zeros(10)
         loop[[frictional.NORM, frictional.SCALE, frictional.LAW, frictional.GOAL, frictional.SAME]] = (
             r, multipliers.R_SCALE, math.inf, frictional.PROGRESS * r, self._same_matrix,
         )  # fmt: skip
         # in the order of their places
         limits[:] = (
             problem.tolerance * self.scale, problem.enough_of_one * self.scale, floor, problem.contact_tolerance,
-            problem.linear_tolerance, stiffest, problem.max_newton, pcg.most_iterations(m), pcg.batch_of(m, A),
+            problem.linear_tolerance, problem.max_newton, pcg.most_iterations(m), pcg.batch_of(m, A),
             problem.extrapolate_after, problem.later_tolerance,
         )  # fmt: skip
         while loop[frictional.VERDICT] == frictional.RUNNING:

@@ -59,14 +59,16 @@ def survey(
 
 
 @kernel
-def find_way(m: ti.template(), s: ti.template(), x_start: ti.template(), way: ti.template()) -> ti.f64:
-    """way (n_nodes) [m] since x_start; returns by how much a vertex of the surface left the straight way that was searched."""
+def find_way(
+    m: ti.template(), s: ti.template(), x_start: ti.template(), way: ti.template(), strayed: ti.types.ndarray()
+):  # fmt: skip
+    """way (n_nodes) [m] since x_start; strayed (1,) [m]: the most by which a vertex left the straight way that was searched."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         way[i] = m.state.x[i] - x_start[i]
-    most = ti.cast(0.0, ti.f64)
     ti.loop_config(serialize=True)
     for _ in range(1):
+        most = ti.cast(0.0, ti.f64)
         for k in range(s.n_verts):
             if s.node[k] >= 0:
                 d, known = way[s.node[k]], s.move[k]
@@ -75,7 +77,7 @@ def find_way(m: ti.template(), s: ti.template(), x_start: ti.template(), way: ti
                 if square > 0.0:
                     share = ti.min(ti.max(d.dot(known) / square, 0.0), 1.0)
                 most = ti.max(most, (d - share * known).norm())
-    return most
+        strayed[0] = most
 
 
 def next_length(ratio: Callable[[float], float], left: float, length: float, longest: float, may_grow: bool) -> float:
