@@ -11,7 +11,7 @@ SEED = 3
 SIDE = 3  # cubes along each side of a pile
 SHAKEN = 0.1  # of an edge: how far vertices inside a cube's faces lie off their grid, so that no two faces have one grid
 APART = 1e-4  # of an edge: between the cubes that do not touch
-SUNK = 1e-3  # of an edge: how deep a body sits in what it lies on
+DEEP_PENETRATION = 1e-3  # of an edge: how deep a body sits in what it lies on
 FRAMES, FPS = 60, 60.0
 
 PILES = (2, 3, 4, 6, 8, 11)  # cells along a cube's edge, of which a pile has 162 n^3 tets
@@ -70,7 +70,7 @@ def two_cubes(cells: int, collision: str) -> ts.Scene:
     scene, material = _scene()
     mesh = ts.box_mesh((cells,) * 3, (1, 1, 1))
     scene.add_body(mesh, material, name="below", collision=collision)
-    scene.add_body(mesh, material, name="above", position=(0.1, 1 - SUNK / cells, 0.05), collision=collision)
+    scene.add_body(mesh, material, name="above", position=(0.1, 1 - DEEP_PENETRATION / cells, 0.05), collision=collision)
     return scene
 
 

@@ -54,12 +54,12 @@ def _frames(panel, films: list[Film], number: str, beside: str | None) -> None:
     panel.set_ylim(bottom=0)
 
 
-def _rows(panel, rows: list[Row], seconds, against: str = "tets") -> None:
+def _rows(panel, rows: list[Row], seconds, restart_test: str = "tets") -> None:
     """A time of each geometry against size."""
     for geometry, colour in zip(GEOMETRIES, COLOURS):
         own = [r for r in rows if r.geometry == geometry]
         if own:
-            panel.plot([getattr(r, against) for r in own], _ms(map(seconds, own)), "o-", color=colour, label=geometry)
+            panel.plot([getattr(r, restart_test) for r in own], _ms(map(seconds, own)), "o-", color=colour, label=geometry)
     panel.set(xscale="log", yscale="log")
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse as sp
 
-from taisoft.contact import api, augmented_lagrangian, host
+from taisoft.contact import api, augmented_lagrangian, numpy_prox
 from taisoft.contact.colouring import store
 from taisoft.contact.graph import colour_greedy, matrix_graph
 from taisoft.contact.solve import solve
@@ -166,7 +166,7 @@ def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
             for n in SWEEPS:
                 start(method)
                 solve(p, method, 0.1 * NONE, n, momentum=momentum)
-                after.append(host.residual(W, b, mu, host.find_factors(W), p.r.to_numpy()[: len(mu)]))
+                after.append(numpy_prox.residual(W, b, mu, numpy_prox.find_factors(W), p.r.to_numpy()[: len(mu)]))
             residuals[name] = tuple(after)
             start(method)
             found[name] = solve(p, method, GOAL, SWEEPS[-1], momentum=momentum)
@@ -216,8 +216,8 @@ def host_rows(problem: Problem, repeats: int) -> list[Row]:
         return r, 0, history
 
     for name, run in (("augmented_lagrangian", lagrangian), ("auto", auto)):
-        factor = host.find_factors(W)
-        residuals = tuple(host.residual(W, b, mu, factor, run(0.1 * NONE, n)[0]) for n in (*SWEEPS[:2], 150))
+        factor = numpy_prox.find_factors(W)
+        residuals = tuple(numpy_prox.residual(W, b, mu, factor, run(0.1 * NONE, n)[0]) for n in (*SWEEPS[:2], 150))
         with counted_operations(problem) as told:
             _, swept, history = run(GOAL, SWEEPS[-1])
         took = seconds({"solve": lambda run=run: run(GOAL, SWEEPS[-1]), "1000": plain}, repeats)

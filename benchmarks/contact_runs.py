@@ -26,7 +26,7 @@ ROUNDS, COLD_ROUNDS = 3, 1
 SETTINGS = ("integrator", "contact_solver", "contact_tolerance", "newton_tolerance", "linear_tolerance", "dt")
 # parts of an explicit step: what is called, where it is looked up
 PARTS = {
-    "search": ("find", "_survey"), "problem": ("begin", "set_free_velocities", "find_factors"),
+    "search": ("find", "_measure_closing"), "problem": ("begin", "set_free_velocities", "find_factors"),
     "solve": ("colour_contacts", "solve"), "elasticity": ("keep_state", "predict", "move"),
 }  # fmt: skip
 REST = "rest"
@@ -71,7 +71,7 @@ class StepCost:
     scene: str
     solver: str
     whole: list[float]
-    parts: dict[str, list[float]]
+    substeps: dict[str, list[float]]
     contacts: list[int]
     sweeps: list[int]
     residual: float
@@ -199,7 +199,7 @@ class Stopwatch:
 def explicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
     """Where the parts of the simulator's explicit steps are called, for `Stopwatch.on`."""
     contact = sim._contact
-    owners = {"find": contact.detection, "_survey": contact, "begin": contact}
+    owners = {"find": contact.detection, "_measure_closing": contact, "begin": contact}
     return [(part, owners.get(name, contact_substeps), name) for part, names in PARTS.items() for name in names]
 
 
@@ -224,8 +224,8 @@ def measure_step(name: str, sim: ts.Simulator, steps: int) -> StepCost:
             sim.step()
             whole = clock() - begin
             for part in PARTS:
-                cost.parts[part].append(watch.spent[part])
-            cost.parts[REST].append(whole - sum(watch.spent.values()))
+                cost.substeps[part].append(watch.spent[part])
+            cost.substeps[REST].append(whole - sum(watch.spent.values()))
     return cost
 
 

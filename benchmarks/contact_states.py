@@ -146,9 +146,14 @@ def can_build(name: str) -> bool:
     return mesh is None or (MESHES / mesh).is_file()
 
 
+def state_of(sim: ts.Simulator):
+    """Positions and what goes with them: the attribute had another name in version 0.1."""
+    return sim._simulation if hasattr(sim, "_simulation") else sim._world
+
+
 def kept_of(sim: ts.Simulator) -> dict:
     """All that the next step rests on."""
-    return {"world": sim._world.snapshot(), "stepper": sim._stepper.snapshot()}
+    return {"world": state_of(sim).snapshot(), "stepper": sim._stepper.snapshot()}
 
 
 def capture(name: str, file: Path, quick: bool) -> None:
@@ -202,7 +207,7 @@ def edge(mesh: ts.TetMesh) -> float:
 
 def solve(sim: ts.Simulator, kept: dict, dt: float, most: int) -> tuple[dict, np.ndarray]:
     """A stage of dt from a state, in halves where it does not converge; and the positions it ends with."""
-    stepper, world = sim._stepper, sim._world
+    stepper, world = sim._stepper, state_of(sim)
     take = getattr(stepper, "take", None) or stepper._try_part
     halves, newton, linear, first, seconds, launched = 1, 0, 0, None, 0.0, 0
     while True:

@@ -11,7 +11,7 @@ from taisoft import simulator
 from taisoft.errors import TaisoftError
 from taisoft.runtime import open_runtime
 from taisoft.scene.scene import Scene
-from taisoft.study.stretch import advance, warm_up
+from taisoft.study.timed_run import advance, warm_up
 
 from .contact_captured import patched
 from .contact_crossover import measure_crossover

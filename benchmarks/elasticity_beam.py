@@ -11,7 +11,7 @@ import taisoft as ts
 from taisoft.output.report import peak_memory
 from taisoft.scene.scene import Scene
 from taisoft.stability import stable_dt
-from taisoft.study.stretch import Stretch, advance, warm_up
+from taisoft.study.timed_run import TimedRun, advance, warm_up
 
 from .exact_path import DENSITY, GRAVITY, POISSON, SAMPLE, SIZE, YOUNG
 
@@ -43,11 +43,11 @@ def steps_within_limit(cells) -> int:
     return explicit_steps(beam_scene(cells))
 
 
-def follow_tip(sim: ts.Simulator, steps: int, samples: int) -> tuple[np.ndarray, Stretch]:
+def follow_tip(sim: ts.Simulator, steps: int, samples: int) -> tuple[np.ndarray, TimedRun]:
     """Path (samples + 1, 3) [m] of the mean of the end face's nodes, every `steps` steps from the start, and the stretch."""
     sim.reset()
     tip = np.flatnonzero(sim.scene.body("beam").rest_positions[:, 0] > SIZE[0] / 2 - 1e-9)
-    path, whole = [sim.positions("beam")[tip].mean(axis=0)], Stretch()
+    path, whole = [sim.positions("beam")[tip].mean(axis=0)], TimedRun()
     for _ in range(samples):
         whole += advance(sim, steps)
         path.append(sim.positions("beam")[tip].mean(axis=0))

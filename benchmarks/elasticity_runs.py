@@ -16,7 +16,7 @@ import taisoft as ts
 from taisoft.dynamics import EXPLICIT
 from taisoft.errors import SimulationError
 from taisoft.scene.scene import Scene
-from taisoft.study.stretch import Stretch, advance, warm_up
+from taisoft.study.timed_run import TimedRun, advance, warm_up
 from taisoft.timing import Timing, summarise
 
 from .elasticity_beam import MARGIN, beam_scene, explicit_steps, follow_tip, n_tets
@@ -41,7 +41,7 @@ class Row:
     compile_seconds: list[float] = field(default_factory=list)
     error: float | None = None
     error_unfolded: float | None = None
-    first_run: Stretch | None = None  # taisoft: what the steps did
+    first_run: TimedRun | None = None  # taisoft: what the steps did
     note: str = ""
     failure: str = ""
 

@@ -58,7 +58,7 @@ def measured(rows: list[Row], options: argparse.Namespace, document: Document) -
             stack.enter_context(closing(FolderLock(folder)))
             store = Store(folder)
         signals.run_began()
-        measure(rows, options.arch, options.references, store, lambda: end - time.monotonic(), signals.asked, _tell)
+        measure(rows, options.arch, options.references, store, lambda: end - time.monotonic(), signals.requested, _tell)
     for text in (*page(rows), *store.damaged):
         document.add(text)
     return numbers | {

@@ -19,7 +19,7 @@ from taisoft.errors import SimulationError, TaisoftError
 from taisoft.fields import FieldArena
 from taisoft.runtime import Runtime, compile_clock
 from taisoft.static import StaticSolver
-from taisoft.study.stretch import Stretch, advance
+from taisoft.study.timed_run import TimedRun, advance
 from taisoft.timing import Timing, summarise, time_repeats
 
 from .order_cases import Case, Element, Reference, mesh_name
@@ -108,7 +108,7 @@ class Fall:
 
     def first(self, row: Row) -> None:
         """Run, and write down what was found. Raises SimulationError where a step fails or does not converge."""
-        tip, heights, whole = nearest(self._body.rest_positions, (2, 0, 0)), [], Stretch()
+        tip, heights, whole = nearest(self._body.rest_positions, (2, 0, 0)), [], TimedRun()
         for _ in range(self._steps):
             whole += advance(self._sim, 1)
             heights.append(float(self._sim.positions()[tip, 1].mean()))

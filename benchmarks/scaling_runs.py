@@ -30,7 +30,7 @@ from taisoft.output.report import peak_memory
 from taisoft.runtime import compile_clock, kernel, open_runtime, threads
 from taisoft.scalars import LOWEST_J
 from taisoft.scene.scene import Scene
-from taisoft.study.stretch import advance, warm_up
+from taisoft.study.timed_run import advance, warm_up
 from taisoft.timing import Timing, summarise
 
 from .collision_cases import pile_setup, two_cubes
@@ -121,7 +121,7 @@ def _open(row: Row, build: Callable[[int], Scene], size: int, integrator: str, d
     if dt is None:
         sim.dt = MARGIN * sim.stable_dt
     row.setup_seconds = perf_counter() - begin - sim.compile_seconds
-    m = sim._world.model
+    m = sim._simulation.model
     row.tets = sum(body.mesh.n_tets for body in scene.bodies)
     row.nodes, row.threads = m.n_nodes, 1 if m.serial else threads()
     return sim
@@ -170,7 +170,7 @@ def repeat_elements(m: ti.template(), n: ti.i32):
 
 def _element_seconds(sim: ts.Simulator, n: int) -> float:
     """Seconds of the element loop of a step, done n times."""
-    m, begin = sim._world.model, clock()
+    m, begin = sim._simulation.model, clock()
     if m.serial:
         repeat_elements(m, n)
     else:
@@ -211,7 +211,7 @@ def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
     ]  # fmt: skip
     contact = sim._contact
     if contact is not None:
-        places += [("search", contact.detection, "find"), ("search", contact, "_survey"), ("problem", contact, "begin")]
+        places += [("search", contact.detection, "find"), ("search", contact, "_measure_closing"), ("problem", contact, "begin")]
         places.append(("problem", stage_system, "find_factors"))
     return places
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taisoft.attributes import Guarded, SimulationAttributeError, thawed
-from taisoft.dynamics.world import World
+from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
 from taisoft.errors import SceneError, SimulationError
 from taisoft.records import Energies
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _REBUILT = (
     "integrator", "contact_solver", "self_collision", "allow_unstable", "newton_tolerance", "linear_tolerance",
-    "contact_tolerance", "pullable",
+    "contact_tolerance", "draggable",
 )  # fmt: skip
 INSTEAD = {  # of assigning to an attribute of a simulator, or to one that it might be thought to have
     **{name: f"call sim.set_material(body, {name}=...)" for name in CHANGEABLE},
@@ -38,7 +38,7 @@ INSTEAD = {  # of assigning to an attribute of a simulator, or to one that it mi
     "gravity": "call sim.set_gravity(gravity)", "material": "call sim.set_material(body, young=...)",
     "scene": "make a new Simulator of the other scene", "settings": "call sim.rebuild(integrator=...)",
     "plan": "it follows from the scene and the settings", "stable_dt": "it follows from the scene; set sim.dt",
-    "pulled": "call sim.pull(...) or sim.release()",
+    "dragged": "call sim.drag(...) or sim.release()",
 }  # fmt: skip
 
 
@@ -50,54 +50,54 @@ class StateAccess(Guarded):
     _instead = INSTEAD
     settings: Settings
     _changes: int = 0  # of the state and of numbers, from outside: the energy then jumps
-    _world: World | None = None
+    _simulation: SimulationState | None = None
     _contact: "ContactStep | None"
     _idle_detection: "Detection | None"
 
     @property
     def time(self) -> float:
         """Simulated time [s]."""
-        return self._kept_world().time
+        return self._kept_simulation().time
 
     @property
     def step_count(self) -> int:
         """Steps of dt taken."""
-        return self._kept_world().step_count
+        return self._kept_simulation().step_count
 
     def positions(self, body: str | None = None) -> np.ndarray:
         """(n_nodes, 3) float64 copy [m]; of all bodies, concatenated in the order added, without a name."""
-        return self._open_world().state()[0][self._slice(body)].copy()
+        return self._open_simulation().state()[0][self._slice(body)].copy()
 
     def velocities(self, body: str | None = None) -> np.ndarray:
         """(n_nodes, 3) float64 copy [m/s]."""
-        return self._open_world().state()[1][self._slice(body)].astype(np.float64)
+        return self._open_simulation().state()[1][self._slice(body)].astype(np.float64)
 
     def set_state(self, positions=None, velocities=None, body: str | None = None) -> None:
         """Set positions [m] and velocities [m/s], (n_nodes, 3) each; constrained axes stop. Copies arrays; compiles nothing."""
-        world, rows = self._open_world(), self._slice(body)
+        simulation, rows = self._open_simulation(), self._slice(body)
         for name, value in (("positions", positions), ("velocities", velocities)):
             if value is not None:
                 self._check_rows(name, value, rows)
-        x, v = world.state()
+        x, v = simulation.state()
         if positions is not None:
             x[rows] = positions
         if velocities is not None:
             v[rows] = velocities
-            v[world.motion.constrained()] = 0.0
-        world.set_state(x, v)
+            v[simulation.dirichlet.constrained()] = 0.0
+        simulation.set_state(x, v)
         self._changes += 1
         self._stepper.forget()
 
     def energies(self) -> Energies:
         """Energies of the present state [J]."""
-        model = self._open_world().model
+        model = self._open_simulation().model
         measure(model)
         scalars = model.state.scalars.to_numpy().tolist()
         return Energies(scalars[KINETIC], scalars[ELASTIC], scalars[GRAVITY], scalars[LOADS])
 
     def reactions(self, body: str | None = None) -> np.ndarray:
         """(n_nodes, 3) force of the constraint on each fixed or moved node in the last step [N], else 0."""
-        self._open_world()
+        self._open_simulation()
         return self._stepper.reactions()[self._slice(body)]
 
     def detect_contacts(self) -> "Contacts":
@@ -113,7 +113,7 @@ class StateAccess(Guarded):
         self, name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None
     ) -> None:
         """Change the friction or restitution of a pair of bodies, or of a body and an obstacle; as `Scene.set_contact`."""
-        scene = self._open_world().scene
+        scene = self._open_simulation().scene
         with thawed(scene):
             scene.set_contact(name_a, name_b, friction=friction, restitution=restitution)
         self._changes += 1
@@ -125,7 +125,7 @@ class StateAccess(Guarded):
 
         Where a step was cut into parts, of its last part. Empty before the first step, and where nothing can touch.
         """
-        self._open_world()
+        self._open_simulation()
         if self._contact is not None:
             return self._contact.contacts()
         from taisoft.collision.contacts import no_contacts
@@ -134,7 +134,7 @@ class StateAccess(Guarded):
 
     def contact_force(self, name: str) -> np.ndarray:
         """Sum (3,) of the contact forces on a body or an obstacle over the last step [N]."""
-        scene = self._open_world().scene
+        scene = self._open_simulation().scene
         scene.surface_of(name)
         if self._contact is None:
             return np.zeros(3)
@@ -162,7 +162,7 @@ class StateAccess(Guarded):
         triangles that share a vertex are left out.
         """
         detection = self._find_contacts(0.0)
-        first, colliders = detection.topology.first, self._world.scene.colliders
+        first, colliders = detection.topology.first, self._simulation.scene.colliders
         pairs = detection.intersections()
         owner = np.searchsorted(first, pairs, side="right") - 1
         return [
@@ -171,17 +171,17 @@ class StateAccess(Guarded):
 
     def _find_contacts(self, dt: float) -> "Detection":
         """The contacts of the present state swept by dt [s]; with 0 no path is asked for a later time."""
-        world = self._open_world()
+        simulation = self._open_simulation()
         if self._contact is not None:
-            self._contact.search(world.time, dt)
+            self._contact.search(simulation.time, dt)
             return self._contact.detection
         if self._idle_detection is None:
             from taisoft.collision.pipeline import Detection
 
             itself = self.settings.self_collision
-            self._idle_detection = Detection(world.scene, world.model, world.layout, self._runtime, itself)
+            self._idle_detection = Detection(simulation.scene, simulation.model, simulation.layout, self._runtime, itself)
             self._owned.append(self._idle_detection)
-        self._idle_detection.find(world.time, dt)
+        self._idle_detection.find(simulation.time, dt)
         return self._idle_detection
 
     @property
@@ -191,8 +191,8 @@ class StateAccess(Guarded):
 
     def stress(self, body: str | None = None) -> np.ndarray:
         """Cauchy stress per tet (m,3,3) [Pa], not finite in a flat one; of all bodies, in the order added, without a name."""
-        world = self._open_world()
-        m, layout = world.model, world.layout
+        simulation = self._open_simulation()
+        m, layout = simulation.model, simulation.layout
         bodies = range(len(layout.n_tets)) if body is None else [self._index(body)]
         sigma = np.zeros((m.n_blocks * m.lanes, 9))
         cauchy_stress(m, sigma)
@@ -201,25 +201,25 @@ class StateAccess(Guarded):
 
     def elastic_forces(self) -> np.ndarray:
         """(n_nodes, 3) elastic forces of the present state on all nodes [N]."""
-        world = self._open_world()
+        simulation = self._open_simulation()
         _, force = self._tangent_fields()
-        elastic_forces(world.model)
-        gather_forces(world.model, force)
+        elastic_forces(simulation.model)
+        gather_forces(simulation.model, force)
         return force.to_numpy().astype(np.float64)
 
     def force_differential(self, displacement: np.ndarray) -> np.ndarray:
         """Change of the elastic forces (n_nodes, 3) [N] along a displacement (n_nodes, 3) [m] of all bodies: (df/dx) dx."""
-        world = self._open_world()
+        simulation = self._open_simulation()
         self._check_rows("displacement", displacement, slice(None))
         dx, df = self._tangent_fields()
         upload([(dx, np.asarray(displacement))])
-        force_differential(world.model, dx, df)
+        force_differential(simulation.model, dx, df)
         return df.to_numpy().astype(np.float64)
 
     def _tangent_fields(self) -> tuple:
         """Two fields of (n_nodes) 3-vectors, allocated when first asked for."""
         if self._tangent is None:
-            make, n, real = self._arena.vectors, self._world.model.n_nodes, self._runtime.real
+            make, n, real = self._arena.vectors, self._simulation.model.n_nodes, self._runtime.real
             self._tangent = make("tangent_dx", real, n), make("tangent_df", real, n)
         return self._tangent
 
@@ -248,7 +248,7 @@ class StateAccess(Guarded):
 
     def set_gravity(self, gravity) -> None:
         """Change gravity (3,) [m/s^2]. Copies it, recomputes the rounding floor of the residual; compiles nothing."""
-        self._open_world()
+        self._open_simulation()
         with thawed(self.scene):
             self.scene.gravity = gravity
         self._load_gravity()
@@ -257,14 +257,14 @@ class StateAccess(Guarded):
 
     def _load_gravity(self) -> None:
         """The scene's gravity to the device."""
-        upload([(self._world.model.gravity, self.scene.gravity[None])])
+        upload([(self._simulation.model.gravity, self.scene.gravity[None])])
 
     def set_material(self, body: str, **numbers) -> None:
         """Change numbers of a body's material (young, poisson, density, mass_damping, stiffness_damping); law stays.
 
         Copies arrays, recomputes the rounding floor of the residual and the limit of a stable dt; compiles nothing.
         """
-        world, k = self._open_world(), self._index(body)
+        simulation, k = self._open_simulation(), self._index(body)
         old, old_limit = self.scene.bodies[k].material, self._stable_dt
         changed_material(self.scene.bodies[k], numbers, self.plan.on)
         self._stable_dt = None
@@ -276,22 +276,22 @@ class StateAccess(Guarded):
                 self.scene.bodies[k].material, self._stable_dt = old, old_limit
             raise
         self._changes += 1
-        world.upload_material("density" in numbers)
+        simulation.upload_material("density" in numbers)
         if "density" in numbers:  # a total force is spread by mass: the shares stay, but for their rounding
             self._upload_loads()
         self._stepper.numbers_changed()
 
-    def _open_world(self) -> World:
+    def _open_simulation(self) -> SimulationState:
         """The world, with memory on the device."""
-        world = self._kept_world()
+        simulation = self._kept_simulation()
         self._runtime.check()
-        return world
+        return simulation
 
-    def _kept_world(self) -> World:
+    def _kept_simulation(self) -> SimulationState:
         """The world, for what the host knows."""
-        if self._world is None:
+        if self._simulation is None:
             raise SimulationError("the simulator is closed")
-        return self._world
+        return self._simulation
 
     def _check_stability(self, dt: float, stacklevel: int = 3) -> None:
         limit = self.stable_dt
@@ -308,11 +308,11 @@ class StateAccess(Guarded):
         return self.scene.bodies.index(self.scene.body(body))
 
     def _slice(self, body: str | None) -> slice:
-        return slice(None) if body is None else self._world.layout.nodes(self._index(body))
+        return slice(None) if body is None else self._simulation.layout.nodes(self._index(body))
 
     def _check_rows(self, name: str, value, rows: slice) -> None:
         value = np.asarray(value)
-        wanted = (len(range(*rows.indices(self._world.model.n_nodes))), 3)
+        wanted = (len(range(*rows.indices(self._simulation.model.n_nodes))), 3)
         if value.shape != wanted or value.dtype.kind not in "fiu":
             raise SceneError(f"{name} have shape {value.shape} and type {value.dtype}: they must be {wanted} numbers")
         with np.errstate(over="ignore"):

@@ -30,7 +30,7 @@ from taisoft.scene.numbers import Numbers, numbers_differ, scene_numbers
 from taisoft.scene.scene import Material, Scene
 
 KIND, FORMAT = "taisoft checkpoint", 6  # FORMAT grows with every change of what a file holds
-PARTS = ("settings", "numbers", "start", "marks", "state", "notes")  # of the header, each a table
+PARTS = ("settings", "numbers", "start", "fingerprint", "state", "notes")  # of the header, each a table
 FEATURES = "the features that it needs"  # the last mark: of the plan, which follows from parts and numbers
 
 
@@ -44,7 +44,7 @@ class Checkpoint:
     settings: dict
     numbers: dict
     start: Numbers
-    marks: dict[str, str]
+    fingerprint: dict[str, str]
     state: dict
     notes: dict
 
@@ -58,7 +58,7 @@ def write_checkpoint(
     plain, arrays = _flat(state)
     header = {
         "kind": KIND, "format": FORMAT, "taisoft": __version__, "settings": settings, "numbers": _numbers(scene),
-        "start": scene_numbers(start or scene), "marks": scene_marks(scene, features), "state": plain, "notes": notes,
+        "start": scene_numbers(start or scene), "fingerprint": scene_fingerprint(scene, features), "state": plain, "notes": notes,
     }  # fmt: skip
     text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     with replacing(path) as part, open(part, "wb") as file:
@@ -80,14 +80,14 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
 
 def check_scene(saved: Checkpoint, scene: Scene, features: dict[str, bool]) -> None:
     """Raises SceneError unless the scene is the one that the saved run began with, but for paths."""
-    marks = scene_marks(scene, features)
+    fingerprint = scene_fingerprint(scene, features)
     for kinds in ("bodies", "obstacles"):
-        if marks[kinds] != saved.marks.get(kinds):
+        if fingerprint[kinds] != saved.fingerprint.get(kinds):
             raise SceneError(
-                f"{saved.path} is a checkpoint of another scene: its {kinds} are {saved.marks.get(kinds)}, those of this scene "
-                f"{marks[kinds]}"
+                f"{saved.path} is a checkpoint of another scene: its {kinds} are {saved.fingerprint.get(kinds)}, those here "
+                f"{fingerprint[kinds]}"
             )
-    differing = [name for name in marks | saved.marks if marks.get(name) != saved.marks.get(name)]
+    differing = [name for name in fingerprint | saved.fingerprint if fingerprint.get(name) != saved.fingerprint.get(name)]
     if differing and differing[0] != FEATURES:
         raise SceneError(f"{saved.path} is a checkpoint of another scene, which differs in {differing[0]}")
     found = numbers_differ(saved.start, scene_numbers(scene))
@@ -121,31 +121,31 @@ def load_values(scene: Scene) -> dict:
     }
 
 
-def scene_marks(scene: Scene, features: dict[str, bool]) -> dict[str, str]:
+def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]:
     """A digest of each part of a scene that must be the same where a run goes on, by what to call it."""
-    marks = {  # in the order added, which numbers nodes
+    fingerprint = {  # in the order added, which numbers nodes
         "bodies": json.dumps([body.name for body in scene.bodies]), "obstacles": json.dumps([o.name for o in scene.obstacles]),
     }  # fmt: skip
     for body in scene.bodies:
         what = f"body '{body.name}'"
         for part, values in _body_parts(body).items():
-            marks[f"{what}: {part}"] = _digest(values)
+            fingerprint[f"{what}: {part}"] = _digest(values)
     for one in scene.obstacles:
         what, shape = f"obstacle '{one.name}'", one.shape
         own = [getattr(shape, field.name) for field in dataclasses.fields(shape)]
-        marks[f"{what}: shape, friction, restitution or path"] = _digest(
+        fingerprint[f"{what}: shape, friction, restitution or path"] = _digest(
             [type(shape).__name__, *own, one.friction, one.restitution, *_path_parts(one.path)]
         )
-    marks["collision settings"] = _digest([json.dumps(dataclasses.asdict(scene.collision)), scene.contact_forces])
+    fingerprint["collision settings"] = _digest([json.dumps(dataclasses.asdict(scene.collision)), scene.contact_forces])
     # damping that was 0 at the start is compiled out, and so on
-    marks[FEATURES] = _digest([json.dumps(features)])
-    return marks
+    fingerprint[FEATURES] = _digest([json.dumps(features)])
+    return fingerprint
 
 
 def scene_digest(scene: Scene) -> str:
     """A digest of all that can be compared of a scene: its parts as a checkpoint compares them, and its numbers."""
     loads = [load.value for body in scene.bodies for name in LOADS.values() for load in getattr(body, name)]
-    return _digest([json.dumps(scene_marks(scene, {})), json.dumps(_numbers(scene)), scene.allow_initial_overlap, *loads])
+    return _digest([json.dumps(scene_fingerprint(scene, {})), json.dumps(_numbers(scene)), scene.allow_initial_overlap, *loads])
 
 
 def _body_parts(body: Body) -> dict[str, list]:

@@ -50,7 +50,7 @@ class EnergyCheck:
             self._start(report)
             return
         if self._first and report.n_contacts:
-            self._most += opening_energy(self._sim.scene, OPENED * self._sim._contact.standoff) / CREATED
+            self._most += opening_energy(self._sim.scene, OPENED * self._sim._contact.contact_offset) / CREATED
         self._first = False
         given = self._potential - (report.gravity + report.loads)  # by gravity and loads [J]
         self._most = max(self._most, self._held + given)

@@ -23,7 +23,7 @@ class SimulationError(TaisoftError):
 
 def no_memory(what: str, error: MemoryError) -> SimulationError:
     """The SimulationError for a MemoryError, whose text tells how much was asked for where NumPy raised it."""
-    from taisoft.memory import available_memory, told  # a rare case, in a module that everything imports
+    from taisoft.memory import available_memory, format_bytes  # a rare case, in a module that everything imports
 
     asked = str(error).rstrip(".") or "the system gave no more"
-    return SimulationError(f"not enough memory for {what}: {asked}; available: {told(available_memory())}")
+    return SimulationError(f"not enough memory for {what}: {asked}; available: {format_bytes(available_memory())}")

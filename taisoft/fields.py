@@ -9,7 +9,7 @@ import taichi as ti
 from taisoft.arrays import DTYPES, Array, index_mask
 from taisoft.errors import SimulationError
 from taisoft.lane_pool import OWN_MASK, Lanes
-from taisoft.memory import available_memory, told
+from taisoft.memory import available_memory, format_bytes
 from taisoft.runtime import lane_pool
 
 SMALL = 2**20  # bytes that are not worth a look at what is free
@@ -73,7 +73,7 @@ class FieldArena:
         return needed
 
     def _no_memory(self, name: str, needed: int, free: int | None) -> str:
-        return f"not enough memory for the array '{name}': {told(needed)} are needed, available: {told(free)}"
+        return f"not enough memory for the array '{name}': {format_bytes(needed)} are needed, available: {format_bytes(free)}"
 
     def release(self) -> None:
         """Free all memory, also that of arrays that somebody still refers to: kernels must not be launched with them."""

@@ -32,9 +32,9 @@ def lumped_masses(scene: Scene) -> np.ndarray:
     return np.concatenate([reference.lumped_mass(b) for b in scene.bodies])
 
 
-def weight_masses(scene: Scene) -> np.ndarray:
+def gravity_masses(scene: Scene) -> np.ndarray:
     """What gravity pulls at, int rho N_a dV, of all nodes [kg]."""
-    return np.concatenate([reference.weight_mass(b) for b in scene.bodies])
+    return np.concatenate([reference.gravity_mass(b) for b in scene.bodies])
 
 
 def mass_matrix(scene: Scene) -> sp.csr_matrix:

@@ -48,6 +48,6 @@ def _of_container(root: Path = Path("/sys/fs/cgroup")) -> list[int]:
     return found
 
 
-def told(n_bytes: int | None) -> str:
+def format_bytes(n_bytes: int | None) -> str:
     """A number of bytes for a message, such as "2000000000 bytes (2.00 GB)"."""
     return "unknown" if n_bytes is None else f"{n_bytes} bytes ({n_bytes / 1e9:.2f} GB)"

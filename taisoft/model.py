@@ -16,7 +16,7 @@ from taisoft.arrays import Count
 from taisoft.elements import reference
 from taisoft.fem.terms import terms_of
 from taisoft.fields import FieldArena
-from taisoft.mass import MassMatrix, lumped_masses, upload_mass_matrix, weight_masses
+from taisoft.mass import MassMatrix, gravity_masses, lumped_masses, upload_mass_matrix
 from taisoft.materials import LAWS
 from taisoft.node_graph import PAIRS, NodeGraph, node_graph
 from taisoft.runtime import Runtime, threads
@@ -74,7 +74,7 @@ class Model:
     gather_start: Any  # (n_nodes + 1) i32: rows of gather_entry
     gather_entry: Any  # i32: base index into State.element_force of each node of each tet
     mass: Any  # (n_nodes) lumped mass [kg]
-    weight: Any  # (n_nodes) what gravity pulls at [kg]: the lumped mass, or int rho N_a dV
+    gravity_mass: Any  # (n_nodes) what gravity pulls at [kg]: the lumped mass, or int rho N_a dV
     mass_matrix: Any  # MassMatrix, or None: consistent mass
     free: Any  # (n_nodes) 3-vectors: 1 on free axes, 0 on constrained ones
     gravity: Any  # () 3-vector [m/s^2]
@@ -260,7 +260,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         gather_start=arena.field("gather_start", ti.i32, n_nodes + 1, start),
         gather_entry=arena.field("gather_entry", ti.i32, len(entry), entry),
         mass=mass,
-        weight=arena.field("weight", real, n_nodes, weight_masses(scene).astype(npr)) if on["consistent_weight"] else mass,
+        gravity_mass=arena.field("gravity_mass", real, n_nodes, gravity_masses(scene).astype(npr)) if on["consistent_weight"] else mass,
         mass_matrix=None,
         free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
         gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),

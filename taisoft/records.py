@@ -24,7 +24,7 @@ class StepReport:
 
     time: float  # at the end of the step [s]
     steps: int = 1  # sub-steps of size dt that this report covers
-    parts: int = 1  # that an implicit step was taken in, more where it did not converge or bodies would have passed each other
+    substeps: int = 1  # that an implicit step was taken in, more where it did not converge or bodies would have passed each other
     newton_iterations: int = 0  # with those of tries that were given up; those on few nodes count by the share of these nodes,
     linear_iterations: int = 0  # here too, see `dynamics.elimination`
     contact_iterations: int = 0

@@ -23,14 +23,14 @@ class Resuming(Loading):
         notes: plain data to keep in it. Raises SimulationError while a body is pulled and for a state that is not finite, and
         OutputError.
         """
-        world, (start, count) = self._open_world(), self._time_base
-        if self.pulled is not None:
+        simulation, (start, count) = self._open_simulation(), self._time_base
+        if self.dragged is not None:
             raise SimulationError("a body is being pulled, which no checkpoint holds: release it first")
-        bad = world.find_unfinite()
+        bad = simulation.find_nonfinite()
         if bad is not None:
             raise SimulationError(f"no checkpoint is made of such a state: {bad}")
         own = {"dt": self._dt, "time_base": start, "count_base": count}
-        state = own | {"world": world.snapshot(), "stepper": self._stepper.snapshot(), "loads": load_values(self.scene)}
+        state = own | {"simulation": simulation.snapshot(), "stepper": self._stepper.snapshot(), "loads": load_values(self.scene)}
         write_checkpoint(path, dataclasses.asdict(self.settings), self.scene, self.plan.on, state, notes or {}, self._given)
 
     @classmethod
@@ -54,7 +54,7 @@ class Resuming(Loading):
         settings = saved.settings | ({} if arch is None else {"arch": arch})
         if set(settings) != {field.name for field in dataclasses.fields(Settings)}:
             raise SimulationError(f"{saved.path} holds no state of this scene: its settings are not those of this version")
-        check_scene(saved, scene, plan_of(scene, *(settings[key] for key in ("integrator", "self_collision", "pullable"))).on)
+        check_scene(saved, scene, plan_of(scene, *(settings[key] for key in ("integrator", "self_collision", "draggable"))).on)
         start = scene.snapshot()
         start.allow_initial_overlap = True  # where bodies start is not where they are
         sim = cls(start, **settings)
@@ -72,15 +72,15 @@ class Resuming(Loading):
         return sim
 
     def _restore(self, saved: Checkpoint) -> None:
-        world, state = self._world, saved.state
+        simulation, state = self._simulation, saved.state
         take_numbers(saved, self.scene)
         self._load_gravity()
-        world.upload_material(density=True)
+        simulation.upload_material(density=True)
         self._upload_loads()
         if self._contact is not None:
             self._contact.numbers_changed()
         self._stable_dt = None
         self._dt = check_dt(state["dt"])
         self._time_base = float(state["time_base"]), int(state["count_base"])
-        world.restore(state["world"])
+        simulation.restore(state["simulation"])
         self._stepper.restore(state["stepper"])

@@ -22,7 +22,7 @@ from taisoft.errors import SimulationError
 from taisoft.files import cache_folders
 from taisoft.lane_pool import LanePool
 from taisoft.launching import Kernels
-from taisoft.memory import address_space, told
+from taisoft.memory import address_space, format_bytes
 from taisoft.timing import usable_cores
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
@@ -127,7 +127,8 @@ def _initialise(arch: str, precision: str) -> None:
     folder = _cache_folder()
     room = address_space()
     if arch == "cpu" and room is not None and room < POOL:
-        raise SimulationError(f"not enough memory to start Taichi: {told(POOL)} are needed at once, available: {told(room)}")
+        needed = f"{format_bytes(POOL)} are needed at once, available: {format_bytes(room)}"
+        raise SimulationError(f"not enough memory to start Taichi: {needed}")
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # its greeting
             ti.init(

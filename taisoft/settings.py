@@ -33,7 +33,7 @@ class Settings:
     linear_tolerance: float | None
     contact_solver: str
     contact_tolerance: float | None
-    pullable: bool = False
+    draggable: bool = False
 
     @property
     def explicit(self) -> bool:
@@ -41,10 +41,10 @@ class Settings:
         return self.integrator in EXPLICIT
 
 
-def plan_of(scene: Scene, integrator: str, self_collision: bool, pullable: bool) -> Plan:
+def plan_of(scene: Scene, integrator: str, self_collision: bool, draggable: bool) -> Plan:
     """The plan of a scene under an integrator."""
     explicit = integrator in EXPLICIT
-    return make_plan(scene, explicit, not explicit and scheme_of(integrator).before > 0.0, self_collision, pullable)
+    return make_plan(scene, explicit, not explicit and scheme_of(integrator).before > 0.0, self_collision, draggable)
 
 
 def check_dt(dt) -> float:
@@ -100,7 +100,7 @@ def _check_contact_solver(integrator: str, solver: str, touching: bool) -> None:
 
 def check_settings(
     scene: Scene, dt, integrator, contact_solver, self_collision, precision, arch, allow_unstable, newton_tolerance,
-    linear_tolerance, contact_tolerance, pullable,
+    linear_tolerance, contact_tolerance, draggable,
 ) -> Settings:  # fmt: skip
     """Check every argument of a Simulator. Raises SceneError or SimulationError with one sentence."""
     if not isinstance(scene, Scene):
@@ -118,8 +118,8 @@ def check_settings(
     _check_contact_solver(integrator, contact_solver, scene.pushes(self_collision))
     if not isinstance(allow_unstable, bool):
         raise SimulationError(f"allow_unstable = {allow_unstable!r}: it must be True or False")
-    if not isinstance(pullable, bool):
-        raise SimulationError(f"pullable = {pullable!r}: it must be True or False")
+    if not isinstance(draggable, bool):
+        raise SimulationError(f"draggable = {draggable!r}: it must be True or False")
     _check_tolerance("newton_tolerance", newton_tolerance)
     _check_tolerance("linear_tolerance", linear_tolerance)
     if precision not in ("f32", "f64"):
@@ -128,5 +128,5 @@ def check_settings(
         raise SimulationError(f"arch {arch!r} is unknown: it must be 'cpu' or 'cuda'")
     return Settings(
         check_dt(dt), integrator, precision, arch, allow_unstable, self_collision, newton_tolerance, linear_tolerance,
-        contact_solver, contact_tolerance, pullable,
+        contact_solver, contact_tolerance, draggable,
     )  # fmt: skip

@@ -9,10 +9,10 @@ import numpy as np
 from taisoft import runtime
 from taisoft.attributes import thawed
 from taisoft.dynamics import make_stepper
-from taisoft.dynamics.motion import Motion
+from taisoft.dynamics.dirichlet import DirichletConditions
+from taisoft.dynamics.drag_spring import DragSpring, batch
 from taisoft.dynamics.no_contacts import NoContacts
-from taisoft.dynamics.pull import Pull, batch
-from taisoft.dynamics.world import World
+from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.elasticity import NO_TET, measure
 from taisoft.errors import SceneError, SimulationError, no_memory
 from taisoft.fields import FieldArena
@@ -40,7 +40,7 @@ class Simulator(Resuming):
 
     The scene is frozen: what a simulator can change while it runs are its own numbers, by its set_ methods and dt.
     dt [s]; integrator: one of taisoft.dynamics.INTEGRATORS; newton_tolerance, linear_tolerance: relative, None is adaptive.
-    An explicit integrator refuses a dt above `stable_dt` unless allow_unstable, which only warns. pullable: `pull` is wanted.
+    An explicit integrator refuses a dt above `stable_dt` unless allow_unstable, which only warns. draggable: `pull` is wanted.
     Raises SceneError for a scene that cannot be simulated, SimulationError for settings that cannot be met.
     """
 
@@ -48,11 +48,11 @@ class Simulator(Resuming):
         self, scene: Scene, dt: float = 1 / 60, integrator: str = "implicit_euler", contact_solver: str = "auto",
         self_collision: bool = False, precision: str = "f32", arch: str = "cpu", allow_unstable: bool = False,
         newton_tolerance: float | None = None, linear_tolerance: float | None = None,
-        contact_tolerance: float | None = None, pullable: bool = False,
+        contact_tolerance: float | None = None, draggable: bool = False,
     ):  # fmt: skip
         self.settings = check_settings(
             scene, dt, integrator, contact_solver, self_collision, precision, arch, allow_unstable, newton_tolerance,
-            linear_tolerance, contact_tolerance, pullable,
+            linear_tolerance, contact_tolerance, draggable,
         )  # fmt: skip
         self.scene = scene.snapshot()  # numbers that change while it runs are not those of the user's scene
         self._given, scene = scene, self.scene
@@ -67,21 +67,22 @@ class Simulator(Resuming):
             self._check_stability(self._dt)
         for text in scale_warnings(scene):
             warnings.warn(text, UserWarning, stacklevel=2)
-        self.plan = plan_of(scene, integrator, self_collision, pullable)
+        self.plan = plan_of(scene, integrator, self_collision, draggable)
         self._compiled_before = self._compile_reported = runtime.compile_clock()
         self._runtime = runtime.open_runtime(arch, precision, f"the simulator of {[b.name for b in scene.bodies]}")
         self._arena = FieldArena()
         try:
             model, layout = build_model(scene, self._runtime, self._arena, self.plan.on)
-            self._world = World(scene, self._runtime, self._arena, model, layout, Motion(scene, layout))
+            dirichlet = DirichletConditions(scene, layout)
+            self._simulation = SimulationState(scene, self._runtime, self._arena, model, layout, dirichlet)
             touching = self.plan.on["contact_forces"]
             if touching:
                 from taisoft.dynamics.contact import ContactStep
 
-                self._contact = ContactStep(self._world, self_collision, self.settings.explicit)
+                self._contact = ContactStep(self._simulation, self_collision, self.settings.explicit)
                 self._owned.append(self._contact)
-            self._pull = Pull(self._world) if pullable else None
-            self._stepper = make_stepper(self._world, integrator, self._contact or NoContacts(), contact_solver)
+            self._drag_spring = DragSpring(self._simulation) if draggable else None
+            self._stepper = make_stepper(self._simulation, integrator, self._contact or NoContacts(), contact_solver)
             self._owned.append(self._stepper)
             self.reset()
             if touching and not scene.allow_initial_overlap:
@@ -130,11 +131,11 @@ class Simulator(Resuming):
 
         Raises SimulationError as `step` does, and unless n is an integer of at least 1.
         """
-        world, start, n, unbalanced = self._open_world(), self.step_count, check_count("n", n), (0.0, "")
-        if self.pulled is not None:
+        simulation, start, n, unbalanced = self._open_simulation(), self.step_count, check_count("n", n), (0.0, "")
+        if self.dragged is not None:
             most = batch(self._dt) if self.settings.explicit else 1
             n = min(n, most)
-            self._pull.apply(most * self._dt)  # of less than a batch, too: the spring must not change its stiffness
+            self._drag_spring.apply(most * self._dt)  # of less than a batch, too: the spring must not change its stiffness
             self._loads_changed()
         try:
             result = self._stepper.advance(n, self._dt) if self.settings.explicit else self._stepper.step(self._dt)
@@ -149,7 +150,7 @@ class Simulator(Resuming):
             self._count(1)
             report = self._report()
             report.newton_iterations, report.linear_iterations = result.newton_iterations, result.linear_iterations
-            report.residual, report.converged, report.parts = result.residual, result.converged, self._stepper.parts
+            report.residual, report.converged, report.substeps = result.residual, result.converged, self._stepper.substeps
             worst, name = unbalanced = result.unbalanced
             if name:
                 report.residual, report.converged = max(report.residual, worst), False
@@ -162,21 +163,21 @@ class Simulator(Resuming):
             report.deep, report.crossings = int(self._contact.is_deep), self._contact.crossings
         report.steps = self.step_count - start
         if self._softens:
-            self._tell_softened()
-        report.problems = [f"step {world.step_count}: {what}" for what in self._problems(report, unbalanced)]
+            self._warn_softened()
+        report.problems = [f"step {simulation.step_count}: {what}" for what in self._problems(report, unbalanced)]
         return report
 
     def _failure(self, error: SimulationError) -> SimulationError:
         """The error of a step with the step's number; where the state that it began with was spoilt, with the place."""
         self._runtime.check()  # says so itself
-        where, step = self._world.find_unfinite(), f"step {self.step_count + 1}: "
+        where, step = self._simulation.find_nonfinite(), f"step {self.step_count + 1}: "
         if where is not None:
             return SimulationError(f"{step}{where} at its start")
         return error if str(error).startswith("step ") else SimulationError(f"{step}{error}")
 
-    def _tell_softened(self) -> None:
+    def _warn_softened(self) -> None:
         """Warn, once, of the first tet that is squeezed so far that its law softens."""
-        layout, first = self._world.layout, int(self._world.model.state.scalars[FIRST_SOFTENED])
+        layout, first = self._simulation.layout, int(self._simulation.model.state.scalars[FIRST_SOFTENED])
         if first == NO_TET:
             return
         self._softens = False
@@ -226,7 +227,7 @@ class Simulator(Resuming):
 
     def reset(self) -> None:
         """Back to the scene's start; changed numbers (dt, gravity, materials, loads) stay. Copies arrays; compiles nothing."""
-        self._open_world().restart()
+        self._open_simulation().restart()
         self.release()
         self._changes += 1
         self._time_base = (0.0, 0)
@@ -239,12 +240,12 @@ class Simulator(Resuming):
         of earlier steps is forgotten, as by `set_state`, and a pull ends. Memory is held twice meanwhile.
         Raises SimulationError where the settings cannot be met; this simulator is then as it was.
         """
-        kept, start = self._open_world().snapshot(), self.scene.snapshot()
+        kept, start = self._open_simulation().snapshot(), self.scene.snapshot()
         start.allow_initial_overlap = True  # where bodies start is not where they are
         new = Simulator(start, **(dataclasses.asdict(self.settings) | {"dt": self._dt} | changes))
         with thawed(new.scene):
             new.scene.allow_initial_overlap = self.scene.allow_initial_overlap
-        new._world.restore(kept)
+        new._simulation.restore(kept)
         new._stepper.forget()
         new._time_base, new._given = (self.time, self.step_count), self._given
         new._compiled_before, new._compile_reported = self._compiled_before, self._compile_reported
@@ -255,14 +256,15 @@ class Simulator(Resuming):
         self._release = weakref.finalize(self, give_back, *owned)
 
     def _count(self, done: int) -> None:
-        world = self._world
-        world.step_count += done
+        simulation = self._simulation
+        simulation.step_count += done
         start, count = self._time_base
-        world.time = start + (world.step_count - count) * self._dt
+        simulation.time = start + (simulation.step_count - count) * self._dt
 
     def _report(self) -> StepReport:
-        measure(self._world.model)
-        elastic, lowest, inverted, kinetic, gravity, _, loads = self._world.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
+        measure(self._simulation.model)
+        scalars = self._simulation.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
+        elastic, lowest, inverted, kinetic, gravity, _, loads = scalars
         return StepReport(
             time=self.time,
             min_volume_ratio=lowest,
@@ -289,7 +291,7 @@ class Simulator(Resuming):
     @property
     def field_bytes(self) -> dict[str, int]:
         """Bytes of every allocated array by name."""
-        self._kept_world()
+        self._kept_simulation()
         searched = self._contact or self._idle_detection
         return self._arena.bytes | (searched.field_bytes if searched else {}) | self._stepper.field_bytes
 
@@ -301,9 +303,9 @@ class Simulator(Resuming):
 
     def close(self) -> None:
         """Give memory and runtime back; a closed simulator cannot be used."""
-        if self._world is not None:
+        if self._simulation is not None:
             self._release()
-            self._world = self._stepper = self._contact = self._idle_detection = self._tangent = self._pull = None
+            self._simulation = self._stepper = self._contact = self._idle_detection = self._tangent = self._drag_spring = None
 
     def __enter__(self) -> "Simulator":
         return self

@@ -51,11 +51,11 @@ def hooke_stiffness(body: Body) -> sp.csr_matrix:
     return sp.csr_matrix((K.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(size, size))
 
 
-def held_axes(body: Body, led: bool) -> np.ndarray:
+def held_axes(body: Body, prescribed: bool) -> np.ndarray:
     """(n, 3) bool: axes that are fixed; those that follow a path too, if led."""
     held = np.zeros((body.n_nodes, 3), dtype=bool)
     for c in body.constraints:
-        if led or c.path is None:
+        if prescribed or c.path is None:
             held[np.ix_(c.nodes, np.flatnonzero(c.axes))] = True
     return held
 
@@ -63,7 +63,7 @@ def held_axes(body: Body, led: bool) -> np.ndarray:
 def highest_frequency(body: Body) -> float:
     """omega_max [rad/s] of a body at rest with lumped mass, by Lanczos, a fraction of a percent on the high side."""
     mass = reference.lumped_mass(body)
-    free = ~held_axes(body, led=False)  # a path may let go
+    free = ~held_axes(body, prescribed=False)  # a path may let go
     scale = np.where(free, 1.0 / np.sqrt(mass)[:, None], 0.0)
     if not free.any():
         return 0.0
@@ -163,7 +163,7 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
         raise SceneError(f"mass '{mass}' is unknown: it must be 'lumped' or 'consistent'")
     if not scene.bodies:
         raise SceneError("the scene holds no body")
-    free = np.concatenate([~held_axes(b, led=True) for b in scene.bodies]).reshape(-1)
+    free = np.concatenate([~held_axes(b, prescribed=True) for b in scene.bodies]).reshape(-1)
     n_free = int(free.sum())
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 1 <= k <= n_free:
         raise SceneError(f"k = {k!r}: it must be a whole number from 1 to the {n_free} free axes of the scene")

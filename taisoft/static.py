@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from taisoft.dynamics.contact_newton import solve
-from taisoft.dynamics.motion import Motion
+from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage_result import StageResult
 from taisoft.dynamics.stage_system import Stage, StageSystem
-from taisoft.dynamics.world import World
 from taisoft.elasticity import measure
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fields import FieldArena
@@ -116,17 +116,17 @@ class StaticSolver:
             scene, runtime, arena,
             {**plan.on, "mass_damping": False, "stiffness_damping": False, "consistent_mass": False},
         )  # fmt: skip
-        self.world = World(scene, runtime, arena, model, layout, Motion(scene, layout))
-        self.solver = StageSystem(model, arena, runtime.eps, self.world.motion.moved, NoContacts())
+        self.simulation = SimulationState(scene, runtime, arena, model, layout, DirichletConditions(scene, layout))
+        self.solver = StageSystem(model, arena, runtime.eps, self.simulation.dirichlet.prescribed_nodes, NoContacts())
         self.tolerance = tolerance
-        self.target = self.world.next_target(time)
-        self.world.upload_constraints()
+        self.target = self.simulation.next_target(time)
+        self.simulation.upload_constraints()
         self.gravity = np.array(scene.gravity, dtype=np.float64)
         self.loads = model.loads.to_numpy() if model.loaded else None
 
     def solve(self) -> StaticResult:
         """The whole load at once; failing that, in steps that halve on failure and grow on success."""
-        rest = self.world.layout.rest
+        rest = self.simulation.layout.rest
         self.newton = self.linear = 0
         result, steps, done = self._attempt(rest, 1.0, self.tolerance), 1, 1.0
         if not self._good(result):
@@ -135,7 +135,7 @@ class StaticSolver:
                 goal = min(1.0, done + share)
                 result = self._attempt(x, goal, self.tolerance if goal == 1.0 else max(self.tolerance, 1e-3))
                 if self._good(result):
-                    done, share, steps, x = goal, 1.5 * share, steps + 1, self.world.model.state.x.to_numpy()
+                    done, share, steps, x = goal, 1.5 * share, steps + 1, self.simulation.model.state.x.to_numpy()
                 else:
                     share *= 0.5
             if done < 1.0:  # the state of the last good share, judged by all of the load
@@ -144,18 +144,19 @@ class StaticSolver:
 
     def _good(self, result: StageResult) -> bool:
         """Nothing inverted, and the residual where it should be, or where it can be."""
-        measure(self.world.model)
-        return (result.converged or result.at_rounding) and self.world.model.state.scalars[N_INVERTED] == 0.0
+        measure(self.simulation.model)
+        return (result.converged or result.at_rounding) and self.simulation.model.state.scalars[N_INVERTED] == 0.0
 
     def _attempt(self, x: np.ndarray, share: float, tolerance: float, max_newton: int = MAX_NEWTON) -> StageResult:
         """Solve with a share of the load, from x."""
-        m, w = self.world.model, self.solver.work
+        m, w = self.simulation.model, self.solver.work
         start = [(m.gravity, share * self.gravity[None]), (w.x_hat, x), (m.state.x, x), (m.state.v, np.zeros_like(x))]
         if self.loads is not None:
             start.append((m.loads, share * self.loads))
         if self.target is not None:
-            rest = self.world.layout.rest[self.world.motion.moved]
-            start += [(w.targets, rest + share * (self.target - rest)), (w.moved_axes, self.world.motion.moved_axes())]
+            rest = self.simulation.layout.rest[self.simulation.dirichlet.prescribed_nodes]
+            axes = self.simulation.dirichlet.prescribed_axes()
+            start += [(w.targets, rest + share * (self.target - rest)), (w.prescribed_axes, axes)]
         upload(start)
         result = solve(self.solver, Stage(0.0, 1.0, 1.0, tolerance, max_newton=max_newton))
         self.newton += result.newton_iterations
@@ -169,14 +170,15 @@ class StaticSolver:
         return 0.0 if idle and result.converged else result.residual
 
     def _answer(self, result: StageResult, steps: int, load: float) -> StaticResult:
-        world = self.world
-        measure(world.model)
-        scalars = world.model.state.scalars.to_numpy()
+        simulation = self.simulation
+        measure(simulation.model)
+        scalars = simulation.model.state.scalars.to_numpy()
         if not np.isfinite(result.residual):
-            raise SimulationError(f"solve_static: {world.find_unfinite() or 'the residual is not finite'}")
+            raise SimulationError(f"solve_static: {simulation.find_nonfinite() or 'the residual is not finite'}")
         return StaticResult(
             converged=result.converged and load == 1.0, load=load, at_rounding=result.at_rounding,
             residual=self._residual(result), iterations=self.newton, linear_iterations=self.linear, load_steps=steps,
-            elastic=float(scalars[ELASTIC]), n_inverted=int(scalars[N_INVERTED]), _scene=world.scene, _layout=world.layout,
-            _positions=world.model.state.x.to_numpy(), _reactions=self.solver.held_residual(),
+            elastic=float(scalars[ELASTIC]), n_inverted=int(scalars[N_INVERTED]),
+            _scene=simulation.scene, _layout=simulation.layout,
+            _positions=simulation.model.state.x.to_numpy(), _reactions=self.solver.held_residual(),
         )  # fmt: skip

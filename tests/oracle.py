@@ -41,7 +41,7 @@ class Oracle:
         self.time, self.past, self.acceleration = 0.0, [], None
 
     def _hold(self, scene) -> None:
-        self.fixed, self.led = np.zeros((self.n, 3), dtype=bool), []
+        self.fixed, self.prescribed = np.zeros((self.n, 3), dtype=bool), []
         for body, start in zip(scene.bodies, self.starts):
             for c in body.constraints:
                 mask = np.zeros((self.n, 3), dtype=bool)
@@ -49,26 +49,26 @@ class Oracle:
                 if c.path is None:
                     self.fixed |= mask
                 else:
-                    self.led.append((c.nodes + start, mask, c.path))
+                    self.prescribed.append((c.nodes + start, mask, c.path))
         self.v = np.where(~self._masks(), self.v, 0.0)
 
     def _masks(self):
         mask = self.fixed.copy()
-        for _, led, _ in self.led:
-            mask |= led
+        for _, prescribed, _ in self.prescribed:
+            mask |= prescribed
         return mask
 
     def targets(self, t: float):
         """(positions, mask) of the led axes at a time; groups that let go are dropped, and the past with them."""
         where, mask = self.rest.copy(), np.zeros((self.n, 3), dtype=bool)
-        still = [group for group in self.led if group[2](t) is not None]
-        if len(still) < len(self.led):
-            self.led, self.past, self.acceleration = still, [], None
-        for nodes, led, path in self.led:
+        still = [group for group in self.prescribed if group[2](t) is not None]
+        if len(still) < len(self.prescribed):
+            self.prescribed, self.past, self.acceleration = still, [], None
+        for nodes, prescribed, path in self.prescribed:
             way = np.zeros((self.n, 3))
             way[nodes] = path(t)
-            where = where + np.where(led, way, 0.0)
-            mask |= led
+            where = where + np.where(prescribed, way, 0.0)
+            mask |= prescribed
         return where, mask
 
     # --- elasticity -------------------------------------------------------------------------------------------------
@@ -140,17 +140,17 @@ class Oracle:
 
     def symplectic_euler(self, dt: float) -> None:
         """v += dt a(x, v), x += dt v."""
-        goal, led = self.targets(self.time + dt)
+        goal, prescribed = self.targets(self.time + dt)
         x, v, f = self.x, self.v, self.total_force(self.x, self.v, explicit=True)
-        self.v = np.where(self.fixed | led, 0.0, v + dt * f / self.lumped)
-        self.v = np.where(led, (goal - x) / dt, self.v)
-        self.x = np.where(led, goal, x + dt * self.v)
+        self.v = np.where(self.fixed | prescribed, 0.0, v + dt * f / self.lumped)
+        self.v = np.where(prescribed, (goal - x) / dt, self.v)
+        self.x = np.where(prescribed, goal, x + dt * self.v)
         self._react(f, v, dt)
 
     def velocity_verlet(self, dt: float) -> None:
         """Decay, half a kick, drift, force at the extrapolated velocity, half a kick, decay."""
-        goal, led = self.targets(self.time + dt)
-        held, decay = self.fixed | led, np.exp(-0.5 * dt * self.mass_damping)
+        goal, prescribed = self.targets(self.time + dt)
+        held, decay = self.fixed | prescribed, np.exp(-0.5 * dt * self.mass_damping)
         before, drag = self.v, self.mass_damping * self.lumped
 
         def accelerate(x, v):
@@ -160,9 +160,9 @@ class Oracle:
         a = accelerate(self.x, self.v)[1] if self.acceleration is None else self.acceleration
         half = decay * self.v + 0.5 * dt * a
         way = (goal - self.x) / dt
-        x = np.where(led, goal, self.x + dt * half)
-        f, a = accelerate(x, np.where(led, way, half + 0.5 * dt * a))
-        self.v = np.where(led, way, np.where(self.fixed, 0.0, decay * (half + 0.5 * dt * a)))
+        x = np.where(prescribed, goal, self.x + dt * half)
+        f, a = accelerate(x, np.where(prescribed, way, half + 0.5 * dt * a))
+        self.v = np.where(prescribed, way, np.where(self.fixed, 0.0, decay * (half + 0.5 * dt * a)))
         self.x, self.acceleration = x, a
         self._react(f - drag * self.v, before, dt)
 
@@ -172,61 +172,61 @@ class Oracle:
 
     # --- implicit steps ---------------------------------------------------------------------------------------------
 
-    def led_acceleration(self, dt: float, shares, weights):
+    def prescribed_acceleration(self, dt: float, shares, weights):
         """Second difference (n,3) of the led nodes' ways at shares of the step, over dt^2."""
         total = np.zeros((self.n, 3))
-        for nodes, led, path in self.led:
+        for nodes, prescribed, path in self.prescribed:
             way = np.zeros((self.n, 3))
             way[nodes] = sum(w * np.asarray(path(self.time + share * dt)) for share, w in zip(shares, weights)) / dt**2
-            total += np.where(led, way, 0.0)
+            total += np.where(prescribed, way, 0.0)
         return total
 
-    def led_v_hat(self, v_hat, way, led, beta: float, dt: float, at_end: bool = False):
+    def prescribed_v_hat(self, v_hat, way, prescribed, beta: float, dt: float, at_end: bool = False):
         """v_hat with that of led axes such that (way - v_hat) / beta is their acceleration, where the mass couples nodes."""
         if np.count_nonzero(self.mass - np.diag(np.diag(self.mass))) == 0:
             return v_hat
         rule = ((0, 1 / 3, 2 / 3, 1), (-9, 36, -45, 18)) if at_end else ((0, 0.5, 1), (4, -8, 4))
-        return np.where(led, way - beta * self.led_acceleration(dt, *rule), v_hat)
+        return np.where(prescribed, way - beta * self.prescribed_acceleration(dt, *rule), v_hat)
 
     def implicit_euler(self, dt: float, at_end: bool = False) -> None:
         """M (v1 - v0) = dt f(x0 + dt v1, v1)."""
-        goal, led = self.targets(self.time + dt)
+        goal, prescribed = self.targets(self.time + dt)
         x, v = self.x, self.v
-        v_hat = self.led_v_hat(v, (goal - x) / dt, led, dt, dt, at_end)
-        self.x, self.v = self._stage(x, v_hat, dt, goal, led)
+        v_hat = self.prescribed_v_hat(v, (goal - x) / dt, prescribed, dt, dt, at_end)
+        self.x, self.v = self._stage(x, v_hat, dt, goal, prescribed)
         self._end(x, v, dt)
 
     def implicit_midpoint(self, dt: float) -> None:
         """A stage of half the step, then as much again; led nodes change their velocity once a step, by half in the stage."""
-        goal, led = self.targets(self.time + dt)
+        goal, prescribed = self.targets(self.time + dt)
         x, v, way = self.x, self.v, (goal - self.x) / dt
-        v_hat = self.led_v_hat(np.where(led, (way + v) / 2, v), way, led, dt / 2, dt)
-        xm, vm = self._stage(x, v_hat, dt / 2, (goal + x) / 2, led)
-        self.x, self.v = 2 * xm - x, np.where(led, way, 2 * vm - v)
+        v_hat = self.prescribed_v_hat(np.where(prescribed, (way + v) / 2, v), way, prescribed, dt / 2, dt)
+        xm, vm = self._stage(x, v_hat, dt / 2, (goal + x) / 2, prescribed)
+        self.x, self.v = 2 * xm - x, np.where(prescribed, way, 2 * vm - v)
         self._end(x, v, dt)
 
     def bdf2(self, dt: float) -> None:
         """x1 = 4/3 x0 - 1/3 x_(-1) + 2/3 dt v1, v1 alike; the first step is implicit Euler's."""
-        goal, led = self.targets(self.time + dt)
+        goal, prescribed = self.targets(self.time + dt)
         if not self.past:
             return self.implicit_euler(dt, at_end=True)
         (older_x, older_v), x, v, beta = self.past[-1], self.x, self.v, 2 * dt / 3
         x_hat = (4 * x - older_x) / 3
-        v_hat = self.led_v_hat((4 * v - older_v) / 3, (goal - x_hat) / beta, led, beta, dt, at_end=True)
-        self.x, self.v = self._stage(x_hat, v_hat, beta, goal, led)
+        v_hat = self.prescribed_v_hat((4 * v - older_v) / 3, (goal - x_hat) / beta, prescribed, beta, dt, at_end=True)
+        self.x, self.v = self._stage(x_hat, v_hat, beta, goal, prescribed)
         self._end(x, v, dt)
 
     def linearly_implicit_euler(self, dt: float) -> None:
         """(M + dt a M + dt^2 K + dt b K_d) w = M (v0 - u) + dt f(x, u), v1 = u + w; u and x: led nodes have gone, others stay."""
-        goal, led = self.targets(self.time + dt)
-        free = ~(self.fixed | led).reshape(-1)
+        goal, prescribed = self.targets(self.time + dt)
+        free = ~(self.fixed | prescribed).reshape(-1)
         x, v, damper = self.x, self.v, self.stiffness(self.x, projected=True)
-        start, way = np.where(led, goal, x), np.where(led, (goal - x) / dt, 0.0)
-        old, v = v, self.led_v_hat(v, way, led, dt, dt)
+        start, way = np.where(prescribed, goal, x), np.where(prescribed, (goal - x) / dt, 0.0)
+        old, v = v, self.prescribed_v_hat(v, way, prescribed, dt, dt)
         rhs = (self.mass @ (v - way) + dt * self.total_force(start, way, damper)).reshape(-1)
         self.v = way.copy()
         self.v[free.reshape(-1, 3)] = np.linalg.solve(self._system(dt, start, damper)[np.ix_(free, free)], rhs[free])
-        self.x = np.where(led, goal, x + dt * self.v)
+        self.x = np.where(prescribed, goal, x + dt * self.v)
         self._residual = self.mass @ (self.v - v) / dt - self.total_force(self.x, self.v, damper)
         self._end(x, old, dt)
 
@@ -235,12 +235,12 @@ class Oracle:
         inertia = np.kron((1 + beta * self.mass_damping) * self.mass, np.eye(3))
         return inertia + beta**2 * self.stiffness(x) + beta * np.repeat(self.stiffness_damping, 3, axis=0) * damper
 
-    def _stage(self, x_hat, v_hat, beta: float, goal, led):
+    def _stage(self, x_hat, v_hat, beta: float, goal, prescribed):
         """Solve M (v - v_hat) = beta f(x_hat + beta v, v) on the free axes by dense Newton."""
-        held = self.fixed | led
+        held = self.fixed | prescribed
         free = ~held.reshape(-1)
         damper = self.stiffness(self.x, projected=True)
-        v = np.where(led, (goal - x_hat) / beta, np.where(held, 0.0, v_hat))
+        v = np.where(prescribed, (goal - x_hat) / beta, np.where(held, 0.0, v_hat))
         for _ in range(50):
             x = x_hat + beta * v
             self._residual = self.mass @ (v - v_hat) / beta - self.total_force(x, v, damper)
@@ -262,10 +262,10 @@ class Oracle:
 
     def static(self, time: float = 0.0, load_steps: int = 1):
         """Positions (n,3) in equilibrium, the load and the way of the led nodes applied in equal parts, by dense Newton."""
-        goal, led = self.targets(time)
-        free, x, load = ~(self.fixed | led).reshape(-1), self.rest.copy(), self.applied()
+        goal, prescribed = self.targets(time)
+        free, x, load = ~(self.fixed | prescribed).reshape(-1), self.rest.copy(), self.applied()
         for share in np.arange(1, load_steps + 1) / load_steps:
-            x = self.equilibrium(np.where(led, self.rest + share * (goal - self.rest), x), share * load, free)
+            x = self.equilibrium(np.where(prescribed, self.rest + share * (goal - self.rest), x), share * load, free)
         return x
 
     def equilibrium(self, x, load, free):

@@ -95,7 +95,7 @@ def test_lists_of_a_mesh_and_another_mesh():
 ANOTHER = "add another body by scene.add_body"
 OF_A_BODY = dict.fromkeys(("name", "mesh", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes"), ANOTHER) | {
     "constraints": "call body.fix or body.move", "forces": "call body.add_force", "tractions": "call body.add_traction",
-    "hit_by": "set body.collision",
+    "contact_mode": "set body.collision",
 }  # fmt: skip
 
 

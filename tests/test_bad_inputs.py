@@ -268,7 +268,7 @@ def test_what_is_suspect_is_told(tmp_path):
 
 def assert_far_is_near(out, files, sizes):
     """The same cube 1e6 m away bends by the same, but for the digits that the distance takes."""
-    x = read_checkpoint(out / "checkpoint.npz").state["world"]["x"]
+    x = read_checkpoint(out / "checkpoint.npz").state["simulation"]["x"]
     starts = dict(zip(sizes, np.cumsum([0, *sizes.values()])))
     moves = [x[starts[name] : starts[name] + SIZE] - files[name][0] for name in ("near", "far")]
     assert 1e-4 < np.abs(moves[0]).max() < 0.05 and np.abs(moves[0] - moves[1]).max() < 1e-5 * np.abs(moves[0]).max()

@@ -16,12 +16,12 @@ import taisoft as ts
 from benchmarks import collision, collision_runs
 from benchmarks.collision_cases import (
     CUBES,
+    DEEP_PENETRATION,
     LARGE_PILE,
     OLDER,
     PILES,
     REPORT,
     SHEET,
-    SUNK,
     Setup,
     cubes_setup,
     pile,
@@ -79,7 +79,7 @@ def test_a_pile_touches_and_hardly_overlaps():
 def test_motions_begin_and_end_as_they_say():
     cubes, sheet = cubes_setup(3).build("auto"), SHEET.build("auto")
     height = [turning(cubes, share)[64:, 1].min() - 0.5 for share in (0.0, 1.0)]
-    assert np.allclose(height, [0.005 - SUNK / 3, -0.005 - SUNK / 3])
+    assert np.allclose(height, [0.005 - DEEP_PENETRATION / 3, -0.005 - DEEP_PENETRATION / 3])
     assert np.array_equal(sagging(sheet, 0.0), start(sheet))
     x, n = sagging(sheet, 1.0), sheet.bodies[0].n_nodes
     held = np.abs(start(sheet)[:n, 0]) > 1.999

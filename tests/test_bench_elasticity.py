@@ -24,7 +24,7 @@ from benchmarks.exact_path import SAMPLE, FallingBeam, load_exact
 from taisoft.errors import OutputError, SimulationError
 from taisoft.mass import lumped_masses
 from taisoft.output.tables import markdown
-from taisoft.study.stretch import Stretch, advance
+from taisoft.study.timed_run import TimedRun, advance
 
 CELLS = (12, 3, 3)
 TINY = elasticity.Extent(meshes=(CELLS,), precisions=("f32",), repeats=2, rounds=(2,), seconds=0.02)
@@ -74,8 +74,8 @@ def test_the_path_is_near_the_exact_one(verlet):
 
 
 def test_steps_add_up():
-    total = Stretch(3, 0.1, 1, 5, 2, 7) + Stretch(4, 0.2, 0, 2, 1, 1)
-    assert total == Stretch(7, pytest.approx(0.3), 1, 5, 3, 8)
+    total = TimedRun(3, 0.1, 1, 5, 2, 7) + TimedRun(4, 0.2, 0, 2, 1, 1)
+    assert total == TimedRun(7, pytest.approx(0.3), 1, 5, 3, 8)
 
 
 def test_steps_that_diverge_are_told_and_left_behind(lent, monkeypatch):

@@ -243,7 +243,7 @@ def test_the_interpreted_loop_finds_the_deepest_point():
 def test_the_interpreted_loop_does_what_the_search_does():
     runtime = open_runtime("cpu", "f32", "a test of the report")
     try:
-        with Rig(cubes_setup(2), points.HIT_BY, runtime) as rig:
+        with Rig(cubes_setup(2), points.CONTACT_MODES, runtime) as rig:
             made = points.measure_size(rig, 2, plain.PlainPoints(rig))
             pairs = plain.candidate_pairs(rig)
             body = rig.detection.topology.body

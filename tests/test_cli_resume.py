@@ -35,8 +35,8 @@ def assert_same_folders(a: Path, b: Path, rows: int = 0) -> None:
     assert len(steps[0]) == 7 and steps[0][rows:] == steps[1][max(0, len(steps[1]) - 7 + rows) :]
     assert usd(a) == usd(b)
     one, other = (read_checkpoint(folder / "checkpoint.npz") for folder in (a, b))
-    assert np.array_equal(one.state["world"]["x"], other.state["world"]["x"])
-    assert one.state["world"]["step_count"] == other.state["world"]["step_count"]
+    assert np.array_equal(one.state["simulation"]["x"], other.state["simulation"]["x"])
+    assert one.state["simulation"]["step_count"] == other.state["simulation"]["step_count"]
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_an_interrupted_run_goes_on(whole, tmp_path):
     raising = f"import signal; signal.raise_signal({int(signal.SIGTERM)}) if 0.1 < t < 0.1042 else None\n    return (0, -t, 0)"
     path, out = write(tmp_path / "led.py", LED.replace("{body}", raising)), tmp_path / "out"
     assert run(path, "--out", out, "--seconds", "0.2") == 143
-    assert 0.1 < read_checkpoint(out / "checkpoint.npz").state["world"]["time"] < 0.15
+    assert 0.1 < read_checkpoint(out / "checkpoint.npz").state["simulation"]["time"] < 0.15
     assert run(path, "--out", out, "--resume", out / "checkpoint.npz", "--seconds", "0.2") == 0
     assert_same_folders(whole, out)
 
@@ -86,7 +86,7 @@ def test_a_run_that_was_interrupted_between_two_frames_goes_on(tmp_path):
     path, out, straight = tmp_path / "led.py", tmp_path / "out", tmp_path / "straight"
     write(path, LED.replace("{body}", raising))
     assert run(path, "--out", out, *implicit) == 130
-    assert read_checkpoint(out / "checkpoint.npz").state["world"]["step_count"] == 28
+    assert read_checkpoint(out / "checkpoint.npz").state["simulation"]["step_count"] == 28
     write(path, GENTLE)
     assert run(path, "--out", out, "--resume", out / "checkpoint.npz", *implicit) == 0
     assert run(path, "--out", straight, *implicit) == 0
@@ -94,7 +94,7 @@ def test_a_run_that_was_interrupted_between_two_frames_goes_on(tmp_path):
     assert (out / "steps.csv").read_bytes() == (straight / "steps.csv").read_bytes()
     assert usd(out) == usd(straight)
     one, other = (read_checkpoint(folder / "checkpoint.npz").state for folder in (out, straight))
-    assert np.array_equal(one["world"]["v"], other["world"]["v"])
+    assert np.array_equal(one["simulation"]["v"], other["simulation"]["v"])
     assert np.array_equal(one["stepper"]["x_now"], other["stepper"]["x_now"])
 
 
@@ -105,7 +105,7 @@ def test_a_killed_run_goes_on(whole, tmp_path):
     process = child("run", path, "--headless", "--out", out, "--seconds", "0.2", "--checkpoint-every", str(2 / 30))
     process.communicate(timeout=120)
     assert process.returncode == 9 and not (out / "scene.usdc").exists() and (out / "frames" / "00005.png").exists()
-    assert read_checkpoint(out / "checkpoint.npz").state["world"]["time"] == pytest.approx(4 / 30)
+    assert read_checkpoint(out / "checkpoint.npz").state["simulation"]["time"] == pytest.approx(4 / 30)
     write(path, GENTLE)
     assert run(path, "--out", out, "--resume", out / "checkpoint.npz", "--seconds", "0.2") == 0
     assert_same_folders(whole, out, rows=5)  # the killed run wrote none
@@ -115,8 +115,8 @@ def test_a_failed_run_keeps_its_last_good_state(tmp_path):
     failing = LED.replace("{body}", "return (0, -t, 0) if t < 0.05 else (0, float('nan'), 0)")
     path, out = write(tmp_path / "led.py", failing), tmp_path / "out"
     assert run(path, "--out", out, *SHORT_OUTPUT) == 1
-    world = read_checkpoint(out / "checkpoint.npz").state["world"]
-    assert 0.0 < world["time"] < 0.05 and np.isfinite(world["x"]).all()
+    simulation = read_checkpoint(out / "checkpoint.npz").state["simulation"]
+    assert 0.0 < simulation["time"] < 0.05 and np.isfinite(simulation["x"]).all()
 
 
 def test_a_run_goes_on_elsewhere_with_another_dt(begun, tmp_path):
@@ -227,7 +227,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_previous_one(whole, tmp_path, cap
     path, out = write(tmp_path / "led.py", GENTLE), tmp_path / "out"
     assert run(path, "--out", out, "--checkpoint-every", str(1 / 30)) == 0
     damaged, previous = out / "checkpoint.npz", out / "checkpoint.previous.npz"
-    assert read_checkpoint(previous).state["world"]["time"] == pytest.approx(3 / 30)
+    assert read_checkpoint(previous).state["simulation"]["time"] == pytest.approx(3 / 30)
     damaged.write_bytes(damaged.read_bytes()[:-1000])
     assert run(path, "--out", out, "--resume", damaged, "--seconds", "0.2") == 0
     told = f"previous checkpoint instead, {previous}"

@@ -115,12 +115,12 @@ def test_scenes_have_what_they_say(structure):
     assert (len(scene.bodies[0].nodes.surface) > SERIAL_BELOW) == structure.fine
 
 
-@pytest.mark.parametrize("asked, simulated, static", [(None, "f32", "f64"), ("f32", "f32", "f32"), ("f64", "f64", "f64")])
-def test_precisions(asked, simulated, static, monkeypatch, capsys):
+@pytest.mark.parametrize("requested, simulated, static", [(None, "f32", "f64"), ("f32", "f32", "f32"), ("f64", "f64", "f64")])
+def test_precisions(requested, simulated, static, monkeypatch, capsys):
     structure, found = Structure("implicit_euler", held=True), []
     monkeypatch.setattr(warm_scenes, "structures", lambda: [structure])
     monkeypatch.setattr(warm_scenes, "static_structures", lambda: [structure])
     monkeypatch.setattr(warm, "simulate", lambda structure, precision: found.append(precision))
     monkeypatch.setattr(warm, "solve", lambda structure, precision: found.append(precision))
-    assert main(["warm", *(["--precision", asked] if asked else [])]) == 0
+    assert main(["warm", *(["--precision", requested] if requested else [])]) == 0
     assert found == [simulated, static] and f"statics in {static}" in capsys.readouterr().out

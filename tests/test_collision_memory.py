@@ -92,7 +92,7 @@ def search_everything() -> None:
             v[len(ball) + 3] = bad
             with pytest.raises(SceneError, match="velocities: node .* not finite"):
                 sim.set_state(x, v)
-            for field in (sim._world.model.state.x, sim._world.model.state.v):  # as a step that failed might leave them
+            for field in (sim._simulation.model.state.x, sim._simulation.model.state.v):  # as a step that failed might leave them
                 before = field.to_numpy()
                 field.from_numpy(before + v)
                 sim._contact.forget()
@@ -100,11 +100,11 @@ def search_everything() -> None:
                     sim.detect_contacts()
                 field.from_numpy(before)
             print("node of no triangle", bad)
-            before = sim._world.model.state.x.to_numpy()
-            sim._world.model.state.x.from_numpy(np.where(np.isin(np.arange(len(x)), inside)[:, None], bad, before))
+            before = sim._simulation.model.state.x.to_numpy()
+            sim._simulation.model.state.x.from_numpy(np.where(np.isin(np.arange(len(x)), inside)[:, None], bad, before))
             sim._contact.forget()
             assert sim.detect_contacts().unmapped > 0
-            sim._world.model.state.x.from_numpy(before)
+            sim._simulation.model.state.x.from_numpy(before)
 
 
 def search_in_small_parts() -> None:

@@ -2,7 +2,7 @@
 
 * nodes, signed weights, normals, right-handed frames, friction and restitution of each pair, the latter also when they change;
 * the way of an obstacle at a contact: of a mesh, and of a body that turns; the speed of approach;
-* how far a contact is from its goal: far, within the standoff, penetrating, thrown back;
+* how far a contact is from its goal: far, within the contact offset, penetrating, thrown back;
 * impulses of the step before come back where two features meet again, in the world, in proportion to the step, once.
 """
 
@@ -12,7 +12,7 @@ import taichi as ti
 from rotations import rotation
 
 import taisoft as ts
-from taisoft.contact.assemble import OWN, _warm_impulse, build_found, keep_impulses, short_of_goal
+from taisoft.contact.assemble import OWN, _warm_impulse, build_found, gap_minus_target, keep_impulses
 from taisoft.contact.problem import build_node_problem, fill_field
 from taisoft.contact.restitution import explicit_rise
 from taisoft.fields import FieldArena
@@ -127,7 +127,7 @@ def test_ways_of_obstacles(begun):
         material = (point[on] - obstacle.shape.pivot - shift) @ turn + obstacle.shape.pivot
         expected[on] = obstacle.points_at(t + DT, material) - point[on]
         assert on.sum() >= 2 and np.abs(expected[on]).max() > 1e-4
-    assert np.abs(rows(f.carry, n) - expected).max() < 1e-12
+    assert np.abs(rows(f.obstacle_displacement, n) - expected).max() < 1e-12
     v = sim.velocities()
     relative = np.einsum("kj,kjx->kx", rows(p.weight, n) * (np.arange(6) < rows(p.arity, n)[:, None]), v[rows(p.node, n)])
     approach = ((relative - expected / DT) * rows(p.normal, n)).sum(axis=1)
@@ -167,13 +167,13 @@ def test_warm_start(begun):
 
 @kernel
 def find_goals(
-    f: ti.template(), dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64, force: ti.f64,
+    f: ti.template(), dt: ti.f64, contact_offset: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64, force: ti.f64,
     kicked: ti.f64, out: ti.types.ndarray(),
 ):  # fmt: skip
     """force: what the explicit step's forces change the velocity by [m/s], a share `kicked` of it before the impact."""
     for c in range(f.problem.count[0]):
-        rise = explicit_rise(f, c, dt, standoff, f.approach[c] + force, kicked)
-        out[c] = short_of_goal(f, c, dt, standoff, fast, slow, fastest, rise)
+        rise = explicit_rise(f, c, dt, contact_offset, f.approach[c] + force, kicked)
+        out[c] = gap_minus_target(f, c, dt, contact_offset, fast, slow, fastest, rise)
 
 
 @kernel
@@ -196,7 +196,7 @@ def found():
 def test_how_far_a_contact_is_from_its_goal(found, fast, slow):
     h, dt, fastest = 2e-3, 0.01, 2.0
     cases = [  # gap, restitution, approach, gap - goal
-        (5 * h, 0.0, -9.0, 4 * h),  # may close down to the standoff
+        (5 * h, 0.0, -9.0, 4 * h),  # may close down to the contact offset
         (h, 0.0, -9.0, 0.0),
         (0.25 * h, 0.0, -9.0, -slow * 0.75 * h),  # opens slowly
         (0.0, 0.0, -9.0, -slow * h),
@@ -242,7 +242,7 @@ def test_the_nearest_contact_of_the_same_feature(found):
         fill_field(field, values)
     p.count[0] = n
     keep_impulses(found)
-    world = impulse[:, :1] * normal + impulse[:, 1:2] * t1 + impulse[:, 2:] * np.cross(normal, t1)
+    simulation = impulse[:, :1] * normal + impulse[:, 1:2] * t1 + impulse[:, 2:] * np.cross(normal, t1)
     asked = np.stack([rng.integers(0, 2, n), rng.integers(0, 7, n), rng.integers(0, 3, n)], axis=1)
     at = rng.standard_normal((n, 3))
     fill_field(found.feature, asked)
@@ -253,6 +253,6 @@ def test_the_nearest_contact_of_the_same_feature(found):
     for c in range(n):
         same = np.flatnonzero((feature == asked[c]).all(axis=1))
         several += len(same) > 1
-        wanted = world[same[np.argmin(np.linalg.norm(point[same] - at[c], axis=1))]] if len(same) else np.zeros(3)
+        wanted = simulation[same[np.argmin(np.linalg.norm(point[same] - at[c], axis=1))]] if len(same) else np.zeros(3)
         assert np.abs(out[c] - wanted).max() < 1e-14
     assert several > 10 and (~out.any(axis=1)).sum() > 3

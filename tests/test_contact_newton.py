@@ -102,7 +102,7 @@ def test_impulses_beside_the_rounding_of_a_stiff_body():
 
 def test_both_loops_find_the_same_step(sim, monkeypatch):
     x, reports = steps(sim)
-    whole = [report.newton_iterations for report in reports if report.parts == 1]
+    whole = [report.newton_iterations for report in reports if report.substeps == 1]
     assert all(report.converged for report in reports) and len(whole) >= 3 and max(whole) <= 10
     assert max(report.n_contacts for report in reports) > 10
     monkeypatch.setattr(contact_newton, "solve_linear", from_the_host)
@@ -158,7 +158,7 @@ def test_on_threads_it_is_the_same_step(sim, monkeypatch):
     monkeypatch.setattr(model, "PARALLEL_FROM", 0)
     monkeypatch.setattr(model, "PARALLEL_THREADS", 1)
     with simulator() as parallel:
-        assert not parallel._world.model.serial
+        assert not parallel._simulation.model.serial
         other, reports = steps(parallel)
     assert all(report.converged for report in reports) and np.abs(other - x).max() < 1e-8  # [m]
 

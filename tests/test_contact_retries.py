@@ -46,7 +46,7 @@ def sim(shared_sim):
     return shared_sim
 
 
-def patch_end(sim, monkeypatch, events: dict, tells: str = "sinking") -> list:
+def patch_end(sim, monkeypatch, events: dict, tells: str = "relative_penetration") -> list:
     """events: by the number of the call of the step's look at its end, an exception or how deep it tells, in edges."""
     calls, end = [], sim._contact.end
 
@@ -64,7 +64,7 @@ def patch_end(sim, monkeypatch, events: dict, tells: str = "sinking") -> list:
     return calls
 
 
-@pytest.mark.parametrize("tells, depth", [("sinking", 1.0), ("crossing", 3e-3)])
+@pytest.mark.parametrize("tells, depth", [("relative_penetration", 1.0), ("crossing", 3e-3)])
 def test_a_step_that_ended_too_deep_is_done_again(sim, monkeypatch, tells, depth):
     sim.dt = DT / 2
     halves = [sim.step() for _ in range(2)]
@@ -82,7 +82,7 @@ def test_a_step_that_ended_too_deep_is_done_again(sim, monkeypatch, tells, depth
     assert np.abs(sim.positions() - wanted[0]).max() < 1e-8 and np.abs(sim.velocities() - wanted[1]).max() < 1e-6
     work = [r.newton_iterations for r in (report, whole, *halves)]
     assert whole.newton_iterations < report.newton_iterations and work[0] > max(work[1:])
-    assert report.converged and report.parts == 2 and sim.step_count == 1 and sim.time == DT
+    assert report.converged and report.substeps == 2 and sim.step_count == 1 and sim.time == DT
 
 
 def test_a_try_that_fails_leaves_the_state_before_the_step(sim, monkeypatch):
@@ -98,10 +98,10 @@ def test_a_try_that_fails_leaves_the_state_before_the_step(sim, monkeypatch):
 def test_a_part_that_sank_is_looked_at_along_its_way(sim, monkeypatch):
     """Nothing is there that was not known: the part stays what it was."""
     first = sim.step()
-    wanted, searched, search = sim.positions(), [], sim._contact.search_way
+    wanted, searched, search = sim.positions(), [], sim._contact.search_along_path
     sim.reset()
-    monkeypatch.setattr(sim._contact, "sank", lambda time, dt, before: True)
-    monkeypatch.setattr(sim._contact, "search_way", lambda *at: searched.append((at, search(*at))))
+    monkeypatch.setattr(sim._contact, "penetrates_anew", lambda time, dt, before: True)
+    monkeypatch.setattr(sim._contact, "search_along_path", lambda *at: searched.append((at, search(*at))))
     report = sim.step()
     assert searched == [((0.0, DT), False)] and report.newton_iterations == first.newton_iterations
     assert np.array_equal(sim.positions(), wanted) and report.max_penetration == first.max_penetration

@@ -59,7 +59,7 @@ def test_a_strip_folded_flat_snaps_open(sim):
     energy, worst = sim.energies().total, 0.0
     assert len(sim.intersecting_triangles()) > 20
     reports = [sim.step() for _ in range(4)]
-    assert max(report.parts for report in reports[:2]) > 2
+    assert max(report.substeps for report in reports[:2]) > 2
     for report in reports[2:]:
         assert report.crossings == 0 and report.n_inverted == 0 and report.max_penetration < 1e-6
         worst = max(worst, np.linalg.norm(sim.velocities("thin"), axis=1).max())

@@ -138,8 +138,8 @@ def test_forms_agree_with_momentum(rig, led):
     p, q = rig.nodes(made), rig.matrix(made.W, made.b, made.friction)
     for form in (p, q):
         solve(form, "gauss_seidel", 0.0, 12)
-    assert p.share.to_numpy()[:30] == pytest.approx(q.share.to_numpy()[:30], rel=1e-12)
-    assert (p.share.to_numpy()[:30] < 0.999).any() == led  # one axis held: the block is no multiple of the identity
+    assert p.relaxation.to_numpy()[:30] == pytest.approx(q.relaxation.to_numpy()[:30], rel=1e-12)
+    assert (p.relaxation.to_numpy()[:30] < 0.999).any() == led  # one axis held: the block is no multiple of the identity
     assert impulses(p) == pytest.approx(impulses(q), rel=1e-9, abs=1e-12)
 
 

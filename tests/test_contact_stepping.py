@@ -71,7 +71,7 @@ def go(sim, seconds: float) -> None:
     while sim.step_count < end:
         report = sim.advance(end - sim.step_count)
         assert report.converged and report.problems == [], report
-        assert report.max_penetration < sim._contact.standoff
+        assert report.max_penetration < sim._contact.contact_offset
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def test_rest(damped):
 
     Means over a while, since explicit steps push a little more and a little less.
     """
-    sim, mass = damped, damped._world.model.mass.to_numpy()[:, None]
+    sim, mass = damped, damped._simulation.model.mass.to_numpy()[:, None]
     go(sim, 0.3)
     held = np.isin(np.arange(len(mass)), np.r_[sim._slice("shelf"), sim._slice("load")])
     missing, gaps = {"cube": [], "load": [], "reactions": []}, []
@@ -170,7 +170,7 @@ def test_restitution(sim, restitution):
 def momenta(sim) -> tuple[np.ndarray, np.ndarray]:
     """Of the two that fly, (3,) each, the angular one about the origin."""
     own = slice(sim._slice("left").start, sim._slice("right").stop)
-    p = sim._world.model.mass.to_numpy()[own, None] * sim.velocities()[own]
+    p = sim._simulation.model.mass.to_numpy()[own, None] * sim.velocities()[own]
     return p.sum(axis=0), np.cross(sim.positions()[own], p).sum(axis=0)
 
 
@@ -203,15 +203,15 @@ def test_laws(each):
         c, moved = each.contacts(), each.positions() - x
         on, bdf2 = c.nodes >= 0, not each.settings.explicit and each._stepper.scheme.before > 0
         signed = np.where(on, c.weights, 0.0) * [1, 1, 1, -1, -1, -1]
-        carried = np.where((c.body_b == "belt")[:, None], [speed * each.dt, 0, 0], 0.0)
-        way = np.einsum("kj,kjx->kx", signed, moved[c.nodes]) - carried
+        obstacle_displacement_at = np.where((c.body_b == "belt")[:, None], [speed * each.dt, 0, 0], 0.0)
+        way = np.einsum("kj,kjx->kx", signed, moved[c.nodes]) - obstacle_displacement_at
         v = each.velocities() if bdf2 else moved / each.dt
-        slip = np.einsum("kj,kjx->kx", signed, v[c.nodes]) - carried / each.dt
+        slip = np.einsum("kj,kjx->kx", signed, v[c.nodes]) - obstacle_displacement_at / each.dt
         above = np.maximum(c.gap, 0.0)
-        standoff, fast, slow, fastest = contact.goal
-        opening = np.minimum(slow * (standoff - above) + fast * (above - c.gap), fastest * each.dt)
-        goal = np.where(c.gap < standoff, c.gap + opening, standoff)
-        u_n = (c.gap - goal + (c.normal * way).sum(axis=1)) / (contact._share * each.dt)
+        contact_offset, fast, slow, fastest = contact.gap_targets
+        opening = np.minimum(slow * (contact_offset - above) + fast * (above - c.gap), fastest * each.dt)
+        gap_targets = np.where(c.gap < contact_offset, c.gap + opening, contact_offset)
+        u_n = (c.gap - gap_targets + (c.normal * way).sum(axis=1)) / (contact._share * each.dt)
         t1 = np.cross(c.normal, np.eye(3)[np.argmin(np.abs(c.normal), axis=1)])
         t1 /= np.linalg.norm(t1, axis=1, keepdims=True)
         frame = np.stack([c.normal, t1, np.cross(c.normal, t1)], axis=1)

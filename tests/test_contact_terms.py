@@ -26,13 +26,13 @@ from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, STAY, STEP, form_res
 from taisoft.dynamics.stage_system import StageSystem
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import to_scipy, unpacked
-from taisoft.linear.coupling import add_pulls, clear_pulls, gather_pulls, prepare_terms, pull_with_all
+from taisoft.linear.coupling import add_products, clear_products, form_product, gather_products, prepare_terms
 from taisoft.runtime import kernel
 from taisoft.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
 from taisoft.subset import EVERYTHING
 
 K, BETA, DT = 24, 0.002, 0.003  # contacts; [s]
-GOAL = 1e-3, 0.2, 0.02, 0.05  # standoff [m], shares that a step mends, speed of that at most [m/s]
+GOAL = 1e-3, 0.2, 0.02, 0.05  # contact offset [m], shares that a step mends, speed of that at most [m/s]
 STIFFNESS = 5.0
 FIXED = [0, 7]  # nodes
 
@@ -47,20 +47,20 @@ def couple(
     for _ in range(1):
         for i in range(m.n_nodes):
             d[i] = prepare_terms(m, k, i)
-        clear_pulls(m, k)
+        clear_products(m, k)
         for i in range(m.n_nodes):
-            below[i] = gather_pulls(m, k, i)
-            add_pulls(m, k, i, x[i])
-        clear_pulls(m, k)
+            below[i] = gather_products(m, k, i)
+            add_products(m, k, i, x[i])
+        clear_products(m, k)
         for back in range(m.n_nodes):
             j = m.n_nodes - 1 - back
-            above[j] = gather_pulls(m, k, j)
-            add_pulls(m, k, j, x[j])
-        clear_pulls(m, k)
+            above[j] = gather_products(m, k, j)
+            add_products(m, k, j, x[j])
+        clear_products(m, k)
         for c in range(k.count[0]):
-            pull_with_all(m, k, c, x)
+            form_product(m, k, c, x)
         for i in range(m.n_nodes):
-            both[i] = gather_pulls(m, k, i)
+            both[i] = gather_products(m, k, i)
 
 
 @pytest.fixture(scope="module", params=["f64", "f32"])
@@ -82,11 +82,12 @@ def rig(request):
         k = contact_terms.build_stage_contacts(arena, m, f, arena.vectors("x_start", ti.f64, m.n_nodes))
         for name in ("node", "weight", "normal", "tangent"):
             fill_field(getattr(p, name), getattr(contacts, name))
-        carry = np.where((np.arange(K) % 5 == 0)[:, None], 1e-3 * rng.standard_normal((K, 3)), 0.0)
+        obstacle_displacement = np.where((np.arange(K) % 5 == 0)[:, None], 1e-3 * rng.standard_normal((K, 3)), 0.0)
         friction = np.where(np.arange(K) % 7 == 0, 0.0, 0.5)
         gap = rng.uniform(-2, 3, K) * GOAL[0]
         apart = np.tile([0, 1], (K, 1))  # contacts of a body with itself have other goals
-        for field, values in ((p.arity, arity), (p.friction, friction), (f.gap, gap), (f.carry, carry), (f.body, apart)):
+        fields = (p.arity, p.friction, f.gap, f.obstacle_displacement, f.body)
+        for field, values in zip(fields, (arity, friction, gap, obstacle_displacement, apart)):
             fill_field(field, values)
         p.count[0] = K
         index_nodes(p)
@@ -109,7 +110,8 @@ def rig(request):
         W = J @ np.diag(free.ravel() / np.diag(A)) @ J.T
         yield SimpleNamespace(
             made=made, m=m, p=p, f=f, k=k, solver=solver, work=solver.work, A=A, J=J, W=W, free=free, start=start, x_hat=x_hat,
-            x=x, gap=gap, carry=carry, friction=friction, close=1e-12 if request.param == "f64" else 1e-5,
+            x=x, gap=gap, obstacle_displacement=obstacle_displacement, friction=friction,
+            close=1e-12 if request.param == "f64" else 1e-5,
             vectors=[made.vectors(f"test_{k}") for k in range(4)],
             diagonal=arena.vectors("test_diagonal", m.real, m.n_nodes, n=block_csr.BLOCK),
             frame=np.stack([found.normal, found.tangent, np.cross(found.normal, found.tangent)], axis=1),
@@ -125,12 +127,12 @@ def press(rig, x: np.ndarray) -> np.ndarray:
 
 
 def evaluate(
-    rig, how: int | None = STAY, share: float = 1.0, multiply: bool = False, kind: int = ELASTIC_STAGE, m=None
+    rig, how: int | None = STAY, term_weight: float = 1.0, multiply: bool = False, kind: int = ELASTIC_STAGE, m=None
 ) -> np.ndarray:
     """The norms of the residual. how: None to stay without asking for the forces. m: the model, by default that on one thread."""
     norms, s, m = np.zeros(5), rig.solver, m or rig.m
     if how is not None:
-        move(m, rig.work, rig.k, kind, how, share, 1.0, BETA)
+        move(m, rig.work, rig.k, kind, how, term_weight, 1.0, BETA)
     contact_terms.press(m, rig.k, int(multiply), BETA, STIFFNESS)
     form_residual(m, rig.work, s.matrix, rig.k, kind, BETA, norms)
     return norms
@@ -142,14 +144,14 @@ def pressed(rig):
     rng = np.random.default_rng(11)
     factor = oracle.factors(rig.W)
     way = (rig.x - rig.start).ravel()
-    standoff, fast, slow, fastest = GOAL
+    contact_offset, fast, slow, fastest = GOAL
     above = np.maximum(rig.gap, 0)
-    opening = np.minimum(slow * (standoff - above) + fast * (above - rig.gap), fastest * DT)
-    goal = np.where(rig.gap >= standoff, standoff, rig.gap + opening)
-    assert 0 < (opening == fastest * DT).sum() < (rig.gap < standoff).sum()
-    carried = np.einsum("kij,kj->ki", rig.frame, rig.carry)
-    u = (rig.J @ (rig.x - rig.x_hat).ravel() / BETA).reshape(K, 3) - carried / DT
-    u[:, 0] = (rig.gap - goal + (rig.J @ way).reshape(K, 3)[:, 0] - carried[:, 0]) / BETA
+    opening = np.minimum(slow * (contact_offset - above) + fast * (above - rig.gap), fastest * DT)
+    gap_targets = np.where(rig.gap >= contact_offset, contact_offset, rig.gap + opening)
+    assert 0 < (opening == fastest * DT).sum() < (rig.gap < contact_offset).sum()
+    obstacle_displacement_at = np.einsum("kij,kj->ki", rig.frame, rig.obstacle_displacement)
+    u = (rig.J @ (rig.x - rig.x_hat).ravel() / BETA).reshape(K, 3) - obstacle_displacement_at / DT
+    u[:, 0] = (rig.gap - gap_targets + (rig.J @ way).reshape(K, 3)[:, 0] - obstacle_displacement_at[:, 0]) / BETA
     size = STIFFNESS * factor[:, 0] * np.abs(u).max()
     multiplier = size[:, None] * rng.uniform([-1, -1, -1], [3, 1, 1], (K, 3))
     multiplier[:, 0] = np.maximum(multiplier[:, 0], 0.0)
@@ -253,10 +255,10 @@ def test_residual_of_a_stage(rig, pressed, threads):
     cg.y.from_numpy(y)
     work.residual.from_numpy(before)
     m.state.x.from_numpy(rig.x)
-    for how, share in ((STEP, 1.0), (AGAIN, 0.4), (None, 0.4)):
-        norms = evaluate(rig, how, share, multiply=how is None, m=m)
+    for how, term_weight in ((STEP, 1.0), (AGAIN, 0.4), (None, 0.4)):
+        norms = evaluate(rig, how, term_weight, multiply=how is None, m=m)
         got, rhs, r = work.residual.to_numpy(), cg.rhs.to_numpy(), rig.p.r.to_numpy()[:K]
-        assert np.abs(m.state.x.to_numpy() - rig.x - share * BETA * y.astype(float)).max() < 1e-15
+        assert np.abs(m.state.x.to_numpy() - rig.x - term_weight * BETA * y.astype(float)).max() < 1e-15
         v = m.state.v.to_numpy()
         assert np.abs(v - (m.state.x.to_numpy() - rig.x_hat) / BETA).max() < 10 * rig.close * np.abs(v).max()
         if how == STEP:
@@ -316,7 +318,7 @@ def test_without_friction_nothing_resists_along_the_surface(rig):
     fill_field(rig.p.r, multiplier)
     rig.m.state.x.from_numpy(rig.x)
     evaluate(rig, multiply=True)
-    smooth = np.flatnonzero((rig.friction == 0) & ~rig.carry.any(axis=1))
+    smooth = np.flatnonzero((rig.friction == 0) & ~rig.obstacle_displacement.any(axis=1))
     blocks, n = unpacked(rig.k.work.block.to_numpy()[:K]), rig.frame[:, 0]
     normal = STIFFNESS * oracle.factors(rig.W)[:, :1, None] * n[:, :, None] * n[:, None, :]
     assert len(smooth) >= 2 and np.abs(blocks - normal)[smooth].max() < 10 * rig.close * np.abs(normal).max()

@@ -52,7 +52,7 @@ class Made:
     body: Body
     elements: Elements
 
-    def lead_surface(self, way) -> None:
+    def prescribe_surface(self, way) -> None:
         """Displace the surface nodes by way(X) [m]."""
         X, vertices = self.body.rest_positions, self.body.mesh.vertices
         surface = ((X < vertices.min(axis=0) + 1e-9) | (X > vertices.max(axis=0) - 1e-9)).any(axis=1)
@@ -93,11 +93,11 @@ def solved() -> tuple[dict[tuple, Made], StaticResult]:
         return made[what, order, degree, cells]
 
     for order, degree in ((1, None), (2, 2), (2, 4)):
-        add("patch", order, degree, 2, irregular(), rubber()).lead_surface(lambda X: X @ (A - np.eye(3)).T + B)
+        add("patch", order, degree, 2, irregular(), rubber()).prescribe_surface(lambda X: X @ (A - np.eye(3)).T + B)
         for cells in (4, 8) if order == 1 else (2, 4):
             mesh = ts.box_mesh((cells,) * 3, (1, 1, 1), (0.5, 0.5, 0.5))
             smoothed = add("smooth", order, degree, cells, mesh, rubber(SNH, young=YOUNG, poisson=POISSON))
-            smoothed.lead_surface(smooth)
+            smoothed.prescribe_surface(smooth)
             smoothed.load(body_force)
         for cells in ((4, 1, 1), (11, 2, 2)):
             mesh, material = ts.box_mesh(cells, (4, 1, 1)), ts.Material(young=1e6, poisson=0.3, density=1000.0)

@@ -93,16 +93,16 @@ class TestZoo:
             at_vertices = c.kind != "face_field"  # the deepest point between two balls runs ahead
             assert np.abs(other.point - c.point)[at_vertices].max() < 3e-5 * k
 
-    @pytest.mark.parametrize("light", [False, True])
-    def test_the_same_on_one_thread_and_on_many(self, still, monkeypatch, light):
+    @pytest.mark.parametrize("serial_cheap", [False, True])
+    def test_the_same_on_one_thread_and_on_many(self, still, monkeypatch, serial_cheap):
         """light: loops that do little at a turn on one thread, the others on many, as of surfaces of middling size."""
         sim, _, start, close = still
         if close > 1e-9:
             return  # once is enough
-        one, world = sim.detect_contacts(), sim._world
+        one, simulation = sim.detect_contacts(), sim._simulation
         monkeypatch.setattr(surface, "SERIAL_BELOW", 0)
-        many = Detection(sim.scene, world.model, world.layout, sim._runtime, serial=None if light else False)
-        assert many.surface.light == light
+        many = Detection(sim.scene, simulation.model, simulation.layout, sim._runtime, serial=None if serial_cheap else False)
+        assert many.surface.serial_cheap == serial_cheap
         many.find(0.0, DT)
         first = many.contacts()
         compare(one, first, close=0.0)  # the parts of the work lie in another order
@@ -115,7 +115,7 @@ class TestZoo:
 
     def test_what_is_not_finite_is_refused(self, still):
         sim, _, start, _ = still
-        for field, where in ((sim._world.model.state.x, "brick"), (sim._world.model.state.v, "egg")):
+        for field, where in ((sim._simulation.model.state.x, "brick"), (sim._simulation.model.state.v, "egg")):
             for value in (np.nan, np.inf):
                 before = field.to_numpy()
                 whole, rows = before.copy(), sim._slice(where)

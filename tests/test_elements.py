@@ -84,7 +84,7 @@ def test_the_order_of_vertices_does_not_matter(order):
     turned = body(order, mesh=ts.TetMesh(plain.mesh.vertices, plain.mesh.tets[:, [2, 0, 1, 3]]))
     assert np.array_equal(turned.rest_positions, plain.rest_positions)
     field = polynomial(2)[0](plain.rest_positions)
-    for quantity in (reference.lumped_mass, reference.weight_mass, lambda b: reference.consistent_mass(b) @ field):
+    for quantity in (reference.lumped_mass, reference.gravity_mass, lambda b: reference.consistent_mass(b) @ field):
         assert np.abs(quantity(turned) - quantity(plain)).max() < 1e-12 * np.abs(quantity(plain)).max()
     middle = []
     for made in (plain, turned):  # the mean gradient of a field
@@ -125,7 +125,7 @@ def test_masses_are_the_oracles(order):
     assert np.abs(M - M.T).max() < 1e-13 * M.max() and np.linalg.eigvalsh(M).min() > 0
     assert lumped == pytest.approx(expected.lumped_mass(1200.0)) and lumped.min() > 0
     assert lumped.sum() == pytest.approx(1200 * 0.99) and M.sum() == pytest.approx(1200 * 0.99)
-    assert reference.weight_mass(made) == pytest.approx(M.sum(axis=1))
+    assert reference.gravity_mass(made) == pytest.approx(M.sum(axis=1))
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_a_tet_gives_its_nodes_their_shares(order, shares, weights):
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], dtype=float)
     tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])  # of 200 kg and 400 kg
     made = body(order, mesh=ts.TetMesh(vertices, tets))
-    for found, share in ((reference.lumped_mass(made), shares), (reference.weight_mass(made), weights)):
+    for found, share in ((reference.lumped_mass(made), shares), (reference.gravity_mass(made), weights)):
         assert found[:5] == pytest.approx(share[0] * np.array([200, 600, 600, 600, 400]))
         # by sorted pairs: 01 02 03 of the first tet, 12 13 of both, 14 of the second, 23 of both, 24 34 of the second
         middles = share[1] * np.array([200, 200, 200, 600, 600, 400, 600, 400, 400]) if order == 2 else []

@@ -25,7 +25,7 @@ class StandIn:
         self.scene, self.dt, self.stable_dt, self.time = ts.Scene(), 0.5, 1.0, 0.0
         self.scene.add_body(cube(), rubber(), name="cube")
         self.scene.gravity = (0, 0, 0)
-        self._driven, self._changes, self._contact = False, 0, SimpleNamespace(standoff=0.01)
+        self._driven, self._changes, self._contact = False, 0, SimpleNamespace(contact_offset=0.01)
 
     def energies(self) -> Energies:
         return Energies(100.0, 0.0, 0.0)
@@ -86,7 +86,7 @@ def test_what_is_fed():
 
 
 def test_contacts_of_the_start_open():
-    """To their standoff, which takes energy; later ones have none to take."""
+    """To their contact offset, which takes energy; later ones have none to take."""
     assert told(StandIn(), step(130.0, n_contacts=4)).status == "ok"
     assert told(StandIn(), step(100.0), step(130.0, n_contacts=4)).status == "degraded"
 
@@ -149,7 +149,7 @@ def test_falls_and_bounces(integrator, restitution):
 
 
 def test_a_body_that_just_fits():
-    """Between two planes that it touches: contacts squeeze it by their standoff."""
+    """Between two planes that it touches: contacts squeeze it by their contact offset."""
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.add_body(cube(size=(1, 1, 1)), rubber(), name="cube")
     for k, y in enumerate((-0.5, 0.5)):

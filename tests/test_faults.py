@@ -158,7 +158,7 @@ def test_a_disk_that_is_full(beam, tmp_path, capsys, kind):
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
             assert not (disk / "checkpoint.npz").exists()
             sim.save_checkpoint(tmp_path / "elsewhere.npz")
-            assert np.array_equal(read_checkpoint(tmp_path / "elsewhere.npz").state["world"]["x"], sim.positions())
+            assert np.array_equal(read_checkpoint(tmp_path / "elsewhere.npz").state["simulation"]["x"], sim.positions())
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         if mounted:
@@ -218,7 +218,7 @@ def test_a_disk_that_becomes_read_only(tmp_path, shim):
     lost = [re.match(r"(?:\w+/)?([\w.]+)", line.removeprefix(start))[1] for line in told]
     assert set(lost) == {"00002.png", "points_00002.usdc", "checkpoint.previous.npz", "steps.csv"} and len(lost) == 4
     assert [path.name for path in sorted((out / "frames").iterdir())] == ["00000.png", "00001.png"]
-    assert read_checkpoint(out / "checkpoint.npz").state["world"]["time"] == pytest.approx(1 / 30)
+    assert read_checkpoint(out / "checkpoint.npz").state["simulation"]["time"] == pytest.approx(1 / 30)
     assert_whole(out)
 
 
@@ -292,7 +292,7 @@ def assert_whole(out: Path) -> None:
         assert points.GetTimeSamples()
         assert all(np.isfinite(np.array(points.Get(moment))).all() for moment in points.GetTimeSamples())
     for path in out.glob("checkpoint*.npz"):
-        assert np.isfinite(read_checkpoint(path).state["world"]["x"]).all()
+        assert np.isfinite(read_checkpoint(path).state["simulation"]["x"]).all()
     if (out / "report.json").exists():
         assert report(out)["status"] == "ok" and (out / "steps.csv").exists()
 
@@ -392,9 +392,9 @@ def test_a_number_that_is_spoilt(tmp_path, integrator, others):
         checkpoints.frame(sim, index)
         shown.append(sim.positions())
         if index == 2:
-            x, v = sim._world.state()
+            x, v = sim._simulation.state()
             v[5] = np.nan
-            sim._world.set_state(x, v)
+            sim._simulation.set_state(x, v)
 
     with ts.Simulator(scene, 0.001, integrator) as sim:
         result = sim.run(0.01, spoil, fps=None)
@@ -403,8 +403,8 @@ def test_a_number_that_is_spoilt(tmp_path, integrator, others):
         assert np.array_equal(sim.positions(), shown[-1])
         with pytest.raises(ts.SimulationError, match="no checkpoint is made of such a state: body 'part', node 5"):
             checkpoints.write(sim)
-    world = read_checkpoint(tmp_path / "checkpoint.npz").state["world"]
-    assert world["step_count"] == 2 and np.array_equal(world["x"], shown[-1]) and np.isfinite(world["v"]).all()
+    simulation = read_checkpoint(tmp_path / "checkpoint.npz").state["simulation"]
+    assert simulation["step_count"] == 2 and np.array_equal(simulation["x"], shown[-1]) and np.isfinite(simulation["v"]).all()
 
 
 def landed(capacity: int | None, most: int | None):

@@ -48,7 +48,7 @@ def path(sim, steps: int = 6) -> np.ndarray:
 @pytest.fixture(scope="module", params=DT)
 def sims(request):
     """One simulator whose loads change, and the path of another that has had them from the start."""
-    settings = {"dt": DT[request.param], "integrator": request.param, "precision": "f64", "pullable": True}
+    settings = {"dt": DT[request.param], "integrator": request.param, "precision": "f64", "draggable": True}
     with ts.Simulator(beam(NEXT), **settings) as other:
         expected = path(other)
     with ts.Simulator(beam(), **settings) as sim:
@@ -110,20 +110,20 @@ def test_in_the_middle_of_a_run(sims):
 def test_they_add_up_with_a_pull(sims):
     sim, _ = sims
     nodes = sim.scene.body("beam").forces[0].nodes
-    loads = sim._world.model.loads
+    loads = sim._simulation.model.loads
     change(sim, FIRST)
     sim.reset()
     own = loads.to_numpy()
-    sim.pull("beam", nodes, np.ones(4), (3.0, 1.0, 0.0), 50.0)
+    sim.drag("beam", nodes, np.ones(4), (3.0, 1.0, 0.0), 50.0)
     sim.step()
-    pulled = loads.to_numpy() - own
-    assert np.abs(pulled).max() > 1e-3
+    dragged = loads.to_numpy() - own
+    assert np.abs(dragged).max() > 1e-3
     change(sim)
     both = loads.to_numpy()
     sim.release()
     new = loads.to_numpy()
-    assert np.allclose(both, new + pulled, rtol=0, atol=1e-12) and np.abs(new - own).max() > 1.0
-    sim.pull("beam", nodes, np.ones(4), (3.0, 1.0, 0.0), 50.0)
+    assert np.allclose(both, new + dragged, rtol=0, atol=1e-12) and np.abs(new - own).max() > 1.0
+    sim.drag("beam", nodes, np.ones(4), (3.0, 1.0, 0.0), 50.0)
     sim.step()
     assert np.abs(loads.to_numpy() - new).max() > 1e-3
     sim.set_material("beam", density=1500.0)

@@ -15,7 +15,7 @@ from scenes import COR, SNH, SVK, built, driven_scene, mixed_scene
 import taisoft as ts
 from taisoft import elasticity
 from taisoft.fields import FieldArena
-from taisoft.mass import lumped_masses, mass_matrix, weight_masses
+from taisoft.mass import gravity_masses, lumped_masses, mass_matrix
 from taisoft.model import body_loads, build_model
 from taisoft.scene.changes import changed_material
 from taisoft.scene.plan import make_plan
@@ -46,8 +46,8 @@ def test_nodes_and_masses(rig):
     lumped, M = rig.oracle.lumped[:, 0], rig.oracle.mass
     assert rig.model.mass.to_numpy() == pytest.approx(lumped) and lumped_masses(rig.scene) == pytest.approx(lumped)
     assert np.abs(mass_matrix(rig.scene).toarray() - M).max() < 1e-13 * M.max()
-    assert weight_masses(rig.scene) == pytest.approx(M.sum(axis=1))
-    assert rig.model.weight.to_numpy() == pytest.approx(M.sum(axis=1))
+    assert gravity_masses(rig.scene) == pytest.approx(M.sum(axis=1))
+    assert rig.model.gravity_mass.to_numpy() == pytest.approx(M.sum(axis=1))
     assert [lumped.sum(), M.sum()] == pytest.approx([0.99 * (1000 + 1000 + 800 + 1500)] * 2)
     assert (rig.model.mass_matrix is not None) == rig.model.consistent == quadratic(rig)
 

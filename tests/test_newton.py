@@ -100,7 +100,7 @@ def test_wild_states(sim, kind, monkeypatch):
         "flat": rest * [1.0, 0.0, 1.0],
         "random": rest + 0.7 * spacing * rng.standard_normal(rest.shape),
     }[kind]
-    sim.set_state(positions=np.where(sim._world.motion.constrained(), rest, x))
+    sim.set_state(positions=np.where(sim._simulation.dirichlet.constrained(), rest, x))
     start = sim.energies()
     for _ in range(20):
         result = sim._stepper.step(0.2)
@@ -109,12 +109,12 @@ def test_wild_states(sim, kind, monkeypatch):
     now = sim.energies()
     assert now.total < start.total and now.elastic < 0.03 * start.elastic
     sim._report()
-    assert sim._world.model.state.scalars[MIN_J] > 0.0  # no tet is left inverted
+    assert sim._simulation.model.state.scalars[MIN_J] > 0.0  # no tet is left inverted
 
 
 def test_statics_end_at_the_rounding_of_the_forces(sim):
     """A tolerance that no arithmetic can meet: not converged, and the reason is told."""
-    solver, model = sim._stepper.solver, sim._world.model
+    solver, model = sim._stepper.solver, sim._simulation.model
     solver.work.x_hat.from_numpy(model.state.x.to_numpy())
     model.state.v.fill(0.0)
     result = solve(solver, Stage(0.0, 1.0, 1.0, 1e-18, max_newton=100))

@@ -108,7 +108,7 @@ def stations() -> dict[str, Station]:
 ALL = stations()
 
 
-class World:
+class SimulationState:
     """All stations in one simulator. Q (3,3), T (3,) [m]: where everything is; back: [m] how far each obstacle has gone off its
     contact; speed: of all obstacles along their normals [m/s]."""
 
@@ -174,37 +174,37 @@ def moved(shape, by: np.ndarray):
 
 @pytest.fixture(scope="module")
 def whole():
-    world = World()
-    yield world
-    world.sim.close()
+    simulation = SimulationState()
+    yield simulation
+    simulation.sim.close()
 
 
 @pytest.fixture
-def world(whole):
+def simulation(whole):
     whole.Q, whole.T, whole.back, whole.speed = np.eye(3), np.zeros(3), 0.0, 0.0
     return whole
 
 
-def test_closed_forms(world):
-    world.check()
+def test_closed_forms(simulation):
+    simulation.check()
 
 
-def test_all_turned_and_shifted(world):
+def test_all_turned_and_shifted(simulation):
     rng = np.random.default_rng(3)
     for _ in range(4):
-        world.Q, world.T = rotation(rng.standard_normal(3), rng.uniform(0, np.pi)), 10.0 * rng.standard_normal(3)
-        world.check()
+        simulation.Q, simulation.T = rotation(rng.standard_normal(3), rng.uniform(0, np.pi)), 10.0 * rng.standard_normal(3)
+        simulation.check()
 
 
-def test_obstacles_are_where_their_paths_lead_them(world):
-    world.back = 0.0025
-    world.check()
+def test_obstacles_are_where_their_paths_lead_them(simulation):
+    simulation.back = 0.0025
+    simulation.check()
 
 
-def test_a_moving_obstacle_is_met_before_it_arrives(world):
-    world.back = MARGIN + 0.031  # all gaps are above the margin now: the deepest was -0.03
-    world.check(seen=False)
-    world.speed = 0.05 / DT  # and at the end of the step none is
-    world.check()
-    world.speed = -world.speed
-    world.check(seen=False)
+def test_a_moving_obstacle_is_met_before_it_arrives(simulation):
+    simulation.back = MARGIN + 0.031  # all gaps are above the margin now: the deepest was -0.03
+    simulation.check(seen=False)
+    simulation.speed = 0.05 / DT  # and at the end of the step none is
+    simulation.check()
+    simulation.speed = -simulation.speed
+    simulation.check(seen=False)

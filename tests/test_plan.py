@@ -13,7 +13,7 @@ from taisoft import runtime
 from taisoft.dynamics import EXPLICIT
 from taisoft.scene.plan import make_plan
 
-LOADS, DAMPING, LED = {"loads"}, {"damping", "node_body"}, {"moved", "moved_axes", "targets", "moved_before"}
+LOADS, DAMPING, LED = {"loads"}, {"damping", "node_body"}, {"prescribed_nodes", "prescribed_axes", "targets", "position_before"}
 HELD, VERLET, BOTH = {"held", "held_velocity", "reaction"}, {"acceleration"}, {"half_velocity"}
 
 

@@ -14,8 +14,8 @@ import pytest
 from taisoft.errors import SceneError
 from taisoft.output.history import CAPACITY, QUANTITIES
 from taisoft.records import Energies, StepReport
+from taisoft.view.plot_overlay import MOST_SEGMENTS, cells, drawing, write
 from taisoft.view.plots import GRID_LINES, PLOTS, Plots, curves_of
-from taisoft.view.strip import MOST_SEGMENTS, cells, drawing, write
 
 
 class Settled:

@@ -44,7 +44,7 @@ def test_a_step_that_does_not_converge_is_taken_in_parts(sim, monkeypatch):
     sim.dt = DT
     sim.reset()
     whole = sim.step()
-    assert whole.parts == 1 and np.abs(sim.positions() - wanted[0]).max() > 1e-3  # [m]
+    assert whole.substeps == 1 and np.abs(sim.positions() - wanted[0]).max() > 1e-3  # [m]
     sim.reset()
     solve, results = implicit.solve, []
 
@@ -55,7 +55,7 @@ def test_a_step_that_does_not_converge_is_taken_in_parts(sim, monkeypatch):
 
     monkeypatch.setattr(implicit, "solve", stopping)
     report = sim.step()
-    assert report.converged and report.parts == 2 and sim.step_count == 1 and sim.time == DT
+    assert report.converged and report.substeps == 2 and sim.step_count == 1 and sim.time == DT
     assert report.newton_iterations == sum(r.newton_iterations for r in (whole, *halves))
     close = 1e-9 * np.abs(wanted[1]).max()
     assert np.abs(sim.positions() - wanted[0]).max() < close * DT and np.abs(sim.velocities() - wanted[1]).max() < close
@@ -65,7 +65,7 @@ def test_one_that_never_does_is_told(sim, monkeypatch):
     monkeypatch.setattr(implicit, "MAX_NEWTON", 2)
     result = sim.run(DT, fps=None)
     report = result.step_reports[-1]
-    assert not report.converged and report.parts == 1 and result.status == "degraded"
+    assert not report.converged and report.substeps == 1 and result.status == "degraded"
     assert report.newton_iterations == 2 * (1 + 2 + 4 + 1) and sim.step_count == 1  # in 1, 2 and 4 parts, and again in one
     x = sim.positions()
     assert sim.step().newton_iterations == 2  # parts did not help in the step before
@@ -114,5 +114,5 @@ def test_where_a_try_in_parts_fails_the_step_is_told_as_not_converged(sim, monke
     monkeypatch.setattr(substepping, "RETRIES", 2)
     failing_at(monkeypatch, 3, ts.SimulationError("spoilt"))
     report = sim.step()
-    assert not report.converged and report.parts == 1 and np.abs(sim.positions() - wanted).max() < 1e-12  # [m]
-    assert any(sim._world.motion.released())
+    assert not report.converged and report.substeps == 1 and np.abs(sim.positions() - wanted).max() < 1e-12  # [m]
+    assert any(sim._simulation.dirichlet.released())

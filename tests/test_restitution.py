@@ -74,7 +74,7 @@ def place(sim, height: float, v=(0, 0, 0), turned: tuple = (0, 0, 0), spin: tupl
 
 def go(sim, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """Energies [J] of the cube and its neighbour, and the height of the cube's centre [m], at the start and after each step."""
-    mass = sim._world.model.mass.to_numpy()[sim._slice("cube"), None]
+    mass = sim._simulation.model.mass.to_numpy()[sim._slice("cube"), None]
     energies, heights = [], []
     end = sim.step_count + round(seconds / sim.dt)
     while True:
@@ -177,7 +177,7 @@ def test_two_that_meet(sim, restitution):
     x = sim.positions("cube")
     sim.set_state(positions=x - x.mean(axis=0) + (0, 1.0, 0), velocities=np.tile([1.5, 0.0, 0.0], (len(x), 1)), body="cube")
     energies, _ = go(sim, 0.15)
-    mass = sim._world.model.mass.to_numpy()[:, None]
+    mass = sim._simulation.model.mass.to_numpy()[:, None]
     momentum = (mass * sim.velocities()).sum(axis=0)
     (a, b) = ((mass[s] * sim.velocities()[s]).sum(axis=0) for s in (sim._slice("cube"), sim._slice("other")))
     assert np.abs(momentum - (1.5, 0, 0)).max() < 1e-6 and created(energies, energies[0]) < 1e-6

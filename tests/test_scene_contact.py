@@ -130,7 +130,7 @@ def test_a_snapshot_keeps_what_was_there():
     scene.collision = CollisionSettings()
     assert twin.contact_numbers("a", "b") == (0.7, 0.3) and len(twin.obstacles) == 2
     assert twin.collision.k_dop == 14
-    assert twin.body("a").collision == "auto" and twin.body("a").hit_by == "proximity"
+    assert twin.body("a").collision == "auto" and twin.body("a").contact_mode == "proximity"
 
 
 @pytest.mark.parametrize(
@@ -213,11 +213,11 @@ def test_parts_joined_at_an_edge_count_as_sharp(scene):
 
 
 def test_a_body_may_say_by_what_it_is_hit(scene, body):
-    assert body.collision == "auto" and body.hit_by == scene.snapshot().body("beam").hit_by == "proximity"
+    assert body.collision == "auto" and body.contact_mode == scene.snapshot().body("beam").contact_mode == "proximity"
     told = scene.add_body(MESH, Material(), collision="distance_field")
-    assert told.hit_by == "distance_field"
+    assert told.contact_mode == "distance_field"
     body.collision = "distance_field"
-    assert body.hit_by == "distance_field"
+    assert body.contact_mode == "distance_field"
     with pytest.raises(SceneError, match="^body 'beam': collision must be one of auto, distance_field, proximity"):
         body.collision = "sdf"
-    assert body.hit_by == "distance_field"
+    assert body.contact_mode == "distance_field"

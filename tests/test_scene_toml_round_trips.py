@@ -60,7 +60,7 @@ def everything() -> ts.Scene:
 
 EVERY_SETTING = {
     "dt": 1 / 120, "integrator": "bdf2", "contact_solver": "auto", "self_collision": True, "precision": "f64", "arch": "cpu",
-    "allow_unstable": False, "pullable": True,
+    "allow_unstable": False, "draggable": True,
     "newton_tolerance": 1e-5, "linear_tolerance": None, "contact_tolerance": 1e-3, "seconds": 2,
     "fps": None,
 }  # fmt: skip

@@ -50,7 +50,7 @@ class Pair:
         soft = ts.Material(young=1e3)
         scene.add_body(sheet, soft, name="sheet", collision=collision)
         scene.add_body(self.cube, soft, name="cube", position=(0, 3, 0), collision=collision)
-        assert collision != "auto" or [b.hit_by for b in scene.bodies] == ["proximity", "proximity"]
+        assert collision != "auto" or [b.contact_mode for b in scene.bodies] == ["proximity", "proximity"]
         self.sheet = sheet.vertices
         self.sim = ts.Simulator(scene, dt=1e-4, integrator="symplectic_euler", precision="f64")
 

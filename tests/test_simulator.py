@@ -121,7 +121,7 @@ def test_set_state(sim, beam):
     sim.set_state(positions=x, body="flyer")
     assert np.array_equal(sim.positions("flyer"), x) and np.array_equal(sim.positions("beam"), before[:beam])
     sim.set_state(velocities=v)
-    fixed = sim._world.motion.constrained()
+    fixed = sim._simulation.dirichlet.constrained()
     assert fixed.sum() == 3 * (sim.scene.body("beam").rest_positions[:, 0] < -0.49).sum()
     assert np.array_equal(sim.velocities(), np.where(fixed, 0.0, v))
     oracle = Oracle(sim.scene)
@@ -186,7 +186,7 @@ def test_stress(sim):
     x = sim.positions() + 0.05 * rng.standard_normal(sim.positions().shape)
     sim.set_state(positions=x)
     oracle = Oracle(sim.scene)
-    for part, name in zip(oracle.parts, ("beam", "flyer")):
+    for part, name in zip(oracle.substeps, ("beam", "flyer")):
         F, m, by_tet = oracle.gradients(x, part), part.material, (-1, part.points, 3, 3)
         w = part.weights[:, None, None]
         force = (w * (exact.pk1(m.law, F, m.young, m.poisson) @ exact.transposed(F))).reshape(by_tet).sum(axis=1)

@@ -16,7 +16,7 @@ import pytest
 from surfaces import brute_pairs, pairs_of, place, soup, surface_of
 from test_bvh import EMPTY, colliders, scatter
 
-from taisoft.collision.spatial_hash import COUNTABLE, MOST_CELLS, N_LARGE, SpatialHash, grid_size
+from taisoft.collision.spatial_hash import COUNTABLE, MAX_CELLS, N_LARGE, SpatialHash, grid_size
 from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
 
@@ -36,7 +36,7 @@ def arena():
 @pytest.mark.parametrize("n", [0, 1, 1000, 10**6, 10**8])
 def test_size_of_the_grid(n):
     rng = np.random.default_rng(7)
-    most = min(MOST_CELLS, max(512, 2 * n))
+    most = min(MAX_CELLS, max(512, 2 * n))
     for extent in (np.zeros(3), np.ones(3), np.full(3, 1e300), *10.0 ** rng.uniform(-9, 9, (50, 3))):
         size = np.array(grid_size(extent, 0.1, n))
         assert (size >= 1).all() and (size & (size - 1) == 0).all() and size.prod() <= most

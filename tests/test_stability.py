@@ -126,7 +126,7 @@ def test_a_step_above_the_limit():
         with pytest.raises(ts.SimulationError, match="is above the estimated stability limit"):
             sim.set_material("block", young=1e7)
         assert scene.bodies[0].material.young == 1e5 and sim.stable_dt == limit
-        assert sim._world.model.law_constants[0, 0] == pytest.approx(4 / 3 * scene.bodies[0].material.mu)
+        assert sim._simulation.model.law_constants[0, 0] == pytest.approx(4 / 3 * scene.bodies[0].material.mu)
         sim.set_material("block", density=2000.0)
         assert sim.stable_dt == pytest.approx(np.sqrt(2) * limit, rel=1e-3)
 

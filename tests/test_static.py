@@ -86,7 +86,7 @@ def test_reactions_carry_the_loads(solved):
     assert not result.reactions("beam")[~oracle.fixed.any(axis=1)].any()
 
 
-def test_led_nodes():
+def test_prescribed_nodes():
     """A block is pulled to 1.3 of its length, sideways free: uniform tension, the same force at both ends."""
     scene = ts.Scene(gravity=(0, 0, 0))
     block = scene.add_body(cube(size=(1.0, 1.0, 1.0)), rubber(SVK, poisson=0.0), name="block")

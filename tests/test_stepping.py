@@ -66,7 +66,7 @@ def implicit(request):
 
 def test_explicit_steps_are_the_oracles(explicit):
     oracle = follow(explicit, explicit.settings.integrator, 9, 1e-10)
-    assert len(oracle.led) == 1  # two of the three led nodes have been released
+    assert len(oracle.prescribed) == 1  # two of the three led nodes have been released
 
 
 def test_explicit_steps_of_a_mixture_are_the_oracles(mixture):
@@ -99,7 +99,7 @@ def test_batches_end_where_nodes_are_released(explicit):
 def test_implicit_steps_are_the_oracles(implicit, method, monkeypatch):
     monkeypatch.setattr(implicit._stepper, "scheme", scheme_of(method))
     oracle = follow(implicit, method, 9, 1e-8)
-    assert len(oracle.led) == 1  # two of the three led nodes have been released
+    assert len(oracle.prescribed) == 1  # two of the three led nodes have been released
 
 
 @pytest.mark.parametrize("change", ["dt", "state", "gravity"])
@@ -133,7 +133,7 @@ def test_parallel_kernels(integrator, monkeypatch):
     monkeypatch.setattr("taisoft.model.PARALLEL_THREADS", 0)
     settings = {"newton_tolerance": 1e-13, "linear_tolerance": 1e-13} if integrator == "implicit_euler" else {}
     with simulator(driven_scene(mass_damping=3.0, order=2), integrator, **settings) as sim:
-        assert not sim._world.model.serial
+        assert not sim._simulation.model.serial
         follow(sim, integrator, 9, 1e-8 if settings else 1e-10)
         first = sim.positions(), sim.velocities(), sim.reactions()
         for _ in range(3):
@@ -163,7 +163,7 @@ def test_the_residual_is_a_gradient(implicit, monkeypatch):
     monkeypatch.setattr(implicit._stepper, "scheme", scheme_of("implicit_euler"))
     implicit.reset()
     implicit.step()
-    model, solver, beta = implicit._world.model, implicit._stepper.solver, implicit._stepper._beta
+    model, solver, beta = implicit._simulation.model, implicit._stepper.solver, implicit._stepper._beta
     bodies, v_hat = implicit.scene.bodies, solver.work.v_hat.to_numpy()
     mass = [reference.consistent_mass(b) if model.consistent else np.diag(reference.lumped_mass(b)) for b in bodies]
     mass = block_diag(*[np.asarray(m.todense()) if sp.issparse(m) else m for m in mass])
@@ -210,9 +210,9 @@ def check_momentum(sim, drag_at: int) -> None:
         sim.step()
         v.append(sim.velocities())
         M = oracle.inertia(sim.settings.explicit)
-        acceleration, led = (v[1] - v[0]) / DT, oracle.targets(oracle.time + DT)[1]
+        acceleration, prescribed = (v[1] - v[0]) / DT, oracle.targets(oracle.time + DT)[1]
         if sim.plan.on["consistent_mass"]:
-            acceleration = np.where(led, oracle.led_acceleration(DT, (0, 0.5, 1), (4, -8, 4)), acceleration)
+            acceleration = np.where(prescribed, oracle.prescribed_acceleration(DT, (0, 0.5, 1), (4, -8, 4)), acceleration)
         oracle.time += DT
         rate, drag = M @ acceleration, oracle.mass_damping * (M @ v[drag_at])
         expected = (rate - oracle.applied(sim.settings.explicit) + drag).sum(axis=0)
@@ -293,10 +293,10 @@ def test_a_free_body_in_implicit_steps(implicit, method, monkeypatch):
 
 
 def test_names_mean_what_they_should(monkeypatch):
-    monkeypatch.setattr(dynamics, "ExplicitStepper", lambda world, verlet: verlet)
+    monkeypatch.setattr(dynamics, "ExplicitStepper", lambda simulation, verlet: verlet)
     for name, built in (
-        ("contact_substeps.ContactExplicitStepper", lambda world, verlet, contact, method: (verlet, contact, method)),
-        ("implicit.ImplicitStepper", lambda world, scheme, contact: (scheme, contact)),
+        ("contact_substeps.ContactExplicitStepper", lambda simulation, verlet, contact, method: (verlet, contact, method)),
+        ("implicit.ImplicitStepper", lambda simulation, scheme, contact: (scheme, contact)),
     ):
         monkeypatch.setattr(f"taisoft.dynamics.{name}", built)
     assert [dynamics.make_stepper(None, name, NoContacts(), "auto") for name in EXPLICIT] == [False, True]

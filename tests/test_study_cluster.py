@@ -68,7 +68,7 @@ def test_workers_have_cores_of_their_own_and_can_be_lost(cluster, tmp_path):
     address, processes = cluster
     pids = tmp_path / "pids"
     path = write(tmp_path / "slow.py", SLOW.format(file=str(pids)))
-    request = {"do": "plan", "scene": str(path), "allow_outside": False, "ask": {}}
+    request = {"do": "plan", "scene": str(path), "allow_outside": False, "request": {}}
     with connect(address) as client:
         places, machines = cluster_places(client)
         assert len(places) == 2 and len(machines) == 1
@@ -80,7 +80,7 @@ def test_workers_have_cores_of_their_own_and_can_be_lost(cluster, tmp_path):
         seen: list[int] = []
         end = time.monotonic() + 120
 
-        def asked() -> bool:
+        def requested() -> bool:
             """Kill a worker when both runs have begun; its run then waits for the other worker, which is busy."""
             nonlocal end
             if len(started()) == 2 and not seen:
@@ -90,7 +90,7 @@ def test_workers_have_cores_of_their_own_and_can_be_lost(cluster, tmp_path):
             return False
 
         left = carry_out(
-            [("a", request), ("b", request)], places, lambda key, answer: None, asked=asked,
+            [("a", request), ("b", request)], places, lambda key, answer: None, requested=requested,
             seconds_left=lambda: end - time.monotonic(),
         )  # fmt: skip
         assert sorted(left.values()) == [SPENT, CUT] and len(seen) == 2

@@ -32,7 +32,7 @@ def scene_of(ground: bool = False, ids: bool = False, **numbers) -> ts.Scene:
     return scene
 
 
-def plan_of(scene: ts.Scene, axes: dict, solver: dict | None = None, **ask) -> dict:
+def plan_of(scene: ts.Scene, axes: dict, solver: dict | None = None, **request) -> dict:
     @functools.cache
     def variant(refine: int, order: int | None) -> ts.Scene:
         made = scene
@@ -40,7 +40,7 @@ def plan_of(scene: ts.Scene, axes: dict, solver: dict | None = None, **ask) -> d
             made = refined(made)
         return made if order is None else with_order(made, order)
 
-    return make_plan(variant, solver or {}, ASK | {"axes": axes} | ask)
+    return make_plan(variant, solver or {}, ASK | {"axes": axes} | request)
 
 
 def told(plan: dict) -> dict:
@@ -133,16 +133,16 @@ def test_a_reference_that_nobody_asked_for_is_named():
 
 
 @pytest.mark.parametrize(
-    "ask, error",
+    "wanted, error",
     [
         ({"reference_dt": 1.0, "reference_integrator": "velocity_verlet"}, "reference-dt 1.*takes at most"),
         ({"reference_integrator": "rk4"}, "reference-integrator rk4: it must be one of"),
         ({"seconds": 0.01}, "meet only every"),
     ],
 )
-def test_references_that_cannot_be(ask, error):
+def test_references_that_cannot_be(wanted, error):
     with pytest.raises(SceneError, match=error):
-        plan_of(scene_of(), {"dt": [0.01], "integrator": ["bdf2"]}, **{"seconds": 16.0} | ask)
+        plan_of(scene_of(), {"dt": [0.01], "integrator": ["bdf2"]}, **{"seconds": 16.0} | wanted)
 
 
 def test_a_scene_file_may_refine_itself(tmp_path):

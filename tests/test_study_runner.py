@@ -19,14 +19,14 @@ from taisoft.errors import OutputError
 from taisoft.study import store
 from taisoft.study.grid import Setting
 from taisoft.study.output import check_scene, write
-from taisoft.study.results import Ask
+from taisoft.study.results import Request
 from taisoft.study.runner import Runner
 from taisoft.study.store import NoStore, Store, pack, unpack
 from taisoft.study.table import csv_of, text_of
 from taisoft.timing import versions
 
 DTS = (0.2, 0.1, 0.05)
-ASK = Ask("pendulum", repeats=3)
+ASK = Request("pendulum", repeats=3)
 
 
 def plan(dts=DTS, integrators=("implicit_euler", "bdf2"), reference=0.0125, **more) -> dict:
@@ -43,9 +43,9 @@ def plan(dts=DTS, integrators=("implicit_euler", "bdf2"), reference=0.0125, **mo
     } | more  # fmt: skip
 
 
-def run(place: Pendulum, store=None, ask=ASK, machines=({"name": "here"},), asked=lambda: False, left=lambda: 1.0):
+def run(place: Pendulum, store=None, request=ASK, machines=({"name": "here"},), requested=lambda: False, left=lambda: 1.0):
     told: list[str] = []
-    runner = Runner(ask, [place], list(machines), asked, left, told.append, store or NoStore(), planner=place)
+    runner = Runner(request, [place], list(machines), requested, left, told.append, store or NoStore(), planner=place)
     return None if (planned := runner.plan()) is None else runner.run(planned)
 
 
@@ -102,10 +102,10 @@ def test_the_cheapest_within_the_tolerance_is_named():
     study = run(Pendulum(plan()))
     errors = {(row.setting["integrator"], row.setting["dt"]): row.claimed("max") for row in study.judged()}
     assert errors["bdf2", 0.2] > 0.003 > errors["bdf2", 0.1]
-    study.ask = replace(ASK, tolerance=0.003)
+    study.request = replace(ASK, tolerance=0.003)
     assert (study.cheapest().setting["integrator"], study.cheapest().setting["dt"]) == ("bdf2", 0.1)
     assert "Cheapest within 0.003 (max error): bdf2, dt = 0.1 s, f32, 1.1 s" in text_of(study)
-    study.ask = replace(ASK, tolerance=1e-9)
+    study.request = replace(ASK, tolerance=1e-9)
     assert "No setting is within 1e-09 (max error); the nearest: bdf2, dt = 0.05 s" in text_of(study)
     assert "nothing is known; --reference-dt" in text_of(study)
 
@@ -170,7 +170,7 @@ def test_finished_runs_are_found_again(tmp_path):
 @pytest.mark.parametrize(
     "other",
     [
-        {"machines": [{"name": "there"}]}, {"ask": replace(ASK, repeats=4)}, {"scenes": {"refine 0": "another scene"}},
+        {"machines": [{"name": "there"}]}, {"request": replace(ASK, repeats=4)}, {"scenes": {"refine 0": "another scene"}},
         {"code": "edited"}, {"sources": {"scene.py": "text", "helper.py": "text"}},
     ],
 )  # fmt: skip
@@ -179,7 +179,7 @@ def test_other_machines_settings_scenes_and_code_find_none(tmp_path, other):
     changed = {key: other.pop(key) for key in ("scenes", "sources", "code") if key in other}
     place = Pendulum(plan(**changed))
     run(place, Store(tmp_path), **other)
-    assert len(place.requests) == 1 + (6 if "ask" in other else 8)  # references are not repeated
+    assert len(place.requests) == 1 + (6 if "request" in other else 8)  # references are not repeated
 
 
 def test_the_order_in_which_machines_are_told_does_not_count(tmp_path):
@@ -210,9 +210,9 @@ def test_a_damaged_record_is_done_anew_and_told(tmp_path, damage):
 
 def test_an_interrupted_study_keeps_what_is_done(tmp_path):
     place = Pendulum(plan())
-    study = run(place, Store(tmp_path), asked=lambda: len(place.requests) >= 5)
+    study = run(place, Store(tmp_path), requested=lambda: len(place.requests) >= 5)
     assert study.ended == "the study was interrupted" and len(list((tmp_path / "runs").iterdir())) == 3
-    assert run(Pendulum(plan()), asked=lambda: True) is None
+    assert run(Pendulum(plan()), requested=lambda: True) is None
 
 
 def test_arrays_come_back_bit_by_bit():

@@ -18,7 +18,7 @@ from taisoft.errors import SceneError
 from taisoft.simulator import Simulator
 from taisoft.study import measure
 from taisoft.study.grid import tasks_of
-from taisoft.study.results import Ask
+from taisoft.study.results import Request
 from taisoft.study.runner import Runner
 from taisoft.study.workers import LocalPlace, carry_out, local_places
 from taisoft.timing import usable_cores
@@ -57,14 +57,14 @@ def lent(monkeypatch):
         sim.close()
 
 
-def study_of(tmp_path, hold: str = HELD, **ask):
+def study_of(tmp_path, hold: str = HELD, **request):
     path = write(tmp_path / "bar.py", SCENE.replace("HOLD", hold))
     place = InProcess()
-    return run(place, Ask(str(path), repeats=1, **ask))
+    return run(place, Request(str(path), repeats=1, **request))
 
 
-def run(place: InProcess, ask: Ask):
-    runner = Runner(ask, [place], [{"name": "here"}], lambda: False, lambda: 1.0, lambda _: None, planner=place)
+def run(place: InProcess, request: Request):
+    runner = Runner(request, [place], [{"name": "here"}], lambda: False, lambda: 1.0, lambda _: None, planner=place)
     return runner.run(runner.plan())
 
 
@@ -97,8 +97,8 @@ def test_a_run_that_fails_is_a_record_with_its_reason(tmp_path):
         "\n\ndef path(t):\n    return (0, 0, 0) if t < 0.2 else 1 / 0\n"
     ))  # fmt: skip
     place = InProcess()
-    ask = Ask(str(path), {"dt": [0.01], "integrator": ["velocity_verlet"], "precision": ["f64"]}, repeats=1)
-    study = run(place, ask)
+    request = Request(str(path), {"dt": [0.01], "integrator": ["velocity_verlet"], "precision": ["f64"]}, repeats=1)
+    study = run(place, request)
     assert study.rows[0].status == "failed" and "ZeroDivisionError" in study.rows[0].reason
     assert "ZeroDivisionError" in study.notes[0]
 
@@ -113,7 +113,7 @@ def test_a_run_that_fails_is_a_record_with_its_reason(tmp_path):
 def test_a_bad_solver_dict_is_told(tmp_path, solver, told):
     path = write(tmp_path / "bar.py", SCENE.replace("HOLD", HELD) + f"\n\nsolver = {solver}\n")
     with pytest.raises(SceneError) as error:
-        run(InProcess(), Ask(str(path)))
+        run(InProcess(), Request(str(path)))
     assert told in str(error.value)
 
 
@@ -126,7 +126,7 @@ def test_a_change_of_a_neighbour_or_of_a_refined_mesh_is_another_run(tmp_path):
     path = write(tmp_path / "bar.py", text.replace("HOLD", HELD).replace("LENGTH", repr(str(length))))
     axes = {"dt": [0.01], "integrator": ["velocity_verlet"], "refine": [0, 1]}
     place = InProcess()
-    runner = Runner(Ask(str(path), axes), [place], [{"name": "here"}], bool, lambda: 1.0, str, planner=place)
+    runner = Runner(Request(str(path), axes), [place], [{"name": "here"}], bool, lambda: 1.0, str, planner=place)
     first = runner.plan()
     assert set(first["scenes"]) == {"refine 0", "refine 1"} and set(first["sources"]) == {"bar.py", "neighbour_of_a_study.py"}
     assert runner.plan() == first
@@ -157,12 +157,12 @@ def build():
 
 def answers_of(requests: list, places: list) -> dict:
     answers: dict = {}
-    assert carry_out(requests, places, answers.__setitem__, seconds_left=lambda: 1.0, asked=lambda: False) == {}
+    assert carry_out(requests, places, answers.__setitem__, seconds_left=lambda: 1.0, requested=lambda: False) == {}
     return answers
 
 
 def request(path) -> dict:
-    return {"do": "plan", "scene": str(path), "allow_outside": False, "ask": {}}
+    return {"do": "plan", "scene": str(path), "allow_outside": False, "request": {}}
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system pins no process")

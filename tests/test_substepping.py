@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from taisoft.dynamics.stage_result import StageResult
-from taisoft.dynamics.substepping import MAX_PARTS, SEARCHES, UNDONE, Substepping
+from taisoft.dynamics.substepping import MAX_SUBSTEPS, SEARCHES, UNDONE, Substepping
 from taisoft.errors import SimulationError
 
 DT = 0.1  # [s]
@@ -24,13 +24,13 @@ class Plain:
     idle, is_linear, lossy, met, n_contacts = False, False, True, False, 0
 
     def __init__(self):
-        self.contact = self.world = self.motion = self.history = self
+        self.contact = self.simulation = self.dirichlet = self.history = self
         self.x_now, self.step_count, self.flight = None, 4, np.zeros(0)
         self.x, self.marked = 0.0, 0.0
         self.taken: list[tuple[float, float]] = []
         self.kept: list[tuple[float, float]] = []
         self.starts: list = []  # what retries began with
-        self.sinking = self.crossing = self.penetration = 0.0
+        self.relative_penetration = self.crossing = self.penetration = 0.0
         self.converges = lambda time, dt: True
         self.closing = lambda time, dt: 0.0
         self.depth = lambda time, dt: 0.0
@@ -84,29 +84,29 @@ class Plain:
     def crossing_before(self):
         return 0.0
 
-    def went_astray(self, x_now):
+    def left_searched_path(self, x_now):
         return self.astray(*self.kept[-1])
 
-    def sank(self, time, dt, before):
+    def penetrates_anew(self, time, dt, before):
         return False
 
-    def search_way(self, time, dt):
+    def search_along_path(self, time, dt):
         return self.new_on_way(time, dt)
 
-    def ratio_along_way(self):
+    def closing_ratio_along_path(self):
         return 10.0
 
     def end(self, time, dt):
-        self.sinking = self.depth(*self.kept[-1])
-        return self.sinking
+        self.relative_penetration = self.depth(*self.kept[-1])
+        return self.relative_penetration
 
-    def too_fast(self, dt, parts):
+    def too_fast(self, dt, substeps):
         return "they close at 1 m/s"
 
     def _nothing(self, *_):
         pass
 
-    start_step = start_part = end_part = count_flight = _nothing
+    start_step = start_substep = end_substep = count_flight = _nothing
 
 
 @pytest.fixture
@@ -124,7 +124,7 @@ def covers(plain, dt: float = DT) -> bool:
 def test_one_that_converges(plain):
     wrapped = Substepping(plain)
     result = wrapped.step(0.0, DT)
-    assert plain.taken == [(0.0, DT)] and wrapped.parts == 1 and result.converged and result.newton_iterations == 3
+    assert plain.taken == [(0.0, DT)] and wrapped.substeps == 1 and result.converged and result.newton_iterations == 3
 
 
 def test_one_that_converges_in_two(plain):
@@ -132,7 +132,7 @@ def test_one_that_converges_in_two(plain):
     wrapped = Substepping(plain)
     result = wrapped.step(0.0, DT)
     assert [dt for _, dt in plain.taken] == pytest.approx([DT, DT / 2, DT / 2]) and covers(plain)
-    assert wrapped.parts == 2 and result.converged and result.newton_iterations == 9 and wrapped.recovers
+    assert wrapped.substeps == 2 and result.converged and result.newton_iterations == 9 and wrapped.recovers
 
 
 def test_one_that_never_converges(plain):
@@ -140,7 +140,7 @@ def test_one_that_never_converges(plain):
     wrapped = Substepping(plain)
     result = wrapped.step(0.0, DT)
     assert [dt for _, dt in plain.taken] == pytest.approx([DT, *[DT / 2] * 2, *[DT / 4] * 4, DT])
-    assert wrapped.parts == 1 and not result.converged and not wrapped.recovers and plain.kept == [(0.0, DT)]
+    assert wrapped.substeps == 1 and not result.converged and not wrapped.recovers and plain.kept == [(0.0, DT)]
     plain.x, plain.taken = 0.0, []
     wrapped.step(0.0, DT)
     assert len(plain.taken) == 1  # substeps did not help in the step before
@@ -160,13 +160,13 @@ def test_what_closes_fast_takes_short_substeps(plain):
     wrapped = Substepping(plain)
     wrapped.step(0.0, DT)
     lengths = np.array([dt for _, dt in plain.kept])
-    assert covers(plain) and wrapped.parts == len(lengths) > 5
+    assert covers(plain) and wrapped.substeps == len(lengths) > 5
     fast = [dt for time, dt in plain.kept if 0.04 <= time < 0.06]
     assert max(fast) <= DT / 50 * 1.001 and lengths.max() > 3 * max(fast)
 
 
 def test_what_closes_too_fast_is_refused(plain):
-    plain.closing = lambda time, dt: 2.0 * MAX_PARTS * dt / DT if time > 0.049 else 1.9 * dt / DT
+    plain.closing = lambda time, dt: 2.0 * MAX_SUBSTEPS * dt / DT if time > 0.049 else 1.9 * dt / DT
     with pytest.raises(SimulationError, match="step 5: they close at 1 m/s"):
         Substepping(plain).step(0.0, DT)
     assert plain.x == 0.0
@@ -182,7 +182,7 @@ def test_one_that_ends_deep_is_halved(plain):
 def test_after_so_many_undone_it_goes_on(plain):
     plain.depth = lambda time, dt: 1.0 + time  # deeper and deeper
     Substepping(plain).step(0.0, DT)
-    assert covers(plain) and 0 < len(plain.taken) - len(plain.kept) <= UNDONE and plain.sinking > 1.0
+    assert covers(plain) and 0 < len(plain.taken) - len(plain.kept) <= UNDONE and plain.relative_penetration > 1.0
 
 
 def test_one_that_was_faster_than_seen_is_halved(plain):
@@ -198,7 +198,7 @@ def test_one_that_met_what_was_not_known_is_taken_again(plain):
     result = wrapped.step(0.0, DT)
     assert plain.taken == [(0.0, DT)] * 3 and plain.kept == [(0.0, DT)]
     assert plain.starts == [(0.0, DT)] * 2  # each where the last one ended
-    assert wrapped.parts == 1 and result.newton_iterations == 9
+    assert wrapped.substeps == 1 and result.newton_iterations == 9
 
 
 def test_one_whose_contacts_do_not_settle_is_halved(plain):

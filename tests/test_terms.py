@@ -97,7 +97,7 @@ def test_rigid_motions(rig, term):
 
 
 def test_gravity_is_an_acceleration_too(rig):
-    f, weight = forces(rig, gravity, rig.x), rig.model.weight.to_numpy()
+    f, weight = forces(rig, gravity, rig.x), rig.model.gravity_mass.to_numpy()
     assert gravity.ACCELERATION and np.abs(f - weight[:, None] * rig.model.gravity.to_numpy()[0]).max() < 1e-12
 
 

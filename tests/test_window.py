@@ -20,7 +20,7 @@ from taisoft.output.camera import Camera
 from taisoft.records import StepReport
 from taisoft.view.layers import Layers
 from taisoft.view.loop import Loop
-from taisoft.view.picking import Drag, nearest_hit, pick
+from taisoft.view.picking import MouseDrag, nearest_hit, pick
 
 WATCH = """
 import os, sys
@@ -52,7 +52,7 @@ class Told(ts.Simulator):
         print("reset", flush=True)
 
 
-with Told(beam_scene(), dt={dt}, integrator={integrator!r}, pullable=True) as sim:
+with Told(beam_scene(), dt={dt}, integrator={integrator!r}, draggable=True) as sim:
     show(sim)
     print("ended", sim.settings.integrator, sim.step_count, np.isfinite(sim.energies().total))
 print("closed")
@@ -90,20 +90,20 @@ def test_a_body_is_picked_and_pulled_by_the_cursor(order):
     scene = beam_scene(("one", "two"), order=order)
     sim, camera, size = FakeSimulator(scene), Camera.framing(np.array([[-2.0, -1, -1], [2, 2, 1]])), (1600, 900)
     sim.time, calls = 1.0, []
-    sim.pull = lambda *arguments: calls.append(arguments)
+    sim.drag = lambda *arguments: calls.append(arguments)
     aim = sim.positions("two")[scene.bodies[1].nodes.surface].mean(axis=1)
     aim = aim[np.argmin(np.linalg.norm(aim - camera.position, axis=1))]  # the nearest triangle is not hidden
     across, down, _ = camera.project(aim[None], size)[0]
     cursor = (across / size[0], 1 - down / size[1])
     hit = pick(sim, camera, cursor, size)
     assert scene.bodies[hit.body].name == "two" and np.allclose(hit.point, aim) and np.allclose(hit.weights, 1 / 3)
-    drag = Drag(sim, hit)
+    drag = MouseDrag(sim, hit)
     assert drag.weights.sum() == pytest.approx(1.0) and len(drag.nodes) >= 3
-    drag.pull(sim, camera, cursor, size, 10.0)
+    drag.drag(sim, camera, cursor, size, 10.0)
     name, nodes, weights, target, stiffness = calls[0]
     assert name == "two" and np.allclose(target, weights @ sim.positions("two")[nodes]), "no way, no force"
     assert stiffness == pytest.approx(10 * 4000 * 9.81 / np.sqrt(18))
-    drag.pull(sim, camera, (cursor[0], cursor[1] + 0.1), size, 10.0)
+    drag.drag(sim, camera, (cursor[0], cursor[1] + 0.1), size, 10.0)
     moved = calls[1][3] - target
     assert moved @ camera.axes[0] == pytest.approx(0, abs=1e-9) and moved @ camera.forward == pytest.approx(0, abs=1e-9)
     assert moved @ camera.axes[1] > 0
@@ -339,11 +339,11 @@ def test_pulling_and_sliders(opened):
     before = numbers(desktop)
     desktop.repeat(lambda: click(desktop, 30, SLIDERS["gravity"]), lambda: numbers(desktop)[5] < 5.0, "less gravity")
 
-    def pull():
+    def drag():
         desktop.tool("xdotool", "mouseup", "1")
         desktop.drag(TIP, (0, -250), 0.5)
 
-    desktop.repeat(pull, lambda: numbers(desktop)[1] > before[1] + 0.3, "pulled beam")
+    desktop.repeat(drag, lambda: numbers(desktop)[1] > before[1] + 0.3, "pulled beam")
     desktop.tool("xdotool", "mouseup", "1")
     desktop.wait_for(lambda: numbers(desktop)[1] < before[1] + 0.2, "beam that comes back")
     desktop.repeat(lambda: click(desktop, 225, SLIDERS["young"]), lambda: numbers(desktop)[4] > 2e6, "stiffer beam")

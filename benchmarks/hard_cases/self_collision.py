@@ -3,7 +3,7 @@
 import numpy as np
 
 import taisoft as ts
-from taisoft.elements.reference import lumped_mass, weight_mass
+from taisoft.elements.reference import gravity_mass, lumped_mass
 from taisoft.scene.key_frames import KeyFrames
 
 from ..reference_cases.record import face
@@ -53,7 +53,7 @@ def clamp(session: Session, law: str) -> dict[str, float]:
     for y, way in ((0.14, -0.04), (0.0, 0.04)):
         moved = KeyFrames([0.0, 1.0, 1.5], [WEIGHTLESS, (0.0, way, 0.0), (0.0, way, 0.0)], release=True)
         body.move(lambda X, y=y: (np.abs(X[:, 0] - 0.16) < 1e-9) & (np.abs(X[:, 1] - y) < 1e-9), moved)
-    mass, momenta, impulses = weight_mass(body), [], []
+    mass, momenta, impulses = gravity_mass(body), [], []
 
     def look(sim, k, report):
         momenta.append(mass @ sim.velocities())
@@ -72,14 +72,14 @@ def clamp(session: Session, law: str) -> dict[str, float]:
     }
 
 
-def sheets(session: Session, parts: str) -> dict[str, float]:
+def sheets(session: Session, substeps: str) -> dict[str, float]:
     """S3: two sheets fly at each other, each at 15 m/s, as two bodies or as two parts of one."""
     sheet = box((8, 1, 8), (0.2, 0.005, 0.2))
     rubber = ts.Material(law=SNH, young=1e6, poisson=0.3, density=1000.0)
     scene, apart = ts.Scene(gravity=WEIGHTLESS), np.array([0.0, 0.0125, 0.0])
     n = sheet.n_verts
     toward = np.array([0.0, 15.0, 0.0])
-    if parts == "two bodies":
+    if substeps == "two bodies":
         scene.add_body(sheet, rubber, name="lower", position=-apart, velocity=toward)
         scene.add_body(sheet, rubber, name="upper", position=apart, velocity=-toward)
     else:
@@ -197,10 +197,11 @@ S3 = Case(
     tuple(
         Variant(
             # momentum is kept as well as Newton's method balances forces
-            parts, {"dt": 1 / 120, "integrator": IMPLICIT, "self_collision": parts != "two bodies", "newton_tolerance": 1e-6},
-            {"parts": parts}, MEET,
+            substeps,
+            {"dt": 1 / 120, "integrator": IMPLICIT, "self_collision": substeps != "two bodies", "newton_tolerance": 1e-6},
+            {"parts": substeps}, MEET,
         )
-        for parts in ("two bodies", "two parts of one")
+        for substeps in ("two bodies", "two parts of one")
     ),
     (
         Criterion("least distance between the sheets' middles [m]", 0.0, ANALYTIC, at_least=True),

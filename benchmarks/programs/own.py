@@ -8,7 +8,7 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.scene.scene import Scene
-from taisoft.study.stretch import Stretch, advance, warm_up
+from taisoft.study.timed_run import TimedRun, advance, warm_up
 
 from ..elasticity_runs import lasting_steps
 from ..exact_path import DENSITY, POISSON, SAMPLE
@@ -84,7 +84,7 @@ class Run:
         samples = round(self.work.seconds / SAMPLE)
         if not follow:
             return None, advance(self.sim, samples * self.setting.steps).seconds
-        positions, whole = [self._positions()], Stretch()
+        positions, whole = [self._positions()], TimedRun()
         for _ in range(samples):
             whole += advance(self.sim, self.setting.steps)
             positions.append(self._positions())

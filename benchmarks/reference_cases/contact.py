@@ -1,7 +1,7 @@
 """Contact: friction on slopes, stacks, impacts, momentum, and a ball pressed on a plane.
 
 Blocks are unit cubes of 2 x 2 x 2 cells. Those that slide are damped within, by their stiffness: a soft block that vibrates on
-its base slides further than a rigid one, as it lets go of the plane here and there. Contacts keep a standoff; bodies that
+its base slides further than a rigid one, as it lets go of the plane here and there. Contacts keep a contact offset; bodies that
 begin on a plane move up to it first, by about a millimetre.
 """
 
@@ -16,7 +16,7 @@ from .record import GRAVITY, Case, material, near, small, told, worst
 
 EXPLICIT, IMPLICIT = "symplectic_euler", "implicit_euler"
 STEP = {EXPLICIT: 1e-3, IMPLICIT: 1e-2}  # [s] of blocks of 1e7 Pa
-STANDOFF = 2e-3  # of the mean surface edge
+CONTACT_OFFSET = 2e-3  # of the mean surface edge
 STICKS = 10.0  # friction of what must not move
 STILL, SLIP, STRAIGHT = 1e-5, 5e-3, 1e-4  # limits: [m], of a distance, sideways over distance
 UP = (0.0, 1.0, 0.0)
@@ -28,7 +28,7 @@ def cube(cells: int = 2) -> ts.TetMesh:
 
 
 def mean_edge(mesh: ts.TetMesh) -> float:
-    """Mean edge of its surface [m], by which the standoff is measured."""
+    """Mean edge of its surface [m], by which the contact offset is measured."""
     x = mesh.vertices[mesh.surface]
     return float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).mean())
 
@@ -129,7 +129,7 @@ def stack(reference: dict, arch: str):
 def newton(integrator: str, reference: dict, arch: str):
     """A cube that falls flat on a plane: velocity of its base after the step in which it hits.
 
-    Without restitution the base still moves to its standoff: up to 0.0035 m/s here.
+    Without restitution the base still moves to its contact offset: up to 0.0035 m/s here.
     """
     s = ts.Scene(gravity=(0.0, 0.0, 0.0))
     s.add_body(cube(), material(reference, "COR"), name="cube", position=(0, 0.501, 0), velocity=(0, -2.0, 0))
@@ -153,7 +153,7 @@ def bar(integrator: str, law: str, reference: dict, arch: str):
     value, dt = reference["value"], 2e-4
     mesh = ts.box_mesh((2, 20, 2), (0.1, 1.0, 0.1))
     s = ts.Scene(gravity=(0.0, 0.0, 0.0))
-    place = (0, 0.5 + STANDOFF * mean_edge(mesh), 0)
+    place = (0, 0.5 + CONTACT_OFFSET * mean_edge(mesh), 0)
     body = s.add_body(mesh, material(reference, law), name="bar", position=place, velocity=(0, -0.1, 0))
     s.add_obstacle(ts.HalfSpace((0, 0, 0), UP), name="wall")
     s.set_contact("bar", "wall", friction=0.0, restitution=0.0)
@@ -240,7 +240,8 @@ def hertz(cells: int, limit: float | None, reference: dict, arch: str):
     rows = [row for row in reference["value"]["SNH"] if row["d_over_R"] > 0.015]
     way = [0.0] + [row["d"] for row in rows]
     s = ts.Scene(gravity=(0.0, 0.0, 0.0))
-    ball = s.add_body(mesh, material(reference, "SNH"), name="ball", position=(0.0, radius + STANDOFF * mean_edge(mesh), 0.0))
+    height = radius + CONTACT_OFFSET * mean_edge(mesh)
+    ball = s.add_body(mesh, material(reference, "SNH"), name="ball", position=(0.0, height, 0.0))
     middle = np.flatnonzero(np.abs(mesh.vertices).max(axis=1) < 1e-9)
     flat = np.flatnonzero(np.abs(mesh.vertices[:, 1]) < 1e-9)
     ball.move(flat, lambda t: (0.0, -float(np.interp(t, np.arange(len(way)), way)), 0.0), axes="y")

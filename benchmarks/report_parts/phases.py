@@ -37,7 +37,7 @@ class Shares:
     """Steps of one kind. parts: name -> wall seconds of each step; those of a search are PHASES and OTHER."""
 
     integrator: str
-    hit_by: str
+    contact_mode: str
     dt: float
     parts: dict[str, list[float]] = field(default_factory=dict)
 
@@ -76,24 +76,24 @@ def watched(watch: Stopwatch, sim: ts.Simulator) -> Iterator[None]:
         yield
 
 
-def open_demo(integrator: str, hit_by: str, arch: str) -> ts.Simulator:
+def open_demo(integrator: str, contact_mode: str, arch: str) -> ts.Simulator:
     """The demo in the demo's own steps, or in explicit ones near their limit."""
     scene, own = load_scene(SCENE)
     for body in scene.bodies:
-        body.collision = hit_by
+        body.collision = contact_mode
     settings = {key: own[key] for key in SETTINGS if key in own}
     if integrator == EXPLICIT:
         settings = {"integrator": integrator, "dt": SHARE * stable_dt(scene, verlet=False)}
     return ts.Simulator(scene, arch=arch, **settings)
 
 
-def measure_shares(integrator: str, hit_by: str, extent: Extent) -> Shares:
+def measure_shares(integrator: str, contact_mode: str, extent: Extent) -> Shares:
     """Time the parts of steps from the first impulse on."""
-    with open_demo(integrator, hit_by, extent.arch) as sim:
+    with open_demo(integrator, contact_mode, extent.arch) as sim:
         to_first_impulse(sim)
         sim.step()  # compiles what the first contact needs
         parts = (*PHASES, OTHER, *(name for name in PARTS if name != SEARCH and sim.settings.explicit), REST)
-        shares, watch = Shares(integrator, hit_by, sim.dt, {part: [] for part in parts}), Stopwatch()
+        shares, watch = Shares(integrator, contact_mode, sim.dt, {part: [] for part in parts}), Stopwatch()
         with watched(watch, sim):
             for _ in range(extent.of(*STEPS[integrator])):
                 watch.spent.clear()
@@ -110,11 +110,11 @@ def measure_shares(integrator: str, hit_by: str, extent: Extent) -> Shares:
 def claims_of(found: list[Shares]) -> list[Claim]:
     """Whether the search takes most of a step, contact points most of the search, and what else counts there. The report's way
     decides; what others show stands beside it."""
-    own = next(s for s in found if (s.integrator, s.hit_by) == REPORTS_WAY)
+    own = next(s for s in found if (s.integrator, s.contact_mode) == REPORTS_WAY)
     others = [s for s in found if s is not own]
 
     def told(share) -> str:
-        beside = "; ".join(f"{percent(share(s))} in {s.integrator}, {s.hit_by}" for s in others)
+        beside = "; ".join(f"{percent(share(s))} in {s.integrator}, {s.contact_mode}" for s in others)
         return f"{percent(share(own))} in {own.integrator} through distance fields, as there" + (f" ({beside})" if others else "")
 
     rest = {name: own.total(name) / own.search for name in ("reduction", "candidates")}
@@ -145,7 +145,7 @@ def share_table(found: list[Shares]) -> str:
         for part, seconds in s.parts.items():
             t = summarise(seconds)
             spread = percent(spread_of(t)) if t.median else ""
-            lines.append((s.integrator, s.hit_by, part, f"{1e3 * t.median:.3g}", spread, percent(s.total(part))))
+            lines.append((s.integrator, s.contact_mode, part, f"{1e3 * t.median:.3g}", spread, percent(s.total(part))))
     return markdown(("steps", "hit by", "part", "ms", "spread", "share of a step"), lines, left=(0, 1, 2))
 
 
@@ -160,7 +160,7 @@ def draw(found: list[Shares]) -> bytes:
         colour = COLOURS[k] if k < len(COLOURS) else f"{0.75 - 0.2 * (k - len(COLOURS)):.2f}"
         panel.barh(range(len(found)), width, left=left, color=colour, label=name)
         left += width
-    panel.set_yticks(range(len(found)), [f"{s.integrator}\n{s.hit_by}" for s in found], fontsize="small")
+    panel.set_yticks(range(len(found)), [f"{s.integrator}\n{s.contact_mode}" for s in found], fontsize="small")
     panel.set(xlabel="share of a step [%]", xlim=(0, 100))
     figure.legend(loc="outside right upper", fontsize="small", frameon=False)
     return plot_png(figure)
@@ -180,5 +180,5 @@ def measure(extent: Extent) -> Part:
     part.claims, part.tables = claims_of(found), [share_table(found)]
     part.pictures["phases.png"] = draw(found)
     part.short.append("the report profiled its whole program, mesh and drawing included; these are the steps alone.")
-    part.times = {f"{s.integrator}, {s.hit_by}: a step": summarise(s.whole) for s in found}
+    part.times = {f"{s.integrator}, {s.contact_mode}: a step": summarise(s.whole) for s in found}
     return part

@@ -23,7 +23,7 @@ from ..fit import exponent
 from .page import COLOURS, Claim, Extent, Part, clearly_less, ms, new_figure, plot_png, timed
 from .plain import PlainPoints, candidate_pairs
 
-HIT_BY = "distance_field"  # the report's way
+CONTACT_MODES = "distance_field"  # the report's way
 FILM, FRAMES = ("cubes 9", "cubes 5"), (20, 4)  # of figure 11: a cube turns on another; the first has 1,944 triangles
 SIZES = ("cubes 5", "cubes 9", "cubes 11", "cubes 15", "cubes 20", "pile 6"), ("cubes 2", "cubes 5")  # full, quick
 ROUNDS, PLAIN_ROUNDS = (15, 3), 2
@@ -106,7 +106,7 @@ def measure_here(quick: bool, arch: str, plain: bool) -> Measured:
     found = Measured("GPU" if arch == "cuda" else f"{n} thread{'s' * (n > 1)}", [], [])
     try:
         for name in SIZES[k]:
-            with Rig(setup_of(name), HIT_BY, runtime) as rig:
+            with Rig(setup_of(name), CONTACT_MODES, runtime) as rig:
                 loop = PlainPoints(rig) if plain else None
                 found.sizes.append(measure_size(rig, ROUNDS[k], loop))
                 if name == FILM[k]:

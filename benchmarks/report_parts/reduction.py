@@ -12,7 +12,7 @@ from ..collision_table import reduction_table
 from ..fit import exponent
 from .page import COLOURS, Claim, Extent, Part, clearly_less, ms, new_figure, plot_png
 
-HIT_BY = "proximity"  # has the more contacts to reduce
+CONTACT_MODES = "proximity"  # has the more contacts to reduce
 FILM, FRAMES = 15, (60, 6)  # cells of two cubes that turn on each other
 SIZES = PILES[:5], PILES[:2]
 HALF_WAY = 1.5  # between the exponents of what is linear and what is square
@@ -78,10 +78,10 @@ def measure(extent: Extent) -> Part:
     runtime = open_runtime(extent.arch, "f32", "the report's reduction")
     try:
         rounds = extent.of(ROUNDS, QUICK_ROUNDS)
-        rows = [measure_row(pile_setup(n), HIT_BY, runtime, rounds) for n in extent.of(*SIZES)]
+        rows = [measure_row(pile_setup(n), CONTACT_MODES, runtime, rounds) for n in extent.of(*SIZES)]
         for failure in (row.failure for row in rows if row.failure):
             raise SimulationError(failure)
-        film = measure_film(cubes_setup(extent.of(FILM, 5)), HIT_BY, runtime, extent.of(*FRAMES))
+        film = measure_film(cubes_setup(extent.of(FILM, 5)), CONTACT_MODES, runtime, extent.of(*FRAMES))
     finally:
         runtime.close()
     return Part(

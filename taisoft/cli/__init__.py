@@ -10,7 +10,7 @@ import sys
 from importlib import import_module
 
 from taisoft import __version__
-from taisoft.cli.signals import Left
+from taisoft.cli.signals import Interrupted
 from taisoft.errors import OutputError, TaisoftError, no_memory
 
 EXIT_FAILED = 1
@@ -35,7 +35,7 @@ def main(argv: list[str] | None = None) -> int:
     except MemoryError as error:
         print(f"taisoft: {no_memory('this scene or file', error)}", file=sys.stderr)
         return EXIT_BAD_INPUT
-    except Left as leave:
+    except Interrupted as leave:
         print("taisoft: ended by a signal; nothing was written", file=sys.stderr)
         return EXIT_SIGNAL + leave.signal_number
     except BrokenPipeError:

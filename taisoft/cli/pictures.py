@@ -13,7 +13,7 @@ from taisoft.view.plots import PLOTS, Plots
 
 
 @dataclass(frozen=True)
-class Shown:
+class DisplayOptions:
     """colour: as of `Offscreen`; layers: names, or None for those of old; plots: names; caption: the scene's name, or None."""
 
     colour: str = "body"
@@ -38,24 +38,24 @@ class Shown:
         return Annotations(plots if self.plots else None, self.caption, colouring).draw
 
 
-def shown_of(arguments: Namespace, has_window: bool) -> Shown:
+def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     """What the options ask for. Raises SceneError for unknown names, and where nothing would show what is asked for."""
     has_pictures = arguments.out is not None and not arguments.no_frames
     needs = "needs --out, the folder to write to, and the pictures that --no-frames leaves out"
     layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS)
-    asked = {"video": arguments.video, "caption": arguments.caption}
+    requested = {"video": arguments.video, "caption": arguments.caption}
     if not has_window:
-        asked |= {"layers": layers is not None, "plots": bool(plots)}
-    for option, given in asked.items():
+        requested |= {"layers": layers is not None, "plots": bool(plots)}
+    for option, given in requested.items():
         if given and not has_pictures:
             raise SceneError(f"--{option} {needs}")
     if has_pictures and (plots or arguments.caption) and text_missing():
         raise SceneError(f"{'--plots' if plots else '--caption'}: {text_missing()}")
     caption = Path(arguments.scene).stem if arguments.caption else None
-    return Shown(arguments.colour, layers, plots or (), caption)
+    return DisplayOptions(arguments.colour, layers, plots or (), caption)
 
 
-def check_modelled(shown: Shown, sim) -> None:
+def check_modelled(shown: DisplayOptions, sim) -> None:
     """Raises SceneError for a layer or plot of what sim does not model."""
     if "contacts" in (shown.layers or ()) and not sim.plan.on["contact_forces"]:
         raise SceneError(f"--layers contacts: contact forces are not modelled ({sim.plan.why('contact_forces')})")

@@ -5,7 +5,7 @@ import sys
 import time
 from pathlib import Path
 
-from taisoft.cli.pictures import Shown
+from taisoft.cli.pictures import DisplayOptions
 from taisoft.cli.settings import RunSettings
 from taisoft.errors import OutputError
 from taisoft.output.checkpoint import CheckpointWriter
@@ -77,7 +77,7 @@ class Recording:
         self._checkpoints = CheckpointWriter(self._folder.path, every, None if resumed is None else resumed["checkpoint"])
 
     def add_writers(
-        self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool, shown: Shown,
+        self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool, shown: DisplayOptions,
         plots: Plots | None,
     ) -> None:  # fmt: skip
         """Adds the writers of frames, USD and checkpoints to the observers. What goes on in another way is refused before

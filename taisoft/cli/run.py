@@ -9,13 +9,13 @@ from pathlib import Path
 
 from taisoft.checkpoint import Checkpoint
 from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL
-from taisoft.cli.pictures import Shown, check_modelled, shown_of
+from taisoft.cli.pictures import DisplayOptions, check_modelled, display_options
 from taisoft.cli.recording import Observers, Recording
 from taisoft.cli.scene_file import load_scene
 from taisoft.cli.settings import RunSettings, resolve, resolve_resumed
 from taisoft.cli.signals import Signals
 from taisoft.cli.summary import print_plan, print_state, print_summary
-from taisoft.cli.told import told_warnings
+from taisoft.cli.warnings import printed_warnings
 from taisoft.errors import SceneError, SimulationError
 from taisoft.output.checkpoint import read_last_good
 from taisoft.output.files import check_free
@@ -32,19 +32,19 @@ from taisoft.view.plots import Plots
 def command(arguments: Namespace) -> int:
     """Runs the scene and returns the exit status. What can be refused is refused before a file is written."""
     _check_working_folder()
-    with Signals() as signals, told_warnings() as told:
+    with Signals() as signals, printed_warnings() as told:
         scene, solver = load_scene(arguments.scene, arguments.allow_outside)
         every = _checkpoint_interval(arguments)
         saved: Checkpoint | None = None
         has_window = not arguments.headless and _window_is_possible()
-        shown = shown_of(arguments, has_window)
+        shown = display_options(arguments, has_window)
         watched = has_window and arguments.out is None and arguments.seconds is None
         if arguments.resume is None:
             settings = resolve(solver, arguments, Simulator)
             if arguments.out is not None:
                 check_free(arguments.out, arguments.overwrite)
             with _naming(arguments.scene):
-                sim = Simulator(scene, **settings.simulator | ({"pullable": True} if watched else {}))  # by the mouse
+                sim = Simulator(scene, **settings.simulator | ({"draggable": True} if watched else {}))  # by the mouse
         else:
             saved = read_last_good(arguments.resume)
             kept = saved.settings | ({"fps": saved.notes["fps"]} if "fps" in saved.notes else {})  # frames have numbers
@@ -118,7 +118,7 @@ def _window_is_possible() -> bool:
     return not missing
 
 
-def _watch(sim: Simulator, settings: RunSettings, shown: Shown) -> int:
+def _watch(sim: Simulator, settings: RunSettings, shown: DisplayOptions) -> int:
     """The live window, for as long as it stays open."""
     from taisoft.view.window import show
 
@@ -129,7 +129,7 @@ def _watch(sim: Simulator, settings: RunSettings, shown: Shown) -> int:
 
 def _run(
     sim: Simulator, settings: RunSettings, arguments: Namespace, signals: Signals, told: list[str], has_window: bool,
-    every: float | None, saved: Checkpoint | None, shown: Shown,
+    every: float | None, saved: Checkpoint | None, shown: DisplayOptions,
 ) -> int:  # fmt: skip
     """A run until settings.seconds, with what was computed saved however it ends."""
     observers, resumed, notes = Observers(), None, {}
@@ -152,7 +152,7 @@ def _run(
             settings.seconds,
             on_frame=observers.on_frame,
             fps=settings.fps,
-            stop=lambda: signals.asked() or observers.failed(),
+            stop=lambda: signals.requested() or observers.failed(),
             resumed=resumed is not None,
             on_step=plots.take if plots is not None else None,
         )
@@ -164,12 +164,12 @@ def _run(
                 result.problems.append(str(error))
                 result.status = "failed"
         result.problems[:0] = [f"warning: {text}" for text in told]
-        _tell_failed_output(result, observers, signals)
+        _report_failed_output(result, observers, signals)
         if recording is not None:
             reported = observers.guard(recording.report, result, sim, settings)
-            video = arguments.video and not signals.asked()
+            video = arguments.video and not signals.requested()
             filmed = not video or observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
-            _tell_failed_output(result, observers, signals)
+            _report_failed_output(result, observers, signals)
             if reported and not filmed:
                 observers.guard(recording.report, result, sim, settings)  # anew, with what became of the video
         print_summary(result, sim, observers, recording)
@@ -182,16 +182,16 @@ def _run(
     return EXIT_FAILED if result.status == "failed" else 0
 
 
-def _open_window(sim: Simulator, shown: Shown, plots: Plots):
+def _open_window(sim: Simulator, shown: DisplayOptions, plots: Plots):
     from taisoft.view.window import LiveWindow
 
     return LiveWindow(sim.scene, colour=shown.colour, layers=shown.in_window, plots=plots)
 
 
-def _tell_failed_output(result: RunReport, observers: Observers, signals: Signals) -> None:
+def _report_failed_output(result: RunReport, observers: Observers, signals: Signals) -> None:
     """The run's report tells of all output that failed: report.json may still fit where a picture did not."""
     result.problems += [error for error in observers.errors if error not in result.problems]
     if observers.failed():
-        result.interrupted = result.interrupted and signals.asked()
+        result.interrupted = result.interrupted and signals.requested()
     if observers.failed() and result.status == "ok":
         result.status = "degraded"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.cli.scene_file import load_scene
-from taisoft.cli.told import told_warnings
+from taisoft.cli.warnings import printed_warnings
 from taisoft.mesh.files import WRITERS, read_mesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene.material import Material
@@ -25,7 +25,7 @@ MESHES = (*WRITERS, ".node", ".ele")
 def command(arguments: Namespace) -> int:
     """Writes the file and what it needs beside it, and names them. Raises SceneError for what no file can hold."""
     path = Path(arguments.scene)
-    with told_warnings():
+    with printed_warnings():
         if path.suffix.lower() in MESHES:
             scene, solver = start_from(read_mesh(path), path.stem)
         else:

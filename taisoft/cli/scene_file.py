@@ -81,7 +81,7 @@ def load_scene(
     return scene if order is None or "order" in made else with_order(scene, order), solver
 
 
-def _built(name: str, allow_outside: bool, asked: dict) -> tuple[Scene, dict, set]:
+def _built(name: str, allow_outside: bool, requested: dict) -> tuple[Scene, dict, set]:
     """Scene and `solver` dict, and which of the things asked for build() has seen to; None is not asked for."""
     path = find_scene(name)
     if path.suffix == ".toml":
@@ -92,7 +92,7 @@ def _built(name: str, allow_outside: bool, asked: dict) -> tuple[Scene, dict, se
     build = getattr(module, "build", None)
     if not callable(build):
         raise SceneError(f"{path}: no function build() that returns a Scene")
-    takes = {key: value for key, value in asked.items() if value is not None and key in inspect.signature(build).parameters}
+    takes = {key: value for key, value in requested.items() if value is not None and key in inspect.signature(build).parameters}
     scene = _call(path, functools.partial(build, **takes))
     if not isinstance(scene, Scene):
         raise SceneError(f"{path}: build() returned {type(scene).__name__}, a Scene is needed")

@@ -6,7 +6,7 @@ import signal
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-class Left(BaseException):
+class Interrupted(BaseException):
     """A signal came while there was nothing to save, so the command just leaves."""
 
     def __init__(self, signal_number: int):
@@ -40,13 +40,13 @@ class Signals:
         """From now on the first signal only asks the run to end."""
         self._running = True
 
-    def asked(self) -> bool:
+    def requested(self) -> bool:
         """True once a signal has asked the run to end."""
         return self.number is not None
 
     def _handle(self, number: int, _frame) -> None:
         if not self._running:
-            raise Left(number)
+            raise Interrupted(number)
         if self.number is not None:
             os._exit(128 + number)  # files are published by rename, so leaving here tears none of them
         self.number = number

@@ -9,7 +9,7 @@ from pathlib import Path
 from taisoft.cli import EXIT_FAILED, EXIT_SIGNAL
 from taisoft.cli.scene_file import find_scene
 from taisoft.cli.settings import parse_scalar
-from taisoft.cli.signals import Left, Signals
+from taisoft.cli.signals import Interrupted, Signals
 from taisoft.errors import SceneError
 from taisoft.output.files import FolderLock, check_free, make_folder
 from taisoft.output.report import machine
@@ -17,7 +17,7 @@ from taisoft.scene import checks
 from taisoft.scene.solver import check_solver
 from taisoft.study.grid import AXES
 from taisoft.study.output import FILES, check_scene, write
-from taisoft.study.results import Ask, Study
+from taisoft.study.results import Request, Study
 from taisoft.study.runner import Runner
 from taisoft.study.store import Store
 from taisoft.study.table import text_of
@@ -29,18 +29,18 @@ ENDING = "ending; runs that are finished are kept"
 
 def command(arguments: Namespace) -> int:
     """Runs the study and returns the exit status: 1 where no run of the grid has both a time and an error."""
-    ask = asked(arguments)
-    find_scene(ask.scene)
+    request = requested(arguments)
+    find_scene(request.scene)
     budget = checks.number(arguments.budget, "--budget", above=0.0, unit="s")
     with Signals(ENDING if arguments.out is not None else "ending") as signals, ExitStack() as stack:
-        places, machines = _places(arguments, ask, stack)
+        places, machines = _places(arguments, request, stack)
         if arguments.out is not None:
             check_free(arguments.out, overwrite=False)
         signals.run_began()
-        runner = Runner(ask, places, machines, signals.asked, lambda: end - time.monotonic(), _tell)
+        runner = Runner(request, places, machines, signals.requested, lambda: end - time.monotonic(), _tell)
         plan = runner.plan()
         if plan is None:
-            raise Left(signals.number)
+            raise Interrupted(signals.number)
         if arguments.scheduler is None:
             check_device(plan, len(places))
         if arguments.out is not None:
@@ -71,7 +71,7 @@ def check_device(plan: dict, workers: int) -> None:
         raise SceneError("--workers above 1 does not go with arch cuda: timed runs would share the device")
 
 
-def _places(arguments: Namespace, ask: Ask, stack: ExitStack) -> tuple[list, list[dict]]:
+def _places(arguments: Namespace, request: Request, stack: ExitStack) -> tuple[list, list[dict]]:
     """Where runs are carried out, and on which machines."""
     if arguments.scheduler is None:
         return local_places(1 if arguments.workers is None else arguments.workers), [machine()]
@@ -80,11 +80,11 @@ def _places(arguments: Namespace, ask: Ask, stack: ExitStack) -> tuple[list, lis
     from taisoft.study.cluster import cluster_places, connect
 
     client = stack.enter_context(closing(connect(arguments.scheduler)))
-    ask.scene = str(Path(ask.scene).absolute()) if ask.scene.endswith((".py", ".toml")) else ask.scene
+    request.scene = str(Path(request.scene).absolute()) if request.scene.endswith((".py", ".toml")) else request.scene
     return cluster_places(client)
 
 
-def asked(arguments: Namespace) -> Ask:
+def requested(arguments: Namespace) -> Request:
     """What the options ask for. Raises SceneError for values that no study takes."""
     axes = {}
     for key in AXES:
@@ -95,7 +95,7 @@ def asked(arguments: Namespace) -> Ask:
             checks.number(value, f"--{key.replace('_', '-')}", above=0.0)
     checks.whole(arguments.repeats, "--repeats", tuple(range(1, 101)))
     checks.whole(arguments.reference_refine, "--reference-refine", WHOLE["refine"])
-    return Ask(
+    return Request(
         arguments.scene, axes, arguments.allow_outside, arguments.seconds, arguments.reference_dt,
         arguments.reference_integrator, arguments.reference_refine, arguments.repeats, arguments.tolerance, arguments.by,
     )  # fmt: skip

@@ -71,7 +71,7 @@ def _answer(request: dict) -> dict:
         if request["do"] == "plan":
             _, solver = load(0)
             check_scene_solver(solver)
-            made = make_plan(variant, solver, request["ask"])
+            made = make_plan(variant, solver, request["request"])
             # with the files' content, too: paths that are functions are told apart by nothing else
             own = sources(find_scene(request["scene"]))
             return {"answer": made | {"scenes": scenes, "sources": own, "code": code_digest()}}

@@ -44,9 +44,9 @@ def print_summary(result: RunReport, sim, observers: Observers, recording: Recor
     if result.step_reports:
         worst = min(result.step_reports, key=lambda report: report.min_volume_ratio)
         _line("min J", f"{worst.min_volume_ratio:.4g} at {worst.time:.4g} s, {worst.n_inverted} tets inverted")
-        cut = [report.parts for report in result.step_reports if report.parts > 1]
+        cut = [report.substeps for report in result.step_reports if report.substeps > 1]
         if cut:
-            _line("parts", f"{len(cut)} steps were taken in parts, in {max(cut)} at most")
+            _line("substeps", f"{len(cut)} steps were divided, into at most {max(cut)} substeps")
     if recording is not None:
         for index, text in enumerate(recording.files()):
             _line("" if index else "files", text)

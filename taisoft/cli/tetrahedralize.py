@@ -5,7 +5,7 @@ from pathlib import Path
 
 from taisoft.cli.info import describe
 from taisoft.cli.signals import Signals
-from taisoft.cli.told import told_warnings
+from taisoft.cli.warnings import printed_warnings
 from taisoft.errors import OutputError
 from taisoft.mesh.files import check_ending, write_mesh
 from taisoft.mesh.surface_mesh import read_surface
@@ -20,7 +20,7 @@ def command(arguments: Namespace) -> int:
         raise OutputError(f"{out}: the file exists; --overwrite replaces it")
     if not out.parent.is_dir():
         raise OutputError(f"{out}: there is no folder {out.parent}")
-    with Signals(), told_warnings():
+    with Signals(), printed_warnings():
         surface = read_surface(arguments.surface, weld=arguments.weld)
         mesh = tetrahedralize(surface, arguments.edge_length, arguments.envelope)
         write_mesh(out, mesh)

@@ -15,7 +15,7 @@ from taisoft.arrays import Count
 from taisoft.collision import shapes
 from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import FACE_FIELD, VERTEX_FIELD, write_contact
-from taisoft.collision.features import corner, opposite, sticks_out, unit, vertices_of
+from taisoft.collision.features import corner, in_normal_cone, opposite, unit, vertices_of
 from taisoft.collision.frank_wolfe import deepest_point
 from taisoft.collision.surface import dvec, ivec, part_first
 from taisoft.runtime import kernel
@@ -133,7 +133,7 @@ def _touch(s: ti.template(), o: ti.template(), t, k, margin, out: ti.template(),
                 x = R @ p + o.origin[k]
                 good = 0
                 if j < 3:
-                    good = sticks_out(s, s.triangle[t, j], n)
+                    good = in_normal_cone(s, s.triangle[t, j], n)
                     if kind == shapes.HALF_SPACE and value + ti.min(move.dot(g), 0.0) < 0.0:
                         good = 1
                 else:
@@ -158,14 +158,14 @@ def _touch(s: ti.template(), o: ti.template(), t, k, margin, out: ti.template(),
 @kernel(cse=False)
 def find_analytic(
     s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.template(), used: ti.template(), count: ti.template(),
-    part: ti.i32, more: ti.i32,
+    part: ti.i32, append: ti.i32,
 ):  # fmt: skip
     """Contacts of the soft bodies' triangles with all analytic obstacles, after those in the buffer where `more` is 1."""
     ti.loop_config(serialize=s.serial)
-    for wide in range(s.chunks * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
-            at, end = c * part + more * used[c], (c + 1) * part
+    for task in range(s.chunks * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
+            at, end = c * part + append * used[c], (c + 1) * part
             for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):
                 if s.soft[s.body[t]] == 1 and (s.lo[t] <= s.hi[t]).all():
                     for k in range(o.count):

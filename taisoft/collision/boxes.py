@@ -7,14 +7,14 @@ overlaps nothing.
 
 import taichi as ti
 
-from taisoft.collision.surface import ACTIVE, PAIRS, UNFINITE, dvec, part_first
+from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, dvec, part_first
 from taisoft.runtime import kernel
 
 
 @kernel
 def move_obstacles(s: ti.template(), first: ti.i32, x: ti.types.ndarray(), move: ti.types.ndarray()):
     """Place the vertices of an obstacle, the first of which is `first`: x, move (n,3) f64 [m]."""
-    ti.loop_config(serialize=s.light)
+    ti.loop_config(serialize=s.serial_cheap)
     for i in range(x.shape[0]):
         for q in ti.static(range(3)):
             s.x[first + i][q] = x[i, q]
@@ -22,35 +22,37 @@ def move_obstacles(s: ti.template(), first: ti.i32, x: ti.types.ndarray(), move:
 
 
 @kernel
-def take_led(s: ti.template(), led: ti.template(), move: ti.types.ndarray()):
+def take_prescribed(s: ti.template(), prescribed: ti.template(), move: ti.types.ndarray()):
     """How far each vertex is led in the step: move (n_verts,3) f64 [m], nan where it is not."""
-    ti.loop_config(serialize=s.light)
+    ti.loop_config(serialize=s.serial_cheap)
     for i in range(s.n_verts):
         for q in ti.static(range(3)):
-            led[i][q] = move[i, q]
+            prescribed[i][q] = move[i, q]
 
 
 @ti.func
-def _move_soft(s: ti.template(), x: ti.template(), v: ti.template(), leads: ti.template(), led: ti.template(), dt):
+def _move_soft(
+    s: ti.template(), x: ti.template(), v: ti.template(), has_prescribed: ti.template(), prescribed: ti.template(), dt
+):  # fmt: skip
     """Positions of the soft bodies, and their way: where the model leads a node that, else v dt."""
-    ti.loop_config(serialize=s.light)
+    ti.loop_config(serialize=s.serial_cheap)
     for i in range(s.n_verts):
         if s.node[i] >= 0:
             s.x[i] = x[s.node[i]]
             move = dt * ti.cast(v[s.node[i]], ti.f64)
-            if ti.static(leads):
+            if ti.static(has_prescribed):
                 for q in ti.static(range(3)):
-                    if led[i][q] == led[i][q]:
-                        move[q] = led[i][q]
+                    if prescribed[i][q] == prescribed[i][q]:
+                        move[q] = prescribed[i][q]
             s.move[i] = move
 
 
 @ti.func
 def _box_triangles(s: ti.template(), margin):
     """Boxes, normals and areas of the triangles, and the number of those that are not finite."""
-    s.count[UNFINITE] = 0
+    s.count[NONFINITE] = 0
     half = ti.cast(0.5, ti.f64) * margin
-    ti.loop_config(serialize=s.light)
+    ti.loop_config(serialize=s.serial_cheap)
     for t in range(s.n_triangles):
         i, j, k = s.triangle[t, 0], s.triangle[t, 1], s.triangle[t, 2]
         a, b, c = s.x[i], s.x[j], s.x[k]
@@ -69,17 +71,17 @@ def _box_triangles(s: ti.template(), margin):
             lo = ti.min(a, b, c, a1, b1, c1) - half
             hi = ti.max(a, b, c, a1, b1, c1) + half
         else:
-            ti.atomic_add(s.count[UNFINITE], 1)
+            ti.atomic_add(s.count[NONFINITE], 1)
         s.lo[t], s.hi[t] = lo, hi
 
 
 @ti.func
 def _box_bodies(s: ti.template()):
     """Boxes of the colliders."""
-    ti.loop_config(serialize=s.light)
-    for wide in range(s.n_bodies * s.light_spread):
-        if wide % s.light_spread == 0:
-            b = wide // s.light_spread
+    ti.loop_config(serialize=s.serial_cheap)
+    for task in range(s.n_bodies * s.cheap_spread):
+        if task % s.cheap_spread == 0:
+            b = task // s.cheap_spread
             lo, hi = dvec(ti.math.inf), dvec(-ti.math.inf)
             for t in range(s.first_of[b], s.first_of[b + 1]):
                 lo, hi = ti.min(lo, s.lo[t]), ti.max(hi, s.hi[t])
@@ -104,9 +106,9 @@ def list_near(s: ti.template(), c, own):
 
 
 @ti.func
-def sum_pairs(s: ti.template(), more):
+def sum_pairs(s: ti.template(), append):
     """Sum what each part has looked at; where `more` is 1 it is added to what others have."""
-    total = more * s.count[PAIRS]
+    total = append * s.count[PAIRS]
     for c in range(s.chunks):
         total += s.part[c]
     s.count[PAIRS] = total
@@ -132,10 +134,10 @@ def _meets_another(s: ti.template(), t, first, last):
 @ti.func
 def _list_active(s: ti.template()):
     """List the triangles that can have a partner, in ascending order."""
-    ti.loop_config(serialize=s.light)
-    for wide in range(s.chunks * s.light_spread):
-        if wide % s.light_spread == 0:
-            c = wide // s.light_spread
+    ti.loop_config(serialize=s.serial_cheap)
+    for task in range(s.chunks * s.cheap_spread):
+        if task % s.cheap_spread == 0:
+            c = task // s.cheap_spread
             first, near = part_first(c, s.n_triangles, s.chunks), c * s.n_bodies
             n, n_near, own = 0, 0, -1
             for t in range(first, part_first(c + 1, s.n_triangles, s.chunks)):
@@ -167,12 +169,12 @@ def update_boxes(s: ti.template(), margin: ti.f64):
 
 @kernel
 def update_surface(
-    s: ti.template(), x: ti.template(), v: ti.template(), leads: ti.template(), led: ti.template(), dt: ti.f64,
+    s: ti.template(), x: ti.template(), v: ti.template(), has_prescribed: ti.template(), prescribed: ti.template(), dt: ti.f64,
     margin: ti.f64, active: ti.template(),
 ):  # fmt: skip
     """Take the soft bodies' positions x (n_nodes) [m] and their way in a step of dt [s] from the model, and bring the boxes up to
     date. led: of `take_led`, looked at where `leads`; active: whether those that can have a partner are listed too."""
-    _move_soft(s, x, v, leads, led, dt)
+    _move_soft(s, x, v, has_prescribed, prescribed, dt)
     _box_triangles(s, margin)
     if ti.static(active):
         _box_bodies(s)

@@ -135,10 +135,10 @@ def nodes_below(b: ti.template(), node):
 @ti.func
 def _refit_chunks(s: ti.template(), b: ti.template(), margin):
     """Slabs of all nodes in the chunks."""
-    ti.loop_config(serialize=s.light)
-    for wide in range(b.n_chunks * s.light_spread):
-        if wide % s.light_spread == 0:
-            first = b.chunk[wide // s.light_spread]
+    ti.loop_config(serialize=s.serial_cheap)
+    for task in range(b.n_chunks * s.cheap_spread):
+        if task % s.cheap_spread == 0:
+            first = b.chunk[task // s.cheap_spread]
             n = nodes_below(b, first)
             for k in range(n):
                 node = first + n - 1 - k
@@ -214,9 +214,9 @@ def walk_trees(
 ):  # fmt: skip
     """Pairs of triangles whose slabs overlap, each once. Neighbouring chunks go to different parts, which evens the load."""
     ti.loop_config(serialize=s.serial)
-    for wide in range(b.parts * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
+    for task in range(b.parts * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
             at = c * part
             for k in range((b.n_chunks - c + b.parts - 1) // b.parts):
                 chunk = c + k * b.parts

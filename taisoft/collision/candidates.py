@@ -159,9 +159,9 @@ def pair_rows(
     for t in range(s.n_triangles):
         end[t] = 0
     ti.loop_config(serialize=serial)
-    for wide in range(chunks * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
+    for task in range(chunks * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
             for k in range(c * part, c * part + used[c]):
                 ti.atomic_add(end[pair[k][0]], 1)
                 ti.atomic_add(end[pair[k][1]], 1)
@@ -183,9 +183,9 @@ def fill_rows(
 ):  # fmt: skip
     """Write both directions of every pair into its rows and sort them."""
     ti.loop_config(serialize=serial)
-    for wide in range(chunks * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
+    for task in range(chunks * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
             for k in range(c * part, c * part + used[c]):
                 a, b = pair[k][0], pair[k][1]
                 entry[ti.atomic_add(end[a], 1)] = b

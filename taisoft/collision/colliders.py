@@ -47,14 +47,14 @@ def obstacle_frame(obstacle: Obstacle, t: float) -> tuple[np.ndarray, np.ndarray
     return obstacle.shape.pivot + translation, rotation @ obstacle.shape.frame()
 
 
-def led_vertices(topology: Topology, nodes: np.ndarray, moves: np.ndarray) -> np.ndarray:
+def prescribed_vertices(topology: Topology, nodes: np.ndarray, moves: np.ndarray) -> np.ndarray:
     """(v,3) [m]: how far each vertex is led, nan where it is not. nodes (k,): of the model; moves (k,3) [m], nan likewise."""
     whole = np.full((len(topology.node), 3), np.nan)
     on = np.flatnonzero(topology.node >= 0)
     where = np.full(max(topology.node.max(initial=-1), np.max(nodes, initial=-1)) + 1, -1)
     where[topology.node[on]] = on
-    led = where[nodes] >= 0  # not those inside
-    whole[where[nodes[led]]] = moves[led]
+    prescribed = where[nodes] >= 0  # not those inside
+    whole[where[nodes[prescribed]]] = moves[prescribed]
     return whole
 
 

@@ -10,7 +10,7 @@ import taichi as ti
 from taisoft.collision.boxes import list_near
 from taisoft.collision.candidates import sum_parts
 from taisoft.collision.features import corner
-from taisoft.collision.near import WHOLE, list_triangles, query_box
+from taisoft.collision.queries import WHOLE, list_triangles, query_box
 from taisoft.collision.surface import ACTIVE, dvec, part_first
 from taisoft.runtime import kernel
 
@@ -62,9 +62,9 @@ def find_crossings(
     near, sharp, row, longest, needed, room, half: as of the search that was made. part: (chunks) 3-vectors f64.
     """
     ti.loop_config(serialize=s.serial)
-    for wide in range(s.chunks * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
+    for task in range(s.chunks * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
             begin, own, n_near, most, worst = c * room, -1, 0, 0, dvec(0.0)
             for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
                 t = s.active[j]

@@ -9,7 +9,7 @@ far within a step, the side may be taken wrongly.
 import taichi as ti
 
 from taisoft.collision.contacts import EDGE_EDGE, write_contact
-from taisoft.collision.features import BY_FACES, EDGE_SLACK, corner, edge_normal, edge_sticks_out, sticks_out, unit
+from taisoft.collision.features import BY_FACES, EDGE_SLACK, corner, edge_in_normal_cone, edge_normal, in_normal_cone, unit
 from taisoft.collision.surface import INSIDE_BITS, dvec, ivec
 from taisoft.collision.triangles import closest_lines
 from taisoft.collision.vertex_face import through
@@ -61,7 +61,7 @@ def _is_past_end(s: ti.template(), t, k, place, length, gap, q):
 def _is_freed(s: ti.template(), p, i, u, m, gap):
     """1 where point p of an edge, which lies `gap` < 0 deep below edge m of triangle u, is carried out by what takes vertex i
     out: to less than a tenth of that depth. One that lies deeper than SHALLOW is taken to be far from where i came in."""
-    d = p + s.way_out[i] - corner(s, u, m)
+    d = p + s.exit_direction[i] - corner(s, u, m)
     depth = -d.dot(s.normal[u])
     v = s.neighbour[u, m]
     if v >= 0:
@@ -89,7 +89,7 @@ def _end_tells(s: ti.template(), t, k, p, place, length, gap, u, m, n, by_faces)
             if good == 1:
                 good = _is_behind(s, i, length, u, m, ti.cast(0.0, ti.f64))
             if good == 1:
-                told = told | sticks_out(s, i, n)
+                told = told | in_normal_cone(s, i, n)
     return told
 
 
@@ -176,7 +176,7 @@ def edge_contact(s: ti.template(), way: ti.template(), t, k, u, m, margin, out: 
                     t1, k1, t2, k2 = ti.select(side, u, t), ti.select(side, m, k), ti.select(side, t, u), ti.select(side, k, m)
                     place, length, along = ti.select(side, g * lb, f * la), ti.select(side, lb, la), ti.select(side, -n, n)
                     if good == 1:
-                        good = edge_sticks_out(s, t2, k2, along)
+                        good = edge_in_normal_cone(s, t2, k2, along)
                     if good == 1 and ahead == 0:
                         good = _within(s, t1, k1, place, length, over, t2, k2)
                     if good == 1 and ahead == 0:

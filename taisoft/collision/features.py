@@ -56,7 +56,7 @@ def opposite(s: ti.template(), t, i, j):
 
 
 @ti.func
-def sticks_out(s: ti.template(), i, n):
+def in_normal_cone(s: ti.template(), i, n):
     """1 where vertex i is its surface's furthest point against n near by, and some face there looks against n."""
     x = s.x[i]
     good = 1
@@ -112,7 +112,7 @@ def edge_normal(s: ti.template(), t, k):
 
 
 @ti.func
-def edge_sticks_out(s: ti.template(), t, k, n):
+def edge_in_normal_cone(s: ti.template(), t, k, n):
     """1 where the surface near edge k of triangle t lies against n: towards -n of it, within EDGE_SLACK."""
     i, j = s.triangle[t, k], s.triangle[t, (k + 1) % 3]
     d = unit(s.x[j] - s.x[i])
@@ -137,7 +137,7 @@ def mark_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template())
 
     way: (n_bodies) i32, 0 for bodies hit by a distance field.
     """
-    ti.loop_config(serialize=s.light)
+    ti.loop_config(serialize=s.serial_cheap)
     for c in range(s.count[ACTIVE]):
         t = s.active[c]
         bits = 0
@@ -146,7 +146,7 @@ def mark_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template())
             flat = SMOOTH
         for k in range(3):
             s.inside[s.triangle[t, k]] = 0
-            s.way_out[s.triangle[t, k]] = dvec(0.0)
+            s.exit_direction[s.triangle[t, k]] = dvec(0.0)
             if (s.owns[t] >> (3 + k)) & 1:
                 w = s.neighbour[t, k]
                 if w < 0:

@@ -10,7 +10,7 @@ import numpy as np
 import taichi as ti
 
 from taisoft.collision.analytic import NO_SHAPES, AnalyticObstacles, find_analytic
-from taisoft.collision.boxes import move_obstacles, take_led, update_surface
+from taisoft.collision.boxes import move_obstacles, take_prescribed, update_surface
 from taisoft.collision.bvh import Bvh, Trees
 from taisoft.collision.candidates import Buffer, Candidates, entries
 from taisoft.collision.colliders import (
@@ -18,8 +18,8 @@ from taisoft.collision.colliders import (
     collider_edge,
     collider_surfaces,
     collider_thickness,
-    led_vertices,
     obstacle_frame,
+    prescribed_vertices,
 )
 from taisoft.collision.contacts import KINDS, Contacts, contact_fields, gather
 from taisoft.collision.containment import Containment, Inside
@@ -30,7 +30,7 @@ from taisoft.collision.reduction import FOUND, LEFT, ReductionFields, reduce_con
 from taisoft.collision.sdf import DistanceFields, build_fields, find_in_fields
 from taisoft.collision.self_collision import Intersections
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.collision.surface import ACTIVE, PAIRS, UNFINITE, Surface, build_surface
+from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, Surface, build_surface
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fields import FieldArena
 from taisoft.mesh.quality import mean_surface_edge
@@ -98,20 +98,20 @@ class Detection:
         soft = np.arange(len(scene.colliders)) < len(bodies)
         self.thickness = np.array([collider_thickness(c, self.edge) for c in scene.colliders])
         self._analytic = [(len(bodies) + k, o) for k, o in enumerate(obstacles) if not isinstance(o.shape, MeshObstacle)]
-        ways = [BY_FACES if b.hit_by == "proximity" else BY_FIELD for b in bodies]
+        ways = [BY_FACES if b.contact_mode == "proximity" else BY_FIELD for b in bodies]
         ways += [BY_FACES if isinstance(o.shape, MeshObstacle) else BY_EDGES for o in obstacles]
         self.surface: Surface = build_surface(
             self.topology, self._rest, soft, soft & self_collision, self.thickness, self.edges, runtime, arena, serial
         )
         s = self.surface
         self.broad = self._make_broad(runtime) if self._rows else None
-        self._way = arena.field("contact_way", ti.i32, len(ways), np.array(ways, dtype=np.int32))
+        self._path = arena.field("contact_way", ti.i32, len(ways), np.array(ways, dtype=np.int32))
         self._sharp = arena.field("surface_sharp", ti.i32, max(s.n_triangles, 1))
         self._unmapped = arena.field("unmapped", ti.i32, 1)
         self._crossed = arena.vectors("crossed", ti.f64, s.chunks)
         self._fields = self._make_fields(grids, runtime) if any(grids) else None
         self.shapes = self._make_shapes() if self._analytic else NO_SHAPES
-        self._led = None  # how far vertices are led, where they ever are
+        self._prescribed = None  # how far vertices are led, where they ever are
         row = min(int(np.diff(self.topology.first).max(initial=1)), LONGEST_ROW) * s.chunks
         limits = (settings.initial_capacity or row, settings.max_capacity)
         self._row = Buffer("near", entries, *limits, s.chunks, arena) if self._rows else None
@@ -146,7 +146,7 @@ class Detection:
     def _grids(self) -> list[SdfGrid | None]:
         """Of each collider, None where it has none."""
         cells, margin = self.scene.collision.field_cells, 2.0 * self.margin
-        grids = [body_grid(b, cells, margin) if b.hit_by == "distance_field" else None for b in self.scene.bodies]
+        grids = [body_grid(b, cells, margin) if b.contact_mode == "distance_field" else None for b in self.scene.bodies]
         return grids + [None] * len(self.scene.obstacles)
 
     def _make_fields(self, grids: list[SdfGrid | None], runtime: Runtime) -> DistanceFields:
@@ -171,7 +171,7 @@ class Detection:
 
     # --- a search -------------------------------------------------------------------------------------------------
 
-    def find(self, time: float, dt: float, led: tuple[np.ndarray, np.ndarray] | None = None, way=None) -> None:
+    def find(self, time: float, dt: float, prescribed: tuple[np.ndarray, np.ndarray] | None = None, path=None) -> None:
         """Find the contacts of the model's present state swept by dt [s]: those nearer than the margin at some moment.
 
         Faces that have passed each other are found to a depth of `reach`, the margin and a tenth of the mean edge.
@@ -180,20 +180,21 @@ class Detection:
         way: a field of (n_nodes) f64 3-vectors [m], how far the nodes go, where that is known better than v dt.
         Raises SimulationError where positions are not finite, or a buffer may not grow as far as it must.
         """
-        self._move(time, dt, led, way)
+        self._move(time, dt, prescribed, path)
         self._looked = self._near()
         self._search(self._looked)
         self._reduce()
 
-    def _move(self, time: float, dt: float, led: tuple[np.ndarray, np.ndarray] | None = None, way=None) -> None:
+    def _move(self, time: float, dt: float, prescribed: tuple[np.ndarray, np.ndarray] | None = None, path=None) -> None:
         """The surface where it is and how far it goes, and the boxes."""
         s, m = self.surface, self.model
         self._place_obstacles(time, dt)
-        leads = led is not None and len(led[0]) > 0
-        v, span = (m.state.v, dt) if way is None else (way, 1.0)
-        update_surface(s, m.state.x, v, leads, self._lead(*led) if leads else s.move, span, self.reach, self._rows)
-        if s.count[UNFINITE]:
-            raise SimulationError(self._unfinite())
+        has_prescribed = prescribed is not None and len(prescribed[0]) > 0
+        v, span = (m.state.v, dt) if path is None else (path, 1.0)
+        ways = self._upload_prescribed(*prescribed) if has_prescribed else s.move
+        update_surface(s, m.state.x, v, has_prescribed, ways, span, self.reach, self._rows)
+        if s.count[NONFINITE]:
+            raise SimulationError(self._nonfinite())
 
     def _near(self) -> Trees | Candidates | None:
         """Where to look for near triangles; None where no two surfaces can touch."""
@@ -210,24 +211,24 @@ class Detection:
     def _fill_buffer(self, near: Trees | Candidates | None) -> None:
         """Contacts before the reduction, as far as they fit."""
         s, b, row = self.surface, self.buffer, self._row
-        out, more, half = (b.data, b.used, b.count, b.part), 0, 0.5 * self.reach
+        out, append, half = (b.data, b.used, b.count, b.part), 0, 0.5 * self.reach
         if near is not None:
             rows = (row.data, row.used, row.count, row.part)
             if self._proximity:
-                find_proximity(s, near, self._way, self._sharp, *rows, self.margin, half, *out)
-                more = 1
+                find_proximity(s, near, self._path, self._sharp, *rows, self.margin, half, *out)
+                append = 1
             if self._fields is not None:
-                find_in_fields(s, near, self._fields, self._sharp, *rows, self.margin, half, *out, more, self._unmapped)
-                more = 1
+                find_in_fields(s, near, self._fields, self._sharp, *rows, self.margin, half, *out, append, self._unmapped)
+                append = 1
         if self.shapes.count:
-            find_analytic(s, self.shapes, self.margin, *out, more)
+            find_analytic(s, self.shapes, self.margin, *out, append)
 
     def _reduce(self) -> None:
         """List the contacts that are kept, and count."""
         b = self.buffer
         if self._reduction is None or self._reduction.place.shape[0] != b.capacity:
             arena = FieldArena()
-            self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.light, self.surface.light_spread)
+            self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.serial_cheap, self.surface.cheap_spread)
             self._reduction_arena.release()
             self._reduction_arena = arena
         reduce_contacts(self._reduction, b.data, b.used, b.part, MERGED * self.edge, REDUCTION_CELL * self.edge)
@@ -262,14 +263,14 @@ class Detection:
             ])  # fmt: skip
         self._placed = True
 
-    def _lead(self, nodes: np.ndarray, moves: np.ndarray):
+    def _upload_prescribed(self, nodes: np.ndarray, moves: np.ndarray):
         """The field of how far vertices are led."""
-        if self._led is None:
-            self._led = self._arena.vectors("surface_led", ti.f64, self.surface.n_verts)
-        take_led(self.surface, self._led, led_vertices(self.topology, nodes, moves))
-        return self._led
+        if self._prescribed is None:
+            self._prescribed = self._arena.vectors("surface_led", ti.f64, self.surface.n_verts)
+        take_prescribed(self.surface, self._prescribed, prescribed_vertices(self.topology, nodes, moves))
+        return self._prescribed
 
-    def _unfinite(self) -> str:
+    def _nonfinite(self) -> str:
         x, move = download([self.surface.x, self.surface.move])
         bad = int(np.argmin((np.isfinite(x) & np.isfinite(x + move)).all(axis=1)))
         k = int(np.searchsorted(self.topology.vertex_first, bad, side="right")) - 1

@@ -6,7 +6,7 @@ from taisoft.collision.boxes import list_near, sum_pairs
 from taisoft.collision.candidates import sum_parts
 from taisoft.collision.edge_edge import edge_contact
 from taisoft.collision.features import BY_FACES, mark_sharp_edges
-from taisoft.collision.near import EDGES, list_triangles, query_box
+from taisoft.collision.queries import EDGES, list_triangles, query_box
 from taisoft.collision.surface import ACTIVE, part_first
 from taisoft.collision.vertex_face import vertex_contacts
 from taisoft.runtime import kernel
@@ -25,9 +25,9 @@ def _vertices(
 ):  # fmt: skip
     """The contacts of vertices: the first in the buffer's parts."""
     ti.loop_config(serialize=s.serial)
-    for wide in range(s.chunks * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
+    for task in range(s.chunks * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
             at, end, begin = c * part, (c + 1) * part, c * room
             own, n_near, most, pairs = -1, 0, 0, 0
             for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
@@ -56,9 +56,9 @@ def _edges(
 ):  # fmt: skip
     """The contacts of edges, after those of vertices: which rest on what has been found inside."""
     ti.loop_config(serialize=s.serial)
-    for wide in range(s.chunks * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
+    for task in range(s.chunks * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
             at, end, begin = c * part + used[c], (c + 1) * part, c * room
             own, n_near, most, pairs = -1, 0, longest[c], s.part[c]
             for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):

@@ -91,9 +91,9 @@ def _fill_cells(r: ti.template(), out: ti.template(), used: ti.template(), part,
     for b in range(r.count[MASK] + 1):
         r.bucket_end[b] = 0
     ti.loop_config(serialize=r.serial)
-    for wide in range(r.chunks * r.spread):
-        if wide % r.spread == 0:
-            c = wide // r.spread
+    for task in range(r.chunks * r.spread):
+        if task % r.spread == 0:
+            c = task // r.spread
             for k in range(used[c]):
                 i, at = r.first[c] + k, c * part + k
                 r.place[i] = at

@@ -18,9 +18,9 @@ from taisoft.collision.analytic import DEEPER, deeper_inside
 from taisoft.collision.boxes import list_near, sum_pairs
 from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import FACE_FIELD, VERTEX_FIELD, write_contact
-from taisoft.collision.features import corner, moved, sticks_out, unit, vertices_of
+from taisoft.collision.features import corner, in_normal_cone, moved, unit, vertices_of
 from taisoft.collision.frank_wolfe import deepest_point
-from taisoft.collision.near import WHOLE, list_triangles, query_box
+from taisoft.collision.queries import WHOLE, list_triangles, query_box
 from taisoft.collision.surface import ACTIVE, dvec, ivec, part_first
 from taisoft.collision.triangles import choose, closest_on_triangle
 from taisoft.fields import FieldArena
@@ -210,7 +210,7 @@ def _field_contacts(
                         i = s.triangle[t, ti.min(j, 2)]
                         good = 0
                         if j < 3:
-                            good = sticks_out(s, i, n)
+                            good = in_normal_cone(s, i, n)
                         else:
                             good = deeper_inside(s, t, w, n, x)
                         if good == 1 and j < 3:
@@ -232,17 +232,17 @@ def _field_contacts(
 def find_in_fields(
     s: ti.template(), near: ti.template(), f: ti.template(), sharp: ti.template(), row: ti.template(), longest: ti.template(),
     needed: ti.template(), room: ti.i32, margin: ti.f64, half: ti.f64, out: ti.template(), used: ti.template(),
-    count: ti.template(), part: ti.i32, more: ti.i32, unmapped: ti.template(),
+    count: ti.template(), part: ti.i32, append: ti.i32, unmapped: ti.template(),
 ):  # fmt: skip
     """Contacts with distance fields; unmapped[0] counts the (triangle, body) that no tet maps. As `find_proximity`, after whose
     contacts they come where `more` is 1."""
     unmapped[0] = 0
     ti.loop_config(serialize=s.serial)
-    for wide in range(s.chunks * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
-            at, end, begin = c * part + more * used[c], (c + 1) * part, c * room
-            own, n_near, most, pairs, lost = -1, 0, more * longest[c], 0, 0
+    for task in range(s.chunks * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
+            at, end, begin = c * part + append * used[c], (c + 1) * part, c * room
+            own, n_near, most, pairs, lost = -1, 0, append * longest[c], 0, 0
             for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
                 t = s.active[i]
                 if s.body[t] != own:
@@ -263,4 +263,4 @@ def find_in_fields(
     for _ in range(1):
         sum_parts(used, count, s.chunks)
         sum_parts(longest, needed, s.chunks)
-        sum_pairs(s, more)
+        sum_pairs(s, append)

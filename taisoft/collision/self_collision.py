@@ -31,9 +31,9 @@ def find_intersections(
 ):  # fmt: skip
     """Pairs t < u of the rows that intersect; rows ascend, and so do the pairs of a part and the parts."""
     ti.loop_config(serialize=s.serial)
-    for wide in range(s.chunks * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
+    for task in range(s.chunks * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
             last = (c + 1) * part
             at = c * part
             for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):

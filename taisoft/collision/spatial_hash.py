@@ -22,7 +22,7 @@ from taisoft.runtime import kernel
 
 LARGE = 512  # cells
 COUNTABLE = 2.0**50  # cells from the origin: beyond, neighbouring cells have the same number in f64
-MOST_CELLS = 2**22
+MAX_CELLS = 2**22
 CELLS_PER_TRIANGLE = 2
 ENTRIES_PER_TRIANGLE = 24  # of a row, at first
 SCAN = 256  # parts of the prefix scan
@@ -31,7 +31,7 @@ N_LARGE, N_ENTRIES = 0, 1  # places in the grid's count
 
 def grid_size(extent: np.ndarray, cell: float, n_triangles: int) -> tuple[int, int, int]:
     """Cells along each axis, powers of two: enough for the extent (3,) [m], but not many more than triangles."""
-    most = min(MOST_CELLS, max(512, CELLS_PER_TRIANGLE * n_triangles))
+    most = min(MAX_CELLS, max(512, CELLS_PER_TRIANGLE * n_triangles))
     bits = [max(0, math.ceil(math.log2(min(max(e / cell, 1.0), 2.0**20)))) for e in extent]
     while sum(bits) > math.log2(most):
         bits[bits.index(max(bits))] -= 1
@@ -113,9 +113,9 @@ def count_cells(s: ti.template(), g: ti.template(), inverse: ti.f64):
 def scan_cells(s: ti.template(), g: ti.template()):
     """Prefix sums: cell_start from the counts in cell_end, which then points there too."""
     ti.loop_config(serialize=s.serial)
-    for wide in range(SCAN * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
+    for task in range(SCAN * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
             total = 0
             for k in range(part_first(c, g.n_cells, SCAN), part_first(c + 1, g.n_cells, SCAN)):
                 total += g.cell_end[k]
@@ -129,9 +129,9 @@ def scan_cells(s: ti.template(), g: ti.template()):
             total += n
         g.count[N_ENTRIES] = total
     ti.loop_config(serialize=s.serial)
-    for wide in range(SCAN * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
+    for task in range(SCAN * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
             total = g.scan[c]
             for k in range(part_first(c, g.n_cells, SCAN), part_first(c + 1, g.n_cells, SCAN)):
                 n = g.cell_end[k]
@@ -179,9 +179,9 @@ def find_rows(
         g.start[t] = 0
         g.end[t] = 0
     ti.loop_config(serialize=s.serial)
-    for wide in range(s.chunks * s.spread):
-        if wide % s.spread == 0:
-            c = wide // s.spread
+    for task in range(s.chunks * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
             last = (c + 1) * part
             at = c * part
             for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):

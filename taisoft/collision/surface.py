@@ -16,11 +16,11 @@ from taisoft.runtime import Runtime
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than waking the others (about 50 us a loop)
 # The same for loops that do little at a turn: boxes, the trees' refit, sharp edges, reduction. Measured with two cores: the same
 # with 21,000 triangles, and 1.3 times as fast a search on both with 105,000.
-LIGHT_BELOW = 30000
+SERIAL_CHEAP_BELOW = 30000
 # Taichi gives each CPU thread at least 512 turns of a loop: so many turns belong to one part, and one of them does the work
 SPREAD = {"cpu": 512, "cuda": 1}
 CHUNKS = {"cpu": 64, "cuda": 4096}  # parts of a list that are worked on side by side, each with its own part of a buffer
-UNFINITE, ACTIVE, PAIRS = 0, 1, 2  # places in Surface.count
+NONFINITE, ACTIVE, PAIRS = 0, 1, 2  # places in Surface.count
 INSIDE_BITS = 31  # of Surface.inside; colliders that share a bit lie in one vertex at once next to never
 
 dvec = ti.types.vector(3, ti.f64)
@@ -58,10 +58,10 @@ class Surface:
     n_verts: Count
     n_bodies: Count  # colliders, with those that have no faces
     serial: bool  # whether one thread does it all
-    light: bool  # whether one thread does the loops that do little at a turn
+    serial_cheap: bool  # whether one thread does the loops that do little at a turn
     chunks: int
     spread: int  # turns of a loop for each part, see SPREAD
-    light_spread: int  # the same for light loops
+    cheap_spread: int  # the same for light loops
     triangle: Any  # (n_triangles, 3) i32
     body: Any  # i32
     node: Any  # i32
@@ -90,7 +90,7 @@ class Surface:
     part: Any  # (chunks) i32: counts of the parts of a list
     near: Any  # (chunks * n_bodies) i32: colliders near that which a part is at
     inside: Any  # (n_verts) i32: bit k % INSIDE_BITS where the vertex lies in collider k and has contacts that lead out of it
-    way_out: Any  # (n_verts) 3-vectors f64: by those contacts together [m]
+    exit_direction: Any  # (n_verts) 3-vectors f64: by those contacts together [m]
 
 
 def make_topology(parts: list[tuple[np.ndarray, np.ndarray]]) -> Topology:
@@ -150,9 +150,9 @@ def build_surface(
     serial: None decides by size."""
     t, i = topology, ti.i32
     n, v, bodies = len(t.triangle), len(t.node), len(soft)
-    light = serial
+    serial_cheap = serial
     if serial is None:
-        serial, light = (runtime.arch == "cpu" and n < few for few in (SERIAL_BELOW, LIGHT_BELOW))
+        serial, serial_cheap = (runtime.arch == "cpu" and n < few for few in (SERIAL_BELOW, SERIAL_CHEAP_BELOW))
     chunks = 1 if serial else CHUNKS[runtime.arch]
 
     def ints(name: str, data: np.ndarray):
@@ -166,7 +166,7 @@ def build_surface(
         return arena.vectors(f"surface_{name}", ti.f64, max(count, 1))
 
     return Surface(
-        n, v, bodies, serial, light, chunks, *(1 if alone else SPREAD[runtime.arch] for alone in (serial, light)),
+        n, v, bodies, serial, serial_cheap, chunks, *(1 if alone else SPREAD[runtime.arch] for alone in (serial, serial_cheap)),
         rows("triangle", t.triangle),
         ints("body", t.body), ints("node", t.node),
         rows("neighbour", t.neighbour), ints("owns", t.owns), ints("ring_start", t.ring_start), ints("ring", t.ring),
@@ -179,7 +179,7 @@ def build_surface(
         vectors("body_lo", bodies), vectors("body_hi", bodies),
         arena.field("surface_active", i, max(n, 1)), arena.field("surface_count", i, 4), arena.field("surface_part", i, chunks),
         arena.field("surface_near", i, chunks * max(bodies, 1)), arena.field("surface_inside", i, max(v, 1)),
-        vectors("way_out", v),
+        vectors("exit_direction", v),
     )  # fmt: skip
 
 

@@ -14,11 +14,11 @@ from taisoft.collision.features import (
     ROUNDING,
     corner,
     edge_normal,
+    in_normal_cone,
     moved,
     nearest_of_ring,
     opposite,
     ring_normal,
-    sticks_out,
     unit,
     vertices_of,
 )
@@ -222,7 +222,7 @@ def vertex_contacts(
                 # a groove's other wall; the sides of a plate that has warped are deeper
                 wanted = int(n.dot(n_best) > -0.5) & int(-h <= ti.cast(GROOVE, ti.f64) * least + margin)
         if wanted == 1:
-            wanted = sticks_out(s, i, n)
+            wanted = in_normal_cone(s, i, n)
             if phase == 0 and wanted == 0 and a == INSIDE and -h < least_facing:
                 if n.dot(ring_normal(s, i)) < ti.cast(FACING, ti.f64):
                     least_facing, best_facing = -h, u
@@ -250,7 +250,7 @@ def vertex_contacts(
         if phase >= 2 and wanted == 1:
             if state == INSIDE:
                 s.inside[i] |= 1 << (other % INSIDE_BITS)
-                s.way_out[i] -= gap * n
+                s.exit_direction[i] -= gap * n
             write_contact(
                 out, at, end, own, other, ivec(VERTEX_FACE, i, u), p, n, gap,
                 ivec(i, -1, -1), dvec(1.0, 0.0, 0.0), vertices_of(s, u), w,

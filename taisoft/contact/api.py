@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from taisoft.contact import SOLVERS, augmented_lagrangian, host
+from taisoft.contact import SOLVERS, augmented_lagrangian, numpy_prox
 from taisoft.contact.colouring import store
 from taisoft.contact.graph import colour_greedy, matrix_graph
 from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_field, fill_matrix_problem
@@ -62,7 +62,7 @@ def solve_contact_problem(
         r, history = _auto(W, b, mu, start, tolerance, int(max_iterations))
     else:
         r, history = _run(method, W, b, mu, start, tolerance, int(max_iterations))
-    residual = host.residual(W, b, mu, host.find_factors(W), r)
+    residual = numpy_prox.residual(W, b, mu, numpy_prox.find_factors(W), r)
     return ContactSolution(r.ravel(), residual, history, len(history) - 1, residual <= tolerance)
 
 

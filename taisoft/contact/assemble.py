@@ -1,11 +1,11 @@
 """From contacts that were found to the contact problem: frames, weights, numbers of each pair, warm start.
 
-Where a contact must be at the end of a step, its goal, is a gap of at least `standoff`, a small distance that keeps surfaces
+Where a contact must be at the end of a step, its target, is a gap of at least the contact offset, a distance that keeps surfaces
 apart in spite of what linearising the motion misses. A gap above it may close so far. A gap below it opens slowly, a true
 penetration in a few steps, and never faster than strains the softest body by a percent: else bodies would fly apart. Parts of
-one body keep OWN times the standoff and are mended OWN times as fast. Where the surfaces meet within the step, restitution asks
-for more (`restitution`). The velocity that an impulse must leave is then
-    u_n = (gap - goal)/dt + n.(v_a - v_b) >= 0,
+one body keep OWN times the contact offset and are mended OWN times as fast. Where the surfaces meet within the step,
+restitution asks for more (`restitution`). The velocity that an impulse must leave is then
+    u_n = (gap - target)/dt + n.(v_a - v_b) >= 0,
 which counts motion once: the gap is that at the start of the step.
 """
 
@@ -24,7 +24,7 @@ from taisoft.scene.scene import Scene
 from taisoft.transfer import upload
 
 NEGLIGIBLE = 1e-12  # a weight below it: the node is not part of the contact
-OWN = 5.0  # times the standoff, and times the share of what is mended, between parts of one body: folds turn as they meet
+OWN = 5.0  # times the contact offset, and times the share of what is mended, between parts of one body: folds turn as they meet
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class FoundContacts:
     n_slots: Count  # of the table, a power of two
     point: Any  # 3-vectors f64 [m]
     gap: Any  # f64 [m]
-    carry: Any  # 3-vectors f64: way of an obstacle at the contact in the step [m]
+    obstacle_displacement: Any  # 3-vectors f64: way of an obstacle at the contact in the step [m]
     approach: Any  # f64: normal velocity at the start of the step, negative where surfaces come nearer [m/s]
     restitution: Any  # f64
     leave: Any  # f64: normal velocity that an impact leaves at least, set where a step has one [m/s]
@@ -73,7 +73,7 @@ def build_found(arena: FieldArena, problem: ContactProblem) -> FoundContacts:
         return arena.field(f"found_{name}", ti.f64, n)
 
     return FoundContacts(
-        problem, n_slots, vectors("point"), numbers("gap"), vectors("carry"), numbers("approach"), numbers("restitution"),
+        problem, n_slots, vectors("point"), numbers("gap"), vectors("obstacle_displacement"), numbers("approach"), numbers("restitution"),
         numbers("leave"), numbers("rise"), vectors("struck"), vectors("body", ti.i32, 2), vectors("feature", ti.i32),
         vectors("before_feature", ti.i32), vectors("before_point"), vectors("before_impulse"),
         arena.field("found_slot", ti.i32, n_slots),
@@ -127,7 +127,7 @@ def _numbers_of(q: ti.template(), a, b):
 
 
 @ti.func
-def carried(o: ti.template(), body, x):
+def obstacle_displacement_at(o: ti.template(), body, x):
     """How far the point x of analytic obstacle `body` goes in the step; 0 for any other collider."""
     way = dvec(0.0)
     for k in range(o.count):
@@ -152,7 +152,7 @@ def _take(
                 p.weight[c, k] = sign * weight
                 n = k + 1
             else:  # of an obstacle
-                f.carry[c] = f.carry[c] + weight * s.move[v]
+                f.obstacle_displacement[c] = f.obstacle_displacement[c] + weight * s.move[v]
     return n
 
 
@@ -224,7 +224,7 @@ def fill(
         a, b = found.body[at][0], found.body[at][1]
         friction, restitution = _numbers_of(q, a, b)
         p.friction[c], f.restitution[c] = friction, restitution
-        f.carry[c] = dvec(0.0)
+        f.obstacle_displacement[c] = dvec(0.0)
         k = 0
         for j in ti.static(range(3)):
             k = _take(f, s, c, k, found.nodes_a[at][j], found.weights_a[at][j], 1.0)
@@ -233,9 +233,9 @@ def fill(
         p.arity[c] = k
         if ti.static(o.any):
             if found.nodes_b[at][0] < 0:
-                f.carry[c] = carried(o, b, point - 0.5 * gap * normal)
+                f.obstacle_displacement[c] = obstacle_displacement_at(o, b, point - 0.5 * gap * normal)
         p.order[c] = c
-        v = -f.carry[c] / dt
+        v = -f.obstacle_displacement[c] / dt
         for j in range(k):
             v += p.weight[c, j] * ti.cast(m.state.v[p.node[c, j]], ti.f64)
         f.approach[c] = normal.dot(v)
@@ -250,37 +250,38 @@ def _own(f: ti.template(), c):
 
 
 @ti.func
-def standoff_of(f: ti.template(), c, common):
+def contact_offset_of(f: ti.template(), c, common):
     """Standoff of contact c [m]; common: that of contacts between bodies."""
     return _own(f, c) * common
 
 
 @ti.func
-def short_of_goal(f: ti.template(), c, dt, common_standoff, fast, slow, fastest, rise):
+def gap_minus_target(f: ti.template(), c, dt, common_offset, fast, slow, fastest, rise):
     """gap - goal of contact c [m].
 
     common_standoff [m]: of contacts between bodies. rise: how far restitution opens the gap in the step, or 0 [m].
-    fast, slow: shares of a penetration and of a missing standoff that the step mends; fastest: speed of that at most [m/s].
+    fast, slow: shares of a penetration and of a missing contact offset that the step mends; fastest: speed of that at most [m/s].
     """
-    gap, own, standoff = f.gap[c], _own(f, c), standoff_of(f, c, common_standoff)
-    goal = standoff
-    if gap < standoff:
+    gap, own, contact_offset = f.gap[c], _own(f, c), contact_offset_of(f, c, common_offset)
+    target = contact_offset
+    if gap < contact_offset:
         above = ti.max(gap, 0.0)
-        goal = gap + ti.min(own * (slow * (standoff - above) + fast * (above - gap)), fastest * dt)
+        target = gap + ti.min(own * (slow * (contact_offset - above) + fast * (above - gap)), fastest * dt)
     if rise > 0.0:
-        goal = ti.max(goal, gap + rise)
-    return gap - goal
+        target = ti.max(target, gap + rise)
+    return gap - target
 
 
 @kernel
-def find_impact(f: ti.template(), dt: ti.f64, standoff: ti.f64) -> ti.i32:
+def find_impact(f: ti.template(), dt: ti.f64, contact_offset: ti.f64) -> ti.i32:
     """1 where a contact closes within a step of dt that bore no impulse in the one before."""
     (p,) = ti.static((f.problem,))
     found = 0
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
-            if p.r[c][0] == 0.0 and f.approach[c] < 0.0 and f.gap[c] - standoff_of(f, c, standoff) + dt * f.approach[c] < 0.0:
+            closes = f.gap[c] + dt * f.approach[c] < contact_offset_of(f, c, contact_offset)
+            if p.r[c][0] == 0.0 and f.approach[c] < 0.0 and closes:
                 found = 1
     return found
 

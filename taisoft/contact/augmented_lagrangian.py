@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from taisoft.contact.graph import matrix_graph
-from taisoft.contact.host import find_factors, natural_map, prox, relative
+from taisoft.contact.numpy_prox import find_factors, natural_map, prox, relative
 
 DENSE = 90  # rows of an island up to which its equations are solved as a dense matrix; a larger one may be spread over threads
 START, MOST, LEAST = 1e4, 1e7, 1e-2  # rho

@@ -7,13 +7,13 @@ colours. On one thread it is that. `colouring` groups the contacts, once before 
 
 import taichi as ti
 
-from taisoft.contact.gauss_seidel import relax, share, sweep
+from taisoft.contact.gauss_seidel import relax, relaxation, sweep
 from taisoft.contact.problem import ContactProblem
 from taisoft.runtime import kernel
 
 AT_ONCE = 4  # colours of a launch, which costs more than a loop in it
 
-__all__ = ["share", "sweep", "sweep_at_once"]
+__all__ = ["relaxation", "sweep", "sweep_at_once"]
 
 
 @kernel

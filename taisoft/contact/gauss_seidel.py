@@ -5,17 +5,17 @@ All sweeps run in one kernel on one thread, in the order of `ContactProblem.orde
 
 import taichi as ti
 
-from taisoft.contact import share as shares
-from taisoft.contact.problem import STEP, push, velocity
+from taisoft.contact import r_factor_bounds as bounds
+from taisoft.contact.problem import STEP, add_impulse, velocity
 from taisoft.contact.prox import prox, scaled
 
 
 @ti.func
-def share(p: ti.template(), c, beyond):
+def relaxation(p: ti.template(), c, beyond):
     """Share of its r-factors that contact c takes: all of them without momentum, which forgives no overshooting."""
     result = ti.cast(1.0, ti.f64)
     if beyond == 1:
-        result = shares.alone(p, c)
+        result = bounds.sequential(p, c)
     return result
 
 
@@ -24,8 +24,8 @@ def relax(p: ti.template(), c):
     """One prox of contact c with its share of the r-factors, told to its nodes."""
     r = p.r[c]
     p.guess[c] = r
-    new = prox(r - scaled(p.state[STEP] * p.share[c] * p.factor[c], velocity(p, c)), p.friction[c])
-    push(p, c, new - r)
+    new = prox(r - scaled(p.state[STEP] * p.relaxation[c] * p.factor[c], velocity(p, c)), p.friction[c])
+    add_impulse(p, c, new - r)
     p.r[c] = new
 
 

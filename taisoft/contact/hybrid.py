@@ -2,10 +2,10 @@
 
 import taichi as ti
 
-from taisoft.contact.jacobi import share, sweep_all, sweep_all_at_once
+from taisoft.contact.jacobi import relaxation, sweep_all, sweep_all_at_once
 from taisoft.contact.problem import ContactProblem
 
-__all__ = ["share", "sweep", "sweep_at_once"]
+__all__ = ["relaxation", "sweep", "sweep_at_once"]
 
 
 @ti.func

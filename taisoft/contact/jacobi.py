@@ -5,23 +5,23 @@ The friction disk is that of the last sweep's normal part. `hybrid` shares all b
 
 import taichi as ti
 
-from taisoft.contact import share as shares
+from taisoft.contact import r_factor_bounds as bounds
 from taisoft.contact.problem import STEP, ContactProblem, velocity
 from taisoft.contact.prox import into_disk, prox, scaled
 from taisoft.runtime import kernel
 
 
 @ti.func
-def share(p: ti.template(), c, beyond):
+def relaxation(p: ti.template(), c, beyond):
     """Share of its r-factors that contact c takes, with momentum or without."""
-    return shares.together(p, c)
+    return bounds.gershgorin(p, c)
 
 
 @ti.func
 def relaxed(p: ti.template(), c, fresh: ti.template()):
     """One prox of contact c. fresh: whether the friction disk is that of the new normal part."""
     r = p.r[c]
-    z = r - scaled(p.state[STEP] * p.share[c] * p.factor[c], velocity(p, c))
+    z = r - scaled(p.state[STEP] * p.relaxation[c] * p.factor[c], velocity(p, c))
     new = prox(z, p.friction[c])
     if ti.static(not fresh):
         new = into_disk([new[0], z[1], z[2]], p.friction[c] * r[0])

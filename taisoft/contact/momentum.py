@@ -15,7 +15,7 @@ from taisoft.contact.prox import prox
 
 
 @ti.func
-def against(p: ti.template(), c):
+def restart_test(p: ti.template(), c):
     """What contact c adds to (y - x).F^-1 (x - x_before): y is `guess`, x is r, x_before is `trial`."""
     x, f = p.r[c], p.factor[c]
     back, on = p.guess[c] - x, x - p.trial[c]
@@ -25,7 +25,7 @@ def against(p: ti.template(), c):
 
 
 @ti.func
-def share(p: ti.template(), total):
+def momentum_weight(p: ti.template(), total):
     """(t - 1)/t' of the step beyond, times what the r-factor strategy dares; 0 after a restart. total: the sum of `against`."""
     beyond = ti.cast(0.0, ti.f64)
     t = p.state[MOMENTUM]
@@ -38,7 +38,7 @@ def share(p: ti.template(), total):
 
 
 @ti.func
-def go_beyond(p: ti.template(), c, beyond):
+def extrapolate_impulse(p: ti.template(), c, beyond):
     """Impulses of contact c that the next sweep starts from."""
     x = p.r[c]
     p.r[c] = prox(x + beyond * (x - p.trial[c]), p.friction[c])

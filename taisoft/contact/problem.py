@@ -42,7 +42,7 @@ class ContactProblem:
     b: Any  # 3-vectors [m/s]: u without impulses; (normal, t1, t2)
     factor: Any  # 2-vectors: r-factors of normal and tangents [kg]; 0 where nothing can move
     r: Any  # 3-vectors: impulses [N s]
-    share: Any  # f64: of the r-factors, that a sweep takes at most; its solver's own
+    relaxation: Any  # f64: of the r-factors, that a sweep takes at most; its solver's own
     good: Any  # 3-vectors: the best impulses so far
     guess: Any  # 3-vectors: impulses that a sweep started from
     trial: Any  # 3-vectors: impulses after the last sweep but one
@@ -105,7 +105,7 @@ def _common(arena: FieldArena, capacity: int, serial: bool) -> dict[str, Any]:
     return {
         "capacity": capacity, "serial": serial, "count": arena.field("problem_count", ti.i32, 2),
         "friction": arena.field("problem_friction", ti.f64, capacity), "b": vectors("b"), "factor": vectors("factor", 2),
-        "r": vectors("r"), "share": arena.field("problem_share", ti.f64, capacity), "good": vectors("good"),
+        "r": vectors("r"), "relaxation": arena.field("problem_relaxation", ti.f64, capacity), "good": vectors("good"),
         "guess": vectors("guess"), "trial": vectors("trial"), "term": vectors("term", 2),
         "part": arena.vectors("problem_part", ti.f64, PARTS, n=2), "order": arena.field("problem_order", ti.i32, capacity),
         "colour": arena.field("problem_colour", ti.i32, capacity),
@@ -169,7 +169,7 @@ def velocity(p: ti.template(), c):
 
 
 @ti.func
-def push(p: ti.template(), c, change):
+def add_impulse(p: ti.template(), c, change):
     """Tell the nodes of contact c that its impulse changed. Contacts that are pushed at once must share no movable node."""
     if ti.static(not p.matrix):
         d = to_world(p, c, change)

@@ -43,7 +43,7 @@ def begin(p: ti.template()):
 
 
 @ti.func
-def judge(p: ti.template(), sweeps):
+def accept_or_reject(p: ti.template(), sweeps):
     """After so many sweeps: state[VERDICT] on the impulses, by state[RESIDUAL]."""
     found, good = p.state[RESIDUAL], p.state[GOOD]
     record(p)
@@ -62,7 +62,7 @@ def judge(p: ti.template(), sweeps):
 
 
 @ti.func
-def obey(p: ti.template(), c):
+def apply_verdict(p: ti.template(), c):
     """What the verdict asks of contact c."""
     if p.state[VERDICT] == KEEP:
         p.good[c] = p.r[c]

@@ -47,19 +47,19 @@ def _begin(p: ti.template(), rule: ti.template(), beyond):
     p.state[RESIDUAL] = residual(p)
     r_factor.begin(p)
     for c in range(p.count[0]):
-        p.share[c] = rule.share(p, c, beyond)
+        p.relaxation[c] = rule.relaxation(p, c, beyond)
         p.trial[c] = p.r[c]
         p.good[c] = p.r[c]
 
 
 @ti.func
-def _go_beyond(p: ti.template()):
+def _extrapolate(p: ti.template()):
     total = ti.cast(0.0, ti.f64)
     for c in range(p.count[0]):
-        total += momentum.against(p, c)
-    beyond = momentum.share(p, total)
+        total += momentum.restart_test(p, c)
+    beyond = momentum.momentum_weight(p, total)
     for c in range(p.count[0]):
-        momentum.go_beyond(p, c, beyond)
+        momentum.extrapolate_impulse(p, c, beyond)
 
 
 @kernel
@@ -78,13 +78,13 @@ def run_serial(
             for _k in range(n):
                 rule.sweep(p)
                 if beyond == 1:
-                    _go_beyond(p)
+                    _extrapolate(p)
                 refresh(p)
             done += n
             p.state[RESIDUAL] = residual(p)
-            r_factor.judge(p, ti.cast(n, ti.f64))
+            r_factor.accept_or_reject(p, ti.cast(n, ti.f64))
             for c in range(p.count[0]):
-                r_factor.obey(p, c)
+                r_factor.apply_verdict(p, c)
             if p.state[RESIDUAL] == p.state[GOOD]:
                 refresh(p)
 
@@ -95,7 +95,7 @@ def run_serial(
 @kernel
 def _begin_at_once(p: ti.template(), rule: ti.template(), beyond: ti.i32):
     for c in range(p.count[0]):
-        p.share[c] = rule.share(p, c, beyond)
+        p.relaxation[c] = rule.relaxation(p, c, beyond)
         p.trial[c] = p.r[c]
 
 
@@ -133,22 +133,22 @@ def _look(p: ti.template(), first: ti.i32, sweeps: ti.i32):
         if first == 1:
             r_factor.begin(p)
         else:
-            r_factor.judge(p, ti.cast(sweeps, ti.f64))
+            r_factor.accept_or_reject(p, ti.cast(sweeps, ti.f64))
     for c in range(p.count[0]):
-        r_factor.obey(p, c)
+        r_factor.apply_verdict(p, c)
 
 
 @kernel
-def _go_beyond_at_once(p: ti.template()):
+def _extrapolate_parallel(p: ti.template()):
     for c in range(p.count[0]):
-        p.term[c] = [momentum.against(p, c), 0.0]
+        p.term[c] = [momentum.restart_test(p, c), 0.0]
     for k in range(PARTS):
         _add_part(p, k)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        p.state[CHANGED] = momentum.share(p, _total(p)[0])
+        p.state[CHANGED] = momentum.momentum_weight(p, _total(p)[0])
     for c in range(p.count[0]):
-        momentum.go_beyond(p, c, p.state[CHANGED])
+        momentum.extrapolate_impulse(p, c, p.state[CHANGED])
 
 
 def run_parallel(
@@ -166,7 +166,7 @@ def run_parallel(
         for _ in range(n):
             rule.sweep_at_once(p, colours)
             if beyond:
-                _go_beyond_at_once(p)
+                _extrapolate_parallel(p)
             find_velocities(p)
         done += n
         _look(p, 0, n)

@@ -6,8 +6,8 @@ What a simulator does not need is not imported: kernels take time to decorate.
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.substeps import ExplicitStepper
-from taisoft.dynamics.world import World
 
 if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep
@@ -25,7 +25,7 @@ def scheme_of(integrator: str) -> "Scheme":
 
 
 def make_stepper(
-    world: World, integrator: str, contact: "ContactStep | NoContacts", method: str
+    simulation: SimulationState, integrator: str, contact: "ContactStep | NoContacts", method: str
 ) -> "ExplicitStepper | ImplicitStepper":
     """The stepper of an integrator; the names have been checked.
 
@@ -34,12 +34,12 @@ def make_stepper(
     if integrator in IMPLICIT:
         from taisoft.dynamics.implicit import ImplicitStepper
 
-        return ImplicitStepper(world, scheme_of(integrator), contact)
+        return ImplicitStepper(simulation, scheme_of(integrator), contact)
     verlet = integrator == "velocity_verlet"
     if contact.idle:
-        return ExplicitStepper(world, verlet)
+        return ExplicitStepper(simulation, verlet)
     if method == "auto":
-        method = "gauss_seidel" if world.runtime.arch == "cpu" else "coloured_gauss_seidel"
+        method = "gauss_seidel" if simulation.runtime.arch == "cpu" else "coloured_gauss_seidel"
     from taisoft.dynamics.contact_substeps import ContactExplicitStepper
 
-    return ContactExplicitStepper(world, verlet, contact, method)
+    return ContactExplicitStepper(simulation, verlet, contact, method)

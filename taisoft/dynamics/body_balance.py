@@ -53,9 +53,9 @@ class BodyBalance:
         """
         m, w = solver.model, solver.work
         gather_forces(m, w.pcg.q)
-        fields = [w.residual, m.state.v, w.v_hat, w.pcg.q, m.free, m.mass, m.weight, *([m.loads] if m.loaded else [])]
-        residual, v, v_hat, elastic, free, mass, weight, *loads = (a.astype(np.float64) for a in download(fields))
-        external = weight[:, None] * m.gravity.to_numpy()[0] + (loads[0] if loads else 0.0)
+        fields = [w.residual, m.state.v, w.v_hat, w.pcg.q, m.free, m.mass, m.gravity_mass, *([m.loads] if m.loaded else [])]
+        residual, v, v_hat, elastic, free, mass, gravity_mass, *loads = (a.astype(np.float64) for a in download(fields))
+        external = gravity_mass[:, None] * m.gravity.to_numpy()[0] + (loads[0] if loads else 0.0)
         r, inertia, momentum, elastic, external, masses = (
             self._norm(free * a)
             for a in (

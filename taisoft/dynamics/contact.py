@@ -22,18 +22,27 @@ from taisoft.contact.assemble import (
 )  # fmt: skip
 from taisoft.contact.problem import NODES, build_node_problem, index_nodes
 from taisoft.contact.restitution import find_rebounds
-from taisoft.dynamics.tunnelling import CLOSEST, DEPTH, HASTE, SINKING, SPEED, WHICH, find_way, survey
-from taisoft.dynamics.world import World
+from taisoft.dynamics.ccd_limits import (
+    CLOSING_RATIO,
+    DEPTH,
+    MAX_CLOSING,
+    RELATIVE_PENETRATION,
+    SPEED,
+    WHICH,
+    find_displacement,
+    measure_closing,
+)
+from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
 from taisoft.transfer import download, upload
 
-STANDOFF = 2e-3  # of the finest body's mean surface edge: gap that contacts keep, so that surfaces do not cross in curved motion
-SUNK = 0.02  # of the finer side's mean surface edge: penetration that is told as a problem
-CROSSED_FAR = CROSSED  # of the same: depth of crossing triangles after which an implicit step is done again in smaller parts
-SANK = 1e-3  # of the same: penetration after which the way of an implicit part is searched
+CONTACT_OFFSET = 2e-3  # of the finest body's mean surface edge: gap that contacts keep: moving in curves, surfaces do not cross
+DEEP_PENETRATION = 0.02  # of the finer side's mean surface edge: penetration that is told as a problem
+DEEP_CROSSING = CROSSED  # of the same: depth of crossing triangles after which an implicit step is done again in smaller parts
+NOTICEABLE_PENETRATION = 1e-3  # of the same: penetration after which the way of an implicit part is searched
 FAST = {True: 0.05, False: 0.2}  # share of a penetration that an explicit, an implicit step mends
-SLOW = {True: 0.005, False: 0.02}  # share of a missing standoff
+SLOW = {True: 0.005, False: 0.02}  # share of a missing contact offset
 PUSHED = 0.01  # of the slowest wave in a bar, sqrt(E / rho): speed at which these open at most, which strains as much
 TOLERANCE = {"f32": 1e-4, "f64": 1e-6}  # of the residual of the contact laws, unless asked for
 SPARE = 1024  # contacts beyond two a triangle that there is room for at first
@@ -44,30 +53,30 @@ class ContactStep:
 
     idle = False  # see `NoContacts`
 
-    def __init__(self, world: World, self_collision: bool, explicit: bool):
-        self.world = world
-        m, scene = world.model, world.scene
-        self.detection = Detection(scene, m, world.layout, world.runtime, self_collision)
+    def __init__(self, simulation: SimulationState, self_collision: bool, explicit: bool):
+        self.simulation = simulation
+        m, scene = simulation.model, simulation.scene
+        self.detection = Detection(scene, m, simulation.layout, simulation.runtime, self_collision)
         d = self.detection
-        self.standoff = STANDOFF * float(d.edges[: len(scene.bodies)].min())
+        self.contact_offset = CONTACT_OFFSET * float(d.edges[: len(scene.bodies)].min())
         if d.margin > 0.0:
-            self.standoff = min(self.standoff, 0.5 * d.margin / (OWN if self_collision else 1.0))
+            self.contact_offset = min(self.contact_offset, 0.5 * d.margin / (OWN if self_collision else 1.0))
         # what follows a path may be changed from outside between two steps, and its path may end with the last one
-        self._follows = world.motion.n_moved > 0 or any(o.path is not None for o in scene.obstacles)
+        self._follows = simulation.dirichlet.n_prescribed > 0 or any(o.path is not None for o in scene.obstacles)
         self._shares = FAST[explicit], SLOW[explicit]
         self._portion = 1.0  # of the step that the present part is
-        self.goal = self._goal()
+        self.gap_targets = self._gap_targets()
         self._arena = FieldArena()
         self._make_room(2 * d.surface.n_triangles + SPARE)
         self._own_arena = FieldArena()
-        self._way = self._own_arena.vectors("way", ti.f64, m.n_nodes)
+        self._path = self._own_arena.vectors("path", ti.f64, m.n_nodes)
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self._bounces = scene.bounces
         self.flight = np.zeros(len(scene.colliders))  # sum of dt^2 over the steps since each last touched anything [s^2]
         self._flight_gravity = scene.gravity.copy()
-        self._told = np.zeros(5)  # what `survey` found,
-        self._surveyed: float | None = None  # of the search at hand, for a step of so many seconds
+        self._closing = np.zeros(5)  # what `survey` found,
+        self._measured_for: float | None = None  # of the search at hand, for a step of so many seconds
         self._searched: tuple[float, float] | None = None  # time and dt of the search that is at hand
         self._swept = 0.0  # dt of the last search, at hand or not
         self._ended: tuple[float, float] | None = None  # those of the end that was looked at, until the next part begins
@@ -77,7 +86,8 @@ class ContactStep:
         self.inside: list[tuple[str, str, float]] = []  # who lies inside whom then, and how deep [m]
         self._explicit = explicit
         self._last_time = 0.0
-        self.penetration = self.sinking = 0.0  # at the end of the last step [m], and over the finer side's mean surface edge
+        self.penetration = 0.0  # at the end of the last step [m],
+        self.relative_penetration = 0.0  # and over the finer side's mean surface edge
         self._sum: np.ndarray | None = None  # (n_colliders, 3) [N s] over the parts of the last step, if it had several
         self._span = 0.0  # of the last step [s]
         self._share = 1.0
@@ -85,7 +95,7 @@ class ContactStep:
         self.dropped = 0  # triangles of the last step under an inverted tet, whose contacts a distance field could not tell
 
     def _make_room(self, capacity: int) -> None:
-        arena, m = FieldArena(), self.world.model
+        arena, m = FieldArena(), self.simulation.model
         problem = build_node_problem(arena, capacity, m.n_nodes, m.serial)
         self.found = build_found(arena, problem)
         self._arena.release()
@@ -105,7 +115,7 @@ class ContactStep:
         """The state was set: the search at hand and the impulses of the last step do not belong to it."""
         self._searched = self._ended = None
         self.problem.count[0] = 0
-        self._last_time = self.penetration = self.sinking = self._span = 0.0
+        self._last_time = self.penetration = self.relative_penetration = self._span = 0.0
         self._sum, self.crossing, self.crossings, self.inside = None, None, 0, []
         self.flight[:] = 0.0
 
@@ -125,7 +135,8 @@ class ContactStep:
         rows = self._rows()
         return {
             "capacity": self.problem.capacity, "last_time": self._last_time, "share": self._share, "span": self._span,
-            "sum": self._sum, "penetration": self.penetration, "sinking": self.sinking, "met": self.met, "dropped": self.dropped,
+            "sum": self._sum, "penetration": self.penetration, "relative_penetration": self.relative_penetration,
+            "met": self.met, "dropped": self.dropped,
             "flight": self.flight.copy(), "rows": dict(zip(rows, download(list(rows.values()), self.n_contacts))),
         }  # fmt: skip
 
@@ -142,7 +153,8 @@ class ContactStep:
         upload(whole)
         self.problem.count[0] = n
         self._last_time, self._share, self._span = (float(kept[name]) for name in ("last_time", "share", "span"))
-        self._sum, self.penetration, self.sinking = kept["sum"], float(kept["penetration"]), float(kept["sinking"])
+        self._sum, self.penetration = kept["sum"], float(kept["penetration"])
+        self.relative_penetration = float(kept["relative_penetration"])
         self.met, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self.flight = np.array(kept["flight"], dtype=float)
         self.crossing, self.crossings, self.inside = None, 0, []
@@ -155,41 +167,44 @@ class ContactStep:
         if anew:
             self.problem.count[0], self._last_time = 0, 0.0
 
-    def _goal(self) -> tuple[float, float, float, float]:
-        """Standoff [m], shares of a penetration and of a missing standoff that a part mends, speed of that at most [m/s]."""
-        materials = [b.material for b in self.world.scene.bodies]
+    def _gap_targets(self) -> tuple[float, float, float, float]:
+        """Contact offset [m]; fractions of a penetration and of a missing offset that a substep mends; its top speed [m/s]."""
+        materials = [b.material for b in self.simulation.scene.bodies]
         slowest = min(np.sqrt(m.young / m.density) for m in materials)
-        return self.standoff, self._portion * self._shares[0], self._portion * self._shares[1], PUSHED * float(slowest)
+        return self.contact_offset, self._portion * self._shares[0], self._portion * self._shares[1], PUSHED * float(slowest)
 
     def numbers_changed(self) -> None:
         """Friction or restitution changed."""
-        self._bounces = self.world.scene.bounces
-        if not upload_pair_numbers(self.numbers, self.world.scene):
+        self._bounces = self.simulation.scene.bounces
+        if not upload_pair_numbers(self.numbers, self.simulation.scene):
             arena = FieldArena()
-            self.numbers = build_pair_numbers(arena, self.world.scene)
+            self.numbers = build_pair_numbers(arena, self.simulation.scene)
             self._numbers_arena.release()
             self._numbers_arena = arena
 
     def search(self, time: float, dt: float) -> int:
         """Find the contacts of the present state, at a time [s], swept by dt, unless they are at hand. Returns their number."""
-        world, d, known = self.world, self.detection, self._searched
+        simulation, d, known = self.simulation, self.detection, self._searched
         if known is None or known[1] != dt or abs(known[0] - time) > 1e-6 * dt:
             self._searched = None
-            moved = world.motion.moved
-            led = (moved, world.motion.places(time + dt) - world.model.state.x.to_numpy()[moved]) if len(moved) else None
-            self._find(time, dt, led)
+            prescribed_nodes = simulation.dirichlet.prescribed_nodes
+            prescribed = None
+            if len(prescribed_nodes):
+                x = simulation.model.state.x.to_numpy()[prescribed_nodes]
+                prescribed = prescribed_nodes, simulation.dirichlet.places(time + dt) - x
+            self._find(time, dt, prescribed)
             self._searched, self._swept = (time, dt), dt
         return d.counts.contacts
 
     def _find(self, *arguments, **named) -> None:
         """`Detection.find`."""
-        self._surveyed = None
+        self._measured_for = None
         self.detection.find(*arguments, **named)
 
     def begin(self, time: float, dt: float) -> int:
         """Fill the problem for a step of dt [s] from the state at a time, impulses those of the last step. Returns its size."""
-        n, d, m, self._ended = self.search(time, dt), self.detection, self.world.model, None
-        self.goal = self._goal()
+        n, d, m, self._ended = self.search(time, dt), self.detection, self.simulation.model, None
+        self.gap_targets = self._gap_targets()
         self.dropped = max(self.dropped, d.counts.unmapped)
         if n > self.problem.capacity:
             self._make_room(2 * n)
@@ -211,18 +226,18 @@ class ContactStep:
 
     def meets(self, dt: float) -> bool:
         """Whether surfaces that bore nothing so far come together in a step of dt that has begun; `met` keeps it."""
-        self.met = bool(find_impact(self.found, dt, self.standoff))
+        self.met = bool(find_impact(self.found, dt, self.contact_offset))
         return self.met
 
     def rebounds(self, dt: float) -> bool:
         """Whether surfaces are thrown back in an implicit step of dt that has begun; `met` keeps it."""
-        scene = self.world.scene
+        scene = self.simulation.scene
         if not self._bounces or self.n_contacts == 0:
             return False
         if (self._flight_gravity != scene.gravity).any():  # what another gravity took is not known
             self._flight_gravity = scene.gravity.copy()
             self.flight[:] = 0.0
-        found = find_rebounds(self.found, self.world.model.gravity, self.flight, dt, self.standoff) > 0
+        found = find_rebounds(self.found, self.simulation.model.gravity, self.flight, dt, self.contact_offset) > 0
         self.met = self.met or found
         return found
 
@@ -230,13 +245,13 @@ class ContactStep:
         """A part of dt has ended. lossy: whether flights lose energy in it, as implicit Euler's do."""
         if not self._bounces:
             return
-        scene, first = self.world.scene, self.world.layout.node_start[:-1]
+        scene, first = self.simulation.scene, self.simulation.layout.node_start[:-1]
         added, f, p = dt**2 if lossy else 0.0, self.found, self.problem
         self.flight += np.where(self.flight > 0.0, added, dt**2)
         r, struck, body = download([p.r, f.struck, f.body], self.n_contacts)
         self.flight[body[(r != 0.0).any(axis=1)]] = 0.0
         self.flight[body[(struck != 0.0).any(axis=1)]] = dt**2
-        constrained = np.logical_or.reduceat(self.world.motion.constrained().any(axis=1), first)
+        constrained = np.logical_or.reduceat(self.simulation.dirichlet.constrained().any(axis=1), first)
         self.flight[: len(scene.bodies)][constrained] = 0.0
         self.flight[len(scene.bodies) :] = 0.0
 
@@ -244,11 +259,11 @@ class ContactStep:
         """A step of dt begins."""
         self._portion, self._span, self.dropped, self._sum = 1.0, dt, 0, None
 
-    def start_part(self, dt: float) -> None:
+    def start_substep(self, dt: float) -> None:
         """A part of dt of the step begins, or is begun anew with another length."""
         self._portion = dt / self._span
 
-    def end_part(self) -> None:
+    def end_substep(self) -> None:
         """Count the impulses of a part."""
         if self._portion < 1.0:
             self._sum = self._impulses() + (0.0 if self._sum is None else self._sum)
@@ -260,19 +275,22 @@ class ContactStep:
 
     def _impulses(self) -> np.ndarray:
         """(n_colliders, 3) impulses on each from the contacts at hand [N s]."""
-        c, total = self.contacts(), np.zeros((len(self.world.scene.colliders), 3))
-        place = {one.name: k for k, one in enumerate(self.world.scene.colliders)}
+        c, total = self.contacts(), np.zeros((len(self.simulation.scene.colliders), 3))
+        place = {one.name: k for k, one in enumerate(self.simulation.scene.colliders)}
         for names, sign in ((c.body_a, 1.0), (c.body_b, -1.0)):
             np.add.at(total, [place[name] for name in names], sign * c.impulse)
         return total
 
-    def sank(self, time: float, dt: float, before: float) -> bool:
-        """Whether a part of dt that ends at a time ends with something newly in each other, or deeper; before: `sinking` then."""
+    def penetrates_anew(self, time: float, dt: float, before: float) -> bool:
+        """Whether a substep of dt that ends at a time leaves a new or deeper penetration.
+
+        before: `relative_penetration` at its start.
+        """
         self._look_at_end(time, dt)
-        return self.sinking > max(SANK, 1.1 * before)
+        return self.relative_penetration > max(NOTICEABLE_PENETRATION, 1.1 * before)
 
     def end(self, time: float, dt: float) -> float:
-        """The deepest penetration [m] that is left at the end of a step or part of dt, at a time. Sets `sinking`."""
+        """The deepest penetration [m] that is left at the end of a step or part of dt, at a time. Sets `relative_penetration`."""
         return self._look_at_end(time, dt)
 
     def _look_at_end(self, time: float, dt: float) -> float:
@@ -287,11 +305,11 @@ class ContactStep:
             if not self._follows:
                 raise
             self._find(time, 0.0)  # a path that ends here; the next step reports it
-        told = self._survey(dt)
-        depth, self.sinking = float(told[DEPTH]), float(told[SINKING])
+        closing = self._measure_closing(dt)
+        depth, self.relative_penetration = float(closing[DEPTH]), float(closing[RELATIVE_PENETRATION])
         if not self._explicit:
             crossing = self.cross()
-            depth, self.sinking = max(depth, crossing[0]), max(self.sinking, crossing[1])
+            depth, self.relative_penetration = max(depth, crossing[0]), max(self.relative_penetration, crossing[1])
         if self._follows:
             self._searched = None
         self._depth, self._ended = depth, (time, dt)
@@ -300,38 +318,38 @@ class ContactStep:
     @property
     def is_deep(self) -> bool:
         """Whether the last step ended with a deep penetration."""
-        return self.sinking > SUNK
+        return self.relative_penetration > DEEP_PENETRATION
 
     def deep_from(self, a: int, b: int) -> float:
         """Penetration [m] of two colliders above which a step counts as deep."""
-        return SUNK * float(min(self.detection.edges[a], self.detection.edges[b]))
+        return DEEP_PENETRATION * float(min(self.detection.edges[a], self.detection.edges[b]))
 
     def cross(self) -> tuple[float, float]:
         """How deep triangles cross, or colliders lie inside each other, where the last search found them [m], and over the finer
         side's mean surface edge. Counts crossings as `crossings`, lists the others as `inside`."""
-        told, edges = self.detection.crossings(), self.detection.edges
-        depth, crossing, inside = float(told[CROSSING_DEPTH]), float(told[DEPTH_OVER_EDGE]), {}
+        closing, edges = self.detection.crossings(), self.detection.edges
+        depth, crossing, inside = float(closing[CROSSING_DEPTH]), float(closing[DEPTH_OVER_EDGE]), {}
         for one in self.detection.contained():
             pair = min(one.a, one.b), max(one.a, one.b)
             inside[pair] = max(inside.get(pair, 0.0), one.depth)
             # a part that is thinner than an edge counts as deep where its middle is half as deep in the other as in itself
-            scale = min(edges[one.a], edges[one.b], 0.5 * one.room / SUNK if one.room > 0.0 else np.inf)
+            scale = min(edges[one.a], edges[one.b], 0.5 * one.room / DEEP_PENETRATION if one.room > 0.0 else np.inf)
             depth, crossing = max(depth, one.depth), max(crossing, one.depth / scale)
         names = [c.name for c in self.detection.scene.colliders]
         self.inside = [(names[a], names[b], deep) for (a, b), deep in inside.items()]
-        self.crossing, self.crossings = crossing, int(told[CROSSINGS])
+        self.crossing, self.crossings = crossing, int(closing[CROSSINGS])
         return depth, crossing
 
-    def went_astray(self, x_start) -> bool:
-        """Whether the surface went where nobody had looked since x_start; keeps its way for `search_way`."""
+    def left_searched_path(self, x_start) -> bool:
+        """Whether the surface went where nobody had looked since x_start; keeps its way for `search_along_path`."""
         strayed = np.zeros(1)
-        find_way(self.world.model, self.detection.surface, x_start, self._way, strayed)
+        find_displacement(self.simulation.model, self.detection.surface, x_start, self._path, strayed)
         return bool(strayed[0] > 0.5 * self.detection.margin)
 
-    def search_way(self, time: float, dt: float) -> bool:
+    def search_along_path(self, time: float, dt: float) -> bool:
         """Search along the way that was found, from the state at the start; whether that finds contacts not known so far."""
         self._searched = self._ended = None
-        self._find(time, dt, way=self._way)
+        self._find(time, dt, path=self._path)
         self._searched, self._swept = (time, dt), dt
         known = set(map(tuple, download([self.found.feature], self.n_contacts)[0].tolist()))
         kept = download([self.detection.kept], self.detection.counts.contacts)[0]
@@ -342,12 +360,12 @@ class ContactStep:
         """The deepest penetration before a step of dt, over the finer side's mean surface edge, and how far contacts close at
         most in it, over what they may."""
         self.search(time, dt)
-        told = self._survey(dt)
-        return float(told[SINKING]), float(told[HASTE])
+        closing = self._measure_closing(dt)
+        return float(closing[RELATIVE_PENETRATION]), float(closing[CLOSING_RATIO])
 
-    def ratio_along_way(self) -> float:
-        """How far contacts closed at most along the way that `search_way` searched, over what they may."""
-        return float(self._survey(self._swept)[HASTE])
+    def closing_ratio_along_path(self) -> float:
+        """How far contacts closed at most along the way that `search_along_path` searched, over what they may."""
+        return float(self._measure_closing(self._swept)[CLOSING_RATIO])
 
     def crossing_before(self) -> float:
         """How deep triangles cross where a step begins that has been looked at, over the finer side's mean surface edge."""
@@ -355,25 +373,25 @@ class ContactStep:
             self.cross()
         return self.crossing
 
-    def _survey(self, dt: float) -> np.ndarray:
+    def _measure_closing(self, dt: float) -> np.ndarray:
         d = self.detection
-        if self._surveyed != dt:
-            survey(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts, dt, self._told)
-            self._surveyed = dt
-        return self._told
+        if self._measured_for != dt:
+            measure_closing(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts, dt, self._closing)
+            self._measured_for = dt
+        return self._closing
 
-    def too_fast(self, dt: float, parts: int = 1) -> str:
+    def too_fast(self, dt: float, substeps: int = 1) -> str:
         """A sentence that names who closes too fast for a step of dt, as the last search found it, how fast, how thick the
         thinner one is, and a dt that would do. parts: that a step is cut into at most."""
-        told, d = self._survey(self._swept), self.detection
-        a, b = d.buffer.data.body[d.kept[int(told[WHICH])]]
+        closing, d = self._measure_closing(self._swept), self.detection
+        a, b = d.buffer.data.body[d.kept[int(closing[WHICH])]]
         names = [d.scene.colliders[k].name for k in (a, b)]
-        thin, speed = float(min(d.thickness[a], d.thickness[b])), float(told[SPEED])
-        cut = f"even cut into {parts} parts " if parts > 1 else ""
+        thin, speed = float(min(d.thickness[a], d.thickness[b])), float(closing[SPEED])
+        cut = f"even cut into {substeps} parts " if substeps > 1 else ""
         return (
             f"'{names[0]}' and '{names[1]}' close at {speed:.3g} m/s, {speed * dt:.3g} m in a step of {dt:.3g} s, "
             f"and the thinner of them is {thin:.3g} m thick, so {cut}they could pass each other unseen: take dt <= "
-            f"{parts * CLOSEST * thin / speed:.3g} s"
+            f"{substeps * MAX_CLOSING * thin / speed:.3g} s"
         )
 
     def contacts(self) -> Contacts:

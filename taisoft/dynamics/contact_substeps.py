@@ -12,8 +12,8 @@ from taisoft.contact.solve import SolveResult, solve
 from taisoft.dynamics import explicit
 from taisoft.dynamics.contact import TOLERANCE, ContactStep
 from taisoft.dynamics.explicit_contact import find_acceleration, finish_verlet, keep_state, move, predict, set_free_velocities
+from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.substeps import ExplicitStepper, SubstepResult
-from taisoft.dynamics.world import World
 from taisoft.errors import SimulationError
 from taisoft.scalars import FAILED, LOWEST_J, MOST_INVERTED
 from taisoft.transfer import download
@@ -42,13 +42,13 @@ class ContactSubstepResult(SubstepResult):
 class ContactExplicitStepper(ExplicitStepper):
     """Takes sub-steps of symplectic Euler or velocity Verlet over a world in which things can touch."""
 
-    def __init__(self, world: World, verlet: bool, contact: ContactStep, method: str):
-        super().__init__(world, verlet)
+    def __init__(self, simulation: SimulationState, verlet: bool, contact: ContactStep, method: str):
+        super().__init__(simulation, verlet)
         self.contact, self.method = contact, method
         self.max_batch = min(self.max_batch, LAUNCHES)
-        m, arena = world.model, world.arena
+        m, arena = simulation.model, simulation.arena
         self._good = GoodState(arena.vectors("x_good", ti.f64, m.n_nodes), arena.vectors("v_good", m.real, m.n_nodes))
-        self.contact_tolerance = TOLERANCE[world.runtime.precision]
+        self.contact_tolerance = TOLERANCE[simulation.runtime.precision]
 
     def forget(self) -> None:
         """The state was set."""
@@ -69,52 +69,52 @@ class ContactExplicitStepper(ExplicitStepper):
 
         Whatever fails leaves the state before its sub-step.
         """
-        world, m, results, depth, done = self.world, self.world.model, [], 0.0, 0
+        simulation, m, results, depth, done = self.simulation, self.simulation.model, [], 0.0, 0
         explicit.begin_parallel(m)
-        n, start = min(n, self.max_batch), world.time
-        self._released, releases, targets = world.motion.released(), world.releases, None
-        if self.work.n_moved:
+        n, start = min(n, self.max_batch), simulation.time
+        self._released, releases, targets = simulation.dirichlet.released(), simulation.releases, None
+        if self.work.n_prescribed:
             n = min(n, self.rows)
-            targets = world.next_targets(start + dt * np.arange(1, n + 1))
-            self.stale = self.stale or world.releases != releases
+            targets = simulation.next_targets(start + dt * np.arange(1, n + 1))
+            self.stale = self.stale or simulation.releases != releases
             n = len(targets)
         self.contact.start_step(dt)
-        sinking = 0.0
+        relative_penetration = 0.0
         try:
             while done < n:
                 keep_state(m, self._good)
                 if targets is not None:
                     self._upload_targets(targets[done : done + 1])
-                results.append(self._substep(world.step_count + done + 1, start + done * dt, dt))
+                results.append(self._substep(simulation.step_count + done + 1, start + done * dt, dt))
                 depth = max(depth, self.contact.end(start + (done + 1) * dt, dt))
-                sinking = max(sinking, self.contact.sinking)
+                relative_penetration = max(relative_penetration, self.contact.relative_penetration)
                 if done + 1 == n:  # once a batch: it costs about as much as a search
                     crossing = self.contact.cross()
-                    depth, sinking = max(depth, crossing[0]), max(sinking, crossing[1])
+                    depth, relative_penetration = max(depth, crossing[0]), max(relative_penetration, crossing[1])
                 done += 1
-                self._released = world.motion.released()
+                self._released = simulation.dirichlet.released()
         except BaseException:  # Ctrl-C, too
             self._restore()
-            world.step_count += done
-            world.time = start + done * dt
+            simulation.step_count += done
+            simulation.time = start + done * dt
             raise
-        self.contact.penetration, self.contact.sinking = depth, sinking
+        self.contact.penetration, self.contact.relative_penetration = depth, relative_penetration
         return ContactSubstepResult(
             n, m.state.scalars[LOWEST_J], int(m.state.scalars[MOST_INVERTED]), sum(r.iterations for r in results if r),
             max((r.residual for r in results if r), default=0.0), all(r.converged for r in results if r),
         )  # fmt: skip
 
     def _restore(self) -> None:
-        world = self.world
+        simulation = self.simulation
         self._put_back(*download([self._good.x, self._good.v]))
-        if world.motion.released() != self._released:
-            world.motion.set_released(self._released)
-            world.upload_constraints()
+        if simulation.dirichlet.released() != self._released:
+            simulation.dirichlet.set_released(self._released)
+            simulation.upload_constraints()
         self.contact.forget()
 
     def _substep(self, step: int, time: float, dt: float) -> SolveResult | None:
         """One sub-step, the step-th, from a time; returns what the contacts' solver did, None where there are none."""
-        m, s, contact = self.world.model, self.work, self.contact
+        m, s, contact = self.simulation.model, self.work, self.contact
         if contact.look(time, dt)[1] > 1.0:
             raise SimulationError(f"step {step}: {contact.too_fast(dt)}")
         if s.verlet and self.stale:
@@ -125,7 +125,7 @@ class ContactExplicitStepper(ExplicitStepper):
         result = None
         if n:
             p = contact.problem
-            set_free_velocities(m, s, contact.found, dt, *contact.goal)
+            set_free_velocities(m, s, contact.found, dt, *contact.gap_targets)
             find_factors(p)
             if self.method == "coloured_gauss_seidel":
                 colour_contacts(p)

@@ -12,7 +12,7 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.contact.assemble import FoundContacts, short_of_goal
+from taisoft.contact.assemble import FoundContacts, gap_minus_target
 from taisoft.contact.problem import CHANGED, NODES, RESIDUAL, SIZE, residual_of
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
 from taisoft.fields import FieldArena
@@ -68,7 +68,7 @@ NO_CONTACTS = StageContacts(None, None, None, NO_COUPLING, *[None] * 4)
 
 @kernel
 def begin_contacts(
-    s: ti.template(), k: ti.template(), impact: ti.template(), beta: ti.f64, dt: ti.f64, goal: ti.types.ndarray()
+    s: ti.template(), k: ti.template(), impact: ti.template(), beta: ti.f64, dt: ti.f64, gap_targets: ti.types.ndarray()
 ):  # fmt: skip
     """What neither x nor the multipliers change in a stage of a step of dt [s].
 
@@ -77,17 +77,17 @@ def begin_contacts(
     p, f, w = ti.static((k.problem, k.found, k.work))
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        offset = -(beta / dt) * f.carry[c]
+        offset = -(beta / dt) * f.obstacle_displacement[c]
         if ti.static(not impact):  # whose x_hat is x_start
             for j in range(p.arity[c]):
                 i = p.node[c, j]
                 offset += p.weight[c, j] * (k.x_start[i] - s.x_hat[i])
         w.tangential_offset[c] = offset
         if ti.static(impact):
-            w.gap_minus_target[c] = -beta * f.leave[c] - (beta / dt) * p.normal[c].dot(f.carry[c])
+            w.gap_minus_target[c] = -beta * f.leave[c] - (beta / dt) * p.normal[c].dot(f.obstacle_displacement[c])
         else:
-            short = short_of_goal(f, c, dt, goal[0], goal[1], goal[2], goal[3], f.rise[c])
-            w.gap_minus_target[c] = short - p.normal[c].dot(f.carry[c])
+            short = gap_minus_target(f, c, dt, gap_targets[0], gap_targets[1], gap_targets[2], gap_targets[3], f.rise[c])
+            w.gap_minus_target[c] = short - p.normal[c].dot(f.obstacle_displacement[c])
 
 
 @ti.func

@@ -17,7 +17,7 @@ from taisoft.scalars import FAILED, INVERTED_NOW, LOWEST_J, MOST_INVERTED, STEPS
 
 
 @ti.func
-def unfinite(value):
+def nonfinite(value):
     """Whether an f64 is NaN, infinite or past the range of f32, told from its bits after rounding to f32."""
     bits = ti.bit_cast(ti.cast(value, ti.f32), ti.i32)
     return (bits & 0x7F800000) == 0x7F800000
@@ -96,36 +96,36 @@ def verlet_kick(m: ti.template(), s: ti.template(), i, dt):
 
 
 @ti.func
-def lead(m: ti.template(), s: ti.template(), row, dt):
+def prescribe(m: ti.template(), s: ti.template(), row, dt):
     """Put the moved nodes on their targets for this sub-step; their velocity is the way per time."""
-    lead_velocities(m, s, row, dt)
-    lead_positions(m, s, row)
+    prescribe_velocities(m, s, row, dt)
+    prescribe_positions(m, s, row)
 
 
 @ti.func
-def lead_velocities(m: ti.template(), s: ti.template(), row, dt):
+def prescribe_velocities(m: ti.template(), s: ti.template(), row, dt):
     """The velocity of the moved nodes: their way per time."""
-    for k in range(s.n_moved):
-        i = s.moved[k]
+    for k in range(s.n_prescribed):
+        i = s.prescribed_nodes[k]
         for a in ti.static(range(3)):
-            if s.moved_axes[k][a] != 0:
-                m.state.v[i][a] = ti.cast((s.targets[row * s.n_moved + k][a] - s.before[k][a]) / dt, m.real)
+            if s.prescribed_axes[k][a] != 0:
+                m.state.v[i][a] = ti.cast((s.targets[row * s.n_prescribed + k][a] - s.before[k][a]) / dt, m.real)
 
 
 @ti.func
-def lead_positions(m: ti.template(), s: ti.template(), row):
+def prescribe_positions(m: ti.template(), s: ti.template(), row):
     """The moved nodes on their targets."""
-    for k in range(s.n_moved):
-        i = s.moved[k]
+    for k in range(s.n_prescribed):
+        i = s.prescribed_nodes[k]
         for a in ti.static(range(3)):
-            if s.moved_axes[k][a] != 0:
-                m.state.x[i][a] = s.targets[row * s.n_moved + k][a]
+            if s.prescribed_axes[k][a] != 0:
+                m.state.x[i][a] = s.targets[row * s.n_prescribed + k][a]
 
 
 @ti.func
 def remember(m: ti.template(), s: ti.template()):
-    for k in range(s.n_moved):
-        s.before[k] = m.state.x[s.moved[k]]
+    for k in range(s.n_prescribed):
+        s.before[k] = m.state.x[s.prescribed_nodes[k]]
 
 
 @ti.func
@@ -172,13 +172,13 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
             if ti.static(s.holds):
                 if done == n - 1:
                     keep_held(m, s)
-            if ti.static(s.leads):
+            if ti.static(s.has_prescribed):
                 remember(m, s)
             if ti.static(s.verlet):
                 for i in range(m.n_nodes):
                     verlet_move(m, s, i, dt, verlet_half(m, s, i, dt))
-                if ti.static(s.leads):
-                    lead(m, s, done, dt64)
+                if ti.static(s.has_prescribed):
+                    prescribe(m, s, done, dt64)
             lowest_now, inverted = elasticity.sum_elements_serially(m)
             lowest = ti.min(lowest, lowest_now)
             total = ti.Vector([0.0, 0.0, 0.0], m.real)
@@ -187,8 +187,8 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
                     total += verlet_kick(m, s, i, dt)
                 else:
                     total += euler_node(m, i, dt)
-            if ti.static(s.leads):
-                lead(m, s, done, dt64)
+            if ti.static(s.has_prescribed):
+                prescribe(m, s, done, dt64)
             if ti.static(s.holds):
                 if done == n - 1:
                     react(m, s, dt)
@@ -199,7 +199,7 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
             low = lowest[0]
             for q in ti.static(range(1, m.lanes)):
                 low = ti.min(low, lowest[q])
-            going = low > -EXPLODED and not unfinite(ti.cast(total[0] + total[1] + total[2], ti.f64))
+            going = low > -EXPLODED and not nonfinite(ti.cast(total[0] + total[1] + total[2], ti.f64))
             done += 1
         m.state.scalars[STEPS_DONE] = done - (0 if going else 1)
         m.state.scalars[LOWEST_J], m.state.scalars[MOST_INVERTED] = low, most
@@ -207,7 +207,7 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
 
 @kernel
 def set_targets(s: ti.template(), rows: ti.types.ndarray()):
-    """Targets of a batch, (sub-steps * n_moved, 3) [m]."""
+    """Targets of a batch, (sub-steps * n_prescribed, 3) [m]."""
     for k in range(rows.shape[0]):
         for a in ti.static(range(3)):
             s.targets[k][a] = rows[k, a]
@@ -232,17 +232,17 @@ def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
     if ti.static(s.holds):
         for k in range(s.n_held):
             s.held_velocity[k] = m.state.v[s.held[k]]
-    if ti.static(s.leads):
-        for k in range(s.n_moved):
-            s.before[k] = m.state.x[s.moved[k]]
+    if ti.static(s.has_prescribed):
+        for k in range(s.n_prescribed):
+            s.before[k] = m.state.x[s.prescribed_nodes[k]]
     if ti.static(s.verlet):
         for i in range(m.n_nodes):
             dt = ti.cast(dt64, m.real)
             verlet_move(m, s, i, dt, verlet_half(m, s, i, dt))
-        if ti.static(s.leads):
+        if ti.static(s.has_prescribed):
             ti.loop_config(serialize=True)
             for _ in range(1):
-                lead(m, s, row, dt64)
+                prescribe(m, s, row, dt64)
 
 
 @kernel
@@ -255,12 +255,12 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
             v = verlet_kick(m, s, i, dt)
         else:
             v = euler_node(m, i, dt)
-        if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
+        if nonfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
             m.state.scalars[FAILED] = 1.0
-    if ti.static(s.leads):
+    if ti.static(s.has_prescribed):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            lead(m, s, row, dt64)
+            prescribe(m, s, row, dt64)
     if ti.static(s.holds):
         ti.loop_config(serialize=True)
         for _ in range(1):

@@ -6,7 +6,7 @@ the middle of the step, which is what moves the nodes. M is lumped, so M^-1 is k
 
 import taichi as ti
 
-from taisoft.contact.assemble import short_of_goal
+from taisoft.contact.assemble import gap_minus_target
 from taisoft.contact.problem import impulse_on, to_frame
 from taisoft.contact.prox import dvec
 from taisoft.contact.restitution import explicit_rise
@@ -14,11 +14,11 @@ from taisoft.dynamics.explicit import (
     acceleration,
     euler_velocity,
     keep_held,
-    lead_positions,
-    lead_velocities,
+    nonfinite,
+    prescribe_positions,
+    prescribe_velocities,
     react,
     remember,
-    unfinite,
     verlet_half,
     verlet_kick,
     verlet_move,
@@ -48,7 +48,7 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
     for _ in range(1):
         if ti.static(s.holds):
             keep_held(m, s)
-        if ti.static(s.leads):
+        if ti.static(s.has_prescribed):
             remember(m, s)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -57,15 +57,15 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
             m.state.v[i] = verlet_half(m, s, i, dt)
         else:
             m.state.v[i] = euler_velocity(m, i, dt)
-    if ti.static(s.leads):
+    if ti.static(s.has_prescribed):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            lead_velocities(m, s, 0, dt64)
+            prescribe_velocities(m, s, 0, dt64)
 
 
 @kernel
 def set_free_velocities(
-    m: ti.template(), s: ti.template(), f: ti.template(), dt: ti.f64, standoff: ti.f64, fast: ti.f64, slow: ti.f64,
+    m: ti.template(), s: ti.template(), f: ti.template(), dt: ti.f64, contact_offset: ti.f64, fast: ti.f64, slow: ti.f64,
     fastest: ti.f64,
 ):  # fmt: skip
     """b of every contact from v*, and the inverse masses."""
@@ -76,12 +76,12 @@ def set_free_velocities(
         p.inverse_mass[i] = ti.cast(m.free[i], ti.f64) / ti.cast(m.mass[i], ti.f64)
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        v = -f.carry[c] / dt
+        v = -f.obstacle_displacement[c] / dt
         for j in range(p.arity[c]):
             v += p.weight[c, j] * ti.cast(m.state.v[p.node[c, j]], ti.f64)
         b = to_frame(p, c, v)
-        rise = explicit_rise(f, c, dt, standoff, b[0], kicked)
-        p.b[c] = dvec(b[0] + short_of_goal(f, c, dt, standoff, fast, slow, fastest, rise) / dt, b[1], b[2])
+        rise = explicit_rise(f, c, dt, contact_offset, b[0], kicked)
+        p.b[c] = dvec(b[0] + gap_minus_target(f, c, dt, contact_offset, fast, slow, fastest, rise) / dt, b[1], b[2])
 
 
 @ti.func
@@ -115,17 +115,17 @@ def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, tou
         v = m.state.v[i]
         if touched == 1:
             v += ti.cast(p.inverse_mass[i] * impulse_on(p, i), m.real)
-        if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
+        if nonfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
             m.state.scalars[FAILED] = 1.0
         if ti.static(s.verlet):
             verlet_move(m, s, i, dt, v)
         else:
             m.state.v[i] = v
             m.state.x[i] = m.state.x[i] + ti.cast(dt * v, ti.f64)
-    if ti.static(s.leads):
+    if ti.static(s.has_prescribed):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            lead_positions(m, s, 0)
+            prescribe_positions(m, s, 0)
     ti.loop_config(serialize=True)
     for _ in range(1):
         if ti.static(not s.verlet):
@@ -139,12 +139,12 @@ def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         v = verlet_kick(m, s, i, ti.cast(dt64, m.real))
-        if unfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
+        if nonfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
             m.state.scalars[FAILED] = 1.0
-    if ti.static(s.leads):
+    if ti.static(s.has_prescribed):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            lead_velocities(m, s, 0, dt64)
+            prescribe_velocities(m, s, 0, dt64)
     ti.loop_config(serialize=True)
     for _ in range(1):
         close_substep(m, s, p, dt64, touched)

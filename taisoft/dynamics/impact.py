@@ -113,7 +113,7 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
     for _ in range(1):
         slope = total(m, SUM)
         for c in range(p.count[0]):
-            fixed = -(SPREAD / tau) * f.carry[c]
+            fixed = -(SPREAD / tau) * f.obstacle_displacement[c]
             for j in range(p.arity[c]):
                 i = p.node[c, j]
                 fixed += p.weight[c, j] * (1.0 - ti.cast(m.free[i], ti.f64)) * ti.cast(s.v_hat[i], ti.f64)

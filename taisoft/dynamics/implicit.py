@@ -14,10 +14,10 @@ from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.elimination import solve_on
 from taisoft.dynamics.impact import solve_bouncing
 from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage_result import StageResult, count_all
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.substepping import Substepping
-from taisoft.dynamics.world import World
 from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
 from taisoft.transfer import download, upload
@@ -96,19 +96,20 @@ class History:
 class ImplicitStepper:
     """Takes steps of one scheme over a world and its contacts."""
 
-    def __init__(self, world: World, scheme: Scheme, contact: ContactStep | NoContacts):
-        self.world, self.scheme, self.contact = world, scheme, contact
-        m, arena = world.model, world.arena
+    def __init__(self, simulation: SimulationState, scheme: Scheme, contact: ContactStep | NoContacts):
+        self.simulation, self.scheme, self.contact = simulation, scheme, contact
+        m, arena = simulation.model, simulation.arena
         self.history = History(
             arena.vectors("x_now", ti.f64, m.n_nodes), arena.vectors("v_now", m.real, m.n_nodes),
             arena.vectors("v_before", m.real, m.n_nodes),
             arena.vectors("x_before", ti.f64, m.n_nodes) if scheme.before else None,
         )  # fmt: skip
-        self.solver = StageSystem(m, arena, world.runtime.eps, world.motion.moved, contact, self.history.x_now)
-        self.tolerance = DEFAULT_TOLERANCE[world.runtime.precision]
-        self.contact_tolerance = TOLERANCE[world.runtime.precision]
+        prescribed = simulation.dirichlet.prescribed_nodes
+        self.solver = StageSystem(m, arena, simulation.runtime.eps, prescribed, contact, self.history.x_now)
+        self.tolerance = DEFAULT_TOLERANCE[simulation.runtime.precision]
+        self.contact_tolerance = TOLERANCE[simulation.runtime.precision]
         self.linear_tolerance: float | None = None
-        balance = BodyBalance(world.scene)
+        balance = BodyBalance(simulation.scene)
         self._balance = balance if balance.n_pieces > 1 else None
         self._substepping = Substepping(self)
         self._mark = None, [], contact.flight  # see `mark`
@@ -143,12 +144,12 @@ class ImplicitStepper:
 
     def step(self, dt: float) -> StageResult:
         """One step of dt, see `Substepping.step`."""
-        return self._substepping.step(self.world.time, dt)
+        return self._substepping.step(self.simulation.time, dt)
 
     @property
-    def parts(self) -> int:
+    def substeps(self) -> int:
         """Substeps that the last step was taken in."""
-        return self._substepping.parts
+        return self._substepping.substeps
 
     @property
     def is_linear(self) -> bool:
@@ -157,14 +158,15 @@ class ImplicitStepper:
 
     def mark(self) -> None:
         """A step begins: it may be undone."""
-        self._mark = None if self.contact.idle else self.world.state(), self.world.motion.released(), self.contact.flight.copy()
+        state = None if self.contact.idle else self.simulation.state()
+        self._mark = state, self.simulation.dirichlet.released(), self.contact.flight.copy()
 
     def return_to_mark(self, taken_back: bool = False) -> None:
         """Back to the step's start, without the past. taken_back: whether the only substep so far has been."""
         state, released, flight = self._mark
         if state is None and not taken_back:
-            restore(self.world.model, self.history)
-            state = self.world.state()
+            restore(self.simulation.model, self.history)
+            state = self.simulation.state()
             self._mark = state, released, flight
         self._put_back(state, released)
         self._past = 0
@@ -173,16 +175,16 @@ class ImplicitStepper:
 
     def _put_back(self, state: tuple[np.ndarray, np.ndarray] | None, released: list[bool]) -> None:
         """Back to a state, None where it has been put back, and to what had let go then."""
-        world = self.world
+        simulation = self.simulation
         if state is not None:
-            world.set_state(*state)
-        if world.motion.released() != released:
-            world.motion.set_released(released)
-            world.upload_constraints()
+            simulation.set_state(*state)
+        if simulation.dirichlet.released() != released:
+            simulation.dirichlet.set_released(released)
+            simulation.upload_constraints()
 
     def back(self) -> None:
         """Back to where the last part began."""
-        restore(self.world.model, self.history)
+        restore(self.simulation.model, self.history)
 
     def retry(self, time: float, dt: float, start: np.ndarray) -> StageResult:
         """The part that was just taken back, with other contacts. start: (n_nodes, 3) [m/s] the velocities it had led to."""
@@ -201,10 +203,10 @@ class ImplicitStepper:
 
     def take(self, time: float, dt: float, start: np.ndarray | None = None) -> StageResult:
         """A step of dt from a time with the contacts of one search. start: velocities (n_nodes, 3) [m/s] to begin with."""
-        world, m, h, w = self.world, self.world.model, self.history, self.solver.work
-        releases = world.releases
-        target = world.next_target(time + dt)
-        if world.releases != releases or dt != self._dt:
+        simulation, m, h, w = self.simulation, self.simulation.model, self.history, self.solver.work
+        releases = simulation.releases
+        target = simulation.next_target(time + dt)
+        if simulation.releases != releases or dt != self._dt:
             self._past = 0
         self.contact.begin(time, dt)
         # no scheme looks back through an impact: it would take the jump for an acceleration
@@ -216,11 +218,12 @@ class ImplicitStepper:
         self.lossy = scheme.before == 0.0
         if target is not None:
             if scheme.midpoint:
-                target = 0.5 * (target + m.state.x.to_numpy()[world.motion.moved])
-            led = [(w.moved_axes, world.motion.moved_axes()), (w.targets, target)]
+                target = 0.5 * (target + m.state.x.to_numpy()[simulation.dirichlet.prescribed_nodes])
+            prescribed = [(w.prescribed_axes, simulation.dirichlet.prescribed_axes()), (w.targets, target)]
             if m.consistent:
-                led.append((w.led_acceleration, world.motion.accelerations(time, dt, self.scheme.before == 0.0)))
-            upload(led)
+                accelerations = simulation.dirichlet.accelerations(time, dt, self.scheme.before == 0.0)
+                prescribed.append((w.prescribed_acceleration, accelerations))
+            upload(prescribed)
         self._beta = scheme.share * dt
         self.contact.acts(scheme.share)
         self.solver.assemble_damper()
@@ -237,10 +240,10 @@ class ImplicitStepper:
         if scheme.midpoint:
             finish_midpoint(m, h)
         if not np.isfinite(result.residual):  # a NaN anywhere in x or v reaches the residual
-            where = world.find_unfinite(self.solver.work.residual.to_numpy()) or "the residual is not finite"
+            where = simulation.find_nonfinite(self.solver.work.residual.to_numpy()) or "the residual is not finite"
             restore(m, h)
             self.forget()
-            raise SimulationError(f"step {world.step_count + 1}: {where}")
+            raise SimulationError(f"step {simulation.step_count + 1}: {where}")
         self._past += 1
         if self.contact.met:
             self._past = 0
@@ -249,7 +252,7 @@ class ImplicitStepper:
     def _begin(self, scheme: Scheme, along: float) -> None:
         """The stage starts, from the present state."""
         multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)
-        begin_step(self.world.model, self.solver.work, self.history, multistep, scheme.now, scheme.before, still, along)
+        begin_step(self.simulation.model, self.solver.work, self.history, multistep, scheme.now, scheme.before, still, along)
 
     def _solve_balanced(self, scheme: Scheme, dt: float, bounces: bool) -> StageResult:
         """The stage; again and more tightly where it left a piece's forces unbalanced beside larger ones."""
@@ -278,14 +281,14 @@ class ImplicitStepper:
 
     def compile_hard_steps(self) -> None:
         """Take the kernels that only hard steps need through the stage at hand, which leaves no state that is of use."""
-        free = np.flatnonzero(self.world.model.free.to_numpy().any(axis=1))
+        free = np.flatnonzero(self.simulation.model.free.to_numpy().any(axis=1))
         solve_on(self.solver, replace(self.solver.stage, tolerance=0.0), free[:1], 0.0)
         self.solver.form_matrix(projected=True)
 
     def reactions(self) -> np.ndarray:
         """(n_nodes, 3) force of the constraints in the last step [N]."""
         if self._beta == 0.0:
-            return np.zeros((self.world.model.n_nodes, 3))
+            return np.zeros((self.simulation.model.n_nodes, 3))
         return self.solver.held_residual() / self._beta
 
     @property

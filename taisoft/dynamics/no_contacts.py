@@ -8,7 +8,7 @@ class NoContacts:
 
     idle = True
     n_contacts, met = 0, False
-    sinking = crossing = penetration = 0.0
+    relative_penetration = crossing = penetration = 0.0
 
     def __init__(self) -> None:
         self.flight = np.zeros(0)
@@ -16,7 +16,7 @@ class NoContacts:
     def _nothing(self, *_arguments, **_named) -> None:
         """What needs no doing."""
 
-    forget = acts = start_step = start_part = end_part = start_again = count_flight = restore = _nothing
+    forget = acts = start_step = start_substep = end_substep = start_again = count_flight = restore = _nothing
 
     def begin(self, time: float, dt: float) -> int:
         """Contacts of a step of dt [s] from a time."""
@@ -39,11 +39,11 @@ class NoContacts:
         """How deep triangles cross."""
         return 0.0
 
-    def went_astray(self, x_start) -> bool:
+    def left_searched_path(self, x_start) -> bool:
         """Whether the surface went where nobody had looked."""
         return False
 
-    def sank(self, time: float, dt: float, before: float) -> bool:
+    def penetrates_anew(self, time: float, dt: float, before: float) -> bool:
         """Whether a substep ends with something newly in each other."""
         return False
 

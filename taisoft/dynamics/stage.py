@@ -21,19 +21,19 @@ class StageWork:
     v_hat: Any
     base: Any  # f64: x before the step that is being tried
     residual: Any  # on all axes; where not free, beta times the constraint force
-    moved: Any  # (n_moved) i32
-    moved_axes: Any  # (n_moved, 3) i32
-    targets: Any  # (n_moved) f64 3-vectors
-    led_acceleration: Any  # (n_moved) f64 3-vectors, only with a consistent mass
-    n_moved: Count
+    prescribed_nodes: Any  # (n_prescribed) i32
+    prescribed_axes: Any  # (n_prescribed, 3) i32
+    targets: Any  # (n_prescribed) f64 3-vectors
+    prescribed_acceleration: Any  # (n_prescribed) f64 3-vectors, only with a consistent mass
+    n_prescribed: Count
     change: Any  # f64: what the mass is multiplied by
     damper: Any  # BlockCsr or None
     pcg: PcgWork  # -r as its right side; y, the change of v that a Newton step makes; its subset, the nodes that move
 
     @property
-    def leads(self) -> bool:
+    def has_prescribed(self) -> bool:
         """Whether nodes are led."""
-        return self.moved is not None
+        return self.prescribed_nodes is not None
 
 
 @ti.func
@@ -43,27 +43,27 @@ def stage_velocity(m: ti.template(), w: ti.template(), i, beta):
 
 
 @kernel
-def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, led_share: ti.f64):
+def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, prescribed_share: ti.f64):
     """x from the first iterate v; led nodes go to their targets, which gives their v.
 
     v_hat of a led node is set so that (v - v_hat) / beta is its acceleration. With a lumped mass, which shows in nothing but
-    the reactions, that is its change of velocity in a step, of which led_share happens in the stage. A consistent mass
+    the reactions, that is its change of velocity in a step, of which prescribed_share happens in the stage. A consistent mass
     drags the neighbours along, so there the path itself says it.
     """
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         m.state.x[i] = w.x_hat[i] + beta * ti.cast(m.state.v[i], ti.f64)
-    if ti.static(w.leads):
+    if ti.static(w.has_prescribed):
         ti.loop_config(serialize=True)
-        for k in range(w.n_moved):
-            i = w.moved[k]
+        for k in range(w.n_prescribed):
+            i = w.prescribed_nodes[k]
             for a in ti.static(range(3)):
-                if w.moved_axes[k][a] != 0:
+                if w.prescribed_axes[k][a] != 0:
                     v = (w.targets[k][a] - w.x_hat[i][a]) / beta
                     if ti.static(m.consistent):
-                        w.v_hat[i][a] = ti.cast(v - beta * w.led_acceleration[k][a], m.real)
+                        w.v_hat[i][a] = ti.cast(v - beta * w.prescribed_acceleration[k][a], m.real)
                     else:
-                        w.v_hat[i][a] = ti.cast(v - led_share * (v - ti.cast(w.v_hat[i][a], ti.f64)), m.real)
+                        w.v_hat[i][a] = ti.cast(v - prescribed_share * (v - ti.cast(w.v_hat[i][a], ti.f64)), m.real)
                     m.state.v[i][a] = ti.cast(v, m.real)
                     m.state.x[i][a] = w.targets[k][a]
 

@@ -78,11 +78,11 @@ class StageSystem:
         self.work = StageWork(
             x_hat=arena.vectors("x_hat", ti.f64, n), v_hat=arena.vectors("v_hat", model.real, n),
             base=arena.vectors("x_base", ti.f64, n), residual=arena.vectors("residual", model.real, n),
-            moved=arena.field("stage_moved", ti.i32, k, prescribed.astype(np.int32)) if k else None,
-            moved_axes=arena.vectors("stage_moved_axes", ti.i32, k) if k else None,
+            prescribed_nodes=arena.field("stage_moved", ti.i32, k, prescribed.astype(np.int32)) if k else None,
+            prescribed_axes=arena.vectors("stage_moved_axes", ti.i32, k) if k else None,
             targets=arena.vectors("stage_targets", ti.f64, k) if k else None,
-            led_acceleration=arena.vectors("led_acceleration", ti.f64, k) if k and model.consistent else None,
-            n_moved=k, change=arena.vectors("change", ti.f64, n), damper=self.damper, pcg=pcg.build_pcg(model, arena),
+            prescribed_acceleration=arena.vectors("prescribed_acceleration", ti.f64, k) if k and model.consistent else None,
+            n_prescribed=k, change=arena.vectors("change", ti.f64, n), damper=self.damper, pcg=pcg.build_pcg(model, arena),
         )  # fmt: skip
         self.rounding = RoundingFloor(model, eps)
         self.kind = ELASTIC_STAGE
@@ -166,7 +166,7 @@ class StageSystem:
             return
         self._fit()
         self._k, impact = self._room, kind == IMPACT
-        begin_contacts(self.work, self._k, impact, stage.beta, stage.dt, np.array(self.contact.goal))
+        begin_contacts(self.work, self._k, impact, stage.beta, stage.dt, np.array(self.contact.gap_targets))
         self.form_matrix_and_factors(projected=impact)
 
     def evaluate(self, how: int | None = STAY, step_length: float = 1.0, new_multipliers: bool = False) -> tuple[float, float]:

@@ -8,7 +8,7 @@ import taichi as ti
 
 from taisoft.arrays import Count
 from taisoft.dynamics import explicit
-from taisoft.dynamics.world import World
+from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.model import Model
 from taisoft.scalars import LOWEST_J, MOST_INVERTED, STEPS_DONE
@@ -25,22 +25,22 @@ class SubstepWork:
     """Fields of the explicit steps; what a scene does not need is None."""
 
     verlet: bool
-    n_moved: Count
+    n_prescribed: Count
     n_held: Count
     acceleration: Any  # (n_nodes) 3-vectors, Verlet
     half_velocity: Any  # (n_nodes) 3-vectors, Verlet with stiffness damping
-    moved: Any  # (n_moved) i32
-    moved_axes: Any  # (n_moved) 3-vectors i32
-    targets: Any  # (rows * n_moved) 3-vectors f64
-    before: Any  # (n_moved) 3-vectors f64: position before the sub-step
+    prescribed_nodes: Any  # (n_prescribed) i32
+    prescribed_axes: Any  # (n_prescribed) 3-vectors i32
+    targets: Any  # (rows * n_prescribed) 3-vectors f64
+    before: Any  # (n_prescribed) 3-vectors f64: position before the sub-step
     held: Any  # (n_held) i32
     held_velocity: Any  # (n_held) 3-vectors
     reaction: Any  # (n_held) 3-vectors [N]
 
     @property
-    def leads(self) -> bool:
+    def has_prescribed(self) -> bool:
         """Whether nodes are moved."""
-        return self.moved is not None
+        return self.prescribed_nodes is not None
 
     @property
     def holds(self) -> bool:
@@ -68,26 +68,29 @@ def largest_batch(m: Model) -> int:
 class ExplicitStepper:
     """Takes sub-steps of symplectic Euler or velocity Verlet over a world."""
 
-    def __init__(self, world: World, verlet: bool):
-        self.world = world
-        m, arena, motion = world.model, world.arena, world.motion
-        n_tets = int(world.layout.n_tets.sum())
+    def __init__(self, simulation: SimulationState, verlet: bool):
+        self.simulation = simulation
+        m, arena, dirichlet = simulation.model, simulation.arena, simulation.dirichlet
+        n_tets = int(simulation.layout.n_tets.sum())
         self.max_batch = largest_batch(m)
-        n_moved, n_held = motion.n_moved, len(motion.held)
-        self.rows = max(1, min(self.max_batch, TARGET_BYTES_PER_TET * n_tets // (24 * max(1, n_moved))))
+        n_prescribed, n_held = dirichlet.n_prescribed, len(dirichlet.held)
+        self.rows = max(1, min(self.max_batch, TARGET_BYTES_PER_TET * n_tets // (24 * max(1, n_prescribed))))
 
         def vectors(name: str, count: int, dtype=m.real, wanted: bool = True, data=None):
             return arena.vectors(name, dtype, count, data) if wanted and count > 0 else None
 
         self.work = SubstepWork(
-            verlet=verlet, n_moved=n_moved, n_held=n_held,
+            verlet=verlet, n_prescribed=n_prescribed, n_held=n_held,
             acceleration=vectors("acceleration", m.n_nodes, wanted=verlet),
             half_velocity=vectors("half_velocity", m.n_nodes, wanted=verlet and m.stiffness_damping),
-            moved=arena.field("moved", ti.i32, n_moved, motion.moved.astype(np.int32)) if n_moved else None,
-            moved_axes=vectors("moved_axes", n_moved, ti.i32, data=motion.moved_axes()),
-            targets=vectors("targets", self.rows * n_moved, ti.f64),
-            before=vectors("moved_before", n_moved, ti.f64),
-            held=arena.field("held", ti.i32, n_held, motion.held.astype(np.int32)) if n_held else None,
+            prescribed_nodes=(
+                arena.field("prescribed_nodes", ti.i32, n_prescribed, dirichlet.prescribed_nodes.astype(np.int32))
+                if n_prescribed else None
+            ),
+            prescribed_axes=vectors("prescribed_axes", n_prescribed, ti.i32, data=dirichlet.prescribed_axes()),
+            targets=vectors("targets", self.rows * n_prescribed, ti.f64),
+            before=vectors("position_before", n_prescribed, ti.f64),
+            held=arena.field("held", ti.i32, n_held, dirichlet.held.astype(np.int32)) if n_held else None,
             held_velocity=vectors("held_velocity", n_held), reaction=vectors("reaction", n_held),
         )  # fmt: skip
         self.stale = True  # Verlet's acceleration does not belong to the present state
@@ -126,15 +129,15 @@ class ExplicitStepper:
         exception leaves the state as it was.
         """
         n = min(n, self.max_batch)
-        world = self.world
-        if self.work.n_moved:
+        simulation = self.simulation
+        if self.work.n_prescribed:
             n = min(n, self.rows)
-            releases = world.releases
-            targets = world.next_targets(world.time + dt * np.arange(1, n + 1))
-            self.stale = self.stale or world.releases != releases
+            releases = simulation.releases
+            targets = simulation.next_targets(simulation.time + dt * np.arange(1, n + 1))
+            self.stale = self.stale or simulation.releases != releases
             n = len(targets)
             self._upload_targets(targets)
-        kept = world.state()
+        kept = simulation.state()
         try:
             result = self._launch(n, dt)
         except BaseException:  # Ctrl-C, heard when the launch has ended: the batch is abandoned
@@ -144,32 +147,33 @@ class ExplicitStepper:
             self._put_back(*kept)
             if result.done > 0:  # deterministic on the CPU: the same sub-steps again, up to the last good one
                 self._launch(result.done, dt)
-            good = world.state()
+            good = simulation.state()
             self._put_back(*good)
             self._launch(1, dt)
             where = self._fault()
             self._put_back(*good)
-            world.step_count += result.done
-            world.time += result.done * dt
-            raise SimulationError(f"step {world.step_count + 1}: {where}")
+            simulation.step_count += result.done
+            simulation.time += result.done * dt
+            raise SimulationError(f"step {simulation.step_count + 1}: {where}")
         return result
 
     def _fault(self) -> str:
         """What ended the last sub-step, whose state is at hand."""
-        lowest = self.world.model.state.scalars[LOWEST_J]
+        lowest = self.simulation.model.state.scalars[LOWEST_J]
         exploded = f"a tet is inside out by {-lowest:.1e} times its volume: the motion has diverged, and a smaller dt is needed"
-        return self.world.find_unfinite() or (exploded if lowest <= -explicit.EXPLODED else "a velocity is no longer finite")
+        other = exploded if lowest <= -explicit.EXPLODED else "a velocity is no longer finite"
+        return self.simulation.find_nonfinite() or other
 
     def _upload_targets(self, targets: np.ndarray) -> None:
         explicit.set_targets(self.work, targets.reshape(-1, 3))
-        upload([(self.work.moved_axes, self.world.motion.moved_axes())])
+        upload([(self.work.prescribed_axes, self.simulation.dirichlet.prescribed_axes())])
 
     def _put_back(self, x: np.ndarray, v: np.ndarray) -> None:
-        self.world.set_state(x, v)
+        self.simulation.set_state(x, v)
         self.stale = True
 
     def _launch(self, n: int, dt: float) -> SubstepResult:
-        m, s = self.world.model, self.work
+        m, s = self.simulation.model, self.work
         if m.serial:
             explicit.advance_serial(m, s, n, dt, int(self.stale))
         else:
@@ -179,13 +183,13 @@ class ExplicitStepper:
         return SubstepResult(int(done), lowest, int(inverted))
 
     def _launch_parallel(self, n: int, dt: float) -> None:
-        m, s = self.world.model, self.work
+        m, s = self.simulation.model, self.work
         if s.verlet and self.stale:
             explicit.elements_parallel(m)
             explicit.restart_parallel(m, s)
         explicit.begin_parallel(m)
         for row in range(n):
-            if s.verlet or s.n_moved or s.n_held:
+            if s.verlet or s.n_prescribed or s.n_held:
                 explicit.drift_parallel(m, s, row, dt)
             explicit.elements_parallel(m)
             explicit.nodes_parallel(m, s, row, dt)
@@ -200,7 +204,7 @@ class ExplicitStepper:
 
     def reactions(self) -> np.ndarray:
         """(n_nodes, 3) force of the constraints in the last sub-step [N]."""
-        out = np.zeros((self.world.model.n_nodes, 3))
+        out = np.zeros((self.simulation.model.n_nodes, 3))
         if self.work.n_held:
-            out[self.world.motion.held] = self.work.reaction.to_numpy()
+            out[self.simulation.dirichlet.held] = self.work.reaction.to_numpy()
         return out

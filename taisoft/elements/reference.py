@@ -96,7 +96,7 @@ def lumped_mass(body: Body) -> np.ndarray:
     return _to_nodes(body, shares)
 
 
-def weight_mass(body: Body) -> np.ndarray:
+def gravity_mass(body: Body) -> np.ndarray:
     """int rho N_a dV at each node (n,) [kg]: what gravity pulls at; for order 2 negative at the corners."""
     shares = np.full(4, 0.25) if body.order == 1 else np.repeat([-0.05, 0.2], [4, 6])
     return _to_nodes(body, shares)

@@ -30,8 +30,8 @@ class Coupling:
     base: Any  # (n_nodes) 12-vectors: the matrix's diagonal without the terms
     n_active: Any  # (n_nodes) i32: active terms of each node, listed from entry_start in the next two
     term: Any  # (capacity * width) i32
-    share: Any  # (capacity * width): the node's weight in it
-    pull: Any  # (capacity) 4-vectors, the last entry 0
+    term_weight: Any  # (capacity * width): the node's weight in it
+    product: Any  # (capacity) 4-vectors, the last entry 0
 
 
 NO_COUPLING = Coupling(0, *[None] * 13)
@@ -65,43 +65,43 @@ def prepare_terms(m: ti.template(), k: ti.template(), i):
         if k.active[c] == 1:
             weight = ti.cast(k.weight[c, own], m.real)
             total += weight * weight * k.block[c]
-            k.term[first + n], k.share[first + n] = c, weight
+            k.term[first + n], k.term_weight[first + n] = c, weight
             n += 1
     k.n_active[i] = n
     return total
 
 
 @ti.func
-def clear_pulls(m: ti.template(), k: ti.template()):
+def clear_products(m: ti.template(), k: ti.template()):
     """No node pulls."""
     for c in range(k.count[0]):
-        k.pull[c] = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
+        k.product[c] = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
 
 
 @ti.func
-def add_pulls(m: ti.template(), k: ti.template(), i, x):
+def add_products(m: ti.template(), k: ti.template(), i, x):
     """Node i pulls with x."""
     first = k.entry_start[i]
     for e in range(first, first + k.n_active[i]):
         c = k.term[e]
-        k.pull[c] += padded_times(k.block[c], k.share[e] * x)
+        k.product[c] += padded_times(k.block[c], k.term_weight[e] * x)
 
 
 @ti.func
-def gather_pulls(m: ti.template(), k: ti.template(), i):
+def gather_products(m: ti.template(), k: ti.template(), i):
     """What the pulls make of row i of J^T D J x."""
     y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
     first = k.entry_start[i]
     for e in range(first, first + k.n_active[i]):
-        y += k.share[e] * k.pull[k.term[e]]
+        y += k.term_weight[e] * k.product[k.term[e]]
     return ti.Vector([y[0], y[1], y[2]])
 
 
 @ti.func
-def pull_with_all(m: ti.template(), k: ti.template(), c, x: ti.template()):
+def form_product(m: ti.template(), k: ti.template(), c, x: ti.template()):
     """Every node of term c pulls with its x."""
     if k.active[c] == 1:
         s = ti.Vector([0.0, 0.0, 0.0], m.real)
         for j in range(k.arity[c]):
             s += ti.cast(k.weight[c, j], m.real) * x[k.node[c, j]]
-        k.pull[c] = padded_times(k.block[c], s)
+        k.product[c] = padded_times(k.block[c], s)

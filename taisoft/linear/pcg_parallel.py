@@ -3,7 +3,7 @@
 import taichi as ti
 
 from taisoft.linear.block_csr import block_times, part_times, row_times
-from taisoft.linear.coupling import gather_pulls, has_terms, prepare_terms, pull_with_all
+from taisoft.linear.coupling import form_product, gather_products, has_terms, prepare_terms
 from taisoft.linear.pcg import (
     CONVERGED,
     COUNT,
@@ -71,7 +71,7 @@ def iterate_once(
     """One iteration; does nothing once stopped."""
     if ti.static(coupling.width > 0):
         for c in range(coupling.count[0]):
-            pull_with_all(m, coupling, c, w.p)
+            form_product(m, coupling, c, w.p)
     for c in range(m.chunks):
         n = n_nodes_of(m, w.subset)
         size = (n + m.chunks - 1) // m.chunks
@@ -82,7 +82,7 @@ def iterate_once(
                 product = ti.Vector([0.0, 0.0, 0.0], m.real)
                 if ti.static(coupling.width > 0):
                     product = part_times(m, A, A.row_start[i], A.row_start[i + 1], w.p)
-                    product += block_times(coupling.base[i], w.p[i]) + gather_pulls(m, coupling, i)
+                    product += block_times(coupling.base[i], w.p[i]) + gather_products(m, coupling, i)
                 else:
                     product = row_times(m, A, i, w.p)
                 q = m.free[i] * product

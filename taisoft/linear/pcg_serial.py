@@ -11,7 +11,7 @@ Comput. 2(1), 1981.
 import taichi as ti
 
 from taisoft.linear.block_csr import block_times, part_times, part_times_backward
-from taisoft.linear.coupling import add_pulls, clear_pulls, gather_pulls, has_terms, prepare_terms
+from taisoft.linear.coupling import add_products, clear_products, gather_products, has_terms, prepare_terms
 from taisoft.linear.pcg import CONVERGED, COUNT, FARTHEST, NEGATIVE, RUNNING, RZ, RZ_START, STEP, STOP, dot64, precondition
 from taisoft.runtime import kernel
 from taisoft.subset import n_nodes_of, node_of
@@ -22,7 +22,7 @@ def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()
     """y = 0, s = (P + L)^-1 rhs, t = P s; the diagonal and what P is on the way."""
     rz = ti.cast(0.0, ti.f64)
     if ti.static(k.width > 0):
-        clear_pulls(m, k)
+        clear_products(m, k)
     for j in range(n_nodes_of(m, w.subset)):
         i = node_of(w.subset, j)
         if ti.static(k.width > 0):
@@ -33,10 +33,10 @@ def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()
             precondition(m, w, i, A.diagonal[i])
         below = part_times(m, A, A.row_start[i], A.row_upper[i], w.r)
         if ti.static(k.width > 0):
-            below += gather_pulls(m, k, i)
+            below += gather_products(m, k, i)
         s = block_times(w.inverse[i], w.rhs[i] - below)
         if ti.static(k.width > 0):
-            add_pulls(m, k, i, s)
+            add_products(m, k, i, s)
         t = block_times(w.block[i], s)
         w.r[i], w.q[i] = s, t
         w.z[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
@@ -63,20 +63,20 @@ def iterations(m: ti.template(), A: ti.template(), coupling: ti.template(), w: t
         stop = CONVERGED
     while k < n and stop == RUNNING:
         if ti.static(coupling.width > 0):
-            clear_pulls(m, coupling)
+            clear_products(m, coupling)
         for back in range(size):
             i = node_of(w.subset, size - 1 - back)
             t = w.q[i] + ti.cast(along, m.real) * w.z[i]  # w.q holds P s of the last update
             w.z[i] = t
             above = part_times_backward(m, A, A.row_upper[i], A.row_start[i + 1], w.p)
             if ti.static(coupling.width > 0):
-                above += gather_pulls(m, coupling, i)
+                above += gather_products(m, coupling, i)
             p = block_times(w.inverse[i], t - above)
             w.p[i] = p
             if ti.static(coupling.width > 0):
-                add_pulls(m, coupling, i, p)
+                add_products(m, coupling, i, p)
         if ti.static(coupling.width > 0):
-            clear_pulls(m, coupling)
+            clear_products(m, coupling)
         curvature = ti.cast(0.0, ti.f64)
         for at in range(size):
             i = node_of(w.subset, at)
@@ -84,10 +84,10 @@ def iterations(m: ti.template(), A: ti.template(), coupling: ti.template(), w: t
             p, t = w.p[i], w.z[i]
             below = part_times(m, A, A.row_start[i], A.row_upper[i], w.q)
             if ti.static(coupling.width > 0):
-                below += gather_pulls(m, coupling, i)
+                below += gather_products(m, coupling, i)
             s = block_times(w.inverse[i], t - block_times(w.mirror[i], p) - below)
             if ti.static(coupling.width > 0):
-                add_pulls(m, coupling, i, s)
+                add_products(m, coupling, i, s)
             w.q[i] = s
             curvature += dot64(t, p + s)
         if not curvature > 0.0:

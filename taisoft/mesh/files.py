@@ -15,9 +15,9 @@ import numpy as np
 from taisoft.errors import MeshError
 from taisoft.files import replacing
 from taisoft.mesh.content import read_content
-from taisoft.mesh.fence import read_fenced
 from taisoft.mesh.gmsh import read_gmsh
 from taisoft.mesh.quality import edge_lengths
+from taisoft.mesh.safe_meshio import read_safely
 from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh, merge_labels
 from taisoft.mesh.tetgen import read_tetgen
 from taisoft.mesh.tetra10 import straightened
@@ -129,7 +129,7 @@ def _read_by_meshio(file: Path, name: str, data: bytes):
                 f"{name}: line {line} announces {found[1][:30].decode()} items, but the file has {len(data)} bytes"
             )
     try:
-        mesh = read_fenced(file, name, data)
+        mesh = read_safely(file, name, data)
     except MeshError as error:
         if any(int(found[1][:30]) == 0 for found in re.finditer(_NEEDED.get(ending, rb"(?!)"), data)):
             raise MeshError(f"{name}: no tetrahedra; the file announces 0 points or cells") from error

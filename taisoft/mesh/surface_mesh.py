@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from taisoft.attributes import MeshAttributeError, guarded_record
 from taisoft.errors import MeshError
 from taisoft.mesh.content import one_line, read_content
-from taisoft.mesh.fence import read_fenced
+from taisoft.mesh.safe_meshio import read_safely
 from taisoft.mesh.tet_mesh import merge_labels
 from taisoft.mesh.topology import triangle_edges
 
@@ -262,7 +262,7 @@ def _read_by_meshio(file: Path, name: str, data: bytes) -> tuple[np.ndarray, np.
         if int(found[2][:30]) > len(data):
             what = f"{found[2][:30].decode()} of element {found[1].decode()}"
             raise MeshError(f"{name}: the head announces {what}, but the file has {len(data)} bytes")
-    mesh = read_fenced(file, name, data, "surface")
+    mesh = read_safely(file, name, data, "surface")
     try:
         blocks = [np.asarray(b.data) for b in mesh.cells if b.type in ("triangle", "quad") or "polygon" in b.type]
         return np.asarray(mesh.points), _fans([b for b in blocks if b.ndim == 2])

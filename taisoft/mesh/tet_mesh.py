@@ -59,10 +59,10 @@ class TetMesh(Guarded):
         self.surface = faces.triangles[rows]
         self.surface_tets = rows // 4
         self.n_components = int(connected_pieces(self.tets, self.n_verts)[0])
-        self._tell_flat()
-        self._tell_joints(faces)
-        self._tell_coincident()
-        self._tell_distance()
+        self._warn_flat()
+        self._warn_joints(faces)
+        self._warn_coincident()
+        self._warn_distance()
         for note in notes:
             self._tell(note)
         self._freeze()
@@ -94,7 +94,7 @@ class TetMesh(Guarded):
     def __repr__(self) -> str:
         return f"TetMesh({self.n_verts} vertices, {self.n_tets} tets, {len(self.surface)} surface triangles)"
 
-    def _tell_distance(self) -> None:
+    def _warn_distance(self) -> None:
         """Warn of a mesh far from the origin: positions keep 16 digits, and the distance takes some of them."""
         size, distance = float(np.ptp(self.vertices, axis=0).max()), float(np.abs(self.vertices).max())
         if distance > FAR * size:
@@ -224,7 +224,7 @@ class TetMesh(Guarded):
             )
         return faces
 
-    def _tell_flat(self) -> None:
+    def _warn_flat(self) -> None:
         """Warn of badly shaped tets: a wave crosses their least height at once, and that sets the explicit step."""
         quality = mean_ratio(edge_lengths(self.vertices, self.tets), self.volumes)
         count = int((quality < NEARLY_FLAT).sum())
@@ -236,7 +236,7 @@ class TetMesh(Guarded):
                 "stiff there"
             )
 
-    def _tell_joints(self, faces: Faces) -> None:
+    def _warn_joints(self, faces: Faces) -> None:
         edges = joint_edges(self.surface)
         if len(edges):
             first = tuple(edges[0].tolist())
@@ -245,7 +245,7 @@ class TetMesh(Guarded):
         if len(vertices):
             self._tell(f"parts are joined at a vertex only at {len(vertices)} vertices: {_listed(vertices)}")
 
-    def _tell_coincident(self) -> None:
+    def _warn_coincident(self) -> None:
         """Count the vertices that lie on another one; such pieces are not connected."""
         labels = merge_labels(self.vertices, COINCIDENT * float(np.linalg.norm(np.ptp(self.vertices, axis=0))))
         first = np.unique(labels, return_index=True)[1]

@@ -12,7 +12,7 @@ from taisoft.mesh.nodes import Nodes, make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.thickness import coarse_bending
 from taisoft.scene import checks
-from taisoft.scene.collision import HIT_BY
+from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.key_frames import KeyFrames
 from taisoft.scene.material import Material
 
@@ -76,7 +76,7 @@ class Body(Guarded):
     """
 
     _read_only = frozenset(_READ_ONLY)
-    _instead = dict.fromkeys(_READ_ONLY, "add another body by scene.add_body") | {"hit_by": "set body.collision"}
+    _instead = dict.fromkeys(_READ_ONLY, "add another body by scene.add_body") | {"contact_mode": "set body.collision"}
     _contents = {
         "constraints": "call body.fix or body.move", "tractions": "call body.add_traction", "forces": "call body.add_force",
     }  # fmt: skip
@@ -134,7 +134,7 @@ class Body(Guarded):
             raise SceneError(f"body {self.name!r}: material must be a Material, not {type(value).__name__}")
         self._material = value
         if self._sealed:  # add_body and the simulator warn themselves
-            self.tell_locking(stacklevel=3)
+            self.warn_locking(stacklevel=3)
 
     @property
     def position(self) -> np.ndarray:
@@ -172,10 +172,10 @@ class Body(Guarded):
 
     @collision.setter
     def collision(self, value: str) -> None:
-        self._collision = checks.choice(value, f"body {self.name!r}: collision", HIT_BY)
+        self._collision = checks.choice(value, f"body {self.name!r}: collision", CONTACT_MODES)
 
     @property
-    def hit_by(self) -> str:
+    def contact_mode(self) -> str:
         """ "proximity", which "auto" is, or "distance_field"."""
         return "proximity" if self.collision == "auto" else self.collision
 
@@ -183,7 +183,7 @@ class Body(Guarded):
         kind = f"{self.mesh.n_tets} tets of order {self.order}"
         return f"Body({self.name!r}, {self.n_nodes} nodes, {kind}, {self.material.law})"
 
-    def tell_locking(self, stacklevel: int) -> None:
+    def warn_locking(self, stacklevel: int) -> None:
         """Warn of linear tets where they lock: above a Poisson's ratio of 0.49. stacklevel: 1 is the caller's line."""
         poisson = self.material.poisson
         if self.order == 1 and poisson > NEARLY_INCOMPRESSIBLE:

@@ -36,7 +36,7 @@ def changed_material(body: Body, numbers: dict[str, float], on: dict[str, bool])
     with thawed(body):
         body.material = material
     if "poisson" in numbers:
-        body.tell_locking(stacklevel=3)
+        body.warn_locking(stacklevel=3)
 
 
 def changed_load(body: Body, kind: str, index: int, value) -> None:

@@ -17,7 +17,7 @@ from taisoft.mesh.nodes import Nodes
 from taisoft.scene import checks
 
 BROAD_PHASES = ("auto", "spatial_hash", "bvh")
-HIT_BY = ("auto", "distance_field", "proximity")
+CONTACT_MODES = ("auto", "distance_field", "proximity")
 SHARP = 60.0  # [degrees] between the normals of neighbours above which a convex edge is sharp
 
 

@@ -32,7 +32,7 @@ def _named(names: list[str]) -> str:
 
 
 def make_plan(
-    scene: Scene, explicit: bool, multistep: bool, self_collision: bool = False, pullable: bool = False
+    scene: Scene, explicit: bool, multistep: bool, self_collision: bool = False, draggable: bool = False
 ) -> Plan:
     """Decide from the scene, the kind of integrator, and whether bodies may touch themselves or are to be pulled."""
     plan = Plan()
@@ -55,7 +55,7 @@ def make_plan(
     )  # fmt: skip
     loaded = bodies(lambda b: b.tractions or b.forces)
     why = f"tractions or forces on {_named(loaded)}" if loaded else "bodies are to be pulled"
-    plan.add("loads", bool(loaded) or pullable, why, "no traction and no force")
+    plan.add("loads", bool(loaded) or draggable, why, "no traction and no force")
     fixed = bodies(lambda b: any(c.path is None for c in b.constraints))
     plan.add("fixed_nodes", bool(fixed), f"on {_named(fixed)}", "no node is fixed")
     moved = bodies(lambda b: any(c.path is not None for c in b.constraints))
@@ -84,10 +84,11 @@ def _add_collision(plan: Plan, scene: Scene, self_collision: bool) -> None:
     hit = scene.bodies if with_triangles > 1 else []
     modes: dict[str, list[str]] = {"distance_field": [], "proximity": []}
     for body in hit:
-        modes[body.hit_by].append(body.name if body.collision == "auto" else f"{body.name} (asked for)")
+        modes[body.contact_mode].append(body.name if body.collision == "auto" else f"{body.name} (asked for)")
     modes["proximity"] += [f"{o.name} (triangles)" for o in obstacles if isinstance(o.shape, MeshObstacle) and scene.bodies]
     modes["proximity"] += [f"{o.name} (edges)" for o in obstacles if isinstance(o.shape, Box) and scene.bodies]
-    modes["proximity"] += [f"{b.name} (sharp edges)" for b in hit if b.hit_by == "distance_field" and has_sharp_edges(b.nodes)]
+    fields = [b for b in hit if b.contact_mode == "distance_field"]
+    modes["proximity"] += [f"{b.name} (sharp edges)" for b in fields if has_sharp_edges(b.nodes)]
     if self_collision:
         modes["proximity"].append("every body (itself)")
     idle = "no triangles can hit a body" if not hit else "every body is hit by "

@@ -147,7 +147,7 @@ class Scene(Guarded):
         name = self._free_name(name, "body")
         body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision)
         list.append(self.bodies, body)
-        body.tell_locking(stacklevel=2)
+        body.warn_locking(stacklevel=2)
         body.warn_bending(stacklevel=2)
         return body
 

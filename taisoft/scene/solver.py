@@ -32,7 +32,7 @@ CHECKS = {
     "precision": lambda value, key: checks.choice(value, key, ("f32", "f64")),
     "arch": lambda value, key: checks.choice(value, key, ("cpu", "cuda")),
     "allow_unstable": checks.flag,
-    "pullable": checks.flag,
+    "draggable": checks.flag,
     "newton_tolerance": _tolerance,
     "linear_tolerance": _tolerance,
     "contact_tolerance": _tolerance,

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 
 from taisoft import runtime
-from taisoft.elements.reference import lumped_mass, traction_forces, weight_mass
+from taisoft.elements.reference import gravity_mass, lumped_mass, traction_forces
 from taisoft.errors import SimulationError, TaisoftError
 from taisoft.mesh.quality import edge_lengths
 from taisoft.output.report import extremes, machine, peak_memory, versions
@@ -14,7 +14,7 @@ from taisoft.records import RunReport
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
 from taisoft.study.store import pack
-from taisoft.study.stretch import advance
+from taisoft.study.timed_run import advance
 from taisoft.timing import load_average, usable_cores
 
 ENOUGH_SECONDS = 20.0  # a run of so much wall time is not repeated: the followed one is its time
@@ -44,7 +44,8 @@ def _facts(scene: Scene, integrator: str, task: dict) -> dict:
     """What is known before the run: sizes, and which laws of conservation hold."""
     bodies = scene.bodies
     damped = any(b.material.mass_damping or b.material.stiffness_damping for b in bodies)
-    led = any(c.path is not None for b in bodies for c in b.constraints) or any(o.path is not None for o in scene.obstacles)
+    prescribed = any(c.path is not None for b in bodies for c in b.constraints)
+    prescribed = prescribed or any(o.path is not None for o in scene.obstacles)
     loaded = any(b.tractions or b.forces for b in bodies)
     pushes = scene.pushes(task["fixed"].get("self_collision", False))
     free = not any(b.constraints for b in bodies) and not any(b.material.mass_damping for b in bodies)
@@ -55,14 +56,14 @@ def _facts(scene: Scene, integrator: str, task: dict) -> dict:
         "tets": sum(b.mesh.n_tets for b in bodies),
         "orders": sorted({b.order for b in bodies}),
         "smallest_edge": min(float(edge_lengths(b.mesh.vertices, b.mesh.tets).min()) for b in bodies),  # [m]
-        "keeps_energy": not (damped or led or loaded or pushes),
+        "keeps_energy": not (damped or prescribed or loaded or pushes),
         "momentum_rate": _load_of(scene).tolist() if free else None,  # [N]
     }
 
 
 def _load_of(scene: Scene) -> np.ndarray:
     """Sum of weights, tractions and forces (3,) [N]."""
-    total = sum(weight_mass(b).sum() for b in scene.bodies) * scene.gravity
+    total = sum(gravity_mass(b).sum() for b in scene.bodies) * scene.gravity
     for body in scene.bodies:
         for load in body.tractions:
             total = total + traction_forces(body, load.triangles, load.value).sum(axis=0)
@@ -128,7 +129,7 @@ class Observer:
 
     def __init__(self, sim: Simulator):
         self.seconds = 0.0
-        of = lumped_mass if sim.settings.explicit else weight_mass
+        of = lumped_mass if sim.settings.explicit else gravity_mass
         self._mass = np.concatenate([of(body) for body in sim.scene.bodies])
         self._path: list[np.ndarray] = []
         self._energies: list[tuple] = []

@@ -18,7 +18,7 @@ def check_scene(folder: Path, scene: str) -> None:
     """Raises OutputError where the folder holds a study of another scene than the one with this digest."""
     try:
         found = json.loads((folder / "study.json").read_bytes())
-        name, same = found["ask"]["scene"], found["scene_digest"] == scene
+        name, same = found["request"]["scene"], found["scene_digest"] == scene
     except FileNotFoundError:
         return
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:

@@ -26,21 +26,21 @@ SECOND_ORDER = ("velocity_verlet", "bdf2", "implicit_midpoint")
 Variant = Callable[[int, int | None], Scene]  # (refine, order) -> scene
 
 
-def make_plan(variant: Variant, solver: dict, ask: dict) -> dict:
+def make_plan(variant: Variant, solver: dict, request: dict) -> dict:
     """The plan of a study as plain data. ask: see `Ask`. Raises SceneError where nothing can be run."""
-    return Planner(variant, solver, ask).plan()
+    return Planner(variant, solver, request).plan()
 
 
 class Planner:
     """A scene's variants with what is asked of them, each found out once."""
 
-    def __init__(self, variant: Variant, solver: dict, ask: dict):
-        self._variant, self._solver, self._ask = variant, solver, ask
+    def __init__(self, variant: Variant, solver: dict, request: dict):
+        self._variant, self._solver, self._ask = variant, solver, request
         self._scenes: dict[tuple, Scene | str] = {}
         self._limits: dict[tuple, float] = {}
         self._notes: list[str] = []
         # what is no axis of the study and no argument of the run holds for all runs
-        left_out = (*AXES, "seconds", "fps", "pullable")
+        left_out = (*AXES, "seconds", "fps", "draggable")
         self.fixed = {key: value for key, value in solver.items() if key not in left_out}
         self.self_collision = self.fixed.get("self_collision", False)
 
@@ -142,17 +142,17 @@ class Planner:
         return not (led or damped or scene.pushes(self.self_collision))
 
     def _integrator(self, scene: Scene, refine: int, order: int | None, kind: str, target: float) -> str:
-        asked = self._ask["reference_integrator"]
-        if asked is not None:
-            if asked not in INTEGRATORS:
-                raise SceneError(f"--reference-integrator {asked}: it must be one of {', '.join(INTEGRATORS)}")
-            if kind and (kind == "explicit") != (asked in EXPLICIT):
+        requested = self._ask["reference_integrator"]
+        if requested is not None:
+            if requested not in INTEGRATORS:
+                raise SceneError(f"--reference-integrator {requested}: it must be one of {', '.join(INTEGRATORS)}")
+            if kind and (kind == "explicit") != (requested in EXPLICIT):
                 instead = "velocity_verlet" if kind == "explicit" else "bdf2"
                 self._notes.append(
-                    f"the {kind} steps of quadratic tets have the reference {instead}, since {asked} has another mass matrix"
+                    f"the {kind} steps of quadratic tets have the reference {instead}, since {requested} has another mass matrix"
                 )
                 return instead
-            return asked
+            return requested
         if kind == "explicit":
             return "velocity_verlet"
         if scene.pushes(self.self_collision):
@@ -161,7 +161,7 @@ class Planner:
         return "velocity_verlet" if not kind and limit > 2.0 * target / SMALLEST_SHARE else "implicit_midpoint"
 
     def _check(self, scene: Scene, setting: Setting) -> None:
-        more = {"self_collision": False, "allow_unstable": False, "pullable": False} | self.fixed
+        more = {"self_collision": False, "allow_unstable": False, "draggable": False} | self.fixed
         check_settings(scene, **setting.simulator(), **more)
 
     def _limit(self, refine: int, order: int | None, integrator: str) -> float:

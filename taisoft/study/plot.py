@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.output.plot import require_matplotlib, save, ticks
-from taisoft.study.judge import Row
+from taisoft.study.accuracy import Row
 from taisoft.study.results import Study
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#555555")
@@ -34,14 +34,14 @@ def draw(study: Study, path: Path) -> bool:
     _points(panel, study, rows)
     _label_front(panel, study)
     times = [x for row in rows for x in np.percentile(row.seconds, (25, 75))]
-    errors = [row.claimed(study.ask.by) for row in rows] + [study.ask.tolerance] + _shown_sure(study, rows)
+    errors = [row.claimed(study.request.by) for row in rows] + [study.request.tolerance] + _shown_sure(study, rows)
     panel.set(xscale="log", yscale="log", xlim=(min(times) / 1.6, max(times) * 1.9), ylim=(min(errors) / 2.0, max(errors) * 2.0))
     for axis, values in ((panel.xaxis, times), (panel.yaxis, errors)):
         ticks(axis, max(values) / min(values))
     space = "to the finest mesh, " if study.space is not None else ""
     panel.set_xlabel("wall time of a simulated second [s], median; bars: quartiles")
-    panel.set_ylabel(f"error in position ({space}{study.ask.by}, over the largest excursion)")
-    panel.set_title(Path(study.ask.scene).stem)
+    panel.set_ylabel(f"error in position ({space}{study.request.by}, over the largest excursion)")
+    panel.set_title(Path(study.request.scene).stem)
     panel.grid(True, which="major", color="#eeeeee")
     panel.set_axisbelow(True)
     panel.legend(fontsize="small", frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -60,7 +60,7 @@ def _points(panel, study: Study, rows: list[Row]) -> None:
             colour = COLOURS[(kinds.index(row_kind) if len(kinds) > 1 else integrators.index(integrator)) % len(COLOURS)]
             label = ", ".join(filter(None, (integrator, row_kind)))
             chain = sorted(own, key=lambda row: row.setting["dt"])
-            places = [row.timing.median for row in chain], [row.claimed(study.ask.by) for row in chain]
+            places = [row.timing.median for row in chain], [row.claimed(study.request.by) for row in chain]
             panel.plot(*places, color=colour, lw=0.8, alpha=0.4, zorder=1)
             for status, fill in (("ok", colour), ("degraded", "white")):
                 some = [row for row in own if row.status == status]
@@ -72,7 +72,7 @@ def _points(panel, study: Study, rows: list[Row]) -> None:
 def _series(panel, study: Study, rows: list[Row], **style) -> None:
     middle = [row.timing.median for row in rows]
     bars = np.transpose([np.abs(np.percentile(row.seconds, (25, 75)) - row.timing.median) for row in rows])
-    errors = [row.claimed(study.ask.by) for row in rows]
+    errors = [row.claimed(study.request.by) for row in rows]
     panel.errorbar(middle, errors, xerr=bars, ls="none", ms=6, elinewidth=1.0, capsize=2, **style)
 
 
@@ -84,11 +84,12 @@ def _kind(row: Row, varying: list[str]) -> str:
 def _lines(panel, study: Study, rows: list[Row]) -> None:
     """The front as stairs, the tolerance, and the references' own errors."""
     front = study.front()
-    times, errors = [row.timing.median for row in front], [row.claimed(study.ask.by) for row in front]
+    times, errors = [row.timing.median for row in front], [row.claimed(study.request.by) for row in front]
     # nothing is faster than its first point, and beyond its last one the front stays where it is
     corners = [times[0], *times, FAR], [FAR, *errors, errors[-1]]
     panel.step(*corners, where="post", color="#999999", lw=1.2, zorder=1, label="Pareto front")
-    panel.axhline(study.ask.tolerance, color="#555555", lw=0.9, ls="--", zorder=1, label=f"tolerance {study.ask.tolerance:g}")
+    tolerance = study.request.tolerance
+    panel.axhline(tolerance, color="#555555", lw=0.9, ls="--", zorder=1, label=f"tolerance {tolerance:g}")
     shown = _shown_sure(study, rows)
     for k, sure in enumerate(shown):
         panel.axhline(sure, color=SURE, lw=1.4, ls=":", zorder=1, label="reference's own error" if k == 0 else None)
@@ -99,12 +100,12 @@ def _lines(panel, study: Study, rows: list[Row]) -> None:
 
 def _sure(study: Study, rows: list[Row]) -> list[float]:
     """What the references of the rows are good to."""
-    return sorted({row.error(study.ask.by)[1] for row in rows})
+    return sorted({row.error(study.request.by)[1] for row in rows})
 
 
 def _shown_sure(study: Study, rows: list[Row]) -> list[float]:
     """Those that lie near enough to the points to be in the picture."""
-    least = min(row.claimed(study.ask.by) for row in rows)
+    least = min(row.claimed(study.request.by) for row in rows)
     return [sure for sure in _sure(study, rows) if sure > least / NEAR]
 
 
@@ -112,7 +113,7 @@ def _label_front(panel, study: Study) -> None:
     """Steps at the points of the front, as far as there is room."""
     front = study.front()
     for row in front[:: -(-len(front) // LABELS)]:
-        place = (row.timing.median, row.claimed(study.ask.by))
+        place = (row.timing.median, row.claimed(study.request.by))
         text = f"{1e3 * row.setting['dt']:.3g} ms"
         box = {"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 0.5}
         panel.annotate(text, place, (5, 7), textcoords="offset points", fontsize=7, color="#333333", bbox=box)

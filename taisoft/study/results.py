@@ -3,12 +3,12 @@
 from dataclasses import asdict, dataclass, field
 
 from taisoft.study import pareto
+from taisoft.study.accuracy import Reference, Row
 from taisoft.study.grid import AXES
-from taisoft.study.judge import Reference, Row
 
 
 @dataclass
-class Ask:
+class Request:
     """What a study is asked for. axes: name -> values, of those given; by: the error that counts, "max" or "rms"."""
 
     scene: str
@@ -36,7 +36,7 @@ class Study:
     of the budget stopped.
     """
 
-    ask: Ask
+    request: Request
     plan: dict
     rows: list[Row] = field(default_factory=list)
     references: list[Reference] = field(default_factory=list)
@@ -52,11 +52,11 @@ class Study:
 
     def judged(self) -> list[Row]:
         """The rows that have a time and an error."""
-        return [row for row in self.rows if row.seconds and row.claimed(self.ask.by) is not None]
+        return [row for row in self.rows if row.seconds and row.claimed(self.request.by) is not None]
 
     def points(self) -> list[tuple[float, float]]:
         """(time, error) of the judged rows."""
-        return [(row.timing.median, row.claimed(self.ask.by)) for row in self.judged()]
+        return [(row.timing.median, row.claimed(self.request.by)) for row in self.judged()]
 
     def front(self) -> list[Row]:
         """The rows that no other is better than in both, by rising time."""
@@ -64,7 +64,7 @@ class Study:
 
     def cheapest(self) -> Row | None:
         """The fastest row within the tolerance."""
-        k = pareto.cheapest(self.points(), self.ask.tolerance)
+        k = pareto.cheapest(self.points(), self.request.tolerance)
         return None if k is None else self.judged()[k]
 
     def nearest(self) -> Row | None:
@@ -92,8 +92,8 @@ def plain(study: Study) -> dict:
     front = study.front()
     rows = [
         asdict(row) | {
-            "seconds_per_simulated_second": row.timing, "error": row.claimed(study.ask.by), "on_front": row in front,
-            "below_reference": below_reference(row, study.ask.by),
+            "seconds_per_simulated_second": row.timing, "error": row.claimed(study.request.by), "on_front": row in front,
+            "below_reference": below_reference(row, study.request.by),
         }
         for row in study.rows
     ]  # fmt: skip
@@ -106,7 +106,7 @@ def plain(study: Study) -> dict:
     ]  # fmt: skip
     cheapest, nearest = study.cheapest(), study.nearest()
     return {
-        "ask": asdict(study.ask), "frame": study.plan["frame"], "frames": study.plan["frames"], "rows": rows,
+        "request": asdict(study.request), "frame": study.plan["frame"], "frames": study.plan["frames"], "rows": rows,
         "references": references, "cheapest": cheapest and cheapest.setting, "nearest": nearest and nearest.setting,
         "notes": study.notes, "ended": study.ended, "machines": study.machines, "workers": study.workers,
         "versions": study.versions, "scene_digest": study.plan["scenes"]["refine 0"], "code_digest": study.plan["code"],

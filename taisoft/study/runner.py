@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from taisoft.errors import SceneError, SimulationError
+from taisoft.study.accuracy import Error, Reference, Row, error_in_space, in_space_sure, make_reference, row_of
 from taisoft.study.grid import mesh_name, tasks_of
-from taisoft.study.judge import Error, Reference, Row, error_in_space, in_space_sure, make_reference, row_of
-from taisoft.study.results import Ask, Study, describe
+from taisoft.study.results import Request, Study, describe
 from taisoft.study.store import NoStore, Store, digest, unpack
 from taisoft.study.workers import CUT, SPENT, LocalPlace, Place, carry_out
 from taisoft.timing import summarise, usable_cores
@@ -28,10 +28,10 @@ class Outcome:
 class Runner:
     """Plans and carries out a study. places: where; machines: what they are; tell: for a line on what goes on."""
 
-    ask: Ask
+    request: Request
     places: list[Place]
     machines: list[dict]
-    asked: Callable[[], bool]
+    requested: Callable[[], bool]
     seconds_left: Callable[[], float]
     tell: Callable[[str], None]
     store: Store | NoStore = field(default_factory=NoStore)
@@ -39,7 +39,7 @@ class Runner:
 
     def run(self, plan: dict) -> Study:
         """The study of a plan. Raises OutputError where a finished run cannot be kept."""
-        study = Study(self.ask, plan, notes=list(plan["notes"]), machines=self.machines, workers=len(self.places))
+        study = Study(self.request, plan, notes=list(plan["notes"]), machines=self.machines, workers=len(self.places))
         study.kept = isinstance(self.store, Store)
         references, settings = tasks_of(plan)
         tasks = [*references, *settings]
@@ -60,16 +60,16 @@ class Runner:
         None where it was interrupted. Raises SceneError for what cannot be studied.
         """
         answers: list[dict] = []
-        request = self._request("plan") | {"ask": self.ask.of_plan()}
+        request = self._request("plan") | {"request": self.request.of_plan()}
 
         def done(_: str, answer: dict) -> None:
             answers.append(answer)
 
-        left = carry_out([("plan", request)], [self.planner], done, seconds_left=lambda: 1.0, asked=self.asked)
+        left = carry_out([("plan", request)], [self.planner], done, seconds_left=lambda: 1.0, requested=self.requested)
         if left:
             return None
         if "answer" not in answers[0]:
-            raise SceneError(answers[0].get("error") or f"the scene {self.ask.scene}: {answers[0]['crash']}")
+            raise SceneError(answers[0].get("error") or f"the scene {self.request.scene}: {answers[0]['crash']}")
         plan = answers[0]["answer"]
         if all(case["refused"] for case in plan["cases"]):
             reasons = "; ".join(dict.fromkeys(case["refused"] for case in plan["cases"]))
@@ -77,12 +77,13 @@ class Runner:
         return plan
 
     def _request(self, do: str) -> dict:
-        return {"do": do, "scene": self.ask.scene, "allow_outside": self.ask.allow_outside}
+        return {"do": do, "scene": self.request.scene, "allow_outside": self.request.allow_outside}
 
     def _task(self, plan: dict, task: dict) -> dict:
         """As `measure` takes it."""
         shared = {"fixed": plan["fixed"], "frame": plan["frame"], "frames": plan["frames"]}
-        return {"setting": task["setting"], "steps": task["steps"], "repeats": self.ask.repeats if task["timed"] else 0} | shared
+        repeats = self.request.repeats if task["timed"] else 0
+        return {"setting": task["setting"], "steps": task["steps"], "repeats": repeats} | shared
 
     def _key(self, plan: dict, task: dict) -> str:
         machines = sorted(self.machines, key=lambda one: one["name"])  # a cluster tells them in any order
@@ -113,7 +114,7 @@ class Runner:
         for key in missing:
             scene = plan["scenes"][mesh_name(tasks[key]["setting"])]
             requests.append((key, same | {"digest": scene, "task": self._task(plan, tasks[key])}))
-        left = carry_out(requests, self.places, done, seconds_left=self.seconds_left, asked=self.asked)
+        left = carry_out(requests, self.places, done, seconds_left=self.seconds_left, requested=self.requested)
         return records, failed, left
 
     def _references(self, study: Study, outcomes: list[Outcome]) -> list[Reference | None]:

@@ -6,8 +6,8 @@ import math
 from dataclasses import asdict
 
 from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.study.accuracy import Error, Row
 from taisoft.study.grid import AXES, mesh_name
-from taisoft.study.judge import Error, Row
 from taisoft.study.results import Study, describe
 
 ALWAYS = ("integrator", "dt")  # axes that have a column even where they do not vary
@@ -16,7 +16,7 @@ ENDED = ("ok", "degraded")
 
 def text_of(study: Study) -> str:
     """The whole study in Markdown: answer, table, what was not run, references, notes."""
-    parts = [f"# {study.ask.scene}: speed against error", answer(study)]
+    parts = [f"# {study.request.scene}: speed against error", answer(study)]
     if study.ended:
         on = "The same command goes on with it." if study.kept else "Without --out nothing of it is kept."
         needed = "if it takes longer than the whole budget, it needs a larger --budget"
@@ -34,14 +34,15 @@ def text_of(study: Study) -> str:
 
 def answer(study: Study) -> str:
     """The cheapest setting within the tolerance, or the nearest one, in a sentence."""
-    goal = f"{study.ask.tolerance:.3g}"
+    goal = f"{study.request.tolerance:.3g}"
     if (row := study.cheapest()) is not None:
         careful = "" if row.status == "ok" else f"; its run is {row.status}"
-        return f"Cheapest within {goal} ({study.ask.by} error): {_named(row, study.ask.by)}{careful}."
+        return f"Cheapest within {goal} ({study.request.by} error): {_named(row, study.request.by)}{careful}."
     if (row := study.nearest()) is not None:
-        sure, finer = row.error(study.ask.by)[1], "--reference-refine" if study.space is not None else "--reference-dt"
-        known = "" if sure <= study.ask.tolerance else f" Below {sure:.2g} nothing is known; {finer} gives a better reference."
-        return f"No setting is within {goal} ({study.ask.by} error); the nearest: {_named(row, study.ask.by)}.{known}"
+        sure, finer = row.error(study.request.by)[1], "--reference-refine" if study.space is not None else "--reference-dt"
+        below = f" Below {sure:.2g} nothing is known; {finer} gives a better reference."
+        known = "" if sure <= study.request.tolerance else below
+        return f"No setting is within {goal} ({study.request.by} error); the nearest: {_named(row, study.request.by)}.{known}"
     return "No setting has both a time and an error."
 
 
@@ -183,4 +184,4 @@ def _cells(row: Row, study: Study, on_front: bool) -> dict:
     told = ("energy", "energy_kept", "momentum", "penetration", "contact_residual", "unconverged", "inverted")
     rest = asdict(row)
     cells |= {key: rest[key] for key in (*told, "compile_seconds", "steps", "nodes", "tets", "threads", "machine")}
-    return {key: "" if value is None else value for key, value in cells.items()} | {"error_by": study.ask.by}
+    return {key: "" if value is None else value for key, value in cells.items()} | {"error_by": study.request.by}

@@ -110,7 +110,7 @@ def local_places(number: int) -> list[LocalPlace]:
 
 def carry_out(
     requests: Iterable[tuple[str, dict]], places: list, done: Callable[[str, dict], None], *,
-    seconds_left: Callable[[], float], asked: Callable[[], bool],
+    seconds_left: Callable[[], float], requested: Callable[[], bool],
 ) -> dict[str, str]:  # fmt: skip
     """Hand out requests (key, request) in their order, and each answer to done(key, answer).
 
@@ -121,7 +121,7 @@ def carry_out(
     lost: dict[int, str] = {}
     try:
         while waiting or busy:
-            why = "the study was interrupted" if asked() else SPENT if seconds_left() <= 0.0 else ""
+            why = "the study was interrupted" if requested() else SPENT if seconds_left() <= 0.0 else ""
             if len(lost) == len(places):
                 why = "; ".join(dict.fromkeys(lost.values()))
             if why:

@@ -64,7 +64,7 @@ class Panel:
     @property
     def strength(self) -> float:
         """Weights of the body that a pull as long as the body's diagonal has."""
-        return 10.0**self._strength if self._sim.pullable else 0.0
+        return 10.0**self._strength if self._sim.draggable else 0.0
 
     def _touching(self) -> list[tuple[str, str]]:
         """Names of the pairs that the slider of friction is about."""
@@ -95,11 +95,11 @@ class Panel:
                 self._friction = friction
                 for pair in self._pairs:
                     self._sim.set_contact(*pair, friction=friction)
-        if self._sim.pullable:
+        if self._sim.draggable:
             self._strength = gui.slider_float(f"pull {self.strength:.3g} weights###pull", self._strength, *STRENGTHS)
-            grip = self._sim.pulled
-            force, most = (np.linalg.norm(grip.force), grip.strongest) if grip is not None else (0.0, 0.0)
-            gui.text(f"pulling with {force:.3g} N of at most {most:.3g}" if grip is not None else "nothing is pulled")
+            drag = self._sim.dragged
+            force, most = (np.linalg.norm(drag.force), drag.max_force) if drag is not None else (0.0, 0.0)
+            gui.text(f"pulling with {force:.3g} N of at most {most:.3g}" if drag is not None else "nothing is pulled")
         if gui.button(f"colour: {TITLES[self._colouring.kind]}###colour"):
             self._colouring.choose_next()
         for text, colour in self._colouring.legend():

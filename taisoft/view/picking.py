@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.dynamics.pull import EARTH
+from taisoft.dynamics.drag_spring import EARTH
 from taisoft.output.camera import Camera
 
 PATCH = 0.1  # radius in units of the diagonal of the body's bounding box at rest
@@ -62,7 +62,7 @@ def pick(sim, camera: Camera, cursor: tuple[float, float], size: tuple[int, int]
     return best
 
 
-class Drag:
+class MouseDrag:
     """A drag of what was hit: pulls it towards the cursor, in the plane through the point that is parallel to the picture."""
 
     def __init__(self, sim, hit: Hit):
@@ -75,12 +75,12 @@ class Drag:
         self._plane = hit.point
         self._offset = self.weights @ sim.positions(body.name)[self.nodes] - hit.point
 
-    def pull(self, sim, camera: Camera, cursor: tuple[float, float], size: tuple[int, int], strength: float) -> None:
+    def drag(self, sim, camera: Camera, cursor: tuple[float, float], size: tuple[int, int], strength: float) -> None:
         """Towards the cursor, by so many weights of the body for a way as long as its bounding box's diagonal."""
         ray, forward = camera.ray(cursor, size), camera.forward
         self.target = camera.position + ray * ((self._plane - camera.position) @ forward / (ray @ forward))
         stiffness = strength * self._mass * EARTH / self._diagonal
-        sim.pull(self.body, self.nodes, self.weights, self.target + self._offset, stiffness)
+        sim.drag(self.body, self.nodes, self.weights, self.target + self._offset, stiffness)
 
     def line(self, sim) -> np.ndarray:
         """From the point that is pulled to the cursor's, (2,3) [m]."""

@@ -19,10 +19,10 @@ from taisoft.view.ggui import Canvas
 from taisoft.view.layers import IN_FRONT, IN_WINDOW, Layers
 from taisoft.view.loop import Loop
 from taisoft.view.panel import Panel
-from taisoft.view.picking import Drag, pick
+from taisoft.view.picking import MouseDrag, pick
+from taisoft.view.plot_overlay import PlotOverlay
 from taisoft.view.plots import Plots
 from taisoft.view.shading import BACKGROUND_TOP
-from taisoft.view.strip import Strip
 from taisoft.view.surfaces import Surfaces
 
 SIZE = (1280, 720)
@@ -55,17 +55,17 @@ class LiveWindow:
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # [m]; 0 once the user moves the camera
         self._surfaces = Surfaces(scene)
         self.layers = Layers(scene, layers)
-        self.strip = Strip(plots, size) if plots is not None else None
+        self.strip = PlotOverlay(plots, size) if plots is not None else None
         self.colouring = Colouring(scene, self._surfaces, colour)
         self._canvas = Canvas(self._surfaces, size, visible=True, n_segments=self.layers.n_segments + 1)
         self._place = PANEL if tall else SHORT_PANEL
         # GGUI places the panel once, by the window's size at that time, and does not tell where the user moves it
         self._panel_pixels = tuple(f * n for f, n in zip(self._place, (*size, *size)))
         self._cursor: tuple[float, float] | None = None  # at the last picture
-        self._mode = ""  # of the drag that is going on: "turn", "zoom", "shift", "pull", or "panel", which is not ours
+        self._mode = ""  # of the drag that is going on: "turn", "zoom", "shift", "drag", or "panel", which is not ours
         self._taken: tuple[int, int] | None = None  # size of the last picture that was recorded
         self._asked_to_close = False
-        self.drag: Drag | None = None
+        self.drag: MouseDrag | None = None
         self.pressed: set[str] = set()
 
     @property
@@ -117,8 +117,8 @@ class LiveWindow:
         ends, colours = self.layers.lines(sim, self.camera)
         if self.drag is None:
             return ends, colours
-        pulled = self.camera.nearer(self.drag.line(sim), IN_FRONT)
-        return np.concatenate([pulled, ends]), np.concatenate([np.tile(PULL_COLOUR, (2, 1)), colours])
+        dragged = self.camera.nearer(self.drag.line(sim), IN_FRONT)
+        return np.concatenate([dragged, ends]), np.concatenate([np.tile(PULL_COLOUR, (2, 1)), colours])
 
     def _read_keys(self) -> None:
         self.pressed.clear()
@@ -148,7 +148,7 @@ class LiveWindow:
         else:
             self._move(button, (cursor[0] - self._cursor[0], cursor[1] - self._cursor[1]), size)
         if self.drag is not None:
-            self.drag.pull(sim, self.camera, cursor, size, panel.strength)
+            self.drag.drag(sim, self.camera, cursor, size, panel.strength)
         self._cursor = cursor
 
     def _begin(self, sim, panel: Panel | None, button, cursor, size) -> str:
@@ -163,9 +163,9 @@ class LiveWindow:
             hit = pick(sim, self.camera, cursor, size)
             if hit is not None:
                 self._widest = 0.0  # a camera that moves back would pull, too
-                self.drag = Drag(sim, hit)
+                self.drag = MouseDrag(sim, hit)
                 panel.chosen = self.drag.body
-                return "pull"
+                return "drag"
         return "turn"
 
     def _move(self, button, way: tuple[float, float], size) -> None:
@@ -187,7 +187,7 @@ def show(
     """Run a simulation in a window until it is closed.
 
     sim: an open Simulator, advanced by 1/fps [s] of simulated time a picture, never faster than real time; made with
-    pullable=True its bodies can be pulled with the mouse. A step that fails pauses the run and its reason is shown; R starts
+    draggable=True its bodies can be pulled with the mouse. A step that fails pauses the run and its reason is shown; R starts
     anew. colour, layers, plots: what is shown to begin with. Raises OutputError, before anything is opened, when a display or a
     Vulkan driver is missing or the process has a window already, SceneError for a plot of what is not modelled.
     """
@@ -207,7 +207,7 @@ def show(
             time.sleep(max(0.0, 1.0 / fps - (time.perf_counter() - started)))
     finally:
         window.close()
-        if sim.pulled is not None:
+        if sim.dragged is not None:
             sim.release()
 
 

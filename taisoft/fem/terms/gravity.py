@@ -11,7 +11,7 @@ SWITCH, LOAD, ACCELERATION = None, True, True
 @ti.func
 def force(m: ti.template(), i):
     """On node i [N]."""
-    return m.weight[i] * m.gravity[0]
+    return m.gravity_mass[i] * m.gravity[0]
 
 
 @ti.func
@@ -23,4 +23,4 @@ def acceleration(m: ti.template(), i):
 @ti.func
 def energy(m: ti.template(), i):
     """Node i's part of the potential [J]."""
-    return -ti.cast(m.weight[i], ti.f64) * ti.cast(m.gravity[0], ti.f64).dot(m.state.x[i])
+    return -ti.cast(m.gravity_mass[i], ti.f64) * ti.cast(m.gravity[0], ti.f64).dot(m.state.x[i])

@@ -9,7 +9,7 @@ WARM_STEPS = 3  # a multistep integrator has met all its kernels by then
 
 
 @dataclass
-class Stretch:
+class TimedRun:
     """What some steps did. seconds: wall time without compiling [s]; inverted: the most tets in one report."""
 
     steps: int = 0
@@ -19,25 +19,25 @@ class Stretch:
     newton_iterations: int = 0
     linear_iterations: int = 0
 
-    def __add__(self, other: "Stretch") -> "Stretch":
+    def __add__(self, other: "TimedRun") -> "TimedRun":
         sums = {k: a + b for (k, a), b in zip(vars(self).items(), vars(other).values())}
-        return Stretch(**sums | {"inverted": max(self.inverted, other.inverted)})
+        return TimedRun(**sums | {"inverted": max(self.inverted, other.inverted)})
 
 
-def advance(sim: Simulator, steps: int) -> Stretch:
+def advance(sim: Simulator, steps: int) -> TimedRun:
     """Take `steps` steps in the largest batches that sim.advance takes, as sim.run does between two frames."""
-    stretch = Stretch(steps)
+    timed = TimedRun(steps)
     compiled, start = sim.compile_seconds, time.perf_counter()
     done = 0
     while done < steps:
         report = sim.advance(steps - done)
         done += report.steps
-        stretch.unconverged += not report.converged
-        stretch.inverted = max(stretch.inverted, report.n_inverted)
-        stretch.newton_iterations += report.newton_iterations
-        stretch.linear_iterations += report.linear_iterations
-    stretch.seconds = time.perf_counter() - start - (sim.compile_seconds - compiled)
-    return stretch
+        timed.unconverged += not report.converged
+        timed.inverted = max(timed.inverted, report.n_inverted)
+        timed.newton_iterations += report.newton_iterations
+        timed.linear_iterations += report.linear_iterations
+    timed.seconds = time.perf_counter() - start - (sim.compile_seconds - compiled)
+    return timed
 
 
 def warm_up(sim: Simulator) -> None:

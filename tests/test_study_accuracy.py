@@ -8,7 +8,7 @@ import pytest
 from taisoft.errors import SimulationError
 from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.shapes import box_mesh
-from taisoft.study.judge import Error, Reference, _momentum_error, distance, error_in_space, in_space_sure, shared_nodes
+from taisoft.study.accuracy import Error, Reference, _momentum_error, distance, error_in_space, in_space_sure, shared_nodes
 
 COARSE = box_mesh((2, 1, 1), (2.0, 1.0, 1.0))
 FINE = make_nodes(COARSE, 2).positions

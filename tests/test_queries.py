@@ -13,7 +13,7 @@ from test_bvh import colliders, scatter
 
 from taisoft.collision.boxes import list_near
 from taisoft.collision.bvh import Bvh
-from taisoft.collision.near import EDGES, WHOLE, list_triangles, query_box
+from taisoft.collision.queries import EDGES, WHOLE, list_triangles, query_box
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.fields import FieldArena
 from taisoft.runtime import kernel

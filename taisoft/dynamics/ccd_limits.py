@@ -15,63 +15,64 @@ from collections.abc import Callable
 import taichi as ti
 
 from taisoft.collision.surface import dvec
-from taisoft.contact.assemble import carried
+from taisoft.contact.assemble import obstacle_displacement_at
 from taisoft.runtime import kernel
 
-CLOSEST = 0.5  # of the thinner side's thickness: how far a contact may close in one step
-DEPTH, HASTE, SPEED, WHICH, SINKING = range(5)  # places in what `survey` tells
+MAX_CLOSING = 0.5  # of the thinner side's thickness: how far a contact may close in one step
+DEPTH, CLOSING_RATIO, SPEED, WHICH, RELATIVE_PENETRATION = range(5)  # places in what `measure_closing` finds
 GROWTH = 2.0  # a part is at most so many times as long as the one before: after an impact what it set off is followed
 ROUNDING = 1e-9  # of a number of parts
 
 
 @kernel
-def survey(
+def measure_closing(
     s: ti.template(), o: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32, dt: ti.f64,
-    told: ti.types.ndarray(),
+    found_closing: ti.types.ndarray(),
 ):  # fmt: skip
-    """told (5,): deepest penetration [m]; the largest ratio of a contact in the coming step (see above); the speed at which that
+    """found_closing (5,): deepest penetration [m]; the largest ratio of a contact in the coming step (see above); the speed at which that
     one closes [m/s]; its number among the kept; the deepest penetration over the finer side's mean surface edge."""
     ti.loop_config(serialize=True)
     for _ in range(1):
-        depth, haste, speed, which = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), -1
-        sinking = ti.cast(0.0, ti.f64)
+        depth, largest_ratio, speed, which = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), -1
+        relative_penetration = ti.cast(0.0, ti.f64)
         for c in range(n):
             at = kept[c]
             depth = ti.max(depth, -found.gap[at])
             a, b = found.body[at][0], found.body[at][1]
-            sinking = ti.max(sinking, -found.gap[at] / ti.min(s.edge[a], s.edge[b]))
-            way = dvec(0.0)
+            relative_penetration = ti.max(relative_penetration, -found.gap[at] / ti.min(s.edge[a], s.edge[b]))
+            displacement = dvec(0.0)
             if ti.static(o.any):
                 if found.nodes_b[at][0] < 0:
-                    way -= carried(o, b, found.point[at])
+                    displacement -= obstacle_displacement_at(o, b, found.point[at])
             for j in ti.static(range(3)):
                 if found.nodes_a[at][j] >= 0:
-                    way += found.weights_a[at][j] * s.move[found.nodes_a[at][j]]
+                    displacement += found.weights_a[at][j] * s.move[found.nodes_a[at][j]]
                 if found.nodes_b[at][j] >= 0:
-                    way -= found.weights_b[at][j] * s.move[found.nodes_b[at][j]]
-            closing = -way.dot(found.normal[at])
-            allowed = CLOSEST * ti.min(s.thickness[a], s.thickness[b])
+                    displacement -= found.weights_b[at][j] * s.move[found.nodes_b[at][j]]
+            closing = -displacement.dot(found.normal[at])
+            allowed = MAX_CLOSING * ti.min(s.thickness[a], s.thickness[b])
             if s.thickness[b] < ti.math.inf and closing > 0.0:
-                ratio = ti.min(closing / allowed, way.norm() / ti.max(found.gap[at], allowed))
-                if ratio > haste:
-                    haste, speed, which = ratio, closing / dt, c
-        told[0], told[1], told[2], told[3], told[4] = depth, haste, speed, which, sinking
+                ratio = ti.min(closing / allowed, displacement.norm() / ti.max(found.gap[at], allowed))
+                if ratio > largest_ratio:
+                    largest_ratio, speed, which = ratio, closing / dt, c
+        found_closing[DEPTH], found_closing[CLOSING_RATIO], found_closing[SPEED] = depth, largest_ratio, speed
+        found_closing[WHICH], found_closing[RELATIVE_PENETRATION] = which, relative_penetration
 
 
 @kernel
-def find_way(
-    m: ti.template(), s: ti.template(), x_start: ti.template(), way: ti.template(), strayed: ti.types.ndarray()
+def find_displacement(
+    m: ti.template(), s: ti.template(), x_start: ti.template(), displacement: ti.template(), strayed: ti.types.ndarray()
 ):  # fmt: skip
     """way (n_nodes) [m] since x_start; strayed (1,) [m]: the most by which a vertex left the straight way that was searched."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        way[i] = m.state.x[i] - x_start[i]
+        displacement[i] = m.state.x[i] - x_start[i]
     ti.loop_config(serialize=True)
     for _ in range(1):
         most = ti.cast(0.0, ti.f64)
         for k in range(s.n_verts):
             if s.node[k] >= 0:
-                d, known = way[s.node[k]], s.move[k]
+                d, known = displacement[s.node[k]], s.move[k]
                 square = known.dot(known)
                 share = ti.cast(0.0, ti.f64)
                 if square > 0.0:
@@ -95,6 +96,6 @@ def next_length(ratio: Callable[[float], float], left: float, length: float, lon
     return left / _count(left / length * max(found, 1.0))
 
 
-def _count(parts: float) -> int:
+def _count(substeps: float) -> int:
     """So many equal parts, or a few more to make it a whole number."""
-    return max(1, math.ceil(parts * (1.0 - ROUNDING)))
+    return max(1, math.ceil(substeps * (1.0 - ROUNDING)))

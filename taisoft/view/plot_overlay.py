@@ -35,7 +35,7 @@ class Cell:
         return any(a <= x <= a + w and b <= y <= b + h for a, b, w, h in (self.box, self.text))
 
 
-class Strip:
+class PlotOverlay:
     """What the window shows of plots, worked out anew when they or the window change, and EVERY seconds at most otherwise.
 
     opened: size of the window as it opened, (width, height) in pixels.

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.dynamics.motion import Motion
+from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.fields import FieldArena
-from taisoft.mass import lumped_masses, upload_mass_matrix, weight_masses
+from taisoft.mass import gravity_masses, lumped_masses, upload_mass_matrix
 from taisoft.model import Layout, Model, body_loads, damping_table, material_table
 from taisoft.runtime import Runtime
 from taisoft.scene.scene import Scene
@@ -14,7 +14,7 @@ from taisoft.transfer import download, upload
 
 
 @dataclass
-class World:
+class SimulationState:
     """A scene in the machine. time [s] is start + count * dt, so that it does not drift."""
 
     scene: Scene
@@ -22,7 +22,7 @@ class World:
     arena: FieldArena
     model: Model
     layout: Layout
-    motion: Motion
+    dirichlet: DirichletConditions
     time: float = 0.0
     step_count: int = 0
     releases: int = 0  # times that led nodes were let go: what steppers know of the past then no longer holds
@@ -40,25 +40,25 @@ class World:
     def snapshot(self) -> dict:
         """What the next step rests on, for a checkpoint; see `taisoft/checkpoint.py`."""
         x, v = self.state()
-        return {"time": self.time, "step_count": self.step_count, "released": self.motion.released(), "x": x, "v": v}
+        return {"time": self.time, "step_count": self.step_count, "released": self.dirichlet.released(), "x": x, "v": v}
 
     def restore(self, kept: dict) -> None:
         """Back to what `snapshot` told, also of another world of the same scene."""
-        self.motion.set_released(kept["released"])
+        self.dirichlet.set_released(kept["released"])
         self.upload_constraints()
         self.set_state(kept["x"], kept["v"])
         self.time, self.step_count = float(kept["time"]), int(kept["step_count"])
 
     def restart(self) -> None:
         """The state at the scene's start."""
-        self.motion.reset()
+        self.dirichlet.reset()
         self.upload_constraints()
         self.set_state(self.layout.rest, self._rest_velocities())  # so that it is compiled before a step must be taken back
         self.time, self.step_count = 0.0, 0
 
     def upload_constraints(self) -> None:
         """Free axes to the device."""
-        upload([(self.model.free, ~self.motion.constrained())])
+        upload([(self.model.free, ~self.dirichlet.constrained())])
 
     def upload_material(self, density: bool) -> None:
         """Material numbers of the bodies to the device, and masses if a density changed."""
@@ -68,8 +68,8 @@ class World:
             numbers.append((m.damping, damping_table(self.scene)))
         if density:
             numbers.append((m.mass, lumped_masses(self.scene)))
-            if m.weight is not m.mass:
-                numbers.append((m.weight, weight_masses(self.scene)))
+            if m.gravity_mass is not m.mass:
+                numbers.append((m.gravity_mass, gravity_masses(self.scene)))
         upload(numbers)
         if density and m.consistent:
             upload_mass_matrix(self.scene, m.mass_matrix)
@@ -89,28 +89,28 @@ class World:
     def _rest_velocities(self) -> np.ndarray:
         """Initial velocities with 0 on constrained axes (n_nodes, 3)."""
         start = [np.broadcast_to(b.velocity, b.rest_positions.shape) for b in self.scene.bodies]
-        return np.where(self.motion.constrained(), 0.0, np.concatenate(start))
+        return np.where(self.dirichlet.constrained(), 0.0, np.concatenate(start))
 
     def next_targets(self, times: np.ndarray) -> np.ndarray | None:
-        """Targets of led nodes (r, n_moved, 3), r >= 1, for the first r of the times; None when nothing is led.
+        """Targets of led nodes (r, n_prescribed, 3), r >= 1, for the first r of the times; None when nothing is led.
 
         Nodes that let go at the first time are released here.
         """
-        if self.motion.n_moved == 0:
+        if self.dirichlet.n_prescribed == 0:
             return None
-        rows, letting_go = self.motion.targets(times)
-        while letting_go and len(rows) == 0:
+        rows, releasing = self.dirichlet.targets(times)
+        while releasing and len(rows) == 0:
             self.releases += 1
             self.upload_constraints()
-            rows, letting_go = self.motion.targets(times)
+            rows, releasing = self.dirichlet.targets(times)
         return rows
 
     def next_target(self, t: float) -> np.ndarray | None:
-        """Targets (n_moved, 3) at one time."""
+        """Targets (n_prescribed, 3) at one time."""
         rows = self.next_targets(np.array([t]))
         return None if rows is None else rows[0]
 
-    def find_unfinite(self, force: np.ndarray | None = None) -> str | None:
+    def find_nonfinite(self, force: np.ndarray | None = None) -> str | None:
         """Names the first node whose position, velocity or force (n_nodes, 3) is not finite, in a few words."""
         x, v = self.state()
         # explicit steps give up beyond the range of f32

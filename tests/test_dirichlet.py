@@ -13,7 +13,7 @@ import pytest
 from scenes import cube, element, rubber
 
 import taisoft as ts
-from taisoft.dynamics.motion import Motion
+from taisoft.dynamics.dirichlet import DirichletConditions
 
 both_orders = pytest.mark.parametrize("order, n", [(1, 8), (2, 26)])  # of the second body, and its number of nodes
 
@@ -22,13 +22,13 @@ def made(*paths, order: int = 1):
     """Two cubes; the second, a metre up, is led by the paths (nodes, axes, path) and fixed at node 7 along x, y."""
     scene = ts.Scene()
     scene.add_body(cube(), rubber(), name="still").fix([2], axes="z")
-    second = scene.add_body(cube(), rubber(), name="led", position=(0, 1, 0), **element(order))
+    second = scene.add_body(cube(), rubber(), name="prescribed", position=(0, 1, 0), **element(order))
     second.fix([7], axes="xy")
     for nodes, axes, path in paths:
         second.move(nodes, path, axes=axes)
     rest = np.concatenate([body.rest_positions + body.position for body in scene.bodies])
     layout = SimpleNamespace(rest=rest, node_start=np.array([0, 8, len(rest)]))
-    return Motion(scene, layout), rest
+    return DirichletConditions(scene, layout), rest
 
 
 def until(end, way):
@@ -38,57 +38,57 @@ def until(end, way):
 @both_orders
 def test_masks(order, n):
     """The last led node is the middle of an edge if the body is quadratic."""
-    motion, _ = made(([0, 1], "xz", lambda t: (t, 0, 0)), ([1, n - 2], "y", lambda t: (0, t, 0)), order=order)
+    dirichlet, _ = made(([0, 1], "xz", lambda t: (t, 0, 0)), ([1, n - 2], "y", lambda t: (0, t, 0)), order=order)
     expected = np.zeros((8 + n, 3), dtype=bool)
     expected[2, 2] = expected[15, :2] = True
     expected[[8, 9], 0] = expected[[8, 9], 2] = expected[[9, 6 + n], 1] = True
-    assert np.array_equal(motion.constrained(), expected)
-    assert list(motion.moved) == [8, 9, 9, 6 + n] and motion.n_moved == 4
-    assert list(motion.held) == sorted([2, 8, 9, 6 + n, 15])
-    assert motion.moved_axes().tolist() == [[1, 0, 1], [1, 0, 1], [0, 1, 0], [0, 1, 0]]
+    assert np.array_equal(dirichlet.constrained(), expected)
+    assert list(dirichlet.prescribed_nodes) == [8, 9, 9, 6 + n] and dirichlet.n_prescribed == 4
+    assert list(dirichlet.held) == sorted([2, 8, 9, 6 + n, 15])
+    assert dirichlet.prescribed_axes().tolist() == [[1, 0, 1], [1, 0, 1], [0, 1, 0], [0, 1, 0]]
 
 
 @both_orders
 def test_targets(order, n):
     way = np.array([[1.0, 2, 3], [4, 5, 6]])
-    motion, rest = made(([n - 3, 2], "xyz", lambda t: t * way), ([3], "y", lambda t: (0, -t, 0)), order=order)
-    rows, letting_go = motion.targets(np.array([0.5, 2.0]))
-    assert rows.shape == (2, 3, 3) and not letting_go
+    dirichlet, rest = made(([n - 3, 2], "xyz", lambda t: t * way), ([3], "y", lambda t: (0, -t, 0)), order=order)
+    rows, releasing = dirichlet.targets(np.array([0.5, 2.0]))
+    assert rows.shape == (2, 3, 3) and not releasing
     for row, t in zip(rows, (0.5, 2.0)):
         assert row == pytest.approx(np.concatenate([rest[[5 + n, 10]] + t * way, rest[[11]] + [[0, -t, 0]]]))
 
 
 def test_release():
-    motion, rest = made(
+    dirichlet, rest = made(
         ([0, 1], "xyz", until(1.0, lambda t: (t, 0, 0))), ([3], "y", until(2.0, lambda t: (0, t, 0)))
     )
     times = np.array([0.5, 1.0, 1.5, 1.75, 2.5])
-    rows, letting_go = motion.targets(times)
-    assert len(rows) == 2 and letting_go and motion.constrained()[8].all()  # not before its time has come
-    rows, letting_go = motion.targets(times[2:])
-    assert len(rows) == 0 and letting_go and not motion.constrained()[[8, 9]].any() and motion.constrained()[11, 1]
-    assert motion.moved_axes().tolist() == [[0, 0, 0], [0, 0, 0], [0, 1, 0]]
-    rows, letting_go = motion.targets(times[2:])
-    assert len(rows) == 2 and letting_go and rows[1, 2] == pytest.approx(rest[11] + [0, 1.75, 0])
-    assert motion.targets(times[4:])[1]
-    rows, letting_go = motion.targets(times[4:])
-    assert len(rows) == 1 and not letting_go
-    motion.reset()
-    assert motion.constrained()[8].all() and len(motion.targets(times)[0]) == 2
+    rows, releasing = dirichlet.targets(times)
+    assert len(rows) == 2 and releasing and dirichlet.constrained()[8].all()  # not before its time has come
+    rows, releasing = dirichlet.targets(times[2:])
+    assert len(rows) == 0 and releasing and not dirichlet.constrained()[[8, 9]].any() and dirichlet.constrained()[11, 1]
+    assert dirichlet.prescribed_axes().tolist() == [[0, 0, 0], [0, 0, 0], [0, 1, 0]]
+    rows, releasing = dirichlet.targets(times[2:])
+    assert len(rows) == 2 and releasing and rows[1, 2] == pytest.approx(rest[11] + [0, 1.75, 0])
+    assert dirichlet.targets(times[4:])[1]
+    rows, releasing = dirichlet.targets(times[4:])
+    assert len(rows) == 1 and not releasing
+    dirichlet.reset()
+    assert dirichlet.constrained()[8].all() and len(dirichlet.targets(times)[0]) == 2
 
 
 @pytest.mark.parametrize(
     "way", [(1, 2), np.zeros((3, 3)), np.zeros((2, 2)), (0, np.nan, 0), np.full((2, 3), np.inf), 1.0]
 )
 def test_what_a_path_may_give(way):
-    motion, _ = made(([0, 1], "xyz", lambda t: (0, 0, 0) if t < 1 else way))
-    motion.targets(np.array([0.5]))
-    with pytest.raises(ts.SimulationError, match=r"body 'led': the path of its moved nodes gave .* at t = 1.5 s"):
-        motion.targets(np.array([1.5]))
+    dirichlet, _ = made(([0, 1], "xyz", lambda t: (0, 0, 0) if t < 1 else way))
+    dirichlet.targets(np.array([0.5]))
+    with pytest.raises(ts.SimulationError, match=r"body 'prescribed': the path of its moved nodes gave .* at t = 1.5 s"):
+        dirichlet.targets(np.array([1.5]))
 
 
 @pytest.mark.parametrize("late, words", [(lambda t: 1 / 0, "ZeroDivisionError: "), (lambda t: "up", "ValueError: ")])
 def test_a_path_that_fails(late, words):
-    motion, _ = made(([0, 1], "xyz", lambda t: (0, 0, 0) if t < 1 else late(t)))
-    with pytest.raises(ts.SimulationError, match=f"body 'led': the path of its moved nodes failed at t = 1.5 s: {words}"):
-        motion.targets(np.array([1.5]))
+    dirichlet, _ = made(([0, 1], "xyz", lambda t: (0, 0, 0) if t < 1 else late(t)))
+    with pytest.raises(ts.SimulationError, match=f"body 'prescribed': the path of its moved nodes failed at t = 1.5 s: {words}"):
+        dirichlet.targets(np.array([1.5]))

@@ -36,14 +36,14 @@ def _inverse(total):
 
 
 @ti.func
-def alone(p: ti.template(), c):
+def sequential(p: ti.template(), c):
     """For contacts that are relaxed one after the other, in (0, 1]; 1 where all nodes move alike along all axes."""
     a = _roots(p, c)
     return ti.min(1.0, _inverse(_norm(own_block(p, c), a, a)))
 
 
 @ti.func
-def together(p: ti.template(), c):
+def gershgorin(p: ti.template(), c):
     """For contacts that are relaxed at once, in (0, 1]."""
     total = ti.cast(0.0, ti.f64)
     a = _roots(p, c)

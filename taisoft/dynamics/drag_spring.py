@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.dynamics.world import World
+from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 
@@ -27,7 +27,7 @@ BATCH = 16  # and as many of them at most
 
 
 @dataclass
-class Grip:
+class Drag:
     """What is pulled, and how: nodes (k,) of all bodies, weights (k,) of sum 1, target (3,) [m], stiffness [N/m] asked for."""
 
     body: str
@@ -36,7 +36,7 @@ class Grip:
     target: np.ndarray
     stiffness: float
     mass: float  # that the force meets [kg]
-    strongest: float  # |F| is at most this [N]
+    max_force: float  # |F| is at most this [N]
     point: np.ndarray  # (3,) where it was when the force was taken [m]
     force: np.ndarray  # (3,) [N]
 
@@ -46,16 +46,16 @@ def batch(dt: float) -> int:
     return max(1, min(BATCH, int(HELD / dt)))
 
 
-class Pull:
+class DragSpring:
     """The pull on a world whose model has loads."""
 
-    def __init__(self, world: World):
-        self._world = world
-        self.grip: Grip | None = None
+    def __init__(self, simulation: SimulationState):
+        self._simulation = simulation
+        self.drag: Drag | None = None
 
     def take(self, body: int, nodes, weights, target, stiffness) -> None:
         """Pull that point of a body from the next step on, in place of what was pulled before. Raises SceneError."""
-        own, layout = self._world.scene.bodies[body], self._world.layout
+        own, layout = self._simulation.scene.bodies[body], self._simulation.layout
         nodes, weights = np.atleast_1d(nodes), np.atleast_1d(np.asarray(weights, dtype=np.float64))
         good = nodes.ndim == 1 and nodes.dtype.kind in "iu" and len(nodes) > 0
         if not good or nodes.min() < 0 or nodes.max() >= own.n_nodes:
@@ -65,37 +65,37 @@ class Pull:
         target = checks.array(target, f"body '{own.name}': the target of a pull", ((3,),))
         stiffness = checks.number(stiffness, "the stiffness of a pull", above=0.0, unit="N/m")
         nodes, weights = nodes + layout.node_start[body], weights / weights.sum()
-        masses = self._world.model.mass.to_numpy().astype(np.float64)
+        masses = self._simulation.model.mass.to_numpy().astype(np.float64)
         mass = 1.0 / float((weights**2 / masses[nodes]).sum())
         area = (mass / own.material.density) ** (2 / 3)
-        strongest = min(STRAIN * own.material.young * area, HEAVY * EARTH * float(masses[layout.nodes(body)].sum()))
-        self._world.upload_loads()  # the nodes may be others
-        self.grip = Grip(own.name, nodes, weights, target, stiffness, mass, strongest, target, np.zeros(3))
-        self.grip.point = weights @ self._world.state()[0][nodes]
+        max_force = min(STRAIN * own.material.young * area, HEAVY * EARTH * float(masses[layout.nodes(body)].sum()))
+        self._simulation.upload_loads()  # the nodes may be others
+        self.drag = Drag(own.name, nodes, weights, target, stiffness, mass, max_force, target, np.zeros(3))
+        self.drag.point = weights @ self._simulation.state()[0][nodes]
 
     def apply(self, held: float) -> None:
         """Take the force anew, to be held over a time [s]."""
-        grip = self.grip
-        x, v = self._world.state()
-        k = min(grip.stiffness, SOFT * grip.mass / held**2)
-        c = min(np.sqrt(k * grip.mass), SOFT * grip.mass / held)
-        grip.point = grip.weights @ x[grip.nodes]
-        force = k * (grip.target - grip.point) - c * (grip.weights @ v[grip.nodes].astype(np.float64))
+        drag = self.drag
+        x, v = self._simulation.state()
+        k = min(drag.stiffness, SOFT * drag.mass / held**2)
+        c = min(np.sqrt(k * drag.mass), SOFT * drag.mass / held)
+        drag.point = drag.weights @ x[drag.nodes]
+        force = k * (drag.target - drag.point) - c * (drag.weights @ v[drag.nodes].astype(np.float64))
         size = float(np.linalg.norm(force))
-        grip.force = force * min(1.0, grip.strongest / size) if size > 0.0 else force
+        drag.force = force * min(1.0, drag.max_force / size) if size > 0.0 else force
         self.upload()
 
-    def let_go(self) -> bool:
+    def release(self) -> bool:
         """The scene's own loads alone; False where nothing was pulled."""
-        if self.grip is None:
+        if self.drag is None:
             return False
-        self.grip = None
+        self.drag = None
         self.upload()
         return True
 
     def upload(self) -> None:
         """The scene's loads to the device, and the pull's force where something is pulled."""
-        if self.grip is None:
-            self._world.upload_loads()
+        if self.drag is None:
+            self._simulation.upload_loads()
         else:
-            self._world.upload_loads(self.grip.nodes, np.outer(self.grip.weights, self.grip.force))
+            self._simulation.upload_loads(self.drag.nodes, np.outer(self.drag.weights, self.drag.force))

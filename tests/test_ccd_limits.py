@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.dynamics.tunnelling import next_length
+from taisoft.dynamics.ccd_limits import next_length
 
 THICK = 0.01  # [m] of the sheet
 DT = {"implicit_euler": 1 / 60, "symplectic_euler": 2e-4}  # [s]
@@ -82,11 +82,11 @@ def test_only_what_is_near_is_cut(sim):
     if sim.settings.explicit:
         pytest.skip("explicit steps have no parts")
     shoot(sim, 20.0)
-    parts = [sim.step().parts for _ in range(2)]
-    assert 2 < max(parts) < 20 < 20.0 * sim.dt / (0.5 * THICK)
+    substeps = [sim.step().substeps for _ in range(2)]
+    assert 2 < max(substeps) < 20 < 20.0 * sim.dt / (0.5 * THICK)
     shoot(sim, 20.0)
     sim.set_state(positions=sim.positions("shot") + (0, 1.0, 0), body="shot")
-    assert sim.step().parts == 1
+    assert sim.step().substeps == 1
 
 
 def test_a_shot_too_fast_is_refused(sim):
@@ -96,13 +96,13 @@ def test_a_shot_too_fast_is_refused(sim):
     gap = 1e-3 if explicit else 0.015  # [m]; explicit steps look at it once before the impact
     sim.set_state(positions=sim.positions("shot") - (0, 0.1 - 0.025 - 0.5 * THICK - gap, 0), body="shot")
     x, v = sim.positions(), sim.velocities()
-    with pytest.raises(ts.SimulationError) as told:
+    with pytest.raises(ts.SimulationError) as closing:
         sim.step()
-    text = str(told.value)
+    text = str(closing.value)
     number = r"([0-9.e+-]+)"
     found = re.search(
         rf"^step 1: 'sheet' and 'shot' close at {number} m/s, {number} m in a step of {number} s, and the thinner of them is "
-        rf"{number} m thick, so {'' if explicit else 'even cut into 256 parts '}they could pass each other unseen: "
+        rf"{number} m thick, so {'' if explicit else 'even cut into 256 substeps '}they could pass each other unseen: "
         rf"take dt <= {number} s$", text,
     )  # fmt: skip
     assert found, text
@@ -122,16 +122,16 @@ def test_a_plane_is_thick_enough(sim):
     explicit = sim.settings.explicit
     speed = 150.0 if explicit else 60.0  # [m/s], ways of 0.03 and 1 m a step, to a cube of 0.05 m
     shoot(sim, speed, "faller")
-    borne, lowest, told = [], np.inf, []
+    borne, lowest, closing = [], np.inf, []
     for _ in range(round(3.2 / speed / sim.dt) if explicit else 6):
-        told += sim.step().problems
+        closing += sim.step().problems
         lowest = min(lowest, sim.positions("faller")[:, 1].min())
         borne.append(sim.contact_force("plane")[1])
     assert min(borne) < (-1000.0 if explicit else -400.0)  # [N]; 450 N stop the cube within an implicit step
     if explicit:  # at four times the speed of its waves it is crushed, and a little of it may sink in, which is told
-        assert -1.05 < lowest < -0.9 and (lowest > -1.0 or any("deep in each other" in text for text in told))
+        assert -1.05 < lowest < -0.9 and (lowest > -1.0 or any("deep in each other" in text for text in closing))
     else:
-        assert -1.0 < lowest < -0.99 and told == []
+        assert -1.0 < lowest < -0.99 and closing == []
 
 
 def test_every_vertex_that_comes_below_a_plane_has_a_contact(sim):

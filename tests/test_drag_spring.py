@@ -8,9 +8,9 @@
 
 import numpy as np
 import pytest
+from taisoft.dynamics.drag_spring import HEAVY, SOFT, STRAIN, batch
 
 import taisoft as ts
-from taisoft.dynamics.pull import HEAVY, SOFT, STRAIN, batch
 from taisoft.errors import SceneError, SimulationError
 from taisoft.runtime import compile_clock
 
@@ -34,40 +34,40 @@ def test_pulled_to_rest_and_back(integrator, order):
     rest = scene.bodies[0].rest_positions
     start = rest[tip].mean(axis=0)
     target = start + (0, 0.1, 0.15)
-    with ts.Simulator(scene, dt=SETTINGS[integrator], integrator=integrator, pullable=True) as sim:
+    with ts.Simulator(scene, dt=SETTINGS[integrator], integrator=integrator, draggable=True) as sim:
         if sim.settings.explicit:
             sim.dt = 0.5 * sim.stable_dt
-        sim.pull("beam", tip, np.ones(len(tip)), target, 15000.0)
+        sim.drag("beam", tip, np.ones(len(tip)), target, 15000.0)
         sim.run(2.0, fps=20)
-        grip, pulled = sim.pulled, sim.positions()
-        assert np.allclose(grip.force, 15000.0 * (target - pulled[tip].mean(axis=0)), rtol=0.01, atol=0.5)
-        way, wanted = pulled[tip].mean(axis=0) - start, target - start
+        drag, dragged = sim.dragged, sim.positions()
+        assert np.allclose(drag.force, 15000.0 * (target - dragged[tip].mean(axis=0)), rtol=0.01, atol=0.5)
+        way, wanted = dragged[tip].mean(axis=0) - start, target - start
         assert 0.2 < way @ wanted / (wanted @ wanted) < 0.95
         sim.release()
         sim.run(2.0, fps=20)
         assert np.abs(sim.positions() - rest).max() < 0.003
     still, _ = beam(order)
-    still.bodies[0].add_force(tip, np.outer(np.full(len(tip), 1 / len(tip)), grip.force))
+    still.bodies[0].add_force(tip, np.outer(np.full(len(tip), 1 / len(tip)), drag.force))
     static = ts.solve_static(still, precision="f32", tolerance=1e-4)
-    assert np.abs(static.positions("beam") - pulled).max() < 0.02 * np.linalg.norm(way)
+    assert np.abs(static.positions("beam") - dragged).max() < 0.02 * np.linalg.norm(way)
 
 
 @pytest.mark.parametrize("integrator", SETTINGS)
 def test_the_stiffest_pull_stays_bounded(integrator):
     scene, tip = beam()
     corner = tip[:1]
-    with ts.Simulator(scene, dt=SETTINGS[integrator], integrator=integrator, pullable=True) as sim:
+    with ts.Simulator(scene, dt=SETTINGS[integrator], integrator=integrator, draggable=True) as sim:
         if sim.settings.explicit:
             sim.dt = 0.9 * sim.stable_dt
         target = scene.bodies[0].rest_positions[corner[0]] + (0, 0.1, 0)
-        sim.pull("beam", corner, [2.0], target, 1e12)
+        sim.drag("beam", corner, [2.0], target, 1e12)
         energies = []
         for _ in range(40):
             assert sim.run(0.05, fps=20).status == "ok"
-            assert np.linalg.norm(sim.pulled.force) <= 1.0001 * sim.pulled.strongest
+            assert np.linalg.norm(sim.dragged.force) <= 1.0001 * sim.dragged.max_force
             energies.append(sim.energies().kinetic + sim.energies().elastic)
-        grip, held = sim.pulled, sim.dt * (batch(sim.dt) if sim.settings.explicit else 1)
-        assert max(energies) < 0.5 * SOFT * grip.mass / held**2 * 0.1**2, "no more than the spring held at the start"
+        drag, held = sim.dragged, sim.dt * (batch(sim.dt) if sim.settings.explicit else 1)
+        assert max(energies) < 0.5 * SOFT * drag.mass / held**2 * 0.1**2, "no more than the spring held at the start"
         assert sim.energies().kinetic < 0.05 * sim.energies().elastic, "it comes to rest"
         assert np.linalg.norm(sim.positions()[corner[0]] - target) < 0.09
 
@@ -75,35 +75,35 @@ def test_the_stiffest_pull_stays_bounded(integrator):
 @pytest.mark.parametrize("integrator", ["implicit_euler", "symplectic_euler"])
 def test_a_mad_pull_is_held_back(integrator):
     scene, tip = beam()
-    with ts.Simulator(scene, dt=SETTINGS[integrator], integrator=integrator, pullable=True) as sim:
+    with ts.Simulator(scene, dt=SETTINGS[integrator], integrator=integrator, draggable=True) as sim:
         if sim.settings.explicit:
             sim.dt = 0.5 * sim.stable_dt
         for far in ((9.0, 50.0, 0.0), (-90.0, 0.0, 0.0)):
-            sim.pull("beam", tip[:3], np.ones(3), far, 1e12)
+            sim.drag("beam", tip[:3], np.ones(3), far, 1e12)
             for _ in range(10):
                 result = sim.run(0.05, fps=20)
                 assert result.status != "failed"
                 assert all(step.n_inverted == 0 for step in result.step_reports)
-            grip, mass = sim.pulled, 1000.0 * 0.5
-            assert np.linalg.norm(grip.force) <= 1.0001 * min(HEAVY * 9.81 * mass, STRAIN * 1e6 * (grip.mass / 1000.0) ** (2 / 3))
+            drag, mass = sim.dragged, 1000.0 * 0.5
+            assert np.linalg.norm(drag.force) <= 1.0001 * min(HEAVY * 9.81 * mass, STRAIN * 1e6 * (drag.mass / 1000.0) ** (2 / 3))
             assert np.abs(sim.positions()).max() < 5.0
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "velocity_verlet"])
 def test_a_pull_compiles_nothing_and_leaves_nothing(integrator):
     ways = []
-    for pulled in (False, True):
+    for dragged in (False, True):
         scene, tip = beam()
         scene.gravity = (0, -1, 0)
-        with ts.Simulator(scene, dt=1e-3, integrator=integrator, pullable=True) as sim:
+        with ts.Simulator(scene, dt=1e-3, integrator=integrator, draggable=True) as sim:
             sim.advance(4)
-            if pulled:
+            if dragged:
                 compiled = compile_clock()
-                sim.pull("beam", tip, np.ones(len(tip)), (1, 1, 0), 100.0)
+                sim.drag("beam", tip, np.ones(len(tip)), (1, 1, 0), 100.0)
                 sim.advance(4)
-                assert compile_clock() == compiled and np.linalg.norm(sim.pulled.force) > 0
+                assert compile_clock() == compiled and np.linalg.norm(sim.dragged.force) > 0
                 sim.reset()
-                assert sim.pulled is None
+                assert sim.dragged is None
                 sim.advance(4)
             ways.append(sim.positions())
     assert np.array_equal(*ways)
@@ -114,9 +114,9 @@ def test_pulling_is_refused_unless_wanted():
     with ts.Simulator(scene, dt=0.01) as sim:
         assert not sim.plan.on["loads"] and "loads" not in sim.field_bytes
         sim.release()
-        with pytest.raises(SimulationError, match="pullable=True"):
-            sim.pull("beam", tip, np.ones(len(tip)), (0, 0, 0), 1.0)
-    with ts.Simulator(scene, dt=0.01, pullable=True) as sim:
+        with pytest.raises(SimulationError, match="draggable=True"):
+            sim.drag("beam", tip, np.ones(len(tip)), (0, 0, 0), 1.0)
+    with ts.Simulator(scene, dt=0.01, draggable=True) as sim:
         entry = next(e for e in sim.plan.entries if e["feature"] == "loads")
         assert entry["on"] and entry["why"] == "bodies are to be pulled"
         for nodes, weights, target, message in (
@@ -125,6 +125,6 @@ def test_pulling_is_refused_unless_wanted():
             ([0], [1.0], (0, np.nan, 0), "target"),
         ):  # fmt: skip
             with pytest.raises(SceneError, match=message):
-                sim.pull("beam", nodes, weights, target, 1.0)
-    with pytest.raises(SimulationError, match="pullable = 1"):
-        ts.Simulator(scene, pullable=1)
+                sim.drag("beam", nodes, weights, target, 1.0)
+    with pytest.raises(SimulationError, match="draggable = 1"):
+        ts.Simulator(scene, draggable=1)

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def told_warnings() -> Iterator[list[str]]:
+def printed_warnings() -> Iterator[list[str]]:
     """Prints each warning as one sentence, and yields the list of them, which the report repeats."""
     told: list[str] = []
 

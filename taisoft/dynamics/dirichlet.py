@@ -18,10 +18,10 @@ class _Group:
     released: bool = False
 
 
-class Motion:
+class DirichletConditions:
     """Constraints of all bodies.
 
-    moved (n_moved,): model rows of led nodes, group by group; a node led by two groups on different axes has two rows.
+    moved (n_prescribed,): model rows of led nodes, group by group; a node led by two groups on different axes has two rows.
     held (n_held,): model rows with a constrained axis at the start.
     """
 
@@ -29,16 +29,16 @@ class Motion:
         self._rest = layout.rest
         self._fixed = np.zeros((len(layout.rest), 3), dtype=bool)
         self._groups: list[_Group] = []
-        n_moved = 0
+        n_prescribed = 0
         for k, body in enumerate(scene.bodies):
             for c in body.constraints:
                 rows = c.nodes + layout.node_start[k]
                 if c.path is None:
                     self._fixed[np.ix_(rows, np.flatnonzero(c.axes))] = True
                 else:
-                    self._groups.append(_Group(body.name, c, rows, slice(n_moved, n_moved + len(rows))))
-                    n_moved += len(rows)
-        self.moved = np.concatenate([g.nodes for g in self._groups]) if self._groups else np.zeros(0, dtype=np.int64)
+                    self._groups.append(_Group(body.name, c, rows, slice(n_prescribed, n_prescribed + len(rows))))
+                    n_prescribed += len(rows)
+        self.prescribed_nodes = np.concatenate([g.nodes for g in self._groups]) if self._groups else np.zeros(0, dtype=np.int64)
         self.held = np.flatnonzero(self.constrained().any(axis=1))
 
     def reset(self) -> None:
@@ -56,9 +56,9 @@ class Motion:
             g.released = gone
 
     @property
-    def n_moved(self) -> int:
+    def n_prescribed(self) -> int:
         """Rows of led nodes, released ones included."""
-        return len(self.moved)
+        return len(self.prescribed_nodes)
 
     def constrained(self) -> np.ndarray:
         """(n_nodes, 3) bool: axes that are fixed or led now."""
@@ -68,9 +68,9 @@ class Motion:
                 mask[np.ix_(g.nodes, np.flatnonzero(g.constraint.axes))] = True
         return mask
 
-    def moved_axes(self) -> np.ndarray:
-        """(n_moved, 3) int32: 1 where a row's axis is led now."""
-        axes = np.zeros((self.n_moved, 3), dtype=np.int32)
+    def prescribed_axes(self) -> np.ndarray:
+        """(n_prescribed, 3) int32: 1 where a row's axis is led now."""
+        axes = np.zeros((self.n_prescribed, 3), dtype=np.int32)
         for g in self._groups:
             if not g.released:
                 axes[g.rows] = g.constraint.axes
@@ -79,30 +79,30 @@ class Motion:
     def targets(self, times: np.ndarray) -> tuple[np.ndarray, bool]:
         """Positions of the led nodes at the times (k,) [s], up to the first release.
 
-        Returns (r, n_moved, 3) [m] with r <= k, and whether a group lets go at times[r]. If that is times[0], the groups
+        Returns (r, n_prescribed, 3) [m] with r <= k, and whether a group lets go at times[r]. If that is times[0], the groups
         that let go are released and the call is to be repeated.
         """
-        rows = np.zeros((len(times), self.n_moved, 3))
+        rows = np.zeros((len(times), self.n_prescribed, 3))
         for r, t in enumerate(times):
-            letting_go = []
+            releasing = []
             for g in self._groups:
                 if g.released:
                     continue
                 way = self._ask(g, float(t))
                 if way is None:
-                    letting_go.append(g)
+                    releasing.append(g)
                     continue
                 rows[r, g.rows] = self._rest[g.nodes] + way
-            if letting_go:
+            if releasing:
                 if r == 0:
-                    for g in letting_go:
+                    for g in releasing:
                         g.released = True
                 return rows[:r], True
         return rows, False
 
     def places(self, t: float) -> np.ndarray:
-        """Positions (n_moved, 3) of the led nodes at a time [m], nan on axes that are free or let go by then."""
-        places = np.full((self.n_moved, 3), np.nan)
+        """Positions (n_prescribed, 3) of the led nodes at a time [m], nan on axes that are free or let go by then."""
+        places = np.full((self.n_prescribed, 3), np.nan)
         for g in self._groups:
             way = None if g.released else self._ask(g, t)
             if way is not None:
@@ -110,12 +110,12 @@ class Motion:
         return places
 
     def accelerations(self, start: float, dt: float, middle: bool) -> np.ndarray:
-        """Accelerations (n_moved, 3) [m/s^2] of the led nodes over the step from start [s]: at its middle, or at its end.
+        """Accelerations (n_prescribed, 3) [m/s^2] of the led nodes over the step from start [s]: at its middle, or at its end.
 
         Second order in dt, from places within the step alone: a jump of the velocity between two steps is no force.
         """
         shares, weights = ((0, 1 / 2, 1), (4, -8, 4)) if middle else ((0, 1 / 3, 2 / 3, 1), (-9, 36, -45, 18))
-        total = np.zeros((self.n_moved, 3))
+        total = np.zeros((self.n_prescribed, 3))
         for g in self._groups:
             if g.released:
                 continue

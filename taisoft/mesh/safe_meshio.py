@@ -114,7 +114,7 @@ class _Console(meshio_messages.Console):
 meshio_messages.Console = _Console
 
 
-def read_fenced(file: Path, name: str, data: bytes, kind: str = "mesh") -> meshio.Mesh:
+def read_safely(file: Path, name: str, data: bytes, kind: str = "mesh") -> meshio.Mesh:
     """What meshio reads from a file. name: the file, for messages; data: its content; kind: "mesh" or "surface".
 
     Raises MeshError, whatever meshio does.
