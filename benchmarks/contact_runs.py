@@ -71,7 +71,7 @@ class StepCost:
     scene: str
     solver: str
     whole: list[float]
-    substeps: dict[str, list[float]]
+    parts: dict[str, list[float]]
     contacts: list[int]
     sweeps: list[int]
     residual: float
@@ -224,8 +224,8 @@ def measure_step(name: str, sim: ts.Simulator, steps: int) -> StepCost:
             sim.step()
             whole = clock() - begin
             for part in PARTS:
-                cost.substeps[part].append(watch.spent[part])
-            cost.substeps[REST].append(whole - sum(watch.spent.values()))
+                cost.parts[part].append(watch.spent[part])
+            cost.parts[REST].append(whole - sum(watch.spent.values()))
     return cost
 
 

@@ -102,7 +102,7 @@ def test_a_shot_too_fast_is_refused(sim):
     number = r"([0-9.e+-]+)"
     found = re.search(
         rf"^step 1: 'sheet' and 'shot' close at {number} m/s, {number} m in a step of {number} s, and the thinner of them is "
-        rf"{number} m thick, so {'' if explicit else 'even cut into 256 substeps '}they could pass each other unseen: "
+        rf"{number} m thick, so {'' if explicit else 'even in 256 substeps '}they could pass each other unseen: "
         rf"take dt <= {number} s$", text,
     )  # fmt: skip
     assert found, text

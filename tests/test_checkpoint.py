@@ -72,7 +72,7 @@ COUNTS = {
     "velocity_verlet": {"stepper/acceleration": lambda a: 0 * a},
     "bdf2": {"stepper/x_now": lambda x: 0 * x, "stepper/past": lambda n: 0},
 }
-COUNTS_LATE = {name: {"world/released": lambda r: [False] * len(r)} for name in COUNTS}  # others do not mind a second release
+COUNTS_LATE = {name: {"simulation/released": lambda r: [False] * len(r)} for name in COUNTS}  # others do not mind a second release
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_going_on_without_contacts(tmp_path, integrator, precision):
         assert loaded.scene.body("flyer").material == sim.scene.body("flyer").material != scene.body("flyer").material
         assert np.array_equal(loaded.reactions(), reactions)
         assert_same(follow(loaded, 35), told)
-        spoilt = {"world/v": lambda v: 0.5 * v, "time_base": lambda t: t + 1e-3, **COUNTS.get(integrator, {})}
+        spoilt = {"simulation/v": lambda v: 0.5 * v, "time_base": lambda t: t + 1e-3, **COUNTS.get(integrator, {})}
         assert_every_part_counts(loaded, early, spoilt, told[:8])
         assert_every_part_counts(loaded, late, COUNTS_LATE.get(integrator, {}), told[30:])
 
@@ -242,7 +242,7 @@ def changed(saved: Path, path: Path, member: str, change) -> Path:
 
 
 def test_a_changed_number_is_found(saved, tmp_path):
-    path = changed(saved, tmp_path / "changed.npz", "world/x", lambda x: x + 1e-12)
+    path = changed(saved, tmp_path / "changed.npz", "simulation/x", lambda x: x + 1e-12)
     assert "is damaged: its checksum" in refusal(path)
 
 

@@ -72,14 +72,14 @@ def clamp(session: Session, law: str) -> dict[str, float]:
     }
 
 
-def sheets(session: Session, substeps: str) -> dict[str, float]:
+def sheets(session: Session, parts: str) -> dict[str, float]:
     """S3: two sheets fly at each other, each at 15 m/s, as two bodies or as two parts of one."""
     sheet = box((8, 1, 8), (0.2, 0.005, 0.2))
     rubber = ts.Material(law=SNH, young=1e6, poisson=0.3, density=1000.0)
     scene, apart = ts.Scene(gravity=WEIGHTLESS), np.array([0.0, 0.0125, 0.0])
     n = sheet.n_verts
     toward = np.array([0.0, 15.0, 0.0])
-    if substeps == "two bodies":
+    if parts == "two bodies":
         scene.add_body(sheet, rubber, name="lower", position=-apart, velocity=toward)
         scene.add_body(sheet, rubber, name="upper", position=apart, velocity=-toward)
     else:
@@ -197,11 +197,11 @@ S3 = Case(
     tuple(
         Variant(
             # momentum is kept as well as Newton's method balances forces
-            substeps,
-            {"dt": 1 / 120, "integrator": IMPLICIT, "self_collision": substeps != "two bodies", "newton_tolerance": 1e-6},
-            {"parts": substeps}, MEET,
+            parts,
+            {"dt": 1 / 120, "integrator": IMPLICIT, "self_collision": parts != "two bodies", "newton_tolerance": 1e-6},
+            {"parts": parts}, MEET,
         )
-        for substeps in ("two bodies", "two parts of one")
+        for parts in ("two bodies", "two parts of one")
     ),
     (
         Criterion("least distance between the sheets' middles [m]", 0.0, ANALYTIC, at_least=True),

@@ -387,7 +387,7 @@ class ContactStep:
         a, b = d.buffer.data.body[d.kept[int(closing[WHICH])]]
         names = [d.scene.colliders[k].name for k in (a, b)]
         thin, speed = float(min(d.thickness[a], d.thickness[b])), float(closing[SPEED])
-        cut = f"even cut into {substeps} parts " if substeps > 1 else ""
+        cut = f"even in {substeps} substeps " if substeps > 1 else ""
         return (
             f"'{names[0]}' and '{names[1]}' close at {speed:.3g} m/s, {speed * dt:.3g} m in a step of {dt:.3g} s, "
             f"and the thinner of them is {thin:.3g} m thick, so {cut}they could pass each other unseen: take dt <= "
