@@ -30,10 +30,10 @@ _SET_TRACTION = f"call sim.set_traction(body, index, value) for one that is ther
 class Constraint:
     """Nodes held along some axes: at their start, or at their start plus a displacement that depends on time."""
 
-    nodes: np.ndarray  # (k,) int64 node ids
-    axes: np.ndarray  # (3,) bool
-    path: Callable | None = None  # t [s] -> displacement (3,) or (k,3) [m], None once released; no path: they stay
-    where: Callable | None = None  # what chose the nodes, where that was a function: on another mesh it can choose again
+    nodes: np.ndarray  #: (k,) int64 node ids
+    axes: np.ndarray  #: (3,) bool
+    path: Callable | None = None  #: t [s] -> displacement (3,) or (k,3) [m], None once released; no path: they stay
+    where: Callable | None = None  #: what chose the nodes, where that was a function: on another mesh it can choose again
 
     def __post_init__(self):
         _make_read_only(self.nodes, self.axes)
@@ -44,8 +44,8 @@ class Constraint:
 class Traction:
     """A dead load on surface triangles."""
 
-    triangles: np.ndarray  # (k,) int64 rows of mesh.surface
-    value: np.ndarray  # (3,) force per reference area [Pa]
+    triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
+    value: np.ndarray  #: (3,) force per reference area [Pa]
 
     def __post_init__(self):
         _make_read_only(self.triangles, self.value)
@@ -56,9 +56,9 @@ class Traction:
 class NodalForce:
     """A dead load on nodes: a total spread over them by their lumped mass, or one force for each."""
 
-    nodes: np.ndarray  # (k,) int64 node ids
-    value: np.ndarray  # (3,) total force, or (k,3) one a node [N]
-    where: Callable | None = None  # as of a Constraint
+    nodes: np.ndarray  #: (k,) int64 node ids
+    value: np.ndarray  #: (3,) total force, or (k,3) one a node [N]
+    where: Callable | None = None  #: as of a Constraint
 
     def __post_init__(self):
         _make_read_only(self.nodes, self.value)

@@ -26,13 +26,13 @@ SHARP = 60.0  # [degrees] between the normals of neighbours above which a convex
 class CollisionSettings:
     """Numbers of the search for contacts. Raises SceneError for those outside the rules below."""
 
-    broad_phase: str = "auto"  # one of BROAD_PHASES; auto: a hierarchy on the CPU unless colliders are many, else the hash
-    cell_ratio: float = 2.2  # edge of a hash cell over the mean surface edge, > 0
-    margin: float | None = None  # [m] within which contacts are reported, >= 0; None: 0.1 of the mean surface edge
-    k_dop: int = 6  # planes of a hierarchy's boxes: 6, 14 or 18
-    field_cells: int = 32  # cells of a distance field along a body's longest side, 8 to 256
-    initial_capacity: int | None = None  # of the buffers of pairs and contacts, at least 64; None: from the surface
-    max_capacity: int | None = None  # of any buffer: parts of the work times the largest one; None: what the memory holds
+    broad_phase: str = "auto"  #: one of BROAD_PHASES; auto: a hierarchy on the CPU unless colliders are many, else the hash
+    cell_ratio: float = 2.2  #: edge of a hash cell over the mean surface edge, > 0
+    margin: float | None = None  #: [m] within which contacts are reported, >= 0; None: 0.1 of the mean surface edge
+    k_dop: int = 6  #: planes of a hierarchy's boxes: 6, 14 or 18
+    field_cells: int = 32  #: cells of a distance field along a body's longest side, 8 to 256
+    initial_capacity: int | None = None  #: of the buffers of pairs and contacts, at least 64; None: from the surface
+    max_capacity: int | None = None  #: of any buffer: parts of the work times the largest one; None: what the memory holds
 
     def __post_init__(self):
         what = "collision settings"
