@@ -68,7 +68,7 @@ def main(argv=None) -> int:
     first, _, rest = __doc__.partition("\n")
     parser = argparse.ArgumentParser(prog="taisoft bench figures", description=first, epilog=rest.partition("\n\n")[2])
     parser.add_argument("--only", action="append", choices=WRITES, metavar="NAME", help=f"one of {', '.join(WRITES)}; repeatable")
-    parser.add_argument("--quick", action="store_true", help="small cases; give --results too, since the manual takes no quick ones")
+    parser.add_argument("--quick", action="store_true", help="small cases; give --results too, the manual takes no quick ones")
     parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="default benchmarks/results")
     parser.add_argument("--logs", type=Path, default=Path("out/figures"), metavar="DIR", help="default out/figures")
     options = parser.parse_args(argv)

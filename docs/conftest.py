@@ -33,8 +33,8 @@ def run_shell(example) -> None:
     assert done.returncode == 0, f"{example.parsed}\n{done.stdout}\n{done.stderr}"
 
 
-def parse_commands(example) -> None:
-    for line in example.parsed.replace("\\\n", " ").splitlines():
+def check_commands(block: str) -> None:
+    for line in block.splitlines():
         if line.startswith("taisoft "):
             _parser().parse_args(shlex.split(line, comments=True)[1:])
 
@@ -47,12 +47,13 @@ def own_folder(tmp_path_factory):
     os.chdir(before)
 
 
-pytest_collect_file = Sybil(
+SYBIL = Sybil(
     parsers=[
         PythonCodeBlockParser(), CodeBlockParser("toml", read_scene), CodeBlockParser("sh", run_shell),
-        CodeBlockParser("console", parse_commands),
+        CodeBlockParser("console", lambda example: check_commands(example.parsed)),
     ],
     patterns=["*.md"],
     excludes=["results/*"],
     fixtures=["own_folder"],
-).pytest()  # fmt: skip
+)  # fmt: skip
+pytest_collect_file = SYBIL.pytest()

@@ -8,8 +8,9 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "assets")]
 
-import taisoft as ts  # noqa: E402
 from make_gallery import film  # noqa: E402
+
+import taisoft as ts  # noqa: E402
 from taisoft.output.files import write_bytes  # noqa: E402
 from taisoft.output.frames import png_bytes  # noqa: E402
 

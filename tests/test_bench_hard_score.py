@@ -3,7 +3,7 @@
 * solved is what ended as it must with all limits kept; a refusal, a stop or a degraded end where there is an answer is not;
 * wrong is an ok end that must not be one, that hides something, or that misses a limit on its answer, not on its cost;
 * the headline is the sum over the groups and over the cases; what was not run is asked, and not solved;
-* stored results are judged by what is asked today: their verdicts, their page and the manual's table; what is not solved has a cause.
+* stored results are judged by what is asked today: verdicts, page and the manual's table; what is not solved has a cause.
 """
 
 import json

@@ -28,9 +28,9 @@ class KeyFrames:
     times: np.ndarray  #: (k,) ascending [s]
     translations: np.ndarray | None = None  #: (k,3) [m]; None: none
     rotations: np.ndarray | None = None  #: (k,3) unit axis times angle [rad]; None: none
-    pivot: np.ndarray | None = None  #: (3,) [m]; None: the mean of the led nodes, the pivot of the obstacle's shape
-    smooth: bool = False  #: rest at every key: the share s of the way between two is s^2 (3 - 2 s)
-    release: bool = False  #: led nodes go free at the last time
+    pivot: np.ndarray | None = None  #: (3,) [m]; None: the mean of the prescribed nodes, or the pivot of the obstacle's shape
+    smooth: bool = False  #: at rest at every key: a fraction s of the time between two keys covers s^2 (3 - 2 s) of the distance
+    release: bool = False  #: prescribed nodes are released at the last time
 
     def __post_init__(self):
         what = "key frames"
