@@ -18,7 +18,6 @@ version = release = taisoft.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax"]
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3
-exclude_patterns = ["results/report-*/**"]
 html_theme = "furo"
 html_title = f"taisoft {release}"
 html_copy_source = False
@@ -32,9 +31,7 @@ add_module_names = False
 def copy_results(app) -> None:
     """The measured pages, with their plots, beside the pages of the manual."""
     shutil.rmtree(PAGES_OF_RESULTS, ignore_errors=True)
-    PAGES_OF_RESULTS.mkdir()
-    for path in sorted(RESULTS.glob("*.md")) + sorted(RESULTS.glob("*.png")):
-        shutil.copy(path, PAGES_OF_RESULTS)
+    shutil.copytree(RESULTS, PAGES_OF_RESULTS, ignore=shutil.ignore_patterns("*.json"))
 
 
 def as_rest(app, what, name, obj, options, lines: list[str]) -> None:

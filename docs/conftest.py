@@ -53,7 +53,7 @@ SYBIL = Sybil(
         CodeBlockParser("console", lambda example: check_commands(example.parsed)),
     ],
     patterns=["*.md"],
-    excludes=["results/*"],
+    excludes=["results/*", "results/*/*"],
     fixtures=["own_folder"],
 )  # fmt: skip
 pytest_collect_file = SYBIL.pytest()

@@ -4,7 +4,7 @@
 * every public name, every argument of a Simulator and every value that it may have is in the API reference;
 * every command, option and key of the window is on the page of the command line, and no other;
 * every integrator and law has its row where one chooses;
-* links between files lead somewhere, and the README is short.
+* links between files lead somewhere, the README is short, and pictures are small.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from taisoft.settings import IMPLICIT_CONTACT, Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-PAGES = sorted(path for path in DOCS.rglob("*.md") if path.parent.name != "results")
+PAGES = sorted(path for path in DOCS.rglob("*.md") if "results" not in path.relative_to(DOCS).parts)
 RUN = {"python", "toml", "sh", "console"}  # kinds of blocks that docs/conftest.py runs or reads
 SHOWN = {"text", "{toctree}", "{literalinclude}", "{eval-rst}"}  # that are no examples
 KEYS = {" ": "Space", "Escape": "Escape", "Right": "right arrow"}  # as the page calls them
@@ -77,6 +77,11 @@ def test_links_lead_somewhere(path):
 
 def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
+
+
+def test_pictures_are_small():
+    sizes = [path.stat().st_size for path in DOCS.rglob("*.png") if "results" not in path.relative_to(DOCS).parts]
+    assert sizes and max(sizes) <= 60_000 and sum(sizes) <= 500_000
 
 
 def test_every_public_name_is_in_the_reference():
