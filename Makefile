@@ -8,9 +8,10 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
+DOCS_READY := $(VENV)/docs-ready
 DEMO_OUT := out/hanging_beam
 
-.PHONY: demo test test-long figures lint clean
+.PHONY: demo test test-long figures docs lint clean
 
 demo: $(READY)
 	$(BIN)/taisoft run hanging_beam --headless --out $(DEMO_OUT) --overwrite
@@ -27,6 +28,12 @@ figures: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,peers]'
 	$(BIN)/taisoft bench figures
 
+# Runs every example of the manual, then builds it; any warning is an error.
+docs: $(DOCS_READY)
+	$(BIN)/python -m pytest -q -p no:cacheprovider -p no:warnings docs
+	$(BIN)/sphinx-build -q -n -W --keep-going docs out/docs
+	@echo "Written to out/docs: open out/docs/index.html."
+
 lint: $(READY)
 	$(BIN)/ruff check .
 
@@ -37,6 +44,10 @@ $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $(READY)
+
+$(DOCS_READY): $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@touch $(DOCS_READY)
 
 clean:
 	rm -rf $(VENV) out build dist .pytest_cache .ruff_cache .hypothesis

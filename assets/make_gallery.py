@@ -1,4 +1,4 @@
-"""Draws the README's pictures: `python assets/make_gallery.py [DEMO ...]` (minutes) writes assets/gallery/*.png, one strip a
+"""Draws the gallery's pictures: `python assets/make_gallery.py [DEMO ...]` (minutes) writes assets/gallery/*.png, one strip a
 scene.
 
 A strip shows a scene at a few moments, from the same place, side by side.
@@ -44,13 +44,14 @@ STRIPS = {
 def film(
     sim: ts.Simulator, moments: tuple, size: tuple[int, int], view: tuple, seconds: float, fps: float,
     layers: tuple[str, ...] = IN_PICTURES, on_moment: Callable[[ts.Simulator], None] | None = None, on_step=None,
+    colour: str = "body",
 ) -> tuple[np.ndarray, ts.RunReport]:  # fmt: skip
     """Run for some seconds; the pictures of the moments [s] side by side, uint8 (height, width, 3), and what the run did.
 
-    on_moment: called with each picture; on_step: as `Simulator.run` has it.
+    on_moment: called with each picture; on_step: as `Simulator.run` has it; colour: as of `Offscreen`.
     """
     target, distance, azimuth, elevation = view
-    drawing = Offscreen(sim.scene, size, Camera(np.array(target), distance, azimuth, elevation), layers=layers)
+    drawing = Offscreen(sim.scene, size, Camera(np.array(target), distance, azimuth, elevation), colour=colour, layers=layers)
     frames = [round(moment * fps) for moment in moments]
     pictures: list[np.ndarray] = []
 

@@ -1,4 +1,4 @@
-"""Every measured page and figure in one go, then README's tables.
+"""Every measured page and figure in one go, then the manual's tables.
 
 taisoft bench figures [--only NAME] [--quick] [--results DIR] [--logs DIR]
 
@@ -68,7 +68,7 @@ def main(argv=None) -> int:
     first, _, rest = __doc__.partition("\n")
     parser = argparse.ArgumentParser(prog="taisoft bench figures", description=first, epilog=rest.partition("\n\n")[2])
     parser.add_argument("--only", action="append", choices=WRITES, metavar="NAME", help=f"one of {', '.join(WRITES)}; repeatable")
-    parser.add_argument("--quick", action="store_true", help="small cases; give --results too, since README takes no quick ones")
+    parser.add_argument("--quick", action="store_true", help="small cases; give --results too, the manual takes no quick ones")
     parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="default benchmarks/results")
     parser.add_argument("--logs", type=Path, default=Path("out/figures"), metavar="DIR", help="default out/figures")
     options = parser.parse_args(argv)
@@ -77,8 +77,8 @@ def main(argv=None) -> int:
     results, logs = make_folder(options.results).resolve(), make_folder(options.logs)
     ended = make(options.only or WRITES, options.quick, results, logs)
     if results == RESULTS:
-        done = subprocess.run([sys.executable, "-m", "taisoft", "bench", "readme"], stdin=subprocess.DEVNULL, check=False)
-        ended.append(Ended("readme", done.returncode, 0.0, load_average()))
+        done = subprocess.run([sys.executable, "-m", "taisoft", "bench", "manual"], stdin=subprocess.DEVNULL, check=False)
+        ended.append(Ended("manual", done.returncode, 0.0, load_average()))
     rows = [(one.name, str(one.status), f"{one.seconds:.0f}", load_text(one.load)) for one in ended]
     print(markdown(("benchmark", "exit status", "seconds", "load at its start"), rows, left=(0,)))
     return 0 if all(one.status == 0 for one in ended) else 1

@@ -99,7 +99,7 @@ def run(
     for work in works:
         rows[work.key] = measure(work, here, rounds, arch)
     found = [rows[work.key] for work in WORKS if work.key in rows]
-    numbers |= {"quick": rounds < ROUNDS or len(here) < len(PROGRAMS)}  # not for the README
+    numbers |= {"quick": rounds < ROUNDS or len(here) < len(PROGRAMS)}  # not for the manual
     numbers |= page(text, found, document)
     document.add(again_text(earlier, times_of(rows[work.key] for work in works), numbers))
     document.add(f"Load at the end: {load_text(load_average())}")

@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Energies:
-    """Energies of a state [J]; elastic is 0 at rest, gravity is -sum m g.x and loads -sum f.x, 0 at the origin."""
+    """Energies of a state [J]."""
 
-    kinetic: float
-    elastic: float
-    gravity: float
-    loads: float = 0.0  # of forces and tractions, and of a pull as it is now
+    kinetic: float  #: [J]
+    elastic: float  #: [J], 0 at rest
+    gravity: float  #: -sum m g.x [J], 0 at the origin
+    loads: float = 0.0  #: -sum f.x of forces, tractions and a pull [J], 0 at the origin
 
     @property
     def total(self) -> float:
@@ -22,40 +22,40 @@ class Energies:
 class StepReport:
     """What one step did. A batch of explicit sub-steps gives one report: extremes over its sub-steps, the rest at its end."""
 
-    time: float  # at the end of the step [s]
-    steps: int = 1  # sub-steps of size dt that this report covers
-    substeps: int = 1  # that an implicit step was taken in, more where it did not converge or bodies would have passed each other
-    newton_iterations: int = 0  # with those of tries that were given up; those on few nodes count by the share of these nodes,
-    linear_iterations: int = 0  # here too, see `dynamics.elimination`
-    contact_iterations: int = 0
-    residual: float = 0.0  # relative residual of the implicit equations, 0 for explicit steps
-    contact_residual: float = 0.0
-    n_contacts: int = 0
-    dropped_contacts: int = 0
-    max_penetration: float = 0.0  # [m], of the contacts found, and how far triangles that cross must part
-    crossings: int = 0  # pairs of surface triangles that cross by more than 0.1 % of the finer side's mean surface edge
-    deep: int = 0  # 1 where that is more than 2 % of the finer side's mean surface edge; a number among numbers
-    min_volume_ratio: float = 1.0  # smallest J = det F
-    n_inverted: int = 0  # tets with J <= 0
-    kinetic: float = 0.0  # [J]
-    elastic: float = 0.0  # [J]
-    gravity: float = 0.0  # [J]
-    loads: float = 0.0  # [J] of dead loads: -sum f.x
-    converged: bool = True
-    problems: list[str] = field(default_factory=list)
+    time: float  #: at the end of the step [s]
+    steps: int = 1  #: steps of size dt that this report covers
+    substeps: int = 1  #: that an implicit step was divided into, because it did not converge or bodies would have passed each other
+    newton_iterations: int = 0  #: with those of discarded attempts; an elimination counts by its share of the nodes
+    linear_iterations: int = 0  #: of conjugate gradients, counted alike
+    contact_iterations: int = 0  #: sweeps of explicit steps, multiplier updates of implicit ones
+    residual: float = 0.0  #: relative residual of the implicit equations, 0 for explicit steps
+    contact_residual: float = 0.0  #: residual of the contact laws, |p - prox(p - f u)| / |p|
+    n_contacts: int = 0  #: contacts of the step
+    dropped_contacts: int = 0  #: triangles under inverted tets, whose contacts a distance field cannot give
+    max_penetration: float = 0.0  #: of the contacts found, and how far crossing triangles must part [m]
+    crossings: int = 0  #: pairs of surface triangles that cross by more than 0.1 % of the finer side's mean surface edge
+    deep: int = 0  #: 1 where something is deeper than 2 % of the finer side's mean surface edge, else 0
+    min_volume_ratio: float = 1.0  #: smallest J = det F
+    n_inverted: int = 0  #: tets with J <= 0
+    kinetic: float = 0.0  #: [J]
+    elastic: float = 0.0  #: [J]
+    gravity: float = 0.0  #: [J]
+    loads: float = 0.0  #: of dead loads, -sum f.x [J]
+    converged: bool = True  #: residuals are within their tolerances
+    problems: list[str] = field(default_factory=list)  #: sentences
 
 
 @dataclass
 class RunReport:
-    """What a run did. status: ok | degraded | failed; problems says why it is not ok."""
+    """What a run did."""
 
-    status: str = "ok"
-    problems: list[str] = field(default_factory=list)
-    steps: int = 0
-    sim_seconds: float = 0.0
-    wall_seconds: float = 0.0  # without compile time
-    compile_seconds: float = 0.0
-    interrupted: bool = False  # a signal ended the run early
-    step_reports: list[StepReport] = field(default_factory=list)
-    dt: float | None = None  # [s] of its steps
-    dt_requested: float | None = None  # [s] that the simulator had, where the run changed it to fit the frames
+    status: str = "ok"  #: "ok", "degraded" or "failed"
+    problems: list[str] = field(default_factory=list)  #: why it is not "ok", in sentences; notes begin with "note:"
+    steps: int = 0  #: steps of dt taken
+    sim_seconds: float = 0.0  #: simulated time [s]
+    wall_seconds: float = 0.0  #: without compile time [s]
+    compile_seconds: float = 0.0  #: spent starting Taichi and compiling kernels [s]
+    interrupted: bool = False  #: a signal ended the run early
+    step_reports: list[StepReport] = field(default_factory=list)  #: one a step; of explicit runs one a frame
+    dt: float | None = None  #: of its steps [s]
+    dt_requested: float | None = None  #: that the simulator had, where the run changed it to fit the frames [s]

@@ -26,23 +26,17 @@ SMALLEST_LOAD_STEP = 1.0 / 256.0
 
 @dataclass(frozen=True)
 class StaticResult:
-    """A state of equilibrium, or the nearest that was found; residual: |force on free axes| / |applied load|, without any load
-    over the constraint forces, and 0 where these too are nothing but rounding.
+    """A state of equilibrium, or the nearest that was found."""
 
-    load: share of the whole load that equilibrium was found for; below 1 the state is that of the last, failed attempt.
-    at_rounding: the residual is down at the rounding of the forces, so no tolerance below it can be met.
-    load_steps: how many parts the load was applied in. n_inverted: tets with J <= 0.
-    """
-
-    converged: bool
-    load: float
-    at_rounding: bool
-    residual: float
-    iterations: int  # Newton's, over all load steps
-    linear_iterations: int
-    load_steps: int
-    elastic: float  # stored energy [J]
-    n_inverted: int
+    converged: bool  #: the residual is within the tolerance, for the whole load
+    load: float  #: share of the load that equilibrium was found for; below 1 the state is that of the last, failed attempt
+    at_rounding: bool  #: the residual is down at the rounding of the forces, so no tolerance below it can be met
+    residual: float  #: |force on free axes| / |applied load|, without any load over the constraint forces
+    iterations: int  #: of Newton's method, over all load steps
+    linear_iterations: int  #: of conjugate gradients
+    load_steps: int  #: steps that the load was applied in
+    elastic: float  #: stored energy [J]
+    n_inverted: int  #: tets with J <= 0
     _scene: Scene
     _layout: Layout
     _positions: np.ndarray

@@ -1,4 +1,4 @@
-"""All figures in one go: every benchmark with its own files, past one that fails, and README only from whole results."""
+"""All figures in one go: every benchmark with its own files, past one that fails, and the manual only from whole results."""
 
 import subprocess
 from types import SimpleNamespace
@@ -31,9 +31,9 @@ def test_all_in_turn_past_a_failure(ran, tmp_path, capsys):
     assert "| collision  |           1 |" in capsys.readouterr().out
 
 
-def test_readme_is_made_from_whole_results_only(ran, tmp_path):
+def test_manual_is_made_from_whole_results_only(ran, tmp_path):
     assert figures.main(["--only", "order", "--logs", str(tmp_path)]) == 0
-    assert [command[4] for command in ran] == ["order", "readme"]
+    assert [command[4] for command in ran] == ["order", "manual"]
     with pytest.raises(SystemExit):
         figures.main(["--quick"])
     ran.clear()

@@ -3,14 +3,14 @@
 * solved is what ended as it must with all limits kept; a refusal, a stop or a degraded end where there is an answer is not;
 * wrong is an ok end that must not be one, that hides something, or that misses a limit on its answer, not on its cost;
 * the headline is the sum over the groups and over the cases; what was not run is asked, and not solved;
-* stored results are judged by what is asked today: their verdicts, their page and README's table; what is not solved has a cause.
+* stored results are judged by what is asked today: verdicts, page and the manual's table; what is not solved has a cause.
 """
 
 import json
 
 import pytest
 
-from benchmarks import hard, readme
+from benchmarks import hard, manual
 from benchmarks.document import RESULTS
 from benchmarks.hard_cases import CASES, GROUPS
 from benchmarks.hard_cases.record import (
@@ -94,8 +94,8 @@ def table_numbers(text: str, wanted: str) -> list[int]:
 
 @pytest.fixture(scope="module")
 def results() -> dict:
-    """The stored results that README tells of."""
-    return readme.newest(RESULTS, "hard")
+    """The stored results of the manual's table."""
+    return manual.newest(RESULTS, "hard")
 
 
 def test_the_headline_is_the_sum(results):
@@ -104,7 +104,7 @@ def test_the_headline_is_the_sum(results):
     assert counts[ASKED] == len(rows) == sum(len(case.variants) for case in CASES) == sum(counts[name] for name in COLUMNS)
     assert counts[SOLVED] == sum(row["solved"] for row in results["rows"]) and str(counts[SOLVED]) in headline(rows)
     assert [case for cases in GROUPS.values() for case in cases] == list(CASES)
-    for text in (scoreboard(rows), readme.hard(RESULTS)):
+    for text in (scoreboard(rows), manual.hard(RESULTS)):
         assert headline(rows) in text and (NOT_RUN in text) == bool(counts[NOT_RUN])
         for name in (ASKED, SOLVED, *COLUMNS[:-1]):
             *lines, last = table_numbers(text, name)

@@ -1,5 +1,6 @@
 """The laws, each against NumPy and against itself:
 
+* a scene may name each of them;
 * no energy and no stress at rest, Hooke's law for small strains down to 1e-9;
 * psi(QF) = psi(F) = psi(FQ), P(QF) = Q P(F), P(FQ) = P(F) Q;
 * psi, P, dP and the projected dP equal the oracle's, in f64 and f32, also for inverted, flat, tiny and huge F;
@@ -21,6 +22,7 @@ from taisoft import runtime
 from taisoft.materials import LAWS
 from taisoft.materials.evaluate import evaluate_differential
 from taisoft.runtime import kernel
+from taisoft.scene.material import LAWS as NAMES
 
 YOUNG, POISSON = 3e5, 0.35  # [Pa]; not round, so that mu, lambda and their multiples all differ
 each_law = pytest.mark.parametrize("law", LAWS)
@@ -74,6 +76,10 @@ MODERATE = moderate()
 
 def differential(law, F, D, projected=False):
     return evaluate_differential(law, F, D, YOUNG, POISSON, projected)
+
+
+def test_scenes_know_every_law():
+    assert sorted(LAWS) == sorted(NAMES)
 
 
 @each_law

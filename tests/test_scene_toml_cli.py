@@ -1,5 +1,5 @@
 """`taisoft run` takes a scene file as it takes the same scene in Python; what is bad leaves before any output; `taisoft scene`
-writes one; the README's example is one.
+writes one; the manual's example is one.
 """
 
 import re
@@ -57,8 +57,8 @@ def test_allow_outside_is_an_option(tmp_path, capsys):
     assert main(["scene", str(path), "--out", str(out), "--allow-outside"]) == 3
 
 
-def test_the_scene_file_of_the_readme(tmp_path):
-    blocks = re.findall(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+def test_the_scene_file_of_the_manual(tmp_path):
+    blocks = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "files.md").read_text(), re.DOTALL)
     assert len(blocks) == 1
     scene, solver = read(tmp_path, blocks[0])
     assert scene.bodies and scene.obstacles and solver

@@ -162,7 +162,7 @@ def _add_study(commands) -> None:
     _add_scene_name(parser)
     grid = parser.add_argument_group("grid (comma lists)")
     for name, told in (
-        ("dt", "steps [s]"), ("integrator", "see the README"), ("order", "of the elements of all bodies, 1 or 2"),
+        ("dt", "steps [s]"), ("integrator", "names, such as bdf2"), ("order", "of the elements of all bodies, 1 or 2"),
         ("refine", "how often every tet is cut into eight"), ("precision", "f32, f64"),
         ("newton-tolerance", "relative, or none: adaptive"), ("linear-tolerance", "of conjugate gradients, relative, or none"),
         ("contact-solver", "auto or a solver"), ("contact-tolerance", "relative, or none"), ("arch", "cpu, cuda"),

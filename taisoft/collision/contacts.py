@@ -37,29 +37,22 @@ class ContactFields:
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Contacts on the host, all arrays (k, ...) and in an order that does not depend on threads.
+    """Contacts on the host, all arrays (k, ...) and in an order that does not depend on threads."""
 
-    point (k,3) [m], normal (k,3), gap (k,) [m], impulse (k,3) [N s] on a; body_a, body_b: names, an obstacle is always b;
-    nodes, weights (k,6): three of each side, numbers of the model's nodes over all bodies, -1 and 0 where there is none;
-    kind: of "vertex_face", "edge_edge", "vertex_field", "face_field"; feature (k,2): ids that stay while two features meet.
-    friction, restitution (k,): of the pair, from the scene. found: contacts before the reduction; unmapped: triangles whose tet
-    is inverted, so that a distance field could not be used.
-    """
-
-    point: np.ndarray
-    normal: np.ndarray
-    gap: np.ndarray
-    impulse: np.ndarray
-    body_a: np.ndarray
-    body_b: np.ndarray
-    nodes: np.ndarray
-    weights: np.ndarray
-    kind: np.ndarray
-    feature: np.ndarray
-    friction: np.ndarray
-    restitution: np.ndarray
-    found: int
-    unmapped: int
+    point: np.ndarray  #: (k,3) midway between the two surface points [m]
+    normal: np.ndarray  #: (k,3) unit vectors from b to a
+    gap: np.ndarray  #: (k,) [m], negative for a penetration
+    impulse: np.ndarray  #: (k,3) on a [N s]; b gets the opposite
+    body_a: np.ndarray  #: (k,) names
+    body_b: np.ndarray  #: (k,) names; an obstacle is always b
+    nodes: np.ndarray  #: (k,6) three of each side, numbered over all bodies, -1 where there is none
+    weights: np.ndarray  #: (k,6) of these nodes, 0 where there is none
+    kind: np.ndarray  #: (k,) "vertex_face", "edge_edge", "vertex_field" or "face_field"
+    feature: np.ndarray  #: (k,2) ids that stay while the same two features meet
+    friction: np.ndarray  #: (k,) of the pair
+    restitution: np.ndarray  #: (k,) of the pair
+    found: int  #: contacts before the reduction
+    unmapped: int  #: triangles whose tet is inverted, so that a distance field could not be used
 
     def __len__(self) -> int:
         return len(self.gap)

@@ -18,9 +18,9 @@ from taisoft.transfer import download
 class Overlap:
     """Two colliders that overlap by a depth [m]."""
 
-    name_a: str
-    name_b: str
-    depth: float
+    name_a: str  #: of a body
+    name_b: str  #: of a body or an obstacle
+    depth: float  #: [m]
 
 
 def find_overlaps(detection: Detection) -> list[Overlap]:

@@ -30,10 +30,10 @@ _SET_TRACTION = f"call sim.set_traction(body, index, value) for one that is ther
 class Constraint:
     """Nodes held along some axes: at their start, or at their start plus a displacement that depends on time."""
 
-    nodes: np.ndarray  # (k,) int64 node ids
-    axes: np.ndarray  # (3,) bool
-    path: Callable | None = None  # t [s] -> displacement (3,) or (k,3) [m], None once released; no path: they stay
-    where: Callable | None = None  # what chose the nodes, where that was a function: on another mesh it can choose again
+    nodes: np.ndarray  #: (k,) int64 node ids
+    axes: np.ndarray  #: (3,) bool
+    path: Callable | None = None  #: t [s] -> displacement (3,) or (k,3) [m], None once released; no path: they stay
+    where: Callable | None = None  #: what chose the nodes, where that was a function: on another mesh it can choose again
 
     def __post_init__(self):
         _make_read_only(self.nodes, self.axes)
@@ -44,8 +44,8 @@ class Constraint:
 class Traction:
     """A dead load on surface triangles."""
 
-    triangles: np.ndarray  # (k,) int64 rows of mesh.surface
-    value: np.ndarray  # (3,) force per reference area [Pa]
+    triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
+    value: np.ndarray  #: (3,) force per reference area [Pa]
 
     def __post_init__(self):
         _make_read_only(self.triangles, self.value)
@@ -56,9 +56,9 @@ class Traction:
 class NodalForce:
     """A dead load on nodes: a total spread over them by their lumped mass, or one force for each."""
 
-    nodes: np.ndarray  # (k,) int64 node ids
-    value: np.ndarray  # (3,) total force, or (k,3) one a node [N]
-    where: Callable | None = None  # as of a Constraint
+    nodes: np.ndarray  #: (k,) int64 node ids
+    value: np.ndarray  #: (3,) total force, or (k,3) one a node [N]
+    where: Callable | None = None  #: as of a Constraint
 
     def __post_init__(self):
         _make_read_only(self.nodes, self.value)
@@ -67,12 +67,10 @@ class NodalForce:
 class Body(Guarded):
     """One elastic body of a scene; made by `Scene.add_body`.
 
-    name, mesh, material. position: (3,) [m], where the body starts: its nodes begin at rest_positions + position.
-    velocity: (3,) or (n,3) [m/s], of the start. order: 1 or 2, of the elements' shape functions; quadrature_degree: of
-    polynomials that their quadrature integrates exactly. nodes: `Nodes`, the mesh's vertices and for order 2 the middles
-    of its edges. constraints, tractions, forces: lists of `Constraint`, `Traction`, `NodalForce`, which can be taken out but are
-    added by calls only. collision: one of HIT_BY. Only material, position, velocity and collision can be set, each checked.
-    `tell_locking` and `warn_bending` warn of tets of order 1 where they are far too stiff; `Scene.add_body` calls both.
+    Its nodes start at rest_positions + position. order: 1 or 2, of the elements' shape functions; quadrature_degree: of the
+    polynomials that their quadrature integrates exactly. nodes: the mesh's vertices and, for order 2, the midpoints of its
+    edges. constraints, tractions, forces: lists; items can be removed from them, but are added by `fix`, `move`, `add_traction`
+    and `add_force` only. material, position, velocity and collision can be set, each checked; nothing else can.
     """
 
     _read_only = frozenset(_READ_ONLY)
@@ -167,7 +165,7 @@ class Body(Guarded):
 
     @property
     def collision(self) -> str:
-        """By what the body is to be hit, one of HIT_BY; setting it raises SceneError for anything else."""
+        """How others hit the body: "auto", "distance_field" or "proximity"; anything else raises SceneError."""
         return self._collision
 
     @collision.setter
@@ -216,12 +214,12 @@ class Body(Guarded):
         return self._hold(Constraint(nodes, checks.axes(axes, what), where=_function(where)), _FIXED, what)
 
     def move(self, where, path: Callable | KeyFrames, axes: str = "xyz") -> Constraint:
-        """Lead nodes along a path.
+        """Prescribe the motion of nodes by a path.
 
         where: as for `fix`, but no id twice. path: callable t [s] -> displacement from the start, (3,) or (k,3) in the
         order of the chosen nodes [m], or None from the moment they are released; it is called once here, for t = 0. Or
-        `KeyFrames`, whose pivot is a place where the body starts. axes: the directions led. Raises SceneError when no node is
-        chosen, one is held already, or the path is not of this kind.
+        `KeyFrames`, whose pivot is given where the body starts. axes: the directions prescribed. Raises SceneError when no
+        node is chosen, one is held already, or the path is not of this kind.
         """
         self._check_open("move")
         what = f"body {self.name!r}: move"

@@ -24,15 +24,15 @@ SHARP = 60.0  # [degrees] between the normals of neighbours above which a convex
 @guarded_record("collision settings", "give scene.collision new CollisionSettings({name}=...) before a Simulator takes the scene")
 @dataclass(frozen=True)
 class CollisionSettings:
-    """Numbers of the search for contacts. Raises SceneError for those outside the rules below."""
+    """Settings of contact detection. Raises SceneError for numbers outside the rules below."""
 
-    broad_phase: str = "auto"  # one of BROAD_PHASES; auto: a hierarchy on the CPU unless colliders are many, else the hash
-    cell_ratio: float = 2.2  # edge of a hash cell over the mean surface edge, > 0
-    margin: float | None = None  # [m] within which contacts are reported, >= 0; None: 0.1 of the mean surface edge
-    k_dop: int = 6  # planes of a hierarchy's boxes: 6, 14 or 18
-    field_cells: int = 32  # cells of a distance field along a body's longest side, 8 to 256
-    initial_capacity: int | None = None  # of the buffers of pairs and contacts, at least 64; None: from the surface
-    max_capacity: int | None = None  # of any buffer: parts of the work times the largest one; None: what the memory holds
+    broad_phase: str = "auto"  #: "auto", "spatial_hash" or "bvh"; auto: bvh on the CPU for up to 200 colliders, else the hash
+    cell_ratio: float = 2.2  #: edge of a hash cell over the mean surface edge, > 0
+    margin: float | None = None  #: distance within which contacts are reported [m], >= 0; None: 0.1 of the mean surface edge
+    k_dop: int = 6  #: planes of the boxes of "bvh": 6, 14 or 18
+    field_cells: int = 32  #: cells of a distance field along a body's longest side, 8 to 256
+    initial_capacity: int | None = None  #: of the buffers of pairs and contacts, at least 64; None: from the surface
+    max_capacity: int | None = None  #: of any buffer; None: what the memory holds
 
     def __post_init__(self):
         what = "collision settings"

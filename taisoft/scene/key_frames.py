@@ -25,12 +25,12 @@ class KeyFrames:
     Points move as x -> rotation @ (x - pivot) + pivot + translation, x being where they start. Raises SceneError.
     """
 
-    times: np.ndarray  # (k,) ascending [s]
-    translations: np.ndarray | None = None  # (k,3) [m]; None: none
-    rotations: np.ndarray | None = None  # (k,3) unit axis times angle [rad]; None: none
-    pivot: np.ndarray | None = None  # (3,) [m]; None: the mean of the led nodes, the pivot of the obstacle's shape
-    smooth: bool = False  # rest at every key: the share s of the way between two is s^2 (3 - 2 s)
-    release: bool = False  # led nodes go free at the last time
+    times: np.ndarray  #: (k,) ascending [s]
+    translations: np.ndarray | None = None  #: (k,3) [m]; None: none
+    rotations: np.ndarray | None = None  #: (k,3) unit axis times angle [rad]; None: none
+    pivot: np.ndarray | None = None  #: (3,) [m]; None: the mean of the prescribed nodes, or the pivot of the obstacle's shape
+    smooth: bool = False  #: at rest at every key: a fraction s of the time between two keys covers s^2 (3 - 2 s) of the distance
+    release: bool = False  #: prescribed nodes are released at the last time
 
     def __post_init__(self):
         what = "key frames"
@@ -94,7 +94,7 @@ class NodePath:
     """Key frames as `Body.move` follows them: t [s] -> displacement (3,) or (k,3) [m], or None once the nodes are free."""
 
     frames: KeyFrames
-    starts: np.ndarray  # (k,3) [m]
+    starts: np.ndarray  #: (k,3) [m]
 
     def __call__(self, t: float) -> np.ndarray | None:
         if self.frames.release and t >= self.frames.times[-1]:
@@ -111,7 +111,7 @@ class ShapePath:
     """Key frames as an obstacle follows them: t [s] -> (translation (3,) [m], rotation (3,3) about its shape's pivot)."""
 
     frames: KeyFrames
-    center: np.ndarray  # (3,) [m], the shape's pivot
+    center: np.ndarray  #: (3,) [m], the shape's pivot
 
     def __call__(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         translation, rotation = self.frames(t)

@@ -14,14 +14,14 @@ LAWS = ("st_venant_kirchhoff", "corotational", "stable_neo_hookean")
 class Material:
     """An elastic material with damping and surface numbers. Raises SceneError for numbers outside the rules below."""
 
-    law: str = "stable_neo_hookean"  # one of LAWS
-    young: float = 1e6  # Young's modulus [Pa], > 0
-    poisson: float = 0.3  # Poisson's ratio, in the open interval (-1, 0.5)
-    density: float = 1000.0  # [kg/m^3], > 0
-    friction: float = 0.5  # Coulomb's coefficient, >= 0
-    restitution: float = 0.0  # share of the normal speed that comes back, 0 to 1
-    mass_damping: float = 0.0  # [1/s], >= 0
-    stiffness_damping: float = 0.0  # [s], >= 0
+    law: str = "stable_neo_hookean"  #: "st_venant_kirchhoff", "corotational" or "stable_neo_hookean"
+    young: float = 1e6  #: Young's modulus [Pa], > 0
+    poisson: float = 0.3  #: Poisson's ratio, in the open interval (-1, 0.5)
+    density: float = 1000.0  #: [kg/m^3], > 0
+    friction: float = 0.5  #: Coulomb's coefficient, >= 0
+    restitution: float = 0.0  #: ratio of the normal speeds after and before an impact, 0 to 1
+    mass_damping: float = 0.0  #: [1/s], >= 0
+    stiffness_damping: float = 0.0  #: [s], >= 0
 
     def __post_init__(self):
         checks.choice(self.law, "material: law", LAWS)

@@ -66,8 +66,8 @@ class Shape:
 class HalfSpace(Shape):
     """All points x with (x - point) . normal <= 0. Raises SceneError for a normal without length."""
 
-    point: np.ndarray  # (3,) [m] of its boundary
-    normal: np.ndarray  # (3,), any length; kept as a unit vector
+    point: np.ndarray  #: (3,) [m] of its boundary
+    normal: np.ndarray  #: (3,), any length; kept as a unit vector
     kind: ClassVar[int] = 0
     word: ClassVar[str] = "half-space"
 
@@ -90,8 +90,8 @@ class HalfSpace(Shape):
 class Sphere(Shape):
     """A ball. Raises SceneError unless its radius is above 0."""
 
-    center: np.ndarray  # (3,) [m]
-    radius: float  # [m]
+    center: np.ndarray  #: (3,) [m]
+    radius: float  #: [m]
     kind: ClassVar[int] = 1
     word: ClassVar[str] = "sphere"
 
@@ -109,8 +109,8 @@ class Sphere(Shape):
 class Box(Shape):
     """A box along the axes. Raises SceneError unless its half extents are above 0."""
 
-    center: np.ndarray  # (3,) [m]
-    half_extents: np.ndarray  # (3,) [m]
+    center: np.ndarray  #: (3,) [m]
+    half_extents: np.ndarray  #: (3,) [m]
     kind: ClassVar[int] = 2
     word: ClassVar[str] = "box"
 
@@ -134,9 +134,9 @@ class Box(Shape):
 class Capsule(Shape):
     """All points within a radius of the segment from a to b. Raises SceneError unless the radius is above 0 and a is not b."""
 
-    a: np.ndarray  # (3,) [m]
-    b: np.ndarray  # (3,) [m]
-    radius: float  # [m]
+    a: np.ndarray  #: (3,) [m]
+    b: np.ndarray  #: (3,) [m]
+    radius: float  #: [m]
     kind: ClassVar[int] = 3
     word: ClassVar[str] = "capsule"
 
@@ -168,8 +168,8 @@ class MeshObstacle(Shape):
     neighbours that are not oriented alike.
     """
 
-    vertices: np.ndarray  # (n,3) [m]
-    triangles: np.ndarray  # (t,3) int64
+    vertices: np.ndarray  #: (n,3) [m]
+    triangles: np.ndarray  #: (t,3) int64
     kind: ClassVar[int] = 4
     word: ClassVar[str] = "mesh obstacle"
 
@@ -266,8 +266,8 @@ class Obstacle:
 
     shape: Shape
     name: str
-    friction: float = 0.5  # Coulomb's coefficient, >= 0
-    restitution: float = 0.0  # 0 to 1
+    friction: float = 0.5  #: Coulomb's coefficient, >= 0
+    restitution: float = 0.0  #: 0 to 1
     path: Callable | None = None
 
     def __post_init__(self):

@@ -25,9 +25,9 @@ __all__ = ["LAWS", "Body", "Constraint", "Material", "NodalForce", "Scene", "Tra
 class Scene(Guarded):
     """What is simulated: gravity, bodies and obstacles. SI units, y up.
 
-    contact_pairs: {frozenset of two names, or of one for a body with itself: (friction, restitution)}, each a number or
-    None where the default of `contact_numbers` holds; read-only, `set_contact` adds to it. Bodies and obstacles can be taken out
-    of their lists, and are added by calls only. A Simulator that takes a scene freezes it, see `freeze`.
+    bodies, obstacles: lists; items can be removed from them, but are added by `add_body` and `add_obstacle` only. contact_pairs:
+    {frozenset of two names, or of one for a body with itself: (friction, restitution)}, each a number or None where the default
+    of `contact_numbers` holds; read-only, `set_contact` adds to it. A Simulator that takes a scene freezes it, see `freeze`.
     """
 
     _contents = {
@@ -62,7 +62,7 @@ class Scene(Guarded):
 
     @property
     def collision(self) -> CollisionSettings:
-        """How contacts are looked for."""
+        """Settings of contact detection."""
         return self._collision
 
     @collision.setter
@@ -73,7 +73,7 @@ class Scene(Guarded):
 
     @property
     def allow_initial_overlap(self) -> bool:
-        """Whether things may overlap at the start; otherwise a simulator refuses what is deeper than 1e-6 of the smaller size."""
+        """Whether things may overlap at the start; else a simulator refuses overlaps deeper than 1e-6 of the smaller size."""
         return self._allow_initial_overlap
 
     @allow_initial_overlap.setter
@@ -82,7 +82,7 @@ class Scene(Guarded):
 
     @property
     def contact_forces(self) -> bool:
-        """Whether things that touch push each other; otherwise they pass through, and contacts are found when asked for."""
+        """Whether contacts exert forces; otherwise things pass through each other, and `detect_contacts` still finds contacts."""
         return self._contact_forces
 
     @contact_forces.setter
@@ -95,7 +95,7 @@ class Scene(Guarded):
 
     @property
     def colliders(self) -> list[Body | Obstacle]:
-        """Bodies, then obstacles, each in the order added: what numbers in contacts count."""
+        """Bodies, then obstacles, each in the order added."""
         return [*self.bodies, *self.obstacles]
 
     def __repr__(self) -> str:
@@ -105,7 +105,7 @@ class Scene(Guarded):
         return f"Scene(gravity={tuple(self.gravity.tolist())}, {names})"
 
     def snapshot(self) -> "Scene":
-        """A copy that can change apart from this one, with its bodies, even where this one is frozen; meshes are shared."""
+        """A copy, with its bodies, that can be changed even where this one is frozen; meshes are shared."""
         twin = copy.copy(self)
         with thawed(twin):
             twin.bodies = [copy.copy(body) for body in self.bodies]
@@ -138,7 +138,7 @@ class Scene(Guarded):
 
         mesh: its shape at rest. name: unique, "body0" and so on where left out. position: (3,) [m], shift of the start.
         velocity: (3,) for all nodes or (n,3) [m/s]. order: 1, linear tets, or 2, quadratic ones with nodes in the middle of
-        every edge. quadrature_degree: None for the default, for order 2 four points (2) or fourteen (4). collision: by what
+        every edge. quadrature_degree: None for the default, for order 2 four points (2) or fourteen (4). collision: how
         others hit it, "proximity", which is also "auto", or "distance_field". Warns where tets of order 1 are far too stiff:
         at a Poisson's ratio above 0.49, or where so few lie through a thin body that it bends at most half as far as it should.
         Raises SceneError.
@@ -176,7 +176,7 @@ class Scene(Guarded):
     def set_contact(
         self, name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None
     ) -> None:
-        """Set what counts between two bodies, a body and an obstacle, or a body and itself (its name twice).
+        """Set friction and restitution between two bodies, a body and an obstacle, or a body and itself (its name twice).
 
         A number left out stays as it was. Raises SceneError for names that do not exist, two obstacles, numbers outside
         the rules, or no number at all.

@@ -1,10 +1,10 @@
-"""README: its measured tables, made anew from the files in benchmarks/results.
+"""Manual: its measured tables, made anew from the files in benchmarks/results.
 
-taisoft bench readme [--check]
+taisoft bench manual [--check]
 
-What stands in README.md between `<!-- begin NAME -->` and `<!-- end NAME -->` is the text of TABLES[NAME], made from the newest
+The text between `<!-- begin NAME -->` and `<!-- end NAME -->` on a page of docs/ is that of TABLES[NAME], made from the newest
 results of a benchmark, so that no measured number is typed by hand. A table is a function of the folder of results. --check
-writes nothing. Exit status: 0, or with --check 1 where README.md is not what the results say.
+writes nothing. Exit status: 0, or with --check 1 where a page differs from the results.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from .order_table import DEFAULT_DEGREE, GOAL
 from .reference_cases.record import label
 from .works.table import compare_table
 
-README = Path(__file__).resolve().parents[1] / "README.md"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 BLOCK = re.compile(r"(<!-- begin (\w+) -->\n).*?(<!-- end \2 -->\n)", re.DOTALL)
 MARKER = re.compile(r"<!-- (?:begin|end) (\w+) -->")
 ORDERS = {1: "linear", 2: "quadratic"}
@@ -167,26 +167,33 @@ def filled(text: str, results: Path = RESULTS) -> str:
     return BLOCK.sub(lambda m: f"{m[1]}\n{TABLES[m[2]](results)}\n\n{m[3]}", text)
 
 
+def pages() -> list[Path]:
+    """Pages of the manual that hold tables. Raises OutputError where there are none."""
+    found = [path for path in sorted(DOCS.glob("*.md")) if MARKER.search(path.read_text(encoding="utf-8"))]
+    if not found:
+        raise OutputError(f"{DOCS} holds no page with tables: run this in a checkout")
+    return found
+
+
 def main(argv=None) -> int:
-    """Write README.md anew, or tell whether it is as it should be. Raises OutputError."""
+    """Write the pages anew, or say which differ from the results. Raises OutputError."""
     first, _, rest = __doc__.partition("\n")
-    parser = argparse.ArgumentParser(prog="taisoft bench readme", description=first, epilog=rest.partition("\n\n")[2])
+    parser = argparse.ArgumentParser(prog="taisoft bench manual", description=first, epilog=rest.partition("\n\n")[2])
     parser.add_argument("--check", action="store_true", help="write nothing")
     options = parser.parse_args(argv)
-    try:
-        text = README.read_text(encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{README} cannot be read: {error.strerror}") from error
-    made = filled(text)
-    if made == text:
-        print(f"{README.name} is what the results say")
-        return 0
-    if options.check:
-        print(f"{README.name} is not what the results say: `taisoft bench readme` writes it anew")
-        return 1
-    write_bytes(README, made.encode())
-    print(f"written: {README}")
-    return 0
+    differing = 0
+    for page in pages():
+        text = page.read_text(encoding="utf-8")
+        made = filled(text)
+        if made == text:
+            print(f"{page.name} agrees with the results")
+        elif options.check:
+            print(f"{page.name} differs from the results: `taisoft bench manual` writes it anew")
+            differing += 1
+        else:
+            write_bytes(page, made.encode())
+            print(f"written: {page}")
+    return 1 if differing else 0
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""The README's measured tables:
+"""The manual's measured tables:
 
-* README.md is what the results in benchmarks/results say, to the letter;
-* a number changed in the results or in README.md is seen, and written anew;
+* they are what the results in benchmarks/results say, to the letter, and each is on one page;
+* a number changed in the results or on a page is seen, and written anew;
 * the newest whole results count, and what is missing, unknown or unpaired is told in a sentence.
 """
 
@@ -10,8 +10,8 @@ import shutil
 
 import pytest
 
-from benchmarks import readme
-from benchmarks.readme import BLOCK, README, RESULTS, TABLES, filled, newest
+from benchmarks import manual
+from benchmarks.manual import BLOCK, RESULTS, TABLES, filled, newest, pages
 from taisoft.errors import OutputError
 
 TEXT = "before\n<!-- begin fake -->\nold\n<!-- end fake -->\nafter\n"
@@ -23,25 +23,28 @@ def fake(monkeypatch):
     monkeypatch.setitem(TABLES, "fake", lambda results: f"made of {results}")
 
 
-def test_readme_is_what_the_results_say():
-    text = README.read_text(encoding="utf-8")
-    assert {name for _, name, _ in BLOCK.findall(text)} <= set(TABLES) and BLOCK.search(text)
-    assert filled(text) == text, "`taisoft bench readme` writes it anew"
+def texts() -> list[str]:
+    return [page.read_text(encoding="utf-8") for page in pages()]
 
 
-def test_every_table_is_in_the_readme():
-    assert sorted(name for _, name, _ in BLOCK.findall(README.read_text(encoding="utf-8"))) == sorted(TABLES)
+def test_the_manual_is_what_the_results_say():
+    for text in texts():
+        assert {name for _, name, _ in BLOCK.findall(text)} <= set(TABLES) and BLOCK.search(text)
+        assert filled(text) == text, "`taisoft bench manual` writes it anew"
+
+
+def test_every_table_is_in_the_manual():
+    assert sorted(name for text in texts() for _, name, _ in BLOCK.findall(text)) == sorted(TABLES)
 
 
 def test_a_changed_number_is_seen(tmp_path):
     shutil.copytree(RESULTS, tmp_path / "results")
     path = next((tmp_path / "results").glob("order-*.json"))
     numbers = json.loads(path.read_text())
-    row = next(r for r in numbers["rows"] if r["case"] == readme.HANGING and r["order"] == 2)
+    row = next(r for r in numbers["rows"] if r["case"] == manual.HANGING and r["order"] == 2)
     row["measured"][0] *= 1.001
     path.write_text(json.dumps(numbers))
-    text = README.read_text(encoding="utf-8")
-    assert filled(text, tmp_path / "results") != text
+    assert [filled(text, tmp_path / "results") != text for text in texts()].count(True) == 1
 
 
 def test_marked_parts_are_made_anew_and_the_rest_stays(fake):
@@ -73,10 +76,12 @@ def test_the_newest_whole_results_count(tmp_path):
 
 
 def test_writes_or_tells(fake, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(readme, "README", tmp_path / "README.md")
-    with pytest.raises(OutputError, match="README.md"):
-        readme.main([])
-    readme.README.write_text(TEXT)
-    assert readme.main(["--check"]) == 1 and readme.README.read_text() == TEXT
-    assert readme.main([]) == 0 and "made of" in readme.README.read_text()
-    assert readme.main(["--check"]) == 0 and "is what the results say" in capsys.readouterr().out
+    monkeypatch.setattr(manual, "DOCS", tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text("no table")
+    with pytest.raises(OutputError, match="no page with tables"):
+        manual.main([])
+    page.write_text(TEXT)
+    assert manual.main(["--check"]) == 1 and page.read_text() == TEXT
+    assert manual.main([]) == 0 and "made of" in page.read_text()
+    assert manual.main(["--check"]) == 0 and "agrees with the results" in capsys.readouterr().out
