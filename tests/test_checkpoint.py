@@ -295,10 +295,10 @@ def damped(scene):
 @pytest.mark.parametrize(
     "change, told",
     [
-        (renamed, 'its bodies are ["beam", "flyer"], those of this scene ["beam", "fly"]'),
+        (renamed, 'its bodies are ["beam", "flyer"], those here ["beam", "fly"]'),
         (reordered, 'this scene ["flyer", "beam"]'), (with_other_mesh, "in body 'flyer': mesh"),
         (held, "in body 'flyer': constraints"), (loaded, "in body 'flyer': loads"),
-        (with_obstacle, 'its obstacles are [], those of this scene ["floor"]'),
+        (with_obstacle, 'its obstacles are [], those here ["floor"]'),
         (with_other_law, "in body 'flyer': order, quadrature, law"),
         (damped, "body 'flyer': mass_damping is 0.1 in this scene and was 0.0 at the start"),
     ],
