@@ -296,7 +296,7 @@ def damped(scene):
     "change, told",
     [
         (renamed, 'its bodies are ["beam", "flyer"], those here ["beam", "fly"]'),
-        (reordered, 'this scene ["flyer", "beam"]'), (with_other_mesh, "in body 'flyer': mesh"),
+        (reordered, 'those here ["flyer", "beam"]'), (with_other_mesh, "in body 'flyer': mesh"),
         (held, "in body 'flyer': constraints"), (loaded, "in body 'flyer': loads"),
         (with_obstacle, 'its obstacles are [], those here ["floor"]'),
         (with_other_law, "in body 'flyer': order, quadrature, law"),
