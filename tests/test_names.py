@@ -1,0 +1,45 @@
+"""Names stay the field's: what the code was once called does not come back.
+
+Identifiers are read from the source by Python's tokenizer, so comments and sentences may use the words.
+"""
+
+import io
+import tokenize
+from pathlib import Path
+
+import pytest
+
+import taisoft
+
+PACKAGE = Path(taisoft.__file__).parent
+FORMER = {
+    # former name: the one to use
+    "led": "prescribed", "led_nodes": "prescribed_nodes", "leads": "has_prescribed", "let_go": "release", "letting_go": "releasing",
+    "told": "what it is: a message, a report, a list of warnings", "told_warnings": "printed_warnings", "tell_locking": "warn_locking",
+    "World": "SimulationState", "Motion": "DirichletConditions", "Pull": "DragSpring", "Grip": "Drag", "pullable": "draggable",
+    "pulled": "dragged", "Stretch": "TimedRun", "Strip": "PlotOverlay", "Ask": "Request", "Left": "Interrupted",
+    "Shown": "DisplayOptions", "SUNK": "DEEP_PENETRATION", "SANK": "NOTICEABLE_PENETRATION", "sinking": "relative_penetration",
+    "HASTE": "MAX_CLOSING_RATIO", "survey": "measure_closing", "find_way": "find_displacement", "way_out": "exit_direction",
+    "STANDOFF": "CONTACT_OFFSET", "standoff": "contact_offset", "short_of_goal": "gap_minus_target", "carry": "obstacle_displacement",
+    "lag": "tangential_offset", "misfit": "prox_residual", "go_beyond": "extrapolate_impulse", "against": "restart_test",
+    "obey": "apply_verdict", "sticks_out": "in_normal_cone", "hit_by": "contact_mode", "unfinite": "nonfinite", "fence": "safe_meshio",
+    "read_fenced": "read_safely", "scene_marks": "scene_fingerprint", "MAX_PARTS": "MAX_SUBSTEPS",
+}  # fmt: skip
+
+
+def identifiers(path: Path) -> set[str]:
+    """All names in a file's code, and the file's own."""
+    tokens = tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline)
+    return {token.string for token in tokens if token.type == tokenize.NAME} | {path.stem}
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_no_former_name(path):
+    found = identifiers(path) & set(FORMER)
+    assert not found, "; ".join(f"{name}: use {FORMER[name]}" for name in sorted(found))
+
+
+def test_the_scan_sees_names_and_no_words(tmp_path):
+    path = tmp_path / "fence.py"
+    path.write_text('def told(standoff):  # of a carry\n    """The goal is told."""\n    return f"{standoff} survey"\n')
+    assert {"told", "standoff", "fence"} <= identifiers(path) and not {"carry", "goal", "survey"} & identifiers(path)
