@@ -157,7 +157,7 @@ def edge_contact(s: ti.template(), mode: ti.template(), t, k, u, m, margin, out:
                 n = unit(c)
                 f, g, _ = closest_lines(a0, a1, b0, b1)
                 gap = (a0 - b0).dot(n)
-                overhang = (1.0 - shift) * ti.cast(MAX_MISS, ti.f64) * ti.abs(gap)  # only if they penetrate now
+                overhang = (1.0 - shift) * ti.cast(MAX_MISS, ti.f64) * ti.abs(gap)  # 0 at the end of the step
                 # cheap test first: most pairs do not cross, whichever is above
                 good = int(-overhang <= f * la <= la + overhang) & int(-overhang <= g * lb <= lb + overhang)
                 if good == 1:

@@ -134,7 +134,9 @@ class Detection:
             kind = "bvh" if runtime.arch == "cpu" and few_colliders else "spatial_hash"
         if kind == "bvh":
             x = self._rest + self._start_shift()
-            return Bvh(s, self.topology, x, self.reach, runtime, self._arena, settings.k_dop, capacity=limits[0], most=limits[1])
+            return Bvh(
+                s, self.topology, x, self.reach, runtime, self._arena, settings.k_dop, capacity=limits[0], max_capacity=limits[1]
+            )
         extent = np.ptp((self._rest + self._start_shift())[self.topology.triangle].reshape(-1, 3), axis=0)
         return SpatialHash(s, self._arena, settings.cell_ratio * self.edge, extent, *limits)
 
