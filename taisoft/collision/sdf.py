@@ -1,8 +1,8 @@
 """Contacts with soft bodies by their signed distance at rest, mapped by the deformation (report, section 2.3.2).
 
 A point near body B maps to B's material space through the tet behind the nearest of B's surface triangles near it:
-X = X0 + F^-1 (x - x0). There phi is interpolated on a grid. In the world the normal is F^-T grad phi, normalised (a covector), and
-the gap phi / |F^-T grad phi|. Vertices of A are contacts if the normal lies in their normal cone. A triangle adds its deepest
+X = X0 + F^-1 (x - x0). There phi is interpolated on a grid. In the world the normal is F^-T grad phi, normalised (a covector),
+and the gap phi / |F^-T grad phi|. Vertices of A are contacts if the normal lies in their normal cone. A triangle adds its deepest
 point if that is deeper than its corners: one Frank-Wolfe solve per (triangle, body), skipped if phi at the corners excludes it.
 Weak: a grid rounds edges (crossing sharp edges are left to `proximity`), and far from rest phi is no longer a distance.
 """
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.collision.analytic import DEEPER, deeper_inside
+from taisoft.collision.analytic import MIN_EXTRA_DEPTH, is_surface_minimum
 from taisoft.collision.boxes import list_near, sum_pairs
 from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import FACE_FIELD, VERTEX_FIELD, write_contact
@@ -177,7 +177,7 @@ def _field_contacts(
                 v, value = deepest_point(f, k, A, B, C, phi)
                 for i in ti.static(range(3)):
                     w[i] = v[i]
-                accepted = value < phi.min() - ti.cast(DEEPER, ti.f64) * reach and w.max() < 1.0 - 1e-6
+                accepted = value < phi.min() - ti.cast(MIN_EXTRA_DEPTH, ti.f64) * reach and w.max() < 1.0 - 1e-6
         if accepted:
             x = w[0] * corner(s, t, 0) + w[1] * corner(s, t, 1) + w[2] * corner(s, t, 2)
             u = _nearest(s, f, entry, first, last, x)
@@ -211,7 +211,7 @@ def _field_contacts(
                         if j < 3:
                             valid = in_normal_cone(s, i, n)
                         else:
-                            valid = deeper_inside(s, t, w, n, x)
+                            valid = is_surface_minimum(s, t, w, n, x)
                         if valid == 1 and j < 3:
                             write_contact(
                                 out, at, end, own, other, ivec(VERTEX_FIELD, i, other), x, n, gap,
