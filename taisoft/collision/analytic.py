@@ -61,8 +61,8 @@ def is_surface_minimum(s: ti.template(), t, w, n, x):
     """1 if the deepest point x of triangle t, weights w, is also a local minimum of the whole surface that faces n.
 
     To within ALIGNMENT_SINE, n must oppose the triangle's normal at an interior point and be perpendicular to the edge at a point
-    on an edge: at a kink of phi, as in the middle of a box, no gradient gives the exit direction. On an edge, the neighbour must not
-    lie deeper, and only the triangle that owns the edge accepts.
+    on an edge: at a kink of phi, as in the middle of a box, no gradient gives the exit direction. On an edge, the neighbour must
+    not lie deeper, and only the triangle that owns the edge accepts.
     """
     facing = s.normal[t]
     valid = 1

@@ -73,14 +73,14 @@ class Buffer:
         needed = self.count[NEEDED]
         if needed <= self.part:
             return False
-        wanted = needed * self.chunks
-        if self.max_capacity is not None and wanted > self.max_capacity:
+        required = needed * self.chunks
+        if self.max_capacity is not None and required > self.max_capacity:
             raise SimulationError(
-                f"{self.name}: {wanted} entries are needed ({self.chunks} parts of {needed}), "
+                f"{self.name}: {required} entries are needed ({self.chunks} parts of {needed}), "
                 f"and max_capacity allows {self.max_capacity}"
             )
         self.growths += 1
-        self._allocate(int(SLACK * wanted))
+        self._allocate(int(SLACK * required))
         return True
 
     def clear(self) -> None:

@@ -91,11 +91,11 @@ def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:
 @ti.func
 def _lowest_vertex(nodes):
     """Lowest vertex that is not -1."""
-    least = nodes[0]
+    lowest = nodes[0]
     for k in ti.static(range(1, 3)):
-        if nodes[k] >= 0 and nodes[k] < least:
-            least = nodes[k]
-    return least
+        if nodes[k] >= 0 and nodes[k] < lowest:
+            lowest = nodes[k]
+    return lowest
 
 
 @ti.func
@@ -124,12 +124,12 @@ def write_contact(out: ti.template(), at, last, body_a, body_b, feature, point_a
 
 @kernel
 def gather_contacts(
-    out: ti.template(), place: ti.template(), n: ti.i32, floats: ti.types.ndarray(), integers: ti.types.ndarray()
+    out: ti.template(), index: ti.template(), n: ti.i32, floats: ti.types.ndarray(), integers: ti.types.ndarray()
 ):  # fmt: skip
-    """Copy the contacts place[:n] for `gather`: floats (n,13) and integers (n,11)."""
+    """Copy the contacts index[:n] for `gather`: floats (n,13) and integers (n,11)."""
     ti.loop_config(serialize=True)
     for i in range(n):
-        at = place[i]
+        at = index[i]
         floats[i, 12] = out.gap[at]
         for q in ti.static(range(3)):
             floats[i, q], floats[i, 3 + q] = out.point[at][q], out.normal[at][q]
@@ -140,12 +140,12 @@ def gather_contacts(
             integers[i, q] = out.body[at][q]
 
 
-def gather(out: ContactFields, place: Any, n: int) -> dict[str, np.ndarray]:
-    """Download the contacts at the buffer indices place[:n], (n, ...) each: point, normal, gap, body, feature, and nodes and
+def gather(out: ContactFields, index: Any, n: int) -> dict[str, np.ndarray]:
+    """Download the contacts at the buffer indices index[:n], (n, ...) each: point, normal, gap, body, feature, and nodes and
     weights (n,6) of both sides."""
     floats, integers = np.zeros((n, 13)), np.zeros((n, 11), dtype=np.int32)
     if n:
-        gather_contacts(out, place, n, floats, integers)
+        gather_contacts(out, index, n, floats, integers)
     return {
         "point": floats[:, :3], "normal": floats[:, 3:6], "weights": floats[:, 6:12], "gap": floats[:, 12],
         "body": integers[:, :2], "feature": integers[:, 2:5], "nodes": integers[:, 5:],

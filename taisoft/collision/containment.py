@@ -166,6 +166,6 @@ def _round_depths(shape: Sphere | Capsule, points: np.ndarray) -> np.ndarray:
     """Depths (n,) [m] of points (n,3) in a sphere or a capsule, in its frame; negative outside."""
     along = np.zeros(len(points))
     if isinstance(shape, Capsule):
-        half = shape.size()[0]
-        along = np.clip(points[:, 0], -half, half)
+        half_length = shape.size()[0]
+        along = np.clip(points[:, 0], -half_length, half_length)
     return shape.radius - np.linalg.norm(points - along[:, None] * np.array([1.0, 0.0, 0.0]), axis=1)

@@ -81,14 +81,14 @@ def _covered_by_end(s: ti.template(), t, k, p, position, length, gap, u, m, n, b
     if gap < 0.0:
         for e in range(2):
             i = s.triangle[t, (k + e) % 3]
-            good = int(ti.select(e == 0, position, length - position) <= end_range)
-            if good == 1 and by_faces == 1:
-                good = (s.inside[i] >> (s.body[u] % INSIDE_BITS)) & 1
-                if good == 1:
-                    good = _is_freed(s, p, i, u, m, gap)
-            if good == 1:
-                good = _is_behind(s, i, length, u, m, ti.cast(0.0, ti.f64))
-            if good == 1:
+            valid = int(ti.select(e == 0, position, length - position) <= end_range)
+            if valid == 1 and by_faces == 1:
+                valid = (s.inside[i] >> (s.body[u] % INSIDE_BITS)) & 1
+                if valid == 1:
+                    valid = _is_freed(s, p, i, u, m, gap)
+            if valid == 1:
+                valid = _is_behind(s, i, length, u, m, ti.cast(0.0, ti.f64))
+            if valid == 1:
                 covered = covered | in_normal_cone(s, i, n)
     return covered
 
@@ -100,11 +100,11 @@ def _within(s: ti.template(), t, k, position, length, overhang, u, m):
     Edges of two bodies side by side also cross beyond their ends, one below the other, without penetration.
     """
     beyond = ti.min(overhang, ti.cast(MAX_OVERHANG, ti.f64) * length)
-    good = int(-beyond <= position <= length + beyond)
-    if good == 1 and (position < 0.0 or position > length):
+    valid = int(-beyond <= position <= length + beyond)
+    if valid == 1 and (position < 0.0 or position > length):
         e = int(position > length)
-        good = _is_behind(s, s.triangle[t, (k + e) % 3], length, u, m, ti.cast(END_SLACK, ti.f64))
-    return good
+        valid = _is_behind(s, s.triangle[t, (k + e) % 3], length, u, m, ti.cast(END_SLACK, ti.f64))
+    return valid
 
 
 @ti.func
@@ -116,12 +116,12 @@ def _move(s: ti.template(), t, k, f):
 @ti.func
 def _moves_enough(s: ti.template(), t, k, u, m):
     """1 if two edges move relative to each other by more than MIN_MOTION in the step; skips the second test for edges at rest."""
-    far = ti.cast(0.0, ti.f64)
+    max_motion = ti.cast(0.0, ti.f64)
     for i in range(2):
         for j in range(2):
-            far = ti.max(far, (_move(s, t, k, ti.cast(i, ti.f64)) - _move(s, u, m, ti.cast(j, ti.f64))).norm())
+            max_motion = ti.max(max_motion, (_move(s, t, k, ti.cast(i, ti.f64)) - _move(s, u, m, ti.cast(j, ti.f64))).norm())
     shorter = ti.min((corner(s, t, k + 1) - corner(s, t, k)).norm(), (corner(s, u, m + 1) - corner(s, u, m)).norm())
-    return int(far > ti.cast(MIN_MOTION, ti.f64) * shorter)
+    return int(max_motion > ti.cast(MIN_MOTION, ti.f64) * shorter)
 
 
 @ti.func
@@ -143,10 +143,10 @@ def edge_contact(s: ti.template(), mode: ti.template(), t, k, u, m, margin, out:
     `find_proximity`. Return the new count."""
     at = start
     for at_end in range(2):
-        good = int(at == start)
-        if at_end == 1 and good == 1:
-            good = _moves_enough(s, t, k, u, m)
-        if good == 1:
+        valid = int(at == start)
+        if at_end == 1 and valid == 1:
+            valid = _moves_enough(s, t, k, u, m)
+        if valid == 1:
             shift, closing = ti.cast(at_end, ti.f64), ti.cast(0.0, ti.f64)
             a0, a1 = corner(s, t, k) + shift * _move(s, t, k, 0.0), corner(s, t, k + 1) + shift * _move(s, t, k, 1.0)
             b0, b1 = corner(s, u, m) + shift * _move(s, u, m, 0.0), corner(s, u, m + 1) + shift * _move(s, u, m, 1.0)
@@ -159,8 +159,8 @@ def edge_contact(s: ti.template(), mode: ti.template(), t, k, u, m, margin, out:
                 gap = (a0 - b0).dot(n)
                 overhang = (1.0 - shift) * ti.cast(MAX_MISS, ti.f64) * ti.abs(gap)  # 0 at the end of the step
                 # cheap test first: most pairs do not cross, whichever is above
-                good = int(-overhang <= f * la <= la + overhang) & int(-overhang <= g * lb <= lb + overhang)
-                if good == 1:
+                valid = int(-overhang <= f * la <= la + overhang) & int(-overhang <= g * lb <= lb + overhang)
+                if valid == 1:
                     n_t, n_u = edge_normal(s, t, k), edge_normal(s, u, m)
                     if n.dot(n_u - n_t) < 0.0:
                         n, gap = -n, -gap
@@ -168,24 +168,24 @@ def edge_contact(s: ti.template(), mode: ti.template(), t, k, u, m, margin, out:
                     overhang = ti.cast(MAX_MISS, ti.f64) * ti.max(-gap, 0.0)
                     in_range = gap - ti.max(closing, 0.0) <= margin and gap >= -_max_depth(s, t, k, u, m, f, g, la, lb)
                     if at_end == 1:  # if they come from farther away, other features are nearest by then
-                        least = -ti.cast(MIN_MOTION, ti.f64) * ti.min(la, lb)  # passed by less: still above
-                        in_range = in_range and gap < 0.0 and gap + closing > least and gap + closing <= margin
+                        min_gap = -ti.cast(MIN_MOTION, ti.f64) * ti.min(la, lb)  # passed by less: still above
+                        in_range = in_range and gap < 0.0 and gap + closing > min_gap and gap + closing <= margin
                     # both signs of n lie in the normal cone of a nearly flat edge: take the sides that face each other
-                    good = int(in_range) & int(n.dot(n_u) > 0.0) & int(n.dot(n_t) < 0.0)
+                    valid = int(in_range) & int(n.dot(n_u) > 0.0) & int(n.dot(n_t) < 0.0)
                 for side in range(2):  # one edge, then the other, so that callees are compiled once
                     t1, k1, t2, k2 = ti.select(side, u, t), ti.select(side, m, k), ti.select(side, t, u), ti.select(side, k, m)
                     position, length, along = ti.select(side, g * lb, f * la), ti.select(side, lb, la), ti.select(side, -n, n)
-                    if good == 1:
-                        good = edge_in_normal_cone(s, t2, k2, along)
-                    if good == 1 and at_end == 0:
-                        good = _within(s, t1, k1, position, length, overhang, t2, k2)
-                    if good == 1 and at_end == 0:
-                        good = 1 - _is_past_end(s, t1, k1, position, length, gap, ti.select(side, a0 + f * da, b0 + g * db))
-                    if good == 1 and at_end == 0:
+                    if valid == 1:
+                        valid = edge_in_normal_cone(s, t2, k2, along)
+                    if valid == 1 and at_end == 0:
+                        valid = _within(s, t1, k1, position, length, overhang, t2, k2)
+                    if valid == 1 and at_end == 0:
+                        valid = 1 - _is_past_end(s, t1, k1, position, length, gap, ti.select(side, a0 + f * da, b0 + g * db))
+                    if valid == 1 and at_end == 0:
                         by_faces = int(mode[s.body[t2]] == BY_FACES) | int(s.body[t1] == s.body[t2])
                         p = ti.select(side, b0 + g * db, a0 + f * da)
-                        good = 1 - _covered_by_end(s, t1, k1, p, position, length, gap, t2, k2, along, by_faces)
-                if good == 1:
+                        valid = 1 - _covered_by_end(s, t1, k1, p, position, length, gap, t2, k2, along, by_faces)
+                if valid == 1:
                     gap += shift * closing
                     # if a parameter was clamped, the contact is at that end
                     f_in, g_in = ti.min(ti.max(f, 0.0), 1.0), ti.min(ti.max(g, 0.0), 1.0)

@@ -59,17 +59,17 @@ def opposite(s: ti.template(), t, i, j):
 def in_normal_cone(s: ti.template(), i, n):
     """1 if vertex i is locally its surface's extreme point along -n, and some adjacent face has a normal opposing n."""
     x = s.x[i]
-    good = 1
+    valid = 1
     k = s.around_start[i]
-    while good == 1 and k < s.around_start[i + 1]:
+    while valid == 1 and k < s.around_start[i + 1]:
         e = s.x[s.around[k]] - x
         h = e.dot(n)
         if h < 0.0 and h * h > ti.cast(CORNER_SLACK**2, ti.f64) * e.dot(e):
-            good = 0
+            valid = 0
         k += 1
     facing = 0
     r = s.ring_start[i]
-    while good == 1 and facing == 0 and r < s.ring_start[i + 1]:
+    while valid == 1 and facing == 0 and r < s.ring_start[i + 1]:
         facing = int(s.normal[s.ring[r]].dot(n) < 0.0)
         r += 1
     return facing
@@ -79,14 +79,14 @@ def in_normal_cone(s: ti.template(), i, n):
 def nearest_of_ring(s: ti.template(), i, d):
     """1 if vertex i is locally the nearest point of its surface to the point at offset d (3,) [m] from it."""
     x = s.x[i]
-    good = 1
+    valid = 1
     k = s.around_start[i]
-    while good == 1 and k < s.around_start[i + 1]:
+    while valid == 1 and k < s.around_start[i + 1]:
         e = s.x[s.around[k]] - x
         if e.dot(d) > ti.cast(ROUNDING, ti.f64) * e.norm() * d.norm():
-            good = 0
+            valid = 0
         k += 1
-    return good
+    return valid
 
 
 @ti.func
@@ -116,7 +116,7 @@ def edge_in_normal_cone(s: ti.template(), t, k, n):
     """1 if the triangles at edge k of triangle t lie on the -n side of it, within EDGE_SLACK."""
     i, j = s.triangle[t, k], s.triangle[t, (k + 1) % 3]
     d = unit(s.x[j] - s.x[i])
-    good = 1
+    valid = 1
     for side in range(2):
         w = t
         if side == 1:
@@ -126,8 +126,8 @@ def edge_in_normal_cone(s: ti.template(), t, k, n):
             e -= e.dot(d) * d
             h = e.dot(n)
             if h > 0.0 and h * h > ti.cast(EDGE_SLACK**2, ti.f64) * e.dot(e):
-                good = 0
-    return good
+                valid = 0
+    return valid
 
 
 @ti.func

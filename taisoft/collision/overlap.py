@@ -70,12 +70,12 @@ def _solids(detection: Detection) -> list[Solid]:
 def _depth_in_round(solid: Solid, shape: Sphere | Capsule, origin: np.ndarray, rotation: np.ndarray) -> float:
     """Penetration depth [m] of a solid and a sphere or a capsule; 0 if separate. origin (3,), rotation (3,3): its frame."""
     lo, hi = solid.box
-    half = shape.size()[0] if isinstance(shape, Capsule) else 0.0
-    ends = origin + half * np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]) @ rotation.T
+    half_length = shape.size()[0] if isinstance(shape, Capsule) else 0.0
+    ends = origin + half_length * np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]) @ rotation.T
     if (ends.max(axis=0) < lo - shape.radius).any() or (ends.min(axis=0) > hi + shape.radius).any():
         return 0.0
     inside = solid.depth_of(np.stack([*ends, origin]), lo, hi)
     if inside > 0.0:
         return max(inside, shape.radius)
-    distance = segment_distance(solid.corners, *ends) if half else float(distances(solid.corners, ends[:1])[0])
+    distance = segment_distance(solid.corners, *ends) if half_length else float(distances(solid.corners, ends[:1])[0])
     return max(0.0, shape.radius - distance)

@@ -213,14 +213,14 @@ class Detection:
     def _fill_buffer(self, near: Trees | Candidates | None) -> None:
         """Write the contacts before reduction, as many as fit."""
         s, b, row = self.surface, self.buffer, self._near_buffer
-        out, append, half = (b.data, b.used, b.count, b.part), 0, 0.5 * self.reach
+        out, append, padding = (b.data, b.used, b.count, b.part), 0, 0.5 * self.reach
         if near is not None:
             rows = (row.data, row.used, row.count, row.part)
             if self._proximity:
-                find_proximity(s, near, self._contact_mode, self._sharp, *rows, self.margin, half, *out)
+                find_proximity(s, near, self._contact_mode, self._sharp, *rows, self.margin, padding, *out)
                 append = 1
             if self._fields is not None:
-                find_in_fields(s, near, self._fields, self._sharp, *rows, self.margin, half, *out, append, self._unmapped)
+                find_in_fields(s, near, self._fields, self._sharp, *rows, self.margin, padding, *out, append, self._unmapped)
                 append = 1
         if self.shapes.count:
             find_analytic(s, self.shapes, self.margin, *out, append)

@@ -98,11 +98,11 @@ def build_fields(
     of_body = np.cumsum([g is not None for g in grids]) - 1
     of_body = np.where([g is not None for g in grids], of_body, -1)
     n = max(int(first[-1]), 1)
-    behind, place, inverse = np.zeros((n, 4)), np.zeros((n, 3)), np.zeros((n, 3, 3))
+    behind, tet_corner, inverse = np.zeros((n, 4)), np.zeros((n, 3)), np.zeros((n, 3, 3))
     for k, body in enumerate(bodies):
         rows, tets = slice(first[k], first[k + 1]), body.nodes.surface_tets
         rest = body.nodes.positions[tets]
-        behind[rows], place[rows] = tets + node_start[k], rest[:, 0]
+        behind[rows], tet_corner[rows] = tets + node_start[k], rest[:, 0]
         inverse[rows] = np.linalg.inv((rest[:, 1:] - rest[:, :1]).transpose(0, 2, 1))
     count = max(len(used), 1)
     blank = np.zeros((1, 3))
@@ -116,7 +116,7 @@ def build_fields(
                     np.concatenate([g.phi.reshape(-1) for g in used]).astype(npr) if used else None),
         x,
         arena.vectors("field_behind", ti.i32, n, behind.astype(np.int32), n=4),
-        arena.vectors("field_corner", ti.f64, n, place),
+        arena.vectors("field_corner", ti.f64, n, tet_corner),
         arena.vectors("field_inverse", ti.f64, 3 * n, inverse.reshape(-1, 3)),
     )  # fmt: skip
 
@@ -124,17 +124,17 @@ def build_fields(
 @ti.func
 def _nearest(s: ti.template(), f: ti.template(), entry: ti.template(), first, last, p):
     """Return the triangle of entry[first:last] nearest to p whose tet is not inverted, -1 if there is none."""
-    found, least = -1, ti.cast(ti.math.inf, ti.f64)
+    found, min_squared = -1, ti.cast(ti.math.inf, ti.f64)
     for e in range(first, last):
         u = entry[e]
         outside = ti.max(s.lo[u] - p, p - s.hi[u], 0.0)  # distance to its box, a lower bound of that to the triangle
-        if outside.dot(outside) < least:
+        if outside.dot(outside) < min_squared:
             a, b, c = corner(s, u, 0), corner(s, u, 1), corner(s, u, 2)
             w, _ = closest_on_triangle(p, a, b, c)
             d = p - (w[0] * a + w[1] * b + w[2] * c)
-            if d.dot(d) < least:
+            if d.dot(d) < min_squared:
                 if _gradient_of(f, u).determinant() > ti.cast(MIN_DET_F, ti.f64):
-                    least = d.dot(d)
+                    min_squared = d.dot(d)
                     found = u
     return found
 

@@ -68,8 +68,8 @@ class Intersections:
             if not found.grow_if_full():
                 break
         data, used = download([found.data, found.used])
-        places = np.arange(found.capacity)
-        return data[: found.capacity][places % found.part < np.repeat(used, found.part)]
+        indices = np.arange(found.capacity)
+        return data[: found.capacity][indices % found.part < np.repeat(used, found.part)]
 
     def release(self) -> None:
         """Free the memory of the buffer."""

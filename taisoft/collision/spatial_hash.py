@@ -53,14 +53,14 @@ def _cells_of(s: ti.template(), g: ti.template(), t, inverse):
     """First wrapped cell of a triangle's box, and the number it covers along each axis; (0, 0, 0) for a large one."""
     lo, hi = s.lo[t], s.hi[t]
     count = ivec(0)
-    far = ti.cast(0.0, ti.f64)
+    farthest = ti.cast(0.0, ti.f64)
     cells = ti.cast(1.0, ti.f64)
     for q in ti.static(range(3)):
-        far = ti.max(far, ti.max(ti.abs(lo[q]), ti.abs(hi[q])) * inverse)
+        farthest = ti.max(farthest, ti.max(ti.abs(lo[q]), ti.abs(hi[q])) * inverse)
         # the same floors as for the corner of an overlap, so that no cell is missed
         cells *= ti.min(ti.floor(hi[q] * inverse) - ti.floor(lo[q] * inverse) + 1.0, ti.cast(g.size[q], ti.f64))
     first = ivec(0)
-    if far < COUNTABLE and cells <= LARGE:
+    if farthest < COUNTABLE and cells <= LARGE:
         first = _cell_of(g, lo, inverse)
         for q in ti.static(range(3)):
             span = ti.floor(hi[q] * inverse) - ti.floor(lo[q] * inverse) + 1.0

@@ -33,28 +33,28 @@ def build_trees(centroid: np.ndarray, first: np.ndarray, leaves: int) -> TreeTab
     """Build balanced trees over centroids (t,3) of triangles. first: (colliders + 1,) first triangle of each collider."""
     count, start = np.diff(first), np.asarray(first[:-1])
     nodes = np.maximum(2 * count - 1, 0)
-    place = np.cumsum(nodes) - nodes
+    node = np.cumsum(nodes) - nodes
     link = np.zeros(int(nodes.sum()), dtype=np.int64)
-    root = np.where(count > 0, place, -1)
+    root = np.where(count > 0, node, -1)
     body = np.flatnonzero(count)
-    start, count, place, order = start[body], count[body], place[body], np.arange(first[-1])
+    start, count, node, order = start[body], count[body], node[body], np.arange(first[-1])
     above = np.ones(len(body), dtype=bool)  # whether the node lies above the chunks
     chunks, bodies, levels = [], [], []
     level = 0
     while len(count):
         begins = above & (count <= leaves)
-        chunks.append(place[begins])
+        chunks.append(node[begins])
         bodies.append(body[begins])
         above &= ~begins
-        levels.append(place[above])
+        levels.append(node[above])
         leaf = count == 1
-        link[place[leaf]] = -1 - order[start[leaf]]
-        start, count, place, body, above = (a[~leaf] for a in (start, count, place, body, above))
-        link[place] = 2 * count - 1
+        link[node[leaf]] = -1 - order[start[leaf]]
+        start, count, node, body, above = (a[~leaf] for a in (start, count, node, body, above))
+        link[node] = 2 * count - 1
         _split(order, start, count, centroid)
         left = (count + 1) // 2
         start, count = np.concatenate([start, start + left]), np.concatenate([left, count - left])
-        place, body, above = np.concatenate([place + 1, place + 2 * left]), np.tile(body, 2), np.tile(above, 2)
+        node, body, above = np.concatenate([node + 1, node + 2 * left]), np.tile(body, 2), np.tile(above, 2)
         level += 1
     levels = [x for x in levels if len(x)][::-1]
     chunk, chunk_body = np.concatenate([[], *chunks]).astype(np.int64), np.concatenate([[], *bodies]).astype(np.int64)

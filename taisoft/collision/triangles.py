@@ -179,13 +179,13 @@ def _intersect(corners):
             first = (k % 6) // 3 * 3
             p = _corner(corners, k % 6)
             a, b, c = _corner(corners, 3 - first), _corner(corners, 4 - first), _corner(corners, 5 - first)
-            tried = 1
+            test = 1
             if k < 6:
                 q = _corner(corners, first + (k + 1) % 3)
                 crosses, s = _crossing(p, q, a, b, c)
-                tried = crosses
+                test = crosses
                 p += s * (q - p)
-            if tried == 1:
+            if test == 1:
                 w, _ = closest_on_triangle(p, a, b, c)
                 offset = p - (w[0] * a + w[1] * b + w[2] * c)
         else:

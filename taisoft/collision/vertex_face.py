@@ -133,10 +133,10 @@ def vertex_contacts(
     other = s.body[entry[first]]
     inf = ti.cast(ti.math.inf, ti.f64)
     one_plus = 1.0 + ti.cast(TINY, ti.f64)
-    state, nearest, best, least = NONE, inf, -1, inf
+    state, nearest, best, min_depth = NONE, inf, -1, inf
     # BESIDE triangles count only at the overall nearest point, and only if no face there has the vertex outside
-    any_nearest, clear, nearest_beside, best_beside, least_beside = inf, 0, inf, -1, inf
-    best_facing, least_facing = -1, inf  # faces that the vertex faces, though a neighbour lies deeper
+    min_distance, outside, nearest_beside, best_beside, min_depth_beside = inf, 0, inf, -1, inf
+    best_facing, min_depth_facing = -1, inf  # of faces opposed by the vertex normal, though a neighbour lies deeper
     slack, n_best, total, exit_direction, depth = inf, dvec(0.0), dvec(0.0), dvec(0.0), inf
     normals = ti.Matrix.zero(ti.f64, MAX_TIP_FACES, 3)
     count = 0
@@ -147,19 +147,19 @@ def vertex_contacts(
     while phase <= 3:
         if q == size:  # later passes depend on the results of the first
             if phase == 0:
-                if clear == 1 and state == INSIDE:
+                if outside == 1 and state == INSIDE:
                     state = NONE
-                if clear == 0 and nearest_beside < nearest:
+                if outside == 0 and nearest_beside < nearest:
                     state = INSIDE
-                if clear == 0 and least_beside < least:
-                    least, best = least_beside, best_beside
-                if clear == 0 and best_facing >= 0:
+                if outside == 0 and min_depth_beside < min_depth:
+                    min_depth, best = min_depth_beside, best_beside
+                if outside == 0 and best_facing >= 0:
                     # a neighbour may be out on the far side already; a slight penetration never exits through the far side
-                    if state == NONE or (state == INSIDE and least_facing < ti.cast(FACING_DEPTH_RATIO, ti.f64) * least):
-                        state, least, best = INSIDE, least_facing, best_facing
+                    if state == NONE or (state == INSIDE and min_depth_facing < ti.cast(FACING_DEPTH_RATIO, ti.f64) * min_depth):
+                        state, min_depth, best = INSIDE, min_depth_facing, best_facing
                 if state == INSIDE:
                     n_best = 1.0 * s.normal[best]
-                    slack = ti.cast(1e-6, ti.f64) * least
+                    slack = ti.cast(1e-6, ti.f64) * min_depth
                     for c in ti.static(range(3)):
                         normals[0, c] = n_best[c]
                     total += n_best
@@ -171,7 +171,7 @@ def vertex_contacts(
                 if n_stored <= MAX_STORED:
                     size = n_stored
             elif phase == 1:
-                exit_direction, depth = n_best, least
+                exit_direction, depth = n_best, min_depth
                 if count > 1 and total.norm() > 0.05:
                     exit_direction, depth = unit(total), inf  # along it the vertex exits through the first face it reaches
             elif phase == 2:
@@ -192,13 +192,13 @@ def vertex_contacts(
         near = distance - closing(s, i, u, w, n) <= margin
         accepted = 0
         if phase == 0:
-            if own_near == 0 and distance <= any_nearest * one_plus:
-                if distance * one_plus < any_nearest:
-                    clear, nearest_beside, best_beside, least_beside = 0, inf, -1, inf
-                any_nearest = ti.min(any_nearest, distance)
+            if own_near == 0 and distance <= min_distance * one_plus:
+                if distance * one_plus < min_distance:
+                    outside, nearest_beside, best_beside, min_depth_beside = 0, inf, -1, inf
+                min_distance = ti.min(min_distance, distance)
                 if h > ti.cast(OUTSIDE_SLACK, ti.f64) * ti.sqrt(s.area[u]):
-                    clear = 1
-            pierced = relation == BESIDE and distance <= any_nearest * one_plus
+                    outside = 1
+            pierced = relation == BESIDE and distance <= min_distance * one_plus
             accepted = int(relation == INSIDE or pierced or (relation == OUTSIDE and near))
             if accepted == 1:
                 if n_stored < MAX_STORED:
@@ -206,38 +206,40 @@ def vertex_contacts(
                 n_stored += 1
         elif state == OUTSIDE:
             accepted = int(relation == OUTSIDE and near)
-        elif phase < 3 and (relation == INSIDE or (relation == BESIDE and clear == 0 and distance <= any_nearest * one_plus)):
+        elif phase < 3 and (relation == INSIDE or (relation == BESIDE and outside == 0 and distance <= min_distance * one_plus)):
             ridge = 0
             if relation == INSIDE:
                 ridge = _form_ridge(s, p, best, n_best, u, n, slack)
-            known = 0
+            duplicate = 0
             for k in range(count):
                 if n.dot(dvec(normals[k, 0], normals[k, 1], normals[k, 2])) > ti.cast(COPLANAR, ti.f64):
-                    known = 1
+                    duplicate = 1
             if phase == 1:
-                accepted = int(ridge == 1 and known == 0 and count < MAX_TIP_FACES and -h <= RIDGE_DEPTH_RATIO * least + slack)
-            elif known == 1 or ridge == 1:
+                accepted = int(
+                    ridge == 1 and duplicate == 0 and count < MAX_TIP_FACES and -h <= RIDGE_DEPTH_RATIO * min_depth + slack
+                )
+            elif duplicate == 1 or ridge == 1:
                 if count > 1 and n.dot(exit_direction) > 0.0:
                     depth = ti.min(depth, -h / n.dot(exit_direction))
             else:
                 # a groove's other wall; the sides of a warped plate are deeper
-                accepted = int(n.dot(n_best) > -0.5) & int(-h <= ti.cast(GROOVE_DEPTH_RATIO, ti.f64) * least + margin)
+                accepted = int(n.dot(n_best) > -0.5) & int(-h <= ti.cast(GROOVE_DEPTH_RATIO, ti.f64) * min_depth + margin)
         if accepted == 1:
             accepted = in_normal_cone(s, i, n)
-            if phase == 0 and accepted == 0 and relation == INSIDE and -h < least_facing:
+            if phase == 0 and accepted == 0 and relation == INSIDE and -h < min_depth_facing:
                 if n.dot(ring_normal(s, i)) < ti.cast(FACING, ti.f64):
-                    least_facing, best_facing = -h, u
+                    min_depth_facing, best_facing = -h, u
         gap = h
         if phase == 0 and accepted == 1:
             if relation == BESIDE:
                 nearest_beside = ti.min(nearest_beside, distance)
-                if -h < least_beside:
-                    least_beside, best_beside = -h, u
+                if -h < min_depth_beside:
+                    min_depth_beside, best_beside = -h, u
             else:
                 if distance < nearest:
                     nearest, state = distance, relation
-                if relation == INSIDE and -h < least:
-                    least, best = -h, u
+                if relation == INSIDE and -h < min_depth:
+                    min_depth, best = -h, u
         elif phase == 1 and accepted == 1:
             for c in ti.static(range(3)):
                 normals[count, c] = n[c]
