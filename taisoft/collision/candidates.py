@@ -16,7 +16,7 @@ from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
 from taisoft.runtime import kernel
 
-SLACK = 1.5  # growth: a buffer is enlarged to this times the required size
+SLACK = 1.5  # a full buffer grows to this times the required size
 NEEDED, TOTAL = 0, 1  # indices into a buffer's count
 
 

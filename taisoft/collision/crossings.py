@@ -54,18 +54,18 @@ def crossing_depth(s: ti.template(), t, u):
 @kernel
 def find_crossings(
     s: ti.template(), near: ti.template(), sharp: ti.template(), row: ti.template(), longest: ti.template(),
-    needed: ti.template(), room: ti.i32, padding: ti.f64, part: ti.template(), depths: ti.types.ndarray(),
+    needed: ti.template(), capacity: ti.i32, padding: ti.f64, part: ti.template(), depths: ti.types.ndarray(),
 ):  # fmt: skip
     """Write depths (3,): the deepest crossing [m]; the deepest relative to the finer side's mean surface edge; the number of
     triangle pairs that cross by more than CROSSED of that edge.
 
-    near, sharp, row, longest, needed, room, padding: as in the last search. part: (chunks) 3-vectors f64.
+    near, sharp, row, longest, needed, capacity, padding: as in the last search. part: (chunks) 3-vectors f64.
     """
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):
         if task % s.spread == 0:
             c = task // s.spread
-            begin, own, n_near, max_row, worst = c * room, -1, 0, 0, dvec(0.0)
+            begin, own, n_near, max_row, worst = c * capacity, -1, 0, 0, dvec(0.0)
             for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
                 t = s.active[j]
                 if s.body[t] != own:
@@ -75,9 +75,9 @@ def find_crossings(
                 for k in range(n_near):
                     other = s.near[c * s.n_bodies + k]
                     if other >= own:  # each pair is found once, by its first triangle
-                        n = list_triangles(s, near, sharp, other, t, WHOLE, lo, hi, row, begin, begin + room)
+                        n = list_triangles(s, near, sharp, other, t, WHOLE, lo, hi, row, begin, begin + capacity)
                         max_row = ti.max(max_row, n)
-                        if n <= room:
+                        if n <= capacity:
                             for e in range(begin, begin + n):
                                 if row[e] > t:
                                     d = crossing_depth(s, t, row[e])

@@ -11,10 +11,10 @@ from taisoft.collision.surface import ACTIVE, dvec, ivec
 
 BY_FIELD, BY_FACES, BY_EDGES = 0, 1, 2  # contact mode of a collider; boxes use their edges and their analytic distance
 CORNER_SLACK, EDGE_SLACK = 0.25, 0.05  # sines
-FLAT = 0.99985  # cosine of 1 degree: flatter edges are blunt, meet sharp ones only, and sink by < 0.5 % of an edge
-LEVEL = 0.9998  # cosine of 1 degree: concave edges that turn by less count as flat
+SHARP_COSINE = 0.99985  # cosine of 1 degree: flatter edges are blunt, meet sharp ones only, and sink by < 0.5 % of an edge
+FLAT_COSINE = 0.9998  # cosine of 1 degree: concave edges that turn by less count as flat
 ROUNDING = 1e-9  # cosine below which an edge counts as perpendicular to a direction; common in mirrored bodies
-SMOOTH = 0.5  # cosine of 60 degrees: FLAT for bodies with a distance field, which handles blunt edges itself
+FIELD_SHARP_COSINE = 0.5  # cosine of 60 degrees: SHARP_COSINE for bodies with a distance field, which handles blunt edges itself
 
 
 @ti.func
@@ -141,9 +141,9 @@ def mark_sharp_edges(s: ti.template(), mode: ti.template(), sharp: ti.template()
     for c in range(s.count[ACTIVE]):
         t = s.active[c]
         bits = 0
-        flat = ti.cast(FLAT, ti.f64)
+        sharp_cosine = ti.cast(SHARP_COSINE, ti.f64)
         if mode[s.body[t]] == BY_FIELD:
-            flat = SMOOTH
+            sharp_cosine = FIELD_SHARP_COSINE
         for k in range(3):
             s.inside[s.triangle[t, k]] = 0
             s.exit_direction[s.triangle[t, k]] = dvec(0.0)
@@ -156,9 +156,9 @@ def mark_sharp_edges(s: ti.template(), mode: ti.template(), sharp: ti.template()
                     n = s.normal[t]
                     cosine = n.dot(s.normal[w])
                     out = (s.x[opposite(s, w, i, j)] - s.x[i]).dot(n) < 0.0
-                    if out and cosine < flat:
+                    if out and cosine < sharp_cosine:
                         bits |= 9 << k
-                    elif cosine > ti.cast(LEVEL, ti.f64):  # flat: it may bend over a rim, unless it is rigid
+                    elif cosine > ti.cast(FLAT_COSINE, ti.f64):  # flat: it may bend over a rim, unless it is rigid
                         if mode[s.body[t]] != BY_FIELD and s.soft[s.body[t]] == 1:
                             bits |= 8 << k
                     elif out:

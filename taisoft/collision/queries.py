@@ -86,7 +86,7 @@ def list_triangles(
     """List the triangles of collider `other` near corner q of triangle t, or near all of t if q is EDGES or WHOLE.
 
     near: trees or rows; sharp: of `mark_sharp_edges`; lo, hi: of `query_box`. They are written to entry[begin:last] in ascending
-    order. Return their number, which may exceed the room.
+    order. Return their number, which may be more than fit.
     """
     at = begin
     if ti.static(near.walked):

@@ -25,7 +25,7 @@ FOUND, LEFT, UNDECIDED, MASK = 0, 1, 2, 3  # indices into the count; LEFT: kept 
 
 @dataclass(frozen=True, eq=False)
 class ReductionFields:
-    """Work space. The first count[LEFT] entries of `kept` are the kept contacts' indices in the buffer, ascending."""
+    """Workspace. The first count[LEFT] entries of `kept` are the kept contacts' indices in the buffer, ascending."""
 
     buckets: Count  # a power of two; the number in use grows with the number of contacts
     chunks: int
@@ -43,7 +43,7 @@ class ReductionFields:
 
 
 def reduction_fields(arena: FieldArena, capacity: int, chunks: int, serial: bool, spread: int = 1) -> ReductionFields:
-    """Allocate the work space for `capacity` contacts in `chunks` parts."""
+    """Allocate the workspace for `capacity` contacts in `chunks` parts."""
     buckets = 1 << max(capacity - 1, 63).bit_length()
 
     def ints(name: str, n: int):

@@ -230,7 +230,7 @@ def _field_contacts(
 @kernel(cse=False)
 def find_in_fields(
     s: ti.template(), near: ti.template(), f: ti.template(), sharp: ti.template(), row: ti.template(), longest: ti.template(),
-    needed: ti.template(), room: ti.i32, margin: ti.f64, padding: ti.f64, out: ti.template(), used: ti.template(),
+    needed: ti.template(), capacity: ti.i32, margin: ti.f64, padding: ti.f64, out: ti.template(), used: ti.template(),
     count: ti.template(), part: ti.i32, append: ti.i32, unmapped: ti.template(),
 ):  # fmt: skip
     """Write contacts with distance fields; unmapped[0] counts the (triangle, body) pairs that no tet maps. Arguments as in
@@ -240,7 +240,7 @@ def find_in_fields(
     for task in range(s.chunks * s.spread):
         if task % s.spread == 0:
             c = task // s.spread
-            at, end, begin = c * part + append * used[c], (c + 1) * part, c * room
+            at, end, begin = c * part + append * used[c], (c + 1) * part, c * capacity
             own, n_near, max_row, pairs, n_unmapped = -1, 0, append * longest[c], 0, 0
             for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
                 t = s.active[i]
@@ -251,9 +251,9 @@ def find_in_fields(
                 for k in range(n_near):
                     other = s.near[c * s.n_bodies + k]
                     if f.of_body[other] >= 0 and other != own:
-                        n = list_triangles(s, near, sharp, other, t, WHOLE, lo, hi, row, begin, begin + room)
+                        n = list_triangles(s, near, sharp, other, t, WHOLE, lo, hi, row, begin, begin + capacity)
                         max_row, pairs = ti.max(max_row, n), pairs + n
-                        if 0 < n <= room:
+                        if 0 < n <= capacity:
                             at, failed = _field_contacts(s, f, row, begin, begin + n, t, margin, out, at, end)
                             n_unmapped += failed
             used[c], longest[c], s.part[c] = at - c * part, max_row, pairs

@@ -19,7 +19,7 @@ from taisoft.collision.surface import ACTIVE, Surface, boxes_overlap, ivec, may_
 from taisoft.fields import FieldArena
 from taisoft.runtime import kernel
 
-LARGE = 512  # cells
+LARGE = 512  # cells above which a triangle counts as large
 COUNTABLE = 2.0**50  # cells from the origin beyond which f64 cannot distinguish neighbouring cells
 MAX_CELLS = 2**22
 CELLS_PER_TRIANGLE = 2

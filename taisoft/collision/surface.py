@@ -29,7 +29,7 @@ ivec = ti.types.vector(3, ti.i32)
 
 @dataclass(frozen=True)
 class Topology:
-    """Triangles on the host. Surface vertices are numbered over all colliders.
+    """Triangles on the host. Vertices are numbered over all colliders, surface vertices only.
 
     triangle: (t,3) vertices; body: (t,) collider, ascending; first: (n_bodies + 1,) first triangle of each collider;
     vertex_first: (n_bodies + 1,) first vertex; node: (v,) the model's node, -1 for obstacles; neighbour: (t,3) triangle across

@@ -10,7 +10,7 @@ Intersection is decided by distances: of an edge's crossing of the other triangl
 Moeller and Trumbore 1997, whose barycentric coordinates are noise where edge and plane are nearly parallel), then of corners
 and edges.
 
-Source of the problems: Ericson, Real-Time Collision Detection, 2005, sections 5.1.5 and 5.1.9.
+Source of the problem statements: Ericson, Real-Time Collision Detection, 2005, sections 5.1.5 and 5.1.9.
 """
 
 import taichi as ti
@@ -32,7 +32,7 @@ def _corner(corners, k):
 
 @ti.func
 def closest_on_segment(p, a, b):
-    """Parameter t in [0, 1] of the point a + t (b - a) nearest to p; 0 where a = b. All (3,) [m]."""
+    """Parameter t in [0, 1] of the point a + t (b - a) nearest to p; 0 if a = b. All (3,) [m]."""
     d = b - a
     dd = d.dot(d)
     t = ti.cast(0.0, ti.f64)
