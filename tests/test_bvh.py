@@ -154,7 +154,7 @@ def test_buffers_grow_or_stop(rig):
     tree = Bvh(rig.surface, rig.topology, rig.x0, rig.margin, rig.machine, _arena(rig), capacity=64)
     assert np.array_equal(pairs_of(tree.find()), expected) and tree.pairs.growths and tree.rows.rows.growths
     tree.release()
-    tree = Bvh(rig.surface, rig.topology, rig.x0, rig.margin, rig.machine, _arena(rig), capacity=64, most=65)
+    tree = Bvh(rig.surface, rig.topology, rig.x0, rig.margin, rig.machine, _arena(rig), capacity=64, max_capacity=65)
     with pytest.raises(SimulationError, match="bvh_pairs: [0-9]+ entries are needed .* allows 65"):
         tree.find()
     tree.release()

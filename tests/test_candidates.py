@@ -115,7 +115,7 @@ def test_a_buffer_stops_at_its_limit(rig, arena):
     with pytest.raises(SimulationError, match=r"^things: 120 entries are needed \(3 parts of 40\), and max_capacity allows 119$"):
         buffer.grow_if_full()
     assert (buffer.capacity, buffer.growths) == (15, 0)
-    buffer.most = 120
+    buffer.max_capacity = 120
     assert buffer.grow_if_full() and buffer.capacity == 120
     assert not buffer.grow_if_full()
     buffer.release()

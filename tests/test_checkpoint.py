@@ -72,7 +72,8 @@ COUNTS = {
     "velocity_verlet": {"stepper/acceleration": lambda a: 0 * a},
     "bdf2": {"stepper/x_now": lambda x: 0 * x, "stepper/past": lambda n: 0},
 }
-COUNTS_LATE = {name: {"simulation/released": lambda r: [False] * len(r)} for name in COUNTS}  # others do not mind a second release
+# others do not mind a second release
+COUNTS_LATE = {name: {"simulation/released": lambda r: [False] * len(r)} for name in COUNTS}
 
 
 @pytest.mark.parametrize(

@@ -141,4 +141,4 @@ def test_two_bodies(arena):
         kept = ~(lost[expected[:, 0]] | lost[expected[:, 1]])
         assert np.array_equal(find(), expected[kept]) and not kept.all()
         with pytest.raises(SimulationError, match="intersections: [0-9]+ entries are needed .* allows 64"):
-            finder(made, FieldArena(), capacity=64, most=64)()
+            finder(made, FieldArena(), capacity=64, max_capacity=64)()

@@ -160,14 +160,14 @@ def test_capacities_grow_or_stop(rig, arena):
     expected, chunks = brute_pairs(rig), rig.surface.chunks
     used = SpatialHash(rig.surface, arena, 0.1, np.ones(3), capacity=64)
     members, rows = used.members, used.rows
-    for buffer, buffer.most in ((members, 64), (rows, 65)):
+    for buffer, buffer.max_capacity in ((members, 64), (rows, 65)):
         with pytest.raises(SimulationError) as stopped:
             used.find()
         needed = used.grid.cell_count.to_numpy().prod(axis=1).sum() if buffer is members else rows.count[0] * chunks
-        ending = f"\\({buffer.chunks} parts of [0-9]+\\), and max_capacity allows {buffer.most}$"
+        ending = f"\\({buffer.chunks} parts of [0-9]+\\), and max_capacity allows {buffer.max_capacity}$"
         assert re.match(f"{buffer.name}: {needed} entries are needed {ending}", str(stopped.value))
         assert needed > 500 and buffer.capacity == 64 and buffer.growths == 0
-        buffer.most = int(needed)  # just enough
+        buffer.max_capacity = int(needed)  # just enough
     assert needed >= 2 * len(expected) and (chunks > 1 or needed == 2 * len(expected))
     assert np.array_equal(pairs_of(used.find()), expected)
     assert (members.growths, rows.growths) == (1, 1) and rows.capacity == needed

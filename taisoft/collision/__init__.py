@@ -1,1 +1,1 @@
-"""From a state to a list of contacts: candidates, geometry, reduction."""
+"""Contact detection: broad-phase candidates, contact geometry, reduction."""

@@ -1,8 +1,8 @@
-"""Boxes of the surface's triangles and colliders, and which triangles can have a partner.
+"""Bounding boxes of the surface's triangles and colliders, and the list of active triangles, which can have a partner.
 
-A triangle's box holds it at the start and at the end of the step and is grown by half the margin, so that two triangles whose
-distance falls below the margin have overlapping boxes. A triangle with a coordinate that is not finite has an empty box, which
-overlaps nothing.
+A triangle's box bounds it at the start and at the end of the step and is grown by half the margin, so that two triangles whose
+distance falls below the margin have overlapping boxes. A triangle with a non-finite coordinate has an empty box, which overlaps
+nothing.
 """
 
 import taichi as ti
@@ -13,7 +13,7 @@ from taisoft.runtime import kernel
 
 @kernel
 def move_obstacles(s: ti.template(), first: ti.i32, x: ti.types.ndarray(), move: ti.types.ndarray()):
-    """Place the vertices of an obstacle, the first of which is `first`: x, move (n,3) f64 [m]."""
+    """Set positions x and displacements move, (n,3) f64 [m], of an obstacle's vertices, from vertex `first` on."""
     ti.loop_config(serialize=s.serial_cheap)
     for i in range(x.shape[0]):
         for q in ti.static(range(3)):
@@ -23,7 +23,7 @@ def move_obstacles(s: ti.template(), first: ti.i32, x: ti.types.ndarray(), move:
 
 @kernel
 def take_prescribed(s: ti.template(), prescribed: ti.template(), move: ti.types.ndarray()):
-    """How far each vertex is led in the step: move (n_verts,3) f64 [m], nan where it is not."""
+    """Store the prescribed displacements of vertices in the step: move (n_verts,3) f64 [m], nan where free."""
     ti.loop_config(serialize=s.serial_cheap)
     for i in range(s.n_verts):
         for q in ti.static(range(3)):
@@ -34,7 +34,7 @@ def take_prescribed(s: ti.template(), prescribed: ti.template(), move: ti.types.
 def _move_soft(
     s: ti.template(), x: ti.template(), v: ti.template(), has_prescribed: ti.template(), prescribed: ti.template(), dt
 ):  # fmt: skip
-    """Positions of the soft bodies, and their way: where the model leads a node that, else v dt."""
+    """Set positions and displacements of the soft bodies: prescribed ones where given, else v dt."""
     ti.loop_config(serialize=s.serial_cheap)
     for i in range(s.n_verts):
         if s.node[i] >= 0:
@@ -49,7 +49,7 @@ def _move_soft(
 
 @ti.func
 def _box_triangles(s: ti.template(), margin):
-    """Boxes, normals and areas of the triangles, and the number of those that are not finite."""
+    """Compute boxes, normals and areas of the triangles, and count the non-finite ones."""
     s.count[NONFINITE] = 0
     half = ti.cast(0.5, ti.f64) * margin
     ti.loop_config(serialize=s.serial_cheap)
@@ -62,9 +62,9 @@ def _box_triangles(s: ti.template(), margin):
         s.area[t] = length
         s.normal[t] = ti.select(length > 0.0, n / length, 0.0)
         finite = 1
-        for q in ti.static(range(3)):  # 0 times what is not finite is nan
-            none = 0.0 * a[q] + 0.0 * b[q] + 0.0 * c[q] + 0.0 * a1[q] + 0.0 * b1[q] + 0.0 * c1[q]
-            if not none == 0.0:
+        for q in ti.static(range(3)):  # 0 times a non-finite number is nan
+            zero = 0.0 * a[q] + 0.0 * b[q] + 0.0 * c[q] + 0.0 * a1[q] + 0.0 * b1[q] + 0.0 * c1[q]
+            if not zero == 0.0:
                 finite = 0
         lo, hi = dvec(ti.math.inf), dvec(-ti.math.inf)
         if finite == 1:
@@ -77,7 +77,7 @@ def _box_triangles(s: ti.template(), margin):
 
 @ti.func
 def _box_bodies(s: ti.template()):
-    """Boxes of the colliders."""
+    """Compute the boxes of the colliders."""
     ti.loop_config(serialize=s.serial_cheap)
     for task in range(s.n_bodies * s.cheap_spread):
         if task % s.cheap_spread == 0:
@@ -90,16 +90,16 @@ def _box_bodies(s: ti.template()):
 
 @ti.func
 def list_near(s: ti.template(), c, own):
-    """List the colliders that collider `own` may touch and whose boxes meet its own, ascending, itself too where it is tested
-    against itself: s.near[c * n_bodies] and on. Returns their number."""
+    """List, ascending from s.near[c * n_bodies], the colliders that collider `own` may touch and whose boxes overlap its own,
+    including itself if it is tested against itself. Return their number."""
     n = 0
     for b in range(s.n_bodies):
-        wanted = 0
+        accepted = 0
         if b == own:
-            wanted = s.self_on[own]
+            accepted = s.self_on[own]
         elif s.soft[own] | s.soft[b]:
-            wanted = int((s.body_lo[own] <= s.body_hi[b]).all()) & int((s.body_lo[b] <= s.body_hi[own]).all())
-        if wanted == 1:
+            accepted = int((s.body_lo[own] <= s.body_hi[b]).all()) & int((s.body_lo[b] <= s.body_hi[own]).all())
+        if accepted == 1:
             s.near[c * s.n_bodies + n] = b
             n += 1
     return n
@@ -107,7 +107,7 @@ def list_near(s: ti.template(), c, own):
 
 @ti.func
 def sum_pairs(s: ti.template(), append):
-    """Sum what each part has looked at; where `more` is 1 it is added to what others have."""
+    """Sum the tested pairs of all parts; if `append` is 1, add them to the previous sum."""
     total = append * s.count[PAIRS]
     for c in range(s.chunks):
         total += s.part[c]
@@ -115,8 +115,8 @@ def sum_pairs(s: ti.template(), append):
 
 
 @ti.func
-def _meets_another(s: ti.template(), t, first, last):
-    """1 where the box of a triangle meets that of one of the colliders s.near[first:last], its own too."""
+def _can_have_partner(s: ti.template(), t, first, last):
+    """1 if the box of a triangle overlaps that of a collider in s.near[first:last], its own included."""
     own, lo, hi = s.body[t], s.lo[t], s.hi[t]
     found = 0
     if (lo <= hi).all():
@@ -144,7 +144,7 @@ def _list_active(s: ti.template()):
                 if s.body[t] != own:
                     own = s.body[t]
                     n_near = list_near(s, c, own)
-                if _meets_another(s, t, near, near + n_near) == 1:
+                if _can_have_partner(s, t, near, near + n_near) == 1:
                     s.active[first + n] = t
                     n += 1
             s.part[c] = n
@@ -153,7 +153,7 @@ def _list_active(s: ti.template()):
         total = 0
         for k in range(s.chunks):
             base = part_first(k, s.n_triangles, s.chunks)
-            for j in range(s.part[k]):  # moves left only, so nothing is overwritten before it is read
+            for j in range(s.part[k]):  # entries move left only, so none is overwritten before it is read
                 s.active[total + j] = s.active[base + j]
             total += s.part[k]
         s.count[ACTIVE] = total
@@ -161,7 +161,7 @@ def _list_active(s: ti.template()):
 
 @kernel
 def update_boxes(s: ti.template(), margin: ti.f64):
-    """Boxes of triangles and colliders from x and move, normals, and the triangles that can have a partner."""
+    """Update the boxes of triangles and colliders from x and move, the normals, and the active triangles."""
     _box_triangles(s, margin)
     _box_bodies(s)
     _list_active(s)
@@ -172,8 +172,8 @@ def update_surface(
     s: ti.template(), x: ti.template(), v: ti.template(), has_prescribed: ti.template(), prescribed: ti.template(), dt: ti.f64,
     margin: ti.f64, active: ti.template(),
 ):  # fmt: skip
-    """Take the soft bodies' positions x (n_nodes) [m] and their way in a step of dt [s] from the model, and bring the boxes up to
-    date. led: of `take_led`, looked at where `leads`; active: whether those that can have a partner are listed too."""
+    """Set the soft bodies' positions x (n_nodes) [m] and displacements in a step of dt [s] from the model, and update the boxes.
+    prescribed: of `take_prescribed`, read if has_prescribed; active: whether to list the active triangles too."""
     _move_soft(s, x, v, has_prescribed, prescribed, dt)
     _box_triangles(s, margin)
     if ti.static(active):

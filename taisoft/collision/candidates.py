@@ -1,9 +1,8 @@
-"""Candidates: for every triangle the others whose boxes it meets, as rows, whichever broad phase found them.
+"""Candidates of either broad phase: for every triangle, the row of triangles whose boxes overlap its own.
 
-Rows hold both directions of a pair and ascend, so that what is done with them does not depend on threads, and on neither
-the order of the cells nor that of the tree. Buffers are parts of equal size, one for each part of the work; a part
-that is too small is counted to its end, the buffer grows to what was needed, and the search is done again: a list that was
-cut short is never used.
+Rows hold both directions of a pair and ascend, so that results do not depend on threads or on the order of cells or trees. A
+buffer has one part of equal size per chunk of the work. If a part is too small, the search still counts to its end, the buffer
+grows to the required size, and the search is repeated: a truncated list is never used.
 """
 
 from collections.abc import Callable
@@ -17,8 +16,8 @@ from taisoft.errors import SimulationError
 from taisoft.fields import FieldArena
 from taisoft.runtime import kernel
 
-SLACK = 1.5  # a buffer grows to this times what was needed
-NEEDED, TOTAL = 0, 1  # places in a buffer's count
+SLACK = 1.5  # a full buffer grows to this times the required size
+NEEDED, TOTAL = 0, 1  # indices into a buffer's count
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,18 +27,18 @@ class Candidates:
     start: Any  # (n_triangles) i32
     end: Any  # (n_triangles) i32
     entry: Any  # i32
-    walked: bool = False  # unlike trees
+    walked: bool = False  # queried by rows, unlike trees
 
 
 class Buffer:
-    """A field of entries in `chunks` equal parts that grows when one was too small.
+    """A field of entries in `chunks` equal parts that grows when one is too small.
 
-    make(arena, capacity) allocates what is kept in it. count: (2) i32, what the largest part needed, and all parts together;
+    make(arena, capacity) allocates the data. count: (2) i32, entries needed by the largest part and by all parts together;
     used: (chunks) i32, entries of each part.
     """
 
-    def __init__(self, name: str, make: Callable, capacity: int, most: int | None, chunks: int, arena: FieldArena):
-        self.name, self._make, self.most, self.chunks = name, make, most, chunks
+    def __init__(self, name: str, make: Callable, capacity: int, max_capacity: int | None, chunks: int, arena: FieldArena):
+        self.name, self._make, self.max_capacity, self.chunks = name, make, max_capacity, chunks
         self.count = arena.field(f"{name}_count", ti.i32, 2)
         self.used = arena.field(f"{name}_used", ti.i32, chunks)
         self.growths = 0
@@ -48,39 +47,40 @@ class Buffer:
 
     def _allocate(self, capacity: int) -> None:
         part = max(-(-capacity // self.chunks), 1)
-        if self.most is not None:
-            part = max(min(part, self.most // self.chunks), 1)
+        if self.max_capacity is not None:
+            part = max(min(part, self.max_capacity // self.chunks), 1)
         arena = FieldArena()
-        data = self._make(arena, part * self.chunks)  # may fail for want of memory: what was there then stays
+        data = self._make(arena, part * self.chunks)  # if this runs out of memory, the old data stay
         if self._arena is not None:
             self._arena.release()
         self._arena, self.data, self.part = arena, data, part
 
     @property
     def capacity(self) -> int:
-        """Entries that fit."""
+        """Number of entries that fit."""
         return self.part * self.chunks
 
     @property
     def bytes(self) -> int:
-        """Memory of the entries."""
+        """Memory of the entries [bytes]."""
         return sum(self._arena.bytes.values())
 
     def grow_if_full(self) -> bool:
-        """Grow where the last search did not fit; True where it has grown, so that the search must be done again.
+        """Grow if the last search did not fit. Return True if it has grown, so that the search must be repeated.
 
-        Raises SimulationError where it may not grow that far.
+        Raise SimulationError if max_capacity does not allow it.
         """
         needed = self.count[NEEDED]
         if needed <= self.part:
             return False
-        wanted = needed * self.chunks
-        if self.most is not None and wanted > self.most:
+        required = needed * self.chunks
+        if self.max_capacity is not None and required > self.max_capacity:
             raise SimulationError(
-                f"{self.name}: {wanted} entries are needed ({self.chunks} parts of {needed}), and max_capacity allows {self.most}"
+                f"{self.name}: {required} entries are needed ({self.chunks} parts of {needed}), "
+                f"and max_capacity allows {self.max_capacity}"
             )
         self.growths += 1
-        self._allocate(int(SLACK * wanted))
+        self._allocate(int(SLACK * required))
         return True
 
     def clear(self) -> None:
@@ -92,34 +92,34 @@ class Buffer:
         sum_used(self.used, self.count, self.chunks)
 
     def release(self) -> None:
-        """Give the memory back."""
+        """Free the memory."""
         self._arena.release()
 
 
 def entries(arena: FieldArena, capacity: int):
-    """A field of row entries."""
+    """Allocate a field of row entries."""
     return arena.field("entry", ti.i32, capacity)
 
 
 def pairs(arena: FieldArena, capacity: int):
-    """A field of pairs."""
+    """Allocate a field of pairs."""
     return arena.vectors("pair", ti.i32, capacity, n=2)
 
 
 @ti.func
 def sum_parts(used: ti.template(), count: ti.template(), chunks: ti.template()):
-    """What the largest part needed, and all of them."""
-    most, total = 0, 0
+    """Set `count`: the entries of the largest part, and of all parts."""
+    largest, total = 0, 0
     for c in range(chunks):
-        most = ti.max(most, used[c])
+        largest = ti.max(largest, used[c])
         total += used[c]
-    count[NEEDED] = most
+    count[NEEDED] = largest
     count[TOTAL] = total
 
 
 @kernel
 def sum_used(used: ti.template(), count: ti.template(), chunks: ti.template()):
-    """`sum_parts` on its own."""
+    """`sum_parts` as a kernel."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         sum_parts(used, count, chunks)
@@ -127,7 +127,7 @@ def sum_used(used: ti.template(), count: ti.template(), chunks: ti.template()):
 
 @ti.func
 def sort_row(entry: ti.template(), first, last):
-    """Sort entry[first:last] in place (Shell's sort: rows are short mostly, but not always)."""
+    """Sort entry[first:last] in place by Shell sort: rows are mostly short, but not always."""
     step = 1
     while step < (last - first) // 9:
         step = 3 * step + 1
@@ -135,16 +135,16 @@ def sort_row(entry: ti.template(), first, last):
         for i in range(first + step, last):
             value = entry[i]
             j = i - step
-            going = 1
-            while going == 1:
+            shifting = 1
+            while shifting == 1:
                 if j >= first:
                     if entry[j] > value:
                         entry[j + step] = entry[j]
                         j -= step
                     else:
-                        going = 0
+                        shifting = 0
                 else:
-                    going = 0
+                    shifting = 0
             entry[j + step] = value
         step //= 3
 
@@ -154,7 +154,7 @@ def pair_rows(
     s: ti.template(), pair: ti.template(), used: ti.template(), part: ti.i32, chunks: ti.template(), serial: ti.template(),
     start: ti.template(), end: ti.template(), count: ti.template(),
 ):  # fmt: skip
-    """Lengths and places of the rows that pairs give in both directions; count[NEEDED] is the sum of the lengths."""
+    """Compute starts and lengths of the rows of pairs in both directions; count[NEEDED] is the sum of the lengths."""
     ti.loop_config(serialize=serial)
     for t in range(s.n_triangles):
         end[t] = 0
@@ -196,23 +196,23 @@ def fill_rows(
 
 
 class PairRows:
-    """Turns a buffer of pairs, each once, into rows."""
+    """Convert a buffer of pairs, each listed once, into rows."""
 
-    def __init__(self, surface: Surface, arena: FieldArena, capacity: int, most: int | None):
+    def __init__(self, surface: Surface, arena: FieldArena, capacity: int, max_capacity: int | None):
         n = max(surface.n_triangles, 1)
         self.surface = surface
         self.start, self.end = arena.field("pair_rows_start", ti.i32, n), arena.field("pair_rows_end", ti.i32, n)
-        self.rows = Buffer("candidate_rows", entries, capacity, most, 1, arena)
+        self.rows = Buffer("candidate_rows", entries, capacity, max_capacity, 1, arena)
 
     def from_pairs(self, found: Buffer) -> Candidates:
-        """Rows of the pairs in a buffer, both directions, ascending."""
+        """Return rows of the pairs in a buffer, both directions, ascending."""
         s = self.surface
-        where = (found.data, found.used, found.part, found.chunks, s.serial, self.start, self.end)
-        pair_rows(s, *where, self.rows.count)
+        arguments = (found.data, found.used, found.part, found.chunks, s.serial, self.start, self.end)
+        pair_rows(s, *arguments, self.rows.count)
         self.rows.grow_if_full()
-        fill_rows(s, *where, self.rows.data)
+        fill_rows(s, *arguments, self.rows.data)
         return Candidates(self.start, self.end, self.rows.data)
 
     def release(self) -> None:
-        """Give the memory back."""
+        """Free the memory."""
         self.rows.release()

@@ -1,8 +1,8 @@
-"""Contacts: where two surfaces touch or will touch within the step, as fields for kernels and as a record for the host.
+"""Contacts of surfaces that touch or will touch within the step, as fields for kernels and as a record for the host.
 
 A contact has a side a and a side b, each a point on up to three nodes with weights that sum to 1; an obstacle is always b and
-has no nodes. The normal is a unit vector that points from b to a; the gap is the distance of the two points along it,
-negative where they penetrate. A feature names what meets what, and stays while that lasts.
+has no nodes. The normal is a unit vector from b to a; the gap is the signed distance of the two points along it, negative in
+penetration. A feature identifies the pair of mesh features in contact, and persists while they stay in contact.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ import taichi as ti
 from taisoft.fields import FieldArena
 from taisoft.runtime import kernel
 
-# kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + its number there); vertex and collider;
+# kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + local edge); vertex and collider;
 # triangle and collider
 VERTEX_FACE, EDGE_EDGE, VERTEX_FIELD, FACE_FIELD = 0, 1, 2, 3
 KINDS = ("vertex_face", "edge_edge", "vertex_field", "face_field")
@@ -29,7 +29,7 @@ class ContactFields:
     gap: Any  # f64 [m]
     body: Any  # 2-vectors i32: colliders
     feature: Any  # 3-vectors i32: kind and two ids
-    nodes_a: Any  # 3-vectors i32: vertices of the surface, -1 where there is none
+    nodes_a: Any  # 3-vectors i32: vertices of the surface, -1 for unused entries
     nodes_b: Any
     weights_a: Any  # 3-vectors f64
     weights_b: Any
@@ -37,6 +37,7 @@ class ContactFields:
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
+<<<<<<< HEAD
     """Contacts on the host, all arrays (k, ...) and in an order that does not depend on threads."""
 
     point: np.ndarray  #: (k,3) midway between the two surface points [m]
@@ -53,13 +54,38 @@ class Contacts:
     restitution: np.ndarray  #: (k,) of the pair
     found: int  #: contacts before the reduction
     unmapped: int  #: triangles whose tet is inverted, so that a distance field could not be used
+=======
+    """Contacts on the host, all arrays (k, ...), in an order that does not depend on threads.
+
+    point (k,3) [m], normal (k,3), gap (k,) [m], impulse (k,3) [N s] on a; body_a, body_b: names, an obstacle is always b;
+    nodes, weights (k,6): three for each side, the model's nodes numbered over all bodies, -1 and 0 for unused entries;
+    kind: "vertex_face", "edge_edge", "vertex_field" or "face_field"; feature (k,2): ids that persist while two features meet.
+    friction, restitution (k,): of the pair, from the scene. found: contacts before reduction; unmapped: triangles for which a
+    distance field could not be used because the tet is inverted.
+    """
+
+    point: np.ndarray
+    normal: np.ndarray
+    gap: np.ndarray
+    impulse: np.ndarray
+    body_a: np.ndarray
+    body_b: np.ndarray
+    nodes: np.ndarray
+    weights: np.ndarray
+    kind: np.ndarray
+    feature: np.ndarray
+    friction: np.ndarray
+    restitution: np.ndarray
+    found: int
+    unmapped: int
+>>>>>>> prose-1
 
     def __len__(self) -> int:
         return len(self.gap)
 
 
 def no_contacts() -> Contacts:
-    """A record of none."""
+    """Return an empty record."""
     names, integers = np.zeros(0, dtype=object), np.zeros((0, 2), dtype=np.int64)
     vectors, numbers = np.zeros((0, 3)), np.zeros(0)
     return Contacts(
@@ -69,7 +95,7 @@ def no_contacts() -> Contacts:
 
 
 def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:
-    """Room for that many contacts."""
+    """Allocate a buffer for `capacity` contacts."""
 
     def vectors(name: str, dtype, n: int = 3):
         return arena.vectors(f"contact_{name}", dtype, capacity, n=n)
@@ -82,35 +108,33 @@ def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:
 
 
 @ti.func
-def _least_vertex(nodes):
-    """The least that is not -1."""
-    least = nodes[0]
+def _lowest_vertex(nodes):
+    """Lowest vertex that is not -1."""
+    lowest = nodes[0]
     for k in ti.static(range(1, 3)):
-        if nodes[k] >= 0 and nodes[k] < least:
-            least = nodes[k]
-    return least
+        if nodes[k] >= 0 and nodes[k] < lowest:
+            lowest = nodes[k]
+    return lowest
 
 
 @ti.func
-def write_contact(
-    out: ti.template(), at, last, body_a, body_b, feature, point_a, n, gap, nodes_a, weights_a, nodes_b, weights_b
-):
-    """Write a contact where it still fits. n points from b to a.
+def write_contact(out: ti.template(), at, last, body_a, body_b, feature, point_a, n, gap, nodes_a, weights_a, nodes_b, weights_b):
+    """Write a contact if it fits. n points from b to a.
 
-    Sides are swapped so that a is the collider of least number, and in one body the side of the least vertex: what is found from
-    both sides then looks alike.
+    Sides are swapped so that a is the collider of lower index or, within one body, the side with the lowest vertex. A contact
+    found from both sides is then stored identically.
     """
     if at < last:
         out.point[at] = point_a - 0.5 * gap * n
         out.gap[at] = gap
         out.feature[at] = feature
         sign = ti.cast(1.0, ti.f64)
-        least_a, least_b = _least_vertex(nodes_a), _least_vertex(nodes_b)
-        if body_a > body_b or (body_a == body_b and least_a > least_b):
+        lowest_a, lowest_b = _lowest_vertex(nodes_a), _lowest_vertex(nodes_b)
+        if body_a > body_b or (body_a == body_b and lowest_a > lowest_b):
             sign = -1.0
         out.normal[at] = sign * n
         out.body[at] = ti.Vector([ti.min(body_a, body_b), ti.max(body_a, body_b)])
-        for q in ti.static(range(3)):  # entry by entry: the compiler fails on a vector stored as it was handed in
+        for q in ti.static(range(3)):  # entry by entry: the compiler fails when a vector argument is stored whole
             out.nodes_a[at][q] = ti.select(sign > 0.0, nodes_a[q], nodes_b[q])
             out.nodes_b[at][q] = ti.select(sign > 0.0, nodes_b[q], nodes_a[q])
             out.weights_a[at][q] = ti.select(sign > 0.0, weights_a[q], weights_b[q])
@@ -119,29 +143,29 @@ def write_contact(
 
 @kernel
 def gather_contacts(
-    out: ti.template(), place: ti.template(), n: ti.i32, real: ti.types.ndarray(), whole: ti.types.ndarray()
+    out: ti.template(), index: ti.template(), n: ti.i32, floats: ti.types.ndarray(), integers: ti.types.ndarray()
 ):  # fmt: skip
-    """`gather` for the contacts place[:n]: numbers (n,13) and integers (n,11)."""
+    """Copy the contacts index[:n] for `gather`: floats (n,13) and integers (n,11)."""
     ti.loop_config(serialize=True)
     for i in range(n):
-        at = place[i]
-        real[i, 12] = out.gap[at]
+        at = index[i]
+        floats[i, 12] = out.gap[at]
         for q in ti.static(range(3)):
-            real[i, q], real[i, 3 + q] = out.point[at][q], out.normal[at][q]
-            real[i, 6 + q], real[i, 9 + q] = out.weights_a[at][q], out.weights_b[at][q]
-            whole[i, 2 + q] = out.feature[at][q]
-            whole[i, 5 + q], whole[i, 8 + q] = out.nodes_a[at][q], out.nodes_b[at][q]
+            floats[i, q], floats[i, 3 + q] = out.point[at][q], out.normal[at][q]
+            floats[i, 6 + q], floats[i, 9 + q] = out.weights_a[at][q], out.weights_b[at][q]
+            integers[i, 2 + q] = out.feature[at][q]
+            integers[i, 5 + q], integers[i, 8 + q] = out.nodes_a[at][q], out.nodes_b[at][q]
         for q in ti.static(range(2)):
-            whole[i, q] = out.body[at][q]
+            integers[i, q] = out.body[at][q]
 
 
-def gather(out: ContactFields, place: Any, n: int) -> dict[str, np.ndarray]:
-    """The contacts at the first n places in a field of them, (n, ...) of each: point, normal, gap, body, feature, and of both
-    sides nodes and weights (n,6)."""
-    real, whole = np.zeros((n, 13)), np.zeros((n, 11), dtype=np.int32)
+def gather(out: ContactFields, index: Any, n: int) -> dict[str, np.ndarray]:
+    """Download the contacts at the buffer indices index[:n], (n, ...) each: point, normal, gap, body, feature, and nodes and
+    weights (n,6) of both sides."""
+    floats, integers = np.zeros((n, 13)), np.zeros((n, 11), dtype=np.int32)
     if n:
-        gather_contacts(out, place, n, real, whole)
+        gather_contacts(out, index, n, floats, integers)
     return {
-        "point": real[:, :3], "normal": real[:, 3:6], "weights": real[:, 6:12], "gap": real[:, 12],
-        "body": whole[:, :2], "feature": whole[:, 2:5], "nodes": whole[:, 5:],
+        "point": floats[:, :3], "normal": floats[:, 3:6], "weights": floats[:, 6:12], "gap": floats[:, 12],
+        "body": integers[:, :2], "feature": integers[:, 2:5], "nodes": integers[:, 5:],
     }  # fmt: skip

@@ -1,8 +1,8 @@
-"""How far surfaces have passed through each other where their triangles are now.
+"""Measure how deeply the triangles of surfaces cross at their present positions.
 
-No search for contacts tells that wholly: it sees faces and edges that have passed each other by less than its depth. A pair of
-triangles crosses as deep as they must part to be clear of each other, along one of their normals or along what is across an edge
-of each (Gottschalk, Lin, Manocha 1996). What only touches crosses 0 deep.
+Contact detection alone cannot measure this: it finds only faces and edges that have passed each other by less than its depth. The
+crossing depth of two triangles is the smallest separating translation along one of their normals or along the cross product of
+an edge of each (separating axis test; Gottschalk, Lin, Manocha 1996). Triangles that only touch have depth 0.
 """
 
 import taichi as ti
@@ -15,8 +15,8 @@ from taisoft.collision.surface import ACTIVE, dvec, part_first
 from taisoft.runtime import kernel
 
 PARALLEL = 1e-6  # sine below which two edges have no common normal
-CROSSED = 1e-3  # of the finer side's mean surface edge: crossings less deep do not count; contacts are solved to about that
-CROSSING_DEPTH, DEPTH_OVER_EDGE, CROSSINGS = range(3)  # places in what `find_crossings` tells
+CROSSED = 1e-3  # of the finer side's mean surface edge: depth below which crossings do not count; about the contact accuracy
+CROSSING_DEPTH, DEPTH_OVER_EDGE, CROSSINGS = range(3)  # indices in the result of `find_crossings`
 
 
 @ti.func
@@ -27,10 +27,10 @@ def _edge(s: ti.template(), t, k):
 
 @ti.func
 def crossing_depth(s: ti.template(), t, u):
-    """How far [m] triangles t and u must part to be clear of each other; 0 where they are, and where one has no area."""
-    far = ti.cast(ti.math.inf, ti.f64)
-    depth, k = far, 0
-    while k < 11 and depth > 0.0:  # two normals, nine pairs of edges; most are clear along the first
+    """Smallest separating translation [m] of triangles t and u; 0 if they are separate or one has no area."""
+    inf = ti.cast(ti.math.inf, ti.f64)
+    depth, k = inf, 0
+    while k < 11 and depth > 0.0:  # two normals, nine pairs of edges; the first axis separates most
         i, j = (k - 2) // 3, (k - 2) % 3
         first, second = _edge(s, t, ti.max(i, 0)), _edge(s, u, ti.max(j, 0))
         if k < 2:
@@ -40,7 +40,7 @@ def crossing_depth(s: ti.template(), t, u):
         length = axis.norm()
         if length > ti.cast(PARALLEL, ti.f64) * first.norm() * second.norm():
             axis /= length
-            lo_t, hi_t, lo_u, hi_u = far, -far, far, -far
+            lo_t, hi_t, lo_u, hi_u = inf, -inf, inf, -inf
             for c in range(3):
                 at_t, at_u = (corner(s, t, c) - corner(s, u, 0)).dot(axis), (corner(s, u, c) - corner(s, u, 0)).dot(axis)
                 lo_t, hi_t, lo_u, hi_u = ti.min(lo_t, at_t), ti.max(hi_t, at_t), ti.min(lo_u, at_u), ti.max(hi_u, at_u)
@@ -54,43 +54,43 @@ def crossing_depth(s: ti.template(), t, u):
 @kernel
 def find_crossings(
     s: ti.template(), near: ti.template(), sharp: ti.template(), row: ti.template(), longest: ti.template(),
-    needed: ti.template(), room: ti.i32, half: ti.f64, part: ti.template(), told: ti.types.ndarray(),
+    needed: ti.template(), capacity: ti.i32, padding: ti.f64, part: ti.template(), depths: ti.types.ndarray(),
 ):  # fmt: skip
-    """told (3,): the deepest crossing [m]; the deepest over the finer side's mean surface edge; pairs of triangles that cross
-    deeper than CROSSED of that.
+    """Write depths (3,): the deepest crossing [m]; the deepest relative to the finer side's mean surface edge; the number of
+    triangle pairs that cross by more than CROSSED of that edge.
 
-    near, sharp, row, longest, needed, room, half: as of the search that was made. part: (chunks) 3-vectors f64.
+    near, sharp, row, longest, needed, capacity, padding: as in the last search. part: (chunks) 3-vectors f64.
     """
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):
         if task % s.spread == 0:
             c = task // s.spread
-            begin, own, n_near, most, worst = c * room, -1, 0, 0, dvec(0.0)
+            begin, own, n_near, max_row, worst = c * capacity, -1, 0, 0, dvec(0.0)
             for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
                 t = s.active[j]
                 if s.body[t] != own:
                     own = s.body[t]
                     n_near = list_near(s, c, own)
-                lo, hi = query_box(s, near, t, WHOLE, half)
+                lo, hi = query_box(s, near, t, WHOLE, padding)
                 for k in range(n_near):
                     other = s.near[c * s.n_bodies + k]
-                    if other >= own:  # of two triangles the first finds the other
-                        n = list_triangles(s, near, sharp, other, t, WHOLE, lo, hi, row, begin, begin + room)
-                        most = ti.max(most, n)
-                        if n <= room:
+                    if other >= own:  # each pair is found once, by its first triangle
+                        n = list_triangles(s, near, sharp, other, t, WHOLE, lo, hi, row, begin, begin + capacity)
+                        max_row = ti.max(max_row, n)
+                        if n <= capacity:
                             for e in range(begin, begin + n):
                                 if row[e] > t:
                                     d = crossing_depth(s, t, row[e])
-                                    over = d / ti.min(s.edge[own], s.edge[other])
-                                    worst = ti.max(worst, dvec(d, over, 0.0))
-                                    worst[CROSSINGS] += ti.cast(over > CROSSED, ti.f64)
-            part[c], longest[c] = worst, most
+                                    relative = d / ti.min(s.edge[own], s.edge[other])
+                                    worst = ti.max(worst, dvec(d, relative, 0.0))
+                                    worst[CROSSINGS] += ti.cast(relative > CROSSED, ti.f64)
+            part[c], longest[c] = worst, max_row
     ti.loop_config(serialize=True)
     for _ in range(1):
         sum_parts(longest, needed, s.chunks)
         for i in range(3):
-            told[i] = 0.0
+            depths[i] = 0.0
         for c in range(s.chunks):
-            told[CROSSING_DEPTH] = ti.max(told[CROSSING_DEPTH], part[c][CROSSING_DEPTH])
-            told[DEPTH_OVER_EDGE] = ti.max(told[DEPTH_OVER_EDGE], part[c][DEPTH_OVER_EDGE])
-            told[CROSSINGS] += part[c][CROSSINGS]
+            depths[CROSSING_DEPTH] = ti.max(depths[CROSSING_DEPTH], part[c][CROSSING_DEPTH])
+            depths[DEPTH_OVER_EDGE] = ti.max(depths[DEPTH_OVER_EDGE], part[c][DEPTH_OVER_EDGE])
+            depths[CROSSINGS] += part[c][CROSSINGS]

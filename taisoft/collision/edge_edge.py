@@ -1,9 +1,9 @@
-"""Contacts of two edges that cross: where their lines are nearest, along the normal that is across both.
+"""Contacts of two crossing edges: at the nearest points of their lines, along the normal n perpendicular to both.
 
-Both edges must stick out along it. Edges that penetrate have shifted along each other, so they may cross a little beyond an end.
-Where an end lies inside the other body and the way out of its own contact frees the edge, that tells already. Edges that do not
-cross are looked at again where they will be at the end of the step, with the faces as they stand at its start: where these turn
-far within a step, the side may be taken wrongly.
+n must lie in the normal cones of both edges. Penetrating edges have shifted along each other, so they may cross slightly beyond
+an end. Skip an edge pair when an endpoint's vertex contact already separates it. Pairs that do not cross are tested again at
+their positions at the end of the step, with the face normals of its start. Weak: if faces turn far within a step, the side may
+be wrong.
 """
 
 import taichi as ti
@@ -12,28 +12,28 @@ from taisoft.collision.contacts import EDGE_EDGE, write_contact
 from taisoft.collision.features import BY_FACES, EDGE_SLACK, corner, edge_in_normal_cone, edge_normal, in_normal_cone, unit
 from taisoft.collision.surface import INSIDE_BITS, dvec, ivec
 from taisoft.collision.triangles import closest_lines
-from taisoft.collision.vertex_face import through
+from taisoft.collision.vertex_face import max_self_depth
 
-# How far beyond the ends of edges that penetrate they may cross, since they have shifted along each other: in depths, and at most
-# in lengths of the edge, since farther out the surfaces are elsewhere
-MISS, BEYOND = 2.0, 0.05
-AHEAD = 1e-3  # of the shorter edge: relative motion in a step below which nothing comes to cross that counts
+# Penetrating edges have shifted along each other and may cross beyond an end, by at most MAX_MISS depths and MAX_OVERHANG lengths
+# of the edge; the surfaces are elsewhere farther out
+MAX_MISS, MAX_OVERHANG = 2.0, 0.05
+MIN_MOTION = 1e-3  # of the shorter edge: relative motion in a step below which no new crossing counts
 CROSSING = 0.02  # sine below which two edges count as parallel
-END = 10.0  # depths from an end within which it tells of a crossing
-FREED = 0.1  # of a crossing's depth: less than that does not count once the end is out
-SHALLOW = 0.2  # of the crossed edge's length: deeper, a crossing is likely none but seen across a groove
-# Of an edge's length: an end that lies so little before the faces counts as behind them. Where a vertex passes a sharp edge, the
-# edges on both sides of it cross that a little beyond it, each along its own normal
-NEARLY = 5e-4
+END_RANGE = 10.0  # depths from an end within which the end's own contact covers a crossing
+FREED = 0.1  # of a crossing's depth: a smaller remaining depth does not count once the end is out
+SHALLOW = 0.2  # of the crossed edge's length: a deeper crossing is probably a false one across a groove
+# Of an edge's length: an end this little before the faces counts as behind them. Where a vertex passes a sharp edge, its edges on
+# both sides cross that edge slightly beyond their ends, each along its own normal
+END_SLACK = 5e-4
 TINY = 1e-9  # of lengths: rounding
 
 
 @ti.func
-def _is_behind(s: ti.template(), i, length, u, m, share):
-    """1 where vertex i, of an edge of that length, lies behind both faces at edge m of triangle u, or before them by no more than
-    a share of the length."""
+def _is_behind(s: ti.template(), i, length, u, m, fraction):
+    """1 if vertex i, of an edge of the given length, lies behind both faces at edge m of triangle u, or before them by at most
+    the given fraction of the length."""
     d = s.x[i] - corner(s, u, m)
-    slack = share * length + ti.cast(TINY, ti.f64) * (length + d.norm())
+    slack = fraction * length + ti.cast(TINY, ti.f64) * (length + d.norm())
     behind = int(d.dot(s.normal[u]) <= slack)
     v = s.neighbour[u, m]
     if v >= 0:
@@ -42,12 +42,12 @@ def _is_behind(s: ti.template(), i, length, u, m, share):
 
 
 @ti.func
-def _is_past_end(s: ti.template(), t, k, place, length, gap, q):
-    """1 where edge k of triangle t is crossed so near an end that point q of the other edge, below it, is out of the body again:
+def _is_past_end(s: ti.template(), t, k, position, length, gap, q):
+    """1 if edge k of triangle t is crossed so near an end that point q of the other edge, below it, is outside the body again:
     in front of a face at that end that the edge lies behind."""
     past = 0
     for e in range(2):
-        if ti.select(e == 0, place, length - place) < -gap:
+        if ti.select(e == 0, position, length - position) < -gap:
             i, j = s.triangle[t, (k + e) % 3], s.triangle[t, (k + 1 - e) % 3]
             r = s.ring_start[i]
             while past == 0 and r < s.ring_start[i + 1]:
@@ -59,8 +59,8 @@ def _is_past_end(s: ti.template(), t, k, place, length, gap, q):
 
 @ti.func
 def _is_freed(s: ti.template(), p, i, u, m, gap):
-    """1 where point p of an edge, which lies `gap` < 0 deep below edge m of triangle u, is carried out by what takes vertex i
-    out: to less than a tenth of that depth. One that lies deeper than SHALLOW is taken to be far from where i came in."""
+    """1 if the exit displacement of vertex i also frees point p of its edge, `gap` < 0 deep below edge m of triangle u: the depth
+    left is below FREED of that. A point deeper than SHALLOW counts as freed: it is far from where i entered."""
     d = p + s.exit_direction[i] - corner(s, u, m)
     depth = -d.dot(s.normal[u])
     v = s.neighbour[u, m]
@@ -71,85 +71,85 @@ def _is_freed(s: ti.template(), p, i, u, m, gap):
 
 
 @ti.func
-def _end_tells(s: ti.template(), t, k, p, place, length, gap, u, m, n, by_faces):
-    """1 where edge k of triangle t crosses at p so near an end that the end's own contact tells of it: it lies inside, behind
-    both faces at edge m of triangle u, sticks out along n, and once it is out the crossing is, too.
+def _covered_by_end(s: ti.template(), t, k, p, position, length, gap, u, m, n, by_faces):
+    """1 if edge k of triangle t crosses at p so near an end that the end's own contact covers it: the end is inside, behind both
+    faces at edge m of triangle u, n is in its normal cone, and moving it out removes the crossing too.
 
-    by_faces: whether vertices find their contacts with u's collider by faces, so that it is known whether this one has any.
+    by_faces: whether vertices find contacts with u's collider by faces; only then `inside` shows if the end has a contact.
     """
-    told, over = 0, -ti.cast(END, ti.f64) * gap
+    covered, end_range = 0, -ti.cast(END_RANGE, ti.f64) * gap
     if gap < 0.0:
         for e in range(2):
             i = s.triangle[t, (k + e) % 3]
-            good = int(ti.select(e == 0, place, length - place) <= over)
-            if good == 1 and by_faces == 1:
-                good = (s.inside[i] >> (s.body[u] % INSIDE_BITS)) & 1
-                if good == 1:
-                    good = _is_freed(s, p, i, u, m, gap)
-            if good == 1:
-                good = _is_behind(s, i, length, u, m, ti.cast(0.0, ti.f64))
-            if good == 1:
-                told = told | in_normal_cone(s, i, n)
-    return told
+            valid = int(ti.select(e == 0, position, length - position) <= end_range)
+            if valid == 1 and by_faces == 1:
+                valid = (s.inside[i] >> (s.body[u] % INSIDE_BITS)) & 1
+                if valid == 1:
+                    valid = _is_freed(s, p, i, u, m, gap)
+            if valid == 1:
+                valid = _is_behind(s, i, length, u, m, ti.cast(0.0, ti.f64))
+            if valid == 1:
+                covered = covered | in_normal_cone(s, i, n)
+    return covered
 
 
 @ti.func
-def _within(s: ti.template(), t, k, place, length, over, u, m):
-    """1 where edge k of triangle t is crossed between its ends, or so little beyond one as `over`, if that end lies inside.
+def _within(s: ti.template(), t, k, position, length, overhang, u, m):
+    """1 if edge k of triangle t is crossed between its ends, or at most `overhang` beyond an end that lies inside.
 
-    Of two bodies side by side the edges cross beyond their ends, too, one below the other, and nothing penetrates.
+    Edges of two bodies side by side also cross beyond their ends, one below the other, without penetration.
     """
-    beyond = ti.min(over, ti.cast(BEYOND, ti.f64) * length)
-    good = int(-beyond <= place <= length + beyond)
-    if good == 1 and (place < 0.0 or place > length):
-        e = int(place > length)
-        good = _is_behind(s, s.triangle[t, (k + e) % 3], length, u, m, ti.cast(NEARLY, ti.f64))
-    return good
+    beyond = ti.min(overhang, ti.cast(MAX_OVERHANG, ti.f64) * length)
+    valid = int(-beyond <= position <= length + beyond)
+    if valid == 1 and (position < 0.0 or position > length):
+        e = int(position > length)
+        valid = _is_behind(s, s.triangle[t, (k + e) % 3], length, u, m, ti.cast(END_SLACK, ti.f64))
+    return valid
 
 
 @ti.func
-def _way(s: ti.template(), t, k, f):
-    """How far the point a share f along edge k of triangle t goes in the step (3,) [m]."""
+def _move(s: ti.template(), t, k, f):
+    """Displacement (3,) [m] in the step of the point at parameter f of edge k of triangle t."""
     return (1.0 - f) * s.move[s.triangle[t, k]] + f * s.move[s.triangle[t, (k + 1) % 3]]
 
 
 @ti.func
-def _moves(s: ti.template(), t, k, u, m):
-    """Whether two edges move relative to each other by enough to count in the step: where most rest, that saves a look."""
-    far = ti.cast(0.0, ti.f64)
+def _moves_enough(s: ti.template(), t, k, u, m):
+    """1 if two edges move relative to each other by more than MIN_MOTION in the step; skips the second test for edges at rest."""
+    max_motion = ti.cast(0.0, ti.f64)
     for i in range(2):
         for j in range(2):
-            far = ti.max(far, (_way(s, t, k, ti.cast(i, ti.f64)) - _way(s, u, m, ti.cast(j, ti.f64))).norm())
+            max_motion = ti.max(max_motion, (_move(s, t, k, ti.cast(i, ti.f64)) - _move(s, u, m, ti.cast(j, ti.f64))).norm())
     shorter = ti.min((corner(s, t, k + 1) - corner(s, t, k)).norm(), (corner(s, u, m + 1) - corner(s, u, m)).norm())
-    return int(far > ti.cast(AHEAD, ti.f64) * shorter)
+    return int(max_motion > ti.cast(MIN_MOTION, ti.f64) * shorter)
 
 
 @ti.func
-def _deepest(s: ti.template(), t, k, u, m, f, g, la, lb):
-    """How deep [m] edges that really cross can be: of thin bodies side by side, those of the far sides cross too, as deep as both
-    are thick."""
+def _max_depth(s: ti.template(), t, k, u, m, f, g, la, lb):
+    """Largest depth [m] of a true crossing: edges on the far sides of thin bodies side by side cross too, as deep as both are
+    thick."""
     deepest = ti.cast(0.5, ti.f64) * ti.min(la, lb, s.thickness[s.body[t]], s.thickness[s.body[u]])
-    if s.body[t] == s.body[u]:  # deeper it is the body's own thickness, squeezed
+    if s.body[t] == s.body[u]:  # deeper crossings are the body's own compressed thickness
         rest = (1.0 - f) * s.rest[s.triangle[t, k]] + f * s.rest[s.triangle[t, (k + 1) % 3]]
         rest -= (1.0 - g) * s.rest[s.triangle[u, m]] + g * s.rest[s.triangle[u, (m + 1) % 3]]
-        deepest = ti.min(deepest, through(s, s.body[t], rest.norm()))
+        deepest = ti.min(deepest, max_self_depth(s, s.body[t], rest.norm()))
     return deepest
 
 
 @ti.func
-def edge_contact(s: ti.template(), way: ti.template(), t, k, u, m, margin, out: ti.template(), start, end):
-    """The contact of edge k of triangle t with edge m of triangle u, if they cross, or if they cross at the end of the step and
-    penetrate by then: a fold that slides over an edge. Its gap is that of the same points at the start. way: as in
-    `find_proximity`. Returns the new count."""
+def edge_contact(s: ti.template(), mode: ti.template(), t, k, u, m, margin, out: ti.template(), start, end):
+    """Write the contact of edge k of triangle t with edge m of triangle u if they cross now, or cross and penetrate at the end of
+    the step, as a fold that slides over an edge does. The gap is that of the same points at the start. mode: as in
+    `find_proximity`. Return the new count."""
     at = start
-    for ahead in range(2):
-        good = int(at == start)
-        if ahead == 1 and good == 1:
-            good = _moves(s, t, k, u, m)
-        if good == 1:
-            late, closing = ti.cast(ahead, ti.f64), ti.cast(0.0, ti.f64)
-            a0, a1 = corner(s, t, k) + late * _way(s, t, k, 0.0), corner(s, t, k + 1) + late * _way(s, t, k, 1.0)
-            b0, b1 = corner(s, u, m) + late * _way(s, u, m, 0.0), corner(s, u, m + 1) + late * _way(s, u, m, 1.0)
+    for at_end in range(2):
+        valid = int(at == start)
+        if at_end == 1 and valid == 1:
+            valid = _moves_enough(s, t, k, u, m)
+        if valid == 1:
+            shift, closing = ti.cast(at_end, ti.f64), ti.cast(0.0, ti.f64)
+            a0, a1 = corner(s, t, k) + shift * _move(s, t, k, 0.0), corner(s, t, k + 1) + shift * _move(s, t, k, 1.0)
+            b0, b1 = corner(s, u, m) + shift * _move(s, u, m, 0.0), corner(s, u, m + 1) + shift * _move(s, u, m, 1.0)
             da, db = a1 - a0, b1 - b0
             c = da.cross(db)
             la, lb = da.norm(), db.norm()
@@ -157,39 +157,39 @@ def edge_contact(s: ti.template(), way: ti.template(), t, k, u, m, margin, out: 
                 n = unit(c)
                 f, g, _ = closest_lines(a0, a1, b0, b1)
                 gap = (a0 - b0).dot(n)
-                over = (1.0 - late) * ti.cast(MISS, ti.f64) * ti.abs(gap)  # what penetrates has shifted along the edges
-                # most pairs do not cross, whichever of them is above: that takes longer to tell
-                good = int(-over <= f * la <= la + over) & int(-over <= g * lb <= lb + over)
-                if good == 1:
+                overhang = (1.0 - shift) * ti.cast(MAX_MISS, ti.f64) * ti.abs(gap)  # 0 at the end of the step
+                # cheap test first: most pairs do not cross, whichever is above
+                valid = int(-overhang <= f * la <= la + overhang) & int(-overhang <= g * lb <= lb + overhang)
+                if valid == 1:
                     n_t, n_u = edge_normal(s, t, k), edge_normal(s, u, m)
                     if n.dot(n_u - n_t) < 0.0:
                         n, gap = -n, -gap
-                    closing = -(_way(s, t, k, f) - _way(s, u, m, g)).dot(n)
-                    over = ti.cast(MISS, ti.f64) * ti.max(-gap, 0.0)
-                    near = gap - ti.max(closing, 0.0) <= margin and gap >= -_deepest(s, t, k, u, m, f, g, la, lb)
-                    if ahead == 1:  # of what comes from farther away others are the nearest then
-                        least = -ti.cast(AHEAD, ti.f64) * ti.min(la, lb)  # what is so little past each other counts as above
-                        near = near and gap < 0.0 and gap + closing > least and gap + closing <= margin
-                    # a nearly flat edge sticks out along either normal: the sides that look at each other count
-                    good = int(near) & int(n.dot(n_u) > 0.0) & int(n.dot(n_t) < 0.0)
-                for side in range(2):  # one edge, then the other, so that what is called is compiled once
+                    closing = -(_move(s, t, k, f) - _move(s, u, m, g)).dot(n)
+                    overhang = ti.cast(MAX_MISS, ti.f64) * ti.max(-gap, 0.0)
+                    in_range = gap - ti.max(closing, 0.0) <= margin and gap >= -_max_depth(s, t, k, u, m, f, g, la, lb)
+                    if at_end == 1:  # if they come from farther away, other features are nearest by then
+                        min_gap = -ti.cast(MIN_MOTION, ti.f64) * ti.min(la, lb)  # passed by less: still above
+                        in_range = in_range and gap < 0.0 and gap + closing > min_gap and gap + closing <= margin
+                    # both signs of n lie in the normal cone of a nearly flat edge: take the sides that face each other
+                    valid = int(in_range) & int(n.dot(n_u) > 0.0) & int(n.dot(n_t) < 0.0)
+                for side in range(2):  # one edge, then the other, so that callees are compiled once
                     t1, k1, t2, k2 = ti.select(side, u, t), ti.select(side, m, k), ti.select(side, t, u), ti.select(side, k, m)
-                    place, length, along = ti.select(side, g * lb, f * la), ti.select(side, lb, la), ti.select(side, -n, n)
-                    if good == 1:
-                        good = edge_in_normal_cone(s, t2, k2, along)
-                    if good == 1 and ahead == 0:
-                        good = _within(s, t1, k1, place, length, over, t2, k2)
-                    if good == 1 and ahead == 0:
-                        good = 1 - _is_past_end(s, t1, k1, place, length, gap, ti.select(side, a0 + f * da, b0 + g * db))
-                    if good == 1 and ahead == 0:
-                        by_faces = int(way[s.body[t2]] == BY_FACES) | int(s.body[t1] == s.body[t2])
+                    position, length, along = ti.select(side, g * lb, f * la), ti.select(side, lb, la), ti.select(side, -n, n)
+                    if valid == 1:
+                        valid = edge_in_normal_cone(s, t2, k2, along)
+                    if valid == 1 and at_end == 0:
+                        valid = _within(s, t1, k1, position, length, overhang, t2, k2)
+                    if valid == 1 and at_end == 0:
+                        valid = 1 - _is_past_end(s, t1, k1, position, length, gap, ti.select(side, a0 + f * da, b0 + g * db))
+                    if valid == 1 and at_end == 0:
+                        by_faces = int(mode[s.body[t2]] == BY_FACES) | int(s.body[t1] == s.body[t2])
                         p = ti.select(side, b0 + g * db, a0 + f * da)
-                        good = 1 - _end_tells(s, t1, k1, p, place, length, gap, t2, k2, along, by_faces)
-                if good == 1:
-                    gap += late * closing
-                    # where one was clamped to an end, the contact is at that end
+                        valid = 1 - _covered_by_end(s, t1, k1, p, position, length, gap, t2, k2, along, by_faces)
+                if valid == 1:
+                    gap += shift * closing
+                    # if a parameter was clamped, the contact is at that end
                     f_in, g_in = ti.min(ti.max(f, 0.0), 1.0), ti.min(ti.max(g, 0.0), 1.0)
-                    middle = a0 + f_in * da - late * _way(s, t, k, f) - 0.5 * gap * n
+                    middle = a0 + f_in * da - shift * _move(s, t, k, f) - 0.5 * gap * n
                     if g_in != g:
                         middle = b0 + g_in * db + 0.5 * gap * n
                     f, g = f_in, g_in

@@ -1,25 +1,25 @@
-"""Corners and edges of the deformed surface: which are features at all, and towards which side they stick out.
+"""Corners and edges of the deformed surface: which are contact features, and their normal cones.
 
-A contact is a local minimum of the distance, and that can be seen from one side at a time: along the normal n, which points from
-b to a, no neighbour of a's feature may lie further towards b, and none of b's further towards a (Gauss map test). SLACK is the
-sine of the angle by which it may be missed: surfaces at rest on each other are never quite flat.
+A contact is a local minimum of the distance, which can be tested on each side separately: along the normal n, which points from b
+to a, no neighbour of a's feature may lie further towards b, and none of b's further towards a (Gauss map test). The SLACK
+constants are sines of the tolerated angle: surfaces at rest on each other are never quite flat.
 """
 
 import taichi as ti
 
 from taisoft.collision.surface import ACTIVE, dvec, ivec
 
-BY_FIELD, BY_FACES, BY_EDGES = 0, 1, 2  # how a collider is hit; a box by its edges beside its analytic distance
+BY_FIELD, BY_FACES, BY_EDGES = 0, 1, 2  # contact mode of a collider; boxes use their edges and their analytic distance
 CORNER_SLACK, EDGE_SLACK = 0.25, 0.05  # sines
-FLAT = 0.99985  # cosine of 1 degree: edges that turn by less are blunt, meet sharp ones only, and sink by < 0.5 % of an edge
-LEVEL = 0.9998  # cosine of 1 degree: edges that are hollow by less count as flat
-ROUNDING = 1e-9  # cosine below which an edge is square to a direction but for rounding: mirrored bodies have many that are
-SMOOTH = 0.5  # cosine of 60 degrees: the same for bodies hit by a distance field, which sees blunt edges itself
+SHARP_COSINE = 0.99985  # cosine of 1 degree: flatter edges are blunt, meet sharp ones only, and sink by < 0.5 % of an edge
+FLAT_COSINE = 0.9998  # cosine of 1 degree: concave edges that turn by less count as flat
+ROUNDING = 1e-9  # cosine below which an edge counts as perpendicular to a direction; common in mirrored bodies
+FIELD_SHARP_COSINE = 0.5  # cosine of 60 degrees: SHARP_COSINE for bodies with a distance field, which handles blunt edges itself
 
 
 @ti.func
 def corner(s: ti.template(), t, k):
-    """Position of corner k of triangle t, k from 0 to 3 (3 is 0 again)."""
+    """Position (3,) [m] of corner k % 3 of triangle t."""
     return s.x[s.triangle[t, k % 3]]
 
 
@@ -31,13 +31,13 @@ def vertices_of(s: ti.template(), t):
 
 @ti.func
 def moved(s: ti.template(), t, w):
-    """How far the point with weights w (3,) of triangle t goes in the step (3,) [m]."""
+    """Displacement (3,) [m] in the step of the point of triangle t with weights w (3,)."""
     return w[0] * s.move[s.triangle[t, 0]] + w[1] * s.move[s.triangle[t, 1]] + w[2] * s.move[s.triangle[t, 2]]
 
 
 @ti.func
 def unit(v):
-    """v over its length, 0 where it has none."""
+    """Normalise v; 0 if its length is 0."""
     length = v.norm()
     result = dvec(0.0)
     if length > 0.0:
@@ -47,7 +47,7 @@ def unit(v):
 
 @ti.func
 def opposite(s: ti.template(), t, i, j):
-    """The corner of triangle t that is neither vertex i nor j."""
+    """Return the vertex of triangle t that is neither i nor j."""
     found = s.triangle[t, 0]
     for k in range(1, 3):
         if found == i or found == j:
@@ -57,19 +57,19 @@ def opposite(s: ti.template(), t, i, j):
 
 @ti.func
 def in_normal_cone(s: ti.template(), i, n):
-    """1 where vertex i is its surface's furthest point against n near by, and some face there looks against n."""
+    """1 if vertex i is locally its surface's extreme point along -n, and some adjacent face has a normal opposing n."""
     x = s.x[i]
-    good = 1
+    valid = 1
     k = s.around_start[i]
-    while good == 1 and k < s.around_start[i + 1]:
+    while valid == 1 and k < s.around_start[i + 1]:
         e = s.x[s.around[k]] - x
         h = e.dot(n)
         if h < 0.0 and h * h > ti.cast(CORNER_SLACK**2, ti.f64) * e.dot(e):
-            good = 0
+            valid = 0
         k += 1
     facing = 0
     r = s.ring_start[i]
-    while good == 1 and facing == 0 and r < s.ring_start[i + 1]:
+    while valid == 1 and facing == 0 and r < s.ring_start[i + 1]:
         facing = int(s.normal[s.ring[r]].dot(n) < 0.0)
         r += 1
     return facing
@@ -77,21 +77,21 @@ def in_normal_cone(s: ti.template(), i, n):
 
 @ti.func
 def nearest_of_ring(s: ti.template(), i, d):
-    """1 where vertex i is the nearest point of its surface, near by, to the point d away from it."""
+    """1 if vertex i is locally the nearest point of its surface to the point at offset d (3,) [m] from it."""
     x = s.x[i]
-    good = 1
+    valid = 1
     k = s.around_start[i]
-    while good == 1 and k < s.around_start[i + 1]:
+    while valid == 1 and k < s.around_start[i + 1]:
         e = s.x[s.around[k]] - x
         if e.dot(d) > ti.cast(ROUNDING, ti.f64) * e.norm() * d.norm():
-            good = 0
+            valid = 0
         k += 1
-    return good
+    return valid
 
 
 @ti.func
 def ring_normal(s: ti.template(), i):
-    """Unit normal of the surface at vertex i: the mean of its triangles by their angles."""
+    """Unit normal of the surface at vertex i: angle-weighted mean of its triangles' normals."""
     total = dvec(0.0)
     for r in range(s.ring_start[i], s.ring_start[i + 1]):
         t = s.ring[r]
@@ -104,7 +104,7 @@ def ring_normal(s: ti.template(), i):
 
 @ti.func
 def edge_normal(s: ti.template(), t, k):
-    """Sum of the unit normals at edge k of triangle t."""
+    """Sum of the unit normals of the triangles at edge k of triangle t."""
     total = s.normal[t]
     if s.neighbour[t, k] >= 0:
         total += s.normal[s.neighbour[t, k]]
@@ -113,10 +113,10 @@ def edge_normal(s: ti.template(), t, k):
 
 @ti.func
 def edge_in_normal_cone(s: ti.template(), t, k, n):
-    """1 where the surface near edge k of triangle t lies against n: towards -n of it, within EDGE_SLACK."""
+    """1 if the triangles at edge k of triangle t lie on the -n side of it, within EDGE_SLACK."""
     i, j = s.triangle[t, k], s.triangle[t, (k + 1) % 3]
     d = unit(s.x[j] - s.x[i])
-    good = 1
+    valid = 1
     for side in range(2):
         w = t
         if side == 1:
@@ -126,24 +126,24 @@ def edge_in_normal_cone(s: ti.template(), t, k, n):
             e -= e.dot(d) * d
             h = e.dot(n)
             if h > 0.0 and h * h > ti.cast(EDGE_SLACK**2, ti.f64) * e.dot(e):
-                good = 0
-    return good
+                valid = 0
+    return valid
 
 
 @ti.func
-def mark_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template()):
-    """Bits 0-2 of each active triangle: edges that it owns and that stick out, open ones too; 3-5: those, and flat ones. Vertices
-    of them are inside nothing yet.
+def mark_sharp_edges(s: ti.template(), mode: ti.template(), sharp: ti.template()):
+    """Write the edge bits of each active triangle. Bits 0-2: owned edges that are convex and sharp, or open; 3-5: those and flat
+    ones. Also clear `inside` and `exit_direction` of their vertices.
 
-    way: (n_bodies) i32, 0 for bodies hit by a distance field.
+    mode: (n_bodies) i32, BY_FIELD for bodies with a distance field.
     """
     ti.loop_config(serialize=s.serial_cheap)
     for c in range(s.count[ACTIVE]):
         t = s.active[c]
         bits = 0
-        flat = ti.cast(FLAT, ti.f64)
-        if way[s.body[t]] == BY_FIELD:
-            flat = SMOOTH
+        sharp_cosine = ti.cast(SHARP_COSINE, ti.f64)
+        if mode[s.body[t]] == BY_FIELD:
+            sharp_cosine = FIELD_SHARP_COSINE
         for k in range(3):
             s.inside[s.triangle[t, k]] = 0
             s.exit_direction[s.triangle[t, k]] = dvec(0.0)
@@ -156,12 +156,12 @@ def mark_sharp_edges(s: ti.template(), way: ti.template(), sharp: ti.template())
                     n = s.normal[t]
                     cosine = n.dot(s.normal[w])
                     out = (s.x[opposite(s, w, i, j)] - s.x[i]).dot(n) < 0.0
-                    if out and cosine < flat:
+                    if out and cosine < sharp_cosine:
                         bits |= 9 << k
-                    elif cosine > ti.cast(LEVEL, ti.f64):  # level: it may bend over a rim, unless it is rigid
-                        if way[s.body[t]] != BY_FIELD and s.soft[s.body[t]] == 1:
+                    elif cosine > ti.cast(FLAT_COSINE, ti.f64):  # flat: it may bend over a rim, unless it is rigid
+                        if mode[s.body[t]] != BY_FIELD and s.soft[s.body[t]] == 1:
                             bits |= 8 << k
                     elif out:
-                        if way[s.body[t]] != BY_FIELD:
+                        if mode[s.body[t]] != BY_FIELD:
                             bits |= 8 << k
         sharp[t] = bits

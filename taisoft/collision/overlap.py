@@ -1,6 +1,6 @@
-"""Overlap at the start of a scene: how deep bodies stick in each other and in obstacles, whatever the search for contacts sees.
+"""Initial overlap of a scene: penetration depths of bodies with each other and with obstacles, at any depth.
 
-The search looks for what can touch in a step and passes over what lies deep inside. Here all pairs are looked at, on the host.
+Contact detection finds features that can touch in a step and misses deep penetration. Here all pairs are tested, on the host.
 """
 
 from dataclasses import dataclass
@@ -24,36 +24,36 @@ class Overlap:
 
 
 def find_overlaps(detection: Detection) -> list[Overlap]:
-    """The overlaps in the state that was searched last that are deeper than ALLOWED, the largest share of a size first."""
+    """Return the overlaps deeper than ALLOWED in the state of the last search, in order of decreasing relative depth."""
     colliders = detection.scene.colliders
     solids = _solids(detection)
     size = np.array([solid.size for solid in solids])
     depth: dict[tuple[int, int], float] = {}
 
-    def deepen(a: int, b: int, deep: float) -> None:
-        depth[a, b] = max(depth.get((a, b), 0.0), deep)
+    def update_depth(a: int, b: int, new_depth: float) -> None:
+        depth[a, b] = max(depth.get((a, b), 0.0), new_depth)
 
     n_bodies = len(detection.scene.bodies)
     lo, hi = (np.array(corner) for corner in zip(*(solid.box for solid in solids)))
     for a in range(n_bodies):
-        meet = ((lo[a] <= hi[a + 1 :]) & (lo[a + 1 :] <= hi[a])).all(axis=1)
-        for b in a + 1 + np.flatnonzero(meet):
-            deepen(a, int(b), overlap_depth(solids[a], solids[b]))
+        overlapping = ((lo[a] <= hi[a + 1 :]) & (lo[a + 1 :] <= hi[a])).all(axis=1)
+        for b in a + 1 + np.flatnonzero(overlapping):
+            update_depth(a, int(b), overlap_depth(solids[a], solids[b]))
     if detection.shapes.count:
         owner, origin, rotation = download([detection.shapes.body, detection.shapes.origin, detection.shapes.rotation])
         for a, k in np.ndindex(n_bodies, len(owner)):
             b, frame = int(owner[k]), (origin[k], rotation[3 * k : 3 * k + 3])
             if isinstance(colliders[b].shape, HalfSpace):
-                deepen(a, b, -float((solids[a].vertices - frame[0]).dot(frame[1][:, 1]).min()))
-            elif isinstance(colliders[b].shape, (Sphere, Capsule)):  # a box is a solid like others
-                deepen(a, b, _depth_in_round(solids[a], colliders[b].shape, *frame))
-    shares = {(a, b): deep / min(size[a], size[b]) for (a, b), deep in depth.items()}
-    pairs = sorted((pair for pair in depth if shares[pair] > ALLOWED), key=lambda pair: -shares[pair])
+                update_depth(a, b, -float((solids[a].vertices - frame[0]).dot(frame[1][:, 1]).min()))
+            elif isinstance(colliders[b].shape, (Sphere, Capsule)):  # boxes are handled as solids
+                update_depth(a, b, _depth_in_round(solids[a], colliders[b].shape, *frame))
+    relative_depth = {(a, b): new_depth / min(size[a], size[b]) for (a, b), new_depth in depth.items()}
+    pairs = sorted((pair for pair in depth if relative_depth[pair] > ALLOWED), key=lambda pair: -relative_depth[pair])
     return [Overlap(colliders[a].name, colliders[b].name, float(depth[a, b])) for a, b in pairs]
 
 
 def _solids(detection: Detection) -> list[Solid]:
-    """The colliders where the last search found them; obstacles have no tets."""
+    """Return the colliders at the positions of the last search; obstacles have no tets."""
     topology, start = detection.topology, detection.layout.node_start
     x, nodes = download([detection.surface.x, detection.model.state.x])
     solids = []
@@ -68,14 +68,14 @@ def _solids(detection: Detection) -> list[Solid]:
 
 
 def _depth_in_round(solid: Solid, shape: Sphere | Capsule, origin: np.ndarray, rotation: np.ndarray) -> float:
-    """How deep [m] a solid and a sphere or a capsule lie in each other; 0 where apart. origin (3,), rotation (3,3): its frame."""
+    """Penetration depth [m] of a solid and a sphere or a capsule; 0 if separate. origin (3,), rotation (3,3): its frame."""
     lo, hi = solid.box
-    half = shape.size()[0] if isinstance(shape, Capsule) else 0.0
-    ends = origin + half * np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]) @ rotation.T
+    half_length = shape.size()[0] if isinstance(shape, Capsule) else 0.0
+    ends = origin + half_length * np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]) @ rotation.T
     if (ends.max(axis=0) < lo - shape.radius).any() or (ends.min(axis=0) > hi + shape.radius).any():
         return 0.0
     inside = solid.depth_of(np.stack([*ends, origin]), lo, hi)
     if inside > 0.0:
         return max(inside, shape.radius)
-    away = segment_distance(solid.corners, *ends) if half else float(distances(solid.corners, ends[:1])[0])
-    return max(0.0, shape.radius - away)
+    distance = segment_distance(solid.corners, *ends) if half_length else float(distances(solid.corners, ends[:1])[0])
+    return max(0.0, shape.radius - distance)

@@ -1,10 +1,10 @@
-"""Reduction: contacts of one pair, nearer than a tolerance and with one normal, are one (report, section 3.1.3).
+"""Contact reduction: merge contacts of one pair of bodies that are within a tolerance, with one normal (report, section 3.1.3).
 
-By kind, feature and place in the list, a contact is kept unless an earlier kept one is that near: what two nested loops give.
-Here each looks only at the contacts in the cells round it, so the cost grows with their number. Cells hash into buckets;
-a cell is wider than twice the tolerance, and those that the tolerance reaches into are looked
-through too, so the result does not depend on where the cells lie. Rounds, until all are decided: a contact whose earlier
-neighbours are all dropped is kept, one with a kept earlier neighbour is dropped.
+In the order of kind, feature and position in the buffer, a contact is kept unless an earlier kept one is within the tolerance:
+the result of two nested loops. Here each contact is compared only with those in the cells around it, so the cost is linear. Cells
+hash into buckets. A cell is wider than twice the tolerance, and every cell within the tolerance is searched, so the result does
+not depend on the placement of the cells. Rounds are repeated until all contacts are decided: a contact is kept once all its
+earlier neighbours are dropped, and dropped once an earlier neighbour is kept.
 """
 
 from dataclasses import dataclass
@@ -20,30 +20,30 @@ from taisoft.runtime import kernel
 
 SAME_NORMAL = 0.996  # cosine of 5 degrees
 UNKNOWN, KEPT, DROPPED = 0, 1, 2
-FOUND, LEFT, UNDECIDED, MASK = 0, 1, 2, 3  # places in the count; MASK: buckets in use, less one
+FOUND, LEFT, UNDECIDED, MASK = 0, 1, 2, 3  # indices into the count; LEFT: kept contacts; MASK: buckets in use, minus one
 
 
 @dataclass(frozen=True, eq=False)
 class ReductionFields:
-    """Work space. The first count[LEFT] of `kept` are the contacts' places in the buffer, in its order."""
+    """Workspace. The first count[LEFT] entries of `kept` are the kept contacts' indices in the buffer, ascending."""
 
-    buckets: Count  # a power of two; as many are used as there are contacts
+    buckets: Count  # a power of two; the number in use grows with the number of contacts
     chunks: int
     serial: bool
     spread: int  # as of the surface
-    place: Any  # (capacity) i32: of the i-th contact found
-    bucket: Any  # (capacity) i32: of the i-th contact
-    bucket_start: Any  # (buckets) i32: where its members begin and end
+    place: Any  # (capacity) i32: buffer index of the i-th contact found
+    bucket: Any  # (capacity) i32: bucket of the i-th contact
+    bucket_start: Any  # (buckets) i32: range of its entries in `member`
     bucket_end: Any
-    member: Any  # (capacity) i32: places
-    state: Any  # (capacity) i32: of the contact at each place
+    member: Any  # (capacity) i32: buffer indices, by bucket
+    state: Any  # (capacity) i32: state of the contact at each buffer index
     kept: Any  # (capacity) i32
     count: Any  # (4) i32
     first: Any  # (chunks) i32: number of the first contact of each part
 
 
 def reduction_fields(arena: FieldArena, capacity: int, chunks: int, serial: bool, spread: int = 1) -> ReductionFields:
-    """Room for that many contacts in `chunks` parts."""
+    """Allocate the workspace for `capacity` contacts in `chunks` parts."""
     buckets = 1 << max(capacity - 1, 63).bit_length()
 
     def ints(name: str, n: int):
@@ -58,7 +58,7 @@ def reduction_fields(arena: FieldArena, capacity: int, chunks: int, serial: bool
 
 @ti.func
 def _cell(p, inverse):
-    """Cell of a point, wrapped so that it is a small number."""
+    """Cell of a point, wrapped to small indices."""
     cell = ivec(0)
     for q in ti.static(range(3)):
         k = ti.floor(p[q] * inverse)
@@ -75,7 +75,7 @@ def _bucket(r: ti.template(), cell):
 
 @ti.func
 def _fill_cells(r: ti.template(), out: ti.template(), used: ti.template(), part, inverse):
-    """Number the contacts of all parts through and put them into the cells."""
+    """Number the contacts over all parts and enter them into the cells."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         total = 0
@@ -115,7 +115,7 @@ def _fill_cells(r: ti.template(), out: ti.template(), used: ti.template(), part,
 
 @ti.func
 def is_same(out: ti.template(), a, b, tolerance):
-    """Whether the contacts at a and b are one."""
+    """Whether the contacts at a and b are to be merged."""
     result = False
     if (out.body[a] == out.body[b]).all():
         d = out.point[a] - out.point[b]
@@ -125,7 +125,7 @@ def is_same(out: ti.template(), a, b, tolerance):
 
 @ti.func
 def is_earlier(out: ti.template(), a, b):
-    """1 where the contact at a comes before that at b: by kind, the exact ones first, then by feature, then by place."""
+    """1 if the contact at a precedes that at b: by kind, exact ones first, then by feature, then by buffer index."""
     result = int(a < b)
     for q in ti.static((2, 1, 0)):
         if out.feature[a][q] != out.feature[b][q]:
@@ -135,7 +135,7 @@ def is_earlier(out: ti.template(), a, b):
 
 @ti.func
 def _decide(r: ti.template(), out: ti.template(), at, inverse, tolerance):
-    """State of the contact at a place by the states of the earlier ones near it."""
+    """State of the contact at a buffer index, from the states of the earlier ones near it."""
     p = out.point[at]
     lo, hi = _cell(p - tolerance, inverse), _cell(p + tolerance, inverse)
     n = ti.select(lo == hi, 1, 2)
@@ -148,11 +148,11 @@ def _decide(r: ti.template(), out: ti.template(), at, inverse, tolerance):
         for m in range(r.bucket_start[b], r.bucket_end[b]):
             other = r.member[m]
             d = p - out.point[other]
-            if d.dot(d) <= tolerance * tolerance:  # most are told apart by this
+            if d.dot(d) <= tolerance * tolerance:  # this test rejects most
                 if is_earlier(out, other, at) == 1:
-                    theirs = r.state[other]
-                    if theirs != DROPPED and is_same(out, at, other, tolerance):
-                        if theirs == KEPT:
+                    other_state = r.state[other]
+                    if other_state != DROPPED and is_same(out, at, other, tolerance):
+                        if other_state == KEPT:
                             state = DROPPED
                         elif state == KEPT:
                             state = UNKNOWN
@@ -162,7 +162,7 @@ def _decide(r: ti.template(), out: ti.template(), at, inverse, tolerance):
 
 @ti.func
 def _decide_all(r: ti.template(), out: ti.template(), inverse, tolerance):
-    """A round: decide what can be decided."""
+    """Run one round: decide every contact that can be decided."""
     r.count[UNDECIDED] = 0
     ti.loop_config(serialize=r.serial)
     for i in range(r.count[FOUND]):
@@ -177,7 +177,7 @@ def _decide_all(r: ti.template(), out: ti.template(), inverse, tolerance):
 
 @ti.func
 def _list_kept(r: ti.template()):
-    """List the kept contacts in order, when all are decided."""
+    """List the kept contacts in order, once all are decided."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         n = 0
@@ -193,7 +193,7 @@ def _list_kept(r: ti.template()):
 def begin_reduction(
     r: ti.template(), out: ti.template(), used: ti.template(), part: ti.i32, inverse: ti.f64, tolerance: ti.f64
 ):  # fmt: skip
-    """Put the contacts into the cells, and the first round; the only one, unless contacts wait for others."""
+    """Enter the contacts into the cells and run the first round; more are needed only while contacts are undecided."""
     _fill_cells(r, out, used, part, inverse)
     _decide_all(r, out, inverse, tolerance)
     _list_kept(r)
@@ -201,7 +201,7 @@ def begin_reduction(
 
 @kernel
 def decide(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64):
-    """A further round."""
+    """Run a further round."""
     _decide_all(r, out, inverse, tolerance)
     _list_kept(r)
 
@@ -209,7 +209,7 @@ def decide(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.
 def reduce_contacts(
     r: ReductionFields, out: ContactFields, used: Any, part: int, tolerance: float, cell: float
 ) -> None:  # fmt: skip
-    """Fill r.kept and r.count. tolerance [m]; cell: edge of the cells [m], widened to 2.5 times the tolerance."""
+    """Fill r.kept and r.count. tolerance [m]; cell: edge of the cells [m], at least 2.5 times the tolerance."""
     inverse = 1.0 / max(cell, 2.5 * tolerance)
     begin_reduction(r, out, used, part, inverse, tolerance)
     while r.count[UNDECIDED] > 0:

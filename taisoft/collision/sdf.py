@@ -1,11 +1,10 @@
 """Contacts with soft bodies by their signed distance at rest, mapped by the deformation (report, section 2.3.2).
 
-A point near body B goes to B's material space through the tet behind the nearest of B's surface triangles near it:
-X = X0 + F^-1 (x - x0). There phi is read from a grid. Back in the world the normal is F^-T grad phi, normalised (a covector), and
-the gap phi / |F^-T grad phi|. Vertices of A are contacts where its surface sticks out towards B; a triangle adds its deepest
-point where that lies deeper than its corners: one Frank-Wolfe solve for each (triangle, body), and none where phi at the
-corners excludes it. Weak: a grid rounds edges (sharp ones that cross are left to `proximity`), and far from rest phi is no
-distance any more.
+A point near body B maps to B's material space through the tet behind the nearest of B's surface triangles near it:
+X = X0 + F^-1 (x - x0). There phi is interpolated on a grid. In the world the normal is F^-T grad phi, normalised (a covector),
+and the gap phi / |F^-T grad phi|. Vertices of A are contacts if the normal lies in their normal cone. A triangle adds its deepest
+point if that is deeper than its corners: one Frank-Wolfe solve per (triangle, body), skipped if phi at the corners excludes it.
+Weak: a grid rounds edges (crossing sharp edges are left to `proximity`), and far from rest phi is no longer a distance.
 """
 
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.collision.analytic import DEEPER, deeper_inside
+from taisoft.collision.analytic import MIN_EXTRA_DEPTH, is_surface_minimum
 from taisoft.collision.boxes import list_near, sum_pairs
 from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import FACE_FIELD, VERTEX_FIELD, write_contact
@@ -28,18 +27,18 @@ from taisoft.mesh.sdf_grid import SdfGrid
 from taisoft.runtime import kernel
 from taisoft.scene.body import Body
 
-FLATTEST = 1e-3  # det F below which a tet maps nothing
+MIN_DET_F = 1e-3  # det F below which a tet is not used for the mapping
 
 
 @dataclass(frozen=True, eq=False)
 class DistanceFields:
-    """The grids of all bodies that have one, and the tets behind all triangles."""
+    """Signed distance grids of the bodies, and the tets behind all surface triangles."""
 
-    of_body: Any  # (n_bodies) i32: field of each collider, -1 where it has none
+    of_body: Any  # (n_bodies) i32: field of each collider, -1 for none
     origin: Any  # (fields) 3-vectors f64 [m]
     spacing: Any  # (fields) 3-vectors f64 [m]
     points: Any  # (fields) 3-vectors i32: grid points along each axis
-    first: Any  # (fields) i32: in phi
+    first: Any  # (fields) i32: index of each field's first value in phi
     phi: Any  # [m]
     x: Any  # the model's nodes
     behind: Any  # (n_triangles) 4-vectors i32: nodes of the tet behind each triangle
@@ -48,38 +47,38 @@ class DistanceFields:
 
     @ti.func
     def sample(self, k, p):
-        """phi [m] and its gradient at the material point p (3,) of field k: trilinear, and beyond the grid farther by the way."""
-        cell, share = ivec(0), dvec(0.0)  # indexed by static numbers only
-        away = ti.cast(0.0, ti.f64)
+        """phi [m] and its gradient at material point p (3,) of field k: trilinear, plus the distance to the grid beyond it."""
+        cell, fraction = ivec(0), dvec(0.0)  # indexed by static numbers only
+        outside = ti.cast(0.0, ti.f64)
         for q in ti.static(range(3)):
             last = ti.cast(self.points[k][q] - 1, ti.f64)
             at = (p[q] - self.origin[k][q]) / self.spacing[k][q]
             inside = ti.min(ti.max(at, 0.0), last)
-            away += ((at - inside) * self.spacing[k][q]) ** 2
+            outside += ((at - inside) * self.spacing[k][q]) ** 2
             cell[q] = ti.min(ti.cast(inside, ti.i32), self.points[k][q] - 2)
-            share[q] = inside - ti.cast(cell[q], ti.f64)
+            fraction[q] = inside - ti.cast(cell[q], ti.f64)
         n = self.points[k]
         base = self.first[k] + (cell[0] * n[1] + cell[1]) * n[2] + cell[2]
         value, g = ti.cast(0.0, ti.f64), dvec(0.0)
         for c in range(8):
             i, j, m = c >> 2, (c >> 1) & 1, c & 1
             f = ti.cast(self.phi[base + (i * n[1] + j) * n[2] + m], ti.f64)
-            a, da = 1.0 - share[0], ti.cast(-1.0, ti.f64)
+            a, da = 1.0 - fraction[0], ti.cast(-1.0, ti.f64)
             if i == 1:
-                a, da = share[0], ti.cast(1.0, ti.f64)
-            b, db = 1.0 - share[1], ti.cast(-1.0, ti.f64)
+                a, da = fraction[0], ti.cast(1.0, ti.f64)
+            b, db = 1.0 - fraction[1], ti.cast(-1.0, ti.f64)
             if j == 1:
-                b, db = share[1], ti.cast(1.0, ti.f64)
-            d, dd = 1.0 - share[2], ti.cast(-1.0, ti.f64)
+                b, db = fraction[1], ti.cast(1.0, ti.f64)
+            d, dd = 1.0 - fraction[2], ti.cast(-1.0, ti.f64)
             if m == 1:
-                d, dd = share[2], ti.cast(1.0, ti.f64)
+                d, dd = fraction[2], ti.cast(1.0, ti.f64)
             value += a * b * d * f
             g += dvec(da * b * d, a * db * d, a * b * dd) * f
-        return value + ti.sqrt(away), g / self.spacing[k]
+        return value + ti.sqrt(outside), g / self.spacing[k]
 
     @ti.func
     def gradient(self, k, p):
-        """Gradient at p by differences over one cell: it does not jump between cells, and is exact where phi is linear."""
+        """Gradient at p by central differences over one cell: continuous across cells, exact for linear phi."""
         g = dvec(0.0)
         for q in range(3):
             e = dvec(ti.cast(q == 0, ti.f64), ti.cast(q == 1, ti.f64), ti.cast(q == 2, ti.f64))
@@ -94,16 +93,16 @@ def build_fields(
     bodies: list[Body], grids: list[SdfGrid | None], x: Any, first: np.ndarray, node_start: np.ndarray, real: Any, npr: type,
     arena: FieldArena,
 ) -> DistanceFields:  # fmt: skip
-    """Upload the grids (one or None for each collider; obstacles have none) and the tets behind the bodies' triangles."""
+    """Upload the grids (one or None per collider; None for obstacles) and the tets behind the bodies' triangles."""
     used = [g for g in grids if g is not None]
     of_body = np.cumsum([g is not None for g in grids]) - 1
     of_body = np.where([g is not None for g in grids], of_body, -1)
     n = max(int(first[-1]), 1)
-    behind, place, inverse = np.zeros((n, 4)), np.zeros((n, 3)), np.zeros((n, 3, 3))
+    behind, tet_corner, inverse = np.zeros((n, 4)), np.zeros((n, 3)), np.zeros((n, 3, 3))
     for k, body in enumerate(bodies):
         rows, tets = slice(first[k], first[k + 1]), body.nodes.surface_tets
         rest = body.nodes.positions[tets]
-        behind[rows], place[rows] = tets + node_start[k], rest[:, 0]
+        behind[rows], tet_corner[rows] = tets + node_start[k], rest[:, 0]
         inverse[rows] = np.linalg.inv((rest[:, 1:] - rest[:, :1]).transpose(0, 2, 1))
     count = max(len(used), 1)
     blank = np.zeros((1, 3))
@@ -117,25 +116,25 @@ def build_fields(
                     np.concatenate([g.phi.reshape(-1) for g in used]).astype(npr) if used else None),
         x,
         arena.vectors("field_behind", ti.i32, n, behind.astype(np.int32), n=4),
-        arena.vectors("field_corner", ti.f64, n, place),
+        arena.vectors("field_corner", ti.f64, n, tet_corner),
         arena.vectors("field_inverse", ti.f64, 3 * n, inverse.reshape(-1, 3)),
     )  # fmt: skip
 
 
 @ti.func
 def _nearest(s: ti.template(), f: ti.template(), entry: ti.template(), first, last, p):
-    """The triangle of entry[first:last] nearest to p whose tet is not inverted, -1 where there is none."""
-    found, least = -1, ti.cast(ti.math.inf, ti.f64)
+    """Return the triangle of entry[first:last] nearest to p whose tet is not inverted, -1 if there is none."""
+    found, min_squared = -1, ti.cast(ti.math.inf, ti.f64)
     for e in range(first, last):
         u = entry[e]
-        outside = ti.max(s.lo[u] - p, p - s.hi[u], 0.0)  # of its box, which is no nearer than the triangle
-        if outside.dot(outside) < least:
+        outside = ti.max(s.lo[u] - p, p - s.hi[u], 0.0)  # distance to its box, a lower bound of that to the triangle
+        if outside.dot(outside) < min_squared:
             a, b, c = corner(s, u, 0), corner(s, u, 1), corner(s, u, 2)
             w, _ = closest_on_triangle(p, a, b, c)
             d = p - (w[0] * a + w[1] * b + w[2] * c)
-            if d.dot(d) < least:
-                if _gradient_of(f, u).determinant() > ti.cast(FLATTEST, ti.f64):
-                    least = d.dot(d)
+            if d.dot(d) < min_squared:
+                if _gradient_of(f, u).determinant() > ti.cast(MIN_DET_F, ti.f64):
+                    min_squared = d.dot(d)
                     found = u
     return found
 
@@ -149,8 +148,8 @@ def _gradient_of(f: ti.template(), u):
 
 
 @ti.func
-def _material(f: ti.template(), u, p):
-    """Material point of p through the tet behind triangle u, and the inverse of its deformation gradient."""
+def _to_material(f: ti.template(), u, p):
+    """Map p to material space through the tet behind triangle u: the material point and F^-1."""
     G = _gradient_of(f, u).inverse()
     return f.corner[u] + G @ (p - f.x[f.behind[u][0]]), G
 
@@ -159,45 +158,45 @@ def _material(f: ti.template(), u, p):
 def _field_contacts(
     s: ti.template(), f: ti.template(), entry: ti.template(), first, last, t, margin, out: ti.template(), start, end
 ):
-    """Contacts of triangle t with the field of the body of entry[first:last]. Returns the new count, and 1 where no tet maps."""
+    """Write contacts of triangle t with the field of the body of entry[first:last]. Return the count, and 1 if no tet maps."""
     at, unmapped = start, 0
     own, other = s.body[t], s.body[entry[first]]
     k = f.of_body[other]
     A, B, C = dvec(0.0), dvec(0.0), dvec(0.0)  # corners in material space
     phi = dvec(0.0)
-    reach, way = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    reach, motion = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     j = 0
     while j < 4 and unmapped == 0:  # the corners, then the deepest point between them
         w = dvec(ti.cast(j == 0, ti.f64), ti.cast(j == 1, ti.f64), ti.cast(j == 2, ti.f64))
-        wanted = True
+        accepted = True
         if j == 3:
             reach = ti.max((A - B).norm(), (B - C).norm(), (C - A).norm())
-            # phi grows by at most 1 per metre at rest; the world's margin and way count double there, for bodies squeezed to half
-            wanted = phi.min() - reach <= 2.0 * (margin + way)
-            if wanted:
+            # |grad phi| <= 1 at rest; world margin and motion are doubled there, which allows compression to half
+            accepted = phi.min() - reach <= 2.0 * (margin + motion)
+            if accepted:
                 v, value = deepest_point(f, k, A, B, C, phi)
                 for i in ti.static(range(3)):
                     w[i] = v[i]
-                wanted = value < phi.min() - ti.cast(DEEPER, ti.f64) * reach and w.max() < 1.0 - 1e-6
-        if wanted:
+                accepted = value < phi.min() - ti.cast(MIN_EXTRA_DEPTH, ti.f64) * reach and w.max() < 1.0 - 1e-6
+        if accepted:
             x = w[0] * corner(s, t, 0) + w[1] * corner(s, t, 1) + w[2] * corner(s, t, 2)
             u = _nearest(s, f, entry, first, last, x)
             if u < 0:
                 unmapped = 1
             else:
-                X, G = _material(f, u, x)
+                X, G = _to_material(f, u, x)
                 value, _ = f.sample(k, X)
                 if j < 3:
-                    way = ti.max(way, (s.move[s.triangle[t, j]] - moved(s, u, dvec(1.0 / 3.0))).norm())
+                    motion = ti.max(motion, (s.move[s.triangle[t, j]] - moved(s, u, dvec(1.0 / 3.0))).norm())
                 for i in ti.static(range(3)):
                     if i == j:
                         phi[i] = value
-                        wanted = (s.owns[t] >> i) & 1 == 1
+                        accepted = (s.owns[t] >> i) & 1 == 1
                 for i in ti.static(range(3)):
                     A[i] = ti.select(j == 0, X[i], A[i])
                     B[i] = ti.select(j == 1, X[i], B[i])
                     C[i] = ti.select(j == 2, X[i], C[i])
-                if wanted:
+                if accepted:
                     n = G.transpose() @ f.gradient(k, X)
                     length = n.norm()
                     gap = value / ti.max(length, 1e-30)
@@ -205,21 +204,21 @@ def _field_contacts(
                     a, b, c = corner(s, u, 0), corner(s, u, 1), corner(s, u, 2)
                     v, _ = closest_on_triangle(x - gap * n, a, b, c)
                     tu, tt = vertices_of(s, u), vertices_of(s, t)
-                    nearer = (moved(s, t, w) - moved(s, u, v)).dot(n)
-                    if length > 0.0 and gap + ti.min(nearer, 0.0) <= margin:
+                    approach = (moved(s, t, w) - moved(s, u, v)).dot(n)
+                    if length > 0.0 and gap + ti.min(approach, 0.0) <= margin:
                         i = s.triangle[t, ti.min(j, 2)]
-                        good = 0
+                        valid = 0
                         if j < 3:
-                            good = in_normal_cone(s, i, n)
+                            valid = in_normal_cone(s, i, n)
                         else:
-                            good = deeper_inside(s, t, w, n, x)
-                        if good == 1 and j < 3:
+                            valid = is_surface_minimum(s, t, w, n, x)
+                        if valid == 1 and j < 3:
                             write_contact(
                                 out, at, end, own, other, ivec(VERTEX_FIELD, i, other), x, n, gap,
                                 ivec(i, -1, -1), dvec(1.0, 0.0, 0.0), tu, v,
                             )  # fmt: skip
                             at += 1
-                        elif good == 1:
+                        elif valid == 1:
                             write_contact(
                                 out, at, end, own, other, ivec(FACE_FIELD, t, other), x, n, gap, tt, w, tu, v
                             )  # fmt: skip
@@ -231,34 +230,34 @@ def _field_contacts(
 @kernel(cse=False)
 def find_in_fields(
     s: ti.template(), near: ti.template(), f: ti.template(), sharp: ti.template(), row: ti.template(), longest: ti.template(),
-    needed: ti.template(), room: ti.i32, margin: ti.f64, half: ti.f64, out: ti.template(), used: ti.template(),
+    needed: ti.template(), capacity: ti.i32, margin: ti.f64, padding: ti.f64, out: ti.template(), used: ti.template(),
     count: ti.template(), part: ti.i32, append: ti.i32, unmapped: ti.template(),
 ):  # fmt: skip
-    """Contacts with distance fields; unmapped[0] counts the (triangle, body) that no tet maps. As `find_proximity`, after whose
-    contacts they come where `more` is 1."""
+    """Write contacts with distance fields; unmapped[0] counts the (triangle, body) pairs that no tet maps. Arguments as in
+    `find_proximity`; contacts are appended to its own if `append` is 1."""
     unmapped[0] = 0
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):
         if task % s.spread == 0:
             c = task // s.spread
-            at, end, begin = c * part + append * used[c], (c + 1) * part, c * room
-            own, n_near, most, pairs, lost = -1, 0, append * longest[c], 0, 0
+            at, end, begin = c * part + append * used[c], (c + 1) * part, c * capacity
+            own, n_near, max_row, pairs, n_unmapped = -1, 0, append * longest[c], 0, 0
             for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
                 t = s.active[i]
                 if s.body[t] != own:
                     own = s.body[t]
                     n_near = list_near(s, c, own)
-                lo, hi = query_box(s, near, t, WHOLE, half)
+                lo, hi = query_box(s, near, t, WHOLE, padding)
                 for k in range(n_near):
                     other = s.near[c * s.n_bodies + k]
                     if f.of_body[other] >= 0 and other != own:
-                        n = list_triangles(s, near, sharp, other, t, WHOLE, lo, hi, row, begin, begin + room)
-                        most, pairs = ti.max(most, n), pairs + n
-                        if 0 < n <= room:
-                            at, miss = _field_contacts(s, f, row, begin, begin + n, t, margin, out, at, end)
-                            lost += miss
-            used[c], longest[c], s.part[c] = at - c * part, most, pairs
-            ti.atomic_add(unmapped[0], lost)
+                        n = list_triangles(s, near, sharp, other, t, WHOLE, lo, hi, row, begin, begin + capacity)
+                        max_row, pairs = ti.max(max_row, n), pairs + n
+                        if 0 < n <= capacity:
+                            at, failed = _field_contacts(s, f, row, begin, begin + n, t, margin, out, at, end)
+                            n_unmapped += failed
+            used[c], longest[c], s.part[c] = at - c * part, max_row, pairs
+            ti.atomic_add(unmapped[0], n_unmapped)
     ti.loop_config(serialize=True)
     for _ in range(1):
         sum_parts(used, count, s.chunks)

@@ -1,7 +1,7 @@
-"""Which triangles intersect: of a body with itself, and of bodies with each other.
+"""Find intersecting triangles, within a body and between bodies.
 
-Candidates leave out triangles that share a vertex, by number: those touch always. A fold is still found, by their
-neighbours. Positions are those of now, without the motion during the step.
+Candidates exclude triangles that share a vertex index, since those always touch. A fold is still found through their neighbours.
+Present positions are used, without the motion during the step.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ from taisoft.transfer import download
 
 @ti.func
 def intersect(s: ti.template(), t, u):
-    """1 where triangles t and u of the surface intersect or touch, else 0."""
+    """1 if triangles t and u of the surface intersect or touch, else 0."""
     return triangles_intersect(
         corner(s, t, 0), corner(s, t, 1), corner(s, t, 2), corner(s, u, 0), corner(s, u, 1), corner(s, u, 2)
     )
@@ -29,7 +29,7 @@ def find_intersections(
     s: ti.template(), start: ti.template(), end: ti.template(), entry: ti.template(), pair: ti.template(), used: ti.template(),
     total: ti.template(), part: ti.i32,
 ):  # fmt: skip
-    """Pairs t < u of the rows that intersect; rows ascend, and so do the pairs of a part and the parts."""
+    """Find the pairs t < u of the rows that intersect, in ascending order within each part and over the parts."""
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):
         if task % s.spread == 0:
@@ -50,17 +50,17 @@ def find_intersections(
 
 
 class Intersections:
-    """Finds the intersecting triangles among candidates."""
+    """Find the intersecting triangles among candidates."""
 
-    def __init__(self, surface: Surface, arena: FieldArena, capacity: int | None = None, most: int | None = None):
-        """capacity: pairs at first; most: pairs at most; None for the default."""
+    def __init__(self, surface: Surface, arena: FieldArena, capacity: int | None = None, max_capacity: int | None = None):
+        """capacity, max_capacity: initial and maximum number of pairs; None for the default."""
         self.surface = surface
-        self.pairs = Buffer("intersections", pairs, capacity or surface.n_triangles + 64, most, surface.chunks, arena)
+        self.pairs = Buffer("intersections", pairs, capacity or surface.n_triangles + 64, max_capacity, surface.chunks, arena)
 
     def find(self, candidates: Candidates) -> np.ndarray:
-        """(k,2) triangles t < u that intersect or touch, in ascending order, of the present positions.
+        """Return the (k,2) triangles t < u that intersect or touch at the present positions, in ascending order.
 
-        Raises SimulationError where the buffer may not grow as far as it must.
+        Raise SimulationError if the buffer would outgrow its limit.
         """
         found, c = self.pairs, candidates
         while True:
@@ -68,9 +68,9 @@ class Intersections:
             if not found.grow_if_full():
                 break
         data, used = download([found.data, found.used])
-        places = np.arange(found.capacity)
-        return data[: found.capacity][places % found.part < np.repeat(used, found.part)]
+        indices = np.arange(found.capacity)
+        return data[: found.capacity][indices % found.part < np.repeat(used, found.part)]
 
     def release(self) -> None:
-        """Give the memory of the buffer back."""
+        """Free the memory of the buffer."""
         self.pairs.release()

@@ -1,8 +1,8 @@
 """Signed distances of the analytic obstacles in their own frames, negative inside, and their gradients.
 
 Half-space: y. Sphere: |p| - r. Box: half extents h; outside the distance to its surface, inside the largest p_i - h_i. Capsule: a
-segment along x of half length h, radius r. Where the gradient is not unique (a centre, a segment's middle line, a box's diagonal
-planes) one of the possible unit vectors is given.
+segment along x of half length h, radius r. If the gradient is not unique (at a centre, on a segment, on a box's diagonal planes),
+one of the possible unit vectors is returned.
 """
 
 import taichi as ti
@@ -14,7 +14,7 @@ HALF_SPACE, SPHERE, BOX, CAPSULE = 0, 1, 2, 3
 
 @ti.func
 def _from_core(d, r):
-    """Distance to a ball or capsule whose centre line is d away, and its gradient."""
+    """Distance to a sphere or capsule and its gradient; d: offset from its centre or segment."""
     length = d.norm()
     g = dvec(0.0, 1.0, 0.0)
     if length > 0.0:

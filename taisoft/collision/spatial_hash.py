@@ -1,10 +1,9 @@
 """Candidates by spatial hashing over a dense grid (report, section 3.1.4; Teschner et al. 2003, Vision, Modeling, Visualization).
 
-Count, prefix scan, scatter: each triangle is put into the cells that its swept box covers; then each looks through its cells.
-A pair is accepted in the one cell that holds the least corner of the boxes' overlap, so it is found once. The grid is
-periodic: indices wrap round its size, which puts far things into cells of near ones but never outside the memory; the
-box test keeps the answer exact. A triangle that covers more than LARGE cells, or lies so far out that cells can no longer be
-counted, is not put into the grid but compared with every other one.
+Count, prefix scan, scatter: each triangle is entered into the cells that its swept box covers; then each searches its cells.
+A pair is accepted only in the cell that holds the lower corner of the boxes' overlap, so it is found once. The grid is periodic:
+indices wrap around its size, so distant triangles may share a cell but never leave the memory; the box test keeps the result
+exact. A triangle that covers more than LARGE cells, or lies beyond COUNTABLE cells, is compared with every other one instead.
 """
 
 import math
@@ -20,27 +19,27 @@ from taisoft.collision.surface import ACTIVE, Surface, boxes_overlap, ivec, may_
 from taisoft.fields import FieldArena
 from taisoft.runtime import kernel
 
-LARGE = 512  # cells
-COUNTABLE = 2.0**50  # cells from the origin: beyond, neighbouring cells have the same number in f64
+LARGE = 512  # cells above which a triangle counts as large
+COUNTABLE = 2.0**50  # cells from the origin beyond which f64 cannot distinguish neighbouring cells
 MAX_CELLS = 2**22
 CELLS_PER_TRIANGLE = 2
-ENTRIES_PER_TRIANGLE = 24  # of a row, at first
+ENTRIES_PER_TRIANGLE = 24  # row entries, initial capacity
 SCAN = 256  # parts of the prefix scan
-N_LARGE, N_ENTRIES = 0, 1  # places in the grid's count
+N_LARGE, N_ENTRIES = 0, 1  # indices into Grid.count
 
 
 def grid_size(extent: np.ndarray, cell: float, n_triangles: int) -> tuple[int, int, int]:
-    """Cells along each axis, powers of two: enough for the extent (3,) [m], but not many more than triangles."""
-    most = min(MAX_CELLS, max(512, CELLS_PER_TRIANGLE * n_triangles))
+    """Return the cells along each axis, powers of two: enough for the extent (3,) [m], but not many more than triangles."""
+    max_cells = min(MAX_CELLS, max(512, CELLS_PER_TRIANGLE * n_triangles))
     bits = [max(0, math.ceil(math.log2(min(max(e / cell, 1.0), 2.0**20)))) for e in extent]
-    while sum(bits) > math.log2(most):
+    while sum(bits) > math.log2(max_cells):
         bits[bits.index(max(bits))] -= 1
     return tuple(2**b for b in bits)
 
 
 @ti.func
 def _cell_of(g: ti.template(), x, inverse):
-    """Wrapped cell of a point that can be counted."""
+    """Wrapped cell of a point within COUNTABLE cells of the origin."""
     cell = ivec(0)
     for q in ti.static(range(3)):
         n = ti.cast(g.size[q], ti.f64)
@@ -51,17 +50,17 @@ def _cell_of(g: ti.template(), x, inverse):
 
 @ti.func
 def _cells_of(s: ti.template(), g: ti.template(), t, inverse):
-    """First wrapped cell of a triangle's box, and how many it covers along each axis; (0, 0, 0) for a large one."""
+    """First wrapped cell of a triangle's box, and the number it covers along each axis; (0, 0, 0) for a large one."""
     lo, hi = s.lo[t], s.hi[t]
     count = ivec(0)
-    far = ti.cast(0.0, ti.f64)
+    farthest = ti.cast(0.0, ti.f64)
     cells = ti.cast(1.0, ti.f64)
     for q in ti.static(range(3)):
-        far = ti.max(far, ti.max(ti.abs(lo[q]), ti.abs(hi[q])) * inverse)
+        farthest = ti.max(farthest, ti.max(ti.abs(lo[q]), ti.abs(hi[q])) * inverse)
         # the same floors as for the corner of an overlap, so that no cell is missed
         cells *= ti.min(ti.floor(hi[q] * inverse) - ti.floor(lo[q] * inverse) + 1.0, ti.cast(g.size[q], ti.f64))
     first = ivec(0)
-    if far < COUNTABLE and cells <= LARGE:
+    if farthest < COUNTABLE and cells <= LARGE:
         first = _cell_of(g, lo, inverse)
         for q in ti.static(range(3)):
             span = ti.floor(hi[q] * inverse) - ti.floor(lo[q] * inverse) + 1.0
@@ -71,7 +70,7 @@ def _cells_of(s: ti.template(), g: ti.template(), t, inverse):
 
 @ti.func
 def _bucket(g: ti.template(), first, count, k):
-    """Number in memory of the k-th cell of a box."""
+    """Index in memory of the k-th cell of a box."""
     z = k % count[2]
     y = (k // count[2]) % count[1]
     x = k // (count[2] * count[1])
@@ -86,7 +85,7 @@ def _index(g: ti.template(), cell):
 
 @kernel
 def count_cells(s: ti.template(), g: ti.template(), inverse: ti.f64):
-    """Cells of each active triangle, entries of each cell, the list of large triangles."""
+    """Find the cells of each active triangle, count the entries of each cell, list the large triangles."""
     ti.loop_config(serialize=s.serial)
     for c in range(g.n_cells):
         g.cell_end[c] = 0
@@ -111,7 +110,7 @@ def count_cells(s: ti.template(), g: ti.template(), inverse: ti.f64):
 
 @kernel
 def scan_cells(s: ti.template(), g: ti.template()):
-    """Prefix sums: cell_start from the counts in cell_end, which then points there too."""
+    """Compute cell_start as the prefix sums of the counts in cell_end, and set cell_end to the same."""
     ti.loop_config(serialize=s.serial)
     for task in range(SCAN * s.spread):
         if task % s.spread == 0:
@@ -142,7 +141,7 @@ def scan_cells(s: ti.template(), g: ti.template()):
 
 @kernel
 def scatter_cells(s: ti.template(), g: ti.template(), member: ti.template()):
-    """Write the active triangles into their cells; the order in a cell is that of the threads."""
+    """Write the active triangles into their cells; the order within a cell depends on the threads."""
     ti.loop_config(serialize=s.serial)
     for i in range(s.count[ACTIVE]):
         t = s.active[i]
@@ -153,14 +152,14 @@ def scatter_cells(s: ti.template(), g: ti.template(), member: ti.template()):
 
 @ti.func
 def _append(entry: ti.template(), at, last, u):
-    """Write an entry where it still fits; the count goes on."""
+    """Write an entry if it fits; the caller counts it regardless."""
     if at < last:
         entry[at] = u
 
 
 @ti.func
 def _is_pair(s: ti.template(), t, u):
-    """1 where two triangles' boxes overlap and they may touch."""
+    """1 if two triangles' boxes overlap and they may touch."""
     found = 0
     if u != t:
         if boxes_overlap(s, t, u):
@@ -173,7 +172,7 @@ def find_rows(
     s: ti.template(), g: ti.template(), member: ti.template(), entry: ti.template(), used: ti.template(),
     total: ti.template(), part: ti.i32, inverse: ti.f64,
 ):  # fmt: skip
-    """Each active triangle's row, sorted; a part of the list fills its own part of the entries."""
+    """Write each active triangle's row, sorted; each chunk fills its own part of the entries."""
     ti.loop_config(serialize=s.serial)
     for t in range(s.n_triangles):
         g.start[t] = 0
@@ -234,7 +233,7 @@ class Grid:
     scan: Any  # (SCAN) i32: sums of the parts of the scan
     first_cell: Any  # (n_triangles) 3-vectors i32: of the cells that a box covers
     cell_count: Any  # (n_triangles) 3-vectors i32: along each axis, 0 for large ones
-    large: Any  # i32: the first count[N_LARGE] are the large triangles
+    large: Any  # i32: large triangles, the first count[N_LARGE] entries
     count: Any  # (2) i32
     start: Any  # (n_triangles) i32: rows
     end: Any
@@ -260,21 +259,21 @@ def _make_grid(size: tuple[int, int, int], n: int, arena: FieldArena) -> Grid:
 
 
 class SpatialHash:
-    """The broad phase by a dense grid. cell: edge of the cells [m]; may be changed at any time."""
+    """Broad phase by a dense grid. cell: edge length of the cells [m]; may be changed at any time."""
 
     def __init__(
         self, surface: Surface, arena: FieldArena, cell: float, extent: np.ndarray, capacity: int | None = None,
-        most: int | None = None,
+        max_capacity: int | None = None,
     ):  # fmt: skip
-        """extent: (3,) [m], of what is usually there. capacity: entries at first, most: at most; None for the default."""
+        """extent: typical extent (3,) [m]. capacity, max_capacity: initial and maximum entries; None for the default."""
         n = surface.n_triangles
         self.surface, self.cell = surface, cell
         self.grid = _make_grid(grid_size(extent, cell, n), max(n, 1), arena)
-        self.members = Buffer("hash_cells", entries, capacity or 8 * n + 64, most, 1, arena)
-        self.rows = Buffer("hash_rows", entries, capacity or ENTRIES_PER_TRIANGLE * n + 64, most, surface.chunks, arena)
+        self.members = Buffer("hash_cells", entries, capacity or 8 * n + 64, max_capacity, 1, arena)
+        self.rows = Buffer("hash_rows", entries, capacity or ENTRIES_PER_TRIANGLE * n + 64, max_capacity, surface.chunks, arena)
 
     def find(self) -> Candidates:
-        """The candidates of the present boxes. Raises SimulationError where a buffer may not grow as far as it must."""
+        """Return the candidates of the present boxes. Raise SimulationError if a buffer would outgrow its limit."""
         s, g, inverse = self.surface, self.grid, 1.0 / self.cell
         count_cells(s, g, inverse)
         scan_cells(s, g)
@@ -288,15 +287,15 @@ class SpatialHash:
                 return Candidates(g.start, g.end, rows.data)
 
     def near(self) -> Candidates:
-        """The same, for `near.py` to look into."""
+        """The same, for `queries.py`."""
         return self.find()
 
     @property
     def buffers(self) -> tuple[Buffer, ...]:
-        """What grows."""
+        """The growing buffers."""
         return self.members, self.rows
 
     def release(self) -> None:
-        """Give the memory of the buffers back."""
+        """Free the memory of the buffers."""
         for buffer in self.buffers:
             buffer.release()

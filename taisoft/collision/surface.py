@@ -1,6 +1,6 @@
-"""Surface: the triangles of everything that can be touched, in one list: soft bodies first, then obstacles that have faces.
+"""Surface triangles of all colliders in one list: soft bodies first, then obstacles that have faces.
 
-Positions and boxes are f64 in either precision: a gap is a small difference of large numbers. `boxes.py` fills them.
+Positions and boxes are f64 in either precision, since a gap is a small difference of large numbers. `boxes.py` fills them.
 """
 
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ from taisoft.arrays import Count
 from taisoft.fields import FieldArena
 from taisoft.runtime import Runtime
 
-SERIAL_BELOW = 1500  # triangles below which one thread is faster than waking the others (about 50 us a loop)
-# The same for loops that do little at a turn: boxes, the trees' refit, sharp edges, reduction. Measured with two cores: the same
-# with 21,000 triangles, and 1.3 times as fast a search on both with 105,000.
+SERIAL_BELOW = 1500  # triangles below which one thread is faster than starting the others (about 50 us a loop)
+# The same for loops with little work per iteration: boxes, tree refit, sharp edges, reduction. Measured with two cores: equal at
+# 21,000 triangles; at 105,000 the search is 1.3 times as fast on both cores.
 SERIAL_CHEAP_BELOW = 30000
-# Taichi gives each CPU thread at least 512 turns of a loop: so many turns belong to one part, and one of them does the work
+# Taichi gives each CPU thread at least 512 iterations of a loop: each chunk takes that many, and only the first does the work
 SPREAD = {"cpu": 512, "cuda": 1}
-CHUNKS = {"cpu": 64, "cuda": 4096}  # parts of a list that are worked on side by side, each with its own part of a buffer
-NONFINITE, ACTIVE, PAIRS = 0, 1, 2  # places in Surface.count
-INSIDE_BITS = 31  # of Surface.inside; colliders that share a bit lie in one vertex at once next to never
+CHUNKS = {"cpu": 64, "cuda": 4096}  # chunks of a list that are processed in parallel, each with its own part of a buffer
+NONFINITE, ACTIVE, PAIRS = 0, 1, 2  # indices into Surface.count
+INSIDE_BITS = 31  # of Surface.inside; one vertex is almost never inside two colliders with the same bit
 
 dvec = ti.types.vector(3, ti.f64)
 ivec = ti.types.vector(3, ti.i32)
@@ -29,12 +29,12 @@ ivec = ti.types.vector(3, ti.i32)
 
 @dataclass(frozen=True)
 class Topology:
-    """Triangles on the host. Vertices are numbered over all colliders, without those inside the bodies.
+    """Triangles on the host. Vertices are numbered over all colliders, surface vertices only.
 
     triangle: (t,3) vertices; body: (t,) collider, ascending; first: (n_bodies + 1,) first triangle of each collider;
     vertex_first: (n_bodies + 1,) first vertex; node: (v,) the model's node, -1 for obstacles; neighbour: (t,3) triangle across
-    the edge from corner k to k + 1, -1 where there is none; owns: (t,) bits 0-2 corners, 3-5 edges that this triangle
-    handles for all that share them; ring_start, ring: triangles round each vertex; around_start, around: vertices round it.
+    the edge from corner k to k + 1, -1 if there is none; owns: (t,) bits 0-2 corners, 3-5 edges that this triangle handles on
+    behalf of all that share them; ring_start, ring: triangles around each vertex; around_start, around: adjacent vertices.
     """
 
     triangle: np.ndarray
@@ -52,16 +52,16 @@ class Topology:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Fields of the triangles, for kernels; `Topology` says what the tables hold."""
+    """Fields of the triangles, for kernels; the tables are described in `Topology`."""
 
     n_triangles: Count
     n_verts: Count
-    n_bodies: Count  # colliders, with those that have no faces
-    serial: bool  # whether one thread does it all
-    serial_cheap: bool  # whether one thread does the loops that do little at a turn
+    n_bodies: Count  # colliders, including those without faces
+    serial: bool  # whether one thread runs all loops
+    serial_cheap: bool  # whether one thread runs the cheap loops
     chunks: int
-    spread: int  # turns of a loop for each part, see SPREAD
-    cheap_spread: int  # the same for light loops
+    spread: int  # loop iterations per chunk, see SPREAD
+    cheap_spread: int  # the same for cheap loops
     triangle: Any  # (n_triangles, 3) i32
     body: Any  # i32
     node: Any  # i32
@@ -72,29 +72,29 @@ class Surface:
     around_start: Any  # i32
     around: Any  # i32
     soft: Any  # (n_bodies) i32: 1 for soft bodies
-    self_on: Any  # (n_bodies) i32: 1 where a body is tested against itself
+    self_on: Any  # (n_bodies) i32: 1 if a body is tested against itself
     first_of: Any  # (n_bodies + 1) i32
-    thickness: Any  # (n_bodies) f64: how thick each is [m], inf for half-spaces
+    thickness: Any  # (n_bodies) f64: thickness [m], inf for half-spaces
     edge: Any  # (n_bodies) f64: mean surface edges of the bodies [m], inf for obstacles
-    rest: Any  # (n_verts) 3-vectors f64: at rest [m]
-    x: Any  # (n_verts) 3-vectors f64: where they are [m]
-    move: Any  # (n_verts) 3-vectors f64: how far they go in the step [m]
+    rest: Any  # (n_verts) 3-vectors f64: rest positions [m]
+    x: Any  # (n_verts) 3-vectors f64: present positions [m]
+    move: Any  # (n_verts) 3-vectors f64: displacements in the step [m]
     lo: Any  # 3-vectors f64: boxes of the triangles [m]
     hi: Any
-    normal: Any  # 3-vectors f64: unit normals of the triangles where they are, 0 where they have none
+    normal: Any  # 3-vectors f64: unit normals of the triangles at x, 0 for degenerate ones
     area: Any  # f64: twice their areas [m^2]
     body_lo: Any  # (n_bodies) 3-vectors f64
     body_hi: Any
-    active: Any  # i32: triangles whose box meets another collider's, ascending; the first count[ACTIVE] hold
-    count: Any  # (4) i32: UNFINITE and ACTIVE triangles, and PAIRS of what is near with what
-    part: Any  # (chunks) i32: counts of the parts of a list
-    near: Any  # (chunks * n_bodies) i32: colliders near that which a part is at
-    inside: Any  # (n_verts) i32: bit k % INSIDE_BITS where the vertex lies in collider k and has contacts that lead out of it
-    exit_direction: Any  # (n_verts) 3-vectors f64: by those contacts together [m]
+    active: Any  # i32: triangles whose box meets another collider's, ascending; the first count[ACTIVE] are valid
+    count: Any  # (4) i32: numbers of NONFINITE and ACTIVE triangles, and of (query, nearby triangle) PAIRS
+    part: Any  # (chunks) i32: count of each chunk
+    near: Any  # (chunks * n_bodies) i32: colliders near each chunk's current collider
+    inside: Any  # (n_verts) i32: bit k % INSIDE_BITS is set if the vertex is in collider k and has contacts that move it out
+    exit_direction: Any  # (n_verts) 3-vectors f64: summed exit displacements of those contacts [m]
 
 
 def make_topology(parts: list[tuple[np.ndarray, np.ndarray]]) -> Topology:
-    """Number the surfaces of all colliders through. parts: of each, (t,3) triangles and (v,) the nodes they name."""
+    """Combine the surfaces of all colliders. parts: for each, (t,3) triangles and the (v,) nodes of their vertices."""
     triangle, body, node, first, vertex_first = [], [], [], [0], [0]
     for k, (triangles, nodes) in enumerate(parts):
         triangle.append(triangles + vertex_first[-1])
@@ -103,31 +103,31 @@ def make_topology(parts: list[tuple[np.ndarray, np.ndarray]]) -> Topology:
         first.append(first[-1] + len(triangles))
         vertex_first.append(vertex_first[-1] + len(nodes))
     t = np.concatenate(triangle).reshape(-1, 3)
-    neighbour, edge_owned = _edges(t)
+    neighbour, edge_owned = _edge_neighbours(t)
     corners = t.reshape(-1)
     order = np.argsort(corners, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=vertex_first[-1]))])
     ring = order // 3
     owner = np.full(vertex_first[-1], -1)
     used = start[1:] > start[:-1]
-    owner[used] = ring[start[:-1][used]]  # the first triangle round a vertex
+    owner[used] = ring[start[:-1][used]]  # the first triangle around a vertex
     corner_owned = owner[t] == np.arange(len(t))[:, None]
     bits = np.concatenate([corner_owned, edge_owned], axis=1) @ (1 << np.arange(6))
     return Topology(
         t, np.concatenate(body), np.array(first), np.array(vertex_first), np.concatenate(node), neighbour, bits, start, ring,
-        *_around(t, vertex_first[-1]),
+        *_adjacent_vertices(t, vertex_first[-1]),
     )  # fmt: skip
 
 
-def _around(t: np.ndarray, n_verts: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where each vertex's list begins (n_verts + 1,), and the vertices that share an edge with it, ascending."""
+def _adjacent_vertices(t: np.ndarray, n_verts: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the start of each vertex's list (n_verts + 1,), and the adjacent vertices, ascending."""
     ends = t[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     code = np.unique(np.concatenate([ends, ends[:, ::-1]]) @ [n_verts, 1])
     return np.searchsorted(code, np.arange(n_verts + 1) * n_verts), code % max(n_verts, 1)
 
 
-def _edges(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Neighbours (t,3) across each triangle's edges, -1 at open and at crowded edges; (t,3) bool: it owns the edge."""
+def _edge_neighbours(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return neighbours (t,3) across the edges, -1 at open and non-manifold edges; (t,3) bool: the triangle owns the edge."""
     ends = np.sort(np.stack([t, np.roll(t, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     new = np.ones(len(order), dtype=bool)
@@ -138,7 +138,7 @@ def _edges(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     a, b = order[starts[counts == 2]], order[starts[counts == 2] + 1]
     neighbour[a], neighbour[b] = b // 3, a // 3
     owned = np.zeros(len(order), dtype=bool)
-    owned[order[starts]] = True  # the sort is stable: the triangle of least number
+    owned[order[starts]] = True  # the lowest triangle, since the sort is stable
     return neighbour.reshape(-1, 3), owned.reshape(-1, 3)
 
 
@@ -152,21 +152,21 @@ def build_surface(
     n, v, bodies = len(t.triangle), len(t.node), len(soft)
     serial_cheap = serial
     if serial is None:
-        serial, serial_cheap = (runtime.arch == "cpu" and n < few for few in (SERIAL_BELOW, SERIAL_CHEAP_BELOW))
+        serial, serial_cheap = (runtime.arch == "cpu" and n < limit for limit in (SERIAL_BELOW, SERIAL_CHEAP_BELOW))
     chunks = 1 if serial else CHUNKS[runtime.arch]
 
     def ints(name: str, data: np.ndarray):
-        return arena.field(f"surface_{name}", i, max(len(data), 1), _filled(data))
+        return arena.field(f"surface_{name}", i, max(len(data), 1), _non_empty(data))
 
     def rows(name: str, data: np.ndarray):
-        # not a field of vectors: in one kernel with both run-time and fixed numbers of components, the compiler mixes these up
-        return arena.field(f"surface_{name}", i, (max(len(data), 1), 3), _filled(data))
+        # not a vector field: the compiler confuses run-time and fixed component indices within one kernel
+        return arena.field(f"surface_{name}", i, (max(len(data), 1), 3), _non_empty(data))
 
     def vectors(name: str, count: int):
         return arena.vectors(f"surface_{name}", ti.f64, max(count, 1))
 
     return Surface(
-        n, v, bodies, serial, serial_cheap, chunks, *(1 if alone else SPREAD[runtime.arch] for alone in (serial, serial_cheap)),
+        n, v, bodies, serial, serial_cheap, chunks, *(1 if one else SPREAD[runtime.arch] for one in (serial, serial_cheap)),
         rows("triangle", t.triangle),
         ints("body", t.body), ints("node", t.node),
         rows("neighbour", t.neighbour), ints("owns", t.owns), ints("ring_start", t.ring_start), ints("ring", t.ring),
@@ -183,22 +183,22 @@ def build_surface(
     )  # fmt: skip
 
 
-def _filled(data: np.ndarray) -> np.ndarray:
-    """As i32, with one row at least: no field is empty."""
+def _non_empty(data: np.ndarray) -> np.ndarray:
+    """Convert to i32 with at least one row, since no field may be empty."""
     data = np.asarray(data)
     return (data if len(data) else np.zeros((1, *data.shape[1:]))).astype(np.int32)
 
 
 @ti.func
 def part_first(c, n, parts: ti.template()):
-    """Where part c of a list of n begins, when it is cut into equal parts."""
+    """Return the start of part c of a list of n entries divided into equal parts."""
     return c * (n // parts) + ti.min(c, n % parts)
 
 
 @ti.func
 def boxes_overlap(s: ti.template(), t, u):
     """Whether the boxes of two triangles share a point."""
-    found = False  # axis by axis: most boxes are told apart by the first
+    found = False  # axis by axis: the first one separates most boxes
     if s.lo[t][0] <= s.hi[u][0] and s.lo[u][0] <= s.hi[t][0]:
         if s.lo[t][1] <= s.hi[u][1] and s.lo[u][1] <= s.hi[t][1]:
             found = s.lo[t][2] <= s.hi[u][2] and s.lo[u][2] <= s.hi[t][2]
@@ -218,8 +218,8 @@ def share_vertex(s: ti.template(), t, u):
 
 @ti.func
 def may_touch(s: ti.template(), t, u):
-    """Whether two triangles are a pair that counts: of different colliders, one of them soft; or of one body that is
-    tested against itself, without a common vertex."""
+    """Whether two triangles are a valid pair: of different colliders, one of them soft; or of one body that is tested against
+    itself, without a common vertex."""
     a, b = s.body[t], s.body[u]
     result = 0
     if a != b:

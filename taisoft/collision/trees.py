@@ -1,8 +1,8 @@
 """Balanced binary trees over the triangles of each collider, as tables on the host; `bvh.py` keeps k-DOPs at their nodes.
 
-Built top-down, all nodes of a level at once: the triangles of a node are sorted by their centroids along the longest extent of
-those and cut in the middle. The nodes of a subtree are consecutive, the first child follows its parent, and the trees follow
-each other in the order of the colliders.
+Built top-down, all nodes of a level at once: the triangles of a node are sorted along the longest extent of their centroids and
+split in the middle. The nodes of a subtree are consecutive, the first child follows its parent, and the trees follow each other
+in the order of the colliders.
 """
 
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ import numpy as np
 class TreeTables:
     """Trees on the host.
 
-    link: (nodes,) number of nodes of the subtree, for a leaf -1 - its triangle; root: (colliders,) -1 where there is no triangle;
-    chunk: roots of the chunks; chunk_body: their colliders; top: nodes above the chunks, the deepest first; top_first: where
-    each level of those begins, and their number; chunk_depth, depth: levels below the root of a chunk and of a tree, at most.
+    link: (nodes,) number of nodes of the subtree, for a leaf -1 - its triangle; root: (colliders,) -1 if there is no triangle;
+    chunk: roots of the chunks; chunk_body: their colliders; top: nodes above the chunks, the deepest first; top_first: start of
+    each level of those, then their number; chunk_depth, depth: maximum levels below the root of a chunk and of a tree.
     """
 
     link: np.ndarray
@@ -30,31 +30,31 @@ class TreeTables:
 
 
 def build_trees(centroid: np.ndarray, first: np.ndarray, leaves: int) -> TreeTables:
-    """Balanced trees over centroids (t,3) of triangles; first: (colliders + 1,) first triangle of each collider."""
+    """Build balanced trees over centroids (t,3) of triangles. first: (colliders + 1,) first triangle of each collider."""
     count, start = np.diff(first), np.asarray(first[:-1])
     nodes = np.maximum(2 * count - 1, 0)
-    place = np.cumsum(nodes) - nodes
+    node = np.cumsum(nodes) - nodes
     link = np.zeros(int(nodes.sum()), dtype=np.int64)
-    root = np.where(count > 0, place, -1)
+    root = np.where(count > 0, node, -1)
     body = np.flatnonzero(count)
-    start, count, place, order = start[body], count[body], place[body], np.arange(first[-1])
-    above = np.ones(len(body), dtype=bool)  # whether no chunk has begun yet
+    start, count, node, order = start[body], count[body], node[body], np.arange(first[-1])
+    above = np.ones(len(body), dtype=bool)  # whether the node lies above the chunks
     chunks, bodies, levels = [], [], []
     level = 0
     while len(count):
         begins = above & (count <= leaves)
-        chunks.append(place[begins])
+        chunks.append(node[begins])
         bodies.append(body[begins])
         above &= ~begins
-        levels.append(place[above])
+        levels.append(node[above])
         leaf = count == 1
-        link[place[leaf]] = -1 - order[start[leaf]]
-        start, count, place, body, above = (a[~leaf] for a in (start, count, place, body, above))
-        link[place] = 2 * count - 1
+        link[node[leaf]] = -1 - order[start[leaf]]
+        start, count, node, body, above = (a[~leaf] for a in (start, count, node, body, above))
+        link[node] = 2 * count - 1
         _split(order, start, count, centroid)
         left = (count + 1) // 2
         start, count = np.concatenate([start, start + left]), np.concatenate([left, count - left])
-        place, body, above = np.concatenate([place + 1, place + 2 * left]), np.tile(body, 2), np.tile(above, 2)
+        node, body, above = np.concatenate([node + 1, node + 2 * left]), np.tile(body, 2), np.tile(above, 2)
         level += 1
     levels = [x for x in levels if len(x)][::-1]
     chunk, chunk_body = np.concatenate([[], *chunks]).astype(np.int64), np.concatenate([[], *bodies]).astype(np.int64)
@@ -67,7 +67,7 @@ def build_trees(centroid: np.ndarray, first: np.ndarray, leaves: int) -> TreeTab
 
 
 def _split(order: np.ndarray, start: np.ndarray, count: np.ndarray, centroid: np.ndarray) -> None:
-    """Sort each stretch order[start : start + count] along the longest extent of its centroids, in place."""
+    """Sort each range order[start : start + count] along the longest extent of its centroids, in place."""
     if len(count) == 0:
         return
     offset = np.cumsum(count) - count

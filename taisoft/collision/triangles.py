@@ -1,27 +1,27 @@
-"""Nearest points of triangles and segments, and whether two triangles intersect: f64, no NaN for any finite input.
+"""Closest points of triangles and segments, and triangle-triangle intersection, in f64; no NaN for any finite input.
 
-A convex quadratic over a triangle, or over the square of two segments, has its minimum inside or on the boundary. So each
-function takes the interior solution where it is feasible, the boundary (point against segment) otherwise, and keeps what
-is nearest in fact: degenerate triangles and segments then need no cases. Interior solutions come from cross products,
-whose relative error grows with 1/sin of the smallest angle and not with its square. Weak: far from a triangle, by 1e8 of
-its size, the region is decided by rounding.
+A convex quadratic over a triangle, or over the square of two segments' parameters, has its minimum inside or on the boundary. So
+each function takes the interior solution if it is feasible, else the boundary (point against segment), and keeps the nearest
+point actually computed: degenerate triangles and segments then need no special cases. Interior solutions come from cross
+products, whose relative error grows with 1/sin of the smallest angle and not with its square. Weak: farther from a triangle than
+1e8 of its size, the region is decided by rounding.
 
 Intersection is decided by distances: of an edge's crossing of the other triangle's plane from that triangle (the test of
 Moeller and Trumbore 1997, whose barycentric coordinates are noise where edge and plane are nearly parallel), then of corners
 and edges.
 
-Source: Ericson, Real-Time Collision Detection, 2005, sections 5.1.5 and 5.1.9, for what is sought.
+Source of the problem statements: Ericson, Real-Time Collision Detection, 2005, sections 5.1.5 and 5.1.9.
 """
 
 import taichi as ti
 
 from taisoft.collision.surface import dvec
 
-TOUCHING = 1e-10  # triangles this near, in lengths of their longest edge, touch
+TOUCHING = 1e-10  # of the longest edge: distance at which triangles touch
 PARALLEL = 1e-8  # sine below which two segments count as parallel
 ROUNDING = 1e-14  # bounds the relative error of a volume (six times a tetrahedron's) formed in f64
 
-FACE, EDGE, CORNER = 0, 1, 4  # regions of a triangle; EDGE + k leads from corner k to the next
+FACE, EDGE, CORNER = 0, 1, 4  # regions of a triangle; edge k leads from corner k to the next
 
 
 @ti.func
@@ -32,7 +32,7 @@ def _corner(corners, k):
 
 @ti.func
 def closest_on_segment(p, a, b):
-    """Parameter t in [0, 1] of the point a + t (b - a) nearest to p; 0 where a = b. All (3,) [m]."""
+    """Parameter t in [0, 1] of the point a + t (b - a) nearest to p; 0 if a = b. All (3,) [m]."""
     d = b - a
     dd = d.dot(d)
     t = ti.cast(0.0, ti.f64)
@@ -43,7 +43,7 @@ def closest_on_segment(p, a, b):
 
 @ti.func
 def choose(k, a, b, c):
-    """a, b or c, as k is 0, 1 or 2. Not by indexing a matrix: the compiler fails where one indexed so is handed on."""
+    """Return a, b or c for k = 0, 1 or 2. A matrix indexed by k would fail to compile when passed on to a function."""
     return ti.select(k == 0, a, ti.select(k == 1, b, c))
 
 
@@ -51,8 +51,8 @@ def choose(k, a, b, c):
 def closest_on_triangle(p, a, b, c):
     """Point of a triangle nearest to p: its barycentric coordinates (3,), which sum to 1, and its region.
 
-    p, a, b, c: (3,) f64 [m]. region: 0 face, 1..3 inner part of edge k - 1 (from corner k - 1 to the next), 4..6 corner
-    k - 4. A degenerate triangle is its edges.
+    p, a, b, c: (3,) f64 [m]. region k: 0 face, 1..3 interior of edge k - 1 (from corner k - 1 to the next), 4..6 corner k - 4.
+    A degenerate triangle is treated as its edges.
     """
     n = (b - a).cross(c - a)
     nn = n.dot(n)
@@ -60,8 +60,8 @@ def closest_on_triangle(p, a, b, c):
     height = ti.cast(ti.math.inf, ti.f64)
     if nn > 0.0:
         beta, gamma = (c - a).cross(a - p).dot(n) / nn, (b - a).cross(p - a).dot(n) / nn
-        away = p - a - beta * (b - a) - gamma * (c - a)
-        height = away.dot(away)
+        offset = p - a - beta * (b - a) - gamma * (c - a)
+        height = offset.dot(offset)
     alpha = 1.0 - beta - gamma
     region = FACE
     if not (alpha > 0.0 and beta > 0.0 and gamma > 0.0 and height < ti.math.inf):
@@ -70,9 +70,9 @@ def closest_on_triangle(p, a, b, c):
         for k in range(3):
             u, v = choose(k, a, b, c), choose(k, b, c, a)
             t = closest_on_segment(p, u, v)
-            away = p - (u + t * (v - u))
-            if away.dot(away) < nearest:
-                nearest, edge, along = away.dot(away), k, t
+            offset = p - (u + t * (v - u))
+            if offset.dot(offset) < nearest:
+                nearest, edge, along = offset.dot(offset), k, t
         region = EDGE + edge
         if along == 0.0:
             region = CORNER + edge
@@ -86,8 +86,8 @@ def closest_on_triangle(p, a, b, c):
 
 @ti.func
 def closest_lines(p0, p1, q0, q1):
-    """Parameters (s, t), unclamped, of the nearest points of the lines p0 + s (p1 - p0) and q0 + t (q1 - q0), and 1 where
-    the lines are parallel or either is a point (then s = t = 0), else 0. All (3,) f64 [m]."""
+    """Unclamped parameters (s, t) of the nearest points of the lines p0 + s (p1 - p0) and q0 + t (q1 - q0), and 1 if the
+    lines are parallel or either is a point (then s = t = 0), else 0. All (3,) f64 [m]."""
     u, v, w = p1 - p0, q1 - q0, q0 - p0
     n = u.cross(v)
     nn = n.dot(n)
@@ -103,22 +103,22 @@ def closest_lines(p0, p1, q0, q1):
 def closest_segments(p0, p1, q0, q1):
     """Parameters (s, t) in [0, 1] of the nearest points of two segments p0 p1 and q0 q1, and whether they are parallel.
 
-    All (3,) f64 [m]. Of parallel segments that run beside each other, an end of one is given; the third value is then 1.
+    All (3,) f64 [m]. For overlapping parallel segments, an end of one of them is returned; the third value is then 1.
     """
     ends = ti.Matrix.rows([p0, p1, q0, q1])
     s, t, parallel = closest_lines(p0, p1, q0, q1)
     nearest = ti.cast(ti.math.inf, ti.f64)
     if parallel == 0 and 0.0 < s < 1.0 and 0.0 < t < 1.0:
-        away = p0 + s * (p1 - p0) - (q0 + t * (q1 - q0))
-        nearest = away.dot(away)
+        offset = p0 + s * (p1 - p0) - (q0 + t * (q1 - q0))
+        nearest = offset.dot(offset)
     for k in range(4):  # the two ends of p against q, then those of q against p
         other = 2 - 2 * (k // 2)
         e, a, b = _corner(ends, k), _corner(ends, other), _corner(ends, other + 1)
         at = ti.cast(k % 2, ti.f64)
         r = closest_on_segment(e, a, b)
-        away = e - (a + r * (b - a))
-        if away.dot(away) < nearest:
-            nearest = away.dot(away)
+        offset = e - (a + r * (b - a))
+        if offset.dot(offset) < nearest:
+            nearest = offset.dot(offset)
             s, t = at, r
             if k >= 2:
                 s, t = r, at
@@ -127,7 +127,7 @@ def closest_segments(p0, p1, q0, q1):
 
 @ti.func
 def _crossing(p, q, a, b, c):
-    """Where the segment p q crosses the plane of a triangle: 1 and the parameter in [0, 1], or 0 and 0."""
+    """Intersect segment p q with the plane of a triangle: 1 and the parameter in [0, 1], or 0 and 0."""
     n = (b - a).cross(c - a)
     above, below = (p - a).dot(n), (q - a).dot(n)
     crosses, s = 0, ti.cast(0.0, ti.f64)
@@ -137,8 +137,8 @@ def _crossing(p, q, a, b, c):
 
 
 @ti.func
-def _apart(corners, first, size):
-    """Whether one triangle (rows `first` and on) lies clear of the other's plane, on one side of it."""
+def _is_clear_of_plane(corners, first, size):
+    """Whether one triangle (rows from `first` on) lies strictly on one side of the other's plane."""
     other = 3 - first
     a = _corner(corners, other)
     n = (_corner(corners, other + 1) - a).cross(_corner(corners, other + 2) - a)
@@ -154,7 +154,7 @@ def _apart(corners, first, size):
 
 @ti.func
 def _longest_edge(corners):
-    """Of two triangles [m]."""
+    """Length of the longest edge of two triangles [m]."""
     longest = ti.cast(0.0, ti.f64)
     for k in range(6):
         e = _corner(corners, k) - _corner(corners, k // 3 * 3 + (k + 1) % 3)
@@ -163,38 +163,38 @@ def _longest_edge(corners):
 
 
 @ti.func
-def _meet(corners):
+def _intersect(corners):
     """Whether the triangles of rows 0 to 2 and 3 to 5 intersect or touch."""
     size = _longest_edge(corners)
     touching = ti.cast(TOUCHING, ti.f64) * size
     possible = 1
     for side in range(2):
-        if possible == 1 and _apart(corners, 3 * side, size):
+        if possible == 1 and _is_clear_of_plane(corners, 3 * side, size):
             possible = 0
     found = 0
     k = 0
     while possible == 1 and found == 0 and k < 21:
-        away = dvec(2.0 * touching)
+        offset = dvec(2.0 * touching)
         if k < 12:
             first = (k % 6) // 3 * 3
             p = _corner(corners, k % 6)
             a, b, c = _corner(corners, 3 - first), _corner(corners, 4 - first), _corner(corners, 5 - first)
-            tried = 1
+            test = 1
             if k < 6:
                 q = _corner(corners, first + (k + 1) % 3)
                 crosses, s = _crossing(p, q, a, b, c)
-                tried = crosses
+                test = crosses
                 p += s * (q - p)
-            if tried == 1:
+            if test == 1:
                 w, _ = closest_on_triangle(p, a, b, c)
-                away = p - (w[0] * a + w[1] * b + w[2] * c)
+                offset = p - (w[0] * a + w[1] * b + w[2] * c)
         else:
             i, j = (k - 12) // 3, (k - 12) % 3
             p0, p1 = _corner(corners, i), _corner(corners, (i + 1) % 3)
             q0, q1 = _corner(corners, 3 + j), _corner(corners, 3 + (j + 1) % 3)
             s, t, _ = closest_segments(p0, p1, q0, q1)
-            away = p0 + s * (p1 - p0) - (q0 + t * (q1 - q0))
-        if away.norm() <= touching:
+            offset = p0 + s * (p1 - p0) - (q0 + t * (q1 - q0))
+        if offset.norm() <= touching:
             found = 1
         k += 1
     return found
@@ -202,16 +202,16 @@ def _meet(corners):
 
 @ti.func
 def triangles_intersect(a0, a1, a2, b0, b1, b2):
-    """1 where two triangles intersect or touch, else 0; corners (3,) f64 [m], degenerate triangles too.
+    """1 if two triangles, possibly degenerate, intersect or touch, else 0. Corners (3,) f64 [m].
 
-    They touch where two of their points are nearer than 1e-10 of the longest of the six edges. The points tried: where an edge
-    crosses the other's plane, which decides most cases, and the nearest on its triangle; then, for what rounding hides from that
-    and for coplanar triangles, each corner and the nearest on the other triangle, and the nearest of any two edges.
+    They touch if two of their points are nearer than 1e-10 of the longest of the six edges. First tested are the points where an
+    edge crosses the other's plane, against that triangle; this decides most cases. Then, for coplanar triangles and cases lost to
+    rounding, each corner is tested against the other triangle, and each edge against each edge of the other.
     """
     lo_a, hi_a = ti.min(a0, a1, a2), ti.max(a0, a1, a2)
     lo_b, hi_b = ti.min(b0, b1, b2), ti.max(b0, b1, b2)
-    beside = ti.cast(2.0 * TOUCHING, ti.f64) * ti.max(hi_a - lo_a, hi_b - lo_b).max()  # an edge is at most sqrt(3) extents
+    padding = ti.cast(2.0 * TOUCHING, ti.f64) * ti.max(hi_a - lo_a, hi_b - lo_b).max()  # an edge is at most sqrt(3) extents
     result = 0
-    if (lo_a <= hi_b + beside).all() and (lo_b <= hi_a + beside).all():
-        result = _meet(ti.Matrix.rows([a0, a1, a2, b0, b1, b2]))
+    if (lo_a <= hi_b + padding).all() and (lo_b <= hi_a + padding).all():
+        result = _intersect(ti.Matrix.rows([a0, a1, a2, b0, b1, b2]))
     return result

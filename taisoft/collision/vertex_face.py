@@ -1,10 +1,10 @@
-"""Contacts of a vertex with a face, an edge or a corner of another surface, both as they are deformed.
+"""Contacts of a vertex with a face, an edge or a corner of another surface, both deformed.
 
-Every vertex looks at the triangles of one other collider near its way (`near.py`). Outside, each local minimum of the distance
-is a contact: above a groove there are two, across a flat edge between two triangles there is one. Inside, each face that the
-vertex can leave by is one; faces that meet in a ridge or a tip are left together, by way of that ridge or tip. Faces count only
-where the vertex's own surface sticks out along their normal, or, if it sticks out along none, looks at them: so the vertex under
-a block never takes the far side of a thin sheet for its way out.
+Each vertex is tested against the triangles of one other collider near its swept path (`queries.py`). Outside, each local minimum
+of the distance is a contact: two above a groove, one across a flat edge between two triangles. Inside, each face through which
+the vertex can exit is a contact; faces that meet in a ridge or a tip share one exit direction, over that ridge or tip. A face
+counts only if its normal lies in the vertex's normal cone or, if no face's normal does, if the vertex normal opposes it. So a
+vertex under a block never exits through the far side of a thin sheet.
 """
 
 import taichi as ti
@@ -25,34 +25,35 @@ from taisoft.collision.features import (
 from taisoft.collision.surface import INSIDE_BITS, dvec, ivec
 from taisoft.collision.triangles import CORNER, EDGE, closest_on_triangle
 
-TOGETHER = 2.0  # depths behind two faces of a ridge that differ by less are left together
-GROOVE = 10.0  # depths behind a groove's wall, beyond the margin, that there may be behind its other one
-SAME = 0.999  # cosine above which two faces count as one plane
-KEPT = 16  # faces near a vertex that are remembered between passes
-FACES = 8  # of a tip that are told apart
-FACING = -0.5  # cosine between normals below which a vertex looks at a face
-SLIGHTER = 0.25  # of the depth behind the face that it sticks out to: less behind one that it looks at goes before
-SLIGHT = 1e-6  # of a triangle's size: a vertex so little outside a side is not yet outside; wider than what `edge_edge` allows
-THROUGH = 0.5  # of their distance at rest: so far apart or farther, parts of one body count as near by at rest too
-TINY = 1e-9  # of a triangle's size: nearer, a direction comes from normals
+RIDGE_DEPTH_RATIO = 2.0  # largest ratio of the depths behind the faces of a ridge that share an exit direction
+GROOVE_DEPTH_RATIO = 10.0  # largest depth behind a groove's second wall, beyond the margin, in depths behind the first
+COPLANAR = 0.999  # cosine above which two faces count as one plane
+MAX_STORED = 16  # faces near a vertex that are stored between passes
+MAX_TIP_FACES = 8  # distinct faces of a tip
+FACING = -0.5  # cosine between normals below which a vertex faces a triangle
+FACING_DEPTH_RATIO = 0.25  # of the depth behind the face in the normal cone: a facing triangle less deep takes precedence
+OUTSIDE_SLACK = 1e-6  # of a triangle's size: a vertex this little before a face is not yet outside; wider than in `edge_edge`
+MAX_REST_RATIO = 0.5  # of the rest distance: parts of one body at least this far apart are neighbours at rest too
+TINY = 1e-9  # of a triangle's size: below this distance, directions come from normals
 
 NONE, OUTSIDE, INSIDE, BESIDE = 0, 1, 2, 3
 
 
 @ti.func
-def through(s: ti.template(), body, apart):
-    """How deep [m] parts of a body that are `apart` [m] at rest can be in each other: deeper, the body is squeezed between them.
-    Parts less than an edge apart cannot: a thin body that is squeezed to half would be taken for one that meets itself."""
-    return ti.select(apart > s.edge[body], ti.cast(THROUGH, ti.f64) * apart, ti.cast(0.0, ti.f64))
+def max_self_depth(s: ti.template(), body, rest_distance):
+    """Largest possible self-penetration [m] of parts of a body `rest_distance` [m] apart; if deeper, the body is compressed.
+
+    It is 0 for parts less than an edge apart: a thin body compressed to half would otherwise count as touching itself."""
+    return ti.select(rest_distance > s.edge[body], ti.cast(MAX_REST_RATIO, ti.f64) * rest_distance, ti.cast(0.0, ti.f64))
 
 
 @ti.func
-def relate(s: ti.template(), i, u):
-    """How vertex i lies to triangle u: (state, normal, height over its plane, distance, weights of the nearest point, own).
+def classify(s: ti.template(), i, u):
+    """Classify vertex i against triangle u: (state, normal, height over its plane, distance, weights of the nearest point, own).
 
-    OUTSIDE: at the nearest point of the surface near by; the normal then leads from it. INSIDE: behind it; BESIDE: behind its
-    plane, the foot beside it, as of the walls of a groove that is pierced at its bottom. NONE: anything else.
-    own: 1 where it is part of the vertex's own body that is near by at rest too; behind such a face no vertex is inside.
+    OUTSIDE: u holds the locally nearest point of its surface, and the normal points from it to i. INSIDE: i is behind u. BESIDE:
+    i is behind u's plane and projects beside u, as at the walls of a groove pierced at its bottom. NONE: anything else.
+    own: 1 if u is a part of the vertex's own body that is near it at rest too; no vertex is inside behind such a face.
     """
     p = s.x[i]
     size = ti.sqrt(s.area[u])
@@ -95,18 +96,18 @@ def relate(s: ti.template(), i, u):
     own = 0
     if s.body[u] == s.body[s.ring[s.ring_start[i]]]:
         c0, c1, c2 = s.rest[s.triangle[u, 0]], s.rest[s.triangle[u, 1]], s.rest[s.triangle[u, 2]]
-        apart = s.rest[i] - (w[0] * c0 + w[1] * c1 + w[2] * c2)
-        own = int(distance > ti.cast(THROUGH, ti.f64) * apart.norm())
-        if h < 0.0 and (s.rest[i] - c0).dot((c1 - c0).cross(c2 - c0)) < 0.0:  # not across a slot, where it lies before the face
-            own = int(distance > through(s, s.body[u], apart.norm()))
+        rest_distance = s.rest[i] - (w[0] * c0 + w[1] * c1 + w[2] * c2)
+        own = int(distance > ti.cast(MAX_REST_RATIO, ti.f64) * rest_distance.norm())
+        if h < 0.0 and (s.rest[i] - c0).dot((c1 - c0).cross(c2 - c0)) < 0.0:  # not across a slot, where i lies before the face
+            own = int(distance > max_self_depth(s, s.body[u], rest_distance.norm()))
         if state == BESIDE or (own == 1 and state == INSIDE):
             state = NONE
     return state, n, h, distance, w, own
 
 
 @ti.func
-def _behind_each_other(s: ti.template(), p, u, n_u, v, n_v, slack):
-    """Whether triangles u and v meet in a ridge as seen from p behind both: its foot on each lies behind the other."""
+def _form_ridge(s: ti.template(), p, u, n_u, v, n_v, slack):
+    """Whether triangles u and v form a ridge for p behind both: the projection of p onto each plane lies behind the other."""
     h_u, h_v = (p - corner(s, u, 0)).dot(n_u), (p - corner(s, v, 0)).dot(n_v)
     foot_u, foot_v = p - h_u * n_u, p - h_v * n_v
     return int((foot_u - corner(s, v, 0)).dot(n_v) <= slack) & int((foot_v - corner(s, u, 0)).dot(n_u) <= slack)
@@ -114,7 +115,7 @@ def _behind_each_other(s: ti.template(), p, u, n_u, v, n_v, slack):
 
 @ti.func
 def closing(s: ti.template(), i, u, w, n):
-    """How much nearer vertex i comes to the point w of triangle u along n during the step [m], 0 where it leaves."""
+    """Approach [m] of vertex i to the point w of triangle u along n during the step; 0 if they separate."""
     return ti.max(-(s.move[i] - moved(s, u, w)).dot(n), 0.0)
 
 
@@ -122,43 +123,43 @@ def closing(s: ti.template(), i, u, w, n):
 def vertex_contacts(
     s: ti.template(), entry: ti.template(), first, last, i, own, margin, out: ti.template(), start, end
 ):  # fmt: skip
-    """Contacts of vertex i of collider `own` with the triangles entry[first:last], all of one collider. Returns the new count.
+    """Write contacts of vertex i of collider `own` with triangles entry[first:last], all of one collider. Return the new count.
 
-    out[start:end] is where contacts go; margin [m]: largest gap at the nearest moment of the step. Three passes in one loop, so
-    that what they call is compiled once: what the vertex is, which faces it leaves together, and the contacts.
+    Contacts go to out[start:end]. margin [m]: largest gap at the closest time of the step. Passes share one loop, so that their
+    callees are compiled once: classify the vertex, collect the faces of a common exit direction, write the contacts.
     """
     at = start
     p = s.x[i]
     other = s.body[entry[first]]
     inf = ti.cast(ti.math.inf, ti.f64)
-    one = 1.0 + ti.cast(TINY, ti.f64)
-    state, nearest, best, least = NONE, inf, -1, inf
-    # what it lies beside counts at the nearest point of all, and unless some face there says that it is outside
-    any_nearest, clear, nearest_beside, best_beside, least_beside = inf, 0, inf, -1, inf
-    best_facing, least_facing = -1, inf  # of the faces that its surface looks at, though a neighbour lies deeper
-    slack, n_best, total, way, depth = inf, dvec(0.0), dvec(0.0), dvec(0.0), inf
-    normals = ti.Matrix.zero(ti.f64, FACES, 3)
+    one_plus = 1.0 + ti.cast(TINY, ti.f64)
+    state, nearest, best, min_depth = NONE, inf, -1, inf
+    # BESIDE triangles count only at the overall nearest point, and only if no face there has the vertex outside
+    min_distance, outside, nearest_beside, best_beside, min_depth_beside = inf, 0, inf, -1, inf
+    best_facing, min_depth_facing = -1, inf  # of faces opposed by the vertex normal, though a neighbour lies deeper
+    slack, n_best, total, exit_direction, depth = inf, dvec(0.0), dvec(0.0), dvec(0.0), inf
+    normals = ti.Matrix.zero(ti.f64, MAX_TIP_FACES, 3)
     count = 0
-    # faces that the later passes look at again; where they are too many, those go through the whole row
-    kept = ti.Vector.zero(ti.i32, KEPT)
-    n_kept = 0
+    # faces for the later passes; if there are too many, those passes use the whole row
+    stored = ti.Vector.zero(ti.i32, MAX_STORED)
+    n_stored = 0
     phase, q, size = 0, 0, last - first
     while phase <= 3:
-        if q == size:  # the passes that follow rest on what the first found
+        if q == size:  # later passes depend on the results of the first
             if phase == 0:
-                if clear == 1 and state == INSIDE:
+                if outside == 1 and state == INSIDE:
                     state = NONE
-                if clear == 0 and nearest_beside < nearest:
+                if outside == 0 and nearest_beside < nearest:
                     state = INSIDE
-                if clear == 0 and least_beside < least:
-                    least, best = least_beside, best_beside
-                if clear == 0 and best_facing >= 0:
-                    # the neighbour may be out on the other side already; no far side is the way out of a slight penetration
-                    if state == NONE or (state == INSIDE and least_facing < ti.cast(SLIGHTER, ti.f64) * least):
-                        state, least, best = INSIDE, least_facing, best_facing
+                if outside == 0 and min_depth_beside < min_depth:
+                    min_depth, best = min_depth_beside, best_beside
+                if outside == 0 and best_facing >= 0:
+                    # a neighbour may be out on the far side already; a slight penetration never exits through the far side
+                    if state == NONE or (state == INSIDE and min_depth_facing < ti.cast(FACING_DEPTH_RATIO, ti.f64) * min_depth):
+                        state, min_depth, best = INSIDE, min_depth_facing, best_facing
                 if state == INSIDE:
                     n_best = 1.0 * s.normal[best]
-                    slack = ti.cast(1e-6, ti.f64) * least
+                    slack = ti.cast(1e-6, ti.f64) * min_depth
                     for c in ti.static(range(3)):
                         normals[0, c] = n_best[c]
                     total += n_best
@@ -167,12 +168,12 @@ def vertex_contacts(
                     phase = 1
                 else:
                     phase = 3
-                if n_kept <= KEPT:
-                    size = n_kept
+                if n_stored <= MAX_STORED:
+                    size = n_stored
             elif phase == 1:
-                way, depth = n_best, least
+                exit_direction, depth = n_best, min_depth
                 if count > 1 and total.norm() > 0.05:
-                    way, depth = unit(total), inf  # along it the vertex leaves through the first face that it comes to
+                    exit_direction, depth = unit(total), inf  # along it the vertex exits through the first face it reaches
             elif phase == 2:
                 size = 1
                 if state == OUTSIDE:
@@ -184,70 +185,72 @@ def vertex_contacts(
         u = best
         if phase < 3:
             u = entry[first + q]
-            if phase > 0 and n_kept <= KEPT:
-                u = kept[q]
+            if phase > 0 and n_stored <= MAX_STORED:
+                u = stored[q]
         q += 1
-        a, n, h, distance, w, own_near = relate(s, i, u)
+        relation, n, h, distance, w, own_near = classify(s, i, u)
         near = distance - closing(s, i, u, w, n) <= margin
-        wanted = 0
+        accepted = 0
         if phase == 0:
-            if own_near == 0 and distance <= any_nearest * one:
-                if distance * one < any_nearest:
-                    clear, nearest_beside, best_beside, least_beside = 0, inf, -1, inf
-                any_nearest = ti.min(any_nearest, distance)
-                if h > ti.cast(SLIGHT, ti.f64) * ti.sqrt(s.area[u]):
-                    clear = 1
-            pierced = a == BESIDE and distance <= any_nearest * one
-            wanted = int(a == INSIDE or pierced or (a == OUTSIDE and near))
-            if wanted == 1:
-                if n_kept < KEPT:
-                    kept[n_kept] = u
-                n_kept += 1
+            if own_near == 0 and distance <= min_distance * one_plus:
+                if distance * one_plus < min_distance:
+                    outside, nearest_beside, best_beside, min_depth_beside = 0, inf, -1, inf
+                min_distance = ti.min(min_distance, distance)
+                if h > ti.cast(OUTSIDE_SLACK, ti.f64) * ti.sqrt(s.area[u]):
+                    outside = 1
+            pierced = relation == BESIDE and distance <= min_distance * one_plus
+            accepted = int(relation == INSIDE or pierced or (relation == OUTSIDE and near))
+            if accepted == 1:
+                if n_stored < MAX_STORED:
+                    stored[n_stored] = u
+                n_stored += 1
         elif state == OUTSIDE:
-            wanted = int(a == OUTSIDE and near)
-        elif phase < 3 and (a == INSIDE or (a == BESIDE and clear == 0 and distance <= any_nearest * one)):
-            together = 0
-            if a == INSIDE:
-                together = _behind_each_other(s, p, best, n_best, u, n, slack)
-            known = 0
+            accepted = int(relation == OUTSIDE and near)
+        elif phase < 3 and (relation == INSIDE or (relation == BESIDE and outside == 0 and distance <= min_distance * one_plus)):
+            ridge = 0
+            if relation == INSIDE:
+                ridge = _form_ridge(s, p, best, n_best, u, n, slack)
+            duplicate = 0
             for k in range(count):
-                if n.dot(dvec(normals[k, 0], normals[k, 1], normals[k, 2])) > ti.cast(SAME, ti.f64):
-                    known = 1
+                if n.dot(dvec(normals[k, 0], normals[k, 1], normals[k, 2])) > ti.cast(COPLANAR, ti.f64):
+                    duplicate = 1
             if phase == 1:
-                wanted = int(together == 1 and known == 0 and count < FACES and -h <= TOGETHER * least + slack)
-            elif known == 1 or together == 1:
-                if count > 1 and n.dot(way) > 0.0:
-                    depth = ti.min(depth, -h / n.dot(way))
+                accepted = int(
+                    ridge == 1 and duplicate == 0 and count < MAX_TIP_FACES and -h <= RIDGE_DEPTH_RATIO * min_depth + slack
+                )
+            elif duplicate == 1 or ridge == 1:
+                if count > 1 and n.dot(exit_direction) > 0.0:
+                    depth = ti.min(depth, -h / n.dot(exit_direction))
             else:
-                # a groove's other wall; the sides of a plate that has warped are deeper
-                wanted = int(n.dot(n_best) > -0.5) & int(-h <= ti.cast(GROOVE, ti.f64) * least + margin)
-        if wanted == 1:
-            wanted = in_normal_cone(s, i, n)
-            if phase == 0 and wanted == 0 and a == INSIDE and -h < least_facing:
+                # a groove's other wall; the sides of a warped plate are deeper
+                accepted = int(n.dot(n_best) > -0.5) & int(-h <= ti.cast(GROOVE_DEPTH_RATIO, ti.f64) * min_depth + margin)
+        if accepted == 1:
+            accepted = in_normal_cone(s, i, n)
+            if phase == 0 and accepted == 0 and relation == INSIDE and -h < min_depth_facing:
                 if n.dot(ring_normal(s, i)) < ti.cast(FACING, ti.f64):
-                    least_facing, best_facing = -h, u
+                    min_depth_facing, best_facing = -h, u
         gap = h
-        if phase == 0 and wanted == 1:
-            if a == BESIDE:
+        if phase == 0 and accepted == 1:
+            if relation == BESIDE:
                 nearest_beside = ti.min(nearest_beside, distance)
-                if -h < least_beside:
-                    least_beside, best_beside = -h, u
+                if -h < min_depth_beside:
+                    min_depth_beside, best_beside = -h, u
             else:
                 if distance < nearest:
-                    nearest, state = distance, a
-                if a == INSIDE and -h < least:
-                    least, best = -h, u
-        elif phase == 1 and wanted == 1:
+                    nearest, state = distance, relation
+                if relation == INSIDE and -h < min_depth:
+                    min_depth, best = -h, u
+        elif phase == 1 and accepted == 1:
             for c in ti.static(range(3)):
                 normals[count, c] = n[c]
             count += 1
             total += n
         elif phase == 3:
-            wanted, gap = 1, -depth
-            n = 1.0 * way
+            accepted, gap = 1, -depth
+            n = 1.0 * exit_direction
         elif state == OUTSIDE:
             gap = distance
-        if phase >= 2 and wanted == 1:
+        if phase >= 2 and accepted == 1:
             if state == INSIDE:
                 s.inside[i] |= 1 << (other % INSIDE_BITS)
                 s.exit_direction[i] -= gap * n
