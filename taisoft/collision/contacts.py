@@ -37,7 +37,6 @@ class ContactFields:
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-<<<<<<< HEAD
     """Contacts on the host, all arrays (k, ...) and in an order that does not depend on threads."""
 
     point: np.ndarray  #: (k,3) midway between the two surface points [m]
@@ -54,31 +53,6 @@ class Contacts:
     restitution: np.ndarray  #: (k,) of the pair
     found: int  #: contacts before the reduction
     unmapped: int  #: triangles whose tet is inverted, so that a distance field could not be used
-=======
-    """Contacts on the host, all arrays (k, ...), in an order that does not depend on threads.
-
-    point (k,3) [m], normal (k,3), gap (k,) [m], impulse (k,3) [N s] on a; body_a, body_b: names, an obstacle is always b;
-    nodes, weights (k,6): three for each side, the model's nodes numbered over all bodies, -1 and 0 for unused entries;
-    kind: "vertex_face", "edge_edge", "vertex_field" or "face_field"; feature (k,2): ids that persist while two features meet.
-    friction, restitution (k,): of the pair, from the scene. found: contacts before reduction; unmapped: triangles for which a
-    distance field could not be used because the tet is inverted.
-    """
-
-    point: np.ndarray
-    normal: np.ndarray
-    gap: np.ndarray
-    impulse: np.ndarray
-    body_a: np.ndarray
-    body_b: np.ndarray
-    nodes: np.ndarray
-    weights: np.ndarray
-    kind: np.ndarray
-    feature: np.ndarray
-    friction: np.ndarray
-    restitution: np.ndarray
-    found: int
-    unmapped: int
->>>>>>> prose-1
 
     def __len__(self) -> int:
         return len(self.gap)
