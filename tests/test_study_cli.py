@@ -85,7 +85,7 @@ def test_workers_do_not_share_a_device():
 
     check_device(plan(""), 1)
     check_device(plan("there is none"), 2)
-    with pytest.raises(SceneError, match="does not go with arch cuda"):
+    with pytest.raises(SceneError, match="cannot be used with arch cuda"):
         check_device(plan(""), 2)
 
 
@@ -96,7 +96,7 @@ def test_workers_do_not_share_a_device():
 def test_exit_status(monkeypatch, rows, ended, signal_number, status):
     monkeypatch.setattr(study_command, "text_of", lambda study: "")
     study = SimpleNamespace(comparable_rows=lambda: [object()] * rows, ended=ended)
-    assert study_command._told(study, Namespace(out=None), SimpleNamespace(number=signal_number)) == status
+    assert study_command._report_study(study, Namespace(out=None), SimpleNamespace(number=signal_number)) == status
 
 
 # --- interrupted ------------------------------------------------------------------------------------------------------

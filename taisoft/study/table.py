@@ -88,10 +88,10 @@ def _method(study: Study) -> str:
         )
     if study.space is not None:
         space_error = next((row.in_space_sure for row in study.rows if row.in_space_sure is not None), None)
-        if own is not None:
+        if space_error is not None:
             lines.append(
                 f"* errors in space are relative to the reference with {mesh_name(study.space.setting)}; its own error is "
-                f"{own.max:.2g} (max), {own.rms:.2g} (rms): {study.space_error_source}"
+                f"{space_error.max:.2g} (max), {space_error.rms:.2g} (rms): {study.space_error_source}"
             )
     seconds = study.plan["frame"] * study.plan["frames"] if study.plan["frame"] else 0.0
     threads = sorted({row.threads for row in study.rows if row.threads})
