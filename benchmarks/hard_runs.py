@@ -147,7 +147,7 @@ def _carry_out(rows: Iterable[Row], arch, finer, store, seconds_left, asked, tel
             _leave_out(row, why, finer)
             tell(f"{what}: {why}")
 
-    left = carry_out(requests, [LocalPlace(usable_cores(), CHILD)], done, seconds_left=seconds_left, requested=asked)
+    left = carry_out(requests, [LocalPlace(usable_cores(), CHILD)], done, seconds_left=seconds_left, stop_requested=asked)
     for key, why in left.items():
         _leave_out(waiting[key], why, finer)
 

@@ -121,9 +121,9 @@ def test_a_run_draws_them(tmp_path):
 @pytest.mark.parametrize(
     "arguments, told",
     [
-        (["--plots", "energy"], "--plots energy: 'energy' is none of its names (did you mean energies?); there are energies, "),
-        (["--plots", "energies,"], "'' is none of its names"),
-        (["--layers", "wires,contact"], "'contact' is none of its names (did you mean contacts?)"),
+        (["--plots", "energy"], "--plots energy: 'energy' is not a valid name (did you mean energies?); there are energies, "),
+        (["--plots", "energies,"], "'' is not a valid name"),
+        (["--layers", "wires,contact"], "'contact' is not a valid name (did you mean contacts?)"),
         (["--layers", "contacts"], "--layers contacts: contact forces are not modelled (one body, and nothing that it could"),
         (["--plots", "contacts"], "no plot 'contacts': contact forces are not modelled (one body, and nothing"),
         (["--plots", "iterations"], "no plot 'iterations': steps of symplectic_euler are explicit"),

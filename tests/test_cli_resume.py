@@ -135,10 +135,10 @@ def test_a_run_goes_on_elsewhere_with_another_dt(begun, tmp_path):
 @pytest.mark.parametrize(
     "arguments, told",
     [
-        (["--precision", "f64"], "precision is f32 there and cannot become f64 within a run"),
+        (["--precision", "f64"], "precision is f32 there and cannot become f64 in a run"),
         (["--set", "solver.integrator=bdf2"], "integrator is symplectic_euler there and cannot become bdf2"),
         (["--set", "solver.dt=0.5"], "above the estimated stability limit"),
-        (["--seconds", "0.1"], "it is at t = 0.1 s already, and the run ends at 0.1 s"),
+        (["--seconds", "0.1"], "it is already at t = 0.1 s, and the run ends at 0.1 s"),
         (["--checkpoint-every", "-1"], "--checkpoint-every must be greater than 0 s, not -1"),
     ],
 )

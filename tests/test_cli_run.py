@@ -180,7 +180,7 @@ def test_first_signal_saves_what_there_is(tmp_path, number, capfd):
     assert record["interrupted"] and record["status"] == "degraded" and 0.0 < record["sim_seconds"] < 0.1
     assert (tmp_path / "out" / "scene.usdc").exists()
     captured = capfd.readouterr()
-    assert "ended early by a signal" in captured.out and "a second signal leaves at once" in captured.err
+    assert "ended early by a signal" in captured.out and "a second signal exits immediately" in captured.err
 
 
 def test_signal_before_the_run_writes_nothing(tmp_path, capsys):
@@ -197,7 +197,7 @@ def test_second_signal_leaves_at_once(tmp_path):
     process = child("run", path, "--headless", "--out", tmp_path / "out", *SHORT_OUTPUT)
     try:
         for line in process.stderr:
-            if "a second signal leaves at once" in line:
+            if "a second signal exits immediately" in line:
                 break
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=50)  # of the 60 s that it would hang

@@ -29,8 +29,8 @@ from taisoft.scene.obstacles import MeshObstacle
 from taisoft.settings import plan_of
 
 DEMOS = {
-    "hanging_beam": Structure("velocity_verlet", held=True),
-    "twisting_bar": Structure("implicit_euler", held=True, moved=True, mass_damping=True),
+    "hanging_beam": Structure("velocity_verlet", fixed=True),
+    "twisting_bar": Structure("implicit_euler", fixed=True, prescribed=True, mass_damping=True),
 }
 
 
@@ -105,7 +105,7 @@ def test_scenes_have_what_they_say(structure):
     scene = build(structure)
     on = plan_of(scene, structure.integrator or "implicit_euler", False, False).on
     for name, feature in (
-        ("held", "fixed_nodes"), ("moved", "moving_nodes"), ("loaded", "loads"), ("mass_damping", "mass_damping"),
+        ("fixed", "fixed_nodes"), ("prescribed", "moving_nodes"), ("loaded", "loads"), ("mass_damping", "mass_damping"),
         ("stiffness_damping", "stiffness_damping"),
     ):  # fmt: skip
         assert on[feature] == getattr(structure, name), feature
@@ -117,7 +117,7 @@ def test_scenes_have_what_they_say(structure):
 
 @pytest.mark.parametrize("requested, simulated, static", [(None, "f32", "f64"), ("f32", "f32", "f32"), ("f64", "f64", "f64")])
 def test_precisions(requested, simulated, static, monkeypatch, capsys):
-    structure, found = Structure("implicit_euler", held=True), []
+    structure, found = Structure("implicit_euler", fixed=True), []
     monkeypatch.setattr(warm_scenes, "structures", lambda: [structure])
     monkeypatch.setattr(warm_scenes, "static_structures", lambda: [structure])
     monkeypatch.setattr(warm, "simulate", lambda structure, precision: found.append(precision))

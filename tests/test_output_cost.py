@@ -74,4 +74,4 @@ def test_compiling_in_an_observer_is_no_output(monkeypatch, capsys):
     assert result.compile_seconds == pytest.approx(10.0)
     sim.energies = lambda: Energies(0.0, 0.0, 0.0)
     print_summary(result, sim, observers, None)
-    assert "7.50 s, 7.50 s of them for output; and 10.00 s to compile" in capsys.readouterr().out
+    assert "7.50 s, 7.50 s of it for output; plus 10.00 s to compile" in capsys.readouterr().out

@@ -8,7 +8,7 @@ import pytest
 from taisoft.errors import SimulationError
 from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.shapes import box_mesh
-from taisoft.study.accuracy import Error, Reference, _momentum_error, distance, error_in_space, in_space_sure, shared_nodes
+from taisoft.study.accuracy import Error, Reference, _momentum_error, distance, error_in_space, finest_own_error, shared_nodes
 
 COARSE = box_mesh((2, 1, 1), (2.0, 1.0, 1.0))
 FINE = make_nodes(COARSE, 2).positions
@@ -47,15 +47,15 @@ def test_the_finest_mesh_is_as_good_as_a_third_of_the_distance_to_the_next():
     finest = reference(FINE, [["a", len(FINE)]], shift=1.0, own=1e-3, refine=2)
     near = reference(COARSE.vertices, [["a", COARSE.n_verts]], shift=0.9, refine=1)
     far = reference(COARSE.vertices, [["a", COARSE.n_verts]], shift=0.5)
-    own, told = in_space_sure(finest, [far, near])
+    own, told = finest_own_error(finest, [far, near])
     assert own.max == pytest.approx(0.1 / 2.0 / 3.0) and "refine 1" in told
     chance = reference(COARSE.vertices, [["a", COARSE.n_verts]], shift=0.99)  # nearer, but a coarser mesh
-    assert in_space_sure(finest, [chance, near])[0] == own
-    own, told = in_space_sure(replace(finest, order_in_time=1), [far, near])  # as with contacts
+    assert finest_own_error(finest, [chance, near])[0] == own
+    own, told = finest_own_error(replace(finest, order_in_time=1), [far, near])  # as with contacts
     assert own.max == pytest.approx(0.1 / 2.0) and told.startswith("the distance")
-    assert in_space_sure(finest, [])[0] == finest.own
-    finest.own = Error(0.5, 0.5)
-    assert in_space_sure(finest, [far, near])[0].max == 0.5
+    assert finest_own_error(finest, [])[0] == finest.own_error
+    finest.own_error = Error(0.5, 0.5)
+    assert finest_own_error(finest, [far, near])[0].max == 0.5
 
 
 def test_distances_are_relative():

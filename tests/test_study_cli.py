@@ -85,7 +85,7 @@ def test_workers_do_not_share_a_device():
 
     check_device(plan(""), 1)
     check_device(plan("there is none"), 2)
-    with pytest.raises(SceneError, match="does not go with arch cuda"):
+    with pytest.raises(SceneError, match="cannot be used with arch cuda"):
         check_device(plan(""), 2)
 
 
@@ -95,8 +95,8 @@ def test_workers_do_not_share_a_device():
 )
 def test_exit_status(monkeypatch, rows, ended, signal_number, status):
     monkeypatch.setattr(study_command, "text_of", lambda study: "")
-    study = SimpleNamespace(judged=lambda: [object()] * rows, ended=ended)
-    assert study_command._told(study, Namespace(out=None), SimpleNamespace(number=signal_number)) == status
+    study = SimpleNamespace(comparable_rows=lambda: [object()] * rows, ended=ended)
+    assert study_command._report_study(study, Namespace(out=None), SimpleNamespace(number=signal_number)) == status
 
 
 # --- interrupted ------------------------------------------------------------------------------------------------------
@@ -128,7 +128,7 @@ def test_interrupted_then_killed_a_study_goes_on(tmp_path, capsys):
     process.send_signal(signal.SIGINT)
     printed, told = process.communicate(timeout=120)
     assert process.returncode == 130 and "ending; runs that are finished are kept" in told
-    assert "Not complete: the study was interrupted. The same command goes on with it." in printed
+    assert "Not complete: the study was interrupted. The same command continues it." in printed
     first = records(out)
     assert 1 <= len(first) < 4 and (out / "study.md").exists()
 

@@ -19,7 +19,7 @@ pytest.importorskip("distributed")
 
 from taisoft.cli import main
 from taisoft.study.cluster import cluster_places, connect
-from taisoft.study.workers import CUT, SPENT, carry_out
+from taisoft.study.workers import BUDGET_SPENT, CUT_BY_BUDGET, carry_out
 from taisoft.timing import usable_cores
 
 SLOW = "import os, time\n\n\ndef build():\n    open({file!r}, 'a').write(f'{{os.getpid()}}\\n')\n    time.sleep(300)\n"
@@ -80,7 +80,7 @@ def test_workers_have_cores_of_their_own_and_can_be_lost(cluster, tmp_path):
         seen: list[int] = []
         end = time.monotonic() + 120
 
-        def requested() -> bool:
+        def stop_requested() -> bool:
             """Kill a worker when both runs have begun; its run then waits for the other worker, which is busy."""
             nonlocal end
             if len(started()) == 2 and not seen:
@@ -90,10 +90,10 @@ def test_workers_have_cores_of_their_own_and_can_be_lost(cluster, tmp_path):
             return False
 
         left = carry_out(
-            [("a", request), ("b", request)], places, lambda key, answer: None, requested=requested,
+            [("a", request), ("b", request)], places, lambda key, answer: None, stop_requested=stop_requested,
             seconds_left=lambda: end - time.monotonic(),
         )  # fmt: skip
-        assert sorted(left.values()) == [SPENT, CUT] and len(seen) == 2
+        assert sorted(left.values()) == [BUDGET_SPENT, CUT_BY_BUDGET] and len(seen) == 2
     deadline = time.monotonic() + 60
     while any(map(is_running, started())):
         assert time.monotonic() < deadline, "a run outlives the study"

@@ -6,7 +6,7 @@ import pytest
 
 from taisoft.cli.study import values_of
 from taisoft.errors import SceneError
-from taisoft.study.grid import AXES, MOST_FRAMES, Setting, cases, complete, expand, frame_time, steps_in, tasks_of
+from taisoft.study.grid import AXES, MAX_FRAMES, Setting, cases, complete, expand, frame_time, steps_in, tasks_of
 
 EXPLICIT = ("symplectic_euler", "velocity_verlet")
 
@@ -62,15 +62,15 @@ def test_refused_and_equal_ones_stay_in_the_list():
 )
 def test_frames_are_multiples_of_every_step(steps, seconds, frame, frames):
     found = frame_time(steps, seconds)
-    assert found == (pytest.approx(frame), frames) and frames <= MOST_FRAMES
+    assert found == (pytest.approx(frame), frames) and frames <= MAX_FRAMES
     for dt in steps:
         assert steps_in(found[0], dt) * dt == pytest.approx(found[0], rel=1e-9)
 
 
 def test_steps_that_never_meet_are_refused():
-    with pytest.raises(SceneError, match="meet only every 0.7 s.*multiples of one another"):
+    with pytest.raises(SceneError, match="coincide only every 0.7 s.*multiples of one another"):
         frame_time([0.1, 0.07], 2.0)
-    with pytest.raises(SceneError, match="never meet"):
+    with pytest.raises(SceneError, match="no common multiple"):
         frame_time([2**0.5 / 100, 0.01], 2.0)
     assert frame_time([2**0.5 / 100], 2.0)[0] == pytest.approx(3 * 2**0.5 / 100)
 

@@ -69,7 +69,7 @@ def test_axes_that_do_not_count_are_not_run_twice():
     reasons = [case["refused"] for case in plan_of(scene_of(), axes)["cases"]]
     assert reasons.count("") == 1 and len(reasons) == 4
     assert any("velocity_verlet solves no equations" in r for r in reasons)
-    assert any("nothing can touch in this scene" in r for r in reasons)
+    assert any("nothing can come into contact in this scene" in r for r in reasons)
 
 
 def test_a_scene_that_cannot_be_refined_says_why():
@@ -104,7 +104,7 @@ def test_a_reference_integrator_of_the_other_mass_is_replaced_and_told():
         "explicit": "velocity_verlet", "implicit": "implicit_midpoint",
     }  # fmt: skip
     assert plan["notes"] == [
-        "the explicit steps of quadratic tets have the reference velocity_verlet, since implicit_midpoint has another mass matrix"
+        "explicit steps of quadratic tets use the reference velocity_verlet, because implicit_midpoint has another mass matrix"
     ]
 
 
@@ -135,7 +135,7 @@ def test_a_reference_that_nobody_asked_for_is_named():
 @pytest.mark.parametrize(
     "wanted, error",
     [
-        ({"reference_dt": 1.0, "reference_integrator": "velocity_verlet"}, "reference-dt 1.*takes at most"),
+        ({"reference_dt": 1.0, "reference_integrator": "velocity_verlet"}, "reference-dt 1.*allows at most"),
         ({"reference_integrator": "rk4"}, "reference-integrator rk4: it must be one of"),
         ({"seconds": 0.01}, "meet only every"),
     ],

@@ -61,12 +61,12 @@ def test_errors_fall_with_the_order(integrator, order):
     study = run(Pendulum(plan()))
     rows = rows_of(study, integrator)
     for by in ("max", "rms"):
-        errors = [row.claimed(by) for row in rows]
+        errors = [row.resolved_error(by) for row in rows]
         orders = np.log2(np.divide(errors[:-1], errors[1:]))
         assert np.allclose(orders, order, atol=0.15), orders
     # to the exact cos t at 4 s, over the excursion of 2
     exact = abs(unpack(Pendulum(plan())._record(task(0.05, integrator))["path"])[-1, 1, 0] - np.cos(4.0)) / (1.0 - np.cos(np.pi))
-    assert rows[-1].in_time.max >= exact - 2 * study.references[0].own.max
+    assert rows[-1].in_time.max >= exact - 2 * study.references[0].own_error.max
 
 
 def task(dt: float, integrator: str) -> dict:
@@ -77,15 +77,15 @@ def test_the_references_own_error_is_what_it_is_off():
     reference = run(Pendulum(plan())).references[0]
     exact = np.cos(np.arange(21) * 0.2)
     off = np.abs(reference.path[:, 1, 0] - exact).max() / reference.excursion
-    assert reference.own.max == pytest.approx(off, rel=0.05)
+    assert reference.own_error.max == pytest.approx(off, rel=0.05)
 
 
 def test_nothing_below_the_references_own_error_is_fact():
     study = run(Pendulum(plan(dts=(0.2, 0.025), reference=0.0125)))
     fine = rows_of(study, "bdf2")[1]
-    fine.in_time = replace(fine.in_time, max=0.5 * study.references[0].own.max)
-    assert fine.claimed("max") == study.references[0].own.max
-    assert f"< {study.references[0].own.max:.2g}" in text_of(study)
+    fine.in_time = replace(fine.in_time, max=0.5 * study.references[0].own_error.max)
+    assert fine.resolved_error("max") == study.references[0].own_error.max
+    assert f"< {study.references[0].own_error.max:.2g}" in text_of(study)
 
 
 def test_energy_drift_is_that_of_the_method():
@@ -100,14 +100,14 @@ def test_energy_drift_is_that_of_the_method():
 
 def test_the_cheapest_within_the_tolerance_is_named():
     study = run(Pendulum(plan()))
-    errors = {(row.setting["integrator"], row.setting["dt"]): row.claimed("max") for row in study.judged()}
+    errors = {(row.setting["integrator"], row.setting["dt"]): row.resolved_error("max") for row in study.comparable_rows()}
     assert errors["bdf2", 0.2] > 0.003 > errors["bdf2", 0.1]
     study.request = replace(ASK, tolerance=0.003)
     assert (study.cheapest().setting["integrator"], study.cheapest().setting["dt"]) == ("bdf2", 0.1)
     assert "Cheapest within 0.003 (max error): bdf2, dt = 0.1 s, f32, 1.1 s" in text_of(study)
     study.request = replace(ASK, tolerance=1e-9)
     assert "No setting is within 1e-09 (max error); the nearest: bdf2, dt = 0.05 s" in text_of(study)
-    assert "nothing is known; --reference-dt" in text_of(study)
+    assert "are not resolved; --reference-dt" in text_of(study)
 
 
 def test_what_fails_or_crashes_stays_with_its_reason():
@@ -125,8 +125,8 @@ def test_what_fails_or_crashes_stays_with_its_reason():
 @pytest.mark.parametrize("how", ["failing", "crashing"])
 def test_without_its_reference_a_study_has_times_but_no_errors(how):
     study = run(Pendulum(plan(), **{how: {0.0125: "it is too small"}}))
-    assert not study.judged() and all(row.seconds for row in study.rows if row.status == "ok")
-    assert "it is too small; what it is needed for has no error" in text_of(study)
+    assert not study.comparable_rows() and all(row.seconds for row in study.rows if row.status == "ok")
+    assert "it is too small; runs that need it have no error" in text_of(study)
     assert "No setting has both a time and an error" in text_of(study)
 
 
@@ -142,7 +142,7 @@ def test_refused_combinations_are_told_as_a_product_where_they_are_one():
 
 
 @pytest.mark.parametrize(
-    "kept, told", [(True, "The same command goes on with it."), (False, "Without --out nothing of it is kept.")]
+    "kept, told", [(True, "The same command continues it."), (False, "Without --out nothing is kept.")]
 )
 def test_a_spent_budget_leaves_runs_out_and_says_so(tmp_path, kept, told):
     place = Pendulum(plan())
@@ -203,7 +203,7 @@ def test_a_damaged_record_is_done_anew_and_told(tmp_path, damage):
     place, store = Pendulum(plan()), Store(tmp_path)
     again = run(place, store)
     assert len(place.requests) == 2
-    assert len(store.damaged) == 1 and f"{path} is damaged and its run is done anew: " in text_of(again)
+    assert len(store.damaged) == 1 and f"{path} is damaged and its run is repeated: " in text_of(again)
     assert [row.in_time for row in again.rows] == [row.in_time for row in first.rows]
     assert Store(tmp_path).read(path.stem) is not None
 
@@ -254,7 +254,7 @@ def test_a_folder_takes_a_study_of_its_own_scene_alone(tmp_path):
     with pytest.raises(OutputError, match="holds a study of another scene .pendulum"):
         check_scene(tmp_path, "another")
     (tmp_path / "study.json").write_text("[]")
-    with pytest.raises(OutputError, match="holds a study.json that is no study's"):
+    with pytest.raises(OutputError, match="holds a study.json that is not a study"):
         check_scene(tmp_path, "scene")
 
 

@@ -75,11 +75,11 @@ def run(place: InProcess, request: Request):
 def test_the_order_of_convergence_is_the_integrators(tmp_path, lent, integrator, order):
     axes = {"dt": [0.01, 0.005, 0.0025], "integrator": [integrator], "precision": ["f64"]}
     study = study_of(tmp_path, axes=axes, reference_integrator="velocity_verlet")
-    rows = study.judged()
+    rows = study.comparable_rows()
     assert [row.setting["dt"] for row in rows] == axes["dt"] and study.references[0].setting["integrator"] == "velocity_verlet"
     errors = np.array([row.in_time.rms for row in rows])
     assert np.allclose(np.log2(errors[:-1] / errors[1:]), order, atol=0.25), errors
-    assert (errors > 10 * study.references[0].own.rms).all()  # so that they are facts
+    assert (errors > 10 * study.references[0].own_error.rms).all()  # so that they are facts
     assert all(row.status == "ok" and row.unconverged == 0 and row.energy_kept for row in rows)
 
 
@@ -157,7 +157,7 @@ def build():
 
 def answers_of(requests: list, places: list) -> dict:
     answers: dict = {}
-    assert carry_out(requests, places, answers.__setitem__, seconds_left=lambda: 1.0, requested=lambda: False) == {}
+    assert carry_out(requests, places, answers.__setitem__, seconds_left=lambda: 1.0, stop_requested=lambda: False) == {}
     return answers
 
 

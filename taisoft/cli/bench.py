@@ -1,4 +1,4 @@
-"""`taisoft bench NAME`: hands the remaining arguments to benchmarks/NAME.py, main(argv) -> exit status."""
+"""`taisoft bench NAME`: passes the remaining arguments to main(argv) -> exit status in benchmarks/NAME.py."""
 
 from argparse import Namespace
 
@@ -9,8 +9,8 @@ from taisoft.scene.checks import nearest
 
 
 def command(arguments: Namespace) -> int:
-    """Runs the benchmark, or lists all of them if none is named. Raises SceneError for an unknown name."""
-    # a part of a benchmark, or a peer in a folder below, is no benchmark of its own
+    """Run the benchmark, or list all of them if none is named. Raises SceneError for an unknown name."""
+    # files in subfolders, and files without main(), are parts of benchmarks
     files = {name: path for name, path in shipped_files("benchmarks").items() if "." not in name}
     benchmarks = {name: path for name, path in files.items() if "def main(" in path.read_text()}
     if arguments.name in (None, "-h", "--help"):

@@ -1,5 +1,8 @@
-"""`taisoft doctor`: what this machine offers and how to get what is missing. Nothing here can end the process: Taichi's
-Vulkan probe loads drivers and runs in a process of its own, CUDA is asked through its driver library."""
+"""`taisoft doctor`: what this machine offers and how to get what is missing.
+
+Nothing here can crash the process: Taichi's Vulkan probe, which loads drivers, runs in its own process; CUDA is queried
+through its driver library.
+"""
 
 import ctypes
 import os
@@ -13,14 +16,14 @@ from importlib import metadata
 from taisoft import __version__
 
 REQUIRED = ("taichi", "numpy", "scipy", "meshio", "usd-core", "networkx", "rich")
-# package -> the extra that installs it; only benchmarks compare with other programs, only studies use a cluster
+# package -> the extra that installs it; only benchmarks use other programs, only studies use a cluster
 OPTIONAL = {"mujoco": "peers", "pybullet": "peers", "newton": "peers", "matplotlib": "plot", "distributed": "cluster"}
 VULKAN_PROBE = "from taichi._lib import core; print('vulkan', core.with_vulkan())"
 PROBE_SECONDS = 60.0  # loading Taichi from a cold disk takes several seconds
 
 
 def command(_: Namespace) -> int:
-    """Prints one line per finding and always returns 0: a missing part is news, not an error."""
+    """Print one line per finding; always return 0, because a missing part is not an error."""
     lines = [
         ("taisoft", f"{__version__}, Python {platform.python_version()}"),
         ("machine", f"{platform.platform()}, {os.cpu_count()} cores"),
@@ -44,14 +47,14 @@ def _version(package: str, extra: str = "") -> str:
 
 
 def cuda() -> str:
-    """Whether the NVIDIA driver offers a device, with its name and the driver's CUDA version."""
+    """Return whether the NVIDIA driver offers a device, with its name and the driver's CUDA version."""
     try:
         driver = ctypes.CDLL("libcuda.so.1")
     except OSError:
         return "no: there is no NVIDIA driver (libcuda.so.1); install it, or use --arch cpu"
     status = driver.cuInit(0)
     if status != 0:
-        return f"no: the NVIDIA driver does not start (cuInit gives {status}); see nvidia-smi, or use --arch cpu"
+        return f"no: the NVIDIA driver does not start (cuInit returned {status}); see nvidia-smi, or use --arch cpu"
     count, version, name = ctypes.c_int(), ctypes.c_int(), ctypes.create_string_buffer(100)
     driver.cuDeviceGetCount(ctypes.byref(count))
     if count.value == 0:
@@ -62,7 +65,7 @@ def cuda() -> str:
 
 
 def vulkan() -> str:
-    """Whether Taichi finds a Vulkan driver, which windows and pictures need."""
+    """Return whether Taichi finds a Vulkan driver, which windows and pictures need."""
     hint = "no pictures, no window; install a driver (Debian: apt install mesa-vulkan-drivers)"
     try:
         probe = subprocess.run(
@@ -76,10 +79,10 @@ def vulkan() -> str:
 
 
 def display() -> str:
-    """Whether there is a display for the live window, or a way to a virtual one."""
+    """Return whether there is a display for the live window, or how to get a virtual one."""
     for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
         if os.environ.get(variable):
             return f"yes: {variable}={os.environ[variable]}"
     if shutil.which("xvfb-run"):
-        return "no, but a virtual one can be had: xvfb-run -a taisoft run SCENE; or use --headless"
+        return "no, but a virtual one is available: xvfb-run -a taisoft run SCENE; or use --headless"
     return "no: use --headless, or a virtual one (Debian: apt install xvfb)"

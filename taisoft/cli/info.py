@@ -1,6 +1,6 @@
-"""`taisoft info MESH`: what a mesh file holds, how good its tets are, and what a run would say about it.
+"""`taisoft info MESH`: a mesh file's contents, the quality of its tets, and the warnings a run would give.
 
-Of a surface: what keeps it from bounding a solid, and how it becomes one.
+For a surface: why it does not bound a solid, and how to fill it with tets.
 """
 
 import shlex
@@ -15,13 +15,13 @@ from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface
 from taisoft.mesh.tet_mesh import TetMesh
 
-SHARP = 0.1  # mean ratio below which a tet stiffens its surroundings and slows the solver noticeably
+POOR_QUALITY = 0.1  # mean ratio below which a tet stiffens its surroundings and slows the solver noticeably
 MILLIMETRES_ABOVE = 20.0  # longest side in file units: soft bodies of more than 20 m are rare, parts of 20 mm are not
 TINY_BELOW = 1e-3  # soft bodies under 1 mm are rare
 
 
 def command(arguments: Namespace) -> int:
-    """Prints counts, size, a guess at the unit, quality and problems. Raises MeshError if the file is no mesh."""
+    """Print counts, size, likely unit, quality and problems. Raises MeshError if the file is not a mesh."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they are listed as problems below
         if Path(arguments.mesh).suffix.lower() in FORMATS:
@@ -35,7 +35,7 @@ def command(arguments: Namespace) -> int:
 
 
 def describe_surface(surface: SurfaceMesh) -> list[tuple[str, str]]:
-    """(name, text) lines about a surface; lengths in the file's own unit."""
+    """Return (name, text) lines about a surface; lengths in the file's own unit."""
     x, faults = surface.vertices, surface.faults()
     a, b, c = np.moveaxis(x[surface.triangles], 1, 0)
     lengths = np.concatenate([np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))])
@@ -47,8 +47,8 @@ def describe_surface(surface: SurfaceMesh) -> list[tuple[str, str]]:
         ("edges", f"{lengths.min():.4g} to {lengths.max():.4g}, median {np.median(lengths):.4g}"),
     ]
     lines += _listed("problems", [*surface.warnings, *faults])
-    made = f"{Path(surface.source).stem}.msh"
-    return lines + [("next", f"fill it with tets: taisoft tetrahedralize {shlex.join([surface.source, '--out', made])}")]
+    mesh_name = f"{Path(surface.source).stem}.msh"
+    return lines + [("next", f"fill it with tets: taisoft tetrahedralize {shlex.join([surface.source, '--out', mesh_name])}")]
 
 
 def _head(counts: str, vertices: np.ndarray) -> list[tuple[str, str]]:
@@ -65,7 +65,7 @@ def _listed(name: str, texts: list[str]) -> list[tuple[str, str]]:
 
 
 def describe(mesh: TetMesh) -> list[tuple[str, str]]:
-    """(name, text) lines about a mesh; lengths in the file's own unit."""
+    """Return (name, text) lines about a mesh; lengths in the file's own unit."""
     lengths = edge_lengths(mesh.vertices, mesh.tets)
     quality = mean_ratio(lengths, mesh.volumes)
     pieces = "1 piece" if mesh.n_components == 1 else f"{mesh.n_components} pieces"
@@ -76,14 +76,14 @@ def describe(mesh: TetMesh) -> list[tuple[str, str]]:
         (
             "quality",
             f"mean ratio {quality.min():.3f} (tet {quality.argmin()}) to {quality.max():.3f}, median"
-            f" {np.median(quality):.3f}; 1 is a regular tet, {np.count_nonzero(quality < SHARP)} are below {SHARP}",
+            f" {np.median(quality):.3f}; 1 is a regular tet, {np.count_nonzero(quality < POOR_QUALITY)} are below {POOR_QUALITY}",
         ),
     ]
     return lines + _listed("problems", mesh.warnings)
 
 
 def unit_guess(longest: float) -> str:
-    """A guess at the unit of the file from its longest side; taisoft itself reads every file as metres."""
+    """Guess the unit of a file from its longest side; taisoft itself reads every file as metres."""
     if longest > MILLIMETRES_ABOVE:
         return f"read as metres, the longest side is {longest:.4g} m; probably millimetres: scale by 0.001"
     if longest < TINY_BELOW:

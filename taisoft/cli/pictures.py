@@ -1,4 +1,4 @@
-"""What `taisoft run` shows in pictures and in the window beside the bodies: colours, layers, plots, a caption."""
+"""Display options of `taisoft run` for pictures and the window: colours, layers, plots, a caption."""
 
 from argparse import Namespace
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from taisoft.view.plots import PLOTS, Plots
 
 @dataclass(frozen=True)
 class DisplayOptions:
-    """colour: as of `Offscreen`; layers: names, or None for those of old; plots: names; caption: the scene's name, or None."""
+    """colour: as in `Offscreen`; layers: names, or None for the defaults; plots: names; caption: the scene's name, or None."""
 
     colour: str = "body"
     layers: tuple[str, ...] | None = None
@@ -32,16 +32,16 @@ class DisplayOptions:
         return IN_WINDOW if self.layers is None else self.layers
 
     def annotate(self, plots: Plots | None, colouring: Colouring):
-        """What draws plots and caption on pictures, for `FrameWriter`; None where there is nothing to draw."""
+        """Return a function that draws plots and caption on pictures, for `FrameWriter`; None if there are none."""
         if not self.plots and self.caption is None:
             return None
         return Annotations(plots if self.plots else None, self.caption, colouring).draw
 
 
 def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
-    """What the options ask for. Raises SceneError for unknown names, and where nothing would show what is asked for."""
+    """Return the requested display options. Raises SceneError for unknown names and for options that nothing would show."""
     has_pictures = arguments.out is not None and not arguments.no_frames
-    needs = "needs --out, the folder to write to, and the pictures that --no-frames leaves out"
+    needs = "needs --out, the folder to write to, and pictures, that is, no --no-frames"
     layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS)
     requested = {"video": arguments.video, "caption": arguments.caption}
     if not has_window:
@@ -56,20 +56,20 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
 
 
 def check_modelled(shown: DisplayOptions, sim) -> None:
-    """Raises SceneError for a layer or plot of what sim does not model."""
+    """Raise SceneError for a layer or plot of a feature that sim does not model."""
     if "contacts" in (shown.layers or ()) and not sim.plan.on["contact_forces"]:
         raise SceneError(f"--layers contacts: contact forces are not modelled ({sim.plan.why('contact_forces')})")
     Plots(sim, shown.plots)
 
 
 def _names(option: str, text: str | None, known) -> tuple[str, ...] | None:
-    """Names of an option's value, joined by commas; `none` is none of them, no value None."""
+    """Return the comma-separated names in an option's value; `none` gives (), no value None. Raises SceneError."""
     if text is None:
         return None
     names = tuple(name.strip() for name in text.split(",")) if text.strip() != "none" else ()
     for name in names:
         if name not in known:
             raise SceneError(
-                f"--{option} {text}: {name!r} is none of its names{nearest(name, known)}; there are {', '.join(known)}, and none"
+                f"--{option} {text}: {name!r} is not a valid name{nearest(name, known)}; there are {', '.join(known)}, and none"
             )
     return names

@@ -1,4 +1,4 @@
-"""What a run writes: the observers of `taisoft run` together, kept going or ended as one."""
+"""Output of `taisoft run`: its observers and the folder of its results."""
 
 import shlex
 import sys
@@ -20,10 +20,10 @@ from taisoft.view.plots import Plots
 
 
 class Observers:
-    """Hands every frame to its members; the first that cannot write asks the run to end, and all such sentences are kept.
+    """Passes every frame to its members; after the first write error the run should end.
 
-    errors: what each OutputError said, each text once; seconds: wall time spent in the members [s], less that of compiling,
-    as in the wall time of a run. A member has frame(sim, index) and close().
+    errors: the distinct messages of all OutputErrors; seconds: wall time spent in the members [s], without compiling, as in
+    the wall time of a run. A member has frame(sim, index) and close().
     """
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class Observers:
         self.seconds = 0.0
 
     def on_frame(self, sim, index: int, _report) -> None:
-        """For Simulator.run. Never raises OutputError: what was computed must still be reported."""
+        """Pass to Simulator.run. Never raises OutputError, because computed results must still be reported."""
         start, compiled = time.perf_counter(), sim.compile_seconds
         for member in self.members:
             if not self.errors:
@@ -40,16 +40,16 @@ class Observers:
         self.seconds += time.perf_counter() - start - (sim.compile_seconds - compiled)
 
     def failed(self) -> bool:
-        """True once something could not be written."""
+        """Return whether something could not be written."""
         return bool(self.errors)
 
     def close(self) -> None:
-        """Closes the members, last first, each of them whatever the others do."""
+        """Close all members, last first, even if some fail."""
         while self.members:
             self.guard(self.members.pop().close)
 
     def guard(self, write, *arguments) -> bool:
-        """write(*arguments), and whether it could be written; an OutputError is kept and not raised."""
+        """Call write(*arguments) and return whether it succeeded; an OutputError is recorded, not raised."""
         try:
             write(*arguments)
         except OutputError as error:
@@ -60,12 +60,12 @@ class Observers:
 
 
 class Recording:
-    """The results of a run in one folder: report.json, steps.csv, checkpoint.npz and, where wanted, frames/ and scene.usdc.
+    """Results of a run in one folder: report.json, steps.csv, checkpoint.npz and, if requested, frames/ and scene.usdc.
 
-    resumed: of a run that goes on, the `checkpoint`, its `time` [s] and the first `frame`; the folder's results before them
-    are continued. every: simulated time between two checkpoints [s]; None for one at the end. notes: those of the checkpoint, if
-    a run goes on. Raises OutputError if the folder
-    cannot be written or holds results and neither overwrite is on nor the run goes on.
+    resumed: for a resumed run, the `checkpoint`, its `time` [s] and the first `frame`; earlier results in the folder are
+    continued. every: simulated time between two checkpoints [s]; None for one at the end. notes: those of the checkpoint of
+    a resumed run. Raises OutputError if the folder cannot be written, or holds results and neither overwrite nor resumed is
+    given.
     """
 
     def __init__(
@@ -80,12 +80,14 @@ class Recording:
         self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool, shown: DisplayOptions,
         plots: Plots | None,
     ) -> None:  # fmt: skip
-        """Adds the writers of frames, USD and checkpoints to the observers. What goes on in another way is refused before
-        anything is removed."""
+        """Add the writers of frames, USD and checkpoints to the observers.
+
+        A resumed run that does not match the earlier USD file is refused before anything is removed.
+        """
         rate = fps or 1.0 / sim.dt
         if with_usd:
-            folder, itself = self._folder.path, sim.settings.self_collision
-            usd = UsdWriter(folder, sim.scene, fps=rate, self_collision=itself, first=self._first or 0)
+            folder, self_collision = self._folder.path, sim.settings.self_collision
+            usd = UsdWriter(folder, sim.scene, fps=rate, self_collision=self_collision, first=self._first or 0)
             observers.members.append(usd)
             self._checkpoints.before = usd.flush
         if self._first is not None:
@@ -99,22 +101,22 @@ class Recording:
         observers.members.append(self._checkpoints)
 
     def checkpoint(self, sim) -> None:
-        """Writes checkpoint.npz. Raises OutputError."""
+        """Write checkpoint.npz. Raises OutputError."""
         self._checkpoints.write(sim)
 
     def video(self, fps: float) -> None:
-        """Writes video.mp4 from the pictures, or prints how it is made where ffmpeg is missing. Raises OutputError."""
+        """Write video.mp4 from the pictures, or print the command if ffmpeg is missing. Raises OutputError."""
         folder = self._folder.path
         if not picture_numbers(folder):
             return
         if find_ffmpeg() is None:
             line = shlex.join(command(folder, fps))
-            print(f"taisoft: no video without ffmpeg (pip install 'taisoft[video]'); where there is one: {line}", file=sys.stderr)
+            print(f"taisoft: no video without ffmpeg (pip install 'taisoft[video]'); the command is: {line}", file=sys.stderr)
             return
         write_video(folder, fps)
 
     def report(self, result: RunReport, sim, settings: RunSettings) -> None:
-        """Writes report.json and steps.csv, and removes what an earlier run left. Raises OutputError."""
+        """Write report.json and steps.csv, and remove files left by an earlier run. Raises OutputError."""
         record = settings.as_dict() | {"dt": sim.dt}
         write_report(
             self._folder.path,
@@ -130,7 +132,7 @@ class Recording:
         self._folder.discard_stale()
 
     def files(self) -> list[str]:
-        """What the folder holds now, one text for each file and one for all pictures."""
+        """Return the contents of the folder: one text per file and one for all pictures."""
         paths = [path for path in (self.path / name for name in RESULT_FILES) if path.is_file()]
         found = [f"{path} ({_size(path.stat().st_size)})" for path in paths]
         pictures = list((self.path / FRAMES_NAME).glob("*.png"))
@@ -140,7 +142,7 @@ class Recording:
         return found
 
     def close(self) -> None:
-        """Gives the folder back."""
+        """Release the folder."""
         self._folder.close()
 
 

@@ -1,4 +1,4 @@
-"""`taisoft run SCENE`: load, check, build, run, save, tell."""
+"""`taisoft run SCENE`: load, check, build, run, save, report."""
 
 import os
 import sys
@@ -30,21 +30,21 @@ from taisoft.view.plots import Plots
 
 
 def command(arguments: Namespace) -> int:
-    """Runs the scene and returns the exit status. What can be refused is refused before a file is written."""
+    """Run the scene and return the exit status. Bad input is refused before any file is written."""
     _check_working_folder()
-    with Signals() as signals, printed_warnings() as told:
+    with Signals() as signals, printed_warnings() as warned:
         scene, solver = load_scene(arguments.scene, arguments.allow_outside)
         every = _checkpoint_interval(arguments)
         saved: Checkpoint | None = None
         has_window = not arguments.headless and _window_is_possible()
         shown = display_options(arguments, has_window)
-        watched = has_window and arguments.out is None and arguments.seconds is None
+        interactive = has_window and arguments.out is None and arguments.seconds is None
         if arguments.resume is None:
             settings = resolve(solver, arguments, Simulator)
             if arguments.out is not None:
                 check_free(arguments.out, arguments.overwrite)
-            with _naming(arguments.scene):
-                sim = Simulator(scene, **settings.simulator | ({"draggable": True} if watched else {}))  # by the mouse
+            with _prefix_errors(arguments.scene):
+                sim = Simulator(scene, **settings.simulator | ({"draggable": True} if interactive else {}))  # by the mouse
         else:
             saved = read_last_good(arguments.resume)
             kept = saved.settings | ({"fps": saved.notes["fps"]} if "fps" in saved.notes else {})  # frames have numbers
@@ -53,17 +53,17 @@ def command(arguments: Namespace) -> int:
         with sim:
             check_modelled(shown, sim)
             print_plan(sim)
-            if watched:
-                return _watch(sim, settings, shown)
+            if interactive:
+                return _show_window(sim, settings, shown)
             _check_time_left(sim, settings, arguments)
-            with _naming(arguments.scene):
+            with _prefix_errors(arguments.scene):
                 check_length(settings.seconds, sim.dt, settings.fps)
-            return _run(sim, settings, arguments, signals, told, has_window, every, saved, shown)
+            return _run(sim, settings, arguments, signals, warned, has_window, every, saved, shown)
 
 
 @contextmanager
-def _naming(scene: str) -> Iterator[None]:
-    """Why the scene cannot be simulated as it was asked for is told with its name."""
+def _prefix_errors(scene: str) -> Iterator[None]:
+    """Prefix errors raised in the context with the scene's name."""
     try:
         yield
     except (SceneError, SimulationError) as error:
@@ -71,7 +71,7 @@ def _naming(scene: str) -> Iterator[None]:
 
 
 def _checkpoint_interval(arguments: Namespace) -> float | None:
-    """Of --checkpoint-every [s]. Raises SceneError."""
+    """Return the value of --checkpoint-every [s], or None. Raises SceneError."""
     every = arguments.checkpoint_every
     if every is None:
         return None
@@ -81,7 +81,7 @@ def _checkpoint_interval(arguments: Namespace) -> float | None:
 
 
 def _resumed(saved: Checkpoint, scene: Scene, settings: RunSettings) -> Simulator:
-    """The simulator that goes on, with another dt where that was asked for."""
+    """Return the resumed simulator, with another dt if requested."""
     sim = Simulator.from_checkpoint(saved, scene, arch=settings.simulator["arch"])
     if "dt" in settings.changed:
         try:
@@ -94,16 +94,16 @@ def _resumed(saved: Checkpoint, scene: Scene, settings: RunSettings) -> Simulato
 
 
 def _check_time_left(sim: Simulator, settings: RunSettings, arguments: Namespace) -> None:
-    """Raises SceneError for a checkpoint from the end of the run."""
+    """Raise SceneError if the checkpoint is already at the end of the run."""
     if arguments.resume is not None and settings.seconds - sim.time < 0.5 * sim.dt:
         raise SceneError(
-            f"--resume {arguments.resume}: it is at t = {sim.time:g} s already, and the run ends at {settings.seconds:g} s; "
-            "--seconds sets another end"
+            f"--resume {arguments.resume}: it is already at t = {sim.time:g} s, and the run ends at {settings.seconds:g} s; "
+            "--seconds sets a later end"
         )
 
 
 def _check_working_folder() -> None:
-    """Raises SceneError if the working folder is gone: Taichi asks for it when it starts."""
+    """Raise SceneError if the working folder is gone, because Taichi needs it to start."""
     try:
         os.getcwd()
     except OSError as error:
@@ -111,15 +111,15 @@ def _check_working_folder() -> None:
 
 
 def _window_is_possible() -> bool:
-    """Whether the live window can be opened; says why where it cannot, since opening it would end the process."""
+    """Return whether the live window can be opened; print why not, because opening it would crash the process."""
     missing = display_missing() or vulkan_missing()
     if missing:
         print(f"taisoft: running without a window: {missing}", file=sys.stderr)
     return not missing
 
 
-def _watch(sim: Simulator, settings: RunSettings, shown: DisplayOptions) -> int:
-    """The live window, for as long as it stays open."""
+def _show_window(sim: Simulator, settings: RunSettings, shown: DisplayOptions) -> int:
+    """Show the live window until it is closed."""
     from taisoft.view.window import show
 
     show(sim, fps=settings.fps or 1.0 / sim.dt, colour=shown.colour, layers=shown.in_window, plots=shown.plots)
@@ -128,10 +128,10 @@ def _watch(sim: Simulator, settings: RunSettings, shown: DisplayOptions) -> int:
 
 
 def _run(
-    sim: Simulator, settings: RunSettings, arguments: Namespace, signals: Signals, told: list[str], has_window: bool,
+    sim: Simulator, settings: RunSettings, arguments: Namespace, signals: Signals, warned: list[str], has_window: bool,
     every: float | None, saved: Checkpoint | None, shown: DisplayOptions,
 ) -> int:  # fmt: skip
-    """A run until settings.seconds, with what was computed saved however it ends."""
+    """Run until settings.seconds; save what was computed, however the run ends."""
     observers, resumed, notes = Observers(), None, {}
     plots = Plots(sim, shown.plots) if shown.plots or has_window else None
     if saved is not None:
@@ -160,18 +160,18 @@ def _run(
         if recording is not None:
             try:
                 observers.guard(recording.checkpoint, sim)
-            except SimulationError as error:  # the state is not worth keeping; an earlier checkpoint stays
+            except SimulationError as error:  # the state is invalid; an earlier checkpoint stays
                 result.problems.append(str(error))
                 result.status = "failed"
-        result.problems[:0] = [f"warning: {text}" for text in told]
+        result.problems[:0] = [f"warning: {text}" for text in warned]
         _report_failed_output(result, observers, signals)
         if recording is not None:
             reported = observers.guard(recording.report, result, sim, settings)
             video = arguments.video and not signals.requested()
-            filmed = not video or observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
+            video_written = not video or observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
             _report_failed_output(result, observers, signals)
-            if reported and not filmed:
-                observers.guard(recording.report, result, sim, settings)  # anew, with what became of the video
+            if reported and not video_written:
+                observers.guard(recording.report, result, sim, settings)  # again, with the video's errors
         print_summary(result, sim, observers, recording)
     if observers.failed():
         for error in observers.errors:
@@ -189,7 +189,7 @@ def _open_window(sim: Simulator, shown: DisplayOptions, plots: Plots):
 
 
 def _report_failed_output(result: RunReport, observers: Observers, signals: Signals) -> None:
-    """The run's report tells of all output that failed: report.json may still fit where a picture did not."""
+    """Add all output errors to the run's report: report.json may still fit on the disk when a picture did not."""
     result.problems += [error for error in observers.errors if error not in result.problems]
     if observers.failed():
         result.interrupted = result.interrupted and signals.requested()

@@ -1,7 +1,7 @@
-"""Finding and loading what `taisoft run` and `taisoft bench` name: demos, benchmarks and a user's own .toml and .py files.
+"""Find and load demos, benchmarks and a user's own .toml and .py files for `taisoft run` and `taisoft bench`.
 
-A checkout keeps demos/ and benchmarks/ beside the package; an installed wheel carries them inside it. A .py file is run
-as Python: only run files you trust. A .toml file is data.
+A checkout has demos/ and benchmarks/ beside the package; an installed wheel has them inside it. A .py file is executed as
+Python: only run files you trust. A .toml file is data.
 """
 
 import ast
@@ -23,9 +23,9 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def shipped_files(folder: str) -> dict[str, Path]:
-    """Name -> path of the .py files in the shipped folder `folder` ("demos" or "benchmarks"), sorted by name.
+    """Return name -> path of the .py files in the shipped folder ("demos" or "benchmarks"), sorted by name.
 
-    A file in a subfolder is called subfolder.name; files that start with _ are helpers and have no name.
+    A file in a subfolder is called subfolder.name; files that start with _ are helpers and left out.
     """
     place = shipped_folder(folder)
     paths = sorted(place.rglob("[!_]*.py")) if place else []
@@ -33,12 +33,12 @@ def shipped_files(folder: str) -> dict[str, Path]:
 
 
 def shipped_folder(folder: str) -> Path | None:
-    """Path of a shipped folder: inside the package (a wheel), else beside it (a checkout), else None."""
+    """Return a shipped folder: inside the package (a wheel), else beside it (a checkout), else None."""
     return next((place for place in (PACKAGE / folder, PACKAGE.parent / folder) if place.is_dir()), None)
 
 
 def load_shipped(folder: str, name: str) -> ModuleType:
-    """Imports the shipped file `name`; the folder is its package, so that it may import its neighbours relatively."""
+    """Import the shipped file `name`; the folder is its package, so relative imports work."""
     package = ModuleType(f"taisoft_{folder}")
     package.__path__ = [str(shipped_folder(folder))]
     sys.modules[package.__name__] = package
@@ -46,12 +46,12 @@ def load_shipped(folder: str, name: str) -> ModuleType:
 
 
 def first_line(path: Path) -> str:
-    """The first line of the docstring of a .py file, read without running it; empty if it has none."""
+    """Return the first docstring line of a .py file without running it; empty if there is none."""
     return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition("\n")[0]
 
 
 def find_scene(name: str) -> Path:
-    """Path of the file that SCENE names: a .toml or .py file, or a demo. Raises SceneError if there is none."""
+    """Return the path of SCENE: a .toml or .py file, or a demo. Raises SceneError if there is none."""
     if name.endswith((".py", ".toml")):
         path = Path(name)
         if not path.is_file():
@@ -68,46 +68,45 @@ def find_scene(name: str) -> Path:
 def load_scene(
     name: str, allow_outside: bool = False, refine: int | None = None, order: int | None = None
 ) -> tuple[Scene, dict]:
-    """The scene that SCENE names and its `solver` dict (empty if the file has none).
+    """Load the scene named SCENE and its `solver` dict (empty if the file has none).
 
-    allow_outside: let a .toml file name meshes outside of its folder. refine: how often the meshes are to be refined; order:
-    that of all bodies; None for what the scene says. A build() with a parameter of that name does it itself, elsewhere it is
-    done as `taisoft.scene.refine` says. Raises SceneError, or MeshError for a mesh, naming the file and, where its code is at
-    fault, the line.
+    allow_outside: let a .toml file name meshes outside its folder. refine: number of mesh refinements; order: element order of
+    all bodies; None keeps the scene's own. They are passed to a build() with a parameter of that name, else applied by
+    `taisoft.scene.refine`. Raises SceneError, or MeshError for a mesh, naming the file and, for errors in its code, the line.
     """
-    scene, solver, made = _built(name, allow_outside, {"refine": refine, "order": order})
-    for _ in range(0 if "refine" in made else refine or 0):
+    scene, solver, handled = _load(name, allow_outside, {"refine": refine, "order": order})
+    for _ in range(0 if "refine" in handled else refine or 0):
         scene = refined(scene)
-    return scene if order is None or "order" in made else with_order(scene, order), solver
+    return scene if order is None or "order" in handled else with_order(scene, order), solver
 
 
-def _built(name: str, allow_outside: bool, requested: dict) -> tuple[Scene, dict, set]:
-    """Scene and `solver` dict, and which of the things asked for build() has seen to; None is not asked for."""
+def _load(name: str, allow_outside: bool, requested: dict) -> tuple[Scene, dict, set]:
+    """Return the scene, the `solver` dict, and the keys of `requested` passed to build(); None values are not requested."""
     path = find_scene(name)
     if path.suffix == ".toml":
-        from taisoft.scene.toml import read_scene  # brings meshio along, which `taisoft list` does without
+        from taisoft.scene.toml import read_scene  # imports meshio, which `taisoft list` does not need
 
         return *read_scene(path, allow_outside), set()
     module = load_module(path)
     build = getattr(module, "build", None)
     if not callable(build):
         raise SceneError(f"{path}: no function build() that returns a Scene")
-    takes = {key: value for key, value in requested.items() if value is not None and key in inspect.signature(build).parameters}
-    scene = _call(path, functools.partial(build, **takes))
+    passed = {key: value for key, value in requested.items() if value is not None and key in inspect.signature(build).parameters}
+    scene = _call(path, functools.partial(build, **passed))
     if not isinstance(scene, Scene):
         raise SceneError(f"{path}: build() returned {type(scene).__name__}, a Scene is needed")
     solver = getattr(module, "solver", {})
     if not isinstance(solver, dict) or not all(isinstance(key, str) for key in solver):
         raise SceneError(f"{path}: solver must be a dict of Simulator arguments")
-    return scene, dict(solver), set(takes)
+    return scene, dict(solver), set(passed)
 
 
 def load_module(path: Path) -> ModuleType:
-    """Runs a .py file as a module. Raises SceneError naming file and line if it cannot be run."""
+    """Execute a .py file as a module. Raises SceneError naming file and line if it fails."""
     spec = importlib.util.spec_from_file_location(f"taisoft_file_{path.stem}", path)
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up by name
-    # A file split in two imports its neighbour by name; last on the path, so that it hides no other module.
+    sys.modules[spec.name] = module  # dataclasses look up their module by name
+    # A file may import modules in its folder; last on the path, so that it hides no other module.
     folder = str(path.absolute().parent)
     if folder not in sys.path:
         sys.path.append(folder)
@@ -116,7 +115,7 @@ def load_module(path: Path) -> ModuleType:
 
 
 def _call(path: Path, function, *arguments):
-    """function(*arguments), with an exception of the file's code turned into one sentence."""
+    """Return function(*arguments); an exception in the file's code becomes a one-sentence error."""
     try:
         return function(*arguments)
     except (Exception, SystemExit) as error:  # a file may raise anything
@@ -125,7 +124,7 @@ def _call(path: Path, function, *arguments):
 
 
 def _place(path: Path, error: BaseException) -> str:
-    """ "file, line n": the innermost line of the file that led to the error, or the file alone."""
+    """Return "file, line n", the innermost line of the file in the traceback, or the file alone."""
     if isinstance(error, SyntaxError) and error.filename == str(path):
         return f"{path}, line {error.lineno}"
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
@@ -133,7 +132,7 @@ def _place(path: Path, error: BaseException) -> str:
 
 
 def _sentence(error: BaseException) -> str:
-    """The error's text in one line; taisoft's own sentences stand alone, others are led by their type."""
+    """Return the error's text in one line, prefixed with its type unless it is taisoft's own."""
     text = " ".join((error.msg if isinstance(error, SyntaxError) else str(error)).split())
     if isinstance(error, (MeshError, SceneError)):
         return text

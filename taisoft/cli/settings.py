@@ -18,9 +18,9 @@ BARE_WORD = re.compile(r"[A-Za-z_]\w*")
 
 @dataclass
 class RunSettings:
-    """What a run starts with. simulator: arguments of Simulator; seconds [s]; fps [1/s], None for a frame a step.
+    """Settings of a run. simulator: arguments of Simulator; seconds [s]; fps [1/s], None for a frame per step.
 
-    changed: of a run that goes on, the names of arguments that differ from the checkpoint's.
+    changed: for a resumed run, the arguments that replace the checkpoint's.
     """
 
     simulator: dict
@@ -30,14 +30,14 @@ class RunSettings:
     changed: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict:
-        """Every setting of the run by name, given or by default."""
+        """Return every setting of the run by name, given or default."""
         return self.defaults | self.simulator | {"seconds": self.seconds, "fps": self.fps}
 
 
 def resolve(solver: dict, arguments: Namespace, simulator_class: type) -> RunSettings:
-    """Merges the three sources; options win over --set, --set wins over the scene.
+    """Merge the three sources; options override --set, --set overrides the scene.
 
-    Raises SceneError for an unknown key, a value that is no TOML scalar, an option and a --set that disagree, or
+    Raises SceneError for an unknown key, a value that is not a TOML scalar, an option and a --set that disagree, or
     seconds and fps that are not finite and positive. Simulator checks its own arguments.
     """
     defaults = _defaults(simulator_class)
@@ -48,17 +48,17 @@ def resolve(solver: dict, arguments: Namespace, simulator_class: type) -> RunSet
 
 
 def resolve_resumed(solver: dict, arguments: Namespace, simulator_class: type, saved: dict) -> RunSettings:
-    """As `resolve`, for a run that goes on with the settings of a checkpoint, over which the scene's do not count.
+    """As `resolve`, for a resumed run: the checkpoint's settings override the scene's.
 
-    saved: arguments of Simulator, and fps if the checkpoint tells.
+    saved: arguments of Simulator, and fps if the checkpoint has it.
 
-    Raises SceneError for an option or a --set that asks for something else than saved; only dt and arch may change.
+    Raises SceneError for an option or a --set that differs from saved; only dt and arch may change.
     """
     defaults = _defaults(simulator_class)
     given = _given(arguments, defaults, solver)
     for key, value in given.items():
         if key not in ("seconds", "dt", "arch") and value != saved.get(key, value):
-            raise SceneError(f"--resume {arguments.resume}: {key} is {saved[key]} there and cannot become {value} within a run")
+            raise SceneError(f"--resume {arguments.resume}: {key} is {saved[key]} there and cannot become {value} in a run")
     changed = {key: given[key] for key in ("dt", "arch") if key in given}
     own = {key: value for key, value in saved.items() if key not in RUN_KEYS}
     settings = RunSettings(simulator=own | changed, defaults=defaults, changed=list(changed))
@@ -66,7 +66,7 @@ def resolve_resumed(solver: dict, arguments: Namespace, simulator_class: type, s
 
 
 def _given(arguments: Namespace, defaults: dict, solver: dict) -> dict:
-    """What --set and the other options ask for; the scene's solver dict is checked, too."""
+    """Return the settings given by --set and the other options; check the scene's solver dict, too."""
     keys = [*defaults, *RUN_KEYS]
     _refuse_unknown(solver, keys, OF_SCENE)
     given = parse_assignments(arguments.assignments, keys)
@@ -88,7 +88,7 @@ def _with_run_keys(settings: RunSettings, merged: dict) -> RunSettings:
 
 
 def parse_assignments(assignments: list[str], keys: list[str]) -> dict:
-    """["solver.dt=0.01", ...] -> {"dt": 0.01, ...}; a value is a TOML scalar, a bare word or none."""
+    """Parse ["solver.dt=0.01", ...] to {"dt": 0.01, ...}; a value is a TOML scalar, a bare word or none."""
     values = {}
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
@@ -101,7 +101,7 @@ def parse_assignments(assignments: list[str], keys: list[str]) -> dict:
 
 
 def parse_scalar(text: str, assignment: str, option: str = "--set") -> float | int | bool | str | None:
-    """A number, true, false or "text" as TOML writes them; a bare word is text, and none is Python's None."""
+    """Parse a number, true, false or "text" in TOML syntax; a bare word is text, and none is None."""
     try:
         table = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
@@ -114,7 +114,7 @@ def parse_scalar(text: str, assignment: str, option: str = "--set") -> float | i
 
 
 def check_scene_solver(solver: dict) -> None:
-    """Raises SceneError for a `solver` dict of a scene with unknown keys or values that no run takes."""
+    """Raise SceneError if a scene's `solver` dict has unknown keys or invalid values."""
     _refuse_unknown(solver, list(CHECKS), OF_SCENE)
     try:
         check_solver(**solver)
@@ -123,7 +123,7 @@ def check_scene_solver(solver: dict) -> None:
 
 
 def _defaults(simulator_class: type) -> dict:
-    """Argument -> default value of Simulator, without the scene."""
+    """Return argument -> default value of Simulator, without the scene."""
     parameters = inspect.signature(simulator_class).parameters.values()
     return {parameter.name: parameter.default for parameter in parameters if parameter.name != "scene"}
 

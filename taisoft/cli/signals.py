@@ -1,4 +1,4 @@
-"""What SIGINT and SIGTERM mean: the first ends the run after its current batch, a second leaves at once."""
+"""Handling of SIGINT and SIGTERM: the first ends the run after its current batch, a second exits immediately."""
 
 import os
 import signal
@@ -7,7 +7,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(BaseException):
-    """A signal came while there was nothing to save, so the command just leaves."""
+    """A signal arrived when there was nothing to save, so the command just exits."""
 
     def __init__(self, signal_number: int):
         super().__init__(signal_number)
@@ -17,9 +17,9 @@ class Interrupted(BaseException):
 class Signals:
     """Handles SIGINT and SIGTERM while a command runs; restores the old handlers afterwards.
 
-    `number` is the first signal's number, or None. Until `run_began()` a signal raises Left: there is nothing
-    to save yet. After it, `asked()` turns true and the run is expected to end by itself and save what it has.
-    ending: what the first signal is answered with.
+    `number` is the first signal's number, or None. Before `run_began()` a signal raises Interrupted, because there is
+    nothing to save yet. After it, a signal makes `requested()` return True, and the run should end and save its results.
+    ending: message printed at the first signal.
     """
 
     def __init__(self, ending: str = "ending after the current step and saving") -> None:
@@ -37,18 +37,18 @@ class Signals:
             signal.signal(number, handler)
 
     def run_began(self) -> None:
-        """From now on the first signal only asks the run to end."""
+        """Make the first signal only request the run to end."""
         self._running = True
 
     def requested(self) -> bool:
-        """True once a signal has asked the run to end."""
+        """Return whether a signal has requested the run to end."""
         return self.number is not None
 
     def _handle(self, number: int, _frame) -> None:
         if not self._running:
             raise Interrupted(number)
         if self.number is not None:
-            os._exit(128 + number)  # files are published by rename, so leaving here tears none of them
+            os._exit(128 + number)  # files are written by rename, so exiting here leaves none incomplete
         self.number = number
-        # os.write, since print could be interrupted in the middle of its own buffer
-        os.write(2, f"\ntaisoft: {self._ending}; a second signal leaves at once\n".encode())
+        # os.write, because print is not reentrant
+        os.write(2, f"\ntaisoft: {self._ending}; a second signal exits immediately\n".encode())

@@ -1,4 +1,4 @@
-"""`taisoft study SCENE`: a scene over a grid of settings, speed against error."""
+"""`taisoft study SCENE`: runs a scene over a grid of settings, speed against error."""
 
 import sys
 import time
@@ -23,13 +23,13 @@ from taisoft.study.store import Store
 from taisoft.study.table import text_of
 from taisoft.study.workers import local_places
 
-WHOLE = {"order": (1, 2), "refine": (0, 1, 2, 3, 4)}
+INTEGER_AXES = {"order": (1, 2), "refine": (0, 1, 2, 3, 4)}
 ENDING = "ending; runs that are finished are kept"
 
 
 def command(arguments: Namespace) -> int:
-    """Runs the study and returns the exit status: 1 where no run of the grid has both a time and an error."""
-    request = requested(arguments)
+    """Run the study and return the exit status: 1 if no run of the grid has both a time and an error."""
+    request = parse_request(arguments)
     find_scene(request.scene)
     budget = checks.number(arguments.budget, "--budget", above=0.0, unit="s")
     with Signals(ENDING if arguments.out is not None else "ending") as signals, ExitStack() as stack:
@@ -37,7 +37,7 @@ def command(arguments: Namespace) -> int:
         if arguments.out is not None:
             check_free(arguments.out, overwrite=False)
         signals.run_began()
-        runner = Runner(request, places, machines, signals.requested, lambda: end - time.monotonic(), _tell)
+        runner = Runner(request, places, machines, signals.requested, lambda: end - time.monotonic(), _print_status)
         plan = runner.plan()
         if plan is None:
             raise Interrupted(signals.number)
@@ -49,34 +49,34 @@ def command(arguments: Namespace) -> int:
             stack.enter_context(closing(FolderLock(folder)))
             runner.store = Store(folder)
         end = time.monotonic() + budget
-        return _told(runner.run(plan), arguments, signals)
+        return _report_study(runner.run(plan), arguments, signals)
 
 
-def _told(study: Study, arguments: Namespace, signals: Signals) -> int:
-    """Prints and writes what was found."""
+def _report_study(study: Study, arguments: Namespace, signals: Signals) -> int:
+    """Print and write the results; return the exit status."""
     print(text_of(study), end="")
     if arguments.out is not None:
-        if told := write(study, Path(arguments.out)):
-            _tell(told)
+        if note := write(study, Path(arguments.out)):
+            _print_status(note)
         files = [name for name in FILES if (Path(arguments.out) / name).exists()]
         print(f"\nwritten to {arguments.out}: {', '.join(files)}, runs/")
-    if signals.number is not None and study.ended:  # a signal while the table is written leaves a whole study
+    if signals.number is not None and study.ended:  # a signal while the table is written leaves a complete study
         return EXIT_SIGNAL + signals.number
-    return 0 if study.judged() else EXIT_FAILED
+    return 0 if study.comparable_rows() else EXIT_FAILED
 
 
 def check_device(plan: dict, workers: int) -> None:
-    """Raises SceneError where several processes of this machine would be timed on one device."""
+    """Raise SceneError if several processes of this machine would be timed on one device."""
     if workers > 1 and any(case["setting"]["arch"] == "cuda" for case in plan["cases"] if not case["refused"]):
-        raise SceneError("--workers above 1 does not go with arch cuda: timed runs would share the device")
+        raise SceneError("--workers above 1 cannot be used with arch cuda: timed runs would share the device")
 
 
 def _places(arguments: Namespace, request: Request, stack: ExitStack) -> tuple[list, list[dict]]:
-    """Where runs are carried out, and on which machines."""
+    """Return the places that execute runs, and their machines."""
     if arguments.scheduler is None:
         return local_places(1 if arguments.workers is None else arguments.workers), [machine()]
     if arguments.workers is not None:
-        raise SceneError("--workers is for this machine's processes, and --scheduler has workers of its own: give one of them")
+        raise SceneError("--workers sets this machine's processes, and --scheduler has its own workers: give one of them")
     from taisoft.study.cluster import cluster_places, connect
 
     client = stack.enter_context(closing(connect(arguments.scheduler)))
@@ -84,8 +84,8 @@ def _places(arguments: Namespace, request: Request, stack: ExitStack) -> tuple[l
     return cluster_places(client)
 
 
-def requested(arguments: Namespace) -> Request:
-    """What the options ask for. Raises SceneError for values that no study takes."""
+def parse_request(arguments: Namespace) -> Request:
+    """Return the request given by the options. Raises SceneError for invalid values."""
     axes = {}
     for key in AXES:
         if (text := getattr(arguments, key)) is not None:
@@ -94,7 +94,7 @@ def requested(arguments: Namespace) -> Request:
         if (value := getattr(arguments, key)) is not None:
             checks.number(value, f"--{key.replace('_', '-')}", above=0.0)
     checks.whole(arguments.repeats, "--repeats", tuple(range(1, 101)))
-    checks.whole(arguments.reference_refine, "--reference-refine", WHOLE["refine"])
+    checks.whole(arguments.reference_refine, "--reference-refine", INTEGER_AXES["refine"])
     return Request(
         arguments.scene, axes, arguments.allow_outside, arguments.seconds, arguments.reference_dt,
         arguments.reference_integrator, arguments.reference_refine, arguments.repeats, arguments.tolerance, arguments.by,
@@ -102,12 +102,12 @@ def requested(arguments: Namespace) -> Request:
 
 
 def values_of(key: str, text: str) -> list:
-    """The values of an axis from a comma list, each once; `none` is adaptive."""
+    """Return the distinct values of an axis from a comma-separated list; `none` is adaptive."""
     option = f"--{key.replace('_', '-')}"
     values = [parse_scalar(part.strip(), part, option) for part in text.split(",")]
     for k, value in enumerate(values):
-        if key in WHOLE:
-            checks.whole(value, option, WHOLE[key])
+        if key in INTEGER_AXES:
+            checks.whole(value, option, INTEGER_AXES[key])
         else:
             try:
                 check_solver(**{key: value})
@@ -118,5 +118,5 @@ def values_of(key: str, text: str) -> list:
     return [float(value) if key == "dt" else value for value in values]
 
 
-def _tell(text: str) -> None:
+def _print_status(text: str) -> None:
     print(f"taisoft: {text}", file=sys.stderr, flush=True)

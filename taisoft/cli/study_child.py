@@ -1,7 +1,7 @@
-"""A process of a study: one line of JSON on stdin says what to do, JSON on stdout is the answer.
+"""Child process of a study: reads a request as one line of JSON on stdin and writes its answer as JSON on stdout.
 
-It leaves when stdin closes, so that it does not outlive the command, and takes its cores before NumPy and Taichi start.
-What a scene prints goes to stderr.
+It exits when stdin closes, so that it does not outlive the command, and is pinned to its cores before NumPy and Taichi start.
+Output of a scene goes to stderr.
 """
 
 import functools
@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 
 def main() -> None:
-    """Reads {"do": "plan" or "run", ...} and writes {"answer": ...} or {"error": sentence}."""
+    """Read {"do": "plan" or "run", ...} and write {"answer": ...} or {"error": sentence}."""
     serve(_answer)
 
 
@@ -25,7 +25,7 @@ def serve(answer: Callable[[dict], dict]) -> None:
         if not part:
             os._exit(1)
         line += part
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     request = json.loads(line)
@@ -34,7 +34,7 @@ def serve(answer: Callable[[dict], dict]) -> None:
     out.write(_text(answer(request)))
     out.flush()
     sys.stderr.flush()
-    os._exit(0)  # nothing is left to do, and taking Taichi down takes time
+    os._exit(0)  # skips Taichi's slow shutdown
 
 
 def _text(answer: dict) -> bytes:
@@ -43,7 +43,7 @@ def _text(answer: dict) -> bytes:
     return json_text(answer).encode()
 
 
-def _leave_with_parent() -> None:
+def _exit_with_parent() -> None:
     while os.read(0, 4096):
         pass
     os._exit(1)
@@ -71,17 +71,17 @@ def _answer(request: dict) -> dict:
         if request["do"] == "plan":
             _, solver = load(0)
             check_scene_solver(solver)
-            made = make_plan(variant, solver, request["request"])
-            # with the files' content, too: paths that are functions are told apart by nothing else
+            plan = make_plan(variant, solver, request["request"])
+            # include the files' content: nothing else distinguishes paths that are functions
             own = sources(find_scene(request["scene"]))
-            return {"answer": made | {"scenes": scenes, "sources": own, "code": code_digest()}}
+            return {"answer": plan | {"scenes": scenes, "sources": own, "code": code_digest()}}
         if code_digest() != request["code"]:
-            return {"error": "taisoft, Taichi or NumPy there is not the one that planned the study"}
+            return {"error": "taisoft, Taichi or NumPy there differs from the one that planned the study"}
         task = request["task"]
         scene = variant(task["setting"]["refine"], task["setting"]["order"])
-        told = digests(find_scene(request["scene"]), request["sources"])
-        if scenes != {mesh_name(task["setting"]): request["digest"]} or told != request["sources"]:
-            return {"error": "the scene there is not the one that was planned: it was changed meanwhile, or is another file"}
+        found = digests(find_scene(request["scene"]), request["sources"])
+        if scenes != {mesh_name(task["setting"]): request["digest"]} or found != request["sources"]:
+            return {"error": "the scene there differs from the planned one: it was changed meanwhile, or is another file"}
         return {"answer": measure(scene, task)}
     except TaisoftError as error:
         return {"error": str(error)}

@@ -1,4 +1,4 @@
-"""What `taisoft run` prints: the plan before, one screen of results after."""
+"""Output of `taisoft run` on the terminal: the plan before the run, one screen of results after it."""
 
 import textwrap
 
@@ -11,7 +11,7 @@ PROBLEMS_SHOWN = 5
 
 
 def print_plan(sim) -> None:
-    """Which features the scene needs, and why; report.json also says why the others are left out."""
+    """Print which features the scene needs, and why; report.json also says why the others are left out."""
     on = [entry for entry in sim.plan.entries if entry["on"]]
     off = [entry["feature"] for entry in sim.plan.entries if not entry["on"]]
     width = max((len(entry["feature"]) for entry in on), default=0)
@@ -21,14 +21,14 @@ def print_plan(sim) -> None:
 
 
 def print_state(sim) -> None:
-    """Time and energies of the simulator's present state."""
+    """Print time and energies of the simulator's current state."""
     _line("time", f"{sim.time:.6g} s simulated in {sim.step_count} steps of {sim.dt:.6g} s")
     e = sim.energies()
     _line("energy", f"kinetic {e.kinetic:.6g} J, elastic {e.elastic:.6g} J, gravity {e.gravity:.6g} J")
 
 
 def print_summary(result: RunReport, sim, observers: Observers, recording: Recording | None) -> None:
-    """Status and a changed dt, problems, time, smallest volume ratio, energies, files."""
+    """Print status and a changed dt, problems, time, smallest volume ratio, energies, files."""
     print()
     changed = dt_sentence(result)
     early = ", ended early by a signal" if result.interrupted else ""
@@ -40,13 +40,13 @@ def print_summary(result: RunReport, sim, observers: Observers, recording: Recor
         _line("", f"and {len(problems) - PROBLEMS_SHOWN} more problems")
     print_state(sim)
     wall, output = result.wall_seconds, observers.seconds
-    _line("wall", f"{wall:.2f} s, {output:.2f} s of them for output; and {result.compile_seconds:.2f} s to compile")
+    _line("wall", f"{wall:.2f} s, {output:.2f} s of it for output; plus {result.compile_seconds:.2f} s to compile")
     if result.step_reports:
         worst = min(result.step_reports, key=lambda report: report.min_volume_ratio)
         _line("min J", f"{worst.min_volume_ratio:.4g} at {worst.time:.4g} s, {worst.n_inverted} tets inverted")
-        cut = [report.substeps for report in result.step_reports if report.substeps > 1]
-        if cut:
-            _line("substeps", f"{len(cut)} steps were divided, into at most {max(cut)} substeps")
+        divided = [report.substeps for report in result.step_reports if report.substeps > 1]
+        if divided:
+            _line("substeps", f"{len(divided)} steps were divided, into at most {max(divided)} substeps")
     if recording is not None:
         for index, text in enumerate(recording.files()):
             _line("" if index else "files", text)

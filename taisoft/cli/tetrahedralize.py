@@ -1,4 +1,4 @@
-"""`taisoft tetrahedralize SURFACE`: a surface filled with tets, as a mesh file."""
+"""`taisoft tetrahedralize SURFACE`: fills a surface with tets and writes a mesh file."""
 
 from argparse import Namespace
 from pathlib import Path
@@ -13,7 +13,7 @@ from taisoft.mesh.tetrahedralize import tetrahedralize
 
 
 def command(arguments: Namespace) -> int:
-    """Writes the mesh and tells what is in it. What can be refused is refused before the mesher starts."""
+    """Write the mesh and print its properties. Bad arguments are refused before the mesher starts."""
     out = Path(arguments.out)
     check_ending(out)
     if out.exists() and not arguments.overwrite:

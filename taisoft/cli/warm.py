@@ -1,4 +1,4 @@
-"""`taisoft warm`: compiles the kernels of common scenes ahead, so that later runs find them in the cache on disk."""
+"""`taisoft warm`: compiles the kernels of common scenes in advance, so that later runs find them in the disk cache."""
 
 import contextlib
 import time
@@ -17,18 +17,18 @@ from taisoft.dynamics import EXPLICIT
 from taisoft.errors import SimulationError
 from taisoft.runtime import n_compiled
 
-STEPS = {True: (1e-5, 200), False: (1e-2, 10)}  # of explicit and implicit integrators: dt [s], and how many
-LONG = 1.0  # [s]
-HEAVY = (0.0, -500.0, 0.0)  # [m/s^2]
-SQUEEZE = np.array([0.3, 1.0, 1.0])  # of positions
-WILD = 0.5  # of a body's extent in a step: speed at which nodes fly about
+STEPS = {True: (1e-5, 200), False: (1e-2, 10)}  # explicit integrator: (dt [s], number of steps)
+LONG_DT = 1.0  # [s]
+STRONG_GRAVITY = (0.0, -500.0, 0.0)  # [m/s^2]
+SQUEEZE = np.array([0.3, 1.0, 1.0])  # factor of positions
+RANDOM_SPEED = 0.5  # of nodes, in smallest extents of the scene per step
 
 
 def command(arguments: Namespace) -> int:
-    """Compiles, one line for each structure, and returns 0. Without --precision simulations are in f32, statics in f64."""
+    """Compile, print one line per structure, and return 0. Without --precision simulations use f32, statics f64."""
     start, before = time.perf_counter(), n_compiled()
     with compile_message.silenced():
-        for structure in dict.fromkeys(warm_scenes.structures()):  # laws and integrators share some
+        for structure in dict.fromkeys(warm_scenes.structures()):  # some laws and integrators have structures in common
             _report(str(structure), simulate, structure, arguments.precision or "f32")
         for structure in warm_scenes.static_structures():
             precision = arguments.precision or "f64"
@@ -38,7 +38,7 @@ def command(arguments: Namespace) -> int:
 
 
 def simulate(structure: Structure, precision: str) -> None:
-    """A few steps, and what a run with --out writes of them."""
+    """Take a few steps, and compute what a run with --out writes."""
     dt, count = STEPS[structure.integrator in EXPLICIT]
     with ts.Simulator(warm_scenes.build(structure), dt=dt, integrator=structure.integrator, precision=precision) as sim:
         while sim.step_count < count:
@@ -47,29 +47,29 @@ def simulate(structure: Structure, precision: str) -> None:
         if implicit:
             sim._stepper.compile_hard_steps()
         if not sim.touches and implicit:
-            sim.dt = LONG  # so long that inertia does not hide the stiffness
-            sim.set_state(SQUEEZE * sim.positions())  # where the stiffness must be projected and the line search has work
+            sim.dt = LONG_DT  # so long that stiffness dominates inertia
+            sim.set_state(SQUEEZE * sim.positions())  # needs projected stiffness and a line search
             sim.step()
         if implicit:
             x = sim.positions()
-            size = WILD * float(np.ptp(x, axis=0).min()) / sim.dt
+            size = RANDOM_SPEED * float(np.ptp(x, axis=0).min()) / sim.dt
             sim.set_state(velocities=size * np.random.default_rng(0).standard_normal(x.shape))
-            with contextlib.suppress(SimulationError):  # what is refused or ends in no numbers has compiled all the same
+            with contextlib.suppress(SimulationError):  # a step that fails has compiled its kernels all the same
                 sim.step()
         sim.energies()
         sim.stress()
 
 
 def solve(structure: Structure, precision: str) -> None:
-    """The static state under a load so large that the line search has work."""
+    """Solve for the static state under a load large enough to need the line search."""
     scene = warm_scenes.build(structure)
-    scene.gravity = HEAVY
+    scene.gravity = STRONG_GRAVITY
     ts.solve_static(scene, precision=precision)
 
 
 def _report(what: str, do: Callable, *arguments: Any) -> None:
     start, before = time.perf_counter(), n_compiled()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of scenes that nobody looks at
+        warnings.simplefilter("ignore")  # these scenes are not the user's
         do(*arguments)
     print(f"{what:<90} {n_compiled() - before:3d} kernels {time.perf_counter() - start:6.1f} s", flush=True)

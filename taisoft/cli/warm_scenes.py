@@ -1,7 +1,7 @@
-"""The structures that `taisoft warm` compiles, as data, and a tiny scene of each.
+"""The structures that `taisoft warm` compiles, as data, and a tiny scene for each.
 
-A kernel depends on what a `Structure` names, and on neither meshes nor numbers: a cube of 40 tets does for a body. Every
-demo's structure is in the table, which `tests/test_cli_warm.py` checks.
+Kernels depend on the fields of `Structure`, not on meshes or numbers, so a cube of 40 tets suffices for a body. The table
+contains every demo's structure, which `tests/test_cli_warm.py` checks.
 """
 
 from collections.abc import Iterator
@@ -16,32 +16,32 @@ from taisoft.scene.key_frames import KeyFrames
 from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle
 from taisoft.scene.scene import LAWS, Material, Scene
 
-IMPLICIT = ("implicit_euler", "bdf2")  # of those, the common ones
+IMPLICIT = ("implicit_euler", "bdf2")  # the common ones
 STATIC = ""  # in place of an integrator
 SIZE = 0.1  # [m] of a cube
-SPEED = 2.0  # [m/s] of what falls: so hard that the steps of a collision are tried again
+SPEED = 2.0  # [m/s] of falling bodies: fast enough that collisions retry steps
 
 
 @dataclass(frozen=True)
 class Structure:
-    """What kernels are compiled for. obstacles: of "half-space", "box" and "mesh"; orders: of a body's elements each.
+    """Features that kernels are compiled for. obstacles: "half-space", "box" or "mesh"; orders: element order of each body.
 
-    held, moved: nodes that are fixed, or follow a path; thin: tets so flat that strains are formed in f64; fine: a surface of
-    more than 1,500 triangles, searched by parallel loops.
+    fixed, prescribed: some nodes are fixed, or follow a path; loaded: forces on nodes; thin: tets so flat that strains are
+    computed in f64; fine: a surface of more than 1,500 triangles, searched by parallel loops.
     """
 
     integrator: str
     law: str = "stable_neo_hookean"
     orders: tuple[int, ...] = (1,)
     obstacles: tuple[str, ...] = ()
-    held: bool = False
-    moved: bool = False
+    fixed: bool = False
+    prescribed: bool = False
     loaded: bool = False
     mass_damping: bool = False
     stiffness_damping: bool = False
     thin: bool = False
     fine: bool = False
-    touching: bool = True  # whether bodies may touch
+    contacts: bool = True  # whether contact forces are modelled
 
     def __str__(self) -> str:
         words = [name.replace("_", " ") for name in (self.law, self.integrator) if name]
@@ -54,13 +54,13 @@ class Structure:
 
 
 def structures() -> Iterator[Structure]:
-    """The table: first what all laws have in common, then what the default law is used with."""
+    """Yield the table: first the features common to all laws, then those of the default law."""
     for law in LAWS:
         for integrator in (*EXPLICIT, *IMPLICIT):
-            yield Structure(integrator, law, held=True)
-        yield Structure("implicit_euler", law, held=True, mass_damping=True)
+            yield Structure(integrator, law, fixed=True)
+        yield Structure("implicit_euler", law, fixed=True, mass_damping=True)
         yield Structure("implicit_euler", law, obstacles=("half-space",))
-        yield Structure("implicit_euler", law, orders=(1, 1), held=True)
+        yield Structure("implicit_euler", law, orders=(1, 1), fixed=True)
         yield Structure("symplectic_euler", law, obstacles=("half-space",))
     for integrator in EXPLICIT:
         yield from _explicit(integrator)
@@ -72,58 +72,58 @@ def structures() -> Iterator[Structure]:
 
 
 def static_structures() -> Iterator[Structure]:
-    """For `solve_static`, which takes no integrator and no contacts."""
+    """Yield the structures for `solve_static`, which has no integrator and no contacts."""
     for law in LAWS:
-        yield Structure(STATIC, law, held=True)
-    yield Structure(STATIC, held=True, loaded=True)
-    yield Structure(STATIC, held=True, moved=True)
-    yield Structure(STATIC, orders=(2,), held=True)
+        yield Structure(STATIC, law, fixed=True)
+    yield Structure(STATIC, fixed=True, loaded=True)
+    yield Structure(STATIC, fixed=True, prescribed=True)
+    yield Structure(STATIC, orders=(2,), fixed=True)
 
 
 def _explicit(integrator: str) -> Iterator[Structure]:
     yield Structure(integrator)
-    yield Structure(integrator, held=True, mass_damping=True)
-    yield Structure(integrator, held=True, loaded=True)
-    yield Structure(integrator, held=True, moved=True)
+    yield Structure(integrator, fixed=True, mass_damping=True)
+    yield Structure(integrator, fixed=True, loaded=True)
+    yield Structure(integrator, fixed=True, prescribed=True)
     yield Structure(integrator, obstacles=("half-space",))
-    yield Structure(integrator, orders=(1, 1), held=True)
+    yield Structure(integrator, orders=(1, 1), fixed=True)
 
 
 def _implicit(integrator: str) -> Iterator[Structure]:
     for damped in (False, True):
-        yield Structure(integrator, held=True, mass_damping=damped)
-        yield Structure(integrator, held=True, loaded=True, mass_damping=damped)
-        yield Structure(integrator, held=True, moved=True, mass_damping=damped)
+        yield Structure(integrator, fixed=True, mass_damping=damped)
+        yield Structure(integrator, fixed=True, loaded=True, mass_damping=damped)
+        yield Structure(integrator, fixed=True, prescribed=True, mass_damping=damped)
         yield Structure(integrator, obstacles=("half-space",), mass_damping=damped)
         yield Structure(integrator, obstacles=("half-space", "box"), mass_damping=damped)
-        yield Structure(integrator, orders=(1, 1), held=True, mass_damping=damped)
+        yield Structure(integrator, orders=(1, 1), fixed=True, mass_damping=damped)
         yield Structure(integrator, orders=(1, 1), obstacles=("half-space",), mass_damping=damped)
         yield Structure(integrator, obstacles=("box",), mass_damping=damped)
     yield Structure(integrator, obstacles=("mesh",))
-    yield Structure(integrator, held=True, moved=True, stiffness_damping=True)
-    yield Structure(integrator, orders=(2,), held=True)
-    yield Structure(integrator, orders=(2,), held=True, mass_damping=True)
-    yield Structure(integrator, orders=(2,), held=True, thin=True, mass_damping=True)
-    yield Structure(integrator, orders=(1, 2), held=True, mass_damping=True, touching=False)
-    yield Structure(integrator, orders=(1, 1), held=True, thin=True, mass_damping=True)
+    yield Structure(integrator, fixed=True, prescribed=True, stiffness_damping=True)
+    yield Structure(integrator, orders=(2,), fixed=True)
+    yield Structure(integrator, orders=(2,), fixed=True, mass_damping=True)
+    yield Structure(integrator, orders=(2,), fixed=True, thin=True, mass_damping=True)
+    yield Structure(integrator, orders=(1, 2), fixed=True, mass_damping=True, contacts=False)
+    yield Structure(integrator, orders=(1, 1), fixed=True, thin=True, mass_damping=True)
 
 
 def build(structure: Structure) -> Scene:
-    """Cubes, or first a sheet, one above the other, falling on what is below; the first is held, moved and loaded."""
+    """Build stacked cubes (the lowest may be a sheet) that fall on what is below; the lowest has the conditions and loads."""
     scene = Scene()
-    scene.contact_forces = structure.touching
+    scene.contact_forces = structure.contacts
     damping = {"mass_damping": float(structure.mass_damping), "stiffness_damping": 1e-3 * structure.stiffness_damping}
     soft = Material(law=structure.law, young=1e5, poisson=0.3, density=1000.0, friction=0.5, **damping)
     mesh, bottom = _first_mesh(structure), 0.001 * SIZE
     for k, order in enumerate(structure.orders):
         height = float(np.ptp(mesh.vertices[:, 1]))
-        falls = k > 0 or not structure.held
+        falls = k > 0 or not structure.fixed
         scene.add_body(
             mesh, soft, name=f"body {k}", position=(0.0, bottom + 0.5 * height, 0.0), order=order,
             velocity=(0.0, -SPEED if falls else 0.0, 0.0),
         )  # fmt: skip
         mesh, bottom = box_mesh((2, 2, 2), (0.5 * SIZE, 0.5 * SIZE, 0.5 * SIZE)), bottom + height + 0.001 * SIZE
-    _condition(scene.bodies[0], structure)
+    _add_conditions(scene.bodies[0], structure)
     for name in structure.obstacles:
         scene.add_obstacle(_obstacle(name), name=name, friction=0.5)
     return scene
@@ -136,12 +136,12 @@ def _first_mesh(structure: Structure) -> TetMesh:
     return sheet_mesh((cells, cells), (SIZE * cells, SIZE / 50 if structure.thin else SIZE, SIZE * cells))
 
 
-def _condition(body, structure: Structure) -> None:
-    """Hold, move and load the body on its sides."""
+def _add_conditions(body, structure: Structure) -> None:
+    """Fix, prescribe and load nodes on the body's sides."""
     side = float(np.abs(body.rest_positions[:, 0]).max()) - 1e-6
-    if structure.held:
+    if structure.fixed:
         body.fix(lambda X: X[:, 0] < -side)
-    if structure.moved:
+    if structure.prescribed:
         body.move(lambda X: X[:, 0] > side, KeyFrames([0.0, 1.0], [(0.0, 0.0, 0.0), (0.1 * SIZE, 0.0, 0.0)], release=True))
     if structure.loaded:
         body.add_force(lambda X: X[:, 0] > side, (0.0, 1.0, 0.0))

@@ -1,4 +1,4 @@
-"""Warnings of a command, as sentences on stderr."""
+"""Prints the warnings of a command as sentences on stderr."""
 
 import sys
 import warnings
@@ -8,16 +8,16 @@ from contextlib import contextmanager
 
 @contextmanager
 def printed_warnings() -> Iterator[list[str]]:
-    """Prints each warning as one sentence, and yields the list of them, which the report repeats."""
-    told: list[str] = []
+    """Print each warning as one sentence; yield the list of their texts, which goes into the report."""
+    texts: list[str] = []
 
-    def tell(message, category, filename, lineno, file=None, line=None) -> None:
+    def show(message, category, filename, lineno, file=None, line=None) -> None:
         is_ours = category is UserWarning
         text = str(message) if is_ours else f"{filename}, line {lineno}: {category.__name__}: {message}"
-        told.append(text)
+        texts.append(text)
         print(f"taisoft: warning: {text}", file=sys.stderr)
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = tell
-        yield told
+        warnings.showwarning = show
+        yield texts

@@ -1,1 +1,1 @@
-"""A study: one scene over a grid of settings, each run in its own process, speed against error."""
+"""Studies: one scene over a grid of settings, each run in its own process; speed against error."""

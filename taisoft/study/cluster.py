@@ -1,8 +1,8 @@
-"""A study on a Dask cluster: each worker of it is a place that carries out one run at a time, in a process of its own.
+"""Studies on a Dask cluster: each worker executes one run at a time, in a separate process.
 
-Workers on one machine share its cores evenly, so that timed runs share none; all places have as many cores as the poorest one.
-A worker needs this taisoft and the scene under the same name; both are checked before every run. Dask hands Python objects
-around unencrypted: use a cluster whose network you trust.
+The cores of a machine are divided evenly among its workers, so that timed runs do not share cores. Every worker uses as many
+cores as the smallest one has. A worker needs this taisoft and the scene under the same name; both are checked before every run.
+Dask sends Python objects unencrypted: use only a cluster on a trusted network.
 """
 
 import threading
@@ -12,13 +12,13 @@ from contextlib import suppress
 
 from taisoft.errors import SceneError
 from taisoft.output.report import machine
-from taisoft.study.workers import LOOK_EVERY, LocalPlace
+from taisoft.study.workers import POLL_INTERVAL, LocalPlace
 from taisoft.timing import usable_cores
 
 CONNECT_SECONDS = 10
-ASK_EVERY = 2.0  # [s] between two looks at which workers are alive
+ALIVE_CHECK_INTERVAL = 2.0  # [s]
 
-_running: dict[str, LocalPlace] = {}  # on a worker: what it carries out, by name
+_running: dict[str, LocalPlace] = {}  # on a worker: its current runs, by name
 _lock = threading.Lock()
 
 
@@ -27,7 +27,7 @@ class ClusterPlace:
 
     def __init__(self, client, address: str, cores: list[int]):
         self.cores, self._client, self._address = cores, client, address
-        self._future, self._name, self._asked = None, "", 0.0
+        self._future, self._name, self._last_check = None, "", 0.0
 
     def start(self, request: dict) -> None:
         """See Place."""
@@ -41,7 +41,7 @@ class ClusterPlace:
         if self._future is None:
             return None
         if not self._future.done():
-            return self._gone()
+            return self._check_alive()
         future, self._future = self._future, None
         if future.status == "finished":
             return future.result()
@@ -50,21 +50,21 @@ class ClusterPlace:
         return {"lost": f"the worker {self._address} is gone"}
 
     def stop(self) -> None:
-        """See Place. Dask ends no task that has begun, so the worker is asked to."""
+        """See Place. Dask cannot stop a running task, so a second task stops it on the worker."""
         if self._future is not None:
-            with suppress(Exception):  # whatever Dask raises where worker or scheduler are gone: then nothing is left to end
-                self._client.run(end, self._name, workers=[self._address], on_error="ignore")
+            with suppress(Exception):  # Dask may raise anything if worker or scheduler are gone; nothing is then left to stop
+                self._client.run(stop_run, self._name, workers=[self._address], on_error="ignore")
                 self._future.cancel()
             self._future = None
 
-    def _gone(self) -> dict | None:
-        """Asked now and then, since Dask keeps a task waiting for a worker that will not come back."""
-        if time.monotonic() - self._asked < ASK_EVERY:
+    def _check_alive(self) -> dict | None:
+        """Check periodically that the worker is alive, because Dask keeps a task waiting for a lost worker."""
+        if time.monotonic() - self._last_check < ALIVE_CHECK_INTERVAL:
             return None
-        self._asked = time.monotonic()
+        self._last_check = time.monotonic()
         try:
             alive = self._address in self._client.scheduler_info(n_workers=-1)["workers"]
-        except Exception as error:  # Dask's own and Tornado's kinds
+        except Exception as error:  # Dask and Tornado have their own exception types
             return {"lost": f"the scheduler does not answer ({type(error).__name__})"}
         if alive:
             return None
@@ -73,7 +73,7 @@ class ClusterPlace:
 
 
 def serve(request: dict, cores: list[int], name: str) -> dict:
-    """On a worker: carry out a request in a child process."""
+    """Execute a request in a child process (runs on a worker)."""
     place = LocalPlace(cores)
     with _lock:
         _running[name] = place
@@ -84,23 +84,23 @@ def serve(request: dict, cores: list[int], name: str) -> dict:
             if answer is not None:
                 _running.pop(name, None)
                 return answer
-        time.sleep(LOOK_EVERY)
+        time.sleep(POLL_INTERVAL)
 
 
-def end(name: str) -> None:
-    """On a worker: end what `serve` carries out under that name."""
+def stop_run(name: str) -> None:
+    """Stop the run that `serve` started under this name (runs on a worker)."""
     with _lock:
         if place := _running.pop(name, None):
             place.stop()
 
 
-def facts() -> dict:
-    """On a worker: its machine and its cores."""
+def worker_info() -> dict:
+    """Return the worker's machine and cores (runs on a worker)."""
     return {"machine": machine(), "cores": usable_cores()}
 
 
 def connect(address: str):
-    """A client of the scheduler at that address. Raises SceneError, in one sentence, where there is none."""
+    """Return a client of the scheduler at this address. Raises SceneError if there is none."""
     try:
         from distributed import Client
     except ImportError:
@@ -112,21 +112,21 @@ def connect(address: str):
 
 
 def cluster_places(client) -> tuple[list[ClusterPlace], list[dict]]:
-    """A place for each worker, and the machines they are on. Raises SceneError where there is none, or no core for each."""
+    """Return one place per worker, and their machines. Raises SceneError without workers or with fewer cores than workers."""
     try:
-        found = client.run(facts)
-    except Exception as error:  # what a worker raises comes through as it is
+        workers = client.run(worker_info)
+    except Exception as error:  # exceptions of the workers are re-raised here unchanged
         raise SceneError(f"the cluster's workers cannot run taisoft: {type(error).__name__}: {error}") from None
-    if not found:
+    if not workers:
         raise SceneError("the cluster has no worker")
     places = []
-    for name in dict.fromkeys(one["machine"]["name"] for one in found.values()):
-        own = {address: one["cores"] for address, one in found.items() if one["machine"]["name"] == name}
+    for name in dict.fromkeys(info["machine"]["name"] for info in workers.values()):
+        own = {address: info["cores"] for address, info in workers.items() if info["machine"]["name"] == name}
         cores = sorted(set().union(*own.values()))
         each = len(cores) // len(own)
         if each == 0:
-            raise SceneError(f"{len(own)} workers on {name} share {len(cores)} cores: timed runs need one each")
+            raise SceneError(f"{len(own)} workers on {name} share {len(cores)} cores: each timed run needs its own")
         places += [(address, cores[k * each : (k + 1) * each]) for k, address in enumerate(own)]
-    least = min(len(cores) for _, cores in places)
-    machines = {one["machine"]["name"]: one["machine"] for one in found.values()}
-    return [ClusterPlace(client, address, cores[:least]) for address, cores in places], list(machines.values())
+    n_cores = min(len(cores) for _, cores in places)
+    machines = {info["machine"]["name"]: info["machine"] for info in workers.values()}
+    return [ClusterPlace(client, address, cores[:n_cores]) for address, cores in places], list(machines.values())

@@ -1,4 +1,4 @@
-"""One run of a study, in a process of its own: followed once at the frames, then timed from its start without them."""
+"""One run of a study, in its own process: recorded once at the frames, then timed from the start without recording."""
 
 import time
 import warnings
@@ -17,31 +17,31 @@ from taisoft.study.store import pack
 from taisoft.study.timed_run import advance
 from taisoft.timing import load_average, usable_cores
 
-ENOUGH_SECONDS = 20.0  # a run of so much wall time is not repeated: the followed one is its time
-SHORT_SECONDS, MOST_RUNS = 0.5, 25  # short ones are repeated more often, until they took so long or were so many
+MAX_REPEATED_SECONDS = 20.0  # a run with a longer wall time is not repeated: the recorded run gives its time
+SHORT_SECONDS, MAX_RUNS = 0.5, 25  # short runs are repeated until their total time [s] or their number reaches these
 
 
 def measure(scene: Scene, task: dict) -> dict:
-    """The record of one run of a scene, refined as `setting` says, as plain data; a run that fails is one that says why.
+    """Return the record of one run of a scene that is already refined, as plain data; a failed run's record says why.
 
-    task: `setting`, `fixed` (further arguments of Simulator), `frame` [s], `frames`, `steps` (in a frame), `repeats` (timed
-    runs at least, 0 for none).
+    task: `setting`, `fixed` (further arguments of Simulator), `frame` [s], `frames`, `steps` (per frame), `repeats` (minimum
+    number of timed runs, 0 for none).
     """
     setting = {key: value for key, value in task["setting"].items() if key not in ("refine", "order")}
-    record = {"task": task} | _facts(scene, setting["integrator"], task) | _place()
-    with warnings.catch_warnings(record=True) as told:
+    record = {"task": task} | _scene_facts(scene, setting["integrator"], task) | _environment()
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         record |= _run(scene, setting | task["fixed"], task)
-    record["warnings"] = list(dict.fromkeys(str(one.message) for one in told if issubclass(one.category, UserWarning)))
+    record["warnings"] = list(dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning)))
     return record | {"load_at_the_end": load_average(), "peak_memory_bytes": peak_memory(), "threads": runtime.threads()}
 
 
-def _place() -> dict:
+def _environment() -> dict:
     return {"machine": machine(), "versions": versions(), "cores": usable_cores(), "load": load_average()}
 
 
-def _facts(scene: Scene, integrator: str, task: dict) -> dict:
-    """What is known before the run: sizes, and which laws of conservation hold."""
+def _scene_facts(scene: Scene, integrator: str, task: dict) -> dict:
+    """Return what is known before the run: sizes, and which conservation laws hold."""
     bodies = scene.bodies
     damped = any(b.material.mass_damping or b.material.stiffness_damping for b in bodies)
     prescribed = any(c.path is not None for b in bodies for c in b.constraints)
@@ -57,12 +57,12 @@ def _facts(scene: Scene, integrator: str, task: dict) -> dict:
         "orders": sorted({b.order for b in bodies}),
         "smallest_edge": min(float(edge_lengths(b.mesh.vertices, b.mesh.tets).min()) for b in bodies),  # [m]
         "keeps_energy": not (damped or prescribed or loaded or pushes),
-        "momentum_rate": _load_of(scene).tolist() if free else None,  # [N]
+        "momentum_rate": _total_load(scene).tolist() if free else None,  # [N]
     }
 
 
-def _load_of(scene: Scene) -> np.ndarray:
-    """Sum of weights, tractions and forces (3,) [N]."""
+def _total_load(scene: Scene) -> np.ndarray:
+    """Return the sum of weights, tractions and forces (3,) [N]."""
     total = sum(gravity_mass(b).sum() for b in scene.bodies) * scene.gravity
     for body in scene.bodies:
         for load in body.tractions:
@@ -77,12 +77,12 @@ def _run(scene: Scene, simulator: dict, task: dict) -> dict:
     try:
         with Simulator(scene, **simulator) as sim:
             built = time.perf_counter() - start
-            return {"build_seconds": built} | _follow_and_time(sim, task)
+            return {"build_seconds": built} | _record_and_time(sim, task)
     except TaisoftError as error:
         return {"status": "failed", "problems": [str(error)], "seconds": [], "path": None}
 
 
-def _follow_and_time(sim: Simulator, task: dict) -> dict:
+def _record_and_time(sim: Simulator, task: dict) -> dict:
     observer, length = Observer(sim), task["frame"] * task["frames"]
     result = sim.run(length, on_frame=observer.frame, fps=1.0 / task["frame"])
     numbers = {
@@ -95,8 +95,8 @@ def _follow_and_time(sim: Simulator, task: dict) -> dict:
     if task["repeats"]:
         try:
             numbers["seconds"] = list(_timed(sim, task, (result.wall_seconds - observer.seconds) / length))
-        except SimulationError as error:  # what ran once may still fail, where threads change the order of sums
-            return numbers | {"status": "failed", "problems": [*result.problems, f"when it was repeated: {error}"]}
+        except SimulationError as error:  # a repeat may still fail, because threads change the order of sums
+            return numbers | {"status": "failed", "problems": [*result.problems, f"in a repeated run: {error}"]}
     return numbers | observer.numbers() | {"compile_seconds": sim.compile_seconds}
 
 
@@ -110,14 +110,14 @@ def _counts(result: RunReport) -> dict:
     }
 
 
-def _timed(sim: Simulator, task: dict, followed: float):
-    """Wall seconds per simulated second of each timed run; followed: those of the run that was followed."""
+def _timed(sim: Simulator, task: dict, recorded: float):
+    """Yield wall seconds per simulated second of each timed run. recorded: those of the recorded run."""
     length = task["frame"] * task["frames"]
-    if followed * length > ENOUGH_SECONDS:  # without the first launch of each kernel
-        yield followed
+    if recorded * length > MAX_REPEATED_SECONDS:  # without the first launch of each kernel
+        yield recorded
         return
     total, count = 0.0, 0
-    while count < task["repeats"] or (total < SHORT_SECONDS and count < MOST_RUNS):
+    while count < task["repeats"] or (total < SHORT_SECONDS and count < MAX_RUNS):
         sim.reset()
         seconds = advance(sim, task["steps"] * task["frames"]).seconds
         total, count = total + seconds, count + 1
@@ -125,18 +125,18 @@ def _timed(sim: Simulator, task: dict, followed: float):
 
 
 class Observer:
-    """Positions, energies and momentum at the frames. seconds: wall time that this took, without compiling."""
+    """Records positions, energies and momentum at the frames. seconds: its own wall time, without compiling."""
 
     def __init__(self, sim: Simulator):
         self.seconds = 0.0
-        of = lumped_mass if sim.settings.explicit else gravity_mass
-        self._mass = np.concatenate([of(body) for body in sim.scene.bodies])
+        mass = lumped_mass if sim.settings.explicit else gravity_mass
+        self._mass = np.concatenate([mass(body) for body in sim.scene.bodies])
         self._path: list[np.ndarray] = []
         self._energies: list[tuple] = []
         self._momentum: list[np.ndarray] = []
 
     def frame(self, sim: Simulator, _index: int, _report) -> None:
-        """For Simulator.run."""
+        """Record a frame; pass to Simulator.run as on_frame."""
         compiled, start = sim.compile_seconds, time.perf_counter()
         self._path.append(sim.positions())
         e = sim.energies()
@@ -145,6 +145,6 @@ class Observer:
         self.seconds += time.perf_counter() - start - (sim.compile_seconds - compiled)
 
     def numbers(self) -> dict:
-        """As plain data: energies (k,3) [J], momentum (k,3) [kg m/s], path (k,n,3) [m] packed."""
+        """Return plain data: energies (k,3) [J], momentum (k,3) [kg m/s], path (k,n,3) [m] packed."""
         momentum = np.array(self._momentum).tolist()
         return {"energies": np.array(self._energies).tolist(), "momentum": momentum, "path": pack(np.array(self._path))}

@@ -15,20 +15,20 @@ FILES = ("study.md", "study.csv", "study.json", "study.png")
 
 
 def check_scene(folder: Path, scene: str) -> None:
-    """Raises OutputError where the folder holds a study of another scene than the one with this digest."""
+    """Raise OutputError if the folder holds a study of a scene with another digest."""
     try:
         found = json.loads((folder / "study.json").read_bytes())
         name, same = found["request"]["scene"], found["scene_digest"] == scene
     except FileNotFoundError:
         return
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise OutputError(f"the folder {folder} holds a study.json that is no study's: name another folder") from error
+        raise OutputError(f"the folder {folder} holds a study.json that is not a study: name another folder") from error
     if not same:
         raise OutputError(f"the folder {folder} holds a study of another scene ({name}, with other content): name another folder")
 
 
 def write(study: Study, folder: Path) -> str:
-    """Write all of them; returns a sentence where there is no picture, else an empty text. Raises OutputError."""
+    """Write all files. Return a sentence if there is no picture, else an empty text. Raises OutputError."""
     write_bytes(folder / "study.md", text_of(study).encode())
     write_bytes(folder / "study.csv", csv_of(study).encode())
     write_bytes(folder / "study.json", json_text(plain(study)).encode())
@@ -36,13 +36,13 @@ def write(study: Study, folder: Path) -> str:
     try:
         require_matplotlib("study.png")
     except OutputError as error:
-        why = str(error)
+        reason = str(error)
     else:
         if draw(study, picture):
             return ""
-        why = "study.png is not drawn, since no setting has both a time and an error"
+        reason = "study.png is not drawn, because no setting has both a time and an error"
     try:
-        picture.unlink(missing_ok=True)  # of an earlier study: the folder tells of one
+        picture.unlink(missing_ok=True)  # from an earlier study: the folder holds only one
     except OSError as error:
         raise OutputError(f"cannot remove the earlier {picture}: {error.strerror or error}") from error
-    return why
+    return reason

@@ -1,9 +1,9 @@
-"""What a study will run: every combination with its refusal, the frames, and the references. Asked in a child process.
+"""The plan of a study: every combination with its refusal, the frames, and the references. Made in a child process.
 
-A reference is the same mesh in f64 with small steps of second order; its own error is told by another run of twice the step.
-Implicit steps have a consistent mass where elements are quadratic and explicit ones a lumped one (see `taisoft.mass`): there
-the two solve different equations and get a reference each. Where there are several meshes or orders, the finest one's
-reference is also what all are compared with for their error in space.
+A reference runs the same mesh in f64 with small second-order steps; a second run with twice the step estimates its own error.
+With quadratic elements, implicit steps use a consistent mass and explicit ones a lumped mass (see `taisoft.mass`): they solve
+different equations, so each kind gets its own reference. With several meshes or orders, the finest one's reference also gives
+the error in space of all runs.
 """
 
 import math
@@ -17,9 +17,9 @@ from taisoft.settings import check_settings
 from taisoft.stability import stable_dt
 from taisoft.study.grid import AXES, Setting, cases, complete, expand, frame_time, mesh_name
 
-FINER = 8  # the study's smallest dt over the reference's
-LIMIT_SHARE = 0.9  # of the stable step, for a reference's coarser run
-SMALLEST_SHARE = 16  # explicit references may take steps that are so much smaller than those asked for: they are quick
+DT_RATIO = 8  # the study's smallest dt over the reference's
+STABLE_FRACTION = 0.9  # of the stable step, for a reference's coarser run
+EXPLICIT_DT_RATIO = 16  # explicit references may use steps this many times smaller than requested: they are cheap
 
 SECOND_ORDER = ("velocity_verlet", "bdf2", "implicit_midpoint")
 
@@ -27,30 +27,30 @@ Variant = Callable[[int, int | None], Scene]  # (refine, order) -> scene
 
 
 def make_plan(variant: Variant, solver: dict, request: dict) -> dict:
-    """The plan of a study as plain data. ask: see `Ask`. Raises SceneError where nothing can be run."""
+    """Return the plan of a study as plain data. request: see `Request.for_plan`. Raises SceneError if nothing can be run."""
     return Planner(variant, solver, request).plan()
 
 
 class Planner:
-    """A scene's variants with what is asked of them, each found out once."""
+    """Plans the runs of a scene's variants; scenes and stability limits are computed once."""
 
     def __init__(self, variant: Variant, solver: dict, request: dict):
-        self._variant, self._solver, self._ask = variant, solver, request
+        self._variant, self._solver, self._request = variant, solver, request
         self._scenes: dict[tuple, Scene | str] = {}
         self._limits: dict[tuple, float] = {}
         self._notes: list[str] = []
-        # what is no axis of the study and no argument of the run holds for all runs
+        # all other entries of the solver dict apply to every run
         left_out = (*AXES, "seconds", "fps", "draggable")
         self.fixed = {key: value for key, value in solver.items() if key not in left_out}
         self.self_collision = self.fixed.get("self_collision", False)
 
     def plan(self) -> dict:
-        """See `make_plan`."""
+        """Return the plan; see `make_plan`."""
         base = self._scene(0, None)
-        axes = complete(self._ask["axes"], self._solver, EXPLICIT)
+        axes = complete(self._request["axes"], self._solver, EXPLICIT)
         found = cases(expand(axes), self.refusal, self.unused)
         settings = [case.setting for case in found if not case.refused]
-        seconds = self._ask["seconds"] or self._solver.get("seconds", 1.0)
+        seconds = self._request["seconds"] or self._solver.get("seconds", 1.0)
         plan = {
             "fixed": self.fixed, "seconds": seconds,
             "cases": [{"setting": asdict(case.setting), "refused": case.refused} for case in found],
@@ -58,14 +58,14 @@ class Planner:
             "frame": None, "frames": 0, "references": [], "space": None, "notes": self._notes,
         }  # fmt: skip
         if settings:
-            target = self._ask["reference_dt"] or min(s.dt for s in settings) / FINER
+            target = self._request["reference_dt"] or min(s.dt for s in settings) / DT_RATIO
             frame, frames = frame_time([*(s.dt for s in settings), 2.0 * target], seconds)
             plan |= {"frame": frame, "frames": frames} | self._references(settings, target, frame)
         return plan
 
     def refusal(self, setting: Setting) -> str:
-        """Why a setting cannot be run, in a sentence, or an empty text."""
-        scene = self._try(*setting.mesh)
+        """Return why a setting cannot be run, or an empty text."""
+        scene = self._scene_or_reason(*setting.mesh)
         if isinstance(scene, str):
             return scene
         try:
@@ -80,17 +80,17 @@ class Planner:
         return f"dt = {setting.dt:.3g} s is above the stability limit of {setting.integrator}, {limit:.3g} s"
 
     def unused(self, setting: Setting) -> dict[str, str]:
-        """Axes that a setting does not use, and why."""
-        idle = {}
+        """Return the axes that a setting does not use, and why."""
+        unused_axes = {}
         if setting.integrator in EXPLICIT:
-            idle |= dict.fromkeys(("newton_tolerance", "linear_tolerance"), f"{setting.integrator} solves no equations")
+            unused_axes |= dict.fromkeys(("newton_tolerance", "linear_tolerance"), f"{setting.integrator} solves no equations")
         if not self._scene(*setting.mesh).pushes(self.self_collision):
-            idle |= dict.fromkeys(("contact_solver", "contact_tolerance"), "nothing can touch in this scene")
-        return idle
+            unused_axes |= dict.fromkeys(("contact_solver", "contact_tolerance"), "nothing can come into contact in this scene")
+        return unused_axes
 
     def _references(self, settings: list[Setting], target: float, frame: float) -> dict:
-        """The references of the settings' meshes, and the number of the one for errors in space, or None."""
-        extra = self._ask["reference_refine"]
+        """Return the references of the settings' meshes, and the index of the one for errors in space, or None."""
+        extra = self._request["reference_refine"]
         groups = list(dict.fromkeys(self._group(setting) for setting in settings))
         space = None
         if extra or len({(refine, order) for refine, order, _ in groups}) > 1:
@@ -103,30 +103,30 @@ class Planner:
         return {"references": [self._reference(*group, target, frame) for group in groups], "space": space}
 
     def _group(self, setting: Setting) -> tuple[int, int | None, str]:
-        """Which settings solve the same equations in time."""
+        """Return a key shared by settings that solve the same equations in time."""
         scene = self._scene(*setting.mesh)
         quadratic = any(body.order == 2 for body in scene.bodies)
         kind = "" if not quadratic else "explicit" if setting.integrator in EXPLICIT else "implicit"
         return *setting.mesh, kind
 
     def _reference(self, refine: int, order: int | None, kind: str, target: float, frame: float) -> dict:
-        """One reference, as plain data. Raises SceneError, naming it, where it cannot be: nobody need have asked for it."""
+        """Return one reference as plain data. Raises SceneError naming it, because the user may not have requested it."""
         try:
             return self._reference_on(refine, order, kind, target, frame)
         except TaisoftError as error:
             raise SceneError(f"the reference ({mesh_name({'refine': refine, 'order': order})}): {error}") from error
 
     def _reference_on(self, refine: int, order: int | None, kind: str, target: float, frame: float) -> dict:
-        """A setting with its steps per frame, an even number."""
+        """Return a setting with its steps per frame, an even number."""
         scene = self._scene(refine, order)
         integrator = self._integrator(scene, refine, order, kind, target)
         steps = 2 * math.ceil(frame / target / 2 - 1e-9)
         if integrator in EXPLICIT:
-            limit = LIMIT_SHARE * self._limit(refine, order, integrator)
-            if 2.0 * target > limit and self._ask["reference_dt"]:
+            limit = STABLE_FRACTION * self._limit(refine, order, integrator)
+            if 2.0 * target > limit and self._request["reference_dt"]:
                 raise SceneError(
-                    f"--reference-dt {target:g}: the reference is also run with twice the step, and {integrator} takes at most "
-                    f"{limit:.3g} s there"
+                    f"--reference-dt {target:g}: the reference is also run with twice the step, and {integrator} allows at most "
+                    f"{limit:.3g} s"
                 )
             steps = max(steps, 2 * math.ceil(frame / limit))
         setting = Setting(frame / steps, integrator, order, refine, "f64")
@@ -135,21 +135,21 @@ class Planner:
         return {"setting": asdict(setting), "kind": kind, "order_in_time": order_in_time, "steps": steps}
 
     def _is_smooth(self, scene: Scene) -> bool:
-        """Whether methods keep their order: not with contacts, forces that depend on velocities, or paths, which may jump."""
+        """Return whether methods keep their order: not with contacts, velocity-dependent forces, or paths, which may jump."""
         materials = [body.material for body in scene.bodies]
-        led = any(c.path is not None for body in scene.bodies for c in body.constraints)
+        prescribed = any(c.path is not None for body in scene.bodies for c in body.constraints)
         damped = any(material.mass_damping or material.stiffness_damping for material in materials)
-        return not (led or damped or scene.pushes(self.self_collision))
+        return not (prescribed or damped or scene.pushes(self.self_collision))
 
     def _integrator(self, scene: Scene, refine: int, order: int | None, kind: str, target: float) -> str:
-        requested = self._ask["reference_integrator"]
+        requested = self._request["reference_integrator"]
         if requested is not None:
             if requested not in INTEGRATORS:
                 raise SceneError(f"--reference-integrator {requested}: it must be one of {', '.join(INTEGRATORS)}")
             if kind and (kind == "explicit") != (requested in EXPLICIT):
                 instead = "velocity_verlet" if kind == "explicit" else "bdf2"
                 self._notes.append(
-                    f"the {kind} steps of quadratic tets have the reference {instead}, since {requested} has another mass matrix"
+                    f"{kind} steps of quadratic tets use the reference {instead}, because {requested} has another mass matrix"
                 )
                 return instead
             return requested
@@ -157,12 +157,12 @@ class Planner:
             return "velocity_verlet"
         if scene.pushes(self.self_collision):
             return "bdf2"
-        limit = LIMIT_SHARE * self._limit(refine, order, "velocity_verlet")
-        return "velocity_verlet" if not kind and limit > 2.0 * target / SMALLEST_SHARE else "implicit_midpoint"
+        limit = STABLE_FRACTION * self._limit(refine, order, "velocity_verlet")
+        return "velocity_verlet" if not kind and limit > 2.0 * target / EXPLICIT_DT_RATIO else "implicit_midpoint"
 
     def _check(self, scene: Scene, setting: Setting) -> None:
-        more = {"self_collision": False, "allow_unstable": False, "draggable": False} | self.fixed
-        check_settings(scene, **setting.simulator(), **more)
+        defaults = {"self_collision": False, "allow_unstable": False, "draggable": False} | self.fixed
+        check_settings(scene, **setting.simulator(), **defaults)
 
     def _limit(self, refine: int, order: int | None, integrator: str) -> float:
         key = (refine, order, integrator)
@@ -171,13 +171,13 @@ class Planner:
         return self._limits[key]
 
     def _scene(self, refine: int, order: int | None) -> Scene:
-        scene = self._try(refine, order)
+        scene = self._scene_or_reason(refine, order)
         if isinstance(scene, str):
             raise SceneError(scene)
         return scene
 
-    def _try(self, refine: int, order: int | None) -> Scene | str:
-        """The scene, or why there is none."""
+    def _scene_or_reason(self, refine: int, order: int | None) -> Scene | str:
+        """Return the scene, or why it cannot be built."""
         if (refine, order) not in self._scenes:
             try:
                 self._scenes[refine, order] = self._variant(refine, order)

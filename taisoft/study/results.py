@@ -1,4 +1,4 @@
-"""What a study is asked for and what it found."""
+"""The request for a study and its results."""
 
 from dataclasses import asdict, dataclass, field
 
@@ -9,7 +9,7 @@ from taisoft.study.grid import AXES
 
 @dataclass
 class Request:
-    """What a study is asked for. axes: name -> values, of those given; by: the error that counts, "max" or "rms"."""
+    """Request for a study. axes: name -> values, only the axes given; by: the error used, "max" or "rms"."""
 
     scene: str
     axes: dict[str, list] = field(default_factory=dict)
@@ -22,18 +22,18 @@ class Request:
     tolerance: float = 0.01
     by: str = "max"
 
-    def of_plan(self) -> dict:
-        """What the plan depends on."""
+    def for_plan(self) -> dict:
+        """Return what the plan depends on."""
         keys = ("axes", "seconds", "reference_dt", "reference_integrator", "reference_refine")
         return {key: getattr(self, key) for key in keys}
 
 
 @dataclass
 class Study:
-    """What a study found.
+    """Results of a study.
 
-    rows: one a combination; notes: sentences that a reader must know; ended: why it is not complete; cut: the runs that the end
-    of the budget stopped.
+    rows: one per combination; notes: sentences for the reader; ended: why it is incomplete; cut: runs that were stopped when
+    the budget was spent.
     """
 
     request: Request
@@ -41,40 +41,40 @@ class Study:
     rows: list[Row] = field(default_factory=list)
     references: list[Reference] = field(default_factory=list)
     space: Reference | None = None
-    space_told_by: str = ""
+    space_error_source: str = ""  # how the error of `space` was estimated
     notes: list[str] = field(default_factory=list)
     machines: list[dict] = field(default_factory=list)
     workers: int = 1  # runs at a time
     versions: dict = field(default_factory=dict)
     ended: str = ""
     cut: list[str] = field(default_factory=list)
-    kept: bool = False  # whether finished runs are kept, so that a study can go on
+    kept: bool = False  # whether finished runs are kept, so that a study can continue
 
-    def judged(self) -> list[Row]:
-        """The rows that have a time and an error."""
-        return [row for row in self.rows if row.seconds and row.claimed(self.request.by) is not None]
+    def comparable_rows(self) -> list[Row]:
+        """Return the rows that have a time and an error."""
+        return [row for row in self.rows if row.seconds and row.resolved_error(self.request.by) is not None]
 
     def points(self) -> list[tuple[float, float]]:
-        """(time, error) of the judged rows."""
-        return [(row.timing.median, row.claimed(self.request.by)) for row in self.judged()]
+        """Return (time, error) of the comparable rows."""
+        return [(row.timing.median, row.resolved_error(self.request.by)) for row in self.comparable_rows()]
 
     def front(self) -> list[Row]:
-        """The rows that no other is better than in both, by rising time."""
-        return [self.judged()[k] for k in pareto.front(self.points())]
+        """Return the rows of the Pareto front, by rising time."""
+        return [self.comparable_rows()[k] for k in pareto.front(self.points())]
 
     def cheapest(self) -> Row | None:
-        """The fastest row within the tolerance."""
+        """Return the fastest row within the tolerance, or None."""
         k = pareto.cheapest(self.points(), self.request.tolerance)
-        return None if k is None else self.judged()[k]
+        return None if k is None else self.comparable_rows()[k]
 
     def nearest(self) -> Row | None:
-        """The row of least error."""
+        """Return the row of least error, or None."""
         k = pareto.nearest(self.points())
-        return None if k is None else self.judged()[k]
+        return None if k is None else self.comparable_rows()[k]
 
 
 def describe(task: dict) -> str:
-    """A setting in short: what is always told, and of the rest what is not the default."""
+    """Return a short description of a setting: integrator, dt, precision, and the rest if not default."""
     setting = task["setting"]
     words = [setting["integrator"], f"dt = {setting['dt']:.4g} s", setting["precision"]]
     if setting["order"] is not None:
@@ -88,18 +88,18 @@ def describe(task: dict) -> str:
 
 
 def plain(study: Study) -> dict:
-    """All of a study's numbers for study.json."""
+    """Return a study as plain data for study.json."""
     front = study.front()
     rows = [
         asdict(row) | {
-            "seconds_per_simulated_second": row.timing, "error": row.claimed(study.request.by), "on_front": row in front,
+            "seconds_per_simulated_second": row.timing, "error": row.resolved_error(study.request.by), "on_front": row in front,
             "below_reference": below_reference(row, study.request.by),
         }
         for row in study.rows
     ]  # fmt: skip
     references = [
         {
-            "setting": r.setting, "steps": r.steps, "excursion": r.excursion, "own_error": r.own, "kind": r.kind,
+            "setting": r.setting, "steps": r.steps, "excursion": r.excursion, "own_error": r.own_error, "kind": r.kind,
             "order_in_time": r.order_in_time, "problems": r.problems, "in_space": r is study.space,
         }
         for r in study.references
@@ -114,6 +114,6 @@ def plain(study: Study) -> dict:
 
 
 def below_reference(row: Row, by: str) -> bool:
-    """Whether the row's error is below what its reference is good to."""
-    found = row.error(by)
-    return found is not None and found[0] < found[1]
+    """Return whether the row's error is below its reference's own error."""
+    pair = row.error(by)
+    return pair is not None and pair[0] < pair[1]

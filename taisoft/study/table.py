@@ -10,50 +10,50 @@ from taisoft.study.accuracy import Error, Row
 from taisoft.study.grid import AXES, mesh_name
 from taisoft.study.results import Study, describe
 
-ALWAYS = ("integrator", "dt")  # axes that have a column even where they do not vary
-ENDED = ("ok", "degraded")
+ALWAYS_SHOWN = ("integrator", "dt")  # axes that have a column even if they do not vary
+FINISHED = ("ok", "degraded")
 
 
 def text_of(study: Study) -> str:
-    """The whole study in Markdown: answer, table, what was not run, references, notes."""
+    """Return the whole study in Markdown: answer, table, runs not done, references, notes."""
     parts = [f"# {study.request.scene}: speed against error", answer(study)]
     if study.ended:
-        on = "The same command goes on with it." if study.kept else "Without --out nothing of it is kept."
+        resume = "The same command continues it." if study.kept else "Without --out nothing is kept."
         needed = "if it takes longer than the whole budget, it needs a larger --budget"
-        parts.append(" ".join([f"Not complete: {study.ended}. {on}", *(f"Cut: {run}; {needed}." for run in study.cut)]))
-    ran = [row for row in study.rows if row.status in (*ENDED, "failed")]
+        parts.append(" ".join([f"Not complete: {study.ended}. {resume}", *(f"Cut: {run}; {needed}." for run in study.cut)]))
+    ran = [row for row in study.rows if row.status in (*FINISHED, "failed")]
     if ran:
         parts.append(run_table(study, ran))
     parts += [_reasons(title, study.rows, status) for title, status in (("Failed", "failed"), ("Degraded", "degraded"))]
     parts += [_reasons(title, study.rows, status) for title, status in (("Refused", "refused"), ("Left out", "left out"))]
-    parts.append(_how(study))
+    parts.append(_method(study))
     if study.notes:
         parts.append("Notes:\n\n" + "\n".join(f"* {note}" for note in study.notes))
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def answer(study: Study) -> str:
-    """The cheapest setting within the tolerance, or the nearest one, in a sentence."""
+    """Return a sentence naming the cheapest setting within the tolerance, or else the one of least error."""
     goal = f"{study.request.tolerance:.3g}"
     if (row := study.cheapest()) is not None:
-        careful = "" if row.status == "ok" else f"; its run is {row.status}"
-        return f"Cheapest within {goal} ({study.request.by} error): {_named(row, study.request.by)}{careful}."
+        caveat = "" if row.status == "ok" else f"; its run is {row.status}"
+        return f"Cheapest within {goal} ({study.request.by} error): {_label(row, study.request.by)}{caveat}."
     if (row := study.nearest()) is not None:
-        sure, finer = row.error(study.request.by)[1], "--reference-refine" if study.space is not None else "--reference-dt"
-        below = f" Below {sure:.2g} nothing is known; {finer} gives a better reference."
-        known = "" if sure <= study.request.tolerance else below
-        return f"No setting is within {goal} ({study.request.by} error); the nearest: {_named(row, study.request.by)}.{known}"
+        own, option = row.error(study.request.by)[1], "--reference-refine" if study.space is not None else "--reference-dt"
+        below = f" Errors below {own:.2g} are not resolved; {option} gives a better reference."
+        limit = "" if own <= study.request.tolerance else below
+        return f"No setting is within {goal} ({study.request.by} error); the nearest: {_label(row, study.request.by)}.{limit}"
     return "No setting has both a time and an error."
 
 
-def _named(row: Row, by: str) -> str:
-    return f"{describe({'setting': row.setting})}, {_seconds(row)} s a simulated second, error {shown_error(*row.error(by))}"
+def _label(row: Row, by: str) -> str:
+    return f"{describe({'setting': row.setting})}, {_seconds(row)} s per simulated second, error {format_error(*row.error(by))}"
 
 
 def run_table(study: Study, rows: list[Row]) -> str:
-    """A row a run; * marks the front. Columns that say the same in every row are left out."""
+    """Return a table with one row per run; * marks the front. Axes that do not vary are left out."""
     front = study.front()
-    axes = [key for key in AXES if key in ALWAYS or len({row.setting[key] for row in rows}) > 1]
+    axes = [key for key in AXES if key in ALWAYS_SHOWN or len({row.setting[key] for row in rows}) > 1]
     in_space = any(row.in_space is not None for row in rows)
     columns: dict[str, list[str]] = {"": ["*" if row in front else "" for row in rows]}
     columns |= {_heading(key): [_axis(row.setting[key]) for row in rows] for key in axes}
@@ -61,8 +61,8 @@ def run_table(study: Study, rows: list[Row]) -> str:
     columns["spread"] = [percent(spread_of(row.timing)) if row.seconds else "" for row in rows]
     for name, get in (("time", lambda r: (r.in_time, r.in_time_sure)), ("space", lambda r: (r.in_space, r.in_space_sure))):
         if name == "time" or in_space:
-            of = f"error in {name}" if in_space else "error"
-            columns[f"{of}, max"] = [_error(*get(row), "max") for row in rows]
+            title = f"error in {name}" if in_space else "error"
+            columns[f"{title}, max"] = [_error(*get(row), "max") for row in rows]
             columns["rms" if not in_space else f"rms in {name}"] = [_error(*get(row), "rms") for row in rows]
     kept = any(row.energy_kept for row in rows)
     columns["energy drift" if kept else "energy error"] = [_number(row.energy) for row in rows]
@@ -77,31 +77,31 @@ def run_table(study: Study, rows: list[Row]) -> str:
     return markdown(list(columns), list(zip(*columns.values())), left=left)
 
 
-def _how(study: Study) -> str:
-    """What the errors are of, what the references are good to, and how times were taken."""
+def _method(study: Study) -> str:
+    """Return what the errors refer to, the references' own errors, and how times were measured."""
     lines = []
     for reference in study.references:
-        own, setting = reference.own, reference.setting
+        own, setting = reference.own_error, reference.setting
         lines.append(
             f"* {describe({'setting': setting, 'timed': False})}: largest excursion {reference.excursion:.4g} m, own error "
-            f"{own.max:.2g} (max), {own.rms:.2g} (rms), from dt against 2 dt as of order {reference.order_in_time}"
+            f"{own.max:.2g} (max), {own.rms:.2g} (rms), from dt and 2 dt, assuming order {reference.order_in_time}"
         )
     if study.space is not None:
-        sure = next((row.in_space_sure for row in study.rows if row.in_space_sure is not None), None)
-        if sure is not None:
+        space_error = next((row.in_space_sure for row in study.rows if row.in_space_sure is not None), None)
+        if space_error is not None:
             lines.append(
-                f"* errors in space are those to the reference with {mesh_name(study.space.setting)}; it is good to "
-                f"{sure.max:.2g} (max), {sure.rms:.2g} (rms): {study.space_told_by}"
+                f"* errors in space are relative to the reference with {mesh_name(study.space.setting)}; its own error is "
+                f"{space_error.max:.2g} (max), {space_error.rms:.2g} (rms): {study.space_error_source}"
             )
     seconds = study.plan["frame"] * study.plan["frames"] if study.plan["frame"] else 0.0
     threads = sorted({row.threads for row in study.rows if row.threads})
-    on = f"{' or '.join(map(str, threads)) or 'no'} thread{'s' if threads != [1] else ''}, {study.workers} at a time"
-    told = (
+    cores = f"{' or '.join(map(str, threads)) or 'no'} thread{'s' if threads != [1] else ''}, {study.workers} at a time"
+    summary = (
         f"{seconds:g} s simulated, compared at {study.plan['frames']} frames. Errors are distances over the reference's largest "
-        f"excursion; `<` marks one below what the reference is good to. Times are medians of {_repeats(study)} runs on {on}, "
-        "compiling apart; spread is the distance of the quartiles over the median; * marks the front."
+        f"excursion; `<` marks one below the reference's own error. Times are medians of {_repeats(study)} runs on {cores}, "
+        "without compilation; spread is the interquartile range over the median; * marks the front."
     )
-    return told + ("\n\nReferences:\n\n" + "\n".join(lines) if lines else "")
+    return summary + ("\n\nReferences:\n\n" + "\n".join(lines) if lines else "")
 
 
 def _repeats(study: Study) -> str:
@@ -110,32 +110,32 @@ def _repeats(study: Study) -> str:
 
 
 def _reasons(title: str, rows: list[Row], status: str) -> str:
-    """A list of settings with the reason of their status; equal reasons together."""
+    """Return a list of settings with the reason for their status, grouped by reason."""
     by_reason: dict[str, list[dict]] = {}
     for row in rows:
         if row.status == status:
             by_reason.setdefault(row.reason, []).append(row.setting)
     if not by_reason:
         return ""
-    return f"{title}:\n\n" + "\n".join(f"* {_all_of(settings)}: {reason}" for reason, settings in by_reason.items())
+    return f"{title}:\n\n" + "\n".join(f"* {_describe_settings(settings)}: {reason}" for reason, settings in by_reason.items())
 
 
-def _all_of(settings: list[dict]) -> str:
-    """Settings in short: what they are the product of, where they are one."""
+def _describe_settings(settings: list[dict]) -> str:
+    """Return a short description of settings, as a product of axes if they form one."""
     values = {key: list(dict.fromkeys(s[key] for s in settings)) for key in AXES}
     if len(settings) > 2 and len(settings) == math.prod(map(len, values.values())):
-        varying = [f"{key} {' | '.join(map(_axis, of))}" for key, of in values.items() if len(of) > 1]
+        varying = [f"{key} {' | '.join(map(_axis, options))}" for key, options in values.items() if len(options) > 1]
         return f"{settings[0]['integrator']}, " * (len(values["integrator"]) == 1) + ", ".join(varying)
     return "; ".join(describe({"setting": setting}) for setting in settings)
 
 
-def shown_error(error: float, sure: float) -> str:
-    """An error, or "< " what its reference is good to."""
-    return f"< {sure:.2g}" if error < sure else f"{error:.3g}"
+def format_error(error: float, own: float) -> str:
+    """Return an error as text, or "< own" if it is below its reference's own error."""
+    return f"< {own:.2g}" if error < own else f"{error:.3g}"
 
 
-def _error(error: Error | None, sure: Error | None, by: str) -> str:
-    return "" if error is None else shown_error(getattr(error, by), getattr(sure, by))
+def _error(error: Error | None, own: Error | None, by: str) -> str:
+    return "" if error is None else format_error(getattr(error, by), getattr(own, by))
 
 
 def _heading(key: str) -> str:
@@ -159,7 +159,7 @@ def _count(value: int | None) -> str:
 
 
 def csv_of(study: Study) -> str:
-    """A row a combination with every number of it, RFC 4180; what is not known is empty."""
+    """Return all numbers as CSV (RFC 4180), one row per combination; unknown values are empty."""
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     front = study.front()
@@ -177,11 +177,11 @@ def _cells(row: Row, study: Study, on_front: bool) -> dict:
     cells |= {"seconds_per_simulated_second": timing and timing.median, "spread": timing and spread_of(timing)}
     cells |= {"repeats": len(row.seconds)}
     for name in ("in_time", "in_space"):
-        error, sure = getattr(row, name), getattr(row, f"{name}_sure")
+        error, own = getattr(row, name), getattr(row, f"{name}_sure")
         for by in ("max", "rms"):
             cells[f"error_{name}_{by}"] = error and getattr(error, by)
-            cells[f"reference_{name}_{by}"] = sure and getattr(sure, by)
-    told = ("energy", "energy_kept", "momentum", "penetration", "contact_residual", "unconverged", "inverted")
+            cells[f"reference_{name}_{by}"] = own and getattr(own, by)
+    numbers = ("energy", "energy_kept", "momentum", "penetration", "contact_residual", "unconverged", "inverted")
     rest = asdict(row)
-    cells |= {key: rest[key] for key in (*told, "compile_seconds", "steps", "nodes", "tets", "threads", "machine")}
+    cells |= {key: rest[key] for key in (*numbers, "compile_seconds", "steps", "nodes", "tets", "threads", "machine")}
     return {key: "" if value is None else value for key, value in cells.items()} | {"error_by": study.request.by}

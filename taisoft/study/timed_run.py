@@ -1,16 +1,16 @@
-"""A stretch of steps timed without compiling, the way of every timing of whole runs: warm up, reset, advance."""
+"""Timing of a number of steps without compilation: warm up, reset, advance. All timings of whole runs use this."""
 
 import time
 from dataclasses import dataclass
 
 from taisoft.simulator import Simulator
 
-WARM_STEPS = 3  # a multistep integrator has met all its kernels by then
+WARM_STEPS = 3  # enough for a multistep integrator to compile all its kernels
 
 
 @dataclass
 class TimedRun:
-    """What some steps did. seconds: wall time without compiling [s]; inverted: the most tets in one report."""
+    """Totals of some steps. seconds: wall time without compiling [s]; inverted: maximum inverted tets in one report."""
 
     steps: int = 0
     seconds: float = 0.0
@@ -25,7 +25,7 @@ class TimedRun:
 
 
 def advance(sim: Simulator, steps: int) -> TimedRun:
-    """Take `steps` steps in the largest batches that sim.advance takes, as sim.run does between two frames."""
+    """Take `steps` steps in the largest batches that sim.advance allows, as sim.run does between two frames."""
     timed = TimedRun(steps)
     compiled, start = sim.compile_seconds, time.perf_counter()
     done = 0
@@ -41,7 +41,7 @@ def advance(sim: Simulator, steps: int) -> TimedRun:
 
 
 def warm_up(sim: Simulator) -> None:
-    """Compile what steps need, and go back to the start."""
+    """Compile the kernels that steps need, then reset to the start."""
     for _ in range(WARM_STEPS):
         sim.step()
     sim.reset()

@@ -1,7 +1,7 @@
-"""Where runs are carried out: child processes, each on cores of its own, and the loop that hands them out.
+"""Places that execute runs: child processes, each on its own cores; and the loop that distributes requests to them.
 
-A place takes one request at a time: `start(request)`, `poll()` -> the answer or None, `stop()`. The requests and answers are
-those of `taisoft/cli/study_child.py`. The places of a cluster are in `taisoft.study.cluster`.
+A place takes one request at a time: `start(request)`, `poll()` -> the answer or None, `stop()`. Requests and answers are
+defined in `taisoft/cli/study_child.py`. Places on a cluster are in `taisoft.study.cluster`.
 """
 
 import json
@@ -19,43 +19,43 @@ from taisoft.errors import SceneError
 from taisoft.timing import usable_cores
 
 CHILD = (sys.executable, "-m", "taisoft.cli.study_child")
-LOOK_EVERY = 0.05  # [s]
-SPENT, CUT = "the budget was spent", "the budget was spent while it ran"
+POLL_INTERVAL = 0.05  # [s]
+BUDGET_SPENT, CUT_BY_BUDGET = "the budget was spent", "the budget was spent while it ran"
 
 
 class Place(Protocol):
-    """Where one run at a time is carried out, on `cores`."""
+    """Executes one run at a time, on `cores`."""
 
     cores: list[int]
 
     def start(self, request: dict) -> None:
-        """Begin with a request."""
+        """Start a request."""
 
     def poll(self) -> dict | None:
-        """{"answer": ...}, {"error": ...}, {"crash": ...} or, where the place is no more, {"lost": sentence}; None until then."""
+        """Return {"answer": ...}, {"error": ...}, {"crash": ...} or, for a lost place, {"lost": sentence}; None until then."""
 
     def stop(self) -> None:
-        """End what is going on, if anything is."""
+        """Stop the current run, if any."""
 
 
 class LocalPlace:
-    """Child processes on this machine, one at a time. child: their command, which speaks as `study_child`."""
+    """Runs child processes on this machine, one at a time. child: their command, with the protocol of `study_child`."""
 
     def __init__(self, cores: list[int], child: tuple[str, ...] = CHILD):
         self.cores, self._child = cores, child
         self._process: subprocess.Popen | None = None
 
     def start(self, request: dict) -> None:
-        """See Place. A session of its own keeps the terminal's Ctrl-C from it; it leaves when we do, by its stdin."""
-        self._out, self._told = tempfile.TemporaryFile(), tempfile.TemporaryFile()
+        """See Place. A new session shields the child from the terminal's Ctrl-C; it exits when its stdin closes."""
+        self._stdout, self._stderr = tempfile.TemporaryFile(), tempfile.TemporaryFile()
         self._process = subprocess.Popen(
-            self._child, stdin=subprocess.PIPE, stdout=self._out, stderr=self._told, start_new_session=True
+            self._child, stdin=subprocess.PIPE, stdout=self._stdout, stderr=self._stderr, start_new_session=True
         )
         try:
             self._process.stdin.write(json.dumps(request | {"cores": self.cores}).encode() + b"\n")
             self._process.stdin.flush()
         except BrokenPipeError:
-            pass  # it has ended already, and `poll` tells
+            pass  # the child has already ended; `poll` returns the reason
 
     def poll(self) -> dict | None:
         """See Place."""
@@ -64,11 +64,11 @@ class LocalPlace:
             return None
         self._process = None
         _close_stdin(process)
-        out, told = _content(self._out), _content(self._told).decode(errors="replace")
+        stdout, stderr = _content(self._stdout), _content(self._stderr).decode(errors="replace")
         try:
-            return json.loads(out)
+            return json.loads(stdout)
         except ValueError:
-            return {"crash": _how_it_ended(process.returncode, told)}
+            return {"crash": _exit_reason(process.returncode, stderr)}
 
     def stop(self) -> None:
         """See Place."""
@@ -80,7 +80,7 @@ class LocalPlace:
 
 
 def _close_stdin(process: subprocess.Popen) -> None:
-    with suppress(BrokenPipeError):  # what it did not read before it ended is still to be written
+    with suppress(BrokenPipeError):  # closing flushes what the child did not read before it ended
         process.stdin.close()
 
 
@@ -90,57 +90,57 @@ def _content(file) -> bytes:
         return file.read()
 
 
-def _how_it_ended(code: int, told: str) -> str:
-    """A sentence on a process that gave no answer."""
+def _exit_reason(code: int, stderr: str) -> str:
+    """Return a sentence on how a process without an answer ended."""
     how = f"by signal {signal.Signals(-code).name}" if code < 0 else f"with exit status {code}"
-    last = told.strip().splitlines()
-    return f"its process ended {how} without an answer" + (f": {last[-1]}" if last else "")
+    lines = stderr.strip().splitlines()
+    return f"its process ended {how} without an answer" + (f": {lines[-1]}" if lines else "")
 
 
 def local_places(number: int) -> list[LocalPlace]:
-    """Places that share this process's cores evenly, none twice. Raises SceneError where there are fewer cores."""
+    """Return places that divide this process's cores evenly. Raises SceneError if there are fewer cores than places."""
     cores = usable_cores()
     if not 1 <= number <= len(cores):
         raise SceneError(f"--workers {number}: it must be between 1 and {len(cores)}, the number of cores: timed runs share none")
     if number > 1 and not hasattr(os, "sched_setaffinity"):
-        raise SceneError(f"--workers {number}: this system pins no process to cores, so that timed runs could share one")
+        raise SceneError(f"--workers {number}: this system cannot pin processes to cores, so timed runs could share one")
     each = len(cores) // number
     return [LocalPlace(cores[k * each : (k + 1) * each]) for k in range(number)]
 
 
 def carry_out(
     requests: Iterable[tuple[str, dict]], places: list, done: Callable[[str, dict], None], *,
-    seconds_left: Callable[[], float], requested: Callable[[], bool],
+    seconds_left: Callable[[], float], stop_requested: Callable[[], bool],
 ) -> dict[str, str]:  # fmt: skip
-    """Hand out requests (key, request) in their order, and each answer to done(key, answer).
+    """Execute requests (key, request) in order and call done(key, answer) for each.
 
-    seconds_left: of the budget; asked: whether to end. Returns the keys of what was not finished, and why.
+    seconds_left: of the budget; stop_requested: whether to end. Return the keys of unfinished requests, and why.
     """
     waiting = list(requests)
     busy: dict[int, tuple[str, dict]] = {}
     lost: dict[int, str] = {}
     try:
         while waiting or busy:
-            why = "the study was interrupted" if requested() else SPENT if seconds_left() <= 0.0 else ""
+            why = "the study was interrupted" if stop_requested() else BUDGET_SPENT if seconds_left() <= 0.0 else ""
             if len(lost) == len(places):
                 why = "; ".join(dict.fromkeys(lost.values()))
             if why:
-                cut = dict.fromkeys((key for key, _ in busy.values()), CUT if why == SPENT else why)
+                cut = dict.fromkeys((key for key, _ in busy.values()), CUT_BY_BUDGET if why == BUDGET_SPENT else why)
                 return cut | dict.fromkeys((key for key, _ in waiting), why)
-            moved = False
+            progressed = False
             for k, place in enumerate(places):
                 if k in busy and (answer := place.poll()) is not None:
-                    moved, (key, request) = True, busy.pop(k)
-                    if "lost" in answer:  # another place may still do it
+                    progressed, (key, request) = True, busy.pop(k)
+                    if "lost" in answer:  # another place may still run it
                         lost[k] = answer["lost"]
                         waiting.insert(0, (key, request))
                     else:
                         done(key, answer)
                 if k not in busy and k not in lost and waiting:
-                    moved, busy[k] = True, waiting.pop(0)
+                    progressed, busy[k] = True, waiting.pop(0)
                     place.start(busy[k][1])
-            if not moved:
-                time.sleep(LOOK_EVERY)
+            if not progressed:
+                time.sleep(POLL_INTERVAL)
         return {}
     finally:
         for place in places:
