@@ -32,7 +32,7 @@ CHUNKS = {"cpu": 1024, "cuda": 4096}
 # |Dm| |Dm^-1| above which F is formed in f64: in f32 its rounding error, 6e-8 times this number, would be a strain above 6e-6.
 # Regular tets have 3, those of a sheet whose cells are 30 times as wide as thick about 60
 ILL_CONDITIONED = 100.0
-MATRIX_BLOCKS = {1: 6, 2: 45 + 6}  # 3x3 blocks per tet in the assembly buffer: node pairs and intermediate blocks
+MATRIX_BLOCKS = {1: 6, 2: 45 + 6}  # 3x3 blocks per tet in the assembly buffer: node pairs, and six scratch blocks of order 2
 
 
 @dataclass(frozen=True)
