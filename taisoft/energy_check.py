@@ -8,7 +8,7 @@ overlap. Bodies that touch at the start may also separate to the contact offset.
 Explicit steps conserve another energy, H, for a linear motion of frequencies w <= 2 q / dt, q = dt / stable_dt:
     velocity Verlet:   H = E - |f dt/2|^2 / 2m,   between E - q^2 U and E;
     symplectic Euler:  H = E + v.f dt/2,          |E - H| <= 2 q sqrt(K U),
-K kinetic and U elastic energy. A rise of E within these bounds is not counted.
+with kinetic energy K and elastic energy U. A rise of E within these bounds is not counted.
 
 Weak: energy that is lost and created again goes unnoticed. Energy created by one body may be hidden by that of others.
 """

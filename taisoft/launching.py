@@ -217,13 +217,13 @@ class Compiled:
         self._setters, dummies = [], []  # setters: (argument index, slot, kind) of non-template parameters
         self._leaves: list[tuple[int, int]] = []  # (first slot, argument index) of each template
         slot = 0
-        for at, (structure, annotation) in enumerate(zip(structures, annotations)):
+        for index, (structure, annotation) in enumerate(zip(structures, annotations)):
             if structure is None:
-                self._setters.append((at, (slot,), _setter(annotation)))
-                dummies.append(examples[at] if examples[at] is not None else 0)
+                self._setters.append((index, (slot,), _setter(annotation)))
+                dummies.append(examples[index] if examples[index] is not None else 0)
                 slot += 1
                 continue
-            self._leaves.append((slot, at))
+            self._leaves.append((slot, index))
             kinds = list(leaf_structures(structure))
             dummies += [_dummy(kind) for kind in kinds]
             slot += len(kinds)
@@ -241,8 +241,8 @@ class Compiled:
         if self._public is not None:
             return None
         context = self._cpp.make_launch_context()
-        for slot, at in self._leaves:
-            for k, leaf in enumerate(leaves_of(arguments[at], self.structures[at])):
+        for slot, index in self._leaves:
+            for k, leaf in enumerate(leaves_of(arguments[index], self.structures[index])):
                 if not isinstance(leaf, Array):
                     context.set_arg_int((slot + k,), operator.index(leaf))
                 elif leaf.host is not None:
@@ -259,8 +259,8 @@ class Compiled:
             return self._launch_public(arguments)
         if context is None:
             context = self.context(arguments)
-        for at, slot, kind in self._setters:
-            value = arguments[at]
+        for index, slot, kind in self._setters:
+            value = arguments[index]
             if kind == REAL:
                 context.set_arg_float(slot, value)
             elif kind == INTEGER:
