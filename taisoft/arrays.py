@@ -1,6 +1,6 @@
-"""Arrays of a simulator: kernels take them as arguments, so that compiled code knows neither their size nor whose they are.
+"""Arrays of a simulator. Kernels take them as arguments, so compiled code does not depend on their size or owner.
 
-On the CPU the memory is NumPy's, which the host reads and writes as it is; on CUDA it is Taichi's.
+On the CPU the memory is a NumPy array, which the host accesses directly; on CUDA it is Taichi's.
 """
 
 import math
@@ -12,55 +12,60 @@ from taichi.lang import impl
 
 DTYPES = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u8: np.uint8}
 
-# Annotation of a number in a record of arrays that kernels read at run time. Other numbers, flags and modules of such a record
-# are structure: they are known to the compiler, and a kernel is compiled for each set of them.
+# Annotation of a number that kernels read from a record of arrays at run time. Other numbers, flags and modules of such a record
+# are compile-time structure: a kernel is compiled for each set of them.
 Count = Annotated[int, "run time"]
 
 
 def index_mask(n: int, extents: tuple[int, ...]) -> int:
-    """Bits of the first index of an array of so many numbers an entry, all of which 31 bits can count; 2^31 - 1 of scalars."""
+    """Mask of the first index of an array of n-vectors with these other extents, so that 31 bits can index all its numbers.
+
+    It is 2^31 - 1 for scalars.
+    """
     numbers = max(n, 1) * math.prod(extents)
     return 2 ** (31 - (numbers - 1).bit_length()) - 1
 
 
 class Array:
-    """shape: of its entries, each a scalar or, where n > 0, a vector of n components. Only the first extent may vary at run
-    time: a kernel is compiled for the others."""
+    """An array of scalars, or of vectors of n components if n > 0.
+
+    shape: extents of its entries. Only the first may vary at run time: a kernel is compiled for the others.
+    """
 
     __slots__ = ("dtype", "n", "shape", "host", "device", "__weakref__")
 
     def __init__(self, dtype, shape: tuple[int, ...], n: int, on_host: bool):
         self.dtype, self.n, self.shape = dtype, n, shape
-        self.host = np.empty(self.whole, dtype=DTYPES[dtype]) if on_host else None
+        self.host = np.empty(self.full_shape, dtype=DTYPES[dtype]) if on_host else None
         if on_host:
-            self.host.fill(0)  # written, so that the next array is held against what memory is left
-        # scalars only: Taichi never frees arrays of vectors
-        self.device = None if on_host else ti.ndarray(dtype, (math.prod(self.whole),))
+            self.host.fill(0)  # touch the pages, so that later checks of available memory count them
+        # as scalars, because Taichi never frees arrays of vectors
+        self.device = None if on_host else ti.ndarray(dtype, (math.prod(self.full_shape),))
 
     @property
-    def whole(self) -> tuple[int, ...]:
-        """Shape of all its numbers."""
+    def full_shape(self) -> tuple[int, ...]:
+        """Shape including vector components."""
         return (*self.shape, self.n) if self.n else self.shape
 
     @property
     def structure(self) -> tuple:
-        """What compiled code depends on."""
+        """The properties that compiled code depends on."""
         return self.dtype, self.n, self.shape[1:]
 
     def to_numpy(self, rows: int | None = None) -> np.ndarray:
-        """A copy of the array, or of its first rows."""
+        """Return a copy of the array, or of its first `rows` rows."""
         if self.host is not None:
             return (self.host if rows is None else self.host[:rows]).copy()
-        whole = self.device.to_numpy().reshape(self.whole)
-        return whole if rows is None else whole[:rows].copy()
+        data = self.device.to_numpy().reshape(self.full_shape)
+        return data if rows is None else data[:rows].copy()
 
     def check(self, data: np.ndarray) -> None:
-        """Raises ValueError unless data has the array's shape."""
-        if data.shape != self.whole:
-            raise ValueError(f"an array of shape {self.whole} cannot take one of shape {data.shape}")
+        """Raise ValueError unless data has the array's shape."""
+        if data.shape != self.full_shape:
+            raise ValueError(f"an array of shape {self.full_shape} cannot take one of shape {data.shape}")
 
     def from_numpy(self, data: np.ndarray) -> None:
-        """Take numbers of the array's shape. Raises ValueError for any other, before anything is written."""
+        """Copy data into the array. Raises ValueError, before writing anything, unless it has the array's shape."""
         self.check(data)
         if self.host is not None:
             np.copyto(self.host, data, casting="unsafe")
@@ -68,20 +73,20 @@ class Array:
             self.device.from_numpy(np.ascontiguousarray(data, dtype=DTYPES[self.dtype]).reshape(-1))
 
     def fill(self, value: float) -> None:
-        """The same number everywhere."""
+        """Set every number to value."""
         if self.host is not None:
             self.host[...] = value
         else:
             self.device.fill(value)
 
     def release(self) -> None:
-        """Give the memory back: the array then has no entries."""
+        """Free the memory; the array then has no entries."""
         self.shape = (0, *self.shape[1:])
-        self.host = np.empty(self.whole, dtype=DTYPES[self.dtype]) if self.host is not None else None
+        self.host = np.empty(self.full_shape, dtype=DTYPES[self.dtype]) if self.host is not None else None
         self.device = None
 
     def __getitem__(self, at):
-        """One entry, on the host."""
+        """Return a copy of one entry, on the host."""
         entry = (self.host if self.host is not None else self.to_numpy())[at]
         return entry.copy() if entry.ndim else entry.item()
 
@@ -95,10 +100,10 @@ class Array:
 
 
 class View:
-    """An array inside a kernel. Of several dimensions it is flat in memory, with extents after the first that the compiler knows.
+    """An array inside a kernel: flat memory, with compile-time extents after the first.
 
-    Indices of entries of several numbers are masked, which changes none of them: so the compiler sees that no address overflows,
-    and takes neighbouring numbers for neighbours.
+    The first index is masked, which changes no valid index but shows the compiler that no address overflows, so that it can
+    vectorise adjacent accesses.
     """
 
     def __init__(self, flat, n: int, extents: tuple[int, ...]):
@@ -106,7 +111,7 @@ class View:
 
     @property
     def shape(self):
-        """Of an array of vectors: how many there are."""
+        """Shape (number of vectors,) of an array of vectors; raises TypeError for several dimensions."""
         if self._extents:
             raise TypeError("an array of several dimensions has no shape inside a kernel: pass a Count")
         return self._flat.shape

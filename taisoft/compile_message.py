@@ -1,4 +1,4 @@
-"""Says on stderr that kernels are being compiled: whole lines only, so that they mix with no other output."""
+"""Messages on stderr while kernels are compiled: whole lines only, so that they do not mix with other output."""
 
 import contextlib
 import sys
@@ -7,19 +7,19 @@ from collections.abc import Iterator
 
 MESSAGE = "taisoft: compiling kernels for this kind of scene, once (about 20 s)"
 COMPILED_ABOVE = 0.1  # [s] in the compiler: loading a kernel from the cache on disk takes at most 0.03 s
-COMPILER_SHARE = 0.5  # of a first launch: 0.7 and more when compiling, 0.2 at most when loading, however slow the machine is
-LINE_EVERY = 5.0  # [s] between lines that tell how many kernels are done
+COMPILER_FRACTION = 0.5  # of a first launch: at least 0.7 when compiling, at most 0.2 when loading, on any machine
+LINE_EVERY = 5.0  # [s] between lines with the number of compiled kernels
 _last_line: float | None = None  # when the last line was written [s], None before the first
 _is_silent = False
 
 
 def show(compiler: float, launch: float, n_compiled: int) -> None:
-    """Report a first launch where its kernel was compiled, not loaded from disk.
+    """Report a first launch if its kernel was compiled, not loaded from disk.
 
-    compiler: time spent in the compiler [s]; launch: in all of the launch [s]; n_compiled: kernels of this process so far.
+    compiler: time in the compiler [s]; launch: time of the whole launch [s]; n_compiled: kernels compiled so far.
     """
     global _last_line
-    if _is_silent or compiler < COMPILED_ABOVE or compiler < COMPILER_SHARE * launch:
+    if _is_silent or compiler < COMPILED_ABOVE or compiler < COMPILER_FRACTION * launch:
         return
     now = time.perf_counter()
     if _last_line is None:
@@ -33,7 +33,7 @@ def show(compiler: float, launch: float, n_compiled: int) -> None:
 
 @contextlib.contextmanager
 def silenced() -> Iterator[None]:
-    """Nothing is said inside, where the caller tells of the kernels itself."""
+    """Suppress the messages, for a caller that reports the kernels itself."""
     global _is_silent
     _is_silent = True
     try:
@@ -43,7 +43,7 @@ def silenced() -> Iterator[None]:
 
 
 def _write(line: str) -> None:
-    """To stderr, where there is one: a message is not worth an error."""
+    """Write to stderr if there is one, ignoring errors."""
     if sys.stderr is not None:
-        with contextlib.suppress(OSError, ValueError):  # closed, or its reader has gone
+        with contextlib.suppress(OSError, ValueError):  # stderr is closed, or its reader has exited
             print(line, file=sys.stderr, flush=True)

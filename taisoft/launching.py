@@ -1,13 +1,13 @@
-"""Kernels over records of arrays: compiled once for each structure, launched with whatever arrays and sizes have it.
+"""Kernels over records of arrays: compiled once per structure, launched with any arrays and sizes of that structure.
 
-A kernel's template arguments are records (dataclasses) of arrays, single arrays, modules and constants. Taichi would compile a
-kernel anew for each record. Here a record is taken apart: its arrays and its numbers marked `Count` become arguments, and what is
-left of it (types, extents but the first, flags, laws) is the structure that the code is compiled for. Inside the kernel the
-record is put together again around those arguments, so the kernel's source reads as if it had been handed the record.
-A record may hold others, and tuples of them. Only what a kernel and the functions it calls name is taken from a record.
+A kernel's template arguments are records (dataclasses) of arrays, single arrays, modules and constants. Taichi would recompile
+a kernel for each record. Here a record is flattened: its arrays and its numbers marked `Count` become arguments, and the rest
+(types, all extents but the first, flags, laws) is the structure that the code is compiled for. Inside the kernel the record is
+rebuilt around those arguments, so the kernel's source reads as if it had received the record.
+A record may contain records and tuples of records. Only the fields named by a kernel and the functions it calls are passed.
 
-A launch through Taichi looks every argument's type up; one that is known by its records needs only numbers and addresses in a
-context that is made once. This rests on 1.7.4, the version that taisoft asks for: see `tracing`.
+A launch through Taichi looks up the type of every argument. A launch here whose records are known only sets numbers and
+addresses in a context that is created once. This relies on Taichi 1.7.4, the version that taisoft requires: see `tracing`.
 """
 
 import ast
@@ -29,18 +29,18 @@ from taichi.lang.kernel_impl import Kernel, template
 from taichi.types import ndarray_type, primitive_types
 
 from taisoft.arrays import DTYPES, Array, Count, View
-from taisoft.tracing import QUICK, source_of
+from taisoft.tracing import FAST_TRACING, source_of
 
 RECORD, ARRAY, COUNT, TUPLE, CONSTANT = range(5)
-REAL, WHOLE, HOST_ARRAY = range(3)
-PUBLIC = not QUICK  # launch through Taichi's public interface alone, which takes 20 us and more, and at most 64 arguments
+REAL, INTEGER, HOST_ARRAY = range(3)
+PUBLIC = not FAST_TRACING  # launch only through Taichi's public interface: 20 us or more a launch, at most 64 arguments
 
 
-# --- what of a record a kernel names ------------------------------------------------------------------------------------
+# --- names that a kernel uses -------------------------------------------------------------------------------------------
 
 
 def names_in(function: Callable, seen: set) -> set[str]:
-    """Every name that a function and the functions it can reach by name use, attributes too."""
+    """All names, attributes included, used by a function and by the functions it can reach by name."""
     function = inspect.unwrap(function)
     if function in seen or not isinstance(function, types.FunctionType):
         return set()
@@ -49,42 +49,42 @@ def names_in(function: Callable, seen: set) -> set[str]:
     while codes:
         code = codes.pop()
         names.update(code.co_names)
-        codes += [one for one in code.co_consts if isinstance(one, types.CodeType)]
+        codes += [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
     cells = dict(zip(function.__code__.co_freevars, (cell.cell_contents for cell in function.__closure__ or ())))
     reached = [cells.get(name, function.__globals__.get(name)) for name in names | set(cells)]
-    for one in reached:
-        if _is_ours(one):
-            names |= names_in(one, seen)
-        elif isinstance(one, types.ModuleType) and one.__name__.startswith("taisoft"):
-            for attribute in names & set(vars(one)):
-                if _is_ours(getattr(one, attribute)):
-                    names |= names_in(getattr(one, attribute), seen)
+    for value in reached:
+        if _is_ours(value):
+            names |= names_in(value, seen)
+        elif isinstance(value, types.ModuleType) and value.__name__.startswith("taisoft"):
+            for attribute in names & set(vars(value)):
+                if _is_ours(getattr(value, attribute)):
+                    names |= names_in(getattr(value, attribute), seen)
     return names
 
 
-def _is_ours(one: Any) -> bool:
-    return isinstance(one, types.FunctionType) and not one.__module__.startswith("taichi")
+def _is_ours(value: Any) -> bool:
+    return isinstance(value, types.FunctionType) and not value.__module__.startswith("taichi")
 
 
 def _names_of_types(values: Iterator[Any], names: set[str], seen: set) -> set[str]:
-    """What the methods of records and the functions of modules among the arguments use, where the kernel names them."""
+    """Names used by those methods of records and functions of modules among the arguments that the kernel names."""
     found = set()
     for value in values:
         holder = value if isinstance(value, types.ModuleType) else type(value)
-        for name, one in vars(holder).items():
-            one = one.fget if isinstance(one, property) else one
-            if name in names and isinstance(one, types.FunctionType):
-                found |= names_in(one, seen)
+        for name, member in vars(holder).items():
+            member = member.fget if isinstance(member, property) else member
+            if name in names and isinstance(member, types.FunctionType):
+                found |= names_in(member, seen)
     return found
 
 
 def _holders(value: Any) -> Iterator[Any]:
-    """Records and modules in an argument."""
+    """The records and modules in an argument."""
     if isinstance(value, types.ModuleType):
         yield value
     elif isinstance(value, tuple):
-        for one in value:
-            yield from _holders(one)
+        for item in value:
+            yield from _holders(item)
     elif dataclasses.is_dataclass(value):
         yield value
         for field in dataclasses.fields(value):
@@ -95,11 +95,11 @@ def _holders(value: Any) -> Iterator[Any]:
 
 
 def structure_of(value: Any, names: set[str]) -> tuple:
-    """What code depends on in an argument: equal for arguments that one compiled kernel serves."""
+    """The part of an argument that code depends on: equal for arguments that can share one compiled kernel."""
     if isinstance(value, Array):
         return ARRAY, value.structure
     if isinstance(value, tuple):
-        return TUPLE, tuple([structure_of(one, names) for one in value])
+        return TUPLE, tuple([structure_of(item, names) for item in value])
     if dataclasses.is_dataclass(value):
         parts = []
         for field in dataclasses.fields(value):
@@ -115,27 +115,27 @@ def leaves_of(value: Any, structure: tuple) -> Iterator[Array | int]:
     if structure[0] in (ARRAY, COUNT):
         yield value
     elif structure[0] == TUPLE:
-        for one, part in zip(value, structure[1]):
-            yield from leaves_of(one, part)
+        for item, part in zip(value, structure[1]):
+            yield from leaves_of(item, part)
     elif structure[0] == RECORD:
         for name, part in structure[2]:
             yield from leaves_of(getattr(value, name), part)
 
 
-def kinds_of(structure: tuple) -> Iterator[tuple]:
-    """As `leaves_of`: the structures of the leaves."""
+def leaf_structures(structure: tuple) -> Iterator[tuple]:
+    """The structures of the leaves, in the order of `leaves_of`."""
     if structure[0] in (ARRAY, COUNT):
         yield structure
     elif structure[0] == TUPLE:
         for part in structure[1]:
-            yield from kinds_of(part)
+            yield from leaf_structures(part)
     elif structure[0] == RECORD:
         for _, part in structure[2]:
-            yield from kinds_of(part)
+            yield from leaf_structures(part)
 
 
 def rebuild(structure: tuple, leaves: Iterator[Any]) -> Any:
-    """An argument as the kernel's source knows it, around what stands for its leaves inside the kernel."""
+    """Rebuild an argument inside the kernel around the kernel's own variables for its leaves."""
     if structure[0] == ARRAY:
         (_, n, extents), flat = structure[1], next(leaves)
         return View(flat, n, extents) if n or extents else flat
@@ -152,7 +152,7 @@ def rebuild(structure: tuple, leaves: Iterator[Any]) -> Any:
 
 
 def _annotation(structure: tuple) -> Any:
-    """Taichi's type of a leaf."""
+    """Taichi type of a leaf."""
     if structure[0] == COUNT:
         return ti.i32
     dtype, n, _ = structure[1]
@@ -162,13 +162,13 @@ def _annotation(structure: tuple) -> Any:
 # --- source -------------------------------------------------------------------------------------------------------------
 
 
-_numbers = itertools.count()  # of what is generated
+_numbers = itertools.count()  # of generated functions
 
 
 def generate(function: Callable, structures: dict[str, tuple]) -> Callable:
-    """The function with its templates, by name, replaced by their leaves.
+    """Return the function with its template parameters, given by name, replaced by their leaves.
 
-    Its lines stand where the original's do, in a file of another name that exists in Python's cache of lines alone.
+    Its lines keep their original numbers, in a file of another name that exists only in Python's line cache.
     """
     file, _, first, source = source_of(function)
     tree = ast.parse(source).body[0]
@@ -180,7 +180,7 @@ def generate(function: Callable, structures: dict[str, tuple]) -> Callable:
             scope[f"_type_{name}"] = parameter.annotation
             parameters.append(f"{name}: _type_{name}")
             continue
-        for k, kind in enumerate(kinds_of(structures[name])):
+        for k, kind in enumerate(leaf_structures(structures[name])):
             scope[f"_type_{name}_{k}"] = _annotation(kind)
             parameters.append(f"_{name}_{k}: _type_{name}_{k}")
             handles.append(f"_{name}_{k}")
@@ -194,81 +194,81 @@ def generate(function: Callable, structures: dict[str, tuple]) -> Callable:
     head = f"def {function.__name__}({', '.join(parameters)}){returned}:\n"
     if structures:
         head += f"    {', '.join(structures)}, = _static(_records({', '.join(handles)}))\n"
-    start = first - 1 + body[0].lineno - 1 - head.count("\n")  # lines before the head
+    start = first - 1 + body[0].lineno - 1 - head.count("\n")  # blank lines before the head
     text = "\n" * start + head + "".join(source.splitlines(keepends=True)[body[0].lineno - 1 :])
     name = f"{file}#{function.__name__}-{next(_numbers)}"
     linecache.cache[name] = (len(text), None, text.splitlines(keepends=True), name)
     exec(compile(text, name, "exec"), scope)
-    made = scope[function.__name__]
-    made.__module__ = function.__module__
-    return made
+    generated = scope[function.__name__]
+    generated.__module__ = function.__module__
+    return generated
 
 
 # --- launch -------------------------------------------------------------------------------------------------------------
 
 
 class Compiled:
-    """A kernel compiled for one structure, to be used only while Taichi is not initialised anew."""
+    """A kernel compiled for one structure; valid until Taichi is re-initialised."""
 
     def __init__(self, function: Callable, names: list[str], annotations: list[Any], structures: list[tuple | None], examples):
-        """structures: of the templates, None for other parameters. examples: host arrays among the arguments, else None."""
+        """structures: one per parameter, None if it is no template. examples: the argument if it is a host array, else None."""
         self.structures = structures
-        made = generate(function, {n: s for n, s in zip(names, structures) if s is not None})
-        self._setters, dummies = [], []  # of the other parameters: (place among the arguments, slot, kind)
-        self._leaves: list[tuple[int, int]] = []  # (slot, place among the arguments) of each template's first leaf
+        generated = generate(function, {n: s for n, s in zip(names, structures) if s is not None})
+        self._setters, dummies = [], []  # setters: (argument index, slot, kind) of non-template parameters
+        self._leaves: list[tuple[int, int]] = []  # (first slot, argument index) of each template
         slot = 0
-        for at, (structure, annotation) in enumerate(zip(structures, annotations)):
+        for index, (structure, annotation) in enumerate(zip(structures, annotations)):
             if structure is None:
-                self._setters.append((at, (slot,), _setter(annotation)))
-                dummies.append(examples[at] if examples[at] is not None else 0)
+                self._setters.append((index, (slot,), _setter(annotation)))
+                dummies.append(examples[index] if examples[index] is not None else 0)
                 slot += 1
                 continue
-            self._leaves.append((slot, at))
-            kinds = list(kinds_of(structure))
+            self._leaves.append((slot, index))
+            kinds = list(leaf_structures(structure))
             dummies += [_dummy(kind) for kind in kinds]
             slot += len(kinds)
-        self._public = ti.kernel(made) if PUBLIC else None
+        self._public = ti.kernel(generated) if PUBLIC else None
         if PUBLIC:
             return
-        self._kernel = Kernel(made, AutodiffMode.NONE)
+        self._kernel = Kernel(generated, AutodiffMode.NONE)
         key = self._kernel.ensure_compiled(*dummies)
         self._cpp = self._kernel.compiled_kernels[key]
         program = self._program = impl.get_runtime().prog
         self._data = program.compile_kernel(program.config(), program.get_device_caps(), self._cpp)
 
     def context(self, arguments: tuple) -> Any:
-        """What a launch with the records among these arguments needs; the other arguments are not in it yet."""
+        """Create a launch context that holds the records among the arguments; `launch` sets the other arguments."""
         if self._public is not None:
             return None
         context = self._cpp.make_launch_context()
-        for slot, at in self._leaves:
-            for k, leaf in enumerate(leaves_of(arguments[at], self.structures[at])):
+        for slot, index in self._leaves:
+            for k, leaf in enumerate(leaves_of(arguments[index], self.structures[index])):
                 if not isinstance(leaf, Array):
                     context.set_arg_int((slot + k,), operator.index(leaf))
                 elif leaf.host is not None:
                     host = leaf.host
-                    entries = host.size // max(leaf.n, 1)  # as the kernel counts them; debug mode checks indices by it
+                    entries = host.size // max(leaf.n, 1)  # as the kernel counts them, for index checks in debug mode
                     context.set_arg_external_array_with_shape((slot + k,), host.ctypes.data, host.nbytes, (entries,), 0)
                 else:
                     context.set_arg_ndarray((slot + k,), leaf.device.arr)
         return context
 
     def launch(self, context: Any, arguments: tuple) -> Any:
-        """Launch; returns what the kernel returns. context: of `context`, None where it must be made anew."""
+        """Launch and return the kernel's result. context: from `context`; None to create one for this launch."""
         if self._public is not None:
-            return self._launch_publicly(arguments)
+            return self._launch_public(arguments)
         if context is None:
             context = self.context(arguments)
-        for at, slot, kind in self._setters:
-            value = arguments[at]
+        for index, slot, kind in self._setters:
+            value = arguments[index]
             if kind == REAL:
                 context.set_arg_float(slot, value)
-            elif kind == WHOLE:
+            elif kind == INTEGER:
                 context.set_arg_int(slot, operator.index(value))
             elif value.flags.c_contiguous:
                 context.set_arg_external_array_with_shape(slot, value.ctypes.data, value.nbytes, value.shape, 0)
             else:
-                raise ValueError(f"{self._kernel.func.__name__} takes contiguous arrays alone")
+                raise ValueError(f"{self._kernel.func.__name__} takes only contiguous arrays")
         self._program.launch_kernel(self._data, context)
         returned = self._kernel.return_type
         if returned is None:
@@ -277,8 +277,11 @@ class Compiled:
         values = [self._kernel.construct_kernel_ret(context, kind, (i,)) for i, kind in enumerate(returned)]
         return values[0] if len(values) == 1 else values
 
-    def _launch_publicly(self, arguments: tuple) -> Any:
-        """As Taichi's own launch takes it. What lies on a device travels: Taichi takes scalars there for no vectors."""
+    def _launch_public(self, arguments: tuple) -> Any:
+        """Launch through Taichi's public interface.
+
+        Device arrays are copied to the host and back: Taichi rejects scalar device arrays as vector arguments.
+        """
         flat, copies = [], {}
         for argument, structure in zip(arguments, self.structures):
             for leaf in [argument] if structure is None else leaves_of(argument, structure):
@@ -298,7 +301,7 @@ def _setter(annotation: Any) -> int:
     if id(annotation) in primitive_types.real_type_ids:
         return REAL
     if annotation in (ti.i32, ti.i64):
-        return WHOLE
+        return INTEGER
     if isinstance(annotation, ndarray_type.NdarrayType) and (
         annotation.dtype is None or id(annotation.dtype) in primitive_types.type_ids
     ):
@@ -307,7 +310,7 @@ def _setter(annotation: Any) -> int:
 
 
 def _dummy(structure: tuple) -> Any:
-    """A value of a leaf's type, for the compiler."""
+    """A value of a leaf's type, to compile with."""
     if structure[0] == COUNT:
         return 1
     dtype, n, _ = structure[1]
@@ -315,7 +318,7 @@ def _dummy(structure: tuple) -> Any:
 
 
 class Kernels:
-    """All that has been compiled of one kernel's source."""
+    """All compiled versions of one kernel."""
 
     def __init__(self, function: Callable):
         self._function = function
@@ -328,23 +331,26 @@ class Kernels:
         self.forget()
 
     def forget(self) -> None:
-        """Taichi has been initialised anew."""
+        """Drop everything compiled: Taichi has been re-initialised."""
         self._compiled: dict[tuple, Compiled] = {}
-        self._ready: dict[tuple, tuple] = {}  # by which the records are: compiled kernel, context, and references to them
+        self._ready: dict[tuple, tuple] = {}  # key of the arguments -> compiled kernel, context, weak references
 
     @property
     def n_compiled(self) -> int:
-        """How many structures the kernel has been compiled for."""
+        """Number of structures that the kernel has been compiled for."""
         return len(self._compiled)
 
     def find(self, arguments: tuple) -> tuple | None:
-        """The ready (compiled, context) for these arguments, None where they are new. Raises TypeError for too many or few."""
+        """The prepared (compiled, context, references) for these arguments, or None if they are new.
+
+        Raises TypeError for a wrong number of arguments.
+        """
         if len(arguments) != len(self._names):
             raise TypeError(f"{self._function.__name__} takes {len(self._names)} arguments, not {len(arguments)}")
         return self._ready.get(self._key(arguments))
 
     def _key(self, arguments: tuple) -> tuple:
-        """By which the arguments are known again: which record or array each is, of a constant its value."""
+        """Key of the arguments: the identity of each record or array, the value of each constant."""
         key = [
             (a, kind) if _is_constant[kind := type(a := arguments[k])] else id(a)  # 1, 1.0 and True are equal
             for k in self._templates
@@ -354,7 +360,7 @@ class Kernels:
         return tuple(key)
 
     def prepare(self, arguments: tuple) -> tuple:
-        """As `find`, compiling the kernel where it has not been compiled for the structure of these arguments."""
+        """As `find`, but compile the kernel if it is new for the structure of these arguments."""
         names = self._names_for(arguments)
         structures = [structure_of(a, names) if k in self._templates else None for k, a in enumerate(arguments)]
         kind = tuple([(a.dtype, a.ndim) for a in (arguments[k] for k in self._arrays)])
@@ -364,7 +370,7 @@ class Kernels:
             compiled = Compiled(self._function, self._names, self._annotations, structures, examples)
             self._compiled[tuple(structures), kind] = compiled
         key = self._key(arguments)
-        # one with Taichi's own arrays in it serves once
+        # a context that holds Taichi's own arrays can be launched only once
         context = compiled.context(arguments) if ti.cfg.arch != ti.cuda else None
         ready = compiled, context, self._references(key, arguments)
         self._ready[key] = ready
@@ -382,7 +388,7 @@ class Kernels:
         return names
 
     def _references(self, key: tuple, arguments: tuple) -> list:
-        """So held that what is known of records and arrays goes with the first of them."""
+        """Weak references that remove the entry `key` as soon as one of its records or arrays is collected."""
         ready = self._ready
         return [
             weakref.ref(arguments[k], lambda _, key=key: ready.pop(key, None))
@@ -392,7 +398,7 @@ class Kernels:
 
 
 class _Constants(dict):
-    """Whether an argument of a type is known by its value. A launch asks it of every argument, so it is a look-up."""
+    """Whether arguments of a type are keyed by value. A dict, because a launch checks every argument."""
 
     def __missing__(self, kind: type) -> bool:
         self[kind] = issubclass(kind, (bool, int, float, str, tuple))

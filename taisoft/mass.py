@@ -1,8 +1,8 @@
-"""The mass of a scene's nodes: lumped for explicit steps, consistent in implicit ones where elements are quadratic.
+"""Nodal masses of a scene: lumped for explicit steps; for implicit steps consistent in quadratic bodies.
 
-A lumped mass moves the poles of quadratic tets little but places their weight wrongly (gravity on them is not
-int rho N_a g dV), so implicit steps, which solve systems anyway, take the consistent matrix there. Linear bodies stay lumped:
-beside a quadratic one their rows hold zeros off the diagonal.
+Lumping hardly shifts the frequencies of quadratic tets but distributes their weight wrongly (it is not int rho N_a g dV).
+Implicit steps solve linear systems anyway, so they use the consistent matrix there. Linear bodies stay lumped: in a scene with
+a quadratic body their rows have zeros off the diagonal.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from taisoft.transfer import download, upload
 
 @dataclass(frozen=True, eq=False)
 class MassMatrix:
-    """A symmetric matrix with one number a node pair, the same for each axis, over the pattern of the stiffness [kg]."""
+    """Symmetric mass matrix [kg] with the stiffness pattern and one number per node pair, the same for each axis."""
 
     row_start: Any  # (n_nodes + 1) i32
     column: Any  # (2 n_pairs) i32, ascending in each row, no diagonal
@@ -28,17 +28,17 @@ class MassMatrix:
 
 
 def lumped_masses(scene: Scene) -> np.ndarray:
-    """Lumped masses of all nodes, bodies in order [kg]."""
+    """Lumped masses (n_nodes,) [kg], bodies in order."""
     return np.concatenate([reference.lumped_mass(b) for b in scene.bodies])
 
 
 def gravity_masses(scene: Scene) -> np.ndarray:
-    """What gravity pulls at, int rho N_a dV, of all nodes [kg]."""
+    """Masses used for weight, int rho N_a dV, (n_nodes,) [kg]."""
     return np.concatenate([reference.gravity_mass(b) for b in scene.bodies])
 
 
 def mass_matrix(scene: Scene) -> sp.csr_matrix:
-    """Mass of implicit steps (n_nodes, n_nodes) [kg]: consistent for bodies of order 2, else lumped."""
+    """Mass matrix of implicit steps (n_nodes, n_nodes) [kg]: consistent for bodies of order 2, else lumped."""
     parts = [
         reference.consistent_mass(b) if b.order == 2 else sp.diags(reference.lumped_mass(b)) for b in scene.bodies
     ]
@@ -46,7 +46,7 @@ def mass_matrix(scene: Scene) -> sp.csr_matrix:
 
 
 def upload_mass_matrix(scene: Scene, mass: MassMatrix) -> None:
-    """Fill the matrix on the device from the bodies' densities."""
+    """Fill the device matrix from the bodies' densities."""
     M = mass_matrix(scene)
     start, column = download([mass.row_start, mass.column])
     rows = np.repeat(np.arange(len(start) - 1), np.diff(start))

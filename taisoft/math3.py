@@ -1,8 +1,8 @@
 """3x3 matrices over SIMD lanes.
 
 A matrix is a Python list of nine entries, row by row, each a `ti.Vector` with one value per lane (one tetrahedron each);
-a 3-vector is a list of three. Lists are resolved while Taichi traces a kernel, so nothing but lane arithmetic is left,
-which LLVM turns into SIMD instructions. A list is never assigned twice: each result gets a fresh name.
+a 3-vector is a list of three. Lists are resolved while Taichi traces a kernel, so only lane arithmetic remains, which
+LLVM turns into SIMD instructions. A list is never reassigned: each result gets a fresh name.
 """
 
 import taichi as ti
@@ -62,7 +62,7 @@ def cross(a, b):
 
 @arithmetic
 def cofactor(F):
-    """Cofactor matrix, dJ/dF."""
+    """Cofactor matrix of F, dJ/dF."""
     return [
         F[4] * F[8] - F[5] * F[7],
         F[5] * F[6] - F[3] * F[8],
@@ -94,7 +94,7 @@ def cofactor_differential(F, D):
 
 @arithmetic
 def determinant(F):
-    """det F, by the same products as the cofactor so that both share their work."""
+    """det F, from the same products as the cofactor, so that the compiler can share them."""
     return F[0] * (F[4] * F[8] - F[5] * F[7]) + F[1] * (F[5] * F[6] - F[3] * F[8]) + F[2] * (F[3] * F[7] - F[4] * F[6])
 
 
@@ -110,7 +110,7 @@ def ddot(A, B):
 
 @arithmetic
 def _jacobi_angle(app, aqq, apq):
-    """(cosine, sine) of the rotation that makes the off-diagonal apq of a symmetric 2x2 vanish."""
+    """(cosine, sine) of the rotation that zeroes the off-diagonal apq of a symmetric 2x2 matrix."""
     small = abs(apq) <= 1e-30
     tau = (aqq - app) / ti.select(small, 1.0 + 0.0 * apq, 2.0 * apq)
     t = ti.select(tau >= 0.0, 1.0 + 0.0 * tau, -1.0 + 0.0 * tau) / (abs(tau) + ti.sqrt(1.0 + tau * tau))
@@ -123,14 +123,14 @@ def _jacobi_angle(app, aqq, apq):
 def signed_svd(F, sweeps: ti.template()):
     """F = U diag(s) V^T with U and V rotations, s0 >= s1 >= |s2|, and s2 < 0 exactly when F is inverted.
 
-    One-sided Jacobi on the columns of F / max|F|: columns are turned in pairs until they are orthogonal, then sorted by
-    length; U's third column is the cross product of the first two, so a rank-deficient F gets a full rotation too.
-    Returns (U, s, V), s a list of three. Any finite F is valid. Accuracy: a few units of rounding of |F| in s.
+    One-sided Jacobi on the columns of F / max|F|: pairs of columns are rotated until they are orthogonal, then sorted by
+    length. U's third column is the cross product of the first two, so a rank-deficient F gets a full rotation too.
+    Returns (U, s, V), s a list of three. Any finite F is valid. Accuracy: s within a few rounding units of |F|.
     """
-    big = abs(F[0])
+    largest = abs(F[0])
     for k in ti.static(range(1, 9)):
-        big = ti.max(big, abs(F[k]))
-    unit = ti.select(big > 0.0, big, 1.0 + 0.0 * big)
+        largest = ti.max(largest, abs(F[k]))
+    unit = ti.select(largest > 0.0, largest, 1.0 + 0.0 * largest)
     A = [F[k] / unit for k in ti.static(range(9))]
     one, zero = 1.0 + 0.0 * unit, 0.0 * unit
     V = [one, zero, zero, zero, one, zero, zero, zero, one]
@@ -158,7 +158,7 @@ def _rotate_columns(A: ti.template(), V: ti.template(), p: ti.template(), q: ti.
 
 @ti.func
 def _sort_columns(A: ti.template(), V: ti.template(), p: ti.template(), q: ti.template()):
-    """Exchange two columns of A and V where the later one is longer; one changes sign, so V stays a rotation."""
+    """Swap two columns of A and V if the later one is longer; one changes sign, so V stays a rotation."""
     app = A[p] * A[p] + A[3 + p] * A[3 + p] + A[6 + p] * A[6 + p]
     aqq = A[q] * A[q] + A[3 + q] * A[3 + q] + A[6 + q] * A[6 + q]
     swap = aqq > app
@@ -171,23 +171,23 @@ def _sort_columns(A: ti.template(), V: ti.template(), p: ti.template(), q: ti.te
 
 @arithmetic
 def _left_frame(A):
-    """Orthonormal frame (as a rotation) of A's nearly orthogonal, sorted columns, and their signed lengths."""
+    """Orthonormal frame (a rotation) of A's nearly orthogonal, sorted columns, and their signed lengths."""
     s0 = ti.sqrt(A[0] * A[0] + A[3] * A[3] + A[6] * A[6])
-    none = s0 <= 0.0
-    d0 = ti.select(none, 1.0 + 0.0 * s0, s0)
-    u = [ti.select(none, 1.0 + 0.0 * s0, A[0] / d0), A[3] / d0, A[6] / d0]
-    along = u[0] * A[1] + u[1] * A[4] + u[2] * A[7]
-    w = [A[1] - along * u[0], A[4] - along * u[1], A[7] - along * u[2]]
+    is_zero = s0 <= 0.0
+    d0 = ti.select(is_zero, 1.0 + 0.0 * s0, s0)
+    u = [ti.select(is_zero, 1.0 + 0.0 * s0, A[0] / d0), A[3] / d0, A[6] / d0]
+    projection = u[0] * A[1] + u[1] * A[4] + u[2] * A[7]
+    w = [A[1] - projection * u[0], A[4] - projection * u[1], A[7] - projection * u[2]]
     s1 = ti.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
-    # below this the second column's direction is rounding noise, and any direction across u serves
-    flat = s1 <= 1e-30 + 0.0 * s1
-    ax = abs(u[0]) < 0.6
-    e = [ti.select(ax, 1.0 + 0.0 * s1, 0.0 * s1), ti.select(ax, 0.0 * s1, 1.0 + 0.0 * s1)]
-    n = [-e[1] * u[2], e[0] * u[2], e[1] * u[0] - e[0] * u[1]]  # (e0, e1, 0) cross-built across u
+    # below this the second column's direction is rounding noise, so any direction orthogonal to u will do
+    is_rank_one = s1 <= 1e-30 + 0.0 * s1
+    use_x = abs(u[0]) < 0.6
+    e = [ti.select(use_x, 1.0 + 0.0 * s1, 0.0 * s1), ti.select(use_x, 0.0 * s1, 1.0 + 0.0 * s1)]
+    n = [-e[1] * u[2], e[0] * u[2], e[1] * u[0] - e[0] * u[1]]  # u x (e0, e1, 0), orthogonal to u
     m = [u[1] * n[2] - u[2] * n[1], u[2] * n[0] - u[0] * n[2], u[0] * n[1] - u[1] * n[0]]
     length = ti.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
-    d1 = ti.select(flat, length, s1)
-    t = [ti.select(flat, m[k], w[k]) / d1 for k in ti.static(range(3))]
+    d1 = ti.select(is_rank_one, length, s1)
+    t = [ti.select(is_rank_one, m[k], w[k]) / d1 for k in ti.static(range(3))]
     b = [u[1] * t[2] - u[2] * t[1], u[2] * t[0] - u[0] * t[2], u[0] * t[1] - u[1] * t[0]]
     s2 = b[0] * A[2] + b[1] * A[5] + b[2] * A[8]
     U = [u[0], t[0], b[0], u[1], t[1], b[1], u[2], t[2], b[2]]
@@ -198,7 +198,7 @@ def _left_frame(A):
 def clamp_symmetric(A, sweeps: ti.template()):
     """Nearest positive semi-definite matrix to a symmetric A (nine entries): negative eigenvalues become 0.
 
-    Two-sided Jacobi; A's eigenvectors Q are collected, then Q max(0, D) Q^T is formed.
+    Two-sided Jacobi accumulates A's eigenvectors Q, then Q max(0, D) Q^T is formed.
     """
     D = [A[k] + 0.0 for k in ti.static(range(9))]
     one, zero = 1.0 + 0.0 * A[0], 0.0 * A[0]

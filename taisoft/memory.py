@@ -1,10 +1,10 @@
-"""How much memory this process can still have, so that what does not fit is refused before it is asked for."""
+"""Memory available to this process, so that requests that do not fit are refused before allocation."""
 
 import os
 from contextlib import suppress
 from pathlib import Path
 
-# Files of a container's limit, use, and statistics with the name of what is only cached there: cgroups 2 and 1.
+# Files with a container's limit, use and statistics, and the statistics' entry of reclaimable cache: cgroups 2 and 1.
 _CGROUPS = (
     ("memory.max", "memory.current", "memory.stat", "inactive_file"),
     ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat", "total_inactive_file"),
@@ -12,15 +12,15 @@ _CGROUPS = (
 
 
 def available_memory() -> int | None:
-    """Bytes of main memory that this process can still have: free on the machine, and within the limits set for the process
-    (`ulimit -v`) and its container; None where the system does not tell."""
-    room = address_space()
-    found = [*_of_machine(), *_of_container(), *([] if room is None else [room])]
+    """Bytes of main memory that this process can still allocate: free on the machine, and within the limits of the process
+    (`ulimit -v`) and its container; None if unknown."""
+    mappable = address_space()
+    found = [*_machine_available(), *_container_available(), *([] if mappable is None else [mappable])]
     return max(0, min(found)) if found else None
 
 
 def address_space() -> int | None:
-    """Bytes of addresses that this process can still map, used or not (`ulimit -v`); None where there is no such limit."""
+    """Bytes of address space that this process can still map, used or not (`ulimit -v`); None if there is no such limit."""
     with suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -31,23 +31,23 @@ def address_space() -> int | None:
     return None
 
 
-def _of_machine() -> list[int]:
+def _machine_available() -> list[int]:
     with suppress(OSError, ValueError):
         rows = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
         return [sum(1024 * int(rows.get(name, "0").split()[0]) for name in ("MemAvailable", "SwapFree"))]
     return []
 
 
-def _of_container(root: Path = Path("/sys/fs/cgroup")) -> list[int]:
+def _container_available(root: Path = Path("/sys/fs/cgroup")) -> list[int]:
     found = []
     for limit, used, statistics, cached in _CGROUPS:
-        with suppress(OSError, ValueError):  # "max" where there is no limit
-            most = int((root / limit).read_text())
+        with suppress(OSError, ValueError):  # "max" if there is no limit
+            maximum = int((root / limit).read_text())
             rows = dict(line.split(None, 1) for line in (root / statistics).read_text().splitlines())
-            found.append(most - int((root / used).read_text()) + int(rows.get(cached, "0")))
+            found.append(maximum - int((root / used).read_text()) + int(rows.get(cached, "0")))
     return found
 
 
 def format_bytes(n_bytes: int | None) -> str:
-    """A number of bytes for a message, such as "2000000000 bytes (2.00 GB)"."""
+    """Format a number of bytes for a message, such as "2000000000 bytes (2.00 GB)"."""
     return "unknown" if n_bytes is None else f"{n_bytes} bytes ({n_bytes / 1e9:.2f} GB)"

@@ -1,9 +1,9 @@
-"""Model: the arrays of a scene, beside its `State`. One structure of arrays over all bodies, elements in blocks of SIMD lanes.
+"""Model: the constant arrays of a scene, and its `State`. Structure of arrays over all bodies, elements in blocks of SIMD lanes.
 
-Laws, orders, flags and precision are structure, which kernels are compiled for; topology, rest shape and sizes are constant but
-run-time data, as are gravity, material numbers, loads and constraint masks. Nodes keep the order of the bodies and of their
-meshes. Tets are grouped by order, quadrature and law (a kernel runs one group's blocks in one loop), and a body's last block is
-padded with copies of its last tet of volume 0.
+Kernels are compiled for laws, orders, flags and precision. Topology, rest shape and sizes are constant but run-time data, as are
+gravity, material numbers, loads and constraint masks. Nodes keep the order of the bodies and of their meshes. Tets are grouped
+by order, quadrature and law; a kernel runs one group's blocks in one loop. A body's last block is padded with copies of its last
+tet that have volume 0.
 """
 
 from dataclasses import dataclass, replace
@@ -24,36 +24,36 @@ from taisoft.scene.scene import Material, Scene
 from taisoft.state import State, build_state
 from taisoft.transfer import download
 
-# Points, and threads of the CPU, from which parallel loops are taken instead of one serial kernel. With two threads they took 3.4
-# times as long (213,000 tets, `taisoft bench scaling`)
+# Least quadrature points and CPU threads for parallel loops; below, one serial kernel runs. With two threads, parallel loops took
+# 3.4 times as long (213,000 tets, `taisoft bench scaling`)
 PARALLEL_FROM, PARALLEL_THREADS = 100_000, 8
-# Partial sums of a parallel loop. Taichi gives a loop of few iterations, 128 at least, to one thread of the CPU
+# Partial sums of a parallel loop. On the CPU, Taichi gives a thread at least 128 iterations of a short loop
 CHUNKS = {"cpu": 1024, "cuda": 4096}
-# |Dm| |Dm^-1| from which F is formed in f64: in f32 its rounding, that times 6e-8, would be a strain above 6e-6. Regular tets
-# have 3, those of a sheet whose cells are 30 times as wide as thick about 60
+# |Dm| |Dm^-1| above which F is formed in f64: in f32 its rounding error, 6e-8 times this number, would be a strain above 6e-6.
+# Regular tets have 3, those of a sheet whose cells are 30 times as wide as thick about 60
 ILL_CONDITIONED = 100.0
-MATRIX_BLOCKS = {1: 6, 2: 45 + 6}  # 3x3 blocks per tet in the buffer of an assembly: node pairs, and what they come from
+MATRIX_BLOCKS = {1: 6, 2: 45 + 6}  # 3x3 blocks per tet in the assembly buffer: node pairs, and six scratch blocks of order 2
 
 
 @dataclass(frozen=True)
 class Group:
-    """Blocks of one kind of element and law, and where their parts of the flat arrays begin."""
+    """Blocks of one element type and law, and the offsets of their data in the flat arrays."""
 
     law: Any  # module of taisoft.materials
     order: int
     n_nodes: int  # of an element
     n_points: int
-    first: Count  # block
-    last: Count  # one past its last block
-    nodes_at: Count  # in Model.nodes
-    force_at: Count  # in State.element_force
-    matrix_at: Count  # in the buffer of an assembly
-    points_at: Count  # row of Model.points
+    first: Count  # first block
+    last: Count  # one past the last block
+    nodes_at: Count  # offset in Model.nodes
+    force_at: Count  # offset in State.element_force
+    matrix_at: Count  # offset in the assembly buffer
+    points_at: Count  # first row in Model.points
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Constant arrays, their sizes (`Count`) and structure, and the state: what kernels take as one template argument."""
+    """Constant arrays, their sizes (`Count`), structure and the state: one template argument of kernels."""
 
     real: Any  # Taichi type of everything but positions
     strain_real: Any  # Taichi type in which the deformation gradient is formed
@@ -62,43 +62,43 @@ class Model:
     n_nodes: Count
     n_blocks: Count
     groups: tuple  # of Group
-    state: State  # what moves
+    state: State  # positions, velocities, scratch
     terms: tuple  # modules of fem.terms
-    nodes: Any  # i32: nodes of each tet, per block (node, lane); they ascend, corners before middles
-    rules: tuple  # reference.Quadrature of the groups of order 2, one after the other
-    points: Any  # (points, 28), or None: of these rules, the weight and dN_a/d(l_1, l_2, l_3) of nodes 1 to 9
+    nodes: Any  # i32: nodes of each tet, per block (node, lane); corners, then mid-edge nodes, each ascending
+    rules: tuple  # reference.Quadrature of the order 2 groups, in ascending degree
+    points: Any  # (points, 28), or None: weight and dN_a/d(l_1, l_2, l_3) of nodes 1 to 9 at the points of these rules
     Dm_inv: Any  # (n_blocks, 9, lanes) [1/m]
     volume: Any  # (n_blocks, lanes) [m^3]
     block_body: Any  # (n_blocks) i32
     law_constants: Any  # (n_bodies, 4)
-    gather_start: Any  # (n_nodes + 1) i32: rows of gather_entry
+    gather_start: Any  # (n_nodes + 1) i32: first entry of each node in gather_entry
     gather_entry: Any  # i32: base index into State.element_force of each node of each tet
     mass: Any  # (n_nodes) lumped mass [kg]
-    gravity_mass: Any  # (n_nodes) what gravity pulls at [kg]: the lumped mass, or int rho N_a dV
+    gravity_mass: Any  # (n_nodes) mass used for weight [kg]: the lumped mass, or int rho N_a dV
     mass_matrix: Any  # MassMatrix, or None: consistent mass
     free: Any  # (n_nodes) 3-vectors: 1 on free axes, 0 on constrained ones
     gravity: Any  # () 3-vector [m/s^2]
     loads: Any  # (n_nodes) 3-vectors [N], or None: tractions and forces
-    node_body: Any  # (n_nodes) i32, or None: only where damping needs it
+    node_body: Any  # (n_nodes) i32; None unless damping needs it
     damping: Any  # (n_bodies, 2), or None: mass damping [1/s], stiffness damping [s]
-    consistent: bool  # which of the above are on
+    consistent: bool  # mass_matrix is used
     loaded: bool
     damped: bool
     stiffness_damping: bool
-    chunks: int  # parts of a loop, each with its partial sums
+    chunks: int  # parts of a loop, each with its own partial sums
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where bodies and tets lie in the model, for the host."""
+    """Host-side index ranges of bodies and tets in the model."""
 
     node_start: np.ndarray  # (n_bodies + 1)
     block_start: np.ndarray  # (n_bodies,) first block of each body
     n_tets: np.ndarray  # (n_bodies,)
-    rest: np.ndarray  # (n_nodes, 3) rest positions, placed
+    rest: np.ndarray  # (n_nodes, 3) rest positions in the scene [m]
 
     def nodes(self, body: int) -> slice:
-        """The rows of a body's nodes."""
+        """Rows of a body's nodes."""
         return slice(self.node_start[body], self.node_start[body + 1])
 
 
@@ -133,15 +133,15 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
 
 
 def _rule_table(rules: tuple[reference.Quadrature, ...]) -> np.ndarray:
-    """(points, 28) of `Model.points`."""
+    """Table (points, 28) of `Model.points`."""
     points, weights = np.concatenate([r.points for r in rules]), np.concatenate([r.weights for r in rules])
-    # of the four barycentric derivatives; l_0 = 1 - l_1 - l_2 - l_3
+    # from the four barycentric derivatives; l_0 = 1 - l_1 - l_2 - l_3
     s = reference.shape_derivatives(2, points)[:, 1:]
     return np.column_stack([weights, (s[:, :, 1:] - s[:, :, :1]).reshape(len(points), 27)])
 
 
 def body_loads(scene: Scene) -> np.ndarray:
-    """Nodal forces of tractions and forces (n_nodes, 3) [N]; total forces are spread over their nodes by lumped mass."""
+    """Nodal forces (n_nodes, 3) [N] of tractions and forces; total forces are distributed over their nodes by lumped mass."""
     parts = []
     for body in scene.bodies:
         total = np.zeros((body.n_nodes, 3))
@@ -149,35 +149,35 @@ def body_loads(scene: Scene) -> np.ndarray:
             total += reference.traction_forces(body, t.triangles, t.value)
         mass = reference.lumped_mass(body)
         for f in body.forces:
-            shares = mass[f.nodes] / mass[f.nodes].sum()
-            total[f.nodes] += f.value if f.value.ndim == 2 else np.outer(shares, f.value)
+            weights = mass[f.nodes] / mass[f.nodes].sum()
+            total[f.nodes] += f.value if f.value.ndim == 2 else np.outer(weights, f.value)
         parts.append(total)
     return np.concatenate(parts)
 
 
 def _packed_tets(scene: Scene, layout: Layout, groups: tuple[Group, ...], lanes: int):
-    """Node ids of every lane, a list with (lanes, n_nodes) for each group; Dm^-1, volumes (0 in padding) of every lane."""
+    """Node ids, a list with one (lanes, n_nodes) array per group; Dm^-1 and volume (0 in padding) of every lane."""
     count = groups[-1].last * lanes
     nodes = [np.zeros(((g.last - g.first) * lanes, g.n_nodes), dtype=np.int64) for g in groups]
     Dm_inv, volume = np.zeros((count, 3, 3)), np.zeros(count)
     for k, body in enumerate(scene.bodies):
-        # ascending nodes: F and V do not mind, and every node pair then has one direction in all its tets; the middles
-        # of edges are numbered like their ends, so they can be sorted apart
-        own = body.nodes.elements
-        own = np.concatenate([np.sort(own[:, :4], axis=1), np.sort(own[:, 4:], axis=1)], axis=1)
-        inverse, v = reference.inverse_rest_edges(body.mesh.vertices, own[:, :4])
+        # sort nodes: F and V do not depend on their order, and every node pair then has the same direction in all its tets.
+        # Mid-edge nodes are numbered like their ends, so they can be sorted separately
+        elements = body.nodes.elements
+        elements = np.concatenate([np.sort(elements[:, :4], axis=1), np.sort(elements[:, 4:], axis=1)], axis=1)
+        inverse, v = reference.inverse_rest_edges(body.mesh.vertices, elements[:, :4])
         first, m = layout.block_start[k] * lanes, body.mesh.n_tets
         last = first + -(-m // lanes) * lanes
         padded = np.minimum(np.arange(last - first), m - 1)
         j = next(j for j, g in enumerate(groups) if g.first <= layout.block_start[k] < g.last)
-        at = first - groups[j].first * lanes
-        nodes[j][at : at + len(padded)] = own[padded] + layout.node_start[k]
+        start = first - groups[j].first * lanes
+        nodes[j][start : start + len(padded)] = elements[padded] + layout.node_start[k]
         Dm_inv[first:last], volume[first : first + m] = inverse[padded], v
     return nodes, Dm_inv, volume
 
 
 def _worst_condition(nodes, Dm_inv: np.ndarray, layout: Layout) -> float:
-    """The largest |Dm| |Dm^-1| of a tet, in Frobenius' norm: how many roundings of F = Ds Dm^-1 cancel."""
+    """The largest |Dm| |Dm^-1| of a tet in the Frobenius norm: the amplification of rounding in F = Ds Dm^-1."""
     corners = np.concatenate([own[:, :4] for own in nodes])
     x = layout.rest[corners]
     squares = ((x[:, 1:] - x[:, :1]) ** 2).sum(axis=(1, 2)) * (Dm_inv**2).sum(axis=(1, 2))
@@ -185,7 +185,7 @@ def _worst_condition(nodes, Dm_inv: np.ndarray, layout: Layout) -> float:
 
 
 def _gather_table(nodes, groups: tuple[Group, ...], real: np.ndarray, n_nodes: int, lanes: int):
-    """CSR from node to the entries of the force buffer of its tets, in block order."""
+    """CSR table from node to its entries in the element force buffer, in block order."""
     ids, entries = [], []
     for own, g in zip(nodes, groups):
         lane = np.flatnonzero(real[g.first * lanes : g.last * lanes])
@@ -199,7 +199,7 @@ def _gather_table(nodes, groups: tuple[Group, ...], real: np.ndarray, n_nodes: i
 
 
 def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray]:
-    """The node pairs that share a tet, and for each pair of each tet lanes times its place in an assembly plus its lane."""
+    """Node pairs that share a tet, and for each pair of each tet its index in the assembly buffer times lanes, plus its lane."""
     (nodes, volume), lanes = download([model.nodes, model.volume]), model.lanes
     flat, real = nodes.astype(np.int64), volume.reshape(-1) > 0
     ends, entries = [], []
@@ -214,7 +214,7 @@ def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray]:
 
 
 def lane_layout(values: np.ndarray, lanes: int) -> np.ndarray:
-    """(n_blocks*lanes, c) to (n_blocks, c, lanes)."""
+    """Reorder (n_blocks*lanes, c) to (n_blocks, c, lanes)."""
     return values.reshape(-1, lanes, values.shape[1]).transpose(0, 2, 1)
 
 
@@ -224,7 +224,7 @@ def material_table(materials: list[Material]) -> np.ndarray:
 
 
 def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str, bool]) -> tuple[Model, Layout]:
-    """Allocate and fill the model of a scene. on: the plan's switches; what is off allocates nothing."""
+    """Allocate and fill the model of a scene. on: the plan's switches; features that are off allocate nothing."""
     lanes, real, npr = runtime.lanes, runtime.real, runtime.np_real
     layout, groups = _layout(scene, lanes)
     n_nodes, n_blocks = len(layout.rest), groups[-1].last
@@ -260,7 +260,9 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         gather_start=arena.field("gather_start", ti.i32, n_nodes + 1, start),
         gather_entry=arena.field("gather_entry", ti.i32, len(entry), entry),
         mass=mass,
-        gravity_mass=arena.field("gravity_mass", real, n_nodes, gravity_masses(scene).astype(npr)) if on["consistent_weight"] else mass,
+        gravity_mass=(
+            arena.field("gravity_mass", real, n_nodes, gravity_masses(scene).astype(npr)) if on["consistent_weight"] else mass
+        ),
         mass_matrix=None,
         free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
         gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),
@@ -288,5 +290,5 @@ def _build_mass_matrix(scene: Scene, model: Model, arena: FieldArena, npr: type)
 
 
 def damping_table(scene: Scene) -> np.ndarray:
-    """Mass damping [1/s] and stiffness damping [s] per body (n_bodies, 2)."""
+    """Mass damping [1/s] and stiffness damping [s] of each body (n_bodies, 2)."""
     return np.array([[b.material.mass_damping, b.material.stiffness_damping] for b in scene.bodies])

@@ -72,7 +72,7 @@ def run(
     report.compile_seconds = sim._take_compile_seconds()
     _judge(report)
     if energy is not None:
-        energy.judge(report)
+        energy.add_problem(report)
     end = seconds if resumed else start_time + seconds
     if report.status != "failed" and not report.interrupted and abs(sim.time - end) > (1.0 + ROUNDING) * max(sim.dt, report.dt):
         report.problems.append(

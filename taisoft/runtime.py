@@ -1,8 +1,8 @@
-"""The only place that starts Taichi: arch, precision, flags, kernels and their launch counts.
+"""Taichi's runtime: initialisation, arch, precision, flags, kernels and their launch counts. No other module calls `ti.init`.
 
-Taichi's state belongs to the process, so one (arch, precision) is open at a time. `cfg_optimization=False` works round a
-miscompilation of Taichi 1.7.4 (`A = f(A)` on a local matrix), and also compiles faster; `fast_math=False` keeps NaN
-comparisons and the order of sums (no speed lost).
+Taichi's state belongs to the process, so only one (arch, precision) is open at a time. `cfg_optimization=False` works around
+a miscompilation in Taichi 1.7.4 (`A = f(A)` on a local matrix), and also compiles faster. `fast_math=False` preserves NaN
+comparisons and the order of sums, at no loss of speed.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ import numpy as np
 import taichi as ti
 from taichi.lang import impl
 
-from taisoft import compile_message, tracing  # noqa: F401  tracing before anything is decorated
+from taisoft import compile_message, tracing  # noqa: F401  tracing: before any function is decorated
 from taisoft.errors import SimulationError
 from taisoft.files import cache_folders
 from taisoft.lane_pool import LanePool
@@ -27,23 +27,23 @@ from taisoft.timing import usable_cores
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
-POOL = 2**30  # bytes of address space that Taichi asks for at a time on the CPU
-CACHE = 2**30  # bytes of kernels on disk, above which Taichi removes the oldest; its own limit holds but some 450
+CPU_POOL_BYTES = 2**30  # address space that Taichi reserves at a time on the CPU
+KERNEL_CACHE_BYTES = 2**30  # of kernels on disk, above which Taichi removes the oldest; its default holds only about 450
 
 launches: Counter[str] = Counter()  # kernel name -> launches so far in this process
-_open: list["Runtime"] = []  # simulators that hold the runtime now
+_open: list["Runtime"] = []  # current claims on the runtime
 _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
-_program = None  # Taichi's own state, of that initialisation
-_clock = {"compile": 0.0, "kernels": 0}
-_known: list[Kernels] = []
+_program = None  # Taichi's program object of that initialisation
+_totals = {"compile": 0.0, "kernels": 0}
+_all_kernels: list[Kernels] = []
 _pool: LanePool | None = None
 
 
 class Runtime:
-    """A claim on the process's Taichi runtime; `close` gives it back.
+    """A claim on the process's Taichi runtime; `close` releases it.
 
-    arch: "cpu" | "cuda"; precision: "f32" | "f64"; real: the Taichi type of everything but positions; lanes: elements
-    handled side by side (SIMD lanes on the CPU, 1 on CUDA, where threads take that part).
+    arch: "cpu" | "cuda"; precision: "f32" | "f64"; real: the Taichi type of everything but positions; lanes: number of
+    elements processed together (SIMD lanes on the CPU; 1 on CUDA, where threads run in parallel instead).
     """
 
     def __init__(self, arch: str, precision: str):
@@ -56,29 +56,29 @@ class Runtime:
         self._program = _program
 
     def check(self) -> None:
-        """Raises SimulationError where Taichi was initialised anew since, by whomever: all fields and kernels are gone."""
+        """Raise SimulationError if Taichi has been re-initialised since, by anyone: all fields and kernels are then gone."""
         check_program(self._program)
 
     def close(self) -> None:
-        """Release the claim; Taichi itself stays up until another kind is asked for."""
+        """Release the claim; Taichi itself keeps running until another (arch, precision) is requested."""
         if self in _open:
             _open.remove(self)
 
 
 def check_program(program) -> None:
-    """Raises SimulationError unless Taichi's state is this one: with another one, old fields and kernels end the process."""
+    """Raise SimulationError unless this is Taichi's current program: under another, old fields and kernels end the process."""
     if impl.get_runtime().prog is not program:
         raise SimulationError(
-            "Taichi was initialised anew in this process, by ti.init or ti.reset, which frees all memory of open simulators: "
-            "close this one and make a new one"
+            "Taichi was re-initialised in this process by ti.init or ti.reset, which frees the memory of all open simulators: "
+            "close this one and create a new one"
         )
 
 
 def open_runtime(arch: str, precision: str, owner: str = "a simulator") -> Runtime:
-    """Claim Taichi with this arch and precision, initialising it where needed.
+    """Claim Taichi with this arch and precision, initialising it if needed.
 
-    Raises SimulationError when the names are unknown, another kind is in use, or the arch cannot be had. What held Taichi before
-    another initialisation in this process (a user's own ti.init) holds nothing any more.
+    Raises SimulationError if a name is unknown, another (arch, precision) is in use, or the arch is not available. Claims made
+    before a foreign initialisation in this process (a user's own ti.init) are dropped.
     """
     global _kind
     if arch not in ARCHS:
@@ -91,11 +91,11 @@ def open_runtime(arch: str, precision: str, owner: str = "a simulator") -> Runti
     kind = (arch, precision)
     if _open and _kind != kind:
         raise SimulationError(
-            f"{_open[0].owner} is open with arch '{_kind[0]}' and precision '{_kind[1]}', and one process holds one kind at "
-            f"a time: close it before asking for '{arch}' and '{precision}'"
+            f"{_open[0].owner} is open with arch '{_kind[0]}' and precision '{_kind[1]}', and a process can use only one such "
+            f"pair at a time: close it before requesting '{arch}' and '{precision}'"
         )
     if _kind != kind:
-        _kind = None  # a failed initialisation leaves no kind
+        _kind = None  # stays None if the initialisation fails
         _initialise(arch, precision)
         _kind = kind
     runtime = Runtime(arch, precision)
@@ -105,7 +105,7 @@ def open_runtime(arch: str, precision: str, owner: str = "a simulator") -> Runti
 
 
 def _cache_folder() -> str:
-    """A folder for compiled kernels that can be written: Taichi ends the process where its own cannot."""
+    """A writable folder for compiled kernels; Taichi would end the process if its own were not writable."""
     for folder in cache_folders():
         path = folder / "kernels"
         try:
@@ -114,7 +114,7 @@ def _cache_folder() -> str:
             continue
         if os.access(path, os.W_OK):
             return str(path)
-    raise SimulationError("no folder for compiled kernels can be written: set XDG_CACHE_HOME to one that can")
+    raise SimulationError("no folder for compiled kernels is writable: set XDG_CACHE_HOME to a writable one")
 
 
 def _initialise(arch: str, precision: str) -> None:
@@ -125,32 +125,32 @@ def _initialise(arch: str, precision: str) -> None:
     except FileNotFoundError:
         raise SimulationError("the working folder no longer exists: change to one that does") from None
     folder = _cache_folder()
-    room = address_space()
-    if arch == "cpu" and room is not None and room < POOL:
-        needed = f"{format_bytes(POOL)} are needed at once, available: {format_bytes(room)}"
-        raise SimulationError(f"not enough memory to start Taichi: {needed}")
+    available = address_space()
+    if arch == "cpu" and available is not None and available < CPU_POOL_BYTES:
+        shortage = f"{format_bytes(CPU_POOL_BYTES)} are needed at once, available: {format_bytes(available)}"
+        raise SimulationError(f"not enough memory to start Taichi: {shortage}")
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # its greeting
+        with contextlib.redirect_stdout(io.StringIO()):  # drop Taichi's banner
             ti.init(
                 arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
                 fast_math=False, offline_cache=True, offline_cache_file_path=folder, log_level=ti.ERROR, random_seed=0,
-                offline_cache_max_size_of_files=CACHE,
-                cpu_max_num_threads=len(usable_cores()),  # Taichi would count the cores that it may not use, too
+                offline_cache_max_size_of_files=KERNEL_CACHE_BYTES,
+                cpu_max_num_threads=len(usable_cores()),  # Taichi's default also counts cores this process may not use
             )  # fmt: skip
     except RuntimeError as error:
         raise SimulationError(f"Taichi does not start: {(str(error).splitlines() or ['no reason given'])[0]}") from None
     _program = impl.get_runtime().prog
-    for known in _known:  # they hold the Taichi that was
-        known.forget()
+    for kernels in _all_kernels:  # they refer to the previous program
+        kernels.forget()
     _pool = LanePool(PRECISIONS[precision]) if arch == "cpu" else None
-    _clock["compile"] += time.perf_counter() - clock
-    obtained = "cuda" if ti.cfg.arch == ti.cuda else "cpu"
-    if obtained != arch:
-        raise SimulationError(f"arch '{arch}' is not to be had on this machine (Taichi fell back to '{obtained}')")
+    _totals["compile"] += time.perf_counter() - clock
+    actual = "cuda" if ti.cfg.arch == ti.cuda else "cpu"
+    if actual != arch:
+        raise SimulationError(f"arch '{arch}' is not available on this machine (Taichi fell back to '{actual}')")
 
 
 def lane_pool() -> LanePool | None:
-    """Of the Taichi that is up now; None on CUDA, where threads take the part of lanes."""
+    """The lane pool of the current initialisation; None on CUDA, which uses threads instead of SIMD lanes."""
     return _pool
 
 
@@ -165,16 +165,16 @@ def open_kind() -> tuple[str, str] | None:
 
 
 def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
-    """`ti.kernel` whose launches are counted by name, and whose first launch per set of templates counts as compile time.
+    """`ti.kernel` that counts launches by name and counts the first launch per set of templates as compile time.
 
-    cse: whether Taichi eliminates common subexpressions, in time that grows with the square of the code. What is unrolled over
-    the nodes of an element runs up to 2.5 times as fast for that. Long code with many branches, as a search for contacts, runs
-    no faster, and compiles in 0.6 of the time without it.
+    cse: whether Taichi eliminates common subexpressions, which takes time quadratic in the size of the code. Code unrolled over
+    the nodes of an element runs up to 2.5 times as fast with it. Long branching code, such as contact detection, runs no
+    faster with it, and compiles in 0.6 of the time without it.
     """
     if function is None:
         return functools.partial(kernel, cse=cse)
     kernels = Kernels(function)
-    _known.append(kernels)
+    _all_kernels.append(kernels)
 
     @functools.wraps(function)
     def launch(*arguments):
@@ -184,28 +184,28 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
         if ready is not None:
             return ready[0].launch(ready[1], arguments)
         start, compiler, before = time.perf_counter(), _compiler_clock(), kernels.n_compiled
-        with _eliminating(cse):
+        with _common_subexpressions(cse):
             compiled, context, _ = kernels.prepare(arguments)
-            result = compiled.launch(context, arguments)  # which loads the code where it is new
+            result = compiled.launch(context, arguments)  # loads the code at the first launch
         if kernels.n_compiled > before:
             ti.sync()
             seconds = time.perf_counter() - start
-            _clock["compile"] += seconds
-            _clock["kernels"] += kernels.n_compiled - before
-            compile_message.show(_compiler_clock() - compiler, seconds, _clock["kernels"])
+            _totals["compile"] += seconds
+            _totals["kernels"] += kernels.n_compiled - before
+            compile_message.show(_compiler_clock() - compiler, seconds, _totals["kernels"])
         return result
 
     return launch
 
 
 def _compiler_clock() -> float:
-    """Seconds that Taichi's compiler has taken so far, those in which it loads kernels from disk included."""
+    """Seconds spent so far in Taichi's compiler, including loading kernels from disk."""
     return _program.get_total_compilation_time() if _program is not None else 0.0
 
 
 @contextlib.contextmanager
-def _eliminating(cse: bool) -> Iterator[None]:
-    """Kernels compiled inside go through that pass, or not: at level 0 Taichi leaves it out, and no other that is on."""
+def _common_subexpressions(cse: bool) -> Iterator[None]:
+    """Compile kernels inside with or without that pass: opt_level 0 skips it and no other enabled pass."""
     runtime = impl.get_runtime()
     if cse or runtime.prog is None:
         yield
@@ -219,10 +219,10 @@ def _eliminating(cse: bool) -> Iterator[None]:
 
 
 def n_compiled() -> int:
-    """How many kernels have been compiled so far in this process, each structure counted."""
-    return _clock["kernels"]
+    """Number of kernels compiled so far in this process, each structure counted separately."""
+    return _totals["kernels"]
 
 
 def compile_clock() -> float:
-    """Seconds spent so far on starting Taichi and in first launches (tracing, compiling, and that first run)."""
-    return _clock["compile"]
+    """Seconds spent so far on starting Taichi and in first launches (tracing, compiling and that run)."""
+    return _totals["compile"]

@@ -1,6 +1,6 @@
 """Linear vibration about the rest shape: Hooke stiffness, highest frequency, stable steps, eigenmodes. NumPy and SciPy.
 
-All three laws have Hooke's law as tangent at F = I, so one stiffness serves them: sigma = 2 mu eps + lambda tr(eps) I.
+All three laws linearise to Hooke's law at F = I, so they share one stiffness: sigma = 2 mu eps + lambda tr(eps) I.
 """
 
 from typing import NamedTuple
@@ -14,15 +14,15 @@ from taisoft.errors import SceneError
 from taisoft.mass import lumped_masses
 from taisoft.scene.scene import Body, Scene
 
-CRUSHING = 0.5  # strain under its own weight above which a body's scale is questioned
-LANCZOS_MARGIN = 1.005  # Lanczos nears the highest frequency from below; its tolerance is half of this
+MAX_WEIGHT_STRAIN = 0.5  # strain of a body under its own weight above which its scale is questioned
+LANCZOS_MARGIN = 1.005  # Lanczos approaches the highest frequency from below; its tolerance is half this margin
 
 
 def hooke_differential(body: Body):
-    """Matrix-free K v of one body at rest: a function (n,3) -> (n,3) [N per unit of v]."""
+    """Return v -> K v of one body at rest, matrix-free: a function (n,3) -> (n,3) [N per unit of v]."""
     nodes, mu, lam = body.nodes.elements, body.material.mu, body.material.lam
     gradients, volumes = reference.shape_gradients(body)
-    rows = gradients.swapaxes(2, 3)  # (m, p, 3, nodes of a tet): d/dX_j of v at each point, whose sums SciPy takes fastest
+    rows = gradients.swapaxes(2, 3)  # (m, p, 3, nodes of a tet): d/dX_j of v at each point; SciPy sums this layout fastest
     columns = np.broadcast_to(nodes[:, None, None, :], rows.shape)
     starts = np.arange(0, rows.size + 1, nodes.shape[1])
     gradient = sp.csr_matrix((rows.reshape(-1), columns.reshape(-1), starts), shape=(len(starts) - 1, body.n_nodes))
@@ -51,19 +51,19 @@ def hooke_stiffness(body: Body) -> sp.csr_matrix:
     return sp.csr_matrix((K.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(size, size))
 
 
-def held_axes(body: Body, prescribed: bool) -> np.ndarray:
-    """(n, 3) bool: axes that are fixed; those that follow a path too, if led."""
-    held = np.zeros((body.n_nodes, 3), dtype=bool)
+def constrained_axes(body: Body, prescribed: bool) -> np.ndarray:
+    """Constrained axes (n, 3), bool: the fixed ones, and if `prescribed` those that follow a path too."""
+    constrained = np.zeros((body.n_nodes, 3), dtype=bool)
     for c in body.constraints:
         if prescribed or c.path is None:
-            held[np.ix_(c.nodes, np.flatnonzero(c.axes))] = True
-    return held
+            constrained[np.ix_(c.nodes, np.flatnonzero(c.axes))] = True
+    return constrained
 
 
 def highest_frequency(body: Body) -> float:
-    """omega_max [rad/s] of a body at rest with lumped mass, by Lanczos, a fraction of a percent on the high side."""
+    """omega_max [rad/s] of a body at rest with lumped mass, by Lanczos; overestimated by a fraction of a percent."""
     mass = reference.lumped_mass(body)
-    free = ~held_axes(body, prescribed=False)  # a path may let go
+    free = ~constrained_axes(body, prescribed=False)  # a path may release its nodes
     scale = np.where(free, 1.0 / np.sqrt(mass)[:, None], 0.0)
     if not free.any():
         return 0.0
@@ -81,43 +81,43 @@ def highest_frequency(body: Body) -> float:
 
 
 def scale_warnings(scene: Scene) -> list[str]:
-    """One sentence for each body whose own weight would crush it, as a mesh in millimetres read as metres does."""
-    told = []
+    """One warning for each body whose own weight would crush it, such as a mesh in millimetres read as metres."""
+    warnings = []
     for body in scene.bodies:
         size = float(np.ptp(body.rest_positions, axis=0).max())
-        material, pull = body.material, float(np.linalg.norm(scene.gravity))
-        strain = material.density * pull * size / material.young
-        if strain > CRUSHING:
+        material, gravity = body.material, float(np.linalg.norm(scene.gravity))
+        strain = material.density * gravity * size / material.young
+        if strain > MAX_WEIGHT_STRAIN:
             mass = material.density * float(body.mesh.volumes.sum())
             crossing = size / np.sqrt(material.young / material.density)
-            told.append(
+            warnings.append(
                 f"body '{body.name}': {size:.4g} m long and {mass:.3g} kg, its own weight strains it by about {strain:.2g}; "
                 f"a wave crosses it in {crossing:.2g} s, explicit steps must stay below "
                 f"{2.0 / highest_frequency(body):.2g} s: is the mesh in metres and young in pascals?"
             )
-    return told
+    return warnings
 
 
-def _euler_matrix(z: float, drag: float, viscous: float) -> np.ndarray:
-    """One symplectic Euler step of (x, dt v): z = omega dt; drag, viscous = dt times mass and stiffness damping rate."""
-    v = np.array([-z * z, 1.0 - drag - viscous])
+def _euler_matrix(z: float, alpha: float, beta: float) -> np.ndarray:
+    """Matrix of a symplectic Euler step of (x, dt v). z: omega dt; alpha, beta: dt times the mass and stiffness damping rate."""
+    v = np.array([-z * z, 1.0 - alpha - beta])
     return np.array([[1.0, 0.0], [0.0, 0.0]]) + np.array([v, v])
 
 
-def _verlet_matrix(z: float, drag: float, viscous: float) -> np.ndarray:
-    """One velocity Verlet step of (x, dt v, dt^2 a), as in dynamics/explicit.py."""
-    decay = np.exp(-0.5 * drag)
+def _verlet_matrix(z: float, alpha: float, beta: float) -> np.ndarray:
+    """Matrix of a velocity Verlet step of (x, dt v, dt^2 a), as in dynamics/explicit.py."""
+    decay = np.exp(-0.5 * alpha)
     half = np.array([0.0, decay, 0.5])
     x = np.array([1.0, 0.0, 0.0]) + half
-    a = -z * z * x - viscous * (half + np.array([0.0, 0.0, 0.5]))
+    a = -z * z * x - beta * (half + np.array([0.0, 0.0, 0.5]))
     v = decay * (half + 0.5 * a)
     return np.stack([x, v, a])
 
 
 def stable_dt(scene: Scene, verlet: bool) -> float:
-    """Largest stable step [s] of an explicit integrator about the rest shape; infinite where nothing can vibrate.
+    """Largest stable step [s] of an explicit integrator about the rest shape; infinite if nothing can vibrate.
 
-    Without damping 2/omega_max; damping changes it, so the limit is where an eigenvalue of one step leaves the unit disk.
+    It is 2/omega_max without damping, else the dt at which an eigenvalue of the step matrix leaves the unit disk.
     """
     limit = np.inf
     for body in scene.bodies:
@@ -139,7 +139,7 @@ def _stable_dt_of(omega: float, mass_damping: float, stiffness_damping: float, v
         return np.abs(np.linalg.eigvals(matrix)).max() <= 1.0 + 1e-9
 
     low, high = 0.0, 2.0 / omega
-    while stable(high):  # mass damping can widen the limit
+    while stable(high):  # mass damping can raise the limit
         low, high = high, 2.0 * high
     for _ in range(50):
         middle = 0.5 * (low + high)
@@ -157,13 +157,13 @@ class Modes(NamedTuple):
 def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     """The lowest k eigenfrequencies [Hz] and shapes of a scene at rest, with its constraints; rigid motions count as 0 Hz.
 
-    mass: "lumped" or "consistent". Raises SceneError for a k or mass that cannot be.
+    mass: "lumped" or "consistent". Raises SceneError for an invalid k or mass.
     """
     if mass not in ("lumped", "consistent"):
         raise SceneError(f"mass '{mass}' is unknown: it must be 'lumped' or 'consistent'")
     if not scene.bodies:
         raise SceneError("the scene holds no body")
-    free = np.concatenate([~held_axes(b, prescribed=True) for b in scene.bodies]).reshape(-1)
+    free = np.concatenate([~constrained_axes(b, prescribed=True) for b in scene.bodies]).reshape(-1)
     n_free = int(free.sum())
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 1 <= k <= n_free:
         raise SceneError(f"k = {k!r}: it must be a whole number from 1 to the {n_free} free axes of the scene")
@@ -176,16 +176,16 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     if n_free <= max(200, 2 * k):
         values, vectors = _dense_modes(K, M, k)
     else:
-        # shifted slightly below 0, so that free bodies (K singular) can be factorised too
+        # shift slightly below 0, so that the matrix of free bodies (K singular) can be factorised too
         shift = -1e-6 * K.diagonal().max() / M.diagonal().max()
         start = np.random.default_rng(0).normal(size=n_free)
         values, vectors = spl.eigsh(K.tocsc(), k=int(k), M=M.tocsc(), sigma=shift, which="LM", v0=start)
     order = np.argsort(values)
     shapes = np.zeros((int(k), free.size))
     shapes[:, free] = vectors[:, order].T
-    noise = 1e-9 * K.diagonal().max() / M.diagonal().max()  # rigid motions come out as rounding of either sign
-    clean = np.where(np.abs(values[order]) < noise, 0.0, values[order])
-    return Modes(np.sqrt(np.maximum(clean, 0.0)) / (2.0 * np.pi), shapes.reshape(int(k), -1, 3))
+    noise = 1e-9 * K.diagonal().max() / M.diagonal().max()  # eigenvalues of rigid motions are rounding errors of either sign
+    eigenvalues = np.where(np.abs(values[order]) < noise, 0.0, values[order])
+    return Modes(np.sqrt(np.maximum(eigenvalues, 0.0)) / (2.0 * np.pi), shapes.reshape(int(k), -1, 3))
 
 
 def _dense_modes(K, M, k: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""State: what moves. Positions, velocities, and the scratch of kernels over one model; everything else of it is constant."""
+"""State: positions, velocities and the scratch of kernels over one model. All other model arrays are constant."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,17 +18,17 @@ class State:
 
     x: Any  # (n_nodes) 3-vectors f64: positions [m]
     v: Any  # (n_nodes) 3-vectors: velocities [m/s]
-    element_force: Any  # forces of each tet on its nodes [N], per block (node, axis, lane): a `Lanes` buffer,
-    element_force_at: Count  # where it begins,
-    element_force_mask: int  # and the bits of an index into it
-    scalars: Any  # (N_SCALARS) f64: what kernels leave for the host, each in its place
+    element_force: Any  # forces of each tet on its nodes [N], per block (node, axis, lane): a `Lanes` buffer
+    element_force_at: Count  # first entry of that buffer
+    element_force_mask: int  # index mask of that buffer
+    scalars: Any  # (N_SCALARS) f64: results for the host, indexed by `scalars`
     partial: Any  # (chunks, N_COLUMNS) f64: partial sums, added in a fixed order
 
 
 def build_state(
     arena: FieldArena, runtime: Runtime, x: np.ndarray, v: np.ndarray, n_force_entries: int, chunks: int
 ) -> State:
-    """Allocate a state and fill it with x and v (n_nodes, 3). n_force_entries: numbers that all tets' nodal forces take."""
+    """Allocate a state and fill it with x and v (n_nodes, 3). n_force_entries: size of `element_force`."""
     force = arena.lanes("element_force", runtime.real, n_force_entries)
     return State(
         x=arena.vectors("x", ti.f64, len(x), x), v=arena.vectors("v", runtime.real, len(v), v.astype(runtime.np_real)),

@@ -1,4 +1,4 @@
-"""Static equilibrium: Newton's method on the elastic forces, with load steps where the whole load at once fails."""
+"""Static equilibrium: Newton's method on the elastic forces, with load steps if the full load fails in one step."""
 
 from dataclasses import dataclass
 
@@ -26,12 +26,12 @@ SMALLEST_LOAD_STEP = 1.0 / 256.0
 
 @dataclass(frozen=True)
 class StaticResult:
-    """A state of equilibrium, or the nearest that was found."""
+    """A state of equilibrium, or the closest one found."""
 
     converged: bool  #: the residual is within the tolerance, for the whole load
-    load: float  #: share of the load that equilibrium was found for; below 1 the state is that of the last, failed attempt
+    load: float  #: fraction of the load for which equilibrium was found; below 1 the state is that of the last, failed attempt
     at_rounding: bool  #: the residual is down at the rounding of the forces, so no tolerance below it can be met
-    residual: float  #: |force on free axes| / |applied load|, without any load over the constraint forces
+    residual: float  #: |force on free axes| / |applied load|, without load relative to the constraint forces
     iterations: int  #: of Newton's method, over all load steps
     linear_iterations: int  #: of conjugate gradients
     load_steps: int  #: steps that the load was applied in
@@ -43,11 +43,11 @@ class StaticResult:
     _reactions: np.ndarray
 
     def positions(self, name: str | None = None) -> np.ndarray:
-        """(n_nodes, 3) [m] of a body, or of all bodies concatenated."""
+        """Positions (n_nodes, 3) [m] of a body, or of all bodies concatenated."""
         return self._positions[self._rows(name)].copy()
 
     def reactions(self, name: str | None = None) -> np.ndarray:
-        """(n_nodes, 3) force of the constraints [N]."""
+        """Constraint forces (n_nodes, 3) [N] of a body, or of all bodies concatenated."""
         return self._reactions[self._rows(name)].copy()
 
     def _rows(self, name: str | None) -> slice:
@@ -59,12 +59,12 @@ class StaticResult:
 def solve_static(
     scene: Scene, tolerance: float = 1e-6, precision: str = "f64", arch: str = "cpu", time: float = 0.0
 ) -> StaticResult:
-    """Find the rest state under gravity, loads and constraints; paths of moved nodes are taken at `time` [s].
+    """Find the rest state under gravity, loads and constraints; prescribed nodes follow their paths at `time` [s].
 
-    tolerance: of |residual on free axes| / |applied load| (without any load: over the constraint forces). An open f64
-    runtime is reused, otherwise one is opened and closed. Bodies do not touch each other here. Raises SceneError where
-    nothing holds a body or the scene has obstacles and contact forces, SimulationError when the runtime is taken; a solve
-    that does not converge returns converged=False.
+    tolerance: on |residual on free axes| / |applied load| (without load, relative to the constraint forces). An open f64
+    runtime is reused; otherwise one is opened and closed. Contact is ignored. Raises SceneError if a body is not constrained
+    along every axis or the scene has obstacles and contact forces, SimulationError if the runtime is in use. A solve that
+    does not converge returns converged=False.
     """
     _check(scene, tolerance)
     kind = open_kind()
@@ -89,20 +89,20 @@ def _check(scene: Scene, tolerance: float) -> None:
         raise SceneError(f"tolerance = {tolerance!r}: it must lie between 0 and 1")
     if scene.obstacles and scene.contact_forces:
         raise SceneError(
-            f"solve_static models no contacts, so it takes no scene with obstacles ('{scene.obstacles[0].name}'): step it "
+            f"solve_static does not model contact, so the scene must have no obstacles ('{scene.obstacles[0].name}'): step it "
             "to rest with mass damping instead"
         )
     for body in scene.bodies:
-        held = np.zeros(3, dtype=bool)
+        constrained = np.zeros(3, dtype=bool)
         for c in body.constraints:
-            held |= c.axes
-        if not held.all():
-            missing = "".join(a for a, h in zip("xyz", held, strict=True) if not h)
+            constrained |= c.axes
+        if not constrained.all():
+            missing = "".join(a for a, is_constrained in zip("xyz", constrained, strict=True) if not is_constrained)
             raise SceneError(f"body '{body.name}': nothing holds it along {missing}, so it has no static state")
 
 
 class StaticSolver:
-    """The rest state of a scene in an open runtime; `solve` starts from rest each time it is called."""
+    """Static solver of a scene in an open runtime; each call of `solve` starts from the rest positions."""
 
     def __init__(self, scene: Scene, runtime: Runtime, arena: FieldArena, tolerance: float, time: float):
         plan = make_plan(scene, explicit=False, multistep=False)
@@ -119,38 +119,38 @@ class StaticSolver:
         self.loads = model.loads.to_numpy() if model.loaded else None
 
     def solve(self) -> StaticResult:
-        """The whole load at once; failing that, in steps that halve on failure and grow on success."""
+        """Apply the full load in one step; if that fails, use load steps that halve on failure and grow by half on success."""
         rest = self.simulation.layout.rest
         self.newton = self.linear = 0
-        result, steps, done = self._attempt(rest, 1.0, self.tolerance), 1, 1.0
-        if not self._good(result):
-            done, share, x, steps = 0.0, 0.25, rest, 0
-            while done < 1.0 and share >= SMALLEST_LOAD_STEP:
-                goal = min(1.0, done + share)
-                result = self._attempt(x, goal, self.tolerance if goal == 1.0 else max(self.tolerance, 1e-3))
-                if self._good(result):
-                    done, share, steps, x = goal, 1.5 * share, steps + 1, self.simulation.model.state.x.to_numpy()
+        result, steps, applied = self._attempt(rest, 1.0, self.tolerance), 1, 1.0
+        if not self._is_acceptable(result):
+            applied, step, x, steps = 0.0, 0.25, rest, 0
+            while applied < 1.0 and step >= SMALLEST_LOAD_STEP:
+                target = min(1.0, applied + step)
+                result = self._attempt(x, target, self.tolerance if target == 1.0 else max(self.tolerance, 1e-3))
+                if self._is_acceptable(result):
+                    applied, step, steps, x = target, 1.5 * step, steps + 1, self.simulation.model.state.x.to_numpy()
                 else:
-                    share *= 0.5
-            if done < 1.0:  # the state of the last good share, judged by all of the load
+                    step *= 0.5
+            if applied < 1.0:  # residual of the last good state under the full load
                 result = self._attempt(x, 1.0, self.tolerance, max_newton=0)
-        return self._answer(result, steps, done)
+        return self._result(result, steps, applied)
 
-    def _good(self, result: StageResult) -> bool:
-        """Nothing inverted, and the residual where it should be, or where it can be."""
+    def _is_acceptable(self, result: StageResult) -> bool:
+        """Whether no tet is inverted and the residual has met the tolerance or reached rounding."""
         measure(self.simulation.model)
         return (result.converged or result.at_rounding) and self.simulation.model.state.scalars[N_INVERTED] == 0.0
 
-    def _attempt(self, x: np.ndarray, share: float, tolerance: float, max_newton: int = MAX_NEWTON) -> StageResult:
-        """Solve with a share of the load, from x."""
+    def _attempt(self, x: np.ndarray, fraction: float, tolerance: float, max_newton: int = MAX_NEWTON) -> StageResult:
+        """Solve with a fraction of the load, starting at x."""
         m, w = self.simulation.model, self.solver.work
-        start = [(m.gravity, share * self.gravity[None]), (w.x_hat, x), (m.state.x, x), (m.state.v, np.zeros_like(x))]
+        start = [(m.gravity, fraction * self.gravity[None]), (w.x_hat, x), (m.state.x, x), (m.state.v, np.zeros_like(x))]
         if self.loads is not None:
-            start.append((m.loads, share * self.loads))
+            start.append((m.loads, fraction * self.loads))
         if self.target is not None:
             rest = self.simulation.layout.rest[self.simulation.dirichlet.prescribed_nodes]
             axes = self.simulation.dirichlet.prescribed_axes()
-            start += [(w.targets, rest + share * (self.target - rest)), (w.prescribed_axes, axes)]
+            start += [(w.targets, rest + fraction * (self.target - rest)), (w.prescribed_axes, axes)]
         upload(start)
         result = solve(self.solver, Stage(0.0, 1.0, 1.0, tolerance, max_newton=max_newton))
         self.newton += result.newton_iterations
@@ -158,12 +158,12 @@ class StaticSolver:
         return result
 
     def _residual(self, result: StageResult) -> float:
-        """As solved for; but rounding over rounding, where neither a load nor a constraint exerts a force, tells nothing."""
+        """The residual of the result; 0 without load and constraint forces, where it would be rounding over rounding."""
         loaded = self.gravity.any() or (self.loads is not None and self.loads.any())
-        idle = not loaded and np.linalg.norm(self.solver.held_residual()) <= self.solver.rounding.force
-        return 0.0 if idle and result.converged else result.residual
+        only_rounding = not loaded and np.linalg.norm(self.solver.held_residual()) <= self.solver.rounding.force
+        return 0.0 if only_rounding and result.converged else result.residual
 
-    def _answer(self, result: StageResult, steps: int, load: float) -> StaticResult:
+    def _result(self, result: StageResult, steps: int, load: float) -> StaticResult:
         simulation = self.simulation
         measure(simulation.model)
         scalars = simulation.model.state.scalars.to_numpy()

@@ -40,7 +40,7 @@ def told(sim: StandIn, *reports: StepReport | None) -> RunReport:
             continue
         check.before_step()
         check.after_step(report)
-    check.judge(run)
+    check.add_problem(run)
     return run
 
 

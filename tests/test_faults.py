@@ -489,6 +489,6 @@ def test_a_poor_machine(tmp_path, shim):
     assert 0.0 <= found["wall_seconds"] < 1e4 and 0.0 <= found["compile_seconds"] < 1e4  # the jump is longer
     homeless = POOR + "tempfile.tempdir = os.devnull; sys.exit(main(sys.argv[1:]))"
     done = python(homeless, *arguments, "--overwrite", **surroundings)
-    assert done.returncode == 2 and "no folder for compiled kernels can be written: set XDG_CACHE_HOME" in done.stderr
+    assert done.returncode == 2 and "no folder for compiled kernels is writable: set XDG_CACHE_HOME" in done.stderr
     if not commas:
         pytest.skip("all held but for decimal commas: no locale with them can be made here")

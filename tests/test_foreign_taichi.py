@@ -38,7 +38,7 @@ def refused(*calls):
         try:
             call()
         except ts.SimulationError as error:
-            assert str(error).startswith("Taichi was initialised anew in this process, by ti.init or ti.reset, which"), error
+            assert str(error).startswith("Taichi was re-initialised in this process by ti.init or ti.reset, which"), error
         else:
             raise AssertionError("not refused")
 
@@ -57,7 +57,7 @@ first.step()
 ti.init(arch=ti.cpu, log_level=ti.ERROR)
 refused(*calls(first))
 result = first.run(0.001, fps=None)
-assert result.status == "failed" and result.problems[0].startswith("Taichi was initialised anew") and first.step_count == 1
+assert result.status == "failed" and result.problems[0].startswith("Taichi was re-initialised") and first.step_count == 1
 second = made("f64")  # of another kind, while the first one is open
 second.step()
 refused(*calls(first))
@@ -79,7 +79,7 @@ def greedy(sim, index, report):
 
 
 result = second.run(5e-4, on_frame=greedy, fps=None)
-assert result.status == "failed" and result.steps == 3 and result.problems[-1].startswith("Taichi was initialised anew")
+assert result.status == "failed" and result.steps == 3 and result.problems[-1].startswith("Taichi was re-initialised")
 refused(second.step)
 del second
 gc.collect()

@@ -178,13 +178,13 @@ def test_nothing_of_a_record_is_kept(machine):
     record = make(arena, 4)
     check(record)
     gone = [weakref.ref(one) for one in (record, record.x, record.parts[0].weight)]
-    ready = sum(len(known._ready) for known in runtime._known)
+    ready = sum(len(known._ready) for known in runtime._all_kernels)
     arena.release()
     del record
     gc.collect()
     assert not any(ref() for ref in gone)
     if not launching.PUBLIC:
-        assert sum(len(known._ready) for known in runtime._known) < ready
+        assert sum(len(known._ready) for known in runtime._all_kernels) < ready
 
 
 def test_a_new_taichi_has_nothing_old():

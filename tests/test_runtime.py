@@ -27,7 +27,7 @@ def add_one(x: ti.template()):
 def test_one_kind_at_a_time():
     first = open_runtime("cpu", "f32", "the first one")
     second = open_runtime("cpu", "f32", "the second one")
-    words = "is open with arch 'cpu' and precision 'f32', .*close it before asking for 'cpu' and 'f64'"
+    words = "is open with arch 'cpu' and precision 'f32', .*close it before requesting 'cpu' and 'f64'"
     for holder, claim in (("the first one", first), ("the second one", second)):
         with pytest.raises(SimulationError, match=f"{holder} {words}"):
             open_runtime("cpu", "f64")
@@ -59,7 +59,7 @@ def test_a_foreign_initialisation_is_replaced():
 
 @pytest.mark.skipif(core.with_cuda(), reason="this machine has CUDA")
 def test_cuda_where_there_is_none(capfd):
-    with pytest.raises(SimulationError, match="^arch 'cuda' is not to be had on this machine"):
+    with pytest.raises(SimulationError, match="^arch 'cuda' is not available on this machine"):
         open_runtime("cuda", "f32")
     assert runtime.open_kind() is None
     with opened("f32"):

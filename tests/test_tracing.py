@@ -147,5 +147,5 @@ def rounds(x):
 
 @pytest.mark.parametrize("function", [branches, chooses, loops, adds, both, between, negates, larger, belongs, rounds])
 def test_what_python_would_decide_is_refused(function):
-    with pytest.raises(TypeError, match="^an arithmetic function cannot hold "):
+    with pytest.raises(TypeError, match="^an arithmetic function cannot contain "):
         tracing._as_python(function)

@@ -2,7 +2,7 @@
 
 With d_a = x_a - x_0 and c_a(q) = dN_a/d(l_1, l_2, l_3) at a quadrature point,
     F_q = D_q Dm^-1,  D_q = sum_a d_a c_a(q)^T,     f_a = -V sum_q w_q (P_q Dm^-T) c_a(q),  f_0 = -sum_a f_a.
-For order 1 c_a are the unit vectors, one point is enough, and nothing but Ds Dm^-1 is left.
+For order 1, c_a are the unit vectors, one point suffices, and F = Ds Dm^-1.
 """
 
 import taichi as ti
@@ -41,7 +41,7 @@ def law_constants(m: ti.template(), b, real: ti.template()):
 def differences(m: ti.template(), g: ti.template(), field: ti.template(), b, real: ti.template()):
     """Nodal values of block b of group g relative to node 0: entry 3 (a - 1) + r is component r of node a.
 
-    They are formed in the field's own precision (f64 for positions), then rounded to `real`.
+    Subtracts in the field's precision (f64 for positions), then rounds to `real`.
     """
     at = g.nodes_at + (b - g.first) * (g.n_nodes * m.lanes)
     p = [
@@ -56,7 +56,7 @@ def differences(m: ti.template(), g: ti.template(), field: ti.template(), b, rea
 
 @ti.func
 def weight_at(m: ti.template(), g: ti.template(), q, real: ti.template()):
-    """Share of the volume that quadrature point q of group g stands for."""
+    """Weight of quadrature point q of group g, as a fraction of the volume."""
     w = ti.cast(1.0, real)
     if ti.static(g.order == 2):
         w = ti.cast(m.points[g.points_at + q, 0], real)
@@ -71,7 +71,7 @@ def derivatives_at(m: ti.template(), g: ti.template(), q, real: ti.template()):
 
 @ti.func
 def gradient_at(m: ti.template(), g: ti.template(), E, M, q, real: ti.template()):
-    """Gradient over the rest shape at quadrature point q: F when E holds the differences of x. M: `rest_gradients`."""
+    """Gradient with respect to rest positions at quadrature point q: F if E holds the differences of x. M: `rest_gradients`."""
     if ti.static(g.order == 1):
         return edges_times(E, M)
     else:
@@ -88,7 +88,7 @@ def gradient_at(m: ti.template(), g: ti.template(), E, M, q, real: ti.template()
 
 @ti.func
 def rest_gradients_of_F(m: ti.template(), b):
-    """Dm^-1 of the tets of block b in the precision in which F is formed, which is f64 where a mesh has slivers."""
+    """Dm^-1 of the tets of block b in the precision in which F is formed, which is f64 if a mesh has slivers."""
     return rest_gradients(m, b, m.strain_real)
 
 
@@ -100,7 +100,7 @@ def position_differences(m: ti.template(), g: ti.template(), b):
 
 @ti.func
 def deformation_gradient(m: ti.template(), g: ti.template(), X, N, q):
-    """F at quadrature point q, rounded to `m.real` once it is formed. X: `position_differences`; N: `rest_gradients_of_F`."""
+    """F at quadrature point q, rounded to `m.real`. X: `position_differences`; N: `rest_gradients_of_F`."""
     if ti.static(m.strain_real == m.real):
         return gradient_at(m, g, X, N, q, m.real)
     else:
@@ -119,14 +119,14 @@ def edges_times(D, M):
 
 
 @ti.func
-def no_forces(m: ti.template(), g: ti.template()):
-    """What `add_forces` adds to, at its start."""
+def zero_forces(m: ti.template(), g: ti.template()):
+    """Zero-initialised accumulator for `add_forces`."""
     return [broadcast(ti.cast(0.0, m.real), m.lanes) for k in ti.static(range(3 * (g.n_nodes - 1)))]
 
 
 @ti.func
 def add_forces(m: ti.template(), g: ti.template(), S: ti.template(), P, M, q):
-    """Add what the stress P at quadrature point q gives to S: entry 3 (a - 1) + i, forces per volume of nodes 1 and on."""
+    """Add the contribution of stress P at quadrature point q to S, forces per volume: entry 3 (a - 1) + i, nodes a >= 1."""
     w = weight_at(m, g, q, m.real)
     H = [
         w * (P[3 * i] * M[3 * c] + P[3 * i + 1] * M[3 * c + 1] + P[3 * i + 2] * M[3 * c + 2])
@@ -145,22 +145,22 @@ def add_forces(m: ti.template(), g: ti.template(), S: ti.template(), P, M, q):
 
 @ti.func
 def load_lanes(m: ti.template(), source: ti.template(), at):
-    """The vector of lanes that begins at entry `at * lanes`."""
+    """Load the vector of lanes that begins at entry `at * lanes`."""
     return ti.Vector([source[at * m.lanes + q] for q in ti.static(range(m.lanes))])
 
 
 @ti.func
 def store_lanes(m: ti.template(), out: ti.template(), at, values):
-    """Write a vector of lanes, which begins at entry `at * lanes`; lane by lane keeps it SIMD."""
+    """Store a vector of lanes from entry `at * lanes`, lane by lane, which LLVM vectorises."""
     for q in ti.static(range(m.lanes)):
         out[at * m.lanes + q] = values[q]
 
 
 @ti.func
 def store_forces(m: ti.template(), g: ti.template(), b, S):
-    """Write the nodal forces -V S [N] of block b to `State.element_force`, lane by lane (which keeps it SIMD)."""
+    """Write the nodal forces -V S [N] of block b to `State.element_force`, lane by lane, which LLVM vectorises."""
     V = -volumes(m, b, m.real)
-    # so that the compiler sees that no index overflows, and handles the lanes side by side
+    # the mask shows the compiler that no index overflows, so that it vectorises over lanes
     base = (m.state.element_force_at + g.force_at + (b - g.first) * (3 * g.n_nodes * m.lanes)) & m.state.element_force_mask
     for i in ti.static(range(3)):
         total = broadcast(ti.cast(0.0, m.real), m.lanes)
@@ -175,7 +175,7 @@ def store_forces(m: ti.template(), g: ti.template(), b, S):
 
 @ti.func
 def gather(m: ti.template(), i):
-    """Sum of the tets' forces on node i, in a fixed order."""
+    """Sum of the tets' forces on node i [N], in a fixed order."""
     f = ti.Vector([0.0, 0.0, 0.0], m.real)
     for k in range(m.gather_start[i], m.gather_start[i + 1]):
         e = (m.state.element_force_at + m.gather_entry[k]) & m.state.element_force_mask

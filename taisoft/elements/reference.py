@@ -1,9 +1,9 @@
 """Shape functions, quadrature and masses of linear and quadratic tetrahedra, in barycentric coordinates l_0..l_3. NumPy.
 
 Order 1: N_a = l_a. Order 2: N_a = l_a (2 l_a - 1) at the corners, N_ab = 4 l_a l_b in the middle of the edge ab. Edges are
-straight at rest, so that grad l_k is constant over a tet, and so is the rest volume's density.
-Integrals over a tet are V times a weighted sum over points: for order 1 its centre, where F is what it is everywhere; for
-order 2 four points, exact for degree 2 (Hammer, Stroud 1956), or fourteen, exact for degree 5 (Walkington 2000).
+straight at rest, so grad l_k and the Jacobian of the rest shape are constant over a tet.
+Integrals over a tet are V times a weighted sum over points: for order 1 the centre, since F is constant; for order 2 four
+points, exact for degree 2 (Hammer, Stroud 1956), or fourteen, exact for degree 5 (Walkington 2000).
 """
 
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ import scipy.sparse as sp
 from taisoft.mesh.topology import EDGES
 from taisoft.scene.scene import Body
 
-HRZ_SHARES = {1: (1 / 4, 0.0), 2: (1 / 36, 4 / 27)}  # of a tet's mass: at a corner, in the middle of an edge
-# symmetric rules as (weight of each point, one point of the orbit); a degree met by a better rule takes that
+HRZ_FRACTIONS = {1: (1 / 4, 0.0), 2: (1 / 36, 4 / 27)}  # fraction of a tet's mass at a corner, at a mid-edge node
+# by degree, symmetric rules: (weight of each point, one point of the orbit); the rule of 4 is exact for degree 5
 RULES = {
     1: ((1.0, (1 / 4, 1 / 4, 1 / 4, 1 / 4)),),
     2: ((1 / 4, (0.58541019662496845446, *3 * (0.13819660112501051518,))),),
@@ -31,7 +31,7 @@ RULES = {
 
 @dataclass(frozen=True)
 class Quadrature:
-    """points (p,4): barycentric coordinates; weights (p,): shares of the volume, all positive, sum 1."""
+    """points (p,4): barycentric coordinates; weights (p,): fractions of the volume, all positive, sum 1."""
 
     points: np.ndarray
     weights: np.ndarray
@@ -39,7 +39,7 @@ class Quadrature:
 
 @cache
 def quadrature(degree: int) -> Quadrature:
-    """The rule that integrates polynomials of that degree (1, 2 or 4) exactly."""
+    """The rule that integrates polynomials of the given degree (1, 2 or 4) exactly."""
     points, weights = [], []
     for weight, point in RULES[degree]:
         orbit = sorted(set(permutations(point)), reverse=True)
@@ -49,7 +49,7 @@ def quadrature(degree: int) -> Quadrature:
 
 
 def shape_functions(order: int, points: np.ndarray) -> np.ndarray:
-    """N_a at barycentric points (p,4): (p, 4 or 10)."""
+    """N_a (p, 4 or 10) at barycentric points (p,4)."""
     if order == 1:
         return points.copy()
     middles = [4.0 * points[:, a] * points[:, b] for a, b in EDGES]
@@ -70,7 +70,7 @@ def shape_derivatives(order: int, points: np.ndarray) -> np.ndarray:
 def inverse_rest_edges(vertices: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Dm^-1 (m,3,3) [1/m], with Dm's columns X1-X0, X2-X0, X3-X0, and the rest volumes (m,) [m^3].
 
-    The order of a tet's vertices does not matter: F is the same for each, and the volume is taken as positive.
+    F does not depend on the order of a tet's vertices, and the volume is taken as positive.
     """
     corner = vertices[tets]
     Dm = (corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1)
@@ -78,8 +78,8 @@ def inverse_rest_edges(vertices: np.ndarray, tets: np.ndarray) -> tuple[np.ndarr
 
 
 def shape_gradients(body: Body) -> tuple[np.ndarray, np.ndarray]:
-    """Rest gradients of the shape functions (m, p, 4 or 10, 3) [1/m] at the body's quadrature points, and the volume that
-    each point stands for (m, p) [m^3]."""
+    """Rest gradients of the shape functions (m, p, 4 or 10, 3) [1/m] at the body's quadrature points, and the
+    volumes of these points (m, p) [m^3]."""
     Dm_inv, volumes = inverse_rest_edges(body.mesh.vertices, body.mesh.tets)
     barycentric = np.concatenate([-Dm_inv.sum(axis=1, keepdims=True), Dm_inv], axis=1)
     rule = quadrature(body.quadrature_degree)
@@ -87,23 +87,23 @@ def shape_gradients(body: Body) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lumped_mass(body: Body) -> np.ndarray:
-    """Mass at each node (n,) [kg], positive: the diagonal of the consistent mass scaled to the mass of each tet.
+    """Lumped mass (n,) [kg], positive: the diagonal of the consistent mass scaled to the mass of each tet.
 
-    Source for order 2: Hinton, Rock, Zienkiewicz 1976 (for order 1 a quarter to each vertex, as row sums would).
+    Source for order 2: Hinton, Rock, Zienkiewicz 1976. For order 1 each vertex gets a quarter, as with row sums.
     """
-    corner, middle = HRZ_SHARES[body.order]
-    shares = np.repeat([corner, middle], [4, body.nodes.elements.shape[1] - 4])
-    return _to_nodes(body, shares)
+    corner, middle = HRZ_FRACTIONS[body.order]
+    fractions = np.repeat([corner, middle], [4, body.nodes.elements.shape[1] - 4])
+    return _distribute(body, fractions)
 
 
 def gravity_mass(body: Body) -> np.ndarray:
-    """int rho N_a dV at each node (n,) [kg]: what gravity pulls at; for order 2 negative at the corners."""
-    shares = np.full(4, 0.25) if body.order == 1 else np.repeat([-0.05, 0.2], [4, 6])
-    return _to_nodes(body, shares)
+    """int rho N_a dV at each node (n,) [kg], the mass used for weight; for order 2 negative at the corners."""
+    fractions = np.full(4, 0.25) if body.order == 1 else np.repeat([-0.05, 0.2], [4, 6])
+    return _distribute(body, fractions)
 
 
-def _to_nodes(body: Body, shares: np.ndarray) -> np.ndarray:
-    values = body.material.density * np.outer(body.mesh.volumes, shares)
+def _distribute(body: Body, fractions: np.ndarray) -> np.ndarray:
+    values = body.material.density * np.outer(body.mesh.volumes, fractions)
     return np.bincount(body.nodes.elements.reshape(-1), values.reshape(-1), body.n_nodes)
 
 
@@ -112,10 +112,10 @@ def unit_mass(order: int) -> np.ndarray:
     """int N_a N_b dV / V over a tet: (4,4) or (10,10)."""
     if order == 1:
         return (np.ones((4, 4)) + np.eye(4)) / 20.0
-    touches = np.array([[k in edge for k in range(4)] for edge in EDGES])
+    is_end = np.array([[k in edge for k in range(4)] for edge in EDGES])
     corners = 5.0 * np.eye(4) + 1.0
-    mixed = np.where(touches, -4.0, -6.0)
-    middles = 8.0 * (touches.astype(float) @ touches.T + 1.0) + 8.0 * np.eye(6)
+    mixed = np.where(is_end, -4.0, -6.0)
+    middles = 8.0 * (is_end.astype(float) @ is_end.T + 1.0) + 8.0 * np.eye(6)
     return np.block([[corners, mixed.T], [mixed, middles]]) / 420.0
 
 
@@ -130,14 +130,14 @@ def consistent_mass(body: Body) -> sp.csr_matrix:
 def traction_forces(body: Body, triangles: np.ndarray, traction: np.ndarray) -> np.ndarray:
     """Nodal forces (n,3) [N] of a uniform dead traction (3,) [Pa] per reference area on rows (k,) of mesh.surface.
 
-    A third of a triangle's force goes to each corner of a linear tet's face, to the middle of each edge of a quadratic's.
+    A third of a triangle's force goes to each corner for linear tets, to each mid-edge node for quadratic ones.
     """
     corners = body.mesh.surface[triangles]
     a, b, c = (body.mesh.vertices[corners[:, k]] for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     if body.order == 1:
         nodes = corners
-    else:  # the last of a face's four triangles joins the middles
+    else:  # the last of a face's four triangles connects the mid-edge nodes
         nodes = body.nodes.surface.reshape(-1, 4, 3)[triangles, 3]
-    share = np.bincount(nodes.reshape(-1), np.repeat(area / 3.0, 3), body.n_nodes)
-    return share[:, None] * np.asarray(traction, dtype=np.float64)
+    area_per_node = np.bincount(nodes.reshape(-1), np.repeat(area / 3.0, 3), body.n_nodes)
+    return area_per_node[:, None] * np.asarray(traction, dtype=np.float64)

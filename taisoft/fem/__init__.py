@@ -1,1 +1,1 @@
-"""Finite elements: forces as terms."""
+"""Finite elements: forces, one module per term."""

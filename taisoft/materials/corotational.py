@@ -2,10 +2,10 @@
 
 psi = mu |F - R|^2 + lambda/2 (tr(R^T F) - 3)^2,   F = R S the polar decomposition with det R = +1.
 Source: Sifakis, Barbic, "FEM Simulation of 3D Deformable Solids", SIGGRAPH 2012 course, section 3.4.
-The rotation comes in closed form: f = tr S is the largest root of a quartic in the invariants of F^T F, and R = df/dF
+The rotation has a closed form: f = tr S is the largest root of a quartic in the invariants of F^T F, and R = df/dF
 (Lin, Chitalu, Komura, "Isotropic ARAP Energy Using Cauchy-Green Invariants", ACM TOG 41(6), 2022, derive f that way).
-Where two stretches nearly cancel (s1 + s2 close to 0: strongly inverted F) the quotient loses its digits, and the
-rotation is taken from the signed SVD instead. Weak: R is not unique there, so the stress jumps.
+If two stretches nearly cancel (s1 + s2 close to 0: strongly inverted F) the quotient loses accuracy, and the rotation is
+taken from the signed SVD instead. Weak: R is not unique there, so the stress jumps.
 """
 
 import taichi as ti
@@ -15,10 +15,10 @@ from taisoft.tracing import arithmetic
 
 NAME = "corotational"
 SOFTENS_BELOW = 0.0
-POINT_SECONDS = 60e-9  # of an explicit step per quadrature point on one core
-EXTRA_STEPS = 8  # of Halley beyond the two that moderate strain needs
-SETTLED = 1e-5  # relative change whose cube is below rounding: the next step would change nothing
-SVD_BELOW = 0.04  # relative size of the denominator under which the closed form loses more than about a digit
+POINT_SECONDS = 60e-9  # per quadrature point of an explicit step, on one core
+MAX_EXTRA_ITERATIONS = 8  # maximum Halley iterations beyond the two that suffice for moderate strain
+CONVERGED_BELOW = 1e-5  # relative change whose cube is below rounding, so that the next iteration would change nothing
+SVD_BELOW = 0.04  # relative size of the denominator below which the closed form loses more than about one digit
 
 
 def constants(mu: float, lam: float) -> tuple[float, float, float, float]:
@@ -34,19 +34,19 @@ def _svd_rotation(F):
 
 @arithmetic
 def _halley(f, Ic, J, c0):
-    """Change of f by one Halley step (third order, and from above the largest root never past it)."""
+    """Decrement of f in one Halley iteration: of third order, and from above it never overshoots the largest root."""
     value = f * (f * (f * f - 2.0 * Ic) - 8.0 * J) + c0
     slope = 4.0 * f * (f * f - Ic) - 8.0 * J
-    bend = 6.0 * f * f - 2.0 * Ic  # half the second derivative
-    return value * slope / ti.max(slope * slope - value * bend, 1e-30)
+    curvature = 6.0 * f * f - 2.0 * Ic  # half the second derivative
+    return value * slope / ti.max(slope * slope - value * curvature, 1e-30)
 
 
 @ti.func
 def _any(flags):
-    some = flags[0] != 0
+    result = flags[0] != 0
     for q in ti.static(range(1, flags.n)):
-        some = some or flags[q] != 0
-    return some
+        result = result or flags[q] != 0
+    return result
 
 
 @ti.func
@@ -57,27 +57,27 @@ def rotation(F):
     J = F[0] * G[0] + F[1] * G[1] + F[2] * G[2]
     Ic = C[0] + C[4] + C[8]
     c0 = 2.0 * ddot(C, C) - Ic * Ic
-    f = ti.sqrt(3.0 * Ic)  # above the root, and near it where the stretches are nearly equal
+    f = ti.sqrt(3.0 * Ic)  # above the root, and close to it if the stretches are nearly equal
     f -= _halley(f, Ic, J, c0)
     change = _halley(f, Ic, J, c0)
     f -= change
-    more = 0
-    while more < EXTRA_STEPS and _any(abs(change) > SETTLED * f):
+    iterations = 0
+    while iterations < MAX_EXTRA_ITERATIONS and _any(abs(change) > CONVERGED_BELOW * f):
         change = _halley(f, Ic, J, c0)
         f -= change
-        more += 1
+        iterations += 1
     denominator = f * (f * f - Ic) - 2.0 * J
-    unsure = (denominator <= SVD_BELOW * f * f * f) | (abs(change) > SETTLED * f) | ~(f > 1e-4)
+    use_svd = (denominator <= SVD_BELOW * f * f * f) | (abs(change) > CONVERGED_BELOW * f) | ~(f > 1e-4)
     FC = matmul(F, C)
     a = f * f + Ic
     N = [a * F[k] + 2.0 * f * G[k] - 2.0 * FC[k] for k in ti.static(range(9))]
-    # |R|^2 = 3 takes the rounding of f out of R's length
+    # scaling to |R|^2 = 3 removes the rounding error of f from the norm of R
     scale = ti.sqrt(3.0 / ti.max(ddot(N, N), 1e-30))
     R = [scale * N[k] for k in ti.static(range(9))]
-    if _any(unsure):
+    if _any(use_svd):
         Q = _svd_rotation(F)
         for k in ti.static(range(9)):
-            R[k] = ti.select(unsure, Q[k], R[k])
+            R[k] = ti.select(use_svd, Q[k], R[k])
     return R
 
 
@@ -101,13 +101,13 @@ def pk1(F, p):
 
 @ti.func
 def prepare(F, p):
-    """What `dpk1` and `block` need of F: R, the inverse of tr(S) I - S in the turned frame (R K R^T), and the factors."""
+    """Precompute for `dpk1` and `block`: R, the inverse of tr(S) I - S in the rotated frame (R K R^T), and the factors."""
     R = rotation(F)
     T = matmul_nt(F, R)  # R S R^T, symmetric
     t = T[0] + T[4] + T[8]
     a, b, c = -0.5 * (T[1] + T[3]), -0.5 * (T[2] + T[6]), -0.5 * (T[5] + T[7])
     K = [t - T[0], a, b, a, t - T[4], c, b, c, t - T[8]]
-    det = determinant(K)  # (s0+s1)(s0+s2)(s1+s2): 0 only where the rotation itself is not unique
+    det = determinant(K)  # (s0+s1)(s0+s2)(s1+s2): 0 only if the rotation is not unique
     tiny = 1e-12 * abs(t * t * t) + 1e-30
     inverse = 1.0 / ti.select(abs(det) > tiny, det, tiny)
     C = cofactor(K)
@@ -136,7 +136,7 @@ def dpk1(F, S, D):
 
 @arithmetic
 def block(F, S, ga, gb):
-    """(d/dx_k of) (P g_b)_i for a displacement field with gradient e_k (x) g_a: the nine entries (i, k) [Pa/m^2]."""
+    """Differential of (P g_b)_i along the displacement gradient e_k (x) g_a: nine entries (i, k) [Pa/m^2]."""
     R = [S[k] for k in ti.static(range(9))]
     Ra, Rb = transform(R, ga), transform(R, gb)
     d = 2.0 * S[18] * dot(ga, gb)
@@ -144,13 +144,13 @@ def block(F, S, ga, gb):
     # dR g_b = w x R g_b with w = K (R g_a x e_k), so the matrix over k is -[R g_b]x K [R g_a]x
     N = [cross([S[9 + 3 * i], S[10 + 3 * i], S[11 + 3 * i]], Ra) for i in ti.static(range(3))]
     c = [S[20] * Rb[k] for k in ti.static(range(3))]
-    turn = [
+    rotated = [
         c[(i + 2) % 3] * N[(i + 1) % 3][k] - c[(i + 1) % 3] * N[(i + 2) % 3][k]
         for i in ti.static(range(3))
         for k in ti.static(range(3))
     ]
     return [
-        turn[3 * i + k] + l[i] * Ra[k] + (d if ti.static(i == k) else 0.0)
+        rotated[3 * i + k] + l[i] * Ra[k] + (d if ti.static(i == k) else 0.0)
         for i in ti.static(range(3))
         for k in ti.static(range(3))
     ]
@@ -158,8 +158,11 @@ def block(F, S, ga, gb):
 
 @arithmetic
 def hessian_eigen(s, p):
-    """Second derivatives in the SVD frame: the 3x3 block over the stretches s (nine entries), and the eigenvalues of
-    the symmetric and of the antisymmetric mode of the pairs (0,1), (0,2), (1,2). All [Pa]."""
+    """Second derivatives in the SVD frame [Pa].
+
+    Returns the 3x3 block over the stretches s (nine entries), and the eigenvalues of the symmetric and of the antisymmetric
+    modes of the pairs (0,1), (0,2), (1,2).
+    """
     A = [
         (2.0 * p[0] if ti.static(i == j) else 0.0) + p[1] + 0.0 * s[0]
         for i in ti.static(range(3))

@@ -1,4 +1,4 @@
-"""The laws pointwise, in float64: what tests, tables and teaching look at."""
+"""Pointwise evaluation of the laws in float64, for tests, tables and teaching."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -67,13 +67,13 @@ def _checked(law: str, F: np.ndarray, young: float, poisson: float):
     bad = np.flatnonzero(~np.isfinite(F).all(axis=(1, 2)))
     if len(bad):
         raise SceneError(f"F[{bad[0]}] is not finite")
-    chosen = LAWS[material.law]
-    return chosen, F, np.array(chosen.constants(material.mu, material.lam))
+    law_module = LAWS[material.law]
+    return law_module, F, np.array(law_module.constants(material.mu, material.lam))
 
 
 @contextmanager
 def _double_precision() -> Iterator[int]:
-    """An f64 runtime, reusing an open one whatever its arch; yields its number of lanes."""
+    """Open an f64 runtime, or reuse an open one of any arch; yields its number of lanes."""
     kind = open_kind()
     arch = kind[0] if kind and kind[1] == "f64" else "cpu"
     runtime = open_runtime(arch, "f64", "evaluate_law")
@@ -84,7 +84,7 @@ def _double_precision() -> Iterator[int]:
 
 
 def _to_lanes(values: np.ndarray, lanes: int) -> np.ndarray:
-    """(k, 3, 3) values as (blocks, 9, lanes), the last entry repeated as padding."""
+    """Reorder (k, 3, 3) values to (blocks, 9, lanes), repeating the last one as padding."""
     k = len(values)
     blocks = -(-k // lanes)
     padded = np.concatenate([values, np.repeat(values[-1:], blocks * lanes - k, axis=0)])
@@ -100,21 +100,21 @@ def evaluate_law(law: str, F: np.ndarray, young: float, poisson: float) -> tuple
 
     F: (k,3,3) deformation gradients; young [Pa]; poisson in (-1, 0.5). Raises SceneError on a bad law, number or shape.
     """
-    chosen, F, p = _checked(law, F, young, poisson)
+    law_module, F, p = _checked(law, F, young, poisson)
     with _double_precision() as lanes:
         lane_F = _to_lanes(F, lanes)
         P, psi = np.empty_like(lane_F), np.empty((len(lane_F), lanes))
-        _evaluate(chosen, lanes, lane_F, p, psi, P)
+        _evaluate(law_module, lanes, lane_F, p, psi, P)
     return psi.reshape(-1)[: len(F)].copy(), _from_lanes(P, len(F)).copy()
 
 
 def evaluate_differential(
     law: str, F: np.ndarray, dF: np.ndarray, young: float, poisson: float, projected: bool = False
 ) -> np.ndarray:
-    """Stress differential dP (k,3,3) [Pa] along dF (k,3,3), in float64; projected: of the positive semi-definite part."""
-    chosen, F, p = _checked(law, F, young, poisson)
+    """Stress differential dP (k,3,3) [Pa] along dF (k,3,3), in float64; projected: use the positive semi-definite part."""
+    law_module, F, p = _checked(law, F, young, poisson)
     with _double_precision() as lanes:
         lane_F, D = _to_lanes(F, lanes), _to_lanes(np.array(np.broadcast_to(dF, F.shape), dtype=np.float64), lanes)
         P = np.empty_like(lane_F)
-        _differential(chosen, projected, lanes, lane_F, p, D, P)
+        _differential(law_module, projected, lanes, lane_F, p, D, P)
     return _from_lanes(P, len(F)).copy()

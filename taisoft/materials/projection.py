@@ -1,7 +1,7 @@
-"""The positive semi-definite part of a law's second derivative, exact, in the frame of F's signed SVD.
+"""Projection of a law's second derivative to its positive semi-definite part, exact, in the frame of F's signed SVD.
 
 With F = U diag(s) V^T and dF = U X V^T the second derivative splits into a 3x3 block over X's diagonal and, for each pair
-i < j, a symmetric and an antisymmetric mode of (X_ij, X_ji). Each part is clamped at 0.
+i < j, a symmetric and an antisymmetric mode of (X_ij, X_ji). The eigenvalues of each part are clamped at 0.
 Source: Smith, de Goes, Kim, "Analytic Eigensystems for Isotropic Distortion Energies", ACM TOG 38(1), 2019, gives the
 modes; the 3x3 block is clamped numerically.
 """
@@ -14,18 +14,19 @@ from taisoft.tracing import arithmetic
 
 @ti.func
 def prepare_projected(law: ti.template(), F, p):
-    """U (9), V (9), the clamped block (9), half the clamped symmetric (3) and antisymmetric (3) eigenvalues [Pa]."""
+    """Precompute for `dpk1_projected`: U (9), V (9), the clamped block (9), half the clamped symmetric (3) and antisymmetric (3)
+    eigenvalues [Pa]."""
     U, s, V = signed_svd(F, 5)
     A, symmetric, antisymmetric = law.hessian_eigen(s, p)
     B = clamp_symmetric(A, 5)
-    even = [0.5 * ti.max(symmetric[k], 0.0) for k in ti.static(range(3))]
-    odd = [0.5 * ti.max(antisymmetric[k], 0.0) for k in ti.static(range(3))]
-    return U + V + B + even + odd
+    half_symmetric = [0.5 * ti.max(symmetric[k], 0.0) for k in ti.static(range(3))]
+    half_antisymmetric = [0.5 * ti.max(antisymmetric[k], 0.0) for k in ti.static(range(3))]
+    return U + V + B + half_symmetric + half_antisymmetric
 
 
 @arithmetic
 def dpk1_projected(S, D):
-    """Stress differential [Pa] along D of the projected second derivative, S = prepare_projected(law, F, p)."""
+    """Stress differential along D [Pa] by the projected second derivative, with S = prepare_projected(law, F, p)."""
     U = [S[k] for k in ti.static(range(9))]
     V = [S[9 + k] for k in ti.static(range(9))]
     UD = matmul_tn(U, D)

@@ -2,8 +2,8 @@
 
 psi = mu E : E + lambda/2 tr(E)^2,   E = (F^T F - I)/2,   P = F (2 mu E + lambda tr(E) I).
 Source: Sifakis, Barbic, "FEM Simulation of 3D Deformable Solids", SIGGRAPH 2012 course, section 3.3.
-Weak: softens when compressed below a stretch of 1/sqrt(3) = 0.577 and does not see inversion (psi is blind to
-reflection): squeezed bodies collapse.
+Weak: softens in compression below a stretch of 1/sqrt(3) = 0.577 and does not resist inversion (psi is invariant under
+reflection), so compressed bodies collapse.
 """
 
 import taichi as ti
@@ -12,8 +12,8 @@ from taisoft.math3 import ddot, dot, matmul, matmul_nt, matmul_tn, transform
 from taisoft.tracing import arithmetic
 
 NAME = "st_venant_kirchhoff"
-SOFTENS_BELOW = 0.6  # stretch told with a warning, a little before 1/sqrt(3)
-POINT_SECONDS = 30e-9  # of an explicit step per quadrature point on one core
+SOFTENS_BELOW = 0.6  # stretch that triggers a warning, slightly above 1/sqrt(3)
+POINT_SECONDS = 30e-9  # per quadrature point of an explicit step, on one core
 
 
 def constants(mu: float, lam: float) -> tuple[float, float, float, float]:
@@ -23,7 +23,7 @@ def constants(mu: float, lam: float) -> tuple[float, float, float, float]:
 
 @arithmetic
 def _green_strain(F):
-    """E = (F^T F - I)/2, formed from H = F - I so that small strains keep their digits."""
+    """E = (F^T F - I)/2, computed from H = F - I to avoid cancellation at small strains."""
     H = [F[k] - (1.0 if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
     C = matmul_tn(H, H)
     return [
@@ -48,7 +48,7 @@ def psi(F, p):
 
 @arithmetic
 def pk1(F, p):
-    """First Piola-Kirchhoff stress [Pa]; any F is valid. Written as mu F C + (lambda/2 (tr C - 3) - mu) F, C = F^T F."""
+    """First Piola-Kirchhoff stress [Pa]; any F is valid. Evaluated as mu F C + (lambda/2 (tr C - 3) - mu) F, C = F^T F."""
     C = matmul_tn(F, F)
     FC = matmul(F, C)
     t = 0.5 * p[1] * (C[0] + C[4] + C[8] - 3.0) - p[0]
@@ -57,7 +57,7 @@ def pk1(F, p):
 
 @arithmetic
 def prepare(F, p):
-    """What `dpk1` and `block` need of F: the second Piola-Kirchhoff stress, the Lamé parameters, mu F F^T."""
+    """Precompute for `dpk1` and `block`: the second Piola-Kirchhoff stress, the Lamé parameters, mu F F^T."""
     B = matmul_nt(F, F)
     return _second_pk(_green_strain(F), p) + [p[0], p[1]] + [p[0] * B[k] for k in ti.static(range(9))]
 
@@ -78,7 +78,7 @@ def dpk1(F, S, D):
 
 @arithmetic
 def block(F, S, ga, gb):
-    """(d/dx_k of) (P g_b)_i for a displacement field with gradient e_k (x) g_a: the nine entries (i, k) [Pa/m^2]."""
+    """Differential of (P g_b)_i along the displacement gradient e_k (x) g_a: nine entries (i, k) [Pa/m^2]."""
     Fa, Fb = transform(F, ga), transform(F, gb)
     c, d = dot(ga, gb), dot(ga, transform(S, gb))
     m = [S[9] * Fa[k] for k in ti.static(range(3))]
@@ -92,8 +92,11 @@ def block(F, S, ga, gb):
 
 @arithmetic
 def hessian_eigen(s, p):
-    """Second derivatives in the SVD frame: the 3x3 block over the stretches s (nine entries), and the eigenvalues of
-    the symmetric and of the antisymmetric mode of the pairs (0,1), (0,2), (1,2). All [Pa]."""
+    """Second derivatives in the SVD frame [Pa].
+
+    Returns the 3x3 block over the stretches s (nine entries), and the eigenvalues of the symmetric and of the antisymmetric
+    modes of the pairs (0,1), (0,2), (1,2).
+    """
     h = 0.5 * p[1] * (s[0] * s[0] + s[1] * s[1] + s[2] * s[2] - 3.0)
     A = [
         p[1] * s[i] * s[j] + ((p[0] * (3.0 * s[i] * s[i] - 1.0) + h) if ti.static(i == j) else 0.0)

@@ -1,10 +1,10 @@
 """Stable neo-Hookean solid.
 
 psi = m/2 (Ic - 3) + l/2 (J - alpha)^2 - m/2 ln(Ic + 1) - psi_rest,   Ic = F : F, J = det F,
-m = 4/3 mu, l = lambda + 5/6 mu, alpha = 1 + m/l - m/(4 l): the Lamé parameters of Hooke's law are met at F = I.
+m = 4/3 mu, l = lambda + 5/6 mu, alpha = 1 + m/l - m/(4 l), which match the Lamé parameters of Hooke's law at F = I.
 Source: Smith, de Goes, Kim, "Stable Neo-Hookean Flesh Simulation", ACM TOG 37(2), 2018, eqs 14 and 18.
-Strong: finite for every F, recovers from inversion. Weak: slightly softer in compression than it should be for
-rubber; stress-free states exist only where the log term is kept (as here).
+Strong: finite for every F, recovers from inversion. Weak: slightly too soft in compression for
+rubber. Stress-free states exist only with the log term, which is kept here.
 """
 
 import taichi as ti
@@ -14,7 +14,7 @@ from taisoft.tracing import arithmetic
 
 NAME = "stable_neo_hookean"
 SOFTENS_BELOW = 0.0
-POINT_SECONDS = 30e-9  # of an explicit step per quadrature point on one core
+POINT_SECONDS = 30e-9  # per quadrature point of an explicit step, on one core
 
 
 def constants(mu: float, lam: float) -> tuple[float, float, float, float]:
@@ -28,7 +28,7 @@ def constants(mu: float, lam: float) -> tuple[float, float, float, float]:
 def psi(F, p):
     """Energy density [Pa], 0 at rest.
 
-    Written in d = Ic - 3 and e = J - 1, so that small strains lose no digits: with l (1 - alpha) = -3/4 m,
+    Evaluated in d = Ic - 3 and e = J - 1 to avoid cancellation at small strains: with l (1 - alpha) = -3/4 m,
     psi = m/2 (d - log1p(d/4)) + l/2 e^2 + l (1 - alpha) e.
     """
     H = [F[k] - (1.0 if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
@@ -38,7 +38,7 @@ def psi(F, p):
     G = cofactor(H)
     e = trace + (G[0] + G[4] + G[8]) + H[0] * G[0] + H[1] * G[1] + H[2] * G[2]
     z = 0.25 * d
-    u = 1.0 + z  # log1p by the quotient that cancels the rounding of 1 + z
+    u = 1.0 + z  # log1p as a quotient that cancels the rounding of 1 + z
     log1p = ti.select(u == 1.0, z, ti.log(u) * z / ti.select(u == 1.0, 1.0 + 0.0 * u, u - 1.0))
     return 0.5 * p[0] * (d - log1p) + 0.5 * p[1] * e * e + p[3] * e
 
@@ -55,7 +55,7 @@ def pk1(F, p):
 
 @arithmetic
 def prepare(F, p):
-    """What `dpk1` needs of F: its cofactor and the factors of the four terms."""
+    """Precompute for `dpk1` and `block`: the cofactor of F and the factors of the four terms."""
     G = cofactor(F)
     J = F[0] * G[0] + F[1] * G[1] + F[2] * G[2]
     q = 1.0 / (ddot(F, F) + 1.0)
@@ -73,7 +73,7 @@ def dpk1(F, S, D):
 
 @arithmetic
 def block(F, S, ga, gb):
-    """(d/dx_k of) (P g_b)_i for a displacement field with gradient e_k (x) g_a: the nine entries (i, k) [Pa/m^2]."""
+    """Differential of (P g_b)_i along the displacement gradient e_k (x) g_a: nine entries (i, k) [Pa/m^2]."""
     Fa, Fb, Ga, Gb = transform(F, ga), transform(F, gb), transform(S, ga), transform(S, gb)
     d = S[9] * dot(ga, gb)
     t = transform(F, cross(ga, gb))
@@ -89,8 +89,11 @@ def block(F, S, ga, gb):
 
 @arithmetic
 def hessian_eigen(s, p):
-    """Second derivatives in the SVD frame: the 3x3 block over the stretches s (nine entries), and the eigenvalues of
-    the symmetric and of the antisymmetric mode of the pairs (0,1), (0,2), (1,2). All [Pa]."""
+    """Second derivatives in the SVD frame [Pa].
+
+    Returns the 3x3 block over the stretches s (nine entries), and the eigenvalues of the symmetric and of the antisymmetric
+    modes of the pairs (0,1), (0,2), (1,2).
+    """
     Ic = s[0] * s[0] + s[1] * s[1] + s[2] * s[2]
     q = 1.0 / (Ic + 1.0)
     a, f = p[0] - p[0] * q, 2.0 * p[0] * q * q
@@ -101,5 +104,5 @@ def hessian_eigen(s, p):
         for i in ti.static(range(3))
         for j in ti.static(range(3))
     ]
-    across = [s[2], s[1], s[0]]  # the stretch that is in neither pair
-    return A, [a - b * across[k] for k in ti.static(range(3))], [a + b * across[k] for k in ti.static(range(3))]
+    remaining = [s[2], s[1], s[0]]  # for each pair, the stretch that is not in it
+    return A, [a - b * remaining[k] for k in ti.static(range(3))], [a + b * remaining[k] for k in ti.static(range(3))]

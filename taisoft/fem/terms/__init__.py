@@ -1,14 +1,14 @@
-"""Forces as terms, one a file.
+"""Force terms, one per file.
 
 A term is a module with
-    SWITCH            the plan's switch that turns it on; None: every scene has it
-    LOAD              whether it acts from outside, as what a residual in statics is measured by
-    ACCELERATION      whether explicit steps take it as an acceleration, `acceleration(m, i)` [m/s^2], not as a force
-    force(m, i)       on node i at the present x [N]; that of elasticity once its elements have been summed
-    energy(m, i)      node i's part of its potential [J], in f64; that of elasticity is summed over elements: `element_energy`
-and is listed in TERMS: explicit steps, Newton, statics and reports then ask it. Dampers have no potential, and integrators differ
-in how they take them; their files hold their forces, their work, and what they add to a system's matrix. The drag spring of the
-window is held over a step, so it is one of the dead loads then (`dynamics.pull`).
+    SWITCH            the plan's switch that turns it on; None: always on
+    LOAD              whether it is an applied load, which static residuals are relative to
+    ACCELERATION      whether explicit steps use `acceleration(m, i)` [m/s^2] instead of `force`
+    force(m, i)       on node i at the present x [N]; for elasticity, after its elements have been summed
+    energy(m, i)      node i's part of its potential [J], in f64; elasticity has `element_energy` instead
+and is listed in TERMS, which explicit steps, Newton's method, statics and reports iterate over. Dampers have no potential, and
+integrators treat them differently; their files hold their rates and forces. The drag spring of the window is constant over a
+step and is therefore applied as a dead load (`dynamics.drag_spring`).
 """
 
 from taisoft.fem.terms import dead_loads, elasticity, gravity
@@ -17,5 +17,5 @@ TERMS = (elasticity, gravity, dead_loads)
 
 
 def terms_of(on: dict[str, bool]) -> tuple:
-    """The terms of a scene. on: the plan's switches."""
+    """The active terms of a scene. on: the plan's switches."""
     return tuple(term for term in TERMS if term.SWITCH is None or on[term.SWITCH])

@@ -1,4 +1,4 @@
-"""Dead loads: tractions and nodal forces that keep their direction and size, f_a = F_a, psi = -sum_a F_a.x_a."""
+"""Dead loads: tractions and nodal forces of constant direction and magnitude, f_a = F_a, psi = -sum_a F_a.x_a."""
 
 import taichi as ti
 
@@ -7,7 +7,7 @@ SWITCH, LOAD, ACCELERATION = "loads", True, False
 
 @ti.func
 def force(m: ti.template(), i):
-    """On node i [N]."""
+    """Force on node i [N]."""
     return m.loads[i]
 
 

@@ -1,7 +1,7 @@
 """Elasticity: f_a = -sum_e V sum_q w_q P(F_q) grad N_a, psi = sum_e V sum_q w_q psi(F_q).
 
-Each tet writes the forces on its nodes to a buffer, each node gathers them in a fixed order, so the result does not depend on
-threads. Its blocks -df/dx are those of `linear.element_blocks`, its differential is `elasticity.force_differential`.
+Each tet writes its nodal forces to a buffer, and each node gathers them in a fixed order, so the result does not depend on
+threading. The blocks -df/dx are in `linear.element_blocks`, the differential is `elasticity.force_differential`.
 """
 
 import taichi as ti
@@ -14,13 +14,13 @@ from taisoft.elements.lanes import (
     gather,
     gradient_at,
     law_constants,
-    no_forces,
     position_differences,
     rest_gradients,
     rest_gradients_of_F,
     store_forces,
     volumes,
     weight_at,
+    zero_forces,
 )
 from taisoft.materials.projection import dpk1_projected, prepare_projected
 from taisoft.math3 import determinant, matmul_tn
@@ -29,19 +29,19 @@ from taisoft.subset import block_of, first_block_of, last_block_of
 
 SWITCH, LOAD, ACCELERATION = None, False, False
 HUGE = 1e30  # above any volume ratio
-EXPLODED = 1e9  # size of a negative J beyond which a motion has diverged: inside out, stretched a thousandfold along every axis
+EXPLODED = 1e9  # |J| of an inverted tet beyond which a motion has diverged: stretched a thousandfold along every axis
 
 
 @ti.func
 def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
-    """Nodal forces of block b of group g from x (and from v, where the stiffness damping -c K(x) v is on).
+    """Write the nodal forces of block b of group g at x, and with `damped` the stiffness damping -c K(x) v.
 
-    Returns the least J = det F over each tet's quadrature points.
+    Returns the smallest J = det F over each tet's quadrature points.
     """
     X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
     M = rest_gradients(m, b, m.real)
     p = law_constants(m, b, m.real)
-    S = no_forces(m, g)
+    S = zero_forces(m, g)
     lowest = broadcast(ti.cast(HUGE, m.real), m.lanes)
     if ti.static(damped):
         V = differences(m, g, m.state.v, b, m.real)
@@ -67,21 +67,21 @@ def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
 
 @ti.func
 def force(m: ti.template(), i):
-    """On node i, once `element_force` has run over all blocks [N]."""
+    """Force on node i [N], after `element_force` has run over all blocks."""
     return gather(m, i)
 
 
 @ti.func
 def count_inverted(m: ti.template(), b, J):
-    """Per lane, 1 where a real tet has J <= 0 (padding lanes have no volume)."""
+    """Per lane, 1 if the tet has J <= 0, else 0. Padding lanes, whose volume is 0, count 0."""
     V = volumes(m, b, m.real)
     zero = broadcast(ti.cast(0, ti.i32), m.lanes)
     return ti.select((J <= 0.0) & (V > 0.0), zero + 1, zero)
 
 
 @ti.func
-def report_volumes(m: ti.template(), b, J):
-    """Of block b: scalars LOWEST_J, INVERTED_NOW; FAILED where a tet has exploded."""
+def record_volumes(m: ti.template(), b, J):
+    """Update the scalars LOWEST_J and INVERTED_NOW by block b; set FAILED if a tet has exploded."""
     bad = count_inverted(m, b, J)
     low, count = J[0], bad[0]
     for q in ti.static(range(1, m.lanes)):
@@ -94,7 +94,7 @@ def report_volumes(m: ti.template(), b, J):
 
 @ti.func
 def sum_elements(m: ti.template(), subset: ti.template()):
-    """`element_force` over all blocks of a subset, as loops of a kernel."""
+    """Run `element_force` over all blocks of a subset, as top-level loops of a kernel."""
     for n, g in ti.static(enumerate(m.groups)):
         ti.loop_config(serialize=m.serial)
         for j in range(first_block_of(g, n, subset), last_block_of(g, n, subset)):
@@ -103,16 +103,16 @@ def sum_elements(m: ti.template(), subset: ti.template()):
 
 @ti.func
 def sum_elements_with_damping(m: ti.template()):
-    """As `sum_elements`, with stiffness damping where that is on. scalars: LOWEST_J, INVERTED_NOW, FAILED."""
+    """As `sum_elements` over all blocks, with stiffness damping if it is on. scalars: LOWEST_J, INVERTED_NOW, FAILED."""
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
         for b in range(g.first, g.last):
-            report_volumes(m, b, element_force(m, g, m.stiffness_damping, b))
+            record_volumes(m, b, element_force(m, g, m.stiffness_damping, b))
 
 
 @ti.func
 def sum_elements_serially(m: ti.template()):
-    """The same within a loop on one thread: returns the least J and the number of inverted tets, per lane."""
+    """The same inside a serial loop. Returns the smallest J and the number of inverted tets, per lane."""
     lowest = broadcast(ti.cast(HUGE, m.real), m.lanes)
     inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
     for g in ti.static(m.groups):
@@ -125,10 +125,10 @@ def sum_elements_serially(m: ti.template()):
 
 @ti.func
 def element_energy(m: ti.template(), g: ti.template(), b):
-    """Of block b of group g, per lane and in f64: elastic energy [J], least J over the quadrature points, and, where the law
-    softens below a stretch s, whether the tet is squeezed below it at one of them (1 or 0).
+    """Elastic energy [J], smallest J over the quadrature points and softening flag of block b of group g, per lane, in f64.
 
-    It is where F^T F - s^2 I is not positive definite, which its leading minors tell.
+    The flag is 1 if the law softens below a stretch s and the tet is compressed below s at a quadrature point, else 0. It is
+    if F^T F - s^2 I is not positive definite, which is tested by its leading minors.
     """
     X = differences(m, g, m.state.x, b, ti.f64)
     M = rest_gradients(m, b, ti.f64)

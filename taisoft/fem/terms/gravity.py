@@ -1,6 +1,6 @@
 """Gravity: f_a = m_a g, psi = -sum_a m_a g.x_a.
 
-m_a is the lumped mass, or int rho N_a dV on quadratic tets in implicit steps. Explicit steps take g as it is.
+m_a is the lumped mass, or int rho N_a dV on quadratic tets in implicit steps. Explicit steps use the acceleration g.
 """
 
 import taichi as ti
@@ -10,13 +10,13 @@ SWITCH, LOAD, ACCELERATION = None, True, True
 
 @ti.func
 def force(m: ti.template(), i):
-    """On node i [N]."""
+    """Force on node i [N]."""
     return m.gravity_mass[i] * m.gravity[0]
 
 
 @ti.func
 def acceleration(m: ti.template(), i):
-    """Of node i [m/s^2]."""
+    """Acceleration of node i [m/s^2]."""
     return m.gravity[0]
 
 

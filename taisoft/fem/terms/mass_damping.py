@@ -1,4 +1,7 @@
-"""Mass damping: f = -a M v, a [1/s] of the node's body. Symplectic Euler takes it as 1 - dt a, Verlet as exp(-dt a / 2) twice."""
+"""Mass damping: f = -a M v, a [1/s] of the node's body.
+
+Symplectic Euler scales v by 1 - dt a, velocity Verlet twice by exp(-dt a / 2).
+"""
 
 import taichi as ti
 
@@ -11,11 +14,11 @@ def rate(m: ti.template(), i):
 
 @ti.func
 def force(m: ti.template(), i, v):
-    """On node i with lumped mass [N]."""
+    """Force on node i with lumped mass [N]."""
     return -rate(m, i) * m.mass[i] * v
 
 
 @ti.func
 def decay(m: ti.template(), i, time):
-    """What a free velocity keeps over a time [s]."""
+    """Factor by which a free velocity decays over a time [s]."""
     return ti.exp(-time * rate(m, i))

@@ -1,7 +1,7 @@
 """Stiffness damping: f = -b K_d v, b [s] of the node's body, K_d the projected stiffness.
 
-Explicit steps take K_d at the present x inside the element loop (`elasticity.element_force`), implicit ones an assembled matrix
-of the step's start.
+Explicit steps evaluate K_d at the present x inside the element loop (`elasticity.element_force`); implicit steps assemble it at
+the start of the step.
 """
 
 import taichi as ti
@@ -15,5 +15,5 @@ def rate(m: ti.template(), i):
 
 @ti.func
 def force(m: ti.template(), i, Kv):
-    """On node i [N]. Kv: its row of K_d v [N/s]."""
+    """Force on node i [N]. Kv: its row of K_d v [N/s]."""
     return -rate(m, i) * Kv
