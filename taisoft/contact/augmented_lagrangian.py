@@ -166,7 +166,7 @@ def _linearise(q: np.ndarray, change: np.ndarray, friction: np.ndarray) -> tuple
 
 
 def _step(i: _Island, R_inverse: np.ndarray, f: np.ndarray, G: np.ndarray, D: np.ndarray) -> np.ndarray | None:
-    """Newton's step (3k,): (1 - D (1 - F W')) step = -G; None if the system is singular."""
+    """Newton step (3k,): (1 - D (1 - F W')) step = -G; None if the system is singular."""
     k = len(D)
     blocks = i.W.data.copy()
     blocks[i.diagonal] += R_inverse.reshape(k, 3, 1) * np.eye(3)
