@@ -2,8 +2,8 @@
 
 With B the blocks of F^1/2 W F^1/2, F the r-factors, a step of the fraction s along the velocity lowers the energy of the
 impulses if s B <= 1. For contacts relaxed sequentially only the diagonal block counts: s = 1 / |B_cc|. For contacts relaxed in
-parallel the whole row does: s_c = 1 / sum_d |B_cd| (block Gershgorin). This adapts to the local density of contacts; a single number from the
-largest eigenvalue of F W would slow all contacts down to the worst one.
+parallel the whole row does: s_c = 1 / sum_d |B_cd| (block Gershgorin). This adapts to the local density of contacts; a single
+number from the largest eigenvalue of F W would slow all contacts down to the worst one.
 The norms are upper bounds: sqrt(|B|_1 |B|_inf) for a matrix, absolute values of the weights over nodes.
 """
 
