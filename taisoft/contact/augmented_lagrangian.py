@@ -4,7 +4,7 @@ An outer iteration takes r to the solution of r+ = prox(r - R (W r+ + b)), R = r
 which W + R^-1 replaces W and is invertible even if W is singular. Newton's method solves
     G(q) = q - prox(q - F (W' q + b')) = 0,   W' = W + R^-1,   b' = b - R^-1 r,
 with the derivative of the prox, including that of the disk's radius in q_n. Full steps are taken first: the residual of a
-nonsmooth system must be allowed to rise until it is found which contacts slip, stick or separate; a line search delays that.
+nonsmooth system may have to rise before the contacts that slip, stick and separate are found; a line search delays that.
 If full steps fail, a second attempt damps them. If that fails too, rho shrinks: the smaller it is, the closer r+ is to r and the
 easier to find. rho grows again on success.
 Sources: Alart and Curnier 1991 for the laws as a prox and their derivative; Rockafellar 1976 for the outer iteration.

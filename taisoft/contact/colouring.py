@@ -78,7 +78,7 @@ def _clear_colours(p: ti.template()):
 
 @kernel
 def _colour_round(p: ti.template()) -> ti.i32:
-    """Colour contacts whose higher-priority neighbours are coloured, in this round or before. Return their number."""
+    """Colour contacts whose higher-priority neighbours are coloured (same round included, if visible). Return their number."""
     coloured = 0
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):

@@ -26,7 +26,7 @@ def natural_map(W, b: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: n
 
 
 def relative(changed: float, size: float) -> float:
-    """Residual from |r - prox(r - f u)| and |r|; 1 if r = 0 is not a solution."""
+    """Residual from |r - prox(r - f u)| and |r|; 1 if r is 0 but not a solution."""
     return changed / size if size > 0.0 else float(changed != 0.0)
 
 

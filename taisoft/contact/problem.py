@@ -24,7 +24,7 @@ from taisoft.runtime import kernel
 from taisoft.transfer import upload
 
 NODES = 6  # maximum nodes of a contact, three on each side
-CHANGED, SIZE, RESIDUAL, BEST, STEP, SWEEPS, CHECKS, AGE, MOMENTUM, VERDICT = range(10)  # indices into `state`
+CHANGED, SIZE, RESIDUAL, BEST, STEP, SWEEPS, CHECKS, AGE, MOMENTUM, VERDICT = range(10)  # in `state`; AGE: sweeps since `best`
 HISTORY = 1024  # residuals kept per launch
 CHUNKS = 256  # partial sums over the contacts, so that a sum does not depend on threads
 
@@ -204,7 +204,7 @@ def natural_map(p: ti.template(), c):
 
 @ti.func
 def residual_of(changed, size):
-    """Relative residual from the two sums; 1 if r = 0 is not a solution or r is not a number."""
+    """Relative residual from the two sums; 1 if r is 0 but not a solution, or not a number."""
     result = ti.cast(0.0, ti.f64)
     if size > 0.0:
         result = ti.sqrt(changed / size)
