@@ -79,7 +79,7 @@ def colour_random(graph: sp.csr_matrix, seed: int = 0, shrink: float = 3.0) -> n
         tentative = np.full(k, UNCOLOURED)
         tentative[uncoloured] = np.argmax(np.where(free, generator.random(free.shape), -1.0), axis=1)
         keep = tentative != UNCOLOURED
-        # of two equal colours the lower index keeps its own: if neither did, two palettes of the same single colour would loop forever
+        # of two equal colours the lower index keeps its own: if neither did, two equal palettes of one colour would loop forever
         keep[b[keep[a] & (tentative[a] == tentative[b])]] = False
         colour[keep] = tentative[keep]
         for one, other in ((a, b), (b, a)):
