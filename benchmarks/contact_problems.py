@@ -204,9 +204,9 @@ def host_rows(problem: Problem, repeats: int) -> list[Row]:
 
     def auto(goal: float, most: int):
         with api._problem(W, b, mu, none) as p:
-            swept = solve(p, "gauss_seidel", goal, min(most, api.SWEEPS))
+            swept = solve(p, "gauss_seidel", goal, min(most, api.AUTO_SWEEPS))
             r = p.r.to_numpy()[: len(mu)]
-        if swept.converged or most <= api.SWEEPS:
+        if swept.converged or most <= api.AUTO_SWEEPS:
             return r, swept.iterations, [swept.residual]
         r, history = augmented_lagrangian.solve(W, b, mu, r, goal, most - swept.iterations)
         return r, swept.iterations, history

@@ -1,4 +1,4 @@
-"""Timing on a shared machine: a number is a median with minimum and spread, beside what the machine was doing."""
+"""Timing on a shared machine: median with minimum and spread, and the machine's load."""
 
 import os
 import platform
@@ -13,7 +13,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Timing:
-    """What several repeats of one thing took [s]. `spread` is the distance between the quartiles over the median."""
+    """Times of several repeats [s]. `spread` is the interquartile range over the median."""
 
     median: float
     minimum: float
@@ -23,7 +23,7 @@ class Timing:
 
 
 def summarise(seconds: Iterable[float]) -> Timing:
-    """Timing of the repeats `seconds` (k,) [s]. Raises ValueError where there are none."""
+    """Timing of the repeats `seconds` (k,) [s]. Raises ValueError if there are none."""
     seconds = np.asarray(list(seconds), float)
     if len(seconds) == 0:
         raise ValueError("a timing needs at least one repeat")
@@ -32,7 +32,7 @@ def summarise(seconds: Iterable[float]) -> Timing:
 
 
 def time_repeats(call: Callable[[], object], repeats: int) -> Timing:
-    """Timing of `call()`, done `repeats` times; what should be warm must be warmed before."""
+    """Time `call()` the given number of times. Warm-up is left to the caller."""
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -42,17 +42,17 @@ def time_repeats(call: Callable[[], object], repeats: int) -> Timing:
 
 
 def load_average() -> float | None:
-    """Mean number of running processes over the last minute, None on a system that does not tell."""
+    """Mean number of running processes over the last minute, None if the system does not report it."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
 
 
 def machine() -> dict:
-    """Name of the processor, number of cores this process may use, operating system, and the present load."""
+    """Processor name, number of cores this process may use, operating system and present load."""
     return {"processor": processor(), "cores": len(usable_cores()), "system": platform.platform(), "load": load_average()}
 
 
 def versions(*packages: str) -> dict[str, str | None]:
-    """Version of Python and of each package; None where a package is not installed."""
+    """Version of Python and of each package; None if a package is not installed."""
     found: dict[str, str | None] = {"python": platform.python_version()}
     for package in packages:
         try:
@@ -63,12 +63,12 @@ def versions(*packages: str) -> dict[str, str | None]:
 
 
 def usable_cores() -> list[int]:
-    """Numbers of the cores that this process may use, ascending; all of them on a system that pins no process."""
+    """Numbers of the cores that this process may use, ascending; all of them if the system has no CPU affinity."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
 
 
 def processor() -> str:
-    """Name of the processor, as far as the system tells."""
+    """Name of the processor, as reported by the system."""
     info = Path("/proc/cpuinfo")  # platform.processor() is empty on many Linux systems
     if info.exists():
         for line in info.read_text().splitlines():

@@ -1,4 +1,4 @@
-"""Arrays of a simulator into NumPy's and back."""
+"""Copy arrays between a simulator and NumPy."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from taisoft.arrays import Array
 
 
 def upload(pairs: list[tuple[Array, np.ndarray]]) -> None:
-    """pairs: an array, and numbers of its shape. Raises ValueError for another shape, before anything is written."""
+    """Copy data into arrays of the same shape. Raises ValueError for a wrong shape, before anything is written."""
     for array, data in pairs:
         array.check(data)
     for array, data in pairs:
@@ -14,5 +14,5 @@ def upload(pairs: list[tuple[Array, np.ndarray]]) -> None:
 
 
 def download(arrays: list[Array], rows: int | None = None) -> list[np.ndarray]:
-    """Copies, of the first `rows` rows if that is given."""
+    """Copy arrays to NumPy; only the first `rows` rows if given."""
     return [array.to_numpy(rows) for array in arrays]

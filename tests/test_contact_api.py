@@ -66,7 +66,7 @@ def changed(array: np.ndarray, at, value: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("inputs, options, message", [
-    ((W[:17, :17], B, MU), {}, "W has shape .17, 17.: it must be .3k, 3k., three rows a contact"),
+    ((W[:17, :17], B, MU), {}, "W has shape .17, 17.: it must be .3k, 3k., three rows per contact"),
     ((W[:15], B, MU), {}, "W has shape .15, 18."),
     ((W[0], B, MU), {}, "W has shape .18,."),
     ((W * 1j, B, MU), {}, "W must hold real numbers, not complex128"),

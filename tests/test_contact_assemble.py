@@ -12,9 +12,9 @@ import taichi as ti
 from rotations import rotation
 
 import taisoft as ts
-from taisoft.contact.assemble import OWN, _warm_impulse, build_found, gap_minus_target, keep_impulses
+from taisoft.contact.assemble import SELF_CONTACT, _warm_impulse, build_found, gap_minus_target, keep_impulses
 from taisoft.contact.problem import build_node_problem, fill_field
-from taisoft.contact.restitution import explicit_rise
+from taisoft.contact.restitution import explicit_opening
 from taisoft.fields import FieldArena
 from taisoft.runtime import kernel, open_runtime
 
@@ -172,8 +172,8 @@ def find_goals(
 ):  # fmt: skip
     """force: what the explicit step's forces change the velocity by [m/s], a share `kicked` of it before the impact."""
     for c in range(f.problem.count[0]):
-        rise = explicit_rise(f, c, dt, contact_offset, f.approach[c] + force, kicked)
-        out[c] = gap_minus_target(f, c, dt, contact_offset, fast, slow, fastest, rise)
+        opening = explicit_opening(f, c, dt, contact_offset, f.approach[c] + force, kicked)
+        out[c] = gap_minus_target(f, c, dt, contact_offset, fast, slow, fastest, opening)
 
 
 @kernel
@@ -225,7 +225,7 @@ def test_how_far_a_contact_is_from_its_goal(found, fast, slow):
     back = np.where(less > 0, (0.1 - 0.1 * restitution) * dt, 0.0)
     assert np.abs(out - np.where(later, -(0.4 - 0.1) * dt, expected + back)).max() < 1e-15
     fill_field(found.body, np.ones((len(cases), 2), dtype=int))  # of a body with itself: the same with other numbers
-    find_goals(found, dt, h / OWN, fast / OWN, slow / OWN, fastest, 0.0, 0.0, out)
+    find_goals(found, dt, h / SELF_CONTACT, fast / SELF_CONTACT, slow / SELF_CONTACT, fastest, 0.0, 0.0, out)
     assert np.abs(out - expected).max() < 1e-15
 
 

@@ -1,3 +1,3 @@
-"""Contacts to impulses: the frictional contact problem and its solvers."""
+"""The frictional contact problem and its solvers: impulses from contacts."""
 
-SOLVERS = ("gauss_seidel", "jacobi", "hybrid", "coloured_gauss_seidel")  # a module each
+SOLVERS = ("gauss_seidel", "jacobi", "hybrid", "coloured_gauss_seidel")  # one module each

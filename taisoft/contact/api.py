@@ -1,4 +1,4 @@
-"""`solve_contact_problem`: a frictional contact problem given as a matrix, for those who have one of their own."""
+"""`solve_contact_problem`: solve a frictional contact problem given as a matrix."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,17 +18,17 @@ from taisoft.runtime import open_kind, open_runtime
 from taisoft.scene.checks import array, choice, number
 
 METHODS = (*SOLVERS, "augmented_lagrangian", "auto")
-SWEEPS = 100  # of Gauss-Seidel, before "auto" goes on with an augmented Lagrangian
-BELOW = 0.999  # of the tolerance, which the kernels are asked for: their sums round otherwise than NumPy's
+AUTO_SWEEPS = 100  # of Gauss-Seidel, before "auto" switches to an augmented Lagrangian
+KERNEL_TOLERANCE = 0.999  # of the tolerance: the kernels stop slightly below it, since their sums round differently from NumPy's
 
 
 @dataclass(frozen=True)
 class ContactSolution:
-    """What `solve_contact_problem` found.
+    """Result of `solve_contact_problem`.
 
-    impulse: (3k,) [N s]. residual: |r - prox(r - f (W r + b))| / |r| of it, worked out anew at the end; converged: whether that
-    is within the tolerance. residual_history: at the start and after each iteration; the best impulses are given back, so the
-    last one can be larger than `residual`. iterations: sweeps, and outer iterates of an augmented Lagrangian.
+    impulse: (3k,) [N s]. residual: |r - prox(r - f (W r + b))| / |r|, recomputed for `impulse`; converged: whether it is
+    within the tolerance. residual_history: at the start and after each iteration; its last entry can exceed `residual`, since
+    the best impulses are returned. iterations: sweeps, and outer iterations of the augmented Lagrangian.
     """
 
     impulse: np.ndarray
@@ -41,16 +41,16 @@ class ContactSolution:
 def solve_contact_problem(
     W, b, mu, method: str = "gauss_seidel", tolerance: float = 1e-8, max_iterations: int = 1000
 ) -> ContactSolution:
-    """Impulses r between which and u = W r + b the laws of Signorini and Coulomb hold, in float64.
+    """Find impulses r that satisfy the laws of Signorini and Coulomb with u = W r + b, in float64.
 
-    W: (3k,3k) array or scipy sparse matrix [1/kg], per contact (normal, t1, t2); it may be singular and a little unsymmetric.
-    b: (3k,) velocities without impulses [m/s]. mu: (k,) coefficients of friction. k may be 0. tolerance: of the residual
+    W: (3k,3k) array or scipy sparse matrix [1/kg], per contact (normal, t1, t2); it may be singular and slightly unsymmetric.
+    b: (3k,) velocities without impulses [m/s]. mu: (k,) coefficients of friction. k may be 0. tolerance: bound on the residual
     |r - prox(r - f u)| / |r|, f = 1 / W_nn for normals, 1 / max(W_t1t1, W_t2t2) for both tangents. method:
         gauss_seidel, jacobi, hybrid, coloured_gauss_seidel    sweeps, with momentum;
-        augmented_lagrangian    Newton's method on the host, an outer iterate counts as one iteration;
-        auto    sweeps of Gauss-Seidel, then an augmented Lagrangian, which needs few iterations from there.
-    A contact with W_nn = 0 is one that nothing can move: its impulse is 0 and it is left out. W_nn < 0 is refused.
-    Raises SceneError where an input breaks a rule.
+        augmented_lagrangian    Newton's method on the host; each outer iteration counts as one;
+        auto    Gauss-Seidel sweeps, then an augmented Lagrangian, which needs few iterations from there.
+    A contact with W_nn = 0 cannot be moved: it is left out and its impulse is 0. W_nn < 0 is an error.
+    Raises SceneError for invalid input.
     """
     W, b, mu = _checked(W, b, mu)
     choice(method, "method", METHODS)
@@ -71,7 +71,7 @@ def _checked(W, b, mu) -> tuple[sp.csr_matrix, np.ndarray, np.ndarray]:
         W = np.asarray(W)
         W = W.reshape(0, 0) if W.size == 0 else W
     if W.ndim != 2 or W.shape[0] != W.shape[1] or W.shape[0] % 3:
-        raise SceneError(f"W has shape {W.shape}: it must be (3k, 3k), three rows a contact")
+        raise SceneError(f"W has shape {W.shape}: it must be (3k, 3k), three rows per contact")
     if W.dtype.kind not in "fiu":
         raise SceneError(f"W must hold real numbers, not {W.dtype}")
     W = sp.csr_matrix(W, dtype=np.float64, copy=True)
@@ -83,45 +83,45 @@ def _checked(W, b, mu) -> tuple[sp.csr_matrix, np.ndarray, np.ndarray]:
     negative = np.flatnonzero(W.diagonal() < 0.0)
     if len(negative):
         i = negative[0]
-        raise SceneError(f"W[{i}, {i}] is {W[i, i]:g}: an impulse must not pull its contact back, so it cannot be negative")
+        raise SceneError(f"W[{i}, {i}] is {W[i, i]:g}: it cannot be negative, since an impulse must not pull its contact back")
     n = W.shape[0]
     b, mu = array(b, "b", ((n,),)), array(mu, "mu", ((n // 3,),))
-    below = np.flatnonzero(mu < 0.0)
-    if len(below):
-        raise SceneError(f"mu[{below[0]}] is {mu[below[0]]:g}: a coefficient of friction cannot be negative")
+    negative = np.flatnonzero(mu < 0.0)
+    if len(negative):
+        raise SceneError(f"mu[{negative[0]}] is {mu[negative[0]]:g}: a coefficient of friction cannot be negative")
     return W, b, mu
 
 
 def _run(
-    method: str, W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray, tolerance: float, most: int
+    method: str, W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray, tolerance: float, max_iterations: int
 ) -> tuple[np.ndarray, list[float]]:
     """Impulses (k,3) from the start r, and the residual at the start and after each iteration."""
     if not len(mu):
         return r, [0.0]
     if method == "augmented_lagrangian":
-        return augmented_lagrangian.solve(W, b, mu, r, tolerance, most)
+        return augmented_lagrangian.solve(W, b, mu, r, tolerance, max_iterations)
     with _problem(W, b, mu, r) as p:
         if method == "coloured_gauss_seidel":
             store(p, colour_greedy(matrix_graph(W)))
-        found = solve(p, method, BELOW * tolerance, most, every=1, history=True)
-        return p.r.to_numpy(len(mu)), found.history
+        result = solve(p, method, KERNEL_TOLERANCE * tolerance, max_iterations, every=1, history=True)
+        return p.r.to_numpy(len(mu)), result.history
 
 
 def _auto(
-    W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray, tolerance: float, most: int
+    W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray, tolerance: float, max_iterations: int
 ) -> tuple[np.ndarray, list[float]]:
-    """Sweeps, then outer iterates with what is left of the iterations."""
-    r, told = _run("gauss_seidel", W, b, mu, r, tolerance, min(SWEEPS, most))
-    left = most - len(told) + 1
-    if told[-1] <= tolerance or not left:
-        return r, told
-    r, more = _run("augmented_lagrangian", W, b, mu, r, tolerance, left)
-    return r, told + more[1:]
+    """Gauss-Seidel sweeps, then outer iterations with the rest of max_iterations."""
+    r, history = _run("gauss_seidel", W, b, mu, r, tolerance, min(AUTO_SWEEPS, max_iterations))
+    remaining = max_iterations - len(history) + 1
+    if history[-1] <= tolerance or not remaining:
+        return r, history
+    r, outer = _run("augmented_lagrangian", W, b, mu, r, tolerance, remaining)
+    return r, history + outer[1:]
 
 
 @contextmanager
 def _problem(W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray) -> Iterator[ContactProblem]:
-    """The problem in fields, on the runtime that is open or one of its own."""
+    """The problem in fields, on the open runtime or a new one."""
     arch, precision = open_kind() or ("cpu", "f64")
     runtime = open_runtime(arch, precision, "solve_contact_problem")
     try:

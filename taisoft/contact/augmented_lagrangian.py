@@ -1,13 +1,13 @@
-"""Augmented Lagrangian for a W that is given as a matrix, on the host, by islands of contacts that W joins.
+"""Augmented Lagrangian for a W given as a matrix, on the host, separately for each island of contacts that W couples.
 
-An outer iterate takes r to the solution of r+ = prox(r - R (W r+ + b)), R = rho F with F the r-factors: a proximal step, in which
-W + R^-1 stands for W and can be inverted even where W is singular. Inside is Newton's method on
-    G(q) = q - prox(q - F (W' q + b')),   W' = W + R^-1,   b' = b - R^-1 r,
-with the derivative of the prox, friction disks that open with q_n included. Steps are taken whole: the residual of a nonsmooth
-system must be let rise before the right contacts are found to slip, stick or part, and a line search on it holds that up.
-Where whole steps lead nowhere, a second try damps them; where that fails too, rho shrinks, and the smaller it is, the nearer is
-r+ to r and the easier to find. rho grows again with success.
-Sources: Alart and Curnier 1991 for the laws as a prox and their derivative; Rockafellar 1976 for the outer iterates.
+An outer iteration takes r to the solution of r+ = prox(r - R (W r+ + b)), R = rho F with F the r-factors: a proximal step, in
+which W + R^-1 replaces W and is invertible even if W is singular. Newton's method solves
+    G(q) = q - prox(q - F (W' q + b')) = 0,   W' = W + R^-1,   b' = b - R^-1 r,
+with the derivative of the prox, including that of the disk's radius in q_n. Full steps are taken first: the residual of a
+nonsmooth system may have to rise before the contacts that slip, stick and separate are found; a line search delays that.
+If full steps fail, a second attempt damps them. If that fails too, rho shrinks: the smaller it is, the closer r+ is to r and the
+easier to find. rho grows again on success.
+Sources: Alart and Curnier 1991 for the laws as a prox and their derivative; Rockafellar 1976 for the outer iteration.
 """
 
 from dataclasses import dataclass
@@ -20,26 +20,26 @@ from scipy.sparse.linalg import splu
 from taisoft.contact.graph import matrix_graph
 from taisoft.contact.numpy_prox import find_factors, natural_map, prox, relative
 
-DENSE = 90  # rows of an island up to which its equations are solved as a dense matrix; a larger one may be spread over threads
-START, MOST, LEAST = 1e4, 1e7, 1e-2  # rho
-STEPS = 10  # Newton steps of an outer iterate
-GOAL = 1e-2  # share of |G| that they bring it down to
-HALVINGS = 6
+DENSE = 90  # largest island, in rows, with a dense solve; that of a larger one may run on several threads
+RHO_START, RHO_MAX, RHO_MIN = 1e4, 1e7, 1e-2
+MAX_STEPS = 10  # Newton steps of an outer iteration
+REDUCTION = 1e-2  # of |G| in an outer iteration
+MAX_HALVINGS = 6
 
 
 @dataclass
 class _Island:
-    """Contacts that W joins with one another, and with no others."""
+    """Contacts that W couples with one another and with no others."""
 
     contact: np.ndarray  # (k,)
     W: sp.bsr_matrix  # (3k,3k)
     row: np.ndarray  # (blocks,) contact of each block of W
-    diagonal: np.ndarray  # (k,) blocks of W on its diagonal
+    diagonal: np.ndarray  # (k,) indices of the diagonal blocks of W
     b: np.ndarray  # (3k,)
     friction: np.ndarray  # (k,)
     factor: np.ndarray  # (k,2)
     r: np.ndarray  # (k,3)
-    rho: float = START
+    rho: float = RHO_START
     changed: float = 0.0  # |r - prox(r - f u)|
     size: float = 0.0  # |r|
 
@@ -55,16 +55,16 @@ class _Island:
 def solve(
     W: sp.csr_matrix, b: np.ndarray, friction: np.ndarray, r: np.ndarray, tolerance: float, max_iterations: int
 ) -> tuple[np.ndarray, list[float]]:
-    """Impulses (k,3) from the start r (k,3), and the residual at the start and after each outer iterate.
+    """Return impulses (k,3), starting from r (k,3), and the residual at the start and after each outer iteration.
 
-    W: (3k,3k), which may be singular and a little unsymmetric; b: (3k,). tolerance: of the residual.
+    W: (3k,3k), may be singular and slightly unsymmetric; b: (3k,). tolerance: bound on the residual.
     """
     islands = _islands(W, b, friction, prox(r, friction))
     history = [_residual(islands)]
     while history[-1] > tolerance and len(history) <= max_iterations:
         size = sum(i.size**2 for i in islands)
         for island in islands:
-            # the islands' parts of the residual add up to less than it may be
+            # if every island is below this, their sum is below the tolerance
             if island.changed**2 > 0.5 * tolerance**2 * max(island.size**2, size / len(islands)):
                 _advance(island)
         history.append(_residual(islands))
@@ -79,15 +79,15 @@ def _residual(islands: list[_Island]) -> float:
 
 
 def _islands(W: sp.csr_matrix, b: np.ndarray, friction: np.ndarray, r: np.ndarray) -> list[_Island]:
-    """The islands of all contacts that something can move; the others' impulses stay 0."""
+    """The islands of all movable contacts; the impulses of the others stay 0."""
     factor = find_factors(W)
-    # a tangential factor of 0 says that tangents do not matter; Newton's method wants a number
+    # a tangential factor of 0 means that tangents do not matter; Newton's method needs a positive one
     factor[:, 1] = np.where(factor[:, 1] > 0.0, factor[:, 1], factor[:, 0])
-    count, label = connected_components(matrix_graph(W), directed=False)
-    moved = np.flatnonzero(factor[:, 0] > 0.0)
-    order = moved[np.argsort(label[moved], kind="stable")]
+    count, island_of = connected_components(matrix_graph(W), directed=False)
+    movable = np.flatnonzero(factor[:, 0] > 0.0)
+    order = movable[np.argsort(island_of[movable], kind="stable")]
     islands = []
-    for contact in np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else []:
+    for contact in np.split(order, np.flatnonzero(np.diff(island_of[order])) + 1) if len(order) else []:
         rows = (3 * contact[:, None] + np.arange(3)).ravel()
         part = W[rows][:, rows].tobsr((3, 3))
         row = np.repeat(np.arange(len(contact)), np.diff(part.indptr))
@@ -98,78 +98,78 @@ def _islands(W: sp.csr_matrix, b: np.ndarray, friction: np.ndarray, r: np.ndarra
 
 
 def _advance(i: _Island) -> None:
-    """One outer iterate of an island."""
-    q, found = _newton(i, damped=False)
-    if not found:
-        q, found = _newton(i, damped=True)
-    before, changed, size, residual = i.r, i.changed, i.size, i.residual
+    """One outer iteration of an island."""
+    q, converged = _newton(i, damped=False)
+    if not converged:
+        q, converged = _newton(i, damped=True)
+    previous, changed, size, residual = i.r, i.changed, i.size, i.residual
     i.r = prox(q, i.friction)
     i.measure()
     better = i.residual <= residual
-    # a small rho gives the proximal step, which leads nearer in its own measure though the residual may rise
-    if found and (better or i.rho <= 100.0):
-        i.rho = min(MOST, i.rho * (10.0 if better else 3.0))
+    # with a small rho the proximal step approaches the solution in its own norm, even if the residual rises
+    if converged and (better or i.rho <= 100.0):
+        i.rho = min(RHO_MAX, i.rho * (10.0 if better else 3.0))
     elif not i.residual < 0.5 * residual:
-        i.r, i.changed, i.size = before, changed, size
-        i.rho = max(LEAST, 0.1 * i.rho)
+        i.r, i.changed, i.size = previous, changed, size
+        i.rho = max(RHO_MIN, 0.1 * i.rho)
 
 
 def _newton(i: _Island, damped: bool) -> tuple[np.ndarray, bool]:
-    """q (k,3) with a small G(q), and whether it was found. damped: steps are halved until |G| falls."""
+    """Return q (k,3) with a small G(q), and whether it was found. damped: halve steps until |G| decreases."""
     f = i.factor[:, [0, 1, 1]].ravel()
-    weight, soft = 1.0 / np.sqrt(f), 1.0 / (i.rho * f)
+    weight, R_inverse = 1.0 / np.sqrt(f), 1.0 / (i.rho * f)
     q = i.r.ravel()
-    b = i.b - soft * q
+    b = i.b - R_inverse * q
 
-    def look(q: np.ndarray):
-        G, D = _linearise(q, f * (i.W @ q + soft * q + b), i.friction)
+    def evaluate(q: np.ndarray):
+        G, D = _linearise(q, f * (i.W @ q + R_inverse * q + b), i.friction)
         return G, D, np.linalg.norm(weight * G)
 
-    G, D, size = look(q)
-    goal = GOAL * size
-    for _ in range(STEPS):
-        if not size > goal:
+    G, D, size = evaluate(q)
+    target = REDUCTION * size
+    for _ in range(MAX_STEPS):
+        if not size > target:
             break
-        step = _step(i, soft, f, G, D)
+        step = _step(i, R_inverse, f, G, D)
         if step is None or not np.all(np.isfinite(step)):
             return q.reshape(-1, 3), False
-        share = 1.0
-        for _ in range(HALVINGS if damped else 1):
-            trial = q + share * step
-            new = look(trial)
-            if new[2] < (1.0 - 1e-4 * share) * size:
+        length = 1.0
+        for _ in range(MAX_HALVINGS if damped else 1):
+            trial = q + length * step
+            new = evaluate(trial)
+            if new[2] < (1.0 - 1e-4 * length) * size:
                 break
-            share *= 0.5
+            length *= 0.5
         else:
             if damped:
                 return q.reshape(-1, 3), False
         q, (G, D, size) = trial, new
-    return q.reshape(-1, 3), bool(size <= goal)
+    return q.reshape(-1, 3), bool(size <= target)
 
 
 def _linearise(q: np.ndarray, change: np.ndarray, friction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """G (3k,) = q - prox(z), z = q - change, and the derivative (k,3,3) of prox at z."""
+    """G (3k,) = q - prox(z), z = q - change, and the derivative D (k,3,3) of prox at z."""
     z = (q - change).reshape(-1, 3)
     p = prox(z, friction)
-    pressed = z[:, 0] > 0.0
+    closed = z[:, 0] > 0.0
     size = np.hypot(z[:, 1], z[:, 2])
-    slips = pressed & (size > p[:, 0] * friction)
+    slips = closed & (size > p[:, 0] * friction)
     D = np.zeros((len(z), 3, 3))
-    D[pressed, 0, 0] = 1.0
-    sticks = pressed & ~slips
+    D[closed, 0, 0] = 1.0
+    sticks = closed & ~slips
     D[sticks, 1, 1] = D[sticks, 2, 2] = 1.0
     e = z[slips, 1:] / size[slips, None]
-    share = friction[slips] * z[slips, 0] / size[slips]
-    D[slips, 1:, 1:] = share[:, None, None] * (np.eye(2) - e[:, :, None] * e[:, None, :])
+    scale = friction[slips] * z[slips, 0] / size[slips]
+    D[slips, 1:, 1:] = scale[:, None, None] * (np.eye(2) - e[:, :, None] * e[:, None, :])
     D[slips, 1:, 0] = friction[slips, None] * e
     return q - p.ravel(), D
 
 
-def _step(i: _Island, soft: np.ndarray, f: np.ndarray, G: np.ndarray, D: np.ndarray) -> np.ndarray | None:
-    """Newton's step (3k,): (1 - D (1 - F W')) step = -G; None where it cannot be found."""
+def _step(i: _Island, R_inverse: np.ndarray, f: np.ndarray, G: np.ndarray, D: np.ndarray) -> np.ndarray | None:
+    """Newton step (3k,): (1 - D (1 - F W')) step = -G; None if the system is singular."""
     k = len(D)
     blocks = i.W.data.copy()
-    blocks[i.diagonal] += soft.reshape(k, 3, 1) * np.eye(3)
+    blocks[i.diagonal] += R_inverse.reshape(k, 3, 1) * np.eye(3)
     blocks = (D * f.reshape(k, 1, 3))[i.row] @ blocks
     blocks[i.diagonal] += np.eye(3) - D
     try:

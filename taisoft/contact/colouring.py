@@ -1,8 +1,8 @@
-"""Colours of the contacts in kernels, and the groups that coloured Gauss-Seidel sweeps over.
+"""Parallel colouring of the contacts, and their groups for coloured Gauss-Seidel.
 
-Jones and Plassmann 1993: a contact takes the first colour that is free as soon as all its neighbours of higher priority have
-theirs. That is first-fit in the order of the priorities, whatever the threads do. Priorities are hashes, so that the longest
-chain of waiting contacts is short. A step colours its contacts once, before the first sweep.
+Jones and Plassmann 1993: a contact takes the first free colour once all its neighbours of higher priority are coloured. The
+result is first-fit in the order of the priorities, independent of threads. Priorities are hashes, which keeps the longest chain
+of waiting contacts short. A step colours its contacts once, before the first sweep.
 """
 
 import numpy as np
@@ -14,12 +14,12 @@ from taisoft.contact.problem import NODES, ContactProblem, fill_field, index_nod
 from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
 
-BITS = 30  # colours that are looked at in one go
+BITS = 30  # colours tested at a time, as bits of an integer
 
 
 @ti.func
 def _priority(c):
-    """A number that scatters contacts; two contacts never have the same one."""
+    """Hash of contact c; different for different contacts."""
     x = ti.cast(c, ti.i64)
     for _ in ti.static(range(2)):
         x = ((x ^ (x >> 16)) * 73244475) & 0x7FFFFFFF
@@ -27,40 +27,40 @@ def _priority(c):
 
 
 @ti.func
-def _moves(p: ti.template(), i):
+def _is_movable(p: ti.template(), i):
     return (p.inverse_mass[i] != 0.0).any()
 
 
 @ti.func
-def _waits(p: ti.template(), c):
-    """Whether a neighbour of higher priority has no colour yet."""
-    waits, mine = False, _priority(c)
+def _is_waiting(p: ti.template(), c):
+    """Whether a neighbour of higher priority is uncoloured."""
+    waiting, mine = False, _priority(c)
     for k in range(p.arity[c]):
         i = p.node[c, k]
-        if _moves(p, i):
+        if _is_movable(p, i):
             for e in range(p.entry_start[i], p.entry_start[i + 1]):
                 d = p.entry[e] // NODES
                 if _priority(d) > mine:
                     if p.colour[d] == UNCOLOURED:
-                        waits = True
-    return waits
+                        waiting = True
+    return waiting
 
 
 @ti.func
 def _first_free(p: ti.template(), c):
-    """The least colour that no neighbour of higher priority has."""
+    """The lowest colour that no neighbour of higher priority has."""
     result, low, mine = UNCOLOURED, 0, _priority(c)
     while result == UNCOLOURED:
         taken = 0
         for k in range(p.arity[c]):
             i = p.node[c, k]
-            if _moves(p, i):
+            if _is_movable(p, i):
                 for e in range(p.entry_start[i], p.entry_start[i + 1]):
                     d = p.entry[e] // NODES
-                    above = p.colour[d] - low
+                    offset = p.colour[d] - low
                     if _priority(d) > mine:
-                        if above >= 0 and above < BITS:
-                            taken |= 1 << above
+                        if offset >= 0 and offset < BITS:
+                            taken |= 1 << offset
         for bit in range(BITS):
             if result == UNCOLOURED:
                 if (taken >> bit) & 1 == 0:
@@ -70,7 +70,7 @@ def _first_free(p: ti.template(), c):
 
 
 @kernel
-def _uncolour(p: ti.template()):
+def _clear_colours(p: ti.template()):
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         p.colour[c] = UNCOLOURED
@@ -78,12 +78,12 @@ def _uncolour(p: ti.template()):
 
 @kernel
 def _colour_round(p: ti.template()) -> ti.i32:
-    """Colour whom nobody keeps waiting; returns how many that were. Who is seen coloured in the same round may be so at once."""
+    """Colour contacts whose higher-priority neighbours are coloured (same round included, if visible). Return their number."""
     coloured = 0
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         if p.colour[c] == UNCOLOURED:
-            if not _waits(p, c):
+            if not _is_waiting(p, c):
                 p.colour[c] = _first_free(p, c)
                 coloured += 1
     return coloured
@@ -91,7 +91,7 @@ def _colour_round(p: ti.template()) -> ti.i32:
 
 @kernel
 def _group(p: ti.template()):
-    """order and colour_start from the colours: a counting sort."""
+    """Set `order` and `colour_start` from the colours by a counting sort."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         n, colours = p.count[0], 0
@@ -112,21 +112,21 @@ def _group(p: ti.template()):
 
 
 def colour_parallel(p: ContactProblem) -> None:
-    """Colour and group the contacts of a problem over nodes, on the device; the nodes are indexed."""
-    left = int(p.count[0])
-    _uncolour(p)
-    while left:
+    """Colour and group the contacts of a problem over nodes, on the device. Requires `index_nodes`."""
+    remaining = int(p.count[0])
+    _clear_colours(p)
+    while remaining:
         coloured = int(_colour_round(p))
         if not coloured:
-            raise SimulationError(f"{left} contacts could not be coloured")
-        left -= coloured
+            raise SimulationError(f"{remaining} contacts could not be coloured")
+        remaining -= coloured
     _group(p)
 
 
 def colour_contacts(p: ContactProblem, colouring: str = "parallel", seed: int = 0) -> None:
     """Group the contacts for coloured Gauss-Seidel, once before the sweeps.
 
-    colouring: "parallel", over nodes only; "greedy"; "random", with this seed.
+    colouring: "parallel" (only over nodes), "greedy" or "random" (with `seed`).
     """
     if colouring == "parallel":
         index_nodes(p)
@@ -137,7 +137,7 @@ def colour_contacts(p: ContactProblem, colouring: str = "parallel", seed: int = 
 
 
 def graph_of(p: ContactProblem) -> sp.csr_matrix:
-    """Adjacency of the contacts that a problem holds, brought to the host."""
+    """Adjacency matrix of the problem's contacts, on the host."""
     k = int(p.count[0])
     if not p.matrix:
         return node_graph(p.node.to_numpy(k), p.arity.to_numpy(k), p.inverse_mass.to_numpy())
@@ -148,7 +148,7 @@ def graph_of(p: ContactProblem) -> sp.csr_matrix:
 
 
 def store(p: ContactProblem, colour: np.ndarray) -> None:
-    """Give the problem's contacts these colours (k,) and group them."""
+    """Set the colours (k,) of the problem's contacts and group them."""
     k = len(colour)
     order, start = groups(colour)
     for field, values in ((p.colour, colour), (p.order, order), (p.colour_start, start)):

@@ -1,19 +1,19 @@
-"""Hybrid (report, algorithm 5): Jacobi, but friction with the new normal part."""
+"""Hybrid (report, algorithm 5): Jacobi, but the friction disk uses the new normal impulse."""
 
 import taichi as ti
 
-from taisoft.contact.jacobi import relaxation, sweep_all, sweep_all_at_once
+from taisoft.contact.jacobi import relaxation, sweep_all, sweep_all_parallel
 from taisoft.contact.problem import ContactProblem
 
-__all__ = ["relaxation", "sweep", "sweep_at_once"]
+__all__ = ["relaxation", "sweep", "sweep_parallel"]
 
 
 @ti.func
 def sweep(p: ti.template()):
-    """Every contact once, on this thread."""
+    """Relax every contact once, on this thread."""
     sweep_all(p, True)
 
 
-def sweep_at_once(p: ContactProblem, _colours: int) -> None:
-    """Every contact once, on all threads."""
-    sweep_all_at_once(p, True)
+def sweep_parallel(p: ContactProblem, _colours: int) -> None:
+    """Relax every contact once, on all threads."""
+    sweep_all_parallel(p, True)

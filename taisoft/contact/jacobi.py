@@ -1,6 +1,6 @@
-"""Jacobi (report, algorithm 4): all contacts at once, each with the impulses of the last sweep.
+"""Jacobi (report, algorithm 4): all contacts in parallel, using the impulses of the last sweep.
 
-The friction disk is that of the last sweep's normal part. `hybrid` shares all but this.
+The friction disk, too, uses the normal impulse of the last sweep; `hybrid` differs only in this.
 """
 
 import taichi as ti
@@ -12,54 +12,54 @@ from taisoft.runtime import kernel
 
 
 @ti.func
-def relaxation(p: ti.template(), c, beyond):
-    """Share of its r-factors that contact c takes, with momentum or without."""
+def relaxation(p: ti.template(), c, with_momentum):
+    """Fraction of its r-factors that contact c uses, with momentum or without."""
     return bounds.gershgorin(p, c)
 
 
 @ti.func
-def relaxed(p: ti.template(), c, fresh: ti.template()):
-    """One prox of contact c. fresh: whether the friction disk is that of the new normal part."""
+def relaxed(p: ti.template(), c, new_disk: ti.template()):
+    """Impulse of contact c after one prox step. new_disk: whether the friction disk uses the new normal impulse."""
     r = p.r[c]
     z = r - scaled(p.state[STEP] * p.relaxation[c] * p.factor[c], velocity(p, c))
     new = prox(z, p.friction[c])
-    if ti.static(not fresh):
+    if ti.static(not new_disk):
         new = into_disk([new[0], z[1], z[2]], p.friction[c] * r[0])
     return new
 
 
 @ti.func
-def exchange(p: ti.template(), c):
-    """The new impulses become the present ones, those become the guess."""
-    new = p.guess[c]
-    p.guess[c] = p.r[c]
+def swap(p: ti.template(), c):
+    """Swap the new impulse of contact c, held in sweep_start, with its present one."""
+    new = p.sweep_start[c]
+    p.sweep_start[c] = p.r[c]
     p.r[c] = new
 
 
 @ti.func
-def sweep_all(p: ti.template(), fresh: ti.template()):
-    """Every contact once, on this thread."""
+def sweep_all(p: ti.template(), new_disk: ti.template()):
+    """Relax every contact once, on this thread."""
     for c in range(p.count[0]):
-        p.guess[c] = relaxed(p, c, fresh)
+        p.sweep_start[c] = relaxed(p, c, new_disk)
     for c in range(p.count[0]):
-        exchange(p, c)
+        swap(p, c)
 
 
 @ti.func
 def sweep(p: ti.template()):
-    """Every contact once, on this thread."""
+    """Relax every contact once, on this thread."""
     sweep_all(p, False)
 
 
 @kernel
-def sweep_all_at_once(p: ti.template(), fresh: ti.template()):
-    """Every contact once, on all threads."""
+def sweep_all_parallel(p: ti.template(), new_disk: ti.template()):
+    """Relax every contact once, on all threads."""
     for c in range(p.count[0]):
-        p.guess[c] = relaxed(p, c, fresh)
+        p.sweep_start[c] = relaxed(p, c, new_disk)
     for c in range(p.count[0]):
-        exchange(p, c)
+        swap(p, c)
 
 
-def sweep_at_once(p: ContactProblem, _colours: int) -> None:
-    """Every contact once, on all threads."""
-    sweep_all_at_once(p, False)
+def sweep_parallel(p: ContactProblem, _colours: int) -> None:
+    """Relax every contact once, on all threads."""
+    sweep_all_parallel(p, False)

@@ -1,22 +1,22 @@
-"""The frictional contact problem on the host, in NumPy: W as a matrix, impulses r (k,3), see `problem`."""
+"""The frictional contact problem in NumPy: W as a matrix, impulses r (k,3). See `problem` for the formulas."""
 
 import numpy as np
 import scipy.sparse as sp
 
 
 def find_factors(W: sp.spmatrix) -> np.ndarray:
-    """r-factors (k,2) of normal and tangents from the diagonal of W (3k,3k); 0 where W has nothing there."""
+    """r-factors (k,2) of normal and tangents from the diagonal of W (3k,3k); 0 where the diagonal is not positive."""
     d = W.diagonal().reshape(-1, 3)
     d = np.stack([d[:, 0], d[:, 1:].max(axis=1, initial=0.0)], axis=1)
     return np.divide(1.0, d, out=np.zeros_like(d), where=d > 0.0)
 
 
 def prox(z: np.ndarray, friction: np.ndarray) -> np.ndarray:
-    """Admissible impulses (k,3) for z (k,3): normal parts first, then tangential ones in the disks that they open."""
+    """Project z (k,3) to admissible impulses (k,3): first the normal part, then the tangential part onto its friction disk."""
     normal = np.maximum(z[:, 0], 0.0)
     size, radius = np.hypot(z[:, 1], z[:, 2]), friction * normal
-    share = np.divide(radius, size, out=np.ones_like(size), where=size > radius)
-    return np.column_stack([normal, share * z[:, 1], share * z[:, 2]])
+    scale = np.divide(radius, size, out=np.ones_like(size), where=size > radius)
+    return np.column_stack([normal, scale * z[:, 1], scale * z[:, 2]])
 
 
 def natural_map(W, b: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -26,7 +26,7 @@ def natural_map(W, b: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: n
 
 
 def relative(changed: float, size: float) -> float:
-    """The residual from |r - prox(r - f u)| and |r|; 1 where impulses are wanted and there are none."""
+    """Residual from |r - prox(r - f u)| and |r|; 1 if r is 0 but not a solution."""
     return changed / size if size > 0.0 else float(changed != 0.0)
 
 

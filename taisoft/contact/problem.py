@@ -1,13 +1,13 @@
 """The frictional contact problem: impulses r with u = W r + b, Signorini's and Coulomb's laws between r and u.
 
-W, the Delassus operator, is given in one of two forms. Over nodes: W = J M^-1 J^T, where J r pushes the nodes of each contact by
-their weights, and `w` = M^-1 J^T r is kept up to date; nothing is assembled. As a matrix: 3x3 blocks in CSR. Solvers see
-only `velocity` and `push`, so each is written once.
-The r-factors are 1 / W_nn and 1 / max(W_t1t1, W_t2t2), the same for every solver, since the residual
+W, the Delassus operator, has one of two forms. Over nodes: W = J M^-1 J^T, where J^T r distributes the impulses to the nodes of
+each contact by their weights; `w` = M^-1 J^T r is kept up to date and nothing is assembled. As a matrix: 3x3 blocks in CSR.
+Solvers use only `velocity` and `add_impulse`, so each is written once.
+The r-factors f are 1 / W_nn and 1 / max(W_t1t1, W_t2t2), the same for every solver, since the residual
     |r - prox(r - f u)| / |r|
-rests on them: a change of r between two sweeps shrinks with the step that a solver dares, and tells nothing. What a solver
-dares is its own `share` of them.
-All is f64: impulses are small differences of large ones.
+depends on them. (The change of r between two sweeps is no measure: it shrinks with a solver's step.) Each solver uses its own
+fraction of them, `relaxation`.
+All values are f64: impulses are small differences of large ones.
 """
 
 from dataclasses import dataclass
@@ -23,38 +23,38 @@ from taisoft.fields import FieldArena
 from taisoft.runtime import kernel
 from taisoft.transfer import upload
 
-NODES = 6  # of a contact at most, three on each side
-CHANGED, SIZE, RESIDUAL, GOOD, STEP, SWEEPS, LOOKS, AGE, MOMENTUM, VERDICT = range(10)  # places in `state`
-HISTORY = 1024  # residuals kept of a launch
-PARTS = 256  # of a sum over the contacts, so that it does not depend on threads
+NODES = 6  # maximum nodes of a contact, three on each side
+CHANGED, SIZE, RESIDUAL, BEST, STEP, SWEEPS, CHECKS, AGE, MOMENTUM, VERDICT = range(10)  # in `state`; AGE: sweeps since `best`
+HISTORY = 1024  # residuals kept per launch
+CHUNKS = 256  # partial sums over the contacts, so that a sum does not depend on threads
 
 
 @dataclass(frozen=True, eq=False)
 class ContactProblem:
-    """Fields of up to `capacity` contacts; the first count[0] hold. What a form does not need is None."""
+    """Fields of up to `capacity` contacts; the first count[0] are in use. Fields of the other form of W are None."""
 
     capacity: Count
-    serial: bool  # loops run on one thread
-    matrix: bool  # the form of W
+    serial: bool  # whether loops run on one thread
+    matrix: bool  # whether W is given as a matrix
     n_nodes: Count
     count: Any  # (2) i32: contacts, colours
     friction: Any  # f64
     b: Any  # 3-vectors [m/s]: u without impulses; (normal, t1, t2)
-    factor: Any  # 2-vectors: r-factors of normal and tangents [kg]; 0 where nothing can move
+    factor: Any  # 2-vectors: r-factors of normal and tangents [kg]; 0 if nothing can move
     r: Any  # 3-vectors: impulses [N s]
-    relaxation: Any  # f64: of the r-factors, that a sweep takes at most; its solver's own
-    good: Any  # 3-vectors: the best impulses so far
-    guess: Any  # 3-vectors: impulses that a sweep started from
-    trial: Any  # 3-vectors: impulses after the last sweep but one
-    term: Any  # 2-vectors: what each contact adds to two sums
-    part: Any  # (PARTS) 2-vectors: sums over parts of the contacts
-    order: Any  # i32: contacts in the order of a sweep
+    relaxation: Any  # f64: largest fraction of the r-factors that a sweep uses; set by its solver
+    best: Any  # 3-vectors: the best impulses so far
+    sweep_start: Any  # 3-vectors: impulses at the start of the sweep
+    previous: Any  # 3-vectors: impulses after the previous sweep, before extrapolation
+    term: Any  # 2-vectors: contributions of each contact to two sums
+    partial: Any  # (CHUNKS) 2-vectors: sums over chunks of the contacts
+    order: Any  # i32: contacts in sweep order
     colour: Any  # i32: of each contact, see `graph`
-    colour_start: Any  # (capacity + 1) i32: where each colour starts in `order`
-    state: Any  # (10) f64: two sums, residual, that of `good`, share of the r-factors, counts; see `r_factor`, `momentum`
-    history: Any  # (HISTORY) f64: residuals of the looks of a launch
-    # over nodes
-    node: Any  # (capacity, NODES) i32, the first arity[c] hold
+    colour_start: Any  # (capacity + 1) i32: start of each colour in `order`
+    state: Any  # (10) f64: two sums, residual, that of `best`, fraction of the r-factors, counts; see `r_factor`, `momentum`
+    history: Any  # (HISTORY) f64: residuals at the checks of a launch
+    # W over nodes
+    node: Any  # (capacity, NODES) i32, the first arity[c] are in use
     arity: Any  # i32
     weight: Any  # (capacity, NODES) f64: positive on side a, negative on side b
     normal: Any  # 3-vectors: from b to a
@@ -62,15 +62,15 @@ class ContactProblem:
     inverse_mass: Any  # (n_nodes) 3-vectors [1/kg], 0 on constrained axes
     w: Any  # (n_nodes) 3-vectors [m/s]: M^-1 J^T r
     entry_start: Any  # (n_nodes + 1) i32: contacts of each node
-    entry: Any  # i32: NODES * contact + place
-    # as a matrix
+    entry: Any  # i32: NODES * contact + index of the node in it
+    # W as a matrix
     row_start: Any  # (capacity + 1) i32
     column: Any  # i32
     block: Any  # (blocks, 9) f64
 
 
 def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: bool) -> ContactProblem:
-    """Room for contacts between the nodes of a model."""
+    """Allocate a problem for contacts between the nodes of a model."""
     def vectors(name: str, count: int = capacity):
         return arena.vectors(f"problem_{name}", ti.f64, count)
 
@@ -87,7 +87,7 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
 
 
 def build_matrix_problem(arena: FieldArena, n: int, n_blocks: int, serial: bool) -> ContactProblem:
-    """Room for n contacts and a W of n_blocks 3x3 blocks."""
+    """Allocate a problem for n contacts and a W of n_blocks 3x3 blocks."""
     def ints(name: str, count: int):
         return arena.field(f"problem_{name}", ti.i32, count)
 
@@ -105,9 +105,9 @@ def _common(arena: FieldArena, capacity: int, serial: bool) -> dict[str, Any]:
     return {
         "capacity": capacity, "serial": serial, "count": arena.field("problem_count", ti.i32, 2),
         "friction": arena.field("problem_friction", ti.f64, capacity), "b": vectors("b"), "factor": vectors("factor", 2),
-        "r": vectors("r"), "relaxation": arena.field("problem_relaxation", ti.f64, capacity), "good": vectors("good"),
-        "guess": vectors("guess"), "trial": vectors("trial"), "term": vectors("term", 2),
-        "part": arena.vectors("problem_part", ti.f64, PARTS, n=2), "order": arena.field("problem_order", ti.i32, capacity),
+        "r": vectors("r"), "relaxation": arena.field("problem_relaxation", ti.f64, capacity), "best": vectors("best"),
+        "sweep_start": vectors("sweep_start"), "previous": vectors("previous"), "term": vectors("term", 2),
+        "partial": arena.vectors("problem_partial", ti.f64, CHUNKS, n=2), "order": arena.field("problem_order", ti.i32, capacity),
         "colour": arena.field("problem_colour", ti.i32, capacity),
         "colour_start": arena.field("problem_colour_start", ti.i32, capacity + 1),
         "state": arena.field("problem_state", ti.f64, 10), "history": arena.field("problem_history", ti.f64, HISTORY),
@@ -115,14 +115,14 @@ def _common(arena: FieldArena, capacity: int, serial: bool) -> dict[str, Any]:
 
 
 def fill_field(field, values: np.ndarray) -> None:
-    """The first rows of a field from values (k, ...), 0 in the others."""
+    """Fill the first rows of a field with values (k, ...) and the others with 0."""
     whole = np.zeros((field.shape[0], *values.shape[1:]))
     whole[: len(values)] = values
     upload([(field, whole)])
 
 
 def fill_matrix_problem(p: ContactProblem, W: sp.spmatrix, b: np.ndarray, friction: np.ndarray) -> None:
-    """W (3k,3k), b (3k,) and coefficients of friction (k,) into a problem that has room; impulses are left as they are."""
+    """Upload W (3k,3k), b (3k,) and coefficients of friction (k,) to a problem large enough; keep its impulses."""
     blocks, k = sp.bsr_matrix(W, blocksize=(3, 3)), len(friction)
     blocks.sort_indices()
     p.count[0] = k
@@ -134,19 +134,19 @@ def fill_matrix_problem(p: ContactProblem, W: sp.spmatrix, b: np.ndarray, fricti
     find_factors(p)
 
 
-# --- what solvers see -------------------------------------------------------------------------------------------------
+# --- solver interface -------------------------------------------------------------------------------------------------
 
 
 @ti.func
 def to_frame(p: ti.template(), c, v):
-    """A vector of the world in the frame of contact c."""
+    """Transform a world vector to the frame of contact c."""
     n, t = p.normal[c], p.tangent[c]
     return dvec(n.dot(v), t.dot(v), n.cross(t).dot(v))
 
 
 @ti.func
 def to_world(p: ti.template(), c, r):
-    """A vector of contact c's frame in the world."""
+    """Transform a vector from the frame of contact c to the world."""
     n, t = p.normal[c], p.tangent[c]
     return r[0] * n + r[1] * t + r[2] * n.cross(t)
 
@@ -170,7 +170,7 @@ def velocity(p: ti.template(), c):
 
 @ti.func
 def add_impulse(p: ti.template(), c, change):
-    """Tell the nodes of contact c that its impulse changed. Contacts that are pushed at once must share no movable node."""
+    """Add a change of contact c's impulse to w at its nodes. Contacts updated in parallel must share no movable node."""
     if ti.static(not p.matrix):
         d = to_world(p, c, change)
         for k in range(p.arity[c]):
@@ -180,7 +180,7 @@ def add_impulse(p: ti.template(), c, change):
 
 @ti.func
 def impulse_on(p: ti.template(), i):
-    """(J^T r) of node i [N s], its contacts in a fixed order."""
+    """(J^T r) of node i [N s], summed over its contacts in a fixed order."""
     d = dvec(0.0)
     for e in range(p.entry_start[i], p.entry_start[i + 1]):
         c, k = p.entry[e] // NODES, p.entry[e] % NODES
@@ -204,7 +204,7 @@ def natural_map(p: ti.template(), c):
 
 @ti.func
 def residual_of(changed, size):
-    """The relative residual from the two sums; 1 where impulses are wanted and there are none, or are not a number."""
+    """Relative residual from the two sums; 1 if r is 0 but not a solution, or not a number."""
     result = ti.cast(0.0, ti.f64)
     if size > 0.0:
         result = ti.sqrt(changed / size)
@@ -215,7 +215,7 @@ def residual_of(changed, size):
 
 @kernel
 def find_velocities(p: ti.template()):
-    """w = M^-1 J^T r over nodes; nothing to do for a matrix."""
+    """Set w = M^-1 J^T r over nodes; does nothing if W is a matrix."""
     if ti.static(not p.matrix):
         ti.loop_config(serialize=p.serial)
         for i in range(p.n_nodes):
@@ -256,14 +256,14 @@ def own_block(p: ti.template(), c):
 
 @kernel
 def find_factors(p: ti.template()):
-    """r-factors from the diagonal of W."""
+    """Set the r-factors from the diagonal of W."""
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         B = own_block(p, c)
         across = ti.max(B[1, 1], B[2, 2])
         p.factor[c][0] = ti.select(B[0, 0] > 0.0, 1.0 / B[0, 0], 0.0)
         p.factor[c][1] = ti.select(across > 0.0, 1.0 / across, 0.0)
-        if B[0, 0] <= 0.0:  # nothing can move it
+        if B[0, 0] <= 0.0:  # immovable
             p.r[c] = dvec(0.0)
 
 

@@ -1,8 +1,8 @@
-"""Projections of the PROX formulation (report, section 2.4) and the friction cone's frame.
+"""Projections of the PROX formulation (report, section 2.4) and the contact frame.
 
-An impulse is (normal, t1, t2). With u the relative velocity that it leaves behind and f the r-factors, the laws of Signorini and
-Coulomb hold where r = prox(r - f u): the normal part is not negative, the tangential part lies in the disk of radius
-friction * r_n. Both tangents must share one factor: with two, the fixed point is another friction law.
+An impulse is (normal, t1, t2). With u the relative velocity after the impulse and f the r-factors, the laws of Signorini and
+Coulomb hold if r = prox(r - f u): the normal part is not negative, the tangential part lies in the disk of radius
+friction * r_n. Both tangents must share one factor: with two, the fixed point satisfies another friction law.
 """
 
 import taichi as ti
@@ -12,12 +12,12 @@ dvec = ti.types.vector(3, ti.f64)
 
 @ti.func
 def tangents(n):
-    """Two unit vectors that make a right-handed frame with the unit vector n."""
+    """Two unit vectors that form a right-handed frame with the unit vector n."""
     a = dvec(0.0)
-    least = ti.abs(n).min()
-    if ti.abs(n[0]) == least:
+    smallest = ti.abs(n).min()
+    if ti.abs(n[0]) == smallest:
         a[0] = 1.0
-    elif ti.abs(n[1]) == least:
+    elif ti.abs(n[1]) == smallest:
         a[1] = 1.0
     else:
         a[2] = 1.0
@@ -28,17 +28,17 @@ def tangents(n):
 
 @ti.func
 def into_disk(z, radius):
-    """The impulse z with its tangential part brought into the disk of that radius [N s]."""
+    """Impulse z with its tangential part projected onto the disk of the given radius [N s]."""
     size = ti.sqrt(z[1] * z[1] + z[2] * z[2])
-    share = ti.cast(1.0, ti.f64)
+    scale = ti.cast(1.0, ti.f64)
     if size > radius:
-        share = radius / size
-    return dvec(z[0], share * z[1], share * z[2])
+        scale = radius / size
+    return dvec(z[0], scale * z[1], scale * z[2])
 
 
 @ti.func
 def prox(z, friction):
-    """Nearest admissible impulse: first the normal part, then the tangential one in the disk that it opens."""
+    """Project z to an admissible impulse: first the normal part, then the tangential part onto its friction disk."""
     normal = ti.max(z[0], 0.0)
     return into_disk(dvec(normal, z[1], z[2]), friction * normal)
 

@@ -1,10 +1,10 @@
-"""What share of its r-factors a contact may take at once, so that a sweep does not overshoot.
+"""Bounds on the fraction of its r-factors that a contact may use so that a sweep does not overshoot.
 
-With B the blocks of F^1/2 W F^1/2, F the r-factors, a step of share s along the velocity lowers the energy of the impulses if
-s B <= 1. Contacts that are relaxed one after the other meet their own block only: s = 1 / |B_cc|. Contacts that are relaxed at
-once meet all of theirs: s_c = 1 / sum_d |B_cd| (block Gershgorin), which adapts to where contacts crowd; one number from the
-largest eigenvalue of F W would hold back all for the sake of the worst.
-The norms are bounds, sqrt(|B|_1 |B|_inf) for a matrix and the sizes of weights over nodes.
+With B the blocks of F^1/2 W F^1/2, F the r-factors, a step of the fraction s along the velocity lowers the energy of the
+impulses if s B <= 1. For contacts relaxed sequentially only the diagonal block counts: s = 1 / |B_cc|. For contacts relaxed in
+parallel the whole row does: s_c = 1 / sum_d |B_cd| (block Gershgorin). This adapts to the local density of contacts; a single
+number from the largest eigenvalue of F W would slow all contacts down to the worst one.
+The norms are upper bounds: sqrt(|B|_1 |B|_inf) for a matrix, absolute values of the weights over nodes.
 """
 
 import taichi as ti
@@ -21,7 +21,7 @@ def _roots(p: ti.template(), c):
 
 @ti.func
 def _norm(B, a, b):
-    """Bound of the 2-norm of diag(a) B diag(b)."""
+    """Upper bound of the 2-norm of diag(a) B diag(b)."""
     columns, rows = ti.Vector([0.0, 0.0, 0.0], ti.f64), ti.Vector([0.0, 0.0, 0.0], ti.f64)
     for i, j in ti.static(ti.ndrange(3, 3)):
         size = ti.abs(a[i] * B[i, j] * b[j])
@@ -37,14 +37,14 @@ def _inverse(total):
 
 @ti.func
 def sequential(p: ti.template(), c):
-    """For contacts that are relaxed one after the other, in (0, 1]; 1 where all nodes move alike along all axes."""
+    """Fraction in (0, 1] for sequential relaxation; 1 if no node's inverse mass differs between axes."""
     a = _roots(p, c)
     return ti.min(1.0, _inverse(_norm(own_block(p, c), a, a)))
 
 
 @ti.func
 def gershgorin(p: ti.template(), c):
-    """For contacts that are relaxed at once, in (0, 1]."""
+    """Fraction in (0, 1] for parallel relaxation."""
     total = ti.cast(0.0, ti.f64)
     a = _roots(p, c)
     if ti.static(p.matrix):
@@ -56,9 +56,9 @@ def gershgorin(p: ti.template(), c):
     else:
         for k in range(p.arity[c]):
             i = p.node[c, k]
-            near = ti.cast(0.0, ti.f64)
+            weights = ti.cast(0.0, ti.f64)
             for e in range(p.entry_start[i], p.entry_start[i + 1]):
                 d = p.entry[e] // NODES
-                near += ti.abs(p.weight[d, p.entry[e] % NODES]) * _roots(p, d).max()
-            total += ti.abs(p.weight[c, k]) * p.inverse_mass[i].max() * a.max() * near
+                weights += ti.abs(p.weight[d, p.entry[e] % NODES]) * _roots(p, d).max()
+            total += ti.abs(p.weight[c, k]) * p.inverse_mass[i].max() * a.max() * weights
     return ti.min(1.0, _inverse(total))

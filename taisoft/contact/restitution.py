@@ -1,24 +1,22 @@
-"""Restitution: how fast surfaces that meet within a step part again.
+"""Restitution: the speed at which surfaces that meet within a step separate.
 
-Newton's law, u+ = -e u-, is an event between two velocities at one place. A step sees the surfaces at its start, where a gap is
-left that gravity still closes, and x moves with the velocity after the impact from there. Taken literally, the law then lifts the
-bodies by what they did not fall: energy comes from nowhere. So
+Newton's law, u+ = -e u-, relates two velocities at one place. A step sees the surfaces at its start, with a gap that gravity has
+yet to close, and moves x from there with the velocity after the impact. Applied literally, the law lifts the bodies by the height
+that they did not fall, which creates energy. Therefore
 
-* explicit steps apply the law to the velocity of the time that x_n belongs to, and let what is left of the step's forces act on
-  the velocity after it:
+* explicit steps apply the law to the velocity at the time of x_n and add the rest of the step's velocity change afterwards:
       u >= -e u_s + (u* - u_s),   u* the velocity that the step would reach without impulses.
   In velocity Verlet u_s = u_n. In symplectic Euler v_n belongs to t_n - dt/2 (it is the leapfrog scheme), so u_s = (u_n + u*)/2.
-  With e = 1 the velocity turns round at x_n, which leaves the energy that the scheme keeps, even in v_s, as it is;
-* implicit steps have an impact first (`taisoft.dynamics.impact`), that leaves contacts with the speed w,
-      w^2 = e^2 (u_n^2 + L + 2 a room) - 2 a room,
-  room the gap less the contact offset, a >= 0 the acceleration with which gravity closes it:
-  e^2 of the energy that the surfaces would
-  meet with, less what the room is worth, so that bodies rise to e^2 of the height of their fall. L = a^2 sum dt^2 over the steps
-  of the flight is what implicit Euler took: it loses (a dt)^2 / 2 in each. Bodies are thrown back with that energy too, but with
-  a dt more speed at most, which is what it takes in a flight up and down.
+  With e = 1 the velocity is reversed at x_n. This preserves the energy that the scheme conserves, which is even in v_s;
+* implicit steps begin with an impact (`taisoft.dynamics.impact`), after which contacts separate at the speed w,
+      w^2 = e^2 (u_n^2 + L + 2 a d) - 2 a d,
+  d the gap less the contact offset, a >= 0 the acceleration with which gravity closes it: e^2 times the energy at which the
+  surfaces would meet, less the potential energy of d, so that bodies rise to e^2 of the height of their fall.
+  L = a^2 sum dt^2 over the steps of the flight is the energy that implicit Euler lost, (a dt)^2 / 2 in each. It is restored, but
+  raises the speed of meeting by at most a dt, the speed that implicit Euler loses in a flight up and down.
 
-Weak: bodies turn round where the step begins, up to a step's way above the surface. L is exact for a body that neither touches
-anything nor has fixed nodes; of others nothing is assumed to be lost. What the flight's rotation lost is not given back.
+Weak: bodies reverse where the step begins, up to a step's displacement above the surface. L is exact for a body that touches
+nothing and has no fixed nodes; for others no loss is assumed. The loss of the flight's rotation is not restored.
 """
 
 import taichi as ti
@@ -26,48 +24,48 @@ import taichi as ti
 from taisoft.contact.assemble import contact_offset_of
 from taisoft.runtime import kernel
 
-NEGLIGIBLE_RISE = 0.01  # of the contact offset: a rebound that opens less in a step is none
+NEGLIGIBLE_OPENING = 0.01  # of the contact offset: a rebound that opens the gap less in a step is ignored
 
 
 @ti.func
-def explicit_rise(f: ti.template(), c, dt, common_offset, free, kicked):
-    """How far contact c must open in an explicit step for its restitution [m], 0 without; free: u* along the normal [m/s].
+def explicit_opening(f: ti.template(), c, dt, common_offset, free, kick_fraction):
+    """Least opening of contact c in an explicit step due to restitution [m], 0 without; free: u* along the normal [m/s].
 
-    kicked: share of the step's change of the velocity, u* - u_n, that comes before the impact.
+    kick_fraction: fraction of the step's velocity change u* - u_n that precedes the impact.
     """
-    rise, u = ti.cast(0.0, ti.f64), (1.0 - kicked) * f.approach[c] + kicked * free
+    opening, u = ti.cast(0.0, ti.f64), (1.0 - kick_fraction) * f.approach[c] + kick_fraction * free
     if f.restitution[c] > 0.0 and u < 0.0 and f.gap[c] - contact_offset_of(f, c, common_offset) + dt * free < 0.0:
-        rise = ti.max(0.0, dt * (free - u - f.restitution[c] * u))
-    return rise
+        opening = ti.max(0.0, dt * (free - u - f.restitution[c] * u))
+    return opening
 
 
 @kernel
 def find_rebounds(
     f: ti.template(), gravity: ti.template(), flight: ti.types.ndarray(), dt: ti.f64, common_offset: ti.f64
 ) -> ti.i32:
-    """Set `leave` and `rise` of every contact for an implicit step of dt. Returns how many contacts are thrown back.
+    """Set `min_velocity` and `min_opening` of every contact for an implicit step of dt. Return the number of rebounds.
 
     gravity: field of one 3-vector [m/s^2]. flight: (n_colliders) f64, sum of dt^2 over the steps of a collider's flight [s^2], 0
-    where it is in none. Contacts that are not thrown back may close, or approach as fast as they part now, which takes no work.
+    if it is not in flight. A contact without a rebound may close, or approach as fast as it separates now, which takes no work.
     """
     (p,) = ti.static((f.problem,))
-    found = 0
+    rebounds = 0
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
             u, e, contact_offset = f.approach[c], f.restitution[c], contact_offset_of(f, c, common_offset)
-            room = ti.max(0.0, f.gap[c] - contact_offset)
+            distance = ti.max(0.0, f.gap[c] - contact_offset)
             a, b = f.body[c][0], f.body[c][1]
-            pull = p.normal[c].dot(ti.cast(gravity[0], ti.f64))
-            fall = ti.max(0.0, -pull * (ti.cast(flight[a] > 0.0, ti.f64) - ti.cast(flight[b] > 0.0, ti.f64)))
-            leave, rise = -ti.max(room / dt, u), ti.cast(0.0, ti.f64)
-            if e > 0.0 and u < 0.0 and f.gap[c] - contact_offset + dt * (u - dt * fall) < 0.0:
-                met = ti.min(dt * fall - u, ti.sqrt(u * u + ti.abs(flight[a] - flight[b]) * fall * fall))
-                square = e * e * (met * met + 2.0 * fall * room) - 2.0 * fall * room
-                w = ti.sqrt(ti.max(0.0, square))
-                opens = dt * (w - dt * ti.abs(pull))
-                if opens > NEGLIGIBLE_RISE * contact_offset:
-                    leave, rise = w, opens
-                    found += 1
-            f.leave[c], f.rise[c] = leave, rise
-    return found
+            gravity_n = p.normal[c].dot(ti.cast(gravity[0], ti.f64))
+            closing = ti.max(0.0, -gravity_n * (ti.cast(flight[a] > 0.0, ti.f64) - ti.cast(flight[b] > 0.0, ti.f64)))
+            velocity, opening = -ti.max(distance / dt, u), ti.cast(0.0, ti.f64)
+            if e > 0.0 and u < 0.0 and f.gap[c] - contact_offset + dt * (u - dt * closing) < 0.0:
+                impact_speed = ti.min(dt * closing - u, ti.sqrt(u * u + ti.abs(flight[a] - flight[b]) * closing * closing))
+                w_squared = e * e * (impact_speed * impact_speed + 2.0 * closing * distance) - 2.0 * closing * distance
+                w = ti.sqrt(ti.max(0.0, w_squared))
+                opened = dt * (w - dt * ti.abs(gravity_n))
+                if opened > NEGLIGIBLE_OPENING * contact_offset:
+                    velocity, opening = w, opened
+                    rebounds += 1
+            f.min_velocity[c], f.min_opening[c] = velocity, opening
+    return rebounds

@@ -1,11 +1,11 @@
-"""Sweeps until the residual is small: on one thread in one kernel, or in parallel loops.
+"""Sweep until the residual is small: on one thread in one kernel, or in parallel loops.
 
-rule: the module of a solver, with
-    share(p, c, beyond)         share of its r-factors that contact c takes; beyond: 1 with momentum,
-    sweep(p)                    one sweep on this thread: r from what r was, which is left in `guess`,
-    sweep_at_once(p, colours)   the same on all threads, called from the host.
-On a CPU one thread wins: 0.15 us a contact and sweep, where a parallel loop costs some 30 us to start, a sweep takes two to
-twenty of them, and memory feeds two threads little better than one.
+solver: the module of a solver, with
+    relaxation(p, c, with_momentum)   fraction of its r-factors that contact c uses; with_momentum: 0 or 1,
+    sweep(p)                          one sweep on this thread; the old r is left in `sweep_start`,
+    sweep_parallel(p, colours)        the same on all threads, called from the host.
+On a CPU one thread is faster: it takes 0.15 us per contact and sweep. A parallel loop costs some 30 us to start, a sweep has two
+to twenty of them, and memory bandwidth limits two threads to little more than the speed of one.
 """
 
 from types import ModuleType
@@ -14,10 +14,10 @@ import taichi as ti
 
 from taisoft.contact import momentum, r_factor
 from taisoft.contact.problem import (
+    BEST,
     CHANGED,
-    GOOD,
-    LOOKS,
-    PARTS,
+    CHECKS,
+    CHUNKS,
     RESIDUAL,
     SIZE,
     ContactProblem,
@@ -32,7 +32,7 @@ from taisoft.runtime import kernel
 
 @ti.func
 def refresh(p: ti.template()):
-    """w from the impulses, on this thread."""
+    """Recompute w from the impulses, on this thread."""
     if ti.static(not p.matrix):
         for i in range(p.n_nodes):
             p.w[i] = gather_velocity(p, i)
@@ -42,14 +42,14 @@ def refresh(p: ti.template()):
 
 
 @ti.func
-def _begin(p: ti.template(), rule: ti.template(), beyond):
+def _begin(p: ti.template(), solver: ti.template(), with_momentum):
     refresh(p)
     p.state[RESIDUAL] = residual(p)
     r_factor.begin(p)
     for c in range(p.count[0]):
-        p.relaxation[c] = rule.relaxation(p, c, beyond)
-        p.trial[c] = p.r[c]
-        p.good[c] = p.r[c]
+        p.relaxation[c] = solver.relaxation(p, c, with_momentum)
+        p.previous[c] = p.r[c]
+        p.best[c] = p.r[c]
 
 
 @ti.func
@@ -57,27 +57,28 @@ def _extrapolate(p: ti.template()):
     total = ti.cast(0.0, ti.f64)
     for c in range(p.count[0]):
         total += momentum.restart_test(p, c)
-    beyond = momentum.momentum_weight(p, total)
+    weight = momentum.momentum_weight(p, total)
     for c in range(p.count[0]):
-        momentum.extrapolate_impulse(p, c, beyond)
+        momentum.extrapolate_impulse(p, c, weight)
 
 
 @kernel
 def run_serial(
-    p: ti.template(), rule: ti.template(), first: ti.i32, sweeps: ti.i32, every: ti.i32, tolerance: ti.f64, beyond: ti.i32
-):
-    """Up to that many sweeps, a look at the residual after `every`; first, beyond: 1 where the solve begins, with momentum."""
+    p: ti.template(), solver: ti.template(), first: ti.i32, sweeps: ti.i32, every: ti.i32, tolerance: ti.f64,
+    with_momentum: ti.i32,
+):  # fmt: skip
+    """Run up to `sweeps` sweeps with a residual check after each `every`; first: 1 at the start of a solve."""
     ti.loop_config(serialize=True)
     for _ in range(1):
-        p.state[LOOKS] = 0.0
+        p.state[CHECKS] = 0.0
         if first == 1:
-            _begin(p, rule, beyond)
+            _begin(p, solver, with_momentum)
         done = 0
         while done < sweeps and not p.state[RESIDUAL] <= tolerance:
             n = ti.min(every, sweeps - done)
             for _k in range(n):
-                rule.sweep(p)
-                if beyond == 1:
+                solver.sweep(p)
+                if with_momentum == 1:
                     _extrapolate(p)
                 refresh(p)
             done += n
@@ -85,7 +86,7 @@ def run_serial(
             r_factor.accept_or_reject(p, ti.cast(n, ti.f64))
             for c in range(p.count[0]):
                 r_factor.apply_verdict(p, c)
-            if p.state[RESIDUAL] == p.state[GOOD]:
+            if p.state[RESIDUAL] == p.state[BEST]:
                 refresh(p)
 
 
@@ -93,38 +94,38 @@ def run_serial(
 
 
 @kernel
-def _begin_at_once(p: ti.template(), rule: ti.template(), beyond: ti.i32):
+def _begin_parallel(p: ti.template(), solver: ti.template(), with_momentum: ti.i32):
     for c in range(p.count[0]):
-        p.relaxation[c] = rule.relaxation(p, c, beyond)
-        p.trial[c] = p.r[c]
+        p.relaxation[c] = solver.relaxation(p, c, with_momentum)
+        p.previous[c] = p.r[c]
 
 
 @ti.func
-def _add_part(p: ti.template(), k):
-    """The terms of part k, in order."""
+def _sum_chunk(p: ti.template(), k):
+    """Sum the terms of chunk k, in order."""
     n = p.count[0]
     total = ti.Vector([0.0, 0.0], ti.f64)
-    for c in range(k * n // PARTS, (k + 1) * n // PARTS):
+    for c in range(k * n // CHUNKS, (k + 1) * n // CHUNKS):
         total += p.term[c]
-    p.part[k] = total
+    p.partial[k] = total
 
 
 @ti.func
 def _total(p: ti.template()):
     total = ti.Vector([0.0, 0.0], ti.f64)
-    for k in range(PARTS):
-        total += p.part[k]
+    for k in range(CHUNKS):
+        total += p.partial[k]
     return total
 
 
 @kernel
-def _look(p: ti.template(), first: ti.i32, sweeps: ti.i32):
-    """Judge the impulses; w is up to date."""
+def _check(p: ti.template(), first: ti.i32, sweeps: ti.i32):
+    """Check the residual and save or restore the impulses; w must be up to date."""
     for c in range(p.count[0]):
         d, s = natural_map(p, c)
         p.term[c] = [d, s]
-    for k in range(PARTS):
-        _add_part(p, k)
+    for k in range(CHUNKS):
+        _sum_chunk(p, k)
     ti.loop_config(serialize=True)
     for _ in range(1):
         sums = _total(p)
@@ -142,8 +143,8 @@ def _look(p: ti.template(), first: ti.i32, sweeps: ti.i32):
 def _extrapolate_parallel(p: ti.template()):
     for c in range(p.count[0]):
         p.term[c] = [momentum.restart_test(p, c), 0.0]
-    for k in range(PARTS):
-        _add_part(p, k)
+    for k in range(CHUNKS):
+        _sum_chunk(p, k)
     ti.loop_config(serialize=True)
     for _ in range(1):
         p.state[CHANGED] = momentum.momentum_weight(p, _total(p)[0])
@@ -152,23 +153,23 @@ def _extrapolate_parallel(p: ti.template()):
 
 
 def run_parallel(
-    p: ContactProblem, rule: ModuleType, first: int, sweeps: int, every: int, tolerance: float, beyond: int
+    p: ContactProblem, solver: ModuleType, first: int, sweeps: int, every: int, tolerance: float, with_momentum: int
 ) -> None:
-    """As `run_serial`, on all threads; the host looks at the residual."""
-    p.state[LOOKS] = 0.0
+    """As `run_serial`, on all threads; the host reads the residual."""
+    p.state[CHECKS] = 0.0
     if first:
         find_velocities(p)
-        _begin_at_once(p, rule, beyond)
-        _look(p, 1, 0)
+        _begin_parallel(p, solver, with_momentum)
+        _check(p, 1, 0)
     done, colours = 0, int(p.count[1])
     while done < sweeps and not p.state[RESIDUAL] <= tolerance:
         n = min(every, sweeps - done)
         for _ in range(n):
-            rule.sweep_at_once(p, colours)
-            if beyond:
+            solver.sweep_parallel(p, colours)
+            if with_momentum:
                 _extrapolate_parallel(p)
             find_velocities(p)
         done += n
-        _look(p, 0, n)
-        if p.state[RESIDUAL] == p.state[GOOD]:
+        _check(p, 0, n)
+        if p.state[RESIDUAL] == p.state[BEST]:
             find_velocities(p)

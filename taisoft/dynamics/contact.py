@@ -11,7 +11,7 @@ from taisoft.collision.contacts import Contacts
 from taisoft.collision.crossings import CROSSED, CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.collision.pipeline import Detection
 from taisoft.contact.assemble import (
-    OWN,
+    SELF_CONTACT,
     build_found,
     build_pair_numbers,
     fill,
@@ -60,7 +60,7 @@ class ContactStep:
         d = self.detection
         self.contact_offset = CONTACT_OFFSET * float(d.edges[: len(scene.bodies)].min())
         if d.margin > 0.0:
-            self.contact_offset = min(self.contact_offset, 0.5 * d.margin / (OWN if self_collision else 1.0))
+            self.contact_offset = min(self.contact_offset, 0.5 * d.margin / (SELF_CONTACT if self_collision else 1.0))
         # what follows a path may be changed from outside between two steps, and its path may end with the last one
         self._follows = simulation.dirichlet.n_prescribed > 0 or any(o.path is not None for o in scene.obstacles)
         self._shares = FAST[explicit], SLOW[explicit]
@@ -124,7 +124,7 @@ class ContactStep:
         p, f = self.problem, self.found
         return {
             "normal": p.normal, "tangent": p.tangent, "r": p.r, "node": p.node, "weight": p.weight, "arity": p.arity,
-            "point": f.point, "gap": f.gap, "body": f.body, "feature": f.feature, "struck": f.struck,
+            "point": f.point, "gap": f.gap, "body": f.body, "feature": f.feature, "struck": f.impact_impulse,
         }  # fmt: skip
 
     def snapshot(self) -> dict:
@@ -248,7 +248,7 @@ class ContactStep:
         scene, first = self.simulation.scene, self.simulation.layout.node_start[:-1]
         added, f, p = dt**2 if lossy else 0.0, self.found, self.problem
         self.flight += np.where(self.flight > 0.0, added, dt**2)
-        r, struck, body = download([p.r, f.struck, f.body], self.n_contacts)
+        r, struck, body = download([p.r, f.impact_impulse, f.body], self.n_contacts)
         self.flight[body[(r != 0.0).any(axis=1)]] = 0.0
         self.flight[body[(struck != 0.0).any(axis=1)]] = dt**2
         constrained = np.logical_or.reduceat(self.simulation.dirichlet.constrained().any(axis=1), first)
@@ -399,7 +399,7 @@ class ContactStep:
         f, p = self.found, self.problem
         n = p.count[0]
         normal, tangent, r, struck, point, gap, body, feature, node, weight, arity = download(
-            [p.normal, p.tangent, p.r, f.struck, f.point, f.gap, f.body, f.feature, p.node, p.weight, p.arity], n
+            [p.normal, p.tangent, p.r, f.impact_impulse, f.point, f.gap, f.body, f.feature, p.node, p.weight, p.arity], n
         )
         r = r / self._share + struck
         impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)

@@ -72,7 +72,7 @@ def begin_contacts(
 ):  # fmt: skip
     """What neither x nor the multipliers change in a stage of a step of dt [s].
 
-    impact: whether the contacts' velocity must be `leave`, whatever their gap. goal (4,): see `ContactStep.goal`.
+    impact: whether the contacts' velocity must be `min_velocity`, whatever their gap. goal (4,): see `ContactStep.goal`.
     """
     p, f, w = ti.static((k.problem, k.found, k.work))
     ti.loop_config(serialize=p.serial)
@@ -84,9 +84,9 @@ def begin_contacts(
                 offset += p.weight[c, j] * (k.x_start[i] - s.x_hat[i])
         w.tangential_offset[c] = offset
         if ti.static(impact):
-            w.gap_minus_target[c] = -beta * f.leave[c] - (beta / dt) * p.normal[c].dot(f.obstacle_displacement[c])
+            w.gap_minus_target[c] = -beta * f.min_velocity[c] - (beta / dt) * p.normal[c].dot(f.obstacle_displacement[c])
         else:
-            short = gap_minus_target(f, c, dt, gap_targets[0], gap_targets[1], gap_targets[2], gap_targets[3], f.rise[c])
+            short = gap_minus_target(f, c, dt, gap_targets[0], gap_targets[1], gap_targets[2], gap_targets[3], f.min_opening[c])
             w.gap_minus_target[c] = short - p.normal[c].dot(f.obstacle_displacement[c])
 
 

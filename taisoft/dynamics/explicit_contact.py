@@ -9,7 +9,7 @@ import taichi as ti
 from taisoft.contact.assemble import gap_minus_target
 from taisoft.contact.problem import impulse_on, to_frame
 from taisoft.contact.prox import dvec
-from taisoft.contact.restitution import explicit_rise
+from taisoft.contact.restitution import explicit_opening
 from taisoft.dynamics.explicit import (
     acceleration,
     euler_velocity,
@@ -80,7 +80,7 @@ def set_free_velocities(
         for j in range(p.arity[c]):
             v += p.weight[c, j] * ti.cast(m.state.v[p.node[c, j]], ti.f64)
         b = to_frame(p, c, v)
-        rise = explicit_rise(f, c, dt, contact_offset, b[0], kicked)
+        rise = explicit_opening(f, c, dt, contact_offset, b[0], kicked)
         p.b[c] = dvec(b[0] + gap_minus_target(f, c, dt, contact_offset, fast, slow, fastest, rise) / dt, b[1], b[2])
 
 

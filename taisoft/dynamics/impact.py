@@ -1,7 +1,7 @@
 """The impact before an implicit step in which surfaces meet with restitution: a jump of the velocity at x_n.
 
-    (M + tau^2 K)(v+ - v_n) = J^T p,   u = J v+ - leave,   tau = SPREAD dt,
-with Signorini's and Coulomb's laws between p and u; `leave` is the speed with which a contact must part
+    (M + tau^2 K)(v+ - v_n) = J^T p,   u = J v+ - min_velocity,   tau = SPREAD dt,
+with Signorini's and Coulomb's laws between p and u; `min_velocity` is the speed with which a contact must part
 (`contact.restitution`). With M alone the nodes at the contact would turn round and the body behind them go on: it would
 vibrate, and implicit Euler takes the energy of vibrations whose period is not many steps. tau^2 K keeps these out: a motion
 of frequency w takes 1 / (1 + (w tau)^2) of its part of the impulse. With w tau = 1, implicit Euler loses 1 - 1/e of the
@@ -9,7 +9,7 @@ energy in a period, which is what SPREAD = 2 pi says. A body that waves cross wi
 soft one, or short steps, at its contacts alone, and its elasticity does the rest.
 
 No energy may come of it. The kinetic energy changes by
-    E(s) = s (D.M v_n + p.u_fixed) + s^2 D.M D / 2 <= s sum p_n max(0, leave - |u_n|) / 2,   D = v+ - v_n,
+    E(s) = s (D.M v_n + p.u_fixed) + s^2 D.M D / 2 <= s sum p_n max(0, min_velocity - |u_n|) / 2,   D = v+ - v_n,
 u_fixed what obstacles and prescribed nodes add to u_n, whose work is theirs; the right side is what implicit Euler lost
 before and may get back. Newton's law breaks this where friction turns the slip round (Kane's paradox), or where bodies
 vibrate: then the jump is scaled down by s < 1. What is left of it, the slack, is what tau^2 K took. In the step after it
@@ -69,7 +69,7 @@ def impact_residual(m: ti.template(), A: ti.template(), k: ti.template(), i, tau
 
 @kernel
 def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f64, norms: ti.types.ndarray()):
-    """The impact's stage at v_n, without impulses; those of the last step are kept in `struck`. The matrix has been formed.
+    """The impact's stage at v_n, without impulses; `impact_impulse` keeps those of the last step. The matrix has been formed.
 
     norms: as `form_residual` tells; the scale is the momentum of all nodes at the highest speed that a contact must gain.
     """
@@ -83,9 +83,9 @@ def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f
     for _ in range(1):
         speed, mass = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for c in range(p.count[0]):
-            f.struck[c] = p.r[c]
+            f.impact_impulse[c] = p.r[c]
             p.r[c] = dvec(0.0)
-            speed = ti.max(speed, f.leave[c] - f.approach[c])
+            speed = ti.max(speed, f.min_velocity[c] - f.approach[c])
         for i in range(m.n_nodes):
             mass += ti.cast(m.mass[i], ti.f64) ** 2
         for j in ti.static(range(5)):
@@ -118,14 +118,14 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
                 i = p.node[c, j]
                 fixed += p.weight[c, j] * (1.0 - ti.cast(m.free[i], ti.f64)) * ti.cast(s.v_hat[i], ti.f64)
             slope += to_world(p, c, p.r[c]).dot(fixed)
-            if f.rise[c] > 0.0:
-                slope -= 0.5 * p.r[c][0] * ti.max(0.0, f.leave[c] + f.approach[c])
+            if f.min_opening[c] > 0.0:
+                slope -= 0.5 * p.r[c][0] * ti.max(0.0, f.min_velocity[c] + f.approach[c])
         out[0], out[1] = slope, total(m, OTHER_SUM)
 
 
 @kernel
 def apply_impact(m: ti.template(), s: ti.template(), k: ti.template(), share: ti.f64):
-    """The step begins with that share of the jump. Impulses become those of the last step, and `struck` those of the impact."""
+    """Start the step with that share of the jump; impulses become those of the last step, `impact_impulse` the impact's."""
     p, f = ti.static((k.problem, k.found))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -134,8 +134,8 @@ def apply_impact(m: ti.template(), s: ti.template(), k: ti.template(), share: ti
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         struck = share * p.r[c]
-        p.r[c] = f.struck[c]
-        f.struck[c] = struck
+        p.r[c] = f.impact_impulse[c]
+        f.impact_impulse[c] = struck
 
 
 @kernel
@@ -155,7 +155,7 @@ def holding_work(k: ti.template(), beta: ti.f64) -> ti.f64:
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
-            if f.rise[c] > 0.0:
+            if f.min_opening[c] > 0.0:
                 way = w.tangential_offset[c]
                 for j in range(p.arity[c]):
                     way += p.weight[c, j] * k.displacement[p.node[c, j]]
@@ -169,7 +169,7 @@ def let_go(f: ti.template()):
     (p,) = ti.static((f.problem,))
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        f.rise[c] = 0.0
+        f.min_opening[c] = 0.0
 
 
 def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":

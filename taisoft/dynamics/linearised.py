@@ -18,7 +18,7 @@ from taisoft.dynamics.contact_terms import (
     unprojected,
 )
 from taisoft.dynamics.stage import place_node
-from taisoft.linear.block_csr import block_times, part_times
+from taisoft.linear.block_csr import block_times, partial_row_times
 from taisoft.linear.pcg import dot64, total
 from taisoft.runtime import kernel
 from taisoft.scalars import OTHER_SUM, STEP_LENGTH, SUM
@@ -93,7 +93,7 @@ def step_length(k: ti.template(), at_rest, curvature, start, r_scale):
 def begin_node(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), i):
     """(r.y, y.A y) of node i, whose row of A y is kept; base = x."""
     y = s.pcg.y[i]
-    q = block_times(k.coupling.base[i], y) + part_times(m, A, A.row_start[i], A.row_start[i + 1], s.pcg.y)
+    q = block_times(k.coupling.base[i], y) + partial_row_times(m, A, A.row_start[i], A.row_start[i + 1], s.pcg.y)
     s.pcg.q[i] = q
     s.base[i] = m.state.x[i]
     return dot64(m.free[i] * s.residual[i], y), dot64(y, q)

@@ -238,7 +238,7 @@ class StageSystem:
         # in the order of their places
         limits[:] = (
             problem.tolerance * self.scale, problem.enough_of_one * self.scale, floor, problem.contact_tolerance,
-            problem.linear_tolerance, problem.max_newton, pcg.most_iterations(m), pcg.batch_of(m, A),
+            problem.linear_tolerance, problem.max_newton, pcg.iteration_limit(m), pcg.batch_of(m, A),
             problem.extrapolate_after, problem.later_tolerance,
         )  # fmt: skip
         while loop[frictional.VERDICT] == frictional.RUNNING:
@@ -282,7 +282,7 @@ class StageSystem:
         """y of pcg from -r."""
         m, w = self.model, self.work
         answer = pcg.solve(
-            m, self.matrix, w.pcg, tolerance, pcg.most_iterations(m), self._k.coupling, self._same_matrix
+            m, self.matrix, w.pcg, tolerance, pcg.iteration_limit(m), self._k.coupling, self._same_matrix
         )  # fmt: skip
         self._same_matrix = True
         return answer

@@ -1,8 +1,8 @@
-"""Assembled stiffness: 3x3 block CSR over nodes, its pattern built once.
+"""Assemble the stiffness matrix as 3x3 block CSR over nodes, with a pattern built once.
 
-Each tet writes the blocks K_ab (a < b) between its nodes (`element_blocks`); each node pair gathers its blocks in a fixed
-order and writes K_ij and its transpose; the diagonal block is minus the row's sum, since a translation stores no energy.
-K is the second derivative of the energy (positive at rest), so df/dx = -K. Projected: each element's part is made
+Each tet writes the blocks K_ab (a < b) between its nodes (`element_blocks`). Each node pair gathers its blocks in a fixed
+order and writes K_ij and its transpose. The diagonal block is minus the sum of the row, since a translation stores no energy.
+K is the second derivative of the energy (positive at rest), so df/dx = -K. Projected: each element's contribution is made
 positive semi-definite first.
 """
 
@@ -23,7 +23,7 @@ from taisoft.runtime import kernel
 from taisoft.subset import block_of, edge_of, first_block_of, last_block_of, n_edges_of, n_nodes_of, node_of
 from taisoft.transfer import download
 
-# A block is a 12-vector, column by column with a zero below each, entry (r, c) in place 4 c + r: one address serves for all,
+# A block is a 12-vector, column by column, each padded with a zero: entry (r, c) is at 4 c + r. All entries share one address,
 # and a column times a number is one SIMD instruction.
 BLOCK = 12
 
@@ -34,29 +34,29 @@ class BlockCsr:
 
     n_edges: Count
     row_start: Any  # (n_nodes + 1) i32
-    row_upper: Any  # (n_nodes) i32: where a row's columns pass the diagonal
-    column: Any  # (2 n_edges) i32, ascending in each row, no diagonal
-    value: Any  # (2 n_edges) 12-vectors: blocks as below
+    row_upper: Any  # (n_nodes) i32: first entry of a row right of the diagonal
+    column: Any  # (2 n_edges) i32, ascending in each row, without the diagonal
+    value: Any  # (2 n_edges) 12-vectors: blocks off the diagonal
     diagonal: Any  # (n_nodes) 12-vectors
-    row_sum: Any  # (1) 4-vector: that of the last row, see `keep_padding_lane`
-    element: Any  # K_ab of each tet, per block of tets (pair, entry, lane): a `Lanes` buffer,
-    element_at: Count  # where it begins, in vectors of lanes,
-    element_mask: int  # and the bits of such a number
+    row_sum: Any  # (1) 4-vector: written but not read, see `keep_padding_lane`
+    element: Any  # K_ab of each tet, per block of tets (pair, entry, lane): a `Lanes` buffer
+    element_at: Count  # its start, in vectors of lanes
+    element_mask: int  # bit mask of an index into it, in vectors of lanes
     edge_start: Any  # (n_edges + 1) i32: rows of edge_entry
-    edge_entry: Any  # i32: lanes times the first entry in element, plus the lane
-    edge_upper: Any  # (n_edges) i32: where K_ij lies in value / 9
-    edge_lower: Any  # (n_edges) i32: where K_ji lies
-    term_start: Any  # these three only for quadratic tets: see element_blocks.pair_terms
+    edge_entry: Any  # i32: index into element, lanes times the first entry plus the lane
+    edge_upper: Any  # (n_edges) i32: index of K_ij in value
+    edge_lower: Any  # (n_edges) i32: index of K_ji
+    term_start: Any  # this and the next two only for quadratic tets, see `element_blocks.pair_terms`
     term_pair: Any
     term_factor: Any
 
 
 def build_block_csr(model: Model, arena: FieldArena, real, prefix: str = "stiffness") -> BlockCsr:
-    """Pattern and gather table from the model's tets; values are filled by `assemble`."""
+    """Build the pattern and gather table from the model's tets. `assemble` fills the values."""
     graph, base = model_graph(model)
     n_edges = len(graph.ends)
     if base.max(initial=0) > np.iinfo(np.int32).max - 9 * model.lanes:
-        raise SimulationError(f"{int(model.volume.shape[0]) * model.lanes} tets are too many to assemble a stiffness of")
+        raise SimulationError(f"{int(model.volume.shape[0]) * model.lanes} tets are too many to assemble a stiffness matrix")
     order = np.argsort(graph.pair, kind="stable")
     edge_start = np.concatenate([[0], np.cumsum(np.bincount(graph.pair, minlength=n_edges))])
     size = sum((g.last - g.first) * MATRIX_BLOCKS[g.order] * 9 for g in model.groups)
@@ -86,7 +86,7 @@ def build_block_csr(model: Model, arena: FieldArena, real, prefix: str = "stiffn
 
 
 def sibling(matrix: BlockCsr, model: Model, arena: FieldArena, real, prefix: str) -> BlockCsr:
-    """A second matrix with the same pattern and element buffer, its own values."""
+    """A second matrix that shares pattern and element buffer but has its own values."""
     return replace(
         matrix,
         value=arena.vectors(f"{prefix}_value", real, 2 * matrix.n_edges, n=BLOCK),
@@ -96,7 +96,7 @@ def sibling(matrix: BlockCsr, model: Model, arena: FieldArena, real, prefix: str
 
 @kernel
 def assemble(m: ti.template(), A: ti.template(), subset: ti.template(), projected: ti.template()):
-    """The rows of a subset of A = K(x) [N/m], unprojected or with every element's part made positive semi-definite."""
+    """Assemble the rows of a subset of A = K(x) [N/m]. projected: with positive semi-definite element contributions."""
     for n, g in ti.static(enumerate(m.groups)):
         ti.loop_config(serialize=m.serial)
         for j in range(first_block_of(g, n, subset), last_block_of(g, n, subset)):
@@ -130,28 +130,30 @@ def gather_edge(m: ti.template(), A: ti.template(), e):
 
 @kernel
 def to_system(m: ti.template(), A: ti.template(), damper: ti.template(), subset: ti.template(), c: ti.f64, beta: ti.f64):
-    """A = (c + beta a) M + beta^2 A + beta b K_d in place, the rows of a subset: a, b the damping of the row's body, K_d the
-    damper's values."""
+    """Set A = (c + beta a) M + beta^2 A + beta b K_d in place, for the rows of a subset.
+
+    a, b: mass and stiffness damping of the row's body; K_d: values of the matrix `damper`.
+    """
     ti.loop_config(serialize=m.serial)
     for j in range(n_nodes_of(m, subset)):
         i = node_of(subset, j)
-        k, inertia, drag = ti.cast(beta * beta, m.real), ti.cast(c, m.real), ti.cast(0.0, m.real)
+        k, inertia, damping = ti.cast(beta * beta, m.real), ti.cast(c, m.real), ti.cast(0.0, m.real)
         if ti.static(m.damped):
             inertia += ti.cast(beta, m.real) * mass_damping.rate(m, i)
-            drag = ti.cast(beta, m.real) * stiffness_damping.rate(m, i)
+            damping = ti.cast(beta, m.real) * stiffness_damping.rate(m, i)
         mass = m.mass[i]
         if ti.static(m.consistent):
             mass = m.mass_matrix.diagonal[i]
         for at in range(A.row_start[i], A.row_start[i + 1]):
             A.value[at] = k * A.value[at]
             if ti.static(m.stiffness_damping):
-                A.value[at] += drag * damper.value[at]
+                A.value[at] += damping * damper.value[at]
             if ti.static(m.consistent):
                 for r in ti.static(range(3)):
                     A.value[at][5 * r] += inertia * m.mass_matrix.value[at]
         d = k * A.diagonal[i]
         if ti.static(m.stiffness_damping):
-            d += drag * damper.diagonal[i]
+            d += damping * damper.diagonal[i]
         for r in ti.static(range(3)):
             d[5 * r] += inertia * mass
         A.diagonal[i] = d
@@ -172,17 +174,17 @@ def block_times(B, x):
 
 @ti.func
 def keep_padding_lane(m: ti.template(), A: ti.template(), y):
-    """Store a row's sum, whose last entry nobody reads: else the compiler drops that, and adds three numbers in two operations.
+    """Store a row's sum so that the compiler keeps its unused fourth entry and adds four numbers in one SIMD operation, not two.
 
-    In one, iterations of conjugate gradients take 0.75 of the time where the matrix lies in the cache, 0.9 where it does not.
+    Conjugate gradient iterations then take 0.75 of the time if the matrix fits into the cache, 0.9 if it does not.
     """
     if ti.static(m.serial):
         A.row_sum[0] = y
 
 
 @ti.func
-def part_times(m: ti.template(), A: ti.template(), first, last, x: ti.template()):
-    """Sum of the blocks first..last (of one row) times x at their columns."""
+def partial_row_times(m: ti.template(), A: ti.template(), first, last, x: ti.template()):
+    """Sum of blocks first <= k < last (of one row) times x at their columns."""
     y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
     for k in range(first, last):
         y += padded_times(A.value[k], x[A.column[k]])
@@ -191,8 +193,8 @@ def part_times(m: ti.template(), A: ti.template(), first, last, x: ti.template()
 
 
 @ti.func
-def part_times_backward(m: ti.template(), A: ti.template(), first, last, x: ti.template()):
-    """The same sum from its end: in a sweep from the last row up, the entries of x that were computed last come last."""
+def partial_row_times_backward(m: ti.template(), A: ti.template(), first, last, x: ti.template()):
+    """The same sum in reverse order: a backward sweep then uses the most recently computed entries of x last."""
     y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
     for n in range(last - first):
         k = last - 1 - n
@@ -204,7 +206,7 @@ def part_times_backward(m: ti.template(), A: ti.template(), first, last, x: ti.t
 @ti.func
 def row_times(m: ti.template(), A: ti.template(), i, x: ti.template()):
     """(A x)_i."""
-    return block_times(A.diagonal[i], x[i]) + part_times(m, A, A.row_start[i], A.row_start[i + 1], x)
+    return block_times(A.diagonal[i], x[i]) + partial_row_times(m, A, A.row_start[i], A.row_start[i + 1], x)
 
 
 @kernel
@@ -216,24 +218,24 @@ def multiply(m: ti.template(), A: ti.template(), x: ti.template(), y: ti.templat
 
 
 def packed(blocks: np.ndarray) -> np.ndarray:
-    """(k, 3, 3) as blocks are kept, (k, 12)."""
+    """Convert blocks (k, 3, 3) to the stored form (k, 12)."""
     padded = np.zeros((len(blocks), 3, 4), dtype=blocks.dtype)
     padded[:, :, :3] = blocks.swapaxes(1, 2)
     return padded.reshape(-1, BLOCK)
 
 
-def unpacked(kept: np.ndarray) -> np.ndarray:
-    """(k, 12) as (k, 3, 3) float64."""
-    return kept.reshape(-1, 3, 4)[:, :, :3].swapaxes(1, 2).astype(np.float64)
+def unpacked(blocks: np.ndarray) -> np.ndarray:
+    """Convert stored blocks (k, 12) to (k, 3, 3) float64."""
+    return blocks.reshape(-1, 3, 4)[:, :, :3].swapaxes(1, 2).astype(np.float64)
 
 
 def to_scipy(m: Model, A: BlockCsr) -> sp.csr_matrix:
-    """A copy on the host, (3 n_nodes, 3 n_nodes) float64."""
+    """Copy the matrix to the host, (3 n_nodes, 3 n_nodes) float64."""
     start, column, value, diagonal = download([A.row_start, A.column, A.value, A.diagonal])
     start, off, diagonal = start.astype(np.int64), unpacked(value), unpacked(diagonal)
     shape = (3 * m.n_nodes, 3 * m.n_nodes)
-    own = np.arange(m.n_nodes)
+    rows = np.arange(m.n_nodes)
     return (
         sp.bsr_matrix((off, column, start), shape=shape)
-        + sp.bsr_matrix((diagonal, own, np.arange(m.n_nodes + 1)), shape=shape)
+        + sp.bsr_matrix((diagonal, rows, np.arange(m.n_nodes + 1)), shape=shape)
     ).tocsr()

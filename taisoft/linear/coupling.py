@@ -1,9 +1,9 @@
-"""Terms J^T D J of a matrix, kept in factors: each couples a few nodes by weights times one symmetric 3x3 block.
+"""Matrix terms J^T D J in factored form: each couples a few nodes by weights times one symmetric 3x3 block D.
 
-They come and go with the contacts, so they have no place in the pattern of a `BlockCsr`. A product goes through the terms: each
-pulls with D J x, and a node gathers the pulls of its terms. A sweep over the nodes, which needs what the nodes passed so far
-contribute, adds each node to the pulls as it goes; so either costs one block for each term and node.
-Their part of the diagonal is added to the matrix's.
+They change with the contacts, so the fixed pattern of a `BlockCsr` cannot hold them. A product computes D J x for each term, and
+each node gathers the products of its terms. A Gauss-Seidel sweep, which needs the contributions of the nodes passed so far, adds
+each node to the products as it goes. Either way costs one block per term and node.
+Their diagonal blocks are added to those of the matrix.
 """
 
 from dataclasses import dataclass
@@ -16,22 +16,22 @@ from taisoft.linear.block_csr import padded_times
 
 @dataclass(frozen=True, eq=False)
 class Coupling:
-    """Terms c with nodes node[c, 0..arity[c]), and the places of each node in them: entry = width * c + place."""
+    """Terms c with nodes node[c, 0..arity[c]), and for each node its entries = width * c + index in the term."""
 
     width: int
-    count: Any  # i32, count[0] terms
+    count: Any  # i32: count[0] terms
     node: Any  # (capacity, width) i32
     arity: Any  # (capacity) i32
     weight: Any  # (capacity, width) f64
     entry_start: Any  # (n_nodes + 1) i32
     entry: Any  # i32, ascending for each node
     block: Any  # (capacity) 12-vectors
-    active: Any  # (capacity) i32: 0 where the block is 0
+    active: Any  # (capacity) i32: 0 if the block is 0
     base: Any  # (n_nodes) 12-vectors: the matrix's diagonal without the terms
-    n_active: Any  # (n_nodes) i32: active terms of each node, listed from entry_start in the next two
+    n_active: Any  # (n_nodes) i32: active terms of each node, listed from entry_start on in term and term_weight
     term: Any  # (capacity * width) i32
-    term_weight: Any  # (capacity * width): the node's weight in it
-    product: Any  # (capacity) 4-vectors, the last entry 0
+    term_weight: Any  # (capacity * width): the node's weight in the term
+    product: Any  # (capacity) 4-vectors: D J x of each term, the last entry 0
 
 
 NO_COUPLING = Coupling(0, *[None] * 13)
@@ -40,30 +40,30 @@ NO_COUPLING = Coupling(0, *[None] * 13)
 def build_coupling(
     arena, real, n_nodes: int, count, node, arity, weight, entry_start, entry, block, active, base
 ) -> Coupling:
-    """Terms whose nodes, weights and blocks lie in fields that others fill."""
+    """Build terms over existing fields of nodes, weights and blocks, which the caller fills."""
     capacity, width = node.shape
     return Coupling(
         width, count, node, arity, weight, entry_start, entry, block, active, base,
-        arena.field("coupling_active", ti.i32, n_nodes), arena.field("coupling_term", ti.i32, capacity * width),
-        arena.field("coupling_share", real, capacity * width), arena.vectors("coupling_pull", real, capacity, n=4),
+        arena.field("coupling_n_active", ti.i32, n_nodes), arena.field("coupling_term", ti.i32, capacity * width),
+        arena.field("coupling_term_weight", real, capacity * width), arena.vectors("coupling_product", real, capacity, n=4),
     )  # fmt: skip
 
 
 @ti.func
 def has_terms(k: ti.template(), i):
-    """Whether any term holds node i."""
+    """Whether any term contains node i."""
     return k.entry_start[i] < k.entry_start[i + 1]
 
 
 @ti.func
 def prepare_terms(m: ti.template(), k: ti.template(), i):
-    """List the active terms of node i. Returns the diagonal block of the whole matrix."""
+    """List the active terms of node i. Return the diagonal block of the matrix plus terms."""
     total, n = k.base[i], 0
     first = k.entry_start[i]
     for e in range(first, k.entry_start[i + 1]):
-        c, own = k.entry[e] // k.width, k.entry[e] % k.width
+        c, index = k.entry[e] // k.width, k.entry[e] % k.width
         if k.active[c] == 1:
-            weight = ti.cast(k.weight[c, own], m.real)
+            weight = ti.cast(k.weight[c, index], m.real)
             total += weight * weight * k.block[c]
             k.term[first + n], k.term_weight[first + n] = c, weight
             n += 1
@@ -73,14 +73,14 @@ def prepare_terms(m: ti.template(), k: ti.template(), i):
 
 @ti.func
 def clear_products(m: ti.template(), k: ti.template()):
-    """No node pulls."""
+    """Set the products of all terms to 0."""
     for c in range(k.count[0]):
         k.product[c] = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
 
 
 @ti.func
 def add_products(m: ti.template(), k: ti.template(), i, x):
-    """Node i pulls with x."""
+    """Add the contribution of x at node i to the products of its terms."""
     first = k.entry_start[i]
     for e in range(first, first + k.n_active[i]):
         c = k.term[e]
@@ -89,7 +89,7 @@ def add_products(m: ti.template(), k: ti.template(), i, x):
 
 @ti.func
 def gather_products(m: ti.template(), k: ti.template(), i):
-    """What the pulls make of row i of J^T D J x."""
+    """Row i of J^T D J x, from the products."""
     y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
     first = k.entry_start[i]
     for e in range(first, first + k.n_active[i]):
@@ -99,7 +99,7 @@ def gather_products(m: ti.template(), k: ti.template(), i):
 
 @ti.func
 def form_product(m: ti.template(), k: ti.template(), c, x: ti.template()):
-    """Every node of term c pulls with its x."""
+    """Set the product D J x of term c."""
     if k.active[c] == 1:
         s = ti.Vector([0.0, 0.0, 0.0], m.real)
         for j in range(k.arity[c]):

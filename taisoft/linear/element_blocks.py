@@ -1,8 +1,8 @@
-"""The blocks K_ab between the nodes of a tet, before they are summed over tets.
+"""Stiffness blocks K_ab between the nodes of each tet, before summation over tets.
 
 A linear tet has A_kl = V dP(e grad l_k) grad l_l between its corners, six blocks (k < l). A quadratic one has
-    K_ab = sum_q w_q sum_kl s_ak(q) s_bl(q) A_kl(q),   grad N_a = sum_k s_ak grad l_k,   A_kk = -sum_l A_kl (l other than k);
-so each point's six A_kl go to a scratch part of the buffer, and what they give to each node pair is added from there.
+    K_ab = sum_q w_q sum_kl s_ak(q) s_bl(q) A_kl(q),   grad N_a = sum_k s_ak grad l_k,   A_kk = -sum_l A_kl (l other than k).
+The six A_kl of each quadrature point go to a scratch part of the buffer and are added from there to the node pairs.
 """
 
 import numpy as np
@@ -28,10 +28,10 @@ N_PAIRS = len(PAIRS[2])
 
 
 def pair_terms(rules: list[Quadrature]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the six A_kl of a quadratic tet go, for the p points of some rules.
+    """Terms by which the six A_kl of a quadratic tet contribute to its node pairs, for the p points of the given rules.
 
-    Returns (13,) the first term of each A_kl, and of its transpose after it; (terms,) the node pair that a term is added
-    to; (p, terms) the factors, weight included.
+    Returns (13,) the first term of each A_kl, followed by that of its transpose; (terms,) the node pair of each term;
+    (p, terms) the factors, including quadrature weights.
     """
     weights = np.concatenate([r.weights for r in rules])
     s = shape_derivatives(2, np.concatenate([r.points for r in rules]))
@@ -42,16 +42,16 @@ def pair_terms(rules: list[Quadrature]) -> tuple[np.ndarray, np.ndarray, np.ndar
                 factor = weights * s[:, a, k] * s[:, b, l]
                 for other in range(4) if k == l else (l,):
                     if other != k and factor.any():
-                        own = terms[2 * PAIRS[1].index((min(k, other), max(k, other))) + (k > other)]
-                        own[n] = own.get(n, 0.0) + (-factor if k == l else factor)
-    start = np.cumsum([0] + [len(own) for own in terms])
-    pairs = np.array([n for own in terms for n in own])
-    return start, pairs, np.stack([factor for own in terms for factor in own.values()], axis=1)
+                        factors = terms[2 * PAIRS[1].index((min(k, other), max(k, other))) + (k > other)]
+                        factors[n] = factors.get(n, 0.0) + (-factor if k == l else factor)
+    start = np.cumsum([0] + [len(factors) for factors in terms])
+    pairs = np.array([n for factors in terms for n in factors])
+    return start, pairs, np.stack([factor for factors in terms for factor in factors.values()], axis=1)
 
 
 @ti.func
 def element_blocks(m: ti.template(), g: ti.template(), A: ti.template(), b, projected: ti.template()):
-    """K_ab of the node pairs of block b of group g into A.element."""
+    """Write K_ab of the node pairs of block b of group g to A.element."""
     X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
     p = law_constants(m, b, m.real)
     M = rest_gradients(m, b, m.real)
@@ -70,33 +70,33 @@ def element_blocks(m: ti.template(), g: ti.template(), A: ti.template(), b, proj
             S = g.law.prepare(F, p)
             exact_blocks(m, A, g.law, at, F, S, M, V)
         if ti.static(g.order == 2):
-            spread_terms(m, A, base, at, g.points_at + q)
+            scatter_terms(m, A, base, at, g.points_at + q)
 
 
 @ti.func
-def spread_terms(m: ti.template(), A: ti.template(), base, at, row):
+def scatter_terms(m: ti.template(), A: ti.template(), base, at, row):
     """Add the scratch blocks A_kl of quadrature point `row` to the node pairs of a quadratic tet."""
     for n in range(6):
         B = [load_lanes(m, A.element, at + (9 * n + e)) for e in ti.static(range(9))]
         for u in range(A.term_start[2 * n], A.term_start[2 * n + 1]):
-            w, to = A.term_factor[row, u], base + 9 * A.term_pair[u]
+            w, out = A.term_factor[row, u], base + 9 * A.term_pair[u]
             for e in ti.static(range(9)):
-                store_lanes(m, A.element, to + e, load_lanes(m, A.element, to + e) + w * B[e])
+                store_lanes(m, A.element, out + e, load_lanes(m, A.element, out + e) + w * B[e])
         for u in range(A.term_start[2 * n + 1], A.term_start[2 * n + 2]):
-            w, to = A.term_factor[row, u], base + 9 * A.term_pair[u]
+            w, out = A.term_factor[row, u], base + 9 * A.term_pair[u]
             for e in ti.static(range(9)):
-                store_lanes(m, A.element, to + e, load_lanes(m, A.element, to + e) + w * B[3 * (e % 3) + e // 3])
+                store_lanes(m, A.element, out + e, load_lanes(m, A.element, out + e) + w * B[3 * (e % 3) + e // 3])
 
 
 @ti.func
 def exact_blocks(m: ti.template(), A: ti.template(), law: ti.template(), base, F, S, M, V):
-    """K_ab of the corner pairs by the law's closed form, from `base` on.
+    """Write K_ab of the corner pairs by the law's closed form, from `base` on.
 
-    Corners 1, 2, 3 have the gradients g of M's rows; K_0b is minus the sum over a of K_ab.
+    The gradients g of corners 1, 2, 3 are the rows of M; K_0b is minus the sum over a of K_ab.
     """
     g = [[M[3 * a], M[3 * a + 1], M[3 * a + 2]] for a in ti.static(range(3))]
     K11, K22, K33 = law.block(F, S, g[0], g[0]), law.block(F, S, g[1], g[1]), law.block(F, S, g[2], g[2])
-    # law.block(ga, gb) has the force at b as rows: its transpose is K_ab
+    # the rows of law.block(ga, gb) are the force at b: its transpose is K_ab
     K21, K31, K32 = law.block(F, S, g[0], g[1]), law.block(F, S, g[0], g[2]), law.block(F, S, g[1], g[2])
     for i in ti.static(range(3)):
         for k in ti.static(range(3)):
@@ -110,28 +110,28 @@ def exact_blocks(m: ti.template(), A: ti.template(), law: ti.template(), base, F
 
 @ti.func
 def projected_blocks(m: ti.template(), A: ti.template(), base, S, M, V):
-    """The same of the projected second derivative, a column at a time: unrolled it takes seconds to compile."""
+    """Write K_ab of the projected second derivative, one column at a time: unrolled, it takes seconds to compile."""
     for a in ti.static(range(3)):
         for k in range(3):
             # unit displacement of corner a + 1 along axis k
-            on = [ti.select(k == r, ti.cast(1.0, m.real), ti.cast(0.0, m.real)) for r in ti.static(range(3))]
-            D = [on[r] * M[3 * a + c] for r in ti.static(range(3)) for c in ti.static(range(3))]
+            unit = [ti.select(k == r, ti.cast(1.0, m.real), ti.cast(0.0, m.real)) for r in ti.static(range(3))]
+            D = [unit[r] * M[3 * a + c] for r in ti.static(range(3)) for c in ti.static(range(3))]
             T = dpk1_projected(S, D)
             store_column(m, A, base, a, k, T, M, V)
 
 
 @ti.func
 def store_column(m: ti.template(), A: ti.template(), base, a: ti.template(), k, T, M, V):
-    """Column k of the blocks between corner a + 1 and the others: rows r of K_(c+1)(a+1) as row k of K_(a+1)(c+1)."""
+    """Write column k of the blocks K_(c+1)(a+1) between corner a + 1 and the others, as row k of K_(a+1)(c+1)."""
     for r in ti.static(range(3)):
         g = [
             V * (T[3 * r] * M[3 * c] + T[3 * r + 1] * M[3 * c + 1] + T[3 * r + 2] * M[3 * c + 2])
             for c in ti.static(range(3))
         ]
         g0 = -(g[0] + g[1] + g[2])
-        # pair (0, a + 1) is number a: entry (r, k) of K_0a
+        # pair (0, a + 1) has index a: entry (r, k) of K_0a
         store_lanes(m, A.element, base + (9 * a + 3 * r + k), g0)
         for c in ti.static(range(3)):
             if ti.static(c > a):
-                # pair (a + 1, c + 1) is number a + c + 2: K_(c+1)(a+1)[r, k] is K_(a+1)(c+1)[k, r]
+                # pair (a + 1, c + 1) has index a + c + 2: K_(c+1)(a+1)[r, k] is K_(a+1)(c+1)[k, r]
                 store_lanes(m, A.element, base + (9 * (a + c + 2) + 3 * k + r), g[c])

@@ -1,13 +1,13 @@
 """Preconditioned conjugate gradients for A y = rhs on the free axes, A a `BlockCsr` that holds the whole system.
 
-Serial, in one kernel launch (a launch an iteration would cost more than the iteration): symmetric Gauss-Seidel as
-preconditioner, two to three times fewer iterations than block-Jacobi, at the price of one product by Eisenstat's trick.
+Serial, all in one kernel launch (a launch per iteration would cost more than the iteration): symmetric Gauss-Seidel as
+preconditioner. It needs two to three times fewer iterations than block-Jacobi and, by Eisenstat's trick, costs no extra product.
 Parallel, for many tets and on CUDA: block-Jacobi, whose residual is read every few iterations.
 Vectors are in the model's precision, sums in f64 and in a fixed order. Both stop on sqrt(r.z) relative to the start, z the
-preconditioned residual, and on a direction p of negative curvature (p.Ap <= 0), which is reported: y is then the iterate so far
-plus min(r.z / |p.Ap|, FARTHEST) p, a direction along which a function with this gradient and this second derivative falls.
-Diagonal blocks that are not positive definite are replaced by the sums of their rows' absolute values in the preconditioner,
-which is positive definite then.
+preconditioned residual, and on a direction p of negative curvature (p.Ap <= 0), which is reported. y is then the iterate so far
+plus min(r.z / |p.Ap|, MAX_NEGATIVE_STEP) p, a descent direction for a function with this gradient and second derivative.
+The preconditioner replaces diagonal blocks that are not positive definite by the absolute row sums, which makes it positive
+definite.
 """
 
 from dataclasses import dataclass
@@ -21,38 +21,38 @@ from taisoft.linear.coupling import NO_COUPLING, Coupling
 from taisoft.model import Model
 from taisoft.subset import EVERYTHING, Subset
 
-SERIAL_WORK = 40_000_000  # block products per launch: about 0.2 s, so that Ctrl-C is heard
-PARALLEL_BATCH = 8  # iterations between two looks at the residual
-RZ, RZ_START, STEP, COUNT, STOP = range(5)  # places in `state`
-RUNNING, CONVERGED, NEGATIVE, LEAVING = range(4)  # LEAVING: within an iteration that has met negative curvature
-SINGULAR = 1e-12  # determinant over the product of the diagonal, below which a block counts as singular
-FARTHEST = 10.0  # steps along a direction of negative curvature: the caller's line search goes on from there
+SERIAL_WORK = 40_000_000  # block products per launch: about 0.2 s, so that Ctrl-C takes effect
+PARALLEL_BATCH = 8  # iterations between residual checks
+RZ, RZ_START, STEP, COUNT, STATUS = range(5)  # indices into `state`
+RUNNING, CONVERGED, NEGATIVE, NEGATIVE_PENDING = range(4)  # NEGATIVE_PENDING: found in the present iteration
+SINGULAR = 1e-12  # of the product of its diagonal: a block with a smaller determinant counts as singular
+MAX_NEGATIVE_STEP = 10.0  # multiple of a direction of negative curvature; the caller's line search continues from there
 
 
 @dataclass(frozen=True, eq=False)
 class PcgWork:
-    """Vectors of a solve; (n_nodes) 3-vectors unless said otherwise."""
+    """Vectors of a solve; (n_nodes) 3-vectors unless stated otherwise."""
 
     rhs: Any
     y: Any  # the solution
-    r: Any  # residual; serial: (P + L)^-1 of it
+    r: Any  # residual; serial: (P + L)^-1 times it
     z: Any  # preconditioned residual; serial: (P + L)^T p
     p: Any  # direction
-    q: Any  # A p; serial: (P + L)^-1 of it
-    inverse: Any  # (n_nodes) 12-vectors: of P, the diagonal blocks D of A or what stands for them, 0 on constrained axes
+    q: Any  # A p; serial: (P + L)^-1 times it
+    inverse: Any  # (n_nodes) 12-vectors: of P, the diagonal blocks D of A or their replacements, 0 on constrained axes
     block: Any  # (n_nodes) 12-vectors: P; serial only
     mirror: Any  # (n_nodes) 12-vectors: 2 P - D; serial only
     state: Any  # (5) f64
-    subset: Subset = EVERYTHING  # of the nodes
+    subset: Subset = EVERYTHING  # nodes that form the system
 
 
 @dataclass(frozen=True)
 class LinearResult:
-    """What a solve did."""
+    """Outcome of a solve."""
 
     iterations: int
     converged: bool
-    negative: bool  # negative curvature was met
+    negative: bool  # whether negative curvature was found
 
 
 def build_pcg(model: Model, arena: FieldArena) -> PcgWork:
@@ -66,13 +66,13 @@ def build_pcg(model: Model, arena: FieldArena) -> PcgWork:
     return PcgWork(**vectors, **blocks, state=arena.field("pcg_state", ti.f64, 5))
 
 
-def most_iterations(m: Model) -> int:
-    """After which a solve is given up."""
+def iteration_limit(m: Model) -> int:
+    """Maximum iterations of a solve."""
     return max(1000, 30 * m.n_nodes)
 
 
 def batch_of(m: Model, A: BlockCsr) -> int:
-    """Iterations of a serial launch."""
+    """Iterations per serial launch."""
     return max(1, SERIAL_WORK // (2 * A.n_edges + m.n_nodes))
 
 
@@ -80,11 +80,12 @@ def solve(
     m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int, coupling: Coupling = NO_COUPLING,
     same_matrix: bool = False,
 ) -> LinearResult:  # fmt: skip
-    """Fill w.y from w.rhs. tolerance: sqrt(r.z) relative to the start.
+    """Solve for w.y given w.rhs. tolerance: sqrt(r.z) relative to the start.
 
-    coupling: terms beside A, whose own diagonal is then in coupling.base; A.diagonal is set to that of both.
-    w.subset: the nodes whose rows and unknowns make the system; w.r, w.p and w.q are 0 on all others.
-    same_matrix: A is that of the last solve, terms are between the same nodes: rows without terms keep their preconditioner.
+    coupling: terms added to A. The diagonal of A alone must then be in coupling.base; A.diagonal is set to that of the sum.
+    w.subset: the nodes whose rows and unknowns form the system; w.r, w.p and w.q must be 0 on all others.
+    same_matrix: whether A and the nodes of the terms are those of the last solve; rows without terms then keep their
+    preconditioner.
     """
     from taisoft.linear import pcg_parallel, pcg_serial
 
@@ -92,20 +93,20 @@ def solve(
     batch = batch_of(m, A) if m.serial else PARALLEL_BATCH
     done = 0
     while True:
-        done, stop = method.iterate(m, A, coupling, w, min(batch, max_iterations - done), tolerance, done == 0, same_matrix)
-        if stop != RUNNING or done >= max_iterations:
-            return LinearResult(done, stop == CONVERGED, stop == NEGATIVE)
+        done, status = method.iterate(m, A, coupling, w, min(batch, max_iterations - done), tolerance, done == 0, same_matrix)
+        if status != RUNNING or done >= max_iterations:
+            return LinearResult(done, status == CONVERGED, status == NEGATIVE)
 
 
 @ti.func
 def precondition(m: ti.template(), w: ti.template(), i, D):
-    """P of node i from its diagonal block D (12): its inverse over the free axes, for Gauss-Seidel itself and 2 P - D, too."""
+    """Set the inverse of P over the free axes of node i from its diagonal block D (12); if serial, also P and 2 P - D."""
     free, P = m.free[i], D
-    B = ti.Matrix.zero(ti.f64, 3, 3)  # in f64, so that blocks much stiffer one way than another are inverted too
+    B = ti.Matrix.zero(ti.f64, 3, 3)  # f64, to invert blocks whose stiffness differs much between directions
     for r in ti.static(range(3)):
         for c in ti.static(range(3)):
-            both = free[r] * free[c]
-            B[r, c] = both * D[4 * c + r] + (1.0 - both if ti.static(r == c) else 0.0)
+            free_rc = free[r] * free[c]
+            B[r, c] = free_rc * D[4 * c + r] + (1.0 - free_rc if ti.static(r == c) else 0.0)
     minor = B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
     det, size = B.determinant(), B[0, 0] * B[1, 1] * B[2, 2]
     if not (B[0, 0] > 0.0 and minor > 0.0 and det > SINGULAR * size):
@@ -132,7 +133,7 @@ def dot64(a, b):
 
 @ti.func
 def total(m: ti.template(), column: ti.template()):
-    """Sum of a column of the partial sums, in order."""
+    """Sum of a column of the partial sums, in fixed order."""
     s = ti.cast(0.0, ti.f64)
     for c in range(m.chunks):
         s += m.state.partial[c, column]

@@ -1,8 +1,8 @@
 """CG with symmetric Gauss-Seidel on one thread, all iterations in one launch.
 
-With A = L + D + L^T, P positive definite, D where that is, and the preconditioner M = (P + L) P^-1 (P + L)^T, the vectors kept
-are s = (P + L)^-1 r and t = (P + L)^T p. Since A p = (P + L) p + t - (2 P - D) p, one backward and one forward sweep make an
-iteration:
+With A = L + D + L^T, P positive definite (equal to D where D is), and the preconditioner M = (P + L) P^-1 (P + L)^T, the
+vectors stored are s = (P + L)^-1 r and t = (P + L)^T p. Since A p = (P + L) p + t - (2 P - D) p, an iteration consists of one
+backward and one forward sweep:
     p = (P + L)^-T t,   q = (P + L)^-1 A p = p + (P + L)^-1 (t - (2 P - D) p),   p.Ap = t.q,   r.z = s.P s.
 Source: Eisenstat, "Efficient Implementation of a Class of Preconditioned Conjugate Gradient Methods", SIAM J. Sci. Stat.
 Comput. 2(1), 1981.
@@ -10,16 +10,28 @@ Comput. 2(1), 1981.
 
 import taichi as ti
 
-from taisoft.linear.block_csr import block_times, part_times, part_times_backward
+from taisoft.linear.block_csr import block_times, partial_row_times, partial_row_times_backward
 from taisoft.linear.coupling import add_products, clear_products, gather_products, has_terms, prepare_terms
-from taisoft.linear.pcg import CONVERGED, COUNT, FARTHEST, NEGATIVE, RUNNING, RZ, RZ_START, STEP, STOP, dot64, precondition
+from taisoft.linear.pcg import (
+    CONVERGED,
+    COUNT,
+    MAX_NEGATIVE_STEP,
+    NEGATIVE,
+    RUNNING,
+    RZ,
+    RZ_START,
+    STATUS,
+    STEP,
+    dot64,
+    precondition,
+)
 from taisoft.runtime import kernel
 from taisoft.subset import n_nodes_of, node_of
 
 
 @ti.func
 def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), same_matrix):
-    """y = 0, s = (P + L)^-1 rhs, t = P s; the diagonal and what P is on the way."""
+    """Set the diagonal and P, y = 0, s = (P + L)^-1 rhs, t = P s."""
     rz = ti.cast(0.0, ti.f64)
     if ti.static(k.width > 0):
         clear_products(m, k)
@@ -31,7 +43,7 @@ def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()
                 precondition(m, w, i, A.diagonal[i])
         else:
             precondition(m, w, i, A.diagonal[i])
-        below = part_times(m, A, A.row_start[i], A.row_upper[i], w.r)
+        below = partial_row_times(m, A, A.row_start[i], A.row_upper[i], w.r)
         if ti.static(k.width > 0):
             below += gather_products(m, k, i)
         s = block_times(w.inverse[i], w.rhs[i] - below)
@@ -43,32 +55,32 @@ def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()
         w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
         rz += dot64(s, t)
     w.state[RZ], w.state[RZ_START], w.state[STEP] = rz, rz, 0.0
-    w.state[COUNT], w.state[STOP] = 0.0, RUNNING
+    w.state[COUNT], w.state[STATUS] = 0.0, RUNNING
 
 
 def iterate(
     m, A, k, w, n: int, tolerance: float, begin: bool, same_matrix: bool
 ) -> tuple[int, int]:  # fmt: skip
-    """Up to n iterations, from y = 0 where the solve begins; returns the iterations so far and how it stands."""
-    count, stop = iterate_kernel(m, A, k, w, n, tolerance, int(begin), int(same_matrix))
-    return int(count), int(stop)
+    """Run up to n iterations, from y = 0 if `begin`. Return the iterations so far and the status."""
+    count, status = iterate_kernel(m, A, k, w, n, tolerance, int(begin), int(same_matrix))
+    return int(count), int(status)
 
 
 @ti.func
 def iterations(m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), n, tolerance):
-    """Up to n iterations from where the solve stands: how many, and how it stands then."""
-    rz, along, stop, k = w.state[RZ], w.state[STEP], ti.cast(RUNNING, ti.i32), 0
+    """Run up to n iterations from the present state. Return their number and the status."""
+    rz, beta, status, k = w.state[RZ], w.state[STEP], ti.cast(RUNNING, ti.i32), 0
     limit, size = tolerance * tolerance * w.state[RZ_START], n_nodes_of(m, w.subset)
     if rz <= limit:
-        stop = CONVERGED
-    while k < n and stop == RUNNING:
+        status = CONVERGED
+    while k < n and status == RUNNING:
         if ti.static(coupling.width > 0):
             clear_products(m, coupling)
-        for back in range(size):
-            i = node_of(w.subset, size - 1 - back)
-            t = w.q[i] + ti.cast(along, m.real) * w.z[i]  # w.q holds P s of the last update
+        for reverse in range(size):
+            i = node_of(w.subset, size - 1 - reverse)
+            t = w.q[i] + ti.cast(beta, m.real) * w.z[i]  # w.q holds P s of the last update
             w.z[i] = t
-            above = part_times_backward(m, A, A.row_upper[i], A.row_start[i + 1], w.p)
+            above = partial_row_times_backward(m, A, A.row_upper[i], A.row_start[i + 1], w.p)
             if ti.static(coupling.width > 0):
                 above += gather_products(m, coupling, i)
             p = block_times(w.inverse[i], t - above)
@@ -80,9 +92,9 @@ def iterations(m: ti.template(), A: ti.template(), coupling: ti.template(), w: t
         curvature = ti.cast(0.0, ti.f64)
         for at in range(size):
             i = node_of(w.subset, at)
-            # now w.q holds (P + L)^-1 (t - (2 P - D) p), as the rows below need it
+            # from here on w.q holds (P + L)^-1 (t - (2 P - D) p), which the following rows need
             p, t = w.p[i], w.z[i]
-            below = part_times(m, A, A.row_start[i], A.row_upper[i], w.q)
+            below = partial_row_times(m, A, A.row_start[i], A.row_upper[i], w.q)
             if ti.static(coupling.width > 0):
                 below += gather_products(m, coupling, i)
             s = block_times(w.inverse[i], t - block_times(w.mirror[i], p) - below)
@@ -91,11 +103,13 @@ def iterations(m: ti.template(), A: ti.template(), coupling: ti.template(), w: t
             w.q[i] = s
             curvature += dot64(t, p + s)
         if not curvature > 0.0:
-            stop = NEGATIVE
-            far = ti.cast(ti.min(rz, -FARTHEST * curvature) / -curvature if curvature < 0.0 else FARTHEST, m.real)
+            status = NEGATIVE
+            length = ti.cast(
+                ti.min(rz, -MAX_NEGATIVE_STEP * curvature) / -curvature if curvature < 0.0 else MAX_NEGATIVE_STEP, m.real
+            )
             for at in range(size):
                 i = node_of(w.subset, at)
-                w.y[i] = w.y[i] + far * w.p[i]
+                w.y[i] = w.y[i] + length * w.p[i]
         else:
             step, next_rz = ti.cast(rz / curvature, m.real), ti.cast(0.0, ti.f64)
             for at in range(size):
@@ -107,13 +121,13 @@ def iterations(m: ti.template(), A: ti.template(), coupling: ti.template(), w: t
                 t = block_times(w.block[i], s)
                 w.q[i] = t
                 next_rz += dot64(s, t)
-            along = next_rz / rz
+            beta = next_rz / rz
             rz = next_rz
             k += 1
             if rz <= limit:
-                stop = CONVERGED
-    w.state[RZ], w.state[STEP], w.state[STOP] = rz, along, stop
-    return k, stop
+                status = CONVERGED
+    w.state[RZ], w.state[STEP], w.state[STATUS] = rz, beta, status
+    return k, status
 
 
 @kernel
@@ -121,11 +135,11 @@ def iterate_kernel(
     m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), n: ti.i32,
     tolerance: ti.f64, begin: ti.i32, same_matrix: ti.i32,
 ) -> ti.types.vector(2, ti.f64):
-    """The iterations in one launch: (count, stop)."""
+    """Run the iterations in one launch. Return (count, status)."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         if begin != 0:
             start(m, A, coupling, w, same_matrix)
-        k, _stop = iterations(m, A, coupling, w, n, tolerance)
+        k, _status = iterations(m, A, coupling, w, n, tolerance)
         w.state[COUNT] = w.state[COUNT] + k
-    return ti.Vector([w.state[COUNT], w.state[STOP]])
+    return ti.Vector([w.state[COUNT], w.state[STATUS]])
