@@ -173,11 +173,11 @@ def test_many_launches_are_one(sim, monkeypatch):
 def test_a_retry_begins_where_the_last_try_ended(sim):
     steps(sim, 2)
     stepper, x_start = sim._stepper, sim.positions()
-    result = stepper.take(sim.time, DT)
+    result = stepper.take_substep(sim.time, DT)
     x, v = sim.positions(), sim.velocities()
-    stepper.back()
+    stepper.restore_start()
     assert result.converged and np.array_equal(sim.positions(), x_start)
-    again = stepper.retry(sim.time, DT, v)
+    again = stepper.retry_substep(sim.time, DT, v)
     assert again.converged and 2 * again.newton_iterations < result.newton_iterations
     assert np.abs(sim.positions() - x).max() < 1e-8  # [m]
 
@@ -185,7 +185,7 @@ def test_a_retry_begins_where_the_last_try_ended(sim):
 def test_a_stage_ends_at_its_limit(sim, monkeypatch):
     monkeypatch.setattr(implicit, "MAX_NEWTON_WITH_CONTACTS", 1)
     steps(sim, 2)
-    result = sim._stepper.take(sim.time, DT)
+    result = sim._stepper.take_substep(sim.time, DT)
     assert not result.converged and 1 <= result.newton_iterations <= 1 + FALLBACK
 
 
