@@ -101,7 +101,7 @@ class DirichletConditions:
         return rows, False
 
     def target_positions(self, t: float) -> np.ndarray:
-        """Return positions (n_prescribed, 3) of the prescribed nodes at a time [m], nan on axes that are free or released by then."""
+        """Return positions (n_prescribed, 3) of the prescribed nodes at a time [m], nan on axes free or released by then."""
         target_positions = np.full((self.n_prescribed, 3), np.nan)
         for g in self._groups:
             displacement = None if g.released else self._displacement(g, t)
