@@ -80,9 +80,9 @@ class ContactNewton:
                 system.form_matrix()
             previous, law_residual = self.r, system.contact_residual
             only_laws_remain = self._is_balanced
-            solved, moved = self._solve_contacts(), False
+            result, moved = self._solve_contacts(), False
             self.newton += 1
-            if not solved.negative:
+            if not result.negative:
                 self.r, self.scale = system.end_linearised()
                 moved = self.r < DECREASE * lowest
                 if not moved:  # also if it is not a number
@@ -90,7 +90,7 @@ class ContactNewton:
                     self.r, self.scale, moved = search(system, DECREASE * lowest)
             if not moved:
                 moved = self._fall_back()
-                if not (solved.negative or self.tight):
+                if not (result.negative or self.tight):
                     # if friction cycles, a shorter time step helps, and more of these steps do not
                     moved &= self.r < DECREASE * lowest or (
                         only_laws_remain and system.contact_residual < DECREASE * law_residual
@@ -141,13 +141,13 @@ class ContactNewton:
 
     def _solve_contacts(self) -> "FrictionalResult":
         """Solve the contact problem on the current matrix, or on a projected one if that is indefinite."""
-        solved = self._solve_on_matrix()
-        if solved.negative:
+        result = self._solve_on_matrix()
+        if result.negative:
             self.r, self.scale = self.system.end_linearised(accept=False)
             self.system.form_matrix(projected=True)
             self.newton += 1
-            solved = self._solve_on_matrix()
-        return solved
+            result = self._solve_on_matrix()
+        return result
 
     def _solve_on_matrix(self) -> "FrictionalResult":
         """Solve the contact problem on the current matrix, to a fraction of the stage's residuals."""
@@ -170,9 +170,9 @@ class ContactNewton:
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
             later_tolerance=0.0 if stage.linear_tolerance else LATER_FORCING,
         )  # fmt: skip
-        solved = solve_linear(system, problem, self._first_residual(), self.scale)
-        self.linear, self.multipliers = self.linear + solved.linear, self.multipliers + solved.multipliers
-        return solved
+        result = solve_linear(system, problem, self._first_residual(), self.scale)
+        self.linear, self.multipliers = self.linear + result.linear, self.multipliers + result.multipliers
+        return result
 
     def _first_residual(self) -> float:
         """Return |r| at the start of a solve, of the stage just linearised."""
@@ -204,7 +204,7 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
 
 
 def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
-    """Solve the frictional problem alone, at the present state; on a projected matrix if the own one is indefinite."""
+    """Solve the frictional problem alone, at the present state; on a projected matrix if its own is indefinite."""
     tolerance = stage.linear_tolerance or LINEARISED_FORCING
     problem, linear = replace(stage, max_newton=LINEARISED_SOLVES, linear_tolerance=tolerance), 0
     r, scale = system.evaluate(new_multipliers=True)

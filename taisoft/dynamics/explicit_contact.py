@@ -109,7 +109,7 @@ def subtract_contacts(m: ti.template(), s: ti.template(), p: ti.template(), dt64
 
 @kernel
 def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, has_contacts: ti.i32):
-    """Apply impulses to v, then move x. touched: 1 if there are contacts. scalars: FAILED.
+    """Apply impulses to v, then move x. has_contacts: 1 if there are contacts. scalars: FAILED.
 
     With Verlet `finish_verlet` follows.
     """

@@ -10,14 +10,14 @@ steps, rebounds at its contacts alone, and elasticity does the rest.
 
 The impact must not create energy. The kinetic energy changes by
     E(s) = s (D.M v_n + p.u_fixed) + s^2 D.M D / 2 <= s sum p_n max(0, leave - |u_n|) / 2,   D = v+ - v_n,
-where u_fixed is the part of u_n from obstacles and prescribed nodes, which may do work, and the right side is energy that
-implicit Euler lost before. Newton's law violates this if friction reverses the slip (Kane's paradox), or if bodies vibrate: then
-the jump is scaled by s < 1. The slack of the inequality is the energy taken by tau^2 K. In the step after the impact, contacts
-are constrained to their rebound displacement, which pushes on the lagging body behind them. That work must not exceed the slack,
-else the step is repeated without this constraint.
+where u_fixed is the part of u_n from obstacles and prescribed nodes, whose work is external, and the right side is energy that
+implicit Euler lost before and may be given back. Newton's law violates this if friction reverses the slip (Kane's paradox), or
+if bodies vibrate: then the jump is scaled by s < 1. The slack of the inequality is the energy taken by tau^2 K. In the step
+after the impact, contacts are constrained to their rebound displacement, which pushes on the lagging body behind them. That
+work must not exceed the slack, else the step is repeated without this constraint.
 
 Weakness: within tau the impulse reaches further than sound does. Bodies that waves cross in a few steps rebound lower than e
-requires. Fixed nodes act as walls: bodies attached to them lose the impact's energy.
+requires. Fixed nodes act as walls: bodies attached to them absorb the impact.
 """
 
 import math

@@ -4,7 +4,7 @@ Each step solves with the unprojected matrix by conjugate gradients; at negative
 (`linear.pcg`). The step length is found by `line_search`. CG's tolerance follows Newton's progress (Eisenstat and Walker 1996,
 choice 2). If a slow step leaves a residual on few nodes, these are solved separately first, see `elimination`.
 With contacts, inner solves are inexact: the augmented Lagrangian is minimised until |r| is PROGRESS times its value after the
-multiplier update, or small enough, unless `multiplier_tolerance` or extrapolation require less, see `multipliers`.
+multiplier update, or small enough, unless `multiplier_tolerance` or extrapolation require a smaller |r|, see `multipliers`.
 
 Convergence: |r| <= tolerance * scale, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes, impulses in r, and
 the residual of the contact laws, |p - prox(p - f u)| / |p| with f = 1 / (J diag(A)^-1 J^T), within its own tolerance. A residual

@@ -46,9 +46,9 @@ def stage_velocity(m: ti.template(), w: ti.template(), i, beta):
 def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, prescribed_fraction: ti.f64):
     """Set x from the first iterate v; prescribed nodes move to their targets, which gives their v.
 
-    v_hat of a prescribed node is set so that (v - v_hat) / beta is its acceleration. A lumped mass affects only the reactions,
-    so the velocity change of a step is enough, of which prescribed_fraction happens in the stage. A consistent mass couples to
-    the neighbours, so there the acceleration comes from the path.
+    v_hat of a prescribed node is set so that (v - v_hat) / beta is its acceleration. With a lumped mass, which affects only the
+    reactions, that is the velocity change of a step, of which prescribed_fraction happens in the stage. A consistent mass
+    couples to the neighbours, so there the acceleration comes from the path.
     """
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
