@@ -93,7 +93,7 @@ def rig(request):
         index_nodes(p)
         block_csr.assemble(m, solver.matrix, EVERYTHING, False)
         block_csr.to_system(m, solver.matrix, solver.matrix, EVERYTHING, 1.0, BETA)
-        contact_terms.keep_diagonal(m, solver.matrix, k, EVERYTHING)
+        contact_terms.save_diagonal(m, solver.matrix, k, EVERYTHING)
         find_factors(p)
         A = to_scipy(m, solver.matrix).toarray()
         found = oracle.NodeContacts(
