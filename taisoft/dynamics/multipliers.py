@@ -20,7 +20,7 @@ from taisoft.dynamics.contact_terms import PAST, open_disk
 from taisoft.runtime import kernel
 
 R_SCALE, MIN_R_SCALE, MAX_R_SCALE, MANY_STEPS = 1.0, 0.3, 100.0, 5  # R over the r-factors: start, bounds; steps that halve it
-LAW_INCREASE, STEADY = 1.2, 4.0  # times the previous laws' residual: R is too large, unless below STEADY
+LAW_INCREASE, STEADY = 1.2, 4.0  # times the previous laws' residual: above it R is halved, if larger than STEADY
 LAW_DECREASE = 0.8  # times the previous laws' residual: below it R stays
 MAX_MULTIPLIERS = 200
 EXTRAPOLATE_AFTER = 25  # multipliers
