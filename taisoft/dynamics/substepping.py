@@ -1,6 +1,6 @@
 """Adaptive substepping of implicit steps: when a step is cut, and when cutting ends.
 
-A step that does not converge is repeated in equal substeps. With contacts, each substep is also short enough to miss no collision.
+A step that does not converge is repeated in equal substeps. With contacts, each is also short enough to miss no collision.
 
 Before a substep: while contacts close fast, its length is limited by `ccd_limits`. After it: it is undone and halved if the
 motion was much faster than known when it was cut, if searches along its path kept finding new contacts, if it left a new deep
