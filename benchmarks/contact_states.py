@@ -208,7 +208,7 @@ def edge(mesh: ts.TetMesh) -> float:
 def solve(sim: ts.Simulator, kept: dict, dt: float, most: int) -> tuple[dict, np.ndarray]:
     """A stage of dt from a state, in halves where it does not converge; and the positions it ends with."""
     stepper, world = sim._stepper, state_of(sim)
-    take = getattr(stepper, "take", None) or stepper._try_part
+    take = getattr(stepper, "take_substep", None) or stepper._try_part
     halves, newton, linear, first, seconds, launched = 1, 0, 0, None, 0.0, 0
     while True:
         world.restore(kept["world"])

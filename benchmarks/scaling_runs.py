@@ -205,8 +205,9 @@ def implicit_contact(row: Row, size: int) -> None:
 def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
     """Where the parts of the simulator's implicit steps are called, for `Stopwatch.on`."""
     places = [
-        ("residual", stage_system, "move"), ("residual", stage_system, "press"), ("residual", stage_system, "form_residual"),
-        ("matrix", block_csr, "assemble"), ("matrix", block_csr, "to_system"), ("matrix", stage_system, "keep_diagonal"),
+        ("residual", stage_system, "move"), ("residual", stage_system, "update_impulses"),
+        ("residual", stage_system, "form_residual"),
+        ("matrix", block_csr, "assemble"), ("matrix", block_csr, "to_system"), ("matrix", stage_system, "save_diagonal"),
         ("linear solve", pcg, "solve"), ("report", simulator, "measure"),
     ]  # fmt: skip
     contact = sim._contact

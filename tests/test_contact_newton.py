@@ -17,7 +17,7 @@ from rotations import rotation
 import taisoft as ts
 from taisoft import model
 from taisoft.dynamics import contact_newton, implicit, scheme_of
-from taisoft.dynamics.contact_newton import FALLBACK, Frictional
+from taisoft.dynamics.contact_newton import FALLBACK_STEPS, FrictionalResult
 from taisoft.dynamics.newton import Newton
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.linear import pcg
@@ -59,11 +59,11 @@ def steps(sim, n: int = 6) -> tuple[np.ndarray, list[ts.StepReport]]:
     return sim.positions(), reports
 
 
-def from_the_host(system, problem, r, scale) -> Frictional:
+def from_the_host(system, problem, r, scale) -> FrictionalResult:
     """The loop as it is where loops run on threads."""
     newton = Newton(system, problem)
     result = newton.run(r, scale, fresh=True)
-    return Frictional(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
+    return FrictionalResult(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
 
 
 def counts(reports: list[ts.StepReport]) -> list[tuple[int, int, int]]:
@@ -143,7 +143,7 @@ def test_tight_problems_extrapolate_at_once(sim, monkeypatch, given):
         problems.append((system.stage, problem))
         return from_the_host(system, problem, r, scale)
 
-    monkeypatch.setattr(contact_newton, "HIDING", np.inf)  # only rounding, as it were
+    monkeypatch.setattr(contact_newton, "NEAR_FLOOR", np.inf)  # only rounding, as it were
     monkeypatch.setattr(contact_newton, "solve_linear", solve)
     monkeypatch.setattr(sim._stepper, "linear_tolerance", given)
     steps(sim, 2)
@@ -173,11 +173,11 @@ def test_many_launches_are_one(sim, monkeypatch):
 def test_a_retry_begins_where_the_last_try_ended(sim):
     steps(sim, 2)
     stepper, x_start = sim._stepper, sim.positions()
-    result = stepper.take(sim.time, DT)
+    result = stepper.take_substep(sim.time, DT)
     x, v = sim.positions(), sim.velocities()
-    stepper.back()
+    stepper.restore_start()
     assert result.converged and np.array_equal(sim.positions(), x_start)
-    again = stepper.retry(sim.time, DT, v)
+    again = stepper.retry_substep(sim.time, DT, v)
     assert again.converged and 2 * again.newton_iterations < result.newton_iterations
     assert np.abs(sim.positions() - x).max() < 1e-8  # [m]
 
@@ -185,8 +185,8 @@ def test_a_retry_begins_where_the_last_try_ended(sim):
 def test_a_stage_ends_at_its_limit(sim, monkeypatch):
     monkeypatch.setattr(implicit, "MAX_NEWTON_WITH_CONTACTS", 1)
     steps(sim, 2)
-    result = sim._stepper.take(sim.time, DT)
-    assert not result.converged and 1 <= result.newton_iterations <= 1 + FALLBACK
+    result = sim._stepper.take_substep(sim.time, DT)
+    assert not result.converged and 1 <= result.newton_iterations <= 1 + FALLBACK_STEPS
 
 
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-4])

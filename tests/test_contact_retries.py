@@ -100,7 +100,7 @@ def test_a_part_that_sank_is_looked_at_along_its_way(sim, monkeypatch):
     first = sim.step()
     wanted, searched, search = sim.positions(), [], sim._contact.search_along_path
     sim.reset()
-    monkeypatch.setattr(sim._contact, "penetrates_anew", lambda time, dt, before: True)
+    monkeypatch.setattr(sim._contact, "penetrates_deeper", lambda time, dt, before: True)
     monkeypatch.setattr(sim._contact, "search_along_path", lambda *at: searched.append((at, search(*at))))
     report = sim.step()
     assert searched == [((0.0, DT), False)] and report.newton_iterations == first.newton_iterations

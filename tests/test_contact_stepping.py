@@ -211,7 +211,7 @@ def test_laws(each):
         contact_offset, fast, slow, fastest = contact.gap_targets
         opening = np.minimum(slow * (contact_offset - above) + fast * (above - c.gap), fastest * each.dt)
         gap_targets = np.where(c.gap < contact_offset, c.gap + opening, contact_offset)
-        u_n = (c.gap - gap_targets + (c.normal * way).sum(axis=1)) / (contact._share * each.dt)
+        u_n = (c.gap - gap_targets + (c.normal * way).sum(axis=1)) / (contact._impulse_fraction * each.dt)
         t1 = np.cross(c.normal, np.eye(3)[np.argmin(np.abs(c.normal), axis=1)])
         t1 /= np.linalg.norm(t1, axis=1, keepdims=True)
         frame = np.stack([c.normal, t1, np.cross(c.normal, t1)], axis=1)

@@ -93,7 +93,7 @@ def rig(request):
         index_nodes(p)
         block_csr.assemble(m, solver.matrix, EVERYTHING, False)
         block_csr.to_system(m, solver.matrix, solver.matrix, EVERYTHING, 1.0, BETA)
-        contact_terms.keep_diagonal(m, solver.matrix, k, EVERYTHING)
+        contact_terms.save_diagonal(m, solver.matrix, k, EVERYTHING)
         find_factors(p)
         A = to_scipy(m, solver.matrix).toarray()
         found = oracle.NodeContacts(
@@ -133,7 +133,7 @@ def evaluate(
     norms, s, m = np.zeros(5), rig.solver, m or rig.m
     if how is not None:
         move(m, rig.work, rig.k, kind, how, term_weight, 1.0, BETA)
-    contact_terms.press(m, rig.k, int(multiply), BETA, STIFFNESS)
+    contact_terms.update_impulses(m, rig.k, int(multiply), BETA, STIFFNESS)
     form_residual(m, rig.work, s.matrix, rig.k, kind, BETA, norms)
     return norms
 
@@ -287,7 +287,7 @@ def test_a_linearised_stage_is_linear(rig, threads):
     evaluate(rig, m=m)
     there, at_start = rig.p.r.to_numpy()[:K], work.residual.to_numpy()
     before = at_start + (rig.J.T @ there.ravel()).reshape(-1, 3)
-    linearised.keep_linear(m, work, rig.k)
+    linearised.begin_linearised(m, work, rig.k)
     y = np.linalg.solve(rig.A + 1e6 * np.diag(1 - rig.free.ravel()), -(rig.free * at_start).ravel()).reshape(-1, 3) * rig.free
     y += 0.1 * np.abs(y).max() * rig.free * rng.standard_normal(y.shape)
     cg.y.from_numpy(y.astype(rig.made.machine.np_real))
@@ -303,10 +303,10 @@ def test_a_linearised_stage_is_linear(rig, threads):
     assert norms[0] == pytest.approx(((rig.free * expected) ** 2).sum(), rel=1e3 * rig.close)
     start, end = (rig.free * at_start * y).sum(), (rig.free * expected * y).sum()
     assert abs(end) <= 0.05 * abs(start) + 100 * rig.close * size * np.abs(y).sum()
-    linearised.leave_linear(m, work, rig.k, 1, BETA)
+    linearised.end_linearised(m, work, rig.k, 1, BETA)
     assert np.array_equal(rig.p.r.to_numpy()[:K], r) and np.array_equal(work.base.to_numpy(), rig.start)
     assert np.abs(cg.y.to_numpy() - length * y).max() < 10 * rig.close * np.abs(length * y).max()
-    linearised.leave_linear(m, work, rig.k, 0, BETA)
+    linearised.end_linearised(m, work, rig.k, 0, BETA)
     assert np.array_equal(rig.p.r.to_numpy()[:K], there)
 
 

@@ -116,7 +116,7 @@ def test_the_life_of_a_simulator(earlier, time):
         earlier += [c, sim.detect_contacts()]
         detection, contact = sim._detection, sim._contact
         arenas = [detection._arena, detection._reduction_arena, detection.buffer._arena]
-        arenas += [contact._arena, contact._own_arena, contact._numbers_arena]
+        arenas += [contact._arena, contact._path_arena, contact._numbers_arena]
         assert all(arena.bytes for arena in arenas)
     assert not any(arena.bytes or arena._lanes or arena._arrays for arena in arenas) and not sim._owned
     with pytest.raises(SimulationError, match="closed"):

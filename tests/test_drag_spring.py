@@ -8,9 +8,9 @@
 
 import numpy as np
 import pytest
-from taisoft.dynamics.drag_spring import HEAVY, SOFT, STRAIN, batch
 
 import taisoft as ts
+from taisoft.dynamics.drag_spring import HEAVY, SOFT, STRAIN, batch
 from taisoft.errors import SceneError, SimulationError
 from taisoft.runtime import compile_clock
 

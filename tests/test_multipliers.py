@@ -18,7 +18,7 @@ from scenes import opened
 
 from taisoft.contact.problem import build_node_problem, fill_field
 from taisoft.dynamics.contact_terms import PAST
-from taisoft.dynamics.multipliers import FARTHEST, SOFTEST, STIFFEST, extrapolate_multipliers, next_scale
+from taisoft.dynamics.multipliers import MAX_EXTRAPOLATION, MAX_R_SCALE, MIN_R_SCALE, extrapolate_multipliers, next_scale
 from taisoft.fields import FieldArena
 
 K = 40
@@ -137,7 +137,7 @@ def test_a_change_that_says_nothing_new_is_left_out(rig):
     assert np.abs(renewed - fixed).max() < 1e-6 < np.abs(x - last).max()
 
 
-@pytest.mark.parametrize("steps, taken", [(2.0 * FARTHEST, False), (0.9 * FARTHEST, True)])
+@pytest.mark.parametrize("steps, taken", [(2.0 * MAX_EXTRAPOLATION, False), (0.9 * MAX_EXTRAPOLATION, True)])
 def test_an_extrapolation_that_goes_too_far_is_not_taken(rig, steps, taken):
     """A mode so slow that its end lies so many steps away."""
     step, fixed, x = slow(rig, [1.0 - 1.0 / steps], 9)
@@ -150,7 +150,7 @@ def test_an_extrapolation_that_goes_too_far_is_not_taken(rig, steps, taken):
 
 def test_neither_is_one_whose_second_part_does(rig):
     """Two modes, the slower one so slow that the change before the last one takes it too far."""
-    step, _, x = slow(rig, [1.0 - 0.2 / FARTHEST, 0.5], 10)
+    step, _, x = slow(rig, [1.0 - 0.2 / MAX_EXTRAPOLATION, 0.5], 10)
     begin(rig, x)
     for known in (0, 1):
         x = renew(rig, step(x), known)
@@ -164,10 +164,10 @@ def test_neither_is_one_whose_second_part_does(rig):
         (8.0, 1.3, 1.0, 1, 4.0),  # risen: softer,
         (4.0, 1.3, 1.0, 1, 8.0),  # but not below STEADY
         (8.0, 0.9, 1.0, 1, 16.0),  # hardly fallen after one step: stiffer,
-        (STIFFEST, 0.9, 1.0, 1, STIFFEST),
+        (MAX_R_SCALE, 0.9, 1.0, 1, MAX_R_SCALE),
         (8.0, 0.9, 1.0, 3, 8.0),  # after some: as it is,
         (2.0, 0.9, 1.0, 5, 1.0),  # after many: softer
-        (SOFTEST, 0.9, 1.0, 5, SOFTEST),
+        (MIN_R_SCALE, 0.9, 1.0, 5, MIN_R_SCALE),
         (8.0, 0.7, 1.0, 1, 8.0),  # fallen: as it is
     ],
 )

@@ -12,19 +12,50 @@ import pytest
 import taisoft
 
 PACKAGE = Path(taisoft.__file__).parent
-FORMER = {
-    # former name: the one to use
-    "led": "prescribed", "led_nodes": "prescribed_nodes", "leads": "has_prescribed", "let_go": "release", "letting_go": "releasing",
-    "told": "what it is: a message, a report, a list of warnings", "told_warnings": "printed_warnings", "tell_locking": "warn_locking",
-    "World": "SimulationState", "Motion": "DirichletConditions", "Pull": "DragSpring", "Grip": "Drag", "pullable": "draggable",
-    "pulled": "dragged", "Stretch": "TimedRun", "Strip": "PlotOverlay", "Ask": "Request", "Left": "Interrupted",
-    "Shown": "DisplayOptions", "SUNK": "DEEP_PENETRATION", "SANK": "NOTICEABLE_PENETRATION", "sinking": "relative_penetration",
-    "HASTE": "MAX_CLOSING_RATIO", "survey": "measure_closing", "find_way": "find_displacement", "way_out": "exit_direction",
-    "STANDOFF": "CONTACT_OFFSET", "standoff": "contact_offset", "short_of_goal": "gap_minus_target", "carry": "obstacle_displacement",
-    "lag": "tangential_offset", "misfit": "prox_residual", "go_beyond": "extrapolate_impulse", "against": "restart_test",
-    "obey": "apply_verdict", "sticks_out": "in_normal_cone", "hit_by": "contact_mode", "unfinite": "nonfinite", "fence": "safe_meshio",
-    "read_fenced": "read_safely", "scene_marks": "scene_fingerprint", "MAX_PARTS": "MAX_SUBSTEPS",
-}  # fmt: skip
+FORMER = {  # former name: the one to use
+    "led": "prescribed",
+    "led_nodes": "prescribed_nodes",
+    "leads": "has_prescribed",
+    "let_go": "release",
+    "letting_go": "releasing",
+    "told": "what it is: a message, a report, a list of warnings",
+    "told_warnings": "printed_warnings",
+    "tell_locking": "warn_locking",
+    "World": "SimulationState",
+    "Motion": "DirichletConditions",
+    "Pull": "DragSpring",
+    "Grip": "Drag",
+    "pullable": "draggable",
+    "pulled": "dragged",
+    "Stretch": "TimedRun",
+    "Strip": "PlotOverlay",
+    "Ask": "Request",
+    "Left": "Interrupted",
+    "Shown": "DisplayOptions",
+    "SUNK": "DEEP_PENETRATION",
+    "SANK": "NOTICEABLE_PENETRATION",
+    "sinking": "relative_penetration",
+    "HASTE": "MAX_CLOSING_RATIO",
+    "survey": "measure_closing",
+    "find_way": "find_displacement",
+    "way_out": "exit_direction",
+    "STANDOFF": "CONTACT_OFFSET",
+    "standoff": "contact_offset",
+    "short_of_goal": "gap_minus_target",
+    "carry": "obstacle_displacement",
+    "lag": "tangential_offset",
+    "misfit": "prox_residual",
+    "go_beyond": "extrapolate_impulse",
+    "against": "restart_test",
+    "obey": "apply_verdict",
+    "sticks_out": "in_normal_cone",
+    "hit_by": "contact_mode",
+    "unfinite": "nonfinite",
+    "fence": "safe_meshio",
+    "read_fenced": "read_safely",
+    "scene_marks": "scene_fingerprint",
+    "MAX_PARTS": "MAX_SUBSTEPS",
+}
 
 
 def identifiers(path: Path) -> set[str]:

@@ -164,7 +164,7 @@ def test_an_implicit_step_assembles_what_it_needs():
         assert falling["assemble"] >= 1 and falling["iterate_kernel"] >= 1
         # no damping: no second matrix; a lower residual: no backtracking; nothing to touch: no kernels of contacts
         assert falling["assemble"] <= falling["form_residual"] == falling["move"]
-        assert not {"press", "advance", "keep_linear", "keep_diagonal"} & falling.keys()
+        assert not {"update_impulses", "advance", "begin_linearised", "save_diagonal"} & falling.keys()
         assert falling["measure"] == 2 and "finish_midpoint" not in falling and "elastic_forces" not in falling
 
 

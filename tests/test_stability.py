@@ -204,5 +204,5 @@ def test_a_motion_that_diverges_is_stopped_while_it_is_finite(plane):
         sim.set_state(x + 1e-3 * np.random.default_rng(0).standard_normal(x.shape))
         result = sim.run(400 * sim.dt, fps=None)
         assert result.status == "failed" and result.steps < 200
-        assert re.search(r"^step \d+: a tet is inside out by .* times its volume: the motion has diverged", result.problems[0])
+        assert re.search(r"^step \d+: a tet is inverted by .* times its volume: the motion has diverged", result.problems[0])
         assert np.abs(sim.positions()).max() < 1e6 and sim._report().min_volume_ratio < 0.0

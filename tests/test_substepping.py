@@ -4,7 +4,7 @@
 * substeps are as short as what closes asks for, cover the step without a gap, and grow again after an event;
 * one that met contacts which were not known is taken again with them;
 * one that ends deep, is fast where nobody had looked, or whose contacts do not settle, is undone and halved;
-  after UNDONE of them the step goes on;
+  after MAX_UNDONE of them the step goes on;
 * what closes too fast for the shortest is refused, and an error leaves the state before the step.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from taisoft.dynamics.stage_result import StageResult
-from taisoft.dynamics.substepping import MAX_SUBSTEPS, SEARCHES, UNDONE, Substepping
+from taisoft.dynamics.substepping import MAX_SEARCHES, MAX_SUBSTEPS, MAX_UNDONE, Substepping
 from taisoft.errors import SimulationError
 
 DT = 0.1  # [s]
@@ -21,7 +21,7 @@ DT = 0.1  # [s]
 class Plain:
     """A stepper and its contacts at once: x is the time that it has stepped to. Its answers are set by the tests."""
 
-    idle, is_linear, lossy, met, n_contacts = False, False, True, False, 0
+    idle, is_linear, dissipative, had_impact, n_contacts = False, False, True, False, 0
 
     def __init__(self):
         self.contact = self.simulation = self.dirichlet = self.history = self
@@ -38,16 +38,16 @@ class Plain:
 
     # the stepper
 
-    def mark(self):
+    def save_start(self):
         self.marked = self.x
 
-    def return_to_mark(self, taken_back=False):
+    def return_to_start(self, already_undone=False):
         self.x, self.kept = self.marked, []
 
     def forget(self):
         self.forgotten = True
 
-    def take(self, time, dt):
+    def take_substep(self, time, dt):
         assert time == pytest.approx(self.x)
         self.taken.append((time, dt))
         self.start, self.x = self.x, time + dt
@@ -55,16 +55,16 @@ class Plain:
         good = self.converges(time, dt)
         return StageResult(3, 10, 1e-6 if good else 0.1, good, False)
 
-    def back(self):
+    def restore_start(self):
         self.x = self.start
         self.kept.pop()
 
-    def retry(self, time, dt, start):
+    def retry_substep(self, time, dt, start):
         self.starts.append(start)
-        return self.take(time, dt)
+        return self.take_substep(time, dt)
 
-    def undo(self, released, anew):
-        self.back()
+    def undo_substep(self, released, discard_impulses):
+        self.restore_start()
 
     # its world and contacts
 
@@ -78,16 +78,16 @@ class Plain:
     def released(self):
         return []
 
-    def look(self, time, dt):
+    def measure_start(self, time, dt):
         return 0.0, self.closing(time, dt)
 
-    def crossing_before(self):
+    def initial_crossing(self):
         return 0.0
 
     def left_searched_path(self, x_now):
         return self.astray(*self.kept[-1])
 
-    def penetrates_anew(self, time, dt, before):
+    def penetrates_deeper(self, time, dt, before):
         return False
 
     def search_along_path(self, time, dt):
@@ -100,7 +100,7 @@ class Plain:
         self.relative_penetration = self.depth(*self.kept[-1])
         return self.relative_penetration
 
-    def too_fast(self, dt, substeps):
+    def describe_fast_closing(self, dt, substeps):
         return "they close at 1 m/s"
 
     def _nothing(self, *_):
@@ -132,7 +132,7 @@ def test_one_that_converges_in_two(plain):
     wrapped = Substepping(plain)
     result = wrapped.step(0.0, DT)
     assert [dt for _, dt in plain.taken] == pytest.approx([DT, DT / 2, DT / 2]) and covers(plain)
-    assert wrapped.substeps == 2 and result.converged and result.newton_iterations == 9 and wrapped.recovers
+    assert wrapped.substeps == 2 and result.converged and result.newton_iterations == 9 and wrapped.may_retry
 
 
 def test_one_that_never_converges(plain):
@@ -140,13 +140,13 @@ def test_one_that_never_converges(plain):
     wrapped = Substepping(plain)
     result = wrapped.step(0.0, DT)
     assert [dt for _, dt in plain.taken] == pytest.approx([DT, *[DT / 2] * 2, *[DT / 4] * 4, DT])
-    assert wrapped.substeps == 1 and not result.converged and not wrapped.recovers and plain.kept == [(0.0, DT)]
+    assert wrapped.substeps == 1 and not result.converged and not wrapped.may_retry and plain.kept == [(0.0, DT)]
     plain.x, plain.taken = 0.0, []
     wrapped.step(0.0, DT)
     assert len(plain.taken) == 1  # substeps did not help in the step before
     plain.x, plain.converges = 0.0, lambda time, dt: True
     wrapped.step(0.0, DT)
-    assert wrapped.recovers
+    assert wrapped.may_retry
 
 
 def test_linear_steps_are_not_tried_again(plain):
@@ -182,7 +182,7 @@ def test_one_that_ends_deep_is_halved(plain):
 def test_after_so_many_undone_it_goes_on(plain):
     plain.depth = lambda time, dt: 1.0 + time  # deeper and deeper
     Substepping(plain).step(0.0, DT)
-    assert covers(plain) and 0 < len(plain.taken) - len(plain.kept) <= UNDONE and plain.relative_penetration > 1.0
+    assert covers(plain) and 0 < len(plain.taken) - len(plain.kept) <= MAX_UNDONE and plain.relative_penetration > 1.0
 
 
 def test_one_that_was_faster_than_seen_is_halved(plain):
@@ -205,7 +205,7 @@ def test_one_whose_contacts_do_not_settle_is_halved(plain):
     plain.astray = plain.new_on_way = lambda time, dt: dt > DT / 2
     Substepping(plain).step(0.0, DT)
     whole = [dt for _, dt in plain.taken if dt == DT]
-    assert covers(plain) and len(plain.kept) == 2 and len(whole) == SEARCHES + 1
+    assert covers(plain) and len(plain.kept) == 2 and len(whole) == MAX_SEARCHES + 1
 
 
 def test_an_error_leaves_the_state_before(plain):

@@ -1,6 +1,6 @@
-"""The integrators by name. Adding an implicit one: a file with a `SCHEME`, and its name below.
+"""Integrators by name. To add an implicit one, add a file with a `SCHEME` and its name below.
 
-What a simulator does not need is not imported: kernels take time to decorate.
+Modules are imported only when needed, since decorating kernels takes time.
 """
 
 from importlib import import_module
@@ -20,16 +20,16 @@ INTEGRATORS = (*EXPLICIT, *IMPLICIT)
 
 
 def scheme_of(integrator: str) -> "Scheme":
-    """The scheme of an implicit integrator."""
+    """Return the scheme of an implicit integrator."""
     return import_module(f"taisoft.dynamics.{integrator}").SCHEME
 
 
 def make_stepper(
     simulation: SimulationState, integrator: str, contact: "ContactStep | NoContacts", method: str
 ) -> "ExplicitStepper | ImplicitStepper":
-    """The stepper of an integrator; the names have been checked.
+    """Return the stepper of an integrator, whose name has been checked.
 
-    method: contact solver of explicit steps; "auto" is serial Gauss-Seidel on the CPU, and the coloured one on CUDA.
+    method: contact solver of explicit steps; "auto" is serial Gauss-Seidel on the CPU and coloured Gauss-Seidel on CUDA.
     """
     if integrator in IMPLICIT:
         from taisoft.dynamics.implicit import ImplicitStepper

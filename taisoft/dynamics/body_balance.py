@@ -1,12 +1,12 @@
-"""Whether the forces on every body balance, not only those on the heaviest.
+"""Force balance of each body and connected piece.
 
-Newton's method ends on the norm of the residual over the whole scene, relative to the forces of the whole scene. All forces on a
-body that is much lighter than others, or much less strained, can hide below that: it would neither fall nor rest. So each body,
-and each piece of one that is not connected, is looked at on its own, as
+Newton's method ends on the residual norm of the whole scene, relative to the forces of the whole scene. All forces on a body
+that is much lighter or less strained than others can be smaller than that: it would neither fall nor rest. So each body, and
+each connected piece of one, is checked separately:
     |r|_b <= LIMIT s_b,   s_b = |M (v - v_hat)|_b + beta (|f_el|_b + |M g + loads|_b),
-unless its residual is rounding. What remains of r when it is averaged over a piece that nothing holds moves the piece as a whole;
-elastic forces cancel in it, and their rounding with them, so there only the rounding of momenta counts. It holds of linearly
-implicit steps, too, whose other residual is that of what they do not linearise.
+unless its residual is rounding. The mean of r over a piece without constraints moves the piece as a whole. Elastic forces and
+their rounding cancel in it, so only the rounding of momenta counts there. This check applies to linearly implicit steps, too;
+the rest of their residual is the linearisation error.
 """
 
 from typing import TYPE_CHECKING
@@ -21,13 +21,13 @@ from taisoft.transfer import download
 if TYPE_CHECKING:
     from taisoft.dynamics.stage_system import StageSystem
 
-LIMIT = 0.01  # of the forces on a body: a residual beyond is a wrong motion
-UNFELT = 1e-9  # of a piece's momentum and forces: what a step may lose of its momentum, whatever changed that
-ROUNDING = 4.0  # times the floor of a body, as of the whole scene in `newton`
+LIMIT = 0.01  # of the forces on a body: a larger residual means wrong motion
+NEGLIGIBLE_MOMENTUM = 1e-9  # of a piece's momentum and forces: momentum error that a step may always make
+ROUNDING = 4.0  # times the rounding floor of a body, as for the whole scene in `newton`
 
 
 class BodyBalance:
-    """Residuals of a scene's pieces, one by one."""
+    """Residuals of the connected pieces of a scene."""
 
     def __init__(self, scene: Scene):
         pieces, names, bodies = [], [], []
@@ -43,13 +43,13 @@ class BodyBalance:
 
     @property
     def n_pieces(self) -> int:
-        """How many there are."""
+        """Number of pieces."""
         return len(self._names)
 
     def worst(self, solver: "StageSystem", beta: float, linear: bool) -> tuple[float, str]:
-        """The largest relative residual of a piece in the stage just solved, and which it is; 0 where all are rounding.
+        """Return the largest relative residual of a piece in the stage just solved, and its name; 0 if all are rounding.
 
-        linear: only of what moves pieces as a whole.
+        linear: consider only the mean residuals, which move pieces as a whole.
         """
         m, w = solver.model, solver.work
         gather_forces(m, w.pcg.q)
@@ -64,7 +64,9 @@ class BodyBalance:
         )  # fmt: skip
         scale = inertia + beta * (elastic + external)
         floor = beta * solver.rounding.force_by_body[self._body] + masses * solver.rounding.position / beta
-        mean_floor = max(solver.rounding.eps, UNFELT) * (momentum + beta * elastic) + masses * solver.rounding.position / beta
+        mean_floor = (
+            max(solver.rounding.eps, NEGLIGIBLE_MOMENTUM) * (momentum + beta * elastic) + masses * solver.rounding.position / beta
+        )
         mean = self._mean(residual, free)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.where(mean > ROUNDING * mean_floor, mean / scale, 0.0)
@@ -74,13 +76,13 @@ class BodyBalance:
         return float(ratio[k]), self._names[k]
 
     def _norm(self, a: np.ndarray) -> np.ndarray:
-        """(n_pieces,) of (n_nodes, 3)."""
+        """Return the norms (n_pieces,) of (n_nodes, 3)."""
         return np.sqrt(np.bincount(self._piece, (a**2).sum(axis=1)))
 
     def _mean(self, residual: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """(n_pieces,) norms of the residual averaged over each piece, along the axes on which nothing holds it."""
+        """Return the norms (n_pieces,) of each piece's mean residual, along the axes on which it has no constraint."""
         means = np.zeros((3, self.n_pieces))
         for axis in range(3):
-            held = np.bincount(self._piece, 1.0 - free[:, axis]) > 0.0
-            means[axis] = np.where(held, 0.0, np.bincount(self._piece, residual[:, axis]))
+            constrained = np.bincount(self._piece, 1.0 - free[:, axis]) > 0.0
+            means[axis] = np.where(constrained, 0.0, np.bincount(self._piece, residual[:, axis]))
         return np.linalg.norm(means, axis=0) / np.sqrt(self._n_nodes)

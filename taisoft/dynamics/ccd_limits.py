@@ -1,12 +1,12 @@
-"""How far contacts close in a step, against how far they may before things could pass each other unseen.
+"""Closing ratios of contacts: how far they close in a step, relative to a limit below which no collision is missed.
 
-Two sides that close by no more than half the thinner one's thickness cannot change sides unseen: even if their contact were
-lost, the next search would find them in each other, by less than half of it. Two sides with a larger gap between them may move
-relative to each other, in whatever direction, by that gap: they can touch nothing before it is used up, since theirs is the
-least distance near there (conservative advancement: Mirtich 1996). A contact's ratio is the smaller of
+Two sides that close by no more than half the thinner one's thickness cannot pass through each other unnoticed: even if their
+contact were lost, the next search would find them penetrating by less than half of it. Two sides with a larger gap may move
+relative to each other by that gap in any direction. They touch nothing before, since the gap is the smallest distance nearby
+(conservative advancement: Mirtich 1996). A contact's ratio is the smaller of
     closing / (thickness / 2)   and   |relative motion| / max(gap, thickness / 2),
-and a step in which no contact's ratio exceeds 1 is short enough. Weak where a surface stands out behind what is nearest now: it
-is a contact of its own only if its distance has a local minimum there.
+and a step in which no contact's ratio exceeds 1 is short enough. Weakness: a surface that protrudes behind the nearest one is a
+separate contact only if its distance has a local minimum there.
 """
 
 import math
@@ -19,18 +19,21 @@ from taisoft.contact.assemble import obstacle_displacement_at
 from taisoft.runtime import kernel
 
 MAX_CLOSING = 0.5  # of the thinner side's thickness: how far a contact may close in one step
-DEPTH, CLOSING_RATIO, SPEED, WHICH, RELATIVE_PENETRATION = range(5)  # places in what `measure_closing` finds
-GROWTH = 2.0  # a part is at most so many times as long as the one before: after an impact what it set off is followed
-ROUNDING = 1e-9  # of a number of parts
+DEPTH, CLOSING_RATIO, SPEED, WHICH, RELATIVE_PENETRATION = range(5)  # indices into the result of `measure_closing`
+GROWTH = 2.0  # maximum ratio of a substep's length to the previous one, so that the motion after an impact is resolved
+ROUNDING = 1e-9  # of a number of substeps
 
 
 @kernel
 def measure_closing(
     s: ti.template(), o: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32, dt: ti.f64,
-    found_closing: ti.types.ndarray(),
+    closing_data: ti.types.ndarray(),
 ):  # fmt: skip
-    """found_closing (5,): deepest penetration [m]; the largest ratio of a contact in the coming step (see above); the speed at which that
-    one closes [m/s]; its number among the kept; the deepest penetration over the finer side's mean surface edge."""
+    """Measure the contacts' closing in the coming step of dt.
+
+    closing_data (5,): deepest penetration [m]; largest closing ratio of a contact (see above); its closing speed [m/s]; its
+    number among the kept ones; deepest penetration over the finer side's mean surface edge.
+    """
     ti.loop_config(serialize=True)
     for _ in range(1):
         depth, largest_ratio, speed, which = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), -1
@@ -55,47 +58,50 @@ def measure_closing(
                 ratio = ti.min(closing / allowed, displacement.norm() / ti.max(found.gap[at], allowed))
                 if ratio > largest_ratio:
                     largest_ratio, speed, which = ratio, closing / dt, c
-        found_closing[DEPTH], found_closing[CLOSING_RATIO], found_closing[SPEED] = depth, largest_ratio, speed
-        found_closing[WHICH], found_closing[RELATIVE_PENETRATION] = which, relative_penetration
+        closing_data[DEPTH], closing_data[CLOSING_RATIO], closing_data[SPEED] = depth, largest_ratio, speed
+        closing_data[WHICH], closing_data[RELATIVE_PENETRATION] = which, relative_penetration
 
 
 @kernel
 def find_displacement(
-    m: ti.template(), s: ti.template(), x_start: ti.template(), displacement: ti.template(), strayed: ti.types.ndarray()
+    m: ti.template(), s: ti.template(), x_start: ti.template(), displacement: ti.template(), deviation: ti.types.ndarray()
 ):  # fmt: skip
-    """way (n_nodes) [m] since x_start; strayed (1,) [m]: the most by which a vertex left the straight way that was searched."""
+    """Compute the displacement (n_nodes) [m] since x_start.
+
+    deviation (1,) [m]: largest distance of a vertex from the straight path that was searched.
+    """
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         displacement[i] = m.state.x[i] - x_start[i]
     ti.loop_config(serialize=True)
     for _ in range(1):
-        most = ti.cast(0.0, ti.f64)
+        largest = ti.cast(0.0, ti.f64)
         for k in range(s.n_verts):
             if s.node[k] >= 0:
-                d, known = displacement[s.node[k]], s.move[k]
-                square = known.dot(known)
-                share = ti.cast(0.0, ti.f64)
+                d, searched = displacement[s.node[k]], s.move[k]
+                square = searched.dot(searched)
+                along = ti.cast(0.0, ti.f64)
                 if square > 0.0:
-                    share = ti.min(ti.max(d.dot(known) / square, 0.0), 1.0)
-                most = ti.max(most, (d - share * known).norm())
-        strayed[0] = most
+                    along = ti.min(ti.max(d.dot(searched) / square, 0.0), 1.0)
+                largest = ti.max(largest, (d - along * searched).norm())
+        deviation[0] = largest
 
 
-def next_length(ratio: Callable[[float], float], left: float, length: float, longest: float, may_grow: bool) -> float:
-    """How long [s] the next part of a step is: what is left of it, cut equally, so that no contact's ratio exceeds 1.
+def next_length(ratio: Callable[[float], float], remaining: float, length: float, longest: float, may_grow: bool) -> float:
+    """Return the length [s] of the next substep: the remaining time cut equally, so that no contact's ratio exceeds 1.
 
-    ratio: of a part of so many seconds from here; length: of the part before; longest: no part is longer; may_grow: whether the
-    part may be longer than the one before.
+    ratio: largest closing ratio of a substep of the given length [s] from here; length: of the previous substep; longest: maximum
+    length; may_grow: whether the substep may be longer than the previous one.
     """
-    length = left / _count(left / length)
+    length = remaining / _count(remaining / length)
     found = ratio(length)
-    if may_grow and GROWTH * found <= 1.0 and length < min(left, longest) * (1.0 - ROUNDING):
-        # as the search found it: of a longer part it may find more
-        length = left / _count(left / min(GROWTH * length, longest))
+    if may_grow and GROWTH * found <= 1.0 and length < min(remaining, longest) * (1.0 - ROUNDING):
+        # the ratio holds for the searched length; a longer substep may have more contacts
+        length = remaining / _count(remaining / min(GROWTH * length, longest))
         found = ratio(length)
-    return left / _count(left / length * max(found, 1.0))
+    return remaining / _count(remaining / length * max(found, 1.0))
 
 
 def _count(substeps: float) -> int:
-    """So many equal parts, or a few more to make it a whole number."""
+    """Round a number of equal substeps up, except for rounding errors."""
     return max(1, math.ceil(substeps * (1.0 - ROUNDING)))

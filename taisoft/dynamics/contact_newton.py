@@ -1,40 +1,41 @@
 """Newton's method for a stage with contacts: each step linearises elasticity and solves the frictional problem on that matrix.
 
-The problem on the fixed matrix needs no elements: `Newton` solves it as an augmented Lagrangian, inexactly, from the impulses so
-far. Its way is a direction for the true stage, judged by |r| and else by the slope of the augmented Lagrangian with the impulses
-found as multipliers. Where the matrix is indefinite, a projected one takes its place; where that leads nowhere, a few steps
-minimise the true stage under multipliers instead. What a slow step leaves on few nodes is solved there first (`elimination`).
+The problem on the fixed matrix needs no elements: `Newton` solves it inexactly as an augmented Lagrangian, from the current
+impulses. Its displacement is a direction for the nonlinear stage. A full step is accepted by |r|; else a line search uses the
+slope of the augmented Lagrangian with the new impulses as multipliers. An indefinite matrix is replaced by a projected one. If
+that makes no progress, a few steps minimise the nonlinear stage under multipliers instead. If a slow step leaves a residual on
+few nodes, these are solved separately first (`elimination`).
 """
 
 import math
 from dataclasses import dataclass, replace
 
 from taisoft.dynamics.elimination import eliminate
-from taisoft.dynamics.frictional import INDEFINITE, LINEAR, MULTIPLIERS, NORM, ROUNDING, SOLVED, VERDICT
+from taisoft.dynamics.frictional import INDEFINITE, LINEAR, MULTIPLIERS, NORM, ROUNDING, SOLVED, STATUS
 from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
 from taisoft.dynamics.line_search import choose_start, search
 from taisoft.dynamics.multipliers import MAX_MULTIPLIERS
-from taisoft.dynamics.newton import FALL, SLOW_STEP, Newton
+from taisoft.dynamics.newton import DECREASE, ELIMINATION_RATIO, Newton
 from taisoft.dynamics.residual import AGAIN
 from taisoft.dynamics.stage_result import StageResult, relative
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.launching import PUBLIC
 
-SOLVES, FORCING = 60, 0.3  # linear solves of one frictional problem, and their tolerance
-LATER_FORCING = 0.01  # the least tolerance of those after the first, which move a whole body no more
-SHARE, LAW_SHARE = 0.1, 0.1  # of what the stage has left of |r| and of the laws' residual: what such a problem is solved to,
-LEAST_SHARE, LEAST_LAW_SHARE = 0.3, 0.8  # or these of the tolerances: a whole step on the true stage keeps what was reached
-BALANCE = 0.03  # laws need not hold better than so many times the relative |r| that is asked for: the next matrix undoes that
-SHARE_OF_ONE = 0.3  # of the |r| asked for that ends the steps under one multiplier: new ones at an old |r| overshoot
-LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # linear solves of a linearised stage, and their tolerance
-STALLED, PATIENCE = 0.9, 3  # share of |r| that a step leaves which stalls; so many times as many solves after that
-FALLBACK = 6  # steps on the true stage
-HIDING = 4.0  # times the floor of |r|: where the motion of a whole body may be what is left of it
+SOLVES, FORCING = 60, 0.3  # maximum linear solves of a frictional problem, and their tolerance
+LATER_FORCING = 0.01  # minimum tolerance of those after the first, which no longer change rigid motion
+REDUCTION, LAW_REDUCTION = 0.1, 0.1  # fractions of the stage's |r| and laws' residual to which such a problem is solved,
+TOLERANCE_FRACTION, LAW_TOLERANCE_FRACTION = 0.3, 0.8  # or these of the tolerances, which survive a full nonlinear step
+LAW_BALANCE = 0.03  # laws' residual over the required relative |r|; the next matrix would undo more accuracy
+MULTIPLIER_FRACTION = 0.3  # of the required |r|, ends the steps under one multiplier: updates at a large |r| overshoot
+LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # maximum linear solves of a linearised stage, and their tolerance
+STALLED, STALLED_SOLVES = 0.9, 3  # fraction of |r| left by a stalling step; factor on SOLVES after that
+FALLBACK_STEPS = 6  # steps on the nonlinear stage
+NEAR_FLOOR = 4.0  # times the floor of |r|: below it, |r| may be mostly rigid motion
 
 
 @dataclass(frozen=True)
-class Frictional:
-    """What a solve of a linearised stage did. negative: its matrix is indefinite."""
+class FrictionalResult:
+    """Result of solving a linearised stage. negative: its matrix is indefinite."""
 
     solves: int
     linear: int
@@ -44,83 +45,85 @@ class Frictional:
     r: float
 
 
-def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) -> Frictional:
-    """Solve a linearised stage from (|r|, scale), on one thread in one launch."""
-    if not system.model.serial or PUBLIC:  # Taichi itself takes no more than 64 arguments
+def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) -> FrictionalResult:
+    """Solve a linearised stage from (|r|, scale); on one thread in one launch."""
+    if not system.model.serial or PUBLIC:  # public Taichi takes no more than 64 arguments
         newton = Newton(system, problem)
         result = newton.run(r, scale, fresh=True)
-        return Frictional(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
-    loop = system.solve_frictional(problem, r, system.rounding.of_stage(problem.c, problem.beta))
+        return FrictionalResult(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
+    loop = system.solve_frictional(problem, r, system.rounding.stage_floor(problem.c, problem.beta))
     counts = (int(loop[place]) for place in (SOLVES_DONE, LINEAR, MULTIPLIERS))
-    return Frictional(*counts, loop[VERDICT] == INDEFINITE, loop[VERDICT] == SOLVED, float(loop[NORM]))
+    return FrictionalResult(*counts, loop[STATUS] == INDEFINITE, loop[STATUS] == SOLVED, float(loop[NORM]))
 
 
 class ContactNewton:
-    """Newton steps of a stage with contacts: each linearises elasticity, and solves its contact problem on the fixed matrix."""
+    """Newton steps of a stage with contacts: each linearises elasticity and solves the contact problem on the fixed matrix."""
 
     def __init__(self, system: StageSystem, stage: Stage):
         self.system, self.stage = system, stage
-        self.floor = system.rounding.of_stage(stage.c, stage.beta)
+        self.floor = system.rounding.stage_floor(stage.c, stage.beta)
         self.newton = self.linear = self.multipliers = 0
-        self.eliminated = 0.0  # Newton iterations on few nodes, by their share
+        self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
         self.rounding = self.tight = self.stalls = False
-        self.has_direction = False  # y is a good first direction on the matrix at hand
+        self.has_direction = False  # y is a good first direction on the current matrix
 
     def run(self) -> StageResult:
-        """From the first iterate on, where the matrix has been formed."""
+        """Solve from the first iterate, where the matrix has been formed."""
         system, stage = self.system, self.stage
         self.r, self.scale, self.has_direction = choose_start(system, *system.evaluate(new_multipliers=True))
-        if self.has_direction:  # what was formed at the first iterate is void
+        if self.has_direction:  # the matrix of the first iterate is invalid
             system.form_matrix_and_factors()
             self.r, self.scale = system.evaluate(None)
-        least, stalled = self.r, 0
-        while not self._done() and self.newton < stage.max_newton and math.isfinite(self.r):
+        lowest, stalled = self.r, 0
+        while not self._has_converged() and self.newton < stage.max_newton and math.isfinite(self.r):
             if self.newton > 0:
                 system.form_matrix()
-            previous, law = self.r, system.contact_residual
-            only_laws = self._is_balanced
-            inner, moved = self._solve_contacts(), False
+            previous, law_residual = self.r, system.contact_residual
+            only_laws_remain = self._is_balanced
+            result, moved = self._solve_contacts(), False
             self.newton += 1
-            if not inner.negative:
-                self.r, self.scale = system.leave_linear()
-                moved = self.r < FALL * least
-                if not moved:  # also where it is not a number
+            if not result.negative:
+                self.r, self.scale = system.end_linearised()
+                moved = self.r < DECREASE * lowest
+                if not moved:  # also if it is not a number
                     system.evaluate(AGAIN, 0.0)
-                    self.r, self.scale, moved = search(system, FALL * least)
+                    self.r, self.scale, moved = search(system, DECREASE * lowest)
             if not moved:
                 moved = self._fall_back()
-                if not (inner.negative or self.tight):
-                    # where friction goes round and round, a shorter step helps, and more of these do not
-                    moved &= self.r < FALL * least or (only_laws and system.contact_residual < FALL * law)
-            # where redundant contacts hand impulses on to each other by little, only plain multipliers and a large R lead far
-            stalled += self.r > STALLED * least
+                if not (result.negative or self.tight):
+                    # if friction cycles, a shorter time step helps, and more of these steps do not
+                    moved &= self.r < DECREASE * lowest or (
+                        only_laws_remain and system.contact_residual < DECREASE * law_residual
+                    )
+            # if redundant contacts exchange impulses slowly, only plain multipliers and a large R make progress
+            stalled += self.r > STALLED * lowest
             self.stalls = stalled >= 2
-            if moved and self.r > SLOW_STEP * previous and not self._done():
+            if moved and self.r > ELIMINATION_RATIO * previous and not self._has_converged():
                 self._eliminate()
-            least = min(least, self.r)
+            lowest = min(lowest, self.r)
             self.rounding = self.r <= ROUNDING * self.floor and self.r > 0.5 * previous and self.tight
             if not moved:
                 break
         return StageResult(
             self.newton + round(self.eliminated), round(self.linear), relative(self.r, self.scale),
-            self._done() and math.isfinite(self.r), self.rounding or self.r <= self.floor, self.multipliers,
+            self._has_converged() and math.isfinite(self.r), self.rounding or self.r <= self.floor, self.multipliers,
             system.contact_residual,
         )  # fmt: skip
 
     def _fall_back(self) -> bool:
-        """A few steps on the true stage from where it was linearised; whether there was any."""
+        """Take a few steps on the nonlinear stage from where it was linearised; return whether there was any."""
         system, stage = self.system, self.stage
-        self.r, self.scale = system.leave_linear(taken=False)
-        laws = stage.contact_tolerance if self._is_balanced else math.inf
-        steps = Newton(system, replace(stage, max_newton=FALLBACK, contact_tolerance=laws))
+        self.r, self.scale = system.end_linearised(accept=False)
+        law_tolerance = stage.contact_tolerance if self._is_balanced else math.inf
+        steps = Newton(system, replace(stage, max_newton=FALLBACK_STEPS, contact_tolerance=law_tolerance))
         steps.run(self.r, self.scale, fresh=True)
-        self.newton += max(0, steps.newton - 1)  # the first is on the matrix at hand
+        self.newton += max(0, steps.newton - 1)  # the first uses the current matrix
         self.linear, self.multipliers = self.linear + steps.linear, self.multipliers + steps.multipliers
         self.r, self.scale = system.evaluate(None, new_multipliers=True)
         return steps.newton > 0
 
     def _eliminate(self) -> None:
-        """Solve what a slow step left on few nodes."""
+        """Solve the few nodes that dominate |r| after a slow step."""
         if self._is_balanced:
             return
         found = eliminate(self.system, self.stage, self.r)
@@ -130,78 +133,78 @@ class ContactNewton:
 
     @property
     def _is_balanced(self) -> bool:
-        """Whether |r| is fine, so that the contact laws alone are left."""
+        """Whether |r| has converged, so that only the contact laws remain."""
         return self.r <= self.stage.tolerance * self.scale
 
-    def _done(self) -> bool:
+    def _has_converged(self) -> bool:
         return (self._is_balanced or self.rounding) and self.system.contact_residual <= self.stage.contact_tolerance
 
-    def _solve_contacts(self) -> "Frictional":
-        """The contact problem on the matrix at hand, where that is indefinite on a projected one."""
-        inner = self._solve_on_matrix()
-        if inner.negative:
-            self.r, self.scale = self.system.leave_linear(taken=False)
+    def _solve_contacts(self) -> "FrictionalResult":
+        """Solve the contact problem on the current matrix, or on a projected one if that is indefinite."""
+        result = self._solve_on_matrix()
+        if result.negative:
+            self.r, self.scale = self.system.end_linearised(accept=False)
             self.system.form_matrix(projected=True)
             self.newton += 1
-            inner = self._solve_on_matrix()
-        return inner
+            result = self._solve_on_matrix()
+        return result
 
-    def _solve_on_matrix(self) -> "Frictional":
-        """The contact problem on the matrix at hand, to a share of what the stage has left."""
+    def _solve_on_matrix(self) -> "FrictionalResult":
+        """Solve the contact problem on the current matrix, to a fraction of the stage's residuals."""
         system, stage = self.system, self.stage
         system.linearise()
-        enough = max(SHARE * self.r, LEAST_SHARE * stage.tolerance * self.scale)
-        tolerance = enough / self.scale if self.scale > 0.0 else 0.0
-        # where the rounding of stiff stress hides the motion of a whole body in |r|, only a tight solve gets that motion right,
-        # the first, and impulses only settle where |r| follows them down
-        self.tight = self.r <= HIDING * self.floor
-        law = LEAST_LAW_SHARE * stage.contact_tolerance
+        target = max(REDUCTION * self.r, TOLERANCE_FRACTION * stage.tolerance * self.scale)
+        tolerance = target / self.scale if self.scale > 0.0 else 0.0
+        # if rounding of stiff stress hides the rigid motion in |r|, only a tight first solve gets that motion right, and
+        # impulses converge only if |r| decreases with them
+        self.tight = self.r <= NEAR_FLOOR * self.floor
+        law_tolerance = LAW_TOLERANCE_FRACTION * stage.contact_tolerance
         if not self._is_balanced:
-            law = max(law, BALANCE * tolerance)
+            law_tolerance = max(law_tolerance, LAW_BALANCE * tolerance)
         problem = replace(
             stage, tolerance=tolerance,
-            contact_tolerance=max(LAW_SHARE * system.contact_residual, law),
-            tolerance_of_one=0.0 if self.tight else SHARE_OF_ONE * tolerance,
+            contact_tolerance=max(LAW_REDUCTION * system.contact_residual, law_tolerance),
+            multiplier_tolerance=0.0 if self.tight else MULTIPLIER_FRACTION * tolerance,
             extrapolate_after=MAX_MULTIPLIERS if self.stalls else 0 if self.tight else stage.extrapolate_after,
-            max_newton=PATIENCE * SOLVES if self.stalls else SOLVES,
+            max_newton=STALLED_SOLVES * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
             later_tolerance=0.0 if stage.linear_tolerance else LATER_FORCING,
         )  # fmt: skip
-        inner = solve_linear(system, problem, self._first_residual(), self.scale)
-        self.linear, self.multipliers = self.linear + inner.linear, self.multipliers + inner.multipliers
-        return inner
+        result = solve_linear(system, problem, self._first_residual(), self.scale)
+        self.linear, self.multipliers = self.linear + result.linear, self.multipliers + result.multipliers
+        return result
 
     def _first_residual(self) -> float:
-        """|r| where a solve begins, of the stage that has just been linearised."""
+        """Return |r| at the start of a solve, of the stage just linearised."""
         system = self.system
         if not self.has_direction:
             return self.r
         self.has_direction = False
         r, _ = system.advance()
-        if math.isfinite(r) and system.has_advanced_to_a_root:
+        if math.isfinite(r) and system.found_zero_slope:
             return r
-        r, _ = system.leave_linear(taken=False)
+        r, _ = system.end_linearised(accept=False)
         system.linearise()
         return r
 
 
 def solve(system: StageSystem, stage: Stage) -> StageResult:
-    """Solve a stage from the present v, or from v = 0, see `choose_start`.
+    """Solve a stage from the present v or from v = 0, see `choose_start`.
 
-    x_hat, v_hat, the targets and the contacts are set by the caller.
+    The caller sets x_hat, v_hat, the targets and the contacts.
     """
     system.begin(stage)
     if system.n_contacts == 0:
         newton = Newton(system, stage, eliminate=eliminate)
         if stage.linearised:
-            return newton.run_once()
+            return newton.solve_once()
         r, scale, _ = choose_start(system, *system.evaluate())
         return newton.run(r, scale, fresh=False)
     return solve_linearised(system, stage) if stage.linearised else ContactNewton(system, stage).run()
 
 
 def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
-    """The frictional problem alone, at the present state; of a projected matrix where its own is indefinite."""
+    """Solve the frictional problem alone, at the present state; on a projected matrix if its own is indefinite."""
     tolerance = stage.linear_tolerance or LINEARISED_FORCING
     problem, linear = replace(stage, max_newton=LINEARISED_SOLVES, linear_tolerance=tolerance), 0
     r, scale = system.evaluate(new_multipliers=True)
@@ -211,9 +214,9 @@ def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
         linear += found.linear
         if not found.negative or projected:
             break
-        r, scale = system.leave_linear(taken=False)
+        r, scale = system.end_linearised(accept=False)
         system.form_matrix(projected=True)
-    low = found.r <= system.rounding.of_stage(stage.c, stage.beta)
+    at_floor = found.r <= system.rounding.stage_floor(stage.c, stage.beta)
     return StageResult(
-        found.solves, linear, relative(found.r, scale), found.converged, low, found.multipliers, system.contact_residual,
+        found.solves, linear, relative(found.r, scale), found.converged, at_floor, found.multipliers, system.contact_residual,
     )  # fmt: skip

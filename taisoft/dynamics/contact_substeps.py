@@ -1,4 +1,4 @@
-"""Runs explicit sub-steps with contacts: a search, a contact problem and a solve in each."""
+"""Explicit sub-steps with contacts: a search, a contact problem and a solve in each."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,8 +18,8 @@ from taisoft.errors import SimulationError
 from taisoft.scalars import FAILED, LOWEST_J, MOST_INVERTED
 from taisoft.transfer import download
 
-MAX_SWEEPS = 1000  # of a contact solve; one that needs more is reported as not converged
-LAUNCHES = 200  # sub-steps between two looks at whether the run is to stop
+MAX_SWEEPS = 1000  # per contact solve; one that needs more is reported as not converged
+MAX_CONTACT_BATCH = 200  # maximum sub-steps per batch, between checks for interruption
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,40 +34,40 @@ class GoodState:
 class ContactSubstepResult(SubstepResult):
     """Extremes over a batch."""
 
-    contact_iterations: int = 0  # in all
-    contact_residual: float = 0.0  # the worst
-    contacts_converged: bool = True  # whether those of every sub-step were solved to the tolerance
+    contact_iterations: int = 0  # total
+    contact_residual: float = 0.0  # maximum
+    contacts_converged: bool = True  # in every sub-step
 
 
 class ContactExplicitStepper(ExplicitStepper):
-    """Takes sub-steps of symplectic Euler or velocity Verlet over a world in which things can touch."""
+    """Take sub-steps of symplectic Euler or velocity Verlet with contacts."""
 
     def __init__(self, simulation: SimulationState, verlet: bool, contact: ContactStep, method: str):
         super().__init__(simulation, verlet)
         self.contact, self.method = contact, method
-        self.max_batch = min(self.max_batch, LAUNCHES)
+        self.max_batch = min(self.max_batch, MAX_CONTACT_BATCH)
         m, arena = simulation.model, simulation.arena
         self._good = GoodState(arena.vectors("x_good", ti.f64, m.n_nodes), arena.vectors("v_good", m.real, m.n_nodes))
         self.contact_tolerance = TOLERANCE[simulation.runtime.precision]
 
     def forget(self) -> None:
-        """The state was set."""
+        """Discard the search and impulses, after the state was set."""
         super().forget()
         self.contact.forget()
 
     def snapshot(self) -> dict:
-        """As without contacts, and the contacts of the last sub-step."""
+        """Return the state without contacts, and the contacts of the last sub-step."""
         return super().snapshot() | {"contact": self.contact.snapshot()}
 
     def restore(self, kept: dict) -> None:
-        """Back to what `snapshot` told."""
+        """Restore a `snapshot`."""
         super().restore(kept)
         self.contact.restore(kept["contact"])
 
     def advance(self, n: int, dt: float) -> ContactSubstepResult:
-        """Take n sub-steps of dt, or fewer where led nodes let go or the batch is full; at least one.
+        """Take n sub-steps of dt, or fewer if prescribed nodes are released or the batch is full; at least one.
 
-        Whatever fails leaves the state before its sub-step.
+        If a sub-step fails, the state is the one before it.
         """
         simulation, m, results, depth, done = self.simulation, self.simulation.model, [], 0.0, 0
         explicit.begin_parallel(m)
@@ -76,7 +76,7 @@ class ContactExplicitStepper(ExplicitStepper):
         if self.work.n_prescribed:
             n = min(n, self.rows)
             targets = simulation.next_targets(start + dt * np.arange(1, n + 1))
-            self.stale = self.stale or simulation.releases != releases
+            self.acceleration_stale = self.acceleration_stale or simulation.releases != releases
             n = len(targets)
         self.contact.start_step(dt)
         relative_penetration = 0.0
@@ -88,8 +88,8 @@ class ContactExplicitStepper(ExplicitStepper):
                 results.append(self._substep(simulation.step_count + done + 1, start + done * dt, dt))
                 depth = max(depth, self.contact.end(start + (done + 1) * dt, dt))
                 relative_penetration = max(relative_penetration, self.contact.relative_penetration)
-                if done + 1 == n:  # once a batch: it costs about as much as a search
-                    crossing = self.contact.cross()
+                if done + 1 == n:  # once per batch: it costs about as much as a search
+                    crossing = self.contact.measure_crossings()
                     depth, relative_penetration = max(depth, crossing[0]), max(relative_penetration, crossing[1])
                 done += 1
                 self._released = simulation.dirichlet.released()
@@ -106,20 +106,20 @@ class ContactExplicitStepper(ExplicitStepper):
 
     def _restore(self) -> None:
         simulation = self.simulation
-        self._put_back(*download([self._good.x, self._good.v]))
+        self._restore_state(*download([self._good.x, self._good.v]))
         if simulation.dirichlet.released() != self._released:
             simulation.dirichlet.set_released(self._released)
             simulation.upload_constraints()
         self.contact.forget()
 
     def _substep(self, step: int, time: float, dt: float) -> SolveResult | None:
-        """One sub-step, the step-th, from a time; returns what the contacts' solver did, None where there are none."""
+        """Take sub-step number `step` from a time; return the contact solver's result, None without contacts."""
         m, s, contact = self.simulation.model, self.work, self.contact
-        if contact.look(time, dt)[1] > 1.0:
-            raise SimulationError(f"step {step}: {contact.too_fast(dt)}")
-        if s.verlet and self.stale:
+        if contact.measure_start(time, dt)[1] > 1.0:
+            raise SimulationError(f"step {step}: {contact.describe_fast_closing(dt)}")
+        if s.verlet and self.acceleration_stale:
             find_acceleration(m, s)
-        self.stale = False
+        self.acceleration_stale = False
         n = contact.begin(time, dt)
         predict(m, s, dt)
         result = None
@@ -134,5 +134,5 @@ class ContactExplicitStepper(ExplicitStepper):
         if s.verlet:
             finish_verlet(m, s, contact.problem, dt, int(n > 0))
         if m.state.scalars[FAILED] != 0.0:
-            raise SimulationError(f"step {step}: {self._fault()}")
+            raise SimulationError(f"step {step}: {self._describe_fault()}")
         return result

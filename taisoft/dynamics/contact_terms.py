@@ -1,10 +1,10 @@
-"""Kernels of an implicit stage with contacts: what they add to the residual, the objective and the matrix.
+"""Contact terms of an implicit stage: their contributions to residual, objective and matrix.
 
-With multipliers lambda (impulses) and radii rho of the friction disks that stay while v is sought, the stage minimises
+With multipliers lambda (impulses) and friction disk radii rho, both fixed, the stage minimises
     Phi(v) + sum_c psi_c(lambda - R u),   u = J v + b,
-whose gradient is that of Phi less J^T p, p = prox(lambda - R u), and whose second derivative is A + J^T D J with D = R dp/dz.
+with gradient grad Phi - J^T p, p = prox(lambda - R u), and Hessian A + J^T D J, D = R dp/dz, z = lambda - R u.
 psi of the normal part is max(0, z_n)^2 / 2 R_n; of the tangential part |z_t|^2 / 2 R_t inside the disk and
-(rho |z_t| - rho^2 / 2) / R_t outside. The normal velocity u_n is the gap at the stage's end over beta, less its goal.
+(rho |z_t| - rho^2 / 2) / R_t outside. The normal velocity u_n is the gap at the stage's end over beta, minus its target.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from taisoft.model import Model
 from taisoft.runtime import kernel
 from taisoft.subset import n_nodes_of, node_of
 
-PAST = 2  # renewals of multipliers that are remembered
+PAST = 2  # multiplier updates that are stored
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,31 +31,31 @@ class ContactStageWork:
 
     multiplier: Any  # (capacity) 3-vectors f64: lambda [N s]
     radius: Any  # (capacity) f64: rho [N s]
-    past_impulse: Any  # (PAST capacity) 3-vectors f64: impulses at the last renewals of multipliers, latest first [N s]
-    past_change: Any  # (PAST capacity) 3-vectors f64: those less the multipliers that led to them [N s]
-    tangential_offset: Any  # (capacity) 3-vectors f64: J (x_start - x_hat), less the displacement of an obstacle [m]
-    gap_minus_target: Any  # (capacity) f64: gap - target at the start, less the displacement of an obstacle along the normal [m]
-    velocity: Any  # (capacity) 3-vectors f64: u where a step begins [m/s]
-    rate: Any  # (capacity) 3-vectors f64: of u along the step [m/s]
-    kept: Any  # (capacity) 3-vectors f64: impulses where the stage was linearised [N s]
-    world_impulse: Any  # (capacity) 3-vectors f64: the impulse in the world [N s]
-    prox_residual: Any  # (capacity) 2-vectors f64: of the natural map, and of the impulse, squared
-    block: Any  # (capacity) 12-vectors: J^T D J is made of weights times this
-    active: Any  # (capacity) i32: 1 where the block is not 0
+    past_impulse: Any  # (PAST capacity) 3-vectors f64: impulses at the last multiplier updates, latest first [N s]
+    past_change: Any  # (PAST capacity) 3-vectors f64: those minus the multipliers that gave them [N s]
+    tangential_offset: Any  # (capacity) 3-vectors f64: J (x_start - x_hat) minus obstacle displacement [m]
+    gap_minus_target: Any  # (capacity) f64: gap - target at the start, minus obstacle displacement along the normal [m]
+    velocity: Any  # (capacity) 3-vectors f64: u at the start of a step [m/s]
+    rate: Any  # (capacity) 3-vectors f64: derivative of u along the step [m/s]
+    kept: Any  # (capacity) 3-vectors f64: impulses at linearisation [N s]
+    world_impulse: Any  # (capacity) 3-vectors f64: impulse in world axes [N s]
+    prox_residual: Any  # (capacity) 2-vectors f64: squared norms of the prox residual and of the impulse
+    block: Any  # (capacity) 12-vectors: D in world axes; J^T D J consists of weights times this
+    active: Any  # (capacity) i32: 1 if the block is not 0
 
 
 @dataclass(frozen=True, eq=False)
 class StageContacts:
-    """What the kernels of a stage and of its linear solve need to know of the contacts."""
+    """Contact data for the kernels of a stage and of its linear solve."""
 
     problem: Any  # ContactProblem
     found: Any  # FoundContacts
     work: ContactStageWork
     coupling: Coupling  # of J^T D J
-    x_start: Any  # (n_nodes) 3-vectors f64: where the gaps were taken [m]
-    displacement: Any  # (n_nodes) 3-vectors f64: from there [m]
-    x_linear: Any  # (n_nodes) 3-vectors f64: where a stage was linearised [m]
-    residual_linear: Any  # (n_nodes) 3-vectors: without contacts, of a linearised stage [N s]
+    x_start: Any  # (n_nodes) 3-vectors f64: positions at which gaps were measured [m]
+    displacement: Any  # (n_nodes) 3-vectors f64: displacement from x_start [m]
+    x_linear: Any  # (n_nodes) 3-vectors f64: positions at linearisation [m]
+    residual_linear: Any  # (n_nodes) 3-vectors: residual without contacts of a linearised stage [N s]
 
     @property
     def any(self) -> bool:
@@ -70,15 +70,15 @@ NO_CONTACTS = StageContacts(None, None, None, NO_COUPLING, *[None] * 4)
 def begin_contacts(
     s: ti.template(), k: ti.template(), impact: ti.template(), beta: ti.f64, dt: ti.f64, gap_targets: ti.types.ndarray()
 ):  # fmt: skip
-    """What neither x nor the multipliers change in a stage of a step of dt [s].
+    """Set the constant contact data of a stage, in a step of dt [s].
 
-    impact: whether the contacts' velocity must be `min_velocity`, whatever their gap. goal (4,): see `ContactStep.goal`.
+    impact: whether the contacts' velocity must be `min_velocity`, regardless of gaps. gap_targets (4,): of `ContactStep`.
     """
     p, f, w = ti.static((k.problem, k.found, k.work))
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         offset = -(beta / dt) * f.obstacle_displacement[c]
-        if ti.static(not impact):  # whose x_hat is x_start
+        if ti.static(not impact):  # in an impact x_hat is x_start
             for j in range(p.arity[c]):
                 i = p.node[c, j]
                 offset += p.weight[c, j] * (k.x_start[i] - s.x_hat[i])
@@ -86,26 +86,27 @@ def begin_contacts(
         if ti.static(impact):
             w.gap_minus_target[c] = -beta * f.min_velocity[c] - (beta / dt) * p.normal[c].dot(f.obstacle_displacement[c])
         else:
-            short = gap_minus_target(f, c, dt, gap_targets[0], gap_targets[1], gap_targets[2], gap_targets[3], f.min_opening[c])
-            w.gap_minus_target[c] = short - p.normal[c].dot(f.obstacle_displacement[c])
+            offset_target, fast, slow, fastest = gap_targets[0], gap_targets[1], gap_targets[2], gap_targets[3]
+            gap_to_target = gap_minus_target(f, c, dt, offset_target, fast, slow, fastest, f.min_opening[c])
+            w.gap_minus_target[c] = gap_to_target - p.normal[c].dot(f.obstacle_displacement[c])
 
 
 @ti.func
 def set_multiplier(k: ti.template(), c):
-    """The impulse of contact c becomes its multiplier, and the disk opens as far as that says."""
+    """Set the multiplier of contact c to its impulse, and the friction disk accordingly."""
     k.work.multiplier[c] = k.problem.r[c]
     open_disk(k, c)
 
 
 @ti.func
 def open_disk(k: ti.template(), c):
-    """The friction disk opens as far as the multiplier of contact c says."""
+    """Set the friction disk's radius from the multiplier of contact c."""
     k.work.radius[c] = k.problem.friction[c] * k.work.multiplier[c][0]
 
 
 @ti.func
 def stage_velocity_of(k: ti.template(), c, beta):
-    """u of contact c at the present x: (normal, t1, t2) [m/s]."""
+    """Return u of contact c at the present x: (normal, t1, t2) [m/s]."""
     p, w = ti.static((k.problem, k.work))
     displacement = dvec(0.0)
     for j in range(p.arity[c]):
@@ -115,15 +116,15 @@ def stage_velocity_of(k: ti.template(), c, beta):
 
 
 @ti.func
-def unprojected(k: ti.template(), c, u, r_scale):
-    """z = lambda - R u of contact c."""
+def unprojected_impulse(k: ti.template(), c, u, r_scale):
+    """Return z = lambda - R u of contact c."""
     R = r_scale * k.problem.factor[c]
     return k.work.multiplier[c] - dvec(R[0] * u[0], R[1] * u[1], R[1] * u[2])
 
 
 @ti.func
-def impulse_at(k: ti.template(), c, z):
-    """p = prox(z), with the friction disk frozen; 0 where nothing can move the contact."""
+def projected_impulse(k: ti.template(), c, z):
+    """Return p = prox(z) with the friction disk fixed; 0 if no node of the contact can move."""
     p = into_disk(dvec(ti.max(z[0], 0.0), z[1], z[2]), k.work.radius[c])
     if k.problem.factor[c][0] == 0.0:
         p = dvec(0.0)
@@ -131,22 +132,22 @@ def impulse_at(k: ti.template(), c, z):
 
 
 @ti.func
-def press_contact(m: ti.template(), k: ti.template(), c, beta, r_scale):
-    """Impulse p.r of contact c at the present x, its block of the matrix, and its part in the laws' residual."""
+def update_contact(m: ti.template(), k: ti.template(), c, beta, r_scale):
+    """Compute the impulse p.r of contact c at the present x, its matrix block, and its part of the laws' residual."""
     p, w = ti.static((k.problem, k.work))
     u = stage_velocity_of(k, c, beta)
     Rn, Rt = r_scale * p.factor[c][0], r_scale * p.factor[c][1]
-    z, rho = unprojected(k, c, u, r_scale), w.radius[c]
+    z, rho = unprojected_impulse(k, c, u, r_scale), w.radius[c]
     size = ti.sqrt(z[1] * z[1] + z[2] * z[2])
-    r = impulse_at(k, c, z)
+    r = projected_impulse(k, c, z)
     p.r[c] = r
-    # D in the contact's frame, then in the world
+    # D in the contact frame, then in world axes
     Dn = ti.select(z[0] > 0.0, Rn, 0.0)
-    along, across = Rt, Rt  # along z_t, and across it
-    if size > rho or rho == 0.0:  # slips; without a disk nothing resists, not even where nothing moves yet
-        along, across = 0.0 * Rt, 0.0 * Rt
+    D_along, D_across = Rt, Rt  # along z_t, and perpendicular to it
+    if size > rho or rho == 0.0:  # slips; without a disk there is no resistance, even at rest
+        D_along, D_across = 0.0 * Rt, 0.0 * Rt
         if size > 0.0:
-            across = Rt * rho / size
+            D_across = Rt * rho / size
     n, t1 = p.normal[c], p.tangent[c]
     t2 = n.cross(t1)
     w.world_impulse[c] = r[0] * n + r[1] * t1 + r[2] * t2
@@ -156,26 +157,26 @@ def press_contact(m: ti.template(), k: ti.template(), c, beta, r_scale):
     g = n.cross(e)
     for i in ti.static(range(3)):
         for j in ti.static(range(3)):
-            w.block[c][4 * j + i] = ti.cast(Dn * n[i] * n[j] + along * e[i] * e[j] + across * g[i] * g[j], m.real)
-    w.active[c] = int(Dn > 0.0 or along > 0.0 or across > 0.0)
+            w.block[c][4 * j + i] = ti.cast(Dn * n[i] * n[j] + D_along * e[i] * e[j] + D_across * g[i] * g[j], m.real)
+    w.active[c] = int(Dn > 0.0 or D_along > 0.0 or D_across > 0.0)
     d = r - prox(r - scaled(p.factor[c], u), p.friction[c])
     w.prox_residual[c] = ti.Vector([d.dot(d), r.dot(r)], ti.f64)
 
 
 @ti.func
 def impulse_on_node(k: ti.template(), i):
-    """(J^T r) of node i [N s]; as `impulse_on`, which has no impulses in the world at hand."""
+    """Return (J^T r) of node i [N s]; as `impulse_on`, but from impulses in world axes."""
     p, w = ti.static((k.problem, k.work))
     d = dvec(0.0)
     for e in range(p.entry_start[i], p.entry_start[i + 1]):
-        c, own = p.entry[e] // NODES, p.entry[e] % NODES
-        d += p.weight[c, own] * w.world_impulse[c]
+        c, slot = p.entry[e] // NODES, p.entry[e] % NODES
+        d += p.weight[c, slot] * w.world_impulse[c]
     return d
 
 
 @ti.func
 def sum_residual(k: ti.template()):
-    """Residual of the laws over all contacts."""
+    """Compute the residual of the laws over all contacts."""
     p, w = ti.static((k.problem, k.work))
     changed, size = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     for c in range(p.count[0]):
@@ -186,10 +187,10 @@ def sum_residual(k: ti.template()):
 
 
 @kernel
-def press(m: ti.template(), k: ti.template(), new_multipliers: ti.i32, beta: ti.f64, r_scale: ti.f64):
-    """Find the impulses of all contacts at the present x, their blocks of the matrix, and the residual of their laws.
+def update_impulses(m: ti.template(), k: ti.template(), new_multipliers: ti.i32, beta: ti.f64, r_scale: ti.f64):
+    """Compute impulses and matrix blocks of all contacts at the present x, and the residual of their laws.
 
-    new_multipliers: whether the impulses are made the multipliers first, and the disks opened as far as these say.
+    new_multipliers: whether to set the multipliers to the impulses first, and the friction disks accordingly.
     r_scale: R over the r-factors.
     """
     (p,) = ti.static((k.problem,))
@@ -197,28 +198,28 @@ def press(m: ti.template(), k: ti.template(), new_multipliers: ti.i32, beta: ti.
     for n in range(p.count[0]):
         if new_multipliers == 1:
             set_multiplier(k, n)
-        press_contact(m, k, n, beta, r_scale)
+        update_contact(m, k, n, beta, r_scale)
     ti.loop_config(serialize=True)
     for _ in range(1):
         sum_residual(k)
 
 
 @kernel
-def keep_diagonal(m: ti.template(), A: ti.template(), k: ti.template(), subset: ti.template()):
-    """The matrix has been formed: its diagonal without contacts, and the masses that the r-factors rest on, diag(A)^-1."""
+def save_diagonal(m: ti.template(), A: ti.template(), k: ti.template(), subset: ti.template()):
+    """Save the new matrix's diagonal without contacts, and diag(A)^-1, the inverse masses for the r-factors."""
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for j in range(n_nodes_of(m, subset)):
         i = node_of(subset, j)
         k.coupling.base[i] = A.diagonal[i]
         for a in ti.static(range(3)):
-            # an entry can be negative where tets are strongly compressed
+            # an entry can be negative if tets are strongly compressed
             d = ti.max(ti.abs(ti.cast(A.diagonal[i][5 * a], ti.f64)), ti.cast(m.mass[i], ti.f64))
             p.inverse_mass[i][a] = ti.cast(m.free[i][a], ti.f64) / d
 
 
 def build_stage_contacts(arena: FieldArena, model: Model, found: FoundContacts, x_start: Any) -> StageContacts:
-    """Room for the contacts of `found`. x_start: (n_nodes) 3-vectors f64, filled by the caller."""
+    """Allocate storage for the contacts of `found`. x_start: (n_nodes) 3-vectors f64, filled by the caller."""
     p, n, real = found.problem, model.n_nodes, model.real
     work = ContactStageWork(
         arena.vectors("multiplier", ti.f64, p.capacity), arena.field("friction_radius", ti.f64, p.capacity),

@@ -1,4 +1,4 @@
-"""Constraints as the steps see them: which axes are free, where moved nodes must be at a time, when they are released."""
+"""Dirichlet conditions: constrained axes, target positions of prescribed nodes over time, and their release."""
 
 from dataclasses import dataclass
 
@@ -14,14 +14,14 @@ class _Group:
     name: str  # of the body
     constraint: Constraint
     nodes: np.ndarray  # (k,) rows of the model
-    rows: slice  # rows among the moved nodes
+    rows: slice  # rows among the prescribed nodes
     released: bool = False
 
 
 class DirichletConditions:
     """Constraints of all bodies.
 
-    moved (n_prescribed,): model rows of led nodes, group by group; a node led by two groups on different axes has two rows.
+    prescribed_nodes (n_prescribed,): model rows, group by group; a node prescribed by two groups on different axes has two rows.
     held (n_held,): model rows with a constrained axis at the start.
     """
 
@@ -42,26 +42,26 @@ class DirichletConditions:
         self.held = np.flatnonzero(self.constrained().any(axis=1))
 
     def reset(self) -> None:
-        """Take up every path again."""
+        """Start every path again."""
         for g in self._groups:
             g.released = False
 
     def released(self) -> list[bool]:
-        """Which groups have let go."""
+        """Return which groups are released."""
         return [g.released for g in self._groups]
 
     def set_released(self, released: list[bool]) -> None:
-        """Back to what `released` told."""
-        for g, gone in zip(self._groups, released, strict=True):
-            g.released = gone
+        """Restore the result of `released`."""
+        for g, value in zip(self._groups, released, strict=True):
+            g.released = value
 
     @property
     def n_prescribed(self) -> int:
-        """Rows of led nodes, released ones included."""
+        """Rows of prescribed nodes, including released ones."""
         return len(self.prescribed_nodes)
 
     def constrained(self) -> np.ndarray:
-        """(n_nodes, 3) bool: axes that are fixed or led now."""
+        """Return the axes that are now fixed or prescribed, (n_nodes, 3) bool."""
         mask = self._fixed.copy()
         for g in self._groups:
             if not g.released:
@@ -69,7 +69,7 @@ class DirichletConditions:
         return mask
 
     def prescribed_axes(self) -> np.ndarray:
-        """(n_prescribed, 3) int32: 1 where a row's axis is led now."""
+        """Return 1 for each row's axes that are now prescribed, (n_prescribed, 3) int32."""
         axes = np.zeros((self.n_prescribed, 3), dtype=np.int32)
         for g in self._groups:
             if not g.released:
@@ -77,10 +77,10 @@ class DirichletConditions:
         return axes
 
     def targets(self, times: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Positions of the led nodes at the times (k,) [s], up to the first release.
+        """Return positions of the prescribed nodes at the times (k,) [s], up to the first release.
 
-        Returns (r, n_prescribed, 3) [m] with r <= k, and whether a group lets go at times[r]. If that is times[0], the groups
-        that let go are released and the call is to be repeated.
+        Returns (r, n_prescribed, 3) [m] with r <= k, and whether a group is released at times[r]. If r = 0, those groups are
+        then marked as released, and the call must be repeated.
         """
         rows = np.zeros((len(times), self.n_prescribed, 3))
         for r, t in enumerate(times):
@@ -88,11 +88,11 @@ class DirichletConditions:
             for g in self._groups:
                 if g.released:
                     continue
-                way = self._ask(g, float(t))
-                if way is None:
+                displacement = self._displacement(g, float(t))
+                if displacement is None:
                     releasing.append(g)
                     continue
-                rows[r, g.rows] = self._rest[g.nodes] + way
+                rows[r, g.rows] = self._rest[g.nodes] + displacement
             if releasing:
                 if r == 0:
                     for g in releasing:
@@ -100,49 +100,50 @@ class DirichletConditions:
                 return rows[:r], True
         return rows, False
 
-    def places(self, t: float) -> np.ndarray:
-        """Positions (n_prescribed, 3) of the led nodes at a time [m], nan on axes that are free or let go by then."""
-        places = np.full((self.n_prescribed, 3), np.nan)
+    def target_positions(self, t: float) -> np.ndarray:
+        """Return positions (n_prescribed, 3) of the prescribed nodes at a time [m], nan on axes free or released by then."""
+        target_positions = np.full((self.n_prescribed, 3), np.nan)
         for g in self._groups:
-            way = None if g.released else self._ask(g, t)
-            if way is not None:
-                places[g.rows] = np.where(g.constraint.axes, self._rest[g.nodes] + way, np.nan)
-        return places
+            displacement = None if g.released else self._displacement(g, t)
+            if displacement is not None:
+                target_positions[g.rows] = np.where(g.constraint.axes, self._rest[g.nodes] + displacement, np.nan)
+        return target_positions
 
     def accelerations(self, start: float, dt: float, middle: bool) -> np.ndarray:
-        """Accelerations (n_prescribed, 3) [m/s^2] of the led nodes over the step from start [s]: at its middle, or at its end.
+        """Return accelerations (n_prescribed, 3) [m/s^2] of the prescribed nodes at the middle or end of the step from start [s].
 
-        Second order in dt, from places within the step alone: a jump of the velocity between two steps is no force.
+        Second order in dt, by differences within the step alone, so that a velocity jump between two steps gives no force.
         """
-        shares, weights = ((0, 1 / 2, 1), (4, -8, 4)) if middle else ((0, 1 / 3, 2 / 3, 1), (-9, 36, -45, 18))
+        fractions, weights = ((0, 1 / 2, 1), (4, -8, 4)) if middle else ((0, 1 / 3, 2 / 3, 1), (-9, 36, -45, 18))
         total = np.zeros((self.n_prescribed, 3))
         for g in self._groups:
             if g.released:
                 continue
-            for share, weight in zip(shares, weights):
-                way = self._ask(g, start + share * dt)
-                if way is None:
+            for fraction, weight in zip(fractions, weights):
+                displacement = self._displacement(g, start + fraction * dt)
+                if displacement is None:
                     raise SimulationError(
-                        f"body '{g.name}': the path of its moved nodes gave None at t = {start + share * dt:g} s, "
+                        f"body '{g.name}': the path of its moved nodes gave None at t = {start + fraction * dt:g} s, "
                         "but a displacement later: released nodes stay free"
                     )
-                total[g.rows] += weight / dt**2 * way
+                total[g.rows] += weight / dt**2 * displacement
         return total
 
     @staticmethod
-    def _ask(group: _Group, t: float) -> np.ndarray | None:
-        """A path's displacement at t, checked; SimulationError names the body, the time and the rule."""
-        what = f"body '{group.name}': the path of its moved nodes"
+    def _displacement(group: _Group, t: float) -> np.ndarray | None:
+        """Return a path's displacement at t, checked; a SimulationError names the body, the time and the rule."""
+        subject = f"body '{group.name}': the path of its moved nodes"
         try:
-            way = group.constraint.path(t)
-            if way is None:
+            displacement = group.constraint.path(t)
+            if displacement is None:
                 return None
-            way = np.asarray(way, dtype=np.float64)
+            displacement = np.asarray(displacement, dtype=np.float64)
         except Exception as error:  # a user's function may raise anything
-            raise SimulationError(f"{what} failed at t = {t:g} s: {type(error).__name__}: {error}") from error
-        if way.shape not in ((3,), (len(group.nodes), 3)) or not np.isfinite(way).all():
+            raise SimulationError(f"{subject} failed at t = {t:g} s: {type(error).__name__}: {error}") from error
+        if displacement.shape not in ((3,), (len(group.nodes), 3)) or not np.isfinite(displacement).all():
             raise SimulationError(
-                f"{what} gave {way.tolist() if way.size < 10 else way.shape} at t = {t:g} s: "
+                f"{subject} gave {displacement.tolist() if displacement.size < 10 else displacement.shape} "
+                f"at t = {t:g} s: "
                 f"it must be finite, of shape (3,) or ({len(group.nodes)}, 3)"
             )
-        return way
+        return displacement

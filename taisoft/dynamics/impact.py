@@ -1,23 +1,23 @@
-"""The impact before an implicit step in which surfaces meet with restitution: a jump of the velocity at x_n.
+"""Impact with restitution before an implicit step: a velocity jump at x_n.
 
     (M + tau^2 K)(v+ - v_n) = J^T p,   u = J v+ - min_velocity,   tau = SPREAD dt,
-with Signorini's and Coulomb's laws between p and u; `min_velocity` is the speed with which a contact must part
-(`contact.restitution`). With M alone the nodes at the contact would turn round and the body behind them go on: it would
-vibrate, and implicit Euler takes the energy of vibrations whose period is not many steps. tau^2 K keeps these out: a motion
-of frequency w takes 1 / (1 + (w tau)^2) of its part of the impulse. With w tau = 1, implicit Euler loses 1 - 1/e of the
-energy in a period, which is what SPREAD = 2 pi says. A body that waves cross within the step is thrown back as a whole; a
-soft one, or short steps, at its contacts alone, and its elasticity does the rest.
+with Signorini's and Coulomb's laws between p and u; `min_velocity` is the required separation speed of a contact
+(`contact.restitution`). With M alone the nodes at the contact would reverse while the body behind them moves on. It would
+vibrate, and implicit Euler dissipates vibrations whose period is not many steps. tau^2 K suppresses these: a mode of angular
+frequency w gets 1 / (1 + (w tau)^2) of its part of the impulse. With w tau = 1, implicit Euler loses 1 - 1/e of the energy in
+a period, which gives SPREAD = 2 pi. A body that waves cross within the step rebounds as a whole. A soft one, or one in short
+steps, rebounds at its contacts alone, and elasticity does the rest.
 
-No energy may come of it. The kinetic energy changes by
+The impact must not create energy. The kinetic energy changes by
     E(s) = s (D.M v_n + p.u_fixed) + s^2 D.M D / 2 <= s sum p_n max(0, min_velocity - |u_n|) / 2,   D = v+ - v_n,
-u_fixed what obstacles and prescribed nodes add to u_n, whose work is theirs; the right side is what implicit Euler lost
-before and may get back. Newton's law breaks this where friction turns the slip round (Kane's paradox), or where bodies
-vibrate: then the jump is scaled down by s < 1. What is left of it, the slack, is what tau^2 K took. In the step after it
-contacts are held to their way, so that the body behind them, which lags, is pushed on; that work must not exceed the slack,
-else the step is done again without.
+where u_fixed is the part of u_n from obstacles and prescribed nodes, whose work is external, and the right side is energy that
+implicit Euler lost before and may be given back. Newton's law violates this if friction reverses the slip (Kane's paradox), or
+if bodies vibrate: then the jump is scaled by s < 1. The slack of the inequality is the energy taken by tau^2 K. In the step
+after the impact, contacts are constrained to their rebound displacement, which pushes on the lagging body behind them. That
+work must not exceed the slack, else the step is repeated without this constraint.
 
-Weak: within tau the impulse reaches further than sound does. Bodies in between, which waves cross in some steps, are thrown
-back lower than e says. Held nodes are walls: what hangs on them takes the blow.
+Weakness: within tau the impulse reaches further than sound does. Bodies that waves cross in a few steps rebound lower than e
+requires. Fixed nodes act as walls: bodies attached to them absorb the impact.
 """
 
 import math
@@ -41,37 +41,37 @@ if TYPE_CHECKING:
     from taisoft.dynamics.stage_system import Stage, StageSystem
 
 SPREAD = 2.0 * math.pi  # tau / dt
-SOLVES = 400  # linear solves of an impact
-TOLERANCE = 1e-3  # of the contact laws' residual in an impact: what it leaves undone the step after it does
+SOLVES = 400  # maximum linear solves of an impact
+TOLERANCE = 1e-3  # of the contact laws' residual in an impact; the step after it corrects the rest
 
 
 @ti.func
 def impact_residual(m: ti.template(), A: ti.template(), k: ti.template(), i, tau):
-    """(A D)_i of the jump D = (x - x_linear) / tau, without impulses.
+    """Return (A D)_i of the jump D = (x - x_linear) / tau, without impulses.
 
-    By differences between neighbours, in f64: stiffness does not resist what all nodes share, which is most of the jump, and its
-    rounding, tau^2 times as large, would hide the motion of the whole body.
+    Uses differences between neighbours in f64: stiffness does not resist the common part of the jump, which is most of it, and
+    its rounding, tau^2 times as large, would hide the rigid motion.
     """
     inertia = ti.cast(1.0, m.real)
     if ti.static(m.damped):
         inertia += ti.cast(tau, m.real) * mass_damping.rate(m, i)
-    own, mass = (m.state.x[i] - k.x_linear[i]) / tau, m.mass[i]
+    velocity_jump, mass = (m.state.x[i] - k.x_linear[i]) / tau, m.mass[i]
     if ti.static(m.consistent):
         mass = m.mass_matrix.diagonal[i]
     r = ti.Vector([0.0, 0.0, 0.0], m.real)
     for at in range(A.row_start[i], A.row_start[i + 1]):
         j = A.column[at]
-        r += block_times(A.value[at], ti.cast((m.state.x[j] - k.x_linear[j]) / tau - own, m.real))
+        r += block_times(A.value[at], ti.cast((m.state.x[j] - k.x_linear[j]) / tau - velocity_jump, m.real))
         if ti.static(m.consistent):
             mass += m.mass_matrix.value[at]
-    return r + inertia * mass * ti.cast(own, m.real)
+    return r + inertia * mass * ti.cast(velocity_jump, m.real)
 
 
 @kernel
 def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f64, norms: ti.types.ndarray()):
-    """The impact's stage at v_n, without impulses; `impact_impulse` keeps those of the last step. The matrix has been formed.
+    """Begin the impact's stage at v_n without impulses, after the matrix was formed; save the last step's in `impact_impulse`.
 
-    norms: as `form_residual` tells; the scale is the momentum of all nodes at the highest speed that a contact must gain.
+    norms: as in `form_residual`; the scale is the momentum of all nodes at the largest speed change of a contact.
     """
     p, f = ti.static((k.problem, k.found))
     ti.loop_config(serialize=m.serial)
@@ -95,7 +95,7 @@ def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f
 
 @kernel
 def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f64, out: ti.types.ndarray()):
-    """The jump into s.change, and of E(s): out = (its slope at s = 0 less what may be given back, its second derivative)."""
+    """Store the jump in s.change. out: E'(0) minus the recoverable energy, and E'' of E(s)."""
     p, f = ti.static((k.problem, k.found))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -113,34 +113,34 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
     for _ in range(1):
         slope = total(m, SUM)
         for c in range(p.count[0]):
-            fixed = -(SPREAD / tau) * f.obstacle_displacement[c]
+            u_fixed = -(SPREAD / tau) * f.obstacle_displacement[c]
             for j in range(p.arity[c]):
                 i = p.node[c, j]
-                fixed += p.weight[c, j] * (1.0 - ti.cast(m.free[i], ti.f64)) * ti.cast(s.v_hat[i], ti.f64)
-            slope += to_world(p, c, p.r[c]).dot(fixed)
+                u_fixed += p.weight[c, j] * (1.0 - ti.cast(m.free[i], ti.f64)) * ti.cast(s.v_hat[i], ti.f64)
+            slope += to_world(p, c, p.r[c]).dot(u_fixed)
             if f.min_opening[c] > 0.0:
                 slope -= 0.5 * p.r[c][0] * ti.max(0.0, f.min_velocity[c] + f.approach[c])
         out[0], out[1] = slope, total(m, OTHER_SUM)
 
 
 @kernel
-def apply_impact(m: ti.template(), s: ti.template(), k: ti.template(), share: ti.f64):
-    """Start the step with that share of the jump; impulses become those of the last step, `impact_impulse` the impact's."""
+def apply_impact(m: ti.template(), s: ti.template(), k: ti.template(), fraction: ti.f64):
+    """Apply that fraction of the jump to v_hat; restore the last step's impulses, and set `impact_impulse` to the impact's."""
     p, f = ti.static((k.problem, k.found))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         m.state.x[i] = k.x_start[i]
-        s.v_hat[i] += ti.cast(share * s.change[i], m.real)
+        s.v_hat[i] += ti.cast(fraction * s.change[i], m.real)
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        struck = share * p.r[c]
+        struck = fraction * p.r[c]
         p.r[c] = f.impact_impulse[c]
         f.impact_impulse[c] = struck
 
 
 @kernel
 def start_from(m: ti.template(), s: ti.template(), still: ti.f64):
-    """The first iterate of a step that begins with an impact: v_hat, or 0 where it is linearised at x_n (still = 1)."""
+    """Set the first iterate after an impact: v_hat, or 0 if the step is linearised at x_n (still = 1)."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         m.state.x[i] = s.x_hat[i]
@@ -148,24 +148,24 @@ def start_from(m: ti.template(), s: ti.template(), still: ti.f64):
 
 
 @kernel
-def holding_work(k: ti.template(), beta: ti.f64) -> ti.f64:
-    """Work of the contacts that are held to their way at the end of the step [J]."""
+def rebound_work(k: ti.template(), beta: ti.f64) -> ti.f64:
+    """Return the work of contacts constrained to their rebound displacement, at the end of the step [J]."""
     p, f, w = ti.static((k.problem, k.found, k.work))
     work = ti.cast(0.0, ti.f64)
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
             if f.min_opening[c] > 0.0:
-                way = w.tangential_offset[c]
+                displacement = w.tangential_offset[c]
                 for j in range(p.arity[c]):
-                    way += p.weight[c, j] * k.displacement[p.node[c, j]]
-                work += p.r[c][0] * p.normal[c].dot(way) / beta
+                    displacement += p.weight[c, j] * k.displacement[p.node[c, j]]
+                work += p.r[c][0] * p.normal[c].dot(displacement) / beta
     return work
 
 
 @kernel
-def let_go(f: ti.template()):
-    """No contact is held to its way."""
+def release_contacts(f: ti.template()):
+    """Release all contacts from their rebound displacement."""
     (p,) = ti.static((f.problem,))
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
@@ -173,28 +173,28 @@ def let_go(f: ti.template()):
 
 
 def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":
-    """A step of implicit Euler in which surfaces meet with restitution: the impact, then the stage."""
+    """Solve a step of implicit Euler with restitution: the impact, then the stage."""
     from taisoft.dynamics.contact_newton import solve
     from taisoft.dynamics.newton import Newton
     from taisoft.dynamics.stage_result import count_all, merge
 
     m, w, tau, out = system.model, system.work, SPREAD * stage.dt, np.zeros(2)
-    blow = replace(stage, beta=tau, contact_tolerance=max(stage.contact_tolerance, TOLERANCE), max_newton=SOLVES)
-    k = system.begin_impact(blow)
+    impact_stage = replace(stage, beta=tau, contact_tolerance=max(stage.contact_tolerance, TOLERANCE), max_newton=SOLVES)
+    k = system.begin_impact(impact_stage)
     begin_impact(m, w, k, tau, system.norms)
-    impact = Newton(system, blow).run(*system.evaluate(new_multipliers=True), fresh=True)
+    impact = Newton(system, impact_stage).run(*system.evaluate(new_multipliers=True), fresh=True)
     measure_impact(m, w, k, tau, out)
     slope, curvature = out
     gain = slope + 0.5 * curvature
-    share = 1.0 if gain <= 0.0 else max(0.0, -2.0 * slope / curvature)
-    slack = max(0.0, -share * (slope + 0.5 * share * curvature))  # 0, but for rounding, where the jump is scaled down
-    apply_impact(m, w, k, share)
-    if share < 1.0:
-        let_go(k.found)
+    fraction = 1.0 if gain <= 0.0 else max(0.0, -2.0 * slope / curvature)
+    slack = max(0.0, -fraction * (slope + 0.5 * fraction * curvature))  # 0 except for rounding if the jump is scaled down
+    apply_impact(m, w, k, fraction)
+    if fraction < 1.0:
+        release_contacts(k.found)
     results = [impact]
     while True:
         start_from(m, w, float(stage.linearised))
-        results.append(solve(system, replace(stage, beta=stage.dt, prescribed_share=1.0)))
-        if holding_work(k, stage.dt) <= slack:
+        results.append(solve(system, replace(stage, beta=stage.dt, prescribed_fraction=1.0)))
+        if rebound_work(k, stage.dt) <= slack:
             return count_all(merge([impact, results[-1]]), results[1:-1])
-        let_go(k.found)
+        release_contacts(k.found)

@@ -1,6 +1,6 @@
-"""What the implicit integrators share: one stage x = x_hat + beta v, M (v - v_hat) = beta f(x, v), and its bookkeeping.
+"""Implicit integrators: a step is one stage x = x_hat + beta v, M (v - v_hat) = beta f(x, v).
 
-An integrator is a `Scheme`: how x_hat, v_hat and beta come from the past, and whether the stage is the step's middle.
+An integrator is a `Scheme`: how x_hat, v_hat and beta follow from previous states, and whether the stage is the step's midpoint.
 """
 
 from dataclasses import dataclass, replace
@@ -22,32 +22,32 @@ from taisoft.errors import SimulationError
 from taisoft.runtime import kernel
 from taisoft.transfer import download, upload
 
-MAX_NEWTON, MAX_NEWTON_WITH_CONTACTS = 50, 25  # a step that needs more is cut in parts, or reported as not converged
-TIGHTER = 0.1  # of the tolerance that would just do where a body's forces did not balance
+MAX_NEWTON, MAX_NEWTON_WITH_CONTACTS = 50, 25  # a step that needs more is cut in substeps, or reported as not converged
+TIGHTER = 0.1  # of the tolerance that would just balance the forces on a body
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
 
 @dataclass(frozen=True)
 class Scheme:
-    """x_hat = now x_n - before x_(n-1), v_hat alike, beta = share dt; midpoint: the step ends at twice the stage minus x_n."""
+    """x_hat = now x_n - before x_(n-1), v_hat likewise, beta = beta_over_dt dt; midpoint: the stage is the step's midpoint."""
 
-    share: float
+    beta_over_dt: float
     now: float = 1.0
     before: float = 0.0
     midpoint: bool = False
-    one_iteration: bool = False  # linearised at x_n, one Newton step, no look back
-    start: "Scheme | None" = None  # what takes the first step, when there is no past
+    one_iteration: bool = False  # linearised at x_n, one Newton step, no line search
+    start: "Scheme | None" = None  # scheme of the first step, without history
 
 
 @kernel
 def begin_step(
     m: ti.template(), w: ti.template(), h: ti.template(), multistep: ti.template(), now: ti.f64, before: ti.f64,
-    still: ti.f64, along: ti.f64,
+    still: ti.f64, extrapolation: ti.f64,
 ):  # fmt: skip
-    """State n into the history, x_hat and v_hat of the stage, and the first iterate of v on the free axes.
+    """Store state n in the history; compute x_hat and v_hat of the stage, and the first iterate of v on the free axes.
 
-    The iterate is (1 - still) v_n + along (v_n - v_(n-1)): still is 1 for the linearly implicit step, which is linearised
-    at x_n. Fixed axes keep 0; led nodes are set with the targets.
+    The iterate is (1 - still) v_n + extrapolation (v_n - v_(n-1)). still is 1 for the linearly implicit step, which is
+    linearised at x_n. Fixed axes keep 0; prescribed nodes are set with the targets.
     """
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -61,13 +61,13 @@ def begin_step(
         if ti.static(multistep):
             w.x_hat[i] = now * h.x_now[i] - before * h.x_before[i]
             w.v_hat[i] = ti.cast(now, m.real) * h.v_now[i] - ti.cast(before, m.real) * h.v_before[i]
-        v = ti.cast(1.0 - still, m.real) * h.v_now[i] + ti.cast(along, m.real) * (h.v_now[i] - h.v_before[i])
+        v = ti.cast(1.0 - still, m.real) * h.v_now[i] + ti.cast(extrapolation, m.real) * (h.v_now[i] - h.v_before[i])
         m.state.v[i] = m.free[i] * v
 
 
 @kernel
 def finish_midpoint(m: ti.template(), h: ti.template()):
-    """The stage was the middle: x = 2 x_m - x_n, v = 2 v_m - v_n."""
+    """Extrapolate from the midpoint: x = 2 x_m - x_n, v = 2 v_m - v_n."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         m.state.x[i] = 2.0 * m.state.x[i] - h.x_now[i]
@@ -76,7 +76,7 @@ def finish_midpoint(m: ti.template(), h: ti.template()):
 
 @kernel
 def restore(m: ti.template(), h: ti.template()):
-    """Back to state n."""
+    """Restore state n."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         m.state.x[i] = h.x_now[i]
@@ -94,7 +94,7 @@ class History:
 
 
 class ImplicitStepper:
-    """Takes steps of one scheme over a world and its contacts."""
+    """Take steps of one scheme for a simulation state and its contacts."""
 
     def __init__(self, simulation: SimulationState, scheme: Scheme, contact: ContactStep | NoContacts):
         self.simulation, self.scheme, self.contact = simulation, scheme, contact
@@ -112,69 +112,69 @@ class ImplicitStepper:
         balance = BodyBalance(simulation.scene)
         self._balance = balance if balance.n_pieces > 1 else None
         self._substepping = Substepping(self)
-        self._mark = None, [], contact.flight  # see `mark`
+        self._saved_start = None, [], contact.flight  # see `save_start`
         self.forget()
 
     def forget(self) -> None:
-        """The past is void: the state was set."""
-        self._substepping.recovers = True
-        self._past = 0  # steps whose state is in the history
+        """Discard the history, after the state was set."""
+        self._substepping.may_retry = True
+        self._n_previous = 0  # previous states in the history
         self._beta = self._dt = 0.0  # of the last step
         self.contact.forget()
 
     def numbers_changed(self) -> None:
-        """Gravity or material numbers changed."""
+        """Update for changed gravity or material numbers."""
         self.solver.rounding.measure()
 
     def snapshot(self) -> dict:
-        """What the next step rests on beside the world: the history, what the solver keeps, the contacts."""
+        """Return the state of the stepper: history, solver and contacts."""
         x, v = download([self.history.x_now, self.history.v_now])
         return {
-            "past": self._past, "beta": self._beta, "dt": self._dt, "recovers": self._substepping.recovers,
+            "past": self._n_previous, "beta": self._beta, "dt": self._dt, "recovers": self._substepping.may_retry,
             "x_now": x, "v_now": v, "contact": self.contact.snapshot(), "solver": self.solver.snapshot(),
         }  # fmt: skip
 
     def restore(self, kept: dict) -> None:
-        """Back to what `snapshot` told. x_before and v_before need not be: a step begins by writing them."""
+        """Restore a `snapshot`. It has no x_before and v_before, since each step writes them first."""
         upload([(self.history.x_now, kept["x_now"]), (self.history.v_now, kept["v_now"])])
-        self._past, self._beta, self._dt = int(kept["past"]), float(kept["beta"]), float(kept["dt"])
-        self._substepping.recovers = bool(kept["recovers"])
+        self._n_previous, self._beta, self._dt = int(kept["past"]), float(kept["beta"]), float(kept["dt"])
+        self._substepping.may_retry = bool(kept["recovers"])
         self.contact.restore(kept["contact"])
-        self.solver.restore(kept["solver"])  # after the contacts, whose fields it looks at
+        self.solver.restore(kept["solver"])  # after the contacts, whose fields it uses
 
     def step(self, dt: float) -> StageResult:
-        """One step of dt, see `Substepping.step`."""
+        """Take one step of dt, see `Substepping.step`."""
         return self._substepping.step(self.simulation.time, dt)
 
     @property
     def substeps(self) -> int:
-        """Substeps that the last step was taken in."""
+        """Number of substeps of the last step."""
         return self._substepping.substeps
 
     @property
     def is_linear(self) -> bool:
-        """Whether steps are linearised, so that there is nothing that could converge."""
+        """Whether steps are linearised, without iterations."""
         return self.scheme.one_iteration
 
-    def mark(self) -> None:
-        """A step begins: it may be undone."""
+    def save_start(self) -> None:
+        """Save the start of a step, to which `return_to_start` returns."""
         state = None if self.contact.idle else self.simulation.state()
-        self._mark = state, self.simulation.dirichlet.released(), self.contact.flight.copy()
+        self._saved_start = state, self.simulation.dirichlet.released(), self.contact.flight.copy()
 
-    def return_to_mark(self, taken_back: bool = False) -> None:
-        """Back to the step's start, without the past. taken_back: whether the only substep so far has been."""
-        state, released, flight = self._mark
-        if state is None and not taken_back:
+    def return_to_start(self, already_undone: bool = False) -> None:
+        """Restore the step's start, without history. already_undone: whether the only substep so far has been undone."""
+        state, released, flight = self._saved_start
+        if state is None and not already_undone:
             restore(self.simulation.model, self.history)
             state = self.simulation.state()
-            self._mark = state, released, flight
-        self._put_back(state, released)
-        self._past = 0
+            self._saved_start = state, released, flight
+        self._restore_state(state, released)
+        self._n_previous = 0
         self.contact.forget()
         self.contact.flight[:] = flight
 
-    def _put_back(self, state: tuple[np.ndarray, np.ndarray] | None, released: list[bool]) -> None:
-        """Back to a state, None where it has been put back, and to what had let go then."""
+    def _restore_state(self, state: tuple[np.ndarray, np.ndarray] | None, released: list[bool]) -> None:
+        """Restore a state, if not None, and the released groups."""
         simulation = self.simulation
         if state is not None:
             simulation.set_state(*state)
@@ -182,40 +182,40 @@ class ImplicitStepper:
             simulation.dirichlet.set_released(released)
             simulation.upload_constraints()
 
-    def back(self) -> None:
-        """Back to where the last part began."""
+    def restore_start(self) -> None:
+        """Restore the start of the last substep."""
         restore(self.simulation.model, self.history)
 
-    def retry(self, time: float, dt: float, start: np.ndarray) -> StageResult:
-        """The part that was just taken back, with other contacts. start: (n_nodes, 3) [m/s] the velocities it had led to."""
-        past, self._past = self._past, 0
-        result = self.take(time, dt, start)
-        self._past = min(self._past, past)
+    def retry_substep(self, time: float, dt: float, start: np.ndarray) -> StageResult:
+        """Repeat the restored substep with other contacts. start: (n_nodes, 3) [m/s] velocities reached before."""
+        past, self._n_previous = self._n_previous, 0
+        result = self.take_substep(time, dt, start)
+        self._n_previous = min(self._n_previous, past)
         return result
 
-    def undo(self, released: list[bool], anew: bool) -> None:
-        """Back to where the last part began and to what had let go then, for one of another length; anew: without impulses."""
-        self.back()
-        self._put_back(None, released)
-        self._past = 0
-        # BDF2 tells impacts by what bore nothing in the last step
-        self.contact.start_again(anew or self.scheme.before > 0.0)
+    def undo_substep(self, released: list[bool], discard_impulses: bool) -> None:
+        """Restore the start of the last substep and the groups released then, for another length of it."""
+        self.restore_start()
+        self._restore_state(None, released)
+        self._n_previous = 0
+        # BDF2 detects impacts by the contacts without impulse in the last step
+        self.contact.reset_substep(discard_impulses or self.scheme.before > 0.0)
 
-    def take(self, time: float, dt: float, start: np.ndarray | None = None) -> StageResult:
-        """A step of dt from a time with the contacts of one search. start: velocities (n_nodes, 3) [m/s] to begin with."""
+    def take_substep(self, time: float, dt: float, start: np.ndarray | None = None) -> StageResult:
+        """Take a substep of dt from a time with the contacts of one search. start: (n_nodes, 3) [m/s] first iterate of v."""
         simulation, m, h, w = self.simulation, self.simulation.model, self.history, self.solver.work
         releases = simulation.releases
         target = simulation.next_target(time + dt)
         if simulation.releases != releases or dt != self._dt:
-            self._past = 0
+            self._n_previous = 0
         self.contact.begin(time, dt)
-        # no scheme looks back through an impact: it would take the jump for an acceleration
-        meets = self.scheme.before and self.contact.meets(dt)
-        if (bounces := self.contact.rebounds(dt)) or meets:
-            self._past = 0
+        # multistep schemes restart at an impact: they would take the velocity jump for an acceleration
+        impact = self.scheme.before and self.contact.detect_impact(dt)
+        if (bounces := self.contact.detect_rebounds(dt)) or impact:
+            self._n_previous = 0
         self._dt = dt
-        scheme = self.scheme if self._past > 0 or self.scheme.start is None else self.scheme.start
-        self.lossy = scheme.before == 0.0
+        scheme = self.scheme if self._n_previous > 0 or self.scheme.start is None else self.scheme.start
+        self.dissipative = scheme.before == 0.0
         if target is not None:
             if scheme.midpoint:
                 target = 0.5 * (target + m.state.x.to_numpy()[simulation.dirichlet.prescribed_nodes])
@@ -224,16 +224,16 @@ class ImplicitStepper:
                 accelerations = simulation.dirichlet.accelerations(time, dt, self.scheme.before == 0.0)
                 prescribed.append((w.prescribed_acceleration, accelerations))
             upload(prescribed)
-        self._beta = scheme.share * dt
-        self.contact.acts(scheme.share)
+        self._beta = scheme.beta_over_dt * dt
+        self.contact.set_impulse_fraction(scheme.beta_over_dt)
         self.solver.assemble_damper()
-        along = (0.5 if scheme.midpoint else 1.0) if self._past > 1 and not scheme.one_iteration else 0.0
-        self._begin(scheme, along)
-        if start is not None and not scheme.one_iteration:  # which is linearised at the step's start
+        extrapolation = (0.5 if scheme.midpoint else 1.0) if self._n_previous > 1 and not scheme.one_iteration else 0.0
+        self._begin(scheme, extrapolation)
+        if start is not None and not scheme.one_iteration:  # that one is linearised at the step's start
             upload([(m.state.v, start)])
         try:
             result = self._solve_balanced(scheme, dt, bounces)
-        except BaseException:  # Ctrl-C: the step is abandoned
+        except BaseException:  # Ctrl-C, too: the step is abandoned
             restore(m, h)
             self.forget()
             raise
@@ -244,25 +244,27 @@ class ImplicitStepper:
             restore(m, h)
             self.forget()
             raise SimulationError(f"step {simulation.step_count + 1}: {where}")
-        self._past += 1
-        if self.contact.met:
-            self._past = 0
+        self._n_previous += 1
+        if self.contact.had_impact:
+            self._n_previous = 0
         return result
 
-    def _begin(self, scheme: Scheme, along: float) -> None:
-        """The stage starts, from the present state."""
+    def _begin(self, scheme: Scheme, extrapolation: float) -> None:
+        """Begin the stage from the present state."""
         multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)
-        begin_step(self.simulation.model, self.solver.work, self.history, multistep, scheme.now, scheme.before, still, along)
+        begin_step(
+            self.simulation.model, self.solver.work, self.history, multistep, scheme.now, scheme.before, still, extrapolation
+        )  # fmt: skip
 
     def _solve_balanced(self, scheme: Scheme, dt: float, bounces: bool) -> StageResult:
-        """The stage; again and more tightly where it left a piece's forces unbalanced beside larger ones."""
+        """Solve the stage, and again to a tighter tolerance if the forces on a piece are unbalanced."""
         result, linear = self._solve(scheme, dt, bounces, self.tolerance), scheme.one_iteration
         if self._balance is None or not (result.converged and np.isfinite(result.residual)):
             return result
         worst, name = self._balance.worst(self.solver, self._beta, linear)
         if worst > LIMIT and not bounces:
-            if linear:  # from where it was linearised
-                self.back()
+            if linear:  # linearised at the step's start
+                self.restore_start()
                 self._begin(scheme, 0.0)
             tighter = self.tolerance * LIMIT / min(worst, 1.0) * TIGHTER
             result = count_all(self._solve(scheme, dt, bounces, tighter), [result])
@@ -270,32 +272,32 @@ class ImplicitStepper:
         return replace(result, unbalanced=(worst, name)) if worst > LIMIT else result
 
     def _solve(self, scheme: Scheme, dt: float, bounces: bool, tolerance: float) -> StageResult:
-        """The stage. bounces: whether any contacts are thrown back."""
-        most = MAX_NEWTON if self.contact.n_contacts == 0 else MAX_NEWTON_WITH_CONTACTS
+        """Solve the stage. bounces: whether any contacts rebound."""
+        max_newton = MAX_NEWTON if self.contact.n_contacts == 0 else MAX_NEWTON_WITH_CONTACTS
         stage = Stage(
-            1.0, self._beta, dt, tolerance, self.contact_tolerance, most, self.linear_tolerance, scheme.one_iteration,
+            1.0, self._beta, dt, tolerance, self.contact_tolerance, max_newton, self.linear_tolerance, scheme.one_iteration,
             # prescribed nodes change their velocity once a step, not twice within the midpoint's half step
             0.5 if scheme.midpoint else 1.0,
         )  # fmt: skip
         return solve_bouncing(self.solver, stage) if bounces else solve(self.solver, stage)
 
     def compile_hard_steps(self) -> None:
-        """Take the kernels that only hard steps need through the stage at hand, which leaves no state that is of use."""
+        """Compile the kernels that only hard steps need, by running them on the current stage; its state is then invalid."""
         free = np.flatnonzero(self.simulation.model.free.to_numpy().any(axis=1))
         solve_on(self.solver, replace(self.solver.stage, tolerance=0.0), free[:1], 0.0)
         self.solver.form_matrix(projected=True)
 
     def reactions(self) -> np.ndarray:
-        """(n_nodes, 3) force of the constraints in the last step [N]."""
+        """Return the constraint forces of the last step, (n_nodes, 3) [N]."""
         if self._beta == 0.0:
             return np.zeros((self.simulation.model.n_nodes, 3))
         return self.solver.held_residual() / self._beta
 
     @property
     def field_bytes(self) -> dict[str, int]:
-        """Bytes by name of the solver's fields that come and go."""
+        """Bytes by name of the solver's temporary fields."""
         return self.solver.field_bytes
 
     def release(self) -> None:
-        """Give the memory of these fields back."""
+        """Free the memory of these fields."""
         self.solver.release()

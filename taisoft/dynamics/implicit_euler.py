@@ -5,4 +5,4 @@ First order; stable for every dt; damps a mode of frequency w by 1/sqrt(1 + (w d
 
 from taisoft.dynamics.implicit import Scheme
 
-SCHEME = Scheme(share=1.0)
+SCHEME = Scheme(beta_over_dt=1.0)

@@ -5,4 +5,4 @@ Second order, symplectic, no numerical damping; stiff modes ring rather than die
 
 from taisoft.dynamics.implicit import Scheme
 
-SCHEME = Scheme(share=0.5, midpoint=True)
+SCHEME = Scheme(beta_over_dt=0.5, midpoint=True)

@@ -1,21 +1,21 @@
-"""A stage whose elastic forces are linear: its contact problem on a fixed matrix, which needs no elements.
+"""Linearised stage: the contact problem with linear elastic forces on a fixed matrix, which needs no elements.
 
 The residual without contacts is r_lin = r_0 + A s, s the change of v since. Along a direction e the slope of the augmented
 Lagrangian is
     e.r_lin + a e.A e - sum_c (J e)_c . prox(lambda - R (u + a J e))_c,
-for which two sums over nodes do: its root needs the contacts alone.
+which needs only two sums over nodes; its root is then found from the contacts alone.
 """
 
 import taichi as ti
 
 from taisoft.contact.prox import dvec
 from taisoft.dynamics.contact_terms import (
-    impulse_at,
     impulse_on_node,
-    press_contact,
+    projected_impulse,
     stage_velocity_of,
     sum_residual,
-    unprojected,
+    unprojected_impulse,
+    update_contact,
 )
 from taisoft.dynamics.stage import place_node
 from taisoft.linear.block_csr import block_times, partial_row_times
@@ -23,12 +23,12 @@ from taisoft.linear.pcg import dot64, total
 from taisoft.runtime import kernel
 from taisoft.scalars import OTHER_SUM, STEP_LENGTH, SUM
 
-ROOT, TRIES, LONGEST = 0.05, 40, 1e3  # of the slope at the start: what is root enough; trial lengths; the longest
+ROOT, TRIES, LONGEST = 0.05, 40, 1e3  # tolerance over the initial slope; maximum trial lengths; longest step length
 
 
 @kernel
-def keep_linear(m: ti.template(), s: ti.template(), k: ti.template()):
-    """The stage is linear from here on: x, the residual without contacts, the impulses; no change so far."""
+def begin_linearised(m: ti.template(), s: ti.template(), k: ti.template()):
+    """Begin the linearised stage: save x, the residual without contacts, and the impulses."""
     p, w = ti.static((k.problem, k.work))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -40,10 +40,10 @@ def keep_linear(m: ti.template(), s: ti.template(), k: ti.template()):
 
 
 @kernel
-def leave_linear(m: ti.template(), s: ti.template(), k: ti.template(), taken: ti.i32, beta: ti.f64):
-    """The way from where the stage was linearised as y, from base.
+def end_linearised(m: ti.template(), s: ti.template(), k: ti.template(), accept: ti.i32, beta: ti.f64):
+    """Set y to the velocity change since linearisation, and base to x at that time.
 
-    taken: 0 where what was found is dropped: the impulses are those of then.
+    accept: 0 restores the impulses of that time.
     """
     p, w = ti.static((k.problem, k.work))
     ti.loop_config(serialize=m.serial)
@@ -52,26 +52,26 @@ def leave_linear(m: ti.template(), s: ti.template(), k: ti.template(), taken: ti
         s.base[i] = k.x_linear[i]
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        if taken == 0:
+        if accept == 0:
             p.r[c] = w.kept[c]
 
 
 @ti.func
-def _slope(k: ti.template(), at_rest, curvature, a, r_scale):
-    """Of the augmented Lagrangian at step length a; at_rest: e.r_lin."""
+def _slope(k: ti.template(), linear_slope, curvature, a, r_scale):
+    """Return the slope of the augmented Lagrangian at step length a. linear_slope: e.r_lin."""
     p, w = ti.static((k.problem, k.work))
-    slope = at_rest + a * curvature
+    slope = linear_slope + a * curvature
     for c in range(p.count[0]):
-        z = unprojected(k, c, w.velocity[c] + a * w.rate[c], r_scale)
-        slope -= w.rate[c].dot(impulse_at(k, c, z))
+        z = unprojected_impulse(k, c, w.velocity[c] + a * w.rate[c], r_scale)
+        slope -= w.rate[c].dot(projected_impulse(k, c, z))
     return slope
 
 
 @ti.func
-def step_length(k: ti.template(), at_rest, curvature, start, r_scale):
-    """The root of the slope, which rises where the matrix is positive definite, by the Illinois method."""
+def step_length(k: ti.template(), linear_slope, curvature, start, r_scale):
+    """Return the root of the slope by the Illinois method; the slope increases if the matrix is positive definite."""
     a, low, at_low, high, at_high = 1.0, 0.0, start, -1.0, 0.0
-    slope = _slope(k, at_rest, curvature, a, r_scale)
+    slope = _slope(k, linear_slope, curvature, a, r_scale)
     tries = 0
     while ti.abs(slope) > ROOT * ti.abs(start) and tries < TRIES and a < LONGEST:
         if slope > 0.0:
@@ -84,14 +84,14 @@ def step_length(k: ti.template(), at_rest, curvature, start, r_scale):
             a *= 2.0
         else:
             a = low + (high - low) * ti.min(ti.max(at_low / (at_low - at_high), 0.01), 0.99)
-        slope = _slope(k, at_rest, curvature, a, r_scale)
+        slope = _slope(k, linear_slope, curvature, a, r_scale)
         tries += 1
     return a
 
 
 @ti.func
-def begin_node(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), i):
-    """(r.y, y.A y) of node i, whose row of A y is kept; base = x."""
+def node_slope(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), i):
+    """Return (r.y, y.A y) of node i; store its row of A y, and base = x."""
     y = s.pcg.y[i]
     q = block_times(k.coupling.base[i], y) + partial_row_times(m, A, A.row_start[i], A.row_start[i + 1], s.pcg.y)
     s.pcg.q[i] = q
@@ -100,8 +100,8 @@ def begin_node(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.templ
 
 
 @ti.func
-def begin_contact(s: ti.template(), k: ti.template(), c, beta):
-    """u of contact c and its rate along y; returns p.rate."""
+def contact_slope(s: ti.template(), k: ti.template(), c, beta):
+    """Compute u of contact c and its rate along y; return p.rate."""
     p, w = ti.static((k.problem, k.work))
     w.velocity[c] = stage_velocity_of(k, c, beta)
     d, n, t = dvec(0.0), p.normal[c], p.tangent[c]
@@ -113,21 +113,21 @@ def begin_contact(s: ti.template(), k: ti.template(), c, beta):
 
 
 @ti.func
-def go_along(m: ti.template(), s: ti.template(), k: ti.template(), i, a, beta):
-    """Node i goes a y, and with it the residual without contacts."""
+def move_node_along(m: ti.template(), s: ti.template(), k: ti.template(), i, a, beta):
+    """Move node i by a y, and update the residual without contacts."""
     place_node(m, s, i, a, beta)
     k.displacement[i] = m.state.x[i] - k.x_start[i]
     k.residual_linear[i] += ti.cast(a, m.real) * s.pcg.q[i]
 
 
 @ti.func
-def pressed_residual(m: ti.template(), s: ti.template(), k: ti.template(), i):
-    """Residual of node i with impulses, and -r as CG's right side; returns |r|^2 on its free axes."""
+def node_residual(m: ti.template(), s: ti.template(), k: ti.template(), i):
+    """Compute the residual of node i with impulses, and -r as CG's right side; return |r|^2 on its free axes."""
     r = k.residual_linear[i] - ti.cast(impulse_on_node(k, i), m.real)
     s.residual[i] = r
-    own = m.free[i] * r
-    s.pcg.rhs[i] = -own
-    return dot64(own, own)
+    free_residual = m.free[i] * r
+    s.pcg.rhs[i] = -free_residual
+    return dot64(free_residual, free_residual)
 
 
 @kernel
@@ -135,9 +135,9 @@ def advance(
     m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64,
     norms: ti.types.ndarray(),
 ):  # fmt: skip
-    """Go along y of s.pcg to where the slope vanishes: x, v, impulses, blocks, residual, and -r as CG's right side there.
+    """Move along y of s.pcg to zero slope; update x, v, impulses, blocks, residual, and -r as CG's right side.
 
-    norms (5,): |r|^2 on the free axes alone. scalars: STEP_LENGTH.
+    norms (5,): only |r|^2 on the free axes is set. scalars: STEP_LENGTH.
     """
     p, w = ti.static((k.problem, k.work))
     ti.loop_config(serialize=m.serial)
@@ -145,26 +145,26 @@ def advance(
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
-            own_slope, own_curvature = begin_node(m, s, A, k, i)
-            slope += own_slope
-            curvature += own_curvature
+            slope_i, curvature_i = node_slope(m, s, A, k, i)
+            slope += slope_i
+            curvature += curvature_i
         m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        begin_contact(s, k, c, beta)
+        contact_slope(s, k, c, beta)
     ti.loop_config(serialize=True)
     for _ in range(1):
         start = total(m, SUM)
-        at_rest = start
+        linear_slope = start
         for c in range(p.count[0]):
-            at_rest += w.rate[c].dot(p.r[c])
-        m.state.scalars[STEP_LENGTH] = step_length(k, at_rest, total(m, OTHER_SUM), start, r_scale)
+            linear_slope += w.rate[c].dot(p.r[c])
+        m.state.scalars[STEP_LENGTH] = step_length(k, linear_slope, total(m, OTHER_SUM), start, r_scale)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        go_along(m, s, k, i, m.state.scalars[STEP_LENGTH], beta)
+        move_node_along(m, s, k, i, m.state.scalars[STEP_LENGTH], beta)
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        press_contact(m, k, c, beta, r_scale)
+        update_contact(m, k, c, beta, r_scale)
     ti.loop_config(serialize=True)
     for _ in range(1):
         sum_residual(k)
@@ -173,7 +173,7 @@ def advance(
         size = (m.n_nodes + m.chunks - 1) // m.chunks
         square = ti.cast(0.0, ti.f64)
         for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
-            square += pressed_residual(m, s, k, i)
+            square += node_residual(m, s, k, i)
         m.state.partial[chunk, SUM] = square
     ti.loop_config(serialize=True)
     for _ in range(1):

@@ -1,15 +1,15 @@
-"""Newton's method for an implicit stage, and, under multipliers, for one with contacts.
+"""Newton's method for an implicit stage; with contacts, inside an augmented Lagrangian loop.
 
-A step solves with the unprojected matrix by conjugate gradients; where these meet negative curvature, the direction leads along
-it (`linear.pcg`). How far it goes `line_search` says. CG's tolerance follows Newton's progress (Eisenstat and Walker 1996,
-choice 2). What a slow step leaves on few nodes is solved there first, see `elimination`.
-Contacts make an augmented Lagrangian of the stage, minimised per multiplier down to PROGRESS times what that left of |r|, and
-no further than |r| is small enough, unless `tolerance_of_one` or extrapolation ask for more, see `multipliers`.
+Each step solves with the unprojected matrix by conjugate gradients; at negative curvature the direction follows it
+(`linear.pcg`). The step length is found by `line_search`. CG's tolerance follows Newton's progress (Eisenstat and Walker 1996,
+choice 2). If a slow step leaves a residual on few nodes, these are solved separately first, see `elimination`.
+With contacts, inner solves are inexact: the augmented Lagrangian is minimised until |r| is PROGRESS times its value after the
+multiplier update, or small enough, unless `multiplier_tolerance` or extrapolation require a smaller |r|, see `multipliers`.
 
 Convergence: |r| <= tolerance * scale, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes, impulses in r, and
 the residual of the contact laws, |p - prox(p - f u)| / |p| with f = 1 / (J diag(A)^-1 J^T), within its own tolerance. A residual
-below a few times the rounding of the forces (at rest) that a Newton step no longer halves is rounding, which moves nothing by
-more than that of a strain, and ends the stage as converged, its residual told as it is. In statics the scale is the applied load
+below a few times the rounding of the forces (at rest) that a Newton step no longer halves is rounding. It corresponds to strains
+of rounding size, so the stage ends as converged and reports its actual residual. In statics the scale is the applied load
 (without any: the constraint forces), and rounding above the tolerance is not convergence.
 """
 
@@ -24,152 +24,154 @@ from taisoft.dynamics.residual import ELASTIC_STAGE, IMPACT, LINEARISED, STEP
 from taisoft.dynamics.stage_result import StageResult, relative
 from taisoft.dynamics.stage_system import Stage, StageSystem
 
-LINEAR_LIMIT = 0.01  # true relative residual of a linearly implicit step above which it has failed
-MAX_FORCING, RISEN_FORCING = 0.1, 3e-2  # CG's loosest tolerance, and that after a step that raised |r|
-STATIC_FORCING = 1e-2  # and in statics, where a loose solve leaves a slender body stretched for the next step to mend
-SLOW = 0.2  # a step that leaves more of |r| than this asks for a new matrix,
-SERVES = {False: 1, True: 3}  # which serves at least so many; with contacts most of what changes is what touches
-SLOW_STEP = 0.1  # a step that leaves more of |r| asks for elimination
-FALL = 0.9  # with contacts, share of the least |r| so far below which a step needs no look at its slope
+LINEAR_LIMIT = 0.01  # relative true residual above which a linearly implicit step has failed
+MAX_FORCING, INCREASE_FORCING = 0.1, 3e-2  # CG's maximum tolerance, and that after a step that increased |r|
+STATIC_FORCING = 1e-2  # maximum in statics, where a loose solve leaves a slender body stretched for the next step to correct
+REBUILD_RATIO = 0.2  # a step that leaves a larger fraction of |r| requires a new matrix,
+MIN_USES = {False: 1, True: 3}  # minimum steps per matrix, without and with contacts; with them mostly the active contacts change
+ELIMINATION_RATIO = 0.1  # a step that leaves a larger fraction of |r| requires elimination
+DECREASE = 0.9  # with contacts, fraction of the smallest |r| so far below which a step is accepted without its slope
 
 
 class Newton:
-    """Newton steps of a stage under multipliers that are renewed; where that is linear, of its contact problem alone."""
+    """Newton steps and multiplier updates of a stage; if it is linearised, of its contact problem alone."""
 
     def __init__(
         self, system: StageSystem, stage: Stage,
         eliminate: "Callable[[StageSystem, Stage, float], Any] | None" = None,
     ):  # fmt: skip
-        """eliminate: as `elimination.eliminate`, for steps that leave much; None: there is none."""
+        """eliminate: as `elimination.eliminate`, called after slow steps; None: no elimination."""
         self.system, self.stage, self.eliminate = system, stage, eliminate
-        self.inner = system.kind == LINEARISED  # an indefinite matrix is then left to the caller
-        self.floor = system.rounding.of_stage(stage.c, stage.beta)
-        self.loosest = MAX_FORCING if stage.c > 0.0 else STATIC_FORCING
-        self.newton = self.linear = self.multipliers = self.known = 0
-        self.eliminated = 0.0  # Newton iterations on few nodes, by their share
-        self.rounding = self.negative = False  # nothing but rounding is left of |r|; negative curvature was met
+        self.is_linearised = system.kind == LINEARISED  # the caller then handles an indefinite matrix
+        self.floor = system.rounding.stage_floor(stage.c, stage.beta)
+        self.max_forcing = MAX_FORCING if stage.c > 0.0 else STATIC_FORCING
+        self.newton = self.linear = self.multipliers = self.n_remembered = 0
+        self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
+        self.rounding = self.negative = False  # |r| is only rounding; negative curvature was found
 
     def run(self, r: float, scale: float, fresh: bool) -> StageResult:
-        """From the present state, whose (|r|, scale) is given. fresh: the matrix is formed there."""
-        system, served = self.system, 0
-        self.r, self.scale, self.touching = r, scale, system.n_contacts > 0
-        self.law = math.inf  # the laws' residual when the multipliers were last renewed
-        self._aim()
+        """Solve from the present state, whose (|r|, scale) is given. fresh: whether the matrix is formed there."""
+        system, n_uses = self.system, 0
+        self.r, self.scale, self.has_contacts = r, scale, system.n_contacts > 0
+        self.law_residual = math.inf  # the laws' residual at the last multiplier update
+        self._begin_multiplier()
         while True:
-            if self._near():
-                if self._done() or not self._multiply():
+            if self._inner_done():
+                if self._has_converged() or not self._update_multipliers():
                     break
                 continue
             if self.newton >= self.stage.max_newton:
                 break
-            if not fresh or (served >= SERVES[self.touching] and self.r > SLOW * self.previous):
+            if not fresh or (n_uses >= MIN_USES[self.has_contacts] and self.r > REBUILD_RATIO * self.previous):
                 if system.kind == ELASTIC_STAGE:
                     system.form_matrix()
-                fresh, served = True, 0
-            served += 1
+                fresh, n_uses = True, 0
+            n_uses += 1
             moved = self._step()
-            if not math.isfinite(self.r) or not (moved or served > 1) or (self.inner and self.negative):
+            if not math.isfinite(self.r) or not (moved or n_uses > 1) or (self.is_linearised and self.negative):
                 break
             fresh = moved and not self._eliminate()
-        system.r_scale = R_SCALE  # the next solve finds its own
-        return self._result(self._near() and self._done())
+        system.r_scale = R_SCALE  # initial value of the next solve
+        return self._result(self._inner_done() and self._has_converged())
 
-    def _aim(self) -> None:
-        """The multipliers are new: what |r| is to be brought down to with them."""
-        self.goal, self.least, self.previous, self.forcing, self.taken = PROGRESS * self.r, self.r, 0.0, self.loosest, 0
+    def _begin_multiplier(self) -> None:
+        """Set the target of |r| and reset the progress after a multiplier update."""
+        self.inner_target, self.lowest, self.previous, self.forcing, self.n_inner = (
+            PROGRESS * self.r, self.r, 0.0, self.max_forcing, 0,
+        )  # fmt: skip
 
-    def _near(self) -> bool:
-        """Whether the multipliers have done what they can."""
-        enough = self._target()
-        if not self.touching or self.stage.keeps_multipliers:
-            return self.r <= enough or self.rounding
-        lawful = self.system.contact_residual <= self.stage.contact_tolerance
-        # in an impact whose laws hold only the momenta are left to balance
-        of_one = (FINER if self.multipliers >= self.stage.extrapolate_after else 1.0) * self.stage.enough_of_one * self.scale
-        goal = 0.0 if lawful and self.system.kind == IMPACT else max(of_one, self.goal)
-        return self.r <= (max(enough, goal) if lawful else goal) or self.rounding
+    def _inner_done(self) -> bool:
+        """Return whether |r| is small enough for the present multipliers."""
+        target = self._target()
+        if not self.has_contacts or self.stage.keeps_multipliers:
+            return self.r <= target or self.rounding
+        laws_hold = self.system.contact_residual <= self.stage.contact_tolerance
+        # in an impact whose laws hold, only the momenta remain to be balanced
+        inner = (FINER if self.multipliers >= self.stage.extrapolate_after else 1.0) * self.stage.inner_tolerance * self.scale
+        inner_target = 0.0 if laws_hold and self.system.kind == IMPACT else max(inner, self.inner_target)
+        return self.r <= (max(target, inner_target) if laws_hold else inner_target) or self.rounding
 
     def _target(self) -> float:
         return max(self.stage.tolerance * self.scale, self.stage.absolute_tolerance)
 
-    def _done(self) -> bool:
-        """Whether the stage has converged."""
-        if not (self.r <= self._target() or (self.touching and self.r <= self.floor)):
-            # statics without any load have nothing to compare the rounding with
+    def _has_converged(self) -> bool:
+        """Return whether the stage has converged."""
+        if not (self.r <= self._target() or (self.has_contacts and self.r <= self.floor)):
+            # statics without load has no scale to compare the rounding with
             if not (self.rounding and (self.stage.c > 0.0 or self.scale <= self.floor)):
                 return False
         return self.system.contact_residual <= self.stage.contact_tolerance
 
-    def _multiply(self) -> bool:
-        """Renew the multipliers; False where that has been done too often."""
-        if not self.touching or self.stage.keeps_multipliers or self.multipliers >= MAX_MULTIPLIERS:
+    def _update_multipliers(self) -> bool:
+        """Update the multipliers; return False if their maximum number is reached."""
+        if not self.has_contacts or self.stage.keeps_multipliers or self.multipliers >= MAX_MULTIPLIERS:
             return False
         system, law, extrapolating = self.system, self.system.contact_residual, self.multipliers >= self.stage.extrapolate_after
         if extrapolating:
-            system.extrapolate_multipliers(self.known)
-            system.r_scale, self.known = R_EXTRAPOLATED, min(self.known + 1, PAST)
+            system.extrapolate_multipliers(self.n_remembered)
+            system.r_scale, self.n_remembered = R_EXTRAPOLATED, min(self.n_remembered + 1, PAST)
         else:
-            system.r_scale = next_scale(system.r_scale, law, self.law, self.taken)
-        self.law, self.multipliers, self.rounding = law, self.multipliers + 1, False
+            system.r_scale = next_scale(system.r_scale, law, self.law_residual, self.n_inner)
+        self.law_residual, self.multipliers, self.rounding = law, self.multipliers + 1, False
         self.r, self.scale = system.evaluate(None, new_multipliers=not extrapolating)
-        self._aim()
+        self._begin_multiplier()
         return True
 
     def _step(self) -> bool:
-        """A linear solve and a step along its direction; whether that led anywhere."""
+        """Solve for a direction and step along it; return whether the state moved."""
         system = self.system
-        answer = system.direction(self._linear_tolerance())
-        self.linear += answer.iterations
-        self.newton, self.taken = self.newton + 1, self.taken + 1
-        self.previous, self.negative = self.r, self.negative or answer.negative
-        if self.inner and answer.negative:
+        solution = system.direction(self._linear_tolerance())
+        self.linear += solution.iterations
+        self.newton, self.n_inner = self.newton + 1, self.n_inner + 1
+        self.previous, self.negative = self.r, self.negative or solution.negative
+        if self.is_linearised and solution.negative:
             return False
-        if self.inner:
+        if self.is_linearised:
             (self.r, self.scale), moved = system.advance(), True
         else:
-            self.r, self.scale, moved = search(system, self._enough(answer.negative))
-        self.least = min(self.least, self.r)
-        # statics go on down to the floor
-        low = self.r <= (ROUNDING if self.stage.c > 0.0 else 1.0) * self.floor
-        self.rounding = low and self.r > 0.5 * self.previous
+            self.r, self.scale, moved = search(system, self._acceptable_residual(solution.negative))
+        self.lowest = min(self.lowest, self.r)
+        # statics continues down to the floor
+        near_floor = self.r <= (ROUNDING if self.stage.c > 0.0 else 1.0) * self.floor
+        self.rounding = near_floor and self.r > 0.5 * self.previous
         return moved
 
     def _eliminate(self) -> bool:
-        """Solve what a slow step left on few nodes; whether there was such."""
-        if self.eliminate is None or self.r <= SLOW_STEP * self.previous or self._near():
+        """Solve the few nodes that dominate |r| after a slow step; return whether there were any."""
+        if self.eliminate is None or self.r <= ELIMINATION_RATIO * self.previous or self._inner_done():
             return False
         if (found := self.eliminate(self.system, self.stage, self.r)) is None:
             return False
         self.eliminated, self.linear = self.eliminated + found.newton, self.linear + found.linear
         self.r, self.scale = self.system.evaluate(None)
-        self.least = min(self.least, self.r)
+        self.lowest = min(self.lowest, self.r)
         return True
 
-    def _enough(self, negative: bool) -> float:
-        """|r| below which the end of a whole step needs no look at its slope."""
-        if self.stage.c == 0.0 or negative:  # a lower |r| may be one on a hill
+    def _acceptable_residual(self, negative: bool) -> float:
+        """Return |r| below which a full step is accepted without checking its slope."""
+        if self.stage.c == 0.0 or negative:  # a lower |r| may be at a maximum of the energy
             return self.floor
-        return FALL * self.least if self.touching else self.r
+        return DECREASE * self.lowest if self.has_contacts else self.r
 
     def _linear_tolerance(self) -> float:
-        """CG's tolerance by Newton's progress: Eisenstat and Walker's choice 2, with their safeguard.
+        """Return CG's tolerance by Newton's progress: Eisenstat and Walker's choice 2, with their safeguard.
 
-        A step that bends a slender body raises |r| by stretching it; a loose solve would then only undo that stretch.
+        A step that bends a slender body increases |r| by stretching it; a loose solve would then only undo that stretch.
         """
         if self.stage.linear_tolerance is not None:
             return max(self.stage.linear_tolerance, self.stage.later_tolerance if self.newton > 0 else 0.0)
-        enough = self._target()
+        target = self._target()
         if self.previous == 0.0:
-            self.forcing = self.loosest
+            self.forcing = self.max_forcing
         elif self.r > self.previous:
-            self.forcing = min(RISEN_FORCING, self.loosest)
+            self.forcing = min(INCREASE_FORCING, self.max_forcing)
         else:
-            wanted, guard = 0.9 * (self.r / self.previous) ** 2, 0.9 * self.forcing**2
-            self.forcing = min(self.loosest, max(wanted, guard if guard > 0.1 else 0.0))
-        # the last solve need not go far below what Newton asks for
-        tolerance = max(self.forcing, 0.1 * enough / self.r, 1e-12)
-        # where the rounding of stiff stress hides the motion of the whole body in |r|, only a tight solve gets that motion right
-        return min(tolerance, self.stage.tolerance) if self.floor > enough else tolerance
+            wanted, safeguard = 0.9 * (self.r / self.previous) ** 2, 0.9 * self.forcing**2
+            self.forcing = min(self.max_forcing, max(wanted, safeguard if safeguard > 0.1 else 0.0))
+        # the last solve need not go far below Newton's tolerance
+        tolerance = max(self.forcing, 0.1 * target / self.r, 1e-12)
+        # if rounding of stiff stress hides the rigid motion in |r|, only a tight solve gets that motion right
+        return min(tolerance, self.stage.tolerance) if self.floor > target else tolerance
 
     def _result(self, converged: bool) -> StageResult:
         r, system = self.r, self.system
@@ -178,22 +180,22 @@ class Newton:
             self.rounding or r <= self.floor, self.multipliers, system.contact_residual,
         )  # fmt: skip
 
-    def run_once(self) -> StageResult:
-        """One whole step without looking back, of a linearised stage without contacts: it has converged when the solve has."""
+    def solve_once(self) -> StageResult:
+        """Take one full step without line search, of a linearised stage without contacts; it converges if the solve does."""
         system = self.system
-        self.touching, self.previous = False, 0.0
+        self.has_contacts, self.previous = False, 0.0
         self.r, self.scale = system.evaluate()
         solved = True
         if self.r > self.stage.tolerance * self.scale:
-            # no later step corrects a single solve
+            # no later step corrects this solve
             tolerance = self.stage.linear_tolerance or min(self._linear_tolerance(), self.stage.tolerance)
-            for projected in (False, True):  # of an indefinite matrix there is no least value to go to
+            for projected in (False, True):  # an indefinite quadratic form has no minimum
                 system.form_matrix(projected)
-                answer = system.direction(tolerance)
-                self.linear += answer.iterations
-                if not answer.negative:
+                solution = system.direction(tolerance)
+                self.linear += solution.iterations
+                if not solution.negative:
                     break
-            solved = answer.converged and system.linear_residual() <= LINEAR_LIMIT
+            solved = solution.converged and system.linear_residual() <= LINEAR_LIMIT
             self.r, self.scale = system.evaluate(STEP)
             self.newton = 1
         return self._result(solved)

@@ -1,52 +1,52 @@
-"""The contacts of a scene in which nothing can touch: none, at no cost. It stands in for `ContactStep` in implicit steps."""
+"""Empty contacts of a scene without possible contact. Replaces `ContactStep` in implicit steps at no cost."""
 
 import numpy as np
 
 
 class NoContacts:
-    """As `ContactStep`, with an empty list of contacts."""
+    """`ContactStep` with an empty list of contacts."""
 
     idle = True
-    n_contacts, met = 0, False
+    n_contacts, had_impact = 0, False
     relative_penetration = crossing = penetration = 0.0
 
     def __init__(self) -> None:
         self.flight = np.zeros(0)
 
     def _nothing(self, *_arguments, **_named) -> None:
-        """What needs no doing."""
+        """Do nothing."""
 
-    forget = acts = start_step = start_substep = end_substep = start_again = count_flight = restore = _nothing
+    forget = set_impulse_fraction = start_step = start_substep = end_substep = reset_substep = count_flight = restore = _nothing
 
     def begin(self, time: float, dt: float) -> int:
-        """Contacts of a step of dt [s] from a time."""
+        """Return the number of contacts of a step of dt [s] from a time: 0."""
         return 0
 
     def snapshot(self) -> None:
-        """What the next step rests on: nothing."""
+        """Return no state."""
 
-    def meets(self, dt: float) -> bool:
-        """Whether surfaces come together."""
+    def detect_impact(self, dt: float) -> bool:
+        """Return whether surfaces meet."""
         return False
 
-    rebounds = meets
+    detect_rebounds = detect_impact
 
-    def look(self, time: float, dt: float) -> tuple[float, float]:
-        """Penetration before a step of dt, and how far contacts close in it, over what they may."""
+    def measure_start(self, time: float, dt: float) -> tuple[float, float]:
+        """Return the relative penetration before a step of dt, and the largest closing ratio in it."""
         return 0.0, 0.0
 
-    def crossing_before(self) -> float:
-        """How deep triangles cross."""
+    def initial_crossing(self) -> float:
+        """Return the relative depth of crossing triangles."""
         return 0.0
 
     def left_searched_path(self, x_start) -> bool:
-        """Whether the surface went where nobody had looked."""
+        """Return whether the surface left the searched path."""
         return False
 
-    def penetrates_anew(self, time: float, dt: float, before: float) -> bool:
-        """Whether a substep ends with something newly in each other."""
+    def penetrates_deeper(self, time: float, dt: float, before: float) -> bool:
+        """Return whether a substep leaves a new or deeper penetration."""
         return False
 
     def end(self, time: float, dt: float) -> float:
-        """The deepest penetration at the end of a substep."""
+        """Return the deepest penetration [m] at the end of a substep."""
         return 0.0

@@ -1,7 +1,7 @@
-"""The residual of an implicit stage where a Newton step leads: `move` goes there and finds the elastic forces,
-`contact_terms.press` the impulses of contacts, `form_residual` adds all up.
+"""Residual of an implicit stage after a Newton step: `move` updates the state and computes elastic forces,
+`contact_terms.update_impulses` computes contact impulses, and `form_residual` adds everything.
 
-A linearised stage moves by `linearised.advance` instead, which keeps its residual without contacts.
+A linearised stage moves by `linearised.advance` instead, which updates the residual without contacts.
 """
 
 import taichi as ti
@@ -15,18 +15,18 @@ from taisoft.runtime import kernel
 from taisoft.scalars import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.subset import n_nodes_of, node_of
 
-STAY, STEP, AGAIN = range(3)  # where `move` goes: nowhere, the whole step, another length of the same step
-ELASTIC_STAGE, LINEARISED, IMPACT = range(3)  # kinds of a stage; IMPACT: see `impact`
+STAY, STEP, AGAIN = range(3)  # modes of `move`: stay, full step, another length of the same step
+ELASTIC_STAGE, LINEARISED, IMPACT = range(3)  # kinds of stages; IMPACT: see `impact`
 
 
 @kernel
 def move(
-    m: ti.template(), s: ti.template(), k: ti.template(), kind: ti.template(), how: ti.i32,
+    m: ti.template(), s: ti.template(), k: ti.template(), kind: ti.template(), mode: ti.i32,
     step_length: ti.f64, c: ti.f64, beta: ti.f64,
 ):  # fmt: skip
-    """Go where `how` says, the nodes of s.pcg.subset alone, and find the elastic forces there.
+    """Move the nodes of s.pcg.subset and compute the elastic forces there.
 
-    how: STAY; STEP: base = x, then step_length y, y of s.pcg; AGAIN: base + step_length y. scalars: START_SLOPE of a STEP.
+    mode: STAY; STEP: base = x, then step_length y, y of s.pcg; AGAIN: base + step_length y. scalars: START_SLOPE of a STEP.
     """
     ti.loop_config(serialize=m.serial)
     for chunk in range(m.chunks):
@@ -35,10 +35,10 @@ def move(
         slope = ti.cast(0.0, ti.f64)
         for at in range(chunk * size, ti.min(n, (chunk + 1) * size)):
             i = node_of(s.pcg.subset, at)
-            if how == STEP:
+            if mode == STEP:
                 slope += dot64(m.free[i] * s.residual[i], s.pcg.y[i])
                 s.base[i] = m.state.x[i]
-            if how != STAY:
+            if mode != STAY:
                 place_node(m, s, i, step_length, beta)
             if ti.static(k.any):
                 k.displacement[i] = m.state.x[i] - k.x_start[i]
@@ -49,7 +49,7 @@ def move(
         elasticity.sum_elements(m, s.pcg.subset)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        if how == STEP:
+        if mode == STEP:
             m.state.scalars[START_SLOPE] = total(m, OTHER_SUM)
 
 
@@ -58,10 +58,10 @@ def form_residual(
     m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), kind: ti.template(),
     beta: ti.f64, norms: ti.types.ndarray(),
 ):  # fmt: skip
-    """Residual on the nodes of s.pcg.subset, and -r as CG's right side, from what `move` and `press` have found.
+    """Form the residual on the nodes of s.pcg.subset, and -r as CG's right side, after `move` and `update_impulses`.
 
-    norms (5,), an array of the host (it is told sooner than by a returned vector): |r|^2, |inertia and mass damping|^2,
-    |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on the others; of another kind than ELASTIC_STAGE only those of r.
+    norms (5,), a host array, which is faster than a returned vector: |r|^2, |inertia and mass damping|^2, |f_el|^2, |f_ext|^2
+    on the free axes, and |r|^2 on the others; only those of r if kind is not ELASTIC_STAGE.
     scalars: END_SLOPE.
     """
     ti.loop_config(serialize=m.serial)
@@ -89,7 +89,7 @@ def form_residual(
         for j in ti.static(range(N_NORMS)):
             m.state.partial[chunk, j] = sums[j]
         m.state.partial[chunk, SUM] = slope
-    ti.loop_config(serialize=True)  # a sum outside of any loop would be a loop of its own over threads, 50 us and more
+    ti.loop_config(serialize=True)  # outside of any loop, the sum would become a parallel loop of its own, 50 us and more
     for _ in range(1):
         for j in ti.static(range(N_NORMS) if kind == ELASTIC_STAGE else (0, 4)):
             norms[j] = total(m, j)

@@ -1,4 +1,4 @@
-"""World: what every stepper works on: model, constraints, time; the one place that touches them together."""
+"""Simulation state shared by all steppers: model, constraints, loads and time."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from taisoft.transfer import download, upload
 
 @dataclass
 class SimulationState:
-    """A scene in the machine. time [s] is start + count * dt, so that it does not drift."""
+    """A scene on the device. time [s] is start + count * dt, so that it does not drift."""
 
     scene: Scene
     runtime: Runtime
@@ -25,43 +25,43 @@ class SimulationState:
     dirichlet: DirichletConditions
     time: float = 0.0
     step_count: int = 0
-    releases: int = 0  # times that led nodes were let go: what steppers know of the past then no longer holds
-    loads: np.ndarray | None = None  # (n_nodes, 3) [N] of the scene's tractions and forces; None: not known, or changed since
+    releases: int = 0  # number of releases of prescribed nodes; each invalidates the steppers' history
+    loads: np.ndarray | None = None  # (n_nodes, 3) [N] of the scene's tractions and forces; None: not computed, or outdated
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities of all nodes, as they are held."""
+        """Return positions and velocities of all nodes, in their stored precision."""
         x, v = download([self.model.state.x, self.model.state.v])
         return x, v
 
     def set_state(self, x: np.ndarray, v: np.ndarray) -> None:
-        """Positions [m] and velocities [m/s] of all nodes (n_nodes, 3)."""
+        """Set positions [m] and velocities [m/s] of all nodes, (n_nodes, 3)."""
         upload([(self.model.state.x, x), (self.model.state.v, v)])
 
     def snapshot(self) -> dict:
-        """What the next step rests on, for a checkpoint; see `taisoft/checkpoint.py`."""
+        """Return the state for a checkpoint; see `taisoft/checkpoint.py`."""
         x, v = self.state()
         return {"time": self.time, "step_count": self.step_count, "released": self.dirichlet.released(), "x": x, "v": v}
 
     def restore(self, kept: dict) -> None:
-        """Back to what `snapshot` told, also of another world of the same scene."""
+        """Restore a `snapshot`, also one of another instance of the same scene."""
         self.dirichlet.set_released(kept["released"])
         self.upload_constraints()
         self.set_state(kept["x"], kept["v"])
         self.time, self.step_count = float(kept["time"]), int(kept["step_count"])
 
     def restart(self) -> None:
-        """The state at the scene's start."""
+        """Set the initial state of the scene."""
         self.dirichlet.reset()
         self.upload_constraints()
-        self.set_state(self.layout.rest, self._rest_velocities())  # so that it is compiled before a step must be taken back
+        self.set_state(self.layout.rest, self._rest_velocities())  # compiles it before a step may need it
         self.time, self.step_count = 0.0, 0
 
     def upload_constraints(self) -> None:
-        """Free axes to the device."""
+        """Upload the free axes."""
         upload([(self.model.free, ~self.dirichlet.constrained())])
 
     def upload_material(self, density: bool) -> None:
-        """Material numbers of the bodies to the device, and masses if a density changed."""
+        """Upload material numbers of the bodies, and masses if a density changed."""
         m = self.model
         numbers = [(m.law_constants, material_table([b.material for b in self.scene.bodies]))]
         if m.damping is not None:
@@ -75,7 +75,7 @@ class SimulationState:
             upload_mass_matrix(self.scene, m.mass_matrix)
 
     def upload_loads(self, nodes: np.ndarray | None = None, forces: np.ndarray | None = None) -> None:
-        """The scene's loads to the device, with more forces (k, 3) [N] on nodes (k,) added to them where these are given."""
+        """Upload the scene's loads, plus forces (k, 3) [N] on nodes (k,) if given."""
         if not self.model.loaded:
             return
         if self.loads is None:
@@ -87,14 +87,14 @@ class SimulationState:
         upload([(self.model.loads, loads)])
 
     def _rest_velocities(self) -> np.ndarray:
-        """Initial velocities with 0 on constrained axes (n_nodes, 3)."""
+        """Return initial velocities, 0 on constrained axes, (n_nodes, 3)."""
         start = [np.broadcast_to(b.velocity, b.rest_positions.shape) for b in self.scene.bodies]
         return np.where(self.dirichlet.constrained(), 0.0, np.concatenate(start))
 
     def next_targets(self, times: np.ndarray) -> np.ndarray | None:
-        """Targets of led nodes (r, n_prescribed, 3), r >= 1, for the first r of the times; None when nothing is led.
+        """Return targets of prescribed nodes (r, n_prescribed, 3), r >= 1, for the first r of the times; None without such nodes.
 
-        Nodes that let go at the first time are released here.
+        Nodes whose path ends at the first time are released.
         """
         if self.dirichlet.n_prescribed == 0:
             return None
@@ -106,19 +106,19 @@ class SimulationState:
         return rows
 
     def next_target(self, t: float) -> np.ndarray | None:
-        """Targets (n_prescribed, 3) at one time."""
+        """Return targets (n_prescribed, 3) at one time; None without prescribed nodes."""
         rows = self.next_targets(np.array([t]))
         return None if rows is None else rows[0]
 
     def find_nonfinite(self, force: np.ndarray | None = None) -> str | None:
-        """Names the first node whose position, velocity or force (n_nodes, 3) is not finite, in a few words."""
+        """Describe the first node whose position, velocity or force (n_nodes, 3) is not finite; None if there is none."""
         x, v = self.state()
-        # explicit steps give up beyond the range of f32
-        good = np.isfinite(x).all(axis=1) & (np.abs(v) <= np.finfo(np.float32).max).all(axis=1)
+        # explicit steps fail beyond the range of f32
+        finite = np.isfinite(x).all(axis=1) & (np.abs(v) <= np.finfo(np.float32).max).all(axis=1)
         if force is not None:
-            with np.errstate(over="ignore"):  # a force whose square overflows is as bad as an infinite one
-                good &= np.isfinite((force.astype(np.float64) ** 2).sum(axis=1))
-        bad = np.flatnonzero(~good)
+            with np.errstate(over="ignore"):  # a force whose square overflows counts as infinite
+                finite &= np.isfinite((force.astype(np.float64) ** 2).sum(axis=1))
+        bad = np.flatnonzero(~finite)
         if len(bad) == 0:
             return None
         body = int(np.searchsorted(self.layout.node_start, bad[0], side="right")) - 1

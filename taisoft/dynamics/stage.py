@@ -1,4 +1,4 @@
-"""Fields and kernels of one implicit stage, whose formulas stand in `stage_system`."""
+"""Fields and kernels of one implicit stage; see `stage_system` for the formulas."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,36 +19,36 @@ class StageWork:
 
     x_hat: Any  # f64
     v_hat: Any
-    base: Any  # f64: x before the step that is being tried
-    residual: Any  # on all axes; where not free, beta times the constraint force
+    base: Any  # f64: x before the trial step
+    residual: Any  # on all axes; on constrained ones, beta times the constraint force
     prescribed_nodes: Any  # (n_prescribed) i32
     prescribed_axes: Any  # (n_prescribed, 3) i32
     targets: Any  # (n_prescribed) f64 3-vectors
     prescribed_acceleration: Any  # (n_prescribed) f64 3-vectors, only with a consistent mass
     n_prescribed: Count
-    change: Any  # f64: what the mass is multiplied by
+    change: Any  # f64: velocity change that the mass multiplies, see `set_change`
     damper: Any  # BlockCsr or None
-    pcg: PcgWork  # -r as its right side; y, the change of v that a Newton step makes; its subset, the nodes that move
+    pcg: PcgWork  # right side -r; y, the change of v in a Newton step; subset, the nodes that move
 
     @property
     def has_prescribed(self) -> bool:
-        """Whether nodes are led."""
+        """Whether nodes have prescribed motion."""
         return self.prescribed_nodes is not None
 
 
 @ti.func
 def stage_velocity(m: ti.template(), w: ti.template(), i, beta):
-    """(x - x_hat) / beta of node i in f64: an f32 velocity would make neighbours' positions differ by its rounding."""
+    """Return (x - x_hat) / beta of node i in f64: an f32 velocity would make neighbours' positions differ by its rounding."""
     return (m.state.x[i] - w.x_hat[i]) / beta
 
 
 @kernel
-def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, prescribed_share: ti.f64):
-    """x from the first iterate v; led nodes go to their targets, which gives their v.
+def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, prescribed_fraction: ti.f64):
+    """Set x from the first iterate v; prescribed nodes move to their targets, which gives their v.
 
-    v_hat of a led node is set so that (v - v_hat) / beta is its acceleration. With a lumped mass, which shows in nothing but
-    the reactions, that is its change of velocity in a step, of which prescribed_share happens in the stage. A consistent mass
-    drags the neighbours along, so there the path itself says it.
+    v_hat of a prescribed node is set so that (v - v_hat) / beta is its acceleration. With a lumped mass, which affects only the
+    reactions, that is the velocity change of a step, of which prescribed_fraction happens in the stage. A consistent mass
+    couples to the neighbours, so there the acceleration comes from the path.
     """
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -63,14 +63,14 @@ def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, prescribed_sha
                     if ti.static(m.consistent):
                         w.v_hat[i][a] = ti.cast(v - beta * w.prescribed_acceleration[k][a], m.real)
                     else:
-                        w.v_hat[i][a] = ti.cast(v - prescribed_share * (v - ti.cast(w.v_hat[i][a], ti.f64)), m.real)
+                        w.v_hat[i][a] = ti.cast(v - prescribed_fraction * (v - ti.cast(w.v_hat[i][a], ti.f64)), m.real)
                     m.state.v[i][a] = ti.cast(v, m.real)
                     m.state.x[i][a] = w.targets[k][a]
 
 
 @ti.func
 def set_change(m: ti.template(), w: ti.template(), i, c, beta):
-    """What the mass of node i is multiplied by."""
+    """Set c (v - v_hat), plus beta a v with mass damping, for node i."""
     change = c * (stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64))
     if ti.static(m.damped):
         change += beta * ti.cast(mass_damping.rate(m, i), ti.f64) * ti.cast(m.state.v[i], ti.f64)
@@ -79,23 +79,23 @@ def set_change(m: ti.template(), w: ti.template(), i, c, beta):
 
 @ti.func
 def residual_parts(m: ti.template(), w: ti.template(), i, beta):
-    """(r, inertia and mass damping, own forces, loads) of node i, without contacts; `set_change` and the elements went before."""
+    """Return (r, inertia and mass damping, internal forces, loads) of node i without contacts; uses `change`."""
     zero = ti.Vector([0.0, 0.0, 0.0], m.real)
-    own, loads, damping = zero, zero, zero
+    internal, loads, damping = zero, zero, zero
     for term in ti.static(m.terms):
         if ti.static(term.LOAD):
             loads += term.force(m, i)
         else:
-            own += term.force(m, i)
+            internal += term.force(m, i)
     if ti.static(m.stiffness_damping):
         damping += stiffness_damping.force(m, i, row_times(m, w.damper, i, m.state.v))
     inertia = ti.cast(mass_times(m, i, w.change), m.real)
-    return inertia - ti.cast(beta, m.real) * (own + loads + damping), inertia, own, loads
+    return inertia - ti.cast(beta, m.real) * (internal + loads + damping), inertia, internal, loads
 
 
 @ti.func
 def squares(r, inertia, f, external, free):
-    """What node i adds to the norms of `form_residual`."""
+    """Return the contributions of node i to the norms of `form_residual`."""
     return ti.Vector([norm2(free * r), norm2(free * inertia), norm2(free * f), norm2(free * external), norm2((1.0 - free) * r)])
 
 
@@ -107,16 +107,16 @@ def norm2(a):
 
 @ti.func
 def place_node(m: ti.template(), w: ti.template(), i, step_length, beta):
-    """Node i at base + step_length beta y, v accordingly; y is 0 on constrained axes."""
+    """Move node i to base + step_length beta y, and set v accordingly; y is 0 on constrained axes."""
     m.state.x[i] = w.base[i]
-    if step_length != 0.0:  # back to the base also where y is not a number
+    if step_length != 0.0:  # so that 0 restores the base even if y is not a number
         m.state.x[i] += step_length * beta * ti.cast(w.pcg.y[i], ti.f64)
     m.state.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
 
 
 @kernel
 def set_direction_to_rest(m: ti.template(), w: ti.template()):
-    """y = -v on the free axes."""
+    """Set y = -v on the free axes."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         w.pcg.y[i] = -m.free[i] * m.state.v[i]
@@ -124,7 +124,7 @@ def set_direction_to_rest(m: ti.template(), w: ti.template()):
 
 @kernel
 def negate_direction(m: ti.template(), w: ti.template()):
-    """y = -y."""
+    """Set y = -y."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         w.pcg.y[i] = -w.pcg.y[i]

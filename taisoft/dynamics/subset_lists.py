@@ -1,4 +1,4 @@
-"""Lists of some nodes of a stage and of what touches them: fills a `Subset`."""
+"""Lists of a subset of a stage's nodes and of the edges and blocks at them, for a `Subset`."""
 
 import numpy as np
 import taichi as ti
@@ -11,14 +11,14 @@ from taisoft.transfer import download, upload
 
 
 def entries_of(start: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Places of all entries of some rows, one row after the other. start: (n + 1) where rows begin."""
+    """Return the indices of all entries of some rows, row by row. start: (n + 1) first index of each row."""
     counts = start[rows + 1] - start[rows]
     ends = np.cumsum(counts)
     return np.arange(counts.sum()) + np.repeat(start[rows] - ends + counts, counts)
 
 
 class SubsetLists:
-    """What touches each node of a model, on the host, and room for a subset of them."""
+    """Edges and blocks at each node of a model, on the host, and storage for a subset."""
 
     def __init__(self, m: Model, A: BlockCsr):
         self._groups = m.groups
@@ -37,7 +37,7 @@ class SubsetLists:
         self._subset = Subset(count, *(self._arena.field(f"subset_{name}", ti.i32, n) for name, n in sizes.items()))
 
     def subset(self, nodes: np.ndarray) -> Subset:
-        """Some nodes, ascending, and the edges and blocks that touch them; the same record each time."""
+        """Return a subset of nodes, ascending, with the edges and blocks at them; the same record each time."""
         s, groups = self._subset, self._groups
         edges = np.unique(self._edge[entries_of(self.start, nodes)])
         blocks = np.unique(self._block[entries_of(self._tet_start, nodes)])
@@ -54,5 +54,5 @@ class SubsetLists:
         return self._arena.bytes
 
     def release(self) -> None:
-        """Give their memory back."""
+        """Free their memory."""
         self._arena.release()

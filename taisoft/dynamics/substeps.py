@@ -1,4 +1,4 @@
-"""Runs explicit sub-steps in batches, checks them, and puts the last good state back when one fails."""
+"""Explicit sub-steps in batches, with checks; a failure restores the last good state."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,15 +14,15 @@ from taisoft.model import Model
 from taisoft.scalars import LOWEST_J, MOST_INVERTED, STEPS_DONE
 from taisoft.transfer import upload
 
-LAUNCH_SECONDS = 0.1  # of one launch at most, roughly, so that Ctrl-C is heard
-DAMPING_POINT_SECONDS = 800e-9  # that stiffness damping adds to a law's POINT_SECONDS: it projects the stiffness of each point
+LAUNCH_SECONDS = 0.1  # rough maximum of one launch, so that Ctrl-C takes effect
+DAMPING_POINT_SECONDS = 800e-9  # added by stiffness damping to a law's POINT_SECONDS: it projects the stiffness of each point
 MAX_BATCH = 4096
-TARGET_BYTES_PER_TET = 200  # memory that the targets of a batch may take
+TARGET_BYTES_PER_TET = 200  # maximum memory for the targets of a batch
 
 
 @dataclass(frozen=True, eq=False)
 class SubstepWork:
-    """Fields of the explicit steps; what a scene does not need is None."""
+    """Fields of the explicit steps; None if a scene does not need them."""
 
     verlet: bool
     n_prescribed: Count
@@ -39,12 +39,12 @@ class SubstepWork:
 
     @property
     def has_prescribed(self) -> bool:
-        """Whether nodes are moved."""
+        """Whether nodes have prescribed motion."""
         return self.prescribed_nodes is not None
 
     @property
-    def holds(self) -> bool:
-        """Whether nodes are held."""
+    def has_held(self) -> bool:
+        """Whether nodes are constrained."""
         return self.held is not None
 
 
@@ -58,15 +58,17 @@ class SubstepResult:
 
 
 def largest_batch(m: Model) -> int:
-    """Sub-steps that one launch may take. It rests on the scene alone, not on the clock: where a batch ends shows in the last
-    digit of the report's extremes."""
+    """Return the maximum number of sub-steps per launch.
+
+    It depends on the scene alone, not on measured time, since the ends of batches affect the last digit of the report's extremes.
+    """
     damping = DAMPING_POINT_SECONDS if m.stiffness_damping else 0.0
     seconds = sum((g.last - g.first) * m.lanes * g.n_points * (g.law.POINT_SECONDS + damping) for g in m.groups)
     return max(1, min(MAX_BATCH, int(LAUNCH_SECONDS / seconds)))
 
 
 class ExplicitStepper:
-    """Takes sub-steps of symplectic Euler or velocity Verlet over a world."""
+    """Take sub-steps of symplectic Euler or velocity Verlet."""
 
     def __init__(self, simulation: SimulationState, verlet: bool):
         self.simulation = simulation
@@ -76,13 +78,13 @@ class ExplicitStepper:
         n_prescribed, n_held = dirichlet.n_prescribed, len(dirichlet.held)
         self.rows = max(1, min(self.max_batch, TARGET_BYTES_PER_TET * n_tets // (24 * max(1, n_prescribed))))
 
-        def vectors(name: str, count: int, dtype=m.real, wanted: bool = True, data=None):
-            return arena.vectors(name, dtype, count, data) if wanted and count > 0 else None
+        def vectors(name: str, count: int, dtype=m.real, needed: bool = True, data=None):
+            return arena.vectors(name, dtype, count, data) if needed and count > 0 else None
 
         self.work = SubstepWork(
             verlet=verlet, n_prescribed=n_prescribed, n_held=n_held,
-            acceleration=vectors("acceleration", m.n_nodes, wanted=verlet),
-            half_velocity=vectors("half_velocity", m.n_nodes, wanted=verlet and m.stiffness_damping),
+            acceleration=vectors("acceleration", m.n_nodes, needed=verlet),
+            half_velocity=vectors("half_velocity", m.n_nodes, needed=verlet and m.stiffness_damping),
             prescribed_nodes=(
                 arena.field("prescribed_nodes", ti.i32, n_prescribed, dirichlet.prescribed_nodes.astype(np.int32))
                 if n_prescribed else None
@@ -93,40 +95,40 @@ class ExplicitStepper:
             held=arena.field("held", ti.i32, n_held, dirichlet.held.astype(np.int32)) if n_held else None,
             held_velocity=vectors("held_velocity", n_held), reaction=vectors("reaction", n_held),
         )  # fmt: skip
-        self.stale = True  # Verlet's acceleration does not belong to the present state
+        self.acceleration_stale = True  # Verlet's acceleration does not match the present state
 
     def forget(self) -> None:
-        """The state was set."""
-        self.stale = True
+        """Invalidate the acceleration and clear the reactions, after the state was set."""
+        self.acceleration_stale = True
         if self.work.n_held:
             self.work.reaction.fill(0.0)
 
     def numbers_changed(self) -> None:
-        """Gravity or material numbers changed."""
-        self.stale = True
+        """Invalidate the acceleration, after gravity or material numbers changed."""
+        self.acceleration_stale = True
 
     def _kept_fields(self) -> dict[str, Any]:
-        """Fields that live from one sub-step to the next, by name, where the scene has them."""
+        """Fields kept from one sub-step to the next, by name, if the scene has them."""
         both = {"acceleration": self.work.acceleration, "reaction": self.work.reaction}
         return {name: field for name, field in both.items() if field is not None}
 
     def snapshot(self) -> dict:
-        """What the next sub-step rests on beside the world, and what `reactions` tells.
+        """Return the state of the stepper, including the reactions.
 
-        Verlet's acceleration was found with a velocity of the middle, so it is kept, not found again.
+        Verlet's acceleration was computed with a mid-step velocity, so it is saved, not recomputed.
         """
-        return {"stale": self.stale} | {name: field.to_numpy() for name, field in self._kept_fields().items()}
+        return {"stale": self.acceleration_stale} | {name: field.to_numpy() for name, field in self._kept_fields().items()}
 
     def restore(self, kept: dict) -> None:
-        """Back to what `snapshot` told."""
+        """Restore a `snapshot`."""
         upload([(field, kept[name]) for name, field in self._kept_fields().items()])
-        self.stale = bool(kept["stale"])
+        self.acceleration_stale = bool(kept["stale"])
 
     def advance(self, n: int, dt: float) -> SubstepResult:
-        """Take n sub-steps of dt, or fewer where led nodes let go or the launch would last too long; at least one.
+        """Take n sub-steps of dt, or fewer if prescribed nodes are released or the launch would last too long; at least one.
 
         A sub-step with a non-finite result raises SimulationError, and the state is the one before it; any other
-        exception leaves the state as it was.
+        exception leaves the state unchanged.
         """
         n = min(n, self.max_batch)
         simulation = self.simulation
@@ -134,33 +136,33 @@ class ExplicitStepper:
             n = min(n, self.rows)
             releases = simulation.releases
             targets = simulation.next_targets(simulation.time + dt * np.arange(1, n + 1))
-            self.stale = self.stale or simulation.releases != releases
+            self.acceleration_stale = self.acceleration_stale or simulation.releases != releases
             n = len(targets)
             self._upload_targets(targets)
         kept = simulation.state()
         try:
             result = self._launch(n, dt)
-        except BaseException:  # Ctrl-C, heard when the launch has ended: the batch is abandoned
-            self._put_back(*kept)
+        except BaseException:  # Ctrl-C, raised when the launch has ended: the batch is abandoned
+            self._restore_state(*kept)
             raise
         if result.done < n:
-            self._put_back(*kept)
-            if result.done > 0:  # deterministic on the CPU: the same sub-steps again, up to the last good one
+            self._restore_state(*kept)
+            if result.done > 0:  # deterministic on the CPU: repeat up to the last good sub-step
                 self._launch(result.done, dt)
             good = simulation.state()
-            self._put_back(*good)
+            self._restore_state(*good)
             self._launch(1, dt)
-            where = self._fault()
-            self._put_back(*good)
+            fault = self._describe_fault()
+            self._restore_state(*good)
             simulation.step_count += result.done
             simulation.time += result.done * dt
-            raise SimulationError(f"step {simulation.step_count + 1}: {where}")
+            raise SimulationError(f"step {simulation.step_count + 1}: {fault}")
         return result
 
-    def _fault(self) -> str:
-        """What ended the last sub-step, whose state is at hand."""
+    def _describe_fault(self) -> str:
+        """Describe the failure of the last sub-step, from its state."""
         lowest = self.simulation.model.state.scalars[LOWEST_J]
-        exploded = f"a tet is inside out by {-lowest:.1e} times its volume: the motion has diverged, and a smaller dt is needed"
+        exploded = f"a tet is inverted by {-lowest:.1e} times its volume: the motion has diverged, and a smaller dt is needed"
         other = exploded if lowest <= -explicit.EXPLODED else "a velocity is no longer finite"
         return self.simulation.find_nonfinite() or other
 
@@ -168,23 +170,23 @@ class ExplicitStepper:
         explicit.set_targets(self.work, targets.reshape(-1, 3))
         upload([(self.work.prescribed_axes, self.simulation.dirichlet.prescribed_axes())])
 
-    def _put_back(self, x: np.ndarray, v: np.ndarray) -> None:
+    def _restore_state(self, x: np.ndarray, v: np.ndarray) -> None:
         self.simulation.set_state(x, v)
-        self.stale = True
+        self.acceleration_stale = True
 
     def _launch(self, n: int, dt: float) -> SubstepResult:
         m, s = self.simulation.model, self.work
         if m.serial:
-            explicit.advance_serial(m, s, n, dt, int(self.stale))
+            explicit.advance_serial(m, s, n, dt, int(self.acceleration_stale))
         else:
             self._launch_parallel(n, dt)
-        self.stale = False
+        self.acceleration_stale = False
         done, lowest, inverted = m.state.scalars.to_numpy()[STEPS_DONE : MOST_INVERTED + 1].tolist()
         return SubstepResult(int(done), lowest, int(inverted))
 
     def _launch_parallel(self, n: int, dt: float) -> None:
         m, s = self.simulation.model, self.work
-        if s.verlet and self.stale:
+        if s.verlet and self.acceleration_stale:
             explicit.elements_parallel(m)
             explicit.restart_parallel(m, s)
         explicit.begin_parallel(m)
@@ -196,14 +198,14 @@ class ExplicitStepper:
 
     @property
     def field_bytes(self) -> dict[str, int]:
-        """Bytes by name of fields outside of the simulator's own memory: none."""
+        """Bytes by name of fields outside the simulator's arena: none."""
         return {}
 
     def release(self) -> None:
-        """Nothing to give back."""
+        """Free nothing."""
 
     def reactions(self) -> np.ndarray:
-        """(n_nodes, 3) force of the constraints in the last sub-step [N]."""
+        """Return the constraint forces of the last sub-step, (n_nodes, 3) [N]."""
         out = np.zeros((self.simulation.model.n_nodes, 3))
         if self.work.n_held:
             out[self.simulation.dirichlet.held] = self.work.reaction.to_numpy()
