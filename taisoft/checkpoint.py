@@ -100,7 +100,7 @@ def check_scene(saved: Checkpoint, scene: Scene, features: dict[str, bool]) -> N
         raise SceneError(f"{saved.path} is a checkpoint of another scene, which differs in {FEATURES}")
 
 
-def take_numbers(saved: Checkpoint, scene: Scene) -> None:
+def restore_numbers(saved: Checkpoint, scene: Scene) -> None:
     """Give a scene the gravity, materials, pairs and loads of a checkpoint. Raises SceneError for numbers outside the rules."""
     with thawed(scene, *scene.bodies):
         scene.gravity = saved.numbers["gravity"]

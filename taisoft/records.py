@@ -1,16 +1,16 @@
-"""What a step and a run tell about themselves: plain records, no Taichi."""
+"""Reports of steps and runs: plain records, without Taichi."""
 
 from dataclasses import dataclass, field
 
 
 @dataclass
 class Energies:
-    """Energies of a state [J]; elastic is 0 at rest, gravity is -sum m g.x and loads -sum f.x, 0 at the origin."""
+    """Energies of a state [J]. elastic is 0 at rest; gravity = -sum m g.x and loads = -sum f.x are 0 at the origin."""
 
     kinetic: float
     elastic: float
     gravity: float
-    loads: float = 0.0  # of forces and tractions, and of a pull as it is now
+    loads: float = 0.0  # of forces, tractions and the present force of a drag
 
     @property
     def total(self) -> float:
@@ -20,21 +20,22 @@ class Energies:
 
 @dataclass
 class StepReport:
-    """What one step did. A batch of explicit sub-steps gives one report: extremes over its sub-steps, the rest at its end."""
+    """Result of one step. A batch of explicit sub-steps gives one report: extremes over its sub-steps, the rest at its end."""
 
     time: float  # at the end of the step [s]
-    steps: int = 1  # sub-steps of size dt that this report covers
-    substeps: int = 1  # that an implicit step was taken in, more where it did not converge or bodies would have passed each other
-    newton_iterations: int = 0  # with those of tries that were given up; those on few nodes count by the share of these nodes,
-    linear_iterations: int = 0  # here too, see `dynamics.elimination`
+    steps: int = 1  # steps of dt that this report covers
+    substeps: int = 1  # of an implicit step; above 1 if it did not converge or bodies would have passed through each other
+    # iterations include those of abandoned attempts; those on a subset of nodes count by its fraction, see `dynamics.elimination`
+    newton_iterations: int = 0
+    linear_iterations: int = 0
     contact_iterations: int = 0
     residual: float = 0.0  # relative residual of the implicit equations, 0 for explicit steps
     contact_residual: float = 0.0
     n_contacts: int = 0
     dropped_contacts: int = 0
-    max_penetration: float = 0.0  # [m], of the contacts found, and how far triangles that cross must part
+    max_penetration: float = 0.0  # [m], of the detected contacts and of crossing triangles: how far these must separate
     crossings: int = 0  # pairs of surface triangles that cross by more than 0.1 % of the finer side's mean surface edge
-    deep: int = 0  # 1 where that is more than 2 % of the finer side's mean surface edge; a number among numbers
+    deep: int = 0  # 1 if max_penetration is more than 2 % of the finer side's mean surface edge; int like the other counts
     min_volume_ratio: float = 1.0  # smallest J = det F
     n_inverted: int = 0  # tets with J <= 0
     kinetic: float = 0.0  # [J]
@@ -47,7 +48,7 @@ class StepReport:
 
 @dataclass
 class RunReport:
-    """What a run did. status: ok | degraded | failed; problems says why it is not ok."""
+    """Result of a run. status: ok | degraded | failed; problems says why it is not ok."""
 
     status: str = "ok"
     problems: list[str] = field(default_factory=list)
@@ -57,5 +58,5 @@ class RunReport:
     compile_seconds: float = 0.0
     interrupted: bool = False  # a signal ended the run early
     step_reports: list[StepReport] = field(default_factory=list)
-    dt: float | None = None  # [s] of its steps
-    dt_requested: float | None = None  # [s] that the simulator had, where the run changed it to fit the frames
+    dt: float | None = None  # of its steps [s]
+    dt_requested: float | None = None  # the simulator's dt before the run changed it to fit the frames [s]
