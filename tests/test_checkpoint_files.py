@@ -149,7 +149,7 @@ def test_a_file_cut_off_gives_way_to_the_previous_one(two, share):
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
     name, other = re.escape(str(path)), re.escape(str(previous))
-    told = rf"^{name} is (no checkpoint of taisoft, or )?damaged.*; going on from the previous checkpoint instead, {other}$"
+    told = rf"^{name} is (no checkpoint of taisoft, or )?damaged.*; resuming from the previous checkpoint instead, {other}$"
     with pytest.warns(UserWarning, match=told):
         found = read_last_good(path)
     assert found.state["time"] == 1.0 and found.path == previous
