@@ -218,7 +218,7 @@ def test_sizes_are_checked_before_there_is_room(saved, tmp_path):
 def assert_refused_within(path, n_bytes):
     tracemalloc.start()
     try:
-        with pytest.raises(ts.SimulationError, match="b.npz is no checkpoint of taisoft, or damaged: .*announced"):
+        with pytest.raises(ts.SimulationError, match="b.npz is no checkpoint of taisoft, or damaged: .*declared"):
             checkpoint.read_checkpoint(path)
         assert tracemalloc.get_traced_memory()[1] < n_bytes
     finally:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from taisoft.output.polygons import cut_off
+from taisoft.output.polygons import clip_polygon
 
 UP = np.array([0.0, 1.0, 0.0])
 MAX_ELEVATION = 89.0  # [deg]; at 90 "up" is undefined
@@ -99,7 +99,7 @@ class Camera:
         for corners in triangles[crossing]:
             polygon = np.concatenate([inside[corners], x[corners], colours[corners]], axis=1)
             for k in range(inside.shape[1]):
-                polygon = cut_off(polygon, k)
+                polygon = clip_polygon(polygon, k)
             first = len(x) + len(points)
             faces += [(first, first + k, first + k + 1) for k in range(1, len(polygon) - 1)]
             points += [row[inside.shape[1] :] for row in polygon]

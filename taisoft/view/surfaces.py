@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from taisoft.output.appearance import OBSTACLE_COLOUR, body_colour
 from taisoft.output.obstacle_surface import ObstacleSurface, obstacle_surfaces
-from taisoft.output.polygons import cut_in_four
+from taisoft.output.polygons import subdivide
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
@@ -175,6 +175,6 @@ def _coarse_ball() -> tuple[np.ndarray, np.ndarray]:
     # an odd number of negative axes turns the order x, y, z inward
     triangles = np.array([f if sum(k > 2 for k in f) % 2 == 0 else f[::-1] for f in faces])
     for _ in range(2):
-        points, triangles = cut_in_four(points, triangles)
+        points, triangles = subdivide(points, triangles)
         points = _unit(points)
     return points, triangles
