@@ -14,7 +14,7 @@ import pytest
 from taisoft.errors import SceneError
 from taisoft.output.history import CAPACITY, QUANTITIES
 from taisoft.records import Energies, StepReport
-from taisoft.view.plot_overlay import MOST_SEGMENTS, cells, drawing, write
+from taisoft.view.plot_overlay import MAX_SEGMENTS, cells, drawing, write
 from taisoft.view.plots import GRID_LINES, PLOTS, Plots, curves_of
 
 
@@ -148,7 +148,7 @@ def test_plots_lie_in_the_window(kind, size):
     shown = cells(plots, size)
     assert len(shown) == (len(plots.visible()) if size == (1280, 720) else 2 if size[0] == 800 else 0)
     boxes, ends, colours = drawing(shown, size)
-    assert len(boxes) == len(shown) and len(ends) == len(colours) and len(ends) <= 2 * MOST_SEGMENTS
+    assert len(boxes) == len(shown) and len(ends) == len(colours) and len(ends) <= 2 * MAX_SEGMENTS
     assert np.isfinite(ends).all() and (ends >= 0).all() and (ends <= 1).all() and (boxes >= 0).all() and (boxes <= 1).all()
     gui = Told()
     write(gui, shown, (1280, 720))  # the size as it opened
@@ -158,5 +158,5 @@ def test_plots_lie_in_the_window(kind, size):
     tops = [cell.box[1] for cell in shown]
     assert all(b >= a + cell.box[3] for a, b, cell in zip(tops, tops[1:], shown))
     for cell in shown:
-        assert cell.text[0] + cell.text[2] == cell.box[0] and cell.holds(cell.box[0] + 1, cell.box[1] + 1)
-        assert not cell.holds(cell.text[0] - 1, cell.box[1] + 1)
+        assert cell.text[0] + cell.text[2] == cell.box[0] and cell.contains(cell.box[0] + 1, cell.box[1] + 1)
+        assert not cell.contains(cell.text[0] - 1, cell.box[1] + 1)

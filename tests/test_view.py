@@ -386,7 +386,7 @@ def test_one_window_at_a_time():
     first = Offscreen(scene, SIZE, renderer="vulkan")
     try:
         assert window_holder() == "a picture renderer"
-        with pytest.raises(OutputError, match="a picture renderer holds the one a process can have"):
+        with pytest.raises(OutputError, match="a picture renderer holds the only one a process can have"):
             Offscreen(scene, SIZE, renderer="vulkan")
         second = Offscreen(scene, SIZE)
         assert second.renderer == "software"

@@ -42,7 +42,7 @@ class LiveWindow:
 
     scene: its bodies and obstacles are read once; size: (width, height) in pixels; camera: where to look from, else it shows all
     bodies and moves back after them until the user moves it; tall: with room for sliders in the panel; colour and
-    layers: as of `Offscreen`, to begin with; plots: what can be shown of them. `pressed` holds what the user asked for by keys up
+    layers: as of `Offscreen`, to begin with; plots: what can be shown of them. `pressed` contains what the user asked for by keys up
     to the last draw, values of KEYS. Raises OutputError, before anything is opened, when a display or a Vulkan driver is missing
     or the process has a window already.
     """
@@ -155,7 +155,7 @@ class LiveWindow:
         """What the drag that begins here does."""
         left, top, width, height = self._panel_pixels
         x, y = cursor[0] * size[0], (1.0 - cursor[1]) * size[1]
-        if left <= x <= left + width and top <= y <= top + height or (self.strip is not None and self.strip.holds(x, y)):
+        if left <= x <= left + width and top <= y <= top + height or (self.strip is not None and self.strip.contains(x, y)):
             return "panel"
         if button != ti.ui.LMB:
             return "zoom" if button == ti.ui.RMB else "shift"
