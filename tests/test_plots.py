@@ -32,7 +32,7 @@ class Settled:
 
 
 def filled(n=1000, **kind):
-    plots = Plots(Settled(**kind), tuple(Plots(Settled(**kind)).offered()))
+    plots = Plots(Settled(**kind), tuple(Plots(Settled(**kind)).available()))
     rng = np.random.default_rng(0)
     for k in range(n):
         energies = dict(zip(("kinetic", "elastic", "gravity"), rng.normal(size=3)))
@@ -106,15 +106,15 @@ def test_only_what_is_modelled_is_offered():
         (True, False): {},
     }
     for (explicit, touching), expected in series.items():
-        offered = Plots(Settled(explicit, touching)).offered()
+        offered = Plots(Settled(explicit, touching)).available()
         assert {"energies", "step_time"} <= set(offered) and set(offered) - {"energies", "step_time"} == set(expected)
         for name, names in expected.items():
             assert [s.name for s in offered[name].series] == names
-    with pytest.raises(SceneError, match=r"no plot 'contacts': contact forces are not modelled \(one body\); there are energies"):
+    with pytest.raises(SceneError, match=r"not available: contact forces are not modelled \(one body\); there are energies"):
         Plots(Settled(touching=False), ("contacts",))
-    with pytest.raises(SceneError, match="no plot 'residuals': steps of velocity_verlet are explicit .* and contact forces"):
+    with pytest.raises(SceneError, match="'residuals' is not available: steps of velocity_verlet are explicit .* and contact forces"):
         Plots(Settled(True, False), ("residuals",))
-    with pytest.raises(SceneError, match="no plot is called 'energy'.*did you mean energies"):
+    with pytest.raises(SceneError, match="plot 'energy' is unknown.*did you mean energies"):
         Plots(Settled(), ("energy",))
 
 

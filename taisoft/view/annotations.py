@@ -94,8 +94,9 @@ class Annotations:
     def _draw_plot(self, curves: Curves, left: float, top: float, height: float) -> None:
         """Draw a plot at its upper left corner: title and legend above the curves, times below, the axis limits inside."""
         pad = PADDING[2]
-        background = self._at(left, top, left + WIDTH, top + height + sum(PADDING) + pad)
-        self._pen.rectangle(background, fill=(*PAPER, int(255 * OPACITY)))
+        self._pen.rectangle(
+            self._at(left, top, left + WIDTH, top + height + sum(PADDING) + pad), fill=(*PAPER, int(255 * OPACITY))
+        )
         x0, x1, y0 = left + 2 * pad, left + WIDTH - 2 * pad, top + PADDING[0]
         y1 = y0 + height
         self._write(x0, top + pad, curves.title, SMALL_SIZE, INK)

@@ -129,7 +129,7 @@ class Panel:
 
     def _choose_plots(self, gui) -> None:
         shown = self._plots.shown
-        for name in self._plots.offered():
+        for name in self._plots.available():
             shown[name] = gui.checkbox(f"{PLOTS[name].title}###plot {name}", shown[name])
 
     def _choose_solver(self, gui) -> None:
