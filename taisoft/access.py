@@ -148,7 +148,7 @@ class StateAccess(Guarded):
 
         Slow: unlike `StepReport.max_penetration` it checks all pairs, whether or not their surfaces meet. The depth is the
         largest over the vertices, nodes, tet centres and triangle-tet cuts of either that lie inside the other. In a sphere or
-        a capsule, the depth follows from the smallest distance to its centre or axis.
+        a capsule it is the radius minus the body's distance from the centre or axis.
         """
         return next(iter(self.overlaps()), None)
 

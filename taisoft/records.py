@@ -35,7 +35,7 @@ class StepReport:
     dropped_contacts: int = 0
     max_penetration: float = 0.0  # [m], of the detected contacts and of crossing triangles: how far these must separate
     crossings: int = 0  # pairs of surface triangles that cross by more than 0.1 % of the finer side's mean surface edge
-    deep: int = 0  # 1 if max_penetration is more than 2 % of the finer side's mean surface edge; int like the other counts
+    deep: int = 0  # 1 if a penetration exceeds 2 % of the finer side's mean surface edge, else 0
     min_volume_ratio: float = 1.0  # smallest J = det F
     n_inverted: int = 0  # tets with J <= 0
     kinetic: float = 0.0  # [J]

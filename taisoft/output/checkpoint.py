@@ -63,7 +63,7 @@ class CheckpointWriter:
 def read_last_good(path: str | Path) -> Checkpoint:
     """Return the checkpoint in a file or, if that cannot be read, the previous one beside it, with a warning that names both.
 
-    Raises SimulationError if neither can be read.
+    Raises SimulationError if neither can be read, with the reasons of both.
     """
     path = Path(path)
     previous = path.with_name(PREVIOUS_NAME)

@@ -18,7 +18,7 @@ UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s"}
 TITLES = {"body": "own colour", "stress": "von Mises stress", "stretch": "largest stretch", "speed": "speed"}
 QUANTILE = 0.99  # fraction of the nodes whose values lie within the scale
 DECAY = 0.998  # factor on the running maximum per picture
-LOWER_MARGIN = 1.5  # the scale falls to a lower end only if that is at least this times the running maximum
+LOWER_MARGIN = 1.5  # the end is lowered once this times the running maximum, rounded up, is below it
 MIN_SPAN = {"stress": 1.0, "stretch": 1e-3, "speed": 1e-3}  # smallest span of the scale, for a scene at rest
 # sRGB, from low to high
 COLOURS = np.array([(0.27, 0.42, 0.80), (0.33, 0.70, 0.78), (0.72, 0.82, 0.45), (0.97, 0.70, 0.27), (0.82, 0.20, 0.17)])
