@@ -1,4 +1,4 @@
-"""Elastic soft bodies in Taichi. Importing this package starts no Taichi: a public name is loaded at its first use."""
+"""Elastic soft bodies in Taichi. Importing this package does not start Taichi: public names are loaded at their first use."""
 
 import os
 from importlib import import_module
@@ -6,13 +6,13 @@ from importlib import import_module
 __version__ = "0.1.0"
 
 if os.name == "posix" and "HOME" not in os.environ:
-    # Without HOME, importing Taichi ends the process. expanduser asks the user database, which may not know.
+    # Without HOME, importing Taichi ends the process. expanduser looks in the user database, which may have no entry.
     _home = os.path.expanduser("~")
     os.environ["HOME"] = _home if os.path.isabs(_home) else "/tmp"
 
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # Taichi greets on standard output when imported, else
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # else Taichi prints a banner on standard output when imported
 
-_HOME = {  # public name -> the module that defines it
+_MODULES = {  # public name -> the module that defines it
     "TetMesh": "taisoft.mesh.tet_mesh",
     "box_mesh": "taisoft.mesh.shapes",
     "sheet_mesh": "taisoft.mesh.shapes",
@@ -50,17 +50,17 @@ _HOME = {  # public name -> the module that defines it
     "SimulationError": "taisoft.errors",
 }
 
-__all__ = sorted(_HOME) + ["__version__"]
+__all__ = sorted(_MODULES) + ["__version__"]
 
 
 def __getattr__(name: str):
-    """The public name `name`, imported from its module at the first use (PEP 562)."""
-    if name not in _HOME:
+    """Import a public name from its module at the first use (PEP 562)."""
+    if name not in _MODULES:
         raise AttributeError(f"module 'taisoft' has no attribute {name!r}")
-    value = getattr(import_module(_HOME[name]), name)
+    value = getattr(import_module(_MODULES[name]), name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOME})
+    return sorted({*globals(), *_MODULES})

@@ -1,4 +1,4 @@
-"""What a simulator shows of its state and lets a user change while it runs."""
+"""Access to a simulator's state and results, and its run-time changes."""
 
 import warnings
 from typing import TYPE_CHECKING
@@ -26,7 +26,7 @@ _REBUILT = (
     "integrator", "contact_solver", "self_collision", "allow_unstable", "newton_tolerance", "linear_tolerance",
     "contact_tolerance", "draggable",
 )  # fmt: skip
-INSTEAD = {  # of assigning to an attribute of a simulator, or to one that it might be thought to have
+INSTEAD = {  # what to do instead of assigning to an attribute that a simulator has or might be expected to have
     **{name: f"call sim.set_material(body, {name}=...)" for name in CHANGEABLE},
     **{name: f"call sim.set_contact(name_a, name_b, {name}=...)" for name in ("friction", "restitution")},
     **{name: f"call sim.set_state({name}=...)" for name in ("positions", "velocities")},
@@ -43,13 +43,13 @@ INSTEAD = {  # of assigning to an attribute of a simulator, or to one that it mi
 
 
 class StateAccess(Guarded):
-    """State, results and run-time data of a world; `Simulator` adds building and stepping."""
+    """State, results and run-time data of a simulation; `Simulator` adds construction and stepping."""
 
     _error = SimulationAttributeError
     _read_only = frozenset(("settings", "scene", "plan"))
     _instead = INSTEAD
     settings: Settings
-    _changes: int = 0  # of the state and of numbers, from outside: the energy then jumps
+    _changes: int = 0  # count of user changes to the state or to numbers; at each the energy jumps
     _simulation: SimulationState | None = None
     _contact: "ContactStep | None"
     _idle_detection: "Detection | None"
@@ -57,23 +57,26 @@ class StateAccess(Guarded):
     @property
     def time(self) -> float:
         """Simulated time [s]."""
-        return self._kept_simulation().time
+        return self._host_simulation().time
 
     @property
     def step_count(self) -> int:
         """Steps of dt taken."""
-        return self._kept_simulation().step_count
+        return self._host_simulation().step_count
 
     def positions(self, body: str | None = None) -> np.ndarray:
-        """(n_nodes, 3) float64 copy [m]; of all bodies, concatenated in the order added, without a name."""
+        """Return a float64 copy of a body's node positions (n_nodes, 3) [m]; without a name, of all bodies in the order added."""
         return self._open_simulation().state()[0][self._slice(body)].copy()
 
     def velocities(self, body: str | None = None) -> np.ndarray:
-        """(n_nodes, 3) float64 copy [m/s]."""
+        """Return a float64 copy of the node velocities (n_nodes, 3) [m/s]; body: as for `positions`."""
         return self._open_simulation().state()[1][self._slice(body)].astype(np.float64)
 
     def set_state(self, positions=None, velocities=None, body: str | None = None) -> None:
-        """Set positions [m] and velocities [m/s], (n_nodes, 3) each; constrained axes stop. Copies arrays; compiles nothing."""
+        """Set positions [m] and velocities [m/s], (n_nodes, 3) each. Velocities on constrained axes become 0.
+
+        Copies arrays; compiles nothing.
+        """
         simulation, rows = self._open_simulation(), self._slice(body)
         for name, value in (("positions", positions), ("velocities", velocities)):
             if value is not None:
@@ -89,30 +92,30 @@ class StateAccess(Guarded):
         self._stepper.forget()
 
     def energies(self) -> Energies:
-        """Energies of the present state [J]."""
+        """Return the energies of the present state [J]."""
         model = self._open_simulation().model
         measure(model)
         scalars = model.state.scalars.to_numpy().tolist()
         return Energies(scalars[KINETIC], scalars[ELASTIC], scalars[GRAVITY], scalars[LOADS])
 
     def reactions(self, body: str | None = None) -> np.ndarray:
-        """(n_nodes, 3) force of the constraint on each fixed or moved node in the last step [N], else 0."""
+        """Return the constraint forces (n_nodes, 3) of the last step [N]: on fixed and prescribed nodes, 0 on others."""
         self._open_simulation()
         return self._stepper.reactions()[self._slice(body)]
 
     def detect_contacts(self) -> "Contacts":
-        """The contacts of the present state swept by dt v, impulses 0; no step.
+        """Detect the contacts of the present state swept by dt v, with impulses 0, without taking a step.
 
-        How it is done is the scene's (`Scene.collision`, each body's `collision`), and by what each is hit the plan tells. Memory
-        and kernels for it are made at the first call. Raises MeshError where a distance field cannot be made, SimulationError
-        where positions or velocities are not finite, or a buffer would grow beyond `max_capacity`.
+        `Scene.collision` and each body's `collision` choose the method; the plan lists which one each body and obstacle gets.
+        Memory and kernels are made at the first call. Raises MeshError if a distance field cannot be made, SimulationError
+        if positions or velocities are not finite or a buffer would grow beyond `max_capacity`.
         """
         return self._find_contacts(self._dt).contacts()
 
     def set_contact(
         self, name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None
     ) -> None:
-        """Change the friction or restitution of a pair of bodies, or of a body and an obstacle; as `Scene.set_contact`."""
+        """Change the friction or restitution between two bodies, or a body and an obstacle; see `Scene.set_contact`."""
         scene = self._open_simulation().scene
         with thawed(scene):
             scene.set_contact(name_a, name_b, friction=friction, restitution=restitution)
@@ -121,9 +124,9 @@ class StateAccess(Guarded):
             self._contact.numbers_changed()
 
     def contacts(self) -> "Contacts":
-        """The contacts that the last step began with, gaps those of its start, and the impulses that it gave them [N s].
+        """Return the contacts of the last step, with gaps at its start [m] and the impulses it applied [N s].
 
-        Where a step was cut into parts, of its last part. Empty before the first step, and where nothing can touch.
+        After a step that was cut into substeps, those of the last substep. Empty before the first step and if nothing can touch.
         """
         self._open_simulation()
         if self._contact is not None:
@@ -133,7 +136,7 @@ class StateAccess(Guarded):
         return no_contacts()
 
     def contact_force(self, name: str) -> np.ndarray:
-        """Sum (3,) of the contact forces on a body or an obstacle over the last step [N]."""
+        """Return the total contact force (3,) on a body or an obstacle in the last step [N]."""
         scene = self._open_simulation().scene
         scene.surface_of(name)
         if self._contact is None:
@@ -141,25 +144,25 @@ class StateAccess(Guarded):
         return self._contact.force([c.name for c in scene.colliders].index(name))
 
     def deepest_overlap(self) -> "Overlap | None":
-        """Which two overlap deepest in the present state, and how deep [m]; None where nothing overlaps.
+        """Return the deepest overlapping pair in the present state and its depth [m], or None if nothing overlaps.
 
-        Slow, and unlike `StepReport.max_penetration` it looks at all pairs, whether or not their surfaces meet. The depth is that
-        of the deepest vertex, node, middle of a tet, or cut of a triangle into a tet of either inside the other; a body is as
-        deep in a sphere or a capsule as it comes near its middle or axis.
+        Slow: unlike `StepReport.max_penetration` it checks all pairs, whether or not their surfaces meet. The depth is the
+        largest over the vertices, nodes, tet centres and triangle-tet cuts of either that lie inside the other. In a sphere or
+        a capsule it is the radius minus the body's distance from the centre or axis.
         """
         return next(iter(self.overlaps()), None)
 
     def overlaps(self) -> "list[Overlap]":
-        """All pairs that overlap in the present state, as `deepest_overlap`; the deepest, by the smaller one's size, first."""
+        """Return all overlapping pairs in the present state, deepest relative to the smaller one's size first."""
         from taisoft.collision.overlap import find_overlaps
 
         return find_overlaps(self._find_contacts(0.0))
 
     def intersecting_triangles(self) -> list[tuple[str, int, str, int]]:
-        """Surface triangles that intersect in the present state, each pair once: name and triangle of each.
+        """Return the pairs of surface triangles that intersect in the present state: name and triangle of each, each pair once.
 
-        Triangles are rows of `body.nodes.surface`, or of an obstacle's surface. Of one body only where self_collision is on;
-        triangles that share a vertex are left out.
+        Triangles are rows of `body.nodes.surface`, or of an obstacle's surface. Pairs within one body are included only with
+        self_collision; triangles that share a vertex are left out.
         """
         detection = self._find_contacts(0.0)
         first, colliders = detection.topology.first, self._simulation.scene.colliders
@@ -170,7 +173,7 @@ class StateAccess(Guarded):
         ]
 
     def _find_contacts(self, dt: float) -> "Detection":
-        """The contacts of the present state swept by dt [s]; with 0 no path is asked for a later time."""
+        """Detect the contacts of the present state swept by dt [s]; with 0, paths are evaluated at the present time only."""
         simulation = self._open_simulation()
         if self._contact is not None:
             self._contact.search(simulation.time, dt)
@@ -178,19 +181,19 @@ class StateAccess(Guarded):
         if self._idle_detection is None:
             from taisoft.collision.pipeline import Detection
 
-            itself = self.settings.self_collision
-            self._idle_detection = Detection(simulation.scene, simulation.model, simulation.layout, self._runtime, itself)
+            within = self.settings.self_collision
+            self._idle_detection = Detection(simulation.scene, simulation.model, simulation.layout, self._runtime, within)
             self._owned.append(self._idle_detection)
         self._idle_detection.find(simulation.time, dt)
         return self._idle_detection
 
     @property
     def _detection(self) -> "Detection | None":
-        """What finds the contacts; None where it was not needed yet."""
+        """The contact detection in use; None if none was needed yet."""
         return self._contact.detection if self._contact is not None else self._idle_detection
 
     def stress(self, body: str | None = None) -> np.ndarray:
-        """Cauchy stress per tet (m,3,3) [Pa], not finite in a flat one; of all bodies, in the order added, without a name."""
+        """Return the Cauchy stress per tet (m,3,3) [Pa], not finite in a flat tet; without a name, of all bodies as added."""
         simulation = self._open_simulation()
         m, layout = simulation.model, simulation.layout
         bodies = range(len(layout.n_tets)) if body is None else [self._index(body)]
@@ -200,7 +203,7 @@ class StateAccess(Guarded):
         return np.concatenate([sigma[first[k] : first[k] + layout.n_tets[k]] for k in bodies]).reshape(-1, 3, 3)
 
     def elastic_forces(self) -> np.ndarray:
-        """(n_nodes, 3) elastic forces of the present state on all nodes [N]."""
+        """Return the elastic forces on all nodes in the present state (n_nodes, 3) [N]."""
         simulation = self._open_simulation()
         _, force = self._tangent_fields()
         elastic_forces(simulation.model)
@@ -208,7 +211,7 @@ class StateAccess(Guarded):
         return force.to_numpy().astype(np.float64)
 
     def force_differential(self, displacement: np.ndarray) -> np.ndarray:
-        """Change of the elastic forces (n_nodes, 3) [N] along a displacement (n_nodes, 3) [m] of all bodies: (df/dx) dx."""
+        """Return the change of the elastic forces (df/dx) dx (n_nodes, 3) [N]; displacement: dx (n_nodes, 3) [m] of all nodes."""
         simulation = self._open_simulation()
         self._check_rows("displacement", displacement, slice(None))
         dx, df = self._tangent_fields()
@@ -217,7 +220,7 @@ class StateAccess(Guarded):
         return df.to_numpy().astype(np.float64)
 
     def _tangent_fields(self) -> tuple:
-        """Two fields of (n_nodes) 3-vectors, allocated when first asked for."""
+        """Two fields of n_nodes 3-vectors, allocated at the first use."""
         if self._tangent is None:
             make, n, real = self._arena.vectors, self._simulation.model.n_nodes, self._runtime.real
             self._tangent = make("tangent_dx", real, n), make("tangent_df", real, n)
@@ -225,7 +228,7 @@ class StateAccess(Guarded):
 
     @property
     def dt(self) -> float:
-        """Step [s]; setting it takes effect with the next step."""
+        """Time step [s]; a new value takes effect with the next step."""
         return self._dt
 
     @dt.setter
@@ -241,13 +244,13 @@ class StateAccess(Guarded):
 
     @property
     def stable_dt(self) -> float:
-        """Largest stable step [s] of an explicit integrator about the rest shape: 2/omega_max without damping."""
+        """Largest stable time step [s] of an explicit integrator about the rest shape: 2/omega_max without damping."""
         if self._stable_dt is None:
             self._stable_dt = stable_dt(self.scene, self.settings.integrator == "velocity_verlet")
         return self._stable_dt
 
     def set_gravity(self, gravity) -> None:
-        """Change gravity (3,) [m/s^2]. Copies it, recomputes the rounding floor of the residual; compiles nothing."""
+        """Change gravity (3,) [m/s^2]. Recomputes the rounding floor of the residual; compiles nothing."""
         self._open_simulation()
         with thawed(self.scene):
             self.scene.gravity = gravity
@@ -256,13 +259,13 @@ class StateAccess(Guarded):
         self._stepper.numbers_changed()
 
     def _load_gravity(self) -> None:
-        """The scene's gravity to the device."""
+        """Copy the scene's gravity to the device."""
         upload([(self._simulation.model.gravity, self.scene.gravity[None])])
 
     def set_material(self, body: str, **numbers) -> None:
-        """Change numbers of a body's material (young, poisson, density, mass_damping, stiffness_damping); law stays.
+        """Change numbers of a body's material (young, poisson, density, mass_damping, stiffness_damping); the law stays.
 
-        Copies arrays, recomputes the rounding floor of the residual and the limit of a stable dt; compiles nothing.
+        Copies arrays and recomputes the rounding floor of the residual and the stable dt; compiles nothing.
         """
         simulation, k = self._open_simulation(), self._index(body)
         old, old_limit = self.scene.bodies[k].material, self._stable_dt
@@ -277,18 +280,18 @@ class StateAccess(Guarded):
             raise
         self._changes += 1
         simulation.upload_material("density" in numbers)
-        if "density" in numbers:  # a total force is spread by mass: the shares stay, but for their rounding
+        if "density" in numbers:  # a total force is spread by mass: the nodes' fractions change only by rounding
             self._upload_loads()
         self._stepper.numbers_changed()
 
     def _open_simulation(self) -> SimulationState:
-        """The world, with memory on the device."""
-        simulation = self._kept_simulation()
+        """Return the state and check that its device memory is usable. Raises SimulationError after `close`."""
+        simulation = self._host_simulation()
         self._runtime.check()
         return simulation
 
-    def _kept_simulation(self) -> SimulationState:
-        """The world, for what the host knows."""
+    def _host_simulation(self) -> SimulationState:
+        """Return the state for host data alone. Raises SimulationError after `close`."""
         if self._simulation is None:
             raise SimulationError("the simulator is closed")
         return self._simulation
@@ -312,9 +315,9 @@ class StateAccess(Guarded):
 
     def _check_rows(self, name: str, value, rows: slice) -> None:
         value = np.asarray(value)
-        wanted = (len(range(*rows.indices(self._simulation.model.n_nodes))), 3)
-        if value.shape != wanted or value.dtype.kind not in "fiu":
-            raise SceneError(f"{name} have shape {value.shape} and type {value.dtype}: they must be {wanted} numbers")
+        expected = (len(range(*rows.indices(self._simulation.model.n_nodes))), 3)
+        if value.shape != expected or value.dtype.kind not in "fiu":
+            raise SceneError(f"{name} have shape {value.shape} and type {value.dtype}: they must be {expected} numbers")
         with np.errstate(over="ignore"):
             bad = np.flatnonzero(~np.isfinite(value.astype(self._runtime.np_real)).all(axis=1))
         if len(bad):

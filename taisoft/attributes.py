@@ -1,8 +1,8 @@
-"""What may be assigned to, and the sentence that refuses the rest.
+"""Guards against assigning to attributes that are unknown, read-only or frozen.
 
-`Guarded` is for objects that are built step by step and used then: an unknown attribute is refused with the nearest known one, a
-read-only one with the call to use, and once the object is frozen every change is. `guarded_record` gives a frozen dataclass the
-same sentences. Reading is untouched: getattr, hasattr and dir do what they always do.
+`Guarded` is the base of objects that are built step by step and then used. It refuses an unknown attribute and suggests the
+nearest known one, refuses a read-only attribute and names the call to use instead, and refuses every change once the object is
+frozen. `guarded_record` gives a frozen dataclass the same messages. Reading (getattr, hasattr, dir) is not changed.
 """
 
 import difflib
@@ -18,39 +18,39 @@ _NOTHING = object()
 
 
 class SceneAttributeError(SceneError, AttributeError):
-    """An attribute of a scene, or of a part of one, that does not exist or cannot change."""
+    """An attribute of a scene, or of one of its parts, does not exist or cannot be changed."""
 
 
 class MeshAttributeError(MeshError, AttributeError):
-    """An attribute of a mesh that does not exist or cannot change."""
+    """An attribute of a mesh does not exist or cannot be changed."""
 
 
 class SimulationAttributeError(SimulationError, AttributeError):
-    """An attribute of a simulator that does not exist or cannot be assigned to."""
+    """An attribute of a simulator does not exist or cannot be assigned to."""
 
 
 class Guarded:
-    """Base of classes whose attributes are those that their `__init__` has set by the time it calls `_seal`.
+    """Base of classes whose attributes are those set by `__init__` before it calls `_seal`.
 
-    A class tells what to do instead of an assignment, by attribute: `_instead` at any time, also for names that are no
-    attributes, and `_instead_late` once the object is frozen, also for calls.
+    Class attributes say, by attribute name, what to do instead of an assignment: `_instead` at any time, also for names that are
+    no attributes, and `_instead_frozen` once the object is frozen, also for calls.
     """
 
     _error: ClassVar[type[Exception]] = SceneAttributeError
     _instead: ClassVar[dict[str, str]] = {}
-    _instead_late: ClassVar[dict[str, str]] = {}
-    _otherwise_late: ClassVar[str] = ""  # for what _instead_late leaves out
+    _instead_frozen: ClassVar[dict[str, str]] = {}
+    _default_frozen: ClassVar[str] = ""  # for names that _instead_frozen leaves out
     _read_only: ClassVar[frozenset[str]] = frozenset()  # attributes that only the class itself sets
-    _contents: ClassVar[dict[str, str]] = {}  # lists and dicts that nothing is put into by hand, and the call that does it
+    _contents: ClassVar[dict[str, str]] = {}  # lists and dicts that users must not fill directly -> the call that fills them
     _sealed = False
     _frozen = False
 
-    def _said(self) -> str:
-        """What messages call the object."""
+    def _label(self) -> str:
+        """Return the object's name in messages."""
         return type(self).__name__.lower()
 
     def _seal(self, init: Callable) -> None:
-        """From now on the attributes are known. init: the caller's; a subclass with another one may add attributes after it."""
+        """Refuse new attributes from now on. init: the calling `__init__`; a subclass with its own may add more after it."""
         self._guard_contents()
         if type(self).__init__ is init:
             self.__dict__["_sealed"] = True
@@ -58,35 +58,35 @@ class Guarded:
     def _guard_contents(self) -> None:
         for name, instead in self._contents.items():
             value = self.__dict__[name]
-            held = self.__dict__[name] = FrozenDict(value) if isinstance(value, dict) else GuardedList(value)
-            held._refusal = self._error(f"{self._said()}: {name} cannot be changed by hand: {instead}")
+            guarded = self.__dict__[name] = FrozenDict(value) if isinstance(value, dict) else GuardedList(value)
+            guarded._refusal = self._error(f"{self._label()}: {name} cannot be changed by hand: {instead}")
 
     def _freeze(self) -> None:
-        """Refuse changes from now on, also of lists, dicts and arrays."""
+        """Refuse all changes from now on, also in lists, dicts and arrays."""
         for name, value in self.__dict__.items():
             if isinstance(value, (list, dict)):
-                held = self.__dict__[name] = FrozenDict(value) if isinstance(value, dict) else FrozenList(value)
-                held._refusal = self._late(name)
+                guarded = self.__dict__[name] = FrozenDict(value) if isinstance(value, dict) else FrozenList(value)
+                guarded._refusal = self._frozen_error(name)
             elif isinstance(value, np.ndarray):
                 value.setflags(write=False)
         self.__dict__["_frozen"] = True
 
     def _check_open(self, call: str) -> None:
-        """Raises the error for a call that would change what is frozen."""
+        """Raise the error of a call that would change a frozen object."""
         if self._frozen:
-            raise self._late(call)
+            raise self._frozen_error(call)
 
-    def _late(self, name: str) -> Exception:
+    def _frozen_error(self, name: str) -> Exception:
         call = callable(_declared(type(self), name))
-        instead = self._instead_late.get(name, self._otherwise_late)
+        instead = self._instead_frozen.get(name, self._default_frozen)
         return self._error(
-            f"{self._said()}: {name} {'cannot be called' if call else 'cannot change'} any more, since a Simulator has taken the "
-            f"scene: {instead}"
+            f"{self._label()}: {name} {'cannot be called' if call else 'cannot change'} any more, since a Simulator has taken "
+            f"the scene: {instead}"
         )
 
     def __getstate__(self) -> dict:
-        """For copies and pickles: they have lists, dicts and arrays of their own, and those of a frozen object can change."""
-        return {name: _own(value) for name, value in self.__dict__.items() if name != "_frozen"}
+        """Return the state for copies and pickles, with their own lists, dicts and arrays; copies are not frozen."""
+        return {name: _mutable_copy(value) for name, value in self.__dict__.items() if name != "_frozen"}
 
     def __setstate__(self, state: dict) -> None:
         self.__dict__.update(state)
@@ -94,45 +94,47 @@ class Guarded:
 
     def __setattr__(self, name: str, value) -> None:
         if self._frozen and not name.startswith("_") and name in _public(self):
-            raise self._late(name)
+            raise self._frozen_error(name)
         if self._sealed:
             self._check(name, value)
         object.__setattr__(self, name, value)
 
     def __delattr__(self, name: str) -> None:
         if self._frozen:
-            raise self._late(name)
-        if self._sealed and name in _public(self) and _declared(type(self), name) is _NOTHING:  # a replaced method may go
-            raise self._error(f"{self._said()}: {name} cannot be deleted: {self._rule(name)}")
+            raise self._frozen_error(name)
+        if self._sealed and name in _public(self) and _declared(type(self), name) is _NOTHING:  # an overridden method may go
+            raise self._error(f"{self._label()}: {name} cannot be deleted: {self._rule(name)}")
         object.__delattr__(self, name)
 
     def _check(self, name: str, value) -> None:
-        """Raises the error for what is no attribute, or none that can be assigned to."""
+        """Raise the error of assigning to an attribute that is unknown or cannot be set."""
         declared = _declared(type(self), name)
         if declared is _NOTHING and name not in self.__dict__:
-            raise self._error(unknown(self._said(), name, _public(self), self._instead))
+            raise self._error(unknown(self._label(), name, _public(self), self._instead))
         kept = self._read_only | self._contents.keys()
         settable = declared.fset is not None if isinstance(declared, property) else name not in kept
         if not settable:
-            raise self._error(f"{self._said()}: {name} cannot be set: {self._rule(name)}")
+            raise self._error(f"{self._label()}: {name} cannot be set: {self._rule(name)}")
         if callable(declared) and not callable(value):
             hint = f": {self._instead[name]}" if name in self._instead else ""
-            raise self._error(f"{self._said()}: {name} is a method and cannot be set{hint}")
+            raise self._error(f"{self._label()}: {name} is a method and cannot be set{hint}")
 
     def _rule(self, name: str) -> str:
-        """What to do instead of setting what is there but cannot be set."""
+        """Return what to do instead of setting an attribute that exists but cannot be set."""
         return self._instead.get(name) or self._contents.get(name, "it is read-only")
 
 
 @contextmanager
 def thawed(*items: Guarded) -> Iterator[None]:
-    """What is frozen or read-only can be set meanwhile: for a simulator, which changes the numbers of its own copy of the scene,
-    and for copies that are put together anew."""
+    """Allow setting frozen and read-only attributes within the block.
+
+    For a simulator, which changes the numbers of its own copy of the scene, and for assembling copies.
+    """
     before = [(one, one._sealed, one._frozen) for one in items]
     for one in items:
         for name, value in one.__dict__.items():
             if isinstance(value, (GuardedList, FrozenDict)):
-                one.__dict__[name] = _own(value)
+                one.__dict__[name] = _mutable_copy(value)
         one.__dict__.update(_sealed=False, _frozen=False)
     try:
         yield
@@ -145,19 +147,22 @@ def thawed(*items: Guarded) -> Iterator[None]:
 
 
 def guarded_record(what: str, instead: str, error: type[Exception] = SceneAttributeError) -> Callable[[type], type]:
-    """A decorator of a frozen dataclass. what: what messages call it, with its name if it has one; instead: what to do instead of
-    changing an attribute, with {name} for the attribute. Arrays of its copies and pickles are read-only as its own are."""
+    """Return a decorator that gives a frozen dataclass the messages of `Guarded`.
+
+    what: its label in messages, followed by its name if it has one; instead: what to do instead of changing an attribute, with
+    {name} for the attribute. Arrays of copies and pickles are read-only, as those of the original are.
+    """
 
     def guard(cls: type) -> type:
         def refuse(self, name: str, value=None) -> None:
-            own = getattr(self, "name", None)
-            said = what if own is None else f"{what} {own!r}"
+            own_name = getattr(self, "name", None)
+            label = what if own_name is None else f"{what} {own_name!r}"
             known = _public(self)
             if name in known:
-                raise error(f"{said}: {name} cannot change: {instead.format(name=name)}")
+                raise error(f"{label}: {name} cannot change: {instead.format(name=name)}")
             if type(self) is cls:
-                raise error(unknown(said, name, known, {}))
-            object.__setattr__(self, name, value)  # a subclass's own
+                raise error(unknown(label, name, known, {}))
+            object.__setattr__(self, name, value)  # an attribute of a subclass
 
         def set_state(self, state: dict) -> None:
             self.__dict__.update(state)
@@ -172,7 +177,7 @@ def guarded_record(what: str, instead: str, error: type[Exception] = SceneAttrib
 
 
 def unknown(what: str, name: str, known: set[str], instead: dict[str, str]) -> str:
-    """The sentence about an attribute that does not exist, with what to do instead or the nearest name that does."""
+    """Return the message about an attribute that does not exist, with what to do instead or the nearest existing name."""
     if name in instead:
         return f"{what} has no attribute {name!r}: {instead[name]}"
     near = difflib.get_close_matches(name, sorted(known | set(instead)), n=1)
@@ -183,7 +188,7 @@ def unknown(what: str, name: str, known: set[str], instead: dict[str, str]) -> s
 
 
 class GuardedList(list):
-    """A list that only its owner adds to; items may be taken out of it. Copies and pickles are plain lists."""
+    """A list that only its owner adds to; items may be removed. Copies and pickles are plain lists."""
 
     _refusal: Exception
 
@@ -192,11 +197,11 @@ class GuardedList(list):
 
 
 class FrozenList(GuardedList):
-    """A list of a frozen object, which nobody changes."""
+    """An immutable list of a frozen object."""
 
 
 class FrozenDict(dict):
-    """A dict of a frozen object. Copies and pickles are plain dicts."""
+    """An immutable dict of a frozen object. Copies and pickles are plain dicts."""
 
     _refusal: Exception
 
@@ -216,8 +221,8 @@ for _name in ("__setitem__", "__delitem__", "__ior__", "clear", "pop", "popitem"
     setattr(FrozenDict, _name, _refuse)
 
 
-def _own(value):
-    """A list, dict or array of the same content that can change; anything else as it is."""
+def _mutable_copy(value):
+    """Return a mutable copy of a list, dict or array; anything else unchanged."""
     if isinstance(value, list):
         return list(value)
     if isinstance(value, dict):
@@ -226,10 +231,10 @@ def _own(value):
 
 
 def _declared(cls: type, name: str):
-    """What a class or its bases hold under a name; _NOTHING where they do not."""
+    """Return the attribute that a class or one of its bases defines under a name, or _NOTHING."""
     return getattr(cls, name) if any(name in base.__dict__ for base in cls.__mro__) else _NOTHING
 
 
 def _public(one) -> set[str]:
-    """Names of the public attributes of an object and of its class."""
+    """Return the names of the public attributes of an object and its class."""
     return {name for name in (*dir(type(one)), *one.__dict__) if not name.startswith("_")}

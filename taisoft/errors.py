@@ -1,4 +1,4 @@
-"""The errors a user can meet. Each message is one sentence: the thing, the index, the rule it breaks."""
+"""Errors that users can get. Each message is one sentence: the object, the index, the rule it breaks."""
 
 
 class TaisoftError(Exception):
@@ -18,12 +18,12 @@ class OutputError(TaisoftError):
 
 
 class SimulationError(TaisoftError):
-    """A run cannot start, or a step failed; the state is the last good one."""
+    """A run cannot start, or a step failed; the state stays the last good one."""
 
 
 def no_memory(what: str, error: MemoryError) -> SimulationError:
-    """The SimulationError for a MemoryError, whose text tells how much was asked for where NumPy raised it."""
-    from taisoft.memory import available_memory, format_bytes  # a rare case, in a module that everything imports
+    """Return the SimulationError for a MemoryError; NumPy's text gives the requested size."""
+    from taisoft.memory import available_memory, format_bytes  # rarely needed, and every module imports this one
 
-    asked = str(error).rstrip(".") or "the system gave no more"
-    return SimulationError(f"not enough memory for {what}: {asked}; available: {format_bytes(available_memory())}")
+    reason = str(error).rstrip(".") or "the system refused more"
+    return SimulationError(f"not enough memory for {what}: {reason}; available: {format_bytes(available_memory())}")

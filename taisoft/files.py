@@ -1,7 +1,7 @@
-"""Files that are whole or absent, whenever the process is killed.
+"""Atomic file writing: a file is complete or absent, whenever the process is killed.
 
-A file is written under a temporary name in its own folder (`<name>.<pid>-<n>.part`), flushed, fsynced, renamed, and the
-folder fsynced: whatever stands under a final name is complete.
+A file is written under a temporary name in its own folder (`<name>.<pid>-<n>.part`), flushed, fsynced and renamed, and the
+folder is fsynced. So a file under its final name is always complete.
 """
 
 import errno
@@ -19,41 +19,40 @@ _part_numbers = itertools.count()
 
 
 def cache_folders() -> Iterator[Path]:
-    """Where what can be computed anew may be kept: the user's cache, where the user has one, and then the folder for what is
-    temporary."""
+    """Yield folders for results that can be recomputed: the user's cache, if the user has one, then the temporary folder."""
     home = os.path.expanduser("~")
     if chosen := os.environ.get("XDG_CACHE_HOME"):
         yield Path(chosen) / "taisoft"
-    elif home != "~":  # a user without a home
+    elif home != "~":  # "~" stays for a user without a home folder
         yield Path(home) / ".cache" / "taisoft"
-    with suppress(OSError):  # there is none that can be written
+    with suppress(OSError):  # no temporary folder is writable
         yield Path(tempfile.gettempdir()) / "taisoft"
 
 
 def write_error(path: Path, error: OSError, n_bytes: int | None = None) -> OutputError:
-    """The OutputError that tells of a failed write: path, bytes where known, and the system's reason."""
+    """Return the OutputError for a failed write: path, size if known [bytes], and the system's reason."""
     size = "" if n_bytes is None else f" ({n_bytes} bytes)"
     return OutputError(f"cannot write {path}{size}: {error.strerror or error}")
 
 
 def part_path(path: Path) -> Path:
-    """A temporary name beside path that no other file of this process has; leftovers end in `.part`."""
+    """Return a temporary path beside `path`, unique within this process; it ends in `.part`."""
     return path.with_name(f"{path.name}.{os.getpid()}-{next(_part_numbers)}.part")
 
 
 def publish(part: Path, path: Path) -> None:
-    """Bring a finished temporary file to disk and to its final name. Raises OSError; then the part is still there."""
+    """Flush a finished temporary file to disk and rename it. Raises OSError; the temporary file then remains."""
     _fsync(part, os.O_RDWR)
     os.replace(part, path)
-    if os.name == "posix":  # elsewhere a folder cannot be opened, nor needs to be
+    if os.name == "posix":  # other systems cannot open a folder, and need not
         _fsync(path.parent, os.O_RDONLY)
 
 
 @contextmanager
 def replacing(path: str | Path, n_bytes: int | None = None) -> Iterator[Path]:
-    """Yield a temporary path to fill; at the end of the block it becomes `path`, or vanishes if the block failed.
+    """Yield a temporary path to write. At the end of the block it is renamed to `path`, or removed if the block failed.
 
-    n_bytes: size to name in the message, where known. Raises OutputError for any OSError, inside the block too.
+    n_bytes: size to name in the message, if known. Raises OutputError for any OSError, inside the block too.
     """
     path = Path(path)
     part = part_path(path)
@@ -67,15 +66,15 @@ def replacing(path: str | Path, n_bytes: int | None = None) -> Iterator[Path]:
             part.unlink()
 
 
-def name_also(path: Path, other: Path) -> None:
-    """Let a file, if it is there, have another name too, which it takes from any other file in one step. Raises OSError."""
+def link_file(path: Path, other: Path) -> None:
+    """Give a file, if it exists, a second name `other`, atomically replacing any file of that name. Raises OSError."""
     part = part_path(other)
     try:
         try:
             os.link(path, part)
         except FileNotFoundError:
             return
-        except OSError:  # a file system without links
+        except OSError:  # a file system without hard links
             shutil.copyfile(path, part)
             _fsync(part, os.O_RDWR)
         os.replace(part, other)
@@ -85,7 +84,7 @@ def name_also(path: Path, other: Path) -> None:
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write data to path, whole or not at all. Raises OutputError naming path and size."""
+    """Write data to path atomically. Raises OutputError naming path and size."""
     with replacing(path, len(data)) as part, open(part, "wb") as file:
         file.write(data)
         file.flush()
@@ -97,7 +96,7 @@ def _fsync(path: Path, flags: int) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno != errno.EINVAL:  # some file systems have no fsync for a folder
+        if error.errno != errno.EINVAL:  # some file systems cannot fsync a folder
             raise
     finally:
         os.close(descriptor)

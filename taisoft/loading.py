@@ -1,4 +1,4 @@
-"""Loads that change while a simulator runs: forces and tractions of the scene, and a pull, whose force is added to them."""
+"""Run-time changes of loads: the scene's forces and tractions, and the drag spring, whose force is added to them."""
 
 from taisoft.access import StateAccess
 from taisoft.dynamics.drag_spring import Drag, DragSpring
@@ -7,20 +7,20 @@ from taisoft.scene.changes import changed_load
 
 
 class Loading(StateAccess):
-    """Run-time changes of a simulator's loads; `Simulator` adds building and stepping."""
+    """Run-time changes of a simulator's loads; `Simulator` adds construction and stepping."""
 
     _drag_spring: DragSpring | None = None
 
     def set_force(self, body: str, index: int, value) -> None:
-        """Change a force that `body.add_force` has added, from the next step on.
+        """Change a force added by `body.add_force`, from the next step on.
 
-        index: counted from 0 in the order added to this body. value: (3,) the total, or (k,3) for each of its k nodes [N]. Raises
-        SceneError where there is no such force, or for a value outside the rules.
+        index: from 0 in the order added to this body. value: total (3,), or (k,3) with one row per node [N].
+        Raises SceneError if there is no such force or the value is invalid.
         """
         self._set_load("force", body, index, value)
 
     def set_traction(self, body: str, index: int, value) -> None:
-        """Change a traction that `body.add_traction` has added, from the next step on; index and errors as of `set_force`.
+        """Change a traction added by `body.add_traction`, from the next step on; index and errors as for `set_force`.
 
         value: (3,) per reference area [Pa].
         """
@@ -34,7 +34,7 @@ class Loading(StateAccess):
         self._loads_changed()
 
     def _upload_loads(self) -> None:
-        """The loads of the scene as it is now to the device, under those of a pull."""
+        """Copy the scene's present loads, plus the force of the drag spring, to the device."""
         self._simulation.loads = None
         if self._drag_spring is not None:
             self._drag_spring.upload()
@@ -42,19 +42,19 @@ class Loading(StateAccess):
             self._simulation.upload_loads()
 
     def drag(self, body: str, nodes, weights, target, stiffness: float) -> None:
-        """Pull a point of a body towards target (3,) [m] by a damped spring, in place of what was pulled before.
+        """Pull a point of a body towards target (3,) [m] by a damped spring; replaces an earlier drag.
 
-        The point is the mean of nodes (k,) by weights (k,), which are made to sum to 1; stiffness [N/m]. The force is taken at
-        the start of every step; `taisoft.dynamics.drag_spring` limits stiffness and force, and `dragged` holds both. Raises
-        SimulationError unless the Simulator was made with draggable=True, SceneError for what is no point of the body.
+        The point is the mean of nodes (k,) with weights (k,), which are normalized to sum to 1; stiffness [N/m]. The force is
+        evaluated at the start of every step. `taisoft.dynamics.drag_spring` limits stiffness and force; `dragged` holds both.
+        Raises SimulationError unless the Simulator was made with draggable=True, SceneError for an invalid point of the body.
         """
         self._open_simulation()
         if self._drag_spring is None:
-            raise SimulationError("bodies can be pulled only where the Simulator was made with draggable=True")
+            raise SimulationError("bodies can be dragged only if the Simulator was made with draggable=True")
         self._drag_spring.take(self._index(body), nodes, weights, target, stiffness)
 
     def release(self) -> None:
-        """End the pull; does nothing where nothing is pulled."""
+        """End the drag; does nothing if nothing is dragged."""
         self._open_simulation()
         if self._drag_spring is not None and self._drag_spring.release():
             self._changes += 1
@@ -62,21 +62,21 @@ class Loading(StateAccess):
 
     @property
     def draggable(self) -> bool:
-        """Whether `pull` can be called."""
+        """Whether `drag` can be called."""
         return self._drag_spring is not None
 
     @property
     def dragged(self) -> Drag | None:
-        """What is pulled now, with the point [m] and the force [N] of the last step's start; None where nothing is."""
+        """The present drag, with its point [m] and force [N] at the start of the last step; None if nothing is dragged."""
         return self._drag_spring.drag if self._drag_spring is not None else None
 
     @property
     def _driven(self) -> bool:
-        """Whether something else than the scene's own forces does work now: a drag, prescribed nodes, obstacles that move."""
+        """Whether anything but the scene's own forces does work now: a drag, prescribed nodes or moving obstacles."""
         moving = self._contact is not None and any(obstacle.path is not None for obstacle in self.scene.obstacles)
-        return moving or self.dragged is not None or not all(self._kept_simulation().dirichlet.released())
+        return moving or self.dragged is not None or not all(self._host_simulation().dirichlet.released())
 
     def _loads_changed(self) -> None:
-        """Explicit steps may rest on an acceleration with the old ones."""
+        """Invalidate the acceleration that an explicit stepper keeps, which was computed with the old loads."""
         if self.settings.explicit:
             self._stepper.numbers_changed()

@@ -1,4 +1,4 @@
-"""What a step and a run tell about themselves: plain records, no Taichi."""
+"""Reports of steps and runs: plain records, without Taichi."""
 
 from dataclasses import dataclass, field
 
@@ -10,7 +10,7 @@ class Energies:
     kinetic: float  #: [J]
     elastic: float  #: [J], 0 at rest
     gravity: float  #: -sum m g.x [J], 0 at the origin
-    loads: float = 0.0  #: -sum f.x of forces, tractions and a pull [J], 0 at the origin
+    loads: float = 0.0  #: -sum f.x of forces, tractions and a drag [J], 0 at the origin
 
     @property
     def total(self) -> float:
@@ -20,7 +20,7 @@ class Energies:
 
 @dataclass
 class StepReport:
-    """What one step did. A batch of explicit sub-steps gives one report: extremes over its sub-steps, the rest at its end."""
+    """Result of one step. A batch of explicit sub-steps gives one report: extremes over its sub-steps, the rest at its end."""
 
     time: float  #: at the end of the step [s]
     steps: int = 1  #: steps of size dt that this report covers
@@ -47,7 +47,7 @@ class StepReport:
 
 @dataclass
 class RunReport:
-    """What a run did."""
+    """Result of a run."""
 
     status: str = "ok"  #: "ok", "degraded" or "failed"
     problems: list[str] = field(default_factory=list)  #: why it is not "ok", in sentences; notes begin with "note:"

@@ -1,4 +1,7 @@
-"""A run: steps, frames, a status. Failures end it and are told; what was computed stays."""
+"""Running a simulation for a given time: steps, frames and a status.
+
+A failure ends the run and is reported; the results so far are kept.
+"""
 
 import math
 import time
@@ -15,22 +18,23 @@ if TYPE_CHECKING:
 
 FrameCallback = Callable[["Simulator", int, StepReport | None], None]
 StepCallback = Callable[[StepReport, float], None]
-NEAR = 1e-6  # of dt: a divisor of the frame time this near is what was meant, written with six or seven digits
-ROUNDING = 1e-9  # of the frame time, by which dt times the steps may miss it
-MOST_STEPS = 2.0**52  # of a run: beyond, the time of a float64 stands still
+NEAR = 1e-6  # relative to dt: a divisor of the frame time this close is taken as intended, dt being written with 6 or 7 digits
+ROUNDING = 1e-9  # relative to the frame time: allowed error of dt times the steps per frame
+MAX_STEPS = 2.0**52  # of a run: beyond that, adding dt no longer changes a float64 time
 
 
 def run(
     sim: "Simulator", seconds: float, on_frame: FrameCallback | None = None, fps: float | None = 60,
     stop: Callable[[], bool] | None = None, resumed: bool = False, on_step: StepCallback | None = None,
 ) -> RunReport:  # fmt: skip
-    """Step until `seconds` [s] from now, to the nearest step; frames at fps, or after every step when fps is None.
+    """Step for `seconds` [s] from now, to the nearest step, with frames at fps, or after every step if fps is None.
 
-    on_frame(sim, index, report): called for frame 0 (the start, report None) and after every frame. stop: asked between
-    steps; True ends the run. dt is lowered once to the next divisor of 1/fps, or rounded to one that is within NEAR of it, and
-    the report tells. resumed: seconds and frames count from time 0, not from now; the first frame is `first_frame`.
-    on_step(report, seconds): called after every implicit step and every batch of explicit ones with its wall time, less that of
-    compiling. Never raises for a failed or interrupted run: status and problems say it. Raises SimulationError for bad arguments.
+    on_frame(sim, index, report): called for frame 0 (the start, report None) and after every frame. stop: called between
+    steps; True ends the run. dt is lowered once to the next divisor of 1/fps, or rounded to one within NEAR of it, which
+    the report notes. resumed: seconds and frames count from time 0, not from now; the first frame is `first_frame`.
+    on_step(report, seconds): called after every implicit step and every batch of explicit steps, with its wall time without
+    compilation [s]. A failed or interrupted run does not raise: see the report's status and problems. Raises SimulationError
+    for bad arguments.
     """
     seconds = check_positive("seconds", seconds, "s")
     fps = None if fps is None else check_positive("fps", fps, "1/s")
@@ -41,95 +45,98 @@ def run(
     steps_per_frame = _fit_dt(sim, fps, report)
     total = max(1, round(seconds / sim.dt))
     if not resumed and seconds < 0.5 * sim.dt:
-        report.problems.append(f"note: {seconds:.6g} s are less than half a step: one of {sim.dt:.6g} s is taken")
+        report.problems.append(f"note: {seconds:.6g} s are less than half a step: one step of {sim.dt:.6g} s is taken")
     start_count, start_time = sim.step_count, sim.time
-    behind = round(sim.time / sim.dt) if resumed else 0  # steps of this dt
-    zero = start_count - behind
+    elapsed_steps = round(sim.time / sim.dt) if resumed else 0  # steps of this dt since time 0
+    first_step = start_count - elapsed_steps
     energy: EnergyCheck | None = None
     try:
         energy = EnergyCheck(sim)
-        frame, over = divmod(behind, steps_per_frame)
-        if on_frame is not None and not over:
+        frame, remainder = divmod(elapsed_steps, steps_per_frame)
+        if on_frame is not None and not remainder:
             on_frame(sim, frame, None)
-        while sim.step_count - zero < total and not report.interrupted:
+        while sim.step_count - first_step < total and not report.interrupted:
             frame += 1
-            goal = min(total, frame * steps_per_frame)
-            merged = _advance_to(sim, zero + goal, stop, report, on_step, energy)
+            frame_end = min(total, frame * steps_per_frame)
+            merged = _advance_to(sim, first_step + frame_end, stop, report, on_step, energy)
             if merged is None:
                 break
             if sim.settings.explicit:
                 report.step_reports.append(merged)
-            if on_frame is not None and sim.step_count - zero == goal:
+            if on_frame is not None and sim.step_count - first_step == frame_end:
                 on_frame(sim, frame, merged)
     except (SimulationError, MemoryError) as error:
         report.status = "failed"
         report.problems.append(str(no_memory("the next step", error) if isinstance(error, MemoryError) else error))
     except KeyboardInterrupt:
-        _interrupt(report)
+        _mark_interrupted(report)
     report.steps = sim.step_count - start_count
     report.sim_seconds = sim.time - start_time
     report.wall_seconds = time.perf_counter() - clock - (sim.compile_seconds - compiled)
     report.compile_seconds = sim._take_compile_seconds()
-    _judge(report)
+    _summarize_steps(report)
     if energy is not None:
         energy.add_problem(report)
     end = seconds if resumed else start_time + seconds
     if report.status != "failed" and not report.interrupted and abs(sim.time - end) > (1.0 + ROUNDING) * max(sim.dt, report.dt):
         report.problems.append(
-            f"the run was to end at t = {end:.6g} s and ended at t = {sim.time:.6g} s, since dt or the state changed meanwhile"
+            f"the run ended at t = {sim.time:.6g} s instead of t = {end:.6g} s, since dt or the state changed during it"
         )
         report.status = "degraded"
     if report.steps and report.status != "failed":
         try:
-            _judge_end(sim, report)
+            _check_final_overlap(sim, report)
         except (SimulationError, MemoryError) as error:
             report.status = "failed"
-            report.problems.append(str(no_memory("a look at the end", error) if isinstance(error, MemoryError) else error))
+            report.problems.append(str(no_memory("the final overlap check", error) if isinstance(error, MemoryError) else error))
         except KeyboardInterrupt:
             report.status = "degraded"
-            _interrupt(report)
+            _mark_interrupted(report)
     return report
 
 
 def check_length(seconds: float, dt: float, fps: float | None) -> None:
-    """Raises SimulationError where steps of dt [s], fitted to fps, would never reach `seconds` [s]."""
-    dt = _fitting(dt, fps)[1]
-    if not seconds <= MOST_STEPS * dt:
+    """Raise SimulationError if steps of dt [s], fitted to fps, would never reach `seconds` [s]."""
+    dt = _fit_to_frames(dt, fps)[1]
+    if not seconds <= MAX_STEPS * dt:
         raise SimulationError(
-            f"seconds = {seconds:g} s in steps of {dt:g} s are more than {MOST_STEPS:.2g} steps: the run would never end"
+            f"seconds = {seconds:g} s in steps of {dt:g} s are more than {MAX_STEPS:.2g} steps: the run would never end"
         )
 
 
 def first_frame(sim: "Simulator", fps: float | None) -> int:
-    """Number of the first frame of a resumed run: that of the present state, or where it lies between two the next."""
-    n, dt = _fitting(sim.dt, fps, sim)
+    """Return the number of a resumed run's first frame: that of the present state, or the next one if it lies between two."""
+    n, dt = _fit_to_frames(sim.dt, fps, sim)
     return -(-round(sim.time / dt) // n)
 
 
-def _fitting(dt: float, fps: float | None, sim: "Simulator | None" = None) -> tuple[int, float]:
-    """Steps per frame, and the dt that makes them a frame: the divisor of 1/fps within NEAR of this dt, unless that is not stable
-    in this simulator, else the largest one below it."""
+def _fit_to_frames(dt: float, fps: float | None, sim: "Simulator | None" = None) -> tuple[int, float]:
+    """Return the steps per frame and the dt [s] that fits them to a frame.
+
+    That dt is the divisor of 1/fps within NEAR of the given one, unless the simulator refuses it as unstable, else the largest
+    divisor below it.
+    """
     if fps is None:
         return 1, dt
     frame = 1.0 / fps
-    if not frame <= MOST_STEPS * dt:  # a run that long is refused, see `check_length`
+    if not frame <= MAX_STEPS * dt:  # such a run is refused by `check_length`
         return 1, dt
     n = max(1, round(frame / dt))
     if abs(n * dt - frame) <= ROUNDING * frame:
         return n, dt
-    if abs(n * dt - frame) > NEAR * frame or (frame / n > dt and sim is not None and not _may_take(sim, frame / n)):
+    if abs(n * dt - frame) > NEAR * frame or (frame / n > dt and sim is not None and not _allows_dt(sim, frame / n)):
         n = max(1, math.ceil(frame / dt))
     return n, frame / n
 
 
-def _may_take(sim: "Simulator", dt: float) -> bool:
-    """Whether a simulator does not refuse a dt [s] for its stability."""
+def _allows_dt(sim: "Simulator", dt: float) -> bool:
+    """Return whether the simulator accepts a dt [s] as stable."""
     return not sim.settings.explicit or sim.settings.allow_unstable or dt <= sim.stable_dt
 
 
 def _fit_dt(sim: "Simulator", fps: float | None, report: RunReport) -> int:
-    """Steps per frame; sets dt to a divisor of the frame time where it is none, and tells."""
-    n, dt = _fitting(sim.dt, fps, sim)
+    """Return the steps per frame. Set dt to a divisor of the frame time if it is none, and note that in the report."""
+    n, dt = _fit_to_frames(sim.dt, fps, sim)
     if dt != sim.dt:
         report.dt_requested, sim.dt = sim.dt, dt
     report.dt = sim.dt
@@ -139,41 +146,41 @@ def _fit_dt(sim: "Simulator", fps: float | None, report: RunReport) -> int:
 
 
 def dt_sentence(report: RunReport) -> str:
-    """How a run changed the dt that it was given, in a few words; "" where it did not."""
+    """Describe how a run changed the requested dt; "" if it did not."""
     if report.dt_requested is None:
         return ""
     before, after = report.dt_requested, report.dt
-    done = "rounded" if abs(after - before) <= 1.01 * NEAR * before else "lowered"
+    change = "rounded" if abs(after - before) <= 1.01 * NEAR * before else "lowered"
     texts = ((f"{before:.{digits}g}", f"{after:.{digits}g}") for digits in (6, 9, 17))
     old, new = next(pair for pair in texts if pair[0] != pair[1])
-    return f"dt {done} from {old} s to {new} s"
+    return f"dt {change} from {old} s to {new} s"
 
 
 def _advance_to(
-    sim: "Simulator", goal: int, stop, report: RunReport, on_step: StepCallback | None, energy: EnergyCheck
+    sim: "Simulator", end: int, stop, report: RunReport, on_step: StepCallback | None, energy: EnergyCheck
 ) -> StepReport | None:
-    """Step up to a step count. Explicit batches are merged into one report; implicit steps are listed one by one.
+    """Step up to step count `end`. Merge explicit batches into one report; list implicit steps one by one.
 
-    Returns the merged report, or that of the last implicit step; None when nothing was done.
+    Returns the merged report, or that of the last implicit step; None if no step was taken.
     """
     merged = None
-    while sim.step_count < goal:
+    while sim.step_count < end:
         if stop is not None and stop():
-            _interrupt(report)
+            _mark_interrupted(report)
             break
         energy.before_step()
-        one = timed_advance(sim, goal - sim.step_count, on_step)
-        energy.after_step(one)
+        latest = timed_advance(sim, end - sim.step_count, on_step)
+        energy.after_step(latest)
         if sim.settings.explicit:
-            merged = one if merged is None else _merge(merged, one)
+            merged = latest if merged is None else _merge(merged, latest)
         else:
-            report.step_reports.append(one)
-            merged = one
+            report.step_reports.append(latest)
+            merged = latest
     return merged
 
 
 def timed_advance(sim: "Simulator", n: int, on_step: StepCallback | None) -> StepReport:
-    """sim.advance(n), with on_step told of it."""
+    """Call sim.advance(n), then on_step with its report and wall time without compilation [s]."""
     clock, compiled = time.perf_counter(), sim.compile_seconds
     report = sim.advance(n)
     if on_step is not None:
@@ -182,7 +189,7 @@ def timed_advance(sim: "Simulator", n: int, on_step: StepCallback | None) -> Ste
 
 
 def _merge(a: StepReport, b: StepReport) -> StepReport:
-    """Later report b of an explicit batch with the extremes of a."""
+    """Merge two reports of explicit steps into the later one, b: extremes and sums of both, the rest from b."""
     b.steps += a.steps
     b.min_volume_ratio = min(a.min_volume_ratio, b.min_volume_ratio)
     b.n_inverted = max(a.n_inverted, b.n_inverted)
@@ -197,13 +204,13 @@ def _merge(a: StepReport, b: StepReport) -> StepReport:
     return b
 
 
-def _interrupt(report: RunReport) -> None:
+def _mark_interrupted(report: RunReport) -> None:
     report.interrupted = True
     report.problems.append("the run was interrupted before its end")
 
 
-def _judge_end(sim: "Simulator", report: RunReport) -> None:
-    """Bodies that overlap at the end, however they got there: the pair that is farthest beyond its limit."""
+def _check_final_overlap(sim: "Simulator", report: RunReport) -> None:
+    """Report the pair that overlaps farthest beyond its limit in the final state, whatever the steps reported."""
     found = sim.overlaps() if sim.touches else []
     beyond, worst = max(((o.depth / sim.contact_limit(o.name_a, o.name_b), k) for k, o in enumerate(found)), default=(0.0, 0))
     if beyond > 1.0:
@@ -212,8 +219,8 @@ def _judge_end(sim: "Simulator", report: RunReport) -> None:
         report.status = "degraded"
 
 
-def _judge(report: RunReport) -> None:
-    """Status from what happened: anything dropped, inverted or not converged keeps a run from ok."""
+def _summarize_steps(report: RunReport) -> None:
+    """Add problems and the status: any step that dropped contacts, inverted tets or did not converge degrades the run."""
     steps = report.step_reports
     unconverged = [s for s in steps if not s.converged]
     inverted = [s for s in steps if s.n_inverted > 0]
@@ -221,8 +228,8 @@ def _judge(report: RunReport) -> None:
         worst = max(unconverged, key=lambda s: max(s.residual, s.contact_residual))
         report.problems.append(
             f"{len(unconverged)} of {len(steps)} steps did not converge; the worst, at t = {worst.time:.4g} s, "
-            f"to a relative residual of {worst.residual:.2e}"
-            + (f", its contacts to {worst.contact_residual:.2e}" if worst.n_contacts else "")
+            f"reached a relative residual of {worst.residual:.2e}"
+            + (f" and a contact residual of {worst.contact_residual:.2e}" if worst.n_contacts else "")
         )
     if inverted:
         worst = max(inverted, key=lambda s: s.n_inverted)
@@ -231,13 +238,13 @@ def _judge(report: RunReport) -> None:
         )
     dropped = [s for s in steps if s.dropped_contacts > 0]
     if dropped:
-        report.problems.append(f"in {len(dropped)} of {len(steps)} reported steps contacts under inverted tets were not known")
-    sunk = [s for s in steps if s.deep]
-    if sunk:
-        worst, most = max(sunk, key=lambda s: s.max_penetration), max(s.crossings for s in sunk)
+        report.problems.append(f"in {len(dropped)} of {len(steps)} reported steps contacts of inverted tets were unknown")
+    deep = [s for s in steps if s.deep]
+    if deep:
+        worst, crossings = max(deep, key=lambda s: s.max_penetration), max(s.crossings for s in deep)
         report.problems.append(
-            f"in {len(sunk)} of {len(steps)} reported steps bodies penetrate; the worst, at t = {worst.time:.4g} s, "
-            f"by {worst.max_penetration:.3g} m" + (f", with {most} pairs of triangles that cross" if most else "")
+            f"in {len(deep)} of {len(steps)} reported steps bodies penetrate; the worst, at t = {worst.time:.4g} s, "
+            f"by {worst.max_penetration:.3g} m" + (f", with up to {crossings} crossing pairs of triangles" if crossings else "")
         )
-    if report.status == "ok" and (unconverged or inverted or dropped or sunk or report.interrupted):
+    if report.status == "ok" and (unconverged or inverted or dropped or deep or report.interrupted):
         report.status = "degraded"

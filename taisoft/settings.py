@@ -1,4 +1,4 @@
-"""The settings of a simulation, checked before anything is allocated."""
+"""Settings of a simulation, checked before anything is allocated."""
 
 import difflib
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ IMPLICIT_CONTACT = ("augmented_lagrangian",)
 @guarded_record("settings", "call sim.rebuild({name}=...)")
 @dataclass(frozen=True)
 class Settings:
-    """What a Simulator was asked for; tolerances are relative, None is adaptive."""
+    """Requested settings of a Simulator; tolerances are relative, None is adaptive."""
 
     dt: float  # [s]
     integrator: str
@@ -42,18 +42,18 @@ class Settings:
 
 
 def plan_of(scene: Scene, integrator: str, self_collision: bool, draggable: bool) -> Plan:
-    """The plan of a scene under an integrator."""
+    """Return the plan of a scene under an integrator."""
     explicit = integrator in EXPLICIT
     return make_plan(scene, explicit, not explicit and scheme_of(integrator).before > 0.0, self_collision, draggable)
 
 
 def check_dt(dt) -> float:
-    """dt as a float, or SimulationError."""
+    """Return dt as a float; SimulationError unless it is a finite number above 0."""
     return check_positive("dt", dt, "s")
 
 
 def check_positive(name: str, value, unit: str) -> float:
-    """value as a float; SimulationError unless it is a finite number above 0."""
+    """Return value as a float; SimulationError unless it is a finite number above 0."""
     try:
         return checks.number(value, name, above=0.0, unit=unit)
     except SceneError as error:
@@ -61,7 +61,7 @@ def check_positive(name: str, value, unit: str) -> float:
 
 
 def check_count(name: str, value) -> int:
-    """value as an int; SimulationError unless it is an integer of at least 1."""
+    """Return value as an int; SimulationError unless it is an integer of at least 1."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 1:
         raise SimulationError(f"{name} must be an integer of at least 1, not {value!r}")
     return int(value)
@@ -72,37 +72,37 @@ def _check_tolerance(name: str, value) -> None:
         return
     below = MAX_TOLERANCE.get(name, 1.0)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < below:
-        raise SimulationError(f"{name} = {value!r}: it must lie between 0 and {below:g}, or be None for the adaptive one")
+        raise SimulationError(f"{name} = {value!r}: it must lie between 0 and {below:g}, or be None for an adaptive one")
 
 
 def contact_solvers(integrator: str) -> tuple[str, ...]:
-    """The contact solvers that fit an integrator, beside "auto"."""
+    """Return the contact solvers that an integrator supports, besides "auto"."""
     return EXPLICIT_CONTACT if integrator in EXPLICIT else () if integrator == "implicit_midpoint" else IMPLICIT_CONTACT
 
 
 def _check_contact_solver(integrator: str, solver: str, touching: bool) -> None:
-    """Which integrator takes which contact solver; touching: whether anything can touch."""
-    fitting = contact_solvers(integrator)
+    """Raise SimulationError unless the integrator supports the contact solver. touching: whether anything can touch."""
+    supported = contact_solvers(integrator)
     known = ("auto", *EXPLICIT_CONTACT, *IMPLICIT_CONTACT)
     if solver not in known:
         near = difflib.get_close_matches(str(solver), known, 1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise SimulationError(f"contact_solver {solver!r} is unknown{hint}: it must be one of {', '.join(known)}")
-    if touching and not fitting:
+    if touching and not supported:
         raise SimulationError(
-            f"{integrator} takes no contacts: its stage lies in the middle of the step, where a contact that holds at the end "
-            "need not hold; take bdf2, which is of second order too, or implicit_euler"
+            f"{integrator} does not support contacts: its stage lies in the middle of the step, where a contact condition that "
+            "holds at the end need not hold; use bdf2, which is also second-order, or implicit_euler"
         )
-    if solver != "auto" and solver not in fitting:
-        instead = " or ".join(("'auto'", *fitting))
-        raise SimulationError(f"contact_solver {solver!r} does not fit {integrator}: take {instead}")
+    if solver != "auto" and solver not in supported:
+        instead = " or ".join(("'auto'", *supported))
+        raise SimulationError(f"contact_solver {solver!r} does not fit {integrator}: use {instead}")
 
 
 def check_settings(
     scene: Scene, dt, integrator, contact_solver, self_collision, precision, arch, allow_unstable, newton_tolerance,
     linear_tolerance, contact_tolerance, draggable,
 ) -> Settings:  # fmt: skip
-    """Check every argument of a Simulator. Raises SceneError or SimulationError with one sentence."""
+    """Check every argument of a Simulator. Raises SceneError or SimulationError."""
     if not isinstance(scene, Scene):
         raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
     if not scene.bodies:

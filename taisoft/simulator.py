@@ -1,4 +1,4 @@
-"""Simulator: builds a scene into the machine, steps it, and tells about it."""
+"""Simulator: allocates a scene on the device, steps it, and reports on it."""
 
 import dataclasses
 import warnings
@@ -28,7 +28,7 @@ from taisoft.stability import scale_warnings
 
 
 def _release(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:
-    """Give memory and runtime back; also when a simulator is dropped without `close`."""
+    """Release memory and runtime; also the finalizer of a simulator that was never closed."""
     while owned:
         owned.pop().release()
     arena.release()
@@ -36,11 +36,11 @@ def _release(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:
 
 
 class Simulator(Resuming):
-    """A scene being simulated, as it was when this was made. SI units; positions are float64 in either precision.
+    """A simulation of a scene as it was at construction. SI units; positions are float64 in either precision.
 
-    The scene is frozen: what a simulator can change while it runs are its own numbers, by its set_ methods and dt.
+    The scene is frozen. The simulator has its own copy of the scene's numbers, which its set_ methods change, as `dt` changes dt.
     dt [s]; integrator: one of taisoft.dynamics.INTEGRATORS; newton_tolerance, linear_tolerance: relative, None is adaptive.
-    An explicit integrator refuses a dt above `stable_dt` unless allow_unstable, which only warns. draggable: `pull` is wanted.
+    An explicit integrator refuses a dt above `stable_dt`; with allow_unstable it only warns. draggable: allow `drag`.
     Raises SceneError for a scene that cannot be simulated, SimulationError for settings that cannot be met.
     """
 
@@ -54,15 +54,15 @@ class Simulator(Resuming):
             scene, dt, integrator, contact_solver, self_collision, precision, arch, allow_unstable, newton_tolerance,
             linear_tolerance, contact_tolerance, draggable,
         )  # fmt: skip
-        self.scene = scene.snapshot()  # numbers that change while it runs are not those of the user's scene
-        self._given, scene = scene, self.scene
+        self.scene = scene.snapshot()  # run-time changes must not reach the user's scene
+        self._start_scene, scene = scene, self.scene
         self._dt = self.settings.dt
         self._stable_dt: float | None = None
-        self._owned = []  # what has memory of its own to give back
+        self._owned = []  # objects that have memory of their own to release
         self._contact = None
-        self._idle_detection = None  # of a scene without contact forces, once asked for
-        self._softens = any(LAWS[b.material.law].SOFTENS_BELOW for b in scene.bodies)  # and it was not told yet
-        self._tangent = None  # fields of force_differential, once asked for
+        self._idle_detection = None  # of a scene without contact forces; made on request
+        self._may_soften = any(LAWS[b.material.law].SOFTENS_BELOW for b in scene.bodies)  # until `_warn_softened` has warned
+        self._tangent = None  # fields of force_differential; made on request
         if self.settings.explicit:
             self._check_stability(self._dt)
         for text in scale_warnings(scene):
@@ -98,7 +98,7 @@ class Simulator(Resuming):
         if self._contact is not None:
             self._stepper.contact_tolerance = contact_tolerance or self._stepper.contact_tolerance
         self._release = weakref.finalize(self, _release, self._arena, self._runtime, self._owned)
-        for one in (self._given, scene):
+        for one in (self._start_scene, scene):
             one.freeze()
         self._seal(Simulator.__init__)
 
@@ -112,30 +112,31 @@ class Simulator(Resuming):
 
     @property
     def touches(self) -> bool:
-        """Whether contact forces are modelled."""
+        """Whether contact forces are simulated."""
         return self._contact is not None
 
     def contact_limit(self, a: str, b: str) -> float:
-        """Penetration [m] of two colliders, by name, above which a step counts as deep, where contact forces are modelled."""
+        """Penetration [m] of colliders a and b above which a step counts as deep. Requires contact forces (`touches`)."""
         names = [c.name for c in self.scene.colliders]
         return self._contact.deep_from(names.index(a), names.index(b))
 
     # --- stepping -------------------------------------------------------------------------------------------------
 
     def step(self) -> StepReport:
-        """Exactly one step of dt. Raises SimulationError when the result is not finite; the state is then the last good."""
+        """Take exactly one step of dt. Raises SimulationError if the result is not finite; the state stays the last good one."""
         return self.advance(1)
 
     def advance(self, n: int) -> StepReport:
-        """Up to n steps of dt, at least one: explicit ones in one launch, implicit ones one at a time.
+        """Take up to n steps of dt, at least one: explicit steps in one launch, implicit steps one per call.
 
         Raises SimulationError as `step` does, and unless n is an integer of at least 1.
         """
         simulation, start, n, unbalanced = self._open_simulation(), self.step_count, check_count("n", n), (0.0, "")
         if self.dragged is not None:
-            most = batch(self._dt) if self.settings.explicit else 1
-            n = min(n, most)
-            self._drag_spring.apply(most * self._dt)  # of less than a batch, too: the spring must not change its stiffness
+            max_steps = batch(self._dt) if self.settings.explicit else 1
+            n = min(n, max_steps)
+            # the time of a whole batch even if n is smaller: the spring's stiffness, which depends on it, must not change
+            self._drag_spring.apply(max_steps * self._dt)
             self._loads_changed()
         try:
             result = self._stepper.advance(n, self._dt) if self.settings.explicit else self._stepper.step(self._dt)
@@ -162,50 +163,50 @@ class Simulator(Resuming):
                 report.converged = result.contacts_converged
             report.deep, report.crossings = int(self._contact.is_deep), self._contact.crossings
         report.steps = self.step_count - start
-        if self._softens:
+        if self._may_soften:
             self._warn_softened()
-        report.problems = [f"step {simulation.step_count}: {what}" for what in self._problems(report, unbalanced)]
+        report.problems = [f"step {simulation.step_count}: {problem}" for problem in self._problems(report, unbalanced)]
         return report
 
     def _failure(self, error: SimulationError) -> SimulationError:
-        """The error of a step with the step's number; where the state that it began with was spoilt, with the place."""
-        self._runtime.check()  # says so itself
-        where, step = self._simulation.find_nonfinite(), f"step {self.step_count + 1}: "
-        if where is not None:
-            return SimulationError(f"{step}{where} at its start")
+        """Return a step's error with the step's number; if the state at its start was not finite, name that place instead."""
+        self._runtime.check()  # raises its own error
+        nonfinite, step = self._simulation.find_nonfinite(), f"step {self.step_count + 1}: "
+        if nonfinite is not None:
+            return SimulationError(f"{step}{nonfinite} at its start")
         return error if str(error).startswith("step ") else SimulationError(f"{step}{error}")
 
     def _warn_softened(self) -> None:
-        """Warn, once, of the first tet that is squeezed so far that its law softens."""
+        """Warn once, of the first tet compressed so far that its material law softens."""
         layout, first = self._simulation.layout, int(self._simulation.model.state.scalars[FIRST_SOFTENED])
         if first == NO_TET:
             return
-        self._softens = False
+        self._may_soften = False
         place = first - layout.block_start * self._runtime.lanes
         k = int(np.flatnonzero((place >= 0) & (place < layout.n_tets))[0])
         body = self.scene.bodies[k]
         law = LAWS[body.material.law]
         warnings.warn(
-            f"step {self.step_count}: tet {place[k]} of body '{body.name}' is squeezed to less than {law.SOFTENS_BELOW} of its "
-            f"length, where {law.NAME} softens: tets may collapse and turn inside out, and stay so",
+            f"step {self.step_count}: tet {place[k]} of body '{body.name}' is compressed below {law.SOFTENS_BELOW} of its "
+            f"length, where {law.NAME} softens: tets may collapse or invert, and stay so",
             UserWarning, stacklevel=3,
         )  # fmt: skip
 
     def _problems(self, report: StepReport, unbalanced: tuple[float, str]) -> list[str]:
-        """What was not as it should be, in sentences. unbalanced: see `StageResult`."""
+        """Describe what went wrong in the step, one sentence per problem. unbalanced: see `StageResult`."""
         found = []
         if not report.converged and not self.settings.explicit:
             found.append(
                 f"Newton stopped after {report.newton_iterations} iterations at a relative residual of {report.residual:.2e}"
-                + (f", that of the contacts {report.contact_residual:.2e}" if report.n_contacts else "")
+                + (f" and a contact residual of {report.contact_residual:.2e}" if report.n_contacts else "")
             )
             if unbalanced[1]:
                 worst, name = unbalanced
-                found.append(f"forces on {name} are unbalanced by {worst:.2g} of their size, beside larger ones on others")
+                found.append(f"forces on {name} are unbalanced by {worst:.2g} of their size, beside larger forces elsewhere")
         elif not report.converged:
             found.append(f"the contact solver stopped at a residual of {report.contact_residual:.2e}")
         if report.dropped_contacts:
-            found.append(f"{report.dropped_contacts} triangles lie under inverted tets, so their contacts are not known")
+            found.append(f"{report.dropped_contacts} triangles belong to inverted tets, so their contacts are unknown")
         if report.deep:
             found.append(
                 f"bodies are {report.max_penetration:.3g} m deep in each other or in obstacles"
@@ -222,11 +223,11 @@ class Simulator(Resuming):
     def run(
         self, seconds: float, on_frame=None, fps: float | None = 60, stop=None, resumed: bool = False, on_step=None
     ) -> RunReport:  # fmt: skip
-        """Run for some seconds; see `taisoft.running.run`."""
+        """Run for the given simulated time [s]; see `taisoft.running.run`."""
         return run(self, seconds, on_frame, fps, stop, resumed, on_step)
 
     def reset(self) -> None:
-        """Back to the scene's start; changed numbers (dt, gravity, materials, loads) stay. Copies arrays; compiles nothing."""
+        """Restore the scene's initial state; changed numbers (dt, gravity, materials, loads) stay. Compiles nothing."""
         self._open_simulation().restart()
         self.release()
         self._changes += 1
@@ -234,20 +235,20 @@ class Simulator(Resuming):
         self._stepper.forget()
 
     def rebuild(self, **changes) -> None:
-        """Go on from the present state with other settings, arguments of this class; arch and precision cannot change.
+        """Continue from the present state with other settings, arguments of this class; arch and precision cannot change.
 
-        Positions, velocities, time, count of steps, let-go nodes and changed numbers stay as they are. What the integrator knew
-        of earlier steps is forgotten, as by `set_state`, and a pull ends. Memory is held twice meanwhile.
-        Raises SimulationError where the settings cannot be met; this simulator is then as it was.
+        Positions, velocities, time, step count, released nodes and changed numbers are kept. The integrator's history is
+        discarded, as by `set_state`, and a drag ends. Both simulators are in memory during the call.
+        Raises SimulationError if the settings cannot be met; this simulator is then unchanged.
         """
         kept, start = self._open_simulation().snapshot(), self.scene.snapshot()
-        start.allow_initial_overlap = True  # where bodies start is not where they are
+        start.allow_initial_overlap = True  # bodies move to the present positions below
         new = Simulator(start, **(dataclasses.asdict(self.settings) | {"dt": self._dt} | changes))
         with thawed(new.scene):
             new.scene.allow_initial_overlap = self.scene.allow_initial_overlap
         new._simulation.restore(kept)
         new._stepper.forget()
-        new._time_base, new._given = (self.time, self.step_count), self._given
+        new._time_base, new._start_scene = (self.time, self.step_count), self._start_scene
         new._compiled_before, new._compile_reported = self._compiled_before, self._compile_reported
         new._changes = self._changes + 1
         self._release()
@@ -275,34 +276,34 @@ class Simulator(Resuming):
             loads=loads,
         )
 
-    # --- life ---------------------------------------------------------------------------------------------------------
+    # --- resources ----------------------------------------------------------------------------------------------------
 
     @property
     def compile_seconds(self) -> float:
-        """Seconds spent starting Taichi and compiling kernels for this simulator, its construction included."""
+        """Time spent starting Taichi and compiling kernels for this simulator, including its construction [s]."""
         return runtime.compile_clock() - self._compiled_before
 
     def _take_compile_seconds(self) -> float:
-        """Those that no run has reported yet."""
+        """Return the compile time since the last call [s], so that each run reports its own."""
         now = runtime.compile_clock()
         seconds, self._compile_reported = now - self._compile_reported, now
         return seconds
 
     @property
     def field_bytes(self) -> dict[str, int]:
-        """Bytes of every allocated array by name."""
-        self._kept_simulation()
-        searched = self._contact or self._idle_detection
-        return self._arena.bytes | (searched.field_bytes if searched else {}) | self._stepper.field_bytes
+        """Size of every allocated array [bytes], by name."""
+        self._host_simulation()
+        detection = self._contact or self._idle_detection
+        return self._arena.bytes | (detection.field_bytes if detection else {}) | self._stepper.field_bytes
 
     @property
     def buffer_growths(self) -> dict[str, int]:
-        """How often each buffer of the search for contacts grew since the start; those that never did are left out."""
-        searched = self._contact.detection if self._contact is not None else self._idle_detection
-        return {name: n for name, n in searched.counts.growths.items() if n} if searched is not None else {}
+        """How often each buffer of contact detection grew since the start; buffers that never grew are left out."""
+        detection = self._contact.detection if self._contact is not None else self._idle_detection
+        return {name: n for name, n in detection.counts.growths.items() if n} if detection is not None else {}
 
     def close(self) -> None:
-        """Give memory and runtime back; a closed simulator cannot be used."""
+        """Release memory and runtime; a closed simulator cannot be used."""
         if self._simulation is not None:
             self._release()
             self._simulation = self._stepper = self._contact = self._idle_detection = self._tangent = self._drag_spring = None

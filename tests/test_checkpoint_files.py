@@ -149,7 +149,7 @@ def test_a_file_cut_off_gives_way_to_the_previous_one(two, share):
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
     name, other = re.escape(str(path)), re.escape(str(previous))
-    told = rf"^{name} is (no checkpoint of taisoft, or )?damaged.*; going on from the previous checkpoint instead, {other}$"
+    told = rf"^{name} is (no checkpoint of taisoft, or )?damaged.*; resuming from the previous checkpoint instead, {other}$"
     with pytest.warns(UserWarning, match=told):
         found = read_last_good(path)
     assert found.state["time"] == 1.0 and found.path == previous
@@ -218,7 +218,7 @@ def test_sizes_are_checked_before_there_is_room(saved, tmp_path):
 def assert_refused_within(path, n_bytes):
     tracemalloc.start()
     try:
-        with pytest.raises(ts.SimulationError, match="b.npz is no checkpoint of taisoft, or damaged: .*announced"):
+        with pytest.raises(ts.SimulationError, match="b.npz is no checkpoint of taisoft, or damaged: .*declared"):
             checkpoint.read_checkpoint(path)
         assert tracemalloc.get_traced_memory()[1] < n_bytes
     finally:

@@ -63,7 +63,7 @@ def test_bad_scene_file(tmp_path, capsys, text, told):
         (["--set", "solver.dt=nan"], "dt must be finite, not nan"),
         (["--set", "solver.dt=-1e-3"], "dt must be greater than 0 s, not -0.001"),
         (["--set", "solver.newton_tolerence=1e-3"], "did you mean newton_tolerance?"),
-        (["--set", "solver.contact_solver=augmented_lagrangian"], "does not fit symplectic_euler: take 'auto' or "),
+        (["--set", "solver.contact_solver=augmented_lagrangian"], "does not fit symplectic_euler: use 'auto' or "),
         (["--set", "gravity=3"], "write solver.KEY=VALUE"),
         (["--set", "solver.dt=1 ms"], "'1 ms' is not a number"),
         (["--seconds", "0"], "seconds must be greater than 0, not 0.0"),

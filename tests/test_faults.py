@@ -401,7 +401,7 @@ def test_a_number_that_is_spoilt(tmp_path, integrator, others):
         assert result.status == "failed" and result.steps == 2 and len(shown) == 3
         assert re.search(r"^step 3: body 'part', node 5: position, velocity or force is no longer finite", result.problems[-1])
         assert np.array_equal(sim.positions(), shown[-1])
-        with pytest.raises(ts.SimulationError, match="no checkpoint is made of such a state: body 'part', node 5"):
+        with pytest.raises(ts.SimulationError, match="written of a state that is not finite: body 'part', node 5"):
             checkpoints.write(sim)
     simulation = read_checkpoint(tmp_path / "checkpoint.npz").state["simulation"]
     assert simulation["step_count"] == 2 and np.array_equal(simulation["x"], shown[-1]) and np.isfinite(simulation["v"]).all()

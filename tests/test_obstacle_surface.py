@@ -19,7 +19,7 @@ from usd_stage import faults
 import taisoft as ts
 from taisoft.mesh.half_edges import opposite_half_edges
 from taisoft.output.appearance import OBSTACLE_COLOUR
-from taisoft.output.obstacle_surface import REACH, obstacle_surfaces
+from taisoft.output.obstacle_surface import HALF_SIDE, obstacle_surfaces
 from taisoft.output.usd import UsdWriter, join_chunks
 from taisoft.view.ggui import vulkan_missing
 from taisoft.view.offscreen import Offscreen
@@ -66,7 +66,7 @@ def test_a_half_space():
     a, b, c = (x[surface.triangles[:, k]] for k in range(3))
     area = np.cross(b - a, c - a) / 2
     assert (area @ shape.normal > 0).all()
-    side = 2 * REACH * np.sqrt(3)  # of the diagonal of a cube of 1 m
+    side = 2 * HALF_SIDE * np.sqrt(3)  # of the diagonal of a cube of 1 m
     assert area.sum(axis=0) @ shape.normal == pytest.approx(side**2)
     away = np.array([3, 5, 0]) - x.mean(axis=0)
     assert np.abs(np.cross(away, shape.normal)).max() < 1e-9
@@ -120,7 +120,7 @@ def test_paths():
 
     (floor, ball) = obstacle_surfaces(scene(floor=(ts.HalfSpace((0, 0, 0), (0, 1, 0)), belt), ball=(SOLIDS["sphere"][0], belt)))
     assert np.allclose(floor.at(1.0), floor.vertices + (0, 0.5, 0)) and np.allclose(ball.at(1.0), ball.vertices + (1, 0.5, 0))
-    with pytest.raises(ts.OutputError, match="what is shown of an obstacle has no place: obstacle 'ball': the path .* no more"):
+    with pytest.raises(ts.OutputError, match="an obstacle cannot be shown: obstacle 'ball': the path .* no more"):
         ball.at(1.5)
     spin, tilt = (lambda t: (np.zeros(3), rotation((0, 1, 0), t))), (lambda t: (np.zeros(3), rotation((0, 0, 1), t)))
     (spinning,) = obstacle_surfaces(scene(disc=(ts.HalfSpace((-50, 0, 0), (0, 1, 0)), spin)))

@@ -14,7 +14,7 @@ import pytest
 from taisoft.errors import SceneError
 from taisoft.output.history import CAPACITY, QUANTITIES
 from taisoft.records import Energies, StepReport
-from taisoft.view.plot_overlay import MOST_SEGMENTS, cells, drawing, write
+from taisoft.view.plot_overlay import MAX_SEGMENTS, cells, drawing, write
 from taisoft.view.plots import GRID_LINES, PLOTS, Plots, curves_of
 
 
@@ -32,7 +32,7 @@ class Settled:
 
 
 def filled(n=1000, **kind):
-    plots = Plots(Settled(**kind), tuple(Plots(Settled(**kind)).offered()))
+    plots = Plots(Settled(**kind), tuple(Plots(Settled(**kind)).available()))
     rng = np.random.default_rng(0)
     for k in range(n):
         energies = dict(zip(("kinetic", "elastic", "gravity"), rng.normal(size=3)))
@@ -106,15 +106,15 @@ def test_only_what_is_modelled_is_offered():
         (True, False): {},
     }
     for (explicit, touching), expected in series.items():
-        offered = Plots(Settled(explicit, touching)).offered()
+        offered = Plots(Settled(explicit, touching)).available()
         assert {"energies", "step_time"} <= set(offered) and set(offered) - {"energies", "step_time"} == set(expected)
         for name, names in expected.items():
             assert [s.name for s in offered[name].series] == names
-    with pytest.raises(SceneError, match=r"no plot 'contacts': contact forces are not modelled \(one body\); there are energies"):
+    with pytest.raises(SceneError, match=r"not available: contact forces are not modelled \(one body\); there are energies"):
         Plots(Settled(touching=False), ("contacts",))
-    with pytest.raises(SceneError, match="no plot 'residuals': steps of velocity_verlet are explicit .* and contact forces"):
+    with pytest.raises(SceneError, match="not available: steps of velocity_verlet are explicit .* and contact forces"):
         Plots(Settled(True, False), ("residuals",))
-    with pytest.raises(SceneError, match="no plot is called 'energy'.*did you mean energies"):
+    with pytest.raises(SceneError, match="plot 'energy' is unknown.*did you mean energies"):
         Plots(Settled(), ("energy",))
 
 
@@ -148,7 +148,7 @@ def test_plots_lie_in_the_window(kind, size):
     shown = cells(plots, size)
     assert len(shown) == (len(plots.visible()) if size == (1280, 720) else 2 if size[0] == 800 else 0)
     boxes, ends, colours = drawing(shown, size)
-    assert len(boxes) == len(shown) and len(ends) == len(colours) and len(ends) <= 2 * MOST_SEGMENTS
+    assert len(boxes) == len(shown) and len(ends) == len(colours) and len(ends) <= 2 * MAX_SEGMENTS
     assert np.isfinite(ends).all() and (ends >= 0).all() and (ends <= 1).all() and (boxes >= 0).all() and (boxes <= 1).all()
     gui = Told()
     write(gui, shown, (1280, 720))  # the size as it opened
@@ -158,5 +158,5 @@ def test_plots_lie_in_the_window(kind, size):
     tops = [cell.box[1] for cell in shown]
     assert all(b >= a + cell.box[3] for a, b, cell in zip(tops, tops[1:], shown))
     for cell in shown:
-        assert cell.text[0] + cell.text[2] == cell.box[0] and cell.holds(cell.box[0] + 1, cell.box[1] + 1)
-        assert not cell.holds(cell.text[0] - 1, cell.box[1] + 1)
+        assert cell.text[0] + cell.text[2] == cell.box[0] and cell.contains(cell.box[0] + 1, cell.box[1] + 1)
+        assert not cell.contains(cell.text[0] - 1, cell.box[1] + 1)

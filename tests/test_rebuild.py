@@ -76,7 +76,7 @@ def test_what_cannot_be_met_changes_nothing():
     with ts.Simulator(cubes(), dt=0.01) as sim:
         before, simulation = told(sim), sim._simulation
         for changes, why in (
-            ({"integrator": "implicit_midpoint"}, "implicit_midpoint takes no contacts"),
+            ({"integrator": "implicit_midpoint"}, "implicit_midpoint does not support contacts"),
             ({"integrator": "symplectic_euler"}, "above the estimated stability limit"),
             ({"contact_solver": "jacobi"}, "does not fit implicit_euler"),
             ({"precision": "f64"}, "is open"),

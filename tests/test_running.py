@@ -86,7 +86,7 @@ def test_a_frame_a_step(explicit):
 def test_the_end_is_the_nearest_step(seconds, steps):
     result, seen = frames(StandIn(True, dt=0.01), seconds, fps=20)
     assert result.steps == steps and seen[-1][1] == pytest.approx(steps * 0.01)
-    longer = ["note: 0.001 s are less than half a step: one of 0.01 s is taken"] if seconds < 0.005 else []
+    longer = ["note: 0.001 s are less than half a step: one step of 0.01 s is taken"] if seconds < 0.005 else []
     assert result.problems == longer
 
 
@@ -173,7 +173,7 @@ def test_steps_that_did_not_converge():
     result, _ = frames(StandIn(False, events=events), 0.1, fps=None)
     assert result.status == "degraded"
     assert result.problems == [
-        "2 of 10 steps did not converge; the worst, at t = 0.05 s, to a relative residual of 2.00e-02"
+        "2 of 10 steps did not converge; the worst, at t = 0.05 s, reached a relative residual of 2.00e-02"
     ]
 
 
@@ -343,4 +343,4 @@ def test_a_run_that_ends_elsewhere_is_not_ok(change):
     scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), ts.Material(young=1e5), name="cube")
     with ts.Simulator(scene, dt=1 / 60, precision="f64") as sim:
         result = sim.run(0.2, on_frame)
-    assert result.status == "degraded" and any("was to end at t = 0.2 s" in problem for problem in result.problems)
+    assert result.status == "degraded" and any("instead of t = 0.2 s" in problem for problem in result.problems)

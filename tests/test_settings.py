@@ -37,16 +37,16 @@ def scene() -> ts.Scene:
         ({"allow_unstable": 1}, "allow_unstable = 1: it must be True or False"),
         ({"contact_solver": "gauss_siedel"}, "contact_solver 'gauss_siedel' is unknown .*did you mean 'gauss_seidel'"),
         ({"contact_solver": None}, "contact_solver None is unknown: it must be one of auto, gauss_seidel, "),
-        ({"contact_solver": "gauss_seidel"}, "'gauss_seidel' does not fit implicit_euler: take 'auto' or augmented_lagrangian$"),
+        ({"contact_solver": "gauss_seidel"}, "'gauss_seidel' does not fit implicit_euler: use 'auto' or augmented_lagrangian$"),
         (
             {"contact_solver": "augmented_lagrangian", "integrator": "symplectic_euler"},
-            "does not fit symplectic_euler: take 'auto' or gauss_seidel or jacobi or hybrid or coloured_gauss_seidel$",
+            "does not fit symplectic_euler: use 'auto' or gauss_seidel or jacobi or hybrid or coloured_gauss_seidel$",
         ),
         (
             {"contact_solver": "augmented_lagrangian", "integrator": "implicit_midpoint"},
-            "does not fit implicit_midpoint: take 'auto'$",
+            "does not fit implicit_midpoint: use 'auto'$",
         ),
-        ({"integrator": "implicit_midpoint", "self_collision": True}, "implicit_midpoint takes no contacts: .* take bdf2, "),
+        ({"integrator": "implicit_midpoint", "self_collision": True}, "midpoint does not support contacts: .* use bdf2, "),
         ({"self_collision": 1}, "self_collision = 1: it must be True or False"),
         ({"contact_tolerance": 0.0}, "contact_tolerance = 0.0: it must lie between 0 and 1"),
         ({"contact_tolerance": True}, "contact_tolerance = True: it must lie between 0 and 1"),
@@ -72,7 +72,7 @@ def test_dt_becomes_a_float():
 def test_an_integrator_without_contacts_is_refused_where_something_can_touch():
     touching = scene()
     touching.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
-    with pytest.raises(ts.SimulationError, match="implicit_midpoint takes no contacts: its stage lies in the middle"):
+    with pytest.raises(ts.SimulationError, match="implicit_midpoint does not support contacts: its stage lies in the middle"):
         ts.Simulator(touching, integrator="implicit_midpoint")
     assert runtime.open_kind() is None
     ts.Simulator(scene(), dt=1e-3, integrator="implicit_midpoint").close()

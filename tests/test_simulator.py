@@ -438,4 +438,4 @@ def test_softening_is_told_once(integrator):
                 sim.step()
             told.append([str(one.message) for one in found])
     assert [len(texts) for texts in told] == [0, 1, 0]
-    assert told[1][0].startswith(f"step 2: tet 0 of body '{SVK}' is squeezed to less than 0.6 of its length")
+    assert told[1][0].startswith(f"step 2: tet 0 of body '{SVK}' is compressed below 0.6 of its length")

@@ -59,7 +59,7 @@ def test_what_does_not_fit_the_contacts_is_refused():
     plan = plan_of(scene_of(ground=True), axes)
     reasons = [case["refused"] for case in plan["cases"]]
     assert sum("jacobi' does not fit implicit_euler" in r for r in reasons) == 1
-    assert sum("implicit_midpoint takes no contacts" in r for r in reasons) == 2 and reasons.count("") == 1
+    assert sum("implicit_midpoint does not support contacts" in r for r in reasons) == 2 and reasons.count("") == 1
     assert plan["touching"] and plan["references"][0]["setting"]["integrator"] == "bdf2"
     assert plan["references"][0]["order_in_time"] == 1
 

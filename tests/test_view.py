@@ -25,7 +25,7 @@ from taisoft.output.camera import BORDER, FILL, Camera
 from taisoft.runtime import open_kind, open_runtime
 from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
 from taisoft.view.offscreen import Offscreen
-from taisoft.view.raster import LARGEST_TRIANGLE, rasterise
+from taisoft.view.raster import MAX_COORDINATE, rasterise
 from taisoft.view.surfaces import MARKER_COLOUR, Surfaces, smoothing_groups, vertex_normals
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -98,7 +98,7 @@ def test_a_floor_that_reaches_behind_the_eye():
     both = drawn & expected
     assert np.abs(image[both] / 255 - (hit[both] + half) / (2 * half))[:, [0, 2]].max() < 0.02
     large = np.abs(camera.project(camera.clipped(corners, triangles, shades, (2560, 1440))[0], (2560, 1440))[len(corners) :, :2])
-    assert 1e4 < large.max() < 0.5 * LARGEST_TRIANGLE
+    assert 1e4 < large.max() < 0.5 * MAX_COORDINATE
     for value in (np.nan, np.inf):
         bad = corners.copy()
         bad[4] = value
@@ -386,7 +386,7 @@ def test_one_window_at_a_time():
     first = Offscreen(scene, SIZE, renderer="vulkan")
     try:
         assert window_holder() == "a picture renderer"
-        with pytest.raises(OutputError, match="a picture renderer holds the one a process can have"):
+        with pytest.raises(OutputError, match="a picture renderer holds the only one a process can have"):
             Offscreen(scene, SIZE, renderer="vulkan")
         second = Offscreen(scene, SIZE)
         assert second.renderer == "software"

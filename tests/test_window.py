@@ -188,13 +188,13 @@ def test_a_simulator_is_built_after_a_picture_has_told_of_it():
         return not refused.pop(0)
 
     for works in (False, True):
-        loop.ask(build, "it is built")
+        loop.request_rebuild(build, "it is built")
         loop.react(set())
         loop.advance()
         assert loop.lines()[1] == "it is built" and len(built) == int(works) and sim.step_count == count
         loop.react(set())
         assert len(built) == 1 + int(works)
-        compiled = loop.lines()[0] == "the next step is compiled, for some seconds"
+        compiled = loop.lines()[0] == "compiling the next step, for some seconds"
         assert compiled == works
         if not works:
             loop.advance()

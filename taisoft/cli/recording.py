@@ -95,7 +95,7 @@ class Recording:
         drawing = None
         if with_frames:
             drawing = Offscreen(sim.scene, colour=shown.colour, layers=shown.in_pictures)
-            drawing.go_on(self._notes.get("camera"))
+            drawing.resume(self._notes.get("camera"))
             observers.members.append(FrameWriter(self._folder.path, drawing, shown.annotate(plots, drawing.colouring)))
         self._checkpoints.notes = lambda: {"fps": fps, "camera": drawing.camera.distance if drawing else None}
         observers.members.append(self._checkpoints)

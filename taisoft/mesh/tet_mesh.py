@@ -68,13 +68,13 @@ class TetMesh(Guarded):
         self._freeze()
         self._seal(TetMesh.__init__)
 
-    def _said(self) -> str:
+    def _label(self) -> str:
         return f"mesh of {self.source}" if self.source else "mesh"
 
-    def _late(self, name: str) -> MeshAttributeError:
+    def _frozen_error(self, name: str) -> MeshAttributeError:
         """Frozen from the start: volumes and surface follow from vertices and tets."""
         return self._error(
-            f"{self._said()}: {name} cannot change: make a new mesh, such as ts.TetMesh(0.9 * mesh.vertices, mesh.tets)"
+            f"{self._label()}: {name} cannot change: make a new mesh, such as ts.TetMesh(0.9 * mesh.vertices, mesh.tets)"
         )
 
     def __setstate__(self, state: dict) -> None:

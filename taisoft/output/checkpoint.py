@@ -1,6 +1,6 @@
-"""`checkpoint.npz` of a run's folder: its last good state, at the end and, where asked for, now and then before.
+"""Write `checkpoint.npz` in a run's folder: its last good state, at the end and, if requested, at intervals before.
 
-The one before it is kept as `checkpoint.previous.npz`, so that a run can go on where the last one cannot be read.
+The previous one is kept as `checkpoint.previous.npz`, so that a run can resume if the last one cannot be read.
 """
 
 import warnings
@@ -9,30 +9,30 @@ from pathlib import Path
 
 from taisoft.checkpoint import Checkpoint, read_checkpoint
 from taisoft.errors import SimulationError
-from taisoft.files import name_also, write_error
+from taisoft.files import link_file, write_error
 
 CHECKPOINT_NAME, PREVIOUS_NAME = "checkpoint.npz", "checkpoint.previous.npz"
 
 
 class CheckpointWriter:
-    """Observer that writes folder/checkpoint.npz. every: simulated time between two, at frames [s]; None for none of them.
+    """Observer that writes folder/checkpoint.npz.
 
-    resumed: the checkpoint from which the run goes on; the folder's own then stays as the previous one, that of another run not.
-    before: called before each of those, to bring to disk what else tells of the run up to then. notes: what the file is to hold
-    beside the state.
+    every: simulated time between checkpoints, which are written at frames [s]; None: only at the end. resumed: the checkpoint
+    from which the run resumes; if it is the folder's own it is kept as the previous one, that of another run is not. before:
+    called before each checkpoint at an interval, to flush the run's other files. notes: returns data to store with the state.
     """
 
     def __init__(self, folder: str | Path, every: float | None = None, resumed: str | Path | None = None):
         self.path, self.every = Path(folder) / CHECKPOINT_NAME, every
         self.before: Callable[[], None] = lambda: None
         self.notes: Callable[[], dict] = dict
-        self._last: float | None = None  # simulated time of the last one, or of the start
+        self._last: float | None = None  # simulated time of the last checkpoint, or of the start
         resumed = None if resumed is None else Path(resumed).resolve()
-        self._own = resumed == self.path.resolve()  # whether the file that is there is this run's
-        self._spare = resumed == self.path.with_name(PREVIOUS_NAME).resolve()  # whether the previous one is all there is
+        self._own = resumed == self.path.resolve()  # whether the existing file is of this run
+        self._from_previous = resumed == self.path.with_name(PREVIOUS_NAME).resolve()  # then it is the only good one
 
     def frame(self, sim, _index: int) -> None:
-        """Write if it is time. Raises OutputError."""
+        """Write a checkpoint if one is due. Raises OutputError."""
         if self._last is None:
             self._last = sim.time
         elif self.every is not None and sim.time - self._last >= self.every * (1.0 - 1e-9):
@@ -40,30 +40,30 @@ class CheckpointWriter:
             self.write(sim)
 
     def write(self, sim) -> None:
-        """Write sim's present state. Raises OutputError; the checkpoint that was there is still there then."""
+        """Write sim's present state. Raises OutputError; the existing checkpoint then remains."""
         self._keep_previous()
         sim.save_checkpoint(self.path, self.notes())
         self._last, self._own = sim.time, True
 
     def _keep_previous(self) -> None:
-        """Give the present file its second name."""
+        """Keep the existing checkpoint under the previous one's name, or remove the previous one of another run."""
         previous = self.path.with_name(PREVIOUS_NAME)
         try:
             if self._own:
-                name_also(self.path, previous)
-            elif not self._spare:
+                link_file(self.path, previous)
+            elif not self._from_previous:
                 previous.unlink(missing_ok=True)
         except OSError as error:
             raise write_error(previous, error) from error
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Do nothing; part of the observer interface."""
 
 
 def read_last_good(path: str | Path) -> Checkpoint:
-    """The checkpoint in a file or, where that cannot be read, the previous one beside it, and then a warning names both.
+    """Return the checkpoint in a file or, if that cannot be read, the previous one beside it, with a warning that names both.
 
-    Raises SimulationError where neither can be read, for the reason of the file that was named.
+    Raises SimulationError if neither can be read, with the reasons of both.
     """
     path = Path(path)
     previous = path.with_name(PREVIOUS_NAME)
@@ -77,6 +77,6 @@ def read_last_good(path: str | Path) -> Checkpoint:
         except SimulationError as other:
             raise SimulationError(f"{error}; nor can the previous one be used: {other}") from None
         warnings.warn(
-            f"{error}; going on from the previous checkpoint instead, {previous}", UserWarning, stacklevel=2
+            f"{error}; resuming from the previous checkpoint instead, {previous}", UserWarning, stacklevel=2
         )
         return found

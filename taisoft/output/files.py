@@ -1,7 +1,7 @@
-"""A run's folder, which has one writer; its files are whole or absent (`taisoft/files.py`).
+"""The output folder of a run. It has one writer; its files are complete or absent (`taisoft/files.py`).
 
-The folder's lock is an advisory kernel lock (flock) on a file that holds the writer's process id, so that a dead writer's
-lock is free.
+The folder's lock is an advisory kernel lock (flock) on a file that holds the writer's process id. The kernel releases it when
+the writer dies.
 """
 
 import os
@@ -19,14 +19,14 @@ __all__ = [
 
 LOCK_NAME = "taisoft.lock"
 RESULT_FILES = ("report.json", "steps.csv", "scene.usdc", "checkpoint.npz", "checkpoint.previous.npz", "video.mp4")
-TELLING_FILES = ("report.json", "steps.csv")  # what tells of a run: beside the results of another one they would lie
-# What a writer that was killed leaves: see `taisoft.files.part_path`; USD writes beside that under an ending of its own
+REPORT_FILES = ("report.json", "steps.csv")  # removed at once: beside the results of another run they would be wrong
+# Left by a killed writer: see `taisoft.files.part_path`; USD adds temporary files with a suffix of its own
 TEMPORARY = re.compile(r"\.\d+-\d+\.part$|\.usdc\.\d+-\d+\.[A-Za-z0-9]{6}$")
-RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc"}  # folder -> the files in it that are ours
+RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc"}  # folder -> pattern of a run's files in it
 
 
 def make_folder(path: str | Path) -> Path:
-    """Create a folder with its parents, or accept the one that is there. Raises OutputError."""
+    """Create a folder with its parents, or accept an existing one. Raises OutputError."""
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -38,7 +38,7 @@ def make_folder(path: str | Path) -> Path:
 
 
 def check_free(path: str | Path, overwrite: bool) -> dict:
-    """The results that a folder holds already, by name; OutputError when there are any and overwrite is off. Only looks."""
+    """Return the results in a folder, by name, without changing it. Raises OutputError if there are any and not overwrite."""
     found = _results(Path(path)) if Path(path).is_dir() else {}
     if found and not overwrite:
         raise OutputError(
@@ -48,13 +48,13 @@ def check_free(path: str | Path, overwrite: bool) -> dict:
 
 
 class OutputFolder:
-    """A run's folder: created or taken over, checked, and locked until `close`.
+    """A run's folder: created or reused, checked, and locked until `close`.
 
-    path: created where absent; an empty folder, or one with files that are not a run's, is accepted. overwrite: take a
-    folder that holds results: report.json, steps.csv, frames and chunks go at once, each other file when its successor is
-    complete. first: of a run that goes on, the number of its first frame; results are accepted, what is before it stays, what
-    comes after goes with `clear`, as report.json does, and other files go only for their successors. Raises OutputError when
-    the folder cannot be written, another process writes to it, or it holds results without overwrite.
+    path: created if absent; an empty folder, or one without a run's files, is accepted. overwrite: accept a folder that holds
+    results: report.json, steps.csv, frames and chunks are removed at once, every other file when its successor is complete.
+    first: number of the first frame of a resumed run; results are accepted, earlier frames stay, `clear` removes later ones
+    and report.json, and other files are only replaced. Raises OutputError if the folder cannot be written, another process
+    writes to it, or it holds results without overwrite.
     """
 
     def __init__(self, path: str | Path, overwrite: bool = False, first: int | None = None):
@@ -64,7 +64,7 @@ class OutputFolder:
             self._old = check_free(path, overwrite) if first is None else {}
             _clear_parts(self.path)
             if first is None:
-                _remove(self.path, *TELLING_FILES)
+                _remove(self.path, *REPORT_FILES)
                 _clear_frames(self.path, 0)
             _probe(self.path)
         except OSError as error:
@@ -75,7 +75,7 @@ class OutputFolder:
             raise
 
     def clear(self, first: int) -> None:
-        """Remove report.json, and an earlier run's frames and chunks from that number on. Raises OutputError."""
+        """Remove report.json, and an earlier run's frames and chunks from number `first` on. Raises OutputError."""
         try:
             _remove(self.path, "report.json")
             _clear_frames(self.path, first)
@@ -83,7 +83,7 @@ class OutputFolder:
             raise OutputError(f"cannot write to the output folder {self.path}: {error.strerror or error}") from error
 
     def discard_stale(self) -> None:
-        """Remove the earlier run's result files that this run did not replace, so that a folder tells of one run."""
+        """Remove an earlier run's result files that this run did not replace, so that the folder holds one run."""
         for name, identity in self._old.items():
             file = self.path / name
             if identity is not None and file.exists() and _identity(file) == identity:
@@ -108,24 +108,24 @@ class OutputFolder:
 
 
 class FolderLock:
-    """A folder's lock, held until `close`. Raises OutputError where another process has it, or where none can be had."""
+    """A folder's lock, held until `close`. Raises OutputError if another process holds it or it cannot be taken."""
 
     def __init__(self, folder: Path):
         self._folder = folder
         self._descriptor: int | None = _lock_folder(folder)
 
     def close(self) -> None:
-        """Release it. A second call does nothing."""
+        """Release the lock. A second call does nothing."""
         if self._descriptor is not None:
-            with suppress(OSError):  # the folder may be gone; the kernel frees the lock with the descriptor anyway
+            with suppress(OSError):  # the folder may be gone; closing the descriptor frees the lock anyway
                 (self._folder / LOCK_NAME).unlink()
             os.close(self._descriptor)
             self._descriptor = None
 
 
 def _lock_folder(folder: Path) -> int:
-    """Take the folder's lock and write our pid into it; returns the open descriptor that holds it."""
-    import fcntl  # POSIX only, like the rest of the lock
+    """Take the folder's lock and write the process id into it; return the open descriptor that holds it."""
+    import fcntl  # POSIX only
 
     path = folder / LOCK_NAME
     while True:
@@ -135,7 +135,7 @@ def _lock_folder(folder: Path) -> int:
             raise OutputError(f"cannot write to the output folder {folder}: {error.strerror or error}") from error
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # the last holder may have removed this file between our open and our lock: then it locks nothing
+            # the last holder may have removed this file between open and flock: then the lock is of no use
             if path.exists() and os.fstat(descriptor).st_ino == path.stat().st_ino:
                 os.ftruncate(descriptor, 0)
                 os.write(descriptor, f"{os.getpid()}\n".encode())
@@ -151,13 +151,13 @@ def _lock_folder(folder: Path) -> int:
 
 
 def _identity(file: Path) -> tuple[int, int]:
-    """Tells a file from its successor: inode and time of change (an inode alone is used again)."""
+    """Return inode and modification time, which tell a file from its successor (an inode alone may be reused)."""
     status = file.stat()
     return status.st_ino, status.st_mtime_ns
 
 
 def _results(folder: Path) -> dict[str, tuple[int, int] | None]:
-    """Results of an earlier run: file name -> identity, and subfolder name -> None."""
+    """Return an earlier run's results: file name -> identity, and subfolder name -> None."""
     found: dict[str, tuple[int, int] | None] = {}
     for name in RESULT_FILES:
         if (folder / name).exists():
@@ -169,7 +169,7 @@ def _results(folder: Path) -> dict[str, tuple[int, int] | None]:
 
 
 def _clear_frames(folder: Path, first: int) -> None:
-    """Remove an earlier run's frames, and chunks that begin with them, from that number on."""
+    """Remove an earlier run's frames from number `first` on, and chunks whose first frame is among them."""
     for name, pattern in RESULT_FOLDERS.items():
         for file in (folder / name).glob(pattern):
             if first == 0 or _number(file) >= first:
@@ -177,14 +177,14 @@ def _clear_frames(folder: Path, first: int) -> None:
 
 
 def _remove(folder: Path, *names: str) -> None:
-    """Remove files, where they are there; what is a folder is left for `_probe`."""
+    """Remove files that exist; folders of these names are left for `_probe` to report."""
     for name in names:
         if not (folder / name).is_dir():
             (folder / name).unlink(missing_ok=True)
 
 
 def _clear_parts(folder: Path) -> None:
-    """Remove what a killed writer left under temporary names: ours, and those that USD gives while it writes ours."""
+    """Remove the temporary files of a killed writer, those of USD included."""
     found = [file for name, pattern in RESULT_FOLDERS.items() for file in (folder / name).glob(f"{pattern}.*")]
     found += [file for name in RESULT_FILES for file in folder.glob(f"{name}.*")]
     for file in found:
@@ -193,13 +193,13 @@ def _clear_parts(folder: Path) -> None:
 
 
 def _number(file: Path) -> int:
-    """Of a frame, or of a chunk's first frame; -1 where the name has none."""
+    """Return the number of a frame, or of a chunk's first frame; -1 if the name has none."""
     text = file.stem.removeprefix("points_")
     return int(text) if text.isdecimal() else -1
 
 
 def _probe(folder: Path) -> None:
-    """Prove by doing that files can be created, renamed and removed here, and that no result's name is a folder."""
+    """Check that a file can be created and removed here, and that no result's name is taken by a folder or file."""
     for name in RESULT_FILES:
         if (folder / name).is_dir():
             raise OutputError(f"cannot write {folder / name}: a folder has that name")

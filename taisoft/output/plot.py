@@ -1,4 +1,4 @@
-"""Plots by matplotlib, which is an extra: looked for, labelled and written in one way."""
+"""Helpers for matplotlib plots: import of the optional package, axis ticks, and writing of PNG files."""
 
 import io
 from pathlib import Path
@@ -8,7 +8,7 @@ from taisoft.output.files import write_bytes
 
 
 def require_matplotlib(what: str = "--plot"):
-    """The module. what: needs it. Raises OutputError where it is missing."""
+    """Return the matplotlib module. what: the feature that needs it. Raises OutputError if it is missing."""
     try:
         import matplotlib
     except ImportError:
@@ -28,7 +28,10 @@ def save(figure, path: Path, dpi: int = 130) -> None:
 
 
 def ticks(axis, ratio: float) -> None:
-    """Plain numbers at powers of ten, and between them too where the axis spans few."""
+    """Label a logarithmic axis with plain numbers at powers of ten, and between them if the axis spans few decades.
+
+    ratio: upper over lower limit of the axis.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.set_major_locator(LogLocator(subs=(1.0,) if ratio > 300.0 else (1.0, 3.0) if ratio > 30.0 else (1.0, 2.0, 5.0)))
@@ -37,7 +40,7 @@ def ticks(axis, ratio: float) -> None:
 
 
 def log_ticks(panel) -> None:
-    """`ticks` of those axes of a panel that are logarithmic, by their present limits."""
-    for axis, (least, most) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
+    """Apply `ticks` to the logarithmic axes of a panel, by their present limits."""
+    for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
         if axis.get_scale() == "log":
-            ticks(axis, most / least)
+            ticks(axis, high / low)

@@ -1,19 +1,19 @@
-"""How far a run is: a bar with steps/s and time left on a terminal, a line now and then elsewhere."""
+"""Progress of a run: on a terminal a bar with steps/s and the remaining time, elsewhere a line every few seconds."""
 
 import sys
 import time
 from typing import TextIO
 
-LINE_EVERY = 5.0  # seconds between lines when the stream is no terminal
+LINE_EVERY = 5.0  # time between lines if the stream is not a terminal [s]
 
 
 class Progress:
-    """Observer that tells how far a run of `seconds` [s] simulated time is; it writes to stream (stderr by default)."""
+    """Observer that shows the progress of a run of `seconds` [s] of simulated time on a stream (stderr by default)."""
 
     def __init__(self, seconds: float, label: str = "run", stream: TextIO | None = None):
         self.seconds, self.label = seconds, label
         self.stream = sys.stderr if stream is None else stream
-        self._started: float | None = None  # wall time of the first frame: what came before is building and compiling
+        self._started: float | None = None  # wall time of the first frame; construction and compilation come before
         self._first_time = self._last_line = 0.0
         self._first_step = 0
         self._bar = _bar(seconds, label, self.stream) if self.stream.isatty() else None
@@ -32,7 +32,7 @@ class Progress:
             print(f"{self.label}: {sim.time:.3f} of {self.seconds:g} s, {text}", file=self.stream, flush=True)
 
     def close(self) -> None:
-        """Take the bar down; a second call does nothing."""
+        """Stop the bar; a second call does nothing."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
@@ -63,7 +63,7 @@ def _bar(seconds: float, label: str, stream: TextIO):
 
 
 def _clock(seconds: float) -> str:
-    """Seconds as h:mm:ss or m:ss."""
+    """Format seconds as h:mm:ss or m:ss."""
     minutes, second = divmod(round(seconds), 60)
     hours, minute = divmod(minutes, 60)
     return f"{hours}:{minute:02d}:{second:02d}" if hours else f"{minute}:{second:02d}"

@@ -1,7 +1,7 @@
-"""`report.json` and `steps.csv`: what a run did, with which settings, on which machine.
+"""Write `report.json` and `steps.csv`: the result of a run, its settings and its machine.
 
-report.json holds the RunReport with the extremes over its steps in place of the steps; steps.csv holds one StepReport a
-row. JSON has no NaN: a number that is not finite is null there, and counted under the extremes.
+report.json holds the RunReport, with extremes over the steps in place of the steps; steps.csv holds one StepReport per row.
+JSON has no NaN: numbers that are not finite are null there, and counted in the extremes.
 """
 
 import csv
@@ -30,10 +30,10 @@ def write_report(
 ) -> None:  # fmt: skip
     """Write report.json and steps.csv into folder. Raises OutputError.
 
-    settings: every setting of the run as resolved, by name; plan: the entries of the simulator's plan. Values may be
-    plain, NumPy, paths or dataclasses; anything else is written as its text. resumed: where a run went on from, with its
-    `time` [s]; the rows up to it in the folder's steps.csv then stay, while the report tells of what was computed since.
-    bodies: an entry for each, see `body_records`. buffer_growths: how often each buffer of the search for contacts grew.
+    settings: every resolved setting of the run, by name; plan: the entries of the simulator's plan. Values may be
+    plain, NumPy, paths or dataclasses; anything else is written as its text. resumed: the checkpoint that the run resumed from,
+    with its `time` [s]; rows up to that time in the folder's steps.csv are kept, while the report covers only the steps since.
+    bodies: see `body_records`. buffer_growths: how often each buffer of contact detection grew.
     """
     folder = Path(folder)
     earlier = [] if resumed is None else _rows_until(folder / "steps.csv", resumed["time"])
@@ -54,7 +54,7 @@ def write_report(
 
 
 def body_records(scene) -> list[dict]:
-    """What each body of a scene is made of: its name, law, order, numbers of vertices, tets, nodes and pieces."""
+    """Describe each body of a scene: its name, law, order, and numbers of vertices, tets, nodes and connected pieces."""
     return [
         {
             "name": b.name, "law": b.material.law, "order": b.order, "vertices": b.mesh.n_verts, "tets": b.mesh.n_tets,
@@ -65,13 +65,13 @@ def body_records(scene) -> list[dict]:
 
 
 def run_record(result: RunReport) -> dict:
-    """A RunReport as a dict, with `extremes` over the steps instead of the steps."""
+    """Return a RunReport as a dict, with `extremes` over the steps instead of the steps."""
     record = {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.name != "step_reports"}
     return record | {"extremes": extremes(result.step_reports)}
 
 
 def extremes(reports: list[StepReport]) -> dict:
-    """Per numeric field of StepReport: min and max over the finite values, the times of both [s], the others' number.
+    """Return, per numeric field of StepReport, min and max of the finite values, their times [s], and the count of other values.
 
     `not_converged` counts reports; without reports the dict is empty.
     """
@@ -85,16 +85,16 @@ def extremes(reports: list[StepReport]) -> dict:
         entry: dict = {"not_finite": len(values) - len(finite)}
         if len(finite):
             low, high = finite[values[finite].argmin()], finite[values[finite].argmax()]
-            whole = all(isinstance(getattr(reports[k], name), int) for k in (low, high))
+            integral = all(isinstance(getattr(reports[k], name), int) for k in (low, high))
             entry |= {"min": values[low], "max": values[high], "time_of_min": times[low], "time_of_max": times[high]}
-            if whole:
+            if integral:
                 entry |= {"min": int(values[low]), "max": int(values[high])}
         found[name] = entry
     return found
 
 
 def steps_csv(reports: list[StepReport], earlier: list[list[str]] | None = None) -> str:
-    """The reports as CSV text (RFC 4180): a header and a row each, after earlier rows; problems are joined with '; '."""
+    """Return the reports as CSV text (RFC 4180): a header, earlier rows, and a row per report; problems are joined with '; '."""
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     names = _columns()
@@ -112,7 +112,7 @@ def _columns() -> list[str]:
 
 
 def _rows_until(path: Path, time: float) -> list[list[str]]:
-    """Rows of an earlier run's steps.csv up to a time [s]; none where there is no such file with these columns."""
+    """Return the rows of an earlier run's steps.csv up to a time [s]; none if there is no such file with these columns."""
     try:
         with open(path, newline="", encoding="utf-8") as file:
             header, *rows = csv.reader(file)
@@ -122,12 +122,12 @@ def _rows_until(path: Path, time: float) -> list[list[str]]:
 
 
 def json_text(record: dict) -> str:
-    """The record as JSON that every reader takes: numbers that are not finite become null."""
+    """Return the record as standard JSON text: numbers that are not finite become null."""
     return json.dumps(_plain(record), indent=1, allow_nan=False) + "\n"
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of Python, taisoft and the packages that take part in a run; None where a package cannot tell."""
+    """Return the versions of Python, taisoft and the packages used by a run; None if unknown."""
     import taisoft
 
     found = installed(*PACKAGES)
@@ -135,12 +135,12 @@ def versions() -> dict[str, str | None]:
 
 
 def machine() -> dict:
-    """Name, system, processor and its number of logical cores."""
+    """Return the machine's name, system, processor and number of logical cores."""
     return {"name": platform.node(), "system": platform.platform(), "cpu": processor(), "cores": os.cpu_count()}
 
 
 def peak_memory() -> int | None:
-    """Largest resident size of this process so far [bytes]; None where the system cannot tell."""
+    """Return the largest resident size of this process so far [bytes]; None if the system does not report it."""
     try:
         import resource
     except ImportError:  # not a POSIX system
@@ -156,7 +156,7 @@ def _numeric_fields() -> list[str]:
 
 
 def _plain(value):
-    """value in JSON's own types."""
+    """Convert a value to JSON types."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
     if isinstance(value, dict):

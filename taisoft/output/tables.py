@@ -1,4 +1,4 @@
-"""Tables that read alike on a terminal and in Markdown."""
+"""Tables that are readable both on a terminal and as Markdown."""
 
 from collections.abc import Iterable, Sequence
 
@@ -6,7 +6,7 @@ from taisoft.timing import Timing
 
 
 def markdown(headings: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = ()) -> str:
-    """A Markdown table with its columns lined up; columns are flush right but those in `left`."""
+    """Return a Markdown table with aligned columns: left-aligned those in `left`, right-aligned the others."""
     lines = [tuple(headings), *map(tuple, rows)]
     widths = [max(2, *(len(line[k]) for line in lines)) for k in range(len(headings))]
 
@@ -18,11 +18,11 @@ def markdown(headings: Sequence[str], rows: Iterable[Sequence[str]], left: Seque
     return "\n".join([line(lines[0]), f"|{rule}|", *map(line, lines[1:])])
 
 
-def percent(share: float | None) -> str:
-    """A share in percent; empty for None."""
-    return "" if share is None else f"{share:.1%}"
+def percent(fraction: float | None) -> str:
+    """Format a fraction in percent; empty for None."""
+    return "" if fraction is None else f"{fraction:.1%}"
 
 
 def spread_of(timing: Timing) -> float | None:
-    """The timing's spread, None where a single repeat has none."""
+    """Return a timing's spread; None for a single repeat, which has none."""
     return timing.spread if timing.repeats > 1 else None

@@ -1,21 +1,20 @@
 """OpenUSD export: `chunks/points_<first frame>.usdc` while a run lasts, `scene.usdc` when it ends.
 
-Each chunk is a whole scene of its own (topology, materials, a few frames), published complete: a killed run leaves
-files that open, and loses the frames of the chunk in the making at most. The same frames are appended to a temporary
-`scene.usdc.*.part`, which becomes `scene.usdc` at the end, one file that needs no other; then the chunks go. Appending
-costs what the new frames cost (the crate format writes new values behind the old ones), and saved frames leave memory;
-it would ruin the file if the process died meanwhile, hence the separate chunks. Layers cannot share the work: USD takes
-an attribute's time samples from the strongest layer alone, and value clips are unknown to many readers.
-`join_chunks` makes a `scene.usdc` from the chunks of a run that was killed. A run that goes on begins with the frames before
-its own, from both.
+Each chunk is a complete scene (topology, materials, a few frames), published whole. So a killed run leaves readable files, and
+loses at most the frames of the unfinished chunk. The same frames are appended to a temporary `scene.usdc.*.part`, which becomes
+the self-contained `scene.usdc` at the end; then the chunks are removed. Appending costs only the new frames (the crate format
+writes new values after the old ones) and frees their memory, but it would corrupt the file if the process died meanwhile; hence
+the separate chunks. Composing the chunks as layers does not work: USD takes an attribute's time samples from the strongest layer
+alone, and many readers do not support value clips.
+`join_chunks` makes `scene.usdc` from the chunks of a killed run. A resumed run starts from the earlier frames of both.
 
-Time codes are frame numbers; metres, y up. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose
-guide, so that the two are not drawn over each other) and `material`. Both are flat: a second-order body is written as
-the linear triangles and tets that its elements are cut into, all its nodes as points (`taisoft/mesh/nodes.py`).
-Both carry `primvars:vonMisesStress` [Pa], and where there can be contacts the surface `primvars:contactImpulse` [N s], what
-the contacts of the last step before the frame gave each point; both are those of `nodal_fields.py`.
-An obstacle is `/World/<name>` with `surface` and `material`; its points change over time where it follows a path. A half-space
-whose square lies wholly within others is left out. `/View` holds a camera and lights (`usd_view.py`).
+Time codes are frame numbers; units are metres, y up. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose
+guide, so that the two are not drawn over each other) and `material`. Both are linear: a second-order body is written as
+the linear triangles and tets that its elements are cut into, with all its nodes as points (`taisoft/mesh/nodes.py`).
+Both carry `primvars:vonMisesStress` [Pa]. If there can be contacts, the surface also carries `primvars:contactImpulse` [N s], the
+impulse of the last step before the frame on each point. `nodal_fields.py` defines both.
+An obstacle is `/World/<name>` with `surface` and `material`; its points change over time if it follows a path. A half-space
+whose square lies entirely within others is left out. `/View` holds a camera and lights (`usd_view.py`).
 """
 
 import re
@@ -28,30 +27,30 @@ from taisoft.errors import OutputError
 from taisoft.output.files import make_folder, part_path, publish, replacing, write_error
 from taisoft.output.nodal_fields import NodalMean, contact_impulses, von_mises
 from taisoft.output.usd_prims import IMPULSE, ROOT, STRESS, scene_layer
-from taisoft.output.usd_view import PLACE
+from taisoft.output.usd_view import TRANSLATE
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
-CHANGING = {"points", "extent", f"primvars:{STRESS}", f"primvars:{IMPULSE}", PLACE}  # names of attributes
+TIME_VARYING = {"points", "extent", f"primvars:{STRESS}", f"primvars:{IMPULSE}", TRANSLATE}  # names of attributes
 
 
 class UsdWriter:
     """Observer that writes the scene's bodies and obstacles over time to folder/scene.usdc.
 
-    folder: the run's folder; scene: meshes and names of its bodies and obstacles are read now; fps: frames per second of
-    simulated time [1/s]; chunk_frames: frames per chunk, at most so many are lost when the process is killed;
-    self_collision: the simulator's, for whether there can be contacts; first: of a run that goes on, the number of its first
-    frame: those before it are taken over from what the folder holds. Raises OutputError, also for an obstacle whose path
-    fails, and where the folder holds another scene or frame rate.
+    folder: the run's folder; scene: its meshes and names are read at construction; fps: frames per second of simulated time
+    [1/s]; chunk_frames: frames per chunk, the most that are lost if the process is killed; self_collision: the simulator's
+    setting, which decides with the scene whether there can be contacts; first: number of the first frame of a resumed run;
+    earlier frames are copied from the folder. Raises OutputError, also if an obstacle's path fails or the folder holds another
+    scene or frame rate.
     """
 
     def __init__(
         self, folder: str | Path, scene, fps: float = 60.0, chunk_frames: int = 10, self_collision: bool = False, first: int = 0
     ):  # fmt: skip
         if not fps > 0:
-            raise OutputError(f"USD export: fps is {fps}, it must be positive")
+            raise OutputError(f"USD export: fps is {fps}; it must be positive")
         if chunk_frames < 1:
-            raise OutputError(f"USD export: chunk_frames is {chunk_frames}, it must be at least 1")
+            raise OutputError(f"USD export: chunk_frames is {chunk_frames}; it must be at least 1")
         self.path = Path(folder) / SCENE_NAME
         self.chunks = make_folder(Path(folder) / CHUNKS_NAME)
         self.chunk_frames = chunk_frames
@@ -60,37 +59,37 @@ class UsdWriter:
         self._mean = NodalMean(scene.bodies)
         self._joined = _Joined(self.path, self._template)
         self._chunk = None
-        self._frames: list[int] = []  # in the chunk
+        self._frames: list[int] = []  # frame numbers in the unfinished chunk
         try:
-            self._take_over(first)
+            self._copy_earlier_frames(first)
         except BaseException:
             self._joined.discard()
             raise
 
-    def _take_over(self, first: int) -> None:
-        """Frames before the first one, of an earlier run's scene and of its chunks, which know more."""
+    def _copy_earlier_frames(self, first: int) -> None:
+        """Copy the frames before `first` from an earlier run's scene and from its chunks, which override it."""
         old = [path for path in (self.path, *_chunk_paths(self.chunks)) if first > 0 and path.exists()]
         for path in old:
             layer = _opened(path)
-            if layer.timeCodesPerSecond != self._template.timeCodesPerSecond or _shape(layer) != _shape(self._template):
-                raise OutputError(f"{path} is of another scene or frame rate, so no run can go on in it: name another folder")
+            if layer.timeCodesPerSecond != self._template.timeCodesPerSecond or _structure(layer) != _structure(self._template):
+                raise OutputError(f"{path} is of another scene or frame rate, so no run can resume in it: name another folder")
             self._joined.append(layer, first)
         times = self._joined.layer.ListTimeSamplesForPath(self._view.attribute)
         if times:
-            self._view.go_on(np.array(self._joined.layer.QueryTimeSample(self._view.attribute, times[-1])))
+            self._view.resume(np.array(self._joined.layer.QueryTimeSample(self._view.attribute, times[-1])))
 
     def frame(self, sim, index: int) -> None:
         """Record sim's state as frame index; index must ascend. Raises OutputError."""
         from pxr import Gf
 
-        moved = [(track, surface.at(sim.time).astype(np.float32)) for track, surface in self._moving]  # may fail
+        moved = [(track, surface.at(sim.time).astype(np.float32)) for track, surface in self._moving]  # first, since it may raise
         if self._chunk is None:
             self._chunk = _copy(self._template)
         x = sim.positions()
         points, fields = x.astype(np.float32), {STRESS: von_mises(self._mean(sim.stress())).astype(np.float32)}
         if self._touching:
             fields[IMPULSE] = contact_impulses(sim.contacts(), len(x)).astype(np.float32)
-        samples = [(self._view.attribute, Gf.Vec3d(*self._view.place(x).tolist()))]
+        samples = [(self._view.attribute, Gf.Vec3d(*self._view.follow(x).tolist()))]
         for track in self._tracks:
             samples += track.samples(points, fields)
         for track, corners in moved:
@@ -102,9 +101,9 @@ class UsdWriter:
             self._publish_chunk()
 
     def close(self) -> None:
-        """Complete scene.usdc and remove the chunks; without a frame no file is made. Raises OutputError.
+        """Complete scene.usdc and remove the chunks; without a frame no file is written. Raises OutputError.
 
-        After a failed write there is nothing to complete: the chunks stay as they are.
+        After a failed write nothing is completed, and the chunks stay.
         """
         self.flush()
         if self._joined is not None:
@@ -113,7 +112,7 @@ class UsdWriter:
             _remove_chunks(self.chunks)
 
     def flush(self) -> None:
-        """Publish the chunk in the making, so that no frame before a checkpoint can be lost. Raises OutputError."""
+        """Publish the unfinished chunk, so that no frame before a checkpoint can be lost. Raises OutputError."""
         if self._frames:
             self._publish_chunk()
 
@@ -121,7 +120,7 @@ class UsdWriter:
         chunk, frames = self._chunk, self._frames
         self._chunk, self._frames = None, []
         if self._joined is None:
-            raise OutputError(f"cannot go on writing {self.path}: an earlier write failed")
+            raise OutputError(f"cannot continue writing {self.path}: an earlier write failed")
         try:
             _set_range(chunk, frames[0], frames[-1])
             _export(chunk, self.chunks / f"points_{frames[0]:05d}.usdc")
@@ -133,9 +132,9 @@ class UsdWriter:
 
 
 def join_chunks(folder: str | Path) -> Path:
-    """Make folder/scene.usdc from the chunks that a killed run left, then remove the chunks; returns the path.
+    """Make folder/scene.usdc from the chunks left by a killed run, then remove the chunks; return the path.
 
-    Raises OutputError where there is no chunk, one cannot be read, or the scene cannot be written.
+    Raises OutputError if there is no chunk, one cannot be read, or the scene cannot be written.
     """
     target, chunks = Path(folder) / SCENE_NAME, Path(folder) / CHUNKS_NAME
     paths = _chunk_paths(chunks)
@@ -152,7 +151,7 @@ def join_chunks(folder: str | Path) -> Path:
 
 
 class _Joined:
-    """The one-file scene in the making, under a temporary name until `publish`."""
+    """The unfinished `scene.usdc`, under a temporary name until `publish`."""
 
     def __init__(self, path: Path, template):
         from pxr import Sdf
@@ -163,7 +162,7 @@ class _Joined:
         self.layer.TransferContent(template)
 
     def append(self, chunk, end: int | None = None) -> None:
-        """Add the chunk's frames, those before `end`, and save, which frees their memory. Raises OutputError."""
+        """Add the chunk's frames, or only those before `end`, and save, which frees their memory. Raises OutputError."""
         last = chunk.endTimeCode if end is None else min(chunk.endTimeCode, end - 1)
         if last < chunk.startTimeCode:
             return
@@ -174,13 +173,13 @@ class _Joined:
         self.first = chunk.startTimeCode if self.first is None else self.first
         _set_range(self.layer, self.first, max(last, self.layer.endTimeCode))
         try:
-            _written(self.path, chunk, self.layer.Save)
+            _write_checked(self.path, chunk, self.layer.Save)
         except OutputError:
             self.discard()
             raise
 
     def publish(self) -> None:
-        """Give the file its final name; without frames drop it. Raises OutputError."""
+        """Rename the file to its final name; without frames, discard it. Raises OutputError."""
         if self.first is None:
             self.discard()
             return
@@ -192,9 +191,9 @@ class _Joined:
             raise write_error(self.path, error) from error
 
     def discard(self) -> None:
-        """Drop the layer and its temporary file."""
+        """Discard the layer and its temporary file."""
         self.layer = None
-        with suppress(OSError):  # unreachable when the folder is
+        with suppress(OSError):  # the folder may be unreachable
             self.part.unlink()
 
 
@@ -207,7 +206,7 @@ def _copy(layer):
 
 
 def _without_samples(layer):
-    """A copy of a chunk with its frames taken out: what the joined scene starts from."""
+    """Return a copy of a chunk without its frames, from which the joined scene starts."""
     copy = _copy(layer)
     for path in _sampled(copy):
         for time in copy.ListTimeSamplesForPath(path):
@@ -216,11 +215,11 @@ def _without_samples(layer):
 
 
 def _sampled(layer) -> list:
-    """Paths of the attributes that change over time in a layer of this module, or would if it had frames."""
+    """Return the paths of the time-varying attributes of a layer of this module, whether or not it has frames."""
     from pxr import Sdf
 
     found = []
-    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(path) if path.name in CHANGING else None)
+    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(path) if path.name in TIME_VARYING else None)
     return [path for path in found if path.IsPropertyPath()]
 
 
@@ -229,7 +228,7 @@ def _chunk_paths(chunks: Path) -> list[Path]:
 
 
 def _opened(path: Path):
-    """The layer of a file, apart from it. Raises OutputError."""
+    """Return the layer of a file as an anonymous copy. Raises OutputError."""
     from pxr import Sdf
 
     try:
@@ -238,8 +237,8 @@ def _opened(path: Path):
         raise OutputError(f"{path} cannot be read: {_last_line(error)}") from None
 
 
-def _shape(layer) -> list[str]:
-    """Names of what a layer holds, and the attributes that change in it."""
+def _structure(layer) -> list[str]:
+    """Return the names of a layer's bodies and obstacles, and the paths of its time-varying attributes."""
     root = layer.GetPrimAtPath(ROOT)
     return [*(child.name for child in root.nameChildren), *_sampled(layer)] if root else []
 
@@ -251,15 +250,15 @@ def _set_range(layer, first: float, last: float) -> None:
 def _export(layer, path: Path) -> None:
     """Write a layer under a temporary name, then publish it. Raises OutputError."""
     with replacing(path) as part:
-        _written(path, layer, lambda: layer.Export(str(part), args={"format": "usdc"}))
+        _write_checked(path, layer, lambda: layer.Export(str(part), args={"format": "usdc"}))
 
 
-def _written(path: Path, layer, write) -> None:
-    """Run write(), and turn USD's failure, an exception or False, into an OutputError with the size of the frames."""
+def _write_checked(path: Path, layer, write) -> None:
+    """Call write(), and turn a failure of USD, an exception or False, into an OutputError with the size of the frames."""
     try:
         if write():
             return
-        reason = "USD does not say why"
+        reason = "USD gives no reason"
     except Exception as error:
         reason = _last_line(error)
     n_bytes = sum(
@@ -279,6 +278,6 @@ def _remove_chunks(chunks: Path) -> None:
 
 
 def _last_line(error: Exception) -> str:
-    """The gist of a USD error, whose text is a list of source locations, each with what went wrong there in quotes."""
+    """Return the message of a USD error, whose text is a list of source locations, each with a quoted message."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return re.sub(r"^Error in '.*' at line \d+ in file \S+ : '(.*)'$", r"\1", lines[-1]) if lines else type(error).__name__

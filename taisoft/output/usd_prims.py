@@ -1,8 +1,8 @@
-"""The prims of a scene in OpenUSD: bodies and obstacles with their topology, colours and materials; see `usd.py`.
+"""OpenUSD prims of a scene: bodies and obstacles with their topology, colours and materials; see `usd.py`.
 
-What is solid is single-sided, a half-space too: a viewer that leaves out back faces looks into a bin. For those that show them,
-the half-spaces that hide the bodies from the camera, their backs turned to it at the start, are guides, which viewers leave out
-unless asked. Meshes of obstacles that do not close are double-sided.
+Solids are single-sided, half-spaces included, so that a viewer with back-face culling can look into a bin. For viewers without
+culling, half-spaces that face away from the camera at the start, and so hide the bodies, have purpose guide, which viewers show
+only on request. Open obstacle meshes are double-sided.
 """
 
 import re
@@ -17,14 +17,14 @@ from taisoft.scene.obstacles import HalfSpace, MeshObstacle
 
 ROOT = "/World"
 STRESS, IMPULSE = "vonMisesStress", "contactImpulse"  # primvars
-MAX_NAME = 64  # characters of a prim name; the whole name is kept beside it
+MAX_NAME = 64  # characters of a prim name; the full name is stored as display name
 
 
 def prim_names(names: list[str]) -> list[str]:
-    """Legal, distinct USD prim names for names of bodies and obstacles, in order.
+    """Return legal, distinct USD prim names for names of bodies and obstacles, in order.
 
-    Anything but ASCII letters, digits and underscores becomes an underscore (UTF-8 identifiers are young in USD, and
-    many readers refuse them); a leading digit gets one before it; a name met before gets a number behind it.
+    Characters other than ASCII letters, digits and underscores become underscores (UTF-8 identifiers are new in USD, and
+    many readers reject them). A leading digit gets an underscore before it; a repeated name gets a number appended.
     """
     used: set[str] = set()
     legal = []
@@ -40,10 +40,10 @@ def prim_names(names: list[str]) -> list[str]:
 
 
 class Track:
-    """A prim whose points change over time, and numbers at them.
+    """A prim with time-varying points and primvars.
 
-    gprim: defined; nodes: its points' places in arrays over the nodes of all bodies; primvars: names of its numbers. Paths are
-    made here, since to make them again at every frame costs as much as to set the values.
+    gprim: the defined prim; nodes: indices of its points in arrays over the nodes of all bodies; primvars: names. Paths are
+    built once, since building them at every frame would cost as much as setting the values.
     """
 
     def __init__(self, gprim, nodes: np.ndarray | slice = slice(None), primvars: tuple[str, ...] = ()):
@@ -52,7 +52,7 @@ class Track:
         self._primvars = [(name, gprim.GetPath().AppendProperty(f"primvars:{name}")) for name in primvars]
 
     def samples(self, points: np.ndarray, fields: dict[str, np.ndarray]) -> list[tuple]:
-        """(path, value) of each attribute. points: (n,3) float32 [m]; fields: primvars by name, (n,) or (n,3) float32."""
+        """Return (path, value) of each attribute. points: (n,3) float32 [m]; fields: primvars by name, (n,) or (n,3) float32."""
         from pxr import Vt
 
         x = points[self._nodes]
@@ -64,9 +64,10 @@ class Track:
 
 
 def scene_layer(scene, fps: float, touching: bool) -> tuple[list[Track], list, ViewTrack, object]:
-    """What gets values with the frames, and a layer with all else. touching: whether there can be contacts.
+    """Build a layer with everything that does not change, and the tracks that get values with the frames.
 
-    The tracks of the bodies, (track, surface) of each obstacle that follows a path, and the camera's.
+    touching: whether there can be contacts. Returns the tracks of the bodies, (track, surface) of each obstacle that follows a
+    path, the camera's track and the layer.
     """
     from pxr import Sdf, Usd, UsdGeom
 
@@ -92,7 +93,7 @@ def scene_layer(scene, fps: float, touching: bool) -> tuple[list[Track], list, V
 
 
 def _define_named(stage, name: str, legal_name: str, colour: np.ndarray):
-    """The prim of a body or an obstacle: its path, linear colour and material."""
+    """Define the prim of a body or an obstacle; return its path, linear colour and material."""
     from pxr import Gf, UsdGeom
 
     path = f"{ROOT}/{legal_name}"
@@ -114,12 +115,12 @@ def _define_surface(stage, path: str, triangles: np.ndarray):
 
 
 def extent(points: np.ndarray) -> np.ndarray:
-    """(2,3) float32: least and largest coordinates of points (n,3)."""
+    """Return the smallest and largest coordinates of points (n,3), (2,3) float32."""
     return np.array([points.min(axis=0), points.max(axis=0)], dtype=np.float32)
 
 
 def _define_obstacle(stage, shown: ObstacleSurface, legal_name: str, eye: np.ndarray) -> Track:
-    """Its surface where it starts, for an eye (3,) [m]."""
+    """Define an obstacle's surface at its initial pose. eye: position of the camera (3,) [m]."""
     from pxr import UsdGeom, UsdShade, Vt
 
     path, colour, material = _define_named(stage, shown.obstacle.name, legal_name, OBSTACLE_COLOUR)
@@ -138,7 +139,7 @@ def _define_obstacle(stage, shown: ObstacleSurface, legal_name: str, eye: np.nda
 
 
 def _define_body(stage, body, legal_name: str, index: int, first: int, touching: bool) -> list[Track]:
-    """first: the number of its first node among those of all bodies."""
+    """Define a body's surface, tets and primvars. first: index of its first node among the nodes of all bodies."""
     from pxr import UsdGeom, UsdShade, Vt
 
     path, colour, material = _define_named(stage, body.name, legal_name, body_colour(index))
@@ -159,13 +160,13 @@ def _define_body(stage, body, legal_name: str, index: int, first: int, touching:
         UsdShade.MaterialBindingAPI.Apply(gprim.GetPrim()).Bind(material)
     if touching:
         _define_primvar(surface, IMPULSE, "Vector3fArray", "impulse of the contacts of the last step on the node [N s]")
-    every = slice(first, first + body.n_nodes)
-    shown = (STRESS, IMPULSE) if touching else (STRESS,)
-    return [Track(surface, first + nodes, shown), Track(tets, every, (STRESS,))]
+    all_nodes = slice(first, first + body.n_nodes)
+    primvars = (STRESS, IMPULSE) if touching else (STRESS,)
+    return [Track(surface, first + nodes, primvars), Track(tets, all_nodes, (STRESS,))]
 
 
 def _define_primvar(gprim, name: str, kind: str, meaning: str) -> None:
-    """Numbers at the points, without any yet."""
+    """Define a primvar at the points, without values. meaning: its documentation."""
     from pxr import Sdf, UsdGeom
 
     primvar = UsdGeom.PrimvarsAPI(gprim).CreatePrimvar(name, getattr(Sdf.ValueTypeNames, kind), UsdGeom.Tokens.vertex)

@@ -1,10 +1,10 @@
-"""The camera and the lights of a scene in OpenUSD: `/View`, beside the bodies and outside of the default prim.
+"""Camera and lights of a scene in OpenUSD: `/View`, outside of the default prim.
 
-Who references the scene gets the bodies alone, and no body's name can meet a light's. The camera is that of the pictures: it
-frames the bodies where they start and moves back after them. The lamp shines over the viewer's left shoulder, from where
-upright walls along the axes that face the camera cast no shadow into a bin; the dome is grey all round. Intensities suit an
-exposure of 1 (a white face square to the lamp comes out near white); the lamp is normalized, since readers that know nothing of
-that take its intensity as the irradiance that it is then [W/m^2].
+So a reference to the scene gets the bodies alone, and the names of bodies and lights cannot clash. The camera is that of the
+pictures: it frames the bodies at the start and moves back to keep them in view. The lamp shines over the viewer's left shoulder;
+from there upright walls along the axes that face the camera cast no shadow into a bin. The dome is uniformly grey. Intensities
+suit an exposure of 1 (a white face perpendicular to the lamp renders nearly white). The lamp is normalized: readers that ignore
+this attribute take the intensity as irradiance [W/m^2], which is then the same.
 """
 
 import math
@@ -15,16 +15,19 @@ import numpy as np
 from taisoft.output.appearance import start_positions
 from taisoft.output.camera import MAX_WIDENING, Camera
 
-VIEW, PLACE = "/View", "xformOp:translate"
+VIEW, TRANSLATE = "/View", "xformOp:translate"
 PICTURE = (16, 9)  # width and height
-SENSOR = 0.036  # width [m], as of a camera for film of 36 mm
+SENSOR = 0.036  # width of the film back [m], as for 36 mm film
 LAMP_TURN, LAMP_ELEVATION = -22.0, 54.0  # [deg]: about y from the camera's azimuth, above the horizon
-LAMP, DOME = 2.2, 0.4  # a white diffuse face returns LAMP / pi of the one, DOME of the other
-LENS = 10.0  # sizes in the lens are told in tenths of the scene's unit
+LAMP, DOME = 2.2, 0.4  # a white diffuse face reflects LAMP / pi of the lamp and DOME of the dome
+LENS = 10.0  # USD gives aperture and focal length in tenths of the scene's unit
 
 
 class ViewTrack:
-    """The camera's way: `attribute` is the path of its place, `place` the value in a frame. Defines the prims on a stage."""
+    """Motion of the camera: `attribute` is the path of its translation, `follow` gives its value in a frame.
+
+    Defines the prims of camera and lights on a stage.
+    """
 
     def __init__(self, stage, scene):
         from pxr import Gf, UsdGeom, UsdLux
@@ -41,31 +44,31 @@ class ViewTrack:
         near, far = self.camera.clipping
         camera.CreateClippingRangeAttr(Gf.Vec2f(near, MAX_WIDENING * far))
         camera.AddTranslateOp().Set(Gf.Vec3d(*self.camera.position.tolist()))
-        self.attribute = camera.GetPath().AppendProperty(PLACE)
-        _turn(camera, self.camera.azimuth, self.camera.elevation)
+        self.attribute = camera.GetPath().AppendProperty(TRANSLATE)
+        _aim(camera, self.camera.azimuth, self.camera.elevation)
 
         lamp = UsdLux.DistantLight.Define(stage, f"{VIEW}/lamp")
         lamp.CreateIntensityAttr(LAMP)
         lamp.CreateNormalizeAttr(True)
-        _turn(lamp, self.camera.azimuth + LAMP_TURN, LAMP_ELEVATION)
+        _aim(lamp, self.camera.azimuth + LAMP_TURN, LAMP_ELEVATION)
         UsdLux.DomeLight.Define(stage, f"{VIEW}/dome").CreateIntensityAttr(DOME)
 
-    def go_on(self, place: np.ndarray) -> None:
-        """Start from where the camera was last (3,) [m]."""
-        self._stand_off(float(np.linalg.norm(place - self.camera.target)))
+    def resume(self, position: np.ndarray) -> None:
+        """Start from the camera's last position (3,) [m]."""
+        self._set_distance(float(np.linalg.norm(position - self.camera.target)))
 
-    def place(self, x: np.ndarray) -> np.ndarray:
-        """Where the camera is (3,) [m] once it has moved back after nodes x (n,3) [m]."""
-        self._stand_off(self.camera.widened(x, PICTURE, self._widest).distance)
+    def follow(self, x: np.ndarray) -> np.ndarray:
+        """Move the camera back until nodes x (n,3) [m] are in view; return its position (3,) [m]."""
+        self._set_distance(self.camera.widened(x, PICTURE, self._widest).distance)
         return self.camera.position
 
-    def _stand_off(self, distance: float) -> None:
-        """Rounded, so that a run that goes on finds the same distance from the place that it reads."""
+    def _set_distance(self, distance: float) -> None:
+        """Set the distance [m], rounded so that a resumed run computes the same one from the position that it reads."""
         self.camera = replace(self.camera, distance=float(f"{distance:.12g}"))
 
 
-def _turn(prim, azimuth: float, elevation: float) -> None:
-    """Let what looks or shines along its -z do so from there [deg]."""
+def _aim(prim, azimuth: float, elevation: float) -> None:
+    """Rotate a prim that looks or shines along its -z so that it does so from azimuth and elevation [deg]."""
     from pxr import Gf
 
     prim.AddRotateXYZOp().Set(Gf.Vec3f(-elevation, azimuth, 0.0))

@@ -78,8 +78,8 @@ class Body(Guarded):
     _contents = {
         "constraints": "call body.fix or body.move", "tractions": "call body.add_traction", "forces": "call body.add_force",
     }  # fmt: skip
-    _otherwise_late = ANOTHER
-    _instead_late = {
+    _default_frozen = ANOTHER
+    _instead_frozen = {
         "material": "call sim.set_material(body, young=...)", "position": "call sim.set_state(positions=..., body=...)",
         "velocity": "call sim.set_state(velocities=..., body=...)", "add_force": _SET_FORCE, "forces": _SET_FORCE,
         "add_traction": _SET_TRACTION, "tractions": _SET_TRACTION,
@@ -108,7 +108,7 @@ class Body(Guarded):
         self.forces: list[NodalForce] = []
         self._seal(Body.__init__)
 
-    def _said(self) -> str:
+    def _label(self) -> str:
         return f"body {self.name!r}"
 
     @property

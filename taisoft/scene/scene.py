@@ -34,8 +34,8 @@ class Scene(Guarded):
         "bodies": "call scene.add_body", "obstacles": "call scene.add_obstacle",
         "contact_pairs": "call scene.set_contact(name_a, name_b, friction=...)",
     }  # fmt: skip
-    _otherwise_late = ANOTHER
-    _instead_late = {
+    _default_frozen = ANOTHER
+    _instead_frozen = {
         "gravity": "call sim.set_gravity(gravity)", "set_contact": "call sim.set_contact(name_a, name_b, friction=...)",
         "contact_pairs": "call sim.set_contact(name_a, name_b, friction=...)",
     }  # fmt: skip

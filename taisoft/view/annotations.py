@@ -1,6 +1,6 @@
-"""Text and plots over a picture of a run: its caption below, its plots at the right. Drawn by Pillow, of the extra `plot`.
+"""Captions (below) and plots (at the right) on pictures of a run, drawn by Pillow, of the extra `plot`.
 
-All lengths are those of a picture 720 pixels high, and grow with it. What is annotated is drawn at twice its size and averaged.
+All lengths are for a picture 720 pixels high and scale with it. Annotations are drawn at twice their size and averaged.
 """
 
 from collections.abc import Iterator
@@ -14,21 +14,21 @@ from taisoft.errors import OutputError
 from taisoft.view.colouring import TITLES, UNITS, Colouring, colours_of
 from taisoft.view.plots import Curves, Plots
 
-HEIGHT = 720.0  # of the picture that lengths are told for
+HEIGHT = 720.0  # of the picture that lengths refer to
 MARGIN, WIDTH = 16, 300  # of the plots
-TITLE_SIZE, TEXT_SIZE, SMALL_SIZE = 22, 15, 12  # of letters
-CAPTION_HEIGHT = 160  # of all that a caption is
-ROOM = (22, 16, 4)  # above the curves, below them, and round a plot
-CURVES, LEAST = 92, 40  # height of the curves, and the least where there are many plots
-SAMPLES = 2
+TITLE_SIZE, TEXT_SIZE, SMALL_SIZE = 22, 15, 12  # font sizes
+CAPTION_HEIGHT = 160  # of the area for the whole caption
+PADDING = (22, 16, 4)  # above the curves, below them, and around a plot
+CURVE_HEIGHT, MIN_CURVE_HEIGHT = 92, 40  # the smaller one if there are many plots
+SAMPLES = 2  # per pixel and axis
 INK, FAINT, FRAME, PAPER = (38, 41, 46), (112, 116, 122), (160, 163, 168), (252, 252, 253)  # sRGB
 GRID = (222, 224, 226)
-OPACITY = 0.86  # of the paper
-BAR = (220, 12)  # of the scale of colours: width and height
+OPACITY = 0.86  # of the plots' background
+BAR = (220, 12)  # width and height of the colour bar
 
 
 def text_missing() -> str:
-    """What to install for text in pictures, as a sentence; empty when it is there."""
+    """Return what to install for text in pictures, as a sentence; empty if nothing is missing."""
     missing = [name for module, name in (("PIL", "Pillow"), ("matplotlib", "matplotlib")) if find_spec(module) is None]
     return f"text in pictures needs {' and '.join(missing)}: pip install 'taisoft[plot]'" if missing else ""
 
@@ -36,8 +36,8 @@ def text_missing() -> str:
 class Annotations:
     """Draws plots and a caption on the pictures of a run.
 
-    plots: those shown are drawn; name: of the scene, for a caption, or None for none; colouring: what the bodies' colours mean.
-    Raises OutputError where Pillow or matplotlib, whose font it is, are missing.
+    plots: the visible ones are drawn; name: the scene's name for the caption, or None for no caption; colouring: for the colour
+    bar. Raises OutputError if Pillow, or matplotlib, which supplies the font, is missing.
     """
 
     def __init__(self, plots: Plots | None = None, name: str | None = None, colouring: Colouring | None = None):
@@ -47,32 +47,32 @@ class Annotations:
         import matplotlib
 
         self._plots, self._name, self._colouring = plots, name, colouring
-        self._names = plots.visible() if plots is not None else []  # a window may show others meanwhile
+        self._names = plots.visible() if plots is not None else []  # fixed now: a window may change what is visible
         self._font_file = Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"
         self._fonts: dict = {}
 
     def draw(self, picture: np.ndarray, sim, index: int) -> np.ndarray:
-        """The picture, uint8 (height, width, 3), of sim's present state as frame number index, with what belongs on it."""
+        """Return an annotated copy of a picture, uint8 (height, width, 3), of sim's present state; index: frame number."""
         height, width = picture.shape[:2]
-        self._unit = SAMPLES * height / HEIGHT  # pixels of what is drawn for one of the lengths
+        self._unit = SAMPLES * height / HEIGHT  # drawn pixels per unit of length
         size = width * HEIGHT / height, HEIGHT
         names = self._names
-        done = picture.copy()
+        result = picture.copy()
         if names:
-            with self._sheet(done, (size[0] - MARGIN - WIDTH, MARGIN, size[0] - MARGIN, size[1] - MARGIN)):
+            with self._overlay(result, (size[0] - MARGIN - WIDTH, MARGIN, size[0] - MARGIN, size[1] - MARGIN)):
                 self._draw_plots(names, size)
         if self._name is not None:
-            with self._sheet(done, (0.0, size[1] - CAPTION_HEIGHT, size[0] - WIDTH * bool(names), size[1])):
+            with self._overlay(result, (0.0, size[1] - CAPTION_HEIGHT, size[0] - WIDTH * bool(names), size[1])):
                 self._draw_caption(sim, index, size)
-        return done
+        return result
 
     @contextmanager
-    def _sheet(self, picture: np.ndarray, place: tuple[float, float, float, float]) -> Iterator[None]:
-        """What is drawn meanwhile lies on a sheet over that part of the picture: left, top, right, bottom, in lengths."""
+    def _overlay(self, picture: np.ndarray, box: tuple[float, float, float, float]) -> Iterator[None]:
+        """Draw in the block on a transparent layer over a part of the picture: left, top, right, bottom, in lengths."""
         from PIL import Image, ImageDraw
 
         factor = self._unit / SAMPLES
-        left, top, right, bottom = (max(0, round(factor * length)) for length in place)
+        left, top, right, bottom = (max(0, round(factor * length)) for length in box)
         part = picture[top:bottom, left:right]
         layer = Image.new("RGBA", (SAMPLES * part.shape[1], SAMPLES * part.shape[0]), (*PAPER, 0))
         self._pen, self._origin = ImageDraw.Draw(layer), np.array([SAMPLES * left, SAMPLES * top], dtype=float)
@@ -84,22 +84,24 @@ class Annotations:
     # --- plots --------------------------------------------------------------------------------------------------------
 
     def _draw_plots(self, names: list[str], size: tuple[float, float]) -> None:
-        around = sum(ROOM) + ROOM[2]
-        room = (HEIGHT - 2 * MARGIN) / len(names) - around - ROOM[2]
-        high = min(CURVES, max(LEAST, room))
+        padding = sum(PADDING) + PADDING[2]
+        available = (HEIGHT - 2 * MARGIN) / len(names) - padding - PADDING[2]
+        height = min(CURVE_HEIGHT, max(MIN_CURVE_HEIGHT, available))
         right = size[0] - MARGIN
         for k, name in enumerate(names):
-            self._draw_plot(self._plots.curves(name), right - WIDTH, MARGIN + k * (high + around + ROOM[2]), high)
+            self._draw_plot(self._plots.curves(name), right - WIDTH, MARGIN + k * (height + padding + PADDING[2]), height)
 
-    def _draw_plot(self, curves: Curves, left: float, top: float, high: float) -> None:
-        """On paper whose upper left corner is there: title and legend above the curves, times below, the axis's ends in them."""
-        pad = ROOM[2]
-        self._pen.rectangle(self._at(left, top, left + WIDTH, top + high + sum(ROOM) + pad), fill=(*PAPER, int(255 * OPACITY)))
-        x0, x1, y0 = left + 2 * pad, left + WIDTH - 2 * pad, top + ROOM[0]
-        y1 = y0 + high
+    def _draw_plot(self, curves: Curves, left: float, top: float, height: float) -> None:
+        """Draw a plot at its upper left corner: title and legend above the curves, times below, the axis limits inside."""
+        pad = PADDING[2]
+        self._pen.rectangle(
+            self._at(left, top, left + WIDTH, top + height + sum(PADDING) + pad), fill=(*PAPER, int(255 * OPACITY))
+        )
+        x0, x1, y0 = left + 2 * pad, left + WIDTH - 2 * pad, top + PADDING[0]
+        y1 = y0 + height
         self._write(x0, top + pad, curves.title, SMALL_SIZE, INK)
         for level in curves.grid:
-            y = y1 - level * high
+            y = y1 - level * height
             self._stroke(np.array([(x0, y), (x1, y)]), GRID, 1.0)
         for colour, points in curves.lines:
             for piece in _pieces(points):
@@ -122,45 +124,45 @@ class Annotations:
         energies = sim.energies()
         values = {"kinetic": energies.kinetic, "elastic": energies.elastic, "gravity": energies.gravity}
         bottom = size[1] - MARGIN
-        told = "   ".join(f"{name} {value:.4g} J" for name, value in values.items())
-        self._write(MARGIN, bottom, f"frame {index}   t = {sim.time:.4f} s   {told}", TEXT_SIZE, INK, anchor="lb", halo=True)
+        text = "   ".join(f"{name} {value:.4g} J" for name, value in values.items())
+        self._write(MARGIN, bottom, f"frame {index}   t = {sim.time:.4f} s   {text}", TEXT_SIZE, INK, anchor="lb", halo=True)
         self._write(MARGIN, bottom - TEXT_SIZE - 8, self._name, TITLE_SIZE, INK, anchor="lb", halo=True)
         legend = self._colouring.legend() if self._colouring is not None else []
         if legend:
-            self._draw_scale(legend, bottom - TEXT_SIZE - TITLE_SIZE - 30)
+            self._draw_colour_bar(legend, bottom - TEXT_SIZE - TITLE_SIZE - 30)
 
-    def _draw_scale(self, legend: list[tuple[str, np.ndarray]], bottom: float) -> None:
-        """The scale of colours from low to high, its ends, and above it what it is of."""
-        wide, high = BAR
-        steps = np.linspace(0.0, 1.0, wide + 1)
+    def _draw_colour_bar(self, legend: list[tuple[str, np.ndarray]], bottom: float) -> None:
+        """Draw the colour bar from low to high, its limits below it, and the name of its quantity above."""
+        width, height = BAR
+        steps = np.linspace(0.0, 1.0, width + 1)
         colours = colours_of(steps)
-        top = bottom - TEXT_SIZE - high
-        for k in range(wide):
-            self._pen.rectangle(self._at(MARGIN + k, top, MARGIN + k + 1, top + high), fill=(*_bytes(colours[k]), 255))
+        top = bottom - TEXT_SIZE - height
+        for k in range(width):
+            self._pen.rectangle(self._at(MARGIN + k, top, MARGIN + k + 1, top + height), fill=(*_bytes(colours[k]), 255))
         kind = self._colouring.kind
         self._write(MARGIN, top - 4, TITLES[kind], TEXT_SIZE, INK, anchor="lb", halo=True)
-        for (text, _), share, anchor in zip(legend, (1.0, 0.5, 0.0), ("ra", "ma", "la")):
-            short = text.removesuffix(UNITS[kind]).strip() if share == 0.5 else text.strip()
-            self._write(MARGIN + share * wide, top + high + 3, short, SMALL_SIZE, INK, anchor=anchor, halo=True)
+        for (text, _), fraction, anchor in zip(legend, (1.0, 0.5, 0.0), ("ra", "ma", "la")):
+            short = text.removesuffix(UNITS[kind]).strip() if fraction == 0.5 else text.strip()
+            self._write(MARGIN + fraction * width, top + height + 3, short, SMALL_SIZE, INK, anchor=anchor, halo=True)
 
-    # --- the pen, in lengths ------------------------------------------------------------------------------------------
+    # --- drawing, in lengths ------------------------------------------------------------------------------------------
 
     def _at(self, left: float, top: float, right: float, bottom: float) -> tuple[int, int, int, int]:
-        """Pixels of a rectangle, its last ones included."""
+        """Convert a rectangle to pixels, the last ones included."""
         (left, top), (right, bottom) = np.round(self._unit * np.array([(left, top), (right, bottom)]) - self._origin)
         return int(left), int(top), int(right) - 1, int(bottom) - 1
 
     def _stroke(self, points: np.ndarray, colour: tuple[int, int, int], width: float) -> None:
-        where = [tuple(p) for p in (self._unit * points - self._origin).tolist()]
-        self._pen.line(where, fill=(*colour, 255), width=max(1, round(width * self._unit)), joint="curve")
+        pixels = [tuple(p) for p in (self._unit * points - self._origin).tolist()]
+        self._pen.line(pixels, fill=(*colour, 255), width=max(1, round(width * self._unit)), joint="curve")
 
     def _write(
         self, x: float, y: float, text: str, size: float, colour: tuple[int, int, int], anchor: str = "la", halo: bool = False
     ) -> None:  # fmt: skip
-        """anchor: which part of the text is at x, y, as Pillow names it; halo: with paper round the letters."""
+        """Write text at x, y. anchor: the part of the text at that point, in Pillow's notation; halo: outline the letters."""
         edge = {"stroke_width": round(1.5 * self._unit), "stroke_fill": (*PAPER, 200)} if halo else {}
-        place = tuple((self._unit * np.array([x, y]) - self._origin).tolist())
-        self._pen.text(place, text, (*colour, 255), self._font(size), anchor, **edge)
+        position = tuple((self._unit * np.array([x, y]) - self._origin).tolist())
+        self._pen.text(position, text, (*colour, 255), self._font(size), anchor, **edge)
 
     def _width(self, text: str, size: float) -> float:
         return self._font(size).getlength(text) / self._unit
@@ -175,7 +177,7 @@ class Annotations:
 
 
 def _pieces(points: np.ndarray) -> list[np.ndarray]:
-    """A line (k,2) without its gaps, which are rows of NaN: pieces of two points and more."""
+    """Split a line (k,2) at its gaps, which are rows of NaN; return the pieces of two or more points."""
     gaps = np.flatnonzero(np.isnan(points).any(axis=1))
     parts = np.split(points, gaps)
     return [part for part in (p[~np.isnan(p).any(axis=1)] for p in parts) if len(part) > 1]

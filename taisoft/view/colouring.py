@@ -1,8 +1,8 @@
-"""Bodies coloured by what happens in them: von Mises' stress, the largest principal stretch, or speed, at their nodes.
+"""Colours of bodies by a quantity at their nodes: von Mises stress, largest principal stretch, or speed.
 
-The scale begins at 0 (stretch: at 1) and ends at 1, 2 or 5 times a power of ten above a running maximum of what 99 % of the
-nodes stay below, since stress in a tet that is nearly flat knows no bounds. The maximum fades slowly, and the end falls only when
-it is clearly too high: so it does not flicker, and an impact does not leave everything pale after it.
+The scale begins at 0 (stretch: at 1). It ends at 1, 2 or 5 times a power of ten above a running maximum of the 99 % quantile over
+the nodes; a quantile, since stress in a nearly flat tet is unbounded. The running maximum decays slowly, and the end is lowered
+only when it is clearly too high. So the scale does not flicker, and recovers after an impact.
 """
 
 import math
@@ -16,10 +16,10 @@ from taisoft.view.surfaces import Surfaces
 
 UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s"}
 TITLES = {"body": "own colour", "stress": "von Mises stress", "stretch": "largest stretch", "speed": "speed"}
-BELOW = 0.99  # share of the nodes whose values the scale holds
-FADE = 0.998  # of the running maximum from picture to picture
-ROOM = 1.5  # times the running maximum must lie below a lower end before the scale falls to it
-SMALLEST = {"stress": 1.0, "stretch": 1e-3, "speed": 1e-3}  # ends of a scale in a scene where nothing happens
+QUANTILE = 0.99  # fraction of the nodes whose values lie within the scale
+DECAY = 0.998  # factor on the running maximum per picture
+LOWER_MARGIN = 1.5  # the end is lowered once this times the running maximum, rounded up, is below it
+MIN_SPAN = {"stress": 1.0, "stretch": 1e-3, "speed": 1e-3}  # smallest span of the scale, for a scene at rest
 # sRGB, from low to high
 COLOURS = np.array([(0.27, 0.42, 0.80), (0.33, 0.70, 0.78), (0.72, 0.82, 0.45), (0.97, 0.70, 0.27), (0.82, 0.20, 0.17)])
 
@@ -29,8 +29,8 @@ class Colouring:
 
     def __init__(self, scene, surfaces: Surfaces, kind: str = "body"):
         self._bodies, self._surfaces = scene.bodies, surfaces
-        self._nodal_mean: NodalMean | None = None  # once stress or stretch is asked for
-        self._Dm_inv: list[np.ndarray] = []  # per body, once stretch is asked for
+        self._nodal_mean: NodalMean | None = None  # made when stress or stretch is first shown
+        self._Dm_inv: list[np.ndarray] = []  # per body, made when stretch is first shown
         self.choose(kind)
 
     def choose(self, kind: str) -> None:
@@ -47,11 +47,11 @@ class Colouring:
 
     @property
     def low(self) -> float:
-        """Where the scale begins."""
+        """Lower end of the scale."""
         return 1.0 if self.kind == "stretch" else 0.0
 
     def values(self, sim) -> np.ndarray:
-        """The quantity at the nodes of all bodies (n_nodes,) in sim's present state."""
+        """Return the quantity at the nodes of all bodies (n_nodes,) in sim's present state."""
         if self.kind == "stress":
             return von_mises(self._mean()(sim.stress()))
         if self.kind == "stretch":
@@ -59,34 +59,34 @@ class Colouring:
         return np.linalg.norm(sim.velocities(), axis=1)
 
     def base(self, sim) -> np.ndarray:
-        """Unshaded colours (n,3) of all drawn vertices, sRGB."""
+        """Return unshaded colours (n,3) of all drawn vertices, sRGB."""
         if self.kind == "body":
             return self._surfaces.colours
         above = self.values(sim) - self.low
-        known = above[np.isfinite(above)]
-        self._follow(float(np.quantile(known, BELOW)) if len(known) else 0.0)
+        finite = above[np.isfinite(above)]
+        self._update_scale(float(np.quantile(finite, QUANTILE)) if len(finite) else 0.0)
         return self._surfaces.coloured(colours_of(np.nan_to_num(above / self.span)))
 
     def legend(self) -> list[tuple[str, np.ndarray]]:
-        """Lines of text from high to low, each with its colour (3,); none for the bodies' own colours."""
+        """Return lines of text from high to low, each with its colour (3,); none for the bodies' own colours."""
         if self.kind == "body" or self.span == 0.0:
             return []
-        shares = np.linspace(1.0, 0.0, 3)
-        texts = [f"{self.low + share * self.span:10.4g} {UNITS[self.kind]}" for share in shares]
-        return list(zip(texts, colours_of(shares)))
+        fractions = np.linspace(1.0, 0.0, 3)
+        texts = [f"{self.low + fraction * self.span:10.4g} {UNITS[self.kind]}" for fraction in fractions]
+        return list(zip(texts, colours_of(fractions)))
 
     def _mean(self) -> NodalMean:
         if self._nodal_mean is None:
             self._nodal_mean = NodalMean(self._bodies)
         return self._nodal_mean
 
-    def _follow(self, now: float) -> None:
-        self._peak = max(now, FADE * self._peak, SMALLEST[self.kind])
-        if self._peak > self.span or round_up(ROOM * self._peak) < self.span:
+    def _update_scale(self, value: float) -> None:
+        self._peak = max(value, DECAY * self._peak, MIN_SPAN[self.kind])
+        if self._peak > self.span or round_up(LOWER_MARGIN * self._peak) < self.span:
             self.span = round_up(self._peak)
 
     def _stretches(self, sim) -> np.ndarray:
-        """Largest principal stretch of every tet (m,), of its corners where it is quadratic."""
+        """Return the largest principal stretch of every tet (m,); for quadratic tets that of the linear tet of the corners."""
         if not self._Dm_inv:
             self._Dm_inv = [inverse_rest_edges(b.mesh.vertices, b.mesh.tets)[0] for b in self._bodies]
         parts = []
@@ -97,13 +97,13 @@ class Colouring:
         return np.concatenate(parts)
 
 
-def colours_of(shares: np.ndarray) -> np.ndarray:
-    """sRGB colours (n,3) of shares (n,) of the scale; what lies outside has the colours of its ends."""
-    at = np.linspace(0.0, 1.0, len(COLOURS))
-    return np.column_stack([np.interp(shares, at, COLOURS[:, k]) for k in range(3)])
+def colours_of(fractions: np.ndarray) -> np.ndarray:
+    """Return sRGB colours (n,3) of fractions (n,) of the scale, clamped to [0, 1]."""
+    knots = np.linspace(0.0, 1.0, len(COLOURS))
+    return np.column_stack([np.interp(fractions, knots, COLOURS[:, k]) for k in range(3)])
 
 
 def round_up(value: float) -> float:
-    """The next of 1, 2, 5 times a power of ten, or the value where it is one of them."""
+    """Round a value up to 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(value))
     return next((k * power for k in (1.0, 2.0, 5.0) if k * power >= value * (1.0 - 1e-12)), 10.0 * power)

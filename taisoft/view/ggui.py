@@ -1,9 +1,9 @@
-"""Taichi's renderer behind one door: what it lacks on this machine, and a drawing of the scene's surfaces.
+"""Wrapper of Taichi's renderer (GGUI): its requirements on this machine, and a canvas that draws the scene's surfaces.
 
 Taichi ends the process, past any `except`, when it opens a window without a display, holds two windows, or is
-initialised anew while one lives. So what is missing is asked first, a process holds one window at a time, and an open
-window holds a claim on the runtime. A window also leaves `imgui.ini`, the place of its panel, in the working folder when
-it goes; that is removed again unless it was there before.
+initialised again while a window is open. So requirements are checked first, a process holds one window at a time, and an open
+window holds a claim on the runtime. A closing window also writes `imgui.ini`, the position of its panel, in the working folder;
+that file is removed unless it existed before.
 """
 
 import contextlib
@@ -25,21 +25,21 @@ from taisoft.view.surfaces import Surfaces
 from taisoft.view.vertex_buffer import VertexBuffer, draw_flat_lines, draw_flat_triangles, draw_lines, draw_mesh
 
 LINE_WIDTH = 2.0  # pixels
-FLAT_WIDTH = 0.002  # of lines over the picture, in units of its height
+FLAT_WIDTH = 0.002  # of 2D lines over the picture, in units of its height
 
-_holder: list[str] = []  # what holds the process's one window
+_holder: list[str] = []  # name of the holder of the process's one window
 
 
-@functools.cache  # asking loads drivers, and a refusal is printed by the loader each time
+@functools.cache  # the check loads drivers, and the loader prints every failure
 def vulkan_missing() -> str:
-    """What to install for Taichi's renderer, as a sentence; empty when a Vulkan driver is there."""
+    """Return what to install for Taichi's renderer, as a sentence; empty if there is a Vulkan driver."""
     if core.with_vulkan():
         return ""
     return "there is no Vulkan driver (Debian and Ubuntu: apt install mesa-vulkan-drivers)"
 
 
 def display_missing() -> str:
-    """Why no window can be shown, as a sentence; empty when a display answers. Windows need X11 (Wayland offers it)."""
+    """Return why no window can be shown, as a sentence; empty if a display answers. Windows need X11 (Wayland provides it)."""
     if not sys.platform.startswith("linux"):
         return ""
     name = os.environ.get("DISPLAY", "")
@@ -58,12 +58,12 @@ def display_missing() -> str:
 
 
 def window_holder() -> str:
-    """What holds the process's one window now; empty when it is free."""
+    """Return the name of the holder of the process's one window; empty if there is no window."""
     return _holder[0] if _holder else ""
 
 
-def _panel_file_to_come() -> Path | None:
-    """The file that a window leaves when it goes; None if it is there already or cannot come about."""
+def _future_panel_file() -> Path | None:
+    """Return the path of the file that a closing window will write; None if it exists already or cannot be written."""
     try:
         path = Path.cwd() / "imgui.ini"
     except FileNotFoundError:  # the working folder is gone
@@ -72,11 +72,10 @@ def _panel_file_to_come() -> Path | None:
 
 
 class Canvas:
-    """The process's one Taichi window with the scene's surfaces in it; on the screen, or only in memory.
+    """The process's one Taichi window, on the screen or only in memory, which draws the scene's surfaces.
 
-    surfaces: what is drawn; size: (width, height) in pixels; visible: on the screen; n_segments: most lines that can be drawn;
-    line_width: theirs in pixels.
-    Raises OutputError, before anything is opened, when a Vulkan driver or a display is missing or a window is open already.
+    size: (width, height) in pixels; visible: on the screen; n_segments: largest number of lines; line_width: in pixels.
+    Raises OutputError, before anything is opened, if a Vulkan driver or a display is missing or a window is open already.
     """
 
     def __init__(
@@ -86,23 +85,23 @@ class Canvas:
         if missing:
             raise OutputError(f"cannot open a window: {missing}")
         if _holder:
-            raise OutputError(f"cannot open a window: {_holder[0]} holds the one a process can have; close it first")
+            raise OutputError(f"cannot open a window: {_holder[0]} holds the only one a process can have; close it first")
         arch, precision = open_kind() or ("cpu", "f32")
         if arch != "cpu":
-            raise OutputError(f"cannot open a window: arch is '{arch}', and windows are for arch cpu alone")
+            raise OutputError(f"cannot open a window: arch is '{arch}', and windows need arch cpu")
         owner = "a window" if visible else "a picture renderer"
         self._runtime = open_runtime(arch, precision, owner=owner)
         _holder.append(owner)
         self._surfaces, self._line_width = surfaces, line_width
         self._vertices = VertexBuffer(len(surfaces.colours))
-        self._vertices.normals[:] = 0.0, 1.0, 0.0  # of no effect: the colours are lit already
+        self._vertices.normals[:] = 0.0, 1.0, 0.0  # no effect: the colours are lit already
         self._indices = np.ascontiguousarray(surfaces.triangles.ravel(), dtype=np.int32)
         self._ends = VertexBuffer(2 * n_segments)
-        self._boxes: VertexBuffer | None = None  # drawn over the picture, as `_strokes`; None until something is
-        self._strokes: VertexBuffer | None = None
-        self._flat_ends: np.ndarray | None = None  # what `_strokes` holds
+        self._flat_boxes: VertexBuffer | None = None  # like `_flat_lines` drawn over the picture; made at the first `draw_over`
+        self._flat_lines: VertexBuffer | None = None
+        self._flat_ends: np.ndarray | None = None  # the array that `_flat_lines` was filled from
         self.window = self._canvas = self._scene = None
-        self._litter = _panel_file_to_come()
+        self._panel_file = _future_panel_file()
         try:
             self.window = ti.ui.Window("taisoft", size, show_window=visible)
             self._canvas = self.window.get_canvas()
@@ -117,11 +116,11 @@ class Canvas:
     ) -> None:  # fmt: skip
         """Draw the surfaces with vertices x [m] and unit normals, (n,3) each; background: RGB in [0, 1].
 
-        base: unshaded colours (n,3) in place of the surfaces' own; lines: ends (2k,3) [m] and their colours (2k,3), of which
-        the first n_segments are drawn.
+        base: unshaded colours (n,3) that replace the surfaces' own; lines: ends (2k,3) [m] and colours (2k,3), of which the first
+        n_segments lines are drawn.
         """
         colours = lit_colours(x, normals, self._surfaces.colours if base is None else base, camera)
-        # relative to the target: single precision would blur a scene far from the origin
+        # relative to the target, since single precision is too coarse for a scene far from the origin
         self._vertices.x[:], self._vertices.colours[:] = x - camera.target, colours
         eye = ti.ui.Camera()
         eye.position(*(camera.position - camera.target))
@@ -147,45 +146,45 @@ class Canvas:
         draw_lines(self._scene, self._ends, self._line_width, n)
 
     def draw_over(
-        self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray, most: tuple[int, int], box_colour: tuple
+        self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray, capacity: tuple[int, int], box_colour: tuple
     ) -> None:  # fmt: skip
-        """Draw boxes (k,4), left, bottom, right, top, and lines, ends (2n,2) of colours (2n,3), over the picture.
+        """Draw boxes (k,4), rows left, bottom, right, top, and lines, ends (2n,2) with colours (2n,3), over the picture.
 
-        All in [0, 1] from its lower left corner; most: how many boxes and lines there can be, the same in every call. Arrays that
-        are those of the last call are not copied again.
+        Coordinates are in [0, 1] from the picture's lower left corner. capacity: largest numbers of boxes and lines, the same in
+        every call. If `ends` is the array of the last call, nothing is copied again.
         """
-        if self._boxes is None:
-            self._boxes, self._strokes = VertexBuffer(6 * most[0]), VertexBuffer(2 * most[1])
+        if self._flat_boxes is None:
+            self._flat_boxes, self._flat_lines = VertexBuffer(6 * capacity[0]), VertexBuffer(2 * capacity[1])
         if self._flat_ends is not ends:
-            self._move_over(boxes, ends, colours)
+            self._fill_flat(boxes, ends, colours)
             self._flat_ends = ends
-        draw_flat_triangles(self._canvas, self._boxes, box_colour)
-        draw_flat_lines(self._canvas, self._strokes, FLAT_WIDTH)
+        draw_flat_triangles(self._canvas, self._flat_boxes, box_colour)
+        draw_flat_lines(self._canvas, self._flat_lines, FLAT_WIDTH)
 
-    def _move_over(self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray) -> None:
-        """Take over what `draw_over` draws; the rest are boxes and lines without size."""
+    def _fill_flat(self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray) -> None:
+        """Fill the buffers of `draw_over`; unused boxes and lines get zero size."""
         left, bottom, right, top = boxes.T
         corners = [(left, bottom), (right, bottom), (right, top), (left, bottom), (right, top), (left, top)]
-        self._boxes.x[:], self._strokes.x[:] = 0.0, 0.0
-        self._boxes.x[: 6 * len(boxes), :2] = np.array(corners).transpose(2, 0, 1).reshape(-1, 2)
-        self._strokes.x[: len(ends), :2], self._strokes.colours[: len(ends)] = ends, colours
+        self._flat_boxes.x[:], self._flat_lines.x[:] = 0.0, 0.0
+        self._flat_boxes.x[: 6 * len(boxes), :2] = np.array(corners).transpose(2, 0, 1).reshape(-1, 2)
+        self._flat_lines.x[: len(ends), :2], self._flat_lines.colours[: len(ends)] = ends, colours
 
     def pixels(self, left: int, top: int, right: int, bottom: int) -> np.ndarray:
-        """That part of the drawn picture, uint8 (bottom - top, right - left, 3), first row on top."""
+        """Return a part of the drawn picture, uint8 (bottom - top, right - left, 3), first row on top."""
         buffer = self.window.get_image_buffer_as_numpy()  # float32 (width, height, 4) in [0, 1], first row below
         height = buffer.shape[1]
         part = 255 * buffer[left:right, height - bottom : height - top, :3] + 0.5
         return part.astype(np.uint8).transpose(1, 0, 2)[::-1]
 
     def close(self) -> None:
-        """Destroy the window, release the runtime; a second call does nothing."""
+        """Destroy the window and release the runtime; a second call does nothing."""
         if self._runtime is None:
             return
         if self.window is not None:
             self.window.destroy()
-        if self._litter is not None:
-            with contextlib.suppress(OSError):  # a folder that has become read-only keeps it, and no harm is done
-                self._litter.unlink(missing_ok=True)
+        if self._panel_file is not None:
+            with contextlib.suppress(OSError):  # in a folder that has become read-only the file stays, which is harmless
+                self._panel_file.unlink(missing_ok=True)
         self.window = self._canvas = self._scene = None
         self._runtime.close()
         self._runtime = None

@@ -1,7 +1,7 @@
-"""What the live window does between two pictures: running, stepping, restarting, recording, and how fast it goes.
+"""Loop of the live window between pictures: running, stepping, restarting, recording, and measuring the speed.
 
-Steps follow a clock of 1/fps [s] a picture, and a picture comes at the latest when steps have taken that long: what is then
-missing is let go, so the picture stays fluid while the simulation falls behind real time.
+Each picture advances simulated time by 1/fps [s]. Steps stop once they have taken that much wall time, and the remaining
+simulated time is dropped. So the picture stays fluid while the simulation falls behind real time.
 """
 
 import time
@@ -17,45 +17,46 @@ from taisoft.records import StepReport
 from taisoft.running import timed_advance
 from taisoft.view.plots import Plots
 
-SPEED_OVER = 0.5  # [s] of wall time that steps/s is averaged over
-FIRST_PICTURES = 2  # without a step, which compiles for seconds: GGUI shows no panel at first
-BEHIND = 1.1  # times real time above which the panel says so
+SPEED_WINDOW = 0.5  # wall time over which steps/s is averaged [s]
+FIRST_PICTURES = 2  # before the first step, which compiles for seconds; GGUI shows no panel at first
+SLOW = 1.1  # wall time over simulated time above which the panel reports a slow solver
 OUT = Path("out")
 
 
 class Loop:
-    """Drives sim at fps pictures a second; `problem` is why it paused, `note` what it did, each a sentence or empty.
+    """Drives sim at fps pictures per second.
 
-    folder: where pictures go while it records, else None; plots: what keeps what steps tell.
+    problem: why the run paused; note: the last action; each a sentence or empty. folder: of the pictures while recording, else
+    None; plots: records the steps.
     """
 
     def __init__(self, sim, fps: float, paused: bool, plots: Plots | None = None):
         self.sim, self.fps, self.paused, self._plots = sim, fps, paused, plots
         self.problem = self.note = ""
         self.folder: Path | None = None
-        self._begun = False  # a step was taken, so all is compiled
+        self._compiled = False  # True after a step, since that compiles everything
         self._wait = FIRST_PICTURES  # pictures before the next step
-        self._asked: Callable[[], bool] | None = None  # what is to be done once a picture has told of it
-        self._told = False
+        self._rebuild: Callable[[], bool] | None = None  # requested; called once a picture has shown the note
+        self._note_shown = False
         self._frames = 0
-        self._owed = 0.0  # [s] of simulated time since the last step
-        self._needs = 0.0  # wall time of a simulated second [s]
-        self._spent = [0.0, 0.0]  # wall and simulated [s] since the mark
+        self._time_due = 0.0  # simulated time that steps still have to cover [s]
+        self._cost = 0.0  # wall time over simulated time of the steps
+        self._spent = [0.0, 0.0]  # wall and simulated time of the steps since the mark [s]
         self._speed = 0.0  # [steps/s]
-        self._mark = (time.perf_counter(), sim.step_count)
+        self._mark = (time.perf_counter(), sim.step_count)  # start of the present speed measurement
 
-    def ask(self, build: Callable[[], bool], note: str) -> None:
-        """Have a simulator built anew, once a picture has shown the note; build: says whether it was."""
-        self._asked, self._told, self.note = build, False, note
+    def request_rebuild(self, build: Callable[[], bool], note: str) -> None:
+        """Call build once a picture has shown the note. build: rebuilds the simulator and returns whether it succeeded."""
+        self._rebuild, self._note_shown, self.note = build, False, note
 
     def react(self, pressed: set[str]) -> None:
-        """Do what keys and buttons ask for."""
-        if self._asked is not None and self._told:
-            build, self._asked = self._asked, None
+        """Carry out the actions of keys and buttons."""
+        if self._rebuild is not None and self._note_shown:
+            build, self._rebuild = self._rebuild, None
             if build():
-                self._begun, self._wait, self._owed, self._needs, self.problem = False, FIRST_PICTURES, 0.0, 0.0, ""
+                self._compiled, self._wait, self._time_due, self._cost, self.problem = False, FIRST_PICTURES, 0.0, 0.0, ""
                 self._spent, self._mark = [0.0, 0.0], (time.perf_counter(), self.sim.step_count)
-        self._told = self._asked is not None
+        self._note_shown = self._rebuild is not None
         if "pause" in pressed:
             self.paused = not self.paused
             self.problem = ""
@@ -72,35 +73,35 @@ class Loop:
             self._toggle_recording()
 
     def advance(self) -> None:
-        """One picture's worth of simulated time, or less where that takes longer than a picture may."""
-        if self._wait > 0 or self._asked is not None:
+        """Advance by one picture's simulated time, or less if that takes more wall time than a picture has."""
+        if self._wait > 0 or self._rebuild is not None:
             self._wait -= 1
             return
-        self._owed += 1.0 / self.fps
+        self._time_due += 1.0 / self.fps
         end = time.perf_counter() + 1.0 / self.fps
-        while self._owed >= self.sim.dt * (1.0 - 1e-9) and not self.paused:
+        while self._time_due >= self.sim.dt * (1.0 - 1e-9) and not self.paused:
             before = self.sim.step_count
-            n = int(self._owed / self.sim.dt + 1e-9)
-            if self._needs > 0.0:  # of many explicit steps in one launch no more than a picture has time for
-                n = min(n, int((end - time.perf_counter()) / (self._needs * self.sim.dt) + 0.5))
+            n = int(self._time_due / self.sim.dt + 1e-9)
+            if self._cost > 0.0:  # in one launch, no more explicit steps than a picture has time for
+                n = min(n, int((end - time.perf_counter()) / (self._cost * self.sim.dt) + 0.5))
             self.guarded(lambda n=n: self._advance(max(1, n)))
-            self._owed -= (self.sim.step_count - before) * self.sim.dt
+            self._time_due -= (self.sim.step_count - before) * self.sim.dt
             if time.perf_counter() >= end:
-                self._owed = min(self._owed, 0.0)
+                self._time_due = min(self._time_due, 0.0)
 
     def _advance(self, n: int) -> None:
         self._wait = 0
-        timed_advance(self.sim, n, self._took)
-        self._begun = True
+        timed_advance(self.sim, n, self._after_step)
+        self._compiled = True
 
-    def _took(self, report: StepReport, seconds: float) -> None:
+    def _after_step(self, report: StepReport, seconds: float) -> None:
         self._spent[0] += seconds
         self._spent[1] += report.steps * self.sim.dt
         if self._plots is not None:
             self._plots.take(report, seconds)
 
     def guarded(self, call) -> bool:
-        """Whether it went well; else the run pauses and `problem` says why."""
+        """Call a function and return whether it succeeded. If it raises a TaisoftError, pause and set `problem`."""
         try:
             call()
         except TaisoftError as error:
@@ -110,29 +111,29 @@ class Loop:
         return True
 
     def speed(self) -> str:
-        """Steps per second as text."""
+        """Return the steps per second as text."""
         now, steps = time.perf_counter(), self.sim.step_count
-        since = now - self._mark[0]
-        if since >= SPEED_OVER:
-            self._speed = (steps - self._mark[1]) / since
+        elapsed = now - self._mark[0]
+        if elapsed >= SPEED_WINDOW:
+            self._speed = (steps - self._mark[1]) / elapsed
             self._mark = (now, steps)
             if self._spent[1] > 0.0:
-                self._needs = self._spent[0] / self._spent[1]
+                self._cost = self._spent[0] / self._spent[1]
             self._spent = [0.0, 0.0]
         return f"speed    {self._speed:10.1f} steps/s"
 
     def lines(self) -> list[str]:
-        """What there is to tell, in sentences."""
-        slow = self._needs > BEHIND and not self.paused
-        pace = f"running; the solver needs {self._needs:.1f} times real time" if slow else "running"
-        if not self._begun:
-            pace = "the next step is compiled, for some seconds"
-        return [self.problem or ("paused" if self.paused else pace), *([self.note] if self.note else [])]
+        """Return the status of the run, and the note if there is one."""
+        slow = self._cost > SLOW and not self.paused
+        status = f"running; the solver needs {self._cost:.1f} times real time" if slow else "running"
+        if not self._compiled:
+            status = "compiling the next step, for some seconds"
+        return [self.problem or ("paused" if self.paused else status), *([self.note] if self.note else [])]
 
     # --- recording ----------------------------------------------------------------------------------------------------
 
     def record(self, picture: np.ndarray) -> None:
-        """Write a picture, uint8 (height, width, 3), as the next one of the folder."""
+        """Write a picture, uint8 (height, width, 3), as the next one in the folder."""
         try:
             write_bytes(self.folder / f"{self._frames:05d}.png", png_bytes(picture))
         except OutputError as error:

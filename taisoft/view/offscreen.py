@@ -1,6 +1,6 @@
-"""Pictures of a simulation without a screen: by Taichi's renderer where a Vulkan driver is there, else in NumPy.
+"""Offscreen pictures of a simulation: by Taichi's renderer if there is a Vulkan driver, else in NumPy.
 
-Both draw the same triangles with the same colours at twice the size, and four pixels are averaged into one.
+Both draw the same triangles with the same colours at twice the size, and average four pixels into one.
 """
 
 import sys
@@ -22,19 +22,19 @@ from taisoft.view.surfaces import Surfaces
 SIZE = (1280, 720)
 SAMPLES = 2  # per pixel and axis
 LINE_WIDTH = 1.25  # pixels
-KEY_COLOUR = (1.0, 0.0, 1.0)  # magenta, of what no triangle covers; no lit body has it
+KEY_COLOUR = (1.0, 0.0, 1.0)  # magenta, of pixels that no triangle covers; no lit body has it
 RENDERERS = ("auto", "vulkan", "software")
 
-_told: set[str] = set()  # sentences printed in this process
+_printed: set[str] = set()  # reasons printed by this process
 
 
 class Offscreen:
     """Draws a scene's bodies and obstacles as pictures.
 
-    scene: read once; size: (width, height) in pixels; camera: stays as given, else shows all bodies as they start,
-    and moves back, never nearer, when a body would leave the picture; renderer: "vulkan", "software" or "auto": Vulkan
-    where it can be had, else one line on stderr says why not; colour: of the bodies, their own ("body") or by "stress",
-    "stretch" or "speed"; layers: names of LAYERS that are shown. Raises OutputError.
+    scene: read once; size: (width, height) in pixels; camera: fixed if given, else it frames all bodies at the start and
+    moves back, never nearer, when a body would leave the picture; renderer: "vulkan", "software" or "auto": Vulkan
+    if available, else a line on stderr gives the reason; colour: of the bodies, their own ("body") or by "stress",
+    "stretch" or "speed"; layers: names of visible LAYERS. Raises OutputError.
     """
 
     def __init__(
@@ -55,24 +55,24 @@ class Offscreen:
         self._large = (self.size[0] * SAMPLES, self.size[1] * SAMPLES)
         self._background = background(self._large)
         self._canvas = None
-        self.renderer = _choose() if renderer == "auto" else renderer
+        self.renderer = _choose_renderer() if renderer == "auto" else renderer
         if self.renderer == "vulkan":
             n = self.layers.n_segments if self.layers.has_lines else 0
             self._canvas = Canvas(self.surfaces, self._large, visible=False, n_segments=n, line_width=SAMPLES * LINE_WIDTH)
 
-    def go_on(self, distance: float | None) -> None:
-        """Start with the camera at a distance [m] that it had moved back to; None: where it is."""
+    def resume(self, distance: float | None) -> None:
+        """Set the camera's distance [m] to that of an earlier run; None keeps it."""
         if distance is not None:
             self.camera = replace(self.camera, distance=float(distance))
 
     def image(self, sim) -> np.ndarray:
-        """Picture of sim's present state, uint8 (height, width, 3), first row on top."""
+        """Return a picture of sim's present state, uint8 (height, width, 3), first row on top."""
         bodies = self.surfaces.of_bodies(sim)
         self.camera = self.camera.widened(bodies[0], self.size, self._widest)
         x, normals = self.surfaces.with_obstacles(bodies, sim.time, self.camera.position)
         lines = self.layers.lines(sim, self.camera) if self.layers.has_lines else None
         projected = self.camera.project(x if lines is None else np.concatenate([x, lines[0]]), self._large)
-        left, top, right, bottom = _box(projected, self._large)  # the rest is background, and stays as it is
+        left, top, right, bottom = _bounds(projected, self._large)  # everything else is background
         base = self.colouring.base(sim)
         picture = self._background[::SAMPLES, ::SAMPLES].copy()
         if left == right or top == bottom:
@@ -85,7 +85,7 @@ class Offscreen:
         return picture
 
     def _rasterise(self, x: np.ndarray, colours: np.ndarray, lines, corner: tuple[int, int], part: np.ndarray) -> None:
-        """Draw in NumPy into part, whose upper left corner is at that pixel: triangles with lit colours, and lines as bands."""
+        """Draw triangles with lit colours, and lines as bands, in NumPy into part, whose upper left pixel is `corner`."""
         x, triangles, colours = self.camera.clipped(x, self.surfaces.triangles, colours, self.size)
         projected = self.camera.project(x, self._large)
         if lines is not None:
@@ -100,10 +100,9 @@ class Offscreen:
     def _draw(
         self, x: np.ndarray, normals: np.ndarray, base: np.ndarray, lines, box: tuple[int, int, int, int], part: np.ndarray
     ) -> bool:
-        """Draw by Vulkan into part, what lies in the box; False where nothing came of it.
+        """Draw the contents of the box by Vulkan into part; return False if no surface was drawn.
 
-        On a busy machine Taichi's renderer, now and then, hands out a picture that has been cleared and not drawn on, or that
-        has nothing on it but lines.
+        On a busy machine, Taichi's renderer sometimes returns a picture that was cleared but not drawn, or that shows only lines.
         """
         self._canvas.draw(x, normals, self.camera, KEY_COLOUR, base, lines)
         pixels = self._canvas.pixels(*box)
@@ -123,10 +122,10 @@ class Offscreen:
             self._canvas = None
 
 
-def _box(projected: np.ndarray, size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of what the vertices cover, in whole final pixels and within size.
+def _bounds(projected: np.ndarray, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return left, top, right, bottom of the area that the vertices cover, in whole final pixels and within size.
 
-    All of size where a vertex is behind the eye or not finite.
+    The whole of size if a vertex is behind the eye or not finite.
     """
     if not (np.isfinite(projected).all() and (projected[:, 2] > 0).all()):
         return 0, 0, *size
@@ -137,7 +136,7 @@ def _box(projected: np.ndarray, size: tuple[int, int]) -> tuple[int, int, int, i
 
 
 def _averaged(image: np.ndarray) -> np.ndarray:
-    """Every block of SAMPLES x SAMPLES pixels as one."""
+    """Average every block of SAMPLES x SAMPLES pixels into one."""
     total = np.zeros((image.shape[0] // SAMPLES, image.shape[1] // SAMPLES, 3), dtype=np.uint16)
     for i in range(SAMPLES):
         for j in range(SAMPLES):
@@ -145,16 +144,16 @@ def _averaged(image: np.ndarray) -> np.ndarray:
     return ((total + SAMPLES**2 // 2) // SAMPLES**2).astype(np.uint8)
 
 
-def _choose() -> str:
-    """The renderer that can be had now; a reason against Vulkan is printed once a process."""
+def _choose_renderer() -> str:
+    """Return the renderer that is available now; print the reason against Vulkan once per process."""
     reason = vulkan_missing()
     if not reason and open_kind() is not None and open_kind()[0] != "cpu":
-        reason = "Taichi's renderer is used with arch cpu alone"
+        reason = "Taichi's renderer is used only with arch cpu"
     if not reason and window_holder():
-        reason = f"{window_holder()} holds the one window that a process can have"
+        reason = f"{window_holder()} holds the only window that a process can have"
     if not reason:
         return "vulkan"
-    if reason not in _told:
-        _told.add(reason)
+    if reason not in _printed:
+        _printed.add(reason)
         print(f"taisoft: pictures are drawn in software: {reason}", file=sys.stderr)
     return "software"

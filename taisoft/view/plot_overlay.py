@@ -1,7 +1,7 @@
-"""The plots in the window: a column at its right edge, each a box with lines beside its numbers, which are GGUI's text.
+"""Plots in the live window: a column at its right edge, each a box with curves beside its numbers, which are GGUI text.
 
-GGUI writes in sub-windows only, and places each once by its name, in units of the size that the window had as it opened. So a
-name also tells place and size, which change with the window and with the plots that are shown.
+GGUI writes text only in sub-windows. It positions each once, by name, in units of the window's initial size. So the name of a
+sub-window contains its position and size, which change with the window and the visible plots.
 """
 
 import math
@@ -13,56 +13,56 @@ import numpy as np
 from taisoft.output.history import CAPACITY
 from taisoft.view.plots import GRID_LINES, PLOTS, Curves, Plots
 
-BOX, TEXT, GAP, LINE, TITLE = 230, 200, 8, 17, 34  # pixels: widths, and heights of a line of text and of all around it
+BOX, TEXT, GAP, LINE, TITLE = 230, 200, 8, 17, 34  # widths; heights of a line of text and of title and borders [pixels]
 FRAME_COLOUR, GRID_COLOUR = (0.45, 0.46, 0.48), (0.84, 0.85, 0.86)  # sRGB
 BOX_COLOUR = (0.97, 0.975, 0.98)
-EVERY = 0.2  # [s]
-LIGHTER = 0.55  # of a line's colour, for its numbers, which stand on dark ground
-MOST_BOXES = len(PLOTS)
-MOST_SEGMENTS = sum(4 + 2 * GRID_LINES + len(plot.series) * 2 * CAPACITY for plot in PLOTS.values())
+REFRESH = 0.2  # time between updates of the curves [s]
+LIGHTER = 0.55  # blend of a curve's colour towards white for its numbers, which have a dark background
+MAX_BOXES = len(PLOTS)
+MAX_SEGMENTS = sum(4 + 2 * GRID_LINES + len(plot.series) * 2 * CAPACITY for plot in PLOTS.values())
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A plot in the window: box and text are left, top, width, height in pixels."""
+    """A plot in the window. box, text: left, top, width, height in pixels."""
 
     curves: Curves
     box: tuple[int, int, int, int]
     text: tuple[int, int, int, int]
 
-    def holds(self, x: float, y: float) -> bool:
-        """Whether a pixel lies in it."""
+    def contains(self, x: float, y: float) -> bool:
+        """Return whether a pixel lies in the plot."""
         return any(a <= x <= a + w and b <= y <= b + h for a, b, w, h in (self.box, self.text))
 
 
 class PlotOverlay:
-    """What the window shows of plots, worked out anew when they or the window change, and EVERY seconds at most otherwise.
+    """The visible plots in the window, updated when the choice or the window changes, and otherwise every REFRESH seconds.
 
-    opened: size of the window as it opened, (width, height) in pixels.
+    opened: initial size of the window, (width, height) in pixels.
     """
 
     def __init__(self, plots: Plots, opened: tuple[int, int]):
         self.plots, self.cells, self._opened = plots, [], opened
         self._drawing = drawing([], (1, 1))
-        self._of, self._made = None, -math.inf  # what the drawing is of; when it was made [s]
+        self._drawn_for, self._drawn_at = None, -math.inf  # plots and size of the drawing; its time [s]
 
     def draw(self, canvas, gui, size: tuple[int, int]) -> None:
         """Draw boxes and lines by a `Canvas`, and numbers by GGUI."""
-        what, now = (self.plots.visible(), size), time.perf_counter()
-        if what != self._of or now - self._made >= EVERY:
+        content, now = (self.plots.visible(), size), time.perf_counter()
+        if content != self._drawn_for or now - self._drawn_at >= REFRESH:
             self.cells = cells(self.plots, size)
-            self._drawing, self._of, self._made = drawing(self.cells, size), what, now
+            self._drawing, self._drawn_for, self._drawn_at = drawing(self.cells, size), content, now
         if self.cells:
-            canvas.draw_over(*self._drawing, (MOST_BOXES, MOST_SEGMENTS), BOX_COLOUR)
+            canvas.draw_over(*self._drawing, (MAX_BOXES, MAX_SEGMENTS), BOX_COLOUR)
             write(gui, self.cells, self._opened)
 
-    def holds(self, x: float, y: float) -> bool:
-        """Whether a pixel, from the upper left corner, lies in one of the plots."""
-        return any(cell.holds(x, y) for cell in self.cells)
+    def contains(self, x: float, y: float) -> bool:
+        """Return whether a pixel, counted from the upper left corner, lies in one of the plots."""
+        return any(cell.contains(x, y) for cell in self.cells)
 
 
 def cells(plots: Plots, size: tuple[int, int]) -> list[Cell]:
-    """The plots that are shown, from the top down, as many as there is room for in a window of size (width, height)."""
+    """Lay out the visible plots from the top down, as many as fit in a window of size (width, height)."""
     found, top = [], GAP
     for curves in [plots.curves(name) for name in plots.visible()]:
         height = TITLE + LINE * (len(curves.legend) + 2)
@@ -75,7 +75,7 @@ def cells(plots: Plots, size: tuple[int, int]) -> list[Cell]:
 
 
 def drawing(shown: list[Cell], size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Boxes (k,4), left, bottom, right, top, ends of lines (2n,2) and their colours (2n,3), for `Canvas.draw_over`."""
+    """Return the boxes (k,4), ends of lines (2n,2) and their colours (2n,3) to pass to `Canvas.draw_over`."""
     boxes, ends, colours = np.empty((len(shown), 4)), [np.empty((0, 2))], [np.empty((0, 3))]
     for k, cell in enumerate(shown):
         left, top, width, height = cell.box
@@ -92,11 +92,11 @@ def drawing(shown: list[Cell], size: tuple[int, int]) -> tuple[np.ndarray, np.nd
 
 
 def write(gui, shown: list[Cell], opened: tuple[int, int]) -> None:
-    """The numbers of the plots, in sub-windows of GGUI; opened: as of `Strip`."""
+    """Write the numbers of the plots in sub-windows of GGUI; opened: as for `PlotOverlay`."""
     for cell in shown:
         curves, (left, top, width, height) = cell.curves, cell.text
-        place = left / opened[0], top / opened[1], width / opened[0], height / opened[1]
-        with gui.sub_window(f"{curves.title}##{cell.text}", *place) as page:
+        rectangle = left / opened[0], top / opened[1], width / opened[0], height / opened[1]
+        with gui.sub_window(f"{curves.title}##{cell.text}", *rectangle) as page:
             for name, value, colour in curves.legend:
                 lighter = tuple(LIGHTER + (1 - LIGHTER) * c for c in colour)
                 page.text(f"{name:9}{value:>13}", color=lighter)

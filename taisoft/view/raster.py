@@ -1,28 +1,28 @@
-"""A z-buffer renderer in NumPy, for machines without a Vulkan driver.
+"""A z-buffer rasteriser in NumPy, for machines without a Vulkan driver.
 
-Triangles are cut into spans of pixel rows, spans into pixels whose centre is inside; the nearest triangle of each pixel
-wins, and its corner colours are interpolated with perspective. 1/depth, linear in the picture, serves as the depth.
+Triangles are cut into spans of pixel rows, and spans into pixels whose centre is inside. The nearest triangle of each pixel
+is drawn, with its corner colours interpolated in perspective. The z-buffer holds 1/depth, which is linear in the picture.
 """
 
 import numpy as np
 
-PIXELS_AT_ONCE = 2_000_000  # bounds the memory: some 100 bytes a pixel
-LARGEST_TRIANGLE = 1e6  # pixels; beyond it float64 spans would lose whole pixels; `Camera.clipped` leaves none
+PIXELS_AT_ONCE = 2_000_000  # bounds the memory, about 100 bytes per pixel
+MAX_COORDINATE = 1e6  # pixels; beyond it float64 spans would miss whole pixels; `Camera.clipped` leaves no such triangle
 
 
 def rasterise(
     projected: np.ndarray, triangles: np.ndarray, colours: np.ndarray, near: float, image: np.ndarray
 ) -> np.ndarray:
-    """Draw triangles over image (height, width, 3), uint8 and contiguous; returns the mask of the pixels drawn.
+    """Draw triangles over image (height, width, 3), uint8 and contiguous; return the mask of the pixels drawn.
 
     projected: (n,3) pixel coordinates and depth; triangles: (t,3); colours: (n,3) in [0, 1]. Triangles that reach
-    nearer than `near`, or are not finite, are left out; both sides of a triangle show.
+    nearer than `near`, or are not finite, are skipped; both sides of a triangle are drawn.
     """
     height, width = image.shape[:2]
     corners = projected[triangles]
     with np.errstate(invalid="ignore"):
-        seen = (corners[:, :, 2] > near).all(axis=1) & (np.abs(corners[:, :, :2]) < LARGEST_TRIANGLE).all(axis=(1, 2))
-    triangles, corners = triangles[seen], corners[seen]
+        visible = (corners[:, :, 2] > near).all(axis=1) & (np.abs(corners[:, :, :2]) < MAX_COORDINATE).all(axis=(1, 2))
+    triangles, corners = triangles[visible], corners[visible]
     planes, area = _edge_functions(corners[:, :, :2])
     triangles, corners, planes = triangles[area > 0], corners[area > 0], planes[area > 0]
     inverse = 1.0 / corners[:, :, 2]
@@ -36,48 +36,48 @@ def rasterise(
         start = slope * 0.5 + depth_plane[triangle, 1] * (row + 0.5) + depth_plane[triangle, 2] - slope * (row * width)
         depth = start[span] + slope[span] * pixels
         np.maximum.at(nearest, pixels, depth)
-        won = np.flatnonzero(depth >= nearest[pixels])
-        owner[pixels[won]] = triangle[span[won]]
+        in_front = np.flatnonzero(depth >= nearest[pixels])
+        owner[pixels[in_front]] = triangle[span[in_front]]
 
     drawn = np.flatnonzero(owner >= 0)
-    winners = owner[drawn]
+    owners = owner[drawn]
     # colour / depth is linear in the picture too
-    colour_planes = np.einsum("tk,tkc,tkm->tcm", inverse, colours[triangles], planes)[winners]
+    colour_planes = np.einsum("tk,tkc,tkm->tcm", inverse, colours[triangles], planes)[owners]
     x, y = drawn % width + 0.5, drawn // width + 0.5
-    shown = colour_planes[..., 0] * x[:, None] + colour_planes[..., 1] * y[:, None] + colour_planes[..., 2]
-    shown /= nearest[drawn, None]
-    image.reshape(-1, 3)[drawn] = (255 * np.clip(shown, 0.0, 1.0) + 0.5).astype(np.uint8)
+    pixel_colours = colour_planes[..., 0] * x[:, None] + colour_planes[..., 1] * y[:, None] + colour_planes[..., 2]
+    pixel_colours /= nearest[drawn, None]
+    image.reshape(-1, 3)[drawn] = (255 * np.clip(pixel_colours, 0.0, 1.0) + 0.5).astype(np.uint8)
     return (owner >= 0).reshape(height, width)
 
 
 def stroke(ends: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Lines as pairs of triangles, for `rasterise`.
+    """Convert lines to pairs of triangles, for `rasterise`.
 
-    ends: (2k,3) pixel coordinates and depth, two rows a line; width in pixels. Returns corners (4k,3), those of a line being
-    its first end twice and its second end twice, and triangles (2k,3). Lines without length become triangles without area.
+    ends: (2k,3) pixel coordinates and depth, two rows per line; width in pixels. Returns corners (4k,3), for each line two at its
+    first end and two at its second, and triangles (2k,3). Lines of zero length become triangles of zero area.
     """
     a, b = ends[0::2], ends[1::2]
-    way = b[:, :2] - a[:, :2]
-    length = np.linalg.norm(way, axis=1, keepdims=True)
+    direction = b[:, :2] - a[:, :2]
+    length = np.linalg.norm(direction, axis=1, keepdims=True)
     side = np.zeros_like(a)
-    side[:, :2] = 0.5 * width * way[:, ::-1] * (-1.0, 1.0) / np.where(length > 0, length, np.inf)
+    side[:, :2] = 0.5 * width * direction[:, ::-1] * (-1.0, 1.0) / np.where(length > 0, length, np.inf)
     corners = np.stack([a - side, a + side, b - side, b + side], axis=1).reshape(-1, 3)
     first = 4 * np.arange(len(a))[:, None, None]
     return corners, (first + [[0, 1, 2], [1, 3, 2]]).reshape(-1, 3)
 
 
 def _edge_functions(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric weights of triangles (t,3,2) as planes (t,3,3), weight k = a x + b y + c; and twice |area| (t,)."""
+    """Return barycentric weights of triangles (t,3,2) as planes (t,3,3), weight k = a x + b y + c, and twice |area| (t,)."""
     q, r = np.roll(p, -1, axis=1), np.roll(p, -2, axis=1)  # weight k vanishes on the edge from q to r
     a, b = q[..., 1] - r[..., 1], r[..., 0] - q[..., 0]
     planes = np.stack([a, b, -(a * q[..., 0] + b * q[..., 1])], axis=2)
     area = (a[:, 0] * p[:, 0, 0] + b[:, 0] * p[:, 0, 1]) + planes[:, 0, 2]
-    planes /= np.where(area != 0, area, 1.0)[:, None, None]  # the sign too: inside is positive whichever way it turns
+    planes /= np.where(area != 0, area, 1.0)[:, None, None]  # signed, so that inside is positive for either orientation
     return planes, np.abs(area)
 
 
 def _spans(corners: np.ndarray, planes: np.ndarray, width: int, height: int):
-    """Yield (triangle, row, first pixel, number of pixels) arrays of the covered row pieces, some pixels at a time."""
+    """Yield (triangle, row, first pixel, number of pixels) arrays of the covered spans, about PIXELS_AT_ONCE pixels at a time."""
     low = np.clip(np.ceil(corners[:, :, 1].min(axis=1) - 0.5), 0, height).astype(np.int64)
     high = np.clip(np.floor(corners[:, :, 1].max(axis=1) - 0.5), -1, height - 1).astype(np.int64)
     owner, row = _expand(low, np.maximum(high - low + 1, 0))
@@ -100,7 +100,7 @@ def _spans(corners: np.ndarray, planes: np.ndarray, width: int, height: int):
 
 
 def _expand(start: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For ranges start, start+1, ... of count items: the range each item belongs to, and the item."""
+    """Expand ranges start, start+1, ... of count items: return the range that each item belongs to, and the item."""
     index = np.repeat(np.arange(len(count)), count)
     offset = np.arange(len(index)) - np.repeat(np.cumsum(count) - count, count)
     return index, start[index] + offset

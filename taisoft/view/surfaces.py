@@ -1,9 +1,9 @@
-"""The triangles that a picture shows: every body's surface, split at sharp edges, markers of fixed nodes, and obstacles.
+"""Triangles of a picture: the bodies' surfaces, split at sharp edges, markers of fixed nodes, and obstacles.
 
-A drawn vertex belongs to one node and one smoothing group: the triangles round that node that are connected over edges
-bent by less than CREASE at rest. Its normal is the area-weighted mean over that group, so a ball looks round and a box
+A drawn vertex belongs to one node and one smoothing group: the triangles around that node that are connected over edges
+bent by less than CREASE at rest. Its normal is the area-weighted mean over that group. So a ball looks round and a box
 keeps its edges, in every deformed state. A second-order face is drawn as four flat triangles between its six nodes.
-Of an obstacle those triangles are drawn whose front is turned to the eye: of a bin's walls the inner sides.
+Obstacles are drawn with back-face culling, so that a bin's walls show only their inner sides.
 """
 
 import numpy as np
@@ -12,16 +12,16 @@ from scipy.sparse.csgraph import connected_components
 
 from taisoft.output.appearance import OBSTACLE_COLOUR, body_colour
 from taisoft.output.obstacle_surface import ObstacleSurface, obstacle_surfaces
-from taisoft.output.polygons import cut_in_four
+from taisoft.output.polygons import subdivide
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
 MARKER_SIZE = 0.16  # radius in units of the mean edge length of the body's surface
-MAX_MARKERS = 500  # a picture with more fixed nodes shows an even selection of them
+MAX_MARKERS = 500  # per body; of more fixed nodes, evenly selected ones are shown
 
 
 class Surfaces:
-    """Everything drawn, as one triangle mesh whose topology and colours stay.
+    """All drawn surfaces as one triangle mesh of fixed topology and colours.
 
     scene: its bodies and obstacles are read once. triangles: int32 (t,3) of drawn vertices; colours: float (n,3), unshaded
     sRGB.
@@ -29,12 +29,12 @@ class Surfaces:
 
     def __init__(self, scene):
         self._bodies = [_BodySurface(body, body_colour(k)) for k, body in enumerate(scene.bodies)]
-        self._ends = np.cumsum([body.n_nodes for body in scene.bodies])[:-1]  # of the bodies' nodes among those of all
+        self._ends = np.cumsum([body.n_nodes for body in scene.bodies])[:-1]  # end of each body's nodes, but the last one's
         self._obstacles = [_RigidSurface(surface) for surface in obstacle_surfaces(scene)]
         triangles, colours, n = [], [], 0
         starts = np.concatenate([[0], self._ends])
         nodes = [np.where(body.nodes >= 0, body.nodes + start, -1) for body, start in zip(self._bodies, starts)]
-        self._nodes = np.concatenate(nodes)  # of the bodies' drawn vertices among the nodes of all; -1 of markers
+        self._nodes = np.concatenate(nodes)  # of the bodies' drawn vertices, numbered over all bodies; -1 for markers
         for part in (*self._bodies, *self._obstacles):
             triangles.append(part.triangles + n)
             colours.append(part.colours)
@@ -44,28 +44,28 @@ class Surfaces:
         self.colours = np.concatenate(colours)
 
     def coloured(self, colours: np.ndarray) -> np.ndarray:
-        """Colours (n,3) of all drawn vertices where the bodies' nodes have colours (n_nodes,3)."""
-        every = self.colours.copy()
+        """Return colours (n,3) of all drawn vertices, given colours (n_nodes,3) of the bodies' nodes."""
+        all_colours = self.colours.copy()
         drawn = np.flatnonzero(self._nodes >= 0)
-        every[drawn] = colours[self._nodes[drawn]]
-        return every
+        all_colours[drawn] = colours[self._nodes[drawn]]
+        return all_colours
 
     def of_bodies(self, sim) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [m] and unit normals of the bodies' drawn vertices in sim's present state, each float64 (n,3)."""
+        """Return positions [m] and unit normals of the bodies' drawn vertices in sim's present state, each float64 (n,3)."""
         x = np.split(sim.positions(), self._ends)
-        return _joined([body.vertices(own, self.with_markers) for body, own in zip(self._bodies, x)])
+        return _concatenated([body.vertices(own, self.with_markers) for body, own in zip(self._bodies, x)])
 
     def with_obstacles(
         self, bodies: tuple[np.ndarray, np.ndarray], t: float, eye: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Of all drawn vertices: what `of_bodies` gave, and obstacles at time t [s] as seen from the eye (3,) [m].
+        """Return positions and normals of all drawn vertices: those from `of_bodies`, then the obstacles'.
 
-        Raises OutputError where the path of an obstacle fails.
+        t: time [s]; eye: position (3,) [m], for culling. Raises OutputError if the path of an obstacle fails.
         """
-        return _joined([bodies, *(obstacle.vertices(t, eye) for obstacle in self._obstacles)])
+        return _concatenated([bodies, *(obstacle.vertices(t, eye) for obstacle in self._obstacles)])
 
 
-def _joined(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+def _concatenated(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([x for x, _ in parts]), np.concatenate([n for _, n in parts])
 
 
@@ -86,7 +86,7 @@ class _BodySurface:
         self.triangles = np.concatenate([corners, markers])
         counts = (len(self._nodes), len(ball) * len(self._marked))
         self.colours = np.repeat([colour, MARKER_COLOUR], counts, axis=0)
-        self.nodes = np.concatenate([self._nodes, np.full(counts[1], -1)])  # of each drawn vertex; -1 of markers
+        self.nodes = np.concatenate([self._nodes, np.full(counts[1], -1)])  # of each drawn vertex; -1 for markers
 
     def vertices(self, x: np.ndarray, with_markers: bool) -> tuple[np.ndarray, np.ndarray]:
         drawn = x[self._nodes]
@@ -96,7 +96,7 @@ class _BodySurface:
 
 
 class _RigidSurface:
-    """Each triangle has corners of its own, so that it can be left out."""
+    """Surface of an obstacle. Triangles share no vertices, so that each can be culled."""
 
     def __init__(self, surface: ObstacleSurface):
         self._surface = surface
@@ -108,8 +108,8 @@ class _RigidSurface:
         x = self._surface.at(t)[self._nodes]
         corners, normals = x[self._corners], vertex_normals(x, self._corners)[self._corners]
         a, b, c = np.moveaxis(corners, 1, 0)
-        away = np.einsum("ti,ti->t", np.cross(b - a, c - a), eye - a) <= 0
-        corners[away] = a[away, None]  # triangles without area do not show
+        back_facing = np.einsum("ti,ti->t", np.cross(b - a, c - a), eye - a) <= 0
+        corners[back_facing] = a[back_facing, None]  # triangles of zero area are invisible
         return corners.reshape(-1, 3), normals.reshape(-1, 3)
 
 
@@ -122,7 +122,7 @@ def smoothing_groups(rest: np.ndarray, surface: np.ndarray) -> tuple[np.ndarray,
     t = len(surface)
     a, b, c = (rest[surface[:, k]] for k in range(3))
     normals = _unit(np.cross(b - a, c - a))
-    # half-edges sorted by their vertex pair: neighbours in the list share an edge
+    # sort half-edges by their vertex pair: neighbours in the list share an edge
     ends = np.sort(np.stack([surface, np.roll(surface, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     same = np.flatnonzero((ends[order[1:]] == ends[order[:-1]]).all(axis=1))
@@ -134,8 +134,8 @@ def smoothing_groups(rest: np.ndarray, surface: np.ndarray) -> tuple[np.ndarray,
     links = []
     for end in (first, first // 3 * 3 + (first + 1) % 3):
         for other in (second, second // 3 * 3 + (second + 1) % 3):
-            meet = corner_vertex[end] == corner_vertex[other]
-            links.append(np.stack([end[meet], other[meet]]))
+            same_node = corner_vertex[end] == corner_vertex[other]
+            links.append(np.stack([end[same_node], other[same_node]]))
     i, j = np.concatenate(links, axis=1)
     graph = coo_matrix((np.ones(len(i), dtype=bool), (i, j)), shape=(3 * t, 3 * t))
     n_drawn, group = connected_components(graph, directed=False)
@@ -145,7 +145,7 @@ def smoothing_groups(rest: np.ndarray, surface: np.ndarray) -> tuple[np.ndarray,
 
 
 def vertex_normals(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Unit normals (n,3): per vertex the area-weighted mean over its triangles (t,3); zero where they cancel."""
+    """Return unit normals (n,3): per vertex the area-weighted mean over its triangles (t,3), or zero if they cancel."""
     a, b, c = (x[triangles[:, k]] for k in range(3))
     (u0, u1, u2), (v0, v1, v2) = (b - a).T, (c - a).T
     areas = np.stack([u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0], axis=1)  # np.cross takes twice as long
@@ -161,20 +161,20 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _fixed_surface_nodes(body, surface: np.ndarray) -> np.ndarray:
-    held = [constraint.nodes for constraint in body.constraints if constraint.path is None]
-    if not held:
+    fixed = [constraint.nodes for constraint in body.constraints if constraint.path is None]
+    if not fixed:
         return np.empty(0, dtype=np.int64)
-    nodes = np.intersect1d(np.concatenate(held), surface)
+    nodes = np.intersect1d(np.concatenate(fixed), surface)
     return nodes[:: -(-len(nodes) // MAX_MARKERS)] if len(nodes) else nodes
 
 
 def _coarse_ball() -> tuple[np.ndarray, np.ndarray]:
-    """A coarse unit ball: an octahedron with each face cut in four twice, 66 vertices (n,3) and 128 triangles (t,3)."""
+    """Return a coarse unit sphere: an octahedron subdivided twice, 66 vertices (n,3) and 128 triangles (t,3)."""
     points = np.concatenate([np.eye(3), -np.eye(3)])
     faces = [(x, y, z) for x in (0, 3) for y in (1, 4) for z in (2, 5)]
-    # an odd number of negative axes turns the order x, y, z inward
+    # with an odd number of negative axes, the order x, y, z would point inward
     triangles = np.array([f if sum(k > 2 for k in f) % 2 == 0 else f[::-1] for f in faces])
     for _ in range(2):
-        points, triangles = cut_in_four(points, triangles)
+        points, triangles = subdivide(points, triangles)
         points = _unit(points)
     return points, triangles

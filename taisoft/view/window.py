@@ -1,8 +1,8 @@
-"""The live window: a simulation that runs while it is watched, turned, pulled, paused, stepped and changed.
+"""The live window: shows a running simulation, with mouse, keys and a panel to view and change it.
 
-The left button pulls the body under the cursor, and orbits elsewhere or with Ctrl; the right one zooms, the middle one shifts.
-Space: pause or go on. S or right arrow: one step. R: back to the initial state. V: other colours. W, C, T, F: wires, contacts,
-tractions, fixed nodes. G: plots over time. P: record pictures. Escape or the close button: end. Sliders and buttons are in the
+The left button drags the body under the cursor, and orbits elsewhere or with Ctrl; the right one zooms, the middle one pans.
+Space: pause or continue. S or right arrow: one step. R: back to the initial state. V: other colours. W, C, T, F: wires, contacts,
+tractions, fixed nodes. G: plots over time. P: record pictures. Escape or the close button: quit. Sliders and buttons are in the
 panel, see `taisoft.view.panel`.
 """
 
@@ -26,11 +26,11 @@ from taisoft.view.shading import BACKGROUND_TOP
 from taisoft.view.surfaces import Surfaces
 
 SIZE = (1280, 720)
-PANEL = (0.012, 0.02, 0.27, 0.94)  # left, top, width, height as fractions of the window as it opens
-SHORT_PANEL = (0.012, 0.02, 0.27, 0.24)  # of a run that is only watched
-ORBIT = 240.0  # [deg] for a drag over the whole window
-ZOOM = 16.0  # factor on the distance for such a drag
-PULL_COLOUR = np.array([0.85, 0.10, 0.35])  # sRGB
+PANEL = (0.012, 0.02, 0.27, 0.94)  # left, top, width, height as fractions of the window's initial size
+SHORT_PANEL = (0.012, 0.02, 0.27, 0.24)  # of a window without sliders
+ORBIT = 240.0  # angle for a drag over the whole window [deg]
+ZOOM = 16.0  # factor on the distance for a drag over the whole window
+DRAG_COLOUR = np.array([0.85, 0.10, 0.35])  # sRGB
 KEYS = {
     ti.ui.SPACE: "pause", "s": "step", ti.ui.RIGHT: "step", "r": "reset", "p": "record", "v": "colour",
     "w": "wires", "c": "contacts", "t": "tractions", "f": "fixed_nodes", "g": "plots", ti.ui.ESCAPE: "close",
@@ -40,11 +40,11 @@ KEYS = {
 class LiveWindow:
     """A window that shows a scene; also an observer, with `frame` and `close`, for `Simulator.run`.
 
-    scene: its bodies and obstacles are read once; size: (width, height) in pixels; camera: where to look from, else it shows all
-    bodies and moves back after them until the user moves it; tall: with room for sliders in the panel; colour and
-    layers: as of `Offscreen`, to begin with; plots: what can be shown of them. `pressed` holds what the user asked for by keys up
-    to the last draw, values of KEYS. Raises OutputError, before anything is opened, when a display or a Vulkan driver is missing
-    or the process has a window already.
+    scene: its bodies and obstacles are read once; size: (width, height) in pixels; camera: if None, one that frames all bodies
+    and moves back to keep them in view until the user moves it; tall: make room for sliders in the panel; colour and layers:
+    initial ones, as for `Offscreen`; plots: those that can be shown. `pressed` holds the actions, values of KEYS, requested by
+    keys up to the last draw. Raises OutputError, before anything is opened, if a display or a Vulkan driver is missing or the
+    process has a window already.
     """
 
     def __init__(
@@ -52,31 +52,31 @@ class LiveWindow:
         layers: tuple[str, ...] = IN_WINDOW, plots: Plots | None = None,
     ):  # fmt: skip
         self.camera = camera or Camera.framing(start_positions(scene), size)
-        self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # [m]; 0 once the user moves the camera
+        self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # largest automatic distance [m]; 0: fixed camera
         self._surfaces = Surfaces(scene)
         self.layers = Layers(scene, layers)
-        self.strip = PlotOverlay(plots, size) if plots is not None else None
+        self._overlay = PlotOverlay(plots, size) if plots is not None else None
         self.colouring = Colouring(scene, self._surfaces, colour)
         self._canvas = Canvas(self._surfaces, size, visible=True, n_segments=self.layers.n_segments + 1)
-        self._place = PANEL if tall else SHORT_PANEL
-        # GGUI places the panel once, by the window's size at that time, and does not tell where the user moves it
-        self._panel_pixels = tuple(f * n for f, n in zip(self._place, (*size, *size)))
+        self._panel_rectangle = PANEL if tall else SHORT_PANEL
+        # GGUI positions the panel once, by the window's size at that time, and does not report where the user moves it
+        self._panel_pixels = tuple(f * n for f, n in zip(self._panel_rectangle, (*size, *size)))
         self._cursor: tuple[float, float] | None = None  # at the last picture
-        self._mode = ""  # of the drag that is going on: "turn", "zoom", "shift", "drag", or "panel", which is not ours
-        self._taken: tuple[int, int] | None = None  # size of the last picture that was recorded
-        self._asked_to_close = False
+        self._mode = ""  # of the present mouse drag: "turn", "zoom", "shift", "drag", or "panel", which GGUI handles
+        self._recorded_size: tuple[int, int] | None = None  # of the last recorded picture
+        self._close_requested = False
         self.drag: MouseDrag | None = None
         self.pressed: set[str] = set()
 
     @property
     def closed(self) -> bool:
-        """True once the user asked to close the window, or `close` was called."""
-        return self._asked_to_close or self._canvas.window is None or not self._canvas.window.running
+        """Whether the user has closed the window, or `close` was called."""
+        return self._close_requested or self._canvas.window is None or not self._canvas.window.running
 
     def draw(self, sim, lines: list[str], panel: Panel | None = None, record=None) -> None:
-        """Draw sim's present state with a panel of text lines, show it, and take up keys and mouse.
+        """Draw sim's present state with a panel of text lines, show it, and process keys and mouse.
 
-        panel: the sliders below the lines; record: is given the picture, uint8 (height, width, 3), without the panel.
+        panel: sliders and buttons below the lines; record: called with the picture, uint8 (height, width, 3), without the panel.
         """
         window = self._canvas.window
         self._surfaces.with_markers = self.layers.shown["fixed_nodes"]
@@ -85,16 +85,16 @@ class LiveWindow:
         x, normals = self._surfaces.with_obstacles(bodies, sim.time, self.camera.position)
         self._canvas.draw(x, normals, self.camera, tuple(BACKGROUND_TOP), self.colouring.base(sim), self._lines(sim))
         size = window.get_window_shape()
-        # GGUI shows an empty window once a picture has been taken of it at another size than the present one
-        if record is not None or self._taken not in (None, size):
-            picture = self._canvas.pixels(0, 0, *size)  # before the panel is declared, which would be in it
-            self._taken = size
+        # GGUI shows an empty window after a picture was taken of it at another size than the present one
+        if record is not None or self._recorded_size not in (None, size):
+            picture = self._canvas.pixels(0, 0, *size)  # before the panel is declared, which would else be in the picture
+            self._recorded_size = size
             if record is not None:
                 record(picture)
-        if self.strip is not None:
-            self.strip.draw(self._canvas, window.get_gui(), size)
-        # a line that comes and goes above the sliders would move them under the cursor
-        with window.get_gui().sub_window("taisoft", *self._place) as gui:
+        if self._overlay is not None:
+            self._overlay.draw(self._canvas, window.get_gui(), size)
+        # lines above the sliders must be constant in number: a transient line would move the sliders under the cursor
+        with window.get_gui().sub_window("taisoft", *self._panel_rectangle) as gui:
             for line in lines:
                 gui.text(line)
             if panel is not None:
@@ -104,7 +104,7 @@ class LiveWindow:
         self._read_mouse(sim, panel)
 
     def frame(self, sim, index: int) -> None:
-        """Show a frame of a run that is driven from elsewhere; does nothing once closed."""
+        """Show a frame of a run; does nothing once closed."""
         if not self.closed:
             self.draw(sim, [f"frame {index}", *state_lines(sim)])
 
@@ -113,12 +113,12 @@ class LiveWindow:
         self._canvas.close()
 
     def _lines(self, sim) -> tuple[np.ndarray, np.ndarray]:
-        """Ends and colours of the lines over the picture."""
+        """Return the ends and colours of the lines over the picture."""
         ends, colours = self.layers.lines(sim, self.camera)
         if self.drag is None:
             return ends, colours
         dragged = self.camera.nearer(self.drag.line(sim), IN_FRONT)
-        return np.concatenate([dragged, ends]), np.concatenate([np.tile(PULL_COLOUR, (2, 1)), colours])
+        return np.concatenate([dragged, ends]), np.concatenate([np.tile(DRAG_COLOUR, (2, 1)), colours])
 
     def _read_keys(self) -> None:
         self.pressed.clear()
@@ -127,49 +127,49 @@ class LiveWindow:
                 self.pressed.add(KEYS[event.key])
         for name in self.pressed & set(self.layers.shown):
             self.layers.shown[name] = not self.layers.shown[name]
-        if "plots" in self.pressed and self.strip is not None:
-            self.strip.plots.toggle()
+        if "plots" in self.pressed and self._overlay is not None:
+            self._overlay.plots.toggle()
         if "colour" in self.pressed:
             self.colouring.choose_next()
-        self._asked_to_close |= "close" in self.pressed
+        self._close_requested |= "close" in self.pressed
 
     def _read_mouse(self, sim, panel: Panel | None) -> None:
         window = self._canvas.window
         size = window.get_window_shape()
         button = next((b for b in (ti.ui.LMB, ti.ui.RMB, ti.ui.MMB) if window.is_pressed(b)), None)
         cursor = window.get_cursor_pos()  # from the lower left corner, in [0, 1]
-        if button is None or min(size) < 1:  # a window made as small as nothing has no cursor either
+        if button is None or min(size) < 1:  # a window of zero size has no cursor
             if self.drag is not None:
                 self.drag = None
                 sim.release()
             self._mode = ""
         elif not self._mode:
-            self._mode = self._begin(sim, panel, button, cursor, size)
+            self._mode = self._begin_drag(sim, panel, button, cursor, size)
         else:
-            self._move(button, (cursor[0] - self._cursor[0], cursor[1] - self._cursor[1]), size)
+            self._move_camera(button, (cursor[0] - self._cursor[0], cursor[1] - self._cursor[1]), size)
         if self.drag is not None:
             self.drag.drag(sim, self.camera, cursor, size, panel.strength)
         self._cursor = cursor
 
-    def _begin(self, sim, panel: Panel | None, button, cursor, size) -> str:
-        """What the drag that begins here does."""
+    def _begin_drag(self, sim, panel: Panel | None, button, cursor, size) -> str:
+        """Start a mouse drag at the cursor and return its mode."""
         left, top, width, height = self._panel_pixels
         x, y = cursor[0] * size[0], (1.0 - cursor[1]) * size[1]
-        if left <= x <= left + width and top <= y <= top + height or (self.strip is not None and self.strip.holds(x, y)):
+        if left <= x <= left + width and top <= y <= top + height or (self._overlay is not None and self._overlay.contains(x, y)):
             return "panel"
         if button != ti.ui.LMB:
             return "zoom" if button == ti.ui.RMB else "shift"
         if panel is not None and panel.strength > 0.0 and not self._canvas.window.is_pressed(ti.ui.CTRL):
             hit = pick(sim, self.camera, cursor, size)
             if hit is not None:
-                self._widest = 0.0  # a camera that moves back would pull, too
+                self._widest = 0.0  # a camera that moves back would move the drag's target
                 self.drag = MouseDrag(sim, hit)
                 panel.chosen = self.drag.body
                 return "drag"
         return "turn"
 
-    def _move(self, button, way: tuple[float, float], size) -> None:
-        right, up = way
+    def _move_camera(self, button, displacement: tuple[float, float], size) -> None:
+        right, up = displacement
         if self._mode in ("turn", "zoom", "shift"):
             self._widest = 0.0
         if self._mode == "turn":
@@ -186,13 +186,13 @@ def show(
 ) -> None:  # fmt: skip
     """Run a simulation in a window until it is closed.
 
-    sim: an open Simulator, advanced by 1/fps [s] of simulated time a picture, never faster than real time; made with
-    draggable=True its bodies can be pulled with the mouse. A step that fails pauses the run and its reason is shown; R starts
-    anew. colour, layers, plots: what is shown to begin with. Raises OutputError, before anything is opened, when a display or a
-    Vulkan driver is missing or the process has a window already, SceneError for a plot of what is not modelled.
+    sim: an open Simulator, advanced by 1/fps [s] of simulated time per picture, never faster than real time; if made with
+    draggable=True, its bodies can be dragged with the mouse. A failed step pauses the run and the reason is shown; R restarts.
+    colour, layers, plots: initial ones. Raises OutputError, before anything is opened, if a display or a Vulkan driver is missing
+    or the process has a window already; SceneError for a plot of a quantity that is not simulated.
     """
     if not fps > 0:
-        raise OutputError(f"the window's fps is {fps}, it must be positive")
+        raise OutputError(f"the window's fps is {fps}; it must be positive")
     history = Plots(sim, plots)
     window = LiveWindow(sim.scene, tall=True, colour=colour, layers=layers, plots=history)
     try:
@@ -212,7 +212,7 @@ def show(
 
 
 def state_lines(sim) -> list[str]:
-    """Time and energies of sim as text."""
+    """Return time and energies of sim as lines of text."""
     energies = sim.energies()
     values = {"kinetic": energies.kinetic, "elastic": energies.elastic, "gravity": energies.gravity}
     return [f"time     {sim.time:10.4f} s", *(f"{name:8} {value:10.4g} J" for name, value in values.items())]
