@@ -19,7 +19,7 @@ from taisoft.scene import checks
 from taisoft.scene.key_frames import KeyFrames
 
 DEGENERATE = 1e-9  # a triangle has no area if its smallest height is below this times its longest edge
-UNIT_TOLERANCE = 8 * np.finfo(np.float64).eps  # squared lengths this close to 1 are left as they are, so normals read back unchanged
+UNIT_TOLERANCE = 8 * np.finfo(np.float64).eps  # squared lengths this close to 1 are kept, so normals read back unchanged
 MAKE_ANOTHER = "make another shape; an obstacle moves by its path"
 RIGID_TOLERANCE = 1e-6  # largest allowed entry of R^T R - I for a path's rotation R
 

@@ -6,7 +6,7 @@ The Simulator itself validates names of integrators and contact solvers and thei
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 
-MAX_TOLERANCE = {"newton_tolerance": 0.1}  # a residual of a tenth of the forces is no solution; the limit is 1 for other tolerances
+MAX_TOLERANCE = {"newton_tolerance": 0.1}  # a residual of a tenth of the forces is no solution; others: 1
 
 
 def _positive(value, key: str) -> None:
