@@ -202,9 +202,9 @@ def test_selections_outside_the_rules(body, where, rule):
 
 @pytest.mark.parametrize("axes", ["", "xx", "w", "xyzz", "XY", None, 1, ["x"], "x y"])
 def test_axes_outside_the_rules(body, axes):
-    with pytest.raises(SceneError, match="axes must name some of 'x', 'y', 'z'"):
+    with pytest.raises(SceneError, match="axes must be some of 'x', 'y', 'z'"):
         body.fix([0], axes=axes)
-    with pytest.raises(SceneError, match="axes must name some of 'x', 'y', 'z'"):
+    with pytest.raises(SceneError, match="axes must be some of 'x', 'y', 'z'"):
         body.move([0], still, axes=axes)
 
 

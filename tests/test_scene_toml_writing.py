@@ -20,7 +20,7 @@ def test_what_no_file_can_hold(tmp_path):
         ts.write_scene(path, scene, {"dtt": 1})
     with pytest.raises(ts.SceneError, match="solver: dt must be a number, not '1'"):
         ts.write_scene(path, scene, {"dt": "1"})
-    with pytest.raises(ts.SceneError, match=r"ends in \.toml"):
+    with pytest.raises(ts.SceneError, match=r"end in \.toml"):
         ts.write_scene(tmp_path / "a.tml", scene)
     with pytest.raises(ts.SceneError, match="needs a Scene, not dict"):
         ts.write_scene(path, {})

@@ -126,13 +126,13 @@ def _read_by_meshio(file: Path, name: str, data: bytes):
         if int(found[1][:30]) > len(data):
             line = data.count(b"\n", 0, found.start(1)) + 1
             raise MeshError(
-                f"{name}: line {line} announces {found[1][:30].decode()} items, but the file has {len(data)} bytes"
+                f"{name}: line {line} declares {found[1][:30].decode()} items, but the file has {len(data)} bytes"
             )
     try:
         mesh = read_safely(file, name, data)
     except MeshError as error:
         if any(int(found[1][:30]) == 0 for found in re.finditer(_REQUIRED.get(ending, rb"(?!)"), data)):
-            raise MeshError(f"{name}: no tetrahedra; the file announces 0 points or cells") from error
+            raise MeshError(f"{name}: no tetrahedra; the file declares 0 points or cells") from error
         raise
     return mesh.points, [(block.type, np.asarray(block.data)) for block in mesh.cells]
 

@@ -236,7 +236,7 @@ def _check_total(numbers, total: int, items, what: str):
     """Return the items if their number equals the total declared by the section; raise MeshError otherwise."""
     if len(items) != total:
         index = (0,) if isinstance(numbers, _Text) else ()
-        raise numbers.error(*index, f"{total} {what} were announced, but the blocks hold {len(items)}")
+        raise numbers.error(*index, f"{total} {what} were declared, but the blocks hold {len(items)}")
     return items
 
 

@@ -48,7 +48,7 @@ def _table(file: Path, what: str) -> tuple[list[int], np.ndarray]:
         raise MeshError(f"{file}: line {number}: not a supported mesh: expected the counts of TetGen's format")
     if header[0] > len(lines) - 1:
         last, found = lines[-1][0], len(lines) - 1
-        raise MeshError(f"{file}: line {last}: {header[0]} {what} were announced, but the file ends after {found}")
+        raise MeshError(f"{file}: line {last}: {header[0]} {what} were declared, but the file ends after {found}")
     n_columns = 1 + header[1]
     widest = max((len(words) for _, words in lines[1 : header[0] + 1]), default=0)
     rows = np.empty((header[0], min(n_columns, widest)))

@@ -41,7 +41,7 @@ def write_scene(path, scene: Scene, solver: dict | None = None, overwrite: bool 
     if not isinstance(scene, Scene):
         raise SceneError(f"{file}: write_scene needs a Scene, not {type(scene).__name__}")
     if not scene.bodies:
-        raise SceneError(f"{file}: the scene has no body")
+        raise SceneError(f"{file}: the scene holds no body")
     meshes: dict[str, TetMesh] = {}
     text = toml_of(_document(scene, solver or {}, file.stem, meshes))
     try:
