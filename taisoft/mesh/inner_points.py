@@ -9,7 +9,7 @@ from taisoft.mesh.triangle_queries import distances, nearest_hit
 EQUAL = 1e-9  # relative size difference that counts as a tie; ties take the first element, independent of rounding
 
 
-def parts_of(elements: np.ndarray) -> np.ndarray:
+def connected_parts(elements: np.ndarray) -> np.ndarray:
     """Return the connected part (m,) of each element (m,k), numbered from 0; elements that share a vertex are connected."""
     used, corner = np.unique(elements, return_inverse=True)
     corner = corner.reshape(elements.shape)
@@ -19,7 +19,7 @@ def parts_of(elements: np.ndarray) -> np.ndarray:
 def inner_tets(vertices: np.ndarray, tets: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return for each part the tet (k,) whose centroid lies farthest from its faces, and that distance (k,) [m].
 
-    vertices: (n,3) [m]. tets: (m,4). part: (m,) of `parts_of`.
+    vertices: (n,3) [m]. tets: (m,4). part: (m,) of `connected_parts`.
     """
     faces = vertices[tets[:, TET_FACES]]
     twice = np.linalg.norm(np.cross(faces[:, :, 1] - faces[:, :, 0], faces[:, :, 2] - faces[:, :, 0]), axis=2)
@@ -32,8 +32,8 @@ def inner_tets(vertices: np.ndarray, tets: np.ndarray, part: np.ndarray) -> tupl
 def inner_depths(vertices: np.ndarray, triangles: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return for each part of a surface its largest triangle, the depth of an inner point behind it, and that point's clearance.
 
-    vertices: (n,3) [m]. triangles: (t,3), normals outward. part: (t,) of `parts_of`. Returns triangles (k,); depth (k,) [m]
-    along the inward normal from the centroid, half the distance to the next triangle; distance (k,) [m] of the point from the
+    vertices: (n,3) [m]. triangles: (t,3), normals outward. part: (t,) of `connected_parts`. Returns triangles (k,); depth (k,)
+    [m] along the inward normal from the centroid, half the distance to the next triangle; distance (k,) [m] of the point from the
     surface. If no triangle lies behind, both are 0 and the point lies on the surface.
     """
     corners = vertices[triangles]

@@ -22,9 +22,9 @@ from scipy.sparse.csgraph import connected_components
 from taisoft.errors import MeshError
 from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
 
-MAX_PAIRS = 1 << 19  # most block-triangle pairs processed at once, about 100 bytes each
+MAX_PAIRS = 1 << 19  # maximum number of block-triangle pairs processed at once, about 100 bytes each
 _SLACK = 1e-9  # relative to the size: bounds are widened by this against rounding
-_SCATTERED_PAIRS = 1 << 15  # most point-triangle pairs processed at once for scattered points
+_SCATTERED_PAIRS = 1 << 15  # maximum number of point-triangle pairs processed at once for scattered points
 _BATCH = 64  # points evaluated exactly at once, before checking whether any other point can lie deeper
 
 
@@ -49,10 +49,10 @@ def greatest_depth(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarr
     order = np.argsort(-search.upper, kind="stable")
     deepest = 0.0
     for first in range(0, len(order), _BATCH):
-        some = order[first : first + _BATCH]
-        if search.upper[some[0]] <= deepest:  # no other can lie deeper
+        batch = order[first : first + _BATCH]
+        if search.upper[batch[0]] <= deepest:  # no other can lie deeper
             break
-        deepest = max(deepest, -float(search.signed(some).min()))
+        deepest = max(deepest, -float(search.signed(batch).min()))
     return deepest
 
 
@@ -71,14 +71,14 @@ class _PointSearch:
             return np.zeros(0)
         # a triangle can be nearer only if its centroid is within the bound plus the triangle's radius
         reach = (1.0 + _SLACK) * (self.upper[rows] + surface.radius.max())
-        near = self.tree.query_ball_point(self.points[rows], reach, return_sorted=True)
-        counts = np.array([len(candidates) for candidates in near])
+        nearby = self.tree.query_ball_point(self.points[rows], reach, return_sorted=True)
+        counts = np.array([len(candidates) for candidates in nearby])
         result = []
-        for some in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(np.cumsum(counts) // _SCATTERED_PAIRS)) + 1):
-            starts = np.concatenate([[0], np.cumsum(counts[some])[:-1]])
-            row, triangle = np.repeat(rows[some], counts[some]), np.concatenate(near[some]).astype(np.int64)
-            squared, offset, feature = surface.nearest(self.points[row], triangle)
-            equal = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, starts), counts[some]))
+        for chunk in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(np.cumsum(counts) // _SCATTERED_PAIRS)) + 1):
+            starts = np.concatenate([[0], np.cumsum(counts[chunk])[:-1]])
+            point_row, triangle = np.repeat(rows[chunk], counts[chunk]), np.concatenate(nearby[chunk]).astype(np.int64)
+            squared, offset, feature = surface.nearest(self.points[point_row], triangle)
+            equal = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, starts), counts[chunk]))
             best = equal[np.searchsorted(equal, starts)]  # ties take the first triangle
             inside = surface.sides(offset[best], triangle[best], feature[best]) < 0.0
             result.append(np.where(inside, -1.0, 1.0) * np.sqrt(squared[best]))
@@ -197,9 +197,9 @@ class _Search:
         self._squared = np.empty(len(points))
         self._slack = _SLACK * float(np.linalg.norm(points[-1] - points[0]))
         tree = scipy.spatial.cKDTree(surface.centroid)
-        for some in self._chunks(len(points)):
-            self._triangle[some] = tree.query(points[some])[1]
-            self._squared[some] = surface.nearest(points[some], self._triangle[some])[0]
+        for chunk in self._chunks(len(points)):
+            self._triangle[chunk] = tree.query(points[chunk])[1]
+            self._squared[chunk] = surface.nearest(points[chunk], self._triangle[chunk])[0]
         self._levels = [self._level(0, np.sqrt(self._squared).reshape([len(a) for a in axes]))]
         while self._levels[-1].reach.size > 1:
             coarse = self._levels[-1].upper
@@ -235,25 +235,25 @@ class _Search:
             else:
                 self._improve(block, triangle)
         phi = np.empty(len(self._points))
-        for some in self._chunks(len(phi)):
-            triangle = self._triangle[some]
-            squared, offset, feature = self._surface.nearest(self._points[some], triangle)
-            phi[some] = np.where(self._surface.sides(offset, triangle, feature) < 0, -1.0, 1.0) * np.sqrt(squared)
+        for chunk in self._chunks(len(phi)):
+            triangle = self._triangle[chunk]
+            squared, offset, feature = self._surface.nearest(self._points[chunk], triangle)
+            phi[chunk] = np.where(self._surface.sides(offset, triangle, feature) < 0, -1.0, 1.0) * np.sqrt(squared)
         return phi.reshape([len(a) for a in self._axes])
 
     def _children(self, level: int, block: np.ndarray, triangle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the pairs of child blocks at `level` and triangles that can be nearest to one of their points."""
         fine, parent = self._levels[level], np.unravel_index(block, self._levels[level + 1].upper.shape)
-        kept = []
+        pairs = []
         for corner in range(8):
             ijk = [2 * p + (corner >> (2 - a) & 1) for a, p in enumerate(parent)]
             exists = np.logical_and.reduce([i < n for i, n in zip(ijk, fine.upper.shape)])
-            ijk, some = [i[exists] for i in ijk], triangle[exists]
+            ijk, candidates = [i[exists] for i in ijk], triangle[exists]
             child = np.ravel_multi_index(ijk, fine.upper.shape)
             centre = np.stack([x[i] for x, i in zip(fine.centres, ijk)], axis=1)
-            near = self._surface.bound(centre, some) <= fine.reach[child]
-            kept.append((child[near], some[near]))
-        return tuple(np.concatenate(column) for column in zip(*kept))
+            is_near = self._surface.bound(centre, candidates) <= fine.reach[child]
+            pairs.append((child[is_near], candidates[is_near]))
+        return tuple(np.concatenate(column) for column in zip(*pairs))
 
     def _improve(self, point: np.ndarray, triangle: np.ndarray) -> None:
         """Update the nearest triangles by the pairs' distances; ties take the first triangle."""

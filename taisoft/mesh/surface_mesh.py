@@ -50,7 +50,7 @@ class SurfaceMesh:
             raise MeshError(f"{self.source}: triangle {t}: vertex {triangles[t, k]} does not exist ({len(vertices)} vertices)")
         for field_name, array in (("vertices", vertices), ("triangles", triangles.astype(np.int64))):
             array.setflags(write=False)
-            # The only way to store a clean value in a frozen record.
+            # The only way to store a validated value in a frozen record.
             object.__setattr__(self, field_name, array)
 
     def _as_array(self, what: str, kinds: str, description: str) -> np.ndarray:

@@ -11,7 +11,7 @@ import scipy
 from taisoft.mesh.topology import EDGES, TET_FACES
 
 PARALLEL = 1e-6  # sine below which two edges count as parallel and give no axis
-_PAIRS = 1 << 14  # most pairs processed at once, about 10 kB each
+_PAIRS = 1 << 14  # maximum number of pairs processed at once, about 10 kB each
 
 
 def cut_depths(triangles: np.ndarray, tets: np.ndarray, slack: float) -> tuple[np.ndarray, np.ndarray]:
@@ -31,19 +31,19 @@ def _near_boxes(lo_a: np.ndarray, hi_a: np.ndarray, lo_b: np.ndarray, hi_b: np.n
     """Return the pairs (k,2) of boxes that meet. One k-d tree per size class of b: large boxes widen only their search."""
     middle_a, middle_b = 0.5 * (lo_a + hi_a), 0.5 * (lo_b + hi_b)
     reach_a, reach_b = np.linalg.norm(hi_a - middle_a, axis=1), np.linalg.norm(hi_b - middle_b, axis=1)
-    found = [np.zeros((0, 2), dtype=np.int64)]
-    scale = np.floor(np.log2(np.maximum(reach_b, np.finfo(float).tiny)))
-    for one in np.unique(scale):
-        rows = np.flatnonzero(scale == one)
+    pairs = [np.zeros((0, 2), dtype=np.int64)]
+    size_classes = np.floor(np.log2(np.maximum(reach_b, np.finfo(float).tiny)))
+    for size_class in np.unique(size_classes):
+        rows = np.flatnonzero(size_classes == size_class)
         tree, reach = scipy.spatial.cKDTree(middle_b[rows]), reach_b[rows].max()
         for first in range(0, len(middle_a), _PAIRS):
-            some = slice(first, first + _PAIRS)
-            lists = tree.query_ball_point(middle_a[some], (1.0 + 1e-9) * (reach_a[some] + reach))
+            chunk = slice(first, first + _PAIRS)
+            lists = tree.query_ball_point(middle_a[chunk], (1.0 + 1e-9) * (reach_a[chunk] + reach))
             a = first + np.repeat(np.arange(len(lists)), [len(near) for near in lists])
             b = rows[np.concatenate([np.zeros(0, dtype=np.int64), *lists]).astype(np.int64)]
             meet = ((lo_a[a] <= hi_b[b]) & (lo_b[b] <= hi_a[a])).all(axis=1)
-            found.append(np.stack([a[meet], b[meet]], axis=1))
-    return np.concatenate(found)
+            pairs.append(np.stack([a[meet], b[meet]], axis=1))
+    return np.concatenate(pairs)
 
 
 def _separation(triangle: np.ndarray, tet: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ LARGEST_COORDINATE = float(np.finfo(np.float32).max)  # [m], since forces may be
 MAX_OFFSET_RATIO = 1e5  # distance from the origin over size above which a warning is issued
 COINCIDENT = 1e-9  # vertices closer than this times the mesh's diagonal are coincident
 GENERIC_DIRECTION = np.array([0.56071, 0.64493, 0.51922])  # distinct projections for grid vertices; length at most 1
-MAX_LISTED = 20  # most indices listed in a message
+MAX_LISTED = 20  # maximum number of indices listed in a message
 
 
 class TetMesh(Guarded):

@@ -23,7 +23,7 @@ from taisoft.mesh.tet_mesh import TetMesh
 EDGES_PER_DIAGONAL = 20  # default edge length: the diagonal over this
 ENVELOPE = 0.1  # default envelope over the edge length
 QUALITY = 10.0  # target upper bound of the tets' AMIPS energy: 3 for a regular tet
-MAX_ITERATIONS = 80  # most optimisation iterations
+MAX_ITERATIONS = 80  # maximum number of optimisation iterations
 
 
 def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envelope: float | None = None) -> TetMesh:

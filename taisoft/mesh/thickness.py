@@ -22,7 +22,7 @@ from taisoft.mesh.topology import TET_FACES, Faces, connected_pieces
 
 LAYERS, LENGTH = 1.5, 1.4  # coefficients of the estimate above
 MAX_RAYS = 20_000  # on larger surfaces only every second, third, ... triangle has a ray
-MAX_CROSSED_TETS = 24  # most tets that a ray crosses; with more layers a part is not thin
+MAX_CROSSED_TETS = 24  # maximum number of tets that a ray crosses; with more layers a part is not thin
 MIN_SLENDERNESS = 2.5  # smallest length over thickness of a part that bends
 MIN_STIFFNESS = 2.0  # stiffness factor from which a warning is issued: deflections are halved
 MIN_FRACTION = 0.5  # smallest fraction of the surface that must be thin and too stiff

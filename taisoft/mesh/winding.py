@@ -9,7 +9,7 @@ import numpy as np
 
 from taisoft.mesh.triangle_queries import distances
 
-_PAIRS = 1 << 16  # most point-triangle pairs processed at once, about 500 bytes each
+_PAIRS = 1 << 16  # maximum number of point-triangle pairs processed at once, about 500 bytes each
 
 
 def is_closed(triangles: np.ndarray) -> bool:
@@ -27,10 +27,10 @@ def solid_depths(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     depth = np.zeros(len(points))
     step = max(_PAIRS // max(len(corners), 1), 1)
     for first in range(0, len(points), step):
-        some = points[first : first + step]
-        inside = np.flatnonzero(are_inside(corners, some))
+        batch = points[first : first + step]
+        inside = np.flatnonzero(are_inside(corners, batch))
         if len(inside):
-            depth[first + inside] = distances(corners, some[inside])
+            depth[first + inside] = distances(corners, batch[inside])
     return depth
 
 

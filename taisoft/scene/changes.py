@@ -14,7 +14,7 @@ CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping"
 LOADS = {"force": "forces", "traction": "tractions"}  # kind of load -> the body's list of them
 
 
-def changed_material(body: Body, numbers: dict[str, float], on: dict[str, bool]) -> None:
+def change_material(body: Body, numbers: dict[str, float], on: dict[str, bool]) -> None:
     """Replace numbers of a body's material. The law and damping that is compiled out cannot change at run time.
 
     Warnings point to the line of the caller's caller. Raises SceneError.
@@ -39,7 +39,7 @@ def changed_material(body: Body, numbers: dict[str, float], on: dict[str, bool])
         body.warn_locking(stacklevel=3)
 
 
-def changed_load(body: Body, kind: str, index: int, value) -> None:
+def change_load(body: Body, kind: str, index: int, value) -> None:
     """Set the value of a body's load `index`, counted from 0 in the order added. kind: a key of LOADS.
 
     value: (3,) [N], or (k,3) for the k nodes of a force; (3,) [Pa] for a traction. Raises SceneError.

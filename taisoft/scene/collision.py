@@ -38,22 +38,22 @@ class CollisionSettings:
     def __post_init__(self):
         what = "collision settings"
         checks.choice(self.broad_phase, f"{what}: broad_phase", BROAD_PHASES)
-        clean = {
+        validated = {
             "cell_ratio": checks.number(self.cell_ratio, f"{what}: cell_ratio", above=0.0),
             "k_dop": checks.whole(self.k_dop, f"{what}: k_dop", (6, 14, 18)),
             "field_cells": _count(self.field_cells, f"{what}: field_cells", 8, 256),
         }
         if self.margin is not None:
-            clean["margin"] = checks.number(self.margin, f"{what}: margin", minimum=0.0, unit="m")
+            validated["margin"] = checks.number(self.margin, f"{what}: margin", minimum=0.0, unit="m")
         for field in ("initial_capacity", "max_capacity"):
             if getattr(self, field) is not None:
-                clean[field] = _count(getattr(self, field), f"{what}: {field}", 64, 2**31 - 1)
-        if clean.get("initial_capacity", 0) > clean.get("max_capacity", 2**31):
+                validated[field] = _count(getattr(self, field), f"{what}: {field}", 64, 2**31 - 1)
+        if validated.get("initial_capacity", 0) > validated.get("max_capacity", 2**31):
             raise SceneError(
                 f"{what}: initial_capacity {self.initial_capacity} must not exceed max_capacity {self.max_capacity}"
             )
-        for field, value in clean.items():
-            # The only way to store a clean value in a frozen record.
+        for field, value in validated.items():
+            # The only way to store a validated value in a frozen record.
             object.__setattr__(self, field, value)
 
 

@@ -45,19 +45,19 @@ class KeyFrames:
             raise SceneError(f"{what}: times must ascend, but {times[first + 1]:g} follows {times[first]:g}")
         if self.translations is None and self.rotations is None:
             raise SceneError(f"{what}: translations or rotations are needed")
-        clean = {"times": times, "translations": np.zeros((k, 3))}
+        validated = {"times": times, "translations": np.zeros((k, 3))}
         for field, shape in (("translations", (k, 3)), ("rotations", (k, 3)), ("pivot", (3,))):
             if getattr(self, field) is not None:
-                clean[field] = checks.array(getattr(self, field), f"{what}: {field}", (shape,))
+                validated[field] = checks.array(getattr(self, field), f"{what}: {field}", (shape,))
         for field in ("smooth", "release"):
             checks.flag(getattr(self, field), f"{what}: {field}")
-        if "rotations" in clean:
-            if np.abs(clean["rotations"]).max() > MAX_ANGLE:
+        if "rotations" in validated:
+            if np.abs(validated["rotations"]).max() > MAX_ANGLE:
                 raise SceneError(f"{what}: rotations must be at most {MAX_ANGLE:g} rad about each axis")
-            clean["_turns"] = _turns(clean["rotations"])
-        for field, value in clean.items():
+            validated["_turns"] = _turns(validated["rotations"])
+        for field, value in validated.items():
             value.setflags(write=False)
-            # The only way to store a clean value in a frozen record.
+            # The only way to store a validated value in a frozen record.
             object.__setattr__(self, field, value)
 
     def __call__(self, t: float) -> tuple[np.ndarray, np.ndarray]:

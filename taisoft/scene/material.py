@@ -35,7 +35,7 @@ class Material:
             "stiffness_damping": {"minimum": 0.0, "unit": "s"},
         }
         for field, limit in limits.items():
-            # The only way to store a clean float in a frozen record.
+            # The only way to store a validated float in a frozen record.
             object.__setattr__(self, field, checks.number(getattr(self, field), f"material: {field}", **limit))
         if not -1.0 < self.poisson < 0.5:
             raise SceneError(f"material: poisson must lie in the open interval (-1, 0.5), not {self.poisson:g}")

@@ -25,7 +25,7 @@ def scene_numbers(scene: Scene) -> Numbers:
     return numbers
 
 
-def numbers_differ(before: Numbers, now: Numbers) -> str:
+def first_difference(before: Numbers, now: Numbers) -> str:
     """Return a sentence about the first difference between two scenes' numbers; "" if there is none."""
     for name in before | now:
         old, new = before.get(name), now.get(name)

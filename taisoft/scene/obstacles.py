@@ -52,7 +52,7 @@ class Shape:
         return self._store(field, checks.array(getattr(self, field), f"{self.word}: {field}", ((3,),)))
 
     def _radius(self) -> None:
-        # The only way to store a clean value in a frozen record.
+        # The only way to store a validated value in a frozen record.
         object.__setattr__(self, "radius", checks.number(self.radius, f"{self.word}: radius", above=0.0, unit="m"))
 
     def _store(self, field: str, value: np.ndarray) -> np.ndarray:

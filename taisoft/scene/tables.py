@@ -18,8 +18,8 @@ from taisoft.scene import checks
 BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")  # keys that TOML allows without quotes
 INT_LIMIT = 2**63  # upper bound of TOML integers
 SURROGATES = {chr(code) for code in range(0xD800, 0xE000)}  # no valid characters, and TOML has no escape for them
-MAX_ERROR_LENGTH = 400  # most characters of an error, which may repeat a whole list, without the file's folder
-MAX_VALUE_LENGTH = 40  # most characters of a value in a message
+MAX_ERROR_LENGTH = 400  # maximum number of characters of an error, which may repeat a whole list, without the file's folder
+MAX_VALUE_LENGTH = 40  # maximum number of characters of a value in a message
 
 
 def value_text(value) -> str:

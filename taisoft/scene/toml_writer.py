@@ -24,7 +24,7 @@ from taisoft.scene.solver import CHECKS, check_solver
 from taisoft.scene.tables import key_path, key_text, quote
 from taisoft.scene.toml import NONE_TEXT, SCENE_KEYS, SHAPES
 
-MAX_LINE = 100  # most characters of numbers in a line
+MAX_LINE = 100  # maximum number of characters of numbers in a line
 FOREIGN_PATH = "rotates along a path made for {}, which a file cannot store: pass the ts.KeyFrames themselves"
 
 
