@@ -11,7 +11,7 @@ from taisoft.elasticity import cauchy_stress, elastic_forces, force_differential
 from taisoft.errors import SceneError, SimulationError
 from taisoft.records import Energies
 from taisoft.scalars import ELASTIC, GRAVITY, KINETIC, LOADS
-from taisoft.scene.changes import CHANGEABLE, changed_material
+from taisoft.scene.changes import CHANGEABLE, change_material
 from taisoft.settings import Settings, check_dt
 from taisoft.stability import stable_dt
 from taisoft.transfer import upload
@@ -269,7 +269,7 @@ class StateAccess(Guarded):
         """
         simulation, k = self._open_simulation(), self._index(body)
         old, old_limit = self.scene.bodies[k].material, self._stable_dt
-        changed_material(self.scene.bodies[k], numbers, self.plan.on)
+        change_material(self.scene.bodies[k], numbers, self.plan.on)
         self._stable_dt = None
         try:
             if self.settings.explicit:

@@ -24,9 +24,9 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError, SimulationError
 from taisoft.files import replacing
 from taisoft.scene.body import Body
-from taisoft.scene.changes import LOADS, changed_load
+from taisoft.scene.changes import LOADS, change_load
 from taisoft.scene.key_frames import NodePath, ShapePath
-from taisoft.scene.numbers import Numbers, numbers_differ, scene_numbers
+from taisoft.scene.numbers import Numbers, first_difference, scene_numbers
 from taisoft.scene.scene import Material, Scene
 
 KIND, FORMAT = "taisoft checkpoint", 6  # increment FORMAT with every change of a file's content
@@ -95,7 +95,7 @@ def check_scene(saved: Checkpoint, scene: Scene, features: dict[str, bool]) -> N
     differing = [name for name in fingerprint | saved.fingerprint if fingerprint.get(name) != saved.fingerprint.get(name)]
     if differing and differing[0] != FEATURES:
         raise SceneError(f"{saved.path} is a checkpoint of another scene, which differs in {differing[0]}")
-    found = numbers_differ(saved.start, scene_numbers(scene))
+    found = first_difference(saved.start, scene_numbers(scene))
     if found:
         raise SceneError(
             f"{saved.path} is a checkpoint of another scene: {found}; pass the scene as it was at the start, since a resumed run "
@@ -115,7 +115,7 @@ def restore_numbers(saved: Checkpoint, scene: Scene) -> None:
         for k, body in enumerate(scene.bodies):
             for kind, name in LOADS.items():
                 for i in range(len(getattr(body, name))):
-                    changed_load(body, kind, i, saved.state["loads"][str(k)][kind][str(i)])
+                    change_load(body, kind, i, saved.state["loads"][str(k)][kind][str(i)])
 
 
 def load_values(scene: Scene) -> dict:

@@ -3,7 +3,7 @@
 from taisoft.access import StateAccess
 from taisoft.dynamics.drag_spring import Drag, DragSpring
 from taisoft.errors import SimulationError
-from taisoft.scene.changes import changed_load
+from taisoft.scene.changes import change_load
 
 
 class Loading(StateAccess):
@@ -28,7 +28,7 @@ class Loading(StateAccess):
 
     def _set_load(self, kind: str, body: str, index: int, value) -> None:
         self._open_simulation()
-        changed_load(self.scene.bodies[self._index(body)], kind, index, value)
+        change_load(self.scene.bodies[self._index(body)], kind, index, value)
         self._changes += 1
         self._upload_loads()
         self._loads_changed()

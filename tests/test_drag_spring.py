@@ -118,7 +118,7 @@ def test_pulling_is_refused_unless_wanted():
             sim.drag("beam", tip, np.ones(len(tip)), (0, 0, 0), 1.0)
     with ts.Simulator(scene, dt=0.01, draggable=True) as sim:
         entry = next(e for e in sim.plan.entries if e["feature"] == "loads")
-        assert entry["on"] and entry["why"] == "bodies are to be pulled"
+        assert entry["on"] and entry["why"] == "bodies can be dragged"
         for nodes, weights, target, message in (
             ([99999], [1.0], (0, 0, 0), "from 0 to"), ([0], [1.0, 1.0], (0, 0, 0), "weights"),
             ([0], [-1.0], (0, 0, 0), "weights"),

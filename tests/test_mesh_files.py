@@ -140,10 +140,10 @@ def test_tetgen_counts_from_zero_or_one(tmp_path):
     (tmp_path / "t.ele").write_text("1 4 0\n1 1 2 3 4\n")
     assert read_mesh(tmp_path / "t.node").tets.tolist() == [[0, 1, 2, 3]]
     (tmp_path / "t.ele").write_text("1 4 0\n1 1 2 3\n")
-    with pytest.raises(MeshError, match="t.ele: line 2: 5 numbers should stand here"):
+    with pytest.raises(MeshError, match="t.ele: line 2: expected 5 numbers"):
         read_mesh(tmp_path / "t.ele")
     (tmp_path / "t.ele").write_text("2 4 0\n1 1 2 3 4\n")
-    with pytest.raises(MeshError, match="t.ele: line 2: 2 tets were announced, but the file ends after 1"):
+    with pytest.raises(MeshError, match="t.ele: line 2: 2 tets were declared, but the file ends after 1"):
         read_mesh(tmp_path / "t.node")
     (tmp_path / "t.ele").unlink()
     with pytest.raises(MeshError, match="t.ele: there is no such file; TetGen's files come in pairs"):

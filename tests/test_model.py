@@ -17,7 +17,7 @@ from taisoft import elasticity
 from taisoft.fields import FieldArena
 from taisoft.mass import gravity_masses, lumped_masses, mass_matrix
 from taisoft.model import body_loads, build_model
-from taisoft.scene.changes import changed_material
+from taisoft.scene.changes import change_material
 from taisoft.scene.plan import make_plan
 
 
@@ -145,5 +145,5 @@ def test_one_lane_gives_the_same_forces(rig):
 def test_changes_that_are_refused(rig, numbers, words):
     body, before = rig.scene.body("beam"), rig.scene.body("beam").material
     with pytest.raises(ts.SceneError, match=words):
-        changed_material(body, numbers, make_plan(rig.scene, False, False).on)
+        change_material(body, numbers, make_plan(rig.scene, False, False).on)
     assert body.material is before

@@ -136,11 +136,11 @@ def test_meshes_may_be_open_and_hollow():
         (lambda: ts.MeshObstacle([(0, 0, 0), (1, 1, 1), (2, 2, 2)], [(0, 1, 2)]), "^mesh obstacle: triangle 0 .* no area"),
         (
             lambda: ts.MeshObstacle(TETRA, [(0, 1, 2), (0, 1, 3)]),
-            r"^mesh obstacle: triangles 0 and 1 run along their edge \(0, 1\) in the same direction",
+            r"^mesh obstacle: triangles 0 and 1 traverse their edge \(0, 1\) in the same direction",
         ),
         (
             lambda: ts.MeshObstacle([*TETRA, (1, 1, 1)], [(0, 1, 2), (1, 0, 3), (0, 1, 4)]),
-            r"^mesh obstacle: edge \(0, 1\) belongs to 3 triangles \(0, 1, 2\); an edge may have two at most",
+            r"^mesh obstacle: edge \(0, 1\) belongs to 3 triangles \(0, 1, 2\); an edge may have at most two",
         ),
     ],
 )

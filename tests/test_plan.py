@@ -44,7 +44,7 @@ def test_reasons():
         "obstacles": (False, "the scene has none"),
         "distance_fields": (False, "every body is hit by proximity"),
         "proximity": (True, "hits beam, block, tower, flyer"),
-        "self_collision": (False, "not asked for"),
+        "self_collision": (False, "not requested"),
         "contact_forces": (False, "the scene's contact_forces are off"),
     }
     assert plan.on["loads"] is True and plan.on["moving_nodes"] is False
@@ -103,11 +103,11 @@ def test_contact_geometry_is_there_where_something_can_touch():
     assert not grounded["distance_fields"][0] and not grounded["proximity"][0]
     assert grounded["contact_forces"] == (True, "ball, obstacle0, obstacle1 and 1 more can touch")
     boxed = contact_plan([ball], [plane, box])
-    assert boxed["distance_fields"] == (True, "hits ball (asked for)")
+    assert boxed["distance_fields"] == (True, "hits ball (requested)")
     assert boxed["proximity"] == (True, "hits obstacle1 (edges)")
     two = contact_plan([ball, ("told", "proximity"), ("free", "auto")])
-    assert two["distance_fields"] == (True, "hits ball (asked for)")
-    assert two["proximity"] == (True, "hits told (asked for), free")
+    assert two["distance_fields"] == (True, "hits ball (requested)")
+    assert two["proximity"] == (True, "hits told (requested), free")
 
 
 def test_meshes_and_bodies_themselves_are_hit_by_proximity():
@@ -115,7 +115,7 @@ def test_meshes_and_bodies_themselves_are_hit_by_proximity():
     meshed = contact_plan([("ball", "distance_field")], [ts.MeshObstacle(vertices, triangles)])
     assert meshed["proximity"] == (True, "hits obstacle0 (triangles)") and meshed["distance_fields"][0]
     itself = contact_plan([("ball", "auto")], self_collision=True)
-    assert itself["proximity"] == (True, "hits every body (itself)") and itself["self_collision"] == (True, "asked for")
+    assert itself["proximity"] == (True, "hits every body (itself)") and itself["self_collision"] == (True, "requested")
     assert itself["contact_forces"] == (True, "it can touch itself")
     assert itself["distance_fields"] == (False, "no triangles can hit a body")
 

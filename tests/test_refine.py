@@ -62,7 +62,7 @@ def test_two_faces_held_by_ids_leave_what_is_between_them_untold():
     scene, old = one_body(cells=(1, 1, 1))
     corners = np.flatnonzero((old.rest_positions[:, 1] > 0) & (old.rest_positions[:, 2] > 0))
     old.fix(corners)
-    with pytest.raises(SceneError, match="bar.*cannot be told.*choose by a function"):
+    with pytest.raises(SceneError, match="bar.*ambiguous.*choose by a function"):
         refined(scene)
 
 
@@ -118,5 +118,5 @@ def test_a_path_of_single_nodes_cannot_be_carried_over():
 def test_what_is_held_on_middles_alone_has_no_place_on_linear_tets():
     scene, old = one_body(order=2)
     old.fix([old.n_nodes - 1])
-    with pytest.raises(SceneError, match="middles of edges, which linear tets do not have"):
+    with pytest.raises(SceneError, match="mid-edge nodes are chosen, which linear tets do not have"):
         with_order(scene, 1)

@@ -190,7 +190,7 @@ def test_a_selector_cannot_change_the_mesh(body):
         (lambda X: X[:, 0], r"must return a bool mask of shape \(27,\), not float64"),
         (lambda X: np.array([1, 2]), "must return a bool mask"),
         (lambda X: True, r"must return a bool mask of shape \(27,\), not bool of shape \(\)"),
-        (lambda X: X.missing, "the function that chooses failed: AttributeError"),
+        (lambda X: X.missing, "the selection function failed: AttributeError"),
     ],
 )
 def test_selections_outside_the_rules(body, where, rule):
@@ -202,9 +202,9 @@ def test_selections_outside_the_rules(body, where, rule):
 
 @pytest.mark.parametrize("axes", ["", "xx", "w", "xyzz", "XY", None, 1, ["x"], "x y"])
 def test_axes_outside_the_rules(body, axes):
-    with pytest.raises(SceneError, match="axes must name some of 'x', 'y', 'z'"):
+    with pytest.raises(SceneError, match="axes must be some of 'x', 'y', 'z'"):
         body.fix([0], axes=axes)
-    with pytest.raises(SceneError, match="axes must name some of 'x', 'y', 'z'"):
+    with pytest.raises(SceneError, match="axes must be some of 'x', 'y', 'z'"):
         body.move([0], still, axes=axes)
 
 

@@ -13,7 +13,7 @@ from taisoft.errors import SceneError
 from taisoft.mesh.half_edges import opposite_half_edges
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.mesh.tet_mesh import TetMesh
-from taisoft.scene.collision import CollisionSettings, _sharpest_turn, has_sharp_edges
+from taisoft.scene.collision import CollisionSettings, _largest_convex_angle, has_sharp_edges
 from taisoft.scene.obstacles import Box, HalfSpace, Sphere
 from taisoft.scene.scene import Material, Scene
 
@@ -199,10 +199,10 @@ def test_only_convex_edges_are_sharp():
         mesh = prism(sides)
         x = mesh.vertices[mesh.surface]
         walls = mesh.surface[np.abs(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])[:, 1]) < 1e-9]
-        turn = _sharpest_turn(mesh.vertices, walls, opposite_half_edges(walls))
+        turn = _largest_convex_angle(mesh.vertices, walls, opposite_half_edges(walls))
         assert turn == pytest.approx(360 / sides, abs=1e-6)
         hollow = walls[:, ::-1]
-        assert _sharpest_turn(mesh.vertices, hollow, opposite_half_edges(hollow)) == pytest.approx(0, abs=1e-5)
+        assert _largest_convex_angle(mesh.vertices, hollow, opposite_half_edges(hollow)) == pytest.approx(0, abs=1e-5)
 
 
 def test_parts_joined_at_an_edge_count_as_sharp(scene):

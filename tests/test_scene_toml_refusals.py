@@ -66,7 +66,7 @@ BAD = [
     ("box = {", "bax = {", "bodies.beam.fix[0].nodes.bax is not known (did you mean box?)"),
     ("min = [-1, -1", "min = [-2, -1", ""),
     ("max = [-1, 1, 1]", "max = [-1, 1, -1]", "bodies.beam.fix[0]: no node is chosen"),
-    ('axes = "xz"', 'axes = "xx"', "bodies.beam.fix[0].axes must name some of 'x', 'y', 'z'"),
+    ('axes = "xz"', 'axes = "xx"', "bodies.beam.fix[0].axes must be some of 'x', 'y', 'z'"),
     ("[[bodies.beam.fix]]", "[bodies.beam.fix]", "bodies.beam.fix must be a list of tables [[bodies.beam.fix]], not a table"),
     ("nodes = [8, 9]", "nodes = [8, 12]", "bodies.beam.move[0]: node 12 does not exist"),
     ("nodes = [8, 9]", "nodes = [8, 8]", "bodies.beam.move[0]: node 8 is chosen twice"),

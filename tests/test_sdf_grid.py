@@ -197,7 +197,7 @@ def test_what_has_no_inside_is_refused():
         sdf_grid(vertices, np.delete(triangles, 4, axis=0))
     turned = triangles.copy()
     turned[4] = turned[4][::-1]
-    with pytest.raises(MeshError, match="triangles .*4.* run along their edge .* in the same direction"):
+    with pytest.raises(MeshError, match="triangles .*4.* traverse their edge .* in the same direction"):
         sdf_grid(vertices, turned)
     with pytest.raises(MeshError, match="belongs to 4 triangles"):
         sdf_grid(vertices, np.concatenate([triangles, triangles]))

@@ -15,7 +15,7 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 import taisoft as ts
-from taisoft.mesh.inner_points import inner_depths, inner_tets, parts_of
+from taisoft.mesh.inner_points import connected_parts, inner_depths, inner_tets
 from taisoft.mesh.signed_distance import greatest_depth, signed_distances_at
 from taisoft.mesh.solid_overlap import ALLOWED, Solid, overlap_depth
 from taisoft.mesh.tet_cuts import cut_depths
@@ -175,12 +175,12 @@ def test_inner_points():
     one, two = box(2), turned(box(3, (0.3, 0.2, 0.4)), (0.3, 0.2, 0.1))
     vertices = np.concatenate([one.vertices, two.vertices + (0, 3, 0)])
     tets = np.concatenate([one.tets, two.tets + one.n_verts])
-    part = parts_of(tets)
+    part = connected_parts(tets)
     assert np.array_equal(part, np.repeat([0, 1], [one.n_tets, two.n_tets]))
     best, room = inner_tets(vertices, tets, part)
     assert np.array_equal(part[best], [0, 1])
     both = ts.TetMesh(vertices, tets)
-    surface = parts_of(both.surface)
+    surface = connected_parts(both.surface)
     triangle, behind, clear = inner_depths(both.vertices, both.surface, surface)
     assert np.array_equal(surface[triangle], [0, 1])
     x = both.vertices[both.surface[triangle]]

@@ -76,19 +76,19 @@ OFF_POINTS = "0 0 0\n1 0 0\n0 1 0\n"
     "text, rule",
     [
         ("# nothing\n", "the file is empty"),
-        ("3 1 0\n" + OFF_POINTS, "line 1: not a supported surface: OFF should stand here, not '3'"),
+        ("3 1 0\n" + OFF_POINTS, "line 1: not a supported surface: expected OFF, not '3'"),
         ("4OFF 3 1 0\n" + OFF_POINTS, "line 1: not a supported surface"),
-        ("OFF\n", "line 1: the counts of vertices and faces should stand here"),
-        ("OFF BINARY\n", "line 1: the counts of vertices and faces should stand here"),
-        ("OFF\n3 -1 0\n", "line 2: the counts"),
-        ("OFF\n3\n", "line 2: the counts"),
-        ("OFF\n1000000000 1 0\n" + OFF_POINTS, "line 2 announces 1000000000 vertices and 1 faces, but 3 lines follow"),
-        ("OFF 3 1000000000 0\n" + OFF_POINTS, "line 1 announces 3 vertices and 1000000000 faces, but 3 lines follow"),
-        (f"OFF 3 {'9' * 5000} 0\n", "line 1: the counts"),
-        ("OFF 3 1 0\n0 0 0\n# x\n1 0\n0 1 0\n3 0 1 2\n", "line 4: three coordinates should stand here, not '1 0'"),
-        ("OFF 3 1 0\n" + OFF_POINTS + "2 0 1\n", "line 5: a number of at least 3 corners and as many vertices should"),
-        ("OFF 3 1 0\n" + OFF_POINTS + "1000000000 0 1\n", "line 5: a number of at least 3 corners and as many vertices should"),
-        ("OFF 3 1 0\n" + OFF_POINTS + "3 0 1 x\n", "line 5: a number of at least 3 corners"),
+        ("OFF\n", "line 1: expected the counts of vertices and faces"),
+        ("OFF BINARY\n", "line 1: expected the counts of vertices and faces"),
+        ("OFF\n3 -1 0\n", "line 2: expected the counts"),
+        ("OFF\n3\n", "line 2: expected the counts"),
+        ("OFF\n1000000000 1 0\n" + OFF_POINTS, "line 2 declares 1000000000 vertices and 1 faces, but 3 lines follow"),
+        ("OFF 3 1000000000 0\n" + OFF_POINTS, "line 1 declares 3 vertices and 1000000000 faces, but 3 lines follow"),
+        (f"OFF 3 {'9' * 5000} 0\n", "line 1: expected the counts"),
+        ("OFF 3 1 0\n0 0 0\n# x\n1 0\n0 1 0\n3 0 1 2\n", "line 4: expected three coordinates, not '1 0'"),
+        ("OFF 3 1 0\n" + OFF_POINTS + "2 0 1\n", "line 5: expected a number of at least 3 corners and as many vertices, not"),
+        ("OFF 3 1 0\n" + OFF_POINTS + "1000000000 0 1\n", "line 5: expected a number of at least 3 corners and as many vertices"),
+        ("OFF 3 1 0\n" + OFF_POINTS + "3 0 1 x\n", "line 5: expected a number of at least 3 corners"),
         ("OFF 3 1 0\n" + OFF_POINTS + "3 0 1 3\n", r"line 5: vertex 3 does not exist \(3 vertices\)"),
         ("OFF 3 1 0\n" + OFF_POINTS + "3 0 1 -1\n", r"line 5: vertex -1 does not exist \(3 vertices\)"),
         ("OFF 3 1 0\n0 0 0\n1 0 0\n0 inf 0\n3 0 1 2\n", "vertex 2 coordinate 1 is not finite"),
@@ -213,8 +213,8 @@ def test_faults():
     assert one.startswith("1 hole: 3 edges belong to one triangle") and two.startswith("2 holes: 6 edges")
     turned = T.copy()
     turned[3] = turned[3, ::-1]
-    assert ts.SurfaceMesh(X, turned).faults()[0].startswith("3 edges whose two triangles look to opposite sides")
-    assert ts.SurfaceMesh(X, T[:, ::-1]).faults() == ["all triangles look inward; flip the normals"]
+    assert ts.SurfaceMesh(X, turned).faults()[0].startswith("3 edges have two triangles of opposite orientation")
+    assert ts.SurfaceMesh(X, T[:, ::-1]).faults() == ["all normals point inward; flip them"]
     wall = np.vstack([X, X.mean(axis=0)]), np.vstack([T, [*T[0, :2], len(X)]])
     assert any("belong to more than two triangles" in text for text in ts.SurfaceMesh(*wall).faults())
     two = ts.SurfaceMesh(np.vstack([X, X + 3.0]), np.vstack([T, T + len(X)]))

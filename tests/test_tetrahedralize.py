@@ -27,7 +27,7 @@ from taisoft.mesh import tetrahedralize as module
 def test_tets_of_a_ball(scale, shift, flipped):
     pytest.importorskip("wildmeshing")
     surface = ts.SurfaceMesh(scale * X + shift, T[:, ::-1] if flipped else T, "ball")
-    told = pytest.warns(UserWarning, match="look inward") if flipped else warnings.catch_warnings()
+    told = pytest.warns(UserWarning, match="point inward") if flipped else warnings.catch_warnings()
     with told:
         mesh = ts.tetrahedralize(surface, edge_length=0.25 * scale)
     assert mesh.volumes.sum() == pytest.approx(VOLUME * scale**3, rel=0.05) and mesh.volumes.min() > 0 and mesh.n_components == 1

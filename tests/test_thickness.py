@@ -149,7 +149,7 @@ def test_adding_a_thin_body_warns_once_with_the_callers_line():
     scene = ts.Scene()
     found = told(lambda: scene.add_body(SHEET, RUBBER, name="mat"))
     said = "body 'mat': about 1 linear tet lies through its thickness, and it bends about 30 times too stiffly: "
-    assert [str(one.message) for one in found] == [said + "order=2 bends right"] and found[0].filename == __file__
+    assert [str(one.message) for one in found] == [said + "order=2 bends correctly"] and found[0].filename == __file__
     found = told(lambda: scene.add_body(ts.box_mesh((6, 2, 2), (12, 1, 1)), ts.Material(poisson=0.495), name="bar"))
     assert [one.filename for one in found] == [__file__] * 2
     assert "body 'bar': about 2 linear tets lie through its thickness" in str(found[1].message)

@@ -11,7 +11,7 @@ import numpy as np
 
 from taisoft.collision.analytic import AnalyticObstacles
 from taisoft.collision.surface import Surface, Topology
-from taisoft.mesh.inner_points import inner_depths, inner_tets, parts_of
+from taisoft.mesh.inner_points import connected_parts, inner_depths, inner_tets
 from taisoft.mesh.winding import are_inside, distances, is_closed
 from taisoft.model import Layout
 from taisoft.scene.body import Body
@@ -41,7 +41,7 @@ class _Separation:
     x: np.ndarray
     distance: float
 
-    def holds(self, point: np.ndarray, x: np.ndarray) -> bool:
+    def still_outside(self, point: np.ndarray, x: np.ndarray) -> bool:
         """Whether the point cannot have entered since."""
         moved = np.abs(x - self.x - (point - self.point)).max()
         return bool(np.sqrt(3.0) * moved < self.distance)
@@ -78,7 +78,7 @@ class Containment:
                 best, rooms = self._inner_tets(colliders[k], slice(first, last))
                 nodes.append(self._layout.node_start[k] + colliders[k].nodes.tets[best])
             else:
-                self._part[first:last] = parts_of(own)
+                self._part[first:last] = connected_parts(own)
                 best, depths, rooms = inner_depths(self._rest, own, self._part[first:last])
                 triangles.append(first + best)
                 inner_depth.append(depths)
@@ -99,7 +99,7 @@ class Containment:
     def _inner_tets(self, body: Body, rows: slice) -> tuple[np.ndarray, np.ndarray]:
         """`inner_tets` of a body at rest with triangles `rows`."""
         tets = body.nodes.tets
-        parts = parts_of(tets) if body.mesh.n_components > 1 else np.zeros(len(tets), dtype=np.int64)
+        parts = connected_parts(tets) if body.mesh.n_components > 1 else np.zeros(len(tets), dtype=np.int64)
         of_node = np.zeros(body.n_nodes, dtype=np.int64)
         of_node[tets] = parts[:, None]
         self._part[rows] = of_node[body.nodes.surface[:, 0]]

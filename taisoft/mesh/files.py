@@ -1,7 +1,7 @@
-"""Meshes from files and into files.
+"""Read and write tetrahedral meshes.
 
-Gmsh's and TetGen's files are read by `gmsh.py` and `tetgen.py`, which say where one is broken; every other format by
-meshio, behind a fence (`fence.py`).
+Gmsh and TetGen files are read by `gmsh.py` and `tetgen.py`, which report the place of an error. Every other format is read
+by meshio through `safe_meshio.py`.
 """
 
 import contextlib
@@ -20,13 +20,13 @@ from taisoft.mesh.quality import edge_lengths
 from taisoft.mesh.safe_meshio import read_safely
 from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh, merge_labels
 from taisoft.mesh.tetgen import read_tetgen
-from taisoft.mesh.tetra10 import straightened
+from taisoft.mesh.tetra10 import curved_edge_warnings
 
 TETS = ("tetra", "tetra10")
-BOUNDARY = ("vertex", "line", "line3", "triangle", "triangle6")  # elements that meshers add to mark boundaries; told and left out
+BOUNDARY = ("vertex", "line", "line3", "triangle", "triangle6")  # boundary markers that meshers add; ignored with a warning
 WRITERS = {".msh": "gmsh", ".vtk": "vtk", ".vtu": "vtu", ".mesh": "medit"}
 
-# How to count the faces in a file of a format that cannot hold tets.
+# Pattern that counts the faces in a file of a format that cannot hold tets.
 SURFACES = {
     ".obj": rb"^[ \t]*f[ \t]",
     ".stl": rb"^[ \t]*facet\b",
@@ -34,7 +34,7 @@ SURFACES = {
     ".ply": rb"^[ \t]*element[ \t]+face[ \t]+(\d+)",
 }
 
-# Where a format announces a count: a file of n bytes cannot hold more than n of anything.
+# Where a format declares counts: a file of n bytes cannot hold more than n items.
 _COUNTS = {
     ".vtk": rb"(?:POINTS|CELLS|CELL_TYPES|OFFSETS|CONNECTIVITY)\s+(\d+)",
     ".vtu": rb"NumberOf(?:Points|Cells)\s*=\s*\"(\d+)",
@@ -47,18 +47,18 @@ _COUNTS = {
     ".msh": rb"\$(?:Nodes|Elements)\s+(\d+)[ \t\r]*\n",
 }
 
-# Of these, what a mesh cannot be without.
-_NEEDED = {".vtk": rb"(?:POINTS\s+|CELLS\s+(?:1\s+)?)(\d+)", ".vtu": rb"NumberOf(?:Points|Cells)\s*=\s*\"(\d+)"}
+# The declared counts that must not be 0 in a mesh.
+_REQUIRED = {".vtk": rb"(?:POINTS\s+|CELLS\s+(?:1\s+)?)(\d+)", ".vtu": rb"NumberOf(?:Points|Cells)\s*=\s*\"(\d+)"}
 
-_PLURAL = {"vertex": "vertices", "line": "lines", "triangle": "triangles", "quad": "quads", "hexahedron": "hexahedra"}
+_PLURALS = {"vertex": "vertices", "line": "lines", "triangle": "triangles", "quad": "quads", "hexahedron": "hexahedra"}
 
 def read_mesh(path, fix_orientation: bool = False, weld: float | None = None) -> TetMesh:
     """Read a tetrahedral mesh from a file of any format that meshio knows.
 
-    path: the file; its ending tells the format. fix_orientation: as for `TetMesh`. weld: merge vertices at most this
-    far apart [m], 0 for equal ones only; None merges nothing. Points, lines and triangles next to the tets, and
-    vertices of no tet, are left out with a warning; any other element is refused by name and number. Of second-order
-    tets the corners are taken; a warning tells how many curved edges are straightened. Raises MeshError.
+    path: the file; its extension selects the format. fix_orientation: as for `TetMesh`. weld: merge vertices at most this
+    far apart [m]; 0 merges only equal ones, None merges nothing. Points, lines and triangles beside the tets, and vertices of
+    no tet, are ignored with a warning; any other element type is refused with its name and count. Second-order tets keep only
+    their corners; a warning reports the number of curved edges that become straight. Raises MeshError.
     """
     try:
         file = Path(path)
@@ -76,14 +76,14 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None) ->
     elif ending in (".node", ".ele"):
         found = read_tetgen(file)
     points, cells = found or _read_by_meshio(file, name, data)
-    blocks, notes = _tets_among(name, cells)
+    blocks, notes = _tet_blocks(name, cells)
     return _clean_mesh(name, np.asarray(points), blocks, notes, fix_orientation, weld)
 
 
 def write_mesh(path, mesh: TetMesh) -> None:
-    """Write a mesh as .msh (Gmsh 4.1, text), .vtk, .vtu or .mesh (Medit); the file appears complete or not at all.
+    """Write a mesh atomically as .msh (Gmsh 4.1, text), .vtk, .vtu or .mesh (Medit).
 
-    Raises MeshError for another ending or no TetMesh, OutputError where the file cannot be written.
+    Raises MeshError for another extension or anything but a TetMesh, OutputError if the file cannot be written.
     """
     file = Path(path)
     ending = check_ending(file)
@@ -97,7 +97,7 @@ def write_mesh(path, mesh: TetMesh) -> None:
 
 
 def check_ending(file: Path) -> str:
-    """The file's ending in small letters. Raises MeshError where `write_mesh` could not write such a file."""
+    """Return the file's extension in lower case. Raises MeshError if `write_mesh` does not support it."""
     ending = file.suffix.lower()
     if ending not in WRITERS:
         raise MeshError(f"{file}: a mesh can be written as {', '.join(WRITERS)}, not with the ending {ending!r}")
@@ -105,98 +105,100 @@ def check_ending(file: Path) -> str:
 
 
 def _count_faces(ending: str, data: bytes) -> str:
-    """The faces in a surface file, as text."""
+    """Return the number of faces in a surface file, as text."""
     if ending == ".stl" and len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
-        return _counted({"triangle": int.from_bytes(data[80:84], "little")})
+        return _format_counts({"triangle": int.from_bytes(data[80:84], "little")})
     found = re.findall(SURFACES[ending], data, re.MULTILINE)
     if ending in (".off", ".ply"):
         return f"{found[0][:20].decode()} faces" if found else "no faces"
     if ending == ".obj" and any(len(line.split()) != 4 for line in data.splitlines() if line.split()[:1] == [b"f"]):
         return f"{len(found)} faces"
-    return _counted({"triangle": len(found)})
+    return _format_counts({"triangle": len(found)})
 
 
 def _read_by_meshio(file: Path, name: str, data: bytes):
-    """Points and blocks of elements as meshio gives them, whatever it does on a file that is broken."""
+    """Return points and element blocks read by meshio. Raises MeshError for a broken file."""
     ending = file.suffix.lower()
-    known = meshio.extension_to_filetypes
-    if not any("".join(file.suffixes[-n:]).lower() in known for n in (1, 2)):
+    extensions = meshio.extension_to_filetypes
+    if not any("".join(file.suffixes[-n:]).lower() in extensions for n in (1, 2)):
         raise MeshError(f"{name}: not a supported mesh: the ending {ending!r} is not known")
     for found in re.finditer(_COUNTS.get(ending, rb"(?!)"), data):
         if int(found[1][:30]) > len(data):
             line = data.count(b"\n", 0, found.start(1)) + 1
             raise MeshError(
-                f"{name}: line {line} announces {found[1][:30].decode()} items, but the file has {len(data)} bytes"
+                f"{name}: line {line} declares {found[1][:30].decode()} items, but the file has {len(data)} bytes"
             )
     try:
         mesh = read_safely(file, name, data)
     except MeshError as error:
-        if any(int(found[1][:30]) == 0 for found in re.finditer(_NEEDED.get(ending, rb"(?!)"), data)):
-            raise MeshError(f"{name}: no tetrahedra; the file announces 0 points or cells") from error
+        if any(int(found[1][:30]) == 0 for found in re.finditer(_REQUIRED.get(ending, rb"(?!)"), data)):
+            raise MeshError(f"{name}: no tetrahedra; the file declares 0 points or cells") from error
         raise
     return mesh.points, [(block.type, np.asarray(block.data)) for block in mesh.cells]
 
 
-def _tets_among(name: str, cells: list[tuple[str, np.ndarray]]) -> tuple[list[np.ndarray], list[str]]:
-    """The blocks of tets, (m,4) or (m,10), and what has to be told about other elements."""
+def _tet_blocks(name: str, cells: list[tuple[str, np.ndarray]]) -> tuple[list[np.ndarray], list[str]]:
+    """Return the blocks of tets, (m,4) or (m,10), and warnings about other elements."""
     counts: dict[str, int] = {}
     for kind, nodes in cells:
         if len(nodes):
             counts[kind] = counts.get(kind, 0) + len(nodes)
-    foreign = {kind: count for kind, count in counts.items() if kind not in (*TETS, *BOUNDARY)}
-    if foreign:
-        raise MeshError(f"{name}: only tetrahedra with four or ten nodes can be used, but the file holds {_counted(foreign)}")
+    unsupported = {kind: count for kind, count in counts.items() if kind not in (*TETS, *BOUNDARY)}
+    if unsupported:
+        raise MeshError(
+            f"{name}: only tetrahedra with four or ten nodes can be used, but the file holds {_format_counts(unsupported)}"
+        )
     boundary = {kind: count for kind, count in counts.items() if kind in BOUNDARY}
     if len(boundary) == len(counts):
         advice = "; make a volume mesh first" if boundary else ""
-        raise MeshError(f"{name}: no tetrahedra; {_counted(boundary) if boundary else 'no elements'} found{advice}")
+        raise MeshError(f"{name}: no tetrahedra; {_format_counts(boundary) if boundary else 'no elements'} found{advice}")
     blocks = [nodes for kind, nodes in cells if kind in TETS and len(nodes)]
-    return blocks, [f"{_counted(boundary)} next to the tets are not used"] if boundary else []
+    return blocks, [f"{_format_counts(boundary)} next to the tets are not used"] if boundary else []
 
 
-def _counted(counts: dict[str, int]) -> str:
-    """Such as "3 quads, 1 line"."""
+def _format_counts(counts: dict[str, int]) -> str:
+    """Format counts by element type, such as "3 quads, 1 line"."""
     parts = []
     for kind, count in counts.items():
-        several = _PLURAL.get(kind, f"{kind} elements")
-        parts.append(f"{count} {kind if count == 1 else several}")
+        plural = _PLURALS.get(kind, f"{kind} elements")
+        parts.append(f"{count} {kind if count == 1 else plural}")
     return ", ".join(parts)
 
 
 def _clean_mesh(name, points, blocks, notes, fix_orientation, weld) -> TetMesh:
-    """The TetMesh of the corners, without other vertices and welded; where the arrays are wrong, TetMesh says so first."""
+    """Return the TetMesh of the corners, unused vertices removed, the rest welded. TetMesh itself refuses invalid arrays."""
     tets = np.concatenate([nodes[..., :4] for nodes in blocks])
-    sound = (
+    valid = (
         points.ndim == 2 and points.shape[1] == 3 and points.dtype.kind in "fiu"
         and (np.abs(points) <= LARGEST_COORDINATE).all() and tets.ndim == 2 and tets.size > 0
         and tets.min() >= 0 and tets.max() < len(points)
         and all(nodes.dtype.kind in "iu" for nodes in blocks)
     )  # fmt: skip
-    if not sound:
+    if not valid:
         return TetMesh(points, tets, fix_orientation, source=name, notes=tuple(notes))
     points = points.astype(np.float64)
-    loose = np.ones(len(points), dtype=bool)
-    loose[tets] = False
-    kept = ~loose
-    second = [nodes for nodes in blocks if nodes.shape[1] == 10]
-    if second:
-        cells = np.concatenate(second)
+    unused = np.ones(len(points), dtype=bool)
+    unused[tets] = False
+    used = ~unused
+    second_order = [nodes for nodes in blocks if nodes.shape[1] == 10]
+    if second_order:
+        cells = np.concatenate(second_order)
         bad = np.argwhere((cells < 0) | (cells >= len(points)))
         if len(bad):
             raise MeshError(f"{name}: second-order tet {bad[0, 0]}: node {cells[tuple(bad[0])]} does not exist")
-        notes += straightened(name, points, cells)
-        loose[cells] = False
-    if loose.any():
-        notes.append(f"{loose.sum()} vertices of no tet are left out, the first is vertex {loose.argmax()} of the file")
-    points, tets = points[kept], (np.cumsum(kept) - 1)[tets]
+        notes += curved_edge_warnings(name, points, cells)
+        unused[cells] = False
+    if unused.any():
+        notes.append(f"{unused.sum()} vertices of no tet are left out, the first is vertex {unused.argmax()} of the file")
+    points, tets = points[used], (np.cumsum(used) - 1)[tets]
     if weld is not None:
-        points, tets, note = _welded(name, points, tets, weld)
+        points, tets, note = _weld(name, points, tets, weld)
         notes += note
     return TetMesh(points, tets, fix_orientation, source=name, notes=tuple(notes))
 
 
-def _welded(name: str, points: np.ndarray, tets: np.ndarray, weld) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Points and tets with vertices at most `weld` [m] apart merged into the first of each group, and what to tell."""
+def _weld(name: str, points: np.ndarray, tets: np.ndarray, weld) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Merge vertices at most `weld` [m] apart into the first of each group; return points, tets and warnings."""
     if isinstance(weld, bool) or not isinstance(weld, (int, float, np.number)) or not 0 <= weld < np.inf:
         raise MeshError(f"{name}: weld must be a distance of at least 0 m, or None, not {weld!r}")
     shortest = float(edge_lengths(points, tets).min())

@@ -1,7 +1,7 @@
-"""Gmsh's .msh files, versions 2 (text) and 4.1 (text and binary), read so that a broken file is told with its place.
+"""Read Gmsh .msh files, versions 2 (text) and 4.1 (text and binary), and report the place of an error.
 
-Source: the Gmsh reference manual, "File formats". Only $Nodes and $Elements are read; other sections are passed over.
-Every count is compared with what the file holds before anything is allocated. Weak: text is read as float64, so tags
+Source: the Gmsh reference manual, "File formats". Only $Nodes and $Elements are read; other sections are skipped.
+Every count is checked against the file's content before memory is allocated. Weak: text is read as float64, so tags
 above 2^53 are refused.
 """
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from taisoft.errors import MeshError
 
-# Gmsh's number of an element type -> (name, nodes)
+# Gmsh element type -> (name, number of nodes)
 ELEMENTS = {
     1: ("line", 2), 2: ("triangle", 3), 3: ("quad", 4), 4: ("tetra", 4), 5: ("hexahedron", 8), 6: ("wedge", 6),
     7: ("pyramid", 5), 8: ("line3", 3), 9: ("triangle6", 6), 10: ("quad9", 9), 11: ("tetra10", 10),
@@ -20,7 +20,7 @@ ELEMENTS = {
     29: ("tetra20", 20),
 }  # fmt: skip
 
-_EXACT = 2.0**53  # whole numbers up to here survive float64
+_MAX_EXACT_INT = 2.0**53  # float64 holds every integer up to here exactly
 
 
 _HEAD = re.compile(
@@ -29,14 +29,14 @@ _HEAD = re.compile(
 
 
 class _Text:
-    """Numbers of a text section, handed out in order."""
+    """Sequential reader of the numbers in a text section."""
 
     def __init__(self, name: str, data: bytes, start: int, section: str):
         """start: the first byte after the section's opening line."""
         self.name, self.data, self.start, self.section = name, data, start, section
         end = re.compile(rb"^[ \t]*\$End" + section.encode() + rb"\b", re.MULTILINE).search(data, start)
         if end is None:
-            raise _cut_off(name, data, section)
+            raise _truncated(name, data, section)
         self.end = end.end()
         words = data[start : end.start()].split()
         try:
@@ -47,7 +47,7 @@ class _Text:
         self.at = 0
 
     def line(self, index: int) -> int:
-        """The line of the file, counted from 1, that holds number `index` of the section."""
+        """Return the line of the file, counted from 1, that holds number `index` of the section."""
         line = self.data.count(b"\n", 0, self.start) + 1
         for text in self.data[self.start : self.end].split(b"\n"):
             index -= len(text.split())
@@ -60,7 +60,7 @@ class _Text:
         return MeshError(f"{self.name}: line {self.line(index)} (${self.section}): {text}")
 
     def floats(self, n: int) -> np.ndarray:
-        """The next n numbers."""
+        """Return the next n numbers."""
         left = len(self.numbers) - self.at
         if n > left:
             raise self.error(len(self.numbers) - 1, f"{n} numbers should follow here or before, but only {left} do")
@@ -68,9 +68,9 @@ class _Text:
         return self.numbers[self.at - n : self.at]
 
     def ints(self, n: int, size: bool = False) -> np.ndarray:
-        """The next n numbers, which must be whole; not negative for a size."""
+        """Return the next n numbers, which must be integers, and not negative if size is True."""
         values = self.floats(n)
-        bad = ~((np.floor(values) == values) & (np.abs(values) <= _EXACT))
+        bad = ~((np.floor(values) == values) & (np.abs(values) <= _MAX_EXACT_INT))
         if size:
             bad |= ~(values >= 0)
         if bad.any():
@@ -80,14 +80,14 @@ class _Text:
         return values.astype(np.int64)
 
     def close(self) -> int:
-        """The byte after the section; nothing may be left over in it."""
+        """Return the offset of the byte after the section; all its numbers must have been read."""
         if self.at != len(self.numbers):
             raise self.error(self.at, f"{len(self.numbers) - self.at} numbers are left over")
         return self.end
 
 
 class _Binary:
-    """Numbers of a binary section of version 4.1, handed out in order."""
+    """Sequential reader of the numbers in a binary section, version 4.1."""
 
     def __init__(self, name: str, data: bytes, start: int, section: str, order: str, size: int):
         """start: the first byte after the section's opening line. order: "<" or ">". size: bytes of a size_t."""
@@ -112,7 +112,7 @@ class _Binary:
 
     def ints(self, n: int, size: bool = False) -> np.ndarray:
         values = self._take(n, "size" if size else "int")
-        if size and n and values.max() > _EXACT:
+        if size and n and values.max() > _MAX_EXACT_INT:
             raise self.error(f"{values.max()} is not a count or a tag")
         return values.astype(np.int64)
 
@@ -124,9 +124,9 @@ class _Binary:
 
 
 def read_gmsh(name: str, data: bytes) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]] | None:
-    """Points (n,3) and the blocks of elements (type's name, (k,nodes) indices from 0); None for versions not read here.
+    """Return points (n,3) and element blocks (type name, (k,nodes) indices from 0); None for unsupported versions.
 
-    name: the file, for messages. data: its content. Raises MeshError.
+    name: the file's name for messages. data: its content. Raises MeshError.
     """
     found = _HEAD.match(data)
     if found is None:
@@ -147,7 +147,7 @@ def read_gmsh(name: str, data: bytes) -> tuple[np.ndarray, list[tuple[str, np.nd
         if section not in ("Nodes", "Elements"):
             end = data.find(b"$End" + opening[1], at)
             if end < 0:
-                raise _cut_off(name, data, section)
+                raise _truncated(name, data, section)
             at = end
             continue
         if section in sections:
@@ -164,35 +164,35 @@ def read_gmsh(name: str, data: bytes) -> tuple[np.ndarray, list[tuple[str, np.nd
 
 
 def _nodes_4(numbers) -> tuple[np.ndarray, np.ndarray]:
-    """Tags (n,) and points (n,3) of $Nodes, version 4.1: blocks by entity, first their tags, then their coordinates."""
+    """Read tags (n,) and points (n,3) of $Nodes, version 4.1: one block per entity, tags first, then coordinates."""
     blocks, total = numbers.ints(4, size=True)[:2]
     tags, points = [np.empty(0, dtype=np.int64)], [np.empty((0, 3))]
     for _ in range(blocks):
         dim, _, parametric = numbers.ints(3)
         count = int(numbers.ints(1, size=True)[0])
-        columns = 3 + (min(max(int(dim), 0), 3) if parametric else 0)  # parametric nodes also carry dim parameters
+        columns = 3 + (min(max(int(dim), 0), 3) if parametric else 0)  # parametric nodes have dim extra parameters
         tags.append(numbers.ints(count, size=True))
         points.append(numbers.floats(columns * count).reshape(count, columns)[:, :3])
-    return _counted(numbers, total, np.concatenate(tags), "nodes"), np.concatenate(points)
+    return _check_total(numbers, total, np.concatenate(tags), "nodes"), np.concatenate(points)
 
 
 def _elements_4(numbers) -> list[tuple[str, np.ndarray]]:
-    """Type names and node tags (k,nodes) of $Elements, version 4.1."""
+    """Read type names and node tags (k,nodes) of $Elements, version 4.1."""
     blocks, total = numbers.ints(4, size=True)[:2]
     found = []
     for _ in range(blocks):
         kind, nodes = _kind(numbers, int(numbers.ints(3)[2]))
         count = int(numbers.ints(1, size=True)[0])
         found.append((kind, numbers.ints(count * (1 + nodes), size=True).reshape(count, 1 + nodes)[:, 1:]))
-    _counted(numbers, total, range(sum(len(tags) for _, tags in found)), "elements")
+    _check_total(numbers, total, range(sum(len(tags) for _, tags in found)), "elements")
     return found
 
 
 def _nodes_2(numbers: _Text) -> tuple[np.ndarray, np.ndarray]:
-    """Tags (n,) and points (n,3) of $Nodes, version 2: a count, then rows of tag x y z."""
+    """Read tags (n,) and points (n,3) of $Nodes, version 2: a count, then rows of tag x y z."""
     count = int(numbers.ints(1, size=True)[0])
     rows = numbers.floats(4 * count).reshape(count, 4)
-    bad = ~((np.floor(rows[:, 0]) == rows[:, 0]) & (np.abs(rows[:, 0]) <= _EXACT))
+    bad = ~((np.floor(rows[:, 0]) == rows[:, 0]) & (np.abs(rows[:, 0]) <= _MAX_EXACT_INT))
     if bad.any():
         k = int(np.argmax(bad))
         raise numbers.error(1 + 4 * k, f"{rows[k, 0]:g} is not a node's tag")
@@ -200,7 +200,7 @@ def _nodes_2(numbers: _Text) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _elements_2(numbers: _Text) -> list[tuple[str, np.ndarray]]:
-    """Type names and node tags (k,nodes) of $Elements, version 2: a count, then rows of tag, type, labels, nodes."""
+    """Read type names and node tags (k,nodes) of $Elements, version 2: a count, then rows of tag, type, labels, nodes."""
     count = int(numbers.ints(1, size=True)[0])
     start = numbers.at
     values = numbers.ints(len(numbers.numbers) - start).tolist()
@@ -227,26 +227,26 @@ _READERS = {
 
 def _kind(numbers, code: int) -> tuple[str, int]:
     if code not in ELEMENTS:
-        where = (numbers.at - 1,) if isinstance(numbers, _Text) else ()
-        raise numbers.error(*where, f"Gmsh's element type {code} is not known here")
+        index = (numbers.at - 1,) if isinstance(numbers, _Text) else ()
+        raise numbers.error(*index, f"Gmsh's element type {code} is not known here")
     return ELEMENTS[code]
 
 
-def _counted(numbers, total: int, items, what: str):
-    """The items, whose number must be the total that the section announced."""
+def _check_total(numbers, total: int, items, what: str):
+    """Return the items if their number equals the total declared by the section; raise MeshError otherwise."""
     if len(items) != total:
-        where = (0,) if isinstance(numbers, _Text) else ()
-        raise numbers.error(*where, f"{total} {what} were announced, but the blocks hold {len(items)}")
+        index = (0,) if isinstance(numbers, _Text) else ()
+        raise numbers.error(*index, f"{total} {what} were declared, but the blocks hold {len(items)}")
     return items
 
 
 def _to_indices(name: str, tags: np.ndarray, blocks: list[tuple[str, np.ndarray]]) -> list[tuple[str, np.ndarray]]:
-    """Replace node tags by indices from 0 in the order of the file."""
+    """Replace node tags by indices, counted from 0 in file order."""
     order = np.argsort(tags, kind="stable")
     ordered = tags[order]
-    again = np.flatnonzero(ordered[1:] == ordered[:-1])
-    if len(again):
-        raise MeshError(f"{name}: node {ordered[again[0]]} is given twice")
+    repeated = np.flatnonzero(ordered[1:] == ordered[:-1])
+    if len(repeated):
+        raise MeshError(f"{name}: node {ordered[repeated[0]]} is given twice")
     result = []
     for kind, nodes in blocks:
         if not nodes.size:
@@ -263,7 +263,7 @@ def _to_indices(name: str, tags: np.ndarray, blocks: list[tuple[str, np.ndarray]
     return result
 
 
-def _cut_off(name: str, data: bytes, section: str) -> MeshError:
+def _truncated(name: str, data: bytes, section: str) -> MeshError:
     last = data.rstrip().count(b"\n") + 1
     return MeshError(f"{name}: line {last}: the file ends inside ${section}, before $End{section}")
 

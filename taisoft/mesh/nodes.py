@@ -1,10 +1,10 @@
-"""The nodes of a body's finite elements: the mesh's vertices, and for second-order elements the middles of its edges.
+"""Build the nodes of a body's finite elements: mesh vertices, and mid-edge nodes for second-order elements.
 
-Drawing and contact need flat triangles with a linear tet behind each. A second-order tet is therefore also cut into
-eight: one at each corner, half the tet's size, and the octahedron between them, cut into four round its shortest
-diagonal, which gives the best shaped parts (Bey 1995, Tetrahedral grid refinement, Computing 55). The cut depends on
-the nodes' numbers and places only, not on the order in which a tet lists its corners. Edges are straight at rest, so the
-eight fill the tet; in a bent body they are what lies between the nodes, not the curved element.
+Drawing and contact need flat triangles with a linear tet behind each. A second-order tet is therefore also split into
+eight: one of half size at each corner, and four around the shortest diagonal of the octahedron between them, which gives
+the best shapes (Bey 1995, Tetrahedral grid refinement, Computing 55). The split depends only on node numbers and positions,
+not on the order of a tet's corners. Edges are straight at rest, so the eight fill the tet. In a deformed body they
+interpolate the nodes linearly and differ from the curved element.
 """
 
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ from taisoft.errors import MeshError
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import EDGES, distinct_edges
 
-TIE = 1e-9  # squared diagonals that differ by less than this part of their size count as equal
+TIE_TOLERANCE = 1e-9  # relative difference below which squared diagonals count as equal
 
-# Nodes of an element: corners 0 to 3, then the middle of edge k as 4 + k. The sub-tet at each corner:
+# Nodes of an element: corners 0 to 3, then the midpoint of edge k as 4 + k. The sub-tet at each corner:
 _CORNER_TETS = np.array([(0, 4, 5, 6), (4, 1, 7, 8), (5, 7, 2, 9), (6, 8, 9, 3)])
-# The octahedron's four sub-tets round the diagonal from the middle of edge k to that of edge 5 - k, for k = 0, 1, 2:
+# The octahedron's four sub-tets around the diagonal between the midpoints of edges k and 5 - k, for k = 0, 1, 2:
 _INNER_TETS = np.array(
     [
         [(4, 9, 5, 6), (4, 9, 6, 8), (4, 9, 8, 7), (4, 9, 7, 5)],
@@ -28,17 +28,17 @@ _INNER_TETS = np.array(
         [(6, 7, 4, 5), (6, 7, 5, 9), (6, 7, 9, 8), (6, 7, 8, 4)],
     ]
 )
-_MIDDLE = np.full((4, 4), -1)  # the node in the middle between two corners
+_MID_EDGE_NODE = np.full((4, 4), -1)  # mid-edge node between two corners
 for _k, (_a, _b) in enumerate(EDGES):
-    _MIDDLE[_a, _b] = _MIDDLE[_b, _a] = 4 + _k
+    _MID_EDGE_NODE[_a, _b] = _MID_EDGE_NODE[_b, _a] = 4 + _k
 
 
 @guarded_record("nodes", "they follow from the mesh and the order; add another body", MeshAttributeError)
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """Nodes of a body and how they are joined, all read-only.
+    """Nodes of a body and their connectivity; arrays are read-only.
 
-    positions: (n,3) float64 [m] at rest. elements: (m,4) int64, or (m,10): corners, then the middles of EDGES.
+    positions: (n,3) float64 [m] at rest. elements: (m,4) int64, or (m,10): corners, then the midpoints of EDGES.
     surface: (k,3) int64, flat triangles, normals outward; surface_tets: (k,4) int64, the linear tet behind each.
     tets: (j,4) int64, linear tets that fill the body. Tets are positive, det(x1-x0, x2-x0, x3-x0) > 0.
     """
@@ -55,10 +55,10 @@ class Nodes:
 
 
 def make_nodes(mesh: TetMesh, order: int) -> Nodes:
-    """The nodes of elements of order 1 or 2 on a mesh.
+    """Return the nodes of elements of order 1 or 2 on a mesh.
 
-    Order 1: the mesh's own arrays. Order 2: the vertices, then the middles of the edges in lexicographic order of their
-    ascending vertex pairs; sub-tets 8e to 8e+3 of tet e lie at its corners, the next four round the shortest diagonal
+    Order 1: the mesh's own arrays. Order 2: the vertices, then the mid-edge nodes in lexicographic order of their
+    ascending vertex pairs; sub-tets 8e to 8e+3 of tet e lie at its corners, the next four around the shortest diagonal
     of the octahedron between them; surface triangle t = (a, b, c) of the mesh becomes rows 4t to 4t+3: (a, ab, ca),
     (ab, b, bc), (ca, bc, c), (ab, bc, ca). Raises MeshError for another order.
     """
@@ -77,27 +77,27 @@ def make_nodes(mesh: TetMesh, order: int) -> Nodes:
 
 
 def _shortest_diagonals(mesh: TetMesh) -> np.ndarray:
-    """(m,) the k = 0, 1 or 2 for which the diagonal between edges k and 5 - k is the octahedron's shortest."""
-    place = np.argsort(mesh.tets, axis=1)  # of the corner with the least number in its tet, and so on
-    x = mesh.vertices[np.take_along_axis(mesh.tets, place, axis=1)]
-    # Twice the diagonal from the middle of (0, k) to that of the other two corners, for k = 1, 2, 3.
+    """Return (m,) k = 0, 1 or 2: the diagonal between edges k and 5 - k is the octahedron's shortest."""
+    ascending = np.argsort(mesh.tets, axis=1)  # local corners by ascending vertex number
+    x = mesh.vertices[np.take_along_axis(mesh.tets, ascending, axis=1)]
+    # Twice the diagonal from the midpoint of (0, k) to that of the other two corners, for k = 1, 2, 3.
     twice = np.stack([x[:, 0] + x[:, k] - x[:, a] - x[:, b] for k, a, b in ((1, 2, 3), (2, 1, 3), (3, 1, 2))], axis=1)
     squared = np.einsum("ekx,ekx->ek", twice, twice)
-    # Of equal ones the first: a grid's octahedra have many, and rounding shall not choose.
-    first = np.argmax(squared <= (1.0 + TIE) * squared.min(axis=1, keepdims=True), axis=1)
-    partner = np.take_along_axis(place, 1 + first[:, None], axis=1)[:, 0]
-    return (place[:, 0] ^ partner) - 1  # corners 0,1 or 2,3 -> 0; 0,2 or 1,3 -> 1; 0,3 or 1,2 -> 2
+    # Ties are common on grids; take the first so that rounding does not decide.
+    first = np.argmax(squared <= (1.0 + TIE_TOLERANCE) * squared.min(axis=1, keepdims=True), axis=1)
+    partner = np.take_along_axis(ascending, 1 + first[:, None], axis=1)[:, 0]
+    return (ascending[:, 0] ^ partner) - 1  # corners 0,1 or 2,3 -> 0; 0,2 or 1,3 -> 1; 0,3 or 1,2 -> 2
 
 
 def _split_surface(mesh: TetMesh, elements: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (4t,3) and the sub-tets behind them (4t,4). elements: (m,10); tets: (m,8,4), sub-tets of each tet."""
+    """Return triangles (4t,3) and the sub-tets behind them (4t,4). elements: (m,10); tets: (m,8,4), sub-tets of each tet."""
     owner = mesh.surface_tets
-    corner = np.argmax(mesh.tets[owner][:, None, :] == mesh.surface[:, :, None], axis=2)  # (t,3), place in the tet
-    middle = _MIDDLE[corner, np.roll(corner, -1, axis=1)]  # of ab, bc, ca
+    corner = np.argmax(mesh.tets[owner][:, None, :] == mesh.surface[:, :, None], axis=2)  # (t,3) local corner in the tet
+    middle = _MID_EDGE_NODE[corner, np.roll(corner, -1, axis=1)]  # of ab, bc, ca
     (a, b, c), (ab, bc, ca) = corner.T, middle.T
     local = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1)
     triangles = np.take_along_axis(elements[owner], local, axis=1).reshape(-1, 4, 3)
-    # The inner sub-tet that has all three middles.
+    # The inner sub-tet that has all three mid-edge nodes.
     inner = tets[owner, 4:]
     holds = (inner[:, :, :, None] == triangles[:, 3][:, None, None, :]).any(axis=2).all(axis=2)
     behind = np.concatenate([corner, 4 + np.argmax(holds, axis=1)[:, None]], axis=1)

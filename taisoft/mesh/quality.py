@@ -1,4 +1,4 @@
-"""How long a tet's edges are and how good its shape is."""
+"""Compute edge lengths and shape quality of tets."""
 
 import numpy as np
 
@@ -6,13 +6,13 @@ from taisoft.mesh.topology import EDGES
 
 
 def edge_lengths(vertices: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    """Lengths (m,6) [m] of every tet's edges, in the order of EDGES. vertices: (n,3) [m]. tets: (m,4) int."""
+    """Return the lengths (m,6) [m] of every tet's edges, in the order of EDGES. vertices: (n,3) [m]. tets: (m,4) int."""
     corners = vertices[tets]
     return np.stack([np.linalg.norm(corners[:, a] - corners[:, b], axis=1) for a, b in EDGES], axis=1)
 
 
 def mean_ratio(lengths: np.ndarray, volumes: np.ndarray) -> np.ndarray:
-    """Mean ratio (m,) of tets, 12 (3 V)^(2/3) / sum of squared edge lengths: 1 if regular, 0 if flat.
+    """Return the mean ratio (m,) of tets, 12 (3 V)^(2/3) / sum of squared edge lengths: 1 if regular, 0 if flat.
 
     lengths: (m,6) [m], of the edges. volumes: (m,) [m^3], positive.
     Source: Liu, Joe 1994, Relationship between tetrahedron shape measures, BIT 34.
@@ -21,6 +21,6 @@ def mean_ratio(lengths: np.ndarray, volumes: np.ndarray) -> np.ndarray:
 
 
 def mean_surface_edge(surfaces: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Mean length [m] of the edges of all triangles of the surfaces, each vertices (n,3) [m] and triangles (t,3)."""
+    """Return the mean edge length [m] over all triangles. surfaces: pairs of vertices (n,3) [m] and triangles (t,3)."""
     lengths = [np.linalg.norm(x[t] - x[np.roll(t, -1, axis=1)], axis=2).reshape(-1) for x, t in surfaces]
     return float(np.concatenate(lengths).mean())

@@ -1,7 +1,7 @@
-"""meshio behind a fence.
+"""Read files by meshio with every failure turned into one MeshError.
 
-On a broken file meshio may end the program, print, raise anything, wait for ever, or ask for memory that the file cannot fill;
-here that becomes one MeshError.
+On a broken file meshio may end the program, print, raise any exception, loop forever, or allocate far more memory than the
+file can fill.
 """
 
 import contextlib
@@ -22,80 +22,80 @@ from meshio._helpers import _filetypes_from_path, reader_map
 from taisoft.errors import MeshError
 from taisoft.mesh.content import one_line
 
-PATIENCE = 100  # times that a reader may ask past the end of a file
-PER_BYTE = 16  # numbers that a reader may make room for, for each byte of a file
+MAX_READS_PAST_END = 100  # allowed reads past the end of a file
+MAX_ENTRIES_PER_BYTE = 16  # allowed array entries for each byte of a file
 
-# Readers that would wait for ever at the end of a broken file, by ending.
-_WAITING = {
+# Readers that loop forever at the end of a broken file, by extension.
+_LOOPING_READERS = {
     ".mdpa": "mdpa", ".ply": "ply", ".dat": "tecplot", ".tec": "tecplot", ".nas": "nastran", ".bdf": "nastran", ".fem": "nastran",
 }  # fmt: skip
-_OF_TEXT = ("tecplot", "nastran")
+_TEXT_FORMATS = ("tecplot", "nastran")
 
-_most: ContextVar[float] = ContextVar("most numbers in an array", default=math.inf)
+_max_entries: ContextVar[float] = ContextVar("largest number of array entries", default=math.inf)
 
 
-class _Ending(io.BufferedReader):
-    """A file that raises where a reader asks again and again past its end; some of meshio's readers would for ever."""
+class _BoundedFile(io.BufferedReader):
+    """Binary file that raises EOFError after too many reads past its end, where some meshio readers loop forever."""
 
-    asked = 0
+    empty_reads = 0
 
-    def _told(self, found: bytes) -> bytes:
-        self.asked = 0 if found else self.asked + 1
-        if self.asked > PATIENCE:
+    def _check_end(self, found: bytes) -> bytes:
+        self.empty_reads = 0 if found else self.empty_reads + 1
+        if self.empty_reads > MAX_READS_PAST_END:
             raise EOFError("the file ends too early")
         return found
 
     def readline(self, size: int | None = -1, /) -> bytes:
-        return self._told(super().readline(size))
+        return self._check_end(super().readline(size))
 
     def read(self, size: int | None = -1, /) -> bytes:
-        return self._told(super().read(size))
+        return self._check_end(super().read(size))
 
 
-class _EndingText(io.TextIOWrapper):
-    """The same for text."""
+class _BoundedTextFile(io.TextIOWrapper):
+    """Text file that raises EOFError after too many reads past its end."""
 
-    asked = 0
+    empty_reads = 0
 
     def readline(self, size: int = -1, /) -> str:
         line = super().readline(size)
-        self.asked = 0 if line else self.asked + 1
-        if self.asked > PATIENCE:
+        self.empty_reads = 0 if line else self.empty_reads + 1
+        if self.empty_reads > MAX_READS_PAST_END:
             raise EOFError("the file ends too early")
         return line
 
 
-def _counted(make):
-    """As a method of `_CountingNumpy`: a function of NumPy that makes an array of a shape."""
+def _checked_size(make):
+    """Wrap a NumPy function that allocates an array of a given shape as a size-checked method of `_CountingNumpy`."""
 
-    def method(self, shape, *more, **named):
+    def method(self, shape, *args, **kwargs):
         self._check(math.prod(np.atleast_1d(shape).tolist()))
-        return make(shape, *more, **named)
+        return make(shape, *args, **kwargs)
 
     return method
 
 
 class _CountingNumpy:
-    """NumPy as meshio sees it: arrays whose size a file announces are refused before room is made for what it cannot fill."""
+    """Stand-in for NumPy in meshio: refuses arrays too large for the file to fill, before they are allocated."""
 
     def __getattr__(self, name: str):
         return getattr(np, name)
 
     @staticmethod
     def _check(n: float) -> None:
-        if n > _most.get():
+        if n > _max_entries.get():
             raise MemoryError
 
-    def fromfile(self, file, dtype=float, count=-1, sep="", **more):
+    def fromfile(self, file, dtype=float, count=-1, sep="", **kwargs):
         self._check(count)
-        return np.fromfile(file, dtype, count, sep, **more)
+        return np.fromfile(file, dtype, count, sep, **kwargs)
 
-    def arange(self, *bounds, **more):
+    def arange(self, *bounds, **kwargs):
         low, high, step = (*bounds, 1)[:3] if len(bounds) > 1 else (0, *bounds, 1)
         self._check((high - low) / step if step else 0)
-        return np.arange(*bounds, **more)
+        return np.arange(*bounds, **kwargs)
 
-    empty, zeros, ones, full = map(_counted, (np.empty, np.zeros, np.ones, np.full))
+    empty, zeros, ones, full = map(_checked_size, (np.empty, np.zeros, np.ones, np.full))
 
 
 for _name, _module in list(sys.modules.items()):
@@ -104,10 +104,10 @@ for _name, _module in list(sys.modules.items()):
 
 
 class _Console(meshio_messages.Console):
-    """Where meshio prints: nowhere inside the fence. It takes what a file holds for markup, which may be an error."""
+    """meshio's console, silent inside `read_safely`: it parses file content as markup, which may fail."""
 
     def print(self, *objects, **options) -> None:
-        if _most.get() == math.inf:
+        if _max_entries.get() == math.inf:
             super().print(*objects, **options)
 
 
@@ -115,28 +115,28 @@ meshio_messages.Console = _Console
 
 
 def read_safely(file: Path, name: str, data: bytes, kind: str = "mesh") -> meshio.Mesh:
-    """What meshio reads from a file. name: the file, for messages; data: its content; kind: "mesh" or "surface".
+    """Read a file by meshio. name: the file's name for messages; data: its content; kind: "mesh" or "surface".
 
-    Raises MeshError, whatever meshio does.
+    Raises MeshError for every failure of meshio.
     """
-    printed, bound = io.StringIO(), _most.set(PER_BYTE * len(data) + 4096)
+    printed, token = io.StringIO(), _max_entries.set(MAX_ENTRIES_PER_BYTE * len(data) + 4096)
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), np.errstate(all="ignore"):
-            with _unmarked(file, data) as plain:
+            with _without_bom(file, data) as plain:
                 return _call(plain, file.suffix.lower(), data)
     except ImportError as error:
         raise MeshError(f"{name}: files {file.suffix!r} need the Python package {error.name or error}") from error
     except MemoryError as error:
-        raise MeshError(f"{name}: not a supported {kind}: it asks for more memory than it can fill") from error
+        raise MeshError(f"{name}: not a supported {kind}: it declares more data than it can hold") from error
     except (Exception, SystemExit) as error:
         raise MeshError(f"{name}: not a supported {kind} ({_cause(error, data)})") from error
     finally:
-        _most.reset(bound)
+        _max_entries.reset(token)
 
 
 @contextlib.contextmanager
-def _unmarked(file: Path, data: bytes) -> Iterator[Path]:
-    """The file, or where its content is data after a byte-order mark, which only XML readers know, a copy of data."""
+def _without_bom(file: Path, data: bytes) -> Iterator[Path]:
+    """Yield the file, or a copy without its byte-order mark, which only XML readers accept."""
     if data.startswith(b"<") or file.stat().st_size == len(data):
         yield file
         return
@@ -147,38 +147,38 @@ def _unmarked(file: Path, data: bytes) -> Iterator[Path]:
 
 
 def _cause(error: BaseException, data: bytes) -> str:
-    """What a reader says of a file, in one line, without the file's name, which messages start with."""
+    """Return a reader's error on one line; the caller puts the file's name in front."""
     text = str(error) if isinstance(error, meshio.ReadError) else f"{type(error).__name__}: {error}"
     return one_line(_without_content(text, data)) or "its structure is broken"
 
 
-def _without_content(said: str, data: bytes) -> str:
-    """A message without what the file holds: it may be a file that others must not read."""
+def _without_content(message: str, data: bytes) -> str:
+    """Remove file content from a message: the file may be confidential."""
     content = data.lower()
-    plain = re.sub(r"(['\"`]).*?\1", "...", said, flags=re.DOTALL)
+    plain = re.sub(r"(['\"`]).*?\1", "...", message, flags=re.DOTALL)
     return " ".join("..." if len(word) > 3 and word.lower().encode() in content else word for word in plain.split())
 
 
 def _call(file: Path, ending: str, data: bytes) -> meshio.Mesh:
-    """meshio's mesh; readers that would wait for ever get a file that stops them."""
-    file_format = _WAITING.get(ending)
+    """Read by meshio; readers that could loop forever get a file that raises EOFError."""
+    file_format = _LOOPING_READERS.get(ending)
     if ending == ".msh":
         if data.lstrip()[:1] != b"(":
             return _read(file, ["gmsh"])
         file_format = "ansys"
     if file_format is None:
         return _read(file, _filetypes_from_path(file))
-    with _Ending(io.FileIO(file)) as stream:
-        if file_format in _OF_TEXT:
-            with _EndingText(stream, encoding="utf-8") as text:
+    with _BoundedFile(io.FileIO(file)) as stream:
+        if file_format in _TEXT_FORMATS:
+            with _BoundedTextFile(stream, encoding="utf-8") as text:
                 return meshio.read(text, file_format=file_format)
         return meshio.read(stream, file_format=file_format)
 
 
 def _read(file: Path, formats: list[str]) -> meshio.Mesh:
-    """The mesh in the first of the formats that fits. Raises what the last reader does.
+    """Read the mesh in the first format that fits. Raises the error of the last reader.
 
-    As `meshio.read`, which would print the readers' reasons, broken at a terminal's width, and end the program.
+    Replaces `meshio.read`, which prints the readers' errors, wrapped at the terminal's width, and ends the program.
     """
     readers = [reader_map[name] for name in formats if name in reader_map]
     if not readers:

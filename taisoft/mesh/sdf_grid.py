@@ -1,7 +1,7 @@
-"""Signed distance of a body at rest on a grid whose cells follow each axis's extent, and a folder that keeps such grids.
+"""Compute and cache signed distance grids of bodies at rest; the cell size adapts to the extent along each axis.
 
-A grid is kept under the SHA-256 of what it is made from, so that a body simulated again finds it. A file that is damaged is
-made again; a folder that cannot be written only costs time.
+Grids are cached on disk under the SHA-256 of their inputs. A damaged file is computed again; if the folder is not writable,
+nothing is cached.
 """
 
 import hashlib
@@ -16,15 +16,15 @@ from taisoft.errors import MeshError
 from taisoft.files import cache_folders
 from taisoft.mesh.signed_distance import signed_distances
 
-FORMAT = 1  # of what a kept grid holds; raised when its numbers or their meaning change
-LEAST_CELLS = 8  # across the thinnest side
-PAD = 2  # cells beyond the surface on every side
-_ROUNDING = 1e-9  # of a cell: a side of that little more than n cells has n
+FORMAT = 1  # version of cached grids; increase it when their numbers or meaning change
+MIN_CELLS = 8  # smallest number of cells across a side
+MIN_PADDING = 2  # cells beyond the surface on every side
+_ROUNDING = 1e-9  # fraction of a cell ignored when the number of cells is rounded up
 
 
 @dataclass(frozen=True, eq=False)
 class SdfGrid:
-    """Signed distances at the points origin + (i, j, k) * spacing; arrays are read-only."""
+    """Signed distances at the points origin + (i, j, k) * spacing. Arrays are read-only."""
 
     origin: np.ndarray  # (3,) [m]
     spacing: np.ndarray  # (3,) [m]
@@ -36,24 +36,24 @@ class SdfGrid:
 
 
 def grid_points(vertices: np.ndarray, cells: int, margin: float) -> tuple[np.ndarray, np.ndarray, tuple[int, int, int]]:
-    """Origin (3,) [m], spacing (3,) [m] and shape of the grid that `sdf_grid` lays round vertices (n,3)."""
+    """Return origin (3,) [m], spacing (3,) [m] and shape of the grid of `sdf_grid` around vertices (n,3) [m]."""
     low, side = vertices.min(axis=0), np.ptp(vertices, axis=0)
-    inside = np.maximum(np.ceil(side / (side.max() / cells) - _ROUNDING), LEAST_CELLS)
-    spacing = side / inside
-    pad = np.maximum(np.ceil(margin / spacing - _ROUNDING), PAD)
-    shape = tuple(int(n) for n in inside + 2 * pad + 1)
+    n_cells = np.maximum(np.ceil(side / (side.max() / cells) - _ROUNDING), MIN_CELLS)
+    spacing = side / n_cells
+    pad = np.maximum(np.ceil(margin / spacing - _ROUNDING), MIN_PADDING)
+    shape = tuple(int(n) for n in n_cells + 2 * pad + 1)
     return low - pad * spacing, spacing, shape
 
 
 def sdf_grid(
     vertices: np.ndarray, triangles: np.ndarray, cells: int = 32, max_points: int = 2_000_000, margin: float = 0.0
 ) -> SdfGrid:
-    """Exact signed distances on a grid round a closed surface.
+    """Compute exact signed distances on a grid around a closed surface.
 
-    vertices: (n,3) [m]. triangles: (t,3) int, normals outward; every edge has two. cells: along the longest side; the
-    other sides get cells of about that size, but at least 8. max_points: above which the grid is refused. margin: [m] by
-    which the grid reaches beyond the surface at least; two cells are the least. Raises MeshError for a surface that is
-    open or has triangles without area, and for a grid that is too large.
+    vertices: (n,3) [m]. triangles: (t,3) int, normals outward; every edge has two. cells: along the longest side; other
+    sides get cells of about that size, but at least 8. max_points: limit on the number of grid points. margin: minimum
+    distance [m] from the surface to the grid's border, which is at least two cells. Raises MeshError for an open surface,
+    triangles without area, and a grid above max_points.
     """
     vertices, triangles = _arrays(vertices, triangles)
     used = vertices[np.unique(triangles)]
@@ -73,20 +73,20 @@ def sdf_grid(
 def cached_sdf_grid(
     vertices: np.ndarray, triangles: np.ndarray, cells: int = 32, max_points: int = 2_000_000, margin: float = 0.0
 ) -> SdfGrid:
-    """`sdf_grid` of the same arguments, taken from the folder of kept grids where it is there, else kept there."""
+    """Return `sdf_grid` of the same arguments, read from the cache or computed and stored there."""
     vertices, triangles = _arrays(vertices, triangles)
     path = cache_folder() / f"{_key(vertices, triangles, cells, margin)}.npz"
     grid = _read(path)
-    # Of a file that is whole but not what its name says, or is larger than allowed now, nothing is used.
-    if grid is None or not _fits(grid, vertices[np.unique(triangles)], cells, margin) or grid.phi.size > max_points:
+    # Ignore an intact file that does not match its name or exceeds max_points.
+    if grid is None or not _matches(grid, vertices[np.unique(triangles)], cells, margin) or grid.phi.size > max_points:
         grid = sdf_grid(vertices, triangles, cells, max_points, margin)
         _write(path, grid)
     return grid
 
 
 def cache_folder() -> Path:
-    """Where grids are kept."""
-    return next(cache_folders(), Path(os.devnull)) / "sdf"  # the latter can hold nothing
+    """Return the folder of cached grids."""
+    return next(cache_folders(), Path(os.devnull)) / "sdf"  # os.devnull cannot contain files
 
 
 def _arrays(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -94,7 +94,7 @@ def _arrays(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _key(vertices: np.ndarray, triangles: np.ndarray, cells: int, margin: float) -> str:
-    """Hexadecimal SHA-256 of everything that the numbers of a grid depend on."""
+    """Return the hexadecimal SHA-256 of all inputs of a grid."""
     digest = hashlib.sha256(
         f"{FORMAT} {len(vertices)} {len(triangles)} {int(cells)} {float(margin).hex()}\n".encode()
     )
@@ -104,17 +104,17 @@ def _key(vertices: np.ndarray, triangles: np.ndarray, cells: int, margin: float)
 
 
 def _read(path: Path) -> SdfGrid | None:
-    """The grid in a file, or None where there is none that is whole."""
+    """Return the grid in a file, or None if the file is missing or damaged."""
     try:
-        # Opened here, since np.load leaves what it cannot read open.
+        # Open here, because np.load leaves an unreadable file open.
         with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             return SdfGrid(*(file[name] for name in ("origin", "spacing", "phi")))
-    except Exception:  # a damaged archive raises errors of many kinds, some from the modules that unpack it
+    except Exception:  # a damaged archive raises many kinds of errors, some from the decompression modules
         return None
 
 
-def _fits(grid: SdfGrid, vertices: np.ndarray, cells: int, margin: float) -> bool:
-    """Whether a grid lies where that of these vertices lies, and holds finite numbers."""
+def _matches(grid: SdfGrid, vertices: np.ndarray, cells: int, margin: float) -> bool:
+    """Return whether a grid has the layout for these vertices and finite float64 values."""
     origin, spacing, shape = grid_points(vertices, cells, margin)
     return (
         np.array_equal(grid.origin, origin) and np.array_equal(grid.spacing, spacing) and grid.phi.shape == shape
@@ -123,7 +123,7 @@ def _fits(grid: SdfGrid, vertices: np.ndarray, cells: int, margin: float) -> boo
 
 
 def _write(path: Path, grid: SdfGrid) -> None:
-    """Keep a grid, in one step: a reader never sees half a file. Does nothing where the folder cannot be written."""
+    """Write a grid atomically. Does nothing if the folder is not writable."""
     name = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
-"""Meshes of simple bodies: a box, a thin sheet, a ball, made by array arithmetic without loops over cells.
+"""Generate tet meshes of a box, a thin sheet and a ball by array arithmetic, without loops over cells.
 
-A grid cell is cut into five tets (one regular in the middle, four at the corners; neighbours must be mirrored, hence
-a checkerboard) or six (Kuhn's, all around one diagonal). Five are fewer and better shaped; six are the same in every
-cell, but that gives the whole mesh a preferred diagonal.
+A grid cell is split into five tets (a regular one in the middle, four at corners; neighbours are mirrored in a
+checkerboard) or six (Kuhn's, all around one diagonal). Five are fewer and better shaped. Six are the same in every cell,
+which gives the whole mesh a preferred diagonal.
 """
 
 import itertools
@@ -14,22 +14,22 @@ from taisoft.attributes import thawed
 from taisoft.errors import MeshError
 from taisoft.mesh.tet_mesh import TetMesh
 
-MAX_TETS = 50_000_000  # about 20 GB while a mesh is built and checked
+MAX_TETS = 50_000_000  # about 20 GB of memory while a mesh is built and checked
 
 # Corners of a cell are numbered 4 dx + 2 dy + dz.
 _FIVE_EVEN = np.array([(0, 6, 3, 5), (4, 6, 0, 5), (2, 0, 6, 3), (1, 0, 3, 5), (7, 6, 5, 3)])
 
 
 def box_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five") -> TetMesh:
-    """A box of nx x ny x nz cells.
+    """Return the mesh of a box of nx x ny x nz cells.
 
     cells: three positive integers, the number of cells along x, y, z. size: (3,) edge lengths [m]. center: (3,) [m].
-    pattern: "five" tets a cell, cells mirrored by the parity of i+j+k, even ones with the middle tet 000,110,101,011;
+    pattern: "five" tets per cell, mirrored by the parity of i+j+k, even cells with the middle tet 000,110,101,011;
     or "six", Kuhn's tets around the diagonal 000-111. Vertex (i,j,k) has index (i*(ny+1)+j)*(nz+1)+k.
     Raises MeshError for arguments outside these rules.
     """
-    cells = _cells(cells, "box_mesh", (3,))
-    size, center = _vector(size, "box_mesh", "size", positive=True), _vector(center, "box_mesh", "center")
+    cells = _checked_cells(cells, "box_mesh", (3,))
+    size, center = _checked_vector(size, "box_mesh", "size", positive=True), _checked_vector(center, "box_mesh", "center")
     if pattern not in ("five", "six"):
         raise MeshError(f"box_mesh: pattern must be 'five' or 'six', not {pattern!r}")
     _check_count(cells, 5 if pattern == "five" else 6, "box_mesh")
@@ -37,41 +37,41 @@ def box_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five") -> TetM
     corners = _cell_corners(cells)
     recipe = {"shape": "box", "cells": cells, "size": size, "center": center, "pattern": pattern}
     if pattern == "six":
-        return _made(recipe, vertices, corners[:, _kuhn()])
+        return _with_recipe(recipe, vertices, corners[:, _kuhn()])
     odd = _cell_indices(cells).sum(axis=1) % 2 == 1
-    # Mirroring x exchanges the corners c and c ^ 4 and turns every tet inside out; swapping two vertices turns it back.
+    # Mirroring x exchanges the corners c and c ^ 4 and inverts every tet; swapping two vertices restores its orientation.
     table = np.stack([_FIVE_EVEN, (_FIVE_EVEN ^ 4)[:, [1, 0, 2, 3]]])[odd.astype(int)]
-    return _made(recipe, vertices, np.take_along_axis(corners, table.reshape(len(corners), -1), axis=1))
+    return _with_recipe(recipe, vertices, np.take_along_axis(corners, table.reshape(len(corners), -1), axis=1))
 
 
 def sheet_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five") -> TetMesh:
-    """A flat sheet lying in the x-z plane: a box that is thin along y.
+    """Return the mesh of a flat sheet in the x-z plane: a box that is thin along y.
 
     cells: (nx, nz) for one layer, or (nx, ny, nz). size: (length x, thickness y, length z) [m]; the thickness must not
     exceed the lengths. center, pattern, vertex order and errors as for `box_mesh`.
     """
-    cells = _cells(cells, "sheet_mesh", (2, 3))
+    cells = _checked_cells(cells, "sheet_mesh", (2, 3))
     if len(cells) == 2:
         cells = np.array([cells[0], 1, cells[1]])
-    size = _vector(size, "sheet_mesh", "size", positive=True)
+    size = _checked_vector(size, "sheet_mesh", "size", positive=True)
     if size[1] > min(size[0], size[2]):
         raise MeshError(f"sheet_mesh: size {size.tolist()} has a thickness size[1] above the lengths size[0], size[2]")
     return box_mesh(cells, size, center, pattern)
 
 
 def ball_mesh(radius: float, cells: int, center=(0.0, 0.0, 0.0)) -> TetMesh:
-    """A ball, made from a cube of cells^3 cells whose shells are rounded towards the surface.
+    """Return the mesh of a ball: a cube of cells^3 cells whose shells become rounder towards the surface.
 
-    radius: [m]; all surface vertices lie on it, so the volume is a little below the ball's. cells: even number of cells
-    across, at least 2. center: (3,) [m]. Raises MeshError for arguments outside these rules.
+    radius: [m] of the surface vertices; the volume is slightly below the ball's. cells: even number of cells across,
+    at least 2. center: (3,) [m]. Raises MeshError for arguments outside these rules.
 
-    The six tets of a cell stand around the diagonal that points away from the center, so that none has its four
-    vertices on the sphere; that would leave it flat.
+    The six tets of a cell share the diagonal that points away from the center, so that no tet has all four vertices on
+    the sphere, which would make it nearly flat.
     """
     if isinstance(cells, bool) or not isinstance(cells, Integral) or cells < 2 or cells % 2:
         raise MeshError(f"ball_mesh: cells must be an even integer, at least 2, not {cells!r}")
-    radius = float(_vector([radius] * 3, "ball_mesh", "radius", positive=True)[0])
-    center = _vector(center, "ball_mesh", "center")
+    radius = float(_checked_vector([radius] * 3, "ball_mesh", "radius", positive=True)[0])
+    center = _checked_vector(center, "ball_mesh", "center")
     grid = np.array([cells] * 3)
     _check_count(grid, 6, "ball_mesh")
     inward = 2 * _cell_indices(grid) < cells  # cells below the middle along an axis are mirrored along it
@@ -81,11 +81,11 @@ def ball_mesh(radius: float, cells: int, center=(0.0, 0.0, 0.0)) -> TetMesh:
     table[flipped] = table[flipped][:, :, [0, 1, 3, 2]]
     tets = np.take_along_axis(_cell_corners(grid), table.reshape(len(table), -1), axis=1)
     recipe = {"shape": "ball", "radius": radius, "cells": int(cells), "center": center}
-    return _made(recipe, center + radius * _rounded(2.0 * _grid_points(grid)), tets)
+    return _with_recipe(recipe, center + radius * _cube_to_ball(2.0 * _grid_points(grid)), tets)
 
 
-def _made(recipe: dict, vertices: np.ndarray, tets: np.ndarray) -> TetMesh:
-    """The mesh of vertices (n,3) and tets, four indices each, which knows how it was made."""
+def _with_recipe(recipe: dict, vertices: np.ndarray, tets: np.ndarray) -> TetMesh:
+    """Return the mesh of vertices (n,3) and tets, four indices each, with its recipe."""
     mesh = TetMesh(vertices, tets.reshape(-1, 4))
     for value in recipe.values():
         if isinstance(value, np.ndarray):
@@ -95,8 +95,8 @@ def _made(recipe: dict, vertices: np.ndarray, tets: np.ndarray) -> TetMesh:
     return mesh
 
 
-def _rounded(p: np.ndarray) -> np.ndarray:
-    """Map the cube [-1,1]^3 onto the unit ball along rays: cubes in the middle, ever rounder outwards. p: (n,3)."""
+def _cube_to_ball(p: np.ndarray) -> np.ndarray:
+    """Map the cube [-1,1]^3 to the unit ball along rays: cubic at the center, increasingly round outwards. p: (n,3)."""
     shell = np.abs(p).max(axis=1, keepdims=True)
     length = np.linalg.norm(p, axis=1, keepdims=True)
     to_sphere = shell / np.where(length > 0, length, 1.0)
@@ -104,7 +104,7 @@ def _rounded(p: np.ndarray) -> np.ndarray:
 
 
 def _kuhn() -> np.ndarray:
-    """(6,4) corner numbers: for every order of the axes the path 000 -> ... -> 111; positively oriented."""
+    """Return (6,4) corner numbers: for each order of the axes the path 000 -> ... -> 111, positively oriented."""
     tets = []
     for axes in itertools.permutations(range(3)):
         bits = [4 >> axis for axis in axes]
@@ -115,26 +115,26 @@ def _kuhn() -> np.ndarray:
 
 
 def _cell_indices(cells: np.ndarray) -> np.ndarray:
-    """(nx*ny*nz, 3) indices i, j, k of the cells, k fastest."""
+    """Return (nx*ny*nz, 3) indices i, j, k of the cells, k fastest."""
     return np.indices(cells).reshape(3, -1).T
 
 
 def _cell_corners(cells: np.ndarray) -> np.ndarray:
-    """(nx*ny*nz, 8) vertex indices of every cell's corners, numbered 4 dx + 2 dy + dz."""
+    """Return (nx*ny*nz, 8) vertex indices of every cell's corners, numbered 4 dx + 2 dy + dz."""
     corner = np.indices((2, 2, 2)).reshape(3, -1).T
-    at = _cell_indices(cells)[:, None, :] + corner[None]
-    return (at[..., 0] * (cells[1] + 1) + at[..., 1]) * (cells[2] + 1) + at[..., 2]
+    index = _cell_indices(cells)[:, None, :] + corner[None]
+    return (index[..., 0] * (cells[1] + 1) + index[..., 1]) * (cells[2] + 1) + index[..., 2]
 
 
 def _grid_points(cells: np.ndarray) -> np.ndarray:
-    """((nx+1)(ny+1)(nz+1), 3) points of the grid in [-1/2, 1/2]^3."""
+    """Return ((nx+1)(ny+1)(nz+1), 3) grid points in [-1/2, 1/2]^3."""
     return np.indices(cells + 1).reshape(3, -1).T / cells - 0.5
 
 
-def _cells(cells, shape: str, lengths: tuple[int, ...]) -> np.ndarray:
+def _checked_cells(cells, shape: str, lengths: tuple[int, ...]) -> np.ndarray:
     values = list(cells) if isinstance(cells, (list, tuple, np.ndarray)) else [cells]
-    whole = all(isinstance(c, Integral) and not isinstance(c, bool) and c > 0 for c in values)
-    if len(values) not in lengths or not whole:
+    valid = all(isinstance(c, Integral) and not isinstance(c, bool) and c > 0 for c in values)
+    if len(values) not in lengths or not valid:
         counts = " or ".join({2: "two", 3: "three"}[n] for n in lengths)
         raise MeshError(f"{shape}: cells must be {counts} positive integers, not {cells!r}")
     if max(values) > MAX_TETS:
@@ -151,7 +151,7 @@ def _check_count(cells: np.ndarray, tets_per_cell: int, shape: str) -> None:
         )
 
 
-def _vector(values, shape: str, what: str, positive: bool = False) -> np.ndarray:
+def _checked_vector(values, shape: str, what: str, positive: bool = False) -> np.ndarray:
     try:
         array = np.asarray(values)
     except ValueError as error:

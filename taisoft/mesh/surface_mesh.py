@@ -1,4 +1,4 @@
-"""A surface of triangles as modelling programs give it: read, welded, and looked at for what makes it unfit for a solid."""
+"""Read triangle surfaces from modelling programs, weld them, and find faults that keep them from bounding a solid."""
 
 import re
 import warnings
@@ -18,10 +18,10 @@ from taisoft.mesh.tet_mesh import merge_labels
 from taisoft.mesh.topology import triangle_edges
 
 FORMATS = (".obj", ".stl", ".ply", ".off")
-HEAD = re.compile(r"(?:ST)?C?N?OFF(\d*)$")  # of .off; some programs leave no blank before the counts
-INWARD = "all triangles look inward; flip the normals"
+HEAD = re.compile(r"(?:ST)?C?N?OFF(\d*)$")  # of .off; some programs write no space before the counts
+INWARD = "all normals point inward; flip them"
 MAKE_ANOTHER = "make a new one, such as ts.SurfaceMesh(0.9 * surface.vertices, surface.triangles)"
-FLAT = 1e-12  # a triangle's area below this times its longest edge squared counts as none
+FLAT = 1e-12  # a triangle has no area if its area is below this times its longest edge squared
 
 
 @guarded_record("surface", MAKE_ANOTHER, MeshAttributeError)
@@ -29,8 +29,8 @@ FLAT = 1e-12  # a triangle's area below this times its longest edge squared coun
 class SurfaceMesh:
     """Triangles in space, checked and read-only.
 
-    vertices: (n,3) float64 [m]; triangles: (t,3) int64, counted from 0; source: where it comes from, messages start with it;
-    warnings: what the reader changed. Takes anything that NumPy makes such arrays of. Raises MeshError.
+    vertices: (n,3) float64 [m]; triangles: (t,3) int64, counted from 0; source: origin, which starts every message; warnings:
+    changes made by the reader. Accepts anything that NumPy converts to such arrays. Raises MeshError.
     """
 
     vertices: np.ndarray
@@ -50,19 +50,19 @@ class SurfaceMesh:
             raise MeshError(f"{self.source}: triangle {t}: vertex {triangles[t, k]} does not exist ({len(vertices)} vertices)")
         for field_name, array in (("vertices", vertices), ("triangles", triangles.astype(np.int64))):
             array.setflags(write=False)
-            # The only way to store a clean value in a frozen record.
+            # The only way to store a validated value in a frozen record.
             object.__setattr__(self, field_name, array)
 
-    def _as_array(self, what: str, kinds: str, said: str) -> np.ndarray:
-        """The field as an array (n,3) of these kinds, at least one row."""
+    def _as_array(self, what: str, kinds: str, description: str) -> np.ndarray:
+        """Return the field as an array (n,3) of these kinds with at least one row."""
         try:
             array = np.asarray(getattr(self, what))
         except (ValueError, TypeError, OverflowError) as error:
-            raise MeshError(f"{self.source}: {what} must be {said} of shape (n, 3): {one_line(str(error))}") from error
+            raise MeshError(f"{self.source}: {what} must be {description} of shape (n, 3): {one_line(str(error))}") from error
         if array.size == 0:
             raise MeshError(f"{self.source}: no {what} found")
         if array.dtype.kind not in kinds:
-            raise MeshError(f"{self.source}: {what} must be {said}, not {array.dtype}")
+            raise MeshError(f"{self.source}: {what} must be {description}, not {array.dtype}")
         if array.ndim != 2 or array.shape[1] != 3:
             raise MeshError(f"{self.source}: {what} must have shape (n, 3), not {array.shape}")
         return array
@@ -72,13 +72,13 @@ class SurfaceMesh:
 
     @property
     def volume(self) -> float:
-        """What it encloses [m^3], negative where it is inside out; of a surface with holes a number without meaning."""
+        """Enclosed volume [m^3], negative if all normals point inward; meaningless for a surface with holes."""
         a, b, c = np.moveaxis(self.vertices[self.triangles] - self.vertices.mean(axis=0), 1, 0)
         return float(np.einsum("ti,ti->", a, np.cross(b, c)) / 6.0)
 
     @property
     def area(self) -> float:
-        """Of all triangles together [m^2]."""
+        """Total area [m^2]."""
         a, b, c = np.moveaxis(self.vertices[self.triangles], 1, 0)
         return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)
 
@@ -89,15 +89,15 @@ class SurfaceMesh:
 
     @property
     def n_pieces(self) -> int:
-        """Parts that share no vertex."""
+        """Number of parts that share no vertex."""
         used, inverse = np.unique(self.triangles, return_inverse=True)
         return _components(len(used), inverse.reshape(-1, 3)[:, [0, 1]], inverse.reshape(-1, 3)[:, [1, 2]])
 
     def faults(self) -> list[str]:
-        """What keeps the surface from bounding a solid, a sentence each with what to do; empty where nothing does."""
+        """Return what keeps the surface from bounding a solid, one sentence with a remedy for each fault."""
         ends = self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         distinct, edge, counts = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
-        ways = np.bincount(edge.ravel(), np.where(ends[:, 0] < ends[:, 1], 1, -1), minlength=len(distinct))
+        net_direction = np.bincount(edge.ravel(), np.where(ends[:, 0] < ends[:, 1], 1, -1), minlength=len(distinct))
         found = []
         open_edges = distinct[counts == 1]
         if len(open_edges):
@@ -105,26 +105,26 @@ class SurfaceMesh:
             holes = _components(len(rims), inverse.reshape(-1, 2))
             found.append(
                 f"{holes} {'hole' if holes == 1 else 'holes'}: {len(open_edges)} edges belong to one triangle, the first is "
-                f"{_named(open_edges[0])}; fill holes in a modelling program, or read with a larger weld if they are cracks"
+                f"{_edge_text(open_edges[0])}; fill holes in a modelling program, or read with a larger weld if they are cracks"
             )
-        many = distinct[counts > 2]
-        if len(many):
+        non_manifold = distinct[counts > 2]
+        if len(non_manifold):
             found.append(
-                f"{len(many)} edges belong to more than two triangles, the first is {_named(many[0])}; remove inner walls and "
-                "doubled triangles"
+                f"{len(non_manifold)} edges belong to more than two triangles, the first is {_edge_text(non_manifold[0])}; "
+                "remove inner walls and duplicate triangles"
             )
-        turned = (counts == 2) & (ways != 0)
-        if turned.any():
+        mismatched = (counts == 2) & (net_direction != 0)
+        if mismatched.any():
             found.append(
-                f"{turned.sum()} edges whose two triangles look to opposite sides, the first is {_named(distinct[turned][0])}; "
-                "make the normals consistent"
+                f"{mismatched.sum()} edges have two triangles of opposite orientation, the first is "
+                f"{_edge_text(distinct[mismatched][0])}; make the normals consistent"
             )
         if not found and self.volume < 0.0:
             found.append(INWARD)
         return found
 
 
-def _named(edge: np.ndarray) -> str:
+def _edge_text(edge: np.ndarray) -> str:
     return f"({edge[0]}, {edge[1]})"
 
 
@@ -135,10 +135,10 @@ def _components(n: int, *pairs: np.ndarray) -> int:
 
 
 def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
-    """Read triangles from an .obj, .stl, .ply or .off file; polygons are cut into triangles.
+    """Read triangles from an .obj, .stl, .ply or .off file; polygons are split into triangles.
 
-    weld: vertices at most this far apart [m] become one, 0 for equal ones only (files with texture or normals per corner hold
-    each vertex several times). Triangles without area and doubled ones, and vertices of none, are left out and told as a
+    weld: merge vertices at most this far apart [m]; 0 merges only equal ones (files with texture or normals per corner repeat
+    vertices). Triangles without area, duplicates and unused vertices are removed; all but the last are reported by a
     warning. Raises MeshError.
     """
     try:
@@ -151,13 +151,13 @@ def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
     if isinstance(weld, bool) or not isinstance(weld, Real) or not 0.0 <= weld < np.inf:
         raise MeshError(f"{name}: weld must be a distance of at least 0 m, not {weld!r}")
     data = read_content(file)
-    own = {".obj": _read_obj, ".off": _read_off}.get(ending)
-    points, triangles = own(name, data) if own else _read_by_meshio(file, name, data)
-    return _cleaned(SurfaceMesh(points, triangles, name), float(weld))
+    reader = {".obj": _read_obj, ".off": _read_off}.get(ending)
+    points, triangles = reader(name, data) if reader else _read_by_meshio(file, name, data)
+    return _clean(SurfaceMesh(points, triangles, name), float(weld))
 
 
-def _cleaned(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
-    """The surface welded, without what has no area or is given twice."""
+def _clean(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
+    """Return the welded surface without degenerate and duplicate triangles; issue its warnings."""
     name, points, triangles = surface.source, surface.vertices, surface.triangles
     notes = []
     labels = merge_labels(points, weld)
@@ -183,16 +183,16 @@ def _cleaned(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
 
 
 def _fans(polygons: list[np.ndarray]) -> np.ndarray:
-    """(t,3) triangles of polygons (m,k), each as a fan round its first corner."""
+    """Return triangles (t,3) of polygons (m,k), each split as a fan around its first corner."""
     parts = [p[:, [0, k, k + 1]] for p in polygons for k in range(1, p.shape[1] - 1)]
     return np.concatenate(parts).astype(np.int64) if parts else np.empty((0, 3), dtype=np.int64)
 
 
 def _read_obj(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and faces of a Wavefront file; meshio refuses those with fewer texture coordinates than positions."""
+    """Read positions and faces of a Wavefront file; meshio refuses files with fewer texture coordinates than positions."""
     points, polygons = [], []
     for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
-        words = _words(line)
+        words = _split_line(line)
         try:
             if words[:1] == ["v"]:
                 x, y, z = words[1:4]
@@ -208,18 +208,18 @@ def _read_obj(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_off(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and faces of an Object File Format: OFF, the counts of vertices and faces, a line for each, # for comments.
+    """Read positions and faces of an Object File Format file: OFF, counts of vertices and faces, one line each, # comments.
 
-    What follows a vertex's position and a face's corners, such as colours, is passed over.
+    Data after a vertex's position and a face's corners, such as colours, are skipped.
     Source: Geomview manual, "OFF Files".
     """
-    lines = [(i, words) for i, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1) if (words := _words(line))]
+    lines = [(i, words) for i, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1) if (words := _split_line(line))]
     if not lines:
         raise MeshError(f"{name}: the file is empty")
     number, words = lines[0]
     head = HEAD.match(words[0])
     if not head:
-        raise MeshError(f"{name}: line {number}: not a supported surface: OFF should stand here, not {one_line(words[0])!r}")
+        raise MeshError(f"{name}: line {number}: not a supported surface: expected OFF, not {one_line(words[0])!r}")
     counts, rows = [*filter(None, head.groups()), *words[1:]], lines[1:]
     if not counts and rows:
         (number, counts), rows = rows[0], rows[1:]
@@ -228,9 +228,9 @@ def _read_off(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
         if min(n_points, n_faces) < 0:
             raise ValueError
     except (ValueError, IndexError):
-        raise MeshError(f"{name}: line {number}: the counts of vertices and faces should stand here") from None
+        raise MeshError(f"{name}: line {number}: expected the counts of vertices and faces") from None
     if n_points + n_faces > len(rows):
-        raise MeshError(f"{name}: line {number} announces {n_points} vertices and {n_faces} faces, but {len(rows)} lines follow")
+        raise MeshError(f"{name}: line {number} declares {n_points} vertices and {n_faces} faces, but {len(rows)} lines follow")
     points, polygons = [], []
     for k, (number, words) in enumerate(rows[: n_points + n_faces]):
         try:
@@ -244,15 +244,15 @@ def _read_off(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
                 raise ValueError
         except ValueError:
             what = "three coordinates" if k < n_points else "a number of at least 3 corners and as many vertices"
-            raise MeshError(f"{name}: line {number}: {what} should stand here, not {one_line(' '.join(words))!r}") from None
-        wrong = [corner for corner in corners if not 0 <= corner < n_points]
-        if wrong:
-            raise MeshError(f"{name}: line {number}: vertex {wrong[0]} does not exist ({n_points} vertices)")
+            raise MeshError(f"{name}: line {number}: expected {what}, not {one_line(' '.join(words))!r}") from None
+        missing = [corner for corner in corners if not 0 <= corner < n_points]
+        if missing:
+            raise MeshError(f"{name}: line {number}: vertex {missing[0]} does not exist ({n_points} vertices)")
         polygons.append(np.array([corners]))
     return np.array(points, dtype=np.float64).reshape(-1, 3), _fans(polygons)
 
 
-def _words(line: str) -> list[str]:
+def _split_line(line: str) -> list[str]:
     return line.split("#", 1)[0].split()
 
 
@@ -261,7 +261,7 @@ def _read_by_meshio(file: Path, name: str, data: bytes) -> tuple[np.ndarray, np.
     for found in counts:
         if int(found[2][:30]) > len(data):
             what = f"{found[2][:30].decode()} of element {found[1].decode()}"
-            raise MeshError(f"{name}: the head announces {what}, but the file has {len(data)} bytes")
+            raise MeshError(f"{name}: the header declares {what}, but the file has {len(data)} bytes")
     mesh = read_safely(file, name, data, "surface")
     try:
         blocks = [np.asarray(b.data) for b in mesh.cells if b.type in ("triangle", "quad") or "polygon" in b.type]

@@ -1,9 +1,9 @@
-"""A tetrahedral mesh that has been checked: whoever holds a TetMesh can rely on it.
+"""A validated tetrahedral mesh.
 
-Refused: coordinates that are not finite, indices that do not exist, tets without volume, some tets inverted, tets given
-twice, faces of three tets, vertices of no tet. Told as a warning: all tets inverted (they are flipped), tets that
-are nearly flat, coincident vertices, overlapping neighbours, parts joined at a vertex or an edge only. Tets that overlap without
-sharing a face are not looked for.
+Refused: non-finite coordinates, invalid indices, tets without volume, some tets inverted, duplicate tets, faces of three
+tets, vertices of no tet. Reported by a warning: all tets inverted (they are flipped), nearly flat tets, coincident vertices,
+overlapping neighbours, parts joined only at a vertex or an edge, a mesh far from the origin. Weak: overlaps of tets that share
+no face are not detected.
 """
 
 import warnings
@@ -18,23 +18,23 @@ from taisoft.errors import MeshError
 from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.topology import Faces, connected_pieces, first_repeated_tet, joint_edges, joint_vertices
 
-DEGENERATE = 1e-9  # a tet's volume below this times its longest edge cubed counts as none
-NEARLY_FLAT = 0.02  # mean ratio below which a tet is told; grids and common meshers stay above
-LARGEST_COORDINATE = float(np.finfo(np.float32).max)  # [m], forces may be computed in 32 bits
-FAR = 1e5  # distance from the origin over size, above which a mesh is told to lie far away
-COINCIDENT = 1e-9  # vertices nearer than this times the mesh's diagonal count as coincident
-DIRECTION = np.array([0.56071, 0.64493, 0.51922])  # along which the vertices of regular grids do not coincide; not longer than 1
-LISTED = 20  # indices named in a message at most
+DEGENERATE = 1e-9  # a tet has no volume if it is below this times its longest edge cubed
+NEARLY_FLAT = 0.02  # mean ratio below which a tet causes a warning; grids and common meshers stay above
+LARGEST_COORDINATE = float(np.finfo(np.float32).max)  # [m], since forces may be computed in 32 bits
+MAX_OFFSET_RATIO = 1e5  # distance from the origin over size above which a warning is issued
+COINCIDENT = 1e-9  # vertices closer than this times the mesh's diagonal are coincident
+GENERIC_DIRECTION = np.array([0.56071, 0.64493, 0.51922])  # distinct projections for grid vertices; length at most 1
+MAX_LISTED = 20  # maximum number of indices listed in a message
 
 
 class TetMesh(Guarded):
-    """Tetrahedra in space, checked and read-only: another shape is another mesh, such as TetMesh(0.9 * old.vertices, old.tets).
+    """Validated, read-only tetrahedra. Another shape needs a new mesh, such as TetMesh(0.9 * old.vertices, old.tets).
 
     vertices: (n,3) float64 [m]. tets: (m,4) int64, every det(x1-x0, x2-x0, x3-x0) > 0. volumes: (m,) [m^3].
     surface: (t,3) int64, the faces that belong to one tet, normals outward; surface_tets: (t,) int64, the tet of each.
-    flipped: int64 indices of the tets whose orientation was changed. n_components: pieces, joined by shared vertices.
-    warnings: list of str, what was told but not refused; each is also issued as a UserWarning. recipe: of a mesh from
-    `box_mesh` and its like the shape's name and arguments, which make the same arrays again, else None.
+    flipped: int64 indices of the tets whose orientation was changed. n_components: number of parts connected by vertices.
+    warnings: list of str, each also issued as a UserWarning. recipe: for a mesh from `box_mesh`, `sheet_mesh` or
+    `ball_mesh` the shape's name and the arguments that reproduce its arrays, else None.
     """
 
     _error = MeshAttributeError
@@ -42,11 +42,11 @@ class TetMesh(Guarded):
     def __init__(
         self, vertices, tets, fix_orientation: bool = False, *, source: str | None = None, notes: tuple[str, ...] = ()
     ):
-        """Check and take a copy of the arrays.
+        """Validate and copy the arrays.
 
-        vertices: (n,3) numbers [m]. tets: (m,4) integers, counted from 0. fix_orientation: flip inverted tets where
-        only some are, and list them in `warnings`, instead of refusing them. source: where the mesh comes from, such as
-        a file's name; messages start with it. notes: what a reader has to tell; it joins `warnings`. Raises MeshError.
+        vertices: (n,3) numbers [m]. tets: (m,4) integers, counted from 0. fix_orientation: if only some tets are inverted,
+        flip them and list them in `warnings` instead of refusing them. source: the mesh's origin, such as a file's name,
+        which starts every message. notes: a reader's warnings, added to `warnings`. Raises MeshError.
         """
         self.source = source
         self.recipe: dict | None = None
@@ -64,7 +64,7 @@ class TetMesh(Guarded):
         self._warn_coincident()
         self._warn_distance()
         for note in notes:
-            self._tell(note)
+            self._warn(note)
         self._freeze()
         self._seal(TetMesh.__init__)
 
@@ -72,14 +72,14 @@ class TetMesh(Guarded):
         return f"mesh of {self.source}" if self.source else "mesh"
 
     def _frozen_error(self, name: str) -> MeshAttributeError:
-        """Frozen from the start: volumes and surface follow from vertices and tets."""
+        """Return the error for any assignment: a mesh is frozen, since volumes and surface follow from vertices and tets."""
         return self._error(
             f"{self._label()}: {name} cannot change: make a new mesh, such as ts.TetMesh(0.9 * mesh.vertices, mesh.tets)"
         )
 
     def __setstate__(self, state: dict) -> None:
         super().__setstate__(state)
-        self._freeze()  # copies and pickles too
+        self._freeze()  # freeze copies and unpickled meshes too
 
     @property
     def n_verts(self) -> int:
@@ -95,72 +95,72 @@ class TetMesh(Guarded):
         return f"TetMesh({self.n_verts} vertices, {self.n_tets} tets, {len(self.surface)} surface triangles)"
 
     def _warn_distance(self) -> None:
-        """Warn of a mesh far from the origin: positions keep 16 digits, and the distance takes some of them."""
+        """Warn of a mesh far from the origin: its positions lose some of their 16 digits to the distance."""
         size, distance = float(np.ptp(self.vertices, axis=0).max()), float(np.abs(self.vertices).max())
-        if distance > FAR * size:
-            self._tell(
+        if distance > MAX_OFFSET_RATIO * size:
+            self._warn(
                 f"the mesh lies {distance:.3g} m from the origin, {distance / size:.1g} times its size of {size:.3g} m: "
-                f"its strains are good to {np.finfo(np.float64).eps * distance / size:.0e} at best; centre it for more"
+                f"its strains are accurate to {np.finfo(np.float64).eps * distance / size:.0e} at best; centre it to improve this"
             )
 
-    def _broken(self, text: str) -> MeshError:
+    def _mesh_error(self, text: str) -> MeshError:
         return MeshError(f"{self.source}: {text}" if self.source else text)
 
-    def _tell(self, text: str) -> None:
+    def _warn(self, text: str) -> None:
         self.warnings.append(text)
         warnings.warn(f"{self.source}: {text}" if self.source else text, UserWarning, stacklevel=4)
 
     def _checked_vertices(self, vertices) -> np.ndarray:
-        """(n,3) float64 copy, every coordinate finite."""
+        """Return an (n,3) float64 copy of finite coordinates."""
         array = self._as_array(vertices, "vertices", "fiu", "numbers")
         if array.size == 0:
-            raise self._broken("the mesh has no vertices")
+            raise self._mesh_error("the mesh has no vertices")
         if array.ndim != 2 or array.shape[1] != 3:
-            raise self._broken(f"vertices must have shape (n, 3), not {array.shape}")
+            raise self._mesh_error(f"vertices must have shape (n, 3), not {array.shape}")
         array = np.array(array, dtype=np.float64, order="C")
         bad = np.argwhere(~np.isfinite(array))
         if len(bad):
-            raise self._broken(f"vertex {bad[0, 0]} coordinate {bad[0, 1]} is not finite")
+            raise self._mesh_error(f"vertex {bad[0, 0]} coordinate {bad[0, 1]} is not finite")
         bad = np.argwhere(np.abs(array) > LARGEST_COORDINATE)
         if len(bad):
             value = array[tuple(bad[0])]
-            raise self._broken(f"vertex {bad[0, 0]} coordinate {bad[0, 1]} is {value:g} m, too large for a 32-bit float")
+            raise self._mesh_error(f"vertex {bad[0, 0]} coordinate {bad[0, 1]} is {value:g} m, too large for a 32-bit float")
         return array
 
     def _checked_tets(self, tets) -> np.ndarray:
-        """(m,4) int64 copy: indices exist, no tet names a vertex twice or is given twice, no vertex is left over."""
+        """Return an (m,4) int64 copy: valid indices, no repeated vertex in a tet, no duplicate tet, no unused vertex."""
         array = self._as_array(tets, "tets", "iu", "integers")
         if array.size == 0:
-            raise self._broken("the mesh has no tetrahedra")
+            raise self._mesh_error("the mesh has no tetrahedra")
         if array.ndim != 2 or array.shape[1] != 4:
-            raise self._broken(f"tets must have shape (m, 4), not {array.shape}")
+            raise self._mesh_error(f"tets must have shape (m, 4), not {array.shape}")
         self._check_indices(array)
         array = np.array(array, dtype=np.int64, order="C")
         corners = np.sort(array, axis=1)
         twice = (corners[:, 1:] == corners[:, :-1]).any(axis=1)
         if twice.any():
             e = int(np.argmax(twice))
-            raise self._broken(f"tet {e} names a vertex twice: {tuple(array[e].tolist())}")
+            raise self._mesh_error(f"tet {e} names a vertex twice: {tuple(array[e].tolist())}")
         pair = first_repeated_tet(array)
         if pair:
             corners = tuple(array[pair[0]].tolist())
-            raise self._broken(f"tets {pair[0]} and {pair[1]} have the same four vertices {corners}")
+            raise self._mesh_error(f"tets {pair[0]} and {pair[1]} have the same four vertices {corners}")
         used = np.zeros(self.n_verts, dtype=bool)
         used[array] = True
         if not used.all():
-            raise self._broken(
+            raise self._mesh_error(
                 f"vertex {int(np.argmin(used))} belongs to no tet and would have no mass "
                 f"({int((~used).sum())} such vertices)"
             )
         return array
 
-    def _as_array(self, values, what: str, kinds: str, kinds_said: str) -> np.ndarray:
+    def _as_array(self, values, what: str, kinds: str, kinds_text: str) -> np.ndarray:
         try:
             array = np.asarray(values)
         except (ValueError, TypeError, OverflowError) as error:
-            raise self._broken(f"{what} must be an array of {kinds_said} ({error})") from error
+            raise self._mesh_error(f"{what} must be an array of {kinds_text} ({error})") from error
         if array.size and array.dtype.kind not in kinds:
-            raise self._broken(f"{what} must be {kinds_said}, not of type {array.dtype}")
+            raise self._mesh_error(f"{what} must be {kinds_text}, not of type {array.dtype}")
         return array
 
     def _check_indices(self, tets: np.ndarray) -> None:
@@ -172,65 +172,65 @@ class TetMesh(Guarded):
         hint = ""
         if tets.min() == 1 and tets.max() == n:
             hint = f"; all indices are 1 to {n}: they seem to count from 1, subtract 1"
-        raise self._broken(f"tet {e}: vertex {vertex} does not exist ({n} vertices, counted from 0){hint}")
+        raise self._mesh_error(f"tet {e}: vertex {vertex} does not exist ({n} vertices, counted from 0){hint}")
 
     def _oriented_volumes(self, fix_orientation: bool) -> np.ndarray:
-        """(m,) volumes [m^3], all positive; sets `flipped` and turns those tets round."""
+        """Return positive volumes (m,) [m^3]; set `flipped` and reorient those tets."""
         x = self.vertices[self.tets]
         volumes = np.linalg.det(x[:, 1:] - x[:, :1]) / 6.0
         longest = edge_lengths(self.vertices, self.tets).max(axis=1)
-        flat = ~(np.abs(volumes) > DEGENERATE * longest**3)  # also true for lengths too small to cube
+        flat = ~(np.abs(volumes) > DEGENERATE * longest**3)  # also true if the cubed length underflows
         if flat.any():
             e = int(np.argmax(flat))
-            raise self._broken(
+            raise self._mesh_error(
                 f"tet {e} has no volume: {abs(volumes[e]):.3g} m^3 with a longest edge of {longest[e]:.3g} m "
                 f"({int(flat.sum())} such tets; the volume must exceed {DEGENERATE:g} longest edge^3)"
             )
         inverted = np.flatnonzero(volumes < 0)
         self.flipped = inverted
         if len(inverted) == self.n_tets:
-            self._tell(f"all {self.n_tets} tets are inverted (a mirrored mesh?); all have been flipped")
+            self._warn(f"all {self.n_tets} tets are inverted (a mirrored mesh?); all have been flipped")
         elif len(inverted) and not fix_orientation:
-            raise self._broken(
+            raise self._mesh_error(
                 f"{len(inverted)} of {self.n_tets} tets are inverted, the first is tet {inverted[0]}; "
                 "fix_orientation=True flips and lists them"
             )
         elif len(inverted):
-            self._tell(f"{len(inverted)} of {self.n_tets} inverted tets have been flipped: {_listed(inverted)}")
+            self._warn(f"{len(inverted)} of {self.n_tets} inverted tets have been flipped: {_index_text(inverted)}")
         self.tets[inverted] = self.tets[inverted][:, [0, 1, 3, 2]]
         return np.abs(volumes)
 
     def _checked_faces(self) -> Faces:
-        """The faces, none of which belongs to three tets."""
+        """Return the faces, none of which belongs to three tets; warn of overlapping neighbours."""
         faces = Faces(self.tets)
-        crowded = np.flatnonzero(faces.counts > 2)
-        if len(crowded):
-            start = faces.starts[crowded[0]]
-            rows = faces.order[start : start + faces.counts[crowded[0]]]
+        non_manifold = np.flatnonzero(faces.counts > 2)
+        if len(non_manifold):
+            start = faces.starts[non_manifold[0]]
+            rows = faces.order[start : start + faces.counts[non_manifold[0]]]
             owners = np.sort(rows // 4)
             corners = tuple(np.sort(faces.triangles[rows[0]]).tolist())
-            raise self._broken(
-                f"face {corners} is shared by {len(rows)} tets ({_listed(owners)}); a face may have two at most"
+            raise self._mesh_error(
+                f"face {corners} is shared by {len(rows)} tets ({_index_text(owners)}); a face may have at most two"
             )
-        # Two outward faces of neighbours on opposite sides run in opposite senses; in the same sense, the tets overlap.
+        # The outward faces of neighbours on opposite sides have opposite orientation; equal orientation means overlap.
         pairs = faces.pairs()
         a, b = faces.triangles[pairs[:, 0]], faces.triangles[pairs[:, 1]]
         overlap = (a == b).all(axis=1) | (a == b[:, [1, 2, 0]]).all(axis=1) | (a == b[:, [2, 0, 1]]).all(axis=1)
         if overlap.any():
             first = np.sort(pairs[int(np.argmax(overlap))] // 4)
-            self._tell(
+            self._warn(
                 f"{int(overlap.sum())} pairs of neighbouring tets overlap: they lie on the same side of their face; "
                 f"the first are tets {first[0]} and {first[1]}"
             )
         return faces
 
     def _warn_flat(self) -> None:
-        """Warn of badly shaped tets: a wave crosses their least height at once, and that sets the explicit step."""
+        """Warn of badly shaped tets: the smallest height limits the stable explicit step."""
         quality = mean_ratio(edge_lengths(self.vertices, self.tets), self.volumes)
         count = int((quality < NEARLY_FLAT).sum())
         if count:
             worst = int(np.argmin(quality))
-            self._tell(
+            self._warn(
                 f"{count} tets are nearly flat or needles (mean ratio below {NEARLY_FLAT}, a regular tet has 1), the worst is "
                 f"tet {worst} with {quality[worst]:.2g}: explicit integrators need very small steps, and the body may be too "
                 "stiff there"
@@ -240,30 +240,30 @@ class TetMesh(Guarded):
         edges = joint_edges(self.surface)
         if len(edges):
             first = tuple(edges[0].tolist())
-            self._tell(f"parts are joined at an edge only at {len(edges)} edges, the first is {first}")
+            self._warn(f"parts are joined at an edge only at {len(edges)} edges, the first is {first}")
         vertices = np.setdiff1d(joint_vertices(self.tets, faces), edges)
         if len(vertices):
-            self._tell(f"parts are joined at a vertex only at {len(vertices)} vertices: {_listed(vertices)}")
+            self._warn(f"parts are joined at a vertex only at {len(vertices)} vertices: {_index_text(vertices)}")
 
     def _warn_coincident(self) -> None:
-        """Count the vertices that lie on another one; such pieces are not connected."""
+        """Warn of vertices that coincide with another one; they do not connect their tets."""
         labels = merge_labels(self.vertices, COINCIDENT * float(np.linalg.norm(np.ptp(self.vertices, axis=0))))
         first = np.unique(labels, return_index=True)[1]
         extra = np.setdiff1d(np.arange(self.n_verts), first)
         if len(extra):
-            twin = int(first[labels[extra[0]]])
-            self._tell(
-                f"{len(extra)} vertices coincide with another one, the first is vertex {extra[0]} on vertex {twin}; "
+            original = int(first[labels[extra[0]]])
+            self._warn(
+                f"{len(extra)} vertices coincide with another one, the first is vertex {extra[0]} on vertex {original}; "
                 "they are not connected (read_mesh can weld them)"
             )
 
 
 def merge_labels(points: np.ndarray, tolerance: float) -> np.ndarray:
-    """(n,) int: points at most `tolerance` [m] apart, directly or through others, get the same label from 0.
+    """Return labels (n,), from 0: points at most `tolerance` [m] apart, directly or through others, share a label.
 
     points: (n,3) [m]. Labels follow the order in which a group first appears.
     """
-    # Equal points first: thousands in one place would make as many pairs as their number squared.
+    # Merge equal points first: n of them in one place would make n^2 pairs.
     distinct, labels = np.unique(points + 0.0, axis=0, return_inverse=True)  # + 0.0 makes -0.0 equal to 0.0
     labels = labels.ravel()
     if tolerance > 0 and _may_be_near(distinct, tolerance):
@@ -278,16 +278,16 @@ def merge_labels(points: np.ndarray, tolerance: float) -> np.ndarray:
 
 
 def _may_be_near(points: np.ndarray, tolerance: float) -> bool:
-    """Whether two of distinct points can be at most `tolerance` apart: False where their places along one direction are not.
+    """Return False if projections on GENERIC_DIRECTION show that no two points are at most `tolerance` apart, else True.
 
-    Most meshes have no such vertices, and building a tree takes longer than this.
+    A cheap test that spares most meshes the k-d tree.
     """
-    along = np.sort(points @ DIRECTION)
+    projections = np.sort(points @ GENERIC_DIRECTION)
     rounding = 8.0 * np.finfo(np.float64).eps * float(np.abs(points).max(initial=0.0))
-    return bool((np.diff(along) <= tolerance + rounding).any())
+    return bool((np.diff(projections) <= tolerance + rounding).any())
 
 
-def _listed(indices: np.ndarray) -> str:
-    """Indices as text, shortened where there are many."""
-    text = ", ".join(str(i) for i in indices[:LISTED].tolist())
-    return text if len(indices) <= LISTED else f"{text}, ... ({len(indices)} in all)"
+def _index_text(indices: np.ndarray) -> str:
+    """Return indices as text, shortened after MAX_LISTED."""
+    text = ", ".join(str(i) for i in indices[:MAX_LISTED].tolist())
+    return text if len(indices) <= MAX_LISTED else f"{text}, ... ({len(indices)} in all)"

@@ -1,15 +1,15 @@
-"""How thick a mesh is below its surface, and how far too stiffly linear tets bend there.
+"""Estimate a mesh's thickness below its surface, and by how much linear tets are too stiff in bending there.
 
-A ray goes inwards from the middle of every surface triangle, along its normal, from tet to tet until it comes out: its
-length is the thickness t there. Each tet that it crosses counts for the ray's length in it over the tet's extent along the
-ray, which sums to the number of layers n: of a grid, the number of its cells. The triangle's edges a, b, c give the length
-of the tets across, h^2 = (a^2 + b^2 + c^2) / 4, of a rectangular cell half the square of its diagonal.
+A ray runs inwards from the centroid of every surface triangle, against its normal, from tet to tet until it leaves the
+mesh. Its length is the local thickness t. Each crossed tet contributes the ray's length in it over the tet's extent along the
+ray; the sum is the number of layers n, on a grid the number of its cells. The triangle's edges a, b, c give the tangential size
+of the tets, h^2 = (a^2 + b^2 + c^2) / 4; for a rectangular cell this is half the square of its diagonal.
 
-A linear tet has one strain where bending needs one that changes sign through the thickness, so thin parts bend too
-stiffly, by about 1 + LAYERS / n^2 + LENGTH h^2 / t^2. The two numbers are fitted to cantilevers of 1 to 4 layers, cells 1/8
-to 10 times as long as the beam is thick, both patterns of `box_mesh`, and Poisson's ratios of 0 and 0.3: the estimate is
-0.6 to 1.4 times what they show. Weak: ratios above 0.4 are stiffer still, and since it is not known which way a part
-will bend, the triangle's edges count alike.
+A linear tet has constant strain, but bending strain changes sign through the thickness. Thin parts are therefore too stiff in
+bending, by a factor of about 1 + LAYERS / n^2 + LENGTH h^2 / t^2. The two coefficients are fitted to cantilevers of 1 to 4
+layers, cells 1/8 to 10 times as long as the beam is thick, both patterns of `box_mesh`, and Poisson's ratios of 0 and 0.3; the
+estimate is 0.6 to 1.4 times the measured factor. Weak: ratios above 0.4 are even stiffer, and the direction of bending is
+unknown, so the triangle's edges have equal weight.
 """
 
 from dataclasses import dataclass
@@ -20,55 +20,55 @@ import numpy as np
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import TET_FACES, Faces, connected_pieces
 
-LAYERS, LENGTH = 1.5, 1.4  # of the estimate above
-MOST_RAYS = 20_000  # of a larger surface every second triangle has one, or every third, ...
-MOST_TETS = 24  # that a ray crosses before it is given up: what is behind so many is not thin in tets
-SLENDER = 2.5  # a part bends where the body's length is at least so many times its thickness
-TOO_STIFF = 2.0  # times too stiff: what bends less than half as far as it should is told
-SHARE = 0.5  # of the surface over which a body must be thin and too stiff
+LAYERS, LENGTH = 1.5, 1.4  # coefficients of the estimate above
+MAX_RAYS = 20_000  # on larger surfaces only every second, third, ... triangle has a ray
+MAX_CROSSED_TETS = 24  # maximum number of tets that a ray crosses; with more layers a part is not thin
+MIN_SLENDERNESS = 2.5  # smallest length over thickness of a part that bends
+MIN_STIFFNESS = 2.0  # stiffness factor from which a warning is issued: deflections are halved
+MIN_FRACTION = 0.5  # smallest fraction of the surface that must be thin and too stiff
 
 
 @dataclass(frozen=True)
 class Bending:
-    """Where linear tets bend too stiffly. stiffness: how many times, about; layers: of tets through the thickness, about."""
+    """Approximate bending error. stiffness: factor by which linear tets are too stiff; layers: tets through the thickness."""
 
     stiffness: float
     layers: float
 
 
-_found: "WeakKeyDictionary[TetMesh, Bending | None]" = WeakKeyDictionary()  # of meshes, which never change
+_cache: "WeakKeyDictionary[TetMesh, Bending | None]" = WeakKeyDictionary()  # results by mesh; meshes are immutable
 
 
 def coarse_bending(mesh: TetMesh) -> Bending | None:
-    """The medians over the surface where the mesh is thin and too stiff for linear tets; None where that is less than half.
+    """Return area-weighted medians over the surface that is thin and too stiff with linear tets; None if it is less than half.
 
-    The same whatever the mesh's place, size and turn, and the order of its vertices and tets.
+    Independent of the mesh's position, size and rotation, and of the order of vertices and tets.
     """
-    if mesh not in _found:
-        _found[mesh] = _coarse_bending(mesh)
-    return _found[mesh]
+    if mesh not in _cache:
+        _cache[mesh] = _coarse_bending(mesh)
+    return _cache[mesh]
 
 
 def _coarse_bending(mesh: TetMesh) -> Bending | None:
-    some = np.arange(0, len(mesh.surface), -(-len(mesh.surface) // MOST_RAYS))
-    thickness, layers = measure_thickness(mesh, some)
+    sampled = np.arange(0, len(mesh.surface), -(-len(mesh.surface) // MAX_RAYS))
+    thickness, layers = measure_thickness(mesh, sampled)
     if not np.isfinite(thickness).any():
         return None
-    a, b, c = np.moveaxis(mesh.vertices[mesh.surface[some]], 1, 0)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.surface[sampled]], 1, 0)
     h2 = sum(((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))) / 4.0
-    stiffness = 1.0 + LAYERS / layers**2 + LENGTH * h2 / thickness**2  # 1 where the thickness is infinite
-    coarse = (SLENDER * thickness <= _lengths(mesh)[some]) & (stiffness >= TOO_STIFF)
+    stiffness = 1.0 + LAYERS / layers**2 + LENGTH * h2 / thickness**2  # 1 if the thickness is infinite
+    coarse = (MIN_SLENDERNESS * thickness <= _lengths(mesh)[sampled]) & (stiffness >= MIN_STIFFNESS)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    if areas[coarse].sum() < SHARE * areas.sum():
+    if areas[coarse].sum() < MIN_FRACTION * areas.sum():
         return None
     return Bending(*(_median(values[coarse], areas[coarse]) for values in (stiffness, layers)))
 
 
 def measure_thickness(mesh: TetMesh, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Thickness [m] and layers of tets (k,) below surface triangles (k,); infinite both behind more than MOST_TETS."""
+    """Return thickness (k,) [m] and tet layers (k,) below surface triangles (k,); both inf beyond MAX_CROSSED_TETS."""
     one, other = Faces(mesh.tets).pairs().T
-    behind = np.full(4 * mesh.n_tets, -1)  # the row of a face's other side
-    behind[one], behind[other] = other, one
+    opposite = np.full(4 * mesh.n_tets, -1)  # row of the same face in the neighbouring tet
+    opposite[one], opposite[other] = other, one
     a, b, c = np.moveaxis(mesh.vertices[mesh.surface[triangles]], 1, 0)
     start = (a + b + c) / 3.0
     inward = -np.cross(b - a, c - a)
@@ -76,52 +76,52 @@ def measure_thickness(mesh: TetMesh, triangles: np.ndarray) -> tuple[np.ndarray,
     n = len(triangles)
     thickness, layers, length, count = np.full(n, np.inf), np.full(n, np.inf), np.zeros(n), np.zeros(n)
     ray, tet = np.arange(n), mesh.surface_tets[triangles]
-    for _ in range(MOST_TETS):
+    for _ in range(MAX_CROSSED_TETS):
         corners = mesh.vertices[mesh.tets[tet]] - start[ray][:, None]
         along = np.einsum("rij,rj->ri", corners, inward[ray])
-        out, face = _leaves(corners, inward[ray])
-        out = np.maximum(out, length)
-        count = count + (out - length) / (along.max(axis=1) - along.min(axis=1))
-        across = behind[4 * tet + face]
+        exit_length, face = _exit_points(corners, inward[ray])
+        exit_length = np.maximum(exit_length, length)
+        count = count + (exit_length - length) / (along.max(axis=1) - along.min(axis=1))
+        across = opposite[4 * tet + face]
         ended = across < 0
-        thickness[ray[ended]], layers[ray[ended]] = out[ended], count[ended]
-        ray, tet, length, count = ray[~ended], across[~ended] // 4, out[~ended], count[~ended]
+        thickness[ray[ended]], layers[ray[ended]] = exit_length[ended], count[ended]
+        ray, tet, length, count = ray[~ended], across[~ended] // 4, exit_length[~ended], count[~ended]
         if not len(ray):
             break
     return thickness, layers
 
 
-def _leaves(corners: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where lines from the origin leave tets: the way along unit directions (r,3), and the face; corners: (r,4,3)."""
-    best, face = np.full(len(corners), np.inf), np.zeros(len(corners), dtype=np.int64)
+def _exit_points(corners: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where rays from the origin leave tets: distance along unit directions (r,3), and face. corners: (r,4,3)."""
+    distance, face = np.full(len(corners), np.inf), np.zeros(len(corners), dtype=np.int64)
     for k, (i, j, l) in enumerate(TET_FACES):
         normal = np.cross(corners[:, j] - corners[:, i], corners[:, l] - corners[:, i])
-        speed = np.einsum("rj,rj->r", normal, direction)
+        slope = np.einsum("rj,rj->r", normal, direction)
         height = np.einsum("rj,rj->r", normal, corners[:, i])
         with np.errstate(divide="ignore", invalid="ignore"):
-            at = np.where(speed > 0.0, height / speed, np.inf)
-        nearer = at < best
-        best[nearer], face[nearer] = at[nearer], k
-    return best, face
+            candidate = np.where(slope > 0.0, height / slope, np.inf)
+        nearer = candidate < distance
+        distance[nearer], face[nearer] = candidate[nearer], k
+    return distance, face
 
 
 def _lengths(mesh: TetMesh) -> np.ndarray:
-    """For each surface triangle the length [m] of its piece: of a box with the same largest second moment of volume."""
-    piece = connected_pieces(mesh.tets, mesh.n_verts)[1] if mesh.n_components > 1 else np.zeros(mesh.n_verts, dtype=int)
-    of_tet, tets = piece[mesh.tets[:, 0]], mesh.tets.T
-    volume = np.bincount(of_tet, mesh.volumes)
-    # The integral of a function of degree 2 over a tet: 4/5 of its volume times the value in the middle, 1/20 at each corner.
-    at_corners = sum(np.bincount(corner, mesh.volumes, mesh.n_verts) for corner in tets) / 20.0
-    at_middles = 0.8 * mesh.volumes
-    x = mesh.vertices - mesh.vertices.mean(axis=0)  # those far from the origin keep their digits
-    center = np.stack([np.bincount(piece, 5.0 * at_corners * column) for column in x.T], axis=1) / volume[:, None]
-    x = x - center[piece]
-    middle = sum(x[corner] for corner in tets) / 4.0
+    """Return the length [m] of each surface triangle's part: that of a box with the same largest second moment of volume."""
+    part = connected_pieces(mesh.tets, mesh.n_verts)[1] if mesh.n_components > 1 else np.zeros(mesh.n_verts, dtype=int)
+    tet_part, tets = part[mesh.tets[:, 0]], mesh.tets.T
+    volume = np.bincount(tet_part, mesh.volumes)
+    # Quadrature exact for degree 2: 4/5 of the tet's volume times the value at the centroid plus 1/20 at each corner.
+    corner_weights = sum(np.bincount(corner, mesh.volumes, mesh.n_verts) for corner in tets) / 20.0
+    centroid_weights = 0.8 * mesh.volumes
+    x = mesh.vertices - mesh.vertices.mean(axis=0)  # avoids cancellation far from the origin
+    center = np.stack([np.bincount(part, 5.0 * corner_weights * column) for column in x.T], axis=1) / volume[:, None]
+    x = x - center[part]
+    centroid = sum(x[corner] for corner in tets) / 4.0
     moments = np.empty((len(volume), 3, 3))
     for i, j in np.ndindex(3, 3):
-        moments[:, i, j] = np.bincount(piece, at_corners * x[:, i] * x[:, j])
-        moments[:, i, j] += np.bincount(of_tet, at_middles * middle[:, i] * middle[:, j])
-    return np.sqrt(12.0 * np.linalg.eigvalsh(moments / volume[:, None, None])[:, -1])[piece[mesh.surface[:, 0]]]
+        moments[:, i, j] = np.bincount(part, corner_weights * x[:, i] * x[:, j])
+        moments[:, i, j] += np.bincount(tet_part, centroid_weights * centroid[:, i] * centroid[:, j])
+    return np.sqrt(12.0 * np.linalg.eigvalsh(moments / volume[:, None, None])[:, -1])[part[mesh.surface[:, 0]]]
 
 
 def _median(values: np.ndarray, weights: np.ndarray) -> float:

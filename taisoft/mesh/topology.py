@@ -1,4 +1,4 @@
-"""Connectivity of tetrahedra: edges, faces, surface, pieces and joints. NumPy and SciPy graphs, no loops over elements."""
+"""Compute the connectivity of tetrahedra: edges, faces, surface, parts and joints, without loops over elements."""
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -7,14 +7,14 @@ from scipy.sparse.csgraph import connected_components
 # Face k lies opposite corner k; in this order its normal points out of a positive tet, det(x1-x0, x2-x0, x3-x0) > 0.
 TET_FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
 
-EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners of a tet's six edges; edges k and 5-k do not meet
+EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners of a tet's six edges; edges k and 5-k are opposite
 
 
 class Faces:
-    """The 4m faces of m tets, those of equal vertices brought together.
+    """The 4m faces of m tets, grouped by equal vertices.
 
-    triangles: (4m,3) outward, face k of tet e in row 4e+k. order: (4m,) rows sorted so that equal faces are neighbours.
-    starts, counts: (f,) where each of the f distinct faces begins in `order`, and how many tets own it.
+    triangles: (4m,3) outward, face k of tet e in row 4e+k. order: (4m,) rows sorted so that equal faces are adjacent.
+    starts, counts: (f,) start of each of the f distinct faces in `order`, and number of tets that have it.
     """
 
     def __init__(self, tets: np.ndarray):
@@ -29,17 +29,17 @@ class Faces:
         self.counts = np.diff(np.append(self.starts, len(corners)))
 
     def surface(self) -> np.ndarray:
-        """Rows of `triangles` that one tet alone owns, in the order of the tets."""
+        """Return the rows of `triangles` that belong to one tet only, in the order of the tets."""
         return np.sort(self.order[self.starts[self.counts == 1]])
 
     def pairs(self) -> np.ndarray:
-        """(p,2) rows of `triangles`: the two sides of every face that exactly two tets own."""
+        """Return (p,2) rows of `triangles`: the two sides of every face shared by exactly two tets."""
         first = self.starts[self.counts == 2]
         return np.stack([self.order[first], self.order[first + 1]], axis=1)
 
 
 def distinct_edges(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The edges (k,2), ascending pairs in lexicographic order, and (m,6) the edge of each of a tet's EDGES.
+    """Return the edges (k,2), ascending pairs in lexicographic order, and each tet's edges (m,6) in the order of EDGES.
 
     tets: (m,4) int, indices from 0.
     """
@@ -50,7 +50,7 @@ def distinct_edges(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def first_repeated_tet(tets: np.ndarray) -> tuple[int, int] | None:
-    """The first pair of tets with the same four vertices, or None. tets: (m,4) int."""
+    """Return the first pair of tets with the same four vertices, or None. tets: (m,4) int."""
     corners = np.sort(tets, axis=1)
     order = np.lexsort(corners.T[::-1])
     same = (corners[order[1:]] == corners[order[:-1]]).all(axis=1)
@@ -62,9 +62,9 @@ def first_repeated_tet(tets: np.ndarray) -> tuple[int, int] | None:
 
 
 def connected_pieces(elements: np.ndarray, n_verts: int) -> tuple[int, np.ndarray]:
-    """Number of pieces of elements (m,k), tets or triangles, and the piece of each vertex (n_verts,).
+    """Return the number of connected parts of elements (m,k), tets or triangles, and the part of each vertex (n_verts,).
 
-    Elements belong to one piece when they share a vertex; a vertex without an element is a piece of its own.
+    Elements that share a vertex are connected; a vertex without elements is a separate part.
     """
     rows = np.repeat(elements[:, 0], elements.shape[1] - 1)
     graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, elements[:, 1:].ravel())), shape=(n_verts, n_verts))
@@ -72,27 +72,27 @@ def connected_pieces(elements: np.ndarray, n_verts: int) -> tuple[int, np.ndarra
 
 
 def triangle_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every edge of triangles (t,3) once, (e,2) with ascending vertices, and how many triangles each belongs to (e,)."""
+    """Return the distinct edges (e,2) of triangles (t,3), with ascending vertices, and each edge's number of triangles (e,)."""
     return np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
 
 
 def joint_edges(surface: np.ndarray) -> np.ndarray:
-    """(k,2) surface edges with more than two triangles: parts hang together by an edge alone. surface: (t,3) int."""
+    """Return surface edges (k,2) with more than two triangles, where parts are joined only by an edge. surface: (t,3) int."""
     distinct, counts = triangle_edges(surface)
     return distinct[counts > 2]
 
 
 def joint_vertices(tets: np.ndarray, faces: Faces) -> np.ndarray:
-    """(k,) vertices whose tets do not all reach one another through faces that hold the vertex.
+    """Return vertices (k,) whose tets are not all connected through faces that contain the vertex.
 
-    The graph has a node for every corner of every tet and joins the corners that two tets share through a face; a
-    vertex with more than one connected piece is a joint. Only surface vertices can be one, so only their corners count.
+    The graph has a node for every corner of every tet and connects corners that two tets share through a face. A vertex
+    with more than one component is a joint. Only surface vertices can be joints, so only their corners are included.
     """
     n_verts = int(tets.max()) + 1
     on_surface = np.zeros(n_verts, dtype=bool)
     on_surface[faces.triangles[faces.surface()]] = True
     pairs = faces.pairs()
-    # The corner (0..3) of its tet that each vertex of a face is; both sides are sorted by vertex so that columns agree.
+    # For each vertex of a face, its corner in the tet. Both sides are sorted by vertex so that columns agree.
     sides = []
     for rows in pairs.T:
         triangles = faces.triangles[rows]

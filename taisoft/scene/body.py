@@ -1,4 +1,4 @@
-"""An elastic body as plain data: its mesh, what it is made of, what holds, moves and loads it, by what it is hit."""
+"""Describe an elastic body as plain data: mesh, material, constraints, loads and contact geometry."""
 
 import warnings
 from collections.abc import Callable
@@ -16,19 +16,19 @@ from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.key_frames import KeyFrames
 from taisoft.scene.material import Material
 
-NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock: they bend far too little
-QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # of polynomials integrated exactly, by order; the first is the default
+NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock, so that they bend far too little
+QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # by element order: degrees of polynomials integrated exactly, the default first
 _FREE, _FIXED, _MOVED = 0, 1, 2
-_READ_ONLY = ("name", "mesh", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes")  # what all else rests on
-ANOTHER = "change a copy, scene.snapshot(), and make a new Simulator of it"
-_SET_FORCE = f"call sim.set_force(body, index, value) for one that is there; else {ANOTHER}"
-_SET_TRACTION = f"call sim.set_traction(body, index, value) for one that is there; else {ANOTHER}"
+_READ_ONLY = ("name", "mesh", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes")  # other data depend on these
+USE_A_COPY = "change a copy made by scene.snapshot() and make a new Simulator of it"
+_SET_FORCE = f"call sim.set_force(body, index, value) for an existing one; otherwise {USE_A_COPY}"
+_SET_TRACTION = f"call sim.set_traction(body, index, value) for an existing one; otherwise {USE_A_COPY}"
 
 
 @guarded_record("constraint", "add another one by body.fix or body.move")
 @dataclass(frozen=True, eq=False)
 class Constraint:
-    """Nodes held along some axes: at their start, or at their start plus a displacement that depends on time."""
+    """Nodes prescribed along some axes: at their start position, or at that plus a time-dependent displacement."""
 
     nodes: np.ndarray  #: (k,) int64 node ids
     axes: np.ndarray  #: (3,) bool
@@ -54,10 +54,10 @@ class Traction:
 @guarded_record("force", "call sim.set_force(body, index, value) in a simulation")
 @dataclass(frozen=True, eq=False)
 class NodalForce:
-    """A dead load on nodes: a total spread over them by their lumped mass, or one force for each."""
+    """A dead load on nodes: a total force distributed by lumped mass, or one force per node."""
 
     nodes: np.ndarray  #: (k,) int64 node ids
-    value: np.ndarray  #: (3,) total force, or (k,3) one a node [N]
+    value: np.ndarray  #: (3,) total force, or (k,3) one per node [N]
     where: Callable | None = None  #: as of a Constraint
 
     def __post_init__(self):
@@ -67,10 +67,12 @@ class NodalForce:
 class Body(Guarded):
     """One elastic body of a scene; made by `Scene.add_body`.
 
-    Its nodes start at rest_positions + position. order: 1 or 2, of the elements' shape functions; quadrature_degree: of the
-    polynomials that their quadrature integrates exactly. nodes: the mesh's vertices and, for order 2, the midpoints of its
-    edges. constraints, tractions, forces: lists; items can be removed from them, but are added by `fix`, `move`, `add_traction`
-    and `add_force` only. material, position, velocity and collision can be set, each checked; nothing else can.
+    name, mesh, material. position: (3,) [m]; nodes start at rest_positions + position. velocity: (3,) or (n,3) [m/s], initial.
+    order: 1 or 2, of the elements' shape functions; quadrature_degree: degree of polynomials integrated exactly. nodes:
+    `Nodes`, the mesh's vertices and for order 2 its mid-edge nodes. constraints, tractions, forces: lists of `Constraint`,
+    `Traction`, `NodalForce`; items can be removed, but only methods add them. collision: one of CONTACT_MODES. Only material,
+    position, velocity and collision can be assigned; each is validated. `warn_locking` and `warn_bending` warn if tets of order
+    1 are far too stiff; `Scene.add_body` calls both.
     """
 
     _read_only = frozenset(_READ_ONLY)
@@ -78,7 +80,7 @@ class Body(Guarded):
     _contents = {
         "constraints": "call body.fix or body.move", "tractions": "call body.add_traction", "forces": "call body.add_force",
     }  # fmt: skip
-    _default_frozen = ANOTHER
+    _default_frozen = USE_A_COPY
     _instead_frozen = {
         "material": "call sim.set_material(body, young=...)", "position": "call sim.set_state(positions=..., body=...)",
         "velocity": "call sim.set_state(velocities=..., body=...)", "add_force": _SET_FORCE, "forces": _SET_FORCE,
@@ -113,7 +115,7 @@ class Body(Guarded):
 
     @property
     def rest_positions(self) -> np.ndarray:
-        """(n,3) [m], read-only: the nodes where the body is free of stress; the mesh's vertices come first."""
+        """Stress-free node positions (n,3) [m], read-only; the mesh's vertices come first."""
         return self.nodes.positions
 
     @property
@@ -123,7 +125,7 @@ class Body(Guarded):
 
     @property
     def material(self) -> Material:
-        """What the body is made of; setting it raises SceneError for what is no Material, and warns where linear tets lock."""
+        """Material. Setting it raises SceneError for any other type and warns if linear tets lock."""
         return self._material
 
     @material.setter
@@ -131,12 +133,12 @@ class Body(Guarded):
         if not isinstance(value, Material):
             raise SceneError(f"body {self.name!r}: material must be a Material, not {type(value).__name__}")
         self._material = value
-        if self._sealed:  # add_body and the simulator warn themselves
+        if self._sealed:  # add_body and the simulator issue their own warnings
             self.warn_locking(stacklevel=3)
 
     @property
     def position(self) -> np.ndarray:
-        """(3,) [m], shift of the start; setting it raises SceneError unless it is three finite numbers."""
+        """Initial translation (3,) [m]. Setting it raises SceneError unless it is three finite numbers."""
         return self._position
 
     @position.setter
@@ -145,7 +147,7 @@ class Body(Guarded):
 
     @property
     def velocity(self) -> np.ndarray:
-        """(3,) or (n,3) [m/s], of the start; setting it raises SceneError unless it is finite and of one of these shapes."""
+        """Initial velocity (3,) or (n,3) [m/s]. Setting it raises SceneError unless it is finite and has one of these shapes."""
         return self._velocity
 
     @velocity.setter
@@ -159,13 +161,13 @@ class Body(Guarded):
         return checks.array(value, f"body {self.name!r}: velocity", ((3,), (self.n_nodes, 3)))
 
     def check(self) -> None:
-        """Raises SceneError for what was written into the arrays of position and velocity and could not have been set."""
+        """Raise SceneError if in-place changes made the arrays of position or velocity invalid."""
         self._checked_position(self.position)
         self._checked_velocity(self.velocity)
 
     @property
     def collision(self) -> str:
-        """How others hit the body: "auto", "distance_field" or "proximity"; anything else raises SceneError."""
+        """Contact geometry, one of CONTACT_MODES. Setting it raises SceneError for anything else."""
         return self._collision
 
     @collision.setter
@@ -174,7 +176,7 @@ class Body(Guarded):
 
     @property
     def contact_mode(self) -> str:
-        """ "proximity", which "auto" is, or "distance_field"."""
+        """Resolved contact geometry: "proximity", also for "auto", or "distance_field"."""
         return "proximity" if self.collision == "auto" else self.collision
 
     def __repr__(self) -> str:
@@ -182,7 +184,7 @@ class Body(Guarded):
         return f"Body({self.name!r}, {self.n_nodes} nodes, {kind}, {self.material.law})"
 
     def warn_locking(self, stacklevel: int) -> None:
-        """Warn of linear tets where they lock: above a Poisson's ratio of 0.49. stacklevel: 1 is the caller's line."""
+        """Warn if linear tets lock, at a Poisson's ratio above 0.49. stacklevel: 1 is the caller's line."""
         poisson = self.material.poisson
         if self.order == 1 and poisson > NEARLY_INCOMPRESSIBLE:
             warnings.warn(
@@ -192,34 +194,34 @@ class Body(Guarded):
             )  # fmt: skip
 
     def warn_bending(self, stacklevel: int) -> None:
-        """Warn of linear tets where the body is too thin in tets to bend as it should. stacklevel: as of `tell_locking`."""
+        """Warn if the body has too few linear tets through its thickness to bend correctly. stacklevel: as in `warn_locking`."""
         if self.order == 1 and (found := coarse_bending(self.mesh)) is not None:
             layers = max(1, round(found.layers))
-            times = float(f"{found.stiffness:.1g}")  # the estimate is good to about its first digit
+            times = float(f"{found.stiffness:.1g}")  # only about one digit of the estimate is accurate
             warnings.warn(
                 f"body {self.name!r}: about {layers} linear {'tet lies' if layers == 1 else 'tets lie'} through its thickness, "
-                f"and it bends about {times:.0f} times too stiffly: order=2 bends right",
+                f"and it bends about {times:.0f} times too stiffly: order=2 bends correctly",
                 UserWarning, stacklevel=stacklevel + 1,
             )  # fmt: skip
 
     def fix(self, where, axes: str = "xyz") -> Constraint:
-        """Hold nodes where they start.
+        """Fix nodes at their start positions.
 
         where: node ids, a bool mask (n,), or a callable that gets the rest positions (n,3) and returns such a mask.
-        axes: the directions held, such as "y" or "xz". Raises SceneError when no node is chosen or one is moved.
+        axes: the fixed directions, such as "y" or "xz". Raises SceneError if no node is chosen or one is moved already.
         """
         self._check_open("fix")
         what = f"body {self.name!r}: fix"
         nodes = checks.selection(where, self.rest_positions, what, "node")
-        return self._hold(Constraint(nodes, checks.axes(axes, what), where=_function(where)), _FIXED, what)
+        return self._add_constraint(Constraint(nodes, checks.axes(axes, what), where=_callable_or_none(where)), _FIXED, what)
 
     def move(self, where, path: Callable | KeyFrames, axes: str = "xyz") -> Constraint:
-        """Prescribe the motion of nodes by a path.
+        """Move nodes along a prescribed path.
 
-        where: as for `fix`, but no id twice. path: callable t [s] -> displacement from the start, (3,) or (k,3) in the
-        order of the chosen nodes [m], or None from the moment they are released; it is called once here, for t = 0. Or
-        `KeyFrames`, whose pivot is given where the body starts. axes: the directions prescribed. Raises SceneError when no
-        node is chosen, one is held already, or the path is not of this kind.
+        where: as for `fix`, but without repeated ids. path: callable t [s] -> displacement from the start, (3,) or (k,3) [m] in
+        the order of the chosen nodes, or None from the time of release; it is called once here, for t = 0. Or `KeyFrames`, whose
+        pivot is in start coordinates. axes: the prescribed directions. Raises SceneError if no node is chosen, one is fixed or
+        moved already, or the path is invalid.
         """
         self._check_open("move")
         what = f"body {self.name!r}: move"
@@ -236,13 +238,13 @@ class Body(Guarded):
         if start is None:
             raise SceneError(f"{what}: the path must give a displacement at t = 0, not None")
         checks.array(start, f"{what}: the path's displacement at t = 0", ((3,), (len(nodes), 3)))
-        return self._hold(Constraint(nodes, mask, path, _function(where)), _MOVED, what)
+        return self._add_constraint(Constraint(nodes, mask, path, _callable_or_none(where)), _MOVED, what)
 
     def add_traction(self, where, traction) -> Traction:
-        """Load surface triangles with a dead force per reference area.
+        """Apply a dead load per reference area to surface triangles.
 
         where: rows of mesh.surface, a bool mask (t,), or a callable that gets the triangles' centroids at rest (t,3)
-        and returns such a mask. traction: (3,) [Pa]. Raises SceneError when no triangle is chosen or a number is not
+        and returns such a mask. traction: (3,) [Pa]. Raises SceneError if no triangle is chosen or a number is not
         finite.
         """
         self._check_open("add_traction")
@@ -254,39 +256,39 @@ class Body(Guarded):
         return load
 
     def add_force(self, where, force) -> NodalForce:
-        """Load nodes with a total dead force, spread over them by lumped mass, or with one force for each node.
+        """Apply a dead load to nodes: a total force distributed by lumped mass, or one force per node.
 
         where: as for `fix`; a node chosen twice counts once. force: (3,) the total, or (k,3) in the order of the chosen
-        nodes [N]. Raises SceneError when no node is chosen or numbers are not finite.
+        nodes [N]. Raises SceneError if no node is chosen or numbers are not finite.
         """
         self._check_open("add_force")
         what = f"body {self.name!r}: add_force"
         nodes = checks.selection(where, self.rest_positions, what, "node")
-        load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,), (len(nodes), 3))), _function(where))
+        load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,), (len(nodes), 3))), _callable_or_none(where))
         list.append(self.forces, load)
         return load
 
-    def _hold(self, constraint: Constraint, kind: int, what: str) -> Constraint:
-        """Add a constraint unless it contradicts an earlier one: only two fixes of one node and axis agree."""
-        held = np.full((self.n_nodes, 3), _FREE, dtype=np.int8)  # what holds each node along each axis
-        for one in self.constraints:
-            held[np.ix_(one.nodes, one.axes)] = _FIXED if one.path is None else _MOVED
-        before = held[np.ix_(constraint.nodes, constraint.axes)]
+    def _add_constraint(self, constraint: Constraint, kind: int, what: str) -> Constraint:
+        """Add a constraint. Raises SceneError if a node and axis is constrained already; only repeated fixes are allowed."""
+        kinds = np.full((self.n_nodes, 3), _FREE, dtype=np.int8)  # kind of constraint of each node and axis
+        for earlier in self.constraints:
+            kinds[np.ix_(earlier.nodes, earlier.axes)] = _FIXED if earlier.path is None else _MOVED
+        before = kinds[np.ix_(constraint.nodes, constraint.axes)]
         clash = np.argwhere((before != _FREE) if kind == _MOVED else (before == _MOVED))
         if len(clash):
             row, column = clash[0]
             axis = "xyz"[np.flatnonzero(constraint.axes)[column]]
-            done = "fixed" if before[row, column] == _FIXED else "moved"
-            raise SceneError(f"{what}: node {constraint.nodes[row]} is already {done} along {axis}")
+            verb = "fixed" if before[row, column] == _FIXED else "moved"
+            raise SceneError(f"{what}: node {constraint.nodes[row]} is already {verb} along {axis}")
         list.append(self.constraints, constraint)
         return constraint
 
 
-def _function(where) -> Callable | None:
+def _callable_or_none(where) -> Callable | None:
     return where if callable(where) else None
 
 
 def _make_read_only(*arrays: np.ndarray) -> None:
-    """Of a record that cannot change, and that copies of a scene share."""
+    """Make the arrays of a record read-only, since copies of a scene share it."""
     for array in arrays:
         array.setflags(write=False)

@@ -1,4 +1,4 @@
-"""Numbers of a scene that may change while it is simulated: checked, and put into the simulator's own copy of the scene."""
+"""Validate and apply run-time changes of a scene's numbers to the simulator's own copy of the scene."""
 
 import difflib
 from dataclasses import replace
@@ -11,13 +11,13 @@ from taisoft.scene import checks
 from taisoft.scene.body import Body
 
 CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping")
-LOADS = {"force": "forces", "traction": "tractions"}  # what a load is called, and the list of a body that holds them
+LOADS = {"force": "forces", "traction": "tractions"}  # kind of load -> the body's list of them
 
 
-def changed_material(body: Body, numbers: dict[str, float], on: dict[str, bool]) -> None:
-    """Give a body a material with new numbers; the law, and damping that is compiled out, cannot change while it runs.
+def change_material(body: Body, numbers: dict[str, float], on: dict[str, bool]) -> None:
+    """Replace numbers of a body's material. The law and damping that is compiled out cannot change at run time.
 
-    A warning names the line of the caller's caller.
+    Warnings point to the line of the caller's caller. Raises SceneError.
     """
     for name, value in numbers.items():
         if name not in CHANGEABLE:
@@ -39,8 +39,8 @@ def changed_material(body: Body, numbers: dict[str, float], on: dict[str, bool])
         body.warn_locking(stacklevel=3)
 
 
-def changed_load(body: Body, kind: str, index: int, value) -> None:
-    """Give a body's index-th load of a kind of LOADS, counted from 0 in the order added, another value.
+def change_load(body: Body, kind: str, index: int, value) -> None:
+    """Set the value of a body's load `index`, counted from 0 in the order added. kind: a key of LOADS.
 
     value: (3,) [N], or (k,3) for the k nodes of a force; (3,) [Pa] for a traction. Raises SceneError.
     """

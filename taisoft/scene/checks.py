@@ -1,4 +1,4 @@
-"""Checks of what a scene is given. Each raises SceneError with one sentence, or returns the clean value."""
+"""Validate values given to a scene. Each check returns the converted value or raises SceneError with one sentence."""
 
 import difflib
 from numbers import Real
@@ -7,7 +7,7 @@ import numpy as np
 
 from taisoft.errors import SceneError
 
-LARGEST, SMALLEST = float(np.finfo(np.float32).max), float(np.finfo(np.float32).tiny)  # what may be computed in 32 bits
+LARGEST, SMALLEST = float(np.finfo(np.float32).max), float(np.finfo(np.float32).tiny)  # limits of 32-bit floats
 
 
 def number(
@@ -15,13 +15,13 @@ def number(
     what: str,
     *,
     above: float | None = None,
-    least: float | None = None,
-    most: float | None = None,
+    minimum: float | None = None,
+    maximum: float | None = None,
     unit: str = "",
 ) -> float:
-    """A finite real number, > above, >= least, <= most where these are given, which 32 bits can hold.
+    """Return value as a finite float in the 32-bit range, > above, >= minimum, <= maximum where given.
 
-    what: the start of the message.
+    what: start of the message.
     """
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         raise SceneError(f"{what} must be a number, not {value!r}")
@@ -34,10 +34,10 @@ def number(
     rules = []
     if above is not None:
         rules.append((result > above, f"greater than {above:g}"))
-    if least is not None:
-        rules.append((result >= least, f"at least {least:g}"))
-    if most is not None:
-        rules.append((result <= most, f"at most {most:g}"))
+    if minimum is not None:
+        rules.append((result >= minimum, f"at least {minimum:g}"))
+    if maximum is not None:
+        rules.append((result <= maximum, f"at most {maximum:g}"))
     if not all(kept for kept, _ in rules):
         rule = " and ".join(text for _, text in rules)
         raise SceneError(f"{what} must be {rule}{unit and ' ' + unit}, not {value!r}")
@@ -47,16 +47,16 @@ def number(
 
 
 def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
-    """A float64 copy of finite numbers in one of the shapes. what: the start of the message."""
-    said = " or ".join(str(shape) for shape in shapes)
+    """Return a float64 copy of finite numbers in one of the shapes. what: start of the message."""
+    shapes_text = " or ".join(str(shape) for shape in shapes)
     try:
         result = np.asarray(value)
     except (ValueError, TypeError, OverflowError) as error:
-        raise SceneError(f"{what} must be numbers of shape {said}, not {value!r}") from error
+        raise SceneError(f"{what} must be numbers of shape {shapes_text}, not {value!r}") from error
     if result.dtype.kind not in "fiu":
-        raise SceneError(f"{what} must be numbers of shape {said}, not {value!r}")
+        raise SceneError(f"{what} must be numbers of shape {shapes_text}, not {value!r}")
     if result.shape not in shapes:
-        raise SceneError(f"{what} must have shape {said}, not {result.shape}")
+        raise SceneError(f"{what} must have shape {shapes_text}, not {result.shape}")
     result = np.array(result, dtype=np.float64)
     bad = np.argwhere(~np.isfinite(result))
     if len(bad):
@@ -68,7 +68,7 @@ def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
 
 
 def choice(value, what: str, allowed: tuple[str, ...]) -> str:
-    """One of the allowed words; the message names the nearest one."""
+    """Return value if it is one of the allowed words; otherwise the message suggests the closest one."""
     if isinstance(value, str) and value in allowed:
         return value
     near = difflib.get_close_matches(value.lower(), allowed, n=1) if isinstance(value, str) else []
@@ -77,27 +77,27 @@ def choice(value, what: str, allowed: tuple[str, ...]) -> str:
 
 
 def nearest(name: str, known) -> str:
-    """ " (did you mean X?)" for the known name closest to `name`, or an empty string."""
+    """Return " (did you mean X?)" for the known name closest to `name`, or an empty string."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
     return f" (did you mean {close[0]}?)" if close else ""
 
 
 def flag(value, what: str) -> bool:
-    """value, if it is True or False."""
+    """Return value if it is True or False."""
     if not isinstance(value, bool):
         raise SceneError(f"{what} must be True or False, not {value!r}")
     return value
 
 
 def whole(value, what: str, allowed: tuple[int, ...]) -> int:
-    """One of the allowed whole numbers."""
+    """Return value as an int if it is one of the allowed integers."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value not in allowed:
         raise SceneError(f"{what} must be {' or '.join(map(str, allowed))}, not {value!r}")
     return int(value)
 
 
 def name(value, what: str, taken: list[str]) -> str:
-    """A text with something in it that is not taken yet."""
+    """Return value if it is a non-blank string that is not in `taken`."""
     if not isinstance(value, str) or not value.strip():
         raise SceneError(f"{what} must be a text that is not empty, not {value!r}")
     if value in taken:
@@ -106,27 +106,27 @@ def name(value, what: str, taken: list[str]) -> str:
 
 
 def axes(value, what: str) -> np.ndarray:
-    """(3,) bool for a text such as "xz": some of x, y, z, none twice."""
+    """Return (3,) bool for a string such as "xz": some of x, y, z, without repetition."""
     if not isinstance(value, str) or not value or set(value) - set("xyz") or len(set(value)) != len(value):
-        raise SceneError(f"{what}: axes must name some of 'x', 'y', 'z', none of them twice, not {value!r}")
+        raise SceneError(f"{what}: axes must be some of 'x', 'y', 'z' without repetition, not {value!r}")
     return np.array([axis in value for axis in "xyz"])
 
 
 def selection(where, points: np.ndarray, what: str, items: str, *, repeats: bool = True) -> np.ndarray:
-    """Ids (k,) int64 of the chosen items, at least one.
+    """Return the ids (k,) int64 of the chosen items, k > 0.
 
-    where: ids, a bool mask (n,), or a callable that gets a copy of points (n,3) and returns such a mask. what: the
-    start of the message. items: what is chosen, in the singular. repeats: True drops repeated ids, False refuses them.
+    where: ids, a bool mask (n,), or a callable that gets a copy of points (n,3) and returns such a mask. what: start of
+    the message. items: singular noun for the items. repeats: True drops repeated ids, False refuses them.
     """
     n = len(points)
     if callable(where):
         try:
             mask = np.asarray(where(points.copy()))
         except Exception as error:
-            raise SceneError(f"{what}: the function that chooses failed: {type(error).__name__}: {error}") from error
+            raise SceneError(f"{what}: the selection function failed: {type(error).__name__}: {error}") from error
         if mask.dtype != bool or mask.shape != (n,):
             raise SceneError(
-                f"{what}: the function that chooses must return a bool mask of shape ({n},), "
+                f"{what}: the selection function must return a bool mask of shape ({n},), "
                 f"not {mask.dtype} of shape {mask.shape}"
             )
         ids = np.flatnonzero(mask)

@@ -1,9 +1,10 @@
-"""How contacts are looked for: the settings of a scene, and by which geometry a body is hit.
+"""Define a scene's collision detection settings and geometric tests for them.
 
-A body is hit either by vertex-face and edge-edge proximity of its deformed surface, or through its signed distance grid at rest,
-mapped by the tets behind the surface. A grid is smooth, but it rounds edges off, has cells thicker than a sheet, and where
-neighbouring tets are deformed unlike each other the map tears: hit so, the ball of the demo drop_everything (radius 0.2 m) and
-the edge of a step come to lie 2 cm in each other. So it is taken only where it is asked for.
+Contacts with a body are found either by vertex-face and edge-edge proximity of its deformed surface, or through its signed
+distance grid at rest, mapped by the tets behind the surface. The grid is smooth, but it rounds off edges and its cells may be
+thicker than a sheet. Where the deformation of neighbouring tets differs, the map is discontinuous: in the demo
+drop_everything, the ball (radius 0.2 m) and the edge of a step then penetrate by 2 cm. The grid is therefore used only on
+request.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from taisoft.scene import checks
 
 BROAD_PHASES = ("auto", "spatial_hash", "bvh")
 CONTACT_MODES = ("auto", "distance_field", "proximity")
-SHARP = 60.0  # [degrees] between the normals of neighbours above which a convex edge is sharp
+SHARP = 60.0  # [degrees] between adjacent face normals above which a convex edge is sharp
 
 
 @guarded_record("collision settings", "give scene.collision new CollisionSettings({name}=...) before a Simulator takes the scene")
@@ -37,61 +38,61 @@ class CollisionSettings:
     def __post_init__(self):
         what = "collision settings"
         checks.choice(self.broad_phase, f"{what}: broad_phase", BROAD_PHASES)
-        clean = {
+        validated = {
             "cell_ratio": checks.number(self.cell_ratio, f"{what}: cell_ratio", above=0.0),
             "k_dop": checks.whole(self.k_dop, f"{what}: k_dop", (6, 14, 18)),
             "field_cells": _count(self.field_cells, f"{what}: field_cells", 8, 256),
         }
         if self.margin is not None:
-            clean["margin"] = checks.number(self.margin, f"{what}: margin", least=0.0, unit="m")
+            validated["margin"] = checks.number(self.margin, f"{what}: margin", minimum=0.0, unit="m")
         for field in ("initial_capacity", "max_capacity"):
             if getattr(self, field) is not None:
-                clean[field] = _count(getattr(self, field), f"{what}: {field}", 64, 2**31 - 1)
-        if clean.get("initial_capacity", 0) > clean.get("max_capacity", 2**31):
+                validated[field] = _count(getattr(self, field), f"{what}: {field}", 64, 2**31 - 1)
+        if validated.get("initial_capacity", 0) > validated.get("max_capacity", 2**31):
             raise SceneError(
                 f"{what}: initial_capacity {self.initial_capacity} must not exceed max_capacity {self.max_capacity}"
             )
-        for field, value in clean.items():
-            # The only way to store a clean value in a frozen record.
+        for field, value in validated.items():
+            # The only way to store a validated value in a frozen record.
             object.__setattr__(self, field, value)
 
 
-def _count(value, what: str, least: int, most: int) -> int:
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or not least <= value <= most:
-        raise SceneError(f"{what} must be a whole number from {least} to {most}, not {value!r}")
+def _count(value, what: str, minimum: int, maximum: int) -> int:
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or not minimum <= value <= maximum:
+        raise SceneError(f"{what} must be a whole number from {minimum} to {maximum}, not {value!r}")
     return int(value)
 
 
 def has_sharp_edges(nodes: Nodes) -> bool:
-    """Whether some convex edge of a surface turns by more than SHARP at rest, or parts join at an edge."""
+    """Return whether a convex edge of the surface is sharper than SHARP at rest, or parts are joined at an edge."""
     try:
         opposite = opposite_half_edges(nodes.surface)
     except MeshError:
         return True
-    return _sharpest_turn(nodes.positions, nodes.surface, opposite) > SHARP
+    return _largest_convex_angle(nodes.positions, nodes.surface, opposite) > SHARP
 
 
 def principal_extents(positions: np.ndarray, surface: np.ndarray) -> np.ndarray:
-    """(3,) [m]: sides of the box along the principal axes of the surface's area.
+    """Return the sides (3,) [m] of the bounding box along the principal axes of the surface's area.
 
     With s the sum of a triangle's corners v about the centroid, the integral of x x^T is area/12 (sum v v^T + s s^T).
     """
     x = positions[surface]
     area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1)
     x = x - (area @ x.mean(axis=1)) / area.sum()
-    total = x.sum(axis=1)
-    moment = np.einsum("t,tki,tkj->ij", area, x, x) + np.einsum("t,ti,tj->ij", area, total, total)
+    corner_sum = x.sum(axis=1)
+    moment = np.einsum("t,tki,tkj->ij", area, x, x) + np.einsum("t,ti,tj->ij", area, corner_sum, corner_sum)
     return np.ptp(x.reshape(-1, 3) @ np.linalg.eigh(moment)[1], axis=0)
 
 
-def _sharpest_turn(positions: np.ndarray, surface: np.ndarray, opposite: np.ndarray) -> float:
-    """The largest angle [degrees] by which the normal turns at a convex edge, rounded to 1e-6."""
+def _largest_convex_angle(positions: np.ndarray, surface: np.ndarray, opposite: np.ndarray) -> float:
+    """Return the largest angle [degrees] between adjacent face normals at a convex edge, rounded to 1e-6."""
     normals, _ = normals_and_heights(positions, surface)
     t, k = np.nonzero(opposite >= 0)
     other, at = np.divmod(opposite[t, k], 3)
-    apex = positions[surface[other, (at + 2) % 3]]  # the neighbour's corner beyond the edge
+    apex = positions[surface[other, (at + 2) % 3]]  # the neighbour's corner opposite the edge
     convex = np.einsum("ex,ex->e", apex - positions[surface[t, k]], normals[t]) < 0
     a, b = normals[t[convex]], normals[other[convex]]
-    # From sine and cosine: the arc cosine alone is poor near 0 and 180 degrees.
-    turn = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ex,ex->e", a, b))
-    return round(float(np.degrees(turn.max(initial=0.0))), 6)
+    # arctan2 of sine and cosine, since arccos is inaccurate near 0 and 180 degrees.
+    angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ex,ex->e", a, b))
+    return round(float(np.degrees(angle.max(initial=0.0))), 6)

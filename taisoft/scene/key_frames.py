@@ -1,7 +1,8 @@
-"""Motion by key frames: plain numbers that say where something is when, in place of a function of time.
+"""Prescribe motion by key frames: translations and rotations at given times, as plain numbers.
 
-Between two keys the translation is linear and the rotation turns evenly: about one common axis by the difference of the
-angles, so that full turns count; else by the shortest turn from one to the other. Outside the keys the ends are held.
+Between two keys translation is linear and the rotation rate constant: about a common axis by the difference of the angles, so
+that full turns count; otherwise by the shortest rotation between the two. Before the first and after the last key the end
+value holds.
 """
 
 from dataclasses import dataclass
@@ -13,16 +14,16 @@ from taisoft.attributes import guarded_record
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 
-MOST = 1e6  # [rad] of a rotation vector's entry; above, angles lose their digits
-PARALLEL = 1e-12  # sine of the angle between two axes below which they count as one
+MAX_ANGLE = 1e6  # [rad], largest entry of a rotation vector; larger angles lose digits
+PARALLEL = 1e-12  # sine of the angle between two axes below which they count as the same
 
 
 @guarded_record("key frames", "make new KeyFrames")
 @dataclass(frozen=True, eq=False)
 class KeyFrames:
-    """A path for `Body.move` and `Scene.add_obstacle`; called with t [s], it gives (translation (3,) [m], rotation (3,3)).
+    """A path for `Body.move` and `Scene.add_obstacle`. Calling it with t [s] returns (translation (3,) [m], rotation (3,3)).
 
-    Points move as x -> rotation @ (x - pivot) + pivot + translation, x being where they start. Raises SceneError.
+    Points move as x -> rotation @ (x - pivot) + pivot + translation, where x is the start position. Raises SceneError.
     """
 
     times: np.ndarray  #: (k,) ascending [s]
@@ -44,54 +45,54 @@ class KeyFrames:
             raise SceneError(f"{what}: times must ascend, but {times[first + 1]:g} follows {times[first]:g}")
         if self.translations is None and self.rotations is None:
             raise SceneError(f"{what}: translations or rotations are needed")
-        clean = {"times": times, "translations": np.zeros((k, 3))}
+        validated = {"times": times, "translations": np.zeros((k, 3))}
         for field, shape in (("translations", (k, 3)), ("rotations", (k, 3)), ("pivot", (3,))):
             if getattr(self, field) is not None:
-                clean[field] = checks.array(getattr(self, field), f"{what}: {field}", (shape,))
+                validated[field] = checks.array(getattr(self, field), f"{what}: {field}", (shape,))
         for field in ("smooth", "release"):
             checks.flag(getattr(self, field), f"{what}: {field}")
-        if "rotations" in clean:
-            if np.abs(clean["rotations"]).max() > MOST:
-                raise SceneError(f"{what}: rotations must be at most {MOST:g} rad about each axis")
-            clean["_turns"] = _turns(clean["rotations"])
-        for field, value in clean.items():
+        if "rotations" in validated:
+            if np.abs(validated["rotations"]).max() > MAX_ANGLE:
+                raise SceneError(f"{what}: rotations must be at most {MAX_ANGLE:g} rad about each axis")
+            validated["_turns"] = _turns(validated["rotations"])
+        for field, value in validated.items():
             value.setflags(write=False)
-            # The only way to store a clean value in a frozen record.
+            # The only way to store a validated value in a frozen record.
             object.__setattr__(self, field, value)
 
     def __call__(self, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Translation (3,) [m] and rotation (3,3) at time t [s]."""
+        """Return translation (3,) [m] and rotation (3,3) at time t [s]."""
         last = len(self.times) - 1
         i = min(max(int(np.searchsorted(self.times, t, side="right")) - 1, 0), last)
-        share = 0.0
+        weight = 0.0
         if i < last and t > self.times[i]:
-            share = (t - self.times[i]) / (self.times[i + 1] - self.times[i])
-            share = share * share * (3.0 - 2.0 * share) if self.smooth else share
+            weight = (t - self.times[i]) / (self.times[i + 1] - self.times[i])
+            weight = weight * weight * (3.0 - 2.0 * weight) if self.smooth else weight
         translation = self.translations[i].copy()
-        if share > 0.0:
-            translation += share * (self.translations[i + 1] - self.translations[i])
+        if weight > 0.0:
+            translation += weight * (self.translations[i + 1] - self.translations[i])
         if self.rotations is None:
             return translation, np.eye(3)
         from_rotvec = scipy.spatial.transform.Rotation.from_rotvec
-        rotation = from_rotvec(self.rotations[i].copy())  # scipy wants to write
-        if share > 0.0:
-            rotation = rotation * from_rotvec(share * self._turns[i])
+        rotation = from_rotvec(self.rotations[i].copy())  # scipy needs a writable array
+        if weight > 0.0:
+            rotation = rotation * from_rotvec(weight * self._turns[i])
         return translation, rotation.as_matrix()
 
     def of_nodes(self, starts: np.ndarray) -> "NodePath":
-        """The path of nodes that start at `starts` (k,3) [m]."""
+        """Return the path of nodes that start at `starts` (k,3) [m]."""
         return NodePath(self, starts)
 
     def of_shape(self, center: np.ndarray) -> "ShapePath":
-        """The path of an obstacle whose shape turns about center (3,) [m]. Raises SceneError for frames that release."""
+        """Return the path of an obstacle whose pivot is center (3,) [m]. Raises SceneError if release is set."""
         if self.release:
-            raise SceneError("key frames: release is for nodes; an obstacle cannot be let go")
+            raise SceneError("key frames: release is for nodes; an obstacle cannot be released")
         return ShapePath(self, center)
 
 
 @dataclass(frozen=True, eq=False)
 class NodePath:
-    """Key frames as `Body.move` follows them: t [s] -> displacement (3,) or (k,3) [m], or None once the nodes are free."""
+    """Key frames as a path for nodes: t [s] -> displacement (3,) or (k,3) [m], or None once the nodes are released."""
 
     frames: KeyFrames
     starts: np.ndarray  #: (k,3) [m]
@@ -108,7 +109,7 @@ class NodePath:
 
 @dataclass(frozen=True, eq=False)
 class ShapePath:
-    """Key frames as an obstacle follows them: t [s] -> (translation (3,) [m], rotation (3,3) about its shape's pivot)."""
+    """Key frames as a path for an obstacle: t [s] -> (translation (3,) [m], rotation (3,3) about its shape's pivot)."""
 
     frames: KeyFrames
     center: np.ndarray  #: (3,) [m], the shape's pivot
@@ -122,12 +123,12 @@ class ShapePath:
 
 
 def _turns(rotations: np.ndarray) -> np.ndarray:
-    """(k-1,3) rotation vectors from each rotation to the next, in the frame of the first. rotations: (k,3)."""
+    """Return rotation vectors (k-1,3) from each rotation to the next, in the frame of the first. rotations: (k,3)."""
     a, b = rotations[:-1], rotations[1:]
     if not len(a):
         return a.copy()
     from_rotvec = scipy.spatial.transform.Rotation.from_rotvec
     shortest = (from_rotvec(a).inv() * from_rotvec(b)).as_rotvec()
     lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    one_axis = np.linalg.norm(np.cross(a, b), axis=1) <= PARALLEL * lengths  # no rotation has every axis
-    return np.where(one_axis[:, None], b - a, shortest)
+    parallel = np.linalg.norm(np.cross(a, b), axis=1) <= PARALLEL * lengths  # a zero rotation is parallel to any axis
+    return np.where(parallel[:, None], b - a, shortest)

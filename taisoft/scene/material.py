@@ -1,4 +1,4 @@
-"""What a body is made of: an elastic law and its numbers, all checked."""
+"""Define a material: an elastic law with validated parameters."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ LAWS = ("st_venant_kirchhoff", "corotational", "stable_neo_hookean")
 @guarded_record("material", "make another one by dataclasses.replace, or call sim.set_material(body, {name}=...) in a simulation")
 @dataclass(frozen=True)
 class Material:
-    """An elastic material with damping and surface numbers. Raises SceneError for numbers outside the rules below."""
+    """An elastic material with damping and surface parameters. Raises SceneError for values outside the rules below."""
 
     law: str = "stable_neo_hookean"  #: "st_venant_kirchhoff", "corotational" or "stable_neo_hookean"
     young: float = 1e6  #: Young's modulus [Pa], > 0
@@ -29,13 +29,13 @@ class Material:
             "young": {"above": 0.0, "unit": "Pa"},
             "poisson": {},
             "density": {"above": 0.0, "unit": "kg/m^3"},
-            "friction": {"least": 0.0},
-            "restitution": {"least": 0.0, "most": 1.0},
-            "mass_damping": {"least": 0.0, "unit": "1/s"},
-            "stiffness_damping": {"least": 0.0, "unit": "s"},
+            "friction": {"minimum": 0.0},
+            "restitution": {"minimum": 0.0, "maximum": 1.0},
+            "mass_damping": {"minimum": 0.0, "unit": "1/s"},
+            "stiffness_damping": {"minimum": 0.0, "unit": "s"},
         }
         for field, limit in limits.items():
-            # The only way to store a clean float in a frozen record.
+            # The only way to store a validated float in a frozen record.
             object.__setattr__(self, field, checks.number(getattr(self, field), f"material: {field}", **limit))
         if not -1.0 < self.poisson < 0.5:
             raise SceneError(f"material: poisson must lie in the open interval (-1, 0.5), not {self.poisson:g}")

@@ -1,4 +1,4 @@
-"""The numbers of a scene that a simulator can change while it runs, by what to call each; and how two scenes differ in them."""
+"""Collect, by name, the numbers of a scene that may change at run time, and compare two such sets."""
 
 import dataclasses
 import reprlib
@@ -10,7 +10,7 @@ Numbers = dict[str, float | list | None]
 
 
 def scene_numbers(scene: Scene) -> Numbers:
-    """Plain data: gravity, all numbers of every material, values of loads, friction and restitution set for pairs."""
+    """Return as plain data gravity, all material numbers, load values, and friction and restitution set for pairs."""
     numbers: Numbers = {"gravity": scene.gravity.tolist()}
     for body in scene.bodies:
         for name, value in dataclasses.asdict(body.material).items():
@@ -25,22 +25,22 @@ def scene_numbers(scene: Scene) -> Numbers:
     return numbers
 
 
-def numbers_differ(before: Numbers, now: Numbers) -> str:
-    """A sentence about the first number in which a scene now differs from the one before; empty where none does."""
+def first_difference(before: Numbers, now: Numbers) -> str:
+    """Return a sentence about the first difference between two scenes' numbers; "" if there is none."""
     for name in before | now:
         old, new = before.get(name), now.get(name)
         if old == new:
             continue
-        if _rows(old) and _rows(new) and len(old) == len(new):  # one force for each node
+        if _is_nested(old) and _is_nested(new) and len(old) == len(new):  # one force per node
             row = next(i for i, pair in enumerate(zip(old, new)) if pair[0] != pair[1])
             name, old, new = f"{name}, row {row}", old[row], new[row]
-        return f"{name} is {_told(new)} in this scene and was {_told(old)} at the start of the saved run"
+        return f"{name} is {_number_text(new)} in this scene and was {_number_text(old)} at the start of the saved run"
     return ""
 
 
-def _rows(value) -> bool:
+def _is_nested(value) -> bool:
     return isinstance(value, list) and bool(value) and isinstance(value[0], list)
 
 
-def _told(value) -> str:
+def _number_text(value) -> str:
     return "not set" if value is None else reprlib.repr(value)

@@ -1,7 +1,7 @@
-"""Obstacles: rigid things that bodies touch and that nothing moves but their own path.
+"""Define obstacles: rigid shapes that bodies collide with and that move only along a prescribed path.
 
-A shape is a checked, frozen record. It lives in a frame of its own: x = frame() @ x_local + pivot. Half-space: the local y
-axis is the normal, the solid lies at y <= 0. Capsule: the local x axis runs from a to b. Box and sphere: the world's axes.
+A shape is a validated, frozen record with a local frame: x = frame() @ x_local + pivot. Half-space: the local y axis is the
+normal, the solid lies at y <= 0. Capsule: the local x axis runs from a to b. Box and sphere: the world's axes.
 """
 
 from collections.abc import Callable
@@ -18,41 +18,41 @@ from taisoft.mesh.shapes import box_mesh
 from taisoft.scene import checks
 from taisoft.scene.key_frames import KeyFrames
 
-DEGENERATE = 1e-9  # a triangle's least height below this times its longest edge counts as none
-UNIT = 8 * np.finfo(np.float64).eps  # a squared length this near to 1 is left as it is: a normal read back stays the same
-MAKE_ANOTHER = "make another shape; what moves is an obstacle, by its path"
-RIGID = 1e-6  # largest entry of R^T R - I that a path's rotation may have
+DEGENERATE = 1e-9  # a triangle has no area if its smallest height is below this times its longest edge
+UNIT_TOLERANCE = 8 * np.finfo(np.float64).eps  # squared lengths this close to 1 are kept, so normals read back unchanged
+MAKE_ANOTHER = "make another shape; an obstacle moves by its path"
+RIGID_TOLERANCE = 1e-6  # largest allowed entry of R^T R - I for a path's rotation R
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """What all shapes offer; `kind` tells them apart where branching on a class is impossible. Arrays are read-only."""
+    """Base of all shapes. `kind` identifies them where branching on a class is impossible. Arrays are read-only."""
 
     kind: ClassVar[int]
     word: ClassVar[str]
 
     @property
     def pivot(self) -> np.ndarray:
-        """(3,) [m]: about which a path's rotation turns the shape, and the origin of its frame; the center where it has one."""
+        """Center (3,) [m] of a path's rotation and origin of the local frame; by default the shape's center."""
         return self.center
 
     def frame(self) -> np.ndarray:
-        """(3,3) rotation whose columns are the local axes."""
+        """Return the rotation (3,3) whose columns are the local axes."""
         return np.eye(3)
 
     def size(self) -> np.ndarray:
-        """(3,) [m]: (radius, 0, 0) of a sphere, half extents of a box, (half length, radius, 0) of a capsule, else 0."""
+        """Return (3,) [m]: (radius, 0, 0) of a sphere, half extents of a box, (half length, radius, 0) of a capsule, else 0."""
         return np.zeros(3)
 
     def surface(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Vertices (n,3) [m] and triangles (t,3) int64 with normals out of the solid; None for a shape without."""
+        """Return vertices (n,3) [m] and outward-oriented triangles (t,3) int64; None for a shape without triangles."""
         return None
 
     def _vector(self, field: str) -> np.ndarray:
         return self._store(field, checks.array(getattr(self, field), f"{self.word}: {field}", ((3,),)))
 
     def _radius(self) -> None:
-        # The only way to store a clean value in a frozen record.
+        # The only way to store a validated value in a frozen record.
         object.__setattr__(self, "radius", checks.number(self.radius, f"{self.word}: radius", above=0.0, unit="m"))
 
     def _store(self, field: str, value: np.ndarray) -> np.ndarray:
@@ -77,18 +77,18 @@ class HalfSpace(Shape):
 
     @property
     def pivot(self) -> np.ndarray:
-        """(3,) [m]: the given point."""
+        """The given point (3,) [m]."""
         return self.point
 
     def frame(self) -> np.ndarray:
-        """(3,3): y along the normal."""
+        """Return the rotation (3,3) with local y along the normal."""
         return _axes(self.normal, 1)
 
 
 @guarded_record("sphere", MAKE_ANOTHER)
 @dataclass(frozen=True, eq=False)
 class Sphere(Shape):
-    """A ball. Raises SceneError unless its radius is above 0."""
+    """A solid sphere. Raises SceneError unless its radius is above 0."""
 
     center: np.ndarray  #: (3,) [m]
     radius: float  #: [m]
@@ -100,14 +100,14 @@ class Sphere(Shape):
         self._radius()
 
     def size(self) -> np.ndarray:
-        """(radius, 0, 0) [m]."""
+        """Return (radius, 0, 0) [m]."""
         return np.array([self.radius, 0.0, 0.0])
 
 
 @guarded_record("box", MAKE_ANOTHER)
 @dataclass(frozen=True, eq=False)
 class Box(Shape):
-    """A box along the axes. Raises SceneError unless its half extents are above 0."""
+    """An axis-aligned box. Raises SceneError unless its half extents are above 0."""
 
     center: np.ndarray  #: (3,) [m]
     half_extents: np.ndarray  #: (3,) [m]
@@ -120,11 +120,11 @@ class Box(Shape):
             raise SceneError(f"box: half_extents must be greater than 0 m, not {self.half_extents.tolist()}")
 
     def size(self) -> np.ndarray:
-        """Half extents (3,) [m]."""
+        """Return the half extents (3,) [m]."""
         return self.half_extents.copy()
 
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
-        """8 vertices, 12 triangles; corner (i,j,k) has index 4 i + 2 j + k."""
+        """Return 8 vertices and 12 triangles; corner (i,j,k) has index 4 i + 2 j + k."""
         corners, triangles = _unit_box()
         return self.center + self.half_extents * corners, triangles.copy()
 
@@ -147,25 +147,25 @@ class Capsule(Shape):
 
     @property
     def pivot(self) -> np.ndarray:
-        """(3,) [m]: the middle of a and b."""
+        """Midpoint (3,) [m] of a and b."""
         return self.a + 0.5 * (self.b - self.a)
 
     def frame(self) -> np.ndarray:
-        """(3,3): x from a to b."""
+        """Return the rotation (3,3) with local x from a to b."""
         return _axes(_unit(self.b - self.a, "capsule"), 0)
 
     def size(self) -> np.ndarray:
-        """(half length of the segment, radius, 0) [m]."""
+        """Return (half length of the segment, radius, 0) [m]."""
         return np.array([0.5 * float(np.linalg.norm(self.b - self.a)), self.radius, 0.0])
 
 
 @guarded_record("mesh obstacle", MAKE_ANOTHER)
 @dataclass(frozen=True, eq=False)
 class MeshObstacle(Shape):
-    """Triangles whose normals point out of the solid; they need not close, and normals inward make a hollow.
+    """Triangles whose normals point out of the solid; they may be open, and inward normals bound a cavity.
 
-    Raises SceneError for indices that do not exist, triangles without area, an edge of more than two triangles, and
-    neighbours that are not oriented alike.
+    Raises SceneError for invalid indices, triangles without area, an edge of more than two triangles, and
+    inconsistent orientation.
     """
 
     vertices: np.ndarray  #: (n,3) [m]
@@ -197,7 +197,7 @@ class MeshObstacle(Shape):
         if len(flat):
             raise SceneError(
                 f"mesh obstacle: triangle {flat[0]} {tuple(triangles[flat[0]].tolist())} has no area "
-                f"({len(flat)} such triangles; the least height must exceed {DEGENERATE:g} of the longest edge)"
+                f"({len(flat)} such triangles; the smallest height must exceed {DEGENERATE:g} of the longest edge)"
             )
         try:
             opposite_half_edges(triangles)
@@ -208,27 +208,27 @@ class MeshObstacle(Shape):
 
     @property
     def pivot(self) -> np.ndarray:
-        """(3,) [m]: the mean vertex."""
+        """Mean vertex (3,) [m]."""
         return self.vertices.mean(axis=0)
 
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
-        """Copies of the given arrays."""
+        """Return copies of the given arrays."""
         return self.vertices.copy(), self.triangles.copy()
 
 
 def _unit(vector: np.ndarray, rule: str) -> np.ndarray:
-    """(3,) of length 1; SceneError with the rule where there is no direction."""
+    """Return the unit vector (3,). Raises SceneError with the rule for a zero or infinite vector."""
     largest = float(np.abs(vector).max())
     if largest == 0.0 or not np.isfinite(largest):
         raise SceneError(rule)
-    if largest <= 1.0 and abs(vector @ vector - 1.0) <= UNIT:
+    if largest <= 1.0 and abs(vector @ vector - 1.0) <= UNIT_TOLERANCE:
         return vector.copy()
     scaled = vector / largest
     return scaled / np.linalg.norm(scaled)
 
 
 def _axes(direction: np.ndarray, axis: int) -> np.ndarray:
-    """(3,3) rotation whose column `axis` is the unit direction; the identity where that is the axis already."""
+    """Return a rotation (3,3) whose column `axis` is the unit direction; the identity if it is that axis already."""
     second = np.zeros(3)
     second[np.argmin(np.abs(direction))] = 1.0
     second = second - (second @ direction) * direction
@@ -240,16 +240,16 @@ def _axes(direction: np.ndarray, axis: int) -> np.ndarray:
 
 @cache
 def _unit_box() -> tuple[np.ndarray, np.ndarray]:
-    """Corners (8,3) at -1 and 1, triangles (12,3). Of a cube, since the mesh of a flat box would be warned of."""
+    """Return corners (8,3) at -1 and 1, and triangles (12,3). Made as a cube, since meshing a flat box would warn."""
     mesh = box_mesh((1, 1, 1), (2.0, 2.0, 2.0), pattern="six")
     return mesh.vertices, mesh.surface
 
 
 def surface_numbers(friction, restitution, what: str) -> tuple[float, float]:
-    """Coulomb's coefficient and the restitution as clean floats. what: the start of the message. Raises SceneError."""
+    """Return validated friction and restitution as floats. what: start of the message. Raises SceneError."""
     return (
-        checks.number(friction, f"{what}: friction", least=0.0),
-        checks.number(restitution, f"{what}: restitution", least=0.0, most=1.0),
+        checks.number(friction, f"{what}: friction", minimum=0.0),
+        checks.number(restitution, f"{what}: restitution", minimum=0.0, maximum=1.0),
     )
 
 
@@ -260,8 +260,8 @@ def surface_numbers(friction, restitution, what: str) -> tuple[float, float]:
 class Obstacle:
     """A shape in a scene; made by `Scene.add_obstacle`.
 
-    path: None, `KeyFrames`, or callable t [s] -> (translation (3,) [m], rotation (3,3)); it is called once here, for t = 0.
-    Raises SceneError for another shape, numbers outside the rules, and a path that gives anything else.
+    path: None, `KeyFrames`, or callable t [s] -> (translation (3,) [m], rotation (3,3)), called once here for t = 0. Raises
+    SceneError for an invalid shape, values outside the rules, and a path with another result.
     """
 
     shape: Shape
@@ -285,9 +285,9 @@ class Obstacle:
         self.pose(0.0)
 
     def pose(self, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Translation (3,) [m] and rotation (3,3) at time t [s]: x -> rotation @ (x - pivot) + pivot + translation.
+        """Return translation (3,) [m] and rotation (3,3) at time t [s]: x -> rotation @ (x - pivot) + pivot + translation.
 
-        Raises SceneError, naming the obstacle and the time, for a path that fails or gives no rigid motion.
+        Raises SceneError with the obstacle and the time if the path fails or returns no rigid motion.
         """
         if self.path is None:
             return np.zeros(3), np.eye(3)
@@ -301,15 +301,16 @@ class Obstacle:
         translation = checks.array(translation, f"{what}'s translation at t = {t:g}", ((3,),))
         rotation = checks.array(rotation, f"{what}'s rotation at t = {t:g}", ((3, 3),))
         with np.errstate(over="ignore", invalid="ignore"):
-            rigid = np.abs(rotation.T @ rotation - np.eye(3)).max() <= RIGID and np.linalg.det(rotation) > 0
+            rigid = np.abs(rotation.T @ rotation - np.eye(3)).max() <= RIGID_TOLERANCE and np.linalg.det(rotation) > 0
         if not rigid:
             raise SceneError(
-                f"{what}'s rotation at t = {t:g} must be orthonormal to {RIGID:g} with determinant 1, not {rotation.tolist()}"
+                f"{what}'s rotation at t = {t:g} must be orthonormal to {RIGID_TOLERANCE:g} with determinant 1, "
+                f"not {rotation.tolist()}"
             )
         return translation, rotation
 
     def points_at(self, t: float, points: np.ndarray) -> np.ndarray:
-        """(n,3) [m]: where points (n,3) of the shape as it was given are at time t [s]."""
+        """Return the positions (n,3) [m] at time t [s] of points (n,3) given on the undisplaced shape."""
         translation, rotation = self.pose(t)
         pivot = self.shape.pivot
         return (points - pivot) @ rotation.T + pivot + translation

@@ -1,10 +1,10 @@
-"""A scene on another mesh: every tet cut into eight, or with elements of another order; all else stays what it is.
+"""Refine a scene's meshes by splitting every tet into eight, or change its element order; all else is kept.
 
-Old nodes keep their places and come first, new ones lie in the middle of edges, so that the two solutions can be compared
-node by node. The geometry stays that of the mesh: a ball's corners do not move outwards. What was chosen by a function is
-chosen anew. Of what was chosen by ids, the middle of an edge is chosen where a surface triangle or a tet that is chosen as a
-whole has the edge; where only its two ends are, nothing tells, and that is refused. Tractions go to the parts of their
-triangles. Forces given one for each node stay point forces.
+Old nodes keep their positions and come first; new nodes are edge midpoints, so two solutions can be compared node by node. The
+geometry stays that of the mesh: new nodes of a ball do not move to the sphere. Functions that choose nodes are evaluated again.
+For nodes chosen by id, a midpoint is chosen if its edge belongs to a surface triangle or tet whose nodes are all chosen; if
+only the two ends are chosen, the case is ambiguous and refused. Tractions pass to the parts of their triangles. Forces given
+per node stay point forces.
 """
 
 import copy
@@ -23,28 +23,28 @@ from taisoft.scene.scene import Scene
 
 
 def refined(scene: Scene) -> Scene:
-    """The scene with every tet of every body cut into eight. Raises SceneError where something cannot be carried over."""
+    """Return the scene with every tet split into eight. Raises SceneError if a constraint or load cannot be transferred."""
     return _with_bodies(scene, [_refined(body) for body in scene.bodies])
 
 
 def with_order(scene: Scene, order: int) -> Scene:
-    """The scene with all bodies of order 1 or 2. Raises SceneError as `refined` does."""
+    """Return the scene with all bodies of order 1 or 2. Raises SceneError as `refined` does."""
     return _with_bodies(scene, [copy.copy(body) if body.order == order else _of_order(body, order) for body in scene.bodies])
 
 
 def _with_bodies(scene: Scene, bodies: list[Body]) -> Scene:
-    twin = scene.snapshot()
-    with thawed(twin):
-        twin.bodies = bodies
-    return twin
+    copied = scene.snapshot()
+    with thawed(copied):
+        copied.bodies = bodies
+    return copied
 
 
 def _refined(old: Body) -> Body:
     split = old.nodes if old.order == 2 else make_nodes(old.mesh, 2)
     mesh = TetMesh(split.positions, split.tets)
     edges, _ = distinct_edges(mesh.tets if old.order == 2 else old.mesh.tets)
-    new = _on_mesh(old, mesh, old.order, np.concatenate([_themselves(old.n_nodes), edges]))
-    # Row of the new surface -> triangle of the old one: split.surface has the four parts of each one after another.
+    new = _on_mesh(old, mesh, old.order, np.concatenate([_own_parents(old.n_nodes), edges]))
+    # Row of the new surface -> triangle of the old one: split.surface lists the four parts of each triangle in sequence.
     rows = {tuple(sorted(t)): k // 4 for k, t in enumerate(split.surface.tolist())}
     parents = np.array([rows[tuple(sorted(t))] for t in mesh.surface.tolist()])
     for load in old.tractions:
@@ -53,7 +53,7 @@ def _refined(old: Body) -> Body:
 
 
 def _of_order(old: Body, order: int) -> Body:
-    parents = _themselves(old.mesh.n_verts)
+    parents = _own_parents(old.mesh.n_verts)
     if order == 2:
         parents = np.concatenate([parents, distinct_edges(old.mesh.tets)[0]])
     new = _on_mesh(old, old.mesh, order, parents)
@@ -62,12 +62,12 @@ def _of_order(old: Body, order: int) -> Body:
     return new
 
 
-def _themselves(n: int) -> np.ndarray:
+def _own_parents(n: int) -> np.ndarray:
     return np.repeat(np.arange(n)[:, None], 2, axis=1)
 
 
 def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
-    """The body on another mesh, but for its tractions. parents: (n,2) the old nodes that each new one lies between."""
+    """Return the body on another mesh, without tractions. parents: (n,2), the two old nodes that each new node bisects."""
     velocity = old.velocity if old.velocity.shape == (3,) else old.velocity[parents].mean(axis=1)
     degree = old.quadrature_degree if order == old.order else None
     new = Body(old.name, mesh, old.material, old.position, velocity, order, degree, old.collision)
@@ -83,46 +83,46 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
             new.add_force(_chosen(old, force, parents), force.value)
             continue
         if force.nodes.max() >= new.n_nodes or not (parents[force.nodes] == force.nodes[:, None]).all():
-            raise SceneError(f"body {old.name!r}: forces on the middles of edges have no place on linear tets")
+            raise SceneError(f"body {old.name!r}: linear tets have no mid-edge nodes for its forces")
         new.add_force(force.nodes, force.value)
     return new
 
 
 def _chosen(old: Body, item: Constraint | NodalForce, parents: np.ndarray):
-    """What chooses the new nodes: the function that chose the old ones, or their ids (k,)."""
+    """Return the selection of new nodes: the function that chose the old ones, or ids (k,)."""
     if item.where is not None:
         return item.where
-    held = np.zeros(old.n_nodes, dtype=bool)
-    held[item.nodes] = True
-    chosen = held[parents].all(axis=1)
+    selected = np.zeros(old.n_nodes, dtype=bool)
+    selected[item.nodes] = True
+    chosen = selected[parents].all(axis=1)
     inner = chosen & (parents[:, 0] != parents[:, 1])
-    whole = [set(map(tuple, _edges_of(cells[held[cells].all(axis=1)]))) for cells in (old.nodes.surface, old.nodes.tets)]
+    whole = [set(map(tuple, _edges_of(cells[selected[cells].all(axis=1)]))) for cells in (old.nodes.surface, old.nodes.tets)]
     for a, b in np.sort(parents[inner], axis=1).tolist():
         if (a, b) not in whole[0] and (a, b) not in whole[1]:
             raise SceneError(
-                f"body {old.name!r}: nodes {a} and {b} are held or loaded by their ids, and whether the middle of their edge is "
-                "cannot be told, since no surface triangle or tet that has it is chosen as a whole: choose by a function"
+                f"body {old.name!r}: nodes {a} and {b} are chosen by id, and whether the midpoint of their edge is chosen too is "
+                "ambiguous, since no surface triangle or tet with that edge is chosen as a whole: choose by a function"
             )
     if not chosen.any():
-        raise SceneError(f"body {old.name!r}: what is held or loaded are middles of edges, which linear tets do not have")
+        raise SceneError(f"body {old.name!r}: only mid-edge nodes are chosen, which linear tets do not have")
     return np.flatnonzero(chosen)
 
 
 def _edges_of(cells: np.ndarray) -> list:
-    """Ascending vertex pairs of triangles (k,3) or tets (k,4), with repeats."""
+    """Return ascending vertex pairs of triangles (k,3) or tets (k,4), with repetitions."""
     a, b = np.triu_indices(cells.shape[1], 1)
     return np.sort(np.stack([cells[:, a], cells[:, b]], axis=2).reshape(-1, 2), axis=1).tolist()
 
 
 def _path(old: Body, constraint: Constraint):
-    """The path as Body.move takes it for any number of nodes; without a pivot key frames turn about the old nodes' mean."""
+    """Return the path for any number of nodes; key frames without a pivot keep the old nodes' mean as pivot."""
     path = constraint.path
     if isinstance(path, NodePath):
         frames: KeyFrames = path.frames
         return frames if frames.pivot is not None else replace(frames, pivot=path.starts.mean(axis=0))
     if np.shape(path(0.0)) != (3,):
         raise SceneError(
-            f"body {old.name!r}: a path gives one displacement for each of its {len(constraint.nodes)} nodes, and none for new "
-            "ones: lead them by KeyFrames"
+            f"body {old.name!r}: a path returns one displacement for each of its {len(constraint.nodes)} nodes, and none for "
+            "new nodes: move them by KeyFrames"
         )
     return path

@@ -1,6 +1,6 @@
-"""A scene as plain data: elastic bodies, obstacles, gravity, and what counts where two surfaces meet.
+"""Describe a scene as plain data: elastic bodies, obstacles, gravity, and contact parameters of pairs.
 
-Everything is checked and turned into arrays at the call that adds it, so that a scene that exists can be simulated.
+Every input is validated and converted to arrays when it is added, so an existing scene can be simulated.
 """
 
 import copy
@@ -14,7 +14,7 @@ from taisoft.attributes import Guarded, thawed
 from taisoft.errors import SceneError
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
-from taisoft.scene.body import ANOTHER, Body, Constraint, NodalForce, Traction
+from taisoft.scene.body import USE_A_COPY, Body, Constraint, NodalForce, Traction
 from taisoft.scene.collision import CollisionSettings
 from taisoft.scene.material import LAWS, Material
 from taisoft.scene.obstacles import Obstacle, Shape, surface_numbers
@@ -23,18 +23,18 @@ __all__ = ["LAWS", "Body", "Constraint", "Material", "NodalForce", "Scene", "Tra
 
 
 class Scene(Guarded):
-    """What is simulated: gravity, bodies and obstacles. SI units, y up.
+    """Input of a simulation: gravity, bodies and obstacles. SI units, y up.
 
-    bodies, obstacles: lists; items can be removed from them, but are added by `add_body` and `add_obstacle` only. contact_pairs:
-    {frozenset of two names, or of one for a body with itself: (friction, restitution)}, each a number or None where the default
-    of `contact_numbers` holds; read-only, `set_contact` adds to it. A Simulator that takes a scene freezes it, see `freeze`.
+    contact_pairs: {frozenset of two names, or of one for a body with itself: (friction, restitution)}, each a number, or
+    None for the default of `contact_numbers`; read-only, changed by `set_contact`. Bodies and obstacles can be removed from
+    their lists, but only methods add them. A Simulator freezes the scene that it takes, see `freeze`.
     """
 
     _contents = {
         "bodies": "call scene.add_body", "obstacles": "call scene.add_obstacle",
         "contact_pairs": "call scene.set_contact(name_a, name_b, friction=...)",
     }  # fmt: skip
-    _default_frozen = ANOTHER
+    _default_frozen = USE_A_COPY
     _instead_frozen = {
         "gravity": "call sim.set_gravity(gravity)", "set_contact": "call sim.set_contact(name_a, name_b, friction=...)",
         "contact_pairs": "call sim.set_contact(name_a, name_b, friction=...)",
@@ -53,7 +53,7 @@ class Scene(Guarded):
 
     @property
     def gravity(self) -> np.ndarray:
-        """(3,) [m/s^2]."""
+        """Acceleration of gravity (3,) [m/s^2]."""
         return self._gravity
 
     @gravity.setter
@@ -62,7 +62,7 @@ class Scene(Guarded):
 
     @property
     def collision(self) -> CollisionSettings:
-        """Settings of contact detection."""
+        """Settings of the contact search."""
         return self._collision
 
     @collision.setter
@@ -73,7 +73,7 @@ class Scene(Guarded):
 
     @property
     def allow_initial_overlap(self) -> bool:
-        """Whether things may overlap at the start; else a simulator refuses overlaps deeper than 1e-6 of the smaller size."""
+        """Whether initial overlap is allowed. Otherwise a Simulator refuses overlaps deeper than 1e-6 of the smaller size."""
         return self._allow_initial_overlap
 
     @allow_initial_overlap.setter
@@ -82,7 +82,7 @@ class Scene(Guarded):
 
     @property
     def contact_forces(self) -> bool:
-        """Whether contacts exert forces; otherwise things pass through each other, and `detect_contacts` still finds contacts."""
+        """Whether contacts exert forces. Otherwise bodies pass through each other, and contacts are detected only on request."""
         return self._contact_forces
 
     @contact_forces.setter
@@ -90,12 +90,12 @@ class Scene(Guarded):
         self._contact_forces = checks.flag(value, "scene: contact_forces")
 
     def pushes(self, self_collision: bool) -> bool:
-        """Whether there can be contact forces, self_collision telling whether bodies may touch themselves."""
+        """Return whether contact forces can occur. self_collision: whether bodies collide with themselves."""
         return self.contact_forces and (self_collision or len(self.colliders) > 1)
 
     @property
     def colliders(self) -> list[Body | Obstacle]:
-        """Bodies, then obstacles, each in the order added."""
+        """Bodies, then obstacles, each in the order added; collider indices in contacts refer to this list."""
         return [*self.bodies, *self.obstacles]
 
     def __repr__(self) -> str:
@@ -105,21 +105,21 @@ class Scene(Guarded):
         return f"Scene(gravity={tuple(self.gravity.tolist())}, {names})"
 
     def snapshot(self) -> "Scene":
-        """A copy, with its bodies, that can be changed even where this one is frozen; meshes are shared."""
-        twin = copy.copy(self)
-        with thawed(twin):
-            twin.bodies = [copy.copy(body) for body in self.bodies]
-        return twin
+        """Return an independent, unfrozen copy of the scene and its bodies; meshes are shared."""
+        copied = copy.copy(self)
+        with thawed(copied):
+            copied.bodies = [copy.copy(body) for body in self.bodies]
+        return copied
 
     def check(self) -> None:
-        """Raises SceneError for what was written into arrays of numbers, such as gravity's, and could not have been set."""
+        """Raise SceneError if in-place changes made an array, such as gravity, invalid."""
         checks.array(self.gravity, "scene: gravity", ((3,),))
         for body in self.bodies:
             body.check()
 
     def freeze(self) -> None:
-        """Refuse every later change of the scene and its bodies, which would have no effect: a Simulator that takes the scene
-        calls this. `snapshot` gives a copy that can change."""
+        """Refuse all later changes of the scene and its bodies. A Simulator calls this when it takes the scene, since changes
+        would have no effect. `snapshot` returns a copy that can change."""
         for one in (self, *self.bodies):
             one._freeze()
 
@@ -136,12 +136,12 @@ class Scene(Guarded):
     ) -> Body:
         """Add a body and return it.
 
-        mesh: its shape at rest. name: unique, "body0" and so on where left out. position: (3,) [m], shift of the start.
+        mesh: its shape at rest. name: unique; "body0" and so on by default. position: (3,) [m], initial translation.
         velocity: (3,) for all nodes or (n,3) [m/s]. order: 1, linear tets, or 2, quadratic ones with nodes in the middle of
-        every edge. quadrature_degree: None for the default, for order 2 four points (2) or fourteen (4). collision: how
-        others hit it, "proximity", which is also "auto", or "distance_field". Warns where tets of order 1 are far too stiff:
-        at a Poisson's ratio above 0.49, or where so few lie through a thin body that it bends at most half as far as it should.
-        Raises SceneError.
+        every edge. quadrature_degree: None for the default; order 2 has four points (2) or fourteen (4). collision: contact
+        geometry, "proximity", also for "auto", or "distance_field". Warns if tets of order 1 are far too stiff: at a Poisson's
+        ratio above 0.49, or in a thin body with so few tets through its thickness that it bends at most half as far as it
+        should. Raises SceneError.
         """
         self._check_open("add_body")
         name = self._free_name(name, "body")
@@ -156,8 +156,8 @@ class Scene(Guarded):
     ) -> Obstacle:
         """Add an obstacle and return it.
 
-        shape: HalfSpace, Sphere, Box, Capsule or MeshObstacle. name: unique, "obstacle0" and so on where left out. path:
-        callable t [s] -> (translation (3,) [m], rotation (3,3) about the shape's pivot), which is called once here, for t = 0;
+        shape: HalfSpace, Sphere, Box, Capsule or MeshObstacle. name: unique; "obstacle0" and so on by default. path:
+        callable t [s] -> (translation (3,) [m], rotation (3,3) about the shape's pivot), called once here for t = 0;
         or `KeyFrames`. Raises SceneError.
         """
         self._check_open("add_obstacle")
@@ -166,20 +166,20 @@ class Scene(Guarded):
         return obstacle
 
     def body(self, name: str) -> Body:
-        """The body of that name. Raises SceneError where there is none."""
-        return _found(self.bodies, name, "body")
+        """Return the body with this name. Raises SceneError if there is none."""
+        return _find(self.bodies, name, "body")
 
     def obstacle(self, name: str) -> Obstacle:
-        """The obstacle of that name. Raises SceneError where there is none."""
-        return _found(self.obstacles, name, "obstacle")
+        """Return the obstacle with this name. Raises SceneError if there is none."""
+        return _find(self.obstacles, name, "obstacle")
 
     def set_contact(
         self, name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None
     ) -> None:
-        """Set friction and restitution between two bodies, a body and an obstacle, or a body and itself (its name twice).
+        """Set friction and restitution of two bodies, a body and an obstacle, or a body and itself (its name twice).
 
-        A number left out stays as it was. Raises SceneError for names that do not exist, two obstacles, numbers outside
-        the rules, or no number at all.
+        An omitted number is unchanged. Raises SceneError for unknown names, two obstacles, values outside the rules, or no
+        number at all.
         """
         self._check_open("set_contact")
         pair = self._pair(name_a, name_b)
@@ -190,18 +190,18 @@ class Scene(Guarded):
         given = surface_numbers(
             0.0 if friction is None else friction, 0.0 if restitution is None else restitution, what
         )
-        asked = (friction is not None, restitution is not None)
-        numbers = tuple(new if use else old for new, use, old in zip(given, asked, before))
+        is_given = (friction is not None, restitution is not None)
+        numbers = tuple(new if use else old for new, use, old in zip(given, is_given, before))
         dict.__setitem__(self.contact_pairs, pair, numbers)
 
     @property
     def bounces(self) -> bool:
-        """Whether any two have a restitution."""
+        """Whether any pair has a restitution above 0."""
         own = [self.surface_of(c.name).restitution for c in self.colliders]
         return any(e > 0.0 for e in own) or any(e for _, e in self.contact_pairs.values())
 
     def contact_numbers(self, name_a: str, name_b: str) -> tuple[float, float]:
-        """(friction, restitution) between two: as set, else the frictions' geometric mean and the larger restitution."""
+        """Return (friction, restitution) of a pair: as set, else the geometric mean of frictions and the larger restitution."""
         friction, restitution = self.contact_pairs.get(self._pair(name_a, name_b), (None, None))
         a, b = self.surface_of(name_a), self.surface_of(name_b)
         return (
@@ -210,27 +210,27 @@ class Scene(Guarded):
         )
 
     def _pair(self, name_a: str, name_b: str) -> frozenset[str]:
-        """The key of a pair that can touch, or SceneError."""
-        found = [_found(self.colliders, name, "body or obstacle") for name in (name_a, name_b)]
+        """Return the key of a pair that can collide. Raises SceneError for any other pair."""
+        found = [_find(self.colliders, name, "body or obstacle") for name in (name_a, name_b)]
         if not any(isinstance(one, Body) for one in found):
             raise SceneError(f"scene: contact of {name_a!r} and {name_b!r}: one of the two must be a body")
         return frozenset((name_a, name_b))
 
     def surface_of(self, name: str) -> Material | Obstacle:
-        """The record that holds a collider's own friction and restitution."""
-        one = _found(self.colliders, name, "body or obstacle")
+        """Return the record that holds a collider's own friction and restitution."""
+        one = _find(self.colliders, name, "body or obstacle")
         return one.material if isinstance(one, Body) else one
 
     def _free_name(self, name: str | None, kind: str) -> str:
-        """The name, or where it is None the first free one of its kind; SceneError where it is taken."""
+        """Return the name, or the first free default name if it is None. Raises SceneError if it is taken."""
         taken = [one.name for one in self.colliders]
         if name is None:
             name = next(free for free in (f"{kind}{i}" for i in range(len(taken) + 1)) if free not in taken)
         return checks.name(name, f"scene: {kind} name", taken)
 
 
-def _found(items: list, name: str, kind: str) -> Body | Obstacle:
-    """The item of that name. Raises SceneError, with the nearest name, where there is none."""
+def _find(items: list, name: str, kind: str) -> Body | Obstacle:
+    """Return the item with this name. Raises SceneError with the closest name if there is none."""
     for item in items:
         if item.name == name:
             return item

@@ -1,12 +1,12 @@
-"""The `solver` dict of a scene: arguments of Simulator, and seconds and fps of its run, as far as they can be checked here.
+"""Validate a scene's `solver` dict: arguments of Simulator, and the run's seconds and fps.
 
-Names of integrators and contact solvers, and what fits what, are checked by the Simulator.
+The Simulator itself validates names of integrators and contact solvers and their combinations.
 """
 
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 
-MAX_TOLERANCE = {"newton_tolerance": 0.1}  # a residual as large as a tenth of the forces is no solution; others: below 1
+MAX_TOLERANCE = {"newton_tolerance": 0.1}  # a residual of a tenth of the forces is no solution; others: 1
 
 
 def _positive(value, key: str) -> None:
@@ -14,9 +14,9 @@ def _positive(value, key: str) -> None:
 
 
 def _tolerance(value, key: str) -> None:
-    below = MAX_TOLERANCE.get(key.rpartition(".")[2], 1.0)
-    if value is not None and checks.number(value, key, above=0.0) >= below:
-        raise SceneError(f"{key} must be below {below:g}, not {value!r}")
+    limit = MAX_TOLERANCE.get(key.rpartition(".")[2], 1.0)
+    if value is not None and checks.number(value, key, above=0.0) >= limit:
+        raise SceneError(f"{key} must be below {limit:g}, not {value!r}")
 
 
 def _text(value, key: str) -> None:
@@ -42,7 +42,7 @@ CHECKS = {
 
 
 def check_solver(**solver) -> dict:
-    """The settings as they are; raises SceneError with the key first. Keys must be among those of CHECKS."""
+    """Return the settings unchanged. Raises SceneError, whose text starts with the key. Keys must be in CHECKS."""
     for key, value in solver.items():
         CHECKS[key](value, key)
     return solver

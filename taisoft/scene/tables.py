@@ -1,7 +1,7 @@
-"""Tables of a scene file, read strictly: what is unknown, missing or of another kind is refused, with file and place.
+"""Read tables of a scene file strictly: unknown, missing or mistyped keys are refused with file and key path.
 
-Rules about values are left to what is made from them: `Table.make` calls it with the table's keys as arguments, and puts
-file and place, such as bodies.beam.material.young, in front of what it refuses.
+Values are validated by the functions that take them: `Table.make` calls a function with the table's keys as arguments, and
+prefixes its errors with the file and key path, such as bodies.beam.material.young.
 """
 
 import datetime
@@ -15,74 +15,74 @@ from pathlib import Path
 from taisoft.errors import MeshError, SceneError
 from taisoft.scene import checks
 
-BARE = re.compile(r"[A-Za-z0-9_-]+")  # keys that TOML takes without quotes
-LARGEST = 2**63  # whole numbers of TOML are below
-SURROGATES = {chr(code) for code in range(0xD800, 0xE000)}  # no characters, and no escape can stand for them
-LONGEST = 400  # characters of an error's text, which may repeat a whole list, besides those of the file's folder
-SHOWN = 40  # characters of a value in a message
+BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")  # keys that TOML allows without quotes
+INT_LIMIT = 2**63  # upper bound of TOML integers
+SURROGATES = {chr(code) for code in range(0xD800, 0xE000)}  # no valid characters, and TOML has no escape for them
+MAX_ERROR_LENGTH = 400  # maximum number of characters of an error, which may repeat a whole list, without the file's folder
+MAX_VALUE_LENGTH = 40  # maximum number of characters of a value in a message
 
 
-def shown(value) -> str:
-    """A value in a message, short."""
+def value_text(value) -> str:
+    """Return a value as short text for a message."""
     if isinstance(value, dict):
         return "a table"
     if isinstance(value, list):
         return f"a list of {len(value)}"
     text = str(value).lower() if isinstance(value, bool) else repr(value)
-    return text if len(text) <= SHOWN else text[: SHOWN - 3] + "..."
+    return text if len(text) <= MAX_VALUE_LENGTH else text[: MAX_VALUE_LENGTH - 3] + "..."
 
 
-def quoted(text: str) -> str:
-    """A text in the quotes of TOML, escaped where it must be."""
-    short = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r"}
-    plain = "".join(short.get(c) or (c if c.isprintable() or c in SURROGATES else f"\\U{ord(c):08X}") for c in text)
-    return f'"{plain}"'
+def quote(text: str) -> str:
+    """Return text as a quoted and escaped TOML string."""
+    escapes = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r"}
+    escaped = "".join(escapes.get(c) or (c if c.isprintable() or c in SURROGATES else f"\\U{ord(c):08X}") for c in text)
+    return f'"{escaped}"'
 
 
-def bare_or_quoted(key: str) -> str:
-    """A key as TOML writes it."""
-    return key if BARE.fullmatch(key) else quoted(key)
+def key_text(key: str) -> str:
+    """Return a key as TOML writes it, quoted if needed."""
+    return key if BARE_KEY.fullmatch(key) else quote(key)
 
 
-def joined(place: str, key: str) -> str:
-    """The place of a key in the table at `place`; "" is the file's top."""
-    return f"{place}.{bare_or_quoted(key)}" if place else bare_or_quoted(key)
+def key_path(place: str, key: str) -> str:
+    """Return the path of a key in the table at path `place`; "" is the file's top level."""
+    return f"{place}.{key_text(key)}" if place else key_text(key)
 
 
-def arguments_of(function: Callable, *left_out: str) -> tuple[list[str], list[str]]:
-    """Names of a function's arguments, and of those without a default, apart from those left out."""
-    parameters = [p for p in inspect.signature(function).parameters.values() if p.name not in ("self", *left_out)]
+def arguments_of(function: Callable, *excluded: str) -> tuple[list[str], list[str]]:
+    """Return the names of a function's arguments, and of those without a default, except `excluded`."""
+    parameters = [p for p in inspect.signature(function).parameters.values() if p.name not in ("self", *excluded)]
     return [p.name for p in parameters], [p.name for p in parameters if p.default is inspect.Parameter.empty]
 
 
 def check_values(file: Path, values, place: str = "") -> None:
-    """Refuse, anywhere in a file, numbers that are not finite or too large for 64 bits, and dates and times."""
+    """Raise SceneError if values contain, at any depth, non-finite numbers, integers beyond 64 bits, dates or times."""
     if isinstance(values, dict):
         for key, value in values.items():
-            check_values(file, value, joined(place, key))
+            check_values(file, value, key_path(place, key))
     elif isinstance(values, list):
         for i, value in enumerate(values):
             check_values(file, value, f"{place}[{i}]")
     elif isinstance(values, float) and not math.isfinite(values):
         raise SceneError(f"{file}: {place} must be finite, not {values}")
-    elif isinstance(values, int) and not -LARGEST <= values < LARGEST:
+    elif isinstance(values, int) and not -INT_LIMIT <= values < INT_LIMIT:
         raise SceneError(f"{file}: {place} is a whole number of more than 64 bits")
     elif isinstance(values, (datetime.date, datetime.time)):
-        raise SceneError(f"{file}: {place} is a date or a time, which a scene has no use for")
+        raise SceneError(f"{file}: {place} is a date or a time, which scenes do not use")
 
 
 class Table:
-    """One table of a file. values: key -> value. known: all keys it may have; needed: those it must have. Raises SceneError."""
+    """One table of a file. values: key -> value. known: allowed keys; required: keys that must exist. Raises SceneError."""
 
-    def __init__(self, file: Path, place: str, values, known: list[str], needed: list[str] | tuple = ()):
+    def __init__(self, file: Path, place: str, values, known: list[str], required: list[str] | tuple = ()):
         self.file, self.place, self.known = file, place, known
         if not isinstance(values, dict):
-            raise self.error("", f"must be a table, not {shown(values)}")
-        self.values, among = values, set(known)  # names are known by the thousand
+            raise self.error("", f"must be a table, not {value_text(values)}")
+        self.values, allowed = values, set(known)  # a set, since a file may have thousands of names
         for key in values:
-            if key not in among:
+            if key not in allowed:
                 raise self.error(key, f"is not known{checks.nearest(key, known)}; there are {', '.join(known)}")
-        for key in needed:
+        for key in required:
             if key not in values:
                 raise self.error(key, "is missing")
 
@@ -90,30 +90,30 @@ class Table:
         return key in self.values
 
     def error(self, key: str, text: str) -> SceneError:
-        """The error about a key of this table, or about the table for ""."""
-        return SceneError(f"{self.file}: {joined(self.place, key) if key else self.place} {text}")
+        """Return an error about a key of this table, or about the table itself for ""."""
+        return SceneError(f"{self.file}: {key_path(self.place, key) if key else self.place} {text}")
 
-    def table(self, key: str, known: list[str], needed: list[str] | tuple = ()) -> "Table":
-        """The table under a key."""
-        return Table(self.file, joined(self.place, key), self.values[key], known, needed)
+    def table(self, key: str, known: list[str], required: list[str] | tuple = ()) -> "Table":
+        """Return the table under a key."""
+        return Table(self.file, key_path(self.place, key), self.values[key], known, required)
 
     def named(self, key: str) -> list[str]:
-        """The names of the tables under a key, in their order; none where the key is missing."""
+        """Return the names of the tables under a key, in order; empty if the key is missing."""
         values = self.values.get(key, {})
         if not isinstance(values, dict):
-            raise self.error(key, f"must be tables [{joined(self.place, key)}.NAME], not {shown(values)}")
+            raise self.error(key, f"must be tables [{key_path(self.place, key)}.NAME], not {value_text(values)}")
         return list(values)
 
-    def listed(self, key: str, known: list[str], needed: list[str] | tuple = ()) -> "list[Table]":
-        """The tables of the list under a key; none where the key is missing."""
-        values, place = self.values.get(key, []), joined(self.place, key)
+    def listed(self, key: str, known: list[str], required: list[str] | tuple = ()) -> "list[Table]":
+        """Return the tables of the list under a key; empty if the key is missing."""
+        values, place = self.values.get(key, []), key_path(self.place, key)
         if not isinstance(values, list):
-            raise self.error(key, f"must be a list of tables [[{place}]], not {shown(values)}")
-        return [Table(self.file, f"{place}[{i}]", value, known, needed) for i, value in enumerate(values)]
+            raise self.error(key, f"must be a list of tables [[{place}]], not {value_text(values)}")
+        return [Table(self.file, f"{place}[{i}]", value, known, required) for i, value in enumerate(values)]
 
     def checked(self, key: str):
-        """The value of a key; in lists, at any depth, only numbers that are not true or false."""
-        self._check_numbers(self.values[key], joined(self.place, key))
+        """Return the value of a key. Raises SceneError if a list holds, at any depth, anything but int and float numbers."""
+        self._check_numbers(self.values[key], key_path(self.place, key))
         return self.values[key]
 
     def _check_numbers(self, value, place: str) -> None:
@@ -121,28 +121,28 @@ class Table:
             if isinstance(entry, list):
                 self._check_numbers(entry, f"{place}[{i}]")
             elif isinstance(entry, bool) or not isinstance(entry, (int, float)):
-                raise SceneError(f"{self.file}: {place}[{i}] must be a number, not {shown(entry)}")
+                raise SceneError(f"{self.file}: {place}[{i}] must be a number, not {value_text(entry)}")
 
-    def make(self, function: Callable, *said: str, keys: list[str] | None = None, **more):
-        """function(**more) with the values of `keys`, all by default, as further arguments; what it refuses is `placed`."""
+    def make(self, function: Callable, *prefixes: str, keys: list[str] | None = None, **others):
+        """Call function(**others) with the values of `keys`, by default all, as further arguments; its errors are located."""
         given = {key: self.checked(key) for key in (self.known if keys is None else keys) if key in self.values}
-        with self.placed(*said):
-            return function(**given, **more)
+        with self.located_errors(*prefixes):
+            return function(**given, **others)
 
     @contextmanager
-    def placed(self, *said: str) -> Iterator[None]:
-        """Errors raised inside get the file and this table's place in front. said: starts of their text to leave out."""
+    def located_errors(self, *prefixes: str) -> Iterator[None]:
+        """Prefix errors raised inside with the file and this table's path. prefixes: starts of their text to remove."""
         try:
             yield
         except (SceneError, MeshError) as error:
             text = str(error)
-            for start in said:
+            for start in prefixes:
                 text = text.removeprefix(start)
-            most = LONGEST + len(str(self.file.parent))
-            text = text if len(text) <= most else f"{text[:most]}..."
+            limit = MAX_ERROR_LENGTH + len(str(self.file.parent))
+            text = text if len(text) <= limit else f"{text[:limit]}..."
             key = re.match(r"\w+", text)
             if key and key[0] in self.known:
-                place = joined(self.place, key[0]) + text[key.end() :]
+                place = key_path(self.place, key[0]) + text[key.end() :]
             else:
                 place = f"{self.place}: {text}" if self.place else text
             raise type(error)(f"{self.file}: {place}") from error

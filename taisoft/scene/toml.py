@@ -1,4 +1,4 @@
-"""Scene files: TOML in, a Scene and its `solver` dict out. Data only: nothing in a file is ever run.
+"""Read a scene file in TOML: return a Scene and its `solver` dict. Files hold data only; nothing in them is executed.
 
     gravity, allow_initial_overlap, contact_forces
     [collision]               CollisionSettings
@@ -10,9 +10,9 @@
     [obstacles.NAME]          shape and its arguments, friction, restitution, path (KeyFrames)
     [[contacts]]              between = ["a", "b"], friction, restitution
 
-A mesh is a shape with the arguments of its function, or a file, fix_orientation, weld. nodes and triangles are "all", a
-list of ids, or one of the tables box = { min, max } and half_space = { point, normal }, boundary included, of rest
-positions and centroids. Names of keys and defaults are those of the Python functions.
+A mesh is a shape with the arguments of its function, or a file with fix_orientation and weld. nodes and triangles are "all",
+a list of ids, or a table box = { min, max } or half_space = { point, normal }, which selects nodes by rest position and
+triangles by centroid, boundary included. Keys and defaults are those of the Python functions.
 """
 
 import re
@@ -34,34 +34,34 @@ from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Sphere
 from taisoft.scene.scene import Scene
 from taisoft.scene.solver import CHECKS, check_solver
-from taisoft.scene.tables import Table, arguments_of, check_values, shown
+from taisoft.scene.tables import Table, arguments_of, check_values, value_text
 
 MESHES = {"box": box_mesh, "sheet": sheet_mesh, "ball": ball_mesh}
 SHAPES = {"half_space": HalfSpace, "sphere": Sphere, "box": Box, "capsule": Capsule, "mesh": MeshObstacle}
-CALLS = {"fix": Body.fix, "move": Body.move, "traction": Body.add_traction, "force": Body.add_force}
-ITEMS = {"traction": "triangles"}  # what a load chooses, where it is not nodes
-OWN = ("gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene
-TOP = [*OWN, "collision", "solver", "materials", "bodies", "obstacles", "contacts"]
-ALONE = (*WRITERS, ".node", ".ele")  # formats whose files name no further files
-NONE = "none"
+METHODS = {"fix": Body.fix, "move": Body.move, "traction": Body.add_traction, "force": Body.add_force}
+ITEMS = {"traction": "triangles"}  # what a method selects, if not nodes
+SCENE_KEYS = ("gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene at top level
+TOP_KEYS = [*SCENE_KEYS, "collision", "solver", "materials", "bodies", "obstacles", "contacts"]
+STANDALONE = (*WRITERS, ".node", ".ele")  # formats whose files reference no other files
+NONE_TEXT = "none"
 
 
 def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
-    """The scene in a TOML file, and its `solver` dict: arguments of Simulator, seconds and fps, as far as given.
+    """Return the scene in a TOML file, and its `solver` dict: the given arguments of Simulator, seconds and fps.
 
-    path: the file. allow_outside: let mesh files lie outside of its folder, and be of any format that meshio reads. Raises
-    SceneError or MeshError with the file, the place in it, and the rule.
+    path: the file. allow_outside: allow mesh files outside its folder and in any format that meshio reads. Raises SceneError
+    or MeshError with the file, the key path, and the rule.
     """
     try:
         file = Path(path)
     except TypeError as error:
         raise SceneError(f"read_scene: path must be a file's name, not {path!r}") from error
-    tables = Table(file, "", _parsed(file), TOP, ["bodies"])
+    tables = Table(file, "", _parsed(file), TOP_KEYS, ["bodies"])
     scene = Scene()
-    for key in OWN:
+    for key in SCENE_KEYS:
         if key in tables:
             value = tables.checked(key)
-            with tables.placed("scene: "):
+            with tables.located_errors("scene: "):
                 setattr(scene, key, value)
     if "collision" in tables:
         table = tables.table("collision", *arguments_of(CollisionSettings))
@@ -69,15 +69,15 @@ def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
     solver = {}
     if "solver" in tables:
         solver = tables.table("solver", list(CHECKS)).make(_solver)
-    materials = {name: _material(table) for name, table in _each(tables, "materials", *arguments_of(Material))}
+    materials = {name: _material(table) for name, table in _named_tables(tables, "materials", *arguments_of(Material))}
     if not tables.named("bodies"):
         raise tables.error("bodies", "must hold a table [bodies.NAME]")
     known, _ = arguments_of(Scene.add_body, "name")
-    meshes: dict[str, TetMesh] = {}  # bodies whose mesh is said alike share it
-    for name, table in _each(tables, "bodies", [*known, *CALLS], ["material", "mesh"]):
-        said = str(table.values["mesh"])
-        meshes[said] = meshes.get(said) or _mesh(table, allow_outside)
-        _add_body(scene, name, table, materials, meshes[said])
+    meshes: dict[str, TetMesh] = {}  # bodies with equal mesh tables share one mesh
+    for name, table in _named_tables(tables, "bodies", [*known, *METHODS], ["material", "mesh"]):
+        mesh_text = str(table.values["mesh"])
+        meshes[mesh_text] = meshes.get(mesh_text) or _mesh(table, allow_outside)
+        _add_body(scene, name, table, materials, meshes[mesh_text])
     if obstacles := tables.named("obstacles"):
         parent = tables.table("obstacles", obstacles)
         for name in obstacles:
@@ -87,11 +87,11 @@ def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
 
 
 def _solver(**values) -> dict:
-    return check_solver(**{key: None if value == NONE else value for key, value in values.items()})
+    return check_solver(**{key: None if value == NONE_TEXT else value for key, value in values.items()})
 
 
 def _parsed(file: Path) -> dict:
-    """The file's tables. Raises SceneError for what cannot be read or is no TOML, with the line."""
+    """Return the file's tables. Raises SceneError with the line if the file cannot be read or is not TOML."""
     try:
         data = file.read_bytes()
         if utf16_head(data):
@@ -105,18 +105,18 @@ def _parsed(file: Path) -> dict:
         tables = tomllib.loads(text)
         check_values(file, tables)
     except (ValueError, RecursionError) as error:
-        said = "the file is nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())
-        at = re.search(r" \(at line (\d+), column \d+\)$", said)
-        raise SceneError(f"{file}, line {at[1]}: {said[: at.start()]}" if at else f"{file}: {said}") from None
+        message = "the file is nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())
+        at = re.search(r" \(at line (\d+), column \d+\)$", message)
+        raise SceneError(f"{file}, line {at[1]}: {message[: at.start()]}" if at else f"{file}: {message}") from None
     return tables
 
 
-def _each(tables: Table, key: str, known: list[str], needed: list[str]) -> list[tuple[str, Table]]:
-    """(name, table) of all tables under a key."""
+def _named_tables(tables: Table, key: str, known: list[str], required: list[str]) -> list[tuple[str, Table]]:
+    """Return (name, table) for all tables under a key."""
     if not (names := tables.named(key)):
         return []
     parent = tables.table(key, names)
-    return [(name, parent.table(name, known, needed)) for name in names]
+    return [(name, parent.table(name, known, required)) for name in names]
 
 
 def _material(table: Table) -> Material:
@@ -127,30 +127,32 @@ def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Materi
     material = table.values["material"]
     if isinstance(material, str):
         if material not in materials:
-            raise table.error("material", f"{shown(material)} is not among the materials{checks.nearest(material, materials)}")
+            raise table.error(
+                "material", f"{value_text(material)} is not among the materials{checks.nearest(material, materials)}"
+            )
         material = materials[material]
     else:
         material = _material(table.table("material", *arguments_of(Material)))
     keys, _ = arguments_of(Scene.add_body, "name", "mesh", "material")
     body = table.make(scene.add_body, f"body {name!r}: ", "scene: ", keys=keys, mesh=mesh, material=material, name=name)
-    for key in CALLS:
+    for key in METHODS:
         _call(body, table, key)
 
 
 def _call(body: Body, table: Table, key: str) -> None:
-    """Call the body's method of a key with each of the tables there; its `where` has the name of what it chooses."""
-    method, items = CALLS[key], ITEMS.get(key, "nodes")
-    known, needed = ([items if k == "where" else k for k in keys] for keys in arguments_of(method))
-    for one in table.listed(key, known, needed):
-        more = {"where": _chosen(one, items)}
+    """Call the body's method for each table under a key. In the file its argument `where` is called nodes or triangles."""
+    method, items = METHODS[key], ITEMS.get(key, "nodes")
+    known, required = ([items if k == "where" else k for k in keys] for keys in arguments_of(method))
+    for one in table.listed(key, known, required):
+        extra = {"where": _selection(one, items)}
         if "path" in known:
-            more["path"] = _key_frames(one)
+            extra["path"] = _key_frames(one)
         others = [k for k in known if k not in (items, "path")]
-        one.make(getattr(body, method.__name__), f"body {body.name!r}: {method.__name__}: ", keys=others, **more)
+        one.make(getattr(body, method.__name__), f"body {body.name!r}: {method.__name__}: ", keys=others, **extra)
 
 
 def _mesh(table: Table, allow_outside: bool) -> TetMesh:
-    """The mesh of a body's table: a shape's, or a file's."""
+    """Return the mesh of a body's table, made from a shape or read from a file."""
     files = ["file", *arguments_of(read_mesh, "path")[0]]
     shapes = {key: arguments_of(function) for key, function in MESHES.items()}
     mesh = table.table("mesh", list(dict.fromkeys(["shape", *files, *(key for known, _ in shapes.values() for key in known)])))
@@ -158,49 +160,49 @@ def _mesh(table: Table, allow_outside: bool) -> TetMesh:
         raise mesh.error("", "must have either a shape or a file")
     if "file" in mesh:
         mesh = table.table("mesh", files)
-        path = _inside(mesh, allow_outside)
+        path = _mesh_path(mesh, allow_outside)
         if "fix_orientation" in mesh:
-            with mesh.placed():
+            with mesh.located_errors():
                 checks.flag(mesh.values["fix_orientation"], "fix_orientation")
         return mesh.make(read_mesh, keys=files[1:], path=path)
     shape = _kind(mesh, MESHES)
-    known, needed = shapes[shape]
-    mesh = table.table("mesh", ["shape", *known], needed)
+    known, required = shapes[shape]
+    mesh = table.table("mesh", ["shape", *known], required)
     return mesh.make(MESHES[shape], "box_mesh: ", f"{shape}_mesh: ", keys=known)
 
 
-def _inside(mesh: Table, allow_outside: bool) -> Path:
-    """The mesh file's path; without allow_outside one in the scene file's folder, and so wherever links lead."""
+def _mesh_path(mesh: Table, allow_outside: bool) -> Path:
+    """Return the mesh file's path. Without allow_outside it must lie in the scene file's folder, with links resolved."""
     name = mesh.values["file"]
     if not isinstance(name, str) or not name or "\0" in name:
-        raise mesh.error("file", f"must be a file's name, not {shown(name)}")
+        raise mesh.error("file", f"must be a file's name, not {value_text(name)}")
     folder = mesh.file.parent
     path = folder / name
     if allow_outside:
         return path
     remedy = "--allow-outside (allow_outside=True) lifts this"
-    if path.suffix.lower() not in ALONE:
-        raise mesh.error("file", f"must be one of {', '.join(ALONE)}, since other formats can name further files; {remedy}")
+    if path.suffix.lower() not in STANDALONE:
+        raise mesh.error("file", f"must be one of {', '.join(STANDALONE)}, since other formats can name further files; {remedy}")
     pair = [path.with_suffix(ending) for ending in (".node", ".ele")] if path.suffix.lower() in (".node", ".ele") else [path]
     try:
-        kept = all(one.resolve().is_relative_to(folder.resolve()) for one in pair)
-    except (OSError, RuntimeError) as error:  # such as links in a circle
-        raise mesh.error("file", f"cannot be followed: {getattr(error, 'strerror', None) or error}") from None
-    if Path(name).is_absolute() or ".." in Path(name).parts or not kept:
+        inside = all(one.resolve().is_relative_to(folder.resolve()) for one in pair)
+    except (OSError, RuntimeError) as error:  # such as circular links
+        raise mesh.error("file", f"cannot be resolved: {getattr(error, 'strerror', None) or error}") from None
+    if Path(name).is_absolute() or ".." in Path(name).parts or not inside:
         raise mesh.error("file", f"must lie inside the scene file's folder, without '..' or a link out of it; {remedy}")
     return path
 
 
 def _kind(table: Table, kinds: dict) -> str:
-    """The value of `shape`, one of the kinds."""
+    """Return the value of `shape`, one of the kinds."""
     if "shape" not in table:
         raise table.error("shape", "is missing")
-    with table.placed():
+    with table.located_errors():
         return checks.choice(table.values["shape"], "shape", tuple(kinds))
 
 
-def _chosen(table: Table, key: str):
-    """Ids, or a function of points (n,3), which can also choose on another mesh, to a bool mask (n,)."""
+def _selection(table: Table, key: str):
+    """Return ids, or a function of points (n,3) that returns a bool mask (n,) and also works on another mesh."""
     value = table.values[key]
     if value == "all":
         return lambda X: np.ones(len(X), dtype=bool)
@@ -209,12 +211,12 @@ def _chosen(table: Table, key: str):
             raise table.error(key, "must be a list of whole numbers, the ids")
         return value
     if not isinstance(value, dict) or len(value) != 1:
-        raise table.error(key, f'must be "all", a list of ids, or a table with one of box, half_space, not {shown(value)}')
+        raise table.error(key, f'must be "all", a list of ids, or a table with one of box, half_space, not {value_text(value)}')
     choice = table.table(key, ["box", "half_space"])
     if "box" in choice:
         box = choice.table("box", ["min", "max"], ["min", "max"])
         corners = {end: box.checked(end) for end in ("min", "max")}
-        with box.placed():
+        with box.located_errors():
             low, high = (checks.array(value, end, ((3,),)) for end, value in corners.items())
         if not (low <= high).all():
             raise box.error("min", "must not exceed max")
@@ -232,24 +234,24 @@ def _add_obstacle(scene: Scene, name: str, obstacles: Table) -> None:
     known = dict.fromkeys([*others, *(key for shape in SHAPES.values() for key in arguments_of(shape)[0])])
     known.pop("name")
     kind = _kind(obstacles.table(name, list(known)), SHAPES)
-    keys, needed = arguments_of(SHAPES[kind])
-    table = obstacles.table(name, [key for key in known if key in keys or key in others], needed)
+    keys, required = arguments_of(SHAPES[kind])
+    table = obstacles.table(name, [key for key in known if key in keys or key in others], required)
     shape = table.make(SHAPES[kind], f"{SHAPES[kind].word}: ", keys=keys)
-    more = {"path": _key_frames(table)} if "path" in table else {}
+    extra = {"path": _key_frames(table)} if "path" in table else {}
     table.make(
         scene.add_obstacle, f"obstacle {name!r}: ", "scene: ", "key frames: ", keys=["friction", "restitution"],
-        shape=shape, name=name, **more,
+        shape=shape, name=name, **extra,
     )  # fmt: skip
 
 
 def _set_contacts(scene: Scene, tables: Table) -> None:
-    """The numbers of pairs, each pair once."""
+    """Set friction and restitution of pairs, each pair once."""
     numbers = ["friction", "restitution"]
     for table in tables.listed("contacts", ["between", *numbers], ["between"]):
         pair = table.values["between"]
         if not isinstance(pair, list) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
             raise table.error("between", "must be a list of two names")
         if frozenset(pair) in scene.contact_pairs:
-            raise table.error("between", f"names {shown(pair[0])} and {shown(pair[1])}, which an earlier one did")
-        said = f"scene: contact of {pair[0]!r} and {pair[1]!r}: "
-        table.make(scene.set_contact, said, "scene: ", keys=numbers, name_a=pair[0], name_b=pair[1])
+            raise table.error("between", f"names {value_text(pair[0])} and {value_text(pair[1])}, which an earlier table did")
+        prefix = f"scene: contact of {pair[0]!r} and {pair[1]!r}: "
+        table.make(scene.set_contact, prefix, "scene: ", keys=numbers, name_a=pair[0], name_b=pair[1])

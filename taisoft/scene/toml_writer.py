@@ -1,8 +1,8 @@
-"""A Scene and its `solver` dict into a scene file, from which `read_scene` makes the same run: every number comes back bitwise.
+"""Write a Scene and its `solver` dict to a scene file; `read_scene` restores every number bit for bit.
 
-What functions of Python chose is written as ids. A mesh that `box_mesh` and its like made is written as their arguments, any
-other one as a Gmsh file beside the scene file. Paths must be KeyFrames: a function of time is no data, and a path that turns
-about a pivot and was made for other nodes or another obstacle moves in a way that no key frames of its own say.
+Selections made by Python functions are written as ids. A mesh from `box_mesh`, `sheet_mesh` or `ball_mesh` is written as its
+arguments, any other mesh as a Gmsh file beside the scene file. Paths must be KeyFrames: functions of time cannot be stored. Nor
+can rotating key frames that were bound to other nodes or another obstacle, whose pivot they keep.
 """
 
 import dataclasses
@@ -21,23 +21,23 @@ from taisoft.scene.key_frames import KeyFrames, NodePath, ShapePath
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.scene import Scene
 from taisoft.scene.solver import CHECKS, check_solver
-from taisoft.scene.tables import bare_or_quoted, joined, quoted
-from taisoft.scene.toml import NONE, OWN, SHAPES
+from taisoft.scene.tables import key_path, key_text, quote
+from taisoft.scene.toml import NONE_TEXT, SCENE_KEYS, SHAPES
 
-WIDTH = 100  # of the numbers in a line
-STRANGE = "turns with a path made for {}, which no file can hold: give the ts.KeyFrames themselves"
+MAX_LINE = 100  # maximum number of characters of numbers in a line
+FOREIGN_PATH = "rotates along a path made for {}, which a file cannot store: pass the ts.KeyFrames themselves"
 
 
 def write_scene(path, scene: Scene, solver: dict | None = None, overwrite: bool = False) -> list[Path]:
-    """Write a scene as TOML, with its meshes beside it as NAME_mesh0.msh and so on; returns the files, the TOML first.
+    """Write a scene as TOML, with its meshes beside it as NAME_mesh0.msh and so on; return the files, the TOML first.
 
-    path: a name that ends in .toml. solver: arguments of Simulator, seconds and fps. overwrite: replace files that are
-    there. Raises SceneError for what cannot be said in a file, before any file is written, and OutputError. Every file
-    appears complete or not at all, the TOML last.
+    path: a name that ends in .toml. solver: arguments of Simulator, seconds and fps. overwrite: replace existing files. Raises
+    SceneError for content that cannot be stored, before any file is written, and OutputError. Files are written atomically,
+    the TOML last.
     """
     file = Path(path)
     if file.suffix != ".toml":
-        raise SceneError(f"{file}: a scene file's name ends in .toml")
+        raise SceneError(f"{file}: a scene file's name must end in .toml")
     if not isinstance(scene, Scene):
         raise SceneError(f"{file}: write_scene needs a Scene, not {type(scene).__name__}")
     if not scene.bodies:
@@ -51,7 +51,7 @@ def write_scene(path, scene: Scene, solver: dict | None = None, overwrite: bool 
     files = [file, *(file.with_name(name) for name in meshes)]
     for one in files:
         if one.exists() and not overwrite:
-            raise OutputError(f"{one}: the file exists; overwriting must be asked for")
+            raise OutputError(f"{one}: the file exists, and overwrite is not set")
     for name, mesh in meshes.items():
         write_mesh(file.with_name(name), mesh)
     write_bytes(file, data)
@@ -59,21 +59,21 @@ def write_scene(path, scene: Scene, solver: dict | None = None, overwrite: bool 
 
 
 def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh]) -> dict:
-    """The file's tables. Meshes that need a file are added to `meshes`, file's name -> mesh."""
+    """Return the file's tables. Meshes that need a file are added to `meshes`, file name -> mesh."""
     materials = {}
     for body in scene.bodies:
         materials.setdefault(body.material, f"material{len(materials)}")
     collision = dataclasses.asdict(scene.collision)
     order = [one.name for one in scene.colliders]
-    there = (pair for pair in scene.contact_pairs if pair <= set(order))  # bodies may have been taken out of the scene since
-    pairs = sorted(sorted(order.index(name) for name in pair) for pair in there)
+    present = (pair for pair in scene.contact_pairs if pair <= set(order))  # bodies may have been removed since
+    pairs = sorted(sorted(order.index(name) for name in pair) for pair in present)
     contacts = []
     for pair in pairs:
         names = [order[pair[0]], order[pair[-1]]]
         numbers = zip(("friction", "restitution"), scene.contact_pairs[frozenset(names)])
         contacts.append({"between": names} | {key: value for key, value in numbers if value is not None})
     return {
-        **{key: getattr(scene, key) for key in OWN},
+        **{key: getattr(scene, key) for key in SCENE_KEYS},
         "collision": {key: value for key, value in collision.items() if value is not None},
         "solver": _solver(solver),
         "materials": {name: dataclasses.asdict(material) for material, name in materials.items()},
@@ -95,7 +95,7 @@ def _solver(solver: dict) -> dict:
         check_solver(**plain)
     except SceneError as error:
         raise SceneError(f"solver: {error}") from None
-    return {key: NONE if value is None else value for key, value in plain.items()}
+    return {key: NONE_TEXT if value is None else value for key, value in plain.items()}
 
 
 def _body(body: Body, material: str, stem: str, meshes: dict[str, TetMesh]) -> dict:
@@ -107,16 +107,16 @@ def _body(body: Body, material: str, stem: str, meshes: dict[str, TetMesh]) -> d
     table |= {key: getattr(body, key) for key in ("position", "velocity", "order", "quadrature_degree", "collision")}
     table |= {key: [] for key in ("fix", "move", "traction", "force")}
     for c in body.constraints:
-        held = {"nodes": _ids(c.nodes, body.n_nodes), "axes": "".join(np.array(list("xyz"))[c.axes])}
+        entry = {"nodes": _ids(c.nodes, body.n_nodes), "axes": "".join(np.array(list("xyz"))[c.axes])}
         if c.path is None:
-            table["fix"].append(held)
+            table["fix"].append(entry)
         elif isinstance(c.path, NodePath):
             own = np.array_equal(c.path.starts, body.rest_positions[c.nodes] + body.position)
-            if not own and c.path.frames.rotations is not None:  # without them they move alike wherever they start
-                raise SceneError(f"body {body.name!r}: {STRANGE.format('nodes that start elsewhere')}")
-            table["move"].append(held | {"path": _frames(c.path.frames)})
+            if not own and c.path.frames.rotations is not None:  # without rotations the start does not matter
+                raise SceneError(f"body {body.name!r}: {FOREIGN_PATH.format('nodes that start elsewhere')}")
+            table["move"].append(entry | {"path": _frames(c.path.frames)})
         else:
-            raise SceneError(f"body {body.name!r}: moves along a function, which no file can hold: use ts.KeyFrames")
+            raise SceneError(f"body {body.name!r}: moves along a function, which a file cannot store: use ts.KeyFrames")
     for load in body.tractions:
         table["traction"].append({"triangles": _ids(load.triangles, len(body.mesh.surface)), "traction": load.value})
     for load in body.forces:
@@ -137,34 +137,34 @@ def _obstacle(obstacle: Obstacle) -> dict:
     shape = obstacle.shape
     kind = next((name for name, known in SHAPES.items() if known is type(shape)), None)
     if kind is None:
-        raise SceneError(f"obstacle {obstacle.name!r}: no file can hold a {type(shape).__name__}")
+        raise SceneError(f"obstacle {obstacle.name!r}: a file cannot store a {type(shape).__name__}")
     table = {"shape": kind} | {field.name: getattr(shape, field.name) for field in dataclasses.fields(shape)}
     table |= {"friction": obstacle.friction, "restitution": obstacle.restitution}
     if obstacle.path is None:
         return table
     if not isinstance(obstacle.path, ShapePath):
-        raise SceneError(f"obstacle {obstacle.name!r}: moves along a function, which no file can hold: use ts.KeyFrames")
+        raise SceneError(f"obstacle {obstacle.name!r}: moves along a function, which a file cannot store: use ts.KeyFrames")
     frames, own = obstacle.path.frames, np.array_equal(obstacle.path.center, shape.pivot)
-    if not own and frames.rotations is not None and frames.pivot is not None:  # else the center does not count
-        raise SceneError(f"obstacle {obstacle.name!r}: {STRANGE.format('a shape with another center')}")
+    if not own and frames.rotations is not None and frames.pivot is not None:  # otherwise the center does not matter
+        raise SceneError(f"obstacle {obstacle.name!r}: {FOREIGN_PATH.format('a shape with another center')}")
     return table | {"path": _frames(frames)}
 
 
 def toml_of(tables: dict) -> str:
-    """Nested dicts as TOML: numbers, true and false, texts, lists, arrays, dicts, and lists of dicts."""
+    """Return nested dicts as TOML: numbers, booleans, strings, lists, arrays, dicts, and lists of dicts."""
     return "\n".join(_lines(tables, "")).lstrip("\n") + "\n"
 
 
 def _lines(table: dict, place: str) -> list[str]:
-    below = {key: value for key, value in table.items() if isinstance(value, dict) or _is_tables(value)}
-    lines = [f"{bare_or_quoted(key)} = {_value(value)}" for key, value in table.items() if key not in below and not _none(value)]
-    for key, value in below.items():
-        at = joined(place, key)
-        for one in value if isinstance(value, list) else [value]:
-            head = f"[[{at}]]" if isinstance(value, list) else f"[{at}]"
-            within = _lines(one, at)
-            # a table of tables alone needs no head of its own
-            lines += within if not isinstance(value, list) and within[:1] == [""] else ["", head, *within] if within else []
+    subtables = {key: value for key, value in table.items() if isinstance(value, dict) or _is_tables(value)}
+    lines = [f"{key_text(key)} = {_toml(value)}" for key, value in table.items() if key not in subtables and not _empty(value)]
+    for key, value in subtables.items():
+        path = key_path(place, key)
+        for subtable in value if isinstance(value, list) else [value]:
+            header = f"[[{path}]]" if isinstance(value, list) else f"[{path}]"
+            inner = _lines(subtable, path)
+            # a table that contains only tables needs no header
+            lines += inner if not isinstance(value, list) and inner[:1] == [""] else ["", header, *inner] if inner else []
     return lines
 
 
@@ -172,23 +172,23 @@ def _is_tables(value) -> bool:
     return isinstance(value, list) and bool(value) and isinstance(value[0], dict)
 
 
-def _none(value) -> bool:
+def _empty(value) -> bool:
     return isinstance(value, list) and not value
 
 
-def _value(value) -> str:
+def _toml(value) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return quoted(value)
+        return quote(value)
     if isinstance(value, (int, float)):
         return repr(value)
     entries = value.tolist() if isinstance(value, np.ndarray) else value
     if entries and isinstance(entries[0], list):
-        return "".join(["[", *(f"\n  {_value(row)}," for row in entries), "\n]"])
+        return "".join(["[", *(f"\n  {_toml(row)}," for row in entries), "\n]"])
     lines = [""]
-    for text in map(_value, entries):
-        if lines[-1] and len(lines[-1]) + len(text) > WIDTH:
+    for text in map(_toml, entries):
+        if lines[-1] and len(lines[-1]) + len(text) > MAX_LINE:
             lines.append("")
         lines[-1] += f"{text}, "
     return f"[{lines[0][:-2]}]" if len(lines) == 1 else "".join(["[", *(f"\n  {line[:-1]}" for line in lines), "\n]"])

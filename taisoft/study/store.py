@@ -26,7 +26,7 @@ RUNS = "runs"
 KIND, FORMAT = "taisoft study run", 1
 PACKAGE = Path(__file__).resolve().parents[1]
 NOT_COMPUTING = ("cli", "view", "output", "study")  # folders of the package that results do not depend on
-COMPUTING = ("study/measure.py", "study/stretch.py")  # except these
+COMPUTING = ("study/measure.py", "study/timed_run.py")  # except these
 
 
 def code_digest() -> str:
