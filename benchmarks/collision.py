@@ -13,7 +13,7 @@ is not met. --quick has small meshes, few rounds and frames, and no limit. The w
 import argparse
 import sys
 
-from taisoft.runtime import Runtime, open_runtime
+from taisoft.backend.runtime import Runtime, open_runtime
 from taisoft.timing import load_average
 
 from .collision_cases import (

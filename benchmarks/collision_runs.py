@@ -12,12 +12,12 @@ import numpy as np
 import taichi as ti
 
 import taisoft as ts
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import Runtime, compile_clock
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.pipeline import Detection
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.fields import FieldArena
-from taisoft.model import build_model
-from taisoft.runtime import Runtime, compile_clock
+from taisoft.fem.model import build_model
 from taisoft.scene.plan import make_plan
 from taisoft.timing import Timing, summarise
 

@@ -31,7 +31,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from taisoft.runtime import compile_clock, open_runtime
+from taisoft.backend.runtime import compile_clock, open_runtime
 from taisoft.timing import load_average
 
 from . import contact_problems

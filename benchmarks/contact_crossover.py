@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import taichi as ti
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import Runtime
 from taisoft.contact.problem import NODES, ContactProblem, build_node_problem, find_factors, index_nodes
-from taisoft.fields import FieldArena
 from taisoft.output.tables import markdown
-from taisoft.runtime import Runtime
 
 from .collision_table import crossovers
 from .contact_captured import COLOURED, SERIAL, THREADED, Outcome, Solvers

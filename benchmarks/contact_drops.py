@@ -11,7 +11,11 @@ import warnings
 from collections.abc import Callable
 
 import taisoft as ts
-from taisoft.runtime import compile_clock
+
+try:
+    from taisoft.backend.runtime import compile_clock
+except ImportError:  # version 0.1
+    from taisoft.runtime import compile_clock
 
 if __package__:
     from .contact_states import DOWN, GROUND, IMPLICIT, MESHES, demo, figure, rubber

@@ -12,7 +12,11 @@ import warnings
 from dataclasses import dataclass
 
 import taisoft as ts
-from taisoft.runtime import compile_clock
+
+try:
+    from taisoft.backend.runtime import compile_clock
+except ImportError:  # version 0.1
+    from taisoft.runtime import compile_clock
 
 STATICS = "static beams"
 LAWS = ("stable_neo_hookean", "corotational", "st_venant_kirchhoff")

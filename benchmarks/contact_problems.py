@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse as sp
 
+from taisoft.backend.runtime import open_runtime
 from taisoft.contact import api, augmented_lagrangian, numpy_prox
 from taisoft.contact.colouring import store
 from taisoft.contact.graph import colour_greedy, matrix_graph
 from taisoft.contact.solve import solve
-from taisoft.runtime import open_runtime
 
 PROBLEMS = Path(__file__).resolve().parents[1].parent / "shared" / "contact_problems"
 SWEEPS = (10, 100, 1000)

@@ -19,7 +19,11 @@ from pathlib import Path
 import numpy as np
 
 import taisoft as ts
-from taisoft.runtime import compile_clock, launches
+
+try:
+    from taisoft.backend.runtime import compile_clock, launches
+except ImportError:  # version 0.1
+    from taisoft.runtime import compile_clock, launches
 
 ROOT = Path(ts.__file__).resolve().parents[1]
 MESHES = Path(__file__).resolve().parents[2] / "shared" / "meshes"

@@ -8,8 +8,8 @@ import numpy as np
 
 import taisoft as ts
 from taisoft import simulator
+from taisoft.backend.runtime import open_runtime
 from taisoft.errors import TaisoftError
-from taisoft.runtime import open_runtime
 from taisoft.scene.scene import Scene
 from taisoft.study.timed_run import advance, warm_up
 

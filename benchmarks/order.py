@@ -17,8 +17,8 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
+from taisoft.backend.runtime import open_runtime
 from taisoft.output.plot import require_matplotlib
-from taisoft.runtime import open_runtime
 from taisoft.timing import load_average
 
 from .document import Document, check_out, header

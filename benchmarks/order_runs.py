@@ -15,9 +15,9 @@ from time import perf_counter
 import numpy as np
 
 import taisoft as ts
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import Runtime, compile_clock
 from taisoft.errors import SimulationError, TaisoftError
-from taisoft.fields import FieldArena
-from taisoft.runtime import Runtime, compile_clock
 from taisoft.static import StaticSolver
 from taisoft.study.timed_run import TimedRun, advance
 from taisoft.timing import Timing, summarise, time_repeats

@@ -16,8 +16,8 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError
-from taisoft.runtime import open_runtime
 from taisoft.timing import machine, versions
 
 from .reference_cases import CASES, PROBLEMS

@@ -15,8 +15,8 @@ import numpy as np
 import taichi as ti
 
 import taisoft as ts
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel, open_runtime, threads
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel, open_runtime, threads
 
 from .collision_runs import clock
 

@@ -20,15 +20,16 @@ import numpy as np
 import taichi as ti
 
 import taisoft as ts
-from taisoft import model, simulator
+from taisoft import simulator
+from taisoft.backend.runtime import compile_clock, kernel, open_runtime, threads
 from taisoft.dynamics import stage_system
-from taisoft.elasticity import elastic_forces
-from taisoft.elements.lanes import broadcast
+from taisoft.fem import model
+from taisoft.fem.elasticity import elastic_forces
+from taisoft.fem.lanes import broadcast
+from taisoft.fem.scalars import LOWEST_J
 from taisoft.fem.terms.elasticity import HUGE, element_force
 from taisoft.linear import block_csr, pcg
 from taisoft.output.report import peak_memory
-from taisoft.runtime import compile_clock, kernel, open_runtime, threads
-from taisoft.scalars import LOWEST_J
 from taisoft.scene.scene import Scene
 from taisoft.study.timed_run import advance, warm_up
 from taisoft.timing import Timing, summarise

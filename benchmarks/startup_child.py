@@ -68,7 +68,7 @@ def timed(what: Callable) -> dict[str, float]:
 def compiled() -> int | None:
     """How many kernels have been compiled so far, None where the version cannot tell."""
     try:
-        from taisoft.runtime import n_compiled
+        from taisoft.backend.runtime import n_compiled
     except ImportError:
         return None
     return n_compiled()

@@ -38,7 +38,7 @@ _MODULES = {  # public name -> the module that defines it
     "Simulator": "taisoft.simulator",
     "solve_static": "taisoft.static",
     "modes": "taisoft.stability",
-    "evaluate_law": "taisoft.materials.evaluate",
+    "evaluate_law": "taisoft.fem.laws.evaluate",
     "solve_contact_problem": "taisoft.contact.api",
     "Energies": "taisoft.records",
     "StepReport": "taisoft.records",
@@ -63,4 +63,4 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+    return list(__all__)  # public names only

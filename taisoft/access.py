@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taisoft.attributes import Guarded, SimulationAttributeError, thawed
+from taisoft.backend.transfer import upload
 from taisoft.dynamics.simulation_state import SimulationState
-from taisoft.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
 from taisoft.errors import SceneError, SimulationError
+from taisoft.fem.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
+from taisoft.fem.scalars import ELASTIC, GRAVITY, KINETIC, LOADS
 from taisoft.records import Energies
-from taisoft.scalars import ELASTIC, GRAVITY, KINETIC, LOADS
 from taisoft.scene.changes import CHANGEABLE, change_material
 from taisoft.settings import Settings, check_dt
 from taisoft.stability import stable_dt
-from taisoft.transfer import upload
 
 if TYPE_CHECKING:
     from taisoft.collision.contacts import Contacts

@@ -29,7 +29,7 @@ from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.numbers import Numbers, first_difference, scene_numbers
 from taisoft.scene.scene import Material, Scene
 
-KIND, FORMAT = "taisoft checkpoint", 6  # increment FORMAT with every change of a file's content
+KIND, FORMAT = "taisoft checkpoint", 7  # increment FORMAT with every change of a file's content
 PARTS = ("settings", "numbers", "start", "fingerprint", "state", "notes")  # of the header, each a table
 FEATURES = "the features that it needs"  # last entry of the fingerprint: of the plan, which follows from the parts and numbers
 

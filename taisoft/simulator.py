@@ -6,22 +6,22 @@ import weakref
 
 import numpy as np
 
-from taisoft import runtime
 from taisoft.attributes import thawed
+from taisoft.backend import runtime
+from taisoft.backend.fields import FieldArena
 from taisoft.dynamics import make_stepper
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.drag_spring import DragSpring, batch
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.simulation_state import SimulationState
-from taisoft.elasticity import NO_TET, measure
 from taisoft.errors import SceneError, SimulationError, no_memory
-from taisoft.fields import FieldArena
-from taisoft.materials import LAWS
-from taisoft.model import build_model
+from taisoft.fem.elasticity import NO_TET, measure
+from taisoft.fem.laws import LAWS
+from taisoft.fem.model import build_model
+from taisoft.fem.scalars import FIRST_SOFTENED, LOADS
 from taisoft.records import RunReport, StepReport
 from taisoft.resuming import Resuming
 from taisoft.running import run
-from taisoft.scalars import FIRST_SOFTENED, LOADS
 from taisoft.scene.scene import Scene
 from taisoft.settings import check_count, check_settings, plan_of
 from taisoft.stability import scale_warnings
@@ -39,8 +39,12 @@ class Simulator(Resuming):
     """A simulation of a scene as it was at construction. SI units; positions are float64 in either precision.
 
     The scene is frozen. The simulator has its own copy of the scene's numbers, which its set_ methods change, as `dt` changes dt.
-    dt [s]; integrator: one of taisoft.dynamics.INTEGRATORS; newton_tolerance, linear_tolerance: relative, None is adaptive.
-    An explicit integrator refuses a dt above `stable_dt`; with allow_unstable it only warns. draggable: allow `drag`.
+    dt: step [s]. integrator: "symplectic_euler" or "velocity_verlet" (explicit), "linearly_implicit_euler", "implicit_euler",
+    "implicit_midpoint" (without contacts) or "bdf2" (implicit). contact_solver: "auto"; in explicit steps also "gauss_seidel",
+    "coloured_gauss_seidel", "jacobi" or "hybrid", in implicit ones "augmented_lagrangian". self_collision: whether bodies touch
+    themselves. precision: "f32" or "f64". arch: "cpu" or "cuda". newton_tolerance, linear_tolerance, contact_tolerance: relative;
+    None: the default of the precision, for linear solves adaptive. draggable: allow `drag`.
+    An explicit integrator refuses a dt above `stable_dt`; with allow_unstable it only warns.
     Raises SceneError for a scene that cannot be simulated, SimulationError for settings that cannot be met.
     """
 

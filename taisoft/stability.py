@@ -9,9 +9,9 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 
-from taisoft.elements import reference
 from taisoft.errors import SceneError
-from taisoft.mass import lumped_masses
+from taisoft.fem import reference
+from taisoft.fem.mass import lumped_masses
 from taisoft.scene.scene import Body, Scene
 
 MAX_WEIGHT_STRAIN = 0.5  # strain of a body under its own weight above which its scale is questioned

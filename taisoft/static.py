@@ -4,21 +4,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import Runtime, open_kind, open_runtime
+from taisoft.backend.transfer import upload
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage_result import StageResult
 from taisoft.dynamics.stage_system import Stage, StageSystem
-from taisoft.elasticity import measure
 from taisoft.errors import SceneError, SimulationError
-from taisoft.fields import FieldArena
-from taisoft.model import Layout, build_model
-from taisoft.runtime import Runtime, open_kind, open_runtime
-from taisoft.scalars import ELASTIC, N_INVERTED
+from taisoft.fem.elasticity import measure
+from taisoft.fem.model import Layout, build_model
+from taisoft.fem.scalars import ELASTIC, N_INVERTED
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
-from taisoft.transfer import upload
 
 MAX_NEWTON = 100
 SMALLEST_LOAD_STEP = 1.0 / 256.0

@@ -7,7 +7,7 @@ from command import BEAM, write
 from long import LONG, is_long
 from taichi._lib import core
 
-from taisoft import runtime
+from taisoft.backend import runtime
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 SLOW = (

@@ -3,9 +3,9 @@
 import contact_oracle as oracle
 import numpy as np
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import open_runtime
 from taisoft.contact import problem
-from taisoft.fields import FieldArena
-from taisoft.runtime import open_runtime
 
 CAPACITY, N_NODES, BLOCKS = 300, 40, 4096
 

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 import taichi as ti
 
-from taisoft.runtime import Runtime, open_runtime
+from taisoft.backend.runtime import Runtime, open_runtime
 
 
 @contextmanager

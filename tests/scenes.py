@@ -11,9 +11,9 @@ from oracle import Oracle
 from oracle_elements import mesh_nodes
 
 import taisoft as ts
-from taisoft.fields import FieldArena
-from taisoft.model import Layout, Model, build_model
-from taisoft.runtime import Runtime
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import Runtime
+from taisoft.fem.model import Layout, Model, build_model
 from taisoft.scene.plan import make_plan
 
 SVK, COR, SNH = "st_venant_kirchhoff", "corotational", "stable_neo_hookean"

@@ -12,9 +12,9 @@ import taichi as ti
 from lanes import opened
 
 import taisoft as ts
+from taisoft.backend.runtime import kernel
 from taisoft.collision import shapes
 from taisoft.collision.surface import dvec
-from taisoft.runtime import kernel
 
 SHAPES = {
     "half_space": ts.HalfSpace((0, 0, 0), (0, 1, 0)),

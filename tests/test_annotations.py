@@ -86,6 +86,17 @@ def test_a_caption_lies_below():
     assert not np.array_equal(later, plain), "the number of the frame"
 
 
+@pytest.mark.parametrize("size", [(160, 90), (64, 36)])
+def test_a_colour_bar_fits_a_small_picture(size):
+    """Steps of the bar are narrower than a pixel there."""
+    sim, scene = FakeSimulator(beam_scene()), beam_scene()
+    colouring = Colouring(scene, Surfaces(scene), "stress")
+    colouring.base(sim)
+    coloured = Annotations(name="beam", colouring=colouring).draw(grey(size), sim, 7)
+    plain = Annotations(name="beam").draw(grey(size), sim, 7)
+    assert (coloured != plain).any()
+
+
 def test_a_caption_beside_plots_stays_below_the_bodies():
     sim, scene, plots = FakeSimulator(beam_scene()), beam_scene(), filled()
     picture = Offscreen(scene, SIZE, renderer="software").image(sim)

@@ -15,11 +15,11 @@ from scenes import SNH, SVK, built, driven_scene, mixed_scene
 import taisoft as ts
 from benchmarks.contact_captured import GOAL
 from benchmarks.contact_crossover import measure_crossover
-from taisoft import elasticity
+from taisoft.backend.runtime import open_runtime
+from taisoft.fem import elasticity
+from taisoft.fem.scalars import ELASTIC
+from taisoft.fem.subset import EVERYTHING
 from taisoft.linear import block_csr
-from taisoft.runtime import open_runtime
-from taisoft.scalars import ELASTIC
-from taisoft.subset import EVERYTHING
 
 GPU = pytest.mark.cuda
 ARCHS = ["cpu", pytest.param("cuda", marks=GPU)]

@@ -44,8 +44,8 @@ from benchmarks.collision_runs import (
     measure_row,
 )  # fmt: skip
 from benchmarks.collision_table import best_cell, cell_table, crossover_text, crossovers, find_limits, row_table
+from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError
-from taisoft.runtime import open_runtime
 
 
 def count(scene) -> tuple[int, int]:

@@ -39,11 +39,11 @@ from benchmarks.contact_runs import (
 )  # fmt: skip
 from benchmarks.contact_table import CONTACTS, PILE, STEP_SCENE, count_table, find_limits
 from benchmarks.report_parts import phases
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import open_runtime
 from taisoft.contact import SOLVERS
 from taisoft.contact.graph import node_graph
 from taisoft.errors import OutputError
-from taisoft.fields import FieldArena
-from taisoft.runtime import open_runtime
 
 SCENE = "cube_on_box"
 

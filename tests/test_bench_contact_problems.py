@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import contact_problems as bench
 from benchmarks.contact_problems import Row
-from taisoft.runtime import open_runtime
+from taisoft.backend.runtime import open_runtime
 
 PLAIN = Row("Rover1039", 4, bench.PLAIN, (2.8e-2, 5.9e-4, 1e-10), 430, 0.5, 0.4)
 ROWS = [PLAIN, replace(PLAIN, solver="jacobi", iterations=None), replace(PLAIN, solver="hybrid", time=0.3, operations=0.2)]

@@ -21,8 +21,8 @@ from benchmarks.order_cases import CASES, HANGING, HEAVY, LINEAR, QUADRATIC, QUA
 from benchmarks.order_runs import Row, judge, measure_case, own_reference
 from benchmarks.order_table import Reach, compare, find_limits, row_table, time_to
 from benchmarks.reference_cases.record import GRAVITY
+from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError
-from taisoft.runtime import open_runtime
 
 BEAM = CASES[0]
 REFERENCE = Reference((-2.0,), 1e-3, "made up")

@@ -38,9 +38,9 @@ from benchmarks.report_parts.page import (
     small_png,
     verdict_of,
 )  # fmt: skip
+from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError
 from taisoft.mesh.sdf_grid import SdfGrid
-from taisoft.runtime import open_runtime
 from taisoft.timing import summarise
 
 SPREAD = (0.98, 1.0, 1.02)  # of rounds about their median

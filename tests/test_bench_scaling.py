@@ -21,8 +21,8 @@ from benchmarks.fit import exponent
 from benchmarks.scaling_bytes import GROUPS, LOOPS, Copy, copy_rate, floor_bytes, group_bytes, measure_copy
 from benchmarks.scaling_runs import EXPLICIT, KINDS, ON_ONE, Row, beam, cubes_on_ground, measure
 from benchmarks.scaling_table import growths, time_table
+from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError
-from taisoft.runtime import open_runtime
 
 
 def row(kind="implicit", tets=1000, seconds=1.0, **more) -> Row:

@@ -24,7 +24,7 @@ from command import ROOT
 from scenes import RELEASE, driven_scene
 
 import taisoft as ts
-from taisoft import runtime
+from taisoft.backend import runtime
 from taisoft.checkpoint import read_checkpoint
 from taisoft.dynamics import EXPLICIT
 from taisoft.errors import OutputError, SceneError, SimulationError
@@ -253,7 +253,7 @@ def test_newer_files_are_told_from_damaged_ones(saved, tmp_path):
         return np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
 
     text = refusal(changed(saved, tmp_path / "newer.npz", "header", newer))
-    assert "written by taisoft 9.1 in format 99, and taisoft" in text and "reads format 6" in text
+    assert "written by taisoft 9.1 in format 99, and taisoft" in text and "reads format 7" in text
 
 
 def renamed(scene):

@@ -102,7 +102,7 @@ def test_files_of_the_format_before_are_refused(saved, monkeypatch):
     monkeypatch.setattr(checkpoint, "FORMAT", 5)
     checkpoint.write_checkpoint(saved, {}, scene(1.0), {}, {"x": np.zeros(3)}, {})
     monkeypatch.undo()
-    with pytest.raises(ts.SimulationError, match="in format 5, and taisoft .* reads format 6"):
+    with pytest.raises(ts.SimulationError, match="in format 5, and taisoft .* reads format 7"):
         checkpoint.read_checkpoint(saved)
 
 

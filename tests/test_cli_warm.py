@@ -16,15 +16,15 @@ import pytest
 from command import ROOT
 
 import taisoft as ts
+from taisoft.backend.runtime import n_compiled
 from taisoft.cli import main, warm, warm_scenes
 from taisoft.cli.scene_file import load_scene, shipped_files
 from taisoft.cli.warm_scenes import Structure, build, static_structures, structures
 from taisoft.collision.surface import SERIAL_BELOW
 from taisoft.dynamics import EXPLICIT
 from taisoft.dynamics.elimination import solve_on
-from taisoft.elements.reference import inverse_rest_edges
-from taisoft.model import ILL_CONDITIONED
-from taisoft.runtime import n_compiled
+from taisoft.fem.model import ILL_CONDITIONED
+from taisoft.fem.reference import inverse_rest_edges
 from taisoft.scene.obstacles import MeshObstacle
 from taisoft.settings import plan_of
 

@@ -19,12 +19,12 @@ from surfaces import pairs_of, place, surface_of
 from test_bvh import colliders, scatter
 
 import taisoft as ts
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
 from taisoft.collision import surface
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.errors import SceneError, SimulationError
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -13,7 +13,7 @@ import pytest
 import scipy.sparse as sp
 
 import taisoft as ts
-from taisoft import runtime
+from taisoft.backend import runtime
 from taisoft.contact.api import METHODS
 
 MADE = oracle.random_contacts(0, 6, 12)

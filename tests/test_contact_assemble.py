@@ -12,11 +12,11 @@ import taichi as ti
 from rotations import rotation
 
 import taisoft as ts
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel, open_runtime
 from taisoft.contact.assemble import SELF_CONTACT, _warm_impulse, build_found, gap_minus_target, keep_impulses
 from taisoft.contact.problem import build_node_problem, fill_field
 from taisoft.contact.restitution import explicit_opening
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel, open_runtime
 
 DT = 1e-3  # [s]
 SPIN = np.array([0.3, 2.0, -0.4])  # [rad/s]

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import open_runtime
 from taisoft.contact import colouring, problem
 from taisoft.contact.graph import colour_greedy, colour_random, groups, matrix_graph, node_graph
-from taisoft.fields import FieldArena
-from taisoft.runtime import open_runtime
 
 N_NODES, CAPACITY = 120, 700
 

@@ -15,11 +15,11 @@ import pytest
 from rotations import rotation
 
 import taisoft as ts
-from taisoft import model
 from taisoft.dynamics import contact_newton, implicit, scheme_of
 from taisoft.dynamics.contact_newton import FALLBACK_STEPS, FrictionalResult
 from taisoft.dynamics.newton import Newton
 from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.fem import model
 from taisoft.linear import pcg
 
 DT = 0.01  # [s]

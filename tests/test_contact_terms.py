@@ -17,6 +17,7 @@ import taichi as ti
 from scenes import built, cube, rubber
 
 import taisoft as ts
+from taisoft.backend.runtime import kernel
 from taisoft.contact.assemble import build_found
 from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, find_factors, index_nodes
 from taisoft.dynamics import contact_terms, linearised
@@ -24,12 +25,11 @@ from taisoft.dynamics.contact_terms import NO_CONTACTS
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, STAY, STEP, form_residual, move
 from taisoft.dynamics.stage_system import StageSystem
+from taisoft.fem.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
+from taisoft.fem.subset import EVERYTHING
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import to_scipy, unpacked
 from taisoft.linear.coupling import add_products, clear_products, form_product, gather_products, prepare_terms
-from taisoft.runtime import kernel
-from taisoft.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
-from taisoft.subset import EVERYTHING
 
 K, BETA, DT = 24, 0.002, 0.003  # contacts; [s]
 GOAL = 1e-3, 0.2, 0.02, 0.05  # contact offset [m], shares that a step mends, speed of that at most [m/s]

@@ -14,7 +14,8 @@ import pytest
 from detection_scenes import DT, SOFT, folded, identical, pairs_of, sheets, simulator, sweeping
 
 import taisoft as ts
-from taisoft import collision, runtime
+from taisoft import collision
+from taisoft.backend import runtime
 from taisoft.errors import SimulationError
 
 

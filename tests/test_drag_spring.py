@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import taisoft as ts
+from taisoft.backend.runtime import compile_clock
 from taisoft.dynamics.drag_spring import HEAVY, SOFT, STRAIN, batch
 from taisoft.errors import SceneError, SimulationError
-from taisoft.runtime import compile_clock
 
 RUBBER = ts.Material(law="stable_neo_hookean", young=1e6, poisson=0.3, density=1000.0, mass_damping=8.0)
 SETTINGS = {"implicit_euler": 0.02, "bdf2": 0.02, "implicit_midpoint": 0.02, "velocity_verlet": 1e-3, "symplectic_euler": 1e-3}

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from scenes import SNH, SVK, built, mixed_scene
 
-from taisoft import elasticity
+from taisoft.fem import elasticity
+from taisoft.fem.scalars import ELASTIC, GRAVITY, MIN_J, N_INVERTED
+from taisoft.fem.subset import EVERYTHING
 from taisoft.linear import block_csr
-from taisoft.scalars import ELASTIC, GRAVITY, MIN_J, N_INVERTED
-from taisoft.subset import EVERYTHING
 
 SQUEEZE = np.array([[0.6, 0.1, 0.0], [-0.15, 1.2, 0.05], [0.0, 0.1, 0.7]])
 

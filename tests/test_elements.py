@@ -16,7 +16,7 @@ from oracle_elements import Elements, body_loads
 from scenes import cube, rubber
 
 import taisoft as ts
-from taisoft.elements import reference
+from taisoft.fem import reference
 
 ORDERS = (1, 2)
 POINTS = np.random.default_rng(3).dirichlet(np.ones(4), 20)  # barycentric

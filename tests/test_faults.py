@@ -29,7 +29,7 @@ from png import decode
 from pxr import Sdf, Usd
 
 import taisoft as ts
-from taisoft import fields
+from taisoft.backend import fields
 from taisoft.checkpoint import read_checkpoint
 from taisoft.output.checkpoint import CheckpointWriter
 from taisoft.output.files import LOCK_NAME, OutputFolder
@@ -68,7 +68,7 @@ def shim(tmp_path_factory) -> Path:
 # Each run in the same process, so that kernels are compiled once: (call, part of the path, where it fails)
 FAILING = """
 import contextlib, io, json, os, sys
-from taisoft import runtime
+from taisoft.backend import runtime
 from taisoft.cli import main
 scene, base, shown = sys.argv[1], sys.argv[2], []
 for k, (call, name) in enumerate(json.loads(sys.argv[3])):

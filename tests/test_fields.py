@@ -14,12 +14,12 @@ import pytest
 import taichi as ti
 from lanes import opened
 
-from taisoft import lane_pool, runtime
-from taisoft.arrays import DTYPES
+from taisoft.backend import lane_pool, runtime
+from taisoft.backend.arrays import DTYPES
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
+from taisoft.backend.transfer import download, upload
 from taisoft.errors import SimulationError
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel
-from taisoft.transfer import download, upload
 
 SHAPES = [(7,), (5, 3), (4, 3, 2)]  # of scalars
 
@@ -45,7 +45,7 @@ def test_names_and_bytes():
 def test_memory_that_there_is_not(monkeypatch):
     with opened("f64"):
         arena = FieldArena()
-        monkeypatch.setattr("taisoft.fields.available_memory", lambda: 2**21)
+        monkeypatch.setattr("taisoft.backend.fields.available_memory", lambda: 2**21)
         with pytest.raises(SimulationError, match="not enough memory for the array 'x': .* are needed, available: "):
             arena.field("x", ti.f64, 2**19)
         with pytest.raises(SimulationError, match="not enough memory for the array 'y'"):

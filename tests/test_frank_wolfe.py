@@ -15,11 +15,11 @@ import pytest
 import taichi as ti
 from lanes import opened
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
 from taisoft.collision import shapes
 from taisoft.collision.frank_wolfe import deepest_point
 from taisoft.collision.surface import dvec
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel
 
 array = ti.types.ndarray(dtype=ti.f64)
 NAMES = ("plane", "sphere", "box", "capsule", "torus")  # of the reference; the first four by their numbers as obstacles

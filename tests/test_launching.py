@@ -17,11 +17,11 @@ import pytest
 import taichi as ti
 from lanes import opened
 
-from taisoft import launching, runtime
-from taisoft.arrays import Count
-from taisoft.fields import FieldArena
-from taisoft.materials import corotational, stable_neo_hookean
-from taisoft.runtime import kernel
+from taisoft.backend import launching, runtime
+from taisoft.backend.arrays import Count
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
+from taisoft.fem.laws import corotational, stable_neo_hookean
 
 
 @pytest.fixture(params=[False, True], ids=["quick", "public"])
@@ -200,7 +200,7 @@ def test_a_new_taichi_has_nothing_old():
 
 def test_masks_do_not_change_indices(machine):
     """The largest index that 31 bits can count is not changed, and the next array size is refused."""
-    from taisoft.arrays import index_mask
+    from taisoft.backend.arrays import index_mask
 
     for n, extents in ((0, ()), (2, ()), (3, ()), (12, ()), (0, (9, 4)), (3, (3,))):
         numbers, mask = max(n, 1) * int(np.prod(extents, initial=1)), index_mask(n, extents)

@@ -11,10 +11,10 @@ import pytest
 from scenes import rubber
 
 import taisoft as ts
+from taisoft.backend.runtime import compile_clock
 from taisoft.checkpoint import read_checkpoint
 from taisoft.errors import SceneError
 from taisoft.output.camera import Camera
-from taisoft.runtime import compile_clock
 from taisoft.view.layers import Layers
 
 FIRST = [(0.0, 0.0, 0.0), (1.0, 2.0, 0.0), (0.0, 30.0, 0.0)]  # of the two forces and the traction

@@ -19,7 +19,7 @@ import taisoft as ts
 from taisoft.cli import _parser
 from taisoft.contact import SOLVERS
 from taisoft.dynamics import INTEGRATORS
-from taisoft.materials import LAWS
+from taisoft.fem.laws import LAWS
 from taisoft.settings import IMPLICIT_CONTACT, Settings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -99,6 +99,12 @@ def test_arguments_of_a_simulator():
     for name, _, default in rows[1:]:
         assert eval(default.strip(" `")) == parameters[name].default
     assert set(Settings.__dataclass_fields__) == set(parameters) - {"scene"}
+
+
+def test_help_lists_the_allowed_values():
+    names = set(re.findall(r'"(\w+)"', ts.Simulator.__doc__))
+    assert names == {"auto", "f32", "f64", "cpu", "cuda", *INTEGRATORS, *SOLVERS, *IMPLICIT_CONTACT}
+    assert dir(ts) == sorted(ts.__all__)
 
 
 def test_methods_of_a_simulator():

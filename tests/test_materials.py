@@ -18,10 +18,10 @@ from lanes import load, opened, packed, store, unpacked
 from matrices import MATRICES, rotations
 
 import taisoft as ts
-from taisoft import runtime
-from taisoft.materials import LAWS
-from taisoft.materials.evaluate import evaluate_differential
-from taisoft.runtime import kernel
+from taisoft.backend import runtime
+from taisoft.backend.runtime import kernel
+from taisoft.fem.laws import LAWS
+from taisoft.fem.laws.evaluate import evaluate_differential
 from taisoft.scene.material import LAWS as NAMES
 
 YOUNG, POISSON = 3e5, 0.35  # [Pa]; not round, so that mu, lambda and their multiples all differ

@@ -13,8 +13,8 @@ import taichi as ti
 from lanes import load, opened, packed, store, unpacked
 from matrices import MATRICES
 
-from taisoft import math3
-from taisoft.runtime import kernel
+from taisoft.backend.runtime import kernel
+from taisoft.fem import math3
 
 SWEEPS = 5  # as many as the laws use
 

@@ -15,11 +15,11 @@ from oracle import Oracle
 from scenes import COR, SNH, SVK, built, cube, mixed_scene, rubber
 
 import taisoft as ts
-from taisoft import runtime
+from taisoft.backend import runtime
 from taisoft.dynamics.substeps import LAUNCH_SECONDS, MAX_BATCH, largest_batch
-from taisoft.elasticity import NO_TET, measure
-from taisoft.materials import LAWS
-from taisoft.scalars import FIRST_SOFTENED, GRAVITY
+from taisoft.fem.elasticity import NO_TET, measure
+from taisoft.fem.laws import LAWS
+from taisoft.fem.scalars import FIRST_SOFTENED, GRAVITY
 
 LARGE = 34_560  # tets of the largest mesh whose runs are timed, `taisoft bench elasticity`
 

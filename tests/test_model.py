@@ -13,10 +13,10 @@ from oracle import Oracle
 from scenes import COR, SNH, SVK, built, driven_scene, mixed_scene
 
 import taisoft as ts
-from taisoft import elasticity
-from taisoft.fields import FieldArena
-from taisoft.mass import gravity_masses, lumped_masses, mass_matrix
-from taisoft.model import body_loads, build_model
+from taisoft.backend.fields import FieldArena
+from taisoft.fem import elasticity
+from taisoft.fem.mass import gravity_masses, lumped_masses, mass_matrix
+from taisoft.fem.model import body_loads, build_model
 from taisoft.scene.changes import change_material
 from taisoft.scene.plan import make_plan
 

@@ -9,7 +9,7 @@ import pytest
 from scenes import cube, driven_scene, mixed_scene, rubber
 
 import taisoft as ts
-from taisoft import runtime
+from taisoft.backend import runtime
 from taisoft.dynamics import EXPLICIT
 from taisoft.scene.plan import make_plan
 

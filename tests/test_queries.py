@@ -11,12 +11,12 @@ import taichi as ti
 from surfaces import place, surface_of
 from test_bvh import colliders, scatter
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
 from taisoft.collision.boxes import list_near
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.queries import EDGES, WHOLE, list_triangles, query_box
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel
 
 ROOM = 300
 

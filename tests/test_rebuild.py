@@ -15,7 +15,7 @@ from fake_simulator import beam_scene
 from scenes import RELEASE, driven_scene
 
 import taisoft as ts
-from taisoft import runtime
+from taisoft.backend import runtime
 from taisoft.errors import SimulationError
 
 

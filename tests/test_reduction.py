@@ -11,9 +11,9 @@ import pytest
 import taichi as ti
 from lanes import opened
 
+from taisoft.backend.fields import FieldArena
 from taisoft.collision.contacts import contact_fields
 from taisoft.collision.reduction import FOUND, LEFT, SAME_NORMAL, UNDECIDED, reduce_contacts, reduction_fields
-from taisoft.fields import FieldArena
 
 CAPACITY = 2**13
 LIMIT = np.arccos(SAME_NORMAL)  # [rad]

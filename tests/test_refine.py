@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.elements.reference import traction_forces
 from taisoft.errors import SceneError
+from taisoft.fem.reference import traction_forces
 from taisoft.scene.refine import refined, with_order
 
 RUBBER = ts.Material(young=1e5)

@@ -12,10 +12,10 @@ import taichi as ti
 from lanes import opened
 from taichi._lib import core
 
-from taisoft import launching, runtime
+from taisoft.backend import launching, runtime
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel, open_runtime
 from taisoft.errors import SimulationError
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel, open_runtime
 
 
 @kernel

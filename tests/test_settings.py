@@ -5,7 +5,7 @@ import pytest
 from scenes import cube, rubber
 
 import taisoft as ts
-from taisoft import runtime
+from taisoft.backend import runtime
 from taisoft.settings import check_dt
 
 

@@ -24,7 +24,7 @@ from oracle import Oracle
 from scenes import SNH, SVK, cube, element, rubber
 
 import taisoft as ts
-from taisoft import runtime
+from taisoft.backend import runtime
 
 DT = 0.002  # [s]
 UPRIGHT = np.eye(3)

@@ -16,9 +16,9 @@ import pytest
 from surfaces import brute_pairs, pairs_of, place, soup, surface_of
 from test_bvh import EMPTY, colliders, scatter
 
+from taisoft.backend.fields import FieldArena
 from taisoft.collision.spatial_hash import COUNTABLE, MAX_CELLS, N_LARGE, SpatialHash, grid_size
 from taisoft.errors import SimulationError
-from taisoft.fields import FieldArena
 
 EXTENTS = {"usual": np.ones(3), "one cell": np.zeros(3)}  # [m]
 

@@ -17,7 +17,7 @@ from oracle import Oracle
 from scenes import COR, SNH, SVK, cube, element, rubber
 
 import taisoft as ts
-from taisoft import runtime
+from taisoft.backend import runtime
 from taisoft.stability import highest_frequency, hooke_differential, hooke_stiffness, stable_dt
 
 KINDS = ((1, None), (2, 2), (2, 4))  # order, degree of the quadrature

@@ -14,7 +14,7 @@ from oracle import Oracle
 from scenes import SNH, SVK, cube, element, rubber
 
 import taisoft as ts
-from taisoft import runtime
+from taisoft.backend import runtime
 
 
 def hanging(young: float = 2e3, law: str = SNH, order: int = 1) -> ts.Scene:

@@ -25,9 +25,9 @@ import taisoft as ts
 from taisoft import dynamics
 from taisoft.dynamics import IMPLICIT, scheme_of
 from taisoft.dynamics.no_contacts import NoContacts
-from taisoft.elements import reference
+from taisoft.fem import reference
+from taisoft.fem.model import damping_table
 from taisoft.linear.block_csr import to_scipy
-from taisoft.model import damping_table
 
 DAMPED = {"mass_damping": 3.0, "stiffness_damping": 0.004}
 EXPLICIT = ("symplectic_euler", "velocity_verlet")
@@ -129,8 +129,8 @@ def test_a_change_makes_bdf2_start_anew(implicit, change):
 
 @pytest.mark.parametrize("integrator", [*EXPLICIT, "implicit_euler"])
 def test_parallel_kernels(integrator, monkeypatch):
-    monkeypatch.setattr("taisoft.model.PARALLEL_FROM", 0)
-    monkeypatch.setattr("taisoft.model.PARALLEL_THREADS", 0)
+    monkeypatch.setattr("taisoft.fem.model.PARALLEL_FROM", 0)
+    monkeypatch.setattr("taisoft.fem.model.PARALLEL_THREADS", 0)
     settings = {"newton_tolerance": 1e-13, "linear_tolerance": 1e-13} if integrator == "implicit_euler" else {}
     with simulator(driven_scene(mass_damping=3.0, order=2), integrator, **settings) as sim:
         assert not sim._simulation.model.serial

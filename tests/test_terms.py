@@ -11,14 +11,14 @@ import taichi as ti
 from rotations import rotation
 from scenes import built, driven_scene
 
-from taisoft.elasticity import elastic_forces, measure
+from taisoft.backend.runtime import kernel
+from taisoft.fem.elasticity import elastic_forces, measure
+from taisoft.fem.model import damping_table
+from taisoft.fem.scalars import ELASTIC, GRAVITY, LOADS
+from taisoft.fem.subset import EVERYTHING
 from taisoft.fem.terms import TERMS, dead_loads, elasticity, gravity, mass_damping, stiffness_damping
 from taisoft.linear import block_csr
 from taisoft.linear.block_csr import row_times
-from taisoft.model import damping_table
-from taisoft.runtime import kernel
-from taisoft.scalars import ELASTIC, GRAVITY, LOADS
-from taisoft.subset import EVERYTHING
 
 ENERGY = {elasticity: ELASTIC, gravity: GRAVITY, dead_loads: LOADS}  # where `measure` leaves it
 H = 1e-6  # [m]

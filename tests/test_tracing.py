@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from taisoft import runtime, tracing
-from taisoft.runtime import kernel
-from taisoft.tracing import arithmetic
+from taisoft.backend import runtime, tracing
+from taisoft.backend.runtime import kernel
+from taisoft.backend.tracing import arithmetic
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPT = """

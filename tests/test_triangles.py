@@ -18,9 +18,9 @@ import taichi as ti
 from lanes import opened
 from surfaces import separation
 
+from taisoft.backend.runtime import kernel
 from taisoft.collision import triangles
 from taisoft.collision.surface import dvec
-from taisoft.runtime import kernel
 
 array = ti.types.ndarray(dtype=ti.f64)
 

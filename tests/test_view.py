@@ -20,9 +20,9 @@ import pytest
 from fake_simulator import RUBBER, FakeSimulator, beam_scene
 
 import taisoft as ts
+from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, SimulationError
 from taisoft.output.camera import BORDER, FILL, Camera
-from taisoft.runtime import open_kind, open_runtime
 from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.raster import MAX_COORDINATE, rasterise

@@ -29,7 +29,7 @@ os.chdir({folder!r})
 from fake_simulator import beam_scene
 import numpy as np
 import taisoft as ts
-from taisoft.runtime import compile_clock
+from taisoft.backend.runtime import compile_clock
 from taisoft.view.window import show
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import taisoft as ts
-from taisoft.elements.reference import lumped_mass
+from taisoft.fem.reference import lumped_mass
 from taisoft.output.report import peak_memory
 
 from .contact import on_slope, stack_scene

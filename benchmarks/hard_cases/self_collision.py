@@ -3,7 +3,7 @@
 import numpy as np
 
 import taisoft as ts
-from taisoft.elements.reference import gravity_mass, lumped_mass
+from taisoft.fem.reference import gravity_mass, lumped_mass
 from taisoft.scene.key_frames import KeyFrames
 
 from ..reference_cases.record import face

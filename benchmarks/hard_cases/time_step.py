@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 
 import taisoft as ts
-from taisoft.elements.reference import lumped_mass
+from taisoft.fem.reference import lumped_mass
 from taisoft.scene.key_frames import KeyFrames
 
 from ..reference_cases.record import face

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from taisoft.runtime import open_runtime
+from taisoft.backend.runtime import open_runtime
 from taisoft.timing import summarise
 
 from ..collision_cases import CUBES, FRAMES, RATIOS, SWEPT, cubes_setup

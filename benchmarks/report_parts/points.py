@@ -11,10 +11,10 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
+from taisoft.backend.runtime import open_runtime, threads
 from taisoft.collision.surface import SERIAL_BELOW
 from taisoft.errors import SimulationError
 from taisoft.output.tables import markdown
-from taisoft.runtime import open_runtime, threads
 from taisoft.timing import summarise, usable_cores
 
 from ..collision_cases import Setup, cubes_setup, pile_setup

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from taisoft.backend.runtime import open_runtime
 from taisoft.errors import SimulationError
-from taisoft.runtime import open_runtime
 from taisoft.timing import summarise
 
 from ..collision_cases import PILES, cubes_setup, pile_setup

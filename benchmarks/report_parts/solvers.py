@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from taisoft.runtime import open_runtime
+from taisoft.backend.runtime import open_runtime
 from taisoft.timing import summarise
 
 from ..contact_captured import COLOURED, SERIAL, THREADED, Solvers

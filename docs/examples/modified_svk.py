@@ -6,9 +6,9 @@ Weak: the deviatoric part still softens in compression.
 
 import taichi as ti
 
-from taisoft.materials.st_venant_kirchhoff import _green_strain
-from taisoft.math3 import cofactor, cofactor_differential, cross, ddot, dot, matmul, matmul_nt, matmul_tn, transform
-from taisoft.tracing import arithmetic
+from taisoft.backend.tracing import arithmetic
+from taisoft.fem.laws.st_venant_kirchhoff import _green_strain
+from taisoft.fem.math3 import cofactor, cofactor_differential, cross, ddot, dot, matmul, matmul_nt, matmul_tn, transform
 
 NAME = "modified_svk"
 SOFTENS_BELOW = 0.6

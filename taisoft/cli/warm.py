@@ -11,11 +11,11 @@ import numpy as np
 
 import taisoft as ts
 from taisoft import compile_message
+from taisoft.backend.runtime import n_compiled
 from taisoft.cli import warm_scenes
 from taisoft.cli.warm_scenes import Structure
 from taisoft.dynamics import EXPLICIT
 from taisoft.errors import SimulationError
-from taisoft.runtime import n_compiled
 
 STEPS = {True: (1e-5, 200), False: (1e-2, 10)}  # explicit integrator: (dt [s], number of steps)
 LONG_DT = 1.0  # [s]

@@ -11,14 +11,14 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.arrays import Count
+from taisoft.backend.arrays import Count
+from taisoft.backend.runtime import kernel
 from taisoft.collision import shapes
 from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import FACE_FIELD, VERTEX_FIELD, write_contact
 from taisoft.collision.features import corner, in_normal_cone, opposite, unit, vertices_of
 from taisoft.collision.frank_wolfe import deepest_point
 from taisoft.collision.surface import dvec, ivec, part_first
-from taisoft.runtime import kernel
 
 ALIGNMENT_SINE = 0.26  # sine of 15 degrees: tolerance of grad phi in the conditions of a minimum
 MIN_EXTRA_DEPTH = 1e-5  # of a triangle's size: depth below its corners from which its deepest point is a contact

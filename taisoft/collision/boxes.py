@@ -7,8 +7,8 @@ nothing.
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, dvec, part_first
-from taisoft.runtime import kernel
 
 
 @kernel

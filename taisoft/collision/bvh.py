@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.arrays import Count
+from taisoft.backend.arrays import Count
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import Runtime, kernel
 from taisoft.collision.candidates import Buffer, Candidates, PairRows, pairs, sum_parts
 from taisoft.collision.surface import Surface, Topology, dvec, may_touch
 from taisoft.collision.trees import TreeTables, build_trees
-from taisoft.fields import FieldArena
-from taisoft.runtime import Runtime, kernel
 
 LEAVES = {"cpu": 64, "cuda": 8}  # triangles per chunk: the fastest of 4 to 256 on the CPU, small on CUDA for enough threads
 PAIRS_PER_TRIANGLE = 24  # initial capacity

@@ -11,10 +11,10 @@ from typing import Any
 
 import taichi as ti
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
 from taisoft.collision.surface import Surface
 from taisoft.errors import SimulationError
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel
 
 SLACK = 1.5  # a full buffer grows to this times the required size
 NEEDED, TOTAL = 0, 1  # indices into a buffer's count

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
 
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + local edge); vertex and collider;
 # triangle and collider

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.backend.transfer import download
 from taisoft.collision.analytic import AnalyticObstacles
 from taisoft.collision.surface import Surface, Topology
+from taisoft.fem.model import Layout
 from taisoft.mesh.inner_points import connected_parts, inner_depths, inner_tets
 from taisoft.mesh.winding import are_inside, distances, is_closed
-from taisoft.model import Layout
 from taisoft.scene.body import Body
 from taisoft.scene.obstacles import Capsule, Obstacle, Sphere
 from taisoft.scene.scene import Scene
-from taisoft.transfer import download
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ an edge of each (separating axis test; Gottschalk, Lin, Manocha 1996). Triangles
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.collision.boxes import list_near
 from taisoft.collision.candidates import sum_parts
 from taisoft.collision.features import corner
 from taisoft.collision.queries import WHOLE, list_triangles, query_box
 from taisoft.collision.surface import ACTIVE, dvec, part_first
-from taisoft.runtime import kernel
 
 PARALLEL = 1e-6  # sine below which two edges have no common normal
 CROSSED = 1e-3  # of the finer side's mean surface edge: depth below which crossings do not count; about the contact accuracy

@@ -9,6 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import taichi as ti
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import Runtime
+from taisoft.backend.transfer import download, upload
 from taisoft.collision.analytic import NO_SHAPES, AnalyticObstacles, find_analytic
 from taisoft.collision.boxes import move_obstacles, take_prescribed, update_surface
 from taisoft.collision.bvh import Bvh, Trees
@@ -32,16 +35,13 @@ from taisoft.collision.self_collision import Intersections
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, Surface, build_surface
 from taisoft.errors import SceneError, SimulationError
-from taisoft.fields import FieldArena
+from taisoft.fem.model import Layout, Model
 from taisoft.mesh.quality import mean_surface_edge
 from taisoft.mesh.sdf_grid import SdfGrid
-from taisoft.model import Layout, Model
-from taisoft.runtime import Runtime
 from taisoft.scene.body import Body
 from taisoft.scene.obstacles import MeshObstacle
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
-from taisoft.transfer import download, upload
 
 MARGIN = 0.1  # of the mean surface edge: default distance within which contacts are found
 DEPTH = 0.1  # of the mean surface edge: depth to which flat faces that have passed each other are still found

@@ -2,6 +2,7 @@
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.collision.boxes import list_near, sum_pairs
 from taisoft.collision.candidates import sum_parts
 from taisoft.collision.edge_edge import edge_contact
@@ -9,7 +10,6 @@ from taisoft.collision.features import BY_FACES, mark_sharp_edges
 from taisoft.collision.queries import EDGES, list_triangles, query_box
 from taisoft.collision.surface import ACTIVE, part_first
 from taisoft.collision.vertex_face import vertex_contacts
-from taisoft.runtime import kernel
 
 
 @ti.func

@@ -12,11 +12,11 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.arrays import Count
+from taisoft.backend.arrays import Count
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
 from taisoft.collision.contacts import ContactFields
 from taisoft.collision.surface import ivec
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel
 
 SAME_NORMAL = 0.996  # cosine of 5 degrees
 UNKNOWN, KEPT, DROPPED = 0, 1, 2

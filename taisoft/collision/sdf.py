@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
 from taisoft.collision.analytic import MIN_EXTRA_DEPTH, is_surface_minimum
 from taisoft.collision.boxes import list_near, sum_pairs
 from taisoft.collision.candidates import sum_parts
@@ -22,9 +24,7 @@ from taisoft.collision.frank_wolfe import deepest_point
 from taisoft.collision.queries import WHOLE, list_triangles, query_box
 from taisoft.collision.surface import ACTIVE, dvec, ivec, part_first
 from taisoft.collision.triangles import choose, closest_on_triangle
-from taisoft.fields import FieldArena
 from taisoft.mesh.sdf_grid import SdfGrid
-from taisoft.runtime import kernel
 from taisoft.scene.body import Body
 
 MIN_DET_F = 1e-3  # det F below which a tet is not used for the mapping

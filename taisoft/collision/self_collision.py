@@ -7,13 +7,13 @@ Present positions are used, without the motion during the step.
 import numpy as np
 import taichi as ti
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
+from taisoft.backend.transfer import download
 from taisoft.collision.candidates import Buffer, Candidates, pairs, sum_parts
 from taisoft.collision.features import corner
 from taisoft.collision.surface import Surface, part_first
 from taisoft.collision.triangles import triangles_intersect
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel
-from taisoft.transfer import download
 
 
 @ti.func

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.arrays import Count
+from taisoft.backend.arrays import Count
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import Buffer, Candidates, entries, sort_row, sum_parts
 from taisoft.collision.surface import ACTIVE, Surface, boxes_overlap, ivec, may_touch, part_first
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel
 
 LARGE = 512  # cells above which a triangle counts as large
 COUNTABLE = 2.0**50  # cells from the origin beyond which f64 cannot distinguish neighbouring cells

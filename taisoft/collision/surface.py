@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.arrays import Count
-from taisoft.fields import FieldArena
-from taisoft.runtime import Runtime
+from taisoft.backend.arrays import Count
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import Runtime
 
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than starting the others (about 50 us a loop)
 # The same for loops with little work per iteration: boxes, tree refit, sharp edges, reduction. Measured with two cores: equal at

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.contact import SOLVERS, augmented_lagrangian, numpy_prox
 from taisoft.contact.colouring import store
 from taisoft.contact.graph import colour_greedy, matrix_graph
 from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_field, fill_matrix_problem
 from taisoft.contact.solve import solve
 from taisoft.errors import SceneError
-from taisoft.fields import FieldArena
-from taisoft.runtime import open_kind, open_runtime
 from taisoft.scene.checks import array, choice, number
 
 METHODS = (*SOLVERS, "augmented_lagrangian", "auto")

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.arrays import Count
+from taisoft.backend.arrays import Count
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
+from taisoft.backend.transfer import upload
 from taisoft.contact.problem import ContactProblem, to_frame, to_world
 from taisoft.contact.prox import dvec, prox, tangents
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel
 from taisoft.scene.scene import Scene
-from taisoft.transfer import upload
 
 NEGLIGIBLE = 1e-12  # a node with a smaller weight is left out of the contact
 SELF_CONTACT = 5.0  # factor of contact offset and correction rate in contacts of a body with itself: folds turn as they meet

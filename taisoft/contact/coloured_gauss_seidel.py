@@ -7,9 +7,9 @@ also what runs on one thread. `colouring` groups the contacts, once before the s
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.contact.gauss_seidel import relax, relaxation, sweep
 from taisoft.contact.problem import ContactProblem
-from taisoft.runtime import kernel
 
 BATCH = 4  # colours per launch: a launch costs more than a loop in it
 

@@ -9,10 +9,10 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.contact.graph import UNCOLOURED, colour_greedy, colour_random, groups, matrix_graph, node_graph
 from taisoft.contact.problem import NODES, ContactProblem, fill_field, index_nodes
 from taisoft.errors import SimulationError
-from taisoft.runtime import kernel
 
 BITS = 30  # colours tested at a time, as bits of an integer
 

@@ -5,10 +5,10 @@ The friction disk, too, uses the normal impulse of the last sweep; `hybrid` diff
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.contact import r_factor_bounds as bounds
 from taisoft.contact.problem import STEP, ContactProblem, velocity
 from taisoft.contact.prox import into_disk, prox, scaled
-from taisoft.runtime import kernel
 
 
 @ti.func

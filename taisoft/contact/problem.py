@@ -17,11 +17,11 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.arrays import Count
+from taisoft.backend.arrays import Count
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
+from taisoft.backend.transfer import upload
 from taisoft.contact.prox import dvec, prox, scaled
-from taisoft.fields import FieldArena
-from taisoft.runtime import kernel
-from taisoft.transfer import upload
 
 NODES = 6  # maximum nodes of a contact, three on each side
 CHANGED, SIZE, RESIDUAL, BEST, STEP, SWEEPS, CHECKS, AGE, MOMENTUM, VERDICT = range(10)  # in `state`; AGE: sweeps since `best`

@@ -21,8 +21,8 @@ nothing and has no fixed nodes; for others no loss is assumed. The loss of the f
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.contact.assemble import contact_offset_of
-from taisoft.runtime import kernel
 
 NEGLIGIBLE_OPENING = 0.01  # of the contact offset: a rebound that opens the gap less in a step is ignored
 

@@ -5,10 +5,10 @@ from importlib import import_module
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.contact import SOLVERS, gauss_seidel
 from taisoft.contact.problem import BEST, CHECKS, HISTORY, RESIDUAL, SWEEPS, ContactProblem, find_velocities
 from taisoft.contact.sweeps import run_parallel, run_serial
-from taisoft.runtime import kernel
 
 LAUNCH_VISITS = 1_000_000  # contact visits per launch: about 0.1 s, so that Ctrl-C takes effect
 CHECK_EVERY = 5  # sweeps between residual checks, each of which costs as much as a sweep

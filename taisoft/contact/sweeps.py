@@ -12,6 +12,7 @@ from types import ModuleType
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.contact import momentum, r_factor
 from taisoft.contact.problem import (
     BEST,
@@ -27,7 +28,6 @@ from taisoft.contact.problem import (
     residual,
     residual_of,
 )
-from taisoft.runtime import kernel
 
 
 @ti.func

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taisoft.elasticity import gather_forces
+from taisoft.backend.transfer import download
+from taisoft.fem.elasticity import gather_forces
 from taisoft.mesh.topology import connected_pieces
 from taisoft.scene.scene import Scene
-from taisoft.transfer import download
 
 if TYPE_CHECKING:
     from taisoft.dynamics.stage_system import StageSystem

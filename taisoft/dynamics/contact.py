@@ -7,6 +7,8 @@ motion was too fast for the previous search.
 import numpy as np
 import taichi as ti
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.transfer import download, upload
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.crossings import CROSSED, CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.collision.pipeline import Detection
@@ -34,8 +36,6 @@ from taisoft.dynamics.ccd_limits import (
 )
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
-from taisoft.fields import FieldArena
-from taisoft.transfer import download, upload
 
 CONTACT_OFFSET = 2e-3  # of the finest body's mean surface edge: gap to keep, so that surfaces moving in curves do not cross
 DEEP_PENETRATION = 0.02  # of the finer side's mean surface edge: penetration reported as a problem

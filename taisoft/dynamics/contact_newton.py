@@ -10,6 +10,7 @@ few nodes, these are solved separately first (`elimination`).
 import math
 from dataclasses import dataclass, replace
 
+from taisoft.backend.launching import PUBLIC
 from taisoft.dynamics.elimination import eliminate
 from taisoft.dynamics.frictional import INDEFINITE, LINEAR, MULTIPLIERS, NORM, ROUNDING, SOLVED, STATUS
 from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
@@ -19,7 +20,6 @@ from taisoft.dynamics.newton import DECREASE, ELIMINATION_RATIO, Newton
 from taisoft.dynamics.residual import AGAIN
 from taisoft.dynamics.stage_result import StageResult, relative
 from taisoft.dynamics.stage_system import Stage, StageSystem
-from taisoft.launching import PUBLIC
 
 SOLVES, FORCING = 60, 0.3  # maximum linear solves of a frictional problem, and their tolerance
 LATER_FORCING = 0.01  # minimum tolerance of those after the first, which no longer change rigid motion

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from taisoft.backend.transfer import download
 from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.problem import find_factors
 from taisoft.contact.solve import SolveResult, solve
@@ -15,8 +16,7 @@ from taisoft.dynamics.explicit_contact import find_acceleration, finish_verlet, 
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.substeps import ExplicitStepper, SubstepResult
 from taisoft.errors import SimulationError
-from taisoft.scalars import FAILED, LOWEST_J, MOST_INVERTED
-from taisoft.transfer import download
+from taisoft.fem.scalars import FAILED, LOWEST_J, MOST_INVERTED
 
 MAX_SWEEPS = 1000  # per contact solve; one that needs more is reported as not converged
 MAX_CONTACT_BATCH = 200  # maximum sub-steps per batch, between checks for interruption

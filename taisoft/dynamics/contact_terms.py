@@ -12,15 +12,15 @@ from typing import Any
 
 import taichi as ti
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
 from taisoft.contact.assemble import FoundContacts, gap_minus_target
 from taisoft.contact.problem import CHANGED, NODES, RESIDUAL, SIZE, residual_of
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
-from taisoft.fields import FieldArena
+from taisoft.fem.model import Model
+from taisoft.fem.subset import n_nodes_of, node_of
 from taisoft.linear.block_csr import BLOCK
 from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
-from taisoft.model import Model
-from taisoft.runtime import kernel
-from taisoft.subset import n_nodes_of, node_of
 
 PAST = 2  # multiplier updates that are stored
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taisoft.errors import SimulationError
-from taisoft.model import Layout
+from taisoft.fem.model import Layout
 from taisoft.scene.scene import Constraint, Scene
 
 

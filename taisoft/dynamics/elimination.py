@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from taisoft.backend.transfer import download
 from taisoft.dynamics.newton import Newton
 from taisoft.dynamics.residual import STAY
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.subset_lists import entries_of
-from taisoft.transfer import download
 
 CONCENTRATED, FEW = 0.99, 0.35  # minimum fraction of |r|^2 on the chosen nodes, and maximum fraction of nodes
 RINGS = 2  # of neighbours added to them

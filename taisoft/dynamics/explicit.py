@@ -9,11 +9,11 @@ A small mesh runs all its sub-steps in one serial kernel; a large one takes two 
 
 import taichi as ti
 
-from taisoft.elements.lanes import broadcast
+from taisoft.backend.runtime import kernel
+from taisoft.fem.lanes import broadcast
+from taisoft.fem.scalars import FAILED, INVERTED_NOW, LOWEST_J, MOST_INVERTED, STEPS_DONE
 from taisoft.fem.terms import elasticity, mass_damping
 from taisoft.fem.terms.elasticity import EXPLODED, HUGE
-from taisoft.runtime import kernel
-from taisoft.scalars import FAILED, INVERTED_NOW, LOWEST_J, MOST_INVERTED, STEPS_DONE
 
 
 @ti.func

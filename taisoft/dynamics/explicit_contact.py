@@ -6,6 +6,7 @@ velocity, which moves the nodes. M is lumped, so M^-1 is diagonal (report, secti
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.contact.assemble import gap_minus_target
 from taisoft.contact.problem import impulse_on, to_frame
 from taisoft.contact.prox import dvec
@@ -23,9 +24,8 @@ from taisoft.dynamics.explicit import (
     verlet_half,
     verlet_kick,
 )  # fmt: skip
+from taisoft.fem.scalars import FAILED, INVERTED_NOW, MOST_INVERTED
 from taisoft.fem.terms import elasticity
-from taisoft.runtime import kernel
-from taisoft.scalars import FAILED, INVERTED_NOW, MOST_INVERTED
 
 
 @kernel

@@ -6,6 +6,7 @@ number of CG iterations per launch is limited, so that Ctrl-C takes effect; `loo
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.contact.problem import RESIDUAL
 from taisoft.dynamics.contact_terms import PAST, set_multiplier, sum_residual, update_contact
 from taisoft.dynamics.linearised import contact_slope, move_node_along, node_residual, node_slope, step_length
@@ -13,7 +14,6 @@ from taisoft.dynamics.multipliers import FINER, MAX_MULTIPLIERS, R_EXTRAPOLATED,
 from taisoft.linear import pcg_serial
 from taisoft.linear.pcg import NEGATIVE
 from taisoft.linear.pcg import RUNNING as PCG_RUNNING
-from taisoft.runtime import kernel
 
 ROUNDING = 4.0  # times the floor: |r| that may be rounding, as strains grow (up to 2.8 times was measured, in a thin sheet)
 PROGRESS = 0.3  # fraction of |r| after a multiplier update to which the inner steps reduce it

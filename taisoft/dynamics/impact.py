@@ -27,14 +27,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.contact.problem import to_world
 from taisoft.contact.prox import dvec
+from taisoft.fem.mass import mass_times
+from taisoft.fem.scalars import OTHER_SUM, SUM
 from taisoft.fem.terms import mass_damping
 from taisoft.linear.block_csr import block_times
 from taisoft.linear.pcg import total
-from taisoft.mass import mass_times
-from taisoft.runtime import kernel
-from taisoft.scalars import OTHER_SUM, SUM
 
 if TYPE_CHECKING:
     from taisoft.dynamics.stage_result import StageResult

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
+from taisoft.backend.transfer import download, upload
 from taisoft.dynamics.body_balance import LIMIT, BodyBalance
 from taisoft.dynamics.contact import TOLERANCE, ContactStep
 from taisoft.dynamics.contact_newton import solve
@@ -19,8 +21,6 @@ from taisoft.dynamics.stage_result import StageResult, count_all
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.substepping import Substepping
 from taisoft.errors import SimulationError
-from taisoft.runtime import kernel
-from taisoft.transfer import download, upload
 
 MAX_NEWTON, MAX_NEWTON_WITH_CONTACTS = 50, 25  # a step that needs more is cut in substeps, or reported as not converged
 TIGHTER = 0.1  # of the tolerance that would just balance the forces on a body

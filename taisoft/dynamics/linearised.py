@@ -8,6 +8,7 @@ which needs only two sums over nodes; its root is then found from the contacts a
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.contact.prox import dvec
 from taisoft.dynamics.contact_terms import (
     impulse_on_node,
@@ -18,10 +19,9 @@ from taisoft.dynamics.contact_terms import (
     update_contact,
 )
 from taisoft.dynamics.stage import place_node
+from taisoft.fem.scalars import OTHER_SUM, STEP_LENGTH, SUM
 from taisoft.linear.block_csr import block_times, partial_row_times
 from taisoft.linear.pcg import dot64, total
-from taisoft.runtime import kernel
-from taisoft.scalars import OTHER_SUM, STEP_LENGTH, SUM
 
 ROOT, TRIES, LONGEST = 0.05, 40, 1e3  # tolerance over the initial slope; maximum trial lengths; longest step length
 

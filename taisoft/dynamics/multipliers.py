@@ -15,9 +15,9 @@ minimises |f - sum t_i (f_i+1 - f_i)|, each entry divided by the square root of 
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.contact.prox import dvec
 from taisoft.dynamics.contact_terms import PAST, open_disk
-from taisoft.runtime import kernel
 
 R_SCALE, MIN_R_SCALE, MAX_R_SCALE, MANY_STEPS = 1.0, 0.3, 100.0, 5  # R over the r-factors: start, bounds; steps that halve it
 LAW_INCREASE, STEADY = 1.2, 4.0  # times the previous laws' residual: above it R is halved, if larger than STEADY

@@ -6,14 +6,14 @@ A linearised stage moves by `linearised.advance` instead, which updates the resi
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.dynamics.contact_terms import impulse_on_node
 from taisoft.dynamics.impact import impact_residual
 from taisoft.dynamics.stage import place_node, residual_parts, set_change, squares
+from taisoft.fem.scalars import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
+from taisoft.fem.subset import n_nodes_of, node_of
 from taisoft.fem.terms import elasticity
 from taisoft.linear.pcg import dot64, total
-from taisoft.runtime import kernel
-from taisoft.scalars import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
-from taisoft.subset import n_nodes_of, node_of
 
 STAY, STEP, AGAIN = range(3)  # modes of `move`: stay, full step, another length of the same step
 ELASTIC_STAGE, LINEARISED, IMPACT = range(3)  # kinds of stages; IMPACT: see `impact`

@@ -5,8 +5,8 @@ The rounding of F causes forces as large as those of a strain of eps; the roundi
 
 import numpy as np
 
-from taisoft.model import Model
-from taisoft.transfer import download
+from taisoft.backend.transfer import download
+from taisoft.fem.model import Model
 
 
 class RoundingFloor:

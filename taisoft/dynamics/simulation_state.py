@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import Runtime
+from taisoft.backend.transfer import download, upload
 from taisoft.dynamics.dirichlet import DirichletConditions
-from taisoft.fields import FieldArena
-from taisoft.mass import gravity_masses, lumped_masses, upload_mass_matrix
-from taisoft.model import Layout, Model, body_loads, damping_table, material_table
-from taisoft.runtime import Runtime
+from taisoft.fem.mass import gravity_masses, lumped_masses, upload_mass_matrix
+from taisoft.fem.model import Layout, Model, body_loads, damping_table, material_table
 from taisoft.scene.scene import Scene
-from taisoft.transfer import download, upload
 
 
 @dataclass

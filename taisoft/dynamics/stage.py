@@ -5,12 +5,12 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.arrays import Count
+from taisoft.backend.arrays import Count
+from taisoft.backend.runtime import kernel
+from taisoft.fem.mass import mass_times
 from taisoft.fem.terms import mass_damping, stiffness_damping
 from taisoft.linear.block_csr import row_times
 from taisoft.linear.pcg import PcgWork
-from taisoft.mass import mass_times
-from taisoft.runtime import kernel
 
 
 @dataclass(frozen=True, eq=False)

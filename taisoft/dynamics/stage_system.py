@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import taichi as ti
 
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.transfer import download, upload
 from taisoft.contact.problem import RESIDUAL, find_factors
 from taisoft.dynamics import frictional, multipliers
 from taisoft.dynamics.contact_terms import (
@@ -30,13 +32,11 @@ from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, 
 from taisoft.dynamics.rounding import RoundingFloor
 from taisoft.dynamics.stage import StageWork, begin_stage, negate_direction, set_direction_to_rest
 from taisoft.dynamics.subset_lists import SubsetLists
-from taisoft.fields import FieldArena
+from taisoft.fem.model import Model
+from taisoft.fem.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
+from taisoft.fem.subset import EVERYTHING
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
-from taisoft.model import Model
-from taisoft.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
-from taisoft.subset import EVERYTHING
-from taisoft.transfer import download, upload
 
 if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep

@@ -3,11 +3,11 @@
 import numpy as np
 import taichi as ti
 
-from taisoft.fields import FieldArena
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.transfer import download, upload
+from taisoft.fem.model import Model
+from taisoft.fem.subset import BLOCKS, EDGES, NODES, Subset
 from taisoft.linear.block_csr import BlockCsr
-from taisoft.model import Model
-from taisoft.subset import BLOCKS, EDGES, NODES, Subset
-from taisoft.transfer import download, upload
 
 
 def entries_of(start: np.ndarray, rows: np.ndarray) -> np.ndarray:

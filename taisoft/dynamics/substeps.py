@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.arrays import Count
+from taisoft.backend.arrays import Count
+from taisoft.backend.transfer import upload
 from taisoft.dynamics import explicit
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
-from taisoft.model import Model
-from taisoft.scalars import LOWEST_J, MOST_INVERTED, STEPS_DONE
-from taisoft.transfer import upload
+from taisoft.fem.model import Model
+from taisoft.fem.scalars import LOWEST_J, MOST_INVERTED, STEPS_DONE
 
 LAUNCH_SECONDS = 0.1  # rough maximum of one launch, so that Ctrl-C takes effect
 DAMPING_POINT_SECONDS = 800e-9  # added by stiffness damping to a law's POINT_SECONDS: it projects the stiffness of each point

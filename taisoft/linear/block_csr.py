@@ -13,15 +13,15 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.arrays import Count
+from taisoft.backend.arrays import Count
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import kernel
+from taisoft.backend.transfer import download
 from taisoft.errors import SimulationError
+from taisoft.fem.model import MATRIX_BLOCKS, Model, model_graph
+from taisoft.fem.subset import block_of, edge_of, first_block_of, last_block_of, n_edges_of, n_nodes_of, node_of
 from taisoft.fem.terms import mass_damping, stiffness_damping
-from taisoft.fields import FieldArena
 from taisoft.linear.element_blocks import element_blocks, pair_terms
-from taisoft.model import MATRIX_BLOCKS, Model, model_graph
-from taisoft.runtime import kernel
-from taisoft.subset import block_of, edge_of, first_block_of, last_block_of, n_edges_of, n_nodes_of, node_of
-from taisoft.transfer import download
 
 # A block is a 12-vector, column by column, each padded with a zero: entry (r, c) is at 4 c + r. All entries share one address,
 # and a column times a number is one SIMD instruction.

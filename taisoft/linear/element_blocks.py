@@ -8,7 +8,7 @@ The six A_kl of each quadrature point go to a scratch part of the buffer and are
 import numpy as np
 import taichi as ti
 
-from taisoft.elements.lanes import (
+from taisoft.fem.lanes import (
     broadcast,
     deformation_gradient,
     law_constants,
@@ -19,10 +19,10 @@ from taisoft.elements.lanes import (
     store_lanes,
     volumes,
 )
-from taisoft.elements.reference import Quadrature, shape_derivatives
-from taisoft.materials.projection import dpk1_projected, prepare_projected
-from taisoft.model import MATRIX_BLOCKS
-from taisoft.node_graph import PAIRS
+from taisoft.fem.laws.projection import dpk1_projected, prepare_projected
+from taisoft.fem.model import MATRIX_BLOCKS
+from taisoft.fem.node_graph import PAIRS
+from taisoft.fem.reference import Quadrature, shape_derivatives
 
 N_PAIRS = len(PAIRS[2])
 

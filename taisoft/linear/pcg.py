@@ -15,11 +15,11 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.fields import FieldArena
+from taisoft.backend.fields import FieldArena
+from taisoft.fem.model import Model
+from taisoft.fem.subset import EVERYTHING, Subset
 from taisoft.linear.block_csr import BLOCK, BlockCsr
 from taisoft.linear.coupling import NO_COUPLING, Coupling
-from taisoft.model import Model
-from taisoft.subset import EVERYTHING, Subset
 
 SERIAL_WORK = 40_000_000  # block products per launch: about 0.2 s, so that Ctrl-C takes effect
 PARALLEL_BATCH = 8  # iterations between residual checks

@@ -138,7 +138,9 @@ class Annotations:
         colours = colours_of(steps)
         top = bottom - TEXT_SIZE - height
         for k in range(width):
-            self._pen.rectangle(self._at(MARGIN + k, top, MARGIN + k + 1, top + height), fill=(*_bytes(colours[k]), 255))
+            left, high, right, low = self._at(MARGIN + k, top, MARGIN + k + 1, top + height)
+            if right >= left:  # on a small picture a step of the bar may be narrower than a pixel
+                self._pen.rectangle((left, high, right, max(low, high)), fill=(*_bytes(colours[k]), 255))
         kind = self._colouring.kind
         self._write(MARGIN, top - 4, TITLES[kind], TEXT_SIZE, INK, anchor="lb", halo=True)
         for (text, _), fraction, anchor in zip(legend, (1.0, 0.5, 0.0), ("ra", "ma", "la")):

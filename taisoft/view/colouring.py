@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from taisoft.elements.reference import inverse_rest_edges
 from taisoft.errors import OutputError
+from taisoft.fem.reference import inverse_rest_edges
 from taisoft.output.nodal_fields import NodalMean, von_mises
 from taisoft.view.surfaces import Surfaces
 

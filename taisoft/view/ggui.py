@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import taichi as ti
-from taichi._lib import core
 
+from taisoft.backend.private import core
+from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError
 from taisoft.output.camera import Camera
-from taisoft.runtime import open_kind, open_runtime
 from taisoft.view.shading import lit_colours
 from taisoft.view.surfaces import Surfaces
 from taisoft.view.vertex_buffer import VertexBuffer, draw_flat_lines, draw_flat_triangles, draw_lines, draw_mesh

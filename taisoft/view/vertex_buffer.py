@@ -7,7 +7,8 @@ version that taisoft requires.
 """
 
 import numpy as np
-from taichi.ui.utils import get_field_info
+
+from taisoft.backend.private import get_field_info
 
 POSITION, NORMAL, COLOUR, ALPHA = slice(0, 3), slice(3, 6), slice(8, 11), 11  # columns; 6 and 7 are for textures
 WIDTH = 12

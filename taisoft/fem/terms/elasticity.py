@@ -6,7 +6,7 @@ threading. The blocks -df/dx are in `linear.element_blocks`, the differential is
 
 import taichi as ti
 
-from taisoft.elements.lanes import (
+from taisoft.fem.lanes import (
     add_forces,
     broadcast,
     deformation_gradient,
@@ -22,10 +22,10 @@ from taisoft.elements.lanes import (
     weight_at,
     zero_forces,
 )
-from taisoft.materials.projection import dpk1_projected, prepare_projected
-from taisoft.math3 import determinant, matmul_tn
-from taisoft.scalars import FAILED, INVERTED_NOW, LOWEST_J
-from taisoft.subset import block_of, first_block_of, last_block_of
+from taisoft.fem.laws.projection import dpk1_projected, prepare_projected
+from taisoft.fem.math3 import determinant, matmul_tn
+from taisoft.fem.scalars import FAILED, INVERTED_NOW, LOWEST_J
+from taisoft.fem.subset import block_of, first_block_of, last_block_of
 
 SWITCH, LOAD, ACCELERATION = None, False, False
 HUGE = 1e30  # above any volume ratio

@@ -7,7 +7,7 @@ LLVM turns into SIMD instructions. A list is never reassigned: each result gets 
 
 import taichi as ti
 
-from taisoft.tracing import arithmetic
+from taisoft.backend.tracing import arithmetic
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 

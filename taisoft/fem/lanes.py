@@ -7,7 +7,7 @@ For order 1, c_a are the unit vectors, one point suffices, and F = Ds Dm^-1.
 
 import taichi as ti
 
-from taisoft.tracing import arithmetic
+from taisoft.backend.tracing import arithmetic
 
 
 @ti.func

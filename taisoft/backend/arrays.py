@@ -8,7 +8,8 @@ from typing import Annotated
 
 import numpy as np
 import taichi as ti
-from taichi.lang import impl
+
+from taisoft.backend.private import impl
 
 DTYPES = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u8: np.uint8}
 

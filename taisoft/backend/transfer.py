@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from taisoft.arrays import Array
+from taisoft.backend.arrays import Array
 
 
 def upload(pairs: list[tuple[Array, np.ndarray]]) -> None:

@@ -12,9 +12,9 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.elements import reference
+from taisoft.backend.transfer import download, upload
+from taisoft.fem import reference
 from taisoft.scene.scene import Scene
-from taisoft.transfer import download, upload
 
 
 @dataclass(frozen=True, eq=False)

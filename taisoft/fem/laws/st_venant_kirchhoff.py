@@ -8,8 +8,8 @@ reflection), so compressed bodies collapse.
 
 import taichi as ti
 
-from taisoft.math3 import ddot, dot, matmul, matmul_nt, matmul_tn, transform
-from taisoft.tracing import arithmetic
+from taisoft.backend.tracing import arithmetic
+from taisoft.fem.math3 import ddot, dot, matmul, matmul_nt, matmul_tn, transform
 
 NAME = "st_venant_kirchhoff"
 SOFTENS_BELOW = 0.6  # stretch that triggers a warning, slightly above 1/sqrt(3)

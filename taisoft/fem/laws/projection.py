@@ -8,8 +8,8 @@ modes; the 3x3 block is clamped numerically.
 
 import taichi as ti
 
-from taisoft.math3 import clamp_symmetric, matmul, matmul_nt, matmul_tn, signed_svd
-from taisoft.tracing import arithmetic
+from taisoft.backend.tracing import arithmetic
+from taisoft.fem.math3 import clamp_symmetric, matmul, matmul_nt, matmul_tn, signed_svd
 
 
 @ti.func

@@ -9,8 +9,8 @@ rubber. Stress-free states exist only with the log term, which is kept here.
 
 import taichi as ti
 
-from taisoft.math3 import cofactor, cofactor_differential, cross, ddot, dot, transform
-from taisoft.tracing import arithmetic
+from taisoft.backend.tracing import arithmetic
+from taisoft.fem.math3 import cofactor, cofactor_differential, cross, ddot, dot, transform
 
 NAME = "stable_neo_hookean"
 SOFTENS_BELOW = 0.0

@@ -17,9 +17,8 @@ from collections.abc import Callable
 from typing import Any
 
 import taichi as ti
-from taichi.lang import impl, kernel_impl
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
-from taichi.lang.expr import Expr
+
+from taisoft.backend.private import ASTTransformerContext, Expr, impl, kernel_impl
 
 FAST_TRACING = ti.__version__ == (1, 7, 4) and not os.environ.get("TAISOFT_PUBLIC_TAICHI")
 

@@ -23,13 +23,10 @@ from typing import Any
 
 import numpy as np
 import taichi as ti
-from taichi.lang import impl
-from taichi.lang.enums import AutodiffMode
-from taichi.lang.kernel_impl import Kernel, template
-from taichi.types import ndarray_type, primitive_types
 
-from taisoft.arrays import DTYPES, Array, Count, View
-from taisoft.tracing import FAST_TRACING, source_of
+from taisoft.backend.arrays import DTYPES, Array, Count, View
+from taisoft.backend.private import AutodiffMode, Kernel, impl, ndarray_type, primitive_types, template
+from taisoft.backend.tracing import FAST_TRACING, source_of
 
 RECORD, ARRAY, COUNT, TUPLE, CONSTANT = range(5)
 REAL, INTEGER, HOST_ARRAY = range(3)

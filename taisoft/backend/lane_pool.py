@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import taichi as ti
-from taichi.lang import impl
+
+from taisoft.backend.private import impl
 
 ENTRIES = 2**24  # of the pool: enough for forces and stiffness of 250,000 linear tets
 OWN_MASK = 2**30 - 1  # index mask of a separate field, and its largest number of entries

@@ -6,7 +6,9 @@ corrections: dH = -V dP(F; dF) M^T with M = Dm^-1 (M^-T there), and the fourth c
 
 import taichi as ti
 
-from taisoft.elements.lanes import (
+from taisoft.backend.runtime import kernel
+from taisoft.fem import terms
+from taisoft.fem.lanes import (
     add_forces,
     broadcast,
     deformation_gradient,
@@ -20,14 +22,12 @@ from taisoft.elements.lanes import (
     weight_at,
     zero_forces,
 )
-from taisoft.fem import terms
+from taisoft.fem.mass import mass_times
+from taisoft.fem.math3 import determinant, matmul_nt
+from taisoft.fem.scalars import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, LOADS, MIN_J, N_INVERTED
+from taisoft.fem.subset import EVERYTHING
 from taisoft.fem.terms import elasticity
 from taisoft.fem.terms.elasticity import HUGE
-from taisoft.mass import mass_times
-from taisoft.math3 import determinant, matmul_nt
-from taisoft.runtime import kernel
-from taisoft.scalars import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, LOADS, MIN_J, N_INVERTED
-from taisoft.subset import EVERYTHING
 
 NO_TET = 2**31 - 1  # above any tet index
 

@@ -6,10 +6,10 @@ from contextlib import contextmanager
 import numpy as np
 import taichi as ti
 
+from taisoft.backend.runtime import kernel, open_kind, open_runtime
 from taisoft.errors import SceneError
-from taisoft.materials import LAWS
-from taisoft.materials.projection import dpk1_projected, prepare_projected
-from taisoft.runtime import kernel, open_kind, open_runtime
+from taisoft.fem.laws import LAWS
+from taisoft.fem.laws.projection import dpk1_projected, prepare_projected
 from taisoft.scene.scene import Material
 
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.arrays import Count
-from taisoft.fields import FieldArena
-from taisoft.runtime import Runtime
-from taisoft.scalars import N_COLUMNS, N_SCALARS
+from taisoft.backend.arrays import Count
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import Runtime
+from taisoft.fem.scalars import N_COLUMNS, N_SCALARS
 
 
 @dataclass(frozen=True, eq=False)

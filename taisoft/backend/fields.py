@@ -6,11 +6,11 @@ import weakref
 import numpy as np
 import taichi as ti
 
-from taisoft.arrays import DTYPES, Array, index_mask
+from taisoft.backend.arrays import DTYPES, Array, index_mask
+from taisoft.backend.lane_pool import OWN_MASK, Lanes
+from taisoft.backend.runtime import lane_pool
 from taisoft.errors import SimulationError
-from taisoft.lane_pool import OWN_MASK, Lanes
 from taisoft.memory import available_memory, format_bytes
-from taisoft.runtime import lane_pool
 
 SMALL = 2**20  # bytes up to which available memory is not checked
 

@@ -10,8 +10,8 @@ taken from the signed SVD instead. Weak: R is not unique there, so the stress ju
 
 import taichi as ti
 
-from taisoft.math3 import cofactor, cross, ddot, determinant, dot, matmul, matmul_nt, matmul_tn, signed_svd, transform
-from taisoft.tracing import arithmetic
+from taisoft.backend.tracing import arithmetic
+from taisoft.fem.math3 import cofactor, cross, ddot, determinant, dot, matmul, matmul_nt, matmul_tn, signed_svd, transform
 
 NAME = "corotational"
 SOFTENS_BELOW = 0.0

@@ -15,13 +15,14 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import taichi as ti
-from taichi.lang import impl
 
-from taisoft import compile_message, tracing  # noqa: F401  tracing: before any function is decorated
+from taisoft import compile_message
+from taisoft.backend import tracing  # noqa: F401  tracing: before any function is decorated
+from taisoft.backend.lane_pool import LanePool
+from taisoft.backend.launching import Kernels
+from taisoft.backend.private import impl
 from taisoft.errors import SimulationError
 from taisoft.files import cache_folders
-from taisoft.lane_pool import LanePool
-from taisoft.launching import Kernels
 from taisoft.memory import address_space, format_bytes
 from taisoft.timing import usable_cores
 

@@ -6,6 +6,6 @@ lane functions `psi`, `pk1`, `prepare`, `dpk1`, `block` (the same differential a
 `hessian_eigen`. Tests over the registry check them against each other by finite differences.
 """
 
-from taisoft.materials import corotational, st_venant_kirchhoff, stable_neo_hookean
+from taisoft.fem.laws import corotational, st_venant_kirchhoff, stable_neo_hookean
 
 LAWS = {law.NAME: law for law in (st_venant_kirchhoff, corotational, stable_neo_hookean)}

@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.arrays import Count
-from taisoft.elements import reference
+from taisoft.backend.arrays import Count
+from taisoft.backend.fields import FieldArena
+from taisoft.backend.runtime import Runtime, threads
+from taisoft.backend.transfer import download
+from taisoft.fem import reference
+from taisoft.fem.laws import LAWS
+from taisoft.fem.mass import MassMatrix, gravity_masses, lumped_masses, upload_mass_matrix
+from taisoft.fem.node_graph import PAIRS, NodeGraph, node_graph
+from taisoft.fem.state import State, build_state
 from taisoft.fem.terms import terms_of
-from taisoft.fields import FieldArena
-from taisoft.mass import MassMatrix, gravity_masses, lumped_masses, upload_mass_matrix
-from taisoft.materials import LAWS
-from taisoft.node_graph import PAIRS, NodeGraph, node_graph
-from taisoft.runtime import Runtime, threads
 from taisoft.scene.scene import Material, Scene
-from taisoft.state import State, build_state
-from taisoft.transfer import download
 
 # Least quadrature points and CPU threads for parallel loops; below, one serial kernel runs. With two threads, parallel loops took
 # 3.4 times as long (213,000 tets, `taisoft bench scaling`)
@@ -39,7 +39,7 @@ MATRIX_BLOCKS = {1: 6, 2: 45 + 6}  # 3x3 blocks per tet in the assembly buffer: 
 class Group:
     """Blocks of one element type and law, and the offsets of their data in the flat arrays."""
 
-    law: Any  # module of taisoft.materials
+    law: Any  # module of taisoft.fem.laws
     order: int
     n_nodes: int  # of an element
     n_points: int

@@ -1,1 +1,0 @@
-"""Linear and quadratic tetrahedra: `reference` for the host, `lanes` for kernels."""
