@@ -138,7 +138,7 @@ def test_a_run_draws_them(tmp_path):
         (["--layers", "contacts"], "--layers contacts: contact forces are not modelled (one body, and nothing that it could"),
         (["--plots", "contacts"], "plot 'contacts' is not available: contact forces are not modelled (one body, and nothing"),
         (["--plots", "iterations"], "plot 'iterations' is not available: steps of symplectic_euler are explicit"),
-        (["--caption", "--no-frames"], "--caption needs --out, the folder to write to, and the pictures that --no-frames"),
+        (["--caption", "--no-frames"], "--caption needs --out, the folder to write to, and pictures, so it excludes --no-frames"),
         (["--plots", "energies", "--no-frames"], "--plots needs --out"),
         (["--layers", "none", "--no-frames"], "--layers needs --out"),
     ],

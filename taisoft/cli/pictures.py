@@ -41,7 +41,7 @@ class DisplayOptions:
 def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     """Return the requested display options. Raises SceneError for unknown names and for options that nothing would show."""
     has_pictures = arguments.out is not None and not arguments.no_frames
-    needs = "needs --out, the folder to write to, and pictures, that is, no --no-frames"
+    needs = "needs --out, the folder to write to, and pictures, so it excludes --no-frames"
     layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS)
     requested = {"video": arguments.video, "caption": arguments.caption}
     if not has_window:
