@@ -205,7 +205,7 @@ def test_another_frame_rate_is_refused(tmp_path, capsys):
     before, pictures = usd(out), sorted((out / "frames").iterdir())
     arguments = ("--resume", out / "checkpoint.npz", "--seconds", "0.2")
     assert run(path, "--out", out, *arguments, "--fps", "30") == 2
-    assert "fps is 60.0 there and cannot become 30.0 within a run" in capsys.readouterr().err
+    assert "fps is 60.0 there and cannot become 30.0 in a run" in capsys.readouterr().err
     assert usd(out) == before and report(out)["resumed"] is None and sorted((out / "frames").iterdir()) == pictures
     assert run(path, "--out", out, *arguments) == 0  # the scene's own rate does not count
     assert len(list((out / "frames").iterdir())) == 2 * len(pictures) - 1

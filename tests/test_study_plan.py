@@ -137,7 +137,7 @@ def test_a_reference_that_nobody_asked_for_is_named():
     [
         ({"reference_dt": 1.0, "reference_integrator": "velocity_verlet"}, "reference-dt 1.*allows at most"),
         ({"reference_integrator": "rk4"}, "reference-integrator rk4: it must be one of"),
-        ({"seconds": 0.01}, "meet only every"),
+        ({"seconds": 0.01}, "coincide only every"),
     ],
 )
 def test_references_that_cannot_be(wanted, error):
