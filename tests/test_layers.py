@@ -24,6 +24,7 @@ ORDER = (
     ("attributes",),
     ("backend.private",),
     ("backend.tracing", "backend.arrays", "backend.lane_pool"),
+    ("backend.structure",),
     ("backend.launching",),
     ("backend.runtime",),
     ("backend.transfer",),
@@ -45,7 +46,7 @@ ORDER = (
     ("__main__",),
 )
 LEVEL = {name: level for level, group in enumerate(ORDER) for name in group}
-OWN_TEXT = {(file, call) for file in ("launching.py", "tracing.py") for call in ("compile", "exec")}  # of functions' own source
+OWN_TEXT = {(file, call) for file in ("structure.py", "tracing.py") for call in ("compile", "exec")}  # of functions' own source
 FOREIGN = {("mesh", "scene"), ("collision", "contact"), ("contact", "collision")}  # (importer, imported) of one group
 
 WITHOUT_TAICHI = {"errors", "records", "files", "memory", "timing", "compile_message", "attributes", "mesh", "scene"}
