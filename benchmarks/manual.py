@@ -83,7 +83,7 @@ def order_times(results: Path) -> str:
         if c["goal"] == GOAL and all(reach is not None and reach["bound"] == "=" for reach in reached):
             times = [f"{reach['seconds']:.3g}" for reach in reached]
             lines.append((titles[c["case"]], *times, f"{c['ratio']['median']:.2g}"))
-    table = markdown(("case", "linear [s]", "quadratic [s]", "times less"), lines, left=(0,))
+    table = markdown(("case", "linear [s]", "quadratic [s]", "speed-up"), lines, left=(0,))
     return f"{table}\n\nMeasured on: {measured_on(numbers)}."
 
 

@@ -11,6 +11,8 @@ import argparse
 import importlib.util
 import inspect
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -111,6 +113,13 @@ def test_methods_of_a_simulator():
     listed = re.search(r"autoclass:: taisoft\.Simulator\n +:members: (.*)", text("api.md"))[1].split(", ")
     own = {name for name in dir(ts.Simulator) if not name.startswith("_")}
     assert set(listed) <= own and own - set(listed) <= {"from_checkpoint", "draggable", "dragged"}
+
+
+@pytest.mark.skipif(not (DOCS.parent / ".git").exists() or shutil.which("git") is None, reason="needs a git checkout")
+def test_the_cylinder_applies():
+    command = ["git", "apply", "--check", "docs/examples/cylinder.diff"]
+    done = subprocess.run(command, cwd=DOCS.parent, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_where_one_chooses():

@@ -32,7 +32,7 @@ MAX_STORED = 16  # faces near a vertex that are stored between passes
 MAX_TIP_FACES = 8  # distinct faces of a tip
 FACING = -0.5  # cosine between normals below which a vertex faces a triangle
 FACING_DEPTH_RATIO = 0.25  # of the depth behind the face in the normal cone: a facing triangle less deep takes precedence
-OUTSIDE_SLACK = 1e-6  # of a triangle's size: a vertex this little before a face is not yet outside; wider than in `edge_edge`
+OUTSIDE_SLACK = 1e-6  # of a triangle's size: a vertex at most this far before a face is not outside; wider than in `edge_edge`
 MAX_REST_RATIO = 0.5  # of the rest distance: parts of one body at least this far apart are neighbours at rest too
 TINY = 1e-9  # of a triangle's size: below this distance, directions come from normals
 
@@ -53,7 +53,7 @@ def classify(s: ti.template(), i, u):
 
     OUTSIDE: u holds the locally nearest point of its surface, and the normal points from it to i. INSIDE: i is behind u. BESIDE:
     i is behind u's plane and projects beside u, as at the walls of a groove pierced at its bottom. NONE: anything else.
-    own: 1 if u is a part of the vertex's own body that is near it at rest too; no vertex is inside behind such a face.
+    own: 1 if u belongs to the vertex's body and is near the vertex at rest, too; no vertex is inside behind such a face.
     """
     p = s.x[i]
     size = ti.sqrt(s.area[u])

@@ -1,10 +1,10 @@
 """Newton's method for a stage with contacts: each step linearises elasticity and solves the frictional problem on that matrix.
 
 The problem on the fixed matrix needs no elements: `Newton` solves it inexactly as an augmented Lagrangian, from the current
-impulses. Its displacement is a direction for the nonlinear stage. A full step is accepted by |r|; else a line search uses the
-slope of the augmented Lagrangian with the new impulses as multipliers. An indefinite matrix is replaced by a projected one. If
-that makes no progress, a few steps minimise the nonlinear stage under multipliers instead. If a slow step leaves a residual on
-few nodes, these are solved separately first (`elimination`).
+impulses. Its displacement is a direction for the nonlinear stage. A full step is accepted if |r| falls enough; else a line
+search uses the slope of the augmented Lagrangian with the new impulses as multipliers. An indefinite matrix is replaced by a
+projected one. If that makes no progress, a few steps minimise the nonlinear stage under multipliers instead. If a slow step
+leaves a residual on few nodes, these are solved separately first (`elimination`).
 """
 
 import math
@@ -111,7 +111,7 @@ class ContactNewton:
         )  # fmt: skip
 
     def _fall_back(self) -> bool:
-        """Take a few steps on the nonlinear stage from where it was linearised; return whether there was any."""
+        """Take a few steps on the nonlinear stage from where it was linearised; return whether any step was taken."""
         system, stage = self.system, self.stage
         self.r, self.scale = system.end_linearised(accept=False)
         law_tolerance = stage.contact_tolerance if self._is_balanced else math.inf

@@ -32,8 +32,8 @@ class Constraint:
 
     nodes: np.ndarray  #: (k,) int64 node ids
     axes: np.ndarray  #: (3,) bool
-    path: Callable | None = None  #: t [s] -> displacement (3,) or (k,3) [m], None once released; no path: they stay
-    where: Callable | None = None  #: what chose the nodes, where that was a function: on another mesh it can choose again
+    path: Callable | None = None  #: t [s] -> displacement (3,) or (k,3) [m], None once released; no path: the nodes stay
+    where: Callable | None = None  #: the function that selected the nodes, if any: it can select again on another mesh
 
     def __post_init__(self):
         _make_read_only(self.nodes, self.axes)
@@ -58,7 +58,7 @@ class NodalForce:
 
     nodes: np.ndarray  #: (k,) int64 node ids
     value: np.ndarray  #: (3,) total force, or (k,3) one per node [N]
-    where: Callable | None = None  #: as of a Constraint
+    where: Callable | None = None  #: as in `Constraint`
 
     def __post_init__(self):
         _make_read_only(self.nodes, self.value)
