@@ -151,7 +151,7 @@ def can_build(name: str) -> bool:
 
 
 def state_of(sim: ts.Simulator):
-    """Positions and what goes with them: the attribute had another name in version 0.1."""
+    """Positions and what goes with them: the attribute has had another name."""
     return sim._simulation if hasattr(sim, "_simulation") else sim._world
 
 
@@ -212,7 +212,7 @@ def edge(mesh: ts.TetMesh) -> float:
 def solve(sim: ts.Simulator, kept: dict, dt: float, most: int) -> tuple[dict, np.ndarray]:
     """A stage of dt from a state, in halves where it does not converge; and the positions it ends with."""
     stepper, world = sim._stepper, state_of(sim)
-    take = getattr(stepper, "take_substep", None) or stepper._try_part
+    take = next(getattr(stepper, name) for name in ("take_substep", "take", "_try_part") if hasattr(stepper, name))
     halves, newton, linear, first, seconds, launched = 1, 0, 0, None, 0.0, 0
     while True:
         world.restore(kept["world"])

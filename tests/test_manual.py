@@ -29,6 +29,7 @@ DOCS = ROOT / "docs"
 PAGES = sorted(path for path in DOCS.rglob("*.md") if "results" not in path.relative_to(DOCS).parts)
 RUN = {"python", "toml", "sh", "console"}  # kinds of blocks that docs/conftest.py runs or reads
 SHOWN = {"text", "{toctree}", "{literalinclude}", "{eval-rst}"}  # that are no examples
+EXAMPLES = {"my_scene.py", "drop.py", "taisoft/fem/laws/modified_svk.py"}  # files that a reader writes
 KEYS = {" ": "Space", "Escape": "Escape", "Right": "right arrow"}  # as the page calls them
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(DOCS)))
 
@@ -120,6 +121,16 @@ def test_the_cylinder_applies():
     command = ["git", "apply", "--check", "docs/examples/cylinder.diff"]
     done = subprocess.run(command, cwd=DOCS.parent, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_files_that_are_named_exist():
+    folders = ("taisoft", "benchmarks", "tests", "demos", "docs", "assets")
+    own = {path.name for folder in folders for path in (ROOT / folder).rglob("*.py")}
+    for page in PAGES:
+        named = re.findall(r"`([\w./]+)`", page.read_text(encoding="utf-8"))
+        missing = {name for name in named if name.split("/")[0] in folders and "/" in name and not (ROOT / name).exists()}
+        missing |= {name for name in named if name.endswith(".py") and name != ".py" and Path(name).name not in own}
+        assert missing <= EXAMPLES, f"{page.name}: {missing}"
 
 
 def test_where_one_chooses():

@@ -254,7 +254,7 @@ def test_a_folder_takes_a_study_of_its_own_scene_alone(tmp_path):
     with pytest.raises(OutputError, match="holds a study of another scene .pendulum"):
         check_scene(tmp_path, "another")
     (tmp_path / "study.json").write_text("[]")
-    with pytest.raises(OutputError, match="holds a study.json that is not a study"):
+    with pytest.raises(OutputError, match="holds a study.json not written by this version"):
         check_scene(tmp_path, "scene")
 
 

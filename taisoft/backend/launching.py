@@ -219,12 +219,16 @@ class Kernels:
         return names
 
     def _references(self, key: tuple, arguments: tuple) -> list:
-        """Weak references that remove the entry `key` as soon as one of its records or arrays is collected."""
+        """References beside the entry `key`: weak ones that remove it as soon as a record or array of its is collected.
+
+        Anything else that is known by its id is held, so that no other object takes that id.
+        """
         ready = self._ready
         return [
             weakref.ref(arguments[k], lambda _, key=key: ready.pop(key, None))
-            for k in self._templates
             if isinstance(arguments[k], Array) or dataclasses.is_dataclass(arguments[k])
+            else arguments[k]
+            for k in self._templates
         ]
 
 

@@ -283,7 +283,7 @@ def find_impact(f: ti.template(), dt: ti.f64, contact_offset: ti.f64) -> ti.i32:
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
-            closes = f.gap[c] + dt * f.approach[c] < contact_offset_of(f, c, contact_offset)
+            closes = f.gap[c] - contact_offset_of(f, c, contact_offset) + dt * f.approach[c] < 0.0
             if p.r[c][0] == 0.0 and f.approach[c] < 0.0 and closes:
                 found = 1
     return found

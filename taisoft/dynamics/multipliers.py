@@ -10,7 +10,8 @@ Most problems, and the impacts before a step, need few multipliers. If disks and
 slowly, each multiplier may leave 98 % of the laws' residual. So after EXTRAPOLATE_AFTER of them (`ContactNewton`: at once if |r|
 is only rounding) R becomes R_EXTRAPOLATED and stays, and multipliers are extrapolated from the last two
 (Anderson 1965, in the form of Walker and Ni 2011): with f = p - lambda, the new one is p - sum t_i (p_i+1 - p_i), where t
-minimises |f - sum t_i (f_i+1 - f_i)|, each entry divided by the square root of its r-factor.
+minimises |f - sum t_i (f_i+1 - f_i)|, each entry divided by the square root of its r-factor. Problems of a Newton iteration that
+stalls are never extrapolated: redundant contacts exchange impulses slowly there, which R up to MAX_R_SCALE speeds up.
 """
 
 import taichi as ti

@@ -22,7 +22,7 @@ def check_scene(folder: Path, scene: str) -> None:
     except FileNotFoundError:
         return
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise OutputError(f"the folder {folder} holds a study.json that is not a study: name another folder") from error
+        raise OutputError(f"the folder {folder} holds a study.json not written by this version: name another folder") from error
     if not same:
         raise OutputError(f"the folder {folder} holds a study of another scene ({name}, with other content): name another folder")
 
