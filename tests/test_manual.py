@@ -96,7 +96,7 @@ def test_arguments_of_a_simulator():
     rows = re.findall(r"^\| `(\w+)` \| (.*) \|(.*)\|$", section("api.md", "Simulator"), re.MULTILINE)
     parameters = inspect.signature(ts.Simulator).parameters
     assert [name for name, _, _ in rows] == list(parameters)
-    values = {name: set(re.findall(r'"(\w+)"', told)) for name, told, _ in rows}
+    values = {name: set(re.findall(r'"(\w+)"', documented)) for name, documented, _ in rows}
     assert values["integrator"] == set(INTEGRATORS) and values["contact_solver"] == {"auto", *SOLVERS, *IMPLICIT_CONTACT}
     assert values["precision"] == {"f32", "f64"} and values["arch"] == {"cpu", "cuda"}
     for name, _, default in rows[1:]:
@@ -151,9 +151,9 @@ def test_options_of_the_command():
         assert f"`taisoft {name}`" in page or f"taisoft {name} " in page or f"`{name}`" in page, name
     for name in ("run", "scene", "study", "tetrahedralize"):
         rows = re.findall(r"^\| (`--.*?) \|", section("cli.md", f"`taisoft {name}`"), re.MULTILINE)
-        told = {option for row in rows for option in re.findall(r"`(--[\w-]+)", row)}
+        documented = {option for row in rows for option in re.findall(r"`(--[\w-]+)", row)}
         options = {option for a in commands()[name]._actions for option in a.option_strings}
-        assert told == options - {"-h", "--help"}, name
+        assert documented == options - {"-h", "--help"}, name
     known = {option for parser in commands().values() for a in parser._actions for option in a.option_strings}
     assert set(re.findall(r"`(--[\w-]+)", page)) <= known | {"--version"}
 
@@ -162,5 +162,5 @@ def test_keys_of_the_window():
     from taisoft.view.window import KEYS as keys
 
     rows = re.findall(r"^\| (.*?) \|", section("cli.md", "The live window"), re.MULTILINE)[2:]
-    told = {key for row in rows if "button" not in row for key in row.split(", ")}
-    assert told == {KEYS.get(key, key.upper()) for key in keys}
+    documented = {key for row in rows if "button" not in row for key in row.split(", ")}
+    assert documented == {KEYS.get(key, key.upper()) for key in keys}

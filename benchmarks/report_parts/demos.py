@@ -79,7 +79,7 @@ def _at(sim: ts.Simulator, body: str, chosen: Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass
-class DisplayOptions:
+class DemoRun:
     """A demo as run. numbers: at the moments [m]; problem: of its own check, empty where it passed; spent: wall seconds of the
     steps of each round; contacts: most at a time."""
 
@@ -113,7 +113,7 @@ def _problem(module: ModuleType, sim: ts.Simulator, result: RunReport) -> str:
     return ""
 
 
-def show(scene: Scene, arch: str, rounds: int) -> DisplayOptions:
+def show(scene: Scene, arch: str, rounds: int) -> DemoRun:
     """Run a demo with pictures, check it, and run it again for its time."""
     gallery = load_module(shipped_folder("assets") / "make_gallery.py")
     _, size, view = gallery.STRIPS[scene.demo]
@@ -141,10 +141,10 @@ def show(scene: Scene, arch: str, rounds: int) -> DisplayOptions:
             rounds_spent.append(sum(steps))
         tets = sum(body.mesh.n_tets for body in sim.scene.bodies)
         told = f"{sim.settings.integrator}, dt = {1e3 * sim.dt:.3g} ms"
-    return DisplayOptions(scene, tets, seconds, told, result, problem, numbers, small_png(image), rounds_spent)
+    return DemoRun(scene, tets, seconds, told, result, problem, numbers, small_png(image), rounds_spent)
 
 
-def claim_of(shown: DisplayOptions) -> Claim:
+def claim_of(shown: DemoRun) -> Claim:
     """Whether the demo shows what the report's does, and is to be trusted."""
     s, r = shown.scene, shown.result
     heights = ", ".join(f"{y:.3f}" for y in shown.numbers)
@@ -163,7 +163,7 @@ def hours_claim(seconds: float, simulated: float) -> Claim:
     return Claim(f"demonstration 3 takes hours, about {REPORTS_HOURS:g} (section 3.1).", slow, found, "" if slow else why)
 
 
-def demo_table(shown: list[DisplayOptions]) -> str:
+def demo_table(shown: list[DemoRun]) -> str:
     """A row a demo."""
     lines = []
     for s in shown:
