@@ -36,6 +36,7 @@ docs: $(DOCS_READY)
 
 lint: $(READY)
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check --quiet . || { echo "Run $(BIN)/ruff format ." >&2; exit 1; }
 
 # pip and venv build into $(VENV); the stamp is written last, so that an installation cut short is done again.
 $(READY): pyproject.toml

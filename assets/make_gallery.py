@@ -42,10 +42,17 @@ STRIPS = {
 
 
 def film(
-    sim: ts.Simulator, moments: tuple, size: tuple[int, int], view: tuple, seconds: float, fps: float,
-    layers: tuple[str, ...] = IN_PICTURES, on_moment: Callable[[ts.Simulator], None] | None = None, on_step=None,
+    sim: ts.Simulator,
+    moments: tuple,
+    size: tuple[int, int],
+    view: tuple,
+    seconds: float,
+    fps: float,
+    layers: tuple[str, ...] = IN_PICTURES,
+    on_moment: Callable[[ts.Simulator], None] | None = None,
+    on_step=None,
     colour: str = "body",
-) -> tuple[np.ndarray, ts.RunReport]:  # fmt: skip
+) -> tuple[np.ndarray, ts.RunReport]:
     """Run for some seconds; the pictures of the moments [s] side by side, uint8 (height, width, 3), and what the run did.
 
     on_moment: called with each picture; on_step: as `Simulator.run` has it; colour: as of `Offscreen`.

@@ -16,27 +16,9 @@ import sys
 from taisoft.backend.runtime import Runtime, open_runtime
 from taisoft.timing import load_average
 
-from .collision_cases import (
-    CUBES,
-    FRAMES,
-    LARGE_PILE,
-    PILES,
-    RATIOS,
-    REPORT,
-    SHEET,
-    SWEPT,
-    cubes_setup,
-    pile_setup,
-)  # fmt: skip
+from .collision_cases import CUBES, FRAMES, LARGE_PILE, PILES, RATIOS, REPORT, SHEET, SWEPT, cubes_setup, pile_setup
 from .collision_plot import draw
-from .collision_runs import (
-    GEOMETRIES,
-    QUICK_ROUNDS,
-    ROUNDS,
-    measure_broad,
-    measure_film,
-    measure_row,
-)  # fmt: skip
+from .collision_runs import GEOMETRIES, QUICK_ROUNDS, ROUNDS, measure_broad, measure_film, measure_row
 from .collision_table import (
     broad_table,
     cell_table,
@@ -46,7 +28,7 @@ from .collision_table import (
     older_table,
     reduction_table,
     row_table,
-)  # fmt: skip
+)
 from .document import Document, header
 from .elasticity_table import limit_table
 from .order import parse_options

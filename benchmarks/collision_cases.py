@@ -138,10 +138,6 @@ def cubes_setup(cells: int) -> Setup:
 
 
 SHEET = Setup("sheet and cube", "a cube of 1 m on a sheet of 4 x 0.05 x 4 m", sheet_and_cube, sagging)
-REPORT = (
-    SHEET,
-    Setup("cube on box", "a cube on a box", cube_on_box),
-    Setup("two on two", "two cubes on two boxes", two_on_two),
-)
+REPORT = (SHEET, Setup("cube on box", "a cube on a box", cube_on_box), Setup("two on two", "two cubes on two boxes", two_on_two))
 # [ms] a whole step of the older Python code, contacts and all, on this class of machine; quoted, not measured here
 OLDER = {"sheet and cube": (2400.0, 4200.0), "cube on box": (1435.0, 1435.0), "two on two": (1900.0, 1900.0)}

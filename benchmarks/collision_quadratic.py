@@ -11,9 +11,8 @@ from taisoft.collision.reduction import FOUND, KEPT, LEFT, UNKNOWN, is_same
 
 @kernel
 def reduce_by_pairs(
-    r: ti.template(), out: ti.template(), order: ti.types.ndarray(), state: ti.template(), kept: ti.template(),
-    tolerance: ti.f64,
-):  # fmt: skip
+    r: ti.template(), out: ti.template(), order: ti.types.ndarray(), state: ti.template(), kept: ti.template(), tolerance: ti.f64
+):
     """Two nested loops over the list that a search has left: a contact is kept unless an earlier kept one is the same."""
     ti.loop_config(serialize=True)
     for _ in range(1):

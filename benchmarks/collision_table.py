@@ -32,9 +32,21 @@ def row_table(rows: list[Row]) -> str:
         rest = (f"{x:.1f}" for x in (r.first, r.compile_seconds, r.field_bytes / 1e6))
         lines.append((r.setup, r.geometry, *sizes, *times, *rest))
     headings = (
-        "scene", "hit by", "tets", "triangles", "active", "pairs", "found", "contacts", *(f"{p} [ms]" for p in PHASES),
-        "whole [ms]", "spread", "first [s]", "compile [s]", "fields [MB]",
-    )  # fmt: skip
+        "scene",
+        "hit by",
+        "tets",
+        "triangles",
+        "active",
+        "pairs",
+        "found",
+        "contacts",
+        *(f"{p} [ms]" for p in PHASES),
+        "whole [ms]",
+        "spread",
+        "first [s]",
+        "compile [s]",
+        "fields [MB]",
+    )
     notes = [f"* {r.setup}, {r.geometry}: {r.failure}" for r in rows if r.failure]
     return markdown(headings, lines, left=(0, 1)) + ("\n\n" + "\n".join(notes) if notes else "")
 

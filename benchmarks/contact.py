@@ -46,16 +46,7 @@ from .contact_plot import Snapshot, draw, take_snapshot
 from .contact_replay import capture, replay
 from .contact_runs import measure_film, measure_run, measure_step, open_explicit, open_scene, to_impulses
 from .contact_states import SCENES
-from .contact_table import (
-    PILE,
-    PILE_SECONDS,
-    count_table,
-    find_limits,
-    problem_table,
-    run_table,
-    solver_table,
-    step_table,
-)  # fmt: skip
+from .contact_table import PILE, PILE_SECONDS, count_table, find_limits, problem_table, run_table, solver_table, step_table
 from .document import Document, header
 from .elasticity_table import limit_table
 from .order import parse_options

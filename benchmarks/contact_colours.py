@@ -58,9 +58,10 @@ def colour_all(scene: str, p: ContactProblem, seeds: int) -> tuple[list[Colourin
     least = int(np.diff(start)[movable].max())
     _parallel(p)  # compiles
     ways = {
-        "greedy": lambda _: colour_greedy(graph_of(p)), "random": lambda seed: colour_random(graph_of(p), seed),
+        "greedy": lambda _: colour_greedy(graph_of(p)),
+        "random": lambda seed: colour_random(graph_of(p), seed),
         "parallel": lambda _: _parallel(p),
-    }  # fmt: skip
+    }
     for name, way in ways.items():
         numbers, largest, seconds = [], [], []
         for seed in range(seeds if name == "random" else ROUNDS):
@@ -86,11 +87,17 @@ def colour_table(colourings: list[Colouring]) -> str:
     """A row a scene and way, those of the report below."""
     lines = [
         (
-            c.scene, c.way, f"{c.contacts}", f"{c.least}", _ranged(c.numbers), f"{c.contacts / np.median(c.numbers):.1f}",
-            _ranged(c.largest), f"{1e3 * float(np.median(c.seconds)):.3g}",
+            c.scene,
+            c.way,
+            f"{c.contacts}",
+            f"{c.least}",
+            _ranged(c.numbers),
+            f"{c.contacts / np.median(c.numbers):.1f}",
+            _ranged(c.largest),
+            f"{1e3 * float(np.median(c.seconds)):.3g}",
         )
         for c in colourings
-    ]  # fmt: skip
+    ]
     for scene in dict.fromkeys(c.scene for c in colourings):
         contacts, found = REPORT.get(scene, (0, {}))
         for way, n in found.items():

@@ -79,10 +79,16 @@ def build_plates(n: int, runtime: Runtime, arena: FieldArena) -> ContactProblem:
     normal, tangent = np.tile([0.0, 1.0, 0.0], (k, 1)), np.tile([1.0, 0.0, 0.0], (k, 1))
     across = -u[:, 2]  # along normal x tangent
     for held, values in (
-        (p.node, node), (p.arity, np.full(k, 4, np.int32)), (p.weight, weight), (p.normal, normal), (p.tangent, tangent),
-        (p.inverse_mass, one((2 * first, 3))), (p.b, np.column_stack([u[:, 1], u[:, 0], across])),
-        (p.friction, np.full(k, FRICTION)), (p.order, np.arange(k, dtype=np.int32)),
-    ):  # fmt: skip
+        (p.node, node),
+        (p.arity, np.full(k, 4, np.int32)),
+        (p.weight, weight),
+        (p.normal, normal),
+        (p.tangent, tangent),
+        (p.inverse_mass, one((2 * first, 3))),
+        (p.b, np.column_stack([u[:, 1], u[:, 0], across])),
+        (p.friction, np.full(k, FRICTION)),
+        (p.order, np.arange(k, dtype=np.int32)),
+    ):
         held.from_numpy(np.ascontiguousarray(values))
     index_nodes(p)
     find_factors(p)
@@ -116,9 +122,18 @@ def crossover_table(points: list[Point]) -> str:
         residuals = (f"{o.residual:.1e}" for o in (a, b))
         lines.append((f"{at.contacts:,}", f"{at.colours}", f"{a.sweeps}", f"{b.sweeps}", *residuals, *cells))
     headings = (
-        "contacts", "colours", "sweeps, serial", "coloured", "residual, serial", "coloured", "solve, serial [ms]",
-        "coloured [ms]", "of it colouring [ms]", "sweep, serial [ms]", "coloured [ms]",
-    )  # fmt: skip
+        "contacts",
+        "colours",
+        "sweeps, serial",
+        "coloured",
+        "residual, serial",
+        "coloured",
+        "solve, serial [ms]",
+        "coloured [ms]",
+        "of it colouring [ms]",
+        "sweep, serial [ms]",
+        "coloured [ms]",
+    )
     return markdown(headings, lines)
 
 

@@ -92,10 +92,15 @@ def drop(name: str, steps: int) -> dict:
             seconds.append(time.perf_counter() - begin - (compile_clock() - compiled))
         tets = sum(body.mesh.n_tets for body in sim.scene.bodies)
     return {
-        "scene": name, "tets": tets, "seconds": seconds, "contacts": [int(r.n_contacts) for r in reports],
-        "newton": [r.newton_iterations for r in reports], "linear": [r.linear_iterations for r in reports],
-        "unconverged": sum(not r.converged for r in reports), "penetration": float(reports[-1].max_penetration),
-    }  # fmt: skip
+        "scene": name,
+        "tets": tets,
+        "seconds": seconds,
+        "contacts": [int(r.n_contacts) for r in reports],
+        "newton": [r.newton_iterations for r in reports],
+        "linear": [r.linear_iterations for r in reports],
+        "unconverged": sum(not r.converged for r in reports),
+        "penetration": float(reports[-1].max_penetration),
+    }
 
 
 if __name__ == "__main__":

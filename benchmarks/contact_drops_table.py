@@ -19,8 +19,17 @@ NEWTON = 8.0  # Newton iterations a step on average, of real meshes
 # how many times as long the older version must take: each real mesh, their steps with contacts in all, other scenes
 FASTER, FASTER_WITH_CONTACTS, FASTER_OTHERS = 3.0, 5.0, {"cloth": 10.0, "cube on sheet, Euler": 4.0, "cube on sheet, BDF2": 4.0}
 COLUMNS = (
-    "scene", "tets", "steps", "version", "N a step", "CG a step", "unconverged", "s in all", "s with contacts", "ms a step",
-)  # fmt: skip
+    "scene",
+    "tets",
+    "steps",
+    "version",
+    "N a step",
+    "CG a step",
+    "unconverged",
+    "s in all",
+    "s with contacts",
+    "ms a step",
+)
 
 
 def run(version: Version, name: str, quick: bool) -> dict:
@@ -58,10 +67,17 @@ def row(label: str, one: dict) -> tuple[str, ...]:
     """Cells of a run."""
     steps = len(one["seconds"])
     return (
-        one["scene"], f"{one['tets']:,}", str(steps), label, f"{sum(one['newton']) / steps:.1f}",
-        f"{sum(one['linear']) / steps:.0f}", str(one["unconverged"]), f"{sum(one['seconds']):.2f}", f"{with_contacts(one):.2f}",
+        one["scene"],
+        f"{one['tets']:,}",
+        str(steps),
+        label,
+        f"{sum(one['newton']) / steps:.1f}",
+        f"{sum(one['linear']) / steps:.0f}",
+        str(one["unconverged"]),
+        f"{sum(one['seconds']):.2f}",
+        f"{with_contacts(one):.2f}",
         f"{1e3 * np.median(one['seconds']):.1f}",
-    )  # fmt: skip
+    )
 
 
 def lines_of(found: dict[str, dict[str, dict]], name: str) -> Iterator[str]:

@@ -60,10 +60,13 @@ def beam_steps(case: Case, steps: int) -> dict:
             seconds.append(time.perf_counter() - begin - (compile_clock() - compiled))
     first = min(case.first, steps - 1)
     return {
-        "tets": beam.mesh.n_tets, "seconds": seconds[first:], "newton": [r.newton_iterations for r in reports[first:]],
-        "linear": [r.linear_iterations for r in reports[first:]], "converged": [bool(r.converged) for r in reports[first:]],
+        "tets": beam.mesh.n_tets,
+        "seconds": seconds[first:],
+        "newton": [r.newton_iterations for r in reports[first:]],
+        "linear": [r.linear_iterations for r in reports[first:]],
+        "converged": [bool(r.converged) for r in reports[first:]],
         "inverted": max(int(r.n_inverted) for r in reports[first:]),
-    }  # fmt: skip
+    }
 
 
 def static_beams(number: int) -> dict:

@@ -60,10 +60,17 @@ def row(name: str, label: str, own: dict[str, list[dict]]) -> tuple[str, ...]:
     first, n = own[label][0], max(1, counted(own).sum())
     times = total(own, label, "seconds")
     return (
-        name, f"{first['tets']:,}", f"{first['inverted']:,}", label, str(len(first["converged"])), str(sum(first["converged"])),
-        f"{total(own, label, 'newton')[0] / n:.2f}", f"{total(own, label, 'linear')[0] / n:.0f}",
-        f"{1e3 * np.median(times):.1f}", f"{100 * spread(times):.0f} %",
-    )  # fmt: skip
+        name,
+        f"{first['tets']:,}",
+        f"{first['inverted']:,}",
+        label,
+        str(len(first["converged"])),
+        str(sum(first["converged"])),
+        f"{total(own, label, 'newton')[0] / n:.2f}",
+        f"{total(own, label, 'linear')[0] / n:.0f}",
+        f"{1e3 * np.median(times):.1f}",
+        f"{100 * spread(times):.0f} %",
+    )
 
 
 def limits_of(found: dict[str, dict[str, list[dict]]]) -> Iterator[Limit]:

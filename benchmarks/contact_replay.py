@@ -20,9 +20,19 @@ PRECISIONS, TOLERANCE, EXACT = ("f32", "f64"), 1e-4, 1e-8
 # what this version is held to: median and 90th percentile of Newton iterations, share of states that need halving
 MEDIAN, HIGH, HALVED = 5.0, 12.0, 0.03
 COLUMNS = (
-    "scene", "states", "N median", "N 90 %", "N most", "CG median", "launches", "halved", "unconverged", "ms", "error median",
+    "scene",
+    "states",
+    "N median",
+    "N 90 %",
+    "N most",
+    "CG median",
+    "launches",
+    "halved",
+    "unconverged",
+    "ms",
+    "error median",
     "error most",
-)  # fmt: skip
+)
 
 
 def run(folder: Path, *task: str | Path) -> list[dict]:
@@ -78,12 +88,18 @@ def cells(name: str, rows: list[dict]) -> tuple[str, ...]:
     """Of one scene. Newton and CG: of the first try, whole; launches and time: of all tries."""
     newton, errors = np.array([row["newton"] for row in rows]), np.array([row["error"] for row in rows if "error" in row])
     return (
-        name, str(len(rows)), f"{np.median(newton):.0f}", f"{np.percentile(newton, 90):.0f}", str(newton.max()),
-        f"{np.median([row['linear'] for row in rows]):.0f}", f"{np.median([row['launches'] for row in rows]):.0f}",
-        str(sum(row["halves"] > 1 for row in rows)), str(sum(not row["converged"] for row in rows)),
+        name,
+        str(len(rows)),
+        f"{np.median(newton):.0f}",
+        f"{np.percentile(newton, 90):.0f}",
+        str(newton.max()),
+        f"{np.median([row['linear'] for row in rows]):.0f}",
+        f"{np.median([row['launches'] for row in rows]):.0f}",
+        str(sum(row["halves"] > 1 for row in rows)),
+        str(sum(not row["converged"] for row in rows)),
         f"{1e3 * np.median([row['seconds'] for row in rows]):.1f}",
         *([f"{np.median(errors):.1e}", f"{errors.max():.1e}"] if len(errors) else ["-", "-"]),
-    )  # fmt: skip
+    )
 
 
 def speed_text(found: dict[str, list[dict]], precision: str) -> str:

@@ -26,9 +26,11 @@ ROUNDS, COLD_ROUNDS = 3, 1
 SETTINGS = ("integrator", "contact_solver", "contact_tolerance", "newton_tolerance", "linear_tolerance", "dt")
 # parts of an explicit step: what is called, where it is looked up
 PARTS = {
-    "search": ("find", "_measure_closing"), "problem": ("begin", "set_free_velocities", "find_factors"),
-    "solve": ("colour_contacts", "solve"), "elasticity": ("keep_state", "predict", "move"),
-}  # fmt: skip
+    "search": ("find", "_measure_closing"),
+    "problem": ("begin", "set_free_velocities", "find_factors"),
+    "solve": ("colour_contacts", "solve"),
+    "elasticity": ("keep_state", "predict", "move"),
+}
 REST = "rest"
 
 

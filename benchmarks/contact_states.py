@@ -87,14 +87,10 @@ def mat() -> ts.Scene:
     scene = ts.Scene(gravity=(0, 0, 0))
     mesh = ts.box_mesh((20, 20, 1), (1.0, 1.0, 0.02))
     x = mesh.vertices + np.random.default_rng(0).uniform(-1e-4, 1e-4, mesh.n_verts)[:, None] * [0.0, 0.0, 1.0]
-    body = scene.add_body(
-        ts.TetMesh(x, mesh.tets), ts.Material(young=2e4, poisson=0.4, density=1000.0, friction=0.3), name="mat"
-    )
+    body = scene.add_body(ts.TetMesh(x, mesh.tets), ts.Material(young=2e4, poisson=0.4, density=1000.0, friction=0.3), name="mat")
     turn = np.array([np.radians(90.0) * 8.0, 0.0, 0.0])
     for side in (-1.0, 1.0):
-        body.move(
-            lambda X, side=side: side * X[:, 0] > 0.499, ts.KeyFrames([0.0, 8.0], rotations=[np.zeros(3), side * turn])
-        )
+        body.move(lambda X, side=side: side * X[:, 0] > 0.499, ts.KeyFrames([0.0, 8.0], rotations=[np.zeros(3), side * turn]))
     return scene
 
 
@@ -236,12 +232,18 @@ def solve(sim: ts.Simulator, kept: dict, dt: float, most: int) -> tuple[dict, np
         halves *= 2
     stage = first or done[-1]
     row = {
-        "newton": stage.newton_iterations if stage else 0, "linear": stage.linear_iterations if stage else 0,
-        "all newton": newton, "all linear": linear, "halves": halves, "converged": good,
-        "seconds": seconds, "launches": launched, "residual": done[-1].residual if done[-1] else None,
+        "newton": stage.newton_iterations if stage else 0,
+        "linear": stage.linear_iterations if stage else 0,
+        "all newton": newton,
+        "all linear": linear,
+        "halves": halves,
+        "converged": good,
+        "seconds": seconds,
+        "launches": launched,
+        "residual": done[-1].residual if done[-1] else None,
         "contact residual": done[-1].contact_residual if done[-1] else None,
         "contacts": int(stepper.contact.n_contacts),
-    }  # fmt: skip
+    }
     return row, sim.positions()
 
 

@@ -36,9 +36,7 @@ def count_table(films: list[Film]) -> str:
         step = f"{1e3 * f.dt:.3g}", f"{1e3 * f.stable_dt:.3g}"
         counts = ranged(f.contacts), ranged(f.found), str(reported or "-"), fewer
         lines.append((f.scene, f"{f.tets}", *step, f"{len(f.time)}", *counts))
-    headings = (
-        "scene", "tets", "dt [ms]", "stable [ms]", "frames", "contacts", "before reduction", "the report's", "fewer by",
-    )  # fmt: skip
+    headings = ("scene", "tets", "dt [ms]", "stable [ms]", "frames", "contacts", "before reduction", "the report's", "fewer by")
     return markdown(headings, lines, left=(0,))
 
 
@@ -53,9 +51,7 @@ def solver_table(films: list[Film]) -> str:
             times = _ms(t.median), percent(spread_of(t)), _ms(t.maximum), _ms(np.median([o.median for o in cold]))
             residual = max(o.residual for o in warm + cold)
             lines.append((f.scene, name, *sweeps, *times, f"{residual:.1e}", f"{f.missed([name])} of {2 * len(warm)}"))
-    headings = (
-        "scene", "solver", f"sweeps {WARM}", COLD, f"ms {WARM}", "spread", "most", COLD, "worst residual", "not solved",
-    )  # fmt: skip
+    headings = ("scene", "solver", f"sweeps {WARM}", COLD, f"ms {WARM}", "spread", "most", COLD, "worst residual", "not solved")
     return markdown(headings, lines, left=(0, 1))
 
 
@@ -69,9 +65,18 @@ def run_table(runs: list[Run]) -> str:
         wall = f"{r.wall / r.simulated:.3g}" if r.simulated else "-"
         lines.append((r.scene, r.settings, f"{len(r.seconds)}", *counts, *times, wall, r.status))
     headings = (
-        "scene", "steps", "with contacts", "contacts", "multipliers", "Newton", "CG", "ms", "spread", "wall s per simulated s",
+        "scene",
+        "steps",
+        "with contacts",
+        "contacts",
+        "multipliers",
+        "Newton",
+        "CG",
+        "ms",
+        "spread",
+        "wall s per simulated s",
         "status",
-    )  # fmt: skip
+    )
     notes = [f"* {r.scene}: {text}" for r in runs for text in r.problems]
     return markdown(headings, lines, left=(0, 1)) + ("\n\n" + "\n".join(notes) if notes else "")
 
@@ -85,9 +90,16 @@ def step_table(costs: list[StepCost]) -> str:
         counts = f"{len(c.whole)}", ranged(c.contacts), ranged(c.sweeps), f"{c.residual:.1e}"
         lines.append((c.scene, c.solver, *counts, _ms(t.median), percent(spread_of(t)), *parts))
     headings = (
-        "scene", "solver", "steps", "contacts", "sweeps", "worst residual", "step [ms]", "spread",
+        "scene",
+        "solver",
+        "steps",
+        "contacts",
+        "sweeps",
+        "worst residual",
+        "step [ms]",
+        "spread",
         *(f"{part} [ms]" for part in (*PARTS, REST)),
-    )  # fmt: skip
+    )
     return markdown(headings, lines, left=(0, 1))
 
 

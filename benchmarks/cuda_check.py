@@ -69,9 +69,16 @@ def carry_out(part: Part, limit: float) -> Outcome:
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     environment = os.environ | {"PYTHONPATH": path, "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(
-        part.command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
-        env=environment, cwd=ROOT, start_new_session=True,
-    )  # fmt: skip
+        part.command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        env=environment,
+        cwd=ROOT,
+        start_new_session=True,
+    )
     try:
         printed, _ = process.communicate(timeout=limit)
         outcome.ended = "ok" if process.returncode == 0 else "failed"

@@ -68,9 +68,13 @@ def _timed(work: Work, setting: Setting) -> dict:
     except TaisoftError as error:
         return {"failure": str(error)}
     return {
-        "seconds": seconds / work.seconds, "build_seconds": session.build_seconds, "error": verdict.error,
-        "stands": verdict.stands, "inverted": verdict.inverted, "unconverged": session.unconverged,
-    }  # fmt: skip
+        "seconds": seconds / work.seconds,
+        "build_seconds": session.build_seconds,
+        "error": verdict.error,
+        "stands": verdict.stands,
+        "inverted": verdict.inverted,
+        "unconverged": session.unconverged,
+    }
 
 
 def sweeps(arch: str, quick: bool) -> Iterator[dict]:
@@ -110,11 +114,16 @@ def _timed_size(scene: Scene, integrator: str, dt: float, arch: str) -> dict:
             warm_up(sim)
             stretch = advance(sim, TIMED_STEPS if integrator == "velocity_verlet" else IMPLICIT_STEPS)
             return {
-                "step_ms": 1e3 * stretch.seconds / stretch.steps, "steps": stretch.steps, "linear": stretch.linear_iterations,
-                "newton": stretch.newton_iterations, "unconverged": stretch.unconverged, "inverted": stretch.inverted,
-                "build_seconds": build, "compile_seconds": sim.compile_seconds,
+                "step_ms": 1e3 * stretch.seconds / stretch.steps,
+                "steps": stretch.steps,
+                "linear": stretch.linear_iterations,
+                "newton": stretch.newton_iterations,
+                "unconverged": stretch.unconverged,
+                "inverted": stretch.inverted,
+                "build_seconds": build,
+                "compile_seconds": sim.compile_seconds,
                 "field_bytes": sum(sim.field_bytes.values()),
-            }  # fmt: skip
+            }
     except TaisoftError as error:
         return {"failure": str(error)}
 

@@ -29,10 +29,19 @@ def _works(found: list[dict]) -> str:
             rows.append((one["work"], f"{one['tets']:,}", one["setting"], one["arch"], one["failure"], "", "", "", ""))
             continue
         error = f"{100 * one['error']:.2g} %" if one["error"] is not None else "stands" if one["stands"] else "does not stand"
-        rows.append((
-            one["work"], f"{one['tets']:,}", one["setting"], one["arch"], _number(one["seconds"]), error,
-            str(one["inverted"]), str(one["unconverged"]), _number(one["build_seconds"]),
-        ))  # fmt: skip
+        rows.append(
+            (
+                one["work"],
+                f"{one['tets']:,}",
+                one["setting"],
+                one["arch"],
+                _number(one["seconds"]),
+                error,
+                str(one["inverted"]),
+                str(one["unconverged"]),
+                _number(one["build_seconds"]),
+            )
+        )
     headings = ("work", "tets", "setting", "arch", "s/sim. s", "error", "inverted", "unconverged", "build [s]")
     return markdown(headings, rows, left=(0, 2, 3))
 
@@ -40,12 +49,17 @@ def _works(found: list[dict]) -> str:
 def _sweeps(found: list[dict]) -> str:
     rows = [
         (
-            f"{one['contacts']:,}", str(one["colours"]), _number(one["serial_ms"]), _number(one["coloured_ms"]),
-            _number(one["serial_ms"] / one["coloured_ms"]), str(one["serial_sweeps"]), str(one["coloured_sweeps"]),
+            f"{one['contacts']:,}",
+            str(one["colours"]),
+            _number(one["serial_ms"]),
+            _number(one["coloured_ms"]),
+            _number(one["serial_ms"] / one["coloured_ms"]),
+            str(one["serial_sweeps"]),
+            str(one["coloured_sweeps"]),
             _number(max(one["serial_residual"], one["coloured_residual"]), ".1e"),
         )
         for one in found
-    ]  # fmt: skip
+    ]
     headings = ("contacts", "colours", "serial [ms]", "coloured [ms]", "serial / coloured", "sweeps", "coloured", "residual")
     return markdown(headings, rows)
 
@@ -58,13 +72,29 @@ def _sizes(found: list[dict]) -> str:
             rows.append((*cells, one["failure"], "", "", "", "", "", ""))
             continue
         per_tet = 1e6 * one["step_ms"] / one["tets"]
-        rows.append((
-            *cells, _number(one["step_ms"]), _number(per_tet), f"{one['newton']}/{one['linear']}", str(one["unconverged"]),
-            _number(one["field_bytes"] / 2**20, ".0f"), _number(one["build_seconds"]), _number(one["compile_seconds"]),
-        ))  # fmt: skip
+        rows.append(
+            (
+                *cells,
+                _number(one["step_ms"]),
+                _number(per_tet),
+                f"{one['newton']}/{one['linear']}",
+                str(one["unconverged"]),
+                _number(one["field_bytes"] / 2**20, ".0f"),
+                _number(one["build_seconds"]),
+                _number(one["compile_seconds"]),
+            )
+        )
     headings = (
-        "tets", "integrator", "step [ms]", "ns/tet", "Newton/CG", "unconverged", "fields [MiB]", "build [s]", "compile [s]",
-    )  # fmt: skip
+        "tets",
+        "integrator",
+        "step [ms]",
+        "ns/tet",
+        "Newton/CG",
+        "unconverged",
+        "fields [MiB]",
+        "build [s]",
+        "compile [s]",
+    )
     return markdown(headings, rows, left=(1,))
 
 

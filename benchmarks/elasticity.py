@@ -35,9 +35,13 @@ MEMORY_LIMIT = 1000.0  # bytes of fields per tet, f32
 # What is set beside each other: our integrator, theirs, and the steps theirs takes for one of the first in its rows:
 # explicit ones at their largest steps, implicit ones at 10 ms, and theirs at a quarter of that, nearer to our error.
 PAIRS = (
-    ("velocity_verlet", "euler_staggered", 1), ("symplectic_euler", "euler", 1), ("bdf2", "discrete", 1),
-    ("implicit_midpoint", "discrete", 1), ("bdf2", "discrete", 4), ("implicit_midpoint", "discrete", 4),
-)  # fmt: skip
+    ("velocity_verlet", "euler_staggered", 1),
+    ("symplectic_euler", "euler", 1),
+    ("bdf2", "discrete", 1),
+    ("implicit_midpoint", "discrete", 1),
+    ("bdf2", "discrete", 4),
+    ("implicit_midpoint", "discrete", 4),
+)
 
 
 @dataclass(frozen=True)
@@ -65,9 +69,18 @@ def run_table(rows: list[Row]) -> str:
         error = (f"{row.error:.4%}", f"({row.error_unfolded:.4%})") if row.error is not None else ("-", "-")
         lines.append((f"{row.tets:,}", row.program, row.integrator, f"{1e3 * row.dt:.3f}", *step, *error, build, compiled))
     headings = (
-        "tets", "program", "integrator", "dt [ms]", "us/step", "spread", "s/sim. s", "error", "(0.8 s)", "build [s]",
+        "tets",
+        "program",
+        "integrator",
+        "dt [ms]",
+        "us/step",
+        "spread",
+        "s/sim. s",
+        "error",
+        "(0.8 s)",
+        "build [s]",
         "of it compiling",
-    )  # fmt: skip
+    )
     notes = [
         f"* {row.program} {row.integrator}, dt = {1e3 * row.dt:.3f} ms: {text}"
         for row in rows
@@ -99,11 +112,9 @@ def compare(rows: list[Row]) -> list[tuple[Row, Row, Timing]]:
 def compare_table(pairs: list[tuple[Row, Row, Timing]]) -> str:
     """A row a pair."""
     lines = [
-        (
-            f"{a.tets:,}", *(text for row in (a, b) for text in _named(row)), f"{ratio.median:.2f}", percent(spread_of(ratio)),
-        )
+        (f"{a.tets:,}", *(text for row in (a, b) for text in _named(row)), f"{ratio.median:.2f}", percent(spread_of(ratio)))
         for a, b, ratio in pairs
-    ]  # fmt: skip
+    ]
     headings = ("tets", "taisoft", "error (0.8 s)", "MuJoCo", "error (0.8 s)", "MuJoCo's time / taisoft's", "spread")
     return markdown(headings, lines, left=(1, 3))
 
@@ -137,11 +148,14 @@ def memory_table(rows: list[dict]) -> str:
 
     lines = [
         (
-            f"{row['tets']:,}", row["integrator"], mega(row["field_bytes"]),
-            "-" if row["bytes_per_tet"] is None else f"{row['bytes_per_tet']:.0f}", mega(row["peak_bytes"]),
+            f"{row['tets']:,}",
+            row["integrator"],
+            mega(row["field_bytes"]),
+            "-" if row["bytes_per_tet"] is None else f"{row['bytes_per_tet']:.0f}",
+            mega(row["peak_bytes"]),
         )
         for row in rows
-    ]  # fmt: skip
+    ]
     return markdown(("tets", "integrator", "fields [MB]", "bytes/tet", "peak of the process [MB]"), lines, left=(1,))
 
 
@@ -212,10 +226,14 @@ def measure(extent: Extent, arch: str, peers: bool, document: Document) -> dict:
     load = load_average()
     document.add(f"Load at the end: {load_text(load)}")
     return numbers | {
-        "load_at_the_end": load, "mujoco_left_out": problem, "cost": [x.record() for x in costs],
-        "frames": [x.record() for x in frames], "runs": [x.record() for x in runs], "memory": memory,
+        "load_at_the_end": load,
+        "mujoco_left_out": problem,
+        "cost": [x.record() for x in costs],
+        "frames": [x.record() for x in frames],
+        "runs": [x.record() for x in runs],
+        "memory": memory,
         "limits": [x.record() for x in limits],
-    }  # fmt: skip
+    }
 
 
 def main(argv=None) -> int:
@@ -226,9 +244,13 @@ def main(argv=None) -> int:
     parser.add_argument("--quick", action="store_true", help="two small meshes, f32, one round")
     parser.add_argument("--no-peers", action="store_true", help="leave MuJoCo out")
     parser.add_argument(
-        "--out", type=Path, nargs="?", const=RESULTS, metavar="FILE.json",
+        "--out",
+        type=Path,
+        nargs="?",
+        const=RESULTS,
+        metavar="FILE.json",
         help="write FILE.json and FILE.md too; without a name into benchmarks/results, named after the machine",
-    )  # fmt: skip
+    )
     options = parser.parse_args(argv)
     out = options.out
     if out is not None:

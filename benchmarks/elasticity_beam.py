@@ -63,8 +63,13 @@ def measure_memory(meshes, arch: str, integrators=("velocity_verlet", "bdf2")) -
             with ts.Simulator(beam_scene(cells), dt=dt, integrator=integrator, precision="f32", arch=arch) as sim:
                 warm_up(sim)
                 total = sum(sim.field_bytes.values())
-            rows.append({
-                "tets": n_tets(cells), "integrator": integrator, "field_bytes": total,
-                "bytes_per_tet": total / n_tets(cells), "peak_bytes": peak_memory(),
-            })  # fmt: skip
+            rows.append(
+                {
+                    "tets": n_tets(cells),
+                    "integrator": integrator,
+                    "field_bytes": total,
+                    "bytes_per_tet": total / n_tets(cells),
+                    "peak_bytes": peak_memory(),
+                }
+            )
     return rows

@@ -84,11 +84,20 @@ def cost_table(costs: Sequence[Cost]) -> str:
     rows = []
     for cost in costs:
         t, ratio = cost.timing, cost_ratio(_alike(costs, cost), cost.law)
-        rows.append((
-            f"{cost.tets:,}", cost.precision, cost.integrator, cost.law, f"{1e6 * t.median:.2f}", f"{1e6 * t.minimum:.2f}",
-            percent(spread_of(t)), f"{1e9 * t.median / cost.tets:.2f}", "" if ratio is None else f"{ratio.median:.2f}",
-            f"{cost.compile_seconds:.2f}",
-        ))  # fmt: skip
+        rows.append(
+            (
+                f"{cost.tets:,}",
+                cost.precision,
+                cost.integrator,
+                cost.law,
+                f"{1e6 * t.median:.2f}",
+                f"{1e6 * t.minimum:.2f}",
+                percent(spread_of(t)),
+                f"{1e9 * t.median / cost.tets:.2f}",
+                "" if ratio is None else f"{ratio.median:.2f}",
+                f"{cost.compile_seconds:.2f}",
+            )
+        )
     headings = ("tets", "precision", "integrator", "law", "us/step", "least", "spread", "ns/tet", "/ SNH", "compile [s]")
     return markdown(headings, rows, left=(1, 2, 3))
 

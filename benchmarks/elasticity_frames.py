@@ -96,10 +96,18 @@ def frame_table(rows: list[Frames]) -> str:
     for row in rows:
         run, alone, ratio = summarise(row.run), summarise(row.alone), row.ratio
         added = 1e6 * row.steps * (ratio.median - 1.0) * alone.median
-        lines.append((
-            f"{row.tets:,}", row.integrator, str(row.steps), f"{1e6 * alone.median:.2f}", f"{1e6 * run.median:.2f}",
-            f"{ratio.median:.3f}", percent(spread_of(ratio)), f"{added:.0f}",
-        ))  # fmt: skip
+        lines.append(
+            (
+                f"{row.tets:,}",
+                row.integrator,
+                str(row.steps),
+                f"{1e6 * alone.median:.2f}",
+                f"{1e6 * run.median:.2f}",
+                f"{ratio.median:.3f}",
+                percent(spread_of(ratio)),
+                f"{added:.0f}",
+            )
+        )
     headings = ("tets", "integrator", "steps/frame", "alone [us]", "in a run [us]", "run / alone", "spread", "added [us/frame]")
     return markdown(headings, lines, left=(1,))
 

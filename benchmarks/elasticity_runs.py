@@ -92,9 +92,11 @@ def make_rows(cells, arch: str, peers: bool, seconds: float, implicit=IMPLICIT) 
     verlet, euler = (lasting_steps(beam_scene(cells), name, arch, seconds) for name in reversed(EXPLICIT))
     stable = STABLE_STEPS[tuple(cells)][0]
     own = [
-        ("velocity_verlet", *verlet), ("velocity_verlet", 2 * verlet[0], ""), ("symplectic_euler", *euler),
+        ("velocity_verlet", *verlet),
+        ("velocity_verlet", 2 * verlet[0], ""),
+        ("symplectic_euler", *euler),
         *((name, 1, "") for name in implicit),
-    ]  # fmt: skip
+    ]
     theirs = [("euler_staggered", stable), ("euler_staggered", 2 * stable), ("euler", stable), ("discrete", 1), ("discrete", 4)]
     rows = []
     for k, (integrator, steps, note) in enumerate(own):

@@ -101,9 +101,7 @@ class ExactPath:
         index = np.rint(t / SAMPLE).astype(int)
         off = np.flatnonzero((np.abs(t - index * SAMPLE) > 1e-9) | (index < 0) | (index >= len(self.t)))
         if len(off):
-            raise ValueError(
-                f"time {off[0]}, {t[off[0]]} s, is not a multiple of {SAMPLE} s between 0 and {self.t[-1]} s"
-            )
+            raise ValueError(f"time {off[0]}, {t[off[0]]} s, is not a multiple of {SAMPLE} s between 0 and {self.t[-1]} s")
         use = t <= until + 1e-9
         return float(np.linalg.norm(path[use] - self.path[index[use]], axis=1).max() / self.excursion)
 
@@ -136,8 +134,11 @@ def regenerate(arguments=None) -> None:
         convergence = np.linalg.norm(path - loose, axis=1) / excursion
         stored[f"path_{_key(cells)}"] = path
         stored[f"convergence_{_key(cells)}"] = convergence.astype(np.float32)
-        print(f"{_key(cells):>9} {len(beam.tets):6d} tets: excursion {excursion:.9f} m, two tolerances differ by "
-              f"{convergence.max():.1e} of it, {time.perf_counter() - start:.0f} s", flush=True)
+        print(
+            f"{_key(cells):>9} {len(beam.tets):6d} tets: excursion {excursion:.9f} m, two tolerances differ by "
+            f"{convergence.max():.1e} of it, {time.perf_counter() - start:.0f} s",
+            flush=True,
+        )
     options.out.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(options.out, **stored)
     print(f"written: {options.out}, {options.out.stat().st_size / 1000:.1f} kB")

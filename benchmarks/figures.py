@@ -24,10 +24,17 @@ from .document import RESULTS, default_out, load_text
 
 # name -> what of it is written: a page with numbers (json), a picture beside it (png), or a folder of both (folder)
 WRITES = {
-    "references": ("json",), "elasticity": ("json",), "collision": ("json", "png"), "contact": ("json", "png"),
-    "order": ("json", "png"), "scaling": ("json", "png"), "peers": ("json",), "hard": ("json",), "report": ("folder",),
+    "references": ("json",),
+    "elasticity": ("json",),
+    "collision": ("json", "png"),
+    "contact": ("json", "png"),
+    "order": ("json", "png"),
+    "scaling": ("json", "png"),
+    "peers": ("json",),
+    "hard": ("json",),
+    "report": ("folder",),
     "startup": ("json",),
-}  # fmt: skip
+}
 OPTIONS = {"json": ("--out", ".json"), "png": ("--plot", ".png"), "folder": ("--out", "")}
 NO_QUICK = ("references",)
 

@@ -41,9 +41,12 @@ TITLE = "Hard cases"
 def chosen(case: str | None, quick: bool) -> list[Row]:
     """The rows of a case, or of all; quick: only variants that are cheap."""
     return [
-        Row(one, variant) for one in CASES if case in (None, one.id)
-        for variant in one.variants if not quick or variant.name in one.quick
-    ]  # fmt: skip
+        Row(one, variant)
+        for one in CASES
+        if case in (None, one.id)
+        for variant in one.variants
+        if not quick or variant.name in one.quick
+    ]
 
 
 def measured(rows: list[Row], options: argparse.Namespace, document: Document) -> dict:
@@ -62,8 +65,11 @@ def measured(rows: list[Row], options: argparse.Namespace, document: Document) -
     for text in (*page(rows), *store.damaged):
         document.add(text)
     return numbers | {
-        "arch": options.arch, "quick": options.quick, "load_at_the_end": load_average(), "rows": [row.data() for row in rows],
-    }  # fmt: skip
+        "arch": options.arch,
+        "quick": options.quick,
+        "load_at_the_end": load_average(),
+        "rows": [row.data() for row in rows],
+    }
 
 
 def judged(path: Path, document: Document) -> tuple[list[Row], dict]:
@@ -94,9 +100,13 @@ def main(argv=None) -> int:
     parser.add_argument("--budget", type=float, default=DAY, metavar="SECONDS", help="what is not begun by then is left out")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep finished runs there, and take up those that it holds")
     parser.add_argument(
-        "--out", type=Path, nargs="?", const=RESULTS, metavar="FILE.json",
+        "--out",
+        type=Path,
+        nargs="?",
+        const=RESULTS,
+        metavar="FILE.json",
         help="write FILE.json and FILE.md too; without a name into benchmarks/results, named after the machine",
-    )  # fmt: skip
+    )
     parser.add_argument("--judge", type=Path, metavar="FILE.json", help="judge stored results anew instead; goes alone")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)  # how this command runs one variant
     options = parser.parse_args(argv)

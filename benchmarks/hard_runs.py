@@ -58,12 +58,19 @@ class Row:
             return record and {key: value for key, value in record.items() if key != "points"}
 
         return {
-            "case": self.case.id, "variant": self.variant.name, "settings": self.variant.settings,
-            "must": asdict(self.variant.must), "column": column(self), "solved": not faults(self),
-            "run": bare(self.record), "reference": bare(self.reference), "error": self.error, "left_out": self.left_out,
+            "case": self.case.id,
+            "variant": self.variant.name,
+            "settings": self.variant.settings,
+            "must": asdict(self.variant.must),
+            "column": column(self),
+            "solved": not faults(self),
+            "run": bare(self.record),
+            "reference": bare(self.reference),
+            "error": self.error,
+            "left_out": self.left_out,
             "reference_left_out": self.reference_left_out,
             "verdicts": [verdict.record() for verdict in self.verdicts],
-        }  # fmt: skip
+        }
 
 
 def stored(numbers: dict) -> list[Row]:
@@ -107,16 +114,24 @@ def sources() -> str:
 
 
 def measure(
-    rows: list[Row], arch: str, references: bool, store: Store | NoStore, seconds_left: Callable[[], float],
-    asked: Callable[[], bool], tell: Callable[[str], None],
-) -> None:  # fmt: skip
+    rows: list[Row],
+    arch: str,
+    references: bool,
+    store: Store | NoStore,
+    seconds_left: Callable[[], float],
+    asked: Callable[[], bool],
+    tell: Callable[[str], None],
+) -> None:
     """Fill the rows: all runs first, then the references that are cheap, or all of them. Raises OutputError."""
     _carry_out(rows, arch, 1, store, seconds_left, asked, tell)
     finer = [
-        row for row in rows
-        if row.record and row.variant.reference and row.record["status"] in ANSWERED
+        row
+        for row in rows
+        if row.record
+        and row.variant.reference
+        and row.record["status"] in ANSWERED
         and (references or 2.0 * FINER * row.record["seconds"] <= CHEAP_SECONDS)
-    ]  # fmt: skip
+    ]
     _carry_out(finer, arch, FINER, store, seconds_left, asked, tell)
     for row in rows:
         row.compare()

@@ -10,9 +10,20 @@ from .hard_runs import Row
 from .hard_score import ALL, RULE, cells, faults, headline, how_solved, shown_columns, tally
 
 HEADINGS = (
-    "case", "variant", "run", "quantity", "measured", "limit", "basis", "", "steps", "wall [s]", "step [ms]", "peak [MB]",
+    "case",
+    "variant",
+    "run",
+    "quantity",
+    "measured",
+    "limit",
+    "basis",
+    "",
+    "steps",
+    "wall [s]",
+    "step [ms]",
+    "peak [MB]",
     "error",
-)  # fmt: skip
+)
 LEFT = (0, 1, 2, 3, 5, 6, 7)
 NOTHING = "-"
 
@@ -45,9 +56,12 @@ def row_lines(row: Row) -> list[tuple[str, ...]]:
     record, error = row.record, row.error
     each, peak = record["step_seconds"], record["peak_memory_bytes"]
     cost = (
-        str(record["steps"]), f"{record['seconds']:.1f}", NOTHING if each is None else f"{1e3 * each:.3g}",
-        NOTHING if peak is None else f"{peak / 1e6:.0f}", NOTHING if error is None else f"{error:.1e}",
-    )  # fmt: skip
+        str(record["steps"]),
+        f"{record['seconds']:.1f}",
+        NOTHING if each is None else f"{1e3 * each:.3g}",
+        NOTHING if peak is None else f"{peak / 1e6:.0f}",
+        NOTHING if error is None else f"{error:.1e}",
+    )
     lines = []
     for k, verdict in enumerate(row.verdicts):
         first = (row.case.id, row.variant.name, record["status"]) if k == 0 else ("", "", "")
@@ -115,7 +129,7 @@ def notes(rows: list[Row]) -> str:
     parts = []
     for case in cases.values():
         own = [row for row in rows if row.case is case]
-        lines = [f"* limit on \"{c.quantity}\" ({c.basis}): {c.note}." for c in case.criteria if c.note]
+        lines = [f'* limit on "{c.quantity}" ({c.basis}): {c.note}.' for c in case.criteria if c.note]
         for row in own:
             told = row.record["problems"] if row.record else []
             lines += [f"* {row.variant.name}: {text}" for text in told[:3]]

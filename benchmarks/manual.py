@@ -65,11 +65,16 @@ def order_errors(results: Path) -> str:
 
     lines = [
         (
-            ORDERS[row["order"]], label(row["cells"]), f"{row['tets']:,}", f"{row['nodes']:,}",
-            error(row["order"], row["degree"], row["cells"]), error(row["order"], 4, row["cells"]),
+            ORDERS[row["order"]],
+            label(row["cells"]),
+            f"{row['tets']:,}",
+            f"{row['nodes']:,}",
+            error(row["order"], row["degree"], row["cells"]),
+            error(row["order"], 4, row["cells"]),
         )
-        for row in rows if row["degree"] == DEFAULT_DEGREE[row["order"]]
-    ]  # fmt: skip
+        for row in rows
+        if row["degree"] == DEFAULT_DEGREE[row["order"]]
+    ]
     return markdown(("tets", "cells", "number", "nodes", "error", "with 14 points"), lines, left=(0, 1))
 
 
@@ -149,9 +154,13 @@ def hard(results: Path) -> str:
 
 
 TABLES: dict[str, Callable[[Path], str]] = {  # by marker
-    "order_errors": order_errors, "order_times": order_times, "peers": peers, "scaling": scaling,
-    "collision": collision, "hard": hard,
-}  # fmt: skip
+    "order_errors": order_errors,
+    "order_times": order_times,
+    "peers": peers,
+    "scaling": scaling,
+    "collision": collision,
+    "hard": hard,
+}
 
 
 def filled(text: str, results: Path = RESULTS) -> str:

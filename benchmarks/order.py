@@ -70,11 +70,15 @@ def measure(cases: list[Case], quick: bool, arch: str, document: Document) -> tu
         document.add("## Limits")
         document.add(limit_table(limits))
     numbers |= {
-        "arch": arch, "precision": "f64", "quick": quick, "load_at_the_end": load_average(),
+        "arch": arch,
+        "precision": "f64",
+        "quick": quick,
+        "load_at_the_end": load_average(),
         "references": {case.name: asdict(reference) for case, _, reference in found},
         "rows": [row.record() for _, rows, _ in found for row in rows],
-        "comparisons": [c.record() for c in comparisons], "limits": [x.record() for x in limits],
-    }  # fmt: skip
+        "comparisons": [c.record() for c in comparisons],
+        "limits": [x.record() for x in limits],
+    }
     return numbers, found
 
 

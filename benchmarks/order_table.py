@@ -116,16 +116,42 @@ def row_table(rows: list[Row], reference: Reference) -> str:
     lines = []
     for row in rows:
         t = row.timing
-        lines.append((
-            row.law, str(row.order), str(row.points), label(row.cells), f"{row.tets:,}", f"{row.nodes:,}",
-            ", ".join(f"{x:.6g}" for x in row.measured) or "-", _error(row, reference), str(row.newton), f"{row.linear:,}",
-            "-" if t is None else f"{t.median:.4g}", "" if t is None else percent(spread_of(t)),
-            "-" if t is None else str(t.repeats), f"{row.compile_seconds:.1f}", f"{row.field_bytes / 1e6:.1f}",
-        ))  # fmt: skip
+        lines.append(
+            (
+                row.law,
+                str(row.order),
+                str(row.points),
+                label(row.cells),
+                f"{row.tets:,}",
+                f"{row.nodes:,}",
+                ", ".join(f"{x:.6g}" for x in row.measured) or "-",
+                _error(row, reference),
+                str(row.newton),
+                f"{row.linear:,}",
+                "-" if t is None else f"{t.median:.4g}",
+                "" if t is None else percent(spread_of(t)),
+                "-" if t is None else str(t.repeats),
+                f"{row.compile_seconds:.1f}",
+                f"{row.field_bytes / 1e6:.1f}",
+            )
+        )
     headings = (
-        "law", "order", "points", "cells", "tets", "nodes", "measured", "error [%]", "Newton", "CG", "solve [s]", "spread",
-        "rounds", "compile [s]", "fields [MB]",
-    )  # fmt: skip
+        "law",
+        "order",
+        "points",
+        "cells",
+        "tets",
+        "nodes",
+        "measured",
+        "error [%]",
+        "Newton",
+        "CG",
+        "solve [s]",
+        "spread",
+        "rounds",
+        "compile [s]",
+        "fields [MB]",
+    )
     notes = [f"* order {r.order}, {label(r.cells)}: {r.failure}" for r in rows if r.failure]
     return markdown(headings, lines, left=(0, 3)) + ("\n\n" + "\n".join(notes) if notes else "")
 

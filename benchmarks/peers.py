@@ -122,9 +122,13 @@ def main(argv=None) -> int:
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="rounds over all settings (default %(default)s)")
     parser.add_argument("--quick", action="store_true", help=f"only {' and '.join(QUICK)}, one round")
     parser.add_argument(
-        "--out", type=Path, nargs="?", const=RESULTS, metavar="FILE.json",
+        "--out",
+        type=Path,
+        nargs="?",
+        const=RESULTS,
+        metavar="FILE.json",
         help="write FILE.json, FILE.md and FILE.png; without a name into benchmarks/results, named after the machine",
-    )  # fmt: skip
+    )
     options = parser.parse_args(argv)
     works = [work for work in WORKS if work.key.startswith(options.work or "") and (not options.quick or work.key in QUICK)]
     if not works:

@@ -118,8 +118,10 @@ def main(argv=None) -> int:
     finally:
         runtime.close()
     count = {verdict: sum(row.verdict == verdict for row in rows) for verdict in ("pass", "FAIL", "-")}
-    print(f"{count['pass']} checks passed, {count['FAIL']} failed, {count['-']} without a limit; "
-          f"{time.perf_counter() - start:.0f} s on {options.arch} in f64")  # fmt: skip
+    print(
+        f"{count['pass']} checks passed, {count['FAIL']} failed, {count['-']} without a limit; "
+        f"{time.perf_counter() - start:.0f} s on {options.arch} in f64"
+    )
     if options.out:
         _write(options.out, options.arch, rows)
     return 1 if count["FAIL"] else 0

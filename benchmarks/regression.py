@@ -122,9 +122,17 @@ def row(case: Case, new: Entry, old: Entry | None, seconds: float) -> tuple[str,
     verdict = "new" if old is None else "CHANGED" if differences(case, new, old) else "same"
     before = ("-", "-") if old is None else (f"{old.error:.3e}", f"{old.time:.3g}")
     return (
-        case.name, case.precision, f"{new.error:.3e}", before[0], counts, f"{new.field_bytes:,}", f"{new.time:.3g}", before[1],
-        verdict, f"{seconds:.0f}",
-    )  # fmt: skip
+        case.name,
+        case.precision,
+        f"{new.error:.3e}",
+        before[0],
+        counts,
+        f"{new.field_bytes:,}",
+        f"{new.time:.3g}",
+        before[1],
+        verdict,
+        f"{seconds:.0f}",
+    )
 
 
 HEADINGS = ("case", "", "error", "stored", "counts", "bytes", "time", "stored", "", "s")
@@ -134,9 +142,11 @@ def main(argv=None) -> int:
     """Compute, compare and print. Raises OutputError, or SimulationError where the arch cannot be had."""
     first, _, rest = __doc__.partition("\n")
     parser = argparse.ArgumentParser(
-        prog="taisoft bench regression", description=first, epilog=rest.partition("\n\n")[2],
+        prog="taisoft bench regression",
+        description=first,
+        epilog=rest.partition("\n\n")[2],
         formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    )
     parser.add_argument("--update", action="store_true", help="store what is found")
     parser.add_argument("--case", metavar="NAME", help="only those whose name begins so")
     parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")

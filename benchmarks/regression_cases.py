@@ -87,10 +87,12 @@ class DirichletConditions:
             result, seconds = timed(partial(sim.run, self.seconds, fps=None))
             reports = result.step_reports
             counts = {
-                "steps": result.steps, "newton": sum(r.newton_iterations for r in reports),
-                "linear": sum(r.linear_iterations for r in reports), "contact": sum(r.contact_iterations for r in reports),
+                "steps": result.steps,
+                "newton": sum(r.newton_iterations for r in reports),
+                "linear": sum(r.linear_iterations for r in reports),
+                "contact": sum(r.contact_iterations for r in reports),
                 "contacts": max(r.n_contacts for r in reports),
-            }  # fmt: skip
+            }
             counts = {name: n for name, n in counts.items() if n}
             field_bytes = sum(sim.field_bytes.values())
             return Found(self.read(sim).tolist(), counts, result.status, field_bytes, seconds, result.problems)
@@ -259,13 +261,22 @@ CASES: tuple[Case, ...] = (  # those of one precision follow each other: another
     dirichlet("quadratic beam", TIP, "f64", partial(beam, "SNH", (4, 1, 1), 2), 0.2, way, **SWING),
     *(
         Case(
-            f"static beam, order {order}", "mean way of the nodes; by a solution to 1e-12", "f64", partial(static, 1e-6, order),
-            lambda arch, order=order: static(1e-12, order, arch).measured, 1e-8,
+            f"static beam, order {order}",
+            "mean way of the nodes; by a solution to 1e-12",
+            "f64",
+            partial(static, 1e-6, order),
+            lambda arch, order=order: static(1e-12, order, arch).measured,
+            1e-8,
         )
         for order in (1, 2)
     ),
     Case(
-        "contact problem", "sums of the normal impulses; by a solution to 1e-13", "f64", contact_problem, tight_contact_problem,
-        1e-8, quick=True,
+        "contact problem",
+        "sums of the normal impulses; by a solution to 1e-13",
+        "f64",
+        contact_problem,
+        tight_contact_problem,
+        1e-8,
+        quick=True,
     ),
-)  # fmt: skip
+)

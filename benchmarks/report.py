@@ -31,10 +31,16 @@ from .report_parts import bound, broad, colours, demos, phases, points, reductio
 from .report_parts.page import Extent, Part, part_text, short_text, summary_table
 
 PARTS: dict[str, Callable[[Extent], Part]] = {
-    "demos": demos.measure, "phases": phases.measure, "points": points.measure, "reduction": reduction.measure,
-    "broad": broad.measure, "cells": broad.measure_cells, "colours": colours.measure, "solvers": solvers.measure,
+    "demos": demos.measure,
+    "phases": phases.measure,
+    "points": points.measure,
+    "reduction": reduction.measure,
+    "broad": broad.measure,
+    "cells": broad.measure_cells,
+    "colours": colours.measure,
+    "solvers": solvers.measure,
     "bound": bound.measure,
-}  # fmt: skip
+}
 PAGE, NUMBERS = "README.md", "report.json"
 
 

@@ -79,9 +79,10 @@ def report(rows: list[Row], copies: list[Copy], document: Document) -> dict:
     document.add("## Bytes moved\n\n" + copy_table(copies) + "\n\n" + rate_table(rows, copies))
     document.add("## Exponents over the tets\n\n" + growth_table(found))
     return {
-        "rows": [row.record() for row in rows], "copies": [asdict(copy) for copy in copies],
+        "rows": [row.record() for row in rows],
+        "copies": [asdict(copy) for copy in copies],
         "exponents": [growth.record() for growth in found],
-    }  # fmt: skip
+    }
 
 
 def size_list(text: str) -> list[int]:

@@ -38,8 +38,16 @@ LOOPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # reads, writes
     "system": (("stiffness_value", "mass"), ("stiffness_value", "stiffness_diagonal")),
     "iteration": (
         (
-            "stiffness_value", "stiffness_column", "stiffness_row_start", "stiffness_diagonal", "pcg_inverse",
-            "pcg_y", "pcg_r", "pcg_z", "pcg_p", "pcg_q",
+            "stiffness_value",
+            "stiffness_column",
+            "stiffness_row_start",
+            "stiffness_diagonal",
+            "pcg_inverse",
+            "pcg_y",
+            "pcg_r",
+            "pcg_z",
+            "pcg_p",
+            "pcg_q",
         ),
         ("pcg_y", "pcg_r", "pcg_z", "pcg_p", "pcg_q"),
     ),
@@ -52,7 +60,7 @@ LOOPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # reads, writes
         tuple(f"problem_{name}" for name in ("node", "arity", "weight", "normal", "tangent", "b", "friction", "factor", "r")),
         ("problem_r",),
     ),
-}  # fmt: skip
+}
 GROUPS = ("elements and nodes", "matrix", "search", "contacts")
 COPY_BYTES, COPY_ROUNDS = 2**28, 7  # of one of the two arrays: larger than any cache
 WIDTH = 16  # numbers that the kernel copies at a time

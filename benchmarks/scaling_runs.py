@@ -206,11 +206,15 @@ def implicit_contact(row: Row, size: int) -> None:
 def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
     """Where the parts of the simulator's implicit steps are called, for `Stopwatch.on`."""
     places = [
-        ("residual", stage_system, "move"), ("residual", stage_system, "update_impulses"),
+        ("residual", stage_system, "move"),
+        ("residual", stage_system, "update_impulses"),
         ("residual", stage_system, "form_residual"),
-        ("matrix", block_csr, "assemble"), ("matrix", block_csr, "to_system"), ("matrix", stage_system, "save_diagonal"),
-        ("linear solve", pcg, "solve"), ("report", simulator, "measure"),
-    ]  # fmt: skip
+        ("matrix", block_csr, "assemble"),
+        ("matrix", block_csr, "to_system"),
+        ("matrix", stage_system, "save_diagonal"),
+        ("linear solve", pcg, "solve"),
+        ("report", simulator, "measure"),
+    ]
     contact = sim._contact
     if contact is not None:
         places += [("search", contact.detection, "find"), ("search", contact, "_measure_closing"), ("problem", contact, "begin")]
@@ -286,6 +290,10 @@ def search(row: Row, size: int) -> None:
 
 
 KINDS: dict[str, Callable[[Row, int], None]] = {
-    EXPLICIT: explicit, ON_ONE: explicit_on_one, "implicit": implicit, "search": search,
-    "explicit contact": explicit_contact, "implicit contact": implicit_contact,
-}  # fmt: skip
+    EXPLICIT: explicit,
+    ON_ONE: explicit_on_one,
+    "implicit": implicit,
+    "search": search,
+    "explicit contact": explicit_contact,
+    "implicit contact": implicit_contact,
+}

@@ -39,10 +39,16 @@ def growths(rows: Sequence[Row]) -> list[Growth]:
     for kind in dict.fromkeys(row.kind for row in measured(rows)):
         own = sorted((row for row in measured(rows) if row.kind == kind), key=lambda row: row.tets)
         tets, step = [row.tets for row in own], [row.timing.median for row in own]
-        found.append(Growth(
-            kind, len(own), exponent(tets, step)[0], exponent(tets[-2:], step[-2:])[0],
-            exponent(tets, [r.setup_seconds for r in own])[0], exponent(tets, [sum(r.field_bytes.values()) for r in own])[0],
-        ))  # fmt: skip
+        found.append(
+            Growth(
+                kind,
+                len(own),
+                exponent(tets, step)[0],
+                exponent(tets[-2:], step[-2:])[0],
+                exponent(tets, [r.setup_seconds for r in own])[0],
+                exponent(tets, [sum(r.field_bytes.values()) for r in own])[0],
+            )
+        )
     return found
 
 
@@ -52,10 +58,19 @@ def time_table(rows: Sequence[Row]) -> str:
     for row in measured(rows):
         t = row.timing
         counts = ", ".join(f"{value:,.4g} {name}" for name, value in row.counts.items() if value)
-        lines.append((
-            row.kind, f"{row.tets:,}", str(row.threads), f"{1e3 * t.median:.4g}", percent(spread_of(t)),
-            f"{1e9 * t.median / row.tets:.4g}", counts, f"{row.setup_seconds:.2f}", f"{row.compile_seconds:.1f}",
-        ))  # fmt: skip
+        lines.append(
+            (
+                row.kind,
+                f"{row.tets:,}",
+                str(row.threads),
+                f"{1e3 * t.median:.4g}",
+                percent(spread_of(t)),
+                f"{1e9 * t.median / row.tets:.4g}",
+                counts,
+                f"{row.setup_seconds:.2f}",
+                f"{row.compile_seconds:.1f}",
+            )
+        )
     headings = ("work", "tets", "threads", "ms", "spread", "ns/tet", "of each, on average", "set up [s]", "compile [s]")
     notes = [f"* {row.kind}, {row.tets:,} tets: {row.failure}" for row in rows if row.failure]
     return markdown(headings, lines, left=(0, 6)) + ("\n\n" + "\n".join(notes) if notes else "")
@@ -89,10 +104,17 @@ def rate_table(rows: Sequence[Row], copies: Sequence[Copy]) -> str:
     lines = []
     for row in measured(rows):
         rate, copy = row.moved / row.timing.median, copy_rate(copies, row.threads)
-        lines.append((
-            row.kind, f"{row.tets:,}", f"{row.moved / 1e6:,.3g}", f"{row.moved / row.tets:,.4g}", f"{rate / 1e9:.3g}",
-            f"{copy / 1e9:.3g}", f"{rate / copy:.0%}",
-        ))  # fmt: skip
+        lines.append(
+            (
+                row.kind,
+                f"{row.tets:,}",
+                f"{row.moved / 1e6:,.3g}",
+                f"{row.moved / row.tets:,.4g}",
+                f"{rate / 1e9:.3g}",
+                f"{copy / 1e9:.3g}",
+                f"{rate / copy:.0%}",
+            )
+        )
     headings = ("work", "tets", "moved [MB]", "B/tet", "GB/s", "copy [GB/s]", "of the copy")
     return markdown(headings, lines, left=(0,))
 

@@ -37,9 +37,12 @@ TIMES = 20
 SPEED_CELLS, SPEED_SHEETS, SPEED_ROUNDS = 12, (12, 24), 5
 # in processes of their own: task -> its arguments, and those of --quick
 TASKS = {
-    "statics": ((3,), (3,)), "identify": ((3,), (3,)), "settings": ((4,), (4,)),
-    "surfaces": ((6, 7, 21, 22), (6, 7, 21, 22)), "keep": ((22, 4), (6, 2)),
-}  # fmt: skip
+    "statics": ((3,), (3,)),
+    "identify": ((3,), (3,)),
+    "settings": ((4,), (4,)),
+    "surfaces": ((6, 7, 21, 22), (6, 7, 21, 22)),
+    "keep": ((22, 4), (6, 2)),
+}
 
 
 def ask(version: Version, *task: str | int) -> tuple[dict, dict]:

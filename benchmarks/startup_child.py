@@ -160,6 +160,7 @@ def statics(cells: int) -> dict:
 
 def identify(cells: int) -> dict:
     """Young's modulus from a sag: nine static solves, by bisection of the logarithm."""
+
     def sag(young: float) -> float:
         return ts.solve_static(beam(cells, young)).positions()[:, 1].min()
 
@@ -231,9 +232,16 @@ def often(do: Callable, before: Callable = lambda: None) -> float:
 
 
 TASKS = {
-    "first": first, "again": again, "surfaces": surfaces, "grow": grow, "keep": keep, "statics": statics, "identify": identify,
-    "settings": settings, "speed": speed,
-}  # fmt: skip
+    "first": first,
+    "again": again,
+    "surfaces": surfaces,
+    "grow": grow,
+    "keep": keep,
+    "statics": statics,
+    "identify": identify,
+    "settings": settings,
+    "speed": speed,
+}
 
 if __name__ == "__main__":
     arguments = [int(word) if word.isdigit() else word for word in sys.argv[2:]]

@@ -30,9 +30,13 @@ class Version:
         """The lines that a program prints for a task. Raises SimulationError where it fails."""
         paths = {"PYTHONPATH": str(self.folder)} | ({} if self.cache is None else {"XDG_CACHE_HOME": str(self.cache)})
         done = subprocess.run(
-            [sys.executable, str(program), *map(str, task)], env=os.environ | paths, stdin=subprocess.DEVNULL,
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
+            [sys.executable, str(program), *map(str, task)],
+            env=os.environ | paths,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         if done.returncode:
             last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
             raise SimulationError(f"{self.folder}: task {' '.join(map(str, task))} ended with status {done.returncode}: {last}")

@@ -28,9 +28,7 @@ def build() -> ts.Scene:
     rubber = ts.Material(law="stable_neo_hookean", young=1e6, poisson=0.3, density=1000.0, mass_damping=4.0)
     beam = scene.add_body(mesh, rubber, name="beam")
     beam.fix(lambda X: np.abs(X[:, 0]) > HALF_LENGTH - 1e-6)
-    beam.add_traction(
-        lambda c: (c[:, 1] < -HALF_HEIGHT + 1e-6) & (np.abs(c[:, 0]) < HALF_PATCH), (0.0, TRACTION, 0.0)
-    )
+    beam.add_traction(lambda c: (c[:, 1] < -HALF_HEIGHT + 1e-6) & (np.abs(c[:, 0]) < HALF_PATCH), (0.0, TRACTION, 0.0))
     return scene
 
 

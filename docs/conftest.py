@@ -49,11 +49,13 @@ def own_folder(tmp_path_factory):
 
 SYBIL = Sybil(
     parsers=[
-        PythonCodeBlockParser(), CodeBlockParser("toml", read_scene), CodeBlockParser("sh", run_shell),
+        PythonCodeBlockParser(),
+        CodeBlockParser("toml", read_scene),
+        CodeBlockParser("sh", run_shell),
         CodeBlockParser("console", lambda example: check_commands(example.parsed)),
     ],
     patterns=["*.md"],
     excludes=["results/*", "results/*/*"],
     fixtures=["own_folder"],
-)  # fmt: skip
+)
 pytest_collect_file = SYBIL.pytest()

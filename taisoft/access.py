@@ -23,9 +23,15 @@ if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep
 
 _REBUILT = (
-    "integrator", "contact_solver", "self_collision", "allow_unstable", "newton_tolerance", "linear_tolerance",
-    "contact_tolerance", "draggable",
-)  # fmt: skip
+    "integrator",
+    "contact_solver",
+    "self_collision",
+    "allow_unstable",
+    "newton_tolerance",
+    "linear_tolerance",
+    "contact_tolerance",
+    "draggable",
+)
 INSTEAD = {  # what to do instead of assigning to an attribute that a simulator has or might be expected to have
     **{name: f"call sim.set_material(body, {name}=...)" for name in CHANGEABLE},
     **{name: f"call sim.set_contact(name_a, name_b, {name}=...)" for name in ("friction", "restitution")},
@@ -35,11 +41,14 @@ INSTEAD = {  # what to do instead of assigning to an attribute that a simulator 
     **dict.fromkeys(("traction", "tractions"), "call sim.set_traction(body, index, value)"),
     **dict.fromkeys(("time", "step_count"), "call sim.reset() to go back to the start"),
     **dict.fromkeys(("arch", "precision"), "make a new Simulator"),
-    "gravity": "call sim.set_gravity(gravity)", "material": "call sim.set_material(body, young=...)",
-    "scene": "make a new Simulator of the other scene", "settings": "call sim.rebuild(integrator=...)",
-    "plan": "it follows from the scene and the settings", "stable_dt": "it follows from the scene; set sim.dt",
+    "gravity": "call sim.set_gravity(gravity)",
+    "material": "call sim.set_material(body, young=...)",
+    "scene": "make a new Simulator of the other scene",
+    "settings": "call sim.rebuild(integrator=...)",
+    "plan": "it follows from the scene and the settings",
+    "stable_dt": "it follows from the scene; set sim.dt",
     "dragged": "call sim.drag(...) or sim.release()",
-}  # fmt: skip
+}
 
 
 class StateAccess(Guarded):
@@ -112,9 +121,7 @@ class StateAccess(Guarded):
         """
         return self._find_contacts(self._dt).contacts()
 
-    def set_contact(
-        self, name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None
-    ) -> None:
+    def set_contact(self, name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None) -> None:
         """Change the friction or restitution between two bodies, or a body and an obstacle; see `Scene.set_contact`."""
         scene = self._open_simulation().scene
         with thawed(scene):
@@ -302,9 +309,7 @@ class StateAccess(Guarded):
             return
         text = f"dt = {dt:.3g} s is above the estimated stability limit of {limit:.3g} s of {self.settings.integrator}"
         if not self.settings.allow_unstable:
-            raise SimulationError(
-                f"{text}: take a smaller dt (0.9 of the limit is {0.9 * limit:.3g} s) or allow_unstable=True"
-            )
+            raise SimulationError(f"{text}: take a smaller dt (0.9 of the limit is {0.9 * limit:.3g} s) or allow_unstable=True")
         warnings.warn(text, stacklevel=stacklevel)
 
     def _index(self, body: str) -> int:

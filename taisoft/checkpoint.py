@@ -53,18 +53,30 @@ class Checkpoint:
 
 
 def write_checkpoint(
-    path: str | Path, settings: dict, scene: Scene, features: dict[str, bool], state: dict, notes: dict,
+    path: str | Path,
+    settings: dict,
+    scene: Scene,
+    features: dict[str, bool],
+    state: dict,
+    notes: dict,
     start: Scene | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Write the state of a simulation of a scene. Raises OutputError.
 
     features: of its plan; notes: see Checkpoint; start: the scene at the start of the run, if its numbers may have changed since.
     """
     plain, arrays = _flat(state)
     header = {
-        "kind": KIND, "format": FORMAT, "taisoft": __version__, "settings": settings, "numbers": _numbers(scene),
-        "start": scene_numbers(start or scene), "fingerprint": scene_fingerprint(scene, features), "state": plain, "notes": notes,
-    }  # fmt: skip
+        "kind": KIND,
+        "format": FORMAT,
+        "taisoft": __version__,
+        "settings": settings,
+        "numbers": _numbers(scene),
+        "start": scene_numbers(start or scene),
+        "fingerprint": scene_fingerprint(scene, features),
+        "state": plain,
+        "notes": notes,
+    }
     text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     with replacing(path) as part, open(part, "wb") as file:
         np.savez(file, header=text, sha256=_checksum(text, arrays), **arrays)
@@ -129,8 +141,9 @@ def load_values(scene: Scene) -> dict:
 def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]:
     """Return a digest of each part of a scene that must be unchanged when a run resumes, by the part's name in messages."""
     fingerprint = {  # in the order added, which numbers nodes
-        "bodies": json.dumps([body.name for body in scene.bodies]), "obstacles": json.dumps([o.name for o in scene.obstacles]),
-    }  # fmt: skip
+        "bodies": json.dumps([body.name for body in scene.bodies]),
+        "obstacles": json.dumps([o.name for o in scene.obstacles]),
+    }
     for body in scene.bodies:
         owner = f"body '{body.name}'"
         for part, values in _body_parts(body).items():

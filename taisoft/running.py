@@ -24,9 +24,14 @@ MAX_STEPS = 2.0**52  # of a run: beyond that, adding dt no longer changes a floa
 
 
 def run(
-    sim: "Simulator", seconds: float, on_frame: FrameCallback | None = None, fps: float | None = 60,
-    stop: Callable[[], bool] | None = None, resumed: bool = False, on_step: StepCallback | None = None,
-) -> RunReport:  # fmt: skip
+    sim: "Simulator",
+    seconds: float,
+    on_frame: FrameCallback | None = None,
+    fps: float | None = 60,
+    stop: Callable[[], bool] | None = None,
+    resumed: bool = False,
+    on_step: StepCallback | None = None,
+) -> RunReport:
     """Step for `seconds` [s] from now, to the nearest step, with frames at fps, or after every step if fps is None.
 
     on_frame(sim, index, report): called for frame 0 (the start, report None) and after every frame. stop: called between

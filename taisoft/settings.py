@@ -99,9 +99,19 @@ def _check_contact_solver(integrator: str, solver: str, touching: bool) -> None:
 
 
 def check_settings(
-    scene: Scene, dt, integrator, contact_solver, self_collision, precision, arch, allow_unstable, newton_tolerance,
-    linear_tolerance, contact_tolerance, draggable,
-) -> Settings:  # fmt: skip
+    scene: Scene,
+    dt,
+    integrator,
+    contact_solver,
+    self_collision,
+    precision,
+    arch,
+    allow_unstable,
+    newton_tolerance,
+    linear_tolerance,
+    contact_tolerance,
+    draggable,
+) -> Settings:
     """Check every argument of a Simulator. Raises SceneError or SimulationError."""
     if not isinstance(scene, Scene):
         raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
@@ -127,6 +137,15 @@ def check_settings(
     if arch not in ("cpu", "cuda"):
         raise SimulationError(f"arch {arch!r} is unknown: it must be 'cpu' or 'cuda'")
     return Settings(
-        check_dt(dt), integrator, precision, arch, allow_unstable, self_collision, newton_tolerance, linear_tolerance,
-        contact_solver, contact_tolerance, draggable,
-    )  # fmt: skip
+        check_dt(dt),
+        integrator,
+        precision,
+        arch,
+        allow_unstable,
+        self_collision,
+        newton_tolerance,
+        linear_tolerance,
+        contact_solver,
+        contact_tolerance,
+        draggable,
+    )

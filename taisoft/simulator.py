@@ -49,15 +49,34 @@ class Simulator(Resuming):
     """
 
     def __init__(
-        self, scene: Scene, dt: float = 1 / 60, integrator: str = "implicit_euler", contact_solver: str = "auto",
-        self_collision: bool = False, precision: str = "f32", arch: str = "cpu", allow_unstable: bool = False,
-        newton_tolerance: float | None = None, linear_tolerance: float | None = None,
-        contact_tolerance: float | None = None, draggable: bool = False,
-    ):  # fmt: skip
+        self,
+        scene: Scene,
+        dt: float = 1 / 60,
+        integrator: str = "implicit_euler",
+        contact_solver: str = "auto",
+        self_collision: bool = False,
+        precision: str = "f32",
+        arch: str = "cpu",
+        allow_unstable: bool = False,
+        newton_tolerance: float | None = None,
+        linear_tolerance: float | None = None,
+        contact_tolerance: float | None = None,
+        draggable: bool = False,
+    ):
         self.settings = check_settings(
-            scene, dt, integrator, contact_solver, self_collision, precision, arch, allow_unstable, newton_tolerance,
-            linear_tolerance, contact_tolerance, draggable,
-        )  # fmt: skip
+            scene,
+            dt,
+            integrator,
+            contact_solver,
+            self_collision,
+            precision,
+            arch,
+            allow_unstable,
+            newton_tolerance,
+            linear_tolerance,
+            contact_tolerance,
+            draggable,
+        )
         self.scene = scene.snapshot()  # run-time changes must not reach the user's scene
         self._start_scene, scene = scene, self.scene
         self._dt = self.settings.dt
@@ -193,8 +212,9 @@ class Simulator(Resuming):
         warnings.warn(
             f"step {self.step_count}: tet {place[k]} of body '{body.name}' is compressed below {law.SOFTENS_BELOW} of its "
             f"length, where {law.NAME} softens: tets may collapse or invert, and stay so",
-            UserWarning, stacklevel=3,
-        )  # fmt: skip
+            UserWarning,
+            stacklevel=3,
+        )
 
     def _problems(self, report: StepReport, unbalanced: tuple[float, str]) -> list[str]:
         """Describe what went wrong in the step, one sentence per problem. unbalanced: see `StageResult`."""
@@ -226,7 +246,7 @@ class Simulator(Resuming):
 
     def run(
         self, seconds: float, on_frame=None, fps: float | None = 60, stop=None, resumed: bool = False, on_step=None
-    ) -> RunReport:  # fmt: skip
+    ) -> RunReport:
         """Run for the given simulated time [s]; see `taisoft.running.run`."""
         return run(self, seconds, on_frame, fps, stop, resumed, on_step)
 

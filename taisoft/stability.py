@@ -123,9 +123,7 @@ def stable_dt(scene: Scene, verlet: bool) -> float:
     for body in scene.bodies:
         omega = highest_frequency(body)
         if omega > 0.0:
-            limit = min(
-                limit, _stable_dt_of(omega, body.material.mass_damping, body.material.stiffness_damping, verlet)
-            )
+            limit = min(limit, _stable_dt_of(omega, body.material.mass_damping, body.material.stiffness_damping, verlet))
     return float(limit)
 
 

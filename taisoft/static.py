@@ -107,9 +107,8 @@ class StaticSolver:
     def __init__(self, scene: Scene, runtime: Runtime, arena: FieldArena, tolerance: float, time: float):
         plan = make_plan(scene, explicit=False, multistep=False)
         model, layout = build_model(
-            scene, runtime, arena,
-            {**plan.on, "mass_damping": False, "stiffness_damping": False, "consistent_mass": False},
-        )  # fmt: skip
+            scene, runtime, arena, {**plan.on, "mass_damping": False, "stiffness_damping": False, "consistent_mass": False}
+        )
         self.simulation = SimulationState(scene, runtime, arena, model, layout, DirichletConditions(scene, layout))
         self.solver = StageSystem(model, arena, runtime.eps, self.simulation.dirichlet.prescribed_nodes, NoContacts())
         self.tolerance = tolerance
@@ -170,9 +169,17 @@ class StaticSolver:
         if not np.isfinite(result.residual):
             raise SimulationError(f"solve_static: {simulation.find_nonfinite() or 'the residual is not finite'}")
         return StaticResult(
-            converged=result.converged and load == 1.0, load=load, at_rounding=result.at_rounding,
-            residual=self._residual(result), iterations=self.newton, linear_iterations=self.linear, load_steps=steps,
-            elastic=float(scalars[ELASTIC]), n_inverted=int(scalars[N_INVERTED]),
-            _scene=simulation.scene, _layout=simulation.layout,
-            _positions=simulation.model.state.x.to_numpy(), _reactions=self.solver.held_residual(),
-        )  # fmt: skip
+            converged=result.converged and load == 1.0,
+            load=load,
+            at_rounding=result.at_rounding,
+            residual=self._residual(result),
+            iterations=self.newton,
+            linear_iterations=self.linear,
+            load_steps=steps,
+            elastic=float(scalars[ELASTIC]),
+            n_inverted=int(scalars[N_INVERTED]),
+            _scene=simulation.scene,
+            _layout=simulation.layout,
+            _positions=simulation.model.state.x.to_numpy(),
+            _reactions=self.solver.held_residual(),
+        )

@@ -24,8 +24,7 @@ def build():
 '''
 # The path is called as the run goes on, which puts what it does inside the run.
 LED = BEAM.replace(
-    "    return scene",
-    "    body.move(lambda X: X[:, 0] > 1.99, path)\n    return scene\n\n\ndef path(t):\n    {body}\n",
+    "    return scene", "    body.move(lambda X: X[:, 0] > 1.99, path)\n    return scene\n\n\ndef path(t):\n    {body}\n"
 )
 SHORT_OUTPUT = ("--no-usd", "--no-frames")
 
@@ -47,6 +46,4 @@ def child(*arguments, **keywords) -> subprocess.Popen:
     """The command in a process of its own."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "taisoft", *map(str, arguments)]
-    return subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **keywords
-    )
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **keywords)

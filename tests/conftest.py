@@ -11,8 +11,20 @@ from taisoft.backend import runtime
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 SLOW = (
-    "references", "demos", "contact_stepping", "stepping", "cli_run", "bench_collision", "bvh", "simulator", "self_collision",
-    "checkpoint", "static", "spatial_hash", "elasticity", "detection_runs",
+    "references",
+    "demos",
+    "contact_stepping",
+    "stepping",
+    "cli_run",
+    "bench_collision",
+    "bvh",
+    "simulator",
+    "self_collision",
+    "checkpoint",
+    "static",
+    "spatial_hash",
+    "elasticity",
+    "detection_runs",
 )  # files by time, slowest first
 WRITE_AFTER = 10.0  # [s] of compiling after which kernels are worth writing for the other processes that share the files
 _compiled = [0.0, None]  # compile clock when Taichi was last set back [s]; the file of the last test

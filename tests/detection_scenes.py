@@ -139,11 +139,13 @@ def sheets() -> ts.Scene:
     """Bodies for self-collision, apart: a sheet of 2 m, its thickness below the margin; a thinner plate; a cube."""
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.collision = ts.CollisionSettings(margin=0.03)
-    for k, (name, mesh) in enumerate((
-        ("sheet", ts.sheet_mesh((16, 4), (2.0, 0.02, 1.0))),
-        ("plate", ts.sheet_mesh((5, 5), (1.0, 0.004, 1.0), pattern="six")),
-        ("cube", ts.box_mesh((3, 3, 3), (1.0, 1.0, 1.0))),
-    )):  # fmt: skip
+    for k, (name, mesh) in enumerate(
+        (
+            ("sheet", ts.sheet_mesh((16, 4), (2.0, 0.02, 1.0))),
+            ("plate", ts.sheet_mesh((5, 5), (1.0, 0.004, 1.0), pattern="six")),
+            ("cube", ts.box_mesh((3, 3, 3), (1.0, 1.0, 1.0))),
+        )
+    ):
         scene.add_body(mesh, ts.Material(**SOFT), name=name, position=(0, 3.0 * k, 0))
     return scene
 

@@ -40,9 +40,12 @@ def spin(mesh: ts.TetMesh, order: int) -> np.ndarray:
 
 
 def mixed_scene(
-    laws=(SNH, SVK, COR, SVK), mass_damping: float = 0.0, stiffness_damping: float = 0.0, order: int | str = 1,
+    laws=(SNH, SVK, COR, SVK),
+    mass_damping: float = 0.0,
+    stiffness_damping: float = 0.0,
+    order: int | str = 1,
     degrees: tuple[int, int] = (2, 4),
-) -> ts.Scene:  # fmt: skip
+) -> ts.Scene:
     """Four bodies whose order is not that of the laws, of 10, 5, 6 and 5 tets: none fills its last lanes.
 
     Each has another material, and is held and loaded in another way; the first and the third are damped. They do not touch.
@@ -53,9 +56,8 @@ def mixed_scene(
     scene.contact_forces = False
     damping = {"mass_damping": mass_damping, "stiffness_damping": stiffness_damping}
     beam = scene.add_body(
-        cube(cells=(2, 1, 1)), rubber(laws[0], **damping), name="beam", position=(0.5, 0, 0),
-        **element(orders[0], degrees[0]),
-    )  # fmt: skip
+        cube(cells=(2, 1, 1)), rubber(laws[0], **damping), name="beam", position=(0.5, 0, 0), **element(orders[0], degrees[0])
+    )
     beam.fix(lambda X: X[:, 0] < -0.49)
     beam.add_traction(lambda X: X[:, 0] > 0.49, (300.0, 2000.0, -500.0))
     softer = rubber(laws[1], young=7e4, poisson=0.2)
@@ -75,9 +77,7 @@ def mixed_scene(
 RELEASE = 0.0095  # [s] when the driven scene's first led nodes let go
 
 
-def driven_scene(
-    law: str = SNH, mass_damping: float = 0.0, stiffness_damping: float = 0.0, order: int | str = 1
-) -> ts.Scene:
+def driven_scene(law: str = SNH, mass_damping: float = 0.0, stiffness_damping: float = 0.0, order: int | str = 1) -> ts.Scene:
     """A beam that is held, led and loaded in every way there is, and a flyer; vertices 8..11 are the beam's right end.
 
     Two nodes are led along x and y until they are released, one along z by a path of its own, and their other axes are

@@ -65,13 +65,30 @@ class Pendulum(InProcess):
         momentum = np.stack([v, 0 * v, 0 * v], axis=1).tolist()
         extremes = {name: {"max": 0.0} for name in ("n_inverted", "contact_residual", "max_penetration")}
         return {
-            "task": task, "status": "failed" if why else "ok", "problems": [why] if why else [], "warnings": [],
+            "task": task,
+            "status": "failed" if why else "ok",
+            "problems": [why] if why else [],
+            "warnings": [],
             "seconds": [] if why else [0.1 / h * (1.0 + 0.1 * k) for k in range(task["repeats"])],
-            "compile_seconds": 1.0, "threads": 1, "cores": [0], "machine": {"name": "here"}, "versions": {}, "nodes": 2,
-            "tets": 1, "steps": task["steps"] * task["frames"], "unconverged": 0, "explicit": False, "extremes": extremes,
-            "smallest_edge": 1.0, "keeps_energy": True, "momentum_rate": None, "bodies": [["mass", 2]],
-            "energies": energies, "momentum": momentum, "path": None if why else pack(path),
-        }  # fmt: skip
+            "compile_seconds": 1.0,
+            "threads": 1,
+            "cores": [0],
+            "machine": {"name": "here"},
+            "versions": {},
+            "nodes": 2,
+            "tets": 1,
+            "steps": task["steps"] * task["frames"],
+            "unconverged": 0,
+            "explicit": False,
+            "extremes": extremes,
+            "smallest_edge": 1.0,
+            "keeps_energy": True,
+            "momentum_rate": None,
+            "bodies": [["mass", 2]],
+            "energies": energies,
+            "momentum": momentum,
+            "path": None if why else pack(path),
+        }
 
 
 def is_running(pid: int) -> bool:

@@ -15,9 +15,14 @@ from taisoft.collision.surface import build_surface, make_topology
 
 @contextmanager
 def surface_of(
-    parts: list[tuple[np.ndarray, np.ndarray]], soft=None, self_on=None, move=None, margin: float = 0.1,
-    precision: str = "f64", serial: bool | None = None,
-) -> Iterator[SimpleNamespace]:  # fmt: skip
+    parts: list[tuple[np.ndarray, np.ndarray]],
+    soft=None,
+    self_on=None,
+    move=None,
+    margin: float = 0.1,
+    precision: str = "f64",
+    serial: bool | None = None,
+) -> Iterator[SimpleNamespace]:
     """The surface of colliders, each (vertices (v,3), triangles (t,3)), with boxes up to date: surface, topology, x, move,
     margin, arena, machine. soft, self_on: (colliders,), all and none where None; move: (n_verts,3) [m], 0 where None."""
     x = np.concatenate([vertices for vertices, _ in parts]).astype(np.float64)
@@ -76,8 +81,8 @@ def soup(rng: np.random.Generator, n: int, size: float = 0.3) -> tuple[np.ndarra
     centre = rng.random((n, 3))
     own = np.arange(3 * n).reshape(n, 3)
     free = (centre[:, None] + size * (rng.random((n, 3, 3)) - 0.5)).reshape(-1, 3)
-    free[own[:: 7, 1]] = free[own[:: 7, 0]]  # needles
-    free[own[:: 11, 1]] = free[own[:: 11, 2]] = free[own[:: 11, 0]]  # points
+    free[own[::7, 1]] = free[own[::7, 0]]  # needles
+    free[own[::11, 1]] = free[own[::11, 2]] = free[own[::11, 0]]  # points
     used = rng.random(n) < 0.1  # a few large ones on common vertices
     return np.concatenate([free, vertices]), np.where(used[:, None], 3 * n + triangles, own)
 

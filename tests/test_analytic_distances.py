@@ -30,7 +30,7 @@ SHAPES = {
 @kernel
 def distances(
     kind: ti.i32, a: ti.f64, b: ti.f64, c: ti.f64, X: ti.types.ndarray(dtype=ti.f64), out: ti.types.ndarray(dtype=ti.f64)
-):  # fmt: skip
+):
     for i in range(X.shape[0]):
         phi, g = shapes.distance(kind, dvec(a, b, c), dvec(X[i, 0], X[i, 1], X[i, 2]))
         out[i, 0] = phi

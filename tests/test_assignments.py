@@ -47,15 +47,28 @@ def copies(one) -> tuple:
 # --- meshes -----------------------------------------------------------------------------------------------------------
 
 OF_A_MESH = (
-    "vertices", "tets", "volumes", "surface", "surface_tets", "flipped", "n_components", "warnings", "recipe", "source", "n_tets",
-)  # fmt: skip
+    "vertices",
+    "tets",
+    "volumes",
+    "surface",
+    "surface_tets",
+    "flipped",
+    "n_components",
+    "warnings",
+    "recipe",
+    "source",
+    "n_tets",
+)
 
 
-@pytest.mark.parametrize("make, names, instead", [
-    (cube, OF_A_MESH, "make a new mesh, such as ts.TetMesh[(]0.9 [*] mesh.vertices, mesh.tets[)]"),
-    (surface, ("vertices", "triangles", "warnings", "volume"), "make a new one, such as ts.SurfaceMesh"),
-    (lambda: block().bodies[0].nodes, ("positions", "elements"), "they follow from the mesh and the order; add another body"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "make, names, instead",
+    [
+        (cube, OF_A_MESH, "make a new mesh, such as ts.TetMesh[(]0.9 [*] mesh.vertices, mesh.tets[)]"),
+        (surface, ("vertices", "triangles", "warnings", "volume"), "make a new one, such as ts.SurfaceMesh"),
+        (lambda: block().bodies[0].nodes, ("positions", "elements"), "they follow from the mesh and the order; add another body"),
+    ],
+)
 def test_meshes_never_change(make, names, instead):
     for one in copies(make()):
         for name in names:
@@ -94,9 +107,11 @@ def test_lists_of_a_mesh_and_another_mesh():
 
 ANOTHER = "add another body by scene.add_body"
 OF_A_BODY = dict.fromkeys(("name", "mesh", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes"), ANOTHER) | {
-    "constraints": "call body.fix or body.move", "forces": "call body.add_force", "tractions": "call body.add_traction",
+    "constraints": "call body.fix or body.move",
+    "forces": "call body.add_force",
+    "tractions": "call body.add_traction",
     "contact_mode": "set body.collision",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", OF_A_BODY)
@@ -107,10 +122,20 @@ def test_what_cannot_be_set_of_a_body(name):
         assert isinstance(caught.value, AttributeError)
 
 
-@pytest.mark.parametrize("name, value", [
-    ("material", "rubber"), ("material", None), ("position", (0, np.nan, 0)), ("position", (0, 1)), ("position", "up"),
-    ("velocity", np.zeros((3, 3))), ("velocity", (0, np.inf, 0)), ("velocity", (1e300, 0, 0)), ("collision", "sdf"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("material", "rubber"),
+        ("material", None),
+        ("position", (0, np.nan, 0)),
+        ("position", (0, 1)),
+        ("position", "up"),
+        ("velocity", np.zeros((3, 3))),
+        ("velocity", (0, np.inf, 0)),
+        ("velocity", (1e300, 0, 0)),
+        ("collision", "sdf"),
+    ],
+)
 def test_what_is_set_is_checked_as_it_is_added(name, value):
     body = block().bodies[0]
     given, before = {"material": rubber(), name: value}, getattr(body, name)
@@ -136,11 +161,16 @@ def test_what_can_be_set_of_a_body():
 # --- lists and pairs --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("owner, name, call", [
-    ("scene", "bodies", "scene.add_body"), ("scene", "obstacles", "scene.add_obstacle"),
-    ("body 'block'", "constraints", "body.fix or body.move"), ("body 'block'", "forces", "body.add_force"),
-    ("body 'block'", "tractions", "body.add_traction"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "owner, name, call",
+    [
+        ("scene", "bodies", "scene.add_body"),
+        ("scene", "obstacles", "scene.add_obstacle"),
+        ("body 'block'", "constraints", "body.fix or body.move"),
+        ("body 'block'", "forces", "body.add_force"),
+        ("body 'block'", "tractions", "body.add_traction"),
+    ],
+)
 def test_lists_are_added_to_by_calls(owner, name, call):
     for scene in (block(), block().snapshot(), copy.deepcopy(block())):
         one = scene if owner == "scene" else scene.bodies[0]
@@ -171,11 +201,17 @@ def test_what_is_taken_out_is_free_again(tmp_path):
     assert "friction = 0.3" not in (tmp_path / "a.toml").read_text()
 
 
-@pytest.mark.parametrize("change", [
-    lambda s: s.contact_pairs.__setitem__("foo", ("foo", -3)), lambda s: s.contact_pairs.update({1: 2}),
-    lambda s: s.contact_pairs.clear(), lambda s: s.contact_pairs.pop(frozenset(("block", "ball"))),
-    lambda s: s.contact_pairs.setdefault("foo", -3), lambda s: setattr(s, "contact_pairs", {}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda s: s.contact_pairs.__setitem__("foo", ("foo", -3)),
+        lambda s: s.contact_pairs.update({1: 2}),
+        lambda s: s.contact_pairs.clear(),
+        lambda s: s.contact_pairs.pop(frozenset(("block", "ball"))),
+        lambda s: s.contact_pairs.setdefault("foo", -3),
+        lambda s: setattr(s, "contact_pairs", {}),
+    ],
+)
 def test_contact_pairs_are_set_by_their_call(change):
     for scene in (*copies(block()), block().snapshot()):
         with pytest.raises(SceneError, match="^scene: contact_pairs cannot be .*: call scene.set_contact"):
@@ -188,21 +224,29 @@ def test_contact_pairs_are_set_by_their_call(change):
 # --- arrays -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("make", [
-    lambda: ts.MeshObstacle(np.eye(3), [(0, 1, 2)]), lambda: ts.Box((0, 0, 0), (1, 1, 1)),
-    lambda: ts.KeyFrames([0], [(0, 0, 0)], [(0, 0, 1)]), lambda: block().bodies[0].forces[0],
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: ts.MeshObstacle(np.eye(3), [(0, 1, 2)]),
+        lambda: ts.Box((0, 0, 0), (1, 1, 1)),
+        lambda: ts.KeyFrames([0], [(0, 0, 0)], [(0, 0, 1)]),
+        lambda: block().bodies[0].forces[0],
+    ],
+)
 def test_arrays_of_records_and_of_their_copies(make):
     for one in copies(make()):
         arrays = [value for value in vars(one).values() if isinstance(value, np.ndarray)]
         assert arrays and not any(array.flags.writeable for array in arrays)
 
 
-@pytest.mark.parametrize("array, words", [
-    (lambda s: s.gravity, "^scene: gravity: entry .0. is nan, not finite"),
-    (lambda s: s.bodies[0].position, "^body 'block': position: entry .0. is nan"),
-    (lambda s: s.bodies[1].velocity[None], "^body 'other': velocity: entry .0. is nan"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "array, words",
+    [
+        (lambda s: s.gravity, "^scene: gravity: entry .0. is nan, not finite"),
+        (lambda s: s.bodies[0].position, "^body 'block': position: entry .0. is nan"),
+        (lambda s: s.bodies[1].velocity[None], "^body 'other': velocity: entry .0. is nan"),
+    ],
+)
 def test_what_was_written_into_arrays_is_checked_when_they_are_used(array, words):
     scene = block()
     array(scene)[..., 0] = np.nan

@@ -26,8 +26,10 @@ GROUND = '[obstacles.ground]\nshape = "half_space"\npoint = [0, -2, 0]\nnormal =
 
 
 def scene_text(mesh=BOX, material="", head="", more="", solver="dt = 0.01"):
-    return f"{head}\n[solver]\nseconds = 0.02\nfps = 50\n{solver}\n[bodies.part]\nmaterial = {{ {material} }}\n" \
-        f"mesh = {{ {mesh} }}\n{more}"  # fmt: skip
+    return (
+        f"{head}\n[solver]\nseconds = 0.02\nfps = 50\n{solver}\n[bodies.part]\nmaterial = {{ {material} }}\n"
+        f"mesh = {{ {mesh} }}\n{more}"
+    )
 
 
 def write_mesh(path, points=X, cells=(("tetra", TETS),)):
@@ -69,17 +71,21 @@ MESHES = {
     "beyond": (with_tet([0, 1, 3, SIZE]), "tet 5: vertex 27 does not exist (27 vertices, counted from 0)"),
     "negative": (with_tet([0, 1, 3, -1]), "tet 5: vertex -1 does not exist"),
     "from_one": ({"cells": [("tetra", TETS + 1)]}, "they seem to count from 1, subtract 1"),
-    "inverted": ({"cells": [("tetra", np.vstack([TETS[:7], TETS[7:8, [0, 1, 3, 2]], TETS[8:]]))]},
-                 "1 of 48 tets are inverted, the first is tet 7; fix_orientation"),
+    "inverted": (
+        {"cells": [("tetra", np.vstack([TETS[:7], TETS[7:8, [0, 1, 3, 2]], TETS[8:]]))]},
+        "1 of 48 tets are inverted, the first is tet 7; fix_orientation",
+    ),
     "flat": ({"points": FLAT, "cells": [("tetra", np.vstack([TETS, [[27, 28, 29, 30]]]))]}, "tet 48 has no volume"),
     "no_tets": ({"cells": []}, "no tetrahedra; "),
     "nothing": ({"points": np.zeros((0, 3)), "cells": []}, "no tetrahedra; "),
     "surface": ({"cells": [("triangle", MESH.surface)]}, "no tetrahedra; 48 triangles found; make a volume mesh first"),
     "quads": ({"cells": [("tetra", TETS), ("quad", np.array([[0, 1, 4, 3]]))]}, "but the file holds 1 quad"),
     "hexahedra": ({"cells": [HEXAHEDRON]}, "but the file holds 1 hexahedron"),
-    "three": ({"points": CROWDED, "cells": [("tetra", np.array([[0, 1, 2, 3], [0, 2, 1, 4], [0, 1, 2, 5]]))]},
-              "face (0, 1, 2) is shared by 3 tets (0, 1, 2)"),
-}  # fmt: skip
+    "three": (
+        {"points": CROWDED, "cells": [("tetra", np.array([[0, 1, 2, 3], [0, 2, 1, 4], [0, 1, 2, 5]]))]},
+        "face (0, 1, 2) is shared by 3 tets (0, 1, 2)",
+    ),
+}
 
 
 @pytest.mark.parametrize("ending", [".vtk", ".vtu", ".mesh"])
@@ -121,12 +127,18 @@ def test_files_that_are_no_meshes(tmp_path, capsys):
 def test_what_a_file_holds_is_not_repeated(tmp_path, capsys, ending):
     """A link or --allow-outside could name any file."""
     secrets = [
-        "root:passphrase:17", "passphrase 0 1\n2 passphrase", "passphrase", "1 3 0 0\n0 passphrase 0 0\n",
-        "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\npassphrase\n", "<VTKFile><passphrase/></VTKFile>",
+        "root:passphrase:17",
+        "passphrase 0 1\n2 passphrase",
+        "passphrase",
+        "1 3 0 0\n0 passphrase 0 0\n",
+        "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\npassphrase\n",
+        "<VTKFile><passphrase/></VTKFile>",
         "# vtk DataFile Version 4.2\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS passphrase 1",
-        "# vtk DataFile Version 4.2\nx\nASCII\npassphrase", "MeshVersionFormatted 1\nDimension 3\nVertices\npassphrase",
-        "# vtk DataFile Version 5.1\nx\npassphrase", "MeshVersionFormatted 1\nDimension passphrase",
-    ]  # fmt: skip
+        "# vtk DataFile Version 4.2\nx\nASCII\npassphrase",
+        "MeshVersionFormatted 1\nDimension 3\nVertices\npassphrase",
+        "# vtk DataFile Version 5.1\nx\npassphrase",
+        "MeshVersionFormatted 1\nDimension passphrase",
+    ]
     for secret in secrets:
         (tmp_path / f"part{ending}").write_text(secret)
         told = refusal(tmp_path, capsys, scene_text(f'file = "part{ending}"'), "--allow-outside")
@@ -136,8 +148,10 @@ def test_what_a_file_holds_is_not_repeated(tmp_path, capsys, ending):
 # --- numbers, keys and names ------------------------------------------------------------------------------------------
 
 SCENES = {
-    "margin": (scene_text(head="[collision]\nmargin = 1e-3", mesh=BOX.replace("[1, 1, 1]", "[1e-6, 1e-6, 1e-6]"), more=GROUND),
-               "margin = 0.001 m is larger than the mean surface edge of body 'part', 5.69e-07 m"),
+    "margin": (
+        scene_text(head="[collision]\nmargin = 1e-3", mesh=BOX.replace("[1, 1, 1]", "[1e-6, 1e-6, 1e-6]"), more=GROUND),
+        "margin = 0.001 m is larger than the mean surface edge of body 'part', 5.69e-07 m",
+    ),
     "poisson_half": (scene_text(material="poisson = 0.5"), "poisson must lie in the open interval (-1, 0.5), not 0.5"),
     "poisson_above": (scene_text(material="poisson = 0.7"), "poisson must lie in the open interval (-1, 0.5), not 0.7"),
     "poisson_below": (scene_text(material="poisson = -1"), "poisson must lie in the open interval (-1, 0.5), not -1"),
@@ -162,8 +176,10 @@ SCENES = {
     "tolerance": (scene_text(solver="newton_tolerance = 0"), "solver.newton_tolerance must be greater than 0, not 0"),
     "tolerance_below": (scene_text(solver="contact_tolerance = -1"), "solver.contact_tolerance must be greater than 0, not -1"),
     "cap": (scene_text(solver="max_iterations = 0"), "solver.max_iterations is not known"),
-    "unstable": (scene_text(solver='dt = 0.01\nintegrator = "symplectic_euler"', material="young = 1e8"),
-                 "dt = 0.01 s is above the estimated stability limit of 0.000844 s of symplectic_euler: take a smaller dt"),
+    "unstable": (
+        scene_text(solver='dt = 0.01\nintegrator = "symplectic_euler"', material="young = 1e8"),
+        "dt = 0.01 s is above the estimated stability limit of 0.000844 s of symplectic_euler: take a smaller dt",
+    ),
     "gravity_two": (scene_text(head="gravity = [0, -9.81]"), "gravity must have shape (3,), not (2,)"),
     "gravity_text": (scene_text(head='gravity = "down"'), "gravity must be numbers of shape (3,), not 'down'"),
     "gravity_large": (scene_text(head="gravity = [0, 1e300, 0]"), "gravity: entry [1] is 1e+300, too large for a 32-bit float"),
@@ -181,7 +197,7 @@ SCENES = {
     "cells": (scene_text(BOX.replace("[2, 2, 2]", "[1000000000, 2, 2]")), "give more than the 50000000 tets allowed"),
     "many_cells": (scene_text(BOX.replace("[2, 2, 2]", "[3000, 3000, 3000]")), "give 135000000000 tets, about 5.4e+04 GB"),
     "buffers": (scene_text(head="[collision]\ninitial_capacity = 2000000000", more=GROUND), "fit"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -206,8 +222,11 @@ def test_one_step_more_than_there_can_be(tmp_path, capsys):
         sim.run(1e30, fps=None)
 
 
-PLATE = {"mesh": 'shape = "box", cells = [9, 1, 9], size = [9, 4, 9]', "more": GROUND.replace("-2", "-1.99"),
-         "solver": 'dt = 0.01\nintegrator = "symplectic_euler"'}  # fmt: skip
+PLATE = {
+    "mesh": 'shape = "box", cells = [9, 1, 9], size = [9, 4, 9]',
+    "more": GROUND.replace("-2", "-1.99"),
+    "solver": 'dt = 0.01\nintegrator = "symplectic_euler"',
+}
 SMALL_BUFFERS = "[collision]\ninitial_capacity = 64\n"
 
 
@@ -230,11 +249,16 @@ def test_what_is_suspect_is_told(tmp_path):
     """One run of many bodies; its report, its USD names and its last state."""
     twice = np.vstack([TETS, TETS + SIZE])
     files = {
-        "mirrored": (X, TETS[:, [0, 1, 3, 2]]), "doubled": (np.vstack([X, X + [1, 0, 0]]), twice),
-        "corner": (np.vstack([X, X + 1.0]), twice), "edge": (np.vstack([X, X + [1, 1, 0]]), twice),
-        "two": (np.vstack([X, X + [3, 0, 0]]), twice), "far": (0.1 * X + 1e6, TETS), "near": (0.1 * X, TETS),
-        "millimetres": (100.0 * X, TETS), "turned": (X, np.vstack([TETS[:-1], TETS[-1:, [0, 1, 3, 2]]])),
-    }  # fmt: skip
+        "mirrored": (X, TETS[:, [0, 1, 3, 2]]),
+        "doubled": (np.vstack([X, X + [1, 0, 0]]), twice),
+        "corner": (np.vstack([X, X + 1.0]), twice),
+        "edge": (np.vstack([X, X + [1, 1, 0]]), twice),
+        "two": (np.vstack([X, X + [3, 0, 0]]), twice),
+        "far": (0.1 * X + 1e6, TETS),
+        "near": (0.1 * X, TETS),
+        "millimetres": (100.0 * X, TETS),
+        "turned": (X, np.vstack([TETS[:-1], TETS[-1:, [0, 1, 3, 2]]])),
+    }
     options = {"corner": ", weld = 0", "edge": ", weld = 0", "turned": ", fix_orientation = true"}
     text = 'contact_forces = false\n[solver]\ndt = 0.01\nseconds = 0.05\nfps = 100\nprecision = "f32"\n'
     for name, (points, tets) in files.items():

@@ -29,7 +29,7 @@ from benchmarks.collision_cases import (
     sagging,
     start,
     turning,
-)  # fmt: skip
+)
 from benchmarks.collision_runs import (
     GEOMETRIES,
     HASH,
@@ -42,7 +42,7 @@ from benchmarks.collision_runs import (
     measure_broad,
     measure_film,
     measure_row,
-)  # fmt: skip
+)
 from benchmarks.collision_table import best_cell, cell_table, crossover_text, crossovers, find_limits, row_table
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError

@@ -36,7 +36,7 @@ from benchmarks.contact_runs import (
     open_explicit,
     open_scene,
     to_impulses,
-)  # fmt: skip
+)
 from benchmarks.contact_table import CONTACTS, PILE, STEP_SCENE, count_table, find_limits
 from benchmarks.report_parts import phases
 from taisoft.backend.fields import FieldArena
@@ -260,9 +260,13 @@ def made(scenes=(SCENE, "two_cubes_two_boxes"), ms=1.9, wall=2.9, status="ok", r
     ]
     problems = [ProblemRow("Rover1039", 4, PLAIN, (1.0, 0.1, 0.01), 10, 0.5, 0.5, verdict)]
     return {
-        "films": [made_film(scene, residual) for scene in scenes], "steps": [cost], "runs": runs, "colourings": colourings,
-        "crossover": points, "problems": problems,
-    }  # fmt: skip
+        "films": [made_film(scene, residual) for scene in scenes],
+        "steps": [cost],
+        "runs": runs,
+        "colourings": colourings,
+        "crossover": points,
+        "problems": problems,
+    }
 
 
 def test_limits():
@@ -348,8 +352,10 @@ def test_bodies_that_fall(tmp_path, capsys):
     this, older = (runs[label]["cube at rest"] for label in ("this", "older"))
     assert this["newton"] == older["newton"] and len(this["newton"]) == 5 and this["tets"] == 384 and this["unconverged"] == 0
     assert capsys.readouterr().out.count("| cube at rest |") == 2
-    whole = {label: {name: own["cube at rest"] | {"seconds": [times] * 5} for name in ("bunny", "cloth")}
-             for label, own, times in (("this", runs["this"], 1.0), ("older", runs["older"], 4.0))}  # fmt: skip
+    whole = {
+        label: {name: own["cube at rest"] | {"seconds": [times] * 5} for name in ("bunny", "cloth")}
+        for label, own, times in (("this", runs["this"], 1.0), ("older", runs["older"], 4.0))
+    }
     met = {limit.what: limit.met for limit in contact_drops_table.limits_of(whole)}
     assert met["bunny: time of the older version over this one's"] and not met["cloth: time of the older version over this one's"]
     assert len(met) == 6 and sum(met.values()) == 4

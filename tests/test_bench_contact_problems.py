@@ -45,8 +45,10 @@ def test_verdicts():
     assert told == {bench.PLAIN: "yardstick: pass", "jacobi": "", "hybrid": "best: pass"}
     slow = [replace(row, residuals=(1.0, 1.0, 1.0), time=5.0 + row.time) for row in ROWS]
     assert {row.solver: row.verdict for row in bench.judged(slow)} == {
-        bench.PLAIN: "yardstick: FAIL", "jacobi": "", "hybrid": "best: FAIL"
-    }  # fmt: skip
+        bench.PLAIN: "yardstick: FAIL",
+        "jacobi": "",
+        "hybrid": "best: FAIL",
+    }
     never = [replace(row, iterations=None) for row in ROWS]
     assert all("FAIL" in row.verdict for row in bench.judged(never))
     assert never[0].cells[6] == "-"

@@ -162,8 +162,11 @@ def test_targets_of_the_implicit_runs():
 
 def test_markdown_and_names():
     assert markdown(("a", "name"), [("12", "b"), ("345", "cd")], left=(1,)).splitlines() == [
-        "|   a | name |", "| --: | ---- |", "|  12 | b    |", "| 345 | cd   |",
-    ]  # fmt: skip
+        "|   a | name |",
+        "| --: | ---- |",
+        "|  12 | b    |",
+        "| 345 | cd   |",
+    ]
     assert slug("Intel(R) Xeon(R) CPU @ 2.60GHz") == "intel-xeon-cpu-2-60ghz"
 
 
@@ -173,10 +176,13 @@ def test_each_row_of_taisoft_stands_beside_one_of_mujoco(monkeypatch):
     )
     rows = [(r.program, r.integrator, r.steps, r.note) for r in make_rows(CELLS, "cpu", True, 1.0)]
     assert rows[:6] == [
-        ("taisoft", "velocity_verlet", 3, "told"), ("MuJoCo", "euler_staggered", 2, ""),
-        ("taisoft", "velocity_verlet", 6, ""), ("MuJoCo", "euler_staggered", 4, ""),
-        ("taisoft", "symplectic_euler", 4, "told"), ("MuJoCo", "euler", 2, ""),
-    ]  # fmt: skip
+        ("taisoft", "velocity_verlet", 3, "told"),
+        ("MuJoCo", "euler_staggered", 2, ""),
+        ("taisoft", "velocity_verlet", 6, ""),
+        ("MuJoCo", "euler_staggered", 4, ""),
+        ("taisoft", "symplectic_euler", 4, "told"),
+        ("MuJoCo", "euler", 2, ""),
+    ]
     implicit = ("bdf2", "implicit_midpoint", "implicit_euler", "linearly_implicit_euler")
     assert {(r[1], r[2]) for r in rows[6:]} == {*((name, 1) for name in implicit), ("discrete", 1), ("discrete", 4)}
     assert {r.program for r in make_rows(CELLS, "cpu", False, 1.0)} == {"taisoft"}
@@ -191,9 +197,7 @@ def tiny(monkeypatch):
     monkeypatch.setattr(elasticity, "measure_frames", lambda *a: measure_frames(*a, ("velocity_verlet",)))
     monkeypatch.setattr(elasticity, "measure_memory", lambda *a: measure_memory(*a, integrators=("velocity_verlet",)))
     monkeypatch.setattr(
-        elasticity,
-        "make_rows",
-        lambda cells, arch, peers, seconds: [Row(540, *r) for r in rows if peers or r[0] == "taisoft"],
+        elasticity, "make_rows", lambda cells, arch, peers, seconds: [Row(540, *r) for r in rows if peers or r[0] == "taisoft"]
     )
 
 

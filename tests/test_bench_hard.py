@@ -127,16 +127,23 @@ DEEP = SimpleNamespace(depth=2.0, name_a="a", name_b="b")
         (RunReport("degraded", step_reports=[StepReport(0.1), StepReport(0.2, converged=False)]), 2, [], DEGRADED, [UNCONVERGED]),
         (
             RunReport("degraded", step_reports=[StepReport(0.1, deep=1, dropped_contacts=1)], interrupted=True),
-            1, [], DEGRADED, [DROPPED, INTERRUPTED, PENETRATION],
+            1,
+            [],
+            DEGRADED,
+            [DROPPED, INTERRUPTED, PENETRATION],
         ),
         (RunReport("degraded"), 2, [DEEP], DEGRADED, [OVERLAP]),
     ],
-)  # fmt: skip
+)
 def test_how_a_run_ended(result, done, overlaps, status, causes):
     sim = SimpleNamespace(
-        dt=0.1, step_count=done, touches=True, run=lambda *_, **__: result, overlaps=lambda: overlaps,
+        dt=0.1,
+        step_count=done,
+        touches=True,
+        run=lambda *_, **__: result,
+        overlaps=lambda: overlaps,
         contact_limit=lambda a, b: 1.0,
-    )  # fmt: skip
+    )
 
     def run(session):
         session.go(sim, 2, follow=False)

@@ -55,10 +55,12 @@ def test_marked_parts_are_made_anew_and_the_rest_stays(fake):
 @pytest.mark.parametrize(
     "text, words",
     [
-        (TEXT.replace("fake", "nothing"), "'nothing' is unknown"), (TEXT.replace("<!-- end fake -->\n", ""), "'fake' needs"),
-        (TEXT.replace("begin", "end"), "'fake' needs"), (TEXT.replace("end fake", "end other"), "needs one begin and one end"),
+        (TEXT.replace("fake", "nothing"), "'nothing' is unknown"),
+        (TEXT.replace("<!-- end fake -->\n", ""), "'fake' needs"),
+        (TEXT.replace("begin", "end"), "'fake' needs"),
+        (TEXT.replace("end fake", "end other"), "needs one begin and one end"),
     ],
-)  # fmt: skip
+)
 def test_wrong_markers_are_refused(text, words, fake):
     with pytest.raises(OutputError, match=words):
         filled(text)

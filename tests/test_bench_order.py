@@ -72,10 +72,13 @@ def test_an_error_must_stay_below():
 
 def test_ratios_are_taken_round_by_round_from_the_default_quadrature():
     rows = [
-        row(error=0.04, rounds=(4.0, 8.0, 4.0)), row(error=0.0025, rounds=(16.0, 32.0, 16.0)),
-        row(QUADRATIC, error=0.04, rounds=(0.1, 0.2, 0.1)), row(QUADRATIC, error=0.0025, rounds=(0.4, 0.8, 0.4, 0.4)),
-        row(QUADRATIC_14, error=0.0025, rounds=(0.001,)), row(error=None, rounds=(), failure="no luck"),
-    ]  # fmt: skip
+        row(error=0.04, rounds=(4.0, 8.0, 4.0)),
+        row(error=0.0025, rounds=(16.0, 32.0, 16.0)),
+        row(QUADRATIC, error=0.04, rounds=(0.1, 0.2, 0.1)),
+        row(QUADRATIC, error=0.0025, rounds=(0.4, 0.8, 0.4, 0.4)),
+        row(QUADRATIC_14, error=0.0025, rounds=(0.001,)),
+        row(error=None, rounds=(), failure="no luck"),
+    ]
     found = compare(BEAM, rows, REFERENCE)
     assert found.bound == "=" and (found.ratio.median, found.ratio.spread) == pytest.approx((40, 0))
     assert found.ratio.repeats == 3
@@ -288,8 +291,10 @@ def test_the_whole_writes_and_draws_what_it_prints(faked, tmp_path, capsys, monk
     numbers, shown = json.loads(out.read_text()), capsys.readouterr().out
     assert status == (0 if numbers["limits"][0]["met"] else 1)
     assert [(r["case"], r["order"], r["cells"]) for r in numbers["rows"]][:3] == [
-        ("hanging_beam", 1, [2, 2, 2]), ("hanging_beam", 1, [8, 8, 8]), ("hanging_beam", 2, [1, 1, 1]),
-    ]  # fmt: skip
+        ("hanging_beam", 1, [2, 2, 2]),
+        ("hanging_beam", 1, [8, 8, 8]),
+        ("hanging_beam", 2, [1, 1, 1]),
+    ]
     assert [r["error"] for r in numbers["rows"][:4]] == pytest.approx([0.08, 0.005, 0.02, 0.005])
     told = {(c["case"], c["goal"]): c for c in numbers["comparisons"]}
     assert len(told) == 6 and [told[name, 0.01]["bound"] for name in ("hanging_beam", "beam_fall")] == ["=", ">"]

@@ -139,9 +139,11 @@ def made_row(work: scenes.Work, program: str, seconds: float, error: float | Non
 def test_the_fastest_that_is_good_enough_is_compared():
     work = scenes.hanging_beam((12, 3, 3))
     rows = [
-        made_row(work, "taisoft", 0.1, 5e-3), made_row(work, "taisoft", 0.5, 5e-5), made_row(work, "MuJoCo", 1.0, 5e-5),
+        made_row(work, "taisoft", 0.1, 5e-3),
+        made_row(work, "taisoft", 0.5, 5e-5),
+        made_row(work, "MuJoCo", 1.0, 5e-5),
         made_row(work, "MuJoCo", 0.3, 0.5),
-    ]  # fmt: skip
+    ]
     assert fastest_within(rows, 1e-2) is rows[0] and fastest_within(rows, 1e-4) is rows[1] and fastest_within(rows, 1e-5) is None
     limits = limits_of(rows)
     assert [round(limit.value, 6) for limit in limits] == [1.0, 10.0, 1.0, 2.0, 1.0, 2.0, 0.0]

@@ -37,7 +37,7 @@ from benchmarks.report_parts.page import (
     short_text,
     small_png,
     verdict_of,
-)  # fmt: skip
+)
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError
 from taisoft.mesh.sdf_grid import SdfGrid
@@ -143,8 +143,11 @@ def test_reductions():
     assert holds(reduction.claims_of(rows, film)) == [True, True, False, True]
     flat = [row(n, 1e-3, 1e-7 * n) for n in (1000, 3000, 9000)]
     assert holds(reduction.claims_of(flat, film_of(reduction=(1.0, 9.0), quadratic=(2.0, 2.0), found=(10, 20)))) == [
-        False, False, True, False,
-    ]  # fmt: skip
+        False,
+        False,
+        True,
+        False,
+    ]
 
 
 def measured(where: str, per_tet: float, plain_seconds: float, first: float = 9.0) -> points.Measured:
@@ -200,8 +203,13 @@ def test_solvers():
     def plates(coloured: float) -> list[Point]:
         return [Point(17000, 9, Outcome(50, 1e-5, rounds(1.0), [0.0] * 3), Outcome(50, 1e-5, rounds(coloured), [0.1] * 3))]
 
-    like = {"gauss_seidel": ((5, 5), (2.0, 2.0)), "jacobi": ((20, 90), (3.0, 99.0)), "hybrid": ((20, 80), (1.0, 1.0)),
-            COLOURED: ((5, 6), (4.0, 4.0)), COLOURED + THREADED: ((5, 6), (5.0, 5.0))}  # fmt: skip
+    like = {
+        "gauss_seidel": ((5, 5), (2.0, 2.0)),
+        "jacobi": ((20, 90), (3.0, 99.0)),
+        "hybrid": ((20, 80), (1.0, 1.0)),
+        COLOURED: ((5, 6), (4.0, 4.0)),
+        COLOURED + THREADED: ((5, 6), (5.0, 5.0)),
+    }
     assert holds(solvers.claims_of(film(198, **like), plates(0.5))) == [True, True, True, True, False, True]
     rare = {name: ((*sweeps, sweeps[0]), (*seconds, seconds[0])) for name, (sweeps, seconds) in like.items()}
     assert holds(solvers.claims_of(film(198, **rare), [])) == [True, True, True, True, True]  # one spike of three frames

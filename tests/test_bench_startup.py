@@ -102,14 +102,23 @@ def numbers(seconds: float, compiled: int) -> dict:
     times = {"wall": seconds, "cpu": seconds, "walls": [seconds] * 3, "compiled": compiled}
     memory = {"start": 300.0, "end": 301.0, "times": 4}
     one = {
-        "cold": times, "warm": times, "warm, other size": times, "new files": [0, compiled], "memory": memory,
+        "cold": times,
+        "warm": times,
+        "warm, other size": times,
+        "new files": [0, compiled],
+        "memory": memory,
         "one process": {"first": times, "second": times, "other size": times},
-    }  # fmt: skip
+    }
     return {
-        "beam": one, "cube": one, "statics": {str(k): times for k in range(3)}, "identify": times,
-        "settings": {"reset": 1e-3 * seconds}, "surfaces": {"224 triangles": 9, "284 triangles": compiled}, "keep": memory,
+        "beam": one,
+        "cube": one,
+        "statics": {str(k): times for k in range(3)},
+        "identify": times,
+        "settings": {"reset": 1e-3 * seconds},
+        "surfaces": {"224 triangles": 9, "284 triangles": compiled},
+        "keep": memory,
         "speed": dict.fromkeys(startup.SLOWER, [1e-3, 1.1e-3, 2e-3]),
-    }  # fmt: skip
+    }
 
 
 def test_the_page(monkeypatch, tmp_path, capsys):

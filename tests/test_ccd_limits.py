@@ -103,8 +103,9 @@ def test_a_shot_too_fast_is_refused(sim):
     found = re.search(
         rf"^step 1: 'sheet' and 'shot' close at {number} m/s, {number} m in a step of {number} s, and the thinner of them is "
         rf"{number} m thick, so {'' if explicit else 'even in 256 substeps '}they could pass each other unseen: "
-        rf"take dt <= {number} s$", text,
-    )  # fmt: skip
+        rf"take dt <= {number} s$",
+        text,
+    )
     assert found, text
     told_speed, way, dt, thick, wanted = map(float, found.groups())
     assert told_speed == pytest.approx(speed, rel=1e-2) and way == pytest.approx(speed * sim.dt, rel=1e-2)

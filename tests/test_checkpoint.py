@@ -79,10 +79,16 @@ COUNTS_LATE = {name: {"simulation/released": lambda r: [False] * len(r)} for nam
 @pytest.mark.parametrize(
     "integrator, precision",
     [
-        ("bdf2", "f64"), ("velocity_verlet", "f32"), ("bdf2", "f32"), ("velocity_verlet", "f64"), ("symplectic_euler", "f64"),
-        ("implicit_euler", "f32"), ("implicit_midpoint", "f64"), ("linearly_implicit_euler", "f32"),
+        ("bdf2", "f64"),
+        ("velocity_verlet", "f32"),
+        ("bdf2", "f32"),
+        ("velocity_verlet", "f64"),
+        ("symplectic_euler", "f64"),
+        ("implicit_euler", "f32"),
+        ("implicit_midpoint", "f64"),
+        ("linearly_implicit_euler", "f32"),
     ],
-)  # fmt: skip
+)
 def test_going_on_without_contacts(tmp_path, integrator, precision):
     """Nodes are let go at RELEASE, which lies between the two checkpoints."""
     scene, dt = driven_scene(mass_damping=0.5, stiffness_damping=1e-4), RELEASE / 19
@@ -113,11 +119,14 @@ def test_going_on_without_contacts(tmp_path, integrator, precision):
 @pytest.mark.parametrize(
     "integrator, precision, settings",
     [
-        ("symplectic_euler", "f32", {}), ("velocity_verlet", "f64", {"self_collision": True}),
-        ("symplectic_euler", "f64", {"contact_solver": "coloured_gauss_seidel"}), ("bdf2", "f32", {"self_collision": True}),
-        ("linearly_implicit_euler", "f64", {}), ("implicit_euler", "f32", {}),
+        ("symplectic_euler", "f32", {}),
+        ("velocity_verlet", "f64", {"self_collision": True}),
+        ("symplectic_euler", "f64", {"contact_solver": "coloured_gauss_seidel"}),
+        ("bdf2", "f32", {"self_collision": True}),
+        ("linearly_implicit_euler", "f64", {}),
+        ("implicit_euler", "f32", {}),
     ],
-)  # fmt: skip
+)
 def test_going_on_with_contacts(tmp_path, integrator, precision, settings):
     """A plate presses a cube and is let go after the checkpoint; a ball moves into the cube.
 
@@ -297,13 +306,15 @@ def damped(scene):
     "change, told",
     [
         (renamed, 'its bodies are ["beam", "flyer"], those here ["beam", "fly"]'),
-        (reordered, 'those here ["flyer", "beam"]'), (with_other_mesh, "in body 'flyer': mesh"),
-        (held, "in body 'flyer': constraints"), (loaded, "in body 'flyer': loads"),
+        (reordered, 'those here ["flyer", "beam"]'),
+        (with_other_mesh, "in body 'flyer': mesh"),
+        (held, "in body 'flyer': constraints"),
+        (loaded, "in body 'flyer': loads"),
         (with_obstacle, 'its obstacles are [], those here ["floor"]'),
         (with_other_law, "in body 'flyer': order, quadrature, law"),
         (damped, "body 'flyer': mass_damping is 0.1 in this scene and was 0.0 at the start"),
     ],
-)  # fmt: skip
+)
 def test_another_scene(saved, change, told):
     scene = driven_scene()
     change(scene)

@@ -129,9 +129,7 @@ def test_what_is_no_scalar(text):
 
 
 def test_options_win_over_set_and_set_over_the_scene():
-    arguments = Namespace(
-        arch=None, precision="f64", seconds=2.0, fps=None, assignments=["solver.dt=0.5", "solver.fps=none"]
-    )
+    arguments = Namespace(arch=None, precision="f64", seconds=2.0, fps=None, assignments=["solver.dt=0.5", "solver.fps=none"])
     resolved = settings.resolve({"dt": 0.1, "precision": "f32", "seconds": 1.0, "fps": 30}, arguments, FakeSimulator)
     assert resolved.simulator == {"dt": 0.5, "precision": "f64"}
     assert (resolved.seconds, resolved.fps) == (2.0, None)

@@ -221,9 +221,7 @@ def test_a_working_folder_that_is_gone(beam, tmp_path):
         text=True,
     )
     assert done.returncode == 2
-    assert (
-        done.stderr == "taisoft: the working folder cannot be used (No such file or directory): change to another one\n"
-    )
+    assert done.stderr == "taisoft: the working folder cannot be used (No such file or directory): change to another one\n"
     assert not (tmp_path / "out").exists()
 
 

@@ -45,9 +45,15 @@ def key(scene: ts.Scene, integrator: str, **solver) -> tuple:
     counts = [len(b.nodes.surface) for b in scene.bodies] + [len(s[1]) for s in surfaces if s is not None]
     touches = "contact_forces" in on
     return (
-        integrator, tuple(sorted(on)), tuple(groups), any(is_thin(b) for b in scene.bodies), touches and analytic,
-        touches and len(counts) > 1, touches and sum(counts) >= SERIAL_BELOW, solver.get("contact_solver", "auto"),
-    )  # fmt: skip
+        integrator,
+        tuple(sorted(on)),
+        tuple(groups),
+        any(is_thin(b) for b in scene.bodies),
+        touches and analytic,
+        touches and len(counts) > 1,
+        touches and sum(counts) >= SERIAL_BELOW,
+        solver.get("contact_solver", "auto"),
+    )
 
 
 def is_thin(body) -> bool:
@@ -105,9 +111,12 @@ def test_scenes_have_what_they_say(structure):
     scene = build(structure)
     on = plan_of(scene, structure.integrator or "implicit_euler", False, False).on
     for name, feature in (
-        ("fixed", "fixed_nodes"), ("prescribed", "moving_nodes"), ("loaded", "loads"), ("mass_damping", "mass_damping"),
+        ("fixed", "fixed_nodes"),
+        ("prescribed", "moving_nodes"),
+        ("loaded", "loads"),
+        ("mass_damping", "mass_damping"),
         ("stiffness_damping", "stiffness_damping"),
-    ):  # fmt: skip
+    ):
         assert on[feature] == getattr(structure, name), feature
     assert [b.order for b in scene.bodies] == list(structure.orders) and on[f"law:{structure.law}"]
     assert [o.name for o in scene.obstacles] == list(structure.obstacles)

@@ -65,32 +65,35 @@ def changed(array: np.ndarray, at, value: float) -> np.ndarray:
     return copy
 
 
-@pytest.mark.parametrize("inputs, options, message", [
-    ((W[:17, :17], B, MU), {}, "W has shape .17, 17.: it must be .3k, 3k., three rows per contact"),
-    ((W[:15], B, MU), {}, "W has shape .15, 18."),
-    ((W[0], B, MU), {}, "W has shape .18,."),
-    ((W * 1j, B, MU), {}, "W must hold real numbers, not complex128"),
-    ((W.astype(str), B, MU), {}, "W must hold real numbers"),
-    ((changed(W, (4, 7), np.nan), B, MU), {}, r"W\[4, 7\] is nan, not finite"),
-    ((sp.csr_matrix(changed(W, (4, 7), np.inf)), B, MU), {}, r"W\[4, 7\] is inf, not finite"),
-    ((changed(W, (6, 6), -2.0), B, MU), {}, r"W\[6, 6\] is -2: .* cannot be negative"),
-    ((W, B[:-1], MU), {}, r"b must have shape \(18,\), not \(17,\)"),
-    ((W, B.reshape(6, 3), MU), {}, r"b must have shape \(18,\), not \(6, 3\)"),
-    ((W, changed(B, 3, np.inf), MU), {}, r"b: entry \[3\] is inf, not finite"),
-    ((W, ["a"] * 18, MU), {}, "b must be numbers"),
-    ((W, B, MU[:5]), {}, r"mu must have shape \(6,\), not \(5,\)"),
-    ((W, B, 0.5), {}, r"mu must have shape \(6,\), not \(\)"),
-    ((W, B, changed(MU, 2, -0.1)), {}, r"mu\[2\] is -0.1: a coefficient of friction cannot be negative"),
-    ((W, B, changed(MU, 2, np.nan)), {}, r"mu: entry \[2\] is nan"),
-    ((W, B, MU), {"method": "gauss_siedel"}, "method must be one of .* did you mean 'gauss_seidel'"),
-    ((W, B, MU), {"method": None}, "method must be one of"),
-    ((W, B, MU), {"tolerance": 0.0}, "tolerance must be greater than 0"),
-    ((W, B, MU), {"tolerance": np.nan}, "tolerance must be finite"),
-    ((W, B, MU), {"tolerance": "small"}, "tolerance must be a number"),
-    ((W, B, MU), {"max_iterations": 0}, "max_iterations must be a whole number of at least 1, not 0"),
-    ((W, B, MU), {"max_iterations": 2.5}, "max_iterations must be a whole number"),
-    ((W, B, MU), {"max_iterations": True}, "max_iterations must be a whole number"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "inputs, options, message",
+    [
+        ((W[:17, :17], B, MU), {}, "W has shape .17, 17.: it must be .3k, 3k., three rows per contact"),
+        ((W[:15], B, MU), {}, "W has shape .15, 18."),
+        ((W[0], B, MU), {}, "W has shape .18,."),
+        ((W * 1j, B, MU), {}, "W must hold real numbers, not complex128"),
+        ((W.astype(str), B, MU), {}, "W must hold real numbers"),
+        ((changed(W, (4, 7), np.nan), B, MU), {}, r"W\[4, 7\] is nan, not finite"),
+        ((sp.csr_matrix(changed(W, (4, 7), np.inf)), B, MU), {}, r"W\[4, 7\] is inf, not finite"),
+        ((changed(W, (6, 6), -2.0), B, MU), {}, r"W\[6, 6\] is -2: .* cannot be negative"),
+        ((W, B[:-1], MU), {}, r"b must have shape \(18,\), not \(17,\)"),
+        ((W, B.reshape(6, 3), MU), {}, r"b must have shape \(18,\), not \(6, 3\)"),
+        ((W, changed(B, 3, np.inf), MU), {}, r"b: entry \[3\] is inf, not finite"),
+        ((W, ["a"] * 18, MU), {}, "b must be numbers"),
+        ((W, B, MU[:5]), {}, r"mu must have shape \(6,\), not \(5,\)"),
+        ((W, B, 0.5), {}, r"mu must have shape \(6,\), not \(\)"),
+        ((W, B, changed(MU, 2, -0.1)), {}, r"mu\[2\] is -0.1: a coefficient of friction cannot be negative"),
+        ((W, B, changed(MU, 2, np.nan)), {}, r"mu: entry \[2\] is nan"),
+        ((W, B, MU), {"method": "gauss_siedel"}, "method must be one of .* did you mean 'gauss_seidel'"),
+        ((W, B, MU), {"method": None}, "method must be one of"),
+        ((W, B, MU), {"tolerance": 0.0}, "tolerance must be greater than 0"),
+        ((W, B, MU), {"tolerance": np.nan}, "tolerance must be finite"),
+        ((W, B, MU), {"tolerance": "small"}, "tolerance must be a number"),
+        ((W, B, MU), {"max_iterations": 0}, "max_iterations must be a whole number of at least 1, not 0"),
+        ((W, B, MU), {"max_iterations": 2.5}, "max_iterations must be a whole number"),
+        ((W, B, MU), {"max_iterations": True}, "max_iterations must be a whole number"),
+    ],
+)
 def test_refused(inputs, options, message):
     with pytest.raises(ts.SceneError, match=message):
         ts.solve_contact_problem(*inputs, **options)

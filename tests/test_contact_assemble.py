@@ -37,9 +37,12 @@ def scene() -> ts.Scene:
     made = ts.Scene()
     soft = {"young": 1e5, "density": 1000.0}
     made.add_body(
-        ts.box_mesh((2, 1, 2), (1.0, 0.5, 1.0)), ts.Material(friction=0.4, restitution=0.2, **soft), name="block",
-        position=(0, 0.2502, 0), velocity=(0.2, -0.3, 0.1),
-    )  # fmt: skip
+        ts.box_mesh((2, 1, 2), (1.0, 0.5, 1.0)),
+        ts.Material(friction=0.4, restitution=0.2, **soft),
+        name="block",
+        position=(0, 0.2502, 0),
+        velocity=(0.2, -0.3, 0.1),
+    )
     brick = ts.Material(friction=0.9, restitution=0.1, **soft)
     mesh = ts.box_mesh((1, 1, 1), (0.3, 0.2, 0.35))
     made.add_body(mesh, brick, name="brick", position=(0.13, 0.6004, 0.08), velocity=(0, -1, 0))
@@ -167,9 +170,16 @@ def test_warm_start(begun):
 
 @kernel
 def find_goals(
-    f: ti.template(), dt: ti.f64, contact_offset: ti.f64, fast: ti.f64, slow: ti.f64, fastest: ti.f64, force: ti.f64,
-    kicked: ti.f64, out: ti.types.ndarray(),
-):  # fmt: skip
+    f: ti.template(),
+    dt: ti.f64,
+    contact_offset: ti.f64,
+    fast: ti.f64,
+    slow: ti.f64,
+    fastest: ti.f64,
+    force: ti.f64,
+    kicked: ti.f64,
+    out: ti.types.ndarray(),
+):
     """force: what the explicit step's forces change the velocity by [m/s], a share `kicked` of it before the impact."""
     for c in range(f.problem.count[0]):
         opening = explicit_opening(f, c, dt, contact_offset, f.approach[c] + force, kicked)
@@ -208,7 +218,7 @@ def test_how_far_a_contact_is_from_its_goal(found, fast, slow):
         (-4 * h, 0.5, -1e-3, -4 * h * fast - slow * h),  # the penetration asks for more than the bounce
         (-4 * h, 0.5, -90.0, -45.0 * dt),
         (-3.0 * fastest * dt / fast, 0.0, 0.0, -fastest * dt),  # no faster than that
-    ]  # fmt: skip
+    ]
     gap, restitution, approach, expected = np.array(cases).T
     for field, values in ((found.gap, gap), (found.restitution, restitution), (found.approach, approach)):
         fill_field(field, values)

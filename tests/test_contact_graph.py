@@ -40,9 +40,7 @@ def put(p: problem.ContactProblem, made: oracle.NodeContacts) -> None:
 
 def joined(made: oracle.NodeContacts) -> np.ndarray:
     """Adjacency by brute force."""
-    sets = [
-        {i for i in made.node[c, :n] if made.inverse_mass[i].any()} for c, n in enumerate(made.arity)
-    ]
+    sets = [{i for i in made.node[c, :n] if made.inverse_mass[i].any()} for c, n in enumerate(made.arity)]
     return np.array([[bool(a & b) and i != j for j, b in enumerate(sets)] for i, a in enumerate(sets)])
 
 

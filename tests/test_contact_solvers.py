@@ -27,8 +27,17 @@ from taisoft.contact.colouring import colour_contacts, store
 from taisoft.contact.graph import colour_greedy, matrix_graph
 from taisoft.contact.solve import solve
 
-REFERENCES = ("cube_rest_4", "cube_slide_4", "cube_spin_slide_4", "cube_tip_mu1p5", "cube_wedge_groove", "nodal_20_mu0p7",
-              "nodal_3_mu0p5", "nodal_8_mu0p3", "nodal_8_mu1")  # fmt: skip
+REFERENCES = (
+    "cube_rest_4",
+    "cube_slide_4",
+    "cube_spin_slide_4",
+    "cube_tip_mu1p5",
+    "cube_wedge_groove",
+    "nodal_20_mu0p7",
+    "nodal_3_mu0p5",
+    "nodal_8_mu0p3",
+    "nodal_8_mu1",
+)
 YARDSTICK = {  # residual of plain Gauss-Seidel after 10, 100, 1000 sweeps
     "BoxesStack1-i100000-32": (3.1e-2, 2.0e-3, 3.0e-5),
     "Capsules-i100-889": (8.3e-3, 1.6e-4, 3.2e-5),
@@ -193,8 +202,12 @@ def test_hybrid_takes_the_new_disk(rig):
 # --- properties -------------------------------------------------------------------------------------------------------
 
 
-@given(seed=st.integers(0, 2**20), k=st.integers(1, 12), friction=st.sampled_from([0.0, 0.2, 0.7, 1.0]),
-       method=st.sampled_from(sorted(SOLVERS)))  # fmt: skip
+@given(
+    seed=st.integers(0, 2**20),
+    k=st.integers(1, 12),
+    friction=st.sampled_from([0.0, 0.2, 0.7, 1.0]),
+    method=st.sampled_from(sorted(SOLVERS)),
+)
 @settings(max_examples=60, deadline=None, derandomize=True)
 def test_random_problems(seed, k, friction, method):
     made = oracle.random_contacts(seed, k, 12, friction, led=bool(seed % 2))
@@ -247,9 +260,7 @@ def test_the_best_is_left(rig, method):
     left = oracle.residual(made.W, made.b, made.friction, impulses(p))
     assert not found.converged and max(np.diff(found.history)) > 0.0
     assert found.residual == min(found.history[1:]) and left == pytest.approx(found.residual, rel=1e-6)
-    assert p.w.to_numpy() == pytest.approx(
-        made.inverse_mass * (made.jacobian.T @ impulses(p).ravel()).reshape(-1, 3), abs=1e-9
-    )
+    assert p.w.to_numpy() == pytest.approx(made.inverse_mass * (made.jacobian.T @ impulses(p).ravel()).reshape(-1, 3), abs=1e-9)
 
 
 @pytest.mark.parametrize("serial", [True, False])

@@ -39,9 +39,14 @@ FIXED = [0, 7]  # nodes
 
 @kernel
 def couple(
-    m: ti.template(), k: ti.template(), x: ti.template(), above: ti.template(), below: ti.template(), both: ti.template(),
+    m: ti.template(),
+    k: ti.template(),
+    x: ti.template(),
+    above: ti.template(),
+    below: ti.template(),
+    both: ti.template(),
     d: ti.template(),
-):  # fmt: skip
+):
     """(J^T D J x)_i of the nodes above, of those below, and whole; d: the matrix's diagonal blocks."""
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -97,9 +102,15 @@ def rig(request):
         find_factors(p)
         A = to_scipy(m, solver.matrix).toarray()
         found = oracle.NodeContacts(
-            contacts.node, arity, contacts.weight, contacts.normal, contacts.tangent, np.zeros((m.n_nodes, 3)), np.zeros(3 * K),
+            contacts.node,
+            arity,
+            contacts.weight,
+            contacts.normal,
+            contacts.tangent,
+            np.zeros((m.n_nodes, 3)),
+            np.zeros(3 * K),
             friction,
-        )  # fmt: skip
+        )
         start = made.oracle.rest
         x_hat = start + 1e-4 * rng.standard_normal(start.shape)
         x = start + 1e-3 * rng.standard_normal(start.shape)
@@ -109,13 +120,28 @@ def rig(request):
         J = found.jacobian
         W = J @ np.diag(free.ravel() / np.diag(A)) @ J.T
         yield SimpleNamespace(
-            made=made, m=m, p=p, f=f, k=k, solver=solver, work=solver.work, A=A, J=J, W=W, free=free, start=start, x_hat=x_hat,
-            x=x, gap=gap, obstacle_displacement=obstacle_displacement, friction=friction,
+            made=made,
+            m=m,
+            p=p,
+            f=f,
+            k=k,
+            solver=solver,
+            work=solver.work,
+            A=A,
+            J=J,
+            W=W,
+            free=free,
+            start=start,
+            x_hat=x_hat,
+            x=x,
+            gap=gap,
+            obstacle_displacement=obstacle_displacement,
+            friction=friction,
             close=1e-12 if request.param == "f64" else 1e-5,
             vectors=[made.vectors(f"test_{k}") for k in range(4)],
             diagonal=arena.vectors("test_diagonal", m.real, m.n_nodes, n=block_csr.BLOCK),
             frame=np.stack([found.normal, found.tangent, np.cross(found.normal, found.tangent)], axis=1),
-        )  # fmt: skip
+        )
 
 
 def press(rig, x: np.ndarray) -> np.ndarray:

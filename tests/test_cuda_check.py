@@ -25,21 +25,50 @@ RERUN = {"scene": "beam", "integrator": "bdf2", "reruns": 3, "spread": 1.5e-6}
 FOUND = {
     "tests": [{"test": "test_operator[cuda-f32]", "result": "passed"}, {"test": "test_steps[cuda-bdf2]", "result": "failed"}],
     "works": [
-        {"work": "W1", "tets": 540, "setting": "bdf2, 10 ms", "arch": "cuda", "seconds": 0.5, "build_seconds": 2.0,
-         "error": 0.011, "stands": True, "inverted": 0, "unconverged": 0},
+        {
+            "work": "W1",
+            "tets": 540,
+            "setting": "bdf2, 10 ms",
+            "arch": "cuda",
+            "seconds": 0.5,
+            "build_seconds": 2.0,
+            "error": 0.011,
+            "stands": True,
+            "inverted": 0,
+            "unconverged": 0,
+        },
         {"work": "W3", "tets": 3240, "setting": "bdf2, 10 ms", "arch": "cuda", "failure": "it diverged"},
     ],
     "sweeps": [
-        {"contacts": 34, "colours": 7, "serial_ms": 2.0, "coloured_ms": 1.0, "serial_sweeps": 9, "coloured_sweeps": 9,
-         "serial_residual": 5e-5, "coloured_residual": 5e-5},
+        {
+            "contacts": 34,
+            "colours": 7,
+            "serial_ms": 2.0,
+            "coloured_ms": 1.0,
+            "serial_sweeps": 9,
+            "coloured_sweeps": 9,
+            "serial_residual": 5e-5,
+            "coloured_residual": 5e-5,
+        }
     ],
     "sizes": [
-        {"tets": 1_000_000, "integrator": "bdf2", "step_ms": 20.0, "steps": 3, "linear": 60, "newton": 6, "unconverged": 0,
-         "inverted": 0, "build_seconds": 30.0, "compile_seconds": 4.0, "field_bytes": 2**30},
+        {
+            "tets": 1_000_000,
+            "integrator": "bdf2",
+            "step_ms": 20.0,
+            "steps": 3,
+            "linear": 60,
+            "newton": 6,
+            "unconverged": 0,
+            "inverted": 0,
+            "build_seconds": 30.0,
+            "compile_seconds": 4.0,
+            "field_bytes": 2**30,
+        },
         {"tets": 4_000_000, "integrator": "bdf2", "failure": "not enough memory"},
     ],
     "reruns": [RERUN],
-}  # fmt: skip
+}
 
 
 def fake(name: str, code: str, seconds: float = 20.0) -> Part:

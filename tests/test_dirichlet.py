@@ -59,9 +59,7 @@ def test_targets(order, n):
 
 
 def test_release():
-    dirichlet, rest = made(
-        ([0, 1], "xyz", until(1.0, lambda t: (t, 0, 0))), ([3], "y", until(2.0, lambda t: (0, t, 0)))
-    )
+    dirichlet, rest = made(([0, 1], "xyz", until(1.0, lambda t: (t, 0, 0))), ([3], "y", until(2.0, lambda t: (0, t, 0))))
     times = np.array([0.5, 1.0, 1.5, 1.75, 2.5])
     rows, releasing = dirichlet.targets(times)
     assert len(rows) == 2 and releasing and dirichlet.constrained()[8].all()  # not before its time has come
@@ -77,9 +75,7 @@ def test_release():
     assert dirichlet.constrained()[8].all() and len(dirichlet.targets(times)[0]) == 2
 
 
-@pytest.mark.parametrize(
-    "way", [(1, 2), np.zeros((3, 3)), np.zeros((2, 2)), (0, np.nan, 0), np.full((2, 3), np.inf), 1.0]
-)
+@pytest.mark.parametrize("way", [(1, 2), np.zeros((3, 3)), np.zeros((2, 2)), (0, np.nan, 0), np.full((2, 3), np.inf), 1.0])
 def test_what_a_path_may_give(way):
     dirichlet, _ = made(([0, 1], "xyz", lambda t: (0, 0, 0) if t < 1 else way))
     dirichlet.targets(np.array([0.5]))

@@ -120,10 +120,11 @@ def test_pulling_is_refused_unless_wanted():
         entry = next(e for e in sim.plan.entries if e["feature"] == "loads")
         assert entry["on"] and entry["why"] == "bodies can be dragged"
         for nodes, weights, target, message in (
-            ([99999], [1.0], (0, 0, 0), "from 0 to"), ([0], [1.0, 1.0], (0, 0, 0), "weights"),
+            ([99999], [1.0], (0, 0, 0), "from 0 to"),
+            ([0], [1.0, 1.0], (0, 0, 0), "weights"),
             ([0], [-1.0], (0, 0, 0), "weights"),
             ([0], [1.0], (0, np.nan, 0), "target"),
-        ):  # fmt: skip
+        ):
             with pytest.raises(SceneError, match=message):
                 sim.drag("beam", nodes, weights, target, 1.0)
     with pytest.raises(SimulationError, match="draggable = 1"):

@@ -128,9 +128,7 @@ def test_masses_are_the_oracles(order):
     assert reference.gravity_mass(made) == pytest.approx(M.sum(axis=1))
 
 
-@pytest.mark.parametrize(
-    "order, shares, weights", [(1, [1 / 4], [1 / 4]), (2, [1 / 36, 4 / 27], [-1 / 20, 1 / 5])]
-)
+@pytest.mark.parametrize("order, shares, weights", [(1, [1 / 4], [1 / 4]), (2, [1 / 36, 4 / 27], [-1 / 20, 1 / 5])])
 def test_a_tet_gives_its_nodes_their_shares(order, shares, weights):
     """Of the lumped mass, and of weight."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], dtype=float)

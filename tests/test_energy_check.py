@@ -48,13 +48,22 @@ def step(kinetic: float, elastic: float = 0.0, gravity: float = 0.0, loads: floa
     return StepReport(time=1.0, kinetic=kinetic, elastic=elastic, gravity=gravity, loads=loads, **fields)
 
 
-@pytest.mark.parametrize("steps, status", [
-    ([step(109.0)], "ok"), ([step(60.0, 60.0)], "degraded"), ([step(10.0), step(100.0), step(120.0), step(5.0)], "degraded"),
-    ([step(300.0, 0.0, -200.0)], "ok"), ([step(300.0, 0.0, 0.0, -200.0)], "ok"), ([step(320.0, 0.0, -200.0)], "ok"),
-    ([step(340.0, 0.0, -200.0)], "degraded"), ([step(100.0, gravity=20.0)], "degraded"),
-    ([step(90.0), None, step(105.0)], "ok"), ([step(130.0), None, step(100.0)], "degraded"),
-    ([step(np.nan)], "ok"),  # the run has failed
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "steps, status",
+    [
+        ([step(109.0)], "ok"),
+        ([step(60.0, 60.0)], "degraded"),
+        ([step(10.0), step(100.0), step(120.0), step(5.0)], "degraded"),
+        ([step(300.0, 0.0, -200.0)], "ok"),
+        ([step(300.0, 0.0, 0.0, -200.0)], "ok"),
+        ([step(320.0, 0.0, -200.0)], "ok"),
+        ([step(340.0, 0.0, -200.0)], "degraded"),
+        ([step(100.0, gravity=20.0)], "degraded"),
+        ([step(90.0), None, step(105.0)], "ok"),
+        ([step(130.0), None, step(100.0)], "degraded"),
+        ([step(np.nan)], "ok"),  # the run has failed
+    ],
+)
 def test_what_counts(steps, status):
     run = told(StandIn(), *steps)
     assert run.status == status and len(run.problems) == (status == "degraded")
@@ -67,9 +76,10 @@ def test_how_much_is_said():
     assert "rose by 30 J from t = 0 s to 1 s, 30 % of" in told(StandIn(), step(130.0)).problems[0]
 
 
-@pytest.mark.parametrize("integrator, quiet, loud", [
-    ("velocity_verlet", (90.0, 25.0), (105.0, 25.0)), ("symplectic_euler", (90.0, 60.0), (180.0, 60.0))
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "integrator, quiet, loud",
+    [("velocity_verlet", (90.0, 25.0), (105.0, 25.0)), ("symplectic_euler", (90.0, 60.0), (180.0, 60.0))],
+)
 def test_explicit_steps_exchange(integrator, quiet, loud):
     assert told(StandIn(integrator), step(*quiet)).status == "ok"
     assert told(StandIn(integrator), step(*loud)).status == "degraded"
@@ -103,9 +113,10 @@ def strained(law: str, integrator: str, share: float, dt: float | None, steps: i
 
 
 @pytest.mark.filterwarnings("ignore:step")
-@pytest.mark.parametrize("law, integrator, share, dt, steps", [
-    (COR, "symplectic_euler", 0.95, None, 200), (SVK, "linearly_implicit_euler", 0.6, 0.08, 3)
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "law, integrator, share, dt, steps",
+    [(COR, "symplectic_euler", 0.95, None, 200), (SVK, "linearly_implicit_euler", 0.6, 0.08, 3)],
+)
 def test_strained_bodies(law, integrator, share, dt, steps):
     run = strained(law, integrator, share, dt, steps)
     assert run.status == "degraded" and "energy was created" in run.problems[-1]
@@ -128,9 +139,9 @@ def test_swings_and_loads(integrator):
     assert run.status == "ok", run.problems
 
 
-@pytest.mark.parametrize("integrator, restitution", [
-    ("symplectic_euler", 1.0), ("symplectic_euler", 0.5), ("velocity_verlet", 1.0), ("bdf2", 1.0)
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "integrator, restitution", [("symplectic_euler", 1.0), ("symplectic_euler", 0.5), ("velocity_verlet", 1.0), ("bdf2", 1.0)]
+)
 def test_falls_and_bounces(integrator, restitution):
     """Explicit steps at 0.7 of `stable_dt` once made 50 times the energy of the fall."""
     scene, side = ts.Scene(), 0.1

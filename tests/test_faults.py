@@ -83,10 +83,13 @@ print(json.dumps(shown))
 CALLS = {
     "some": [("fsync", "report.json"), ("write", "00001.png|checkpoint.npz")],
     "others": [
-        ("rename", "report.json"), ("fsync", "scene.usdc"), ("rename", "00001.png"), ("write", "steps.csv"),
+        ("rename", "report.json"),
+        ("fsync", "scene.usdc"),
+        ("rename", "00001.png"),
+        ("write", "steps.csv"),
         ("rename", "checkpoint.npz"),
     ],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("which", CALLS)
@@ -195,13 +198,16 @@ def test_a_folder_that_is_taken_away(tmp_path, capsys):
     assert "cannot create the folder" in captured.err and "status" not in captured.out
 
 
-READ_ONLY = TAKEN[TAKEN.index("    body") : TAKEN.index("    from")] + """
+READ_ONLY = (
+    TAKEN[TAKEN.index("    body") : TAKEN.index("    from")]
+    + """
     import os
 
     if t > 0.05:
         os.environ["FAIL_NAME"] = os.environ["LATER"]
     return (0, 0, 0)
 """
+)
 
 
 def test_a_disk_that_becomes_read_only(tmp_path, shim):
@@ -471,8 +477,11 @@ def test_a_poor_machine(tmp_path, shim):
     (tmp_path / "file").write_text("no folder")
     commas = german(tmp_path)
     surroundings = commas | {
-        "LD_PRELOAD": str(shim), "JUMP": "100000", "HOME": None, "XDG_CACHE_HOME": str(tmp_path / "file" / "cache"),
-    }  # fmt: skip
+        "LD_PRELOAD": str(shim),
+        "JUMP": "100000",
+        "HOME": None,
+        "XDG_CACHE_HOME": str(tmp_path / "file" / "cache"),
+    }
     arguments = ("run", path, "--headless", "--out", tmp_path / "poor")
     done = python(POOR + "sys.exit(main(sys.argv[1:]))", *arguments, **surroundings)
     assert done.returncode == 0 and "status   ok" in done.stdout, done.stderr

@@ -12,7 +12,7 @@ import sys
 
 from command import ROOT
 
-SCRIPT = '''
+SCRIPT = """
 import gc
 import numpy as np
 import taichi as ti
@@ -95,7 +95,7 @@ with made("f64") as fourth:
     assert result.status == "ok" and result.steps == 1
     refused(fourth.step)
 print("through")
-'''
+"""
 
 
 def test_taichi_of_others(tmp_path):

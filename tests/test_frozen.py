@@ -40,22 +40,25 @@ def loaded() -> ts.Scene:
 # --- unknown and read-only attributes ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("what, name, words", [
-    (lambda s: s, "gravty", "^scene has no attribute 'gravty'; did you mean 'gravity'[?]$"),
-    (lambda s: s, "zzz", "^scene has no attribute 'zzz'$"),
-    (lambda s: s, "_hidden", "^scene has no attribute '_hidden'$"),
-    (lambda s: s.body("block"), "materal", "^body 'block' has no attribute 'materal'; did you mean 'material'[?]$"),
-    (lambda s: s.body("block").material, "youngs", "^material has no attribute 'youngs'; did you mean 'young'[?]$"),
-    (lambda s: s.body("block").material, "young", "^material: young cannot change: .*sim.set_material.body, young=...."),
-    (lambda s: s.obstacle("ball"), "fricton", "^obstacle 'ball' has no attribute 'fricton'; did you mean 'friction'[?]$"),
-    (lambda s: s.obstacle("ball"), "friction", "^obstacle 'ball': friction cannot change: .*scene.set_contact"),
-    (lambda s: s.obstacle("ball").shape, "radios", "^sphere has no attribute 'radios'; did you mean 'radius'[?]$"),
-    (lambda s: s.obstacle("ball").shape, "radius", "^sphere: radius cannot change: make another shape"),
-    (lambda s: s.collision, "margn", "^collision settings has no attribute 'margn'; did you mean 'margin'[?]$"),
-    (lambda s: s.collision, "margin", "^collision settings: margin cannot change: .*CollisionSettings.margin=...."),
-    (lambda s: s.body("block").forces[0], "value", "^force: value cannot change: call sim.set_force"),
-    (lambda s: s.body("block").tractions[0], "value", "^traction: value cannot change: call sim.set_traction"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "what, name, words",
+    [
+        (lambda s: s, "gravty", "^scene has no attribute 'gravty'; did you mean 'gravity'[?]$"),
+        (lambda s: s, "zzz", "^scene has no attribute 'zzz'$"),
+        (lambda s: s, "_hidden", "^scene has no attribute '_hidden'$"),
+        (lambda s: s.body("block"), "materal", "^body 'block' has no attribute 'materal'; did you mean 'material'[?]$"),
+        (lambda s: s.body("block").material, "youngs", "^material has no attribute 'youngs'; did you mean 'young'[?]$"),
+        (lambda s: s.body("block").material, "young", "^material: young cannot change: .*sim.set_material.body, young=...."),
+        (lambda s: s.obstacle("ball"), "fricton", "^obstacle 'ball' has no attribute 'fricton'; did you mean 'friction'[?]$"),
+        (lambda s: s.obstacle("ball"), "friction", "^obstacle 'ball': friction cannot change: .*scene.set_contact"),
+        (lambda s: s.obstacle("ball").shape, "radios", "^sphere has no attribute 'radios'; did you mean 'radius'[?]$"),
+        (lambda s: s.obstacle("ball").shape, "radius", "^sphere: radius cannot change: make another shape"),
+        (lambda s: s.collision, "margn", "^collision settings has no attribute 'margn'; did you mean 'margin'[?]$"),
+        (lambda s: s.collision, "margin", "^collision settings: margin cannot change: .*CollisionSettings.margin=...."),
+        (lambda s: s.body("block").forces[0], "value", "^force: value cannot change: call sim.set_force"),
+        (lambda s: s.body("block").tractions[0], "value", "^traction: value cannot change: call sim.set_traction"),
+    ],
+)
 def test_attributes_of_scenes(what, name, words):
     one = what(loaded())
     before = dict(one.__dict__)
@@ -66,9 +69,13 @@ def test_attributes_of_scenes(what, name, words):
 
 def test_every_shape_refuses():
     shapes = [
-        ts.HalfSpace((0, 0, 0), (0, 1, 0)), ts.Sphere((0, 0, 0), 1), ts.Box((0, 0, 0), (1, 1, 1)),
-        ts.Capsule((0, 0, 0), (1, 0, 0), 1), ts.MeshObstacle(np.eye(3), [(0, 1, 2)]), ts.KeyFrames([0], [(0, 0, 0)]),
-    ]  # fmt: skip
+        ts.HalfSpace((0, 0, 0), (0, 1, 0)),
+        ts.Sphere((0, 0, 0), 1),
+        ts.Box((0, 0, 0), (1, 1, 1)),
+        ts.Capsule((0, 0, 0), (1, 0, 0), 1),
+        ts.MeshObstacle(np.eye(3), [(0, 1, 2)]),
+        ts.KeyFrames([0], [(0, 0, 0)]),
+    ]
     for shape in shapes:
         with pytest.raises(SceneError, match="has no attribute 'colour'$"):
             shape.colour = 1
@@ -123,7 +130,7 @@ LATE = {
     "tractions": (lambda s: s.body("block").tractions.__setitem__(0, 1), "call sim.set_traction"),
     "constraints": (lambda s: s.body("block").constraints.clear(), "scene.snapshot"),
     "mesh": (lambda s: delattr(s.body("block"), "mesh"), "scene.snapshot"),
-}  # fmt: skip
+}
 NEVER = {"obstacles", "contact_pairs", "name", "forces", "tractions", "mesh"}  # as they are changed there, refused before, too
 
 
@@ -187,9 +194,10 @@ def test_what_the_simulator_changes(taken):
     assert sim.scene.contact_numbers("block", "ball")[0] == 0.1 and sim.scene.body("block").forces[0].value[0] == 2
     assert (scene.gravity[1], scene.body("block").material.young) == (-9.81, 1e5)
     for call in (
-        lambda: sim.set_gravity("down"), lambda: sim.set_contact("block", "ball", friction=-1),
+        lambda: sim.set_gravity("down"),
+        lambda: sim.set_contact("block", "ball", friction=-1),
         lambda: sim.set_material("block", young=1e13),  # not stable
-    ):  # fmt: skip
+    ):
         with pytest.raises((SceneError, SimulationError)):
             call()
         assert sim.scene.body("block").material.young == 2e4
@@ -227,22 +235,25 @@ def test_only_a_simulator_that_was_made_freezes(taken, tmp_path, monkeypatch):
         again.gravity = (0, 0, 0)
 
 
-@pytest.mark.parametrize("name, words", [
-    ("dtt", "^simulator has no attribute 'dtt'; did you mean 'dt'[?]$"),
-    ("gravity", "^simulator has no attribute 'gravity': call sim.set_gravity.gravity.$"),
-    ("gravty", "^simulator has no attribute 'gravty'; did you mean 'gravity'[?] .call sim.set_gravity.gravity..$"),
-    ("young", "^simulator has no attribute 'young': call sim.set_material.body, young=....$"),
-    ("friction", "^simulator has no attribute 'friction': call sim.set_contact"),
-    ("integrator", "^simulator has no attribute 'integrator': call sim.rebuild.integrator=....$"),
-    ("positions", "^simulator: positions is a method and cannot be set: call sim.set_state"),
-    ("step", "^simulator: step is a method and cannot be set$"),
-    ("time", "^simulator: time cannot be set: call sim.reset"),
-    ("stable_dt", "^simulator: stable_dt cannot be set: .*set sim.dt"),
-    ("compile_seconds", "^simulator: compile_seconds cannot be set: it is read-only$"),
-    ("scene", "^simulator: scene cannot be set: make a new Simulator"),
-    ("settings", "^simulator: settings cannot be set: call sim.rebuild"),
-    ("plan", "^simulator: plan cannot be set: it follows"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, words",
+    [
+        ("dtt", "^simulator has no attribute 'dtt'; did you mean 'dt'[?]$"),
+        ("gravity", "^simulator has no attribute 'gravity': call sim.set_gravity.gravity.$"),
+        ("gravty", "^simulator has no attribute 'gravty'; did you mean 'gravity'[?] .call sim.set_gravity.gravity..$"),
+        ("young", "^simulator has no attribute 'young': call sim.set_material.body, young=....$"),
+        ("friction", "^simulator has no attribute 'friction': call sim.set_contact"),
+        ("integrator", "^simulator has no attribute 'integrator': call sim.rebuild.integrator=....$"),
+        ("positions", "^simulator: positions is a method and cannot be set: call sim.set_state"),
+        ("step", "^simulator: step is a method and cannot be set$"),
+        ("time", "^simulator: time cannot be set: call sim.reset"),
+        ("stable_dt", "^simulator: stable_dt cannot be set: .*set sim.dt"),
+        ("compile_seconds", "^simulator: compile_seconds cannot be set: it is read-only$"),
+        ("scene", "^simulator: scene cannot be set: make a new Simulator"),
+        ("settings", "^simulator: settings cannot be set: call sim.rebuild"),
+        ("plan", "^simulator: plan cannot be set: it follows"),
+    ],
+)
 def test_attributes_of_a_simulator(taken, name, words):
     sim = taken[1]
     with pytest.raises(SimulationError, match=words) as caught:

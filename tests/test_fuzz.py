@@ -23,16 +23,48 @@ from taisoft.checkpoint import read_checkpoint, write_checkpoint
 from taisoft.mesh.surface_mesh import FORMATS, read_surface
 
 MESH = ts.box_mesh((2, 1, 1), (2, 1, 1), pattern="six")
-GMSH = {"part.msh": "gmsh", "text.msh": ("gmsh", False), "old.msh": ("gmsh22", False), "older.msh": "gmsh22",
-        "ansys.msh": ("ansys", False)}  # fmt: skip
+GMSH = {
+    "part.msh": "gmsh",
+    "text.msh": ("gmsh", False),
+    "old.msh": ("gmsh22", False),
+    "older.msh": "gmsh22",
+    "ansys.msh": ("ansys", False),
+}
 OTHERS = (
-    "vtk", "vtu", "mesh", "meshb", "vol", "su2", "xml", "dat", "bdf", "nas", "fem", "inp", "mdpa", "avs", "f3grid", "post",
-    "ugrid", "node",
-)  # fmt: skip
+    "vtk",
+    "vtu",
+    "mesh",
+    "meshb",
+    "vol",
+    "su2",
+    "xml",
+    "dat",
+    "bdf",
+    "nas",
+    "fem",
+    "inp",
+    "mdpa",
+    "avs",
+    "f3grid",
+    "post",
+    "ugrid",
+    "node",
+)
 PIECES = (
-    b"-1", b"9", b"nan", b"1e400", b" ", b"\n", b"$End", b"\0", b"\xff\xfe", b"99999", b"3000000", b"\xff\xff\xff\x7f",
+    b"-1",
+    b"9",
+    b"nan",
+    b"1e400",
+    b" ",
+    b"\n",
+    b"$End",
+    b"\0",
+    b"\xff\xfe",
+    b"99999",
+    b"3000000",
+    b"\xff\xff\xff\x7f",
     b"\0\0\0@",
-)  # fmt: skip
+)
 SIZES = (0, -1, 10**5, 10**6, 10**7, 10**9, 2**31, 2**32 - 1, 2**63, 10**30)
 ROOM, PER_BYTE = 5_000_000, 400  # bytes that a reader may take in all, and beside that for each byte of the file
 SECONDS = 20

@@ -28,7 +28,7 @@ def begun(capacity: int = 8, time: float = 0.0, kinetic: float = 0.0) -> History
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.floats(-1e6, 1e6, allow_subnormal=False) | st.just(float("nan")), max_size=200), st.sampled_from([2, 4, 8, 10])
-)  # fmt: skip
+)
 def test_runs_are_what_they_are_of(values, capacity):
     history = begun(capacity)
     for k, value in enumerate(values):
@@ -63,9 +63,18 @@ def test_no_peak_is_lost_and_memory_stays():
 def test_change_of_energy_and_what_is_not_known():
     history = begun(kinetic=10.0, time=3.0)
     report = StepReport(
-        time=3.1, steps=4, kinetic=11.0, elastic=3.0, gravity=-1.0, residual=1e-5, newton_iterations=2, linear_iterations=30,
-        contact_residual=float("inf"), contact_iterations=8, n_contacts=5,
-    )  # fmt: skip
+        time=3.1,
+        steps=4,
+        kinetic=11.0,
+        elastic=3.0,
+        gravity=-1.0,
+        residual=1e-5,
+        newton_iterations=2,
+        linear_iterations=30,
+        contact_residual=float("inf"),
+        contact_iterations=8,
+        n_contacts=5,
+    )
     expected = {"kinetic": 1.0, "elastic": 2.0, "gravity": -3.0, "total": 0.0, "step_time": 5.0}
     implicit = {"newton_residual": 1e-5, "newton_iterations": 2, "linear_iterations": 30}
     contact = {"contact_iterations": 2.0, "n_contacts": 5}

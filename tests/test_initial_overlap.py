@@ -36,11 +36,17 @@ def parts() -> ts.TetMesh:
 def scene() -> ts.Scene:
     """Bodies apart, and one obstacle of each kind; the tests put bodies where they overlap."""
     made = ts.Scene(gravity=(0, 0, 0))
-    for k, (name, mesh) in enumerate((
-        ("cube", ts.box_mesh((1, 1, 1), (1, 1, 1))), ("small", ts.box_mesh((1, 1, 1), (0.2, 0.2, 0.2))),
-        ("big", ts.box_mesh((3, 3, 3), (2, 2, 2))), ("sheet", ts.sheet_mesh((2, 2), (2.0, 0.05, 2.0))),
-        ("rod", ts.box_mesh((1, 1, 1), (0.02, 2.0, 0.02))), ("ball", ts.ball_mesh(0.5, 4)), ("parts", parts()),
-    )):  # fmt: skip
+    for k, (name, mesh) in enumerate(
+        (
+            ("cube", ts.box_mesh((1, 1, 1), (1, 1, 1))),
+            ("small", ts.box_mesh((1, 1, 1), (0.2, 0.2, 0.2))),
+            ("big", ts.box_mesh((3, 3, 3), (2, 2, 2))),
+            ("sheet", ts.sheet_mesh((2, 2), (2.0, 0.05, 2.0))),
+            ("rod", ts.box_mesh((1, 1, 1), (0.02, 2.0, 0.02))),
+            ("ball", ts.ball_mesh(0.5, 4)),
+            ("parts", parts()),
+        )
+    ):
         made.add_body(mesh, SOFT, name=name, position=FAR + (5.0 * k, 0, 0))
     for name, shape in OBSTACLES.items():
         made.add_obstacle(shape, name=name)
@@ -101,10 +107,17 @@ def test_a_body_wholly_inside(sim):
     assert names == {"big", "small"} and found == pytest.approx(1.0 - 0.2, rel=1e-9)  # of the vertex at x = 0.2
 
 
-@pytest.mark.parametrize("name, at, depth", [
-    ("ground", (3, -19.6, 1), 0.1), ("ground", (3, -40.0, 1), 20.5), ("sphere", (10.1, 0.85, 0.1), 0.05),
-    ("box", (20.2, 0.7, 0.05), 0.1), ("capsule", (30.05, 0.75, 0.1), 0.05), ("mesh", (40.2, 0.9, 0.3), 0.1),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, at, depth",
+    [
+        ("ground", (3, -19.6, 1), 0.1),
+        ("ground", (3, -40.0, 1), 20.5),
+        ("sphere", (10.1, 0.85, 0.1), 0.05),
+        ("box", (20.2, 0.7, 0.05), 0.1),
+        ("capsule", (30.05, 0.75, 0.1), 0.05),
+        ("mesh", (40.2, 0.9, 0.3), 0.1),
+    ],
+)
 def test_a_body_in_an_obstacle(sim, name, at, depth):
     """By its vertices, by its faces over something round, or by the obstacle's own vertices."""
     put(sim, "cube", at)
@@ -249,7 +262,6 @@ def test_without_contact_forces_bodies_pass_through_each_other():
         fallen = sim.positions() - start
     assert np.abs(fallen - 6 * np.array([0, -9.81, 0]) * 1e-4**2).max() < 1e-14  # [m], of 1 + 2 + 3 steps' speeds
     assert all(r.converged and not r.n_contacts and not r.problems for r in reports)
-
 
 
 def surfaces():

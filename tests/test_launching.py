@@ -68,9 +68,7 @@ class Record:
 def make(arena: FieldArena, n: int, flag: bool = True, extra: bool = False, power: int = 2, unused: Any = None) -> Record:
     tag = len(arena.bytes)
     x, table = np.arange(3.0 * n).reshape(n, 3), np.arange(6.0 * n).reshape(n, 2, 3)
-    parts = tuple(
-        Part(k, arena.field(f"weight {k} {tag}", ti.f64, n, np.full(n, k + 1.0)), power) for k in range(2)
-    )
+    parts = tuple(Part(k, arena.field(f"weight {k} {tag}", ti.f64, n, np.full(n, k + 1.0)), power) for k in range(2))
     more = arena.field(f"extra {tag}", ti.f64, n, np.full(n, 0.5)) if extra else None
     x, table = arena.vectors(f"x {tag}", ti.f64, n, x), arena.field(f"table {tag}", ti.f64, (n, 2, 3), table)
     return Record(n, x, table, more, parts, flag, unused)

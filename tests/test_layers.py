@@ -113,9 +113,7 @@ def test_import_scan_sees_every_form(tmp_path, monkeypatch):
     """The scan behind the layer test finds absolute, relative and nested imports."""
     (tmp_path / "mesh").mkdir()
     path = tmp_path / "mesh" / "a.py"
-    path.write_text(
-        "import taisoft.cli.run\nfrom . import b\nfrom ..scene import plan\ndef f():\n    from taisoft import view\n"
-    )
+    path.write_text("import taisoft.cli.run\nfrom . import b\nfrom ..scene import plan\ndef f():\n    from taisoft import view\n")
     monkeypatch.setattr("test_layers.PACKAGE", tmp_path)
     assert {"taisoft.cli.run", "taisoft.mesh.b", "taisoft.scene.plan", "taisoft.view"} <= set(imports(path))
 

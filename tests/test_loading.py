@@ -144,17 +144,29 @@ def test_arrows_follow(sims):
     assert up.shape == down.shape and np.abs(up - down).max() > 0.1
 
 
-@pytest.mark.parametrize("call, words", [
-    (lambda s: s.set_force("beam", 2, (0, 0, 0)), "body 'beam': set_force: index must be a whole number from 0 to 1, not 2"),
-    (lambda s: s.set_force("beam", -1, (0, 0, 0)), "from 0 to 1, not -1"),
-    (lambda s: s.set_force("beam", True, (0, 0, 0)), "from 0 to 1, not True"),
-    (lambda s: s.set_force("beam", 1, np.zeros((3, 3))), r"set_force: force 1 must have shape \(3,\) or \(4, 3\), not \(3, 3\)"),
-    (lambda s: s.set_force("beam", 0, (0, np.nan, 0)), r"force 0: entry \[1\] is nan, not finite"),
-    (lambda s: s.set_force("bare", 0, (0, 0, 0)), "body 'bare': set_force: it has no force: give it one of 0 by body.add_force"),
-    (lambda s: s.set_traction("bare", 0, (0, 0, 0)), "set_traction: it has no traction: give it one of 0 by body.add_traction"),
-    (lambda s: s.set_traction("beam", 0, EACH), r"traction 0 must have shape \(3,\), not \(4, 3\)"),
-    (lambda s: s.set_force("bean", 0, (0, 0, 0)), "no body is called 'bean'; did you mean 'beam'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "call, words",
+    [
+        (lambda s: s.set_force("beam", 2, (0, 0, 0)), "body 'beam': set_force: index must be a whole number from 0 to 1, not 2"),
+        (lambda s: s.set_force("beam", -1, (0, 0, 0)), "from 0 to 1, not -1"),
+        (lambda s: s.set_force("beam", True, (0, 0, 0)), "from 0 to 1, not True"),
+        (
+            lambda s: s.set_force("beam", 1, np.zeros((3, 3))),
+            r"set_force: force 1 must have shape \(3,\) or \(4, 3\), not \(3, 3\)",
+        ),
+        (lambda s: s.set_force("beam", 0, (0, np.nan, 0)), r"force 0: entry \[1\] is nan, not finite"),
+        (
+            lambda s: s.set_force("bare", 0, (0, 0, 0)),
+            "body 'bare': set_force: it has no force: give it one of 0 by body.add_force",
+        ),
+        (
+            lambda s: s.set_traction("bare", 0, (0, 0, 0)),
+            "set_traction: it has no traction: give it one of 0 by body.add_traction",
+        ),
+        (lambda s: s.set_traction("beam", 0, EACH), r"traction 0 must have shape \(3,\), not \(4, 3\)"),
+        (lambda s: s.set_force("bean", 0, (0, 0, 0)), "no body is called 'bean'; did you mean 'beam'"),
+    ],
+)
 def test_what_is_refused(sims, call, words):
     sim, _ = sims
     before = [load.value for load in sim.scene.body("beam").forces]

@@ -30,9 +30,13 @@ each_law = pytest.mark.parametrize("law", LAWS)
 
 @kernel
 def law_numbers(
-    law: ti.template(), lanes: ti.template(), A: ti.types.ndarray(), B: ti.types.ndarray(), p: ti.types.ndarray(),
+    law: ti.template(),
+    lanes: ti.template(),
+    A: ti.types.ndarray(),
+    B: ti.types.ndarray(),
+    p: ti.types.ndarray(),
     out: ti.types.ndarray(),
-):  # fmt: skip
+):
     """psi, P and dP of F in A along D in B, and the block of the gradients that are D's first two rows."""
     for b in range(A.shape[0]):
         F, D = load(A, b, lanes, 9), load(B, b, lanes, 9)

@@ -18,10 +18,23 @@ from taisoft.mesh.content import utf16_head
 
 TEXT = {"binary": False}
 MESHES = {
-    ".msh": {"file_format": "gmsh", **TEXT}, "2.msh": {"file_format": "gmsh22", **TEXT},
-    "ansys.msh": {"file_format": "ansys", **TEXT}, ".vtk": TEXT, "42.vtk": {"file_format": "vtk42", **TEXT}, ".vtu": TEXT,
-    ".mesh": {}, ".ele": {}, ".inp": {}, ".avs": {}, ".vol": {}, ".su2": {}, ".dat": {}, ".mdpa": {}, ".f3grid": TEXT, ".xml": {},
-}  # fmt: skip
+    ".msh": {"file_format": "gmsh", **TEXT},
+    "2.msh": {"file_format": "gmsh22", **TEXT},
+    "ansys.msh": {"file_format": "ansys", **TEXT},
+    ".vtk": TEXT,
+    "42.vtk": {"file_format": "vtk42", **TEXT},
+    ".vtu": TEXT,
+    ".mesh": {},
+    ".ele": {},
+    ".inp": {},
+    ".avs": {},
+    ".vol": {},
+    ".su2": {},
+    ".dat": {},
+    ".mdpa": {},
+    ".f3grid": TEXT,
+    ".xml": {},
+}
 SURFACES = {".obj": {}, ".off": {}, ".stl": TEXT, ".ply": TEXT}
 MARK = b"\xef\xbb\xbf"
 

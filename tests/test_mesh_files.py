@@ -30,9 +30,22 @@ MESH = box_mesh((2, 1, 1), (0.3, 0.1, 1.0 / 3.0), center=(0.1, 0.2, 0.3))
 
 # Endings that are read without further packages.
 FORMATS = (
-    ".msh", ".vtk", ".vtu", ".mesh", ".meshb", ".inp", ".avs", ".xml", ".vol", ".su2", ".dat", ".mdpa", ".f3grid",
-    ".post", ".ele",
-)  # fmt: skip
+    ".msh",
+    ".vtk",
+    ".vtu",
+    ".mesh",
+    ".meshb",
+    ".inp",
+    ".avs",
+    ".xml",
+    ".vol",
+    ".su2",
+    ".dat",
+    ".mdpa",
+    ".f3grid",
+    ".post",
+    ".ele",
+)
 
 
 def write_by_meshio(path: Path, cells, points=MESH.vertices, **options) -> Path:
@@ -110,21 +123,14 @@ def test_gmsh_blocks_parametric_nodes_and_sparse_tags(tmp_path):
     )
     with pytest.warns(UserWarning, match="1 triangle next to the tets are not used"):
         mesh = read_mesh(path)
-    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]] and mesh.tets.tolist() == [
-        [0, 1, 2, 3]
-    ]
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]] and mesh.tets.tolist() == [[0, 1, 2, 3]]
 
 
 def test_big_endian_binary(tmp_path):
     path = write_by_meshio(tmp_path / "part.msh", [("tetra", MESH.tets)], file_format="gmsh", binary=True)
     head = b"$MeshFormat\n4.1 1 8\n" + (1).to_bytes(4, "big") + b"\n$EndMeshFormat\n"
     n, m = MESH.n_verts, MESH.n_tets
-    nodes = [
-        np.array([1, n, 1, n], ">u8"),
-        np.array([3, 1, 0], ">i4"),
-        np.array([n], ">u8"),
-        np.arange(1, n + 1).astype(">u8"),
-    ]
+    nodes = [np.array([1, n, 1, n], ">u8"), np.array([3, 1, 0], ">i4"), np.array([n], ">u8"), np.arange(1, n + 1).astype(">u8")]
     nodes.append(MESH.vertices.astype(">f8"))
     rows = np.column_stack([np.arange(m), MESH.tets + 1]).astype(">u8")
     cells = [np.array([1, m, 1, m], ">u8"), np.array([3, 1, 4], ">i4"), np.array([m], ">u8"), rows]
@@ -134,9 +140,7 @@ def test_big_endian_binary(tmp_path):
 
 
 def test_tetgen_counts_from_zero_or_one(tmp_path):
-    (tmp_path / "t.node").write_text(
-        "# made by hand\n4 3 1 0 # head\n\n1 0 0 0 9\n2 1 0 0 9\n3 0 1 0 9 # far\n4 0 0 1 9\n"
-    )
+    (tmp_path / "t.node").write_text("# made by hand\n4 3 1 0 # head\n\n1 0 0 0 9\n2 1 0 0 9\n3 0 1 0 9 # far\n4 0 0 1 9\n")
     (tmp_path / "t.ele").write_text("1 4 0\n1 1 2 3 4\n")
     assert read_mesh(tmp_path / "t.node").tets.tolist() == [[0, 1, 2, 3]]
     (tmp_path / "t.ele").write_text("1 4 0\n1 1 2 3\n")
@@ -186,8 +190,7 @@ def test_surfaces_are_counted(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "kind, nodes, said",
-    [("quad", 4, "2 quads"), ("hexahedron", 8, "2 hexahedra"), ("pyramid", 5, "2 pyramid elements")],
+    "kind, nodes, said", [("quad", 4, "2 quads"), ("hexahedron", 8, "2 hexahedra"), ("pyramid", 5, "2 pyramid elements")]
 )
 @pytest.mark.parametrize("ending", [".vtk", ".msh"])
 def test_other_elements_are_refused_by_name_and_number(tmp_path, kind, nodes, said, ending):
@@ -271,9 +274,7 @@ def test_a_cut_off_gmsh_file_is_told_with_its_line(tmp_path):
     lines = text.splitlines(keepends=True)
     inside = lines.index("$Elements\n") + 5
     path.write_text("".join(lines[:inside]))
-    with pytest.raises(
-        MeshError, match=rf"part.msh: line {inside}: the file ends inside \$Elements, before \$EndElements"
-    ):
+    with pytest.raises(MeshError, match=rf"part.msh: line {inside}: the file ends inside \$Elements, before \$EndElements"):
         read_mesh(path)
     path.write_text("".join(lines[: inside - 1] + lines[inside:]))  # one element lost
     with pytest.raises(MeshError, match=r"part.msh: line \d+ \(\$Elements\): 50 numbers should follow"):
@@ -332,10 +333,7 @@ MANY = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCh
 
 
 @MANY
-@given(
-    st.binary(min_size=1, max_size=400),
-    st.sampled_from([b"", b"$MeshFormat\n4.1 1 8\n\1\0\0\0\n$EndMeshFormat\n$Nodes\n"]),
-)
+@given(st.binary(min_size=1, max_size=400), st.sampled_from([b"", b"$MeshFormat\n4.1 1 8\n\1\0\0\0\n$EndMeshFormat\n$Nodes\n"]))
 @pytest.mark.filterwarnings("ignore")
 def test_random_bytes(tmp_path, content, head):
     path = tmp_path / "mesh.msh"
@@ -406,12 +404,7 @@ def test_no_cut_of_a_gmsh_file_gives_a_partial_mesh(tmp_path, samples, kind):
 
 @pytest.mark.parametrize(
     "name, counts",
-    [
-        ("bar-2523.msh", (886, 2523)),
-        ("bunny.msh", (4670, 19379)),
-        ("sphere1K.msh", (1760, 6851)),
-        ("mat20x20.msh", (800, 2166)),
-    ],
+    [("bar-2523.msh", (886, 2523)), ("bunny.msh", (4670, 19379)), ("sphere1K.msh", (1760, 6851)), ("mat20x20.msh", (800, 2166))],
 )
 def test_meshes_of_others(shared, name, counts):
     mesh = read_mesh(shared / "meshes" / name)

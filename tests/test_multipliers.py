@@ -44,9 +44,11 @@ def rig():
         arena, rng = FieldArena(), np.random.default_rng(5)
         p = build_node_problem(arena, K + 2, 4, True)
         work = Work(
-            arena.vectors("multiplier", ti.f64, K + 2), arena.field("radius", ti.f64, K + 2),
-            arena.vectors("past_impulse", ti.f64, PAST * (K + 2)), arena.vectors("past_change", ti.f64, PAST * (K + 2)),
-        )  # fmt: skip
+            arena.vectors("multiplier", ti.f64, K + 2),
+            arena.field("radius", ti.f64, K + 2),
+            arena.vectors("past_impulse", ti.f64, PAST * (K + 2)),
+            arena.vectors("past_change", ti.f64, PAST * (K + 2)),
+        )
         factor, friction = 10.0 ** rng.uniform(-1, 1, (K, 2)), rng.uniform(0.1, 1.0, K)
         factor[::9] = 0.0  # nothing can move these
         for field, values in ((p.factor, factor), (p.friction, friction)):

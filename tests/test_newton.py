@@ -67,9 +67,7 @@ def test_stopping_early_is_told(sim, monkeypatch):
     sim.set_state(velocities=3.0 * np.random.default_rng(0).standard_normal(sim.positions().shape))
     report = sim.step()
     assert not report.converged and report.newton_iterations == 2 * (1 + 2 + 4 + 1) and report.residual > 1e-12
-    assert report.problems == [
-        f"step 1: Newton stopped after 16 iterations at a relative residual of {report.residual:.2e}"
-    ]
+    assert report.problems == [f"step 1: Newton stopped after 16 iterations at a relative residual of {report.residual:.2e}"]
     result = sim.run(2 / 60, fps=None)
     assert result.status == "degraded" and "2 of 2 steps did not converge" in result.problems[-1]
 

@@ -100,8 +100,11 @@ def test_linear_triangles_bound_the_linear_tets_at_their_place(mesh):
     assert faces.counts.max() <= 2  # neighbours agree on the four triangles between them
     boundary = faces.triangles[faces.surface()]
     assert sorted(map(canonical, boundary)) == sorted(map(canonical, nodes.surface))
-    middle = {tuple(sorted((int(tet[a]), int(tet[b])))): int(e[4 + k]) for tet, e in zip(mesh.tets, nodes.elements)
-              for k, (a, b) in enumerate(EDGES)}  # fmt: skip
+    middle = {
+        tuple(sorted((int(tet[a]), int(tet[b])))): int(e[4 + k])
+        for tet, e in zip(mesh.tets, nodes.elements)
+        for k, (a, b) in enumerate(EDGES)
+    }
     for (a, b, c), four in zip(mesh.surface.tolist(), nodes.surface.reshape(-1, 4, 3).tolist()):
         ab, bc, ca = (middle[tuple(sorted(pair))] for pair in ((a, b), (b, c), (c, a)))
         assert four == [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]

@@ -86,9 +86,7 @@ def stations() -> dict[str, Station]:
         "half_space": on_corner(ts.HalfSpace((0, 0, 0), tilted), np.zeros(3), tilted, -0.003),
         "sphere": on_corner(ts.Sphere((0, 0, 0), 0.4), 0.4 * slope, slope, 0.004),
         "capsule": on_corner(ts.Capsule((-1, 0, 0), (1, 0, 0), 0.2), (0.3, 0.2, 0.0), UP, -0.005),
-        "capsule_end": on_corner(
-            ts.Capsule((-1, -1, 0), (0, 0, 0), 0.2), 0.2 * slope, slope, 0.006
-        ),
+        "capsule_end": on_corner(ts.Capsule((-1, -1, 0), (0, 0, 0), 0.2), 0.2 * slope, slope, 0.006),
         "box_face": on_corner(ts.Box((0, -0.5, 0), (0.5, 0.5, 0.5)), (0.1, 0.0, 0.2), UP, -0.004),
         "box_edge": on_corner(ts.Box((-0.5, -0.5, 0), (0.5, 0.5, 0.5)), (0.0, 0.0, 0.2), (0.5, 1.0, 0.0), 0.007),
         "mesh_open": on_corner(
@@ -152,9 +150,10 @@ class SimulationState:
             gap = station.gap + self.back
             point = self.Q @ (station.point + (10.0 * k, 0, 0) - 0.5 * gap * station.normal) + self.T
             errors = (
-                np.abs(c.point[mine] - point).max(), np.abs(c.normal[mine] - self.Q @ station.normal).max(),
+                np.abs(c.point[mine] - point).max(),
+                np.abs(c.normal[mine] - self.Q @ station.normal).max(),
                 np.abs(c.gap[mine] - gap).max(),
-            )  # fmt: skip
+            )
             close = 2e-4 if station.kind == "face_field" else 1e-9  # a search: phi to 1e-8, where it is least to its root
             if max(errors[:2]) > close or errors[2] > 1e-8 or set(c.kind[mine]) != {station.kind}:
                 wrong.append(f"{name}: {c.kind[mine]} off by {errors}: {c.point[mine]}, {c.normal[mine]}, {c.gap[mine]}")

@@ -65,9 +65,7 @@ def test_a_shape_keeps_its_own_copy():
     assert np.array_equal(mesh.surface()[1], FACES) and mesh.triangles.dtype == np.int64
 
 
-@pytest.mark.parametrize(
-    "direction", [(1, 0, 0), (0, -3, 0), (0, 0, 1e-200), (1, 1, 1), (-1e30, 2e30, 0.5e30), (1e-9, 1, 0)]
-)
+@pytest.mark.parametrize("direction", [(1, 0, 0), (0, -3, 0), (0, 0, 1e-200), (1, 1, 1), (-1e30, 2e30, 0.5e30), (1e-9, 1, 0)])
 def test_frames_are_rotations(direction):
     unit = np.array(direction) / np.abs(direction).max()
     unit = unit / np.linalg.norm(unit)

@@ -16,7 +16,9 @@ from taisoft.cli.summary import print_summary
 from taisoft.records import Energies
 from taisoft.running import run
 
-DRAW = PROLOGUE + """
+DRAW = (
+    PROLOGUE
+    + """
 import numpy as np
 from taisoft.output.camera import Camera
 from taisoft.view.ggui import Canvas
@@ -29,6 +31,7 @@ canvas.draw_over(np.array([[0.1, 0.1, 0.3, 0.2]]), one[:, :2], one, (2, 5), (0.9
 print(canvas.pixels(0, 0, 64, 36).std() > 5)
 canvas.close()
 """
+)
 
 
 def kernels(cache) -> set[str]:

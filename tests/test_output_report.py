@@ -26,12 +26,26 @@ def refuse_constant(name):
 def written(tmp_path):
     steps = [
         StepReport(time=0.1, newton_iterations=3, residual=1e-9, min_volume_ratio=0.9, kinetic=2.0),
-        StepReport(time=0.2, newton_iterations=7, residual=math.nan, min_volume_ratio=0.4, kinetic=math.inf,
-                   converged=False, problems=["slow, very", 'say "no"\nplease']),
+        StepReport(
+            time=0.2,
+            newton_iterations=7,
+            residual=math.nan,
+            min_volume_ratio=0.4,
+            kinetic=math.inf,
+            converged=False,
+            problems=["slow, very", 'say "no"\nplease'],
+        ),
         StepReport(time=0.3, newton_iterations=5, residual=1e-7, min_volume_ratio=0.5, kinetic=1.0, n_inverted=2),
-    ]  # fmt: skip
-    result = RunReport(status="degraded", problems=["step 2 did not converge"], steps=3, sim_seconds=0.3,
-                       wall_seconds=1.25, compile_seconds=0.5, step_reports=steps)  # fmt: skip
+    ]
+    result = RunReport(
+        status="degraded",
+        problems=["step 2 did not converge"],
+        steps=3,
+        sim_seconds=0.3,
+        wall_seconds=1.25,
+        compile_seconds=0.5,
+        step_reports=steps,
+    )
     settings = {"dt": np.float64(0.1), "gravity": np.array([0, -9.81, 0]), "out": Path("results"), "tolerance": None}
     settings["big"] = math.inf
     plan = [{"feature": "contact", "on": False, "why": "no obstacles"}]

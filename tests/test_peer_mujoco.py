@@ -35,12 +35,10 @@ def test_masses_and_elastic_forces_are_those_of_the_beam():
     assert np.abs(data.qacc - expected_acceleration).max() < 1e-10 * np.abs(expected_acceleration).max()
 
 
-@pytest.mark.parametrize("integrator, dt, order, largest", [
-    ("euler", 2.5e-3, 1, 2e-3),
-    ("euler_staggered", 2.5e-3, 2, 5e-5),
-    ("discrete", 2.5e-3, 1, 5e-3),
-    ("rk4", 5e-3, 4, 1e-5),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "integrator, dt, order, largest",
+    [("euler", 2.5e-3, 1, 2e-3), ("euler_staggered", 2.5e-3, 2, 5e-5), ("discrete", 2.5e-3, 1, 5e-3), ("rk4", 5e-3, 4, 1e-5)],
+)
 def test_error_falls_with_the_order_of_the_integrator(integrator, dt, order, largest):
     coarse, fine = (run_mujoco(CELLS, integrator, h, seconds=0.7)["error"] for h in (dt, dt / 2))
     assert coarse < largest

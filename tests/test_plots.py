@@ -68,7 +68,7 @@ def test_values_lie_where_the_axis_says():
     curves = of({"n_contacts": [0, 10, 37, np.nan, 20]}, "contacts")
     assert curves.ends == ("0", "40") and curves.times == (0.0, 4.0)
     assert curves.grid == pytest.approx([0.25, 0.5, 0.75]) and len(curves.grid) <= GRID_LINES
-    (_, points), = curves.lines
+    ((_, points),) = curves.lines
     known = points[~np.isnan(points[:, 1])]
     assert np.allclose(known, [(0, 0), (0.25, 0.25), (0.5, 0.925), (1, 0.5)])
     assert np.isnan(points[3]).all(), "a gap"

@@ -23,9 +23,15 @@ ROOM = 300
 
 @kernel
 def list_all(
-    s: ti.template(), near: ti.template(), sharp: ti.template(), q: ti.i32, half: ti.f64, room: ti.i32, entry: ti.template(),
+    s: ti.template(),
+    near: ti.template(),
+    sharp: ti.template(),
+    q: ti.i32,
+    half: ti.f64,
+    room: ti.i32,
+    entry: ti.template(),
     count: ti.template(),
-):  # fmt: skip
+):
     """count[t, b]: triangles of collider b near corner q of t, -1 where b is not near; entry: the same, at (t, b, 0) and on."""
     ti.loop_config(serialize=True)
     for t in range(s.n_triangles):

@@ -91,6 +91,7 @@ def test_nodal_velocities_are_interpolated():
 
 def test_paths_lead_new_nodes():
     scene, old = one_body()
+
     def chooses(X):  # more than a face, so that the mean of the old nodes and that of the new ones differ
         return X[:, 0] + X[:, 1] > 0.4
 

@@ -45,13 +45,19 @@ def test_every_case_is_stored_and_told_apart():
 @pytest.mark.parametrize(
     "told, changes",
     [
-        ("error 0.0107", {"error": 0.0107}), ("error 0.009", {"error": 0.009}), ("error nan", {"error": float("nan")}),
-        ("status 'degraded'", {"status": "degraded"}), ("field bytes 1002000", {"field_bytes": 1_002_000}),
-        ("field bytes 998000", {"field_bytes": 998_000}), ("newton 106", {"counts": {"newton": 106, "contacts": 9}}),
-        ("newton 94", {"counts": {"newton": 94, "contacts": 9}}), ("contacts 12", {"counts": {"newton": 100, "contacts": 12}}),
-        ("contacts 0", {"counts": {"newton": 100}}), ("sweeps 3", {"counts": {"newton": 100, "contacts": 9, "sweeps": 3}}),
+        ("error 0.0107", {"error": 0.0107}),
+        ("error 0.009", {"error": 0.009}),
+        ("error nan", {"error": float("nan")}),
+        ("status 'degraded'", {"status": "degraded"}),
+        ("field bytes 1002000", {"field_bytes": 1_002_000}),
+        ("field bytes 998000", {"field_bytes": 998_000}),
+        ("newton 106", {"counts": {"newton": 106, "contacts": 9}}),
+        ("newton 94", {"counts": {"newton": 94, "contacts": 9}}),
+        ("contacts 12", {"counts": {"newton": 100, "contacts": 12}}),
+        ("contacts 0", {"counts": {"newton": 100}}),
+        ("sweeps 3", {"counts": {"newton": 100, "contacts": 9, "sweeps": 3}}),
     ],
-)  # fmt: skip
+)
 def test_a_changed_number_is_caught(told, changes):
     found = differences(CASE, replace(ENTRY, **changes), ENTRY)
     assert len(found) == 1 and found[0].startswith(f"{told}, stored ")
@@ -60,11 +66,15 @@ def test_a_changed_number_is_caught(told, changes):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"error": 0.0104}, {"error": 0.0096}, {"time": 99.0}, {"field_bytes": 1_000_500},
-        {"counts": {"newton": 105, "contacts": 11}}, {"counts": {"newton": 95, "contacts": 7}},
+        {"error": 0.0104},
+        {"error": 0.0096},
+        {"time": 99.0},
+        {"field_bytes": 1_000_500},
+        {"counts": {"newton": 105, "contacts": 11}},
+        {"counts": {"newton": 95, "contacts": 7}},
     ],
     ids=str,
-)  # fmt: skip
+)
 def test_what_rounding_may_change_is_not(changes):
     assert differences(CASE, replace(ENTRY, **changes), ENTRY) == []
 
@@ -126,9 +136,12 @@ def test_the_unit_of_times_is_work():
 def test_prints_stores_and_tells(monkeypatch, tmp_path, capsys):
     newton = [100]
     fake = replace(
-        CASE, name="fake", what="made up", run=lambda arch: Found([1.0, -2.02], {"newton": newton[0]}, "ok", 1000, 1.0),
+        CASE,
+        name="fake",
+        what="made up",
+        run=lambda arch: Found([1.0, -2.02], {"newton": newton[0]}, "ok", 1000, 1.0),
         reference=lambda arch: [1.0, -2.0],
-    )  # fmt: skip
+    )
     monkeypatch.setattr(regression, "CASES", (fake,))
     monkeypatch.setattr(regression, "STORE", tmp_path / "stored.json")
     monkeypatch.setattr(regression, "baseline", lambda: 0.5)

@@ -103,13 +103,18 @@ def test_dt_is_lowered_to_a_divisor_of_the_frame(dt, lowered, per_frame):
     assert all(problem.startswith(words) for problem, words in zip(result.problems, expected))
 
 
-@pytest.mark.parametrize("dt, per_frame, words", [
-    (0.00833333, 2, "rounded from 0.00833333 s to 0.00833333333 s"), (0.0083332, 3, "lowered from 0.0083332 s to 0.00555556 s"),
-    (0.01666666, 1, "rounded from 0.01666666 s to 0.0166666667 s"),
-    (0.01666667, 1, "rounded from 0.01666667 s to 0.0166666667 s"),
-    (0.0166668, 1, "lowered from 0.0166668 s to 0.0166667 s"), (0.0166667, 1, "lowered from 0.0166667 s to 0.0166666667 s"),
-    (1 / 120, 2, None),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "dt, per_frame, words",
+    [
+        (0.00833333, 2, "rounded from 0.00833333 s to 0.00833333333 s"),
+        (0.0083332, 3, "lowered from 0.0083332 s to 0.00555556 s"),
+        (0.01666666, 1, "rounded from 0.01666666 s to 0.0166666667 s"),
+        (0.01666667, 1, "rounded from 0.01666667 s to 0.0166666667 s"),
+        (0.0166668, 1, "lowered from 0.0166668 s to 0.0166667 s"),
+        (0.0166667, 1, "lowered from 0.0166667 s to 0.0166666667 s"),
+        (1 / 120, 2, None),
+    ],
+)
 @pytest.mark.parametrize("explicit", [False, True])
 def test_a_dt_that_was_written_with_few_digits(dt, per_frame, words, explicit):
     sim = StandIn(explicit, dt=dt)
@@ -306,10 +311,17 @@ def test_real_ctrl_c(block, monkeypatch):
     assert np.abs(after - block.positions()).max() < 1e-9  # [m]
 
 
-@pytest.mark.parametrize("end, status", [
-    (None, "ok"), (0.005, "ok"), (0.02, "degraded"), (KeyboardInterrupt(), "degraded"), (ts.SimulationError("lost"), "failed"),
-    (MemoryError("lost"), "failed"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "end, status",
+    [
+        (None, "ok"),
+        (0.005, "ok"),
+        (0.02, "degraded"),
+        (KeyboardInterrupt(), "degraded"),
+        (ts.SimulationError("lost"), "failed"),
+        (MemoryError("lost"), "failed"),
+    ],
+)
 def test_the_end_is_judged(end, status):
     """By the deepest overlap [m], or what asking for it raises."""
     sim = StandIn(True)

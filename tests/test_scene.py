@@ -94,9 +94,7 @@ def test_a_misspelt_law_gets_the_nearest_name(law, near):
 
 @pytest.mark.parametrize("law", ["hooke", "", None, 3])
 def test_an_unknown_law_lists_the_known_ones(law):
-    with pytest.raises(
-        SceneError, match="law must be one of st_venant_kirchhoff, corotational, stable_neo_hookean, not"
-    ):
+    with pytest.raises(SceneError, match="law must be one of st_venant_kirchhoff, corotational, stable_neo_hookean, not"):
         Material(law=law)
 
 
@@ -265,9 +263,7 @@ def test_tractions_choose_triangles_by_their_centroids(body):
     assert body.tractions == [load] and body.add_traction([3, 1], (1, 0, 0)).triangles.tolist() == [3, 1]
 
 
-@pytest.mark.parametrize(
-    "where, rule", [([48], "surface triangle 48 does not exist"), ([], "no surface triangle is chosen")]
-)
+@pytest.mark.parametrize("where, rule", [([48], "surface triangle 48 does not exist"), ([], "no surface triangle is chosen")])
 def test_tractions_outside_the_rules(body, where, rule):
     with pytest.raises(SceneError, match=rule):
         body.add_traction(where, (0, 1, 0))

@@ -71,11 +71,11 @@ BAD = [
     ("nodes = [8, 9]", "nodes = [8, 12]", "bodies.beam.move[0]: node 12 does not exist"),
     ("nodes = [8, 9]", "nodes = [8, 8]", "bodies.beam.move[0]: node 8 is chosen twice"),
     ("nodes = [8, 9]", "nodes = [8.0]", "bodies.beam.move[0].nodes must be a list of whole numbers"),
-    ("nodes = [8, 9]", 'nodes = "X[:, 0] < 0"', "bodies.beam.move[0].nodes must be \"all\", a list of ids"),
+    ("nodes = [8, 9]", 'nodes = "X[:, 0] < 0"', 'bodies.beam.move[0].nodes must be "all", a list of ids'),
     ("nodes = [8, 9]", "", "bodies.beam.move[0].nodes is missing"),
     ("nodes = [8, 9]", "nodes = {}", "bodies.beam.move[0].nodes must be"),
     ('axes = "y"', 'axes = "x"', ""),
-    ("nodes = [8, 9]\naxes = \"y\"", 'nodes = [1]\naxes = "x"', "bodies.beam.move[0]: node 1 is already fixed along x"),
+    ('nodes = [8, 9]\naxes = "y"', 'nodes = [1]\naxes = "x"', "bodies.beam.move[0]: node 1 is already fixed along x"),
     ("times = [0, 1]", "times = [0, 0]", "bodies.beam.move[0].path.times must ascend, but 0 follows 0"),
     ("times = [0, 1]", "times = [0]", "bodies.beam.move[0].path.translations must have shape (1, 3), not (2, 3)"),
     ("times = [0, 1]", "times = [-1, 0]", "bodies.beam.move[0]: the path must give a displacement at t = 0, not None"),
@@ -103,7 +103,7 @@ BAD = [
     ("gravity", "gravity = [0, 0, 0]\ngravity", ", line 3: Cannot overwrite a value"),
     ("young = 1e5", f"young = 1{'0' * 5000}", "digits"),
     ("young = 1e5", f"young = {'[' * 5000}", "nested too deeply"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("old, new, told", BAD, ids=[f"{i}-{ascii(new[:30])}" for i, (_, new, _) in enumerate(BAD)])

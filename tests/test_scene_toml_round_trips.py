@@ -59,11 +59,20 @@ def everything() -> ts.Scene:
 
 
 EVERY_SETTING = {
-    "dt": 1 / 120, "integrator": "bdf2", "contact_solver": "auto", "self_collision": True, "precision": "f64", "arch": "cpu",
-    "allow_unstable": False, "draggable": True,
-    "newton_tolerance": 1e-5, "linear_tolerance": None, "contact_tolerance": 1e-3, "seconds": 2,
+    "dt": 1 / 120,
+    "integrator": "bdf2",
+    "contact_solver": "auto",
+    "self_collision": True,
+    "precision": "f64",
+    "arch": "cpu",
+    "allow_unstable": False,
+    "draggable": True,
+    "newton_tolerance": 1e-5,
+    "linear_tolerance": None,
+    "contact_tolerance": 1e-3,
+    "seconds": 2,
     "fps": None,
-}  # fmt: skip
+}
 
 
 def test_everything_comes_back(tmp_path):
@@ -104,9 +113,14 @@ def test_random_numbers_come_back(tmp_path, values):
     scene.collision = ts.CollisionSettings(cell_ratio=draw(positive), margin=draw(st.none() | floats(0, 1e9)))
     loss = draw(floats(0, 1e38))
     material = ts.Material(
-        young=draw(positive), poisson=draw(floats(-1, 0.49, exclude_min=True)), density=draw(positive), friction=loss,
-        restitution=draw(floats(0, 1)), mass_damping=loss, stiffness_damping=draw(floats(0, 1e38)),
-    )  # fmt: skip
+        young=draw(positive),
+        poisson=draw(floats(-1, 0.49, exclude_min=True)),
+        density=draw(positive),
+        friction=loss,
+        restitution=draw(floats(0, 1)),
+        mass_damping=loss,
+        stiffness_damping=draw(floats(0, 1e38)),
+    )
     name, other = draw(st.lists(names, min_size=2, max_size=2, unique=True))
     body = scene.add_body(TURNED, material, name=name, position=draw(vectors), velocity=draw(vectors))
     times = sorted(draw(st.lists(numbers.filter(lambda t: t > 0), min_size=1, max_size=4, unique=True)))

@@ -48,9 +48,7 @@ def test_box_is_the_whole_box(cells, size, pattern):
     assert areas.sum() == pytest.approx(2 * (a * b + b * c + c * a))
 
 
-@pytest.mark.parametrize(
-    "cells, pattern, count", [((12, 3, 3), "five", 540), ((11, 2, 2), "five", 220), ((2, 3, 4), "six", 144)]
-)
+@pytest.mark.parametrize("cells, pattern, count", [((12, 3, 3), "five", 540), ((11, 2, 2), "five", 220), ((2, 3, 4), "six", 144)])
 def test_known_counts(cells, pattern, count):
     assert box_mesh(cells, (4, 1, 1), pattern=pattern).n_tets == count
 
@@ -113,14 +111,10 @@ def test_ball_is_symmetric():
         mirrored = mesh.vertices.copy()
         mirrored[:, axis] *= -1
         assert {tuple(p) for p in np.round(mirrored, 12) + 0.0} == points
-    assert (mesh.volumes[:, None] * mesh.vertices[mesh.tets].mean(axis=1)).sum(axis=0) == pytest.approx(
-        [0, 0, 0], abs=1e-12
-    )
+    assert (mesh.volumes[:, None] * mesh.vertices[mesh.tets].mean(axis=1)).sum(axis=0) == pytest.approx([0, 0, 0], abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    "cells", [(0, 1, 1), (1, -2, 1), (1, 1), (1.5, 1, 1), 3, "abc", (True, 1, 1), (1, 1, 1, 1), None]
-)
+@pytest.mark.parametrize("cells", [(0, 1, 1), (1, -2, 1), (1, 1), (1.5, 1, 1), 3, "abc", (True, 1, 1), (1, 1, 1, 1), None])
 def test_box_refuses_cells(cells):
     with pytest.raises(MeshError, match="box_mesh: cells must be three positive integers"):
         box_mesh(cells, (1, 1, 1))

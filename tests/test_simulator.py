@@ -308,12 +308,24 @@ def test_a_closed_simulator():
     sim.close()
     sim.close()
     calls = (
-        sim.step, sim.reset, sim.positions, sim.velocities, sim.energies, sim.reactions, lambda: sim.advance(3),
-        lambda: sim.run(1.0), lambda: sim.stress("beam"), lambda: sim.set_state(velocities=np.zeros((20, 3))),
-        lambda: sim.set_gravity((0, 0, 0)), lambda: sim.set_material("beam", young=1e4), lambda: sim.time,
-        lambda: sim.step_count, lambda: sim.force_differential(np.zeros((20, 3))), lambda: setattr(sim, "dt", 1e-4),
+        sim.step,
+        sim.reset,
+        sim.positions,
+        sim.velocities,
+        sim.energies,
+        sim.reactions,
+        lambda: sim.advance(3),
+        lambda: sim.run(1.0),
+        lambda: sim.stress("beam"),
+        lambda: sim.set_state(velocities=np.zeros((20, 3))),
+        lambda: sim.set_gravity((0, 0, 0)),
+        lambda: sim.set_material("beam", young=1e4),
+        lambda: sim.time,
+        lambda: sim.step_count,
+        lambda: sim.force_differential(np.zeros((20, 3))),
+        lambda: setattr(sim, "dt", 1e-4),
         lambda: sim.field_bytes,
-    )  # fmt: skip
+    )
     for call in calls:
         with pytest.raises(ts.SimulationError, match="^the simulator is closed$"):
             call()
@@ -366,9 +378,7 @@ def test_simulators_side_by_side_do_not_disturb_each_other(integrator):
     assert all(np.array_equal(alone, beside) for alone, beside in zip(ends[:2], ends[2:], strict=True))
 
 
-def add_pair(
-    scene: ts.Scene, name: str, Q=UPRIGHT, shift=(0.0, 0.0, 0.0), size: float = 1.0, reverse: bool = False
-) -> None:
+def add_pair(scene: ts.Scene, name: str, Q=UPRIGHT, shift=(0.0, 0.0, 0.0), size: float = 1.0, reverse: bool = False) -> None:
     """A loaded pair, quadratic and linear, turned, shifted and enlarged at constant time: lengths, velocities and
     accelerations grow with the size, stresses stay, so the density falls with its square.
     """

@@ -43,10 +43,17 @@ def hollow() -> ts.TetMesh:
 
 
 MESHES = {
-    "coarse": box(1), "cube": box(2), "fine": box(3), "six": box(2, pattern="six"), "half": box(1, (0.5, 1, 1)),
-    "eighth": box(1, (0.5, 0.5, 0.5)), "wide": box(2, (1.1, 1, 1)), "hollow": hollow(),
-    "tilted": turned(box(1), (0, 0, np.pi / 4)), "turned": turned(box(2), (0, np.pi / 2, 0)),
-}  # fmt: skip
+    "coarse": box(1),
+    "cube": box(2),
+    "fine": box(3),
+    "six": box(2, pattern="six"),
+    "half": box(1, (0.5, 1, 1)),
+    "eighth": box(1, (0.5, 0.5, 0.5)),
+    "wide": box(2, (1.1, 1, 1)),
+    "hollow": hollow(),
+    "tilted": turned(box(1), (0, 0, np.pi / 4)),
+    "turned": turned(box(2), (0, np.pi / 2, 0)),
+}
 STILL = Rotation.identity(), np.zeros(3)
 MOTIONS = [STILL, (Rotation.from_rotvec((0, 0, np.pi / 2)), np.array([0.0, 0.1, 0.0]))]
 MOTIONS += [(Rotation.random(random_state=1), np.array([30.0, -60.0, 10.0]))]
@@ -74,24 +81,40 @@ def depths(a: str, b: str, shift) -> np.ndarray:
 
 DOUBLES = ("cube", "coarse", "fine", "six", "turned")
 OVERLAPPING = [  # mesh, mesh, shift of the first [m], bounds of the depth [m]
-    *(("cube", other, (0, 0, 0), 0.5, 0.5) for other in DOUBLES), ("coarse", "coarse", (0, 0, 0), 0.4, 0.5),
+    *(("cube", other, (0, 0, 0), 0.5, 0.5) for other in DOUBLES),
+    ("coarse", "coarse", (0, 0, 0), 0.4, 0.5),
     *(("cube", "cube", shift, 0.4999, 0.5) for shift in ((1e-9, 2e-9, -1e-9), (1e-5, 2e-5, -1e-5), (1e-5, 0, 0))),
     *(("cube", other, (0.1, 0, 0), 0.4, 0.5) for other in ("cube", "fine")),
     *(("cube", other, (0.5, 0, 0), 0.5, 0.5) for other in ("cube", "coarse", "six")),
     *(("cube", other, (0.9, 0, 0), 0.1, 0.1) for other in ("cube", "coarse")),
-    ("coarse", "coarse", (0.3, 0, 0), 0.3, 0.5), ("coarse", "coarse", (1 - 1e-5, 0, 0), 1e-5, 1e-5),
-    ("cube", "cube", (0.9, 0, 0.9), 0.1, 0.1), ("half", "cube", (0.25, 0, 0), 0.25, 0.5),
-    ("half", "coarse", (0.25, 0, 0), 0.25, 0.5), ("eighth", "cube", (0.25, 0.25, 0.25), 0.5, 0.5),
-    ("eighth", "cube", (0.25, 0, 0), 0.25, 0.5), ("eighth", "fine", (0.01, 0.02, 0.03), 0.4, 0.5),
-    ("hollow", "hollow", (0, 0, 0), 0.5, 0.5), ("cube", "hollow", (1, 0, 0), 0.5, 0.5),
+    ("coarse", "coarse", (0.3, 0, 0), 0.3, 0.5),
+    ("coarse", "coarse", (1 - 1e-5, 0, 0), 1e-5, 1e-5),
+    ("cube", "cube", (0.9, 0, 0.9), 0.1, 0.1),
+    ("half", "cube", (0.25, 0, 0), 0.25, 0.5),
+    ("half", "coarse", (0.25, 0, 0), 0.25, 0.5),
+    ("eighth", "cube", (0.25, 0.25, 0.25), 0.5, 0.5),
+    ("eighth", "cube", (0.25, 0, 0), 0.25, 0.5),
+    ("eighth", "fine", (0.01, 0.02, 0.03), 0.4, 0.5),
+    ("hollow", "hollow", (0, 0, 0), 0.5, 0.5),
+    ("cube", "hollow", (1, 0, 0), 0.5, 0.5),
     ("wide", "hollow", (0, 0, 0), 0.05, 0.05),
-]  # fmt: skip
+]
 TOUCHING = [
-    ("cube", "cube", (0, 1, 0)), ("coarse", "fine", (0, 1, 0)), ("cube", "six", (1, 0, 0)), ("cube", "fine", (0.3, 1, 0.2)),
-    ("cube", "cube", (1, 1, 0)), ("cube", "fine", (1, 1, 0.2)), ("cube", "cube", (1, 1, 1)), ("coarse", "hollow", (0, 0, 0)),
-    ("cube", "hollow", (0, 0, 0)), ("eighth", "hollow", (0.1, 0.2, -0.2)), ("eighth", "hollow", (0.25, 0.25, 0)),
-    ("tilted", "cube", (0, 0.5 + np.sqrt(0.5), 0)), ("cube", "cube", (0, 1 - 5e-7, 0)), ("cube", "cube", (3, 0, 0)),
-]  # fmt: skip
+    ("cube", "cube", (0, 1, 0)),
+    ("coarse", "fine", (0, 1, 0)),
+    ("cube", "six", (1, 0, 0)),
+    ("cube", "fine", (0.3, 1, 0.2)),
+    ("cube", "cube", (1, 1, 0)),
+    ("cube", "fine", (1, 1, 0.2)),
+    ("cube", "cube", (1, 1, 1)),
+    ("coarse", "hollow", (0, 0, 0)),
+    ("cube", "hollow", (0, 0, 0)),
+    ("eighth", "hollow", (0.1, 0.2, -0.2)),
+    ("eighth", "hollow", (0.25, 0.25, 0)),
+    ("tilted", "cube", (0, 0.5 + np.sqrt(0.5), 0)),
+    ("cube", "cube", (0, 1 - 5e-7, 0)),
+    ("cube", "cube", (3, 0, 0)),
+]
 
 
 @pytest.mark.parametrize("a, b, shift, least, most", OVERLAPPING)

@@ -101,6 +101,7 @@ def test_exit_status(monkeypatch, rows, ended, signal_number, status):
 
 # --- interrupted ------------------------------------------------------------------------------------------------------
 
+
 def records(out: Path) -> dict[str, int]:
     """Finished runs: name -> time of change."""
     return {path.name: path.stat().st_mtime_ns for path in (out / "runs").glob("*.json")} if out.exists() else {}

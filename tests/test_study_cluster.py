@@ -28,9 +28,12 @@ SLOW = "import os, time\n\n\ndef build():\n    open({file!r}, 'a').write(f'{{os.
 def dask(stack: ExitStack, *arguments) -> subprocess.Popen:
     environment = os.environ | {"PYTHONPATH": str(ROOT), "DASK_DISTRIBUTED__DIAGNOSTICS__NVML": "False"}
     process = subprocess.Popen(
-        [sys.executable, "-m", "distributed.cli." + arguments[0], *map(str, arguments[1:])], env=environment,
-        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
-    )  # fmt: skip
+        [sys.executable, "-m", "distributed.cli." + arguments[0], *map(str, arguments[1:])],
+        env=environment,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+    )
     stack.callback(process.wait)
     stack.callback(process.kill)
     return process
@@ -90,9 +93,12 @@ def test_workers_have_cores_of_their_own_and_can_be_lost(cluster, tmp_path):
             return False
 
         left = carry_out(
-            [("a", request), ("b", request)], places, lambda key, answer: None, stop_requested=stop_requested,
+            [("a", request), ("b", request)],
+            places,
+            lambda key, answer: None,
+            stop_requested=stop_requested,
             seconds_left=lambda: end - time.monotonic(),
-        )  # fmt: skip
+        )
         assert sorted(left.values()) == [BUDGET_SPENT, CUT_BY_BUDGET] and len(seen) == 2
     deadline = time.monotonic() + 60
     while any(map(is_running, started())):

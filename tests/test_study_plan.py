@@ -101,8 +101,9 @@ def test_a_reference_integrator_of_the_other_mass_is_replaced_and_told():
     axes = {"dt": [0.005], "integrator": ["velocity_verlet", "bdf2"], "order": [2]}
     plan = plan_of(scene_of(), axes, reference_integrator="implicit_midpoint")
     assert {r["kind"]: r["setting"]["integrator"] for r in plan["references"]} == {
-        "explicit": "velocity_verlet", "implicit": "implicit_midpoint",
-    }  # fmt: skip
+        "explicit": "velocity_verlet",
+        "implicit": "implicit_midpoint",
+    }
     assert plan["notes"] == [
         "explicit steps of quadratic tets use the reference velocity_verlet, because implicit_midpoint has another mass matrix"
     ]
@@ -112,9 +113,7 @@ def test_quadratic_tets_have_a_reference_for_each_kind_of_mass():
     axes = {"dt": [0.005], "integrator": ["velocity_verlet", "bdf2"], "order": [1, 2]}
     plan = plan_of(scene_of(), axes)
     found = [(r["setting"]["order"], r["kind"], r["setting"]["integrator"]) for r in plan["references"]]
-    assert sorted(found) == [
-        (1, "", "velocity_verlet"), (2, "explicit", "velocity_verlet"), (2, "implicit", "implicit_midpoint"),
-    ]  # fmt: skip
+    assert sorted(found) == [(1, "", "velocity_verlet"), (2, "explicit", "velocity_verlet"), (2, "implicit", "implicit_midpoint")]
     assert found[plan["space"]][:2] == (2, "implicit")
 
 

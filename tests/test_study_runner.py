@@ -36,11 +36,20 @@ def plan(dts=DTS, integrators=("implicit_euler", "bdf2"), reference=0.0125, **mo
     setting = asdict(Setting(reference, "implicit_midpoint", precision="f64"))
     of = {"setting": setting, "kind": "", "order_in_time": 2, "steps": steps}
     return {
-        "scenes": {"refine 0": "scene"}, "sources": {"scene.py": "text"}, "code": "code",
-        "fixed": {}, "frame": 0.2, "frames": 20, "seconds": 4.0, "touching": False,
-        "names": ["mass"], "cases": [refused, *({"setting": s, "refused": ""} for s in settings)], "references": [of],
-        "space": None, "notes": [],
-    } | more  # fmt: skip
+        "scenes": {"refine 0": "scene"},
+        "sources": {"scene.py": "text"},
+        "code": "code",
+        "fixed": {},
+        "frame": 0.2,
+        "frames": 20,
+        "seconds": 4.0,
+        "touching": False,
+        "names": ["mass"],
+        "cases": [refused, *({"setting": s, "refused": ""} for s in settings)],
+        "references": [of],
+        "space": None,
+        "notes": [],
+    } | more
 
 
 def run(place: Pendulum, store=None, request=ASK, machines=({"name": "here"},), requested=lambda: False, left=lambda: 1.0):
@@ -141,9 +150,7 @@ def test_refused_combinations_are_told_as_a_product_where_they_are_one():
     assert "* bdf2, dt = 0.2 s, f32; bdf2, dt = 0.2 s, f64; bdf2, dt = 0.1 s, f32: it does not fit" in refused(*whole[:3])
 
 
-@pytest.mark.parametrize(
-    "kept, told", [(True, "The same command continues it."), (False, "Without --out nothing is kept.")]
-)
+@pytest.mark.parametrize("kept, told", [(True, "The same command continues it."), (False, "Without --out nothing is kept.")])
 def test_a_spent_budget_leaves_runs_out_and_says_so(tmp_path, kept, told):
     place = Pendulum(plan())
     # planning is one of the requests, and not of the budget
@@ -170,10 +177,13 @@ def test_finished_runs_are_found_again(tmp_path):
 @pytest.mark.parametrize(
     "other",
     [
-        {"machines": [{"name": "there"}]}, {"request": replace(ASK, repeats=4)}, {"scenes": {"refine 0": "another scene"}},
-        {"code": "edited"}, {"sources": {"scene.py": "text", "helper.py": "text"}},
+        {"machines": [{"name": "there"}]},
+        {"request": replace(ASK, repeats=4)},
+        {"scenes": {"refine 0": "another scene"}},
+        {"code": "edited"},
+        {"sources": {"scene.py": "text", "helper.py": "text"}},
     ],
-)  # fmt: skip
+)
 def test_other_machines_settings_scenes_and_code_find_none(tmp_path, other):
     run(Pendulum(plan()), Store(tmp_path))
     changed = {key: other.pop(key) for key in ("scenes", "sources", "code") if key in other}

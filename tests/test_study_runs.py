@@ -93,9 +93,11 @@ def test_refinement_and_what_is_kept_in_flight(tmp_path, lent):
 
 
 def test_a_run_that_fails_is_a_record_with_its_reason(tmp_path):
-    path = write(tmp_path / "bar.py", SCENE.replace("HOLD", "bar.move(lambda X: X[:, 0] < -0.99, path)") + (
-        "\n\ndef path(t):\n    return (0, 0, 0) if t < 0.2 else 1 / 0\n"
-    ))  # fmt: skip
+    path = write(
+        tmp_path / "bar.py",
+        SCENE.replace("HOLD", "bar.move(lambda X: X[:, 0] < -0.99, path)")
+        + ("\n\ndef path(t):\n    return (0, 0, 0) if t < 0.2 else 1 / 0\n"),
+    )
     place = InProcess()
     request = Request(str(path), {"dt": [0.01], "integrator": ["velocity_verlet"], "precision": ["f64"]}, repeats=1)
     study = run(place, request)

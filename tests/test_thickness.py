@@ -49,17 +49,29 @@ CUBES = joined(*(ts.box_mesh((1, 1, 1), (1.0, 1.0, 1.0), (1.5 * k, 0.0, 0.0)) fo
 UNEVEN = joined(ts.box_mesh((3, 3, 3), (3.0, 3.0, 3.0)), ts.box_mesh((6, 1, 1), (6.0, 0.5, 1.0), (5.0, 0.0, 0.0)))
 
 COARSE = {
-    "sheet": (SHEET, 1), "irregular sheet": (irregular(SHEET), 1), "tube": (curved(SHEET), 1), "bar": (BAR, 1),
-    "kuhn": (ts.box_mesh((12, 1, 1), (12.0, 1.0, 1.0), pattern="six"), 1), "fine along": (ts.box_mesh((40, 1, 1), (4, 1, 1)), 1),
-    "plate": (ts.box_mesh((4, 1, 4), (2.0, 0.5, 2.0)), 1), "long cells": (ts.box_mesh((6, 2, 2), (12.0, 1.0, 1.0)), 2),
-    "wide bar": (ts.box_mesh((12, 1, 3), (12.0, 1.0, 3.0)), 1), "two bars": (joined(BAR, curved(SHEET)), 1),
-}  # fmt: skip
+    "sheet": (SHEET, 1),
+    "irregular sheet": (irregular(SHEET), 1),
+    "tube": (curved(SHEET), 1),
+    "bar": (BAR, 1),
+    "kuhn": (ts.box_mesh((12, 1, 1), (12.0, 1.0, 1.0), pattern="six"), 1),
+    "fine along": (ts.box_mesh((40, 1, 1), (4, 1, 1)), 1),
+    "plate": (ts.box_mesh((4, 1, 4), (2.0, 0.5, 2.0)), 1),
+    "long cells": (ts.box_mesh((6, 2, 2), (12.0, 1.0, 1.0)), 2),
+    "wide bar": (ts.box_mesh((12, 1, 3), (12.0, 1.0, 3.0)), 1),
+    "two bars": (joined(BAR, curved(SHEET)), 1),
+}
 RIGHT = {
-    "cell": ts.box_mesh((1, 1, 1), (1.0, 1.0, 1.0)), "two cells": ts.box_mesh((2, 1, 1), (2.0, 1.0, 1.0)), "fine": FINE,
-    "two layers": ts.box_mesh((20, 2, 2), (10.0, 1.0, 1.0)), "fine sheet": ts.sheet_mesh((12, 4, 12), (1.0, 0.2, 1.0)),
-    "tet": ts.TetMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]]), "cubes in a row": CUBES,
-    "coarse ball": ts.ball_mesh(1.0, 2), "ball": ts.ball_mesh(1.0, 6), "large cube and thin bar": UNEVEN,
-}  # fmt: skip
+    "cell": ts.box_mesh((1, 1, 1), (1.0, 1.0, 1.0)),
+    "two cells": ts.box_mesh((2, 1, 1), (2.0, 1.0, 1.0)),
+    "fine": FINE,
+    "two layers": ts.box_mesh((20, 2, 2), (10.0, 1.0, 1.0)),
+    "fine sheet": ts.sheet_mesh((12, 4, 12), (1.0, 0.2, 1.0)),
+    "tet": ts.TetMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]]),
+    "cubes in a row": CUBES,
+    "coarse ball": ts.ball_mesh(1.0, 2),
+    "ball": ts.ball_mesh(1.0, 6),
+    "large cube and thin bar": UNEVEN,
+}
 
 
 @pytest.mark.parametrize("name", COARSE)

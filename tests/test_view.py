@@ -317,13 +317,16 @@ from taisoft.view.window import show
 scene = beam_scene()
 sim = FakeSimulator(scene, announce=True)
 """
-TRY_WINDOW = PROLOGUE + """
+TRY_WINDOW = (
+    PROLOGUE
+    + """
 try:
     show(sim)
 except OutputError as error:
     print("refused:", error)
 print(Offscreen(scene, (64, 36), renderer="software").image(sim).shape)
 """
+)
 
 
 def run_child(code, **variables):
@@ -339,7 +342,9 @@ NO_VULKAN = {"VK_ICD_FILENAMES": "/nonexistent", "VK_DRIVER_FILES": "/nonexisten
 
 
 def test_without_vulkan_pictures_are_drawn_in_software():
-    code = PROLOGUE + """
+    code = (
+        PROLOGUE
+        + """
 for _ in range(2):
     drawing = Offscreen(scene, (64, 36))
     print(drawing.renderer, drawing.image(sim).std() > 5)
@@ -349,6 +354,7 @@ try:
 except OutputError as error:
     print(error)
 """
+    )
     out, err = run_child(code, **NO_VULKAN)
     assert out.count("software True") == 2
     assert "cannot open a window: there is no Vulkan driver" in out

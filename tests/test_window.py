@@ -153,10 +153,16 @@ class Clock:
         return StepReport(time=self.step_count * self.dt, steps=n)
 
 
-@pytest.mark.parametrize("dt, seconds_per_step, steps, needs", [
-    (1 / 60, 0.001, 1.0, 0.0), (1 / 600, 0.0001, 10.0, 0.0), (0.05, 0.001, 1 / 3, 0.0), (1e-4, 1e-3, 17.0, 10.0),
-    (1 / 60, 0.5, 1.0, 30.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "dt, seconds_per_step, steps, needs",
+    [
+        (1 / 60, 0.001, 1.0, 0.0),
+        (1 / 600, 0.0001, 10.0, 0.0),
+        (0.05, 0.001, 1 / 3, 0.0),
+        (1e-4, 1e-3, 17.0, 10.0),
+        (1 / 60, 0.5, 1.0, 30.0),
+    ],
+)
 def test_pictures_do_not_wait_for_a_slow_solver(monkeypatch, dt, seconds_per_step, steps, needs):
     sim = Clock(dt, seconds_per_step)
     monkeypatch.setattr("time.perf_counter", lambda: sim.now)

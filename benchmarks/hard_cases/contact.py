@@ -130,9 +130,11 @@ def inner_edges(session: Session) -> dict[str, float]:
         session.go(sim, 200, look)
     path = np.array(path)
     return {
-        "sideways deviation [m]": np.ptp(path[:, 2]), "hop [m]": path[:, 1].max() - path[0, 1],
-        "loss of speed": 1.0 - min(speed), "way [m]": path[-1, 0],
-    }  # fmt: skip
+        "sideways deviation [m]": np.ptp(path[:, 2]),
+        "hop [m]": path[:, 1].max() - path[0, 1],
+        "loss of speed": 1.0 - min(speed),
+        "way [m]": path[-1, 0],
+    }
 
 
 def spiked(session: Session, part: str) -> dict[str, float]:
@@ -172,15 +174,18 @@ def aligned(session: Session, over: str) -> dict[str, float]:
         session.go(sim, 200, look)
         cut = len(sim.intersecting_triangles())
     return {
-        "length of a normal, less 1, most": max(lengths), DEEPEST: session.deepest,
+        "length of a normal, less 1, most": max(lengths),
+        DEEPEST: session.deepest,
         "pairs of triangles that cut each other at the end": float(cut),
-    }  # fmt: skip
+    }
 
 
 STEP = {"dt": 0.005, "integrator": IMPLICIT}
 SLIDES = Must(OK, "Coulomb's law says which cube stays and how fast the others slide")
 C1 = Case(
-    "C1", "a cube on a slope", slope,
+    "C1",
+    "a cube on a slope",
+    slope,
     tuple(Variant(f"friction {mu}", {"dt": 0.01, "integrator": IMPLICIT}, {"friction": mu}, SLIDES) for mu in (0.51, 0.49, 0.0)),
     (
         Criterion("way [m]", 1e-3, PROPOSED, of={"friction": 0.51}),
@@ -189,13 +194,16 @@ C1 = Case(
         Criterion("off the line of steepest descent [degrees]", 1.0, ANALYTIC, of={"friction": (0.49, 0.0)}),
         Criterion(DEEPEST, 1e-4, PROPOSED, note="the catalogue asks for none; this is what cubes at rest keep"),
     ),
-    size=0.1, quick=("friction 0.51",),
-)  # fmt: skip
+    size=0.1,
+    quick=("friction 0.51",),
+)
 
 BUCKLES = "a column of 5 m is higher than the 4.05 m from which a bar of this material buckles under its own weight"
 STANDS = Must(OK, "the stack stands, squeezed by 2.5 % of its height; all ten starts must")
 C2 = Case(
-    "C2", "five cubes on each other", stack,
+    "C2",
+    "five cubes on each other",
+    stack,
     tuple(
         Variant(f"start {seed}", {"dt": 0.025, "integrator": IMPLICIT}, {"seed": seed}, STANDS, reference=seed == 0)
         for seed in range(10)
@@ -206,20 +214,26 @@ C2 = Case(
         Criterion(DEEPEST, 5e-3, PROPOSED),
     ),
     size=5.0,
-)  # fmt: skip
+)
 
 A, B = {"part": "spike"}, {"part": "inner edges"}
 WEDGED = Must(OK, "the spike slides into the hole along its rims; sharp features make normals ambiguous, not absent")
 GLIDES = Must(OK, "a flat mesh is a plane: a cube without friction slides on as it came")
 C3 = Case(
-    "C3", "spike in a hole; inner edges", spiked,
+    "C3",
+    "spike in a hole; inner edges",
+    spiked,
     (Variant("spike", STEP, A, WEDGED), Variant("inner edges", STEP, B, GLIDES)),
     (
         Criterion("numbers that are not finite at the end", 0.0, PROPOSED, of=A),
         Criterion(DEEPEST, 1e-3, PROPOSED, of=A),
         Criterion("largest speed upwards [m/s]", 0.5, PROPOSED, of=A),
         Criterion(
-            "depth of the tip under the rims at the end [m]", 0.1, PROPOSED, at_least=True, of=A,
+            "depth of the tip under the rims at the end [m]",
+            0.1,
+            PROPOSED,
+            at_least=True,
+            of=A,
             note="that the spike rests, with 1e-6 J at most, is not asked: its base is as wide as the hole, so that it wobbles "
             "through and falls on, in f64 and in steps of 1 ms too",
         ),
@@ -227,7 +241,8 @@ C3 = Case(
         Criterion("hop [m]", 1e-3, PROPOSED, of=B),
         Criterion("loss of speed", 0.01, PROPOSED, of=B),
     ),
-    size=0.1, shortfalls=(
+    size=0.1,
+    shortfalls=(
         Shortfall(
             "rounding: in 5 steps of 400 the contact laws stop at a residual of 3e-4 to 8e-4, where 1e-4 is asked; with f64 all "
             "steps converge, to 1e-6",
@@ -236,18 +251,21 @@ C3 = Case(
         ),
     ),
     quick=("inner edges",),
-)  # fmt: skip
+)
 
 TOUCHES = Must(OK, "where several contact normals are equally right, each of them gives an answer")
 C4 = Case(
-    "C4", "features that meet exactly", aligned,
+    "C4",
+    "features that meet exactly",
+    aligned,
     tuple(Variant(over, STEP, {"over": over}, TOUCHES) for over in (*PLACES, "parallel edges")),
     (
         Criterion("length of a normal, less 1, most", 1e-5, PROPOSED),
         Criterion(DEEPEST, 1e-3, PROPOSED),
         Criterion("pairs of triangles that cut each other at the end", 0.0, PROPOSED),
     ),
-    size=0.1, shortfalls=(
+    size=0.1,
+    shortfalls=(
         Shortfall(
             "multipliers stall: the 20 to 43 contacts between the cubes end at a residual of up to 2e-4, f32 asks 1e-4, and "
             "no lower in f64; why is not known",
@@ -256,6 +274,6 @@ C4 = Case(
         ),
     ),
     quick=("corner",),
-)  # fmt: skip
+)
 
 CASES = (C1, C2, C3, C4)

@@ -115,14 +115,20 @@ SI = 2e-3 / np.sqrt(10.0)
 BENDS = Must(OK, "a few flat tets change neither the bar nor how it bends, and an implicit step has a solution for them too")
 TOO_LONG = Must(REFUSED, "this dt is 0.9 of the explicit limit without slivers, which these lower by 8 and by 83 times")
 G1 = Case(
-    "G1", "slivers", slivers,
+    "G1",
+    "slivers",
+    slivers,
     tuple(
         Variant(
-            f"s {s:g}, {law}, {kind}", {"dt": dt, "integrator": kind}, {"law": law, "s": s},
+            f"s {s:g}, {law}, {kind}",
+            {"dt": dt, "integrator": kind},
+            {"law": law, "s": s},
             TOO_LONG if kind == EXPLICIT and s < 1.0 else BENDS,
             reference=kind == IMPLICIT or s == 1.0,
         )
-        for law in (COR, SNH) for kind, dt in ((IMPLICIT, 0.01), (EXPLICIT, SI)) for s in LIMITS
+        for law in (COR, SNH)
+        for kind, dt in ((IMPLICIT, 0.01), (EXPLICIT, SI))
+        for s in LIMITS
     ),
     (
         Criterion(NAMED, 1.5, PROPOSED, note="the load report is that of `taisoft info`"),
@@ -132,15 +138,19 @@ G1 = Case(
     ),
     size=LENGTH,
     quick=(f"s 0.0001, {SNH}, {EXPLICIT}",),
-)  # fmt: skip
+)
 
 HANGS = Must(OK, "the edges of the knives bear the mat, which hangs over them; the catalogue lets thin obstacles be refused")
 G2 = Case(
-    "G2", "mat on knives", knives,
+    "G2",
+    "mat on knives",
+    knives,
     (Variant(SNH, {"dt": 0.01, "integrator": IMPLICIT}, {}, HANGS),),
     (
         Criterion(
-            "deepest of the contacts after any step [m]", 2e-3, PROPOSED,
+            "deepest of the contacts after any step [m]",
+            2e-3,
+            PROPOSED,
             note="the catalogue asks for the depth of vertices and middles alone; a point in a knife, which is 4 mm thick, is "
             "never deeper than 2 mm",
         ),
@@ -148,6 +158,6 @@ G2 = Case(
         Criterion("numbers that are not finite at the end", 0.0, PROPOSED),
     ),
     size=0.6,
-)  # fmt: skip
+)
 
 CASES = (G1, G2)

@@ -43,9 +43,10 @@ def spin(session: Session, law: str) -> dict[str, float]:
 
     energies = np.array(energies)
     return {
-        "drift of the momentum": drift(momenta), "drift of the angular momentum": drift(spins),
+        "drift of the momentum": drift(momenta),
+        "drift of the angular momentum": drift(spins),
         "drift of the energy": float(np.abs(energies / energies[0] - 1.0).max()),
-    }  # fmt: skip
+    }
 
 
 def rest(session: Session) -> dict[str, float]:
@@ -117,10 +118,13 @@ def frames_from(saved: str) -> np.ndarray:
 
 SPINS = Must(OK, "a free body keeps its momenta, and symplectic steps below the limit keep its energy in bounds")
 L1 = Case(
-    "L1", "free spin, 1e5 steps", spin,
+    "L1",
+    "free spin, 1e5 steps",
+    spin,
     tuple(
         Variant(f"{law}, {precision}", {"dt": 5.6e-4, "integrator": EXPLICIT, "precision": precision}, {"law": law}, SPINS)
-        for law in (COR, SNH) for precision in ("f32", "f64")
+        for law in (COR, SNH)
+        for precision in ("f32", "f64")
     ),
     (
         Criterion("drift of the momentum", 1e-4, MEASURED, of={"precision": "f32"}),
@@ -130,11 +134,13 @@ L1 = Case(
         Criterion("drift of the energy", 0.02, MEASURED),
     ),
     size=0.1,
-)  # fmt: skip
+)
 
 RESTS = Must(OK, "the slope's tangent of 0.18 is below the friction of 0.5, so that the cube stays where it is")
 L2 = Case(
-    "L2", "sixty seconds at rest", rest,
+    "L2",
+    "sixty seconds at rest",
+    rest,
     (Variant(COR, {"dt": 0.01, "integrator": IMPLICIT}, {}, RESTS),),
     (
         Criterion("creep after 1 s, most [m]", 1e-4, PROPOSED),
@@ -144,11 +150,13 @@ L2 = Case(
         Criterion("time of the last 1000 steps over that of the first", 1.1, PROPOSED, cost=True),
     ),
     size=0.1,
-)  # fmt: skip
+)
 
 GOES_ON = Must(OK, "a checkpoint holds all that the next step depends on")
 L3 = Case(
-    "L3", "stop and go on", go_on,
+    "L3",
+    "stop and go on",
+    go_on,
     (Variant(SNH, {"dt": 0.025, "integrator": IMPLICIT}, {}, GOES_ON, reference=False),),
     (
         Criterion("contacts when it was stopped", 1.0, ANALYTIC, at_least=True),
@@ -156,6 +164,6 @@ L3 = Case(
         Criterion("frames that differ in a bit", 0.0, PROPOSED),
     ),
     size=5.0,
-)  # fmt: skip
+)
 
 CASES = (L1, L2, L3)

@@ -80,23 +80,33 @@ IMPLICIT, EXPLICIT = "implicit_euler", "symplectic_euler"
 FINITE = Criterion("numbers that are not finite in the last state", 0.0, ANALYTIC)
 
 RECOVERS = Must(
-    OK, "tets start flat or inside out, and count as inverted until they have turned; the law drives them back to the cube's "
-    "shape (measured), which it must have at the end", (INVERTED,),
-)  # fmt: skip
+    OK,
+    "tets start flat or inside out, and count as inverted until they have turned; the law drives them back to the cube's "
+    "shape (measured), which it must have at the end",
+    (INVERTED,),
+)
 STAYS = Must(
-    DEGRADED, "the energy of St. Venant-Kirchhoff is blind to reflections: a mirrored cube is at rest, and a flat one stays "
-    "flat; the run must tell of the inverted tets", (INVERTED,),
-)  # fmt: skip
+    DEGRADED,
+    "the energy of St. Venant-Kirchhoff is blind to reflections: a mirrored cube is at rest, and a flat one stays "
+    "flat; the run must tell of the inverted tets",
+    (INVERTED,),
+)
 DIVERGES = Must(
-    STOPPED, "neo-Hookean stiffens with stretch, so that a tenth of the limit at rest is beyond that of these stretches: the "
-    "catalogue's reference is no longer finite in step 10, and no frame may be written of that", (INVERTED,),
-)  # fmt: skip
+    STOPPED,
+    "neo-Hookean stiffens with stretch, so that a tenth of the limit at rest is beyond that of these stretches: the "
+    "catalogue's reference is no longer finite in step 10, and no frame may be written of that",
+    (INVERTED,),
+)
 
 M1 = Case(
-    "M1", "collapsed to a plane; mirrored", recover,
+    "M1",
+    "collapsed to a plane; mirrored",
+    recover,
     tuple(
         _recovery(law, kind, start, dt, STAYS if law == SVK else RECOVERS)
-        for law in (*LAWS, SVK) for kind, dt in ((IMPLICIT, 0.02), (EXPLICIT, 1e-3)) for start in STARTS[:2]
+        for law in (*LAWS, SVK)
+        for kind, dt in ((IMPLICIT, 0.02), (EXPLICIT, 1e-3))
+        for start in STARTS[:2]
     ),
     (
         Criterion(SHAPE, 1e-3, MEASURED, of={"law": LAWS}),
@@ -114,14 +124,17 @@ M1 = Case(
         ),
     ),
     quick=(f"mirrored, {COR}, {EXPLICIT}, dt 0.001 s",),
-)  # fmt: skip
+)
 
 NOT_ASKED = "the catalogue speaks of neo-Hookean alone; corotational does not stiffen with stretch, and must recover"
 M2 = Case(
-    "M2", "random vertices", recover,
+    "M2",
+    "random vertices",
+    recover,
     tuple(
         _recovery(law, kind, "random", dt, DIVERGES if (law, dt) == (SNH, 1.12e-3) else RECOVERS)
-        for law in LAWS for kind, dt in ((IMPLICIT, 0.01), (EXPLICIT, 2.2e-4), (EXPLICIT, 1.12e-3))
+        for law in LAWS
+        for kind, dt in ((IMPLICIT, 0.01), (EXPLICIT, 2.2e-4), (EXPLICIT, 1.12e-3))
     ),
     (
         Criterion(SHAPE, 1e-3, PROPOSED, of={"integrator": IMPLICIT}),
@@ -132,19 +145,23 @@ M2 = Case(
         Criterion(INVERTED_LAST, 0.0, PROPOSED, of={"dt": 1.12e-3, "law": COR}, note=f"for dt 0.00112 s {NOT_ASKED}"),
         FINITE,
     ),
-    size=1.0, quick=(f"random, {SNH}, {EXPLICIT}, dt 0.00112 s",),
-)  # fmt: skip
+    size=1.0,
+    quick=(f"random, {SNH}, {EXPLICIT}, dt 0.00112 s",),
+)
 
 BEARS = Must(OK, "both laws stay stiff when squeezed to half: the cube has an upright shape all the way, and its rest at the end")
 SNAPS = Must(
-    OK, "St. Venant-Kirchhoff softens below a stretch of 0.577, so that tets may snap through when squeezed to half; the run "
-    "must tell of that", (INVERTED,),
-)  # fmt: skip
+    OK,
+    "St. Venant-Kirchhoff softens below a stretch of 0.577, so that tets may snap through when squeezed to half; the run "
+    "must tell of that",
+    (INVERTED,),
+)
 M3 = Case(
-    "M3", "squeezed past a stretch of 0.577", squeeze,
+    "M3",
+    "squeezed past a stretch of 0.577",
+    squeeze,
     tuple(
-        Variant(law, {"dt": 0.01, "integrator": IMPLICIT}, {"law": law}, SNAPS if law == SVK else BEARS)
-        for law in (SVK, *LAWS)
+        Variant(law, {"dt": 0.01, "integrator": IMPLICIT}, {"law": law}, SNAPS if law == SVK else BEARS) for law in (SVK, *LAWS)
     ),
     (
         Criterion("smallest volume ratio of all steps", 0.05, PROPOSED, at_least=True, of={"law": LAWS}),
@@ -154,17 +171,22 @@ M3 = Case(
         Criterion("run is ok though tets are inverted at the end", 0.0, ANALYTIC, of={"law": SVK}),
     ),
     size=0.1,
-)  # fmt: skip
+)
 
 RECOILS = Must(
-    OK, "drawn to a stretch of 4 the bar holds more than twice the energy that flattens a tet (per volume 85 against 32 kPa in "
-    "neo-Hookean), so that tets may turn inside out when it is let go; none may be at the end", (INVERTED,),
-)  # fmt: skip
+    OK,
+    "drawn to a stretch of 4 the bar holds more than twice the energy that flattens a tet (per volume 85 against 32 kPa in "
+    "neo-Hookean), so that tets may turn inside out when it is let go; none may be at the end",
+    (INVERTED,),
+)
 M4 = Case(
-    "M4", "stretch of 4, a full turn, release", draw_and_twist,
+    "M4",
+    "stretch of 4, a full turn, release",
+    draw_and_twist,
     tuple(Variant(law, {"dt": 0.01, "integrator": IMPLICIT}, {"law": law}, RECOILS) for law in LAWS),
     (Criterion(INVERTED_LAST, 0.0, PROPOSED), Criterion(SHAPE, 5e-3, PROPOSED)),
-    size=0.5, shortfalls=(
+    size=0.5,
+    shortfalls=(
         Shortfall(
             "corotational thins in proportion to stretch: with Poisson's ratio 0.4 no width is left at a stretch of 3.5, "
             "where the rotation flips; the energy has a kink there, and from there on its minimum, in which up to 345 of 540 "
@@ -174,6 +196,6 @@ M4 = Case(
             of={"law": COR},
         ),
     ),
-)  # fmt: skip
+)
 
 CASES = (M1, M2, M3, M4)

@@ -88,11 +88,15 @@ def static_thickness(mesh: ts.TetMesh, soft: ts.Material, inside: np.ndarray) ->
 A, B = {"level": "A"}, {"level": "B"}
 BEARS = Must(OK, "the lower cube bears 0.1 MPa, a hundredth of its stiffness")
 CRUSHED = Must(
-    OK, "the weight asks 9.8 MPa of the lower cube, whose law bears 2.1 MPa at most: it is crushed, its tets may turn inside "
-    "out, and the plane bears the upper cube; the catalogue lets it fail, but there is an answer", (INVERTED,),
-)  # fmt: skip
+    OK,
+    "the weight asks 9.8 MPa of the lower cube, whose law bears 2.1 MPa at most: it is crushed, its tets may turn inside "
+    "out, and the plane bears the upper cube; the catalogue lets it fail, but there is an answer",
+    (INVERTED,),
+)
 R1 = Case(
-    "R1", "mass ratio of 1e4", masses,
+    "R1",
+    "mass ratio of 1e4",
+    masses,
     (
         Variant("A", {"dt": 0.025, "integrator": IMPLICIT}, A, BEARS),
         Variant("B", {"dt": 0.025, "integrator": IMPLICIT}, B, CRUSHED),
@@ -119,18 +123,18 @@ R1 = Case(
             of=B,
         ),
     ),
-)  # fmt: skip
+)
 
 LIES = Must(OK, "the soft slab bears its own weight, a twentieth of its stiffness, and comes to lie on the stiff one")
 R2 = Case(
-    "R2", "stiffness ratio of 1e4", stiffnesses,
+    "R2",
+    "stiffness ratio of 1e4",
+    stiffnesses,
     (Variant("neo-Hookean", {"dt": 0.025, "integrator": IMPLICIT}, {}, LIES),),
     (
         Criterion("deepest penetration after any step [m]", 2e-3, PROPOSED),
         Criterion("thickness of the soft slab over that by statics, less 1", 0.02, ANALYTIC),
-        Criterion(
-            "force between the slabs over the upper one's weight, less 1, most of the last 0.5 s", 0.02, ANALYTIC,
-        ),
+        Criterion("force between the slabs over the upper one's weight, less 1, most of the last 0.5 s", 0.02, ANALYTIC),
     ),
     size=1.0,
     shortfalls=(
@@ -141,6 +145,6 @@ R2 = Case(
             "the contact forces and their residual in f64",
         ),
     ),
-)  # fmt: skip
+)
 
 CASES = (R1, R2)

@@ -134,10 +134,14 @@ def flood(session: Session, capacities: dict, broad_phase: str) -> dict[str, flo
 
 SCALES_EXACTLY = Must(OK, "lengths and times scale together, so that every size has the same answer")
 X1 = Case(
-    "X1", "the same problem at 1 um, 1 mm, 1 m, 1 km", scales,
+    "X1",
+    "the same problem at 1 um, 1 mm, 1 m, 1 km",
+    scales,
     tuple(
         Variant(
-            f"{law}, {kind}, {precision}", {"dt": dt, "integrator": kind, "precision": precision}, {"law": law, "steps": steps},
+            f"{law}, {kind}, {precision}",
+            {"dt": dt, "integrator": kind, "precision": precision},
+            {"law": law, "steps": steps},
             SCALES_EXACTLY,
         )
         for law in (COR, SNH)
@@ -149,14 +153,17 @@ X1 = Case(
         Criterion("tip off that at 1 m, over L, most", 1e-9, ANALYTIC, of={"precision": "f64"}),
         Criterion("iterations over those at 1 m, less 1", 0.2, ANALYTIC, cost=True),
     ),
-    size=0.5, quick=(f"{COR}, {EXPLICIT}, f64",),
-)  # fmt: skip
+    size=0.5,
+    quick=(f"{COR}, {EXPLICIT}, f64",),
+)
 
 FLYING, SPOILT = {"spoilt": False}, {"spoilt": True}
 FLIES = Must(OK, "a fast body far away is a body as any other, and nothing to the one at rest")
 POISONED = Must(STOPPED, "no answer follows from NaN: the step that meets it must end the run and name the body")
 X2 = Case(
-    "X2", "the one that flies away", flyer,
+    "X2",
+    "the one that flies away",
+    flyer,
     (
         Variant("1e4 m/s", {"dt": 0.01, "integrator": IMPLICIT}, FLYING, FLIES),
         Variant("NaN at step 50", {"dt": 0.01, "integrator": IMPLICIT}, SPOILT, POISONED, reference=False),
@@ -167,8 +174,9 @@ X2 = Case(
         Criterion("steps", 50.0, ANALYTIC, of=SPOILT),
         Criterion("sentences that name body 'B'", 1.0, ANALYTIC, at_least=True, of=SPOILT),
     ),
-    size=0.1, quick=("NaN at step 50",),
-)  # fmt: skip
+    size=0.1,
+    quick=("NaN at step 50",),
+)
 
 GROWING, FORBIDDEN = {"initial_capacity": 64}, {"initial_capacity": 64, "max_capacity": 64}
 GROWS = Must(OK, "with memory that may grow the cubes fall as in buffers with room enough")
@@ -177,7 +185,9 @@ FULL = {
     "bvh": Must(STOPPED, "no list is longer than 64 before the cubes touch; then contacts are more, none to be dropped"),
 }
 X3 = Case(
-    "X3", "contact flood with a small buffer", flood,
+    "X3",
+    "contact flood with a small buffer",
+    flood,
     tuple(
         Variant(
             f"{what}, {phase}", {"dt": 0.01, "integrator": IMPLICIT}, {"capacities": given, "broad_phase": phase}, must, False
@@ -191,7 +201,8 @@ X3 = Case(
         Criterion("sentences with needed and available counts", 1.0, PROPOSED, at_least=True, of={"capacities": FORBIDDEN}),
         Criterion("dropped contacts", 0.0, ANALYTIC),
     ),
-    size=0.05, shortfalls=(
+    size=0.05,
+    shortfalls=(
         Shortfall(
             "multipliers stall: in one step, with 472 contacts, the contact laws end at a residual of 1.25e-4, where f32 asks "
             "1e-4, and no lower in f64; memory has no part in it, the run with room enough does the same",
@@ -199,6 +210,6 @@ X3 = Case(
             of={"capacities": GROWING},
         ),
     ),
-)  # fmt: skip
+)
 
 CASES = (X1, X2, X3)

@@ -146,7 +146,9 @@ def jack(session: Session, law: str) -> dict[str, float]:
 TWIST = {"dt": 0.04, "integrator": IMPLICIT, "self_collision": True}
 ROLLS = Must(OK, "a mat can be rolled up without crossing itself: incremental potential contact does so on finer meshes of it")
 S1 = Case(
-    "S1", "twisted mat", mat_twist,
+    "S1",
+    "twisted mat",
+    mat_twist,
     tuple(
         Variant(f"{level}, start {seed}", TWIST, {"seed": seed, "seconds": seconds}, ROLLS, reference=False)
         for level, seconds, seeds in (("A", 2.5, range(10)), ("B", 5.0, range(1)))
@@ -166,40 +168,49 @@ S1 = Case(
             of={"seconds": 5.0},
         ),
     ),
-)  # fmt: skip
+)
 
 CLOSE = {"dt": 0.01, "integrator": IMPLICIT, "self_collision": True}
 CLOSES = Must(OK, "the arms touch, give way and spring back: nothing keeps them from their rest shape")
 S2 = Case(
-    "S2", "closing clamp", clamp,
+    "S2",
+    "closing clamp",
+    clamp,
     tuple(
         Variant(f"{law}, {precision}", CLOSE | {"precision": precision}, {"law": law}, CLOSES)
-        for law in LAWS for precision in ("f32", "f64")
+        for law in LAWS
+        for precision in ("f32", "f64")
     ),
     (
         Criterion("contacts, most", 1.0, ANALYTIC, at_least=True),
         Criterion(DEEPEST, 1e-3, PROPOSED),
         Criterion("shape error at the end, over L", 5e-3, PROPOSED),
         Criterion(
-            "what steps after the release add to the momentum, over the impulses of contacts", 1e-6, ANALYTIC,
+            "what steps after the release add to the momentum, over the impulses of contacts",
+            1e-6,
+            ANALYTIC,
             of={"precision": "f64"},
         ),
     ),
     size=0.16,
-)  # fmt: skip
+)
 
 MEET = Must(
-    OK, "two sheets meet and part again, which shorter parts of the step can follow; the catalogue lets the step be refused, but "
+    OK,
+    "two sheets meet and part again, which shorter parts of the step can follow; the catalogue lets the step be refused, but "
     "there is an answer",
-)  # fmt: skip
+)
 S3 = Case(
-    "S3", "two sheets meet at 30 m/s", sheets,
+    "S3",
+    "two sheets meet at 30 m/s",
+    sheets,
     tuple(
         Variant(
             # momentum is kept as well as Newton's method balances forces
             parts,
             {"dt": 1 / 120, "integrator": IMPLICIT, "self_collision": parts != "two bodies", "newton_tolerance": 1e-6},
-            {"parts": parts}, MEET,
+            {"parts": parts},
+            MEET,
         )
         for parts in ("two bodies", "two parts of one")
     ),
@@ -207,17 +218,22 @@ S3 = Case(
         Criterion("least distance between the sheets' middles [m]", 0.0, ANALYTIC, at_least=True),
         Criterion("momentum over that of one sheet, most", 1e-6, ANALYTIC),
     ),
-    size=0.2, quick=("two bodies",),
-)  # fmt: skip
+    size=0.2,
+    quick=("two bodies",),
+)
 
 FITS = Must(OK, "the jack fills 83 % of the room that the planes leave it, so that it fits without crossing itself")
 S4 = Case(
-    "S4", "trash compactor", jack,
+    "S4",
+    "trash compactor",
+    jack,
     tuple(Variant(law, CLOSE, {"law": law}, FITS, reference=False) for law in LAWS),
     (
         Criterion("numbers that are not finite in the last state", 0.0, PROPOSED),
         Criterion(
-            "deepest in a plane after steps that count as converged [m]", 1e-3, PROPOSED,
+            "deepest in a plane after steps that count as converged [m]",
+            1e-3,
+            PROPOSED,
             note="how deep the jack is in itself, which no limit is asked of, is told beside it",
         ),
         Criterion("shape error at the end, over L", 1e-2, PROPOSED),
@@ -231,6 +247,6 @@ S4 = Case(
             "contacts that do not press a tet further than a bound of its volume",
         ),
     ),
-)  # fmt: skip
+)
 
 CASES = (S1, S2, S3, S4)

@@ -124,29 +124,36 @@ class Session:
                 numbers = {}
                 self.refuse(str(error))
         return {
-            "status": self.status, "causes": sorted(self.causes),
-            "problems": list(dict.fromkeys(self.problems)), "warnings": list(dict.fromkeys(self.warnings)),
+            "status": self.status,
+            "causes": sorted(self.causes),
+            "problems": list(dict.fromkeys(self.problems)),
+            "warnings": list(dict.fromkeys(self.warnings)),
             "numbers": {name: float(value) for name, value in numbers.items()},
-            "steps": self.steps, "seconds": self.seconds, "total_seconds": time.perf_counter() - start,
+            "steps": self.steps,
+            "seconds": self.seconds,
+            "total_seconds": time.perf_counter() - start,
             "step_seconds": float(np.median(self.step_seconds)) if self.step_seconds else None,
             "newton_iterations": sum(report.newton_iterations for report in self.reports),
             "linear_iterations": sum(report.linear_iterations for report in self.reports),
             "contact_iterations": sum(report.contact_iterations for report in self.reports),
             "inverted": max((report.n_inverted for report in self.reports), default=0),
-            "unconverged": self.unconverged, "peak_memory_bytes": peak_memory(),
+            "unconverged": self.unconverged,
+            "peak_memory_bytes": peak_memory(),
             "points": np.concatenate(self.path) if self.path else np.empty((0, 3)),
-        }  # fmt: skip
+        }
 
 
 def causes_of(sim: ts.Simulator, result: RunReport) -> set[str]:
     """What degraded a run."""
     steps = result.step_reports
     found = {
-        UNCONVERGED: any(not step.converged for step in steps), INVERTED: any(step.n_inverted for step in steps),
-        DROPPED: any(step.dropped_contacts for step in steps), PENETRATION: any(step.deep for step in steps),
+        UNCONVERGED: any(not step.converged for step in steps),
+        INVERTED: any(step.n_inverted for step in steps),
+        DROPPED: any(step.dropped_contacts for step in steps),
+        PENETRATION: any(step.deep for step in steps),
         INTERRUPTED: result.interrupted,
         OVERLAP: result.status == DEGRADED and sim.touches and overlapping(sim),
-    }  # fmt: skip
+    }
     return {cause for cause, so in found.items() if so}
 
 

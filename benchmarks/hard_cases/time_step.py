@@ -122,17 +122,25 @@ def stiff_cube(session: Session, law: str) -> dict[str, float]:
 ABOVE = {"dt": 2.5e-3}
 STABLE = Must(OK, "2 ms are below the limit of 2.24 ms, so that the motion stays bounded")
 UNSTABLE = Must(
-    STOPPED, "2.5 ms are beyond the limit of 2.24 ms, which allow_unstable lets pass: the motion grows until tets turn inside "
-    "out, and must be stopped before a number is not finite", (INVERTED,),
-)  # fmt: skip
+    STOPPED,
+    "2.5 ms are beyond the limit of 2.24 ms, which allow_unstable lets pass: the motion grows until tets turn inside "
+    "out, and must be stopped before a number is not finite",
+    (INVERTED,),
+)
 T1 = Case(
-    "T1", "bracket of the explicit limit", bracket,
+    "T1",
+    "bracket of the explicit limit",
+    bracket,
     tuple(
         Variant(
-            f"{law}, dt {dt:g} s", {"dt": dt, "integrator": EXPLICIT, "allow_unstable": dt > STABLE_DT}, {"law": law},
-            must, reference=dt < STABLE_DT,
+            f"{law}, dt {dt:g} s",
+            {"dt": dt, "integrator": EXPLICIT, "allow_unstable": dt > STABLE_DT},
+            {"law": law},
+            must,
+            reference=dt < STABLE_DT,
         )
-        for law in LAWS for dt, must in ((2.0e-3, STABLE), (2.5e-3, UNSTABLE))
+        for law in LAWS
+        for dt, must in ((2.0e-3, STABLE), (2.5e-3, UNSTABLE))
     ),
     (
         Criterion("estimated limit of dt over 2.240e-3 s, less 1", 0.15, MEASURED),
@@ -142,27 +150,30 @@ T1 = Case(
         Criterion("steps until the run was stopped", 59.0, MEASURED, of=ABOVE),
         Criterion("numbers that are not finite in the last state", 0.0, MEASURED),
     ),
-    size=1.0, quick=(f"{COR}, dt 0.002 s", f"{SNH}, dt 0.0025 s"),
-)  # fmt: skip
+    size=1.0,
+    quick=(f"{COR}, dt 0.002 s", f"{SNH}, dt 0.0025 s"),
+)
 
 TWISTS = Must(OK, "an implicit step of any length has a solution; the catalogue lets the long ones fail, if they say so")
 T2 = Case(
-    "T2", "one twist of a rod, dt from 0.002 to 1 s", twist,
-    tuple(
-        Variant(law, {"dt": TWIST_STEPS[0], "integrator": IMPLICIT}, {"law": law}, TWISTS, reference=False)
-        for law in LAWS
-    ),
+    "T2",
+    "one twist of a rod, dt from 0.002 to 1 s",
+    twist,
+    tuple(Variant(law, {"dt": TWIST_STEPS[0], "integrator": IMPLICIT}, {"law": law}, TWISTS, reference=False) for law in LAWS),
     tuple(
         Criterion(f"dt {dt:g} s: {what}", limit, PROPOSED)
-        for dt in TWIST_STEPS if dt <= 0.05
+        for dt in TWIST_STEPS
+        if dt <= 0.05
         for what, limit in (("distance to dt 0.002 s, over L", 0.05), ("inverted tets, most", 0.0))
     ),
     size=1.0,
-)  # fmt: skip
+)
 
 BOUNCES = Must(OK, "rubber stands 67 m/s, as a golf ball does: it flattens, keeps its energy and flies back")
 T3 = Case(
-    "T3", "a ball at 67 m/s on a wall", impact,
+    "T3",
+    "a ball at 67 m/s on a wall",
+    impact,
     (
         Variant("implicit", {"dt": 2e-5, "integrator": IMPLICIT}, {"steps": 200}, BOUNCES),
         Variant("explicit", {"dt": 2e-6, "integrator": EXPLICIT}, {"steps": 2000}, BOUNCES),
@@ -175,18 +186,21 @@ T3 = Case(
         Criterion("contact impulses over the change of momentum, less 1", 0.01, PROPOSED),
     ),
     size=0.04,
-)  # fmt: skip
+)
 
 LANDS = Must(OK, "a stiff cube lands and rests; long steps only damp its waves")
 T4 = Case(
-    "T4", "a cube of 1 GPa in steps of 1/60 s", stiff_cube,
+    "T4",
+    "a cube of 1 GPa in steps of 1/60 s",
+    stiff_cube,
     tuple(Variant(law, {"dt": 1 / 60, "integrator": IMPLICIT, "precision": "f64"}, {"law": law}, LANDS) for law in LAWS),
     (
         Criterion("deepest penetration after any step [m]", 1e-3, PROPOSED),
         Criterion("kinetic energy after 1.5 s [J]", 1e-6, PROPOSED),
         Criterion("height of its middle less 0.05 m [m]", 1e-3, PROPOSED),
     ),
-    size=0.1, quick=(COR,),
-)  # fmt: skip
+    size=0.1,
+    quick=(COR,),
+)
 
 CASES = (T1, T2, T3, T4)

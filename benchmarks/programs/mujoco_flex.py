@@ -25,19 +25,7 @@ import numpy as np
 from taisoft.errors import SceneError, SimulationError
 from taisoft.timing import load_average, machine, summarise, versions
 
-from ..exact_path import (
-    DENSITY,
-    FOLDING_STARTS,
-    GRAVITY,
-    MESHES,
-    POISSON,
-    SAMPLE,
-    SECONDS,
-    SIZE,
-    YOUNG,
-    FallingBeam,
-    load_exact,
-)
+from ..exact_path import DENSITY, FOLDING_STARTS, GRAVITY, MESHES, POISSON, SAMPLE, SECONDS, SIZE, YOUNG, FallingBeam, load_exact
 
 INTEGRATORS = ("euler", "euler_staggered", "rk4", "discrete")
 # For each mesh the smallest number of steps within 10 ms that is stable for 1 s, (Euler, RK4): one step fewer diverges.
@@ -166,8 +154,11 @@ def _settings(mujoco, model, integrator: str) -> dict:
         "threads": 1,
     }
     if integrator == "discrete":
-        settings |= {"solver": mujoco.mjtSolver(model.opt.solver).name, "tolerance": float(model.opt.tolerance),
-                     "iterations": int(model.opt.iterations)}  # fmt: skip
+        settings |= {
+            "solver": mujoco.mjtSolver(model.opt.solver).name,
+            "tolerance": float(model.opt.tolerance),
+            "iterations": int(model.opt.iterations),
+        }
     return settings
 
 

@@ -108,9 +108,18 @@ class Run:
         for body in work.bodies:
             kg = mass[nodes[body.name]]
             add_flex(
-                self.mujoco, spec, body.name, body.mesh.vertices, body.mesh.tets, kg, ~body.fixed, body.young,
-                elastic3d=int(setting.model == NEO_HOOKEAN), **of_flex, **contact,
-            )  # fmt: skip
+                self.mujoco,
+                spec,
+                body.name,
+                body.mesh.vertices,
+                body.mesh.tets,
+                kg,
+                ~body.fixed,
+                body.young,
+                elastic3d=int(setting.model == NEO_HOOKEAN),
+                **of_flex,
+                **contact,
+            )
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=FALSE_ALARM.replace("beam", ".*"))
             self.model = spec.compile()

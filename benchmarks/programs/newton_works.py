@@ -25,9 +25,7 @@ NAME, MODEL = "Newton", NEWTON
 EXPLICIT_MODEL = TAISOFT  # semi_implicit has the law and the masses of taisoft's stable neo-Hookean
 RADIUS = 1e-3  # m
 # Steps of semi_implicit in 10 ms, by tets and Young's modulus [Pa]: about the fewest that last for 1 s, and finer.
-STEPS = {
-    (540, 1e6): (2, 3, 5, 10), (4320, 1e6): (5, 10, 20), (34560, 1e6): (9, 18), (540, 1e8): (20, 40), (540, 1e9): (62, 124),
-}  # fmt: skip
+STEPS = {(540, 1e6): (2, 3, 5, 10), (4320, 1e6): (5, 10, 20), (34560, 1e6): (9, 18), (540, 1e8): (20, 40), (540, 1e9): (62, 124)}
 # semi_implicit on the ground: steps in 10 ms, then what GROUND names. Stiffer springs and larger slopes need shorter steps.
 GROUND = ("stiffness", "damping", "slope", "radius")
 ON_GROUND = ((8, 5e4, 10.0, 20.0, 3e-3), (12, 7e4, 10.0, 30.0, 3e-3), (16, 1e5, 20.0, 40.0, 3e-3), (32, 2e5, 120.0, 100.0, 1e-3))
@@ -72,9 +70,7 @@ def _explicit(work: Work) -> list[Setting]:
         return [Setting(NAME, EXPLICIT_MODEL, "semi_implicit", n) for n in STEPS[work.tets, work.bodies[0].young]]
     if not work.ground or len(work.bodies) > 1:
         return []
-    return [
-        Setting(NAME, EXPLICIT_MODEL, "semi_implicit", steps, dict(zip(GROUND, numbers))) for steps, *numbers in ON_GROUND
-    ]
+    return [Setting(NAME, EXPLICIT_MODEL, "semi_implicit", steps, dict(zip(GROUND, numbers))) for steps, *numbers in ON_GROUND]
 
 
 class Run:
@@ -170,10 +166,18 @@ def _add(builder, body: Body, warp) -> None:
     """A soft mesh with its surface, which contact between bodies needs."""
     material = ts.Material(young=body.young, poisson=POISSON)
     builder.add_soft_mesh(
-        pos=warp.vec3(0.0), rot=warp.quat_identity(), scale=1.0, vel=warp.vec3(0.0), density=DENSITY, k_mu=material.mu,
-        k_lambda=material.lam, k_damp=0.0, vertices=[warp.vec3(*x) for x in body.mesh.vertices],
-        indices=body.mesh.tets.ravel().tolist(), add_surface_mesh_edges=True,
-    )  # fmt: skip
+        pos=warp.vec3(0.0),
+        rot=warp.quat_identity(),
+        scale=1.0,
+        vel=warp.vec3(0.0),
+        density=DENSITY,
+        k_mu=material.mu,
+        k_lambda=material.lam,
+        k_damp=0.0,
+        vertices=[warp.vec3(*x) for x in body.mesh.vertices],
+        indices=body.mesh.tets.ravel().tolist(),
+        add_surface_mesh_edges=True,
+    )
 
 
 def _add_bare(builder, body: Body, kg: np.ndarray, radius: float, warp) -> None:

@@ -73,9 +73,7 @@ class Run:
         self.work, self.setting, self.unconverged = work, setting, 0
         start = perf_counter()
         with unwarned():
-            self.sim = ts.Simulator(
-                make_scene(work, setting.model), dt=setting.dt, integrator=setting.method, **setting.options
-            )
+            self.sim = ts.Simulator(make_scene(work, setting.model), dt=setting.dt, integrator=setting.method, **setting.options)
         warm_up(self.sim)
         self.build_seconds = perf_counter() - start
 

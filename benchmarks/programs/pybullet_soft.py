@@ -86,9 +86,17 @@ class Run:
             path = Path(folder) / "body.vtk"
             path.write_text(_vtk(body))
             made = bullet.loadSoftBody(
-                str(path), mass=DENSITY * float(body.mesh.volumes.sum()), useNeoHookean=1, **law, collisionMargin=MARGIN,
-                frictionCoeff=work.friction, useFaceContact=int(len(work.bodies) > 1), useSelfCollision=0, **several, **here,
-            )  # fmt: skip
+                str(path),
+                mass=DENSITY * float(body.mesh.volumes.sum()),
+                useNeoHookean=1,
+                **law,
+                collisionMargin=MARGIN,
+                frictionCoeff=work.friction,
+                useFaceContact=int(len(work.bodies) > 1),
+                useSelfCollision=0,
+                **several,
+                **here,
+            )
         if np.abs(self._positions_of(made) - body.mesh.vertices).max() > 1e-9:
             raise SimulationError(f"{NAME} has put the nodes of {body.name!r} in another order")
         for node in np.flatnonzero(body.fixed):

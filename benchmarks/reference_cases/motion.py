@@ -18,9 +18,13 @@ from taisoft.fem.mass import lumped_masses
 from .record import LAWS, Case, Check, face, label, material, near, nearest, order, scene, small, told
 
 ORDER = {
-    "symplectic_euler": 1, "velocity_verlet": 2, "linearly_implicit_euler": 1, "implicit_euler": 1, "bdf2": 2,
+    "symplectic_euler": 1,
+    "velocity_verlet": 2,
+    "linearly_implicit_euler": 1,
+    "implicit_euler": 1,
+    "bdf2": 2,
     "implicit_midpoint": 2,
-}  # fmt: skip
+}
 
 
 @dataclass
@@ -130,14 +134,23 @@ def _breathing_bar(reference: dict, law: str) -> ts.Scene:
 
 
 BEAM = Exact(
-    "beam_fall_semidiscrete", lambda reference, law: _falling_beam(reference["geometry"]["cells"], reference, law),
-    lambda reference, law: reference["value"][f"{law}_lumped"], (2, 0, 0), 10,
-    {True: 3200, False: 400}, starts_free=False,
-)  # fmt: skip
+    "beam_fall_semidiscrete",
+    lambda reference, law: _falling_beam(reference["geometry"]["cells"], reference, law),
+    lambda reference, law: reference["value"][f"{law}_lumped"],
+    (2, 0, 0),
+    10,
+    {True: 3200, False: 400},
+    starts_free=False,
+)
 BAR = Exact(
-    "breathing_bar", _breathing_bar, lambda reference, law: reference["value"], (1, 0.25, 0.25), 20,
-    {True: 3200, False: 800}, starts_free=True,
-)  # fmt: skip
+    "breathing_bar",
+    _breathing_bar,
+    lambda reference, law: reference["value"],
+    (1, 0.25, 0.25),
+    20,
+    {True: 3200, False: 800},
+    starts_free=True,
+)
 
 
 # --- spinning block -------------------------------------------------------------------------------------------------

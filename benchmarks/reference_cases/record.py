@@ -65,9 +65,7 @@ class Case:
         return "-".join(part.replace(" ", "_") for part in (self.problem, self.law, self.mesh) if part)
 
 
-def near(
-    quantity: str, measured: float, reference: float, limit: float | None = None, scale: float | None = None
-) -> Check:
+def near(quantity: str, measured: float, reference: float, limit: float | None = None, scale: float | None = None) -> Check:
     """A check of |measured - reference| over `scale`, by default |reference|."""
     scale = abs(reference) if scale is None else scale
     return Check(quantity, float(measured), float(reference), float(abs(measured - reference) / scale), limit)

@@ -166,46 +166,61 @@ def _axial_force(body: Body, result: StaticResult) -> float:
 _TIP = (("uy of the tip [m]", "uy_tip", _at((2, 0, 0))), ("ux of the tip [m]", "ux_tip", _at((2, 0, 0), axis=0)))
 PROBLEMS = (
     Problem(
-        "hanging_beam_E1e6", hanging_beam, _TIP, ("11x2x2", "22x4x4", "44x8x8"), {"SNH": 3, "COR": 3, "SVK": 2},
-        quick=("SNH",),
+        "hanging_beam_E1e6", hanging_beam, _TIP, ("11x2x2", "22x4x4", "44x8x8"), {"SNH": 3, "COR": 3, "SVK": 2}, quick=("SNH",)
     ),
+    Problem("hanging_beam_E2e6", hanging_beam, _TIP, ("11x2x2", "22x4x4", "44x8x8"), {"SNH": 3, "SVK": 2}, quick=("SVK",)),
     Problem(
-        "hanging_beam_E2e6", hanging_beam, _TIP, ("11x2x2", "22x4x4", "44x8x8"), {"SNH": 3, "SVK": 2}, quick=("SVK",)
-    ),
-    Problem(
-        "mid_traction_beam", mid_traction_beam,
+        "mid_traction_beam",
+        mid_traction_beam,
         (
             ("uy of the centre [m]", "uy_centre", _at((0, 0, 0))),
             ("uy of the centre's top [m]", "uy_top_centre", _at((0, 0.05, 0))),
         ),
-        ("80x2x2", "160x4x4"), {"SNH": 2, "SVK": 1, "COR": 1}, quick=("SNH",),
+        ("80x2x2", "160x4x4"),
+        {"SNH": 2, "SVK": 1, "COR": 1},
+        quick=("SNH",),
     ),
     Problem(
-        "cook_membrane_3d", cook_membrane, (("uy of the right face's middle", "uy_mid", _at((48, 52, 0))),),
-        ("8x8x2", "16x16x4", "32x32x8"), {"SVK": 2, "COR": 2, "SNH": 3}, quick=("SVK",),
+        "cook_membrane_3d",
+        cook_membrane,
+        (("uy of the right face's middle", "uy_mid", _at((48, 52, 0))),),
+        ("8x8x2", "16x16x4", "32x32x8"),
+        {"SVK": 2, "COR": 2, "SNH": 3},
+        quick=("SVK",),
     ),
     Problem(  # its load is tiny: 1e-7 of it is the rounding of the stress on the finest mesh
-        "cantilever_small", cantilever, (("mean uy of the end face [m]", "fe3d", _end_face),),
-        ("20x2x2", "40x4x4", "80x8x8"), {"SVK": 3, "COR": 1, "SNH": 1}, quick=("SVK",), tolerance=3e-7,
+        "cantilever_small",
+        cantilever,
+        (("mean uy of the end face [m]", "fe3d", _end_face),),
+        ("20x2x2", "40x4x4", "80x8x8"),
+        {"SVK": 3, "COR": 1, "SNH": 1},
+        quick=("SVK",),
+        tolerance=3e-7,
     ),
     Problem(
-        "soft_sheet_self_weight", soft_sheet,
+        "soft_sheet_self_weight",
+        soft_sheet,
         (
             ("uy of the centre [m]", "uy_centre", _through_thickness(0, 0)),
             ("uy of the free edge's middle [m]", "uy_free_edge_middle", _through_thickness(0, 2)),
         ),
-        ("19x1x9", "38x2x18"), {"SNH": 2, "SVK": 2}, quick=("SNH",),
+        ("19x1x9", "38x2x18"),
+        {"SNH": 2, "SVK": 2},
+        quick=("SNH",),
     ),
     Problem(
-        "twist_bar_90deg", twisted_bar,
+        "twist_bar_90deg",
+        twisted_bar,
         (
             ("torque [N m]", "torque", _torque),
             ("axial force [N]", "axial_force", _axial_force),
             ("energy [J]", "energy", lambda body, result: result.elastic),
         ),
-        ("8x2x2", "16x4x4"), {"SNH": 2, "COR": 2, "SVK": 2}, quick=("SVK",),
+        ("8x2x2", "16x4x4"),
+        {"SNH": 2, "COR": 2, "SVK": 2},
+        quick=("SVK",),
     ),
-)  # fmt: skip
+)
 
 
 def _mean_by_area(body: Body, result: StaticResult, choice) -> float:

@@ -63,9 +63,10 @@ def oscillator(integrator: str, reference: dict, arch: str):
     explicit, implicit = {"allow_unstable": True}, {"newton_tolerance": 1e-13, "linear_tolerance": 1e-13}
     settings = explicit if integrator in EXPLICIT else implicit
     sizes, frequencies = [], []
-    with warnings.catch_warnings(), ts.Simulator(
-        s, dt=1.0 / omega, integrator=integrator, precision="f64", arch=arch, **settings
-    ) as sim:
+    with (
+        warnings.catch_warnings(),
+        ts.Simulator(s, dt=1.0 / omega, integrator=integrator, precision="f64", arch=arch, **settings) as sim,
+    ):
         warnings.simplefilter("ignore", UserWarning)  # that steps of z > 2 are unstable is what is measured
         for text, (amplification, frequency) in reference["value"][key].items():
             z = float(text)

@@ -158,29 +158,35 @@ def claims_of(youngs: list[Limit], sizes: list[Limit], densities: list[Limit], r
     square = is_near(by_size, 2.0, LOOSE)
     return [
         Claim(
-            "the largest stable step of semi-implicit Euler falls like E^-1/2.", is_near(by_young, -0.5, LOOSE),
+            "the largest stable step of semi-implicit Euler falls like E^-1/2.",
+            is_near(by_young, -0.5, LOOSE),
             f"from E = {youngs[0].young:.0e} to {youngs[-1].young:.0e} Pa it falls like E^{by_young:.3f} (no point is more than "
             f"{off:.1%} off). What runs show and `stable_dt` differ by at most {apart:.1%}.",
         ),
         Claim(
-            "it grows like m^1/2, m being a vertex's mass.", is_near(by_density, 0.5, LOOSE),
+            "it grows like m^1/2, m being a vertex's mass.",
+            is_near(by_density, 0.5, LOOSE),
             f"on one mesh, from {densities[0].density:g} to {densities[-1].density:g} kg/m^3, it grows like m^{by_density:.3f}.",
         ),
         Claim(
-            "it grows like (h m)^1/2, so with m like h^3 it is like h^2.", square,
+            "it grows like (h m)^1/2, so with m like h^3 it is like h^2.",
+            square,
             f"from h = 1/{sizes[0].cells} to 1/{sizes[-1].cells} m at one density it is like h^{by_size:.2f}.",
-            "" if square else "The report puts E in the place of the force on a vertex, with a constant between them. That "
+            ""
+            if square
+            else "The report puts E in the place of the force on a vertex, with a constant between them. That "
             "constant is an area, like h^2; with it the same lines give dt < c (m / (h E))^1/2, which is h (density / E)^1/2.",
         ),
         Claim(
-            "beyond the bound semi-implicit steps are unstable.", not any(r.stable for r in beyond),
+            "beyond the bound semi-implicit steps are unstable.",
+            not any(r.stable for r in beyond),
             f"at {', '.join(f'{r.factor:g}' for r in beyond if r.young == beyond[0].young)} times the limit "
             f"{sum(not r.stable for r in beyond)} of {len(beyond)} runs go beyond {BOUNDED:g} times the stretch that they begin "
             f"with, or fail; below it {sum(r.stable for r in explicit if r.factor < 1.0)} of "
             f"{sum(r.factor < 1.0 for r in explicit)} stay.",
         ),
         Claim("implicit steps may be larger.", all(good), _implicit_text(implicit, good)),
-    ]  # fmt: skip
+    ]
 
 
 def _implicit_text(implicit: list[Long], good: list[bool]) -> str:
@@ -197,10 +203,17 @@ def _implicit_text(implicit: list[Long], good: list[bool]) -> str:
 def limit_table(limits: list[Limit]) -> str:
     """A row a cube and material."""
     lines = [
-        (f"{x.young:.0e}", f"{x.density:g}", f"1/{x.cells}", f"{1e3 * x.measured:.4g}", f"{1e3 * x.told:.4g}",
-         f"{x.measured / x.told:.4f}", f"{x.measured * x.cells * np.sqrt(x.young / x.density):.3f}")
+        (
+            f"{x.young:.0e}",
+            f"{x.density:g}",
+            f"1/{x.cells}",
+            f"{1e3 * x.measured:.4g}",
+            f"{1e3 * x.told:.4g}",
+            f"{x.measured / x.told:.4f}",
+            f"{x.measured * x.cells * np.sqrt(x.young / x.density):.3f}",
+        )
         for x in limits
-    ]  # fmt: skip
+    ]
     headings = ("E [Pa]", "density", "h [m]", "by runs [ms]", "stable_dt [ms]", "runs / told", "dt / (h (density / E)^1/2)")
     return markdown(headings, lines)
 
@@ -259,10 +272,13 @@ def measure(extent: Extent) -> Part:
             cube.set(young=limit.young)
             runs += [cube.long_run(factor, limit.measured) for factor in FACTORS]
     return Part(
-        "bound", "The largest stable step", "section 3.3, figure 21",
+        "bound",
+        "The largest stable step",
+        "section 3.3, figure 21",
         "a unit cube of n^3 cells (six tets each), held on one side, in f64. The limit: halving the interval until it is "
         f"{PRECISE:.1%} wide, each dt tried for {STEPS} steps after a kick of {KICK:g} of the speed of sound. Then runs of "
         f"{LONG} steps from a stretch of {STRETCH:.0%}, at multiples of the limit.",
-        claims_of(youngs, sizes, densities, runs), [limit_table([*youngs, *sizes, *densities]), run_table(runs)],
+        claims_of(youngs, sizes, densities, runs),
+        [limit_table([*youngs, *sizes, *densities]), run_table(runs)],
         {"bound.png": draw(youngs, sizes, runs)},
-    )  # fmt: skip
+    )

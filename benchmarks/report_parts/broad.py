@@ -36,22 +36,26 @@ def claims_of(film: Film, sweeps: list[Sweep]) -> list[Claim]:
     )
     return [
         Claim(
-            "at 1,250 tets the spatial hash takes less time than the tree in every frame (figure 17, left).", share == 1.0,
+            "at 1,250 tets the spatial hash takes less time than the tree in every frame (figure 17, left).",
+            share == 1.0,
             f"at {film.tets:,} tets it does in {share:.0%} of {len(hashed)} frames; medians are {1e3 * np.median(hashed):.3g} "
-            f"and {1e3 * np.median(trees):.3g} ms.", "" if share == 1.0 else why,
+            f"and {1e3 * np.median(trees):.3g} ms.",
+            "" if share == 1.0 else why,
         ),
         Claim(
-            f"below about {REPORTS_CROSSOVER:,} tets the hash is the slower one (section 3.1.4).", bool(small) and all(slower),
+            f"below about {REPORTS_CROSSOVER:,} tets the hash is the slower one (section 3.1.4).",
+            bool(small) and all(slower),
             f"it is, by more than the spread, at {sum(slower)} of {len(small)} sizes below.",
             "The report's left figure and its text contradict each other here.",
         ),
         Claim(
-            "above that it is the faster one, with the crossover just there (figure 17, right).", near and all(faster),
+            "above that it is the faster one, with the crossover just there (figure 17, right).",
+            near and all(faster),
             f"over {sweeps[0].tets:,} to {sweeps[-1].tets:,} tets it takes {min(ratios):.2g} to {max(ratios):.2g} times "
             f"the tree's time; {crossed}",
             "" if near and all(faster) else why,
         ),
-    ]  # fmt: skip
+    ]
 
 
 def cell_claims(sweeps: list[Sweep]) -> list[Claim]:
@@ -63,18 +67,23 @@ def cell_claims(sweeps: list[Sweep]) -> list[Claim]:
         reports = min(own, key=lambda s: abs(s.at - REPORTS_BEST))
         good = reports.median(HASH) <= NEAR_BEST * best.median(HASH)
         flat = [s.at for s in own if s.median(HASH) <= NEAR_BEST * best.median(HASH)]
-        claims.append(Claim(
-            f"at {own[0].tets:,} tets cells of {REPORTS_BEST:g} mean edges are best (figure 18).", good,
-            f"{best.at:g} are best; all of {', '.join(f'{x:g}' for x in flat)} are within {NEAR_BEST - 1:.0%} of it, and "
-            f"{reports.at:g} take {reports.median(HASH) / best.median(HASH):.2f} times the best.",
-            "The minimum is flat: larger cells hold more triangles, smaller ones hold each triangle more often.",
-        ))  # fmt: skip
+        claims.append(
+            Claim(
+                f"at {own[0].tets:,} tets cells of {REPORTS_BEST:g} mean edges are best (figure 18).",
+                good,
+                f"{best.at:g} are best; all of {', '.join(f'{x:g}' for x in flat)} are within {NEAR_BEST - 1:.0%} of it, and "
+                f"{reports.at:g} take {reports.median(HASH) / best.median(HASH):.2f} times the best.",
+                "The minimum is flat: larger cells hold more triangles, smaller ones hold each triangle more often.",
+            )
+        )
         worst = own[0].median(HASH) / best.median(HASH)
-        claims.append(Claim(
-            f"at {own[0].tets:,} tets smaller cells take longer (figure 18).",
-            clearly_less(best.rounds[HASH], own[0].rounds[HASH]),
-            f"cells of {own[0].at:g} mean edges take {worst:.2f} times the best.",
-        ))  # fmt: skip
+        claims.append(
+            Claim(
+                f"at {own[0].tets:,} tets smaller cells take longer (figure 18).",
+                clearly_less(best.rounds[HASH], own[0].rounds[HASH]),
+                f"cells of {own[0].at:g} mean edges take {worst:.2f} times the best.",
+            )
+        )
     return claims
 
 
@@ -115,13 +124,17 @@ def measure(extent: Extent) -> Part:
     finally:
         runtime.close()
     return Part(
-        "broad", "Spatial hash against tree", "section 3.1.4, figure 17",
+        "broad",
+        "Spatial hash against tree",
+        "section 3.1.4, figure 17",
         f"the broad phases alone, on a cube that turns on another: pairs of triangles whose boxes meet. The tree is {TREE}: a "
         "chunked hierarchy of k-DOPs, k behind its name; the hash has boxes alone, which is k = 6.",
-        claims_of(film, sweeps), [broad_table(sweeps) + "\n\n" + crossover_text(sweeps)], {"broad.png": draw(film, sweeps)},
+        claims_of(film, sweeps),
+        [broad_table(sweeps) + "\n\n" + crossover_text(sweeps)],
+        {"broad.png": draw(film, sweeps)},
         {f"{s.setup}, {name}": summarise(seconds) for s in sweeps for name, seconds in s.rounds.items()},
         ["the report's scene and k are not told, and its hash is of another kind (a perfect one)."],
-    )  # fmt: skip
+    )
 
 
 def measure_cells(extent: Extent) -> Part:
@@ -134,9 +147,13 @@ def measure_cells(extent: Extent) -> Part:
     finally:
         runtime.close()
     return Part(
-        "cells", "Cells of the spatial hash", "section 3.1.4, figure 18",
+        "cells",
+        "Cells of the spatial hash",
+        "section 3.1.4, figure 18",
         "the spatial hash alone, on a cube on another in the middle of its turn, with cells of these multiples of the mean "
         "surface edge.",
-        cell_claims(sweeps), [cell_table(sweeps)], {"cells.png": draw_cells(sweeps)},
+        cell_claims(sweeps),
+        [cell_table(sweeps)],
+        {"cells.png": draw_cells(sweeps)},
         {f"{s.setup}, {s.at:g}": summarise(s.rounds[HASH]) for s in sweeps},
-    )  # fmt: skip
+    )

@@ -27,27 +27,33 @@ def claims_of(found: list[Colouring]) -> list[Claim]:
     fewer, theirs = all(g < r for g, r in zip(greedy, random)), COLOURS_FOUND["greedy"]
     return [
         Claim(
-            f"the scene has {CONTACTS} contacts.", any(is_near(k, CONTACTS, NEAR * CONTACTS) for k in contacts),
+            f"the scene has {CONTACTS} contacts.",
+            any(is_near(k, CONTACTS, NEAR * CONTACTS) for k in contacts),
             f"ours has {_listed(contacts)}, on the demo's mesh and on that once refined.",
             "The number is that of the mesh, which the report does not tell, and of what its reduction leaves.",
         ),
         Claim(
-            f"greedy colouring needs fewer groups than random, {theirs} against {COLOURS_FOUND['random']}.", fewer,
+            f"greedy colouring needs fewer groups than random, {theirs} against {COLOURS_FOUND['random']}.",
+            fewer,
             f"greedy needs {_listed(greedy)}, random {_listed(random)} (median over seeds), {each}.",
             "" if fewer else "Both come to the fewest that there can be, so that neither can be better.",
         ),
         Claim(
-            "so many groups are needed that each holds about three contacts.", all(groups),
+            "so many groups are needed that each holds about three contacts.",
+            all(groups),
             f"greedy groups hold {_listed(round(k / n, 1) for k, n in zip(contacts, greedy))} contacts each, {each}.",
-            "" if all(groups) else f"No colouring can do with fewer groups than contacts meet at one node, here "
+            ""
+            if all(groups)
+            else f"No colouring can do with fewer groups than contacts meet at one node, here "
             f"{_listed(least)}, and greedy comes to about that. A greedy colouring of {theirs} colours says that some contact of "
             f"the report's has at least {theirs - 1} neighbours.",
         ),
         Claim(
-            "random colouring is not steady.", max(spans) > 0,
+            "random colouring is not steady.",
+            max(spans) > 0,
             f"over {len(by[scenes[0], 'random'].numbers)} seeds its numbers of groups span {_listed(spans)}.",
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _listed(values) -> str:
@@ -71,9 +77,14 @@ def measure(extent: Extent) -> Part:
                 figure_19(panels, take_snapshot(name, sim, colours))
                 picture = plot_png(figure)
     return Part(
-        "colours", "Colours of the contact graph", "section 3.2.3, figure 19",
+        "colours",
+        "Colours of the contact graph",
+        "section 3.2.3, figure 19",
         f"the contacts of the demo {SCENE} in explicit steps, {SETTLE} after the first impulse; two contacts are neighbours "
         "where they share a node that can move. Each colouring is checked: no two neighbours have one colour.",
-        claims_of(found), [colour_table(found)], {"colours.png": picture}, times,
+        claims_of(found),
+        [colour_table(found)],
+        {"colours.png": picture},
+        times,
         [f"the report's mesh is not told, so its {CONTACTS} contacts are met only about as well as a refinement comes to them."],
-    )  # fmt: skip
+    )

@@ -44,33 +44,64 @@ def _falls(x: list[float]) -> bool:
 
 SCENES = (
     Scene(
-        "hanging_beam", "demonstration 1, figure 2", "a beam held at its left end falls under gravity, here from 0 to 1 s",
-        (0.0, 1 / 3, 2 / 3, 1.0), "height of the free end", lambda sim: _at(sim, "beam", lambda X: X[:, 0] > 1.99), _falls,
+        "hanging_beam",
+        "demonstration 1, figure 2",
+        "a beam held at its left end falls under gravity, here from 0 to 1 s",
+        (0.0, 1 / 3, 2 / 3, 1.0),
+        "height of the free end",
+        lambda sim: _at(sim, "beam", lambda X: X[:, 0] > 1.99),
+        _falls,
         quick=True,
     ),
     Scene(
-        "midpoint_traction", "demonstration 2, figure 4", "a beam held at both ends is bent up by a traction under its middle",
-        (0.0, 0.5, 6.0), "height of the middle", lambda sim: _at(sim, "beam", lambda X: np.linalg.norm(X, axis=1) < 1e-9),
-        lambda y: y[1] > 0 and y[2] > 0, ("fixed_nodes", "tractions"), quick=True,
+        "midpoint_traction",
+        "demonstration 2, figure 4",
+        "a beam held at both ends is bent up by a traction under its middle",
+        (0.0, 0.5, 6.0),
+        "height of the middle",
+        lambda sim: _at(sim, "beam", lambda X: np.linalg.norm(X, axis=1) < 1e-9),
+        lambda y: y[1] > 0 and y[2] > 0,
+        ("fixed_nodes", "tractions"),
+        quick=True,
     ),
     Scene(
-        "sheet_and_cube", "demonstration 3, figure 3", "a sheet held at two ends sags under a cube that lies on it",
-        (0.0, 0.3, 0.6, 4.0), "lowest node of the sheet", lambda sim: float(sim.positions("sheet")[:, 1].min()),
-        lambda y: y[-1] < y[0] - 0.05, quick=True,
+        "sheet_and_cube",
+        "demonstration 3, figure 3",
+        "a sheet held at two ends sags under a cube that lies on it",
+        (0.0, 0.3, 0.6, 4.0),
+        "lowest node of the sheet",
+        lambda sim: float(sim.positions("sheet")[:, 1].min()),
+        lambda y: y[-1] < y[0] - 0.05,
+        quick=True,
     ),
     Scene(
-        "bunny_ears", "figure 1, left above", "the ears of a bunny are stretched long", (0.0, 0.9, 1.1, 1.3, 2.0),
-        "tips of the ears", lambda sim: float(sim.positions("bunny")[:, 1].max()), lambda y: y[1] > y[0] + 0.5 > y[-1],
+        "bunny_ears",
+        "figure 1, left above",
+        "the ears of a bunny are stretched long",
+        (0.0, 0.9, 1.1, 1.3, 2.0),
+        "tips of the ears",
+        lambda sim: float(sim.positions("bunny")[:, 1].max()),
+        lambda y: y[1] > y[0] + 0.5 > y[-1],
     ),
     Scene(
-        "sheet_on_box", "figure 1, left below", "a sheet rests on top of a box", (0.0, 0.2, 0.5, 3.0),
-        "lowest node of the sheet", lambda sim: float(sim.positions("sheet")[:, 1].min()), lambda y: 0.0 < y[-1] < 1.0,
+        "sheet_on_box",
+        "figure 1, left below",
+        "a sheet rests on top of a box",
+        (0.0, 0.2, 0.5, 3.0),
+        "lowest node of the sheet",
+        lambda sim: float(sim.positions("sheet")[:, 1].min()),
+        lambda y: 0.0 < y[-1] < 1.0,
     ),
     Scene(
-        "hanging_cloth", "figure 1, right", "a cloth hangs from its upper corners", (0.0, 0.2, 0.4, 0.7, 4.0),
-        "lowest node", lambda sim: float(sim.positions("cloth")[:, 1].min()), lambda y: y[-1] < -0.9,
+        "hanging_cloth",
+        "figure 1, right",
+        "a cloth hangs from its upper corners",
+        (0.0, 0.2, 0.4, 0.7, 4.0),
+        "lowest node",
+        lambda sim: float(sim.positions("cloth")[:, 1].min()),
+        lambda y: y[-1] < -0.9,
     ),
-)  # fmt: skip
+)
 
 
 def _at(sim: ts.Simulator, body: str, chosen: Callable[[np.ndarray], np.ndarray]) -> float:
@@ -132,9 +163,16 @@ def show(scene: Scene, arch: str, rounds: int) -> DemoRun:
             sim.reset()
             if k == 0:
                 image, result = gallery.film(
-                    sim, scene.moments, size, view, seconds, fps, scene.layers,
-                    lambda sim: numbers.append(scene.number(sim)), on_step,
-                )  # fmt: skip
+                    sim,
+                    scene.moments,
+                    size,
+                    view,
+                    seconds,
+                    fps,
+                    scene.layers,
+                    lambda sim: numbers.append(scene.number(sim)),
+                    on_step,
+                )
                 problem = _problem(module, sim, result)
             else:
                 sim.run(seconds, fps=fps, on_step=on_step)
@@ -169,24 +207,46 @@ def demo_table(shown: list[DemoRun]) -> str:
     for s in shown:
         t = s.timing
         contacts = max((r.n_contacts for r in s.result.step_reports), default=0)
-        lines.append((
-            s.scene.demo, s.scene.where, f"{s.tets:,}", s.settings, f"{s.seconds:g}", f"{contacts}", f"{t.median:.3g}",
-            percent(spread_of(t)), f"{s.result.compile_seconds:.1f}", s.result.status, "failed" if s.problem else "passed",
-        ))  # fmt: skip
+        lines.append(
+            (
+                s.scene.demo,
+                s.scene.where,
+                f"{s.tets:,}",
+                s.settings,
+                f"{s.seconds:g}",
+                f"{contacts}",
+                f"{t.median:.3g}",
+                percent(spread_of(t)),
+                f"{s.result.compile_seconds:.1f}",
+                s.result.status,
+                "failed" if s.problem else "passed",
+            )
+        )
     headings = (
-        "demo", "in the report", "tets", "steps", "simulated [s]", "contacts at most", "wall s per simulated s", "spread",
-        "compile [s]", "status", "own check",
-    )  # fmt: skip
+        "demo",
+        "in the report",
+        "tets",
+        "steps",
+        "simulated [s]",
+        "contacts at most",
+        "wall s per simulated s",
+        "spread",
+        "compile [s]",
+        "status",
+        "own check",
+    )
     return markdown(headings, lines, left=(0, 1, 3, 9, 10))
 
 
 def measure(extent: Extent) -> Part:
     """All demos of the report's scenes; a quick run has demonstrations 1 to 3 once."""
     part = Part(
-        "demos", "The demonstrations", "demonstrations 1 to 3, figures 1 to 4",
+        "demos",
+        "The demonstrations",
+        "demonstrations 1 to 3, figures 1 to 4",
         "each demo as `taisoft run` runs it, with its own check; times are of the steps alone, medians over "
         f"{extent.of(ROUNDS, 1)} runs. Meshes and materials are ours, since the report does not tell its own.",
-    )  # fmt: skip
+    )
     shown = [show(s, extent.arch, extent.of(ROUNDS, 1)) for s in SCENES if s.quick or not extent.quick]
     part.claims = [claim_of(s) for s in shown]
     third = next(s for s in shown if s.scene.demo == "sheet_and_cube")

@@ -120,22 +120,28 @@ def claims_of(found: list[Shares]) -> list[Claim]:
     rest = {name: own.total(name) / own.search for name in ("reduction", "candidates")}
     return [
         Claim(
-            "collision detection is where most of the time goes.", own.search > 0.5,
+            "collision detection is where most of the time goes.",
+            own.search > 0.5,
             f"the search takes {told(lambda s: s.search)}.",
             "Where it is less than half, it is compiled code beside other compiled code: the linear systems of implicit steps, "
-            "the contact solve and the report of explicit ones." if any(s.search <= 0.5 for s in found) else "",
+            "the contact solve and the report of explicit ones."
+            if any(s.search <= 0.5 for s in found)
+            else "",
         ),
         Claim(
-            "within it the contact points, by Frank-Wolfe, take most.", own.points > 0.5,
+            "within it the contact points, by Frank-Wolfe, take most.",
+            own.points > 0.5,
             f"of the search they take {told(lambda s: s.points)}.",
         ),
         Claim(
-            "reducing contacts and updating the tree are significant too.", all(share > SIGNIFICANT for share in rest.values()),
+            "reducing contacts and updating the tree are significant too.",
+            all(share > SIGNIFICANT for share in rest.values()),
             "of the search they take " + " and ".join(f"{percent(share)} ({name})" for name, share in rest.items()) + ".",
-            "" if all(share > SIGNIFICANT for share in rest.values()) else "Trees are refitted here, not built, and what a few "
-            "tens of contacts need is launching the kernels.",
+            ""
+            if all(share > SIGNIFICANT for share in rest.values())
+            else "Trees are refitted here, not built, and what a few tens of contacts need is launching the kernels.",
         ),
-    ]  # fmt: skip
+    ]
 
 
 def share_table(found: list[Shares]) -> str:
@@ -169,12 +175,14 @@ def draw(found: list[Shares]) -> bytes:
 def measure(extent: Extent) -> Part:
     """Explicit steps as the report's, and the demo's implicit ones; bodies hit both ways."""
     part = Part(
-        "phases", "Where the time goes", "section 3.1.1, figure 10",
+        "phases",
+        "Where the time goes",
+        "section 3.1.1, figure 10",
         f"steps of the demo {SCENE} from the first impulse on, in {EXPLICIT} at {SHARE:g} of its largest stable step and in the "
         "demo's own implicit steps; bodies hit through distance fields by Frank-Wolfe, which with explicit steps is the report's "
         "way, or by the proximity of their surfaces. Parts are timed between synchronisations; shares are those of their "
         "medians.",
-    )  # fmt: skip
+    )
     kinds = [(i, way) for i in (EXPLICIT, IMPLICIT) for way in WAYS]
     found = [measure_shares(integrator, way, extent) for integrator, way in kinds[: extent.of(None, 1)]]
     part.claims, part.tables = claims_of(found), [share_table(found)]

@@ -58,7 +58,7 @@ class Measured:
 
 
 def setup_of(name: str) -> Setup:
-    """"cubes 5" and "pile 6" are those of `bench collision`."""
+    """ "cubes 5" and "pile 6" are those of `bench collision`."""
     kind, cells = name.split()
     return {"cubes": cubes_setup, "pile": pile_setup}[kind](int(cells))
 
@@ -147,8 +147,11 @@ def claims_of(many: Measured, one: Measured) -> list[Claim]:
     here = f"on {many.where}"
     per_frame = [np.median(p) / np.median(c) for c, p in zip(many.frames, many.plain_frames)]
     faster = all(clearly_less(c, p) for c, p in zip(many.frames, many.plain_frames))
-    ratios = [(p, q, np.median(p.plain) / np.median(q.seconds), np.median(q.seconds) / np.median(p.seconds))
-              for p, q in zip(many.sizes, one.sizes) if p.plain]  # fmt: skip
+    ratios = [
+        (p, q, np.median(p.plain) / np.median(q.seconds), np.median(q.seconds) / np.median(p.seconds))
+        for p, q in zip(many.sizes, one.sizes)
+        if p.plain
+    ]
     by_compiling, by_threads = [r[2] for r in ratios], [r[3] for r in ratios]
     tets = [p.tets for p, *_ in ratios]
     grown, _ = exponent(tets, [np.median(p.seconds) for p, *_ in ratios])
@@ -165,25 +168,32 @@ def claims_of(many: Measured, one: Measured) -> list[Claim]:
             "interpreted loop over the same pairs.",
         ),
         Claim(
-            "it is running in parallel that gains this.", min(by_threads) > max(by_compiling),
+            "it is running in parallel that gains this.",
+            min(by_threads) > max(by_compiling),
             f"compiled for one thread they take {min(by_compiling):,.0f} to {max(by_compiling):,.0f} times less than "
             f"interpreted; {here} they are {min(by_threads):.2f} to {max(by_threads):.2f} times as fast as that.",
-            "" if min(by_threads) > max(by_compiling) else "Most is gained by not interpreting, which a GPU kernel does not "
+            ""
+            if min(by_threads) > max(by_compiling)
+            else "Most is gained by not interpreting, which a GPU kernel does not "
             f"either; below {SERIAL_BELOW:,} triangles one thread does it all on the CPU, since waking others costs more.",
         ),
         Claim(
-            "the parallel computation is slow at its start, and steady afterwards (figure 11).", slow,
+            "the parallel computation is slow at its start, and steady afterwards (figure 11).",
+            slow,
             f"the first search takes {min(p.first for p in many.sizes):.1f} to {max(p.first for p in many.sizes):.1f} s, its "
-            f"contact points {ms(steady)} ms afterwards.", "Here the start is compiling the kernels, there it was moving data.",
+            f"contact points {ms(steady)} ms afterwards.",
+            "Here the start is compiling the kernels, there it was moving data.",
         ),
         Claim(
             "its time stays near zero however many tets there are, while the plain one's grows (figure 12).",
             flat and plain > FLAT,
             f"{span} the time grows like tets^{grown:.2f} {here}, like tets^{plain:.2f} interpreted.",
-            "" if flat else "Work grows with the pairs of near triangles on the surfaces that touch, about tets^(2/3), on any "
+            ""
+            if flat
+            else "Work grows with the pairs of near triangles on the surfaces that touch, about tets^(2/3), on any "
             "machine; near zero it looks beside the interpreted loop.",
         ),
-    ]  # fmt: skip
+    ]
 
 
 def size_table(many: Measured, one: Measured) -> str:
@@ -196,9 +206,20 @@ def size_table(many: Measured, one: Measured) -> str:
         sizes = (f"{n:,}" for n in (p.tets, p.triangles, p.pairs))
         lines.append((p.setup, *sizes, *timed(p.seconds), *timed(q.seconds), *plain, gain, *depth))
     headings = (
-        "scene", "tets", "triangles", "pairs", f"{many.where} [ms]", "spread", f"{one.where} [ms]", "spread",
-        "interpreted [ms]", "spread", "times faster", "deepest [mm]", "interpreted",
-    )  # fmt: skip
+        "scene",
+        "tets",
+        "triangles",
+        "pairs",
+        f"{many.where} [ms]",
+        "spread",
+        f"{one.where} [ms]",
+        "spread",
+        "interpreted [ms]",
+        "spread",
+        "times faster",
+        "deepest [mm]",
+        "interpreted",
+    )
     return markdown(headings, lines, left=(0,))
 
 
@@ -225,12 +246,16 @@ def measure(extent: Extent) -> Part:
     many = measure_here(extent.quick, extent.arch, plain=True)
     one = measure_on_one_thread(extent.quick)
     part = Part(
-        "points", "Contact points, parallel and not", "section 3.1.2, figures 11 and 12",
+        "points",
+        "Contact points, parallel and not",
+        "section 3.1.2, figures 11 and 12",
         "contact points alone of searches through distance fields (Frank-Wolfe), bodies as in `taisoft bench collision`, in "
         "f32: compiled on all threads, compiled on one (a process that has one core), and an interpreted NumPy loop over the "
         f"same pairs, which is not run on more than {MOST_PLAIN:,}. The deepest point of both tells that they do the same.",
-        claims_of(many, one), [size_table(many, one)], {"points.png": draw(many, one)},
-    )  # fmt: skip
+        claims_of(many, one),
+        [size_table(many, one)],
+        {"points.png": draw(many, one)},
+    )
     if extent.arch == "cpu":
         part.short.append(f"the report has a GPU, this run {many.where} of a processor; `--arch cuda` runs it on a GPU.")
     if left := [p.setup for p in many.sizes if not p.plain]:

@@ -31,19 +31,22 @@ def claims_of(rows: list[Row], film: Film) -> list[Claim]:
     grown, _ = exponent(tets, [r.phase("reduction") for r in rows])
     return [
         Claim(
-            "the old reduction is O(n^2), the new one Theta(n), in the worst case (section 3.1.3).", fast < HALF_WAY < slow,
+            "the old reduction is O(n^2), the new one Theta(n), in the worst case (section 3.1.3).",
+            fast < HALF_WAY < slow,
             f"from {found[0]:,} to {found[-1]:,} contacts the nested loops grow like n^{slow:.2f}, ours like n^{fast:.2f}; both "
             f"keep the same contacts in {sum(bool(r.same) for r in rows)} of {len(rows)} scenes.",
             "In the worst case a set of hashes is O(n^2) too, where all fall into one place; Theta(n) is what is expected. And "
             "the old loop as printed does not reduce: its list starts empty, so nothing is ever put into it.",
         ),
         Claim(
-            "at every size the new reduction is faster (figure 14).", all(faster),
+            "at every size the new reduction is faster (figure 14).",
+            all(faster),
             f"it is, by more than the spread, at {sum(faster)} of {len(rows)} sizes; it takes "
             f"{ratios[0]:.3g} times less at {tets[0]:,} tets and {ratios[-1]:.3g} times less at {tets[-1]:,}.",
         ),
         Claim(
-            "its time stays near zero however many tets there are (figure 14).", grown < 0.1,
+            "its time stays near zero however many tets there are (figure 14).",
+            grown < 0.1,
             f"it grows like tets^{grown:.2f}, from {ms(rows[0].phase('reduction'))} ms at {tets[0]:,} tets to "
             f"{ms(rows[-1].phase('reduction'))} ms at {tets[-1]:,}.",
             "" if grown < 0.1 else "Each contact is looked at, so what is linear in contacts grows with the surface.",
@@ -54,10 +57,11 @@ def claims_of(rows: list[Row], film: Film) -> list[Claim]:
             f"over {len(steady)} frames with {min(film.numbers['found']):,} to {max(film.numbers['found']):,} contacts the new "
             f"one takes {ms(np.median(steady))} ms and the old one {ms(np.median(before))} ms, medians; largest less least, over "
             f"the median, are {swing[0]:.0%} and {swing[1]:.0%}.",
-            "" if swing[0] < swing[1] else "Both follow the number of contacts; at tenths of a millisecond the rest is the "
-            "machine.",
+            ""
+            if swing[0] < swing[1]
+            else "Both follow the number of contacts; at tenths of a millisecond the rest is the machine.",
         ),
-    ]  # fmt: skip
+    ]
 
 
 def draw(rows: list[Row], film: Film) -> bytes:
@@ -85,12 +89,19 @@ def measure(extent: Extent) -> Part:
     finally:
         runtime.close()
     return Part(
-        "reduction", "Reduction of contacts", "section 3.1.3, figures 13 and 14",
+        "reduction",
+        "Reduction of contacts",
+        "section 3.1.3, figures 13 and 14",
         "the contacts of one search, reduced by a grid of cells that holds each once, and by two nested loops over the list; "
         "both are compiled, the loops for one thread. Piles of 27 touching cubes over tets, two cubes turning on each other "
         "over frames.",
-        claims_of(rows, film), [reduction_table(rows)], {"reduction.png": draw(rows, film)},
-        {f"{r.setup}, {way}": summarise(seconds) for r in rows
-         for way, seconds in (("O(n)", r.phases["reduction"]), ("O(n^2)", r.quadratic))},
+        claims_of(rows, film),
+        [reduction_table(rows)],
+        {"reduction.png": draw(rows, film)},
+        {
+            f"{r.setup}, {way}": summarise(seconds)
+            for r in rows
+            for way, seconds in (("O(n)", r.phases["reduction"]), ("O(n^2)", r.quadratic))
+        },
         ["the report's loops are interpreted Python; these are compiled, so that they differ by their algorithms alone."],
-    )  # fmt: skip
+    )

@@ -39,35 +39,44 @@ def claims_of(film: Film, points: list[Point]) -> list[Claim]:
     spikes = [max(times[name]) / np.median(times[name]) for name in jacobi]
     claims = [
         Claim(
-            f"the scene has {CONTACTS[SCENE]} contacts.", is_near(contacts, CONTACTS[SCENE], NEAR * CONTACTS[SCENE]),
+            f"the scene has {CONTACTS[SCENE]} contacts.",
+            is_near(contacts, CONTACTS[SCENE], NEAR * CONTACTS[SCENE]),
             f"ours has {contacts:g}, median over {len(film.contacts)} frames.",
             "The number is that of the mesh, which the report does not tell, and of what its reduction leaves.",
         ),
         Claim(
-            "Gauss-Seidel needs fewer iterations than Jacobi in every frame.", bool(few),
+            "Gauss-Seidel needs fewer iterations than Jacobi in every frame.",
+            bool(few),
             f"medians are {np.median(sweeps[SERIAL]):g} and {np.median(sweeps[JACOBI]):g} sweeps (hybrid "
             f"{np.median(sweeps[HYBRID]):g}); Gauss-Seidel needs no more in {beaten:.0%} of the frames. The residual is looked "
             "at after every fifth sweep.",
         ),
         Claim(
-            "the parallel hybrid is by far the fastest.", clear,
+            "the parallel hybrid is by far the fastest.",
+            clear,
             f"{fastest} is the fastest in the median; {hybrid} is faster than each of the others in at least {min(won):.0%} of "
             f"the frames. Medians, in ms: {told}.",
-            "" if clear else "Hybrid sweeps are Jacobi's with the newest normal impulse in the friction bound: they need about "
+            ""
+            if clear
+            else "Hybrid sweeps are Jacobi's with the newest normal impulse in the friction bound: they need about "
             "as many. With tens of contacts a compiled serial sweep takes microseconds, less than waking a thread.",
         ),
         Claim(
-            "in so small a scene parallel Gauss-Seidel is no faster than serial.", slow,
+            "in so small a scene parallel Gauss-Seidel is no faster than serial.",
+            slow,
             f"serial takes {ms(np.median(times[SERIAL]))} ms, coloured "
-            + ", ".join(f"{ms(np.median(times[name]))} ms ({name})" for name in parallel) + ", colouring included.",
+            + ", ".join(f"{ms(np.median(times[name]))} ms ({name})" for name in parallel)
+            + ", colouring included.",
         ),
         Claim(
-            "parallel Jacobi has spikes in time.", max(spikes) > SPIKE,
-            "the slowest frame takes " + ", ".join(f"{s:.1f} times the median ({n})" for n, s in zip(jacobi, spikes))
+            "parallel Jacobi has spikes in time.",
+            max(spikes) > SPIKE,
+            "the slowest frame takes "
+            + ", ".join(f"{s:.1f} times the median ({n})" for n, s in zip(jacobi, spikes))
             + f"; the frame with most sweeps has {sweeps[JACOBI].max() / np.median(sweeps[JACOBI]):.1f} times the median's.",
             "The report blames the machine; frames that need more sweeps take longer, too.",
         ),
-    ]  # fmt: skip
+    ]
     return claims + ([more_contacts(points)] if points else [])
 
 
@@ -76,11 +85,13 @@ def more_contacts(points: list[Point]) -> Claim:
     last = points[-1]
     overtaken = clearly_less(last.coloured.seconds, last.serial.seconds)
     return Claim(
-        "with more contacts parallel Gauss-Seidel will overtake serial (expected, not measured there).", overtaken,
+        "with more contacts parallel Gauss-Seidel will overtake serial (expected, not measured there).",
+        overtaken,
         f"at {last.contacts:,} contacts a solve takes {ms(last.serial.median)} ms serial and {ms(last.coloured.median)} ms "
         f"coloured; a sweep alone {ms(last.serial.per_sweep)} and {ms(last.coloured.per_sweep)} ms.",
-        "" if overtaken else "On so few threads what a sweep gains is less than colouring costs and than the sweeps lose by "
-        "their order.",
+        ""
+        if overtaken
+        else "On so few threads what a sweep gains is less than colouring costs and than the sweeps lose by their order.",
     )
 
 
@@ -114,11 +125,15 @@ def measure(extent: Extent) -> Part:
             runtime.close()
         tables.append(crossover_table(points) + "\n\n" + crossover_text(points, extent.arch))
     part = Part(
-        "solvers", "Contact solvers", "section 3.2.4, figure 20",
+        "solvers",
+        "Contact solvers",
+        "section 3.2.4, figure 20",
         f"the contact problems of explicit steps of the demo {SCENE}, one a frame, each solved to a residual of 1e-4 by all "
         f"solvers in turns; loops run on one thread, or, where it says{THREADED}, on all. And two plates with many contacts.",
-        claims_of(film, points), tables, {"solvers.png": draw(film)},
-    )  # fmt: skip
+        claims_of(film, points),
+        tables,
+        {"solvers.png": draw(film)},
+    )
     part.short.append(short_of(film))
     if extent.quick:
         part.short.append("a quick run leaves out solvers on all threads and the plates with many contacts.")

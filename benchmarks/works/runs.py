@@ -61,10 +61,17 @@ class Row:
         setting = asdict(self.setting) | {"model": str(self.setting.model), "dt": self.setting.dt}
         verdict = self.verdict and asdict(self.verdict)
         return {
-            "work": self.work.key, "tets": self.work.tets, "setting": setting, "rounds": self.rounds, "verdict": verdict,
-            "build_seconds": self.build_seconds, "unconverged": self.unconverged, "failure": self.failure, "date": self.date,
+            "work": self.work.key,
+            "tets": self.work.tets,
+            "setting": setting,
+            "rounds": self.rounds,
+            "verdict": verdict,
+            "build_seconds": self.build_seconds,
+            "unconverged": self.unconverged,
+            "failure": self.failure,
+            "date": self.date,
             "seconds_per_simulated_second": self.timing and asdict(self.timing),
-        }  # fmt: skip
+        }
 
 
 def row_of(work: Work, record: dict, date: str) -> Row:

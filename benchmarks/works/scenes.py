@@ -109,6 +109,9 @@ def cube_on_sheet() -> Work:
 
 
 WORKS: tuple[Work, ...] = (
-    *(hanging_beam(cells) for cells in MESHES), *(hanging_beam(MESHES[0], young) for young in (1e8, 1e9)),
-    dropped_cube(), stack(), cube_on_sheet(),
-)  # fmt: skip
+    *(hanging_beam(cells) for cells in MESHES),
+    *(hanging_beam(MESHES[0], young) for young in (1e8, 1e9)),
+    dropped_cube(),
+    stack(),
+    cube_on_sheet(),
+)

@@ -58,9 +58,17 @@ class SemiDiscrete:
     """
 
     def __init__(
-        self, mesh: TetMesh, law: str, young: float, poisson: float, density: float, gravity: float, free: np.ndarray,
-        *, equal_masses: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        mesh: TetMesh,
+        law: str,
+        young: float,
+        poisson: float,
+        density: float,
+        gravity: float,
+        free: np.ndarray,
+        *,
+        equal_masses: bool = False,
+    ) -> None:
         self.vertices, self.tets, self.volumes, self.free = mesh.vertices, mesh.tets, mesh.volumes, free
         n, m = len(self.vertices), len(self.tets)
         self.mass = np.bincount(self.tets.ravel(), np.repeat(density * self.volumes / 4, 4), n)

@@ -22,9 +22,18 @@ def run_table(rows: list[Row]) -> str:
     path = ("error", "good to") if work.kind == "path" else ("stands", "fell at [s]", "free fall")
     contact = ("penetration [mm]", "over an edge") if work.touches else ()
     headings = (
-        "program", "law", "setting", "dt [ms]", "s/sim. s", "spread", *path, *contact, "inverted tets", "unconverged",
+        "program",
+        "law",
+        "setting",
+        "dt [ms]",
+        "s/sim. s",
+        "spread",
+        *path,
+        *contact,
+        "inverted tets",
+        "unconverged",
         "build [s]",
-    )  # fmt: skip
+    )
     lines = [_line(row) for row in rows if row.timing is not None]
     told = markdown(headings, lines, left=(0, 1, 2)) if lines else "Nothing ran to its end."
     failed = [(row.setting, row.failure) for row in rows if row.failure]
@@ -42,10 +51,17 @@ def _line(row: Row) -> tuple[str, ...]:
     if row.work.touches:
         found += (f"{1e3 * verdict.penetration:.3g}", _percent(verdict.penetration / verdict.edge))
     return (
-        setting.program, str(setting.model), str(setting), f"{1e3 * setting.dt:.3g}", f"{t.median:.4g}", percent(spread_of(t)),
-        *found, str(verdict.inverted), str(row.unconverged) if setting.program == own.NAME else "-",
+        setting.program,
+        str(setting.model),
+        str(setting),
+        f"{1e3 * setting.dt:.3g}",
+        f"{t.median:.4g}",
+        percent(spread_of(t)),
+        *found,
+        str(verdict.inverted),
+        str(row.unconverged) if setting.program == own.NAME else "-",
         f"{row.build_seconds[0]:.2f}",
-    )  # fmt: skip
+    )
 
 
 def _percent(share: float) -> str:
@@ -78,11 +94,18 @@ def comparisons(works: list[list[Row]]) -> list[dict]:
     for rows in works:
         for at, ours, theirs in pairs_of(rows):
             ratio = time_ratio(theirs, ours) if ours and theirs else None
-            found.append({
-                "work": rows[0].work.key, "tets": rows[0].work.tets, "stiff": rows[0].work.stiff, "at": at,
-                "taisoft": _named(ours), "others": _named(theirs),
-                "ratio": ratio and ratio.median, "spread": ratio and spread_of(ratio),
-            })  # fmt: skip
+            found.append(
+                {
+                    "work": rows[0].work.key,
+                    "tets": rows[0].work.tets,
+                    "stiff": rows[0].work.stiff,
+                    "at": at,
+                    "taisoft": _named(ours),
+                    "others": _named(theirs),
+                    "ratio": ratio and ratio.median,
+                    "spread": ratio and spread_of(ratio),
+                }
+            )
     return found
 
 
@@ -90,11 +113,16 @@ def compare_table(found: list[dict]) -> str:
     """A row a work and level, of `comparisons`."""
     lines = [
         (
-            one["work"], f"{one['tets']:,}", one["at"], *one["taisoft"], *one["others"],
-            f"{one['ratio']:.3g}" if one["ratio"] else "-", percent(one["spread"]),
+            one["work"],
+            f"{one['tets']:,}",
+            one["at"],
+            *one["taisoft"],
+            *one["others"],
+            f"{one['ratio']:.3g}" if one["ratio"] else "-",
+            percent(one["spread"]),
         )
         for one in found
-    ]  # fmt: skip
+    ]
     headings = ("work", "tets", "at", "taisoft", "s/sim. s", "best of the others", "s/sim. s", "its time / taisoft's", "spread")
     return markdown(headings, lines, left=(0, 2, 3, 5))
 
@@ -128,11 +156,17 @@ def implicit_table(works: list[list[Row]]) -> str:
     """Of stiff works every program's steps of 10 ms."""
     lines = [
         (
-            row.work.key, row.setting.program, str(row.setting), str(row.setting.model),
-            *(("-", "-") if row.timing is None else (_percent(row.verdict.error), f"{row.timing.median:.3g}")), row.failure,
+            row.work.key,
+            row.setting.program,
+            str(row.setting),
+            str(row.setting.model),
+            *(("-", "-") if row.timing is None else (_percent(row.verdict.error), f"{row.timing.median:.3g}")),
+            row.failure,
         )
-        for rows in works for row in rows if row.work.stiff and row.setting.steps == 1
-    ]  # fmt: skip
+        for rows in works
+        for row in rows
+        if row.work.stiff and row.setting.steps == 1
+    ]
     return markdown(("work", "program", "setting", "law", "error", "s/sim. s", ""), lines, left=(0, 1, 2, 3, 6))
 
 

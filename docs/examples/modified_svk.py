@@ -77,11 +77,14 @@ def block(F, S, ga, gb):
     w = [S[29] * t[k] for k in ti.static(range(3))]
     turn = [0.0 * d, -w[2], w[1], w[2], 0.0 * d, -w[0], -w[1], w[0], 0.0 * d]
     return [
-        S[27] * Fa[i] * Fb[k] + c * S[18 + 3 * i + k] + S[28] * Gb[i] * Ga[k] + turn[3 * i + k]
+        S[27] * Fa[i] * Fb[k]
+        + c * S[18 + 3 * i + k]
+        + S[28] * Gb[i] * Ga[k]
+        + turn[3 * i + k]
         + (d if ti.static(i == k) else 0.0)
         for i in ti.static(range(3))
         for k in ti.static(range(3))
-    ]  # fmt: skip
+    ]
 
 
 @arithmetic

@@ -22,16 +22,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import DTYPES, Array
 from taisoft.backend.private import AutodiffMode, Kernel, impl, ndarray_type, primitive_types, template
-from taisoft.backend.structure import (
-    COUNT,
-    generate,
-    holders,
-    leaf_structures,
-    leaves_of,
-    names_in,
-    names_of_types,
-    structure_of,
-)
+from taisoft.backend.structure import COUNT, generate, holders, leaf_structures, leaves_of, names_in, names_of_types, structure_of
 from taisoft.backend.tracing import FAST_TRACING
 
 REAL, INTEGER, HOST_ARRAY = range(3)

@@ -10,6 +10,15 @@ from taichi.types import ndarray_type, primitive_types
 from taichi.ui.utils import get_field_info
 
 __all__ = [
-    "ASTTransformerContext", "AutodiffMode", "Expr", "Kernel", "core", "get_field_info", "impl", "kernel_impl", "ndarray_type",
-    "primitive_types", "template",
-]  # fmt: skip
+    "ASTTransformerContext",
+    "AutodiffMode",
+    "Expr",
+    "Kernel",
+    "core",
+    "get_field_info",
+    "impl",
+    "kernel_impl",
+    "ndarray_type",
+    "primitive_types",
+    "template",
+]

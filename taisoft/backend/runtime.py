@@ -133,11 +133,18 @@ def _initialise(arch: str, precision: str) -> None:
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # drop Taichi's banner
             ti.init(
-                arch=ARCHS[arch], default_fp=PRECISIONS[precision], default_ip=ti.i32, cfg_optimization=False,
-                fast_math=False, offline_cache=True, offline_cache_file_path=folder, log_level=ti.ERROR, random_seed=0,
+                arch=ARCHS[arch],
+                default_fp=PRECISIONS[precision],
+                default_ip=ti.i32,
+                cfg_optimization=False,
+                fast_math=False,
+                offline_cache=True,
+                offline_cache_file_path=folder,
+                log_level=ti.ERROR,
+                random_seed=0,
                 offline_cache_max_size_of_files=KERNEL_CACHE_BYTES,
                 cpu_max_num_threads=len(usable_cores()),  # Taichi's default also counts cores this process may not use
-            )  # fmt: skip
+            )
     except RuntimeError as error:
         raise SimulationError(f"Taichi does not start: {(str(error).splitlines() or ['no reason given'])[0]}") from None
     _program = impl.get_runtime().prog

@@ -52,7 +52,7 @@ def source_of(function: Callable) -> tuple[str, list[str], int, str]:
 
 def _tree_and_context(
     self, excluded_parameters=(), is_kernel=True, arg_features=None, args=None, ast_builder=None, is_real_function=False
-):  # fmt: skip
+):
     """Replacement of Taichi's function of this name: a fresh syntax tree, which tracing modifies, and its context."""
     file, lines, first, text = source_of(self.func)
     tree = ast.parse(text)
@@ -62,9 +62,18 @@ def _tree_and_context(
         for k in self.template_slot_locations:
             names[self.arguments[k].name] = args[k]
     return tree, ASTTransformerContext(
-        excluded_parameters=excluded_parameters, is_kernel=is_kernel, func=self, arg_features=arg_features, global_vars=names,
-        argument_data=args, src=lines, start_lineno=first, file=file, ast_builder=ast_builder, is_real_function=is_real_function,
-    )  # fmt: skip
+        excluded_parameters=excluded_parameters,
+        is_kernel=is_kernel,
+        func=self,
+        arg_features=arg_features,
+        global_vars=names,
+        argument_data=args,
+        src=lines,
+        start_lineno=first,
+        file=file,
+        ast_builder=ast_builder,
+        is_real_function=is_real_function,
+    )
 
 
 def _position(context: ASTTransformerContext, node) -> str:

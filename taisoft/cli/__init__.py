@@ -103,9 +103,7 @@ def _add_run(commands) -> None:
     parser.add_argument("--precision", choices=("f32", "f64"), help="floating-point precision (default f32)")
     parser.add_argument("--headless", action="store_true", help="open no window")
     parser.add_argument("--seconds", type=float, metavar="T", help="simulated time [s] (default: the scene's, or 1)")
-    parser.add_argument(
-        "--fps", type=float, metavar="N", help="frames per simulated second (default: the scene's, or 60)"
-    )
+    parser.add_argument("--fps", type=float, metavar="N", help="frames per simulated second (default: the scene's, or 60)")
     parser.add_argument("--out", metavar="DIR", help="folder for the results; without it nothing is written")
     parser.add_argument("--overwrite", action="store_true", help="replace results already in DIR")
     parser.add_argument(
@@ -162,11 +160,17 @@ def _add_study(commands) -> None:
     _add_scene_name(parser)
     grid = parser.add_argument_group("grid (comma-separated lists)")
     for name, help_text in (
-        ("dt", "steps [s]"), ("integrator", "names, such as bdf2"), ("order", "of the elements of all bodies, 1 or 2"),
-        ("refine", "how many times every tet is divided into eight"), ("precision", "f32, f64"),
-        ("newton-tolerance", "relative, or none: adaptive"), ("linear-tolerance", "of conjugate gradients, relative, or none"),
-        ("contact-solver", "auto or a solver"), ("contact-tolerance", "relative, or none"), ("arch", "cpu, cuda"),
-    ):  # fmt: skip
+        ("dt", "steps [s]"),
+        ("integrator", "names, such as bdf2"),
+        ("order", "of the elements of all bodies, 1 or 2"),
+        ("refine", "how many times every tet is divided into eight"),
+        ("precision", "f32, f64"),
+        ("newton-tolerance", "relative, or none: adaptive"),
+        ("linear-tolerance", "of conjugate gradients, relative, or none"),
+        ("contact-solver", "auto or a solver"),
+        ("contact-tolerance", "relative, or none"),
+        ("arch", "cpu, cuda"),
+    ):
         grid.add_argument(f"--{name}", metavar="LIST", help=help_text)
     parser.add_argument("--seconds", type=float, metavar="T", help="simulated time [s] (default: the scene's, or 1)")
     parser.add_argument("--tolerance", type=float, default=0.01, metavar="X", help="acceptable error (default 0.01)")
@@ -178,9 +182,7 @@ def _add_study(commands) -> None:
         "--reference-refine", type=int, default=0, metavar="N", help="refinements of the reference beyond the finest mesh"
     )
     parser.add_argument("--out", metavar="DIR", help="folder for the results; a study in it is continued")
-    parser.add_argument(
-        "--budget", type=float, default=600.0, metavar="SECONDS", help="wall time for all runs (default 600)"
-    )
+    parser.add_argument("--budget", type=float, default=600.0, metavar="SECONDS", help="wall time for all runs (default 600)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes at a time, each on its own cores (default 1)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="run on a Dask cluster, e.g. tcp://host:8786 (extra 'cluster')")
     parser.set_defaults(command="study")
@@ -188,6 +190,4 @@ def _add_study(commands) -> None:
 
 def _add_scene_name(parser: argparse.ArgumentParser, others: str = "a .toml scene file or a .py file with build()") -> None:
     parser.add_argument("scene", metavar="SCENE", help=f"a demo's name (see `taisoft list`), {others}")
-    parser.add_argument(
-        "--allow-outside", action="store_true", help="let a .toml file name mesh files outside its folder"
-    )
+    parser.add_argument("--allow-outside", action="store_true", help="let a .toml file name mesh files outside its folder")

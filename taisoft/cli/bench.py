@@ -19,7 +19,5 @@ def command(arguments: Namespace) -> int:
         return 0
     if arguments.name not in benchmarks:
         hint = nearest(arguments.name, benchmarks)
-        raise SceneError(
-            f"no benchmark is called {arguments.name!r}{hint}; there are {', '.join(benchmarks) or 'none'}"
-        )
+        raise SceneError(f"no benchmark is called {arguments.name!r}{hint}; there are {', '.join(benchmarks) or 'none'}")
     return load_shipped("benchmarks", arguments.name).main(arguments.rest) or 0

@@ -70,16 +70,22 @@ class Recording:
 
     def __init__(
         self, path: str, overwrite: bool, resumed: dict | None = None, every: float | None = None, notes: dict | None = None
-    ):  # fmt: skip
+    ):
         self._first = None if resumed is None else resumed["frame"]
         self._folder = OutputFolder(path, overwrite, self._first)
         self.path, self._resumed, self._notes = Path(path), resumed, notes or {}
         self._checkpoints = CheckpointWriter(self._folder.path, every, None if resumed is None else resumed["checkpoint"])
 
     def add_writers(
-        self, observers: Observers, sim, fps: float | None, with_usd: bool, with_frames: bool, shown: DisplayOptions,
+        self,
+        observers: Observers,
+        sim,
+        fps: float | None,
+        with_usd: bool,
+        with_frames: bool,
+        shown: DisplayOptions,
         plots: Plots | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Add the writers of frames, USD and checkpoints to the observers.
 
         A resumed run that does not match the earlier USD file is refused before anything is removed.

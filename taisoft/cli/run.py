@@ -128,9 +128,16 @@ def _show_window(sim: Simulator, settings: RunSettings, shown: DisplayOptions) -
 
 
 def _run(
-    sim: Simulator, settings: RunSettings, arguments: Namespace, signals: Signals, warned: list[str], has_window: bool,
-    every: float | None, saved: Checkpoint | None, shown: DisplayOptions,
-) -> int:  # fmt: skip
+    sim: Simulator,
+    settings: RunSettings,
+    arguments: Namespace,
+    signals: Signals,
+    warned: list[str],
+    has_window: bool,
+    every: float | None,
+    saved: Checkpoint | None,
+    shown: DisplayOptions,
+) -> int:
     """Run until settings.seconds; save what was computed, however the run ends."""
     observers, resumed, notes = Observers(), None, {}
     plots = Plots(sim, shown.plots) if shown.plots or has_window else None

@@ -65,9 +65,7 @@ def find_scene(name: str) -> Path:
     return demos[name]
 
 
-def load_scene(
-    name: str, allow_outside: bool = False, refine: int | None = None, order: int | None = None
-) -> tuple[Scene, dict]:
+def load_scene(name: str, allow_outside: bool = False, refine: int | None = None, order: int | None = None) -> tuple[Scene, dict]:
     """Load the scene named SCENE and its `solver` dict (empty if the file has none).
 
     allow_outside: let a .toml file name meshes outside its folder. refine: number of mesh refinements; order: element order of

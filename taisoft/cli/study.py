@@ -96,9 +96,17 @@ def parse_request(arguments: Namespace) -> Request:
     checks.whole(arguments.repeats, "--repeats", tuple(range(1, 101)))
     checks.whole(arguments.reference_refine, "--reference-refine", INTEGER_AXES["refine"])
     return Request(
-        arguments.scene, axes, arguments.allow_outside, arguments.seconds, arguments.reference_dt,
-        arguments.reference_integrator, arguments.reference_refine, arguments.repeats, arguments.tolerance, arguments.by,
-    )  # fmt: skip
+        arguments.scene,
+        axes,
+        arguments.allow_outside,
+        arguments.seconds,
+        arguments.reference_dt,
+        arguments.reference_integrator,
+        arguments.reference_refine,
+        arguments.repeats,
+        arguments.tolerance,
+        arguments.by,
+    )
 
 
 def values_of(key: str, text: str) -> list:

@@ -119,9 +119,13 @@ def build(structure: Structure) -> Scene:
         height = float(np.ptp(mesh.vertices[:, 1]))
         falls = k > 0 or not structure.fixed
         scene.add_body(
-            mesh, soft, name=f"body {k}", position=(0.0, bottom + 0.5 * height, 0.0), order=order,
+            mesh,
+            soft,
+            name=f"body {k}",
+            position=(0.0, bottom + 0.5 * height, 0.0),
+            order=order,
             velocity=(0.0, -SPEED if falls else 0.0, 0.0),
-        )  # fmt: skip
+        )
         mesh, bottom = box_mesh((2, 2, 2), (0.5 * SIZE, 0.5 * SIZE, 0.5 * SIZE)), bottom + height + 0.001 * SIZE
     _add_conditions(scene.bodies[0], structure)
     for name in structure.obstacles:

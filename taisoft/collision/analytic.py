@@ -141,25 +141,53 @@ def _obstacle_contacts(s: ti.template(), o: ti.template(), t, k, margin, out: ti
                 if valid == 1 and j < 3:
                     i = s.triangle[t, j]
                     write_contact(
-                        out, at, end, s.body[t], o.body[k], ivec(VERTEX_FIELD, i, o.body[k]), x, n, value,
-                        ivec(i, -1, -1), dvec(1.0, 0.0, 0.0), ivec(-1), dvec(0.0),
-                    )  # fmt: skip
+                        out,
+                        at,
+                        end,
+                        s.body[t],
+                        o.body[k],
+                        ivec(VERTEX_FIELD, i, o.body[k]),
+                        x,
+                        n,
+                        value,
+                        ivec(i, -1, -1),
+                        dvec(1.0, 0.0, 0.0),
+                        ivec(-1),
+                        dvec(0.0),
+                    )
                     at += 1
                 elif valid == 1:
                     face = vertices_of(s, t)
                     write_contact(
-                        out, at, end, s.body[t], o.body[k], ivec(FACE_FIELD, t, o.body[k]), x, n, value,
-                        face, w, ivec(-1), dvec(0.0),
-                    )  # fmt: skip
+                        out,
+                        at,
+                        end,
+                        s.body[t],
+                        o.body[k],
+                        ivec(FACE_FIELD, t, o.body[k]),
+                        x,
+                        n,
+                        value,
+                        face,
+                        w,
+                        ivec(-1),
+                        dvec(0.0),
+                    )
                     at += 1
     return at
 
 
 @kernel(cse=False)
 def find_analytic(
-    s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.template(), used: ti.template(), count: ti.template(),
-    part: ti.i32, append: ti.i32,
-):  # fmt: skip
+    s: ti.template(),
+    o: ti.template(),
+    margin: ti.f64,
+    out: ti.template(),
+    used: ti.template(),
+    count: ti.template(),
+    part: ti.i32,
+    append: ti.i32,
+):
     """Write contacts of the soft bodies' triangles with all analytic obstacles; they are appended if `append` is 1."""
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):

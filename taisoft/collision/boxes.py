@@ -33,7 +33,7 @@ def take_prescribed(s: ti.template(), prescribed: ti.template(), move: ti.types.
 @ti.func
 def _move_soft(
     s: ti.template(), x: ti.template(), v: ti.template(), has_prescribed: ti.template(), prescribed: ti.template(), dt
-):  # fmt: skip
+):
     """Set positions and displacements of the soft bodies: prescribed ones where given, else v dt."""
     ti.loop_config(serialize=s.serial_cheap)
     for i in range(s.n_verts):
@@ -169,9 +169,15 @@ def update_boxes(s: ti.template(), margin: ti.f64):
 
 @kernel
 def update_surface(
-    s: ti.template(), x: ti.template(), v: ti.template(), has_prescribed: ti.template(), prescribed: ti.template(), dt: ti.f64,
-    margin: ti.f64, active: ti.template(),
-):  # fmt: skip
+    s: ti.template(),
+    x: ti.template(),
+    v: ti.template(),
+    has_prescribed: ti.template(),
+    prescribed: ti.template(),
+    dt: ti.f64,
+    margin: ti.f64,
+    active: ti.template(),
+):
     """Set the soft bodies' positions x (n_nodes) [m] and displacements in a step of dt [s] from the model, and update the boxes.
     prescribed: of `take_prescribed`, read if has_prescribed; active: whether to list the active triangles too."""
     _move_soft(s, x, v, has_prescribed, prescribed, dt)

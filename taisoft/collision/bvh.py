@@ -69,10 +69,21 @@ def place_trees(t: TreeTables, k: int, parts: int, arena: FieldArena) -> Trees:
         return arena.vectors(f"bvh_{name}", ti.f64, max(len(t.link), 1), n=k // 2)
 
     return Trees(
-        k // 2, DIRECTIONS[k], len(t.chunk), len(t.top), levels, parts, ints("link", t.link), ints("root", t.root),
-        ints("chunk", t.chunk), ints("chunk_body", t.chunk_body), ints("top", t.top), slabs("lo"), slabs("hi"),
+        k // 2,
+        DIRECTIONS[k],
+        len(t.chunk),
+        len(t.top),
+        levels,
+        parts,
+        ints("link", t.link),
+        ints("root", t.root),
+        ints("chunk", t.chunk),
+        ints("chunk_body", t.chunk_body),
+        ints("top", t.top),
+        slabs("lo"),
+        slabs("hi"),
         arena.vectors("bvh_stack", ti.i32, parts * levels, n=2),
-    )  # fmt: skip
+    )
 
 
 @ti.func
@@ -209,9 +220,7 @@ def _walk(s: ti.template(), b: ti.template(), part, root_a, root_b, pair: ti.tem
 
 
 @kernel
-def walk_trees(
-    s: ti.template(), b: ti.template(), pair: ti.template(), used: ti.template(), total: ti.template(), part: ti.i32
-):  # fmt: skip
+def walk_trees(s: ti.template(), b: ti.template(), pair: ti.template(), used: ti.template(), total: ti.template(), part: ti.i32):
     """Find the triangle pairs whose slabs overlap, each once. Neighbouring chunks go to different parts to balance the load."""
     ti.loop_config(serialize=s.serial)
     for task in range(b.parts * s.spread):
@@ -237,9 +246,18 @@ class Bvh:
     """Broad phase by trees. margin [m] must be that of the surface's boxes; it may be changed at any time."""
 
     def __init__(
-        self, surface: Surface, topology: Topology, x: np.ndarray, margin: float, runtime: Runtime, arena: FieldArena,
-        k_dop: int = 6, leaves: int | None = None, capacity: int | None = None, max_capacity: int | None = None,
-    ):  # fmt: skip
+        self,
+        surface: Surface,
+        topology: Topology,
+        x: np.ndarray,
+        margin: float,
+        runtime: Runtime,
+        arena: FieldArena,
+        k_dop: int = 6,
+        leaves: int | None = None,
+        capacity: int | None = None,
+        max_capacity: int | None = None,
+    ):
         """x: (n_verts, 3) [m], the positions that the trees are built for. k_dop: 6, 14 or 18. leaves: most triangles per chunk.
         capacity: initial pairs; max_capacity: limit of pairs and of row entries. None for the default."""
         self.surface, self.margin = surface, margin

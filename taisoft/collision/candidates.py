@@ -151,9 +151,16 @@ def sort_row(entry: ti.template(), first, last):
 
 @kernel
 def pair_rows(
-    s: ti.template(), pair: ti.template(), used: ti.template(), part: ti.i32, chunks: ti.template(), serial: ti.template(),
-    start: ti.template(), end: ti.template(), count: ti.template(),
-):  # fmt: skip
+    s: ti.template(),
+    pair: ti.template(),
+    used: ti.template(),
+    part: ti.i32,
+    chunks: ti.template(),
+    serial: ti.template(),
+    start: ti.template(),
+    end: ti.template(),
+    count: ti.template(),
+):
     """Compute starts and lengths of the rows of pairs in both directions; count[NEEDED] is the sum of the lengths."""
     ti.loop_config(serialize=serial)
     for t in range(s.n_triangles):
@@ -178,9 +185,16 @@ def pair_rows(
 
 @kernel
 def fill_rows(
-    s: ti.template(), pair: ti.template(), used: ti.template(), part: ti.i32, chunks: ti.template(), serial: ti.template(),
-    start: ti.template(), end: ti.template(), entry: ti.template(),
-):  # fmt: skip
+    s: ti.template(),
+    pair: ti.template(),
+    used: ti.template(),
+    part: ti.i32,
+    chunks: ti.template(),
+    serial: ti.template(),
+    start: ti.template(),
+    end: ti.template(),
+    entry: ti.template(),
+):
     """Write both directions of every pair into its rows and sort them."""
     ti.loop_config(serialize=serial)
     for task in range(chunks * s.spread):

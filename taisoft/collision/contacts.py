@@ -63,9 +63,21 @@ def no_contacts() -> Contacts:
     names, integers = np.zeros(0, dtype=object), np.zeros((0, 2), dtype=np.int64)
     vectors, numbers = np.zeros((0, 3)), np.zeros(0)
     return Contacts(
-        vectors, vectors, numbers, vectors, names, names, np.zeros((0, 6), dtype=np.int64), np.zeros((0, 6)), names, integers,
-        numbers, numbers, 0, 0,
-    )  # fmt: skip
+        vectors,
+        vectors,
+        numbers,
+        vectors,
+        names,
+        names,
+        np.zeros((0, 6), dtype=np.int64),
+        np.zeros((0, 6)),
+        names,
+        integers,
+        numbers,
+        numbers,
+        0,
+        0,
+    )
 
 
 def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:
@@ -75,10 +87,16 @@ def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:
         return arena.vectors(f"contact_{name}", dtype, capacity, n=n)
 
     return ContactFields(
-        vectors("point", ti.f64), vectors("normal", ti.f64), arena.field("contact_gap", ti.f64, capacity),
-        vectors("body", ti.i32, 2), vectors("feature", ti.i32), vectors("nodes_a", ti.i32), vectors("nodes_b", ti.i32),
-        vectors("weights_a", ti.f64), vectors("weights_b", ti.f64),
-    )  # fmt: skip
+        vectors("point", ti.f64),
+        vectors("normal", ti.f64),
+        arena.field("contact_gap", ti.f64, capacity),
+        vectors("body", ti.i32, 2),
+        vectors("feature", ti.i32),
+        vectors("nodes_a", ti.i32),
+        vectors("nodes_b", ti.i32),
+        vectors("weights_a", ti.f64),
+        vectors("weights_b", ti.f64),
+    )
 
 
 @ti.func
@@ -118,7 +136,7 @@ def write_contact(out: ti.template(), at, last, body_a, body_b, feature, point_a
 @kernel
 def gather_contacts(
     out: ti.template(), index: ti.template(), n: ti.i32, floats: ti.types.ndarray(), integers: ti.types.ndarray()
-):  # fmt: skip
+):
     """Copy the contacts index[:n] for `gather`: floats (n,13) and integers (n,11)."""
     ti.loop_config(serialize=True)
     for i in range(n):
@@ -140,6 +158,11 @@ def gather(out: ContactFields, index: Any, n: int) -> dict[str, np.ndarray]:
     if n:
         gather_contacts(out, index, n, floats, integers)
     return {
-        "point": floats[:, :3], "normal": floats[:, 3:6], "weights": floats[:, 6:12], "gap": floats[:, 12],
-        "body": integers[:, :2], "feature": integers[:, 2:5], "nodes": integers[:, 5:],
-    }  # fmt: skip
+        "point": floats[:, :3],
+        "normal": floats[:, 3:6],
+        "weights": floats[:, 6:12],
+        "gap": floats[:, 12],
+        "body": integers[:, :2],
+        "feature": integers[:, 2:5],
+        "nodes": integers[:, 5:],
+    }

@@ -51,9 +51,14 @@ class Containment:
     """Inner points of a scene's colliders, and a test for those inside other colliders."""
 
     def __init__(
-        self, scene: Scene, topology: Topology, layout: Layout, rest: np.ndarray, analytic: list[tuple[int, Obstacle]],
+        self,
+        scene: Scene,
+        topology: Topology,
+        layout: Layout,
+        rest: np.ndarray,
+        analytic: list[tuple[int, Obstacle]],
         self_collision: bool,
-    ):  # fmt: skip
+    ):
         """rest: (v,3) [m] vertices of the surfaces. analytic: colliders and obstacles in the order of `AnalyticObstacles`."""
         self._scene, self._topology, self._layout, self._rest, self._self_on = scene, topology, layout, rest, self_collision
         self._round = [(i, k, o.shape) for i, (k, o) in enumerate(analytic) if isinstance(o.shape, (Sphere, Capsule))]

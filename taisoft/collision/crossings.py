@@ -53,9 +53,17 @@ def crossing_depth(s: ti.template(), t, u):
 
 @kernel
 def find_crossings(
-    s: ti.template(), near: ti.template(), sharp: ti.template(), row: ti.template(), longest: ti.template(),
-    needed: ti.template(), capacity: ti.i32, padding: ti.f64, part: ti.template(), depths: ti.types.ndarray(),
-):  # fmt: skip
+    s: ti.template(),
+    near: ti.template(),
+    sharp: ti.template(),
+    row: ti.template(),
+    longest: ti.template(),
+    needed: ti.template(),
+    capacity: ti.i32,
+    padding: ti.f64,
+    part: ti.template(),
+    depths: ti.types.ndarray(),
+):
     """Write depths (3,): the deepest crossing [m]; the deepest relative to the finer side's mean surface edge; the number of
     triangle pairs that cross by more than CROSSED of that edge.
 

@@ -194,9 +194,19 @@ def edge_contact(s: ti.template(), mode: ti.template(), t, k, u, m, margin, out:
                         middle = b0 + g_in * db + 0.5 * gap * n
                     f, g = f_in, g_in
                     write_contact(
-                        out, at, end, s.body[t], s.body[u], ivec(EDGE_EDGE, 3 * t + k, 3 * u + m), middle + 0.5 * gap * n, n, gap,
-                        ivec(s.triangle[t, k], s.triangle[t, (k + 1) % 3], -1), dvec(1.0 - f, f, 0.0),
-                        ivec(s.triangle[u, m], s.triangle[u, (m + 1) % 3], -1), dvec(1.0 - g, g, 0.0),
-                    )  # fmt: skip
+                        out,
+                        at,
+                        end,
+                        s.body[t],
+                        s.body[u],
+                        ivec(EDGE_EDGE, 3 * t + k, 3 * u + m),
+                        middle + 0.5 * gap * n,
+                        n,
+                        gap,
+                        ivec(s.triangle[t, k], s.triangle[t, (k + 1) % 3], -1),
+                        dvec(1.0 - f, f, 0.0),
+                        ivec(s.triangle[u, m], s.triangle[u, (m + 1) % 3], -1),
+                        dvec(1.0 - g, g, 0.0),
+                    )
                     at += 1
     return at

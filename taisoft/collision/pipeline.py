@@ -80,9 +80,14 @@ class Detection:
     """Find the contacts of a scene. edge: mean surface edge of the soft bodies at rest; margin, reach: as in `find` [m]."""
 
     def __init__(
-        self, scene: Scene, model: Model, layout: Layout, runtime: Runtime, self_collision: bool = False,
+        self,
+        scene: Scene,
+        model: Model,
+        layout: Layout,
+        runtime: Runtime,
+        self_collision: bool = False,
         serial: bool | None = None,
-    ):  # fmt: skip
+    ):
         """Allocate what the scene needs. serial: None decides by size. Raise MeshError if a distance field cannot be made."""
         self.scene, self.model, self.layout = scene, model, layout
         settings, bodies, obstacles = scene.collision, scene.bodies, scene.obstacles
@@ -153,9 +158,15 @@ class Detection:
 
     def _make_fields(self, grids: list[SdfGrid | None], runtime: Runtime) -> DistanceFields:
         return build_fields(
-            self.scene.bodies, grids, self.model.state.x, self.topology.first, self.layout.node_start, runtime.real,
-            runtime.np_real, self._arena,
-        )  # fmt: skip
+            self.scene.bodies,
+            grids,
+            self.model.state.x,
+            self.topology.first,
+            self.layout.node_start,
+            runtime.real,
+            runtime.np_real,
+            self._arena,
+        )
 
     def _make_shapes(self) -> AnalyticObstacles:
         arena, n = self._arena, len(self._analytic)
@@ -165,11 +176,15 @@ class Detection:
 
         shapes = [o.shape for _, o in self._analytic]
         return AnalyticObstacles(
-            n, arena.field("obstacle_body", ti.i32, n, np.array([k for k, _ in self._analytic], dtype=np.int32)),
+            n,
+            arena.field("obstacle_body", ti.i32, n, np.array([k for k, _ in self._analytic], dtype=np.int32)),
             arena.field("obstacle_kind", ti.i32, n, np.array([x.kind for x in shapes], dtype=np.int32)),
-            vectors("size", n, np.array([x.size() for x in shapes])), vectors("origin", n), vectors("rotation", 3 * n),
-            vectors("next_origin", n), vectors("next_rotation", 3 * n),
-        )  # fmt: skip
+            vectors("size", n, np.array([x.size() for x in shapes])),
+            vectors("origin", n),
+            vectors("rotation", 3 * n),
+            vectors("next_origin", n),
+            vectors("next_rotation", 3 * n),
+        )
 
     # --- a search -------------------------------------------------------------------------------------------------
 
@@ -259,10 +274,14 @@ class Detection:
                 move_obstacles(self.surface, vertices.start, now, then - now)
         if self._analytic and (first or any(o.path is not None for _, o in self._analytic)):
             s, now, then = self.shapes, *([obstacle_frame(o, t) for _, o in self._analytic] for t in (time, time + dt))
-            upload([
-                (s.origin, np.array([x for x, _ in now])), (s.rotation, np.concatenate([r for _, r in now])),
-                (s.next_origin, np.array([x for x, _ in then])), (s.next_rotation, np.concatenate([r for _, r in then])),
-            ])  # fmt: skip
+            upload(
+                [
+                    (s.origin, np.array([x for x, _ in now])),
+                    (s.rotation, np.concatenate([r for _, r in now])),
+                    (s.next_origin, np.array([x for x, _ in then])),
+                    (s.next_rotation, np.concatenate([r for _, r in then])),
+                ]
+            )
         self._placed = True
 
     def _upload_prescribed(self, nodes: np.ndarray, moves: np.ndarray):
@@ -300,10 +319,21 @@ class Detection:
         pairs, pair = np.unique(body, axis=0, return_inverse=True)
         numbers = np.array([self.scene.contact_numbers(names[a], names[b]) for a, b in pairs]).reshape(-1, 2)[pair.reshape(-1)]
         return Contacts(
-            point, normal, gap, impulse, names[body[:, 0]], names[body[:, 1]], nodes, weights,
-            np.array(KINDS, dtype=object)[feature[:, 0]], feature[:, 1:], numbers[:, 0], numbers[:, 1], self.counts.found,
+            point,
+            normal,
+            gap,
+            impulse,
+            names[body[:, 0]],
+            names[body[:, 1]],
+            nodes,
+            weights,
+            np.array(KINDS, dtype=object)[feature[:, 0]],
+            feature[:, 1:],
+            numbers[:, 0],
+            numbers[:, 1],
+            self.counts.found,
             self.counts.unmapped,
-        )  # fmt: skip
+        )
 
     @property
     def kept(self):

@@ -20,9 +20,19 @@ def can_cross(a, b):
 
 @ti.func
 def _vertices(
-    s: ti.template(), near: ti.template(), mode: ti.template(), sharp: ti.template(), row: ti.template(), longest: ti.template(),
-    capacity, margin, padding, out: ti.template(), used: ti.template(), part,
-):  # fmt: skip
+    s: ti.template(),
+    near: ti.template(),
+    mode: ti.template(),
+    sharp: ti.template(),
+    row: ti.template(),
+    longest: ti.template(),
+    capacity,
+    margin,
+    padding,
+    out: ti.template(),
+    used: ti.template(),
+    part,
+):
     """Write the contacts of vertices, the first in each part of the buffer."""
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):
@@ -51,9 +61,19 @@ def _vertices(
 
 @ti.func
 def _edges(
-    s: ti.template(), near: ti.template(), sharp: ti.template(), mode: ti.template(), row: ti.template(), longest: ti.template(),
-    capacity, margin, padding, out: ti.template(), used: ti.template(), part,
-):  # fmt: skip
+    s: ti.template(),
+    near: ti.template(),
+    sharp: ti.template(),
+    mode: ti.template(),
+    row: ti.template(),
+    longest: ti.template(),
+    capacity,
+    margin,
+    padding,
+    out: ti.template(),
+    used: ti.template(),
+    part,
+):
     """Append the contacts of edges. They depend on the vertices found inside."""
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):
@@ -85,10 +105,21 @@ def _edges(
 
 @kernel(cse=False)
 def find_proximity(
-    s: ti.template(), near: ti.template(), mode: ti.template(), sharp: ti.template(), row: ti.template(), longest: ti.template(),
-    needed: ti.template(), capacity: ti.i32, margin: ti.f64, padding: ti.f64, out: ti.template(), used: ti.template(),
-    count: ti.template(), part: ti.i32,
-):  # fmt: skip
+    s: ti.template(),
+    near: ti.template(),
+    mode: ti.template(),
+    sharp: ti.template(),
+    row: ti.template(),
+    longest: ti.template(),
+    needed: ti.template(),
+    capacity: ti.i32,
+    margin: ti.f64,
+    padding: ti.f64,
+    out: ti.template(),
+    used: ti.template(),
+    count: ti.template(),
+    part: ti.i32,
+):
     """Write all contacts by proximity, the first in the buffer `out`; `used` and `count` hold their numbers.
 
     near: trees or rows of a broad phase; mode: (n_bodies) i32, BY_FIELD, BY_FACES or BY_EDGES; sharp: output of

@@ -50,10 +50,20 @@ def reduction_fields(arena: FieldArena, capacity: int, chunks: int, serial: bool
         return arena.field(f"reduction_{name}", ti.i32, n)
 
     return ReductionFields(
-        buckets, chunks, serial, spread, ints("place", capacity), ints("bucket", capacity), ints("bucket_start", buckets),
-        ints("bucket_end", buckets), ints("member", capacity),
-        ints("state", capacity), ints("kept", capacity), ints("count", 4), ints("first", chunks),
-    )  # fmt: skip
+        buckets,
+        chunks,
+        serial,
+        spread,
+        ints("place", capacity),
+        ints("bucket", capacity),
+        ints("bucket_start", buckets),
+        ints("bucket_end", buckets),
+        ints("member", capacity),
+        ints("state", capacity),
+        ints("kept", capacity),
+        ints("count", 4),
+        ints("first", chunks),
+    )
 
 
 @ti.func
@@ -190,9 +200,7 @@ def _list_kept(r: ti.template()):
 
 
 @kernel
-def begin_reduction(
-    r: ti.template(), out: ti.template(), used: ti.template(), part: ti.i32, inverse: ti.f64, tolerance: ti.f64
-):  # fmt: skip
+def begin_reduction(r: ti.template(), out: ti.template(), used: ti.template(), part: ti.i32, inverse: ti.f64, tolerance: ti.f64):
     """Enter the contacts into the cells and run the first round; more are needed only while contacts are undecided."""
     _fill_cells(r, out, used, part, inverse)
     _decide_all(r, out, inverse, tolerance)
@@ -206,9 +214,7 @@ def decide(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.
     _list_kept(r)
 
 
-def reduce_contacts(
-    r: ReductionFields, out: ContactFields, used: Any, part: int, tolerance: float, cell: float
-) -> None:  # fmt: skip
+def reduce_contacts(r: ReductionFields, out: ContactFields, used: Any, part: int, tolerance: float, cell: float) -> None:
     """Fill r.kept and r.count. tolerance [m]; cell: edge of the cells [m], at least 2.5 times the tolerance."""
     inverse = 1.0 / max(cell, 2.5 * tolerance)
     begin_reduction(r, out, used, part, inverse, tolerance)

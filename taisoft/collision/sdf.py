@@ -90,9 +90,15 @@ class DistanceFields:
 
 
 def build_fields(
-    bodies: list[Body], grids: list[SdfGrid | None], x: Any, first: np.ndarray, node_start: np.ndarray, real: Any, npr: type,
+    bodies: list[Body],
+    grids: list[SdfGrid | None],
+    x: Any,
+    first: np.ndarray,
+    node_start: np.ndarray,
+    real: Any,
+    npr: type,
     arena: FieldArena,
-) -> DistanceFields:  # fmt: skip
+) -> DistanceFields:
     """Upload the grids (one or None per collider; None for obstacles) and the tets behind the bodies' triangles."""
     used = [g for g in grids if g is not None]
     of_body = np.cumsum([g is not None for g in grids]) - 1
@@ -112,13 +118,17 @@ def build_fields(
         arena.vectors("field_spacing", ti.f64, count, np.array([g.spacing for g in used]) if used else blank),
         arena.vectors("field_points", ti.i32, count, np.array([g.phi.shape for g in used] if used else blank).astype(np.int32)),
         arena.field("field_first", ti.i32, count, np.cumsum([0, *(g.phi.size for g in used)])[:count].astype(np.int32)),
-        arena.field("field_phi", real, max(sum(g.phi.size for g in used), 1),
-                    np.concatenate([g.phi.reshape(-1) for g in used]).astype(npr) if used else None),
+        arena.field(
+            "field_phi",
+            real,
+            max(sum(g.phi.size for g in used), 1),
+            np.concatenate([g.phi.reshape(-1) for g in used]).astype(npr) if used else None,
+        ),
         x,
         arena.vectors("field_behind", ti.i32, n, behind.astype(np.int32), n=4),
         arena.vectors("field_corner", ti.f64, n, tet_corner),
         arena.vectors("field_inverse", ti.f64, 3 * n, inverse.reshape(-1, 3)),
-    )  # fmt: skip
+    )
 
 
 @ti.func
@@ -214,14 +224,23 @@ def _field_contacts(
                             valid = is_surface_minimum(s, t, w, n, x)
                         if valid == 1 and j < 3:
                             write_contact(
-                                out, at, end, own, other, ivec(VERTEX_FIELD, i, other), x, n, gap,
-                                ivec(i, -1, -1), dvec(1.0, 0.0, 0.0), tu, v,
-                            )  # fmt: skip
+                                out,
+                                at,
+                                end,
+                                own,
+                                other,
+                                ivec(VERTEX_FIELD, i, other),
+                                x,
+                                n,
+                                gap,
+                                ivec(i, -1, -1),
+                                dvec(1.0, 0.0, 0.0),
+                                tu,
+                                v,
+                            )
                             at += 1
                         elif valid == 1:
-                            write_contact(
-                                out, at, end, own, other, ivec(FACE_FIELD, t, other), x, n, gap, tt, w, tu, v
-                            )  # fmt: skip
+                            write_contact(out, at, end, own, other, ivec(FACE_FIELD, t, other), x, n, gap, tt, w, tu, v)
                             at += 1
         j += 1
     return at, unmapped
@@ -229,10 +248,23 @@ def _field_contacts(
 
 @kernel(cse=False)
 def find_in_fields(
-    s: ti.template(), near: ti.template(), f: ti.template(), sharp: ti.template(), row: ti.template(), longest: ti.template(),
-    needed: ti.template(), capacity: ti.i32, margin: ti.f64, padding: ti.f64, out: ti.template(), used: ti.template(),
-    count: ti.template(), part: ti.i32, append: ti.i32, unmapped: ti.template(),
-):  # fmt: skip
+    s: ti.template(),
+    near: ti.template(),
+    f: ti.template(),
+    sharp: ti.template(),
+    row: ti.template(),
+    longest: ti.template(),
+    needed: ti.template(),
+    capacity: ti.i32,
+    margin: ti.f64,
+    padding: ti.f64,
+    out: ti.template(),
+    used: ti.template(),
+    count: ti.template(),
+    part: ti.i32,
+    append: ti.i32,
+    unmapped: ti.template(),
+):
     """Write contacts with distance fields; unmapped[0] counts the (triangle, body) pairs that no tet maps. Arguments as in
     `find_proximity`; contacts are appended to its own if `append` is 1."""
     unmapped[0] = 0

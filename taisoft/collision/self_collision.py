@@ -26,9 +26,15 @@ def intersect(s: ti.template(), t, u):
 
 @kernel(cse=False)
 def find_intersections(
-    s: ti.template(), start: ti.template(), end: ti.template(), entry: ti.template(), pair: ti.template(), used: ti.template(),
-    total: ti.template(), part: ti.i32,
-):  # fmt: skip
+    s: ti.template(),
+    start: ti.template(),
+    end: ti.template(),
+    entry: ti.template(),
+    pair: ti.template(),
+    used: ti.template(),
+    total: ti.template(),
+    part: ti.i32,
+):
     """Find the pairs t < u of the rows that intersect, in ascending order within each part and over the parts."""
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):

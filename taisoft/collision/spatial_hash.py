@@ -169,9 +169,15 @@ def _is_pair(s: ti.template(), t, u):
 
 @kernel
 def find_rows(
-    s: ti.template(), g: ti.template(), member: ti.template(), entry: ti.template(), used: ti.template(),
-    total: ti.template(), part: ti.i32, inverse: ti.f64,
-):  # fmt: skip
+    s: ti.template(),
+    g: ti.template(),
+    member: ti.template(),
+    entry: ti.template(),
+    used: ti.template(),
+    total: ti.template(),
+    part: ti.i32,
+    inverse: ti.f64,
+):
     """Write each active triangle's row, sorted; each chunk fills its own part of the entries."""
     ti.loop_config(serialize=s.serial)
     for t in range(s.n_triangles):
@@ -252,19 +258,32 @@ def _make_grid(size: tuple[int, int, int], n: int, arena: FieldArena) -> Grid:
         return arena.field(f"hash_{name}", ti.i32, count)
 
     return Grid(
-        *size, cells, ints("cell_start", cells), ints("cell_end", cells), ints("scan", SCAN),
-        arena.vectors("hash_first_cell", ti.i32, n), arena.vectors("hash_cell_count", ti.i32, n), ints("large", n),
-        ints("count", 2), ints("start", n), ints("end", n),
-    )  # fmt: skip
+        *size,
+        cells,
+        ints("cell_start", cells),
+        ints("cell_end", cells),
+        ints("scan", SCAN),
+        arena.vectors("hash_first_cell", ti.i32, n),
+        arena.vectors("hash_cell_count", ti.i32, n),
+        ints("large", n),
+        ints("count", 2),
+        ints("start", n),
+        ints("end", n),
+    )
 
 
 class SpatialHash:
     """Broad phase by a dense grid. cell: edge length of the cells [m]; may be changed at any time."""
 
     def __init__(
-        self, surface: Surface, arena: FieldArena, cell: float, extent: np.ndarray, capacity: int | None = None,
+        self,
+        surface: Surface,
+        arena: FieldArena,
+        cell: float,
+        extent: np.ndarray,
+        capacity: int | None = None,
         max_capacity: int | None = None,
-    ):  # fmt: skip
+    ):
         """extent: typical extent (3,) [m]. capacity, max_capacity: initial and maximum entries; None for the default."""
         n = surface.n_triangles
         self.surface, self.cell = surface, cell

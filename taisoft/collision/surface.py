@@ -114,9 +114,17 @@ def make_topology(parts: list[tuple[np.ndarray, np.ndarray]]) -> Topology:
     corner_owned = owner[t] == np.arange(len(t))[:, None]
     bits = np.concatenate([corner_owned, edge_owned], axis=1) @ (1 << np.arange(6))
     return Topology(
-        t, np.concatenate(body), np.array(first), np.array(vertex_first), np.concatenate(node), neighbour, bits, start, ring,
+        t,
+        np.concatenate(body),
+        np.array(first),
+        np.array(vertex_first),
+        np.concatenate(node),
+        neighbour,
+        bits,
+        start,
+        ring,
         *_adjacent_vertices(t, vertex_first[-1]),
-    )  # fmt: skip
+    )
 
 
 def _adjacent_vertices(t: np.ndarray, n_verts: int) -> tuple[np.ndarray, np.ndarray]:
@@ -143,9 +151,16 @@ def _edge_neighbours(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def build_surface(
-    topology: Topology, rest: np.ndarray, soft: np.ndarray, self_on: np.ndarray, thickness: np.ndarray, edge: np.ndarray,
-    runtime: Runtime, arena: FieldArena, serial: bool | None = None,
-) -> Surface:  # fmt: skip
+    topology: Topology,
+    rest: np.ndarray,
+    soft: np.ndarray,
+    self_on: np.ndarray,
+    thickness: np.ndarray,
+    edge: np.ndarray,
+    runtime: Runtime,
+    arena: FieldArena,
+    serial: bool | None = None,
+) -> Surface:
     """Allocate and fill the fields. rest: (v,3) [m]; soft, self_on: (n_bodies,) bool; thickness, edge: (n_bodies,) [m].
     serial: None decides by size."""
     t, i = topology, ti.i32
@@ -166,21 +181,43 @@ def build_surface(
         return arena.vectors(f"surface_{name}", ti.f64, max(count, 1))
 
     return Surface(
-        n, v, bodies, serial, serial_cheap, chunks, *(1 if one else SPREAD[runtime.arch] for one in (serial, serial_cheap)),
+        n,
+        v,
+        bodies,
+        serial,
+        serial_cheap,
+        chunks,
+        *(1 if one else SPREAD[runtime.arch] for one in (serial, serial_cheap)),
         rows("triangle", t.triangle),
-        ints("body", t.body), ints("node", t.node),
-        rows("neighbour", t.neighbour), ints("owns", t.owns), ints("ring_start", t.ring_start), ints("ring", t.ring),
-        ints("around_start", t.around_start), ints("around", t.around),
-        ints("soft", soft), ints("self_on", self_on), ints("first_of", t.first),
+        ints("body", t.body),
+        ints("node", t.node),
+        rows("neighbour", t.neighbour),
+        ints("owns", t.owns),
+        ints("ring_start", t.ring_start),
+        ints("ring", t.ring),
+        ints("around_start", t.around_start),
+        ints("around", t.around),
+        ints("soft", soft),
+        ints("self_on", self_on),
+        ints("first_of", t.first),
         arena.field("surface_thickness", ti.f64, max(bodies, 1), thickness if bodies else None),
         arena.field("surface_edge", ti.f64, max(bodies, 1), edge if bodies else None),
-        arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None), vectors("x", v), vectors("move", v),
-        vectors("lo", n), vectors("hi", n), vectors("normal", n), arena.field("surface_area", ti.f64, max(n, 1)),
-        vectors("body_lo", bodies), vectors("body_hi", bodies),
-        arena.field("surface_active", i, max(n, 1)), arena.field("surface_count", i, 4), arena.field("surface_part", i, chunks),
-        arena.field("surface_near", i, chunks * max(bodies, 1)), arena.field("surface_inside", i, max(v, 1)),
+        arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None),
+        vectors("x", v),
+        vectors("move", v),
+        vectors("lo", n),
+        vectors("hi", n),
+        vectors("normal", n),
+        arena.field("surface_area", ti.f64, max(n, 1)),
+        vectors("body_lo", bodies),
+        vectors("body_hi", bodies),
+        arena.field("surface_active", i, max(n, 1)),
+        arena.field("surface_count", i, 4),
+        arena.field("surface_part", i, chunks),
+        arena.field("surface_near", i, chunks * max(bodies, 1)),
+        arena.field("surface_inside", i, max(v, 1)),
         vectors("exit_direction", v),
-    )  # fmt: skip
+    )
 
 
 def _non_empty(data: np.ndarray) -> np.ndarray:

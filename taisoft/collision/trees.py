@@ -61,9 +61,15 @@ def build_trees(centroid: np.ndarray, first: np.ndarray, leaves: int) -> TreeTab
     in_order = np.argsort(chunk)
     deepest = int(np.log2(link[chunk].max(initial=1)))  # a balanced tree of n leaves has 2 n - 1 nodes and ceil(log2(n)) levels
     return TreeTables(
-        link, root, chunk[in_order], chunk_body[in_order], np.concatenate([[], *levels]).astype(np.int64),
-        np.cumsum([0, *map(len, levels)]), deepest, max(level - 1, 0),
-    )  # fmt: skip
+        link,
+        root,
+        chunk[in_order],
+        chunk_body[in_order],
+        np.concatenate([[], *levels]).astype(np.int64),
+        np.cumsum([0, *map(len, levels)]),
+        deepest,
+        max(level - 1, 0),
+    )
 
 
 def _split(order: np.ndarray, start: np.ndarray, count: np.ndarray, centroid: np.ndarray) -> None:

@@ -120,9 +120,7 @@ def closing(s: ti.template(), i, u, w, n):
 
 
 @ti.func
-def vertex_contacts(
-    s: ti.template(), entry: ti.template(), first, last, i, own, margin, out: ti.template(), start, end
-):  # fmt: skip
+def vertex_contacts(s: ti.template(), entry: ti.template(), first, last, i, own, margin, out: ti.template(), start, end):
     """Write contacts of vertex i of collider `own` with triangles entry[first:last], all of one collider. Return the new count.
 
     Contacts go to out[start:end]. margin [m]: largest gap at the closest time of the step. Passes share one loop, so that their
@@ -255,8 +253,19 @@ def vertex_contacts(
                 s.inside[i] |= 1 << (other % INSIDE_BITS)
                 s.exit_direction[i] -= gap * n
             write_contact(
-                out, at, end, own, other, ivec(VERTEX_FACE, i, u), p, n, gap,
-                ivec(i, -1, -1), dvec(1.0, 0.0, 0.0), vertices_of(s, u), w,
-            )  # fmt: skip
+                out,
+                at,
+                end,
+                own,
+                other,
+                ivec(VERTEX_FACE, i, u),
+                p,
+                n,
+                gap,
+                ivec(i, -1, -1),
+                dvec(1.0, 0.0, 0.0),
+                vertices_of(s, u),
+                w,
+            )
             at += 1
     return at

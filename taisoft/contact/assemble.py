@@ -73,11 +73,23 @@ def build_found(arena: FieldArena, problem: ContactProblem) -> FoundContacts:
         return arena.field(f"found_{name}", ti.f64, n)
 
     return FoundContacts(
-        problem, n_slots, vectors("point"), numbers("gap"), vectors("obstacle_displacement"), numbers("approach"),
-        numbers("restitution"), numbers("min_velocity"), numbers("min_opening"), vectors("impact_impulse"),
-        vectors("body", ti.i32, 2), vectors("feature", ti.i32), vectors("previous_feature", ti.i32),
-        vectors("previous_point"), vectors("previous_impulse"), arena.field("found_slot", ti.i32, n_slots),
-    )  # fmt: skip
+        problem,
+        n_slots,
+        vectors("point"),
+        numbers("gap"),
+        vectors("obstacle_displacement"),
+        numbers("approach"),
+        numbers("restitution"),
+        numbers("min_velocity"),
+        numbers("min_opening"),
+        vectors("impact_impulse"),
+        vectors("body", ti.i32, 2),
+        vectors("feature", ti.i32),
+        vectors("previous_feature", ti.i32),
+        vectors("previous_point"),
+        vectors("previous_impulse"),
+        arena.field("found_slot", ti.i32, n_slots),
+    )
 
 
 def build_pair_numbers(arena: FieldArena, scene: Scene) -> PairNumbers:
@@ -85,10 +97,13 @@ def build_pair_numbers(arena: FieldArena, scene: Scene) -> PairNumbers:
     n = len(scene.colliders)
     capacity = 2 * len(scene.contact_pairs) + 64
     numbers = PairNumbers(
-        arena.field("collider_friction", ti.f64, n), arena.field("collider_restitution", ti.f64, n),
-        arena.field("n_contact_pairs", ti.i32, 1), arena.vectors("contact_pair", ti.i32, capacity, n=2),
-        arena.field("pair_friction", ti.f64, capacity), arena.field("pair_restitution", ti.f64, capacity),
-    )  # fmt: skip
+        arena.field("collider_friction", ti.f64, n),
+        arena.field("collider_restitution", ti.f64, n),
+        arena.field("n_contact_pairs", ti.i32, 1),
+        arena.vectors("contact_pair", ti.i32, capacity, n=2),
+        arena.field("pair_friction", ti.f64, capacity),
+        arena.field("pair_restitution", ti.f64, capacity),
+    )
     upload_pair_numbers(numbers, scene)
     return numbers
 
@@ -104,12 +119,16 @@ def upload_pair_numbers(numbers: PairNumbers, scene: Scene) -> bool:
         ids = sorted(index[name] for name in names)
         pairs[k] = ids[0], ids[-1]
         values[k] = -1.0 if friction is None else friction, -1.0 if restitution is None else restitution
-    upload([
-        (numbers.friction, np.array([o.friction for o in surfaces])),
-        (numbers.restitution, np.array([o.restitution for o in surfaces])),
-        (numbers.n_pairs, np.array([len(scene.contact_pairs)])), (numbers.pair, pairs),
-        (numbers.pair_friction, values[:, 0]), (numbers.pair_restitution, values[:, 1]),
-    ])  # fmt: skip
+    upload(
+        [
+            (numbers.friction, np.array([o.friction for o in surfaces])),
+            (numbers.restitution, np.array([o.restitution for o in surfaces])),
+            (numbers.n_pairs, np.array([len(scene.contact_pairs)])),
+            (numbers.pair, pairs),
+            (numbers.pair_friction, values[:, 0]),
+            (numbers.pair_restitution, values[:, 1]),
+        ]
+    )
     return True
 
 
@@ -140,9 +159,7 @@ def obstacle_displacement_at(o: ti.template(), body, x):
 
 
 @ti.func
-def _add_vertex(
-    f: ti.template(), s: ti.template(), c, k, v, weight, sign
-):  # fmt: skip
+def _add_vertex(f: ti.template(), s: ti.template(), c, k, v, weight, sign):
     """Add vertex v of the surface to contact c, which has k nodes. Return its new number of nodes."""
     (p,) = ti.static((f.problem,))
     n = k
@@ -205,9 +222,17 @@ def _warm_impulse(f: ti.template(), c):
 
 @kernel
 def fill(
-    f: ti.template(), m: ti.template(), s: ti.template(), o: ti.template(), q: ti.template(), found: ti.template(),
-    kept: ti.template(), n: ti.i32, dt: ti.f64, warm: ti.f64,
-):  # fmt: skip
+    f: ti.template(),
+    m: ti.template(),
+    s: ti.template(),
+    o: ti.template(),
+    q: ti.template(),
+    found: ti.template(),
+    kept: ti.template(),
+    n: ti.i32,
+    dt: ti.f64,
+    warm: ti.f64,
+):
     """Fill the problem's contacts from rows kept[:n] of the detector's buffer `found`. b and the r-factors are not set.
 
     s: Surface; o: AnalyticObstacles; q: PairNumbers. warm: factor of the previous step's impulses.

@@ -26,9 +26,7 @@ def node_graph(node: np.ndarray, arity: np.ndarray, inverse_mass: np.ndarray) ->
     used = np.arange(node.shape[1]) < arity[:, None]
     contact, nodes = np.broadcast_to(np.arange(k)[:, None], node.shape)[used], node[used]
     free = np.any(inverse_mass[nodes] != 0.0, axis=1)
-    touches = sp.csr_matrix(
-        (np.ones(free.sum(), dtype=np.int32), (contact[free], nodes[free])), shape=(k, len(inverse_mass))
-    )
+    touches = sp.csr_matrix((np.ones(free.sum(), dtype=np.int32), (contact[free], nodes[free])), shape=(k, len(inverse_mass)))
     return _without_loops(touches @ touches.T)
 
 

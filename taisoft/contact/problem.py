@@ -71,6 +71,7 @@ class ContactProblem:
 
 def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: bool) -> ContactProblem:
     """Allocate a problem for contacts between the nodes of a model."""
+
     def vectors(name: str, count: int = capacity):
         return arena.vectors(f"problem_{name}", ti.f64, count)
 
@@ -78,24 +79,47 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         return arena.field(f"problem_{name}", ti.i32, shape)
 
     return ContactProblem(
-        **_common(arena, capacity, serial), matrix=False, n_nodes=n_nodes, node=ints("node", (capacity, NODES)),
-        arity=ints("arity", capacity), weight=arena.field("problem_weight", ti.f64, (capacity, NODES)),
-        normal=vectors("normal"), tangent=vectors("tangent"), inverse_mass=vectors("inverse_mass", n_nodes),
-        w=vectors("w", n_nodes), entry_start=ints("entry_start", n_nodes + 1), entry=ints("entry", NODES * capacity),
-        row_start=None, column=None, block=None,
-    )  # fmt: skip
+        **_common(arena, capacity, serial),
+        matrix=False,
+        n_nodes=n_nodes,
+        node=ints("node", (capacity, NODES)),
+        arity=ints("arity", capacity),
+        weight=arena.field("problem_weight", ti.f64, (capacity, NODES)),
+        normal=vectors("normal"),
+        tangent=vectors("tangent"),
+        inverse_mass=vectors("inverse_mass", n_nodes),
+        w=vectors("w", n_nodes),
+        entry_start=ints("entry_start", n_nodes + 1),
+        entry=ints("entry", NODES * capacity),
+        row_start=None,
+        column=None,
+        block=None,
+    )
 
 
 def build_matrix_problem(arena: FieldArena, n: int, n_blocks: int, serial: bool) -> ContactProblem:
     """Allocate a problem for n contacts and a W of n_blocks 3x3 blocks."""
+
     def ints(name: str, count: int):
         return arena.field(f"problem_{name}", ti.i32, count)
 
     return ContactProblem(
-        **_common(arena, n, serial), matrix=True, n_nodes=0, node=None, arity=None, weight=None, normal=None, tangent=None,
-        inverse_mass=None, w=None, entry_start=None, entry=None, row_start=ints("row_start", n + 1),
-        column=ints("column", n_blocks), block=arena.field("problem_block", ti.f64, (n_blocks, 9)),
-    )  # fmt: skip
+        **_common(arena, n, serial),
+        matrix=True,
+        n_nodes=0,
+        node=None,
+        arity=None,
+        weight=None,
+        normal=None,
+        tangent=None,
+        inverse_mass=None,
+        w=None,
+        entry_start=None,
+        entry=None,
+        row_start=ints("row_start", n + 1),
+        column=ints("column", n_blocks),
+        block=arena.field("problem_block", ti.f64, (n_blocks, 9)),
+    )
 
 
 def _common(arena: FieldArena, capacity: int, serial: bool) -> dict[str, Any]:
@@ -103,15 +127,25 @@ def _common(arena: FieldArena, capacity: int, serial: bool) -> dict[str, Any]:
         return arena.vectors(f"problem_{name}", ti.f64, capacity, n=n)
 
     return {
-        "capacity": capacity, "serial": serial, "count": arena.field("problem_count", ti.i32, 2),
-        "friction": arena.field("problem_friction", ti.f64, capacity), "b": vectors("b"), "factor": vectors("factor", 2),
-        "r": vectors("r"), "relaxation": arena.field("problem_relaxation", ti.f64, capacity), "best": vectors("best"),
-        "sweep_start": vectors("sweep_start"), "previous": vectors("previous"), "term": vectors("term", 2),
-        "partial": arena.vectors("problem_partial", ti.f64, CHUNKS, n=2), "order": arena.field("problem_order", ti.i32, capacity),
+        "capacity": capacity,
+        "serial": serial,
+        "count": arena.field("problem_count", ti.i32, 2),
+        "friction": arena.field("problem_friction", ti.f64, capacity),
+        "b": vectors("b"),
+        "factor": vectors("factor", 2),
+        "r": vectors("r"),
+        "relaxation": arena.field("problem_relaxation", ti.f64, capacity),
+        "best": vectors("best"),
+        "sweep_start": vectors("sweep_start"),
+        "previous": vectors("previous"),
+        "term": vectors("term", 2),
+        "partial": arena.vectors("problem_partial", ti.f64, CHUNKS, n=2),
+        "order": arena.field("problem_order", ti.i32, capacity),
         "colour": arena.field("problem_colour", ti.i32, capacity),
         "colour_start": arena.field("problem_colour_start", ti.i32, capacity + 1),
-        "state": arena.field("problem_state", ti.f64, 10), "history": arena.field("problem_history", ti.f64, HISTORY),
-    }  # fmt: skip
+        "state": arena.field("problem_state", ti.f64, 10),
+        "history": arena.field("problem_history", ti.f64, HISTORY),
+    }
 
 
 def fill_field(field, values: np.ndarray) -> None:
@@ -127,9 +161,13 @@ def fill_matrix_problem(p: ContactProblem, W: sp.spmatrix, b: np.ndarray, fricti
     blocks.sort_indices()
     p.count[0] = k
     for field, values in (
-        (p.row_start, blocks.indptr), (p.column, blocks.indices), (p.block, blocks.data.reshape(-1, 9)),
-        (p.b, b.reshape(k, 3)), (p.friction, friction), (p.order, np.arange(k)),
-    ):  # fmt: skip
+        (p.row_start, blocks.indptr),
+        (p.column, blocks.indices),
+        (p.block, blocks.data.reshape(-1, 9)),
+        (p.b, b.reshape(k, 3)),
+        (p.friction, friction),
+        (p.order, np.arange(k)),
+    ):
         fill_field(field, values)
     find_factors(p)
 

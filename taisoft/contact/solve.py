@@ -34,9 +34,14 @@ def _restore_best(p: ti.template()):
 
 
 def solve(
-    p: ContactProblem, method: str, tolerance: float, max_iterations: int, every: int = CHECK_EVERY, history: bool = False,
+    p: ContactProblem,
+    method: str,
+    tolerance: float,
+    max_iterations: int,
+    every: int = CHECK_EVERY,
+    history: bool = False,
     momentum: bool = True,
-) -> SolveResult:  # fmt: skip
+) -> SolveResult:
     """Solve the problem, starting from its impulses and replacing them by the best ones found.
 
     method: one of SOLVERS; coloured_gauss_seidel requires grouped contacts, see `colouring`. tolerance: bound on the residual.

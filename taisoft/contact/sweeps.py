@@ -64,9 +64,14 @@ def _extrapolate(p: ti.template()):
 
 @kernel
 def run_serial(
-    p: ti.template(), solver: ti.template(), first: ti.i32, sweeps: ti.i32, every: ti.i32, tolerance: ti.f64,
+    p: ti.template(),
+    solver: ti.template(),
+    first: ti.i32,
+    sweeps: ti.i32,
+    every: ti.i32,
+    tolerance: ti.f64,
     with_momentum: ti.i32,
-):  # fmt: skip
+):
     """Run up to `sweeps` sweeps with a residual check after each `every`; first: 1 at the start of a solve."""
     ti.loop_config(serialize=True)
     for _ in range(1):

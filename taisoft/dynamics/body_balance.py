@@ -58,10 +58,8 @@ class BodyBalance:
         external = gravity_mass[:, None] * m.gravity.to_numpy()[0] + (loads[0] if loads else 0.0)
         r, inertia, momentum, elastic, external, masses = (
             self._norm(free * a)
-            for a in (
-                residual, mass[:, None] * (v - v_hat), mass[:, None] * v, elastic, external, mass[:, None] * np.ones(3),
-            )
-        )  # fmt: skip
+            for a in (residual, mass[:, None] * (v - v_hat), mass[:, None] * v, elastic, external, mass[:, None] * np.ones(3))
+        )
         scale = inertia + beta * (elastic + external)
         floor = beta * solver.rounding.force_by_body[self._body] + masses * solver.rounding.position / beta
         mean_floor = (

@@ -26,9 +26,14 @@ ROUNDING = 1e-9  # of a number of substeps
 
 @kernel
 def measure_closing(
-    s: ti.template(), o: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32, dt: ti.f64,
+    s: ti.template(),
+    o: ti.template(),
+    found: ti.template(),
+    kept: ti.template(),
+    n: ti.i32,
+    dt: ti.f64,
     closing_data: ti.types.ndarray(),
-):  # fmt: skip
+):
     """Measure the contacts' closing in the coming step of dt.
 
     closing_data (5,): deepest penetration [m]; largest closing ratio of a contact (see above); its closing speed [m/s]; its
@@ -65,7 +70,7 @@ def measure_closing(
 @kernel
 def find_displacement(
     m: ti.template(), s: ti.template(), x_start: ti.template(), displacement: ti.template(), deviation: ti.types.ndarray()
-):  # fmt: skip
+):
     """Compute the displacement (n_nodes) [m] since x_start.
 
     deviation (1,) [m]: largest distance of a vertex from the straight path that was searched.

@@ -21,7 +21,7 @@ from taisoft.contact.assemble import (
     keep_impulses,
     scale_impulses,
     upload_pair_numbers,
-)  # fmt: skip
+)
 from taisoft.contact.problem import NODES, build_node_problem, index_nodes
 from taisoft.contact.restitution import find_rebounds
 from taisoft.dynamics.ccd_limits import (
@@ -123,9 +123,18 @@ class ContactStep:
         """Fields of the last step's contacts, for the warm start of the next step and for `contacts`."""
         p, f = self.problem, self.found
         return {
-            "normal": p.normal, "tangent": p.tangent, "r": p.r, "node": p.node, "weight": p.weight, "arity": p.arity,
-            "point": f.point, "gap": f.gap, "body": f.body, "feature": f.feature, "struck": f.impact_impulse,
-        }  # fmt: skip
+            "normal": p.normal,
+            "tangent": p.tangent,
+            "r": p.r,
+            "node": p.node,
+            "weight": p.weight,
+            "arity": p.arity,
+            "point": f.point,
+            "gap": f.gap,
+            "body": f.body,
+            "feature": f.feature,
+            "struck": f.impact_impulse,
+        }
 
     def snapshot(self) -> dict:
         """Return the last step's contacts and impulses, and the capacity: a step that exceeds it starts without impulses.
@@ -134,12 +143,18 @@ class ContactStep:
         """
         rows = self._contact_fields()
         return {
-            "capacity": self.problem.capacity, "last_time": self._last_time,
-            "share": self._impulse_fraction, "span": self._step_dt,
-            "sum": self._impulse_sum, "penetration": self.penetration, "relative_penetration": self.relative_penetration,
-            "met": self.had_impact, "dropped": self.dropped,
-            "flight": self.flight.copy(), "rows": dict(zip(rows, download(list(rows.values()), self.n_contacts))),
-        }  # fmt: skip
+            "capacity": self.problem.capacity,
+            "last_time": self._last_time,
+            "share": self._impulse_fraction,
+            "span": self._step_dt,
+            "sum": self._impulse_sum,
+            "penetration": self.penetration,
+            "relative_penetration": self.relative_penetration,
+            "met": self.had_impact,
+            "dropped": self.dropped,
+            "flight": self.flight.copy(),
+            "rows": dict(zip(rows, download(list(rows.values()), self.n_contacts))),
+        }
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`."""
@@ -173,9 +188,11 @@ class ContactStep:
         materials = [b.material for b in self.simulation.scene.bodies]
         slowest = min(np.sqrt(m.young / m.density) for m in materials)
         return (
-            self.contact_offset, self._substep_fraction * self._corrections[0], self._substep_fraction * self._corrections[1],
+            self.contact_offset,
+            self._substep_fraction * self._corrections[0],
+            self._substep_fraction * self._corrections[1],
             MAX_OPENING_SPEED * float(slowest),
-        )  # fmt: skip
+        )
 
     def numbers_changed(self) -> None:
         """Upload changed friction or restitution."""

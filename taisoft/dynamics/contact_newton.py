@@ -105,10 +105,14 @@ class ContactNewton:
             if not moved:
                 break
         return StageResult(
-            self.newton + round(self.eliminated), round(self.linear), relative(self.r, self.scale),
-            self._has_converged() and math.isfinite(self.r), self.rounding or self.r <= self.floor, self.multipliers,
+            self.newton + round(self.eliminated),
+            round(self.linear),
+            relative(self.r, self.scale),
+            self._has_converged() and math.isfinite(self.r),
+            self.rounding or self.r <= self.floor,
+            self.multipliers,
             system.contact_residual,
-        )  # fmt: skip
+        )
 
     def _fall_back(self) -> bool:
         """Take a few steps on the nonlinear stage from where it was linearised; return whether any step was taken."""
@@ -162,14 +166,15 @@ class ContactNewton:
         if not self._is_balanced:
             law_tolerance = max(law_tolerance, LAW_BALANCE * tolerance)
         problem = replace(
-            stage, tolerance=tolerance,
+            stage,
+            tolerance=tolerance,
             contact_tolerance=max(LAW_REDUCTION * system.contact_residual, law_tolerance),
             multiplier_tolerance=0.0 if self.tight else MULTIPLIER_FRACTION * tolerance,
             extrapolate_after=MAX_MULTIPLIERS if self.stalls else 0 if self.tight else stage.extrapolate_after,
             max_newton=STALLED_SOLVES * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
             later_tolerance=0.0 if stage.linear_tolerance else LATER_FORCING,
-        )  # fmt: skip
+        )
         result = solve_linear(system, problem, self._first_residual(), self.scale)
         self.linear, self.multipliers = self.linear + result.linear, self.multipliers + result.multipliers
         return result
@@ -218,5 +223,5 @@ def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
         system.form_matrix(projected=True)
     at_floor = found.r <= system.rounding.stage_floor(stage.c, stage.beta)
     return StageResult(
-        found.solves, linear, relative(found.r, scale), found.converged, at_floor, found.multipliers, system.contact_residual,
-    )  # fmt: skip
+        found.solves, linear, relative(found.r, scale), found.converged, at_floor, found.multipliers, system.contact_residual
+    )

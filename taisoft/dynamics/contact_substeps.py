@@ -100,9 +100,13 @@ class ContactExplicitStepper(ExplicitStepper):
             raise
         self.contact.penetration, self.contact.relative_penetration = depth, relative_penetration
         return ContactSubstepResult(
-            n, m.state.scalars[LOWEST_J], int(m.state.scalars[MOST_INVERTED]), sum(r.iterations for r in results if r),
-            max((r.residual for r in results if r), default=0.0), all(r.converged for r in results if r),
-        )  # fmt: skip
+            n,
+            m.state.scalars[LOWEST_J],
+            int(m.state.scalars[MOST_INVERTED]),
+            sum(r.iterations for r in results if r),
+            max((r.residual for r in results if r), default=0.0),
+            all(r.converged for r in results if r),
+        )
 
     def _restore(self) -> None:
         simulation = self.simulation

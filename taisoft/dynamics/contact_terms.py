@@ -69,7 +69,7 @@ NO_CONTACTS = StageContacts(None, None, None, NO_COUPLING, *[None] * 4)
 @kernel
 def begin_contacts(
     s: ti.template(), k: ti.template(), impact: ti.template(), beta: ti.f64, dt: ti.f64, gap_targets: ti.types.ndarray()
-):  # fmt: skip
+):
     """Set the constant contact data of a stage, in a step of dt [s].
 
     impact: whether the contacts' velocity must be `min_velocity`, regardless of gaps. gap_targets (4,): of `ContactStep`.
@@ -222,21 +222,41 @@ def build_stage_contacts(arena: FieldArena, model: Model, found: FoundContacts, 
     """Allocate storage for the contacts of `found`. x_start: (n_nodes) 3-vectors f64, filled by the caller."""
     p, n, real = found.problem, model.n_nodes, model.real
     work = ContactStageWork(
-        arena.vectors("multiplier", ti.f64, p.capacity), arena.field("friction_radius", ti.f64, p.capacity),
-        arena.vectors("past_impulse", ti.f64, PAST * p.capacity), arena.vectors("past_change", ti.f64, PAST * p.capacity),
+        arena.vectors("multiplier", ti.f64, p.capacity),
+        arena.field("friction_radius", ti.f64, p.capacity),
+        arena.vectors("past_impulse", ti.f64, PAST * p.capacity),
+        arena.vectors("past_change", ti.f64, PAST * p.capacity),
         arena.vectors("contact_tangential_offset", ti.f64, p.capacity),
         arena.field("contact_gap_minus_target", ti.f64, p.capacity),
         arena.vectors("contact_velocity", ti.f64, p.capacity),
-        arena.vectors("contact_rate", ti.f64, p.capacity), arena.vectors("contact_kept", ti.f64, p.capacity),
+        arena.vectors("contact_rate", ti.f64, p.capacity),
+        arena.vectors("contact_kept", ti.f64, p.capacity),
         arena.vectors("contact_world_impulse", ti.f64, p.capacity),
         arena.vectors("contact_prox_residual", ti.f64, p.capacity, n=2),
-        arena.vectors("contact_block", real, p.capacity, n=BLOCK), arena.field("contact_active", ti.i32, p.capacity),
-    )  # fmt: skip
+        arena.vectors("contact_block", real, p.capacity, n=BLOCK),
+        arena.field("contact_active", ti.i32, p.capacity),
+    )
     coupling = build_coupling(
-        arena, real, n, p.count, p.node, p.arity, p.weight, p.entry_start, p.entry, work.block, work.active,
+        arena,
+        real,
+        n,
+        p.count,
+        p.node,
+        p.arity,
+        p.weight,
+        p.entry_start,
+        p.entry,
+        work.block,
+        work.active,
         arena.vectors("base_diagonal", real, n, n=BLOCK),
-    )  # fmt: skip
+    )
     return StageContacts(
-        p, found, work, coupling, x_start, arena.vectors("contact_displacement", ti.f64, n),
-        arena.vectors("x_linear", ti.f64, n), arena.vectors("residual_linear", real, n),
-    )  # fmt: skip
+        p,
+        found,
+        work,
+        coupling,
+        x_start,
+        arena.vectors("contact_displacement", ti.f64, n),
+        arena.vectors("x_linear", ti.f64, n),
+        arena.vectors("residual_linear", real, n),
+    )

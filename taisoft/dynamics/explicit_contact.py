@@ -23,7 +23,7 @@ from taisoft.dynamics.explicit import (
     verlet_drift,
     verlet_half,
     verlet_kick,
-)  # fmt: skip
+)
 from taisoft.fem.scalars import FAILED, INVERTED_NOW, MOST_INVERTED
 from taisoft.fem.terms import elasticity
 
@@ -65,9 +65,15 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
 
 @kernel
 def set_free_velocities(
-    m: ti.template(), s: ti.template(), f: ti.template(), dt: ti.f64, contact_offset: ti.f64,
-    penetration_correction: ti.f64, offset_correction: ti.f64, max_speed: ti.f64,
-):  # fmt: skip
+    m: ti.template(),
+    s: ti.template(),
+    f: ti.template(),
+    dt: ti.f64,
+    contact_offset: ti.f64,
+    penetration_correction: ti.f64,
+    offset_correction: ti.f64,
+    max_speed: ti.f64,
+):
     """Compute b of every contact from v*, and the inverse masses."""
     kick_before_impact = ti.static(0.0 if s.verlet else 0.5)
     (p,) = ti.static((f.problem,))

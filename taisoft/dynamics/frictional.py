@@ -22,17 +22,38 @@ PROGRESS = 0.3  # fraction of |r| after a multiplier update to which the inner s
 # |r| before the last step, steps since the update; totals of linear solves, their iterations, multipliers; 1 if |r| is rounding,
 # 1 within a linear solve, its iterations so far, 1 if the matrix is that of the last solve, loop status, stored updates
 (
-    NORM, SCALE, LAW_RESIDUAL, INNER_TARGET, PREVIOUS, STEPS, SOLVES, LINEAR, MULTIPLIERS, AT_ROUNDING,
-    IN_SOLVE, SOLVE_ITERATIONS, SAME_MATRIX, STATUS, REMEMBERED,
-) = range(15)  # fmt: skip
+    NORM,
+    SCALE,
+    LAW_RESIDUAL,
+    INNER_TARGET,
+    PREVIOUS,
+    STEPS,
+    SOLVES,
+    LINEAR,
+    MULTIPLIERS,
+    AT_ROUNDING,
+    IN_SOLVE,
+    SOLVE_ITERATIONS,
+    SAME_MATRIX,
+    STATUS,
+    REMEMBERED,
+) = range(15)
 RUNNING, SOLVED, FAILED, INDEFINITE = range(4)
 # indices into `limits`: |r| [N s] that ends the loop, that ends the steps under one multiplier, rounding floor; laws' residual
 # that ends the loop, tolerance of linear solves; maximum linear solves, CG iterations per solve and per launch; multipliers
 # before extrapolation; minimum tolerance of later solves
 (
-    TARGET, INNER_TOLERANCE, FLOOR, LAW_TOLERANCE, LINEAR_TOLERANCE, MAX_SOLVES, MAX_CG_ITERATIONS, MAX_WORK,
-    EXTRAPOLATE_AFTER, LATER_TOLERANCE,
-) = range(10)  # fmt: skip
+    TARGET,
+    INNER_TOLERANCE,
+    FLOOR,
+    LAW_TOLERANCE,
+    LINEAR_TOLERANCE,
+    MAX_SOLVES,
+    MAX_CG_ITERATIONS,
+    MAX_WORK,
+    EXTRAPOLATE_AFTER,
+    LATER_TOLERANCE,
+) = range(10)
 
 
 @ti.func
@@ -65,9 +86,14 @@ def _advance(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.templat
 
 @kernel
 def solve_frictional(
-    m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, limits: ti.types.ndarray(),
+    m: ti.template(),
+    s: ti.template(),
+    A: ti.template(),
+    k: ti.template(),
+    beta: ti.f64,
+    limits: ti.types.ndarray(),
     loop: ti.types.ndarray(),
-):  # fmt: skip
+):
     """Continue from the state in `loop` (15,); limits (10,)."""
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=True)
@@ -134,5 +160,9 @@ def solve_frictional(
                     status = FAILED
         loop[NORM], loop[SCALE], loop[LAW_RESIDUAL] = r, scale, previous_law
         loop[INNER_TARGET], loop[PREVIOUS], loop[STEPS], loop[AT_ROUNDING], loop[STATUS] = (
-            inner_target, previous, n_steps, rounding, status,
-        )  # fmt: skip
+            inner_target,
+            previous,
+            n_steps,
+            rounding,
+            status,
+        )

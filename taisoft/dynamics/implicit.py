@@ -41,9 +41,15 @@ class Scheme:
 
 @kernel
 def begin_step(
-    m: ti.template(), w: ti.template(), h: ti.template(), multistep: ti.template(), now: ti.f64, before: ti.f64,
-    still: ti.f64, extrapolation: ti.f64,
-):  # fmt: skip
+    m: ti.template(),
+    w: ti.template(),
+    h: ti.template(),
+    multistep: ti.template(),
+    now: ti.f64,
+    before: ti.f64,
+    still: ti.f64,
+    extrapolation: ti.f64,
+):
     """Store state n in the history; compute x_hat and v_hat of the stage, and the first iterate of v on the free axes.
 
     The iterate is (1 - still) v_n + extrapolation (v_n - v_(n-1)). still is 1 for the linearly implicit step, which is
@@ -100,10 +106,11 @@ class ImplicitStepper:
         self.simulation, self.scheme, self.contact = simulation, scheme, contact
         m, arena = simulation.model, simulation.arena
         self.history = History(
-            arena.vectors("x_now", ti.f64, m.n_nodes), arena.vectors("v_now", m.real, m.n_nodes),
+            arena.vectors("x_now", ti.f64, m.n_nodes),
+            arena.vectors("v_now", m.real, m.n_nodes),
             arena.vectors("v_before", m.real, m.n_nodes),
             arena.vectors("x_before", ti.f64, m.n_nodes) if scheme.before else None,
-        )  # fmt: skip
+        )
         prescribed = simulation.dirichlet.prescribed_nodes
         self.solver = StageSystem(m, arena, simulation.runtime.eps, prescribed, contact, self.history.x_now)
         self.tolerance = DEFAULT_TOLERANCE[simulation.runtime.precision]
@@ -130,9 +137,15 @@ class ImplicitStepper:
         """Return the state of the stepper: history, solver and contacts."""
         x, v = download([self.history.x_now, self.history.v_now])
         return {
-            "past": self._n_previous, "beta": self._beta, "dt": self._dt, "recovers": self._substepping.may_retry,
-            "x_now": x, "v_now": v, "contact": self.contact.snapshot(), "solver": self.solver.snapshot(),
-        }  # fmt: skip
+            "past": self._n_previous,
+            "beta": self._beta,
+            "dt": self._dt,
+            "recovers": self._substepping.may_retry,
+            "x_now": x,
+            "v_now": v,
+            "contact": self.contact.snapshot(),
+            "solver": self.solver.snapshot(),
+        }
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`. It has no x_before and v_before, since each step writes them first."""
@@ -254,7 +267,7 @@ class ImplicitStepper:
         multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)
         begin_step(
             self.simulation.model, self.solver.work, self.history, multistep, scheme.now, scheme.before, still, extrapolation
-        )  # fmt: skip
+        )
 
     def _solve_balanced(self, scheme: Scheme, dt: float, bounces: bool) -> StageResult:
         """Solve the stage, and again to a tighter tolerance if the forces on a piece are unbalanced."""
@@ -275,10 +288,17 @@ class ImplicitStepper:
         """Solve the stage. bounces: whether any contacts rebound."""
         max_newton = MAX_NEWTON if self.contact.n_contacts == 0 else MAX_NEWTON_WITH_CONTACTS
         stage = Stage(
-            1.0, self._beta, dt, tolerance, self.contact_tolerance, max_newton, self.linear_tolerance, scheme.one_iteration,
+            1.0,
+            self._beta,
+            dt,
+            tolerance,
+            self.contact_tolerance,
+            max_newton,
+            self.linear_tolerance,
+            scheme.one_iteration,
             # prescribed nodes change their velocity once a step, not twice within the midpoint's half step
             0.5 if scheme.midpoint else 1.0,
-        )  # fmt: skip
+        )
         return solve_bouncing(self.solver, stage) if bounces else solve(self.solver, stage)
 
     def compile_hard_steps(self) -> None:

@@ -132,9 +132,14 @@ def node_residual(m: ti.template(), s: ti.template(), k: ti.template(), i):
 
 @kernel
 def advance(
-    m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64,
+    m: ti.template(),
+    s: ti.template(),
+    A: ti.template(),
+    k: ti.template(),
+    beta: ti.f64,
+    r_scale: ti.f64,
     norms: ti.types.ndarray(),
-):  # fmt: skip
+):
     """Move along y of s.pcg to zero slope; update x, v, impulses, blocks, residual, and -r as CG's right side.
 
     norms (5,): only |r|^2 on the free axes is set. scalars: STEP_LENGTH.

@@ -36,10 +36,7 @@ DECREASE = 0.9  # with contacts, fraction of the smallest |r| so far below which
 class Newton:
     """Newton steps and multiplier updates of a stage; if it is linearised, of its contact problem alone."""
 
-    def __init__(
-        self, system: StageSystem, stage: Stage,
-        eliminate: "Callable[[StageSystem, Stage, float], Any] | None" = None,
-    ):  # fmt: skip
+    def __init__(self, system: StageSystem, stage: Stage, eliminate: "Callable[[StageSystem, Stage, float], Any] | None" = None):
         """eliminate: as `elimination.eliminate`, called after slow steps; None: no elimination."""
         self.system, self.stage, self.eliminate = system, stage, eliminate
         self.is_linearised = system.kind == LINEARISED  # the caller then handles an indefinite matrix
@@ -77,8 +74,12 @@ class Newton:
     def _begin_multiplier(self) -> None:
         """Set the target of |r| and reset the progress after a multiplier update."""
         self.inner_target, self.lowest, self.previous, self.forcing, self.n_inner = (
-            PROGRESS * self.r, self.r, 0.0, self.max_forcing, 0,
-        )  # fmt: skip
+            PROGRESS * self.r,
+            self.r,
+            0.0,
+            self.max_forcing,
+            0,
+        )
 
     def _inner_done(self) -> bool:
         """Return whether |r| is small enough for the present multipliers."""
@@ -176,9 +177,14 @@ class Newton:
     def _result(self, converged: bool) -> StageResult:
         r, system = self.r, self.system
         return StageResult(
-            self.newton + round(self.eliminated), round(self.linear), relative(r, self.scale), converged and math.isfinite(r),
-            self.rounding or r <= self.floor, self.multipliers, system.contact_residual,
-        )  # fmt: skip
+            self.newton + round(self.eliminated),
+            round(self.linear),
+            relative(r, self.scale),
+            converged and math.isfinite(r),
+            self.rounding or r <= self.floor,
+            self.multipliers,
+            system.contact_residual,
+        )
 
     def solve_once(self) -> StageResult:
         """Take one full step without line search, of a linearised stage without contacts; it converges if the solve does."""

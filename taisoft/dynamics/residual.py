@@ -21,9 +21,15 @@ ELASTIC_STAGE, LINEARISED, IMPACT = range(3)  # kinds of stages; IMPACT: see `im
 
 @kernel
 def move(
-    m: ti.template(), s: ti.template(), k: ti.template(), kind: ti.template(), mode: ti.i32,
-    step_length: ti.f64, c: ti.f64, beta: ti.f64,
-):  # fmt: skip
+    m: ti.template(),
+    s: ti.template(),
+    k: ti.template(),
+    kind: ti.template(),
+    mode: ti.i32,
+    step_length: ti.f64,
+    c: ti.f64,
+    beta: ti.f64,
+):
     """Move the nodes of s.pcg.subset and compute the elastic forces there.
 
     mode: STAY; STEP: base = x, then step_length y, y of s.pcg; AGAIN: base + step_length y. scalars: START_SLOPE of a STEP.
@@ -55,9 +61,14 @@ def move(
 
 @kernel
 def form_residual(
-    m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), kind: ti.template(),
-    beta: ti.f64, norms: ti.types.ndarray(),
-):  # fmt: skip
+    m: ti.template(),
+    s: ti.template(),
+    A: ti.template(),
+    k: ti.template(),
+    kind: ti.template(),
+    beta: ti.f64,
+    norms: ti.types.ndarray(),
+):
     """Form the residual on the nodes of s.pcg.subset, and -r as CG's right side, after `move` and `update_impulses`.
 
     norms (5,), a host array, which is faster than a returned vector: |r|^2, |inertia and mass damping|^2, |f_el|^2, |f_ext|^2

@@ -25,17 +25,23 @@ def relative(r: float, scale: float) -> float:
 def merge(results: list[StageResult]) -> StageResult:
     """Merge the substeps of a step: total iterations, largest residuals."""
     return StageResult(
-        sum(r.newton_iterations for r in results), sum(r.linear_iterations for r in results),
-        max(r.residual for r in results), all(r.converged for r in results), all(r.at_rounding for r in results),
-        sum(r.contact_iterations for r in results), max(r.contact_residual for r in results),
+        sum(r.newton_iterations for r in results),
+        sum(r.linear_iterations for r in results),
+        max(r.residual for r in results),
+        all(r.converged for r in results),
+        all(r.at_rounding for r in results),
+        sum(r.contact_iterations for r in results),
+        max(r.contact_residual for r in results),
         max(r.unbalanced for r in results),
-    )  # fmt: skip
+    )
 
 
 def count_all(result: StageResult, discarded: list[StageResult]) -> StageResult:
     """Return the result of a step plus the iterations of discarded attempts."""
     total = merge([result, *discarded])
     return replace(
-        result, newton_iterations=total.newton_iterations, linear_iterations=total.linear_iterations,
+        result,
+        newton_iterations=total.newton_iterations,
+        linear_iterations=total.linear_iterations,
         contact_iterations=total.contact_iterations,
-    )  # fmt: skip
+    )

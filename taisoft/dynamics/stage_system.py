@@ -72,23 +72,33 @@ class StageSystem:
     """Matrix and vectors of the implicit stages of one model, and of their contacts."""
 
     def __init__(
-        self, model: Model, arena: FieldArena, eps: float, prescribed: np.ndarray,
-        contact: "ContactStep | NoContacts", x_start: Any = None,
-    ):  # fmt: skip
+        self,
+        model: Model,
+        arena: FieldArena,
+        eps: float,
+        prescribed: np.ndarray,
+        contact: "ContactStep | NoContacts",
+        x_start: Any = None,
+    ):
         """prescribed: nodes that follow a path. x_start: (n_nodes) 3-vectors f64, positions at the start of the step."""
         self.model, self.contact, self.x_start = model, contact, x_start
         self.matrix: BlockCsr = block_csr.build_block_csr(model, arena, model.real)
         self.damper = block_csr.sibling(self.matrix, model, arena, model.real, "damping") if model.stiffness_damping else None
         n, k = model.n_nodes, len(prescribed)
         self.work = StageWork(
-            x_hat=arena.vectors("x_hat", ti.f64, n), v_hat=arena.vectors("v_hat", model.real, n),
-            base=arena.vectors("x_base", ti.f64, n), residual=arena.vectors("residual", model.real, n),
+            x_hat=arena.vectors("x_hat", ti.f64, n),
+            v_hat=arena.vectors("v_hat", model.real, n),
+            base=arena.vectors("x_base", ti.f64, n),
+            residual=arena.vectors("residual", model.real, n),
             prescribed_nodes=arena.field("stage_moved", ti.i32, k, prescribed.astype(np.int32)) if k else None,
             prescribed_axes=arena.vectors("stage_moved_axes", ti.i32, k) if k else None,
             targets=arena.vectors("stage_targets", ti.f64, k) if k else None,
             prescribed_acceleration=arena.vectors("prescribed_acceleration", ti.f64, k) if k and model.consistent else None,
-            n_prescribed=k, change=arena.vectors("change", ti.f64, n), damper=self.damper, pcg=pcg.build_pcg(model, arena),
-        )  # fmt: skip
+            n_prescribed=k,
+            change=arena.vectors("change", ti.f64, n),
+            damper=self.damper,
+            pcg=pcg.build_pcg(model, arena),
+        )
         self.rounding = RoundingFloor(model, eps)
         self.kind = ELASTIC_STAGE
         self.scale = 0.0  # that |r| is relative to, at its last evaluation
@@ -238,14 +248,25 @@ class StageSystem:
         """Run the loop of a linearised stage from |r|, in launches that Ctrl-C can interrupt between: see `frictional`."""
         m, A, loop, limits = self.model, self.matrix, np.zeros(15), np.zeros(10)
         loop[[frictional.NORM, frictional.SCALE, frictional.LAW_RESIDUAL, frictional.INNER_TARGET, frictional.SAME_MATRIX]] = (
-            r, multipliers.R_SCALE, math.inf, frictional.PROGRESS * r, self._same_matrix,
-        )  # fmt: skip
+            r,
+            multipliers.R_SCALE,
+            math.inf,
+            frictional.PROGRESS * r,
+            self._same_matrix,
+        )
         # in the order of the indices in `frictional`
         limits[:] = (
-            problem.tolerance * self.scale, problem.inner_tolerance * self.scale, floor, problem.contact_tolerance,
-            problem.linear_tolerance, problem.max_newton, pcg.iteration_limit(m), pcg.batch_of(m, A),
-            problem.extrapolate_after, problem.later_tolerance,
-        )  # fmt: skip
+            problem.tolerance * self.scale,
+            problem.inner_tolerance * self.scale,
+            floor,
+            problem.contact_tolerance,
+            problem.linear_tolerance,
+            problem.max_newton,
+            pcg.iteration_limit(m),
+            pcg.batch_of(m, A),
+            problem.extrapolate_after,
+            problem.later_tolerance,
+        )
         while loop[frictional.STATUS] == frictional.RUNNING:
             frictional.solve_frictional(m, self.work, A, self._k, problem.beta, limits, loop)
         self._same_matrix = bool(loop[frictional.SAME_MATRIX])
@@ -286,9 +307,7 @@ class StageSystem:
     def direction(self, tolerance: float) -> pcg.LinearResult:
         """Solve for y of pcg from -r."""
         m, w = self.model, self.work
-        solution = pcg.solve(
-            m, self.matrix, w.pcg, tolerance, pcg.iteration_limit(m), self._k.coupling, self._same_matrix
-        )  # fmt: skip
+        solution = pcg.solve(m, self.matrix, w.pcg, tolerance, pcg.iteration_limit(m), self._k.coupling, self._same_matrix)
         self._same_matrix = True
         return solution
 

@@ -99,8 +99,11 @@ class Substepping:
             time = start + (dt - remaining)
             length = next_length(
                 lambda length, time=time: contact.measure_start(time, length)[1],
-                remaining, length, longest, bool(results) and not undone,
-            )  # fmt: skip
+                remaining,
+                length,
+                longest,
+                bool(results) and not undone,
+            )
             if length < shortest:
                 self._refuse_fast_closing(dt)
             contact.start_substep(length)

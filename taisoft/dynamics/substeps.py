@@ -82,19 +82,23 @@ class ExplicitStepper:
             return arena.vectors(name, dtype, count, data) if needed and count > 0 else None
 
         self.work = SubstepWork(
-            verlet=verlet, n_prescribed=n_prescribed, n_held=n_held,
+            verlet=verlet,
+            n_prescribed=n_prescribed,
+            n_held=n_held,
             acceleration=vectors("acceleration", m.n_nodes, needed=verlet),
             half_velocity=vectors("half_velocity", m.n_nodes, needed=verlet and m.stiffness_damping),
             prescribed_nodes=(
                 arena.field("prescribed_nodes", ti.i32, n_prescribed, dirichlet.prescribed_nodes.astype(np.int32))
-                if n_prescribed else None
+                if n_prescribed
+                else None
             ),
             prescribed_axes=vectors("prescribed_axes", n_prescribed, ti.i32, data=dirichlet.prescribed_axes()),
             targets=vectors("targets", self.rows * n_prescribed, ti.f64),
             before=vectors("position_before", n_prescribed, ti.f64),
             held=arena.field("held", ti.i32, n_held, dirichlet.held.astype(np.int32)) if n_held else None,
-            held_velocity=vectors("held_velocity", n_held), reaction=vectors("reaction", n_held),
-        )  # fmt: skip
+            held_velocity=vectors("held_velocity", n_held),
+            reaction=vectors("reaction", n_held),
+        )
         self.acceleration_stale = True  # Verlet's acceleration does not match the present state
 
     def forget(self) -> None:

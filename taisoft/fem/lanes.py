@@ -19,9 +19,7 @@ def broadcast(value, lanes: ti.template()):
 @ti.func
 def rest_gradients(m: ti.template(), b, real: ti.template()):
     """Dm^-1 of the tets of block b (nine lane entries) [1/m]."""
-    return [
-        ti.Vector([ti.cast(m.Dm_inv[b, c, q], real) for q in ti.static(range(m.lanes))]) for c in ti.static(range(9))
-    ]
+    return [ti.Vector([ti.cast(m.Dm_inv[b, c, q], real) for q in ti.static(range(m.lanes))]) for c in ti.static(range(9))]
 
 
 @ti.func
@@ -44,9 +42,7 @@ def differences(m: ti.template(), g: ti.template(), field: ti.template(), b, rea
     Subtracts in the field's precision (f64 for positions), then rounds to `real`.
     """
     at = g.nodes_at + (b - g.first) * (g.n_nodes * m.lanes)
-    p = [
-        [field[m.nodes[at + (a * m.lanes + q)]] for q in ti.static(range(m.lanes))] for a in ti.static(range(g.n_nodes))
-    ]
+    p = [[field[m.nodes[at + (a * m.lanes + q)]] for q in ti.static(range(m.lanes))] for a in ti.static(range(g.n_nodes))]
     return [
         ti.Vector([ti.cast(p[a][q][r] - p[0][q][r], real) for q in ti.static(range(m.lanes))])
         for a in ti.static(range(1, g.n_nodes))
@@ -77,12 +73,18 @@ def gradient_at(m: ti.template(), g: ti.template(), E, M, q, real: ti.template()
     else:
         C = derivatives_at(m, g, q, real)
         D = [
-            E[r] * C[c] + E[3 + r] * C[3 + c] + E[6 + r] * C[6 + c]
-            + E[9 + r] * C[9 + c] + E[12 + r] * C[12 + c] + E[15 + r] * C[15 + c]
-            + E[18 + r] * C[18 + c] + E[21 + r] * C[21 + c] + E[24 + r] * C[24 + c]
+            E[r] * C[c]
+            + E[3 + r] * C[3 + c]
+            + E[6 + r] * C[6 + c]
+            + E[9 + r] * C[9 + c]
+            + E[12 + r] * C[12 + c]
+            + E[15 + r] * C[15 + c]
+            + E[18 + r] * C[18 + c]
+            + E[21 + r] * C[21 + c]
+            + E[24 + r] * C[24 + c]
             for c in ti.static(range(3))
             for r in ti.static(range(3))
-        ]  # fmt: skip
+        ]
         return edges_times(D, M)
 
 
@@ -111,11 +113,7 @@ def deformation_gradient(m: ti.template(), g: ti.template(), X, N, q):
 @arithmetic
 def edges_times(D, M):
     """D M with D by columns: entry 3 c + r."""
-    return [
-        D[i] * M[j] + D[3 + i] * M[3 + j] + D[6 + i] * M[6 + j]
-        for i in ti.static(range(3))
-        for j in ti.static(range(3))
-    ]
+    return [D[i] * M[j] + D[3 + i] * M[3 + j] + D[6 + i] * M[6 + j] for i in ti.static(range(3)) for j in ti.static(range(3))]
 
 
 @ti.func

@@ -39,9 +39,7 @@ def gravity_masses(scene: Scene) -> np.ndarray:
 
 def mass_matrix(scene: Scene) -> sp.csr_matrix:
     """Mass matrix of implicit steps (n_nodes, n_nodes) [kg]: consistent for bodies of order 2, else lumped."""
-    parts = [
-        reference.consistent_mass(b) if b.order == 2 else sp.diags(reference.lumped_mass(b)) for b in scene.bodies
-    ]
+    parts = [reference.consistent_mass(b) if b.order == 2 else sp.diags(reference.lumped_mass(b)) for b in scene.bodies]
     return sp.block_diag(parts, format="csr")
 
 

@@ -35,11 +35,7 @@ def matmul_nt(A, B):
 @arithmetic
 def matmul_tn(A, B):
     """A^T B."""
-    return [
-        A[i] * B[j] + A[3 + i] * B[3 + j] + A[6 + i] * B[6 + j]
-        for i in ti.static(range(3))
-        for j in ti.static(range(3))
-    ]
+    return [A[i] * B[j] + A[3 + i] * B[3 + j] + A[6 + i] * B[6 + j] for i in ti.static(range(3)) for j in ti.static(range(3))]
 
 
 @arithmetic
@@ -102,10 +98,16 @@ def determinant(F):
 def ddot(A, B):
     """A : B, the sum of the products of the entries."""
     return (
-        A[0] * B[0] + A[1] * B[1] + A[2] * B[2]
-        + A[3] * B[3] + A[4] * B[4] + A[5] * B[5]
-        + A[6] * B[6] + A[7] * B[7] + A[8] * B[8]
-    )  # fmt: skip
+        A[0] * B[0]
+        + A[1] * B[1]
+        + A[2] * B[2]
+        + A[3] * B[3]
+        + A[4] * B[4]
+        + A[5] * B[5]
+        + A[6] * B[6]
+        + A[7] * B[7]
+        + A[8] * B[8]
+    )
 
 
 @arithmetic

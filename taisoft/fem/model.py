@@ -120,10 +120,18 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
         points_at = sum(len(reference.quadrature(r).weights) for r in rules if r < degree) if order == 2 else 0
         groups.append(
             Group(
-                list(LAWS.values())[law], order, n_nodes, len(reference.quadrature(degree).weights), first, block,
-                nodes_at, force_at, matrix_at, points_at,
+                list(LAWS.values())[law],
+                order,
+                n_nodes,
+                len(reference.quadrature(degree).weights),
+                first,
+                block,
+                nodes_at,
+                force_at,
+                matrix_at,
+                points_at,
             )
-        )  # fmt: skip
+        )
         nodes_at += count * n_nodes
         force_at += count * n_nodes * 3
         matrix_at += (block - first) * MATRIX_BLOCKS[order] * 9
@@ -247,16 +255,22 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     rest_lanes = lane_layout(Dm_inv.reshape(-1, 9), lanes).astype(npr if strain_real == real else np.float64)
     mass = arena.field("mass", real, n_nodes, lumped_masses(scene).astype(npr))
     model = Model(
-        real=real, strain_real=strain_real, lanes=lanes, serial=serial, n_nodes=n_nodes, n_blocks=n_blocks, groups=groups,
-        terms=terms_of(on), state=build_state(arena, runtime, layout.rest, velocity, 3 * len(flat_nodes), chunks),
+        real=real,
+        strain_real=strain_real,
+        lanes=lanes,
+        serial=serial,
+        n_nodes=n_nodes,
+        n_blocks=n_blocks,
+        groups=groups,
+        terms=terms_of(on),
+        state=build_state(arena, runtime, layout.rest, velocity, 3 * len(flat_nodes), chunks),
         nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
-        rules=rules, points=arena.field("points", ti.f64, (len(table), 28), table) if rules else None,
+        rules=rules,
+        points=arena.field("points", ti.f64, (len(table), 28), table) if rules else None,
         Dm_inv=arena.field("Dm_inv", strain_real, (n_blocks, 9, lanes), rest_lanes),
         volume=arena.field("volume", real, (n_blocks, lanes), volume.reshape(n_blocks, lanes).astype(npr)),
         block_body=arena.field("block_body", ti.i32, n_blocks, block_body),
-        law_constants=arena.field(
-            "law_constants", ti.f64, (n_bodies, 4), material_table([b.material for b in scene.bodies])
-        ),
+        law_constants=arena.field("law_constants", ti.f64, (n_bodies, 4), material_table([b.material for b in scene.bodies])),
         gather_start=arena.field("gather_start", ti.i32, n_nodes + 1, start),
         gather_entry=arena.field("gather_entry", ti.i32, len(entry), entry),
         mass=mass,
@@ -269,9 +283,12 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         loads=arena.vectors("loads", real, n_nodes, body_loads(scene).astype(npr)) if on["loads"] else None,
         node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
         damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
-        consistent=on["consistent_mass"], loaded=on["loads"], damped=damped, stiffness_damping=on["stiffness_damping"],
+        consistent=on["consistent_mass"],
+        loaded=on["loads"],
+        damped=damped,
+        stiffness_damping=on["stiffness_damping"],
         chunks=chunks,
-    )  # fmt: skip
+    )
     if on["consistent_mass"]:
         model = replace(model, mass_matrix=_build_mass_matrix(scene, model, arena, npr))
     return model, layout

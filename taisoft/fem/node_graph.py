@@ -9,11 +9,7 @@ from taisoft.mesh.topology import EDGES
 # Pairs of an element's nodes, the lower first. Order 2: corner-corner (as order 1), corner-midpoint, midpoint-midpoint.
 PAIRS = {
     1: EDGES,
-    2: (
-        *EDGES,
-        *((a, b) for a in range(4) for b in range(4, 10)),
-        *((a, b) for a in range(4, 10) for b in range(a + 1, 10)),
-    ),
+    2: (*EDGES, *((a, b) for a in range(4) for b in range(4, 10)), *((a, b) for a in range(4, 10) for b in range(a + 1, 10))),
 }
 
 
@@ -40,6 +36,11 @@ def node_graph(pairs: np.ndarray, n_nodes: int) -> NodeGraph:
     position[order] = np.arange(len(order))
     start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n_nodes))])
     return NodeGraph(
-        ends=np.stack([i, j], axis=1), row_start=start, row_upper=start[:-1] + np.bincount(j, minlength=n_nodes),
-        column=columns[order], upper=position[: len(key)], lower=position[len(key) :], pair=pair.reshape(-1),
-    )  # fmt: skip
+        ends=np.stack([i, j], axis=1),
+        row_start=start,
+        row_upper=start[:-1] + np.bincount(j, minlength=n_nodes),
+        column=columns[order],
+        upper=position[: len(key)],
+        lower=position[len(key) :],
+        pair=pair.reshape(-1),
+    )

@@ -25,13 +25,15 @@ class State:
     partial: Any  # (chunks, N_COLUMNS) f64: partial sums, added in a fixed order
 
 
-def build_state(
-    arena: FieldArena, runtime: Runtime, x: np.ndarray, v: np.ndarray, n_force_entries: int, chunks: int
-) -> State:
+def build_state(arena: FieldArena, runtime: Runtime, x: np.ndarray, v: np.ndarray, n_force_entries: int, chunks: int) -> State:
     """Allocate a state and fill it with x and v (n_nodes, 3). n_force_entries: size of `element_force`."""
     force = arena.lanes("element_force", runtime.real, n_force_entries)
     return State(
-        x=arena.vectors("x", ti.f64, len(x), x), v=arena.vectors("v", runtime.real, len(v), v.astype(runtime.np_real)),
-        element_force=force.memory, element_force_at=force.at, element_force_mask=force.mask,
-        scalars=arena.field("scalars", ti.f64, N_SCALARS), partial=arena.field("partial", ti.f64, (chunks, N_COLUMNS)),
-    )  # fmt: skip
+        x=arena.vectors("x", ti.f64, len(x), x),
+        v=arena.vectors("v", runtime.real, len(v), v.astype(runtime.np_real)),
+        element_force=force.memory,
+        element_force_at=force.at,
+        element_force_mask=force.mask,
+        scalars=arena.field("scalars", ti.f64, N_SCALARS),
+        partial=arena.field("partial", ti.f64, (chunks, N_COLUMNS)),
+    )

@@ -73,16 +73,22 @@ def build_block_csr(model: Model, arena: FieldArena, real, prefix: str = "stiffn
         )
         terms = {"term_start": ints("term_start", start), "term_pair": ints("term_pair", pairs), "term_factor": factors}
     return BlockCsr(
-        n_edges=n_edges, row_start=ints("row_start", graph.row_start), row_upper=ints("row_upper", graph.row_upper),
-        column=ints("column", graph.column), value=arena.vectors(f"{prefix}_value", real, 2 * n_edges, n=BLOCK),
+        n_edges=n_edges,
+        row_start=ints("row_start", graph.row_start),
+        row_upper=ints("row_upper", graph.row_upper),
+        column=ints("column", graph.column),
+        value=arena.vectors(f"{prefix}_value", real, 2 * n_edges, n=BLOCK),
         diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
         row_sum=arena.vectors(f"{prefix}_row_sum", real, 1, n=4),
-        element=element.memory, element_at=element.at // model.lanes,
+        element=element.memory,
+        element_at=element.at // model.lanes,
         element_mask=element.mask // model.lanes,
-        edge_start=ints("edge_start", edge_start), edge_entry=ints("edge_entry", base[order]),
-        edge_upper=ints("edge_upper", graph.upper), edge_lower=ints("edge_lower", graph.lower),
+        edge_start=ints("edge_start", edge_start),
+        edge_entry=ints("edge_entry", base[order]),
+        edge_upper=ints("edge_upper", graph.upper),
+        edge_lower=ints("edge_lower", graph.lower),
         **terms,
-    )  # fmt: skip
+    )
 
 
 def sibling(matrix: BlockCsr, model: Model, arena: FieldArena, real, prefix: str) -> BlockCsr:
@@ -236,6 +242,5 @@ def to_scipy(m: Model, A: BlockCsr) -> sp.csr_matrix:
     shape = (3 * m.n_nodes, 3 * m.n_nodes)
     rows = np.arange(m.n_nodes)
     return (
-        sp.bsr_matrix((off, column, start), shape=shape)
-        + sp.bsr_matrix((diagonal, rows, np.arange(m.n_nodes + 1)), shape=shape)
+        sp.bsr_matrix((off, column, start), shape=shape) + sp.bsr_matrix((diagonal, rows, np.arange(m.n_nodes + 1)), shape=shape)
     ).tocsr()

@@ -37,16 +37,25 @@ class Coupling:
 NO_COUPLING = Coupling(0, *[None] * 13)
 
 
-def build_coupling(
-    arena, real, n_nodes: int, count, node, arity, weight, entry_start, entry, block, active, base
-) -> Coupling:
+def build_coupling(arena, real, n_nodes: int, count, node, arity, weight, entry_start, entry, block, active, base) -> Coupling:
     """Build terms over existing fields of nodes, weights and blocks, which the caller fills."""
     capacity, width = node.shape
     return Coupling(
-        width, count, node, arity, weight, entry_start, entry, block, active, base,
-        arena.field("coupling_n_active", ti.i32, n_nodes), arena.field("coupling_term", ti.i32, capacity * width),
-        arena.field("coupling_term_weight", real, capacity * width), arena.vectors("coupling_product", real, capacity, n=4),
-    )  # fmt: skip
+        width,
+        count,
+        node,
+        arity,
+        weight,
+        entry_start,
+        entry,
+        block,
+        active,
+        base,
+        arena.field("coupling_n_active", ti.i32, n_nodes),
+        arena.field("coupling_term", ti.i32, capacity * width),
+        arena.field("coupling_term_weight", real, capacity * width),
+        arena.vectors("coupling_product", real, capacity, n=4),
+    )
 
 
 @ti.func

@@ -124,10 +124,7 @@ def projected_blocks(m: ti.template(), A: ti.template(), base, S, M, V):
 def store_column(m: ti.template(), A: ti.template(), base, a: ti.template(), k, T, M, V):
     """Write column k of the blocks K_(c+1)(a+1) between corner a + 1 and the others, as row k of K_(a+1)(c+1)."""
     for r in ti.static(range(3)):
-        g = [
-            V * (T[3 * r] * M[3 * c] + T[3 * r + 1] * M[3 * c + 1] + T[3 * r + 2] * M[3 * c + 2])
-            for c in ti.static(range(3))
-        ]
+        g = [V * (T[3 * r] * M[3 * c] + T[3 * r + 1] * M[3 * c + 1] + T[3 * r + 2] * M[3 * c + 2]) for c in ti.static(range(3))]
         g0 = -(g[0] + g[1] + g[2])
         # pair (0, a + 1) has index a: entry (r, k) of K_0a
         store_lanes(m, A.element, base + (9 * a + 3 * r + k), g0)

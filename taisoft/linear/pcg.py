@@ -77,9 +77,14 @@ def batch_of(m: Model, A: BlockCsr) -> int:
 
 
 def solve(
-    m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int, coupling: Coupling = NO_COUPLING,
+    m: Model,
+    A: BlockCsr,
+    w: PcgWork,
+    tolerance: float,
+    max_iterations: int,
+    coupling: Coupling = NO_COUPLING,
     same_matrix: bool = False,
-) -> LinearResult:  # fmt: skip
+) -> LinearResult:
     """Solve for w.y given w.rhs. tolerance: sqrt(r.z) relative to the start.
 
     coupling: terms added to A. The diagonal of A alone must then be in coupling.base; A.diagonal is set to that of the sum.

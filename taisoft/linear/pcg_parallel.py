@@ -21,13 +21,11 @@ from taisoft.linear.pcg import (
     dot64,
     precondition,
     total,
-)  # fmt: skip
+)
 
 
 @kernel
-def start(
-    m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), same_matrix: ti.i32
-):  # fmt: skip
+def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), same_matrix: ti.i32):
     """Set the diagonal and its inverse B, y = 0, r = rhs, z = p = B r."""
     for c in range(m.chunks):
         n = n_nodes_of(m, w.subset)
@@ -53,9 +51,7 @@ def start(
         w.state[RZ], w.state[RZ_START], w.state[COUNT], w.state[STATUS] = rz, rz, 0.0, RUNNING
 
 
-def iterate(
-    m, A, coupling, w, n: int, tolerance: float, begin: bool, same_matrix: bool
-) -> tuple[int, int]:  # fmt: skip
+def iterate(m, A, coupling, w, n: int, tolerance: float, begin: bool, same_matrix: bool) -> tuple[int, int]:
     """Run up to n iterations, from y = 0 if `begin`. Return the iterations so far and the status."""
     if begin:
         start(m, A, coupling, w, int(same_matrix))
@@ -65,9 +61,7 @@ def iterate(
 
 
 @kernel
-def iterate_once(
-    m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), tolerance: ti.f64
-):  # fmt: skip
+def iterate_once(m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), tolerance: ti.f64):
     """Run one iteration, or nothing if the status is not RUNNING."""
     if ti.static(coupling.width > 0):
         for c in range(coupling.count[0]):

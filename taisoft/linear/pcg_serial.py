@@ -58,9 +58,7 @@ def start(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()
     w.state[COUNT], w.state[STATUS] = 0.0, RUNNING
 
 
-def iterate(
-    m, A, k, w, n: int, tolerance: float, begin: bool, same_matrix: bool
-) -> tuple[int, int]:  # fmt: skip
+def iterate(m, A, k, w, n: int, tolerance: float, begin: bool, same_matrix: bool) -> tuple[int, int]:
     """Run up to n iterations, from y = 0 if `begin`. Return the iterations so far and the status."""
     count, status = iterate_kernel(m, A, k, w, n, tolerance, int(begin), int(same_matrix))
     return int(count), int(status)
@@ -132,8 +130,14 @@ def iterations(m: ti.template(), A: ti.template(), coupling: ti.template(), w: t
 
 @kernel
 def iterate_kernel(
-    m: ti.template(), A: ti.template(), coupling: ti.template(), w: ti.template(), n: ti.i32,
-    tolerance: ti.f64, begin: ti.i32, same_matrix: ti.i32,
+    m: ti.template(),
+    A: ti.template(),
+    coupling: ti.template(),
+    w: ti.template(),
+    n: ti.i32,
+    tolerance: ti.f64,
+    begin: ti.i32,
+    same_matrix: ti.i32,
 ) -> ti.types.vector(2, ti.f64):
     """Run the iterations in one launch. Return (count, status)."""
     ti.loop_config(serialize=True)

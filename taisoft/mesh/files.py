@@ -52,6 +52,7 @@ _REQUIRED = {".vtk": rb"(?:POINTS\s+|CELLS\s+(?:1\s+)?)(\d+)", ".vtu": rb"Number
 
 _PLURALS = {"vertex": "vertices", "line": "lines", "triangle": "triangles", "quad": "quads", "hexahedron": "hexahedra"}
 
+
 def read_mesh(path, fix_orientation: bool = False, weld: float | None = None) -> TetMesh:
     """Read a tetrahedral mesh from a file of any format that meshio knows.
 
@@ -125,9 +126,7 @@ def _read_by_meshio(file: Path, name: str, data: bytes):
     for found in re.finditer(_COUNTS.get(ending, rb"(?!)"), data):
         if int(found[1][:30]) > len(data):
             line = data.count(b"\n", 0, found.start(1)) + 1
-            raise MeshError(
-                f"{name}: line {line} declares {found[1][:30].decode()} items, but the file has {len(data)} bytes"
-            )
+            raise MeshError(f"{name}: line {line} declares {found[1][:30].decode()} items, but the file has {len(data)} bytes")
     try:
         mesh = read_safely(file, name, data)
     except MeshError as error:
@@ -169,11 +168,16 @@ def _clean_mesh(name, points, blocks, notes, fix_orientation, weld) -> TetMesh:
     """Return the TetMesh of the corners, unused vertices removed, the rest welded. TetMesh itself refuses invalid arrays."""
     tets = np.concatenate([nodes[..., :4] for nodes in blocks])
     valid = (
-        points.ndim == 2 and points.shape[1] == 3 and points.dtype.kind in "fiu"
-        and (np.abs(points) <= LARGEST_COORDINATE).all() and tets.ndim == 2 and tets.size > 0
-        and tets.min() >= 0 and tets.max() < len(points)
+        points.ndim == 2
+        and points.shape[1] == 3
+        and points.dtype.kind in "fiu"
+        and (np.abs(points) <= LARGEST_COORDINATE).all()
+        and tets.ndim == 2
+        and tets.size > 0
+        and tets.min() >= 0
+        and tets.max() < len(points)
         and all(nodes.dtype.kind in "iu" for nodes in blocks)
-    )  # fmt: skip
+    )
     if not valid:
         return TetMesh(points, tets, fix_orientation, source=name, notes=tuple(notes))
     points = points.astype(np.float64)

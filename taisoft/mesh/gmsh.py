@@ -13,19 +13,34 @@ from taisoft.errors import MeshError
 
 # Gmsh element type -> (name, number of nodes)
 ELEMENTS = {
-    1: ("line", 2), 2: ("triangle", 3), 3: ("quad", 4), 4: ("tetra", 4), 5: ("hexahedron", 8), 6: ("wedge", 6),
-    7: ("pyramid", 5), 8: ("line3", 3), 9: ("triangle6", 6), 10: ("quad9", 9), 11: ("tetra10", 10),
-    12: ("hexahedron27", 27), 13: ("wedge18", 18), 14: ("pyramid14", 14), 15: ("vertex", 1), 16: ("quad8", 8),
-    17: ("hexahedron20", 20), 18: ("wedge15", 15), 19: ("pyramid13", 13), 21: ("triangle10", 10), 26: ("line4", 4),
+    1: ("line", 2),
+    2: ("triangle", 3),
+    3: ("quad", 4),
+    4: ("tetra", 4),
+    5: ("hexahedron", 8),
+    6: ("wedge", 6),
+    7: ("pyramid", 5),
+    8: ("line3", 3),
+    9: ("triangle6", 6),
+    10: ("quad9", 9),
+    11: ("tetra10", 10),
+    12: ("hexahedron27", 27),
+    13: ("wedge18", 18),
+    14: ("pyramid14", 14),
+    15: ("vertex", 1),
+    16: ("quad8", 8),
+    17: ("hexahedron20", 20),
+    18: ("wedge15", 15),
+    19: ("pyramid13", 13),
+    21: ("triangle10", 10),
+    26: ("line4", 4),
     29: ("tetra20", 20),
-}  # fmt: skip
+}
 
 _MAX_EXACT_INT = 2.0**53  # float64 holds every integer up to here exactly
 
 
-_HEAD = re.compile(
-    rb"\s*(?:\$Comments.*?\$EndComments\s*)?\$MeshFormat\s+(\S+)\s+([01])\s+(\d{1,2})[ \t\r]*\n", re.DOTALL
-)
+_HEAD = re.compile(rb"\s*(?:\$Comments.*?\$EndComments\s*)?\$MeshFormat\s+(\S+)\s+([01])\s+(\d{1,2})[ \t\r]*\n", re.DOTALL)
 
 
 class _Text:
@@ -220,9 +235,7 @@ def _elements_2(numbers: _Text) -> list[tuple[str, np.ndarray]]:
     return [(ELEMENTS[c][0], np.array(tags, dtype=np.int64).reshape(-1, ELEMENTS[c][1])) for c, tags in found.items()]
 
 
-_READERS = {
-    ("4", "Nodes"): _nodes_4, ("4", "Elements"): _elements_4, ("2", "Nodes"): _nodes_2, ("2", "Elements"): _elements_2,
-}  # fmt: skip
+_READERS = {("4", "Nodes"): _nodes_4, ("4", "Elements"): _elements_4, ("2", "Nodes"): _nodes_2, ("2", "Elements"): _elements_2}
 
 
 def _kind(numbers, code: int) -> tuple[str, int]:

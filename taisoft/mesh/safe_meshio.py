@@ -27,8 +27,14 @@ MAX_ENTRIES_PER_BYTE = 16  # allowed array entries for each byte of a file
 
 # Readers that loop forever at the end of a broken file, by extension.
 _LOOPING_READERS = {
-    ".mdpa": "mdpa", ".ply": "ply", ".dat": "tecplot", ".tec": "tecplot", ".nas": "nastran", ".bdf": "nastran", ".fem": "nastran",
-}  # fmt: skip
+    ".mdpa": "mdpa",
+    ".ply": "ply",
+    ".dat": "tecplot",
+    ".tec": "tecplot",
+    ".nas": "nastran",
+    ".bdf": "nastran",
+    ".fem": "nastran",
+}
 _TEXT_FORMATS = ("tecplot", "nastran")
 
 _max_entries: ContextVar[float] = ContextVar("largest number of array entries", default=math.inf)

@@ -95,9 +95,7 @@ def _arrays(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np
 
 def _key(vertices: np.ndarray, triangles: np.ndarray, cells: int, margin: float) -> str:
     """Return the hexadecimal SHA-256 of all inputs of a grid."""
-    digest = hashlib.sha256(
-        f"{FORMAT} {len(vertices)} {len(triangles)} {int(cells)} {float(margin).hex()}\n".encode()
-    )
+    digest = hashlib.sha256(f"{FORMAT} {len(vertices)} {len(triangles)} {int(cells)} {float(margin).hex()}\n".encode())
     digest.update(vertices.tobytes())
     digest.update(triangles.tobytes())
     return digest.hexdigest()
@@ -117,9 +115,12 @@ def _matches(grid: SdfGrid, vertices: np.ndarray, cells: int, margin: float) -> 
     """Return whether a grid has the layout for these vertices and finite float64 values."""
     origin, spacing, shape = grid_points(vertices, cells, margin)
     return (
-        np.array_equal(grid.origin, origin) and np.array_equal(grid.spacing, spacing) and grid.phi.shape == shape
-        and grid.phi.dtype == np.float64 and bool(np.isfinite(grid.phi).all())
-    )  # fmt: skip
+        np.array_equal(grid.origin, origin)
+        and np.array_equal(grid.spacing, spacing)
+        and grid.phi.shape == shape
+        and grid.phi.dtype == np.float64
+        and bool(np.isfinite(grid.phi).all())
+    )
 
 
 def _write(path: Path, grid: SdfGrid) -> None:

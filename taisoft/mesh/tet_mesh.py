@@ -39,9 +39,7 @@ class TetMesh(Guarded):
 
     _error = MeshAttributeError
 
-    def __init__(
-        self, vertices, tets, fix_orientation: bool = False, *, source: str | None = None, notes: tuple[str, ...] = ()
-    ):
+    def __init__(self, vertices, tets, fix_orientation: bool = False, *, source: str | None = None, notes: tuple[str, ...] = ()):
         """Validate and copy the arrays.
 
         vertices: (n,3) numbers [m]. tets: (m,4) integers, counted from 0. fix_orientation: if only some tets are inverted,
@@ -149,8 +147,7 @@ class TetMesh(Guarded):
         used[array] = True
         if not used.all():
             raise self._mesh_error(
-                f"vertex {int(np.argmin(used))} belongs to no tet and would have no mass "
-                f"({int((~used).sum())} such vertices)"
+                f"vertex {int(np.argmin(used))} belongs to no tet and would have no mass ({int((~used).sum())} such vertices)"
             )
         return array
 

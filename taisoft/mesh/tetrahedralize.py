@@ -79,9 +79,13 @@ def _run_mesher(name: str, vertices: np.ndarray, triangles: np.ndarray, length: 
         command = [sys.executable, "-c", f"import {__name__} as m; m._mesh({str(source)!r}, {str(result)!r})"]
         path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")])
         child = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, cwd=folder,
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            cwd=folder,
             env=os.environ | {"PYTHONPATH": path},
-        )  # fmt: skip
+        )
         try:
             stderr = child.communicate()[1]
         finally:  # do not leave the process running after a signal

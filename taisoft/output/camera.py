@@ -47,9 +47,7 @@ class Camera:
     def forward(self) -> np.ndarray:
         """Unit vector (3,) from the eye to the target."""
         azimuth, elevation = math.radians(self.azimuth), math.radians(self.elevation)
-        return -np.array(
-            [math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation)]
-        )
+        return -np.array([math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation)])
 
     @property
     def axes(self) -> np.ndarray:

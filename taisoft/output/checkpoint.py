@@ -76,7 +76,5 @@ def read_last_good(path: str | Path) -> Checkpoint:
             found = read_checkpoint(previous)
         except SimulationError as other:
             raise SimulationError(f"{error}; nor can the previous one be used: {other}") from None
-        warnings.warn(
-            f"{error}; resuming from the previous checkpoint instead, {previous}", UserWarning, stacklevel=2
-        )
+        warnings.warn(f"{error}; resuming from the previous checkpoint instead, {previous}", UserWarning, stacklevel=2)
         return found

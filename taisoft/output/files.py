@@ -13,9 +13,19 @@ from taisoft.errors import OutputError
 from taisoft.files import part_path, publish, replacing, write_bytes, write_error
 
 __all__ = [
-    "LOCK_NAME", "RESULT_FILES", "RESULT_FOLDERS", "FolderLock", "OutputFolder", "check_free", "make_folder", "part_path",
-    "publish", "replacing", "write_bytes", "write_error",
-]  # fmt: skip
+    "LOCK_NAME",
+    "RESULT_FILES",
+    "RESULT_FOLDERS",
+    "FolderLock",
+    "OutputFolder",
+    "check_free",
+    "make_folder",
+    "part_path",
+    "publish",
+    "replacing",
+    "write_bytes",
+    "write_error",
+]
 
 LOCK_NAME = "taisoft.lock"
 RESULT_FILES = ("report.json", "steps.csv", "scene.usdc", "checkpoint.npz", "checkpoint.previous.npz", "video.mp4")

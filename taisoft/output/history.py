@@ -10,10 +10,18 @@ from taisoft.records import StepReport
 
 CAPACITY = 256  # bins, an even number
 QUANTITIES = (
-    "kinetic", "elastic", "gravity", "total",  # [J], change since the start
-    "newton_residual", "contact_residual", "newton_iterations", "linear_iterations", "contact_iterations",
-    "n_contacts", "step_time",  # wall time [ms]
-)  # fmt: skip
+    "kinetic",
+    "elastic",
+    "gravity",
+    "total",  # [J], change since the start
+    "newton_residual",
+    "contact_residual",
+    "newton_iterations",
+    "linear_iterations",
+    "contact_iterations",
+    "n_contacts",
+    "step_time",  # wall time [ms]
+)
 
 
 class History:
@@ -63,11 +71,19 @@ class History:
         """
         energies = np.array([report.kinetic, report.elastic, report.gravity]) - self._start_energies
         solved, touched = (np.nan if explicit else 1.0), (1.0 if touching else np.nan)
-        row = np.array([
-            *energies, energies.sum(), report.residual * solved, report.contact_residual * touched,
-            report.newton_iterations * solved, report.linear_iterations * solved,
-            report.contact_iterations * touched / report.steps, report.n_contacts * touched, 1e3 * seconds / report.steps,
-        ])  # fmt: skip
+        row = np.array(
+            [
+                *energies,
+                energies.sum(),
+                report.residual * solved,
+                report.contact_residual * touched,
+                report.newton_iterations * solved,
+                report.linear_iterations * solved,
+                report.contact_iterations * touched / report.steps,
+                report.n_contacts * touched,
+                1e3 * seconds / report.steps,
+            ]
+        )
         self._append(report.time, np.where(np.isfinite(row), row, np.nan))
 
     def _append(self, time: float, row: np.ndarray) -> None:

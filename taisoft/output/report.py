@@ -25,9 +25,17 @@ PACKAGES = ("taichi", "numpy", "scipy", "usd-core")
 
 
 def write_report(
-    folder: str | Path, result: RunReport, *, arch: str, precision: str, settings: dict, plan: list[dict],
-    resumed: dict | None = None, bodies: list[dict] | None = None, buffer_growths: dict[str, int] | None = None,
-) -> None:  # fmt: skip
+    folder: str | Path,
+    result: RunReport,
+    *,
+    arch: str,
+    precision: str,
+    settings: dict,
+    plan: list[dict],
+    resumed: dict | None = None,
+    bodies: list[dict] | None = None,
+    buffer_growths: dict[str, int] | None = None,
+) -> None:
     """Write report.json and steps.csv into folder. Raises OutputError.
 
     settings: every resolved setting of the run, by name; plan: the entries of the simulator's plan. Values may be
@@ -57,11 +65,16 @@ def body_records(scene) -> list[dict]:
     """Describe each body of a scene: its name, law, order, and numbers of vertices, tets, nodes and connected pieces."""
     return [
         {
-            "name": b.name, "law": b.material.law, "order": b.order, "vertices": b.mesh.n_verts, "tets": b.mesh.n_tets,
-            "nodes": b.n_nodes, "pieces": b.mesh.n_components,
+            "name": b.name,
+            "law": b.material.law,
+            "order": b.order,
+            "vertices": b.mesh.n_verts,
+            "tets": b.mesh.n_tets,
+            "nodes": b.n_nodes,
+            "pieces": b.mesh.n_components,
         }
         for b in scene.bodies
-    ]  # fmt: skip
+    ]
 
 
 def run_record(result: RunReport) -> dict:

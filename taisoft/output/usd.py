@@ -46,7 +46,7 @@ class UsdWriter:
 
     def __init__(
         self, folder: str | Path, scene, fps: float = 60.0, chunk_frames: int = 10, self_collision: bool = False, first: int = 0
-    ):  # fmt: skip
+    ):
         if not fps > 0:
             raise OutputError(f"USD export: fps is {fps}; it must be positive")
         if chunk_frames < 1:

@@ -35,10 +35,31 @@ def command(folder: Path, fps: float, ffmpeg: str = "ffmpeg", out: Path | None =
     """Return the ffmpeg command that encodes the pictures in folder/frames at fps [1/s], for common players and browsers."""
     first, frames = min(map(int, picture_numbers(folder))), str(folder / FRAMES_NAME).replace("%", "%%")
     return [
-        ffmpeg, "-y", "-loglevel", "error", "-xerror", "-framerate", f"{fps:g}", "-start_number", str(first),
-        "-i", f"{frames}/%05d.png", "-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p",
-        "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-movflags", "+faststart", "-f", "mp4", str(out or folder / VIDEO_NAME),
-    ]  # fmt: skip
+        ffmpeg,
+        "-y",
+        "-loglevel",
+        "error",
+        "-xerror",
+        "-framerate",
+        f"{fps:g}",
+        "-start_number",
+        str(first),
+        "-i",
+        f"{frames}/%05d.png",
+        "-c:v",
+        "libx264",
+        "-crf",
+        "18",
+        "-pix_fmt",
+        "yuv420p",
+        "-vf",
+        "pad=ceil(iw/2)*2:ceil(ih/2)*2",
+        "-movflags",
+        "+faststart",
+        "-f",
+        "mp4",
+        str(out or folder / VIDEO_NAME),
+    ]
 
 
 def write_video(folder: Path, fps: float) -> None:
@@ -49,7 +70,11 @@ def write_video(folder: Path, fps: float) -> None:
     with replacing(path) as part:
         try:
             result = subprocess.run(
-                command(folder, fps, ffmpeg, part), stdin=subprocess.DEVNULL, capture_output=True, timeout=TIMEOUT, check=False,
+                command(folder, fps, ffmpeg, part),
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                timeout=TIMEOUT,
+                check=False,
                 start_new_session=True,  # Ctrl-C goes to the run, which ends ffmpeg
             )
         except subprocess.TimeoutExpired as error:

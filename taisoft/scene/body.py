@@ -78,19 +78,32 @@ class Body(Guarded):
     _read_only = frozenset(_READ_ONLY)
     _instead = dict.fromkeys(_READ_ONLY, "add another body by scene.add_body") | {"contact_mode": "set body.collision"}
     _contents = {
-        "constraints": "call body.fix or body.move", "tractions": "call body.add_traction", "forces": "call body.add_force",
-    }  # fmt: skip
+        "constraints": "call body.fix or body.move",
+        "tractions": "call body.add_traction",
+        "forces": "call body.add_force",
+    }
     _default_frozen = USE_A_COPY
     _instead_frozen = {
-        "material": "call sim.set_material(body, young=...)", "position": "call sim.set_state(positions=..., body=...)",
-        "velocity": "call sim.set_state(velocities=..., body=...)", "add_force": _SET_FORCE, "forces": _SET_FORCE,
-        "add_traction": _SET_TRACTION, "tractions": _SET_TRACTION,
-    }  # fmt: skip
+        "material": "call sim.set_material(body, young=...)",
+        "position": "call sim.set_state(positions=..., body=...)",
+        "velocity": "call sim.set_state(velocities=..., body=...)",
+        "add_force": _SET_FORCE,
+        "forces": _SET_FORCE,
+        "add_traction": _SET_TRACTION,
+        "tractions": _SET_TRACTION,
+    }
 
     def __init__(
-        self, name: str, mesh: TetMesh, material: Material, position, velocity, order: int, quadrature_degree: int | None,
+        self,
+        name: str,
+        mesh: TetMesh,
+        material: Material,
+        position,
+        velocity,
+        order: int,
+        quadrature_degree: int | None,
         collision: str = "auto",
-    ):  # fmt: skip
+    ):
         what = f"body {name!r}"
         if not isinstance(mesh, TetMesh):
             raise SceneError(f"{what}: mesh must be a TetMesh, not {type(mesh).__name__}")
@@ -190,8 +203,9 @@ class Body(Guarded):
             warnings.warn(
                 f"body {self.name!r}: poisson = {poisson:g} is above {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend "
                 "far too little: order=2 locks less",
-                UserWarning, stacklevel=stacklevel + 1,
-            )  # fmt: skip
+                UserWarning,
+                stacklevel=stacklevel + 1,
+            )
 
     def warn_bending(self, stacklevel: int) -> None:
         """Warn if the body has too few linear tets through its thickness to bend correctly. stacklevel: as in `warn_locking`."""
@@ -201,8 +215,9 @@ class Body(Guarded):
             warnings.warn(
                 f"body {self.name!r}: about {layers} linear {'tet lies' if layers == 1 else 'tets lie'} through its thickness, "
                 f"and it bends about {times:.0f} times too stiffly: order=2 bends correctly",
-                UserWarning, stacklevel=stacklevel + 1,
-            )  # fmt: skip
+                UserWarning,
+                stacklevel=stacklevel + 1,
+            )
 
     def fix(self, where, axes: str = "xyz") -> Constraint:
         """Fix nodes at their start positions.

@@ -11,13 +11,7 @@ LARGEST, SMALLEST = float(np.finfo(np.float32).max), float(np.finfo(np.float32).
 
 
 def number(
-    value,
-    what: str,
-    *,
-    above: float | None = None,
-    minimum: float | None = None,
-    maximum: float | None = None,
-    unit: str = "",
+    value, what: str, *, above: float | None = None, minimum: float | None = None, maximum: float | None = None, unit: str = ""
 ) -> float:
     """Return value as a finite float in the 32-bit range, > above, >= minimum, <= maximum where given.
 
@@ -126,8 +120,7 @@ def selection(where, points: np.ndarray, what: str, items: str, *, repeats: bool
             raise SceneError(f"{what}: the selection function failed: {type(error).__name__}: {error}") from error
         if mask.dtype != bool or mask.shape != (n,):
             raise SceneError(
-                f"{what}: the selection function must return a bool mask of shape ({n},), "
-                f"not {mask.dtype} of shape {mask.shape}"
+                f"{what}: the selection function must return a bool mask of shape ({n},), not {mask.dtype} of shape {mask.shape}"
             )
         ids = np.flatnonzero(mask)
     else:

@@ -49,9 +49,7 @@ class CollisionSettings:
             if getattr(self, field) is not None:
                 validated[field] = _count(getattr(self, field), f"{what}: {field}", 64, 2**31 - 1)
         if validated.get("initial_capacity", 0) > validated.get("max_capacity", 2**31):
-            raise SceneError(
-                f"{what}: initial_capacity {self.initial_capacity} must not exceed max_capacity {self.max_capacity}"
-            )
+            raise SceneError(f"{what}: initial_capacity {self.initial_capacity} must not exceed max_capacity {self.max_capacity}")
         for field, value in validated.items():
             # The only way to store a validated value in a frozen record.
             object.__setattr__(self, field, value)

@@ -31,9 +31,7 @@ def _shorten(names: list[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def make_plan(
-    scene: Scene, explicit: bool, multistep: bool, self_collision: bool = False, draggable: bool = False
-) -> Plan:
+def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: bool = False, draggable: bool = False) -> Plan:
     """Plan the features for a scene, the kind of integrator, self-collision, and draggable bodies."""
     plan = Plan()
     laws = {name: [b.name for b in scene.bodies if b.material.law == name] for name in LAWS}
@@ -46,13 +44,17 @@ def make_plan(
     quadratic = bodies(lambda b: b.order == 2)
     plan.add("quadratic_tets", bool(quadratic), f"bodies of order 2: {_shorten(quadratic)}", "every body is of order 1")
     plan.add(
-        "consistent_weight", bool(quadratic) and not explicit, "gravity on quadratic tets acts as int rho N g dV",
+        "consistent_weight",
+        bool(quadratic) and not explicit,
+        "gravity on quadratic tets acts as int rho N g dV",
         "explicit steps take gravity as an acceleration" if quadratic else "on linear tets it is the lumped mass",
-    )  # fmt: skip
+    )
     plan.add(
-        "consistent_mass", bool(quadratic) and not explicit, f"quadratic tets of {_shorten(quadratic)} in implicit steps",
+        "consistent_mass",
+        bool(quadratic) and not explicit,
+        f"quadratic tets of {_shorten(quadratic)} in implicit steps",
         "explicit steps need a diagonal mass" if quadratic else "the mass of linear tets is lumped",
-    )  # fmt: skip
+    )
     loaded = bodies(lambda b: b.tractions or b.forces)
     why = f"tractions or forces on {_shorten(loaded)}" if loaded else "bodies can be dragged"
     plan.add("loads", bool(loaded) or draggable, why, "no traction and no force")
@@ -64,14 +66,14 @@ def make_plan(
     plan.add("mass_damping", bool(dragged), f"material of {_shorten(dragged)}", "every mass_damping is 0")
     viscous = bodies(lambda b: b.material.stiffness_damping > 0)
     plan.add("stiffness_damping", bool(viscous), f"material of {_shorten(viscous)}", "every stiffness_damping is 0")
-    plan.add(
-        "assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only"
-    )
+    plan.add("assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only")
     plan.add("past_states", multistep, "the integrator uses the two previous steps", "a one-step integrator")
     plan.add(
-        "inversion_handling", not explicit, "directions of negative curvature lead out of inverted tets",
+        "inversion_handling",
+        not explicit,
+        "directions of negative curvature lead out of inverted tets",
         "explicit steps need forces only, and every law defines them for inverted tets too",
-    )  # fmt: skip
+    )
     _add_collision(plan, scene, self_collision)
     return plan
 
@@ -98,7 +100,8 @@ def _add_collision(plan: Plan, scene: Scene, self_collision: bool) -> None:
     plan.add("self_collision", self_collision, "requested", "not requested")
     several = len(scene.colliders) > 1
     plan.add(
-        "contact_forces", scene.pushes(self_collision),
+        "contact_forces",
+        scene.pushes(self_collision),
         f"{_shorten([c.name for c in scene.colliders])} can touch" if several else "it can touch itself",
         "one body, and nothing that it could touch" if scene.contact_forces else "the scene's contact_forces are off",
-    )  # fmt: skip
+    )

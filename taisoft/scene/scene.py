@@ -31,14 +31,16 @@ class Scene(Guarded):
     """
 
     _contents = {
-        "bodies": "call scene.add_body", "obstacles": "call scene.add_obstacle",
+        "bodies": "call scene.add_body",
+        "obstacles": "call scene.add_obstacle",
         "contact_pairs": "call scene.set_contact(name_a, name_b, friction=...)",
-    }  # fmt: skip
+    }
     _default_frozen = USE_A_COPY
     _instead_frozen = {
-        "gravity": "call sim.set_gravity(gravity)", "set_contact": "call sim.set_contact(name_a, name_b, friction=...)",
+        "gravity": "call sim.set_gravity(gravity)",
+        "set_contact": "call sim.set_contact(name_a, name_b, friction=...)",
         "contact_pairs": "call sim.set_contact(name_a, name_b, friction=...)",
-    }  # fmt: skip
+    }
 
     def __init__(self, gravity=(0.0, -9.81, 0.0)):
         """gravity: (3,) [m/s^2]. Raises SceneError unless it is three finite numbers."""
@@ -173,9 +175,7 @@ class Scene(Guarded):
         """Return the obstacle with this name. Raises SceneError if there is none."""
         return _find(self.obstacles, name, "obstacle")
 
-    def set_contact(
-        self, name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None
-    ) -> None:
+    def set_contact(self, name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None) -> None:
         """Set friction and restitution of two bodies, a body and an obstacle, or a body and itself (its name twice).
 
         An omitted number is unchanged. Raises SceneError for unknown names, two obstacles, values outside the rules, or no
@@ -187,9 +187,7 @@ class Scene(Guarded):
         if friction is None and restitution is None:
             raise SceneError(f"{what}: give friction or restitution")
         before = self.contact_pairs.get(pair, (None, None))
-        given = surface_numbers(
-            0.0 if friction is None else friction, 0.0 if restitution is None else restitution, what
-        )
+        given = surface_numbers(0.0 if friction is None else friction, 0.0 if restitution is None else restitution, what)
         is_given = (friction is not None, restitution is not None)
         numbers = tuple(new if use else old for new, use, old in zip(given, is_given, before))
         dict.__setitem__(self.contact_pairs, pair, numbers)

@@ -239,9 +239,15 @@ def _add_obstacle(scene: Scene, name: str, obstacles: Table) -> None:
     shape = table.make(SHAPES[kind], f"{SHAPES[kind].word}: ", keys=keys)
     extra = {"path": _key_frames(table)} if "path" in table else {}
     table.make(
-        scene.add_obstacle, f"obstacle {name!r}: ", "scene: ", "key frames: ", keys=["friction", "restitution"],
-        shape=shape, name=name, **extra,
-    )  # fmt: skip
+        scene.add_obstacle,
+        f"obstacle {name!r}: ",
+        "scene: ",
+        "key frames: ",
+        keys=["friction", "restitution"],
+        shape=shape,
+        name=name,
+        **extra,
+    )
 
 
 def _set_contacts(scene: Scene, tables: Table) -> None:

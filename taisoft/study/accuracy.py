@@ -121,11 +121,19 @@ def make_reference(fine: dict, coarse: dict, kind: str, order_in_time: int) -> R
     divisor = 2.0**order_in_time - 1.0
     energies = np.array(fine["energies"])
     return Reference(
-        fine["task"]["setting"], path, largest, Error(difference.rms / divisor, difference.max / divisor), energies.sum(axis=1),
-        float(np.ptp(energies, axis=0).max()), np.array(fine["momentum"]), fine["bodies"], kind,
+        fine["task"]["setting"],
+        path,
+        largest,
+        Error(difference.rms / divisor, difference.max / divisor),
+        energies.sum(axis=1),
+        float(np.ptp(energies, axis=0).max()),
+        np.array(fine["momentum"]),
+        fine["bodies"],
+        kind,
         [text for record in (fine, coarse) for text in record["problems"] if not text.startswith("note")],
-        fine["steps"], order_in_time,
-    )  # fmt: skip
+        fine["steps"],
+        order_in_time,
+    )
 
 
 def finest_own_error(finest: Reference, others: list[Reference]) -> tuple[Error, str]:
@@ -137,9 +145,7 @@ def finest_own_error(finest: Reference, others: list[Reference]) -> tuple[Error,
     # order_in_time is 1 where contacts or paths reduce the order of the method
     difference, smooth = compare(other, finest), finest.order_in_time == 2
     divisor = RICHARDSON if smooth else 1.0
-    own = Error(
-        max(finest.own_error.rms, difference.rms / divisor), max(finest.own_error.max, difference.max / divisor)
-    )
+    own = Error(max(finest.own_error.rms, difference.rms / divisor), max(finest.own_error.max, difference.max / divisor))
     return own, f"{'a third of ' if smooth else ''}the distance to the reference with {mesh_name(other.setting)}"
 
 
@@ -181,10 +187,19 @@ def row_of(record: dict, reference: Reference | None) -> Row:
     """Compare a finished run with the reference on its mesh; without a reference the errors stay None."""
     task = record["task"]
     row = Row(
-        task["setting"], record["status"], "; ".join(record["problems"]), record["seconds"], record.get("compile_seconds"),
-        record["threads"], record["cores"], record["machine"]["name"], record["nodes"], record["tets"], record.get("steps"),
+        task["setting"],
+        record["status"],
+        "; ".join(record["problems"]),
+        record["seconds"],
+        record.get("compile_seconds"),
+        record["threads"],
+        record["cores"],
+        record["machine"]["name"],
+        record["nodes"],
+        record["tets"],
+        record.get("steps"),
         unconverged=record.get("unconverged"),
-    )  # fmt: skip
+    )
     if extremes := record.get("extremes"):
         row.inverted = _maximum(extremes, "n_inverted")
         row.contact_residual = _maximum(extremes, "contact_residual")

@@ -86,10 +86,17 @@ def _record_and_time(sim: Simulator, task: dict) -> dict:
     observer, length = Observer(sim), task["frame"] * task["frames"]
     result = sim.run(length, on_frame=observer.frame, fps=1.0 / task["frame"])
     numbers = {
-        "status": result.status, "problems": result.problems, "steps": result.steps, "reports": len(result.step_reports),
-        "extremes": extremes(result.step_reports), "explicit": sim.settings.explicit, "dt": sim.dt,
-        **_counts(result), "seconds": [], "path": None,
-    }  # fmt: skip
+        "status": result.status,
+        "problems": result.problems,
+        "steps": result.steps,
+        "reports": len(result.step_reports),
+        "extremes": extremes(result.step_reports),
+        "explicit": sim.settings.explicit,
+        "dt": sim.dt,
+        **_counts(result),
+        "seconds": [],
+        "path": None,
+    }
     if result.status == "failed":
         return numbers | {"compile_seconds": sim.compile_seconds}
     if task["repeats"]:

@@ -52,11 +52,17 @@ class Planner:
         settings = [case.setting for case in found if not case.refused]
         seconds = self._request["seconds"] or self._solver.get("seconds", 1.0)
         plan = {
-            "fixed": self.fixed, "seconds": seconds,
+            "fixed": self.fixed,
+            "seconds": seconds,
             "cases": [{"setting": asdict(case.setting), "refused": case.refused} for case in found],
-            "touching": base.pushes(self.self_collision), "names": [body.name for body in base.bodies],
-            "frame": None, "frames": 0, "references": [], "space": None, "notes": self._notes,
-        }  # fmt: skip
+            "touching": base.pushes(self.self_collision),
+            "names": [body.name for body in base.bodies],
+            "frame": None,
+            "frames": 0,
+            "references": [],
+            "space": None,
+            "notes": self._notes,
+        }
         if settings:
             target = self._request["reference_dt"] or min(s.dt for s in settings) / DT_RATIO
             frame, frames = frame_time([*(s.dt for s in settings), 2.0 * target], seconds)

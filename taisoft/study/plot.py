@@ -10,9 +10,13 @@ from taisoft.study.results import Study
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#555555")
 MARKERS = {
-    "symplectic_euler": "v", "velocity_verlet": "^", "linearly_implicit_euler": "D", "implicit_euler": "o", "bdf2": "s",
+    "symplectic_euler": "v",
+    "velocity_verlet": "^",
+    "linearly_implicit_euler": "D",
+    "implicit_euler": "o",
+    "bdf2": "s",
     "implicit_midpoint": "P",
-}  # fmt: skip
+}
 REFERENCE_COLOUR = "#222222"  # of the references' own errors
 SIZE = (7.4, 5.4)  # [inch]
 COLOUR_AXES = ("refine", "order", "precision", "contact_solver", "arch")  # axes shown by colour if they vary

@@ -91,26 +91,45 @@ def plain(study: Study) -> dict:
     """Return a study as plain data for study.json."""
     front = study.front()
     rows = [
-        asdict(row) | {
-            "seconds_per_simulated_second": row.timing, "error": row.resolved_error(study.request.by), "on_front": row in front,
+        asdict(row)
+        | {
+            "seconds_per_simulated_second": row.timing,
+            "error": row.resolved_error(study.request.by),
+            "on_front": row in front,
             "below_reference": below_reference(row, study.request.by),
         }
         for row in study.rows
-    ]  # fmt: skip
+    ]
     references = [
         {
-            "setting": r.setting, "steps": r.steps, "excursion": r.excursion, "own_error": r.own_error, "kind": r.kind,
-            "order_in_time": r.order_in_time, "problems": r.problems, "in_space": r is study.space,
+            "setting": r.setting,
+            "steps": r.steps,
+            "excursion": r.excursion,
+            "own_error": r.own_error,
+            "kind": r.kind,
+            "order_in_time": r.order_in_time,
+            "problems": r.problems,
+            "in_space": r is study.space,
         }
         for r in study.references
-    ]  # fmt: skip
+    ]
     cheapest, nearest = study.cheapest(), study.nearest()
     return {
-        "request": asdict(study.request), "frame": study.plan["frame"], "frames": study.plan["frames"], "rows": rows,
-        "references": references, "cheapest": cheapest and cheapest.setting, "nearest": nearest and nearest.setting,
-        "notes": study.notes, "ended": study.ended, "machines": study.machines, "workers": study.workers,
-        "versions": study.versions, "scene_digest": study.plan["scenes"]["refine 0"], "code_digest": study.plan["code"],
-    }  # fmt: skip
+        "request": asdict(study.request),
+        "frame": study.plan["frame"],
+        "frames": study.plan["frames"],
+        "rows": rows,
+        "references": references,
+        "cheapest": cheapest and cheapest.setting,
+        "nearest": nearest and nearest.setting,
+        "notes": study.notes,
+        "ended": study.ended,
+        "machines": study.machines,
+        "workers": study.workers,
+        "versions": study.versions,
+        "scene_digest": study.plan["scenes"]["refine 0"],
+        "code_digest": study.plan["code"],
+    }
 
 
 def below_reference(row: Row, by: str) -> bool:

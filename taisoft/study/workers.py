@@ -109,9 +109,13 @@ def local_places(number: int) -> list[LocalPlace]:
 
 
 def carry_out(
-    requests: Iterable[tuple[str, dict]], places: list, done: Callable[[str, dict], None], *,
-    seconds_left: Callable[[], float], stop_requested: Callable[[], bool],
-) -> dict[str, str]:  # fmt: skip
+    requests: Iterable[tuple[str, dict]],
+    places: list,
+    done: Callable[[str, dict], None],
+    *,
+    seconds_left: Callable[[], float],
+    stop_requested: Callable[[], bool],
+) -> dict[str, str]:
     """Execute requests (key, request) in order and call done(key, answer) for each.
 
     seconds_left: of the budget; stop_requested: whether to end. Return the keys of unfinished requests, and why.

@@ -160,7 +160,7 @@ class Annotations:
 
     def _write(
         self, x: float, y: float, text: str, size: float, colour: tuple[int, int, int], anchor: str = "la", halo: bool = False
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Write text at x, y. anchor: the part of the text at that point, in Pillow's notation; halo: outline the letters."""
         edge = {"stroke_width": round(1.5 * self._unit), "stroke_fill": (*PAPER, 200)} if halo else {}
         position = tuple((self._unit * np.array([x, y]) - self._origin).tolist())

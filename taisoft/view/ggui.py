@@ -80,7 +80,7 @@ class Canvas:
 
     def __init__(
         self, surfaces: Surfaces, size: tuple[int, int], visible: bool, n_segments: int = 0, line_width: float = LINE_WIDTH
-    ):  # fmt: skip
+    ):
         missing = (visible and display_missing()) or vulkan_missing()
         if missing:
             raise OutputError(f"cannot open a window: {missing}")
@@ -111,9 +111,14 @@ class Canvas:
             raise OutputError(f"cannot open a window: Taichi says: {error}") from error
 
     def draw(
-        self, x: np.ndarray, normals: np.ndarray, camera: Camera, background: tuple[float, float, float],
-        base: np.ndarray | None = None, lines: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        x: np.ndarray,
+        normals: np.ndarray,
+        camera: Camera,
+        background: tuple[float, float, float],
+        base: np.ndarray | None = None,
+        lines: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
         """Draw the surfaces with vertices x [m] and unit normals, (n,3) each; background: RGB in [0, 1].
 
         base: unshaded colours (n,3) that replace the surfaces' own; lines: ends (2k,3) [m] and colours (2k,3), of which the first
@@ -147,7 +152,7 @@ class Canvas:
 
     def draw_over(
         self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray, capacity: tuple[int, int], box_colour: tuple
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Draw boxes (k,4), rows left, bottom, right, top, and lines, ends (2n,2) with colours (2n,3), over the picture.
 
         Coordinates are in [0, 1] from the picture's lower left corner. capacity: largest numbers of boxes and lines, the same in

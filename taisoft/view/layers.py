@@ -41,8 +41,9 @@ class Layers:
         self._peak = 0.0  # [N s]
         self._loaded = [  # per traction, nodes (k,3) of the triangles that get an arrow
             body.mesh.surface[t.triangles[:: -(-len(t.triangles) // MAX_ARROWS)]] + n
-            for body, n in zip(scene.bodies, starts) for t in body.tractions
-        ]  # fmt: skip
+            for body, n in zip(scene.bodies, starts)
+            for t in body.tractions
+        ]
 
     @property
     def has_lines(self) -> bool:

@@ -38,9 +38,14 @@ class Offscreen:
     """
 
     def __init__(
-        self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None, renderer: str = "auto", colour: str = "body",
+        self,
+        scene,
+        size: tuple[int, int] = SIZE,
+        camera: Camera | None = None,
+        renderer: str = "auto",
+        colour: str = "body",
         layers: tuple[str, ...] = IN_PICTURES,
-    ):  # fmt: skip
+    ):
         if renderer not in RENDERERS:
             raise OutputError(f"renderer '{renderer}' is unknown: it must be one of {', '.join(RENDERERS)}")
         if min(size) < 1:

@@ -28,10 +28,14 @@ MAX_FRICTION = 1.5
 STRENGTH_DECADES = (-0.5, 2.5)  # of the drag force over the body's weight, for a displacement as long as the body's diagonal
 COLUMNS = 46  # characters that fit the panel's width
 HELP = (
-    "Left drag: drag a body, or turn", "Ctrl + left: turn", "Right: zoom, middle: pan", "Space: pause, S or Right: step",
-    "R: restart, V: colour, P: record, Esc: quit", "W, C, T, F: wires, contacts, tractions, fixed",
+    "Left drag: drag a body, or turn",
+    "Ctrl + left: turn",
+    "Right: zoom, middle: pan",
+    "Space: pause, S or Right: step",
+    "R: restart, V: colour, P: record, Esc: quit",
+    "W, C, T, F: wires, contacts, tractions, fixed",
     "G: plots over time",
-)  # fmt: skip
+)
 
 
 class Panel:

@@ -42,20 +42,34 @@ class Plot:
 
 
 PLOTS = {
-    "energies": Plot("energy change", "J", (
-        Series("kinetic", "kinetic", BLUE), Series("elastic", "elastic", ORANGE),
-        Series("gravity", "gravity", GREEN), Series("total", "total", DARK),
-    )),
-    "residuals": Plot("residuals", "", (
-        Series("Newton", "newton_residual", BLUE, "implicit"), Series("contacts", "contact_residual", ORANGE, "contact"),
-    ), log=True),
-    "iterations": Plot("iterations of a step", "", (
-        Series("Newton", "newton_iterations", BLUE, "implicit"), Series("CG", "linear_iterations", GREEN, "implicit"),
-        Series("contacts", "contact_iterations", ORANGE, "contact"),
-    )),
+    "energies": Plot(
+        "energy change",
+        "J",
+        (
+            Series("kinetic", "kinetic", BLUE),
+            Series("elastic", "elastic", ORANGE),
+            Series("gravity", "gravity", GREEN),
+            Series("total", "total", DARK),
+        ),
+    ),
+    "residuals": Plot(
+        "residuals",
+        "",
+        (Series("Newton", "newton_residual", BLUE, "implicit"), Series("contacts", "contact_residual", ORANGE, "contact")),
+        log=True,
+    ),
+    "iterations": Plot(
+        "iterations of a step",
+        "",
+        (
+            Series("Newton", "newton_iterations", BLUE, "implicit"),
+            Series("CG", "linear_iterations", GREEN, "implicit"),
+            Series("contacts", "contact_iterations", ORANGE, "contact"),
+        ),
+    ),
     "contacts": Plot("contacts", "", (Series("contacts", "n_contacts", ORANGE, "contact"),)),
     "step_time": Plot("wall time of a step", "ms", (Series("step", "step_time", BLUE),), log=True),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,7 @@ PIXELS_AT_ONCE = 2_000_000  # bounds the memory, about 100 bytes per pixel
 MAX_COORDINATE = 1e6  # pixels; beyond it float64 spans would miss whole pixels; `Camera.clipped` leaves no such triangle
 
 
-def rasterise(
-    projected: np.ndarray, triangles: np.ndarray, colours: np.ndarray, near: float, image: np.ndarray
-) -> np.ndarray:
+def rasterise(projected: np.ndarray, triangles: np.ndarray, colours: np.ndarray, near: float, image: np.ndarray) -> np.ndarray:
     """Draw triangles over image (height, width, 3), uint8 and contiguous; return the mask of the pixels drawn.
 
     projected: (n,3) pixel coordinates and depth; triangles: (t,3); colours: (n,3) in [0, 1]. Triangles that reach

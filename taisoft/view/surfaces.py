@@ -55,9 +55,7 @@ class Surfaces:
         x = np.split(sim.positions(), self._ends)
         return _concatenated([body.vertices(own, self.with_markers) for body, own in zip(self._bodies, x)])
 
-    def with_obstacles(
-        self, bodies: tuple[np.ndarray, np.ndarray], t: float, eye: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def with_obstacles(self, bodies: tuple[np.ndarray, np.ndarray], t: float, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and normals of all drawn vertices: those from `of_bodies`, then the obstacles'.
 
         t: time [s]; eye: position (3,) [m], for culling. Raises OutputError if the path of an obstacle fails.

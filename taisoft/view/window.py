@@ -32,9 +32,19 @@ ORBIT = 240.0  # angle for a drag over the whole window [deg]
 ZOOM = 16.0  # factor on the distance for a drag over the whole window
 DRAG_COLOUR = np.array([0.85, 0.10, 0.35])  # sRGB
 KEYS = {
-    ti.ui.SPACE: "pause", "s": "step", ti.ui.RIGHT: "step", "r": "reset", "p": "record", "v": "colour",
-    "w": "wires", "c": "contacts", "t": "tractions", "f": "fixed_nodes", "g": "plots", ti.ui.ESCAPE: "close",
-}  # fmt: skip
+    ti.ui.SPACE: "pause",
+    "s": "step",
+    ti.ui.RIGHT: "step",
+    "r": "reset",
+    "p": "record",
+    "v": "colour",
+    "w": "wires",
+    "c": "contacts",
+    "t": "tractions",
+    "f": "fixed_nodes",
+    "g": "plots",
+    ti.ui.ESCAPE: "close",
+}
 
 
 class LiveWindow:
@@ -48,9 +58,15 @@ class LiveWindow:
     """
 
     def __init__(
-        self, scene, size: tuple[int, int] = SIZE, camera: Camera | None = None, tall: bool = False, colour: str = "body",
-        layers: tuple[str, ...] = IN_WINDOW, plots: Plots | None = None,
-    ):  # fmt: skip
+        self,
+        scene,
+        size: tuple[int, int] = SIZE,
+        camera: Camera | None = None,
+        tall: bool = False,
+        colour: str = "body",
+        layers: tuple[str, ...] = IN_WINDOW,
+        plots: Plots | None = None,
+    ):
         self.camera = camera or Camera.framing(start_positions(scene), size)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # largest automatic distance [m]; 0: fixed camera
         self._surfaces = Surfaces(scene)
@@ -181,9 +197,13 @@ class LiveWindow:
 
 
 def show(
-    sim, fps: float = 60.0, paused: bool = False, colour: str = "body", layers: tuple[str, ...] = IN_WINDOW,
+    sim,
+    fps: float = 60.0,
+    paused: bool = False,
+    colour: str = "body",
+    layers: tuple[str, ...] = IN_WINDOW,
     plots: tuple[str, ...] = (),
-) -> None:  # fmt: skip
+) -> None:
     """Run a simulation in a window until it is closed.
 
     sim: an open Simulator, advanced by 1/fps [s] of simulated time per picture, never faster than real time; if made with

@@ -163,11 +163,7 @@ def hessian_eigen(s, p):
     Returns the 3x3 block over the stretches s (nine entries), and the eigenvalues of the symmetric and of the antisymmetric
     modes of the pairs (0,1), (0,2), (1,2).
     """
-    A = [
-        (2.0 * p[0] if ti.static(i == j) else 0.0) + p[1] + 0.0 * s[0]
-        for i in ti.static(range(3))
-        for j in ti.static(range(3))
-    ]
+    A = [(2.0 * p[0] if ti.static(i == j) else 0.0) + p[1] + 0.0 * s[0] for i in ti.static(range(3)) for j in ti.static(range(3))]
     symmetric = [2.0 * p[0] + 0.0 * s[0], 2.0 * p[0] + 0.0 * s[0], 2.0 * p[0] + 0.0 * s[0]]
     factor = 2.0 * p[1] * (s[0] + s[1] + s[2] - 3.0) - 4.0 * p[0]
     pair = [s[0] + s[1], s[0] + s[2], s[1] + s[2]]

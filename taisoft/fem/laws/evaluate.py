@@ -27,9 +27,13 @@ def _store(out: ti.template(), b, A, lanes: ti.template()):
 
 @kernel
 def _evaluate(
-    law: ti.template(), lanes: ti.template(), F: ti.types.ndarray(), p: ti.types.ndarray(), psi: ti.types.ndarray(),
+    law: ti.template(),
+    lanes: ti.template(),
+    F: ti.types.ndarray(),
+    p: ti.types.ndarray(),
+    psi: ti.types.ndarray(),
     P: ti.types.ndarray(),
-):  # fmt: skip
+):
     for b in range(F.shape[0]):
         G = _load(F, b, lanes)
         c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(4))]
@@ -42,9 +46,14 @@ def _evaluate(
 
 @kernel
 def _differential(
-    law: ti.template(), projected: ti.template(), lanes: ti.template(), F: ti.types.ndarray(), p: ti.types.ndarray(),
-    D: ti.types.ndarray(), P: ti.types.ndarray(),
-):  # fmt: skip
+    law: ti.template(),
+    projected: ti.template(),
+    lanes: ti.template(),
+    F: ti.types.ndarray(),
+    p: ti.types.ndarray(),
+    D: ti.types.ndarray(),
+    P: ti.types.ndarray(),
+):
     for b in range(F.shape[0]):
         G = _load(F, b, lanes)
         H = _load(D, b, lanes)

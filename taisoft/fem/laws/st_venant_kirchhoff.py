@@ -26,9 +26,7 @@ def _green_strain(F):
     """E = (F^T F - I)/2, computed from H = F - I to avoid cancellation at small strains."""
     H = [F[k] - (1.0 if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
     C = matmul_tn(H, H)
-    return [
-        0.5 * (H[3 * i + j] + H[3 * j + i] + C[3 * i + j]) for i in ti.static(range(3)) for j in ti.static(range(3))
-    ]
+    return [0.5 * (H[3 * i + j] + H[3 * j + i] + C[3 * i + j]) for i in ti.static(range(3)) for j in ti.static(range(3))]
 
 
 @arithmetic

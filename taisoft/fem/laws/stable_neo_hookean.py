@@ -81,10 +81,16 @@ def block(F, S, ga, gb):
     f = [S[10] * Fb[k] for k in ti.static(range(3))]
     g = [S[11] * Gb[k] for k in ti.static(range(3))]
     return [
-        d + f[0] * Fa[0] + g[0] * Ga[0], f[0] * Fa[1] + g[0] * Ga[1] - w[2], f[0] * Fa[2] + g[0] * Ga[2] + w[1],
-        f[1] * Fa[0] + g[1] * Ga[0] + w[2], d + f[1] * Fa[1] + g[1] * Ga[1], f[1] * Fa[2] + g[1] * Ga[2] - w[0],
-        f[2] * Fa[0] + g[2] * Ga[0] - w[1], f[2] * Fa[1] + g[2] * Ga[1] + w[0], d + f[2] * Fa[2] + g[2] * Ga[2],
-    ]  # fmt: skip
+        d + f[0] * Fa[0] + g[0] * Ga[0],
+        f[0] * Fa[1] + g[0] * Ga[1] - w[2],
+        f[0] * Fa[2] + g[0] * Ga[2] + w[1],
+        f[1] * Fa[0] + g[1] * Ga[0] + w[2],
+        d + f[1] * Fa[1] + g[1] * Ga[1],
+        f[1] * Fa[2] + g[1] * Ga[2] - w[0],
+        f[2] * Fa[0] + g[2] * Ga[0] - w[1],
+        f[2] * Fa[1] + g[2] * Ga[1] + w[0],
+        d + f[2] * Fa[2] + g[2] * Ga[2],
+    ]
 
 
 @arithmetic
