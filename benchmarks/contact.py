@@ -70,7 +70,7 @@ def measure(quick: bool, arch: str, document: Document) -> tuple[dict, list[Snap
     if not quick:
         with open_scene(PILE, arch) as sim:
             found["runs"].append(measure_run(PILE, sim, PILE_SECONDS))
-            found["colourings"] += colour_all(PILE, sim._contact.problem, SEEDS)[0]
+            found["colourings"] += colour_all(PILE, sim._dynamics.contact.problem, SEEDS)[0]
     document.add(f"## Implicit steps\n\n{run_table(found['runs'])}")
     document.add(f"## Colours (fig. 19)\n\n{colour_table(found['colourings'])}")
     runtime = open_runtime(arch, "f32", "the benchmark of contacts")
@@ -90,7 +90,7 @@ def _explicit(name: str, quick: bool, arch: str, found: dict) -> Snapshot:
         solvers = Solvers(threads=not quick)
         found["films"].append(measure_film(name, sim, QUICK_FRAMES if quick else FRAMES, solvers))
         to_impulses(sim)
-        colourings, colours = colour_all(name, sim._contact.problem, QUICK_SEEDS if quick else SEEDS)
+        colourings, colours = colour_all(name, sim._dynamics.contact.problem, QUICK_SEEDS if quick else SEEDS)
         found["colourings"] += colourings
         snapshot = take_snapshot(name, sim, colours)
         found["steps"].append(measure_step(name, sim, QUICK_STEPS if quick else STEPS))

@@ -17,8 +17,8 @@ from taisoft.contact import SOLVERS, numpy_prox
 from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.problem import NODES, ContactProblem
 from taisoft.contact.solve import solve
-from taisoft.dynamics import contact_substeps
-from taisoft.dynamics.contact_substeps import MAX_SWEEPS
+from taisoft.dynamics import explicit_contact_stepper
+from taisoft.dynamics.explicit_contact_stepper import MAX_SWEEPS
 
 GOAL = 1e-4  # residual, that of explicit steps in f32
 SERIAL, COLOURED = "gauss_seidel", "coloured_gauss_seidel"
@@ -68,13 +68,13 @@ def patched(owner, name: str, value) -> Iterator[None]:
 @contextmanager
 def shown(look: Callable[[ContactProblem], None]) -> Iterator[None]:
     """Each contact problem of explicit steps is shown to `look` when its solve would begin; it must leave it as it was."""
-    plain = contact_substeps.solve
+    plain = explicit_contact_stepper.solve
 
     def looked_at(p, *rest):
         look(p)
         return plain(p, *rest)
 
-    with patched(contact_substeps, "solve", looked_at):
+    with patched(explicit_contact_stepper, "solve", looked_at):
         yield
 
 

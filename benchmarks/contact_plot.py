@@ -31,7 +31,7 @@ class Snapshot:
 
 def take_snapshot(scene: str, sim, colours: dict[str, np.ndarray]) -> Snapshot:
     """The present picture of a simulator and its contact Jacobian, of nodes that some contact pushes."""
-    J = contact_jacobian(sim._contact.problem).tocoo()
+    J = contact_jacobian(sim._dynamics.contact.problem).tocoo()
     touched = np.zeros((J.shape[0] // 3, J.shape[1] // 3), dtype=bool)
     touched[J.row // 3, J.col // 3] = True
     image = Offscreen(sim.scene, PICTURE, renderer="software").image(sim)

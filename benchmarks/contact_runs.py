@@ -15,7 +15,7 @@ import numpy as np
 import taisoft as ts
 from taisoft.cli.scene_file import load_scene
 from taisoft.contact.problem import ContactProblem
-from taisoft.dynamics import contact_substeps
+from taisoft.dynamics import explicit_contact_stepper
 
 from .contact_captured import GOAL, Outcome, Solvers, clock, make_judge, patched, shown
 
@@ -129,7 +129,7 @@ def to_first_impulse(sim: ts.Simulator) -> None:
 def to_impulses(sim: ts.Simulator) -> None:
     """Step until contacts bear something, if they do not. Raises SimulationError where that takes too long."""
     last = sim.time + LATEST
-    while not sim._contact.problem.r.to_numpy()[: sim._contact.n_contacts].any():
+    while not sim._dynamics.contact.problem.r.to_numpy()[: sim._dynamics.contact.n_contacts].any():
         if sim.time > last:
             raise ts.SimulationError(f"no contact bears anything within {LATEST:g} s")
         sim.step()
@@ -152,7 +152,7 @@ def measure_film(name: str, sim: ts.Simulator, frames: int, solvers: Solvers) ->
                 film.outcomes[start].setdefault(solver, []).append(outcome)
         film.time.append(sim.time)
         film.contacts.append(int(p.count[0]))
-        film.found.append(sim._contact.detection.counts.found)
+        film.found.append(sim._dynamics.contact.detection.counts.found)
 
     to_first_impulse(sim)
     per_frame = max(1, round(1 / (FPS * sim.dt)))
@@ -200,15 +200,15 @@ class Stopwatch:
 
 def explicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
     """Where the parts of the simulator's explicit steps are called, for `Stopwatch.on`."""
-    contact = sim._contact
+    contact = sim._dynamics.contact
     owners = {"find": contact.detection, "_measure_closing": contact, "begin": contact}
-    return [(part, owners.get(name, contact_substeps), name) for part, names in PARTS.items() for name in names]
+    return [(part, owners.get(name, explicit_contact_stepper), name) for part, names in PARTS.items() for name in names]
 
 
 def measure_step(name: str, sim: ts.Simulator, steps: int) -> StepCost:
     """What a step costs from the first impulse on; then the same steps again for their parts."""
     to_first_impulse(sim)
-    cost = StepCost(name, sim._stepper.method, [], {part: [] for part in (*PARTS, REST)}, [], [], 0.0, [])
+    cost = StepCost(name, sim._dynamics.stepper.method, [], {part: [] for part in (*PARTS, REST)}, [], [], 0.0, [])
     for _ in range(steps):
         begin = clock()
         report = sim.step()

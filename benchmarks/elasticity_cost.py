@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 
 import taisoft as ts
-from taisoft.dynamics import EXPLICIT
+from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.output.tables import markdown, percent, spread_of
 from taisoft.study.timed_run import advance, warm_up
 from taisoft.timing import Timing, summarise

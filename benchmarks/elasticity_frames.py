@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 
 import taisoft as ts
-from taisoft.dynamics import EXPLICIT
+from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.output.tables import markdown, percent, spread_of
 from taisoft.study.timed_run import warm_up
 from taisoft.timing import Timing, summarise
@@ -81,7 +81,7 @@ def _take(sim: ts.Simulator, row: Frames, arch: str) -> None:
 
 
 def _steps_alone(sim: ts.Simulator, steps: int) -> None:
-    stepper, done = sim._stepper, 0
+    stepper, done = sim._dynamics.stepper, 0
     while done < steps:
         if sim.settings.explicit:
             done += stepper.advance(steps - done, sim.dt).done

@@ -13,7 +13,7 @@ from time import perf_counter
 import numpy as np
 
 import taisoft as ts
-from taisoft.dynamics import EXPLICIT
+from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import SimulationError
 from taisoft.scene.scene import Scene
 from taisoft.study.timed_run import TimedRun, advance, warm_up

@@ -82,8 +82,8 @@ def floor_bytes(loops: Iterable[str], field_bytes: Mapping[str, int]) -> float:
 
 def group_bytes(sim: ts.Simulator) -> dict[str, int]:
     """Bytes of the simulator's fields by GROUPS."""
-    search = sim._contact.detection.field_bytes if sim._contact else {}
-    contacts = (sim._contact.field_bytes if sim._contact else {}) | sim._stepper.field_bytes
+    search = sim._dynamics.contact.detection.field_bytes if sim._dynamics.contact else {}
+    contacts = (sim._dynamics.contact.field_bytes if sim._dynamics.contact else {}) | sim._dynamics.stepper.field_bytes
     found = dict.fromkeys(GROUPS, 0)
     for name, size in sim.field_bytes.items():
         group = "search" if name in search else "contacts" if name in contacts else GROUPS[name.startswith("stiffness_")]

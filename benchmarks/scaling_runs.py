@@ -122,7 +122,7 @@ def _open(row: Row, build: Callable[[int], Scene], size: int, integrator: str, d
     if dt is None:
         sim.dt = MARGIN * sim.stable_dt
     row.setup_seconds = perf_counter() - begin - sim.compile_seconds
-    m = sim._simulation.model
+    m = sim._dynamics.state.model
     row.tets = sum(body.mesh.n_tets for body in scene.bodies)
     row.nodes, row.threads = m.n_nodes, 1 if m.serial else threads()
     return sim
@@ -171,7 +171,7 @@ def repeat_elements(m: ti.template(), n: ti.i32):
 
 def _element_seconds(sim: ts.Simulator, n: int) -> float:
     """Seconds of the element loop of a step, done n times."""
-    m, begin = sim._simulation.model, clock()
+    m, begin = sim._dynamics.state.model, clock()
     if m.serial:
         repeat_elements(m, n)
     else:
@@ -192,7 +192,7 @@ def explicit_contact(row: Row, size: int) -> None:
     with _open(row, cubes_on_ground, size, "symplectic_euler", None) as sim:
         _one_by_one(row, sim, explicit_places(sim))
         row.field_bytes = group_bytes(sim)
-        sweep = floor_bytes(("sweep",), sim.field_bytes) * row.counts["contacts"] / sim._contact.problem.capacity
+        sweep = floor_bytes(("sweep",), sim.field_bytes) * row.counts["contacts"] / sim._dynamics.contact.problem.capacity
         row.moved = floor_bytes(("elements", "update"), sim.field_bytes) + sweep * row.counts["sweeps"]
 
 
@@ -215,7 +215,7 @@ def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
         ("linear solve", pcg, "solve"),
         ("report", simulator, "measure"),
     ]
-    contact = sim._contact
+    contact = sim._dynamics.contact
     if contact is not None:
         places += [("search", contact.detection, "find"), ("search", contact, "_measure_closing"), ("problem", contact, "begin")]
         places.append(("problem", stage_system, "find_factors"))

@@ -88,8 +88,8 @@ def simulate(name: str, cells: int, steps: int = 10, hard: bool = False) -> None
     build, settings = SCENES[name]
     with ts.Simulator(build(cells), **settings) as sim:
         walk(sim, steps)
-        if hard and hasattr(sim._stepper, "compile_hard_steps"):
-            sim._stepper.compile_hard_steps()
+        if hard and hasattr(sim._dynamics.stepper, "compile_hard_steps"):
+            sim._dynamics.stepper.compile_hard_steps()
 
 
 def walk(sim: ts.Simulator, steps: int) -> None:

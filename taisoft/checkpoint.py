@@ -10,12 +10,11 @@ been interrupted.
 """
 
 import dataclasses
-import hashlib
 import json
 import math
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,15 +22,17 @@ from taisoft import __version__
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError, SimulationError
 from taisoft.files import replacing
-from taisoft.scene.body import Body
 from taisoft.scene.changes import LOADS, change_load
-from taisoft.scene.key_frames import NodePath, ShapePath
+from taisoft.scene.fingerprint import FEATURES, digest, run_time_numbers, scene_fingerprint
 from taisoft.scene.numbers import Numbers, first_difference, scene_numbers
 from taisoft.scene.scene import Material, Scene
+from taisoft.settings import NAMES, plan_of
+
+if TYPE_CHECKING:
+    from taisoft.simulator import Simulator
 
 KIND, FORMAT = "taisoft checkpoint", 7  # increment FORMAT with every change of a file's content
 PARTS = ("settings", "numbers", "start", "fingerprint", "state", "notes")  # of the header, each a table
-FEATURES = "the features that it needs"  # last entry of the fingerprint: of the plan, which follows from the parts and numbers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +72,7 @@ def write_checkpoint(
         "format": FORMAT,
         "taisoft": __version__,
         "settings": settings,
-        "numbers": _numbers(scene),
+        "numbers": run_time_numbers(scene),
         "start": scene_numbers(start or scene),
         "fingerprint": scene_fingerprint(scene, features),
         "state": plain,
@@ -138,76 +139,6 @@ def load_values(scene: Scene) -> dict:
     }
 
 
-def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]:
-    """Return a digest of each part of a scene that must be unchanged when a run resumes, by the part's name in messages."""
-    fingerprint = {  # in the order added, which numbers nodes
-        "bodies": json.dumps([body.name for body in scene.bodies]),
-        "obstacles": json.dumps([o.name for o in scene.obstacles]),
-    }
-    for body in scene.bodies:
-        owner = f"body '{body.name}'"
-        for part, values in _body_parts(body).items():
-            fingerprint[f"{owner}: {part}"] = _digest(values)
-    for obstacle in scene.obstacles:
-        owner, shape = f"obstacle '{obstacle.name}'", obstacle.shape
-        values = [getattr(shape, field.name) for field in dataclasses.fields(shape)]
-        fingerprint[f"{owner}: shape, friction, restitution or path"] = _digest(
-            [type(shape).__name__, *values, obstacle.friction, obstacle.restitution, *_path_parts(obstacle.path)]
-        )
-    fingerprint["collision settings"] = _digest([json.dumps(dataclasses.asdict(scene.collision)), scene.contact_forces])
-    # features unused at the start, such as damping 0, are compiled out
-    fingerprint[FEATURES] = _digest([json.dumps(features)])
-    return fingerprint
-
-
-def scene_digest(scene: Scene) -> str:
-    """Return a digest of everything comparable in a scene: its parts as a checkpoint compares them, and its numbers."""
-    loads = [load.value for body in scene.bodies for name in LOADS.values() for load in getattr(body, name)]
-    return _digest([json.dumps(scene_fingerprint(scene, {})), json.dumps(_numbers(scene)), scene.allow_initial_overlap, *loads])
-
-
-def _body_parts(body: Body) -> dict[str, list]:
-    """Return the values that define a body, by the part's name in messages."""
-    return {
-        "mesh": [body.mesh.vertices, body.mesh.tets],
-        "order, quadrature, law or collision": [body.order, body.quadrature_degree, body.material.law, body.collision],
-        "start": [body.position, body.velocity],
-        "constraints": [x for c in body.constraints for x in (c.nodes, c.axes, *_path_parts(c.path))],
-        "loads": [
-            *(x for t in body.tractions for x in ("traction", t.triangles)),
-            *(x for f in body.forces for x in ("force", f.nodes)),
-        ],
-    }
-
-
-def _path_parts(path: Callable | None) -> list:
-    """Return the comparable values of a path: the data of key frames; of another function only that it exists."""
-    if not isinstance(path, (NodePath, ShapePath)):
-        return [path is None]
-    frames = path.frames
-    values = [frames.times, frames.translations, frames.rotations, frames.pivot, frames.smooth, frames.release]
-    return [*values, path.starts if isinstance(path, NodePath) else path.center]
-
-
-def _numbers(scene: Scene) -> dict:
-    """Return the numbers of a scene that may change at run time, except its loads."""
-    pairs = [[sorted(names), *numbers] for names, numbers in scene.contact_pairs.items()]
-    materials = [dataclasses.asdict(body.material) for body in scene.bodies]
-    return {"gravity": scene.gravity.tolist(), "materials": materials, "pairs": pairs}
-
-
-def _digest(values: list) -> str:
-    """Return the SHA-256 (hex) of arrays and plain values."""
-    sha256 = hashlib.sha256()
-    for value in values:
-        if isinstance(value, np.ndarray):
-            sha256.update(f"{value.dtype.str} {value.shape} ".encode())
-            sha256.update(np.ascontiguousarray(value))
-        else:
-            sha256.update(json.dumps(value).encode())
-    return sha256.hexdigest()
-
-
 def _flat(state: dict, prefix: str = "") -> tuple[dict, dict[str, np.ndarray]]:
     """Flatten a nested dict into plain values (numbers, lists, None) and arrays, with keys joined by slashes."""
     plain, arrays = {}, {}
@@ -225,7 +156,7 @@ def _flat(state: dict, prefix: str = "") -> tuple[dict, dict[str, np.ndarray]]:
 
 def _checksum(header: np.ndarray, arrays: dict[str, np.ndarray]) -> np.ndarray:
     """Return the checksum of a file's content, (32,) uint8."""
-    text = _digest([header, *(x for name in sorted(arrays) for x in (name, arrays[name]))])
+    text = digest([header, *(x for name in sorted(arrays) for x in (name, arrays[name]))])
     return np.frombuffer(bytes.fromhex(text), dtype=np.uint8)
 
 
@@ -298,3 +229,62 @@ def _sentence(reason) -> str:
     """Return a reason given as text unchanged, or an exception's type and first line."""
     text = str(reason).strip().splitlines()
     return reason if isinstance(reason, str) else f"{type(reason).__name__}: {text[0] if text else 'no reason given'}"
+
+
+# --- methods of Simulator -----------------------------------------------------------------------------------------------
+
+
+def save_checkpoint(self: "Simulator", path: str | Path, notes: dict | None = None) -> None:
+    """Write everything the next step depends on to a file, atomically; see `taisoft/checkpoint.py`.
+
+    notes: plain data to store with it. Raises SimulationError while a body is dragged or if the state is not finite, and
+    OutputError.
+    """
+    dynamics = self._open()
+    if self.dragged is not None:
+        raise SimulationError("a body is being dragged, which a checkpoint cannot hold: release it first")
+    bad = dynamics.state.find_nonfinite()
+    if bad is not None:
+        raise SimulationError(f"no checkpoint is written of a state that is not finite: {bad}")
+    state = dynamics.snapshot() | {"loads": load_values(self.scene)}
+    write_checkpoint(path, dataclasses.asdict(self.settings), self.scene, self.plan.on, state, notes or {}, self._start_scene)
+
+
+def load_checkpoint(cls: type["Simulator"], path: str | Path, scene: Scene, arch: str | None = None) -> "Simulator":
+    """Return a simulator that continues from a checkpoint of the same scene, with its settings and numbers.
+
+    scene: supplies what the file does not hold: meshes, constraints, where loads act, obstacles and paths. Only functions of
+    time are not compared. Its numbers must be those at the start of the run; the run continues with those at the time of
+    saving. The scene is frozen, as by a new Simulator. arch: replaces the checkpoint's; only its own arch continues bitwise.
+    No other setting can be changed here; dt, gravity, materials, loads and contact pairs can be changed later, as in any
+    simulator. Initial overlaps are not checked. Raises SimulationError for a file that cannot be used and SceneError for
+    another scene, both naming the file.
+    """
+    return cls.from_checkpoint(read_checkpoint(path), scene, arch)
+
+
+def from_checkpoint(cls: type["Simulator"], saved: Checkpoint, scene: Scene, arch: str | None = None) -> "Simulator":
+    """Do as `load_checkpoint`, from a file's content."""
+    if not isinstance(scene, Scene):
+        raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
+    settings = saved.settings | ({} if arch is None else {"arch": arch})
+    if set(settings) != set(NAMES):
+        raise SimulationError(f"{saved.path} holds no state of this scene: its settings are not those of this version")
+    check_scene(saved, scene, plan_of(scene, *(settings[key] for key in ("integrator", "self_collision", "draggable"))).on)
+    start = scene.snapshot()
+    start.allow_initial_overlap = True  # bodies move to the saved positions below
+    sim = cls(start, **settings)
+    try:
+        with thawed(sim.scene):
+            sim.scene.allow_initial_overlap = scene.allow_initial_overlap
+        restore_numbers(saved, sim.scene)
+        sim._stable_dt = None
+        sim._dynamics.restore(saved.state)
+    except (KeyError, TypeError, ValueError) as error:  # the checksum is right, but the content does not fit this scene
+        sim.close()
+        raise SimulationError(f"{saved.path} holds no state of this scene: {type(error).__name__}: {error}") from None
+    except BaseException:
+        sim.close()
+        raise
+    scene.freeze()
+    return sim

@@ -38,18 +38,20 @@ class EnergyCheck:
 
     def before_step(self) -> None:
         """Reset the start if the state was changed from outside since the last step."""
-        if self._sim._changes != self._changes:
+        if self._sim._host().changes != self._changes:
             self._restart()
 
     def after_step(self, report: StepReport) -> None:
         """Check the energies at the end of a step or batch."""
-        driven, self._driven = self._driven, self._sim._driven
+        driven, self._driven = self._driven, self._sim._host().is_driven
         overlap_resolved = self._sim.scene.allow_initial_overlap and report.max_penetration > 0.0
         if driven or self._driven or overlap_resolved:
             self._start(report)
             return
         if self._first and report.n_contacts:
-            self._motion_energy += opening_energy(self._sim.scene, OPENING_OFFSETS * self._sim._contact.contact_offset) / MAX_RISE
+            self._motion_energy += (
+                opening_energy(self._sim.scene, OPENING_OFFSETS * self._sim._host().contact.contact_offset) / MAX_RISE
+            )
         self._first = False
         released = self._start_potential - (report.gravity + report.loads)  # released by gravity and loads [J]
         self._motion_energy = max(self._motion_energy, self._start_internal + released)
@@ -67,13 +69,13 @@ class EnergyCheck:
     def _restart(self) -> None:
         """Restart the check from the present state and parameters."""
         sim = self._sim
-        self._changes, self._negligible = sim._changes, negligible_energy(sim.scene)
+        self._changes, self._negligible = sim._host().changes, negligible_energy(sim.scene)
         self._q = min(1.0, float(sim.dt / sim.stable_dt)) if sim.settings.explicit else 0.0
         self._start(sim.energies())
 
     def _start(self, now: Energies | StepReport) -> None:
         """Use this state as the start of the comparison."""
-        self._driven, self._time = self._sim._driven, self._sim.time
+        self._driven, self._time = self._sim._host().is_driven, self._sim.time
         self._first = True  # the next step is the first since the start
         self._start_internal, self._start_potential = now.kinetic + now.elastic, now.gravity + now.loads
         self._upper_bound = self._start_internal + self._bounds(now)[1]

@@ -1,38 +1,38 @@
-"""Settings of a simulation, checked before anything is allocated."""
+"""Settings of a simulation: names, defaults and allowed values, checked before anything is allocated."""
 
+import dataclasses
 import difflib
-from dataclasses import dataclass
 
 import numpy as np
 
 from taisoft.attributes import guarded_record
-from taisoft.contact import SOLVERS
-from taisoft.dynamics import EXPLICIT, INTEGRATORS, scheme_of
+from taisoft.contact import SOLVERS as EXPLICIT_CONTACT
+from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS, is_multistep
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
 from taisoft.scene.plan import Plan, make_plan
 from taisoft.scene.scene import Scene
 from taisoft.scene.solver import MAX_TOLERANCE
 
-EXPLICIT_CONTACT = SOLVERS
 IMPLICIT_CONTACT = ("augmented_lagrangian",)
+CONTACT_SOLVERS = ("auto", *EXPLICIT_CONTACT, *IMPLICIT_CONTACT)
 
 
 @guarded_record("settings", "call sim.rebuild({name}=...)")
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Settings:
-    """Requested settings of a Simulator; tolerances are relative, None is adaptive."""
+    """Arguments of a Simulator besides the scene; tolerances are relative, None is the default or adaptive."""
 
-    dt: float  # [s]
-    integrator: str
-    precision: str
-    arch: str
-    allow_unstable: bool
-    self_collision: bool
-    newton_tolerance: float | None
-    linear_tolerance: float | None
-    contact_solver: str
-    contact_tolerance: float | None
+    dt: float = 1 / 60  # [s]
+    integrator: str = "implicit_euler"
+    contact_solver: str = "auto"
+    self_collision: bool = False
+    precision: str = "f32"
+    arch: str = "cpu"
+    allow_unstable: bool = False
+    newton_tolerance: float | None = None
+    linear_tolerance: float | None = None
+    contact_tolerance: float | None = None
     draggable: bool = False
 
     @property
@@ -41,10 +41,43 @@ class Settings:
         return self.integrator in EXPLICIT
 
 
+NAMES = tuple(field.name for field in dataclasses.fields(Settings))
+FLAGS = ("self_collision", "allow_unstable", "draggable")
+TOLERANCES = ("newton_tolerance", "linear_tolerance", "contact_tolerance")
+FIXED = ("dt", "precision", "arch")  # settings that `Simulator.rebuild` is not for: dt is assigned, the others never change
+
+
+def check_settings(scene: Scene, **given) -> Settings:
+    """Check every argument of a Simulator. Raises SceneError or SimulationError."""
+    if not isinstance(scene, Scene):
+        raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
+    if not scene.bodies:
+        raise SceneError("the scene holds no body")
+    scene.check()
+    settings = Settings(**given)
+    _check_name("integrator", settings.integrator, INTEGRATORS)
+    _check_name("contact_solver", settings.contact_solver, CONTACT_SOLVERS)
+    for name in FLAGS:
+        if not isinstance(getattr(settings, name), bool):
+            raise SimulationError(f"{name} = {getattr(settings, name)!r}: it must be True or False")
+    for name in TOLERANCES:
+        _check_tolerance(name, getattr(settings, name))
+    _check_contact_solver(settings, scene.pushes(settings.self_collision))
+    for name, allowed in (("precision", ("f32", "f64")), ("arch", ("cpu", "cuda"))):
+        if getattr(settings, name) not in allowed:
+            a, b = allowed
+            raise SimulationError(f"{name} {getattr(settings, name)!r} is unknown: it must be '{a}' or '{b}'")
+    return dataclasses.replace(settings, dt=check_dt(settings.dt))
+
+
 def plan_of(scene: Scene, integrator: str, self_collision: bool, draggable: bool) -> Plan:
     """Return the plan of a scene under an integrator."""
-    explicit = integrator in EXPLICIT
-    return make_plan(scene, explicit, not explicit and scheme_of(integrator).before > 0.0, self_collision, draggable)
+    return make_plan(scene, integrator in EXPLICIT, is_multistep(integrator), self_collision, draggable)
+
+
+def contact_solvers(integrator: str) -> tuple[str, ...]:
+    """Return the contact solvers that an integrator supports, besides "auto"."""
+    return EXPLICIT_CONTACT if integrator in EXPLICIT else () if integrator == "implicit_midpoint" else IMPLICIT_CONTACT
 
 
 def check_dt(dt) -> float:
@@ -67,6 +100,13 @@ def check_count(name: str, value) -> int:
     return int(value)
 
 
+def _check_name(name: str, value, known: tuple[str, ...]) -> None:
+    if value not in known:
+        near = difflib.get_close_matches(str(value), known, 1)
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        raise SimulationError(f"{name} {value!r} is unknown{hint}: it must be one of {', '.join(known)}")
+
+
 def _check_tolerance(name: str, value) -> None:
     if value is None:
         return
@@ -75,77 +115,15 @@ def _check_tolerance(name: str, value) -> None:
         raise SimulationError(f"{name} = {value!r}: it must lie between 0 and {below:g}, or be None for an adaptive one")
 
 
-def contact_solvers(integrator: str) -> tuple[str, ...]:
-    """Return the contact solvers that an integrator supports, besides "auto"."""
-    return EXPLICIT_CONTACT if integrator in EXPLICIT else () if integrator == "implicit_midpoint" else IMPLICIT_CONTACT
-
-
-def _check_contact_solver(integrator: str, solver: str, touching: bool) -> None:
+def _check_contact_solver(settings: Settings, touching: bool) -> None:
     """Raise SimulationError unless the integrator supports the contact solver. touching: whether anything can touch."""
+    integrator, solver = settings.integrator, settings.contact_solver
     supported = contact_solvers(integrator)
-    known = ("auto", *EXPLICIT_CONTACT, *IMPLICIT_CONTACT)
-    if solver not in known:
-        near = difflib.get_close_matches(str(solver), known, 1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
-        raise SimulationError(f"contact_solver {solver!r} is unknown{hint}: it must be one of {', '.join(known)}")
     if touching and not supported:
         raise SimulationError(
             f"{integrator} does not support contacts: its stage lies in the middle of the step, where a contact condition that "
             "holds at the end need not hold; use bdf2, which is also second-order, or implicit_euler"
         )
-    if solver != "auto" and solver not in supported:
+    if solver not in ("auto", *supported):
         instead = " or ".join(("'auto'", *supported))
         raise SimulationError(f"contact_solver {solver!r} does not fit {integrator}: use {instead}")
-
-
-def check_settings(
-    scene: Scene,
-    dt,
-    integrator,
-    contact_solver,
-    self_collision,
-    precision,
-    arch,
-    allow_unstable,
-    newton_tolerance,
-    linear_tolerance,
-    contact_tolerance,
-    draggable,
-) -> Settings:
-    """Check every argument of a Simulator. Raises SceneError or SimulationError."""
-    if not isinstance(scene, Scene):
-        raise SceneError(f"scene must be a Scene, not {type(scene).__name__}")
-    if not scene.bodies:
-        raise SceneError("the scene holds no body")
-    scene.check()
-    if integrator not in INTEGRATORS:
-        near = difflib.get_close_matches(str(integrator), INTEGRATORS, 1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
-        raise SimulationError(f"integrator {integrator!r} is unknown{hint}: it must be one of {', '.join(INTEGRATORS)}")
-    if not isinstance(self_collision, bool):
-        raise SimulationError(f"self_collision = {self_collision!r}: it must be True or False")
-    _check_tolerance("contact_tolerance", contact_tolerance)
-    _check_contact_solver(integrator, contact_solver, scene.pushes(self_collision))
-    if not isinstance(allow_unstable, bool):
-        raise SimulationError(f"allow_unstable = {allow_unstable!r}: it must be True or False")
-    if not isinstance(draggable, bool):
-        raise SimulationError(f"draggable = {draggable!r}: it must be True or False")
-    _check_tolerance("newton_tolerance", newton_tolerance)
-    _check_tolerance("linear_tolerance", linear_tolerance)
-    if precision not in ("f32", "f64"):
-        raise SimulationError(f"precision {precision!r} is unknown: it must be 'f32' or 'f64'")
-    if arch not in ("cpu", "cuda"):
-        raise SimulationError(f"arch {arch!r} is unknown: it must be 'cpu' or 'cuda'")
-    return Settings(
-        check_dt(dt),
-        integrator,
-        precision,
-        arch,
-        allow_unstable,
-        self_collision,
-        newton_tolerance,
-        linear_tolerance,
-        contact_solver,
-        contact_tolerance,
-        draggable,
-    )

@@ -10,8 +10,8 @@ from taisoft.backend.transfer import upload
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.results import StageResult
 from taisoft.dynamics.simulation_state import SimulationState
-from taisoft.dynamics.stage_result import StageResult
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.elasticity import measure

@@ -15,7 +15,7 @@ def state_of(sim: ts.Simulator) -> State:
 def assert_is_before_first_step(sim: ts.Simulator, before: State) -> None:
     """A first step that failed has left the state as it was, and led nodes led."""
     assert np.array_equal(sim.positions(), before[0]) and np.array_equal(sim.velocities(), before[1])
-    assert sim.time == 0.0 and sim.step_count == 0 and not any(sim._simulation.dirichlet.released())
+    assert sim.time == 0.0 and sim.step_count == 0 and not any(sim._dynamics.state.dirichlet.released())
 
 
 def assert_steps_as_new(sim: ts.Simulator, close: float) -> None:

@@ -29,6 +29,14 @@ def cube(center=(0.0, 0.0, 0.0), cells=(1, 1, 1), size=(1.0, 0.9, 1.1), pattern=
     return ts.box_mesh(cells, size, center, pattern)
 
 
+def rows_of(sim: ts.Simulator, name: str) -> slice:
+    """Rows of a body's nodes among those of all bodies."""
+    bodies = sim.scene.bodies
+    k = [body.name for body in bodies].index(name)
+    first = sum(body.n_nodes for body in bodies[:k])
+    return slice(first, first + bodies[k].n_nodes)
+
+
 def element(order: int, quadrature_degree: int | None = None) -> dict:
     """Arguments of `add_body`; the degree counts for order 2 only."""
     return {"order": order, "quadrature_degree": quadrature_degree if order == 2 else None}

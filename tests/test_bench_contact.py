@@ -112,12 +112,14 @@ def test_a_problem_is_left_as_it_was_and_solvers_agree(sim):
         report = sim.step()
     # what follows is the simulator's own solve of that problem
     assert report.n_contacts == pushes["contacts"] and report.contact_residual <= GOAL
-    assert sim._contact.problem.r.to_numpy()[: pushes["contacts"], 0].sum() == pytest.approx(pushes["wanted"], rel=1e-2, abs=1e-3)
+    assert sim._dynamics.contact.problem.r.to_numpy()[: pushes["contacts"], 0].sum() == pytest.approx(
+        pushes["wanted"], rel=1e-2, abs=1e-3
+    )
 
 
 def test_colourings(sim):
     to_impulses(sim)
-    p = sim._contact.problem
+    p = sim._dynamics.contact.problem
     contacts = read(p)
     graph = node_graph(contacts.node, contacts.arity, contacts.inverse_mass)
     made, colours = colour_all(SCENE, p, 4)

@@ -55,7 +55,7 @@ def test_exponents_are_those_of_power_laws():
 
 def test_bytes_of_an_explicit_step_are_those_counted_by_hand():
     with ts.Simulator(beam(20), dt=1e-4, integrator="velocity_verlet") as sim:  # 4 x 1 x 1 cells
-        n, t, sizes = sim._simulation.model.n_nodes, 20, sim.field_bytes
+        n, t, sizes = sim._dynamics.state.model.n_nodes, 20, sim.field_bytes
         elements = 24 * n + t * (16 + 36 + 4 + 1) + 48 * t  # x; nodes, Dm_inv, volume, a body for four tets; corner
         assert floor_bytes(["elements"], sizes) == elements
         drift, nodes = n * (24 + 12 + 12 + 24 + 12), 48 * t + 4 * (n + 1) + 16 * t + n * (4 + 12 + 12 + 12 + 12)

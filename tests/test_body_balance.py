@@ -71,7 +71,7 @@ def test_a_checkpoint_holds_what_rounding_is_judged_by(scene, tmp_path):
     """It tells of the state where numbers last changed, not of that which is loaded."""
 
     def rounding(sim) -> list[float]:
-        return [sim._stepper.solver.rounding.position, *sim._stepper.solver.rounding.force_by_body]
+        return [sim._dynamics.stepper.solver.rounding.position, *sim._dynamics.stepper.solver.rounding.force_by_body]
 
     with ts.Simulator(scene, dt=DT) as sim:
         start = rounding(sim)

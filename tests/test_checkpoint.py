@@ -26,7 +26,7 @@ from scenes import RELEASE, driven_scene
 import taisoft as ts
 from taisoft.backend import runtime
 from taisoft.checkpoint import read_checkpoint
-from taisoft.dynamics import EXPLICIT
+from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import OutputError, SceneError, SimulationError
 
 
@@ -54,9 +54,9 @@ def assert_every_part_counts(sim: ts.Simulator, path: Path, spoilt: dict, told: 
         for folder in folders:
             place = place[folder]
         place[last] = change(place[last])
-        sim._restore(dataclasses.replace(saved, state=state))
+        sim._dynamics.restore(state)
         assert differ(follow(sim, len(told)), told), f"{name} does not count"
-    sim._restore(saved)  # and as it was
+    sim._dynamics.restore(saved.state)  # and as it was
     assert_same(follow(sim, len(told)), told)
 
 

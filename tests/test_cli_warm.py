@@ -21,8 +21,8 @@ from taisoft.cli import main, warm, warm_scenes
 from taisoft.cli.scene_file import load_scene, shipped_files
 from taisoft.cli.warm_scenes import Structure, build, static_structures, structures
 from taisoft.collision.surface import SERIAL_BELOW
-from taisoft.dynamics import EXPLICIT
 from taisoft.dynamics.elimination import solve_on
+from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.fem.model import ILL_CONDITIONED
 from taisoft.fem.reference import inverse_rest_edges
 from taisoft.scene.obstacles import MeshObstacle
@@ -101,7 +101,7 @@ def test_scenes_of_other_sizes_need_no_other_kernel():
     with ts.Simulator(made, dt=2e-3, integrator="implicit_euler") as sim:
         sim.advance(2)
         assert np.isfinite(sim.positions()).all() and n_compiled() == before
-        solver, x = sim._stepper.solver, sim.positions()
+        solver, x = sim._dynamics.stepper.solver, sim.positions()
         solved = solve_on(solver, replace(solver.stage, tolerance=0.0), np.arange(20, 40), 0.0)  # as hard steps do
         assert solved.linear > 0.0 and not np.array_equal(sim.positions(), x) and n_compiled() == before
 

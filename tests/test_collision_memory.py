@@ -64,7 +64,7 @@ def search_everything() -> None:
         x = sim.positions()
         kinds = set(sim.detect_contacts().kind)
         assert kinds == {"vertex_face", "edge_edge", "vertex_field", "face_field"}, kinds
-        detection = sim._detection
+        detection = sim._dynamics.detection
         assert detection.surface.serial
         ball = np.arange(sim.scene.bodies[0].n_nodes)
         inside = ball[np.linalg.norm(sim.scene.bodies[0].rest_positions, axis=1) < 1e-9]
@@ -92,19 +92,22 @@ def search_everything() -> None:
             v[len(ball) + 3] = bad
             with pytest.raises(SceneError, match="velocities: node .* not finite"):
                 sim.set_state(x, v)
-            for field in (sim._simulation.model.state.x, sim._simulation.model.state.v):  # as a step that failed might leave them
+            for field in (
+                sim._dynamics.state.model.state.x,
+                sim._dynamics.state.model.state.v,
+            ):  # as a step that failed might leave them
                 before = field.to_numpy()
                 field.from_numpy(before + v)
-                sim._contact.forget()
+                sim._dynamics.contact.forget()
                 with pytest.raises(SimulationError, match="body 'wedge', node 3: position or velocity is not finite"):
                     sim.detect_contacts()
                 field.from_numpy(before)
             print("node of no triangle", bad)
-            before = sim._simulation.model.state.x.to_numpy()
-            sim._simulation.model.state.x.from_numpy(np.where(np.isin(np.arange(len(x)), inside)[:, None], bad, before))
-            sim._contact.forget()
+            before = sim._dynamics.state.model.state.x.to_numpy()
+            sim._dynamics.state.model.state.x.from_numpy(np.where(np.isin(np.arange(len(x)), inside)[:, None], bad, before))
+            sim._dynamics.contact.forget()
             assert sim.detect_contacts().unmapped > 0
-            sim._simulation.model.state.x.from_numpy(before)
+            sim._dynamics.state.model.state.x.from_numpy(before)
 
 
 def search_in_small_parts() -> None:
@@ -120,7 +123,7 @@ def search_in_small_parts() -> None:
             sim.set_state(scale * sim.positions())
             with pytest.raises(SimulationError, match=r"contacts: [0-9]+ entries are needed .* max_capacity allows 65"):
                 sim.detect_contacts()
-        assert sim._detection.surface.chunks == 64
+        assert sim._dynamics.detection.surface.chunks == 64
 
 
 def search_by_both_broad_phases() -> None:

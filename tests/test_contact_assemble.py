@@ -65,7 +65,7 @@ def begun(sim):
     """The simulator after a step, with the problem of the next one at hand, and its number of contacts."""
     sim.reset()
     sim.step()
-    return sim, sim._contact.begin(sim.time, DT)
+    return sim, sim._dynamics.contact.begin(sim.time, DT)
 
 
 def rows(field, n: int) -> np.ndarray:
@@ -74,7 +74,7 @@ def rows(field, n: int) -> np.ndarray:
 
 def test_frames_and_pairs(begun):
     sim, n = begun
-    p, f, names = sim._contact.problem, sim._contact.found, [c.name for c in sim.scene.colliders]
+    p, f, names = sim._dynamics.contact.problem, sim._dynamics.contact.found, [c.name for c in sim.scene.colliders]
     normal, t1, body = rows(p.normal, n), rows(p.tangent, n), rows(f.body, n)
     pairs = {tuple(names[k] for k in row) for row in body}
     assert pairs == {("block", "brick"), ("block", "table"), ("other", "lift")} and n >= 12
@@ -90,9 +90,9 @@ def test_numbers_that_change(begun):
     sim, n = begun
     before = sim.scene.contact_numbers("block", "table")
     sim.set_contact("table", "block", friction=0.05, restitution=0.9)
-    sim._contact.begin(sim.time, DT)
-    on = (rows(sim._contact.found.body, n) == [0, 3]).all(axis=1)
-    friction, restitution = rows(sim._contact.problem.friction, n), rows(sim._contact.found.restitution, n)
+    sim._dynamics.contact.begin(sim.time, DT)
+    on = (rows(sim._dynamics.contact.found.body, n) == [0, 3]).all(axis=1)
+    friction, restitution = rows(sim._dynamics.contact.problem.friction, n), rows(sim._dynamics.contact.found.restitution, n)
     assert (friction[on] == 0.05).all() and (restitution[on] == 0.9).all()
     assert 0 < on.sum() < n and (friction[~on] != 0.05).all()
     sim.set_contact("block", "table", *before)
@@ -101,7 +101,7 @@ def test_numbers_that_change(begun):
 def test_nodes_and_weights(begun):
     """Weighted nodes of a side, and what they are told to be: the two points of a contact."""
     sim, n = begun
-    p, f, x = sim._contact.problem, sim._contact.found, sim.positions()
+    p, f, x = sim._dynamics.contact.problem, sim._dynamics.contact.found, sim.positions()
     node, weight, arity = rows(p.node, n), rows(p.weight, n), rows(p.arity, n)
     used = np.arange(6) < arity[:, None]
     assert (weight[used] != 0).all() and arity.min() >= 1 and all(len(set(r[u])) == u.sum() for r, u in zip(node, used))
@@ -121,7 +121,7 @@ def test_nodes_and_weights(begun):
 def test_ways_of_obstacles(begun):
     """Where the obstacle's point of a contact is a step later."""
     sim, n = begun
-    p, f, t = sim._contact.problem, sim._contact.found, sim.time
+    p, f, t = sim._dynamics.contact.problem, sim._dynamics.contact.found, sim.time
     point = rows(f.point, n) - 0.5 * rows(f.gap, n)[:, None] * rows(p.normal, n)
     expected = np.zeros((n, 3))
     for k, obstacle in enumerate(sim.scene.obstacles):
@@ -144,8 +144,8 @@ def test_warm_start(begun):
     sim.step()
     before, dt = sim.contacts(), 0.5 * DT
     assert (np.linalg.norm(before.impulse, axis=1) > 0).sum() >= 8
-    n = sim._contact.begin(sim.time, dt)
-    p, f = sim._contact.problem, sim._contact.found
+    n = sim._dynamics.contact.begin(sim.time, dt)
+    p, f = sim._dynamics.contact.problem, sim._dynamics.contact.found
     key = {(a, b, tuple(ids)): k for k, (a, b, ids) in enumerate(zip(before.body_a, before.body_b, before.feature.tolist()))}
     names, feature, r = [c.name for c in sim.scene.colliders], rows(f.feature, n), rows(p.r, n)
     frame = np.stack([rows(p.normal, n), rows(p.tangent, n), np.cross(rows(p.normal, n), rows(p.tangent, n))], axis=1)
@@ -161,8 +161,8 @@ def test_warm_start(begun):
     assert met >= 8
     sim.set_state(velocities=sim.velocities())
     assert len(sim.contacts()) == 0
-    n = sim._contact.begin(sim.time, DT)
-    assert n and not rows(sim._contact.problem.r, n).any()
+    n = sim._dynamics.contact.begin(sim.time, DT)
+    assert n and not rows(sim._dynamics.contact.problem.r, n).any()
 
 
 # --- goal and warm start on made up numbers ---------------------------------------------------------------------------

@@ -15,9 +15,10 @@ import pytest
 from rotations import rotation
 
 import taisoft as ts
-from taisoft.dynamics import contact_newton, implicit, scheme_of
+from taisoft.dynamics import contact_newton, implicit
 from taisoft.dynamics.contact_newton import FALLBACK_STEPS, FrictionalResult
 from taisoft.dynamics.newton import Newton
+from taisoft.dynamics.schemes import SCHEMES
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.fem import model
 from taisoft.linear import pcg
@@ -48,7 +49,7 @@ def shared_sim():
 
 @pytest.fixture
 def sim(shared_sim, monkeypatch):
-    monkeypatch.setattr(shared_sim._stepper, "scheme", scheme_of("implicit_euler"))
+    monkeypatch.setattr(shared_sim._dynamics.stepper, "scheme", SCHEMES["implicit_euler"])
     shared_sim.reset()
     return shared_sim
 
@@ -125,7 +126,7 @@ def test_extrapolated_multipliers_end_where_others_do(sim, monkeypatch):
 def test_solves_after_the_first_are_looser(sim):
     """Unless their tolerance is the user's."""
     steps(sim, 2)
-    solver, stage = sim._stepper.solver, Stage(1.0, DT, DT, 1e-6, linear_tolerance=1e-4, later_tolerance=1e-2)
+    solver, stage = sim._dynamics.stepper.solver, Stage(1.0, DT, DT, 1e-6, linear_tolerance=1e-4, later_tolerance=1e-2)
     newton = Newton(solver, stage)
     assert newton._linear_tolerance() == 1e-4
     newton.newton = 1
@@ -145,7 +146,7 @@ def test_tight_problems_extrapolate_at_once(sim, monkeypatch, given):
 
     monkeypatch.setattr(contact_newton, "NEAR_FLOOR", np.inf)  # only rounding, as it were
     monkeypatch.setattr(contact_newton, "solve_linear", solve)
-    monkeypatch.setattr(sim._stepper, "linear_tolerance", given)
+    monkeypatch.setattr(sim._dynamics.stepper, "linear_tolerance", given)
     steps(sim, 2)
     assert problems
     for stage, problem in problems:
@@ -158,7 +159,7 @@ def test_on_threads_it_is_the_same_step(sim, monkeypatch):
     monkeypatch.setattr(model, "PARALLEL_FROM", 0)
     monkeypatch.setattr(model, "PARALLEL_THREADS", 1)
     with simulator() as parallel:
-        assert not parallel._simulation.model.serial
+        assert not parallel._dynamics.state.model.serial
         other, reports = steps(parallel)
     assert all(report.converged for report in reports) and np.abs(other - x).max() < 1e-8  # [m]
 
@@ -172,7 +173,7 @@ def test_many_launches_are_one(sim, monkeypatch):
 
 def test_a_retry_begins_where_the_last_try_ended(sim):
     steps(sim, 2)
-    stepper, x_start = sim._stepper, sim.positions()
+    stepper, x_start = sim._dynamics.stepper, sim.positions()
     result = stepper.take_substep(sim.time, DT)
     x, v = sim.positions(), sim.velocities()
     stepper.restore_start()
@@ -185,7 +186,7 @@ def test_a_retry_begins_where_the_last_try_ended(sim):
 def test_a_stage_ends_at_its_limit(sim, monkeypatch):
     monkeypatch.setattr(implicit, "MAX_NEWTON_WITH_CONTACTS", 1)
     steps(sim, 2)
-    result = sim._stepper.take_substep(sim.time, DT)
+    result = sim._dynamics.stepper.take_substep(sim.time, DT)
     assert not result.converged and 1 <= result.newton_iterations <= 1 + FALLBACK_STEPS
 
 
@@ -203,7 +204,7 @@ def test_laws_hold_where_tets_are_inverted(sim):
     x = sim.positions("upper")
     middle = x.mean(axis=0)
     sim.set_state(positions=middle + (x - middle) * (1.0, 0.15, 1.0) - (0, 0.05, 0), body="upper")
-    solver, formed = sim._stepper.solver, []
+    solver, formed = sim._dynamics.stepper.solver, []
 
     def form_matrix(projected=False):
         formed.append(projected)
@@ -222,11 +223,11 @@ def test_laws_hold_where_tets_are_inverted(sim):
 
 
 def test_a_linearised_step_of_an_indefinite_matrix(sim, monkeypatch):
-    monkeypatch.setattr(sim._stepper, "scheme", scheme_of("linearly_implicit_euler"))
+    monkeypatch.setattr(sim._dynamics.stepper, "scheme", SCHEMES["linearly_implicit_euler"])
     x = sim.positions("upper")
     middle = x.mean(axis=0)
     sim.set_state(positions=middle + (x - middle) * (1.0, 0.15, 1.0) - (0, 0.05, 0), body="upper")
-    solver, formed = sim._stepper.solver, []
+    solver, formed = sim._dynamics.stepper.solver, []
 
     def form_matrix(projected=False):
         formed.append(projected)

@@ -48,7 +48,7 @@ def sim(shared_sim):
 
 def patch_end(sim, monkeypatch, events: dict, tells: str = "relative_penetration") -> list:
     """events: by the number of the call of the step's look at its end, an exception or how deep it tells, in edges."""
-    calls, end = [], sim._contact.end
+    calls, end = [], sim._dynamics.contact.end
 
     def told(time, dt):
         depth = end(time, dt)
@@ -57,10 +57,10 @@ def patch_end(sim, monkeypatch, events: dict, tells: str = "relative_penetration
         if isinstance(event, Exception):
             raise event
         if event is not None:
-            setattr(sim._contact, tells, event)
+            setattr(sim._dynamics.contact, tells, event)
         return depth
 
-    monkeypatch.setattr(sim._contact, "end", told)
+    monkeypatch.setattr(sim._dynamics.contact, "end", told)
     return calls
 
 
@@ -98,10 +98,10 @@ def test_a_try_that_fails_leaves_the_state_before_the_step(sim, monkeypatch):
 def test_a_part_that_sank_is_looked_at_along_its_way(sim, monkeypatch):
     """Nothing is there that was not known: the part stays what it was."""
     first = sim.step()
-    wanted, searched, search = sim.positions(), [], sim._contact.search_along_path
+    wanted, searched, search = sim.positions(), [], sim._dynamics.contact.search_along_path
     sim.reset()
-    monkeypatch.setattr(sim._contact, "penetrates_deeper", lambda time, dt, before: True)
-    monkeypatch.setattr(sim._contact, "search_along_path", lambda *at: searched.append((at, search(*at))))
+    monkeypatch.setattr(sim._dynamics.contact, "penetrates_deeper", lambda time, dt, before: True)
+    monkeypatch.setattr(sim._dynamics.contact, "search_along_path", lambda *at: searched.append((at, search(*at))))
     report = sim.step()
     assert searched == [((0.0, DT), False)] and report.newton_iterations == first.newton_iterations
     assert np.array_equal(sim.positions(), wanted) and report.max_penetration == first.max_penetration

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from contact_scenes import FRICTION, GRAVITY, MASS, Stage, scene, sliding, still, turning
 from rotations import rotation
+from scenes import rows_of
 
 import taisoft as ts
-from taisoft.dynamics import scheme_of
+from taisoft.dynamics.schemes import SCHEMES
 from taisoft.settings import EXPLICIT_CONTACT
 
 DT = {"bdf2": 0.01, "symplectic_euler": 1e-3, "velocity_verlet": 1e-3}  # [s]; one for all implicit schemes
@@ -49,7 +50,7 @@ def sim(shared_sim, monkeypatch):
     place.Q, place.T, place.motion = np.eye(3), np.zeros(3), still
     shared_sim.set_gravity(GRAVITY)
     if not shared_sim.settings.explicit:
-        monkeypatch.setattr(shared_sim._stepper, "scheme", scheme_of("implicit_euler"))
+        monkeypatch.setattr(shared_sim._dynamics.stepper, "scheme", SCHEMES["implicit_euler"])
     shared_sim.reset()
     return shared_sim
 
@@ -61,7 +62,7 @@ def each(sim, request, monkeypatch):
         if request.param != IMPLICIT[0]:
             pytest.skip("an explicit integrator is what it is")
     else:
-        monkeypatch.setattr(sim._stepper, "scheme", scheme_of(request.param))
+        monkeypatch.setattr(sim._dynamics.stepper, "scheme", SCHEMES[request.param])
     return sim
 
 
@@ -71,7 +72,7 @@ def go(sim, seconds: float) -> None:
     while sim.step_count < end:
         report = sim.advance(end - sim.step_count)
         assert report.converged and report.problems == [], report
-        assert report.max_penetration < sim._contact.contact_offset
+        assert report.max_penetration < sim._dynamics.contact.contact_offset
 
 
 @pytest.fixture
@@ -89,15 +90,15 @@ def test_rest(damped):
 
     Means over a while, since explicit steps push a little more and a little less.
     """
-    sim, mass = damped, damped._simulation.model.mass.to_numpy()[:, None]
+    sim, mass = damped, damped._dynamics.state.model.mass.to_numpy()[:, None]
     go(sim, 0.3)
-    held = np.isin(np.arange(len(mass)), np.r_[sim._slice("shelf"), sim._slice("load")])
+    held = np.isin(np.arange(len(mass)), np.r_[rows_of(sim, "shelf"), rows_of(sim, "load")])
     missing, gaps = {"cube": [], "load": [], "reactions": []}, []
     for _ in range(20 if sim.settings.explicit else 2):
         drag = -60.0 * mass * sim.velocities()
         sim.step()
         for name in ("cube", "load"):
-            rows = sim._slice(name)
+            rows = rows_of(sim, name)
             missing[name].append(sim.contact_force(name) + drag[rows].sum(axis=0) + MASS * GRAVITY)
         missing["reactions"].append((sim.reactions().sum(axis=0) + drag[held].sum(axis=0)) / 10 + MASS * GRAVITY)
         assert np.abs(sim.contact_force("cube") + sim.contact_force("belt")).max() < 1e-9
@@ -169,8 +170,8 @@ def test_restitution(sim, restitution):
 
 def momenta(sim) -> tuple[np.ndarray, np.ndarray]:
     """Of the two that fly, (3,) each, the angular one about the origin."""
-    own = slice(sim._slice("left").start, sim._slice("right").stop)
-    p = sim._simulation.model.mass.to_numpy()[own, None] * sim.velocities()[own]
+    own = slice(rows_of(sim, "left").start, rows_of(sim, "right").stop)
+    p = sim._dynamics.state.model.mass.to_numpy()[own, None] * sim.velocities()[own]
     return p.sum(axis=0), np.cross(sim.positions()[own], p).sum(axis=0)
 
 
@@ -194,14 +195,14 @@ def test_momentum(each):
 
 def test_laws(each):
     """Of a belt that drags a block, and of a meeting; the goal of a gap as the text of the package says."""
-    contact, speed = each._contact, 0.3
+    contact, speed = each._dynamics.contact, 0.3
     each.place.motion = sliding(speed)
     states = np.zeros(3, dtype=int)
     for k in range(40 if each.settings.explicit else 8):
         x, v = each.positions(), each.velocities()
         each.step()
         c, moved = each.contacts(), each.positions() - x
-        on, bdf2 = c.nodes >= 0, not each.settings.explicit and each._stepper.scheme.before > 0
+        on, bdf2 = c.nodes >= 0, not each.settings.explicit and each._dynamics.stepper.scheme.before > 0
         signed = np.where(on, c.weights, 0.0) * [1, 1, 1, -1, -1, -1]
         obstacle_displacement_at = np.where((c.body_b == "belt")[:, None], [speed * each.dt, 0, 0], 0.0)
         way = np.einsum("kj,kjx->kx", signed, moved[c.nodes]) - obstacle_displacement_at
@@ -278,7 +279,7 @@ def test_all_solvers_of_explicit_steps(sim, monkeypatch):
     sim.place.motion = sliding(0.3)
     found = {}
     for method in EXPLICIT_CONTACT:
-        monkeypatch.setattr(sim._stepper, "method", method)
+        monkeypatch.setattr(sim._dynamics.stepper, "method", method)
         sim.reset()
         report = sim.advance(30)
         assert report.steps == 30 and report.converged

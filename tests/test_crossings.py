@@ -64,7 +64,7 @@ def crumpled(scene: ts.Scene, seed: int) -> dict[str, np.ndarray]:
 def put(sim: ts.Simulator, x: dict[str, np.ndarray]) -> Detection:
     """The search's result where the bodies are there."""
     sim.set_state(np.concatenate([x[body.name] for body in sim.scene.bodies]))
-    return sim._find_contacts(0.0)
+    return sim._dynamics.find_contacts(0.0)
 
 
 @pytest.mark.parametrize("precision, broad_phase, self_collision", [("f64", "bvh", True), ("f32", "spatial_hash", False)])
@@ -72,7 +72,7 @@ def test_all_pairs_by_separating_axes(precision, broad_phase, self_collision):
     scene = boxes(broad_phase=broad_phase)
     with ts.Simulator(scene, dt=0.01, precision=precision, self_collision=self_collision) as sim:
         d = put(sim, crumpled(scene, 0))
-        parallel = Detection(scene, d.model, d.layout, sim._runtime, self_collision, serial=False)
+        parallel = Detection(scene, d.model, d.layout, sim._dynamics.runtime, self_collision, serial=False)
         for seed in range(5):
             d = put(sim, crumpled(scene, seed))
             depth, over, pairs = brute(d, self_collision)
@@ -106,7 +106,7 @@ def test_what_touches_does_not_cross():
     with ts.Simulator(scene, dt=0.01, precision="f64") as sim:
         for off, shift in itertools.product((0.0, 1e-12), (0.0, 0.05)):
             sim.set_state(np.concatenate([mesh.vertices, mesh.vertices + (shift, 0.4 - off, 0.0)]))
-            depth, over, pairs = sim._find_contacts(0.0).crossings()
+            depth, over, pairs = sim._dynamics.find_contacts(0.0).crossings()
             assert depth <= 1.01 * off and over <= 1e-10 and pairs == 0
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from detection_scenes import DT, compare, identical, keys, pairs_of, simulator, zoo
 from rotations import rotation
+from scenes import rows_of
 
 from taisoft.collision import surface
 from taisoft.collision.contacts import KINDS
@@ -99,14 +100,16 @@ class TestZoo:
         sim, _, start, close = still
         if close > 1e-9:
             return  # once is enough
-        one, simulation = sim.detect_contacts(), sim._simulation
+        one, simulation = sim.detect_contacts(), sim._dynamics.state
         monkeypatch.setattr(surface, "SERIAL_BELOW", 0)
-        many = Detection(sim.scene, simulation.model, simulation.layout, sim._runtime, serial=None if serial_cheap else False)
+        many = Detection(
+            sim.scene, simulation.model, simulation.layout, sim._dynamics.runtime, serial=None if serial_cheap else False
+        )
         assert many.surface.serial_cheap == serial_cheap
         many.find(0.0, DT)
         first = many.contacts()
         compare(one, first, close=0.0)  # the parts of the work lie in another order
-        assert sim._detection.surface.serial and not many.surface.serial and many.surface.chunks > 1
+        assert sim._dynamics.detection.surface.serial and not many.surface.serial and many.surface.chunks > 1
         for _ in range(5):
             many.find(0.0, DT)
             assert identical(first, many.contacts())
@@ -115,25 +118,25 @@ class TestZoo:
 
     def test_what_is_not_finite_is_refused(self, still):
         sim, _, start, _ = still
-        for field, where in ((sim._simulation.model.state.x, "brick"), (sim._simulation.model.state.v, "egg")):
+        for field, where in ((sim._dynamics.state.model.state.x, "brick"), (sim._dynamics.state.model.state.v, "egg")):
             for value in (np.nan, np.inf):
                 before = field.to_numpy()
-                whole, rows = before.copy(), sim._slice(where)
+                whole, rows = before.copy(), rows_of(sim, where)
                 node = sim.scene.body(where).nodes.surface[0, 1]
                 whole[rows.start + node, 2] = value
                 field.from_numpy(whole)
-                sim._contact.forget()
+                sim._dynamics.contact.forget()
                 with pytest.raises(SimulationError, match=f"body '{where}', node {node}: position or velocity is not finite"):
                     sim.detect_contacts()
                 field.from_numpy(before)
-                sim._contact.forget()
+                sim._dynamics.contact.forget()
         assert len(sim.detect_contacts())
 
     def test_bodies_apart(self, still):
         sim, place, start, _ = still
         place.T = np.array([0.0, -10.0, 0.0])
         for k, body in enumerate(sim.scene.bodies):
-            sim.set_state(positions=start[sim._slice(body.name)] + (3.0 * k, 0, 0), body=body.name)
+            sim.set_state(positions=start[rows_of(sim, body.name)] + (3.0 * k, 0, 0), body=body.name)
         c = sim.detect_contacts()
         assert (len(c), c.found, sim.intersecting_triangles()) == (0, 0, [])
         shapes = [(0, 3), (0, 3), (0,), (0, 3), (0,), (0,), (0, 6), (0, 6), (0,), (0, 2)]

@@ -115,11 +115,11 @@ def test_the_life_of_a_simulator(earlier, time):
         assert len(sim.detect_contacts()) == 0
         sim.reset()
         earlier += [c, sim.detect_contacts()]
-        detection, contact = sim._detection, sim._contact
+        detection, contact = sim._dynamics.detection, sim._dynamics.contact
         arenas = [detection._arena, detection._reduction_arena, detection.buffer._arena]
         arenas += [contact._arena, contact._path_arena, contact._numbers_arena]
         assert all(arena.bytes for arena in arenas)
-    assert not any(arena.bytes or arena._lanes or arena._arrays for arena in arenas) and not sim._owned
+    assert not any(arena.bytes or arena._lanes or arena._arrays for arena in arenas) and not sim._dynamics._owned
     with pytest.raises(SimulationError, match="closed"):
         sim.detect_contacts()
     assert all(identical(c, other) for other in earlier)
@@ -132,8 +132,8 @@ def test_a_body_alone():
         before, fields = runtime.launches.copy(), set(sim.field_bytes)
         sim.step()
         assert not set(runtime.launches - before) & collision_kernels() and set(sim.field_bytes) == fields
-        assert sim._detection is None and sim._contact is None
+        assert sim._dynamics.detection is None and sim._dynamics.contact is None
         assert len(sim.detect_contacts()) == 0 and sim.intersecting_triangles() == []
         used = set(runtime.launches - before) & collision_kernels()
         assert not used & {"refit", "count_cells", "find_proximity", "find_in_fields", "find_analytic"}
-        assert sim._detection.broad is None
+        assert sim._dynamics.detection.broad is None

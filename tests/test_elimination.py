@@ -93,7 +93,7 @@ def pinched(sim) -> np.ndarray:
 def test_an_elimination_moves_its_nodes_alone():
     with beam() as sim:
         sim.set_state(positions=pinched(sim))
-        stepper = sim._stepper
+        stepper = sim._dynamics.stepper
         system, stage = stepper.solver, Stage(1.0, 0.01, 0.01, 1e-9)
         stepper.contact.begin(0.0, 0.01)
         stepper._begin(stepper.scheme, 0.0)
@@ -115,7 +115,7 @@ def test_an_elimination_moves_its_nodes_alone():
 def test_an_elimination_keeps_the_multipliers():
     with beam(ground=True) as sim:
         sim.set_state(positions=pinched(sim), velocities=np.tile([0.0, -0.5, 0.0], (len(sim.positions()), 1)))
-        stepper = sim._stepper
+        stepper = sim._dynamics.stepper
         system, stage = stepper.solver, Stage(1.0, 0.01, 0.01, 1e-9, contact_tolerance=1e-8)
         stepper.contact.begin(0.0, 0.01)
         stepper._begin(stepper.scheme, 0.0)

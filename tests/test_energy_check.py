@@ -25,7 +25,10 @@ class StandIn:
         self.scene, self.dt, self.stable_dt, self.time = ts.Scene(), 0.5, 1.0, 0.0
         self.scene.add_body(cube(), rubber(), name="cube")
         self.scene.gravity = (0, 0, 0)
-        self._driven, self._changes, self._contact = False, 0, SimpleNamespace(contact_offset=0.01)
+        self.is_driven, self.changes, self.contact = False, 0, SimpleNamespace(contact_offset=0.01)
+
+    def _host(self) -> "StandIn":
+        return self
 
     def energies(self) -> Energies:
         return Energies(100.0, 0.0, 0.0)
@@ -36,7 +39,7 @@ def told(sim: StandIn, *reports: StepReport | None) -> RunReport:
     check, run = EnergyCheck(sim), RunReport()
     for report in reports:
         if report is None:
-            sim._changes += 1
+            sim.changes += 1
             continue
         check.before_step()
         check.after_step(report)
@@ -88,9 +91,9 @@ def test_explicit_steps_exchange(integrator, quiet, loud):
 
 def test_what_is_fed():
     sim = StandIn()
-    sim._driven = True
+    sim.is_driven = True
     assert told(sim, step(500.0)).status == "ok"
-    sim._driven, sim.scene.allow_initial_overlap = False, True
+    sim.is_driven, sim.scene.allow_initial_overlap = False, True
     assert told(sim, step(500.0, max_penetration=0.1), step(505.0)).status == "ok"
     assert told(sim, step(500.0, max_penetration=0.1), step(600.0)).status == "degraded"
 

@@ -398,9 +398,9 @@ def test_a_number_that_is_spoilt(tmp_path, integrator, others):
         checkpoints.frame(sim, index)
         shown.append(sim.positions())
         if index == 2:
-            x, v = sim._simulation.state()
+            x, v = sim._dynamics.state.state()
             v[5] = np.nan
-            sim._simulation.set_state(x, v)
+            sim._dynamics.state.set_state(x, v)
 
     with ts.Simulator(scene, 0.001, integrator) as sim:
         result = sim.run(0.01, spoil, fps=None)

@@ -73,8 +73,8 @@ def put(sim, name: str, at, turn=None) -> None:
 
 
 def overlap(sim) -> tuple[set[str], float] | None:
-    sim._contact.search(0.0, sim.dt)
-    found = next(iter(find_overlaps(sim._contact.detection)), None)
+    sim._dynamics.contact.search(0.0, sim.dt)
+    found = next(iter(find_overlaps(sim._dynamics.contact.detection)), None)
     return None if found is None else ({found.name_a, found.name_b}, found.depth)
 
 

@@ -110,7 +110,7 @@ def test_in_the_middle_of_a_run(sims):
 def test_they_add_up_with_a_pull(sims):
     sim, _ = sims
     nodes = sim.scene.body("beam").forces[0].nodes
-    loads = sim._simulation.model.loads
+    loads = sim._dynamics.state.model.loads
     change(sim, FIRST)
     sim.reset()
     own = loads.to_numpy()

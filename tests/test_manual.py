@@ -20,7 +20,7 @@ import pytest
 import taisoft as ts
 from taisoft.cli import _parser
 from taisoft.contact import SOLVERS
-from taisoft.dynamics import INTEGRATORS
+from taisoft.dynamics.schemes import INTEGRATORS
 from taisoft.fem.laws import LAWS
 from taisoft.settings import IMPLICIT_CONTACT, Settings
 

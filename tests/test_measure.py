@@ -16,7 +16,7 @@ from scenes import COR, SNH, SVK, built, cube, mixed_scene, rubber
 
 import taisoft as ts
 from taisoft.backend import runtime
-from taisoft.dynamics.substeps import LAUNCH_SECONDS, MAX_BATCH, largest_batch
+from taisoft.dynamics.explicit_stepper import LAUNCH_SECONDS, MAX_BATCH, largest_batch
 from taisoft.fem.elasticity import NO_TET, measure
 from taisoft.fem.laws import LAWS
 from taisoft.fem.scalars import FIRST_SOFTENED, GRAVITY

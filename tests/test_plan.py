@@ -10,7 +10,7 @@ from scenes import cube, driven_scene, mixed_scene, rubber
 
 import taisoft as ts
 from taisoft.backend import runtime
-from taisoft.dynamics import EXPLICIT
+from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.scene.plan import make_plan
 
 LOADS, DAMPING, LED = {"loads"}, {"damping", "node_body"}, {"prescribed_nodes", "prescribed_axes", "targets", "position_before"}

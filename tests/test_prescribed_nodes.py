@@ -10,7 +10,7 @@ import pytest
 from scenes import cube, rubber
 
 import taisoft as ts
-from taisoft.dynamics import IMPLICIT, scheme_of
+from taisoft.dynamics.schemes import IMPLICIT, SCHEMES
 
 SPEED = np.array([2.0, 0.0, -1.0])  # [m/s]
 
@@ -46,7 +46,7 @@ def test_rigid_flight(sim):
     sim.paths["now"], sim.dt = lambda t: SPEED * t, 1e-4
     sim.set_gravity((0, 0, 0))
     for method in ["velocity_verlet"] if sim.settings.explicit else IMPLICIT:
-        sim._stepper.scheme = None if sim.settings.explicit else scheme_of(method)
+        sim._dynamics.stepper.scheme = None if sim.settings.explicit else SCHEMES[method]
         sim.reset()
         for _ in range(3):
             sim.step()
@@ -65,7 +65,7 @@ def test_second_order_with_a_led_end(sim, method):
         pytest.skip("Verlet's order is tested by its oracle")
     sim.paths["now"] = lambda t: SPEED * t + (0.1 * np.sin(6 * t) ** 4, 0.02 * t * t, 0.0)
     sim.set_gravity((0, -2, 0))
-    sim._stepper.scheme, ends = scheme_of(method), []
+    sim._dynamics.stepper.scheme, ends = SCHEMES[method], []
     for steps in (80, 160, 320):
         sim.reset()
         sim.dt = 0.4 / steps

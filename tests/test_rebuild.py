@@ -74,7 +74,7 @@ def test_led_nodes_that_were_let_go_stay_free(tmp_path):
 
 def test_what_cannot_be_met_changes_nothing():
     with ts.Simulator(cubes(), dt=0.01) as sim:
-        before, simulation = told(sim), sim._simulation
+        before, simulation = told(sim), sim._dynamics.state
         for changes, why in (
             ({"integrator": "implicit_midpoint"}, "implicit_midpoint does not support contacts"),
             ({"integrator": "symplectic_euler"}, "above the estimated stability limit"),
@@ -85,7 +85,7 @@ def test_what_cannot_be_met_changes_nothing():
             with pytest.raises(SimulationError, match=why):
                 sim.rebuild(**changes)
             assert_same(told(sim), before)
-        assert sim._simulation is simulation and sim.settings.integrator == "implicit_euler"
+        assert sim._dynamics.state is simulation and sim.settings.integrator == "implicit_euler"
         assert not sim.scene.allow_initial_overlap
     assert runtime.open_kind() is None
 

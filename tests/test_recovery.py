@@ -115,4 +115,4 @@ def test_where_a_try_in_parts_fails_the_step_is_told_as_not_converged(sim, monke
     failing_at(monkeypatch, 3, ts.SimulationError("spoilt"))
     report = sim.step()
     assert not report.converged and report.substeps == 1 and np.abs(sim.positions() - wanted).max() < 1e-12  # [m]
-    assert any(sim._simulation.dirichlet.released())
+    assert any(sim._dynamics.state.dirichlet.released())

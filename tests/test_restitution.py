@@ -11,9 +11,10 @@ Energies are told over that at the start, of which the ground is the zero.
 import numpy as np
 import pytest
 from rotations import rotation
+from scenes import rows_of
 
 import taisoft as ts
-from taisoft.dynamics import scheme_of
+from taisoft.dynamics.schemes import SCHEMES
 
 SIDE, HEIGHT, DT, G = 0.1, 0.1, 5e-3, 9.81  # [m], [m], [s], [m/s^2]
 CREATED = 0.005  # of the energy at the start, at most
@@ -49,7 +50,7 @@ def shared_sim():
 @pytest.fixture
 def sim(shared_sim, monkeypatch):
     """The simulator at its start, its steps those of implicit Euler; nothing holds on or bounces."""
-    monkeypatch.setattr(shared_sim._stepper, "scheme", scheme_of("implicit_euler"))
+    monkeypatch.setattr(shared_sim._dynamics.stepper, "scheme", SCHEMES["implicit_euler"])
     restart(shared_sim)
     return shared_sim
 
@@ -74,7 +75,7 @@ def place(sim, height: float, v=(0, 0, 0), turned: tuple = (0, 0, 0), spin: tupl
 
 def go(sim, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """Energies [J] of the cube and its neighbour, and the height of the cube's centre [m], at the start and after each step."""
-    mass = sim._simulation.model.mass.to_numpy()[sim._slice("cube"), None]
+    mass = sim._dynamics.state.model.mass.to_numpy()[rows_of(sim, "cube"), None]
     energies, heights = [], []
     end = sim.step_count + round(seconds / sim.dt)
     while True:
@@ -110,7 +111,7 @@ def test_single_precision():
     "scheme, friction", [("implicit_euler", 0.0), ("implicit_euler", 0.5), ("linearly_implicit_euler", 0.5), ("bdf2", 0.5)]
 )
 def test_returns_to_its_height(sim, monkeypatch, scheme, friction):
-    monkeypatch.setattr(sim._stepper, "scheme", scheme_of(scheme))
+    monkeypatch.setattr(sim._dynamics.stepper, "scheme", SCHEMES[scheme])
     sim.set_contact("cube", "ground", friction=friction, restitution=1.0)
     energies, heights = go(sim, 0.7)
     assert created(energies, G * HEIGHT) < CREATED
@@ -141,7 +142,7 @@ def test_height_is_the_square_of_restitution(sim, restitution, dt, height):
 def test_comes_to_rest(sim):
     sim.set_contact("cube", "ground", friction=0.5, restitution=0.5)
     go(sim, 1.0)
-    assert np.abs(sim.velocities("cube")).max() < 1e-4 and not sim._contact.found.impact_impulse.to_numpy().any()
+    assert np.abs(sim.velocities("cube")).max() < 1e-4 and not sim._dynamics.contact.found.impact_impulse.to_numpy().any()
     assert sim.contact_force("cube")[1] == pytest.approx(G, rel=1e-3)
 
 
@@ -177,9 +178,9 @@ def test_two_that_meet(sim, restitution):
     x = sim.positions("cube")
     sim.set_state(positions=x - x.mean(axis=0) + (0, 1.0, 0), velocities=np.tile([1.5, 0.0, 0.0], (len(x), 1)), body="cube")
     energies, _ = go(sim, 0.15)
-    mass = sim._simulation.model.mass.to_numpy()[:, None]
+    mass = sim._dynamics.state.model.mass.to_numpy()[:, None]
     momentum = (mass * sim.velocities()).sum(axis=0)
-    (a, b) = ((mass[s] * sim.velocities()[s]).sum(axis=0) for s in (sim._slice("cube"), sim._slice("other")))
+    (a, b) = ((mass[s] * sim.velocities()[s]).sum(axis=0) for s in (rows_of(sim, "cube"), rows_of(sim, "other")))
     assert np.abs(momentum - (1.5, 0, 0)).max() < 1e-6 and created(energies, energies[0]) < 1e-6
     assert (b - a)[0] == pytest.approx(1.5 * restitution, rel=0.1)  # off centre: some of it turns them
 

@@ -27,7 +27,10 @@ class StandIn:
         self.settings, self.touches = SimpleNamespace(explicit=explicit, integrator="symplectic_euler"), False
         self.dt, self.step_count, self.time, self.compile_seconds = dt, 0, 0.0, 0.0
         self.events, self.largest_batch = events or {}, largest_batch
-        self.scene, self.stable_dt, self._driven, self._changes = ts.Scene(), 1.0, False, 0
+        self.scene, self.stable_dt, self.is_driven, self.changes = ts.Scene(), 1.0, False, 0
+
+    def _host(self) -> "StandIn":
+        return self
 
     def energies(self) -> Energies:
         return Energies(0.0, 0.0, 0.0)
@@ -291,7 +294,9 @@ def test_real_ctrl_c(block, monkeypatch):
     block.dt = 0.004
     block.advance(1)
     before = block.positions(), block.velocities()
-    worker, name = (block._stepper, "_launch") if block.settings.explicit else (block._stepper.solver, "form_matrix")
+    worker, name = (
+        (block._dynamics.stepper, "_launch") if block.settings.explicit else (block._dynamics.stepper.solver, "form_matrix")
+    )
     working = getattr(worker, name)
 
     def interrupted(*arguments):

@@ -88,4 +88,4 @@ def test_solvers_and_tolerances_that_fit_are_taken(integrator, solver):
     touching.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
     touching.allow_initial_overlap = True  # without a search for it
     with ts.Simulator(touching, **asked) as sim:
-        assert sim._stepper.contact_tolerance == 1e-3 and getattr(sim._stepper, "method", solver) == solver
+        assert sim._dynamics.stepper.contact_tolerance == 1e-3 and getattr(sim._dynamics.stepper, "method", solver) == solver

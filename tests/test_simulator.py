@@ -121,7 +121,7 @@ def test_set_state(sim, beam):
     sim.set_state(positions=x, body="flyer")
     assert np.array_equal(sim.positions("flyer"), x) and np.array_equal(sim.positions("beam"), before[:beam])
     sim.set_state(velocities=v)
-    fixed = sim._simulation.dirichlet.constrained()
+    fixed = sim._dynamics.state.dirichlet.constrained()
     assert fixed.sum() == 3 * (sim.scene.body("beam").rest_positions[:, 0] < -0.49).sum()
     assert np.array_equal(sim.velocities(), np.where(fixed, 0.0, v))
     oracle = Oracle(sim.scene)

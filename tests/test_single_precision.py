@@ -30,7 +30,7 @@ def test_nothing_to_do():
     flight = {"position": (300.0, -200.0, 100.0), "velocity": (20.0, 3.0, -7.0)}
     scene.add_body(cube(), rubber(young=1e7), **flight, **element(2))
     with ts.Simulator(scene, integrator="implicit_euler", precision="f32") as sim:
-        assert sim._stepper.tolerance == 1e-4 and sim._stepper.linear_tolerance is None
+        assert sim._dynamics.stepper.tolerance == 1e-4 and sim._dynamics.stepper.linear_tolerance is None
         start = sim.positions()
         for _ in range(20):
             report = sim.step()

@@ -18,6 +18,7 @@ from scenes import COR, SNH, SVK, cube, element, rubber
 
 import taisoft as ts
 from taisoft.backend import runtime
+from taisoft.dynamics.results import StepResult
 from taisoft.stability import highest_frequency, hooke_differential, hooke_stiffness, stable_dt
 
 KINDS = ((1, None), (2, 2), (2, 4))  # order, degree of the quadrature
@@ -126,7 +127,7 @@ def test_a_step_above_the_limit():
         with pytest.raises(ts.SimulationError, match="is above the estimated stability limit"):
             sim.set_material("block", young=1e7)
         assert scene.bodies[0].material.young == 1e5 and sim.stable_dt == limit
-        assert sim._simulation.model.law_constants[0, 0] == pytest.approx(4 / 3 * scene.bodies[0].material.mu)
+        assert sim._dynamics.state.model.law_constants[0, 0] == pytest.approx(4 / 3 * scene.bodies[0].material.mu)
         sim.set_material("block", density=2000.0)
         assert sim.stable_dt == pytest.approx(np.sqrt(2) * limit, rel=1e-3)
 
@@ -205,4 +206,4 @@ def test_a_motion_that_diverges_is_stopped_while_it_is_finite(plane):
         result = sim.run(400 * sim.dt, fps=None)
         assert result.status == "failed" and result.steps < 200
         assert re.search(r"^step \d+: a tet is inverted by .* times its volume: the motion has diverged", result.problems[0])
-        assert np.abs(sim.positions()).max() < 1e6 and sim._report().min_volume_ratio < 0.0
+        assert np.abs(sim.positions()).max() < 1e6 and sim._dynamics._report(StepResult()).min_volume_ratio < 0.0

@@ -18,16 +18,17 @@ import pytest
 import scipy.sparse as sp
 from following import DT, follow, simulator
 from oracle import Oracle
-from scenes import driven_scene, mixed_scene
+from scenes import driven_scene, mixed_scene, rows_of
 from scipy.linalg import block_diag
 
 import taisoft as ts
-from taisoft import dynamics
-from taisoft.dynamics import IMPLICIT, scheme_of
 from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.schemes import IMPLICIT, INTEGRATORS, SCHEMES
+from taisoft.dynamics.stepper import make_stepper
 from taisoft.fem import reference
 from taisoft.fem.model import damping_table
 from taisoft.linear.block_csr import to_scipy
+from taisoft.settings import Settings
 
 DAMPED = {"mass_damping": 3.0, "stiffness_damping": 0.004}
 EXPLICIT = ("symplectic_euler", "velocity_verlet")
@@ -97,7 +98,7 @@ def test_batches_end_where_nodes_are_released(explicit):
 
 @pytest.mark.parametrize("method", IMPLICIT)
 def test_implicit_steps_are_the_oracles(implicit, method, monkeypatch):
-    monkeypatch.setattr(implicit._stepper, "scheme", scheme_of(method))
+    monkeypatch.setattr(implicit._dynamics.stepper, "scheme", SCHEMES[method])
     oracle = follow(implicit, method, 9, 1e-8)
     assert len(oracle.prescribed) == 1  # two of the three led nodes have been released
 
@@ -133,7 +134,7 @@ def test_parallel_kernels(integrator, monkeypatch):
     monkeypatch.setattr("taisoft.fem.model.PARALLEL_THREADS", 0)
     settings = {"newton_tolerance": 1e-13, "linear_tolerance": 1e-13} if integrator == "implicit_euler" else {}
     with simulator(driven_scene(mass_damping=3.0, order=2), integrator, **settings) as sim:
-        assert not sim._simulation.model.serial
+        assert not sim._dynamics.state.model.serial
         follow(sim, integrator, 9, 1e-8 if settings else 1e-10)
         first = sim.positions(), sim.velocities(), sim.reactions()
         for _ in range(3):
@@ -147,7 +148,7 @@ def test_parallel_kernels(integrator, monkeypatch):
         assert all(np.array_equal(a, b) for a, b in zip(first, (sim.positions(), sim.velocities(), sim.reactions())))
         if sim.settings.explicit:  # a failing sub-step is found, and the last good one is where it ends
             speeds = np.zeros_like(sim.positions())  # of the beam alone, and along itself: nothing comes near the flyer
-            speeds[sim._slice("beam"), 0] = 1e33 * np.sin(sim.positions("beam")[:, 0])
+            speeds[rows_of(sim, "beam"), 0] = 1e33 * np.sin(sim.positions("beam")[:, 0])
             sim.set_state(velocities=speeds)
             with pytest.raises(ts.SimulationError, match=r"step 1\d: body 'beam', node"):
                 sim.advance(5)
@@ -160,10 +161,10 @@ def test_parallel_kernels(integrator, monkeypatch):
 
 def test_the_residual_is_a_gradient(implicit, monkeypatch):
     """Of inertia, energies and both kinds of damping; inertia and damping are NumPy's."""
-    monkeypatch.setattr(implicit._stepper, "scheme", scheme_of("implicit_euler"))
+    monkeypatch.setattr(implicit._dynamics.stepper, "scheme", SCHEMES["implicit_euler"])
     implicit.reset()
     implicit.step()
-    model, solver, beta = implicit._simulation.model, implicit._stepper.solver, implicit._stepper._beta
+    model, solver, beta = implicit._dynamics.state.model, implicit._dynamics.stepper.solver, implicit._dynamics.stepper._beta
     bodies, v_hat = implicit.scene.bodies, solver.work.v_hat.to_numpy()
     mass = [reference.consistent_mass(b) if model.consistent else np.diag(reference.lumped_mass(b)) for b in bodies]
     mass = block_diag(*[np.asarray(m.todense()) if sp.issparse(m) else m for m in mass])
@@ -226,7 +227,7 @@ def test_momentum_of_explicit_steps(explicit):
 
 
 def test_momentum_of_implicit_steps(implicit, monkeypatch):
-    monkeypatch.setattr(implicit._stepper, "scheme", scheme_of("implicit_euler"))
+    monkeypatch.setattr(implicit._dynamics.stepper, "scheme", SCHEMES["implicit_euler"])
     check_momentum(implicit, 1)
 
 
@@ -287,21 +288,26 @@ def test_a_free_body_in_explicit_steps(explicit):
 
 @pytest.mark.parametrize("method", IMPLICIT)
 def test_a_free_body_in_implicit_steps(implicit, method, monkeypatch):
-    monkeypatch.setattr(implicit._stepper, "scheme", scheme_of(method))
+    monkeypatch.setattr(implicit._dynamics.stepper, "scheme", SCHEMES[method])
     check_free_fall(implicit, method)
     check_momentum_of_a_free_body(implicit, method)
 
 
 def test_names_mean_what_they_should(monkeypatch):
-    monkeypatch.setattr(dynamics, "ExplicitStepper", lambda simulation, verlet: verlet)
-    for name, built in (
-        ("contact_substeps.ContactExplicitStepper", lambda simulation, verlet, contact, method: (verlet, contact, method)),
-        ("implicit.ImplicitStepper", lambda simulation, scheme, contact: (scheme, contact)),
+    for module, name in (
+        ("explicit_stepper", "ExplicitStepper"),
+        ("explicit_contact_stepper", "ContactExplicitStepper"),
+        ("implicit", "ImplicitStepper"),
     ):
-        monkeypatch.setattr(f"taisoft.dynamics.{name}", built)
-    assert [dynamics.make_stepper(None, name, NoContacts(), "auto") for name in EXPLICIT] == [False, True]
-    contact = SimpleNamespace(idle=False)
-    touching = [dynamics.make_stepper(None, name, contact, "jacobi") for name in EXPLICIT]
-    assert touching == [(False, contact, "jacobi"), (True, contact, "jacobi")]
+        monkeypatch.setattr(f"taisoft.dynamics.{module}.{name}", lambda *arguments, name=name: (name, *arguments))
+    idle, contact = NoContacts(), SimpleNamespace(idle=False)
+    for integrator in INTEGRATORS:
+        settings = Settings(integrator=integrator)
+        names = ("ImplicitStepper",) * 2 if integrator in IMPLICIT else ("ExplicitStepper", "ContactExplicitStepper")
+        assert make_stepper(None, settings, contact) == (names[1], None, settings, contact)
+        assert make_stepper(None, settings, idle)[0] == names[0]
     assert set(IMPLICIT) == {"linearly_implicit_euler", "implicit_euler", "bdf2", "implicit_midpoint"}
-    assert all(dynamics.make_stepper(None, name, "contact", "auto") == (scheme_of(name), "contact") for name in IMPLICIT)
+
+
+def test_the_explicit_stepper_is_that_of_its_integrator(explicit):
+    assert explicit._dynamics.stepper.work.verlet == (explicit.settings.integrator == "velocity_verlet")

@@ -11,7 +11,7 @@
 import numpy as np
 import pytest
 
-from taisoft.dynamics.stage_result import StageResult
+from taisoft.dynamics.results import StageResult
 from taisoft.dynamics.substepping import MAX_SEARCHES, MAX_SUBSTEPS, MAX_UNDONE, Substepping
 from taisoft.errors import SimulationError
 

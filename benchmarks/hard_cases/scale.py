@@ -85,9 +85,9 @@ def flyer(session: Session, spoilt: bool) -> dict[str, float]:
 
 def spoil(sim: ts.Simulator, body: str) -> None:
     """Make a velocity of a body NaN, behind the simulator's back: from outside none can be set."""
-    x, v = sim._simulation.state()
-    v[sim._slice(body).start] = np.nan
-    sim._simulation.set_state(x, v)
+    x, v = sim._dynamics.state.state()
+    v[sim._dynamics.state.layout.nodes([b.name for b in sim.scene.bodies].index(body)).start] = np.nan
+    sim._dynamics.state.set_state(x, v)
 
 
 def bin_scene(**capacities) -> ts.Scene:

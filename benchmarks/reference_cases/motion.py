@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 import taisoft as ts
-from taisoft.dynamics import EXPLICIT, INTEGRATORS
+from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.errors import SimulationError
 from taisoft.fem.mass import lumped_masses
 

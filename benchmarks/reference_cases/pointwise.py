@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 import taisoft as ts
-from taisoft.dynamics import EXPLICIT, INTEGRATORS
+from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.fem.mass import lumped_masses
 
 from .record import GRAVITY, LAWS, Case, deformation_gradients, face, label, material, near, scene, small, worst

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 import taisoft as ts
-from taisoft.dynamics import EXPLICIT, INTEGRATORS
+from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 
 from .record import SAME_MESH, Case, face, label, material, near, order, scene, worst
 

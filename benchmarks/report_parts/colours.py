@@ -69,7 +69,7 @@ def measure(extent: Extent) -> Part:
             for _ in range(SETTLE):
                 sim.step()
             name = SCENE if not refine else f"{SCENE}, refined"
-            made, colours = colour_all(name, sim._contact.problem, extent.of(SEEDS, QUICK_SEEDS))
+            made, colours = colour_all(name, sim._dynamics.contact.problem, extent.of(SEEDS, QUICK_SEEDS))
             found += made
             times |= {f"{name}, {c.way}": summarise(c.seconds) for c in made}
             if not refine:

@@ -65,7 +65,7 @@ class Shares:
 @contextmanager
 def watched(watch: Stopwatch, sim: ts.Simulator) -> Iterator[None]:
     """The stopwatch takes the parts of the simulator's steps meanwhile, those of a search apart."""
-    detection = sim._contact.detection
+    detection = sim._dynamics.contact.detection
     with ExitStack() as stack:
         if sim.settings.explicit:
             stack.enter_context(watch.on(explicit_places(sim)))

@@ -50,10 +50,10 @@ def _exit_with_parent() -> None:
 
 
 def _answer(request: dict) -> dict:
-    from taisoft.checkpoint import scene_digest
     from taisoft.cli.scene_file import find_scene, load_scene
     from taisoft.cli.settings import check_scene_solver
     from taisoft.errors import TaisoftError
+    from taisoft.scene.fingerprint import scene_digest
     from taisoft.study.grid import mesh_name
     from taisoft.study.measure import measure
     from taisoft.study.plan import make_plan

@@ -14,7 +14,7 @@ from taisoft import compile_message
 from taisoft.backend.runtime import n_compiled
 from taisoft.cli import warm_scenes
 from taisoft.cli.warm_scenes import Structure
-from taisoft.dynamics import EXPLICIT
+from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import SimulationError
 
 STEPS = {True: (1e-5, 200), False: (1e-2, 10)}  # explicit integrator: (dt [s], number of steps)
@@ -45,7 +45,7 @@ def simulate(structure: Structure, precision: str) -> None:
             sim.advance(count - sim.step_count)
         implicit = structure.integrator not in EXPLICIT
         if implicit:
-            sim._stepper.compile_hard_steps()
+            sim._dynamics.stepper.compile_hard_steps()
         if not sim.touches and implicit:
             sim.dt = LONG_DT  # so long that stiffness dominates inertia
             sim.set_state(SQUEEZE * sim.positions())  # needs projected stiffness and a line search

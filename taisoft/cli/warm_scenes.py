@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from taisoft.dynamics import EXPLICIT
+from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.mesh.shapes import box_mesh, sheet_mesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene.key_frames import KeyFrames

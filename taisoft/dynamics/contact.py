@@ -8,9 +8,8 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.fields import FieldArena
-from taisoft.backend.transfer import download, upload
+from taisoft.backend.transfer import download
 from taisoft.collision.contacts import Contacts
-from taisoft.collision.crossings import CROSSED, CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.collision.pipeline import Detection
 from taisoft.contact.assemble import (
     SELF_CONTACT,
@@ -22,25 +21,15 @@ from taisoft.contact.assemble import (
     scale_impulses,
     upload_pair_numbers,
 )
-from taisoft.contact.problem import NODES, build_node_problem, index_nodes
-from taisoft.contact.restitution import find_rebounds
-from taisoft.dynamics.ccd_limits import (
-    CLOSING_RATIO,
-    DEPTH,
-    MAX_CLOSING,
-    RELATIVE_PENETRATION,
-    SPEED,
-    WHICH,
-    find_displacement,
-    measure_closing,
-)
+from taisoft.contact.problem import build_node_problem, index_nodes
+from taisoft.dynamics.ccd_limits import CLOSING_RATIO, DEPTH, RELATIVE_PENETRATION, find_displacement
+from taisoft.dynamics.contact_measures import DEEP_PENETRATION, NOTICEABLE_PENETRATION, ContactMeasures, Crossing
+from taisoft.dynamics.contact_record import read_rows, record_contacts, sum_impulses, write_rows
+from taisoft.dynamics.rebounds import Rebounds
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 
 CONTACT_OFFSET = 2e-3  # of the finest body's mean surface edge: gap to keep, so that surfaces moving in curves do not cross
-DEEP_PENETRATION = 0.02  # of the finer side's mean surface edge: penetration reported as a problem
-DEEP_CROSSING = CROSSED  # of the same: depth of crossing triangles above which an implicit step is repeated in smaller substeps
-NOTICEABLE_PENETRATION = 1e-3  # of the same: penetration above which the path of an implicit substep is searched
 PENETRATION_CORRECTION = {True: 0.05, False: 0.2}  # fraction of a penetration that an explicit (True) or implicit step corrects
 OFFSET_CORRECTION = {True: 0.005, False: 0.02}  # fraction of a missing contact offset, likewise
 MAX_OPENING_SPEED = 0.01  # of the slowest bar wave speed, sqrt(E / rho): maximum opening speed of both; a strain as large
@@ -57,6 +46,7 @@ class ContactStep:
         self.simulation = simulation
         m, scene = simulation.model, simulation.scene
         self.detection = Detection(scene, m, simulation.layout, simulation.runtime, self_collision)
+        self.measures = ContactMeasures(self.detection)
         d = self.detection
         self.contact_offset = CONTACT_OFFSET * float(d.edges[: len(scene.bodies)].min())
         if d.margin > 0.0:
@@ -72,18 +62,13 @@ class ContactStep:
         self._path = self._path_arena.vectors("path", ti.f64, m.n_nodes)
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
-        self._has_restitution = scene.bounces
-        self.flight = np.zeros(len(scene.colliders))  # sum of dt^2 over the steps since each collider's last contact [s^2]
-        self._flight_gravity = scene.gravity.copy()
-        self._closing = np.zeros(5)  # result of `measure_closing`
-        self._measured_for: float | None = None  # dt [s] that `_closing` was computed for; None: outdated
+        self.rebounds = Rebounds(simulation)
         self._searched: tuple[float, float] | None = None  # time and dt of the valid search
         self._searched_dt = 0.0  # dt of the last search, valid or not
         self._measured_end: tuple[float, float] | None = None  # time and dt of the measured end, until the next substep begins
         self._depth = 0.0  # deepest penetration there [m]
         self.crossing: float | None = None  # depth of crossing triangles over the finer side's edge; None: not measured
-        self.crossings = 0  # pairs of crossing triangles at the end of the last step
-        self.inside: list[tuple[str, str, float]] = []  # colliders inside each other then, and depth [m]
+        self.last_crossing = Crossing()  # at the end of the last step
         self._explicit = explicit
         self._last_time = 0.0
         self.penetration = 0.0  # at the end of the last step [m],
@@ -102,6 +87,11 @@ class ContactStep:
         self._arena, self._last_time, self._indexed = arena, 0.0, False
 
     @property
+    def flight(self) -> np.ndarray:
+        """Flight times of the colliders [s^2], see `Rebounds`."""
+        return self.rebounds.flight
+
+    @property
     def problem(self):
         """The `ContactProblem` of the last step begun."""
         return self.found.problem
@@ -116,32 +106,14 @@ class ContactStep:
         self._searched = self._measured_end = None
         self.problem.count[0] = 0
         self._last_time = self.penetration = self.relative_penetration = self._step_dt = 0.0
-        self._impulse_sum, self.crossing, self.crossings, self.inside = None, None, 0, []
+        self._impulse_sum, self.crossing, self.last_crossing = None, None, Crossing()
         self.flight[:] = 0.0
-
-    def _contact_fields(self) -> dict:
-        """Fields of the last step's contacts, for the warm start of the next step and for `contacts`."""
-        p, f = self.problem, self.found
-        return {
-            "normal": p.normal,
-            "tangent": p.tangent,
-            "r": p.r,
-            "node": p.node,
-            "weight": p.weight,
-            "arity": p.arity,
-            "point": f.point,
-            "gap": f.gap,
-            "body": f.body,
-            "feature": f.feature,
-            "struck": f.impact_impulse,
-        }
 
     def snapshot(self) -> dict:
         """Return the last step's contacts and impulses, and the capacity: a step that exceeds it starts without impulses.
 
         The search is not included: from the same state the next one finds the same contacts in the same order.
         """
-        rows = self._contact_fields()
         return {
             "capacity": self.problem.capacity,
             "last_time": self._last_time,
@@ -153,27 +125,20 @@ class ContactStep:
             "met": self.had_impact,
             "dropped": self.dropped,
             "flight": self.flight.copy(),
-            "rows": dict(zip(rows, download(list(rows.values()), self.n_contacts))),
+            "rows": read_rows(self.found),
         }
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`."""
         if kept["capacity"] != self.problem.capacity:
             self._allocate(int(kept["capacity"]))
-        rows, n = kept["rows"], len(kept["rows"]["gap"])
-        whole = []
-        for name, field in self._contact_fields().items():
-            data = np.zeros((self.problem.capacity, *rows[name].shape[1:]), dtype=rows[name].dtype)
-            data[:n] = rows[name]
-            whole.append((field, data))
-        upload(whole)
-        self.problem.count[0] = n
+        write_rows(self.found, kept["rows"])
         self._last_time, self._impulse_fraction, self._step_dt = (float(kept[name]) for name in ("last_time", "share", "span"))
         self._impulse_sum, self.penetration = kept["sum"], float(kept["penetration"])
         self.relative_penetration = float(kept["relative_penetration"])
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
-        self.flight = np.array(kept["flight"], dtype=float)
-        self.crossing, self.crossings, self.inside = None, 0, []
+        self.flight[:] = kept["flight"]
+        self.crossing, self.last_crossing = None, Crossing()
         self._searched = self._measured_end = None
         self._indexed = True  # so that the next step rebuilds the node index, even without contacts
 
@@ -196,7 +161,7 @@ class ContactStep:
 
     def numbers_changed(self) -> None:
         """Upload changed friction or restitution."""
-        self._has_restitution = self.simulation.scene.bounces
+        self.rebounds.numbers_changed()
         if not upload_pair_numbers(self.numbers, self.simulation.scene):
             arena = FieldArena()
             self.numbers = build_pair_numbers(arena, self.simulation.scene)
@@ -219,7 +184,7 @@ class ContactStep:
 
     def _find(self, *arguments, **named) -> None:
         """Call `Detection.find`."""
-        self._measured_for = None
+        self.measures.forget()
         self.detection.find(*arguments, **named)
 
     def begin(self, time: float, dt: float) -> int:
@@ -252,29 +217,15 @@ class ContactStep:
 
     def detect_rebounds(self, dt: float) -> bool:
         """Return whether surfaces rebound in the implicit step of dt that has begun; if so, set `had_impact`."""
-        scene = self.simulation.scene
-        if not self._has_restitution or self.n_contacts == 0:
+        if self.n_contacts == 0:
             return False
-        if (self._flight_gravity != scene.gravity).any():  # energy lost under another gravity is unknown
-            self._flight_gravity = scene.gravity.copy()
-            self.flight[:] = 0.0
-        found = find_rebounds(self.found, self.simulation.model.gravity, self.flight, dt, self.contact_offset) > 0
+        found = self.rebounds.detect(self.found, dt, self.contact_offset)
         self.had_impact = self.had_impact or found
         return found
 
     def count_flight(self, dt: float, dissipative: bool) -> None:
-        """Update `flight` after a substep of dt. dissipative: whether free flight loses energy, as with implicit Euler."""
-        if not self._has_restitution:
-            return
-        scene, first = self.simulation.scene, self.simulation.layout.node_start[:-1]
-        added, f, p = dt**2 if dissipative else 0.0, self.found, self.problem
-        self.flight += np.where(self.flight > 0.0, added, dt**2)
-        r, struck, body = download([p.r, f.impact_impulse, f.body], self.n_contacts)
-        self.flight[body[(r != 0.0).any(axis=1)]] = 0.0
-        self.flight[body[(struck != 0.0).any(axis=1)]] = dt**2
-        constrained = np.logical_or.reduceat(self.simulation.dirichlet.constrained().any(axis=1), first)
-        self.flight[: len(scene.bodies)][constrained] = 0.0
-        self.flight[len(scene.bodies) :] = 0.0
+        """Update the flight times after a substep of dt, see `Rebounds.count_flight`."""
+        self.rebounds.count_flight(self.found, self.n_contacts, dt, dissipative)
 
     def start_step(self, dt: float) -> None:
         """Begin a step of dt."""
@@ -287,20 +238,13 @@ class ContactStep:
     def end_substep(self) -> None:
         """Add the impulses of a substep."""
         if self._substep_fraction < 1.0:
-            self._impulse_sum = self._impulses() + (0.0 if self._impulse_sum is None else self._impulse_sum)
+            impulses = sum_impulses(self.contacts(), self.simulation.scene)
+            self._impulse_sum = impulses + (0.0 if self._impulse_sum is None else self._impulse_sum)
 
     def force(self, collider: int) -> np.ndarray:
         """Return the mean contact force (3,) on a collider over the last step [N]."""
-        total = self._impulses() if self._impulse_sum is None else self._impulse_sum
+        total = sum_impulses(self.contacts(), self.simulation.scene) if self._impulse_sum is None else self._impulse_sum
         return total[collider] / self._step_dt if self._step_dt > 0.0 else np.zeros(3)
-
-    def _impulses(self) -> np.ndarray:
-        """Return the impulse on each collider from the current contacts, (n_colliders, 3) [N s]."""
-        c, total = self.contacts(), np.zeros((len(self.simulation.scene.colliders), 3))
-        place = {one.name: k for k, one in enumerate(self.simulation.scene.colliders)}
-        for names, sign in ((c.body_a, 1.0), (c.body_b, -1.0)):
-            np.add.at(total, [place[name] for name in names], sign * c.impulse)
-        return total
 
     def penetrates_deeper(self, time: float, dt: float, before: float) -> bool:
         """Return whether a substep of dt that ends at a time leaves a new or deeper penetration.
@@ -326,7 +270,7 @@ class ContactStep:
             if not self._has_paths:
                 raise
             self._find(time, 0.0)  # a path ends here; the next step reports it
-        closing = self._measure_closing(dt)
+        closing = self.measures.closing(dt)
         depth, self.relative_penetration = float(closing[DEPTH]), float(closing[RELATIVE_PENETRATION])
         if not self._explicit:
             crossing = self.measure_crossings()
@@ -341,25 +285,12 @@ class ContactStep:
         """Whether the last step ended with a deep penetration."""
         return self.relative_penetration > DEEP_PENETRATION
 
-    def deep_from(self, a: int, b: int) -> float:
-        """Return the penetration [m] of two colliders above which a step counts as deep."""
-        return DEEP_PENETRATION * float(min(self.detection.edges[a], self.detection.edges[b]))
-
     def measure_crossings(self) -> tuple[float, float]:
         """Return the depth of crossing triangles or contained colliders at the last search [m], and over the finer side's mean
-        surface edge. Set `crossing`, the number of `crossings`, and `inside`."""
-        closing, edges = self.detection.crossings(), self.detection.edges
-        depth, crossing, inside = float(closing[CROSSING_DEPTH]), float(closing[DEPTH_OVER_EDGE]), {}
-        for one in self.detection.contained():
-            pair = min(one.a, one.b), max(one.a, one.b)
-            inside[pair] = max(inside.get(pair, 0.0), one.depth)
-            # a piece thinner than an edge counts as deep if its middle is half as deep in the other as in itself
-            scale = min(edges[one.a], edges[one.b], 0.5 * one.room / DEEP_PENETRATION if one.room > 0.0 else np.inf)
-            depth, crossing = max(depth, one.depth), max(crossing, one.depth / scale)
-        names = [c.name for c in self.detection.scene.colliders]
-        self.inside = [(names[a], names[b], deep) for (a, b), deep in inside.items()]
-        self.crossing, self.crossings = crossing, int(closing[CROSSINGS])
-        return depth, crossing
+        surface edge. Set `crossing` and `last_crossing`."""
+        self.last_crossing = found = self.measures.crossing()
+        self.crossing = found.relative
+        return found.depth, found.relative
 
     def left_searched_path(self, x_start) -> bool:
         """Return whether the surface left the searched path since x_start; keep its displacement for `search_along_path`."""
@@ -381,12 +312,12 @@ class ContactStep:
         """Return the deepest penetration before a step of dt over the finer side's mean surface edge, and the largest closing
         ratio in it."""
         self.search(time, dt)
-        closing = self._measure_closing(dt)
+        closing = self.measures.closing(dt)
         return float(closing[RELATIVE_PENETRATION]), float(closing[CLOSING_RATIO])
 
     def closing_ratio_along_path(self) -> float:
         """Return the largest closing ratio along the path of `search_along_path`."""
-        return float(self._measure_closing(self._searched_dt)[CLOSING_RATIO])
+        return float(self.measures.closing(self._searched_dt)[CLOSING_RATIO])
 
     def initial_crossing(self) -> float:
         """Return the depth of crossing triangles over the finer side's mean surface edge, at the start of a searched step."""
@@ -394,37 +325,13 @@ class ContactStep:
             self.measure_crossings()
         return self.crossing
 
-    def _measure_closing(self, dt: float) -> np.ndarray:
-        d = self.detection
-        if self._measured_for != dt:
-            measure_closing(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts, dt, self._closing)
-            self._measured_for = dt
-        return self._closing
-
     def describe_fast_closing(self, dt: float, substeps: int = 1) -> str:
-        """Return a sentence that names the two colliders closing too fast for a step of dt, their speed, the thickness of the
-        thinner one, and a sufficient dt. substeps: maximum number per step."""
-        closing, d = self._measure_closing(self._searched_dt), self.detection
-        a, b = d.buffer.data.body[d.kept[int(closing[WHICH])]]
-        names = [d.scene.colliders[k].name for k in (a, b)]
-        thin, speed = float(min(d.thickness[a], d.thickness[b])), float(closing[SPEED])
-        cut = f"even in {substeps} substeps " if substeps > 1 else ""
-        return (
-            f"'{names[0]}' and '{names[1]}' close at {speed:.3g} m/s, {speed * dt:.3g} m in a step of {dt:.3g} s, "
-            f"and the thinner of them is {thin:.3g} m thick, so {cut}they could pass each other unseen: take dt <= "
-            f"{substeps * MAX_CLOSING * thin / speed:.3g} s"
-        )
+        """Return a sentence about colliders that close too fast for a step of dt [s], see `ContactMeasures`."""
+        return self.measures.describe_fast_closing(dt, self._searched_dt, substeps)
 
     def contacts(self) -> Contacts:
         """Return the contacts of the last step with their impulses."""
-        f, p = self.found, self.problem
-        n = p.count[0]
-        normal, tangent, r, struck, point, gap, body, feature, node, weight, arity = download(
-            [p.normal, p.tangent, p.r, f.impact_impulse, f.point, f.gap, f.body, f.feature, p.node, p.weight, p.arity], n
-        )
-        r = r / self._impulse_fraction + struck
-        impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
-        return self.detection.record(point, normal, gap, impulse, body, feature, *_sides(node, weight, arity))
+        return record_contacts(self.detection, self.found, self._impulse_fraction)
 
     @property
     def field_bytes(self) -> dict[str, int]:
@@ -436,15 +343,3 @@ class ContactStep:
         self.detection.release()
         for arena in (self._arena, self._numbers_arena, self._path_arena):
             arena.release()
-
-
-def _sides(node: np.ndarray, weight: np.ndarray, arity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights (n,6) of a problem's contacts, three per side, as the record stores them."""
-    n, used = len(node), np.arange(NODES) < arity[:, None]
-    side_b = used & (weight < 0.0)
-    n_a = (used & ~side_b).sum(axis=1)  # side a comes first
-    row, column = np.nonzero(used)
-    place = np.where(side_b[row, column], NODES // 2 + column - n_a[row], column)
-    nodes, weights = np.full((n, NODES), -1), np.zeros((n, NODES))
-    nodes[row, place], weights[row, place] = node[row, column], np.abs(weight[row, column])
-    return nodes, weights

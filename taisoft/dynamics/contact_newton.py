@@ -18,7 +18,7 @@ from taisoft.dynamics.line_search import choose_start, search
 from taisoft.dynamics.multipliers import MAX_MULTIPLIERS
 from taisoft.dynamics.newton import DECREASE, ELIMINATION_RATIO, Newton
 from taisoft.dynamics.residual import AGAIN
-from taisoft.dynamics.stage_result import StageResult, relative
+from taisoft.dynamics.results import StageResult, relative
 from taisoft.dynamics.stage_system import Stage, StageSystem
 
 SOLVES, FORCING = 60, 0.3  # maximum linear solves of a frictional problem, and their tolerance

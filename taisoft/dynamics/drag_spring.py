@@ -22,8 +22,6 @@ SOFT = 0.5
 STRAIN = 0.25
 HEAVY = 20.0
 EARTH = 9.81  # [m/s^2], for a body's weight, also in scenes without gravity
-MAX_HOLD_TIME = 0.002  # [s] maximum time that explicit sub-steps hold the force, if longer than one of them
-MAX_HOLD_SUBSTEPS = 16  # maximum number of these sub-steps
 
 
 @dataclass
@@ -39,11 +37,6 @@ class Drag:
     max_force: float  # maximum |F| [N]
     point: np.ndarray  # (3,) dragged point when the force was computed [m]
     force: np.ndarray  # (3,) [N]
-
-
-def batch(dt: float) -> int:
-    """Return the number of explicit sub-steps of dt [s] over which the force is held."""
-    return max(1, min(MAX_HOLD_SUBSTEPS, int(MAX_HOLD_TIME / dt)))
 
 
 class DragSpring:

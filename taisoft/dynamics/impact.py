@@ -37,7 +37,7 @@ from taisoft.linear.block_csr import block_times
 from taisoft.linear.pcg import total
 
 if TYPE_CHECKING:
-    from taisoft.dynamics.stage_result import StageResult
+    from taisoft.dynamics.results import StageResult
     from taisoft.dynamics.stage_system import Stage, StageSystem
 
 SPREAD = 2.0 * math.pi  # tau / dt
@@ -176,7 +176,7 @@ def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":
     """Solve a step of implicit Euler with restitution: the impact, then the stage."""
     from taisoft.dynamics.contact_newton import solve
     from taisoft.dynamics.newton import Newton
-    from taisoft.dynamics.stage_result import count_all, merge
+    from taisoft.dynamics.results import count_all, merge
 
     m, w, tau, out = system.model, system.work, SPREAD * stage.dt, np.zeros(2)
     impact_stage = replace(stage, beta=tau, contact_tolerance=max(stage.contact_tolerance, TOLERANCE), max_newton=SOLVES)

@@ -1,6 +1,7 @@
-"""Implicit integrators: a step is one stage x = x_hat + beta v, M (v - v_hat) = beta f(x, v).
+"""Implicit integrators: a step is one stage x = x_hat + beta v, M (v - v_hat) = beta f(x, v), or several if it is cut.
 
-An integrator is a `Scheme`: how x_hat, v_hat and beta follow from previous states, and whether the stage is the step's midpoint.
+An integrator is a `Scheme` (`schemes`): how x_hat, v_hat and beta follow from previous states, and whether the stage is the
+step's midpoint.
 """
 
 from dataclasses import dataclass, replace
@@ -16,27 +17,17 @@ from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.elimination import solve_on
 from taisoft.dynamics.impact import solve_bouncing
 from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.results import StageResult, StepResult, count_all
+from taisoft.dynamics.schemes import SCHEMES, Scheme
 from taisoft.dynamics.simulation_state import SimulationState
-from taisoft.dynamics.stage_result import StageResult, count_all
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.substepping import Substepping
 from taisoft.errors import SimulationError
+from taisoft.settings import Settings
 
 MAX_NEWTON, MAX_NEWTON_WITH_CONTACTS = 50, 25  # a step that needs more is cut in substeps, or reported as not converged
 TIGHTER = 0.1  # of the tolerance that would just balance the forces on a body
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
-
-
-@dataclass(frozen=True)
-class Scheme:
-    """x_hat = now x_n - before x_(n-1), v_hat likewise, beta = beta_over_dt dt; midpoint: the stage is the step's midpoint."""
-
-    beta_over_dt: float
-    now: float = 1.0
-    before: float = 0.0
-    midpoint: bool = False
-    one_iteration: bool = False  # linearised at x_n, one Newton step, no line search
-    start: "Scheme | None" = None  # scheme of the first step, without history
 
 
 @kernel
@@ -102,20 +93,20 @@ class History:
 class ImplicitStepper:
     """Take steps of one scheme for a simulation state and its contacts."""
 
-    def __init__(self, simulation: SimulationState, scheme: Scheme, contact: ContactStep | NoContacts):
-        self.simulation, self.scheme, self.contact = simulation, scheme, contact
+    def __init__(self, simulation: SimulationState, settings: Settings, contact: ContactStep | NoContacts):
+        self.simulation, self.scheme, self.contact = simulation, SCHEMES[settings.integrator], contact
         m, arena = simulation.model, simulation.arena
         self.history = History(
             arena.vectors("x_now", ti.f64, m.n_nodes),
             arena.vectors("v_now", m.real, m.n_nodes),
             arena.vectors("v_before", m.real, m.n_nodes),
-            arena.vectors("x_before", ti.f64, m.n_nodes) if scheme.before else None,
+            arena.vectors("x_before", ti.f64, m.n_nodes) if self.scheme.before else None,
         )
         prescribed = simulation.dirichlet.prescribed_nodes
         self.solver = StageSystem(m, arena, simulation.runtime.eps, prescribed, contact, self.history.x_now)
-        self.tolerance = DEFAULT_TOLERANCE[simulation.runtime.precision]
-        self.contact_tolerance = TOLERANCE[simulation.runtime.precision]
-        self.linear_tolerance: float | None = None
+        self.tolerance = settings.newton_tolerance or DEFAULT_TOLERANCE[settings.precision]
+        self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
+        self.linear_tolerance = settings.linear_tolerance
         balance = BodyBalance(simulation.scene)
         self._balance = balance if balance.n_pieces > 1 else None
         self._substepping = Substepping(self)
@@ -132,6 +123,13 @@ class ImplicitStepper:
     def numbers_changed(self) -> None:
         """Update for changed gravity or material numbers."""
         self.solver.rounding.measure()
+
+    def loads_changed(self) -> None:
+        """Do nothing: every stage reads the loads."""
+
+    def held_steps(self, dt: float) -> int:
+        """Return the number of steps of dt over which a drag force is held."""
+        return 1
 
     def snapshot(self) -> dict:
         """Return the state of the stepper: history, solver and contacts."""
@@ -155,14 +153,27 @@ class ImplicitStepper:
         self.contact.restore(kept["contact"])
         self.solver.restore(kept["solver"])  # after the contacts, whose fields it uses
 
-    def step(self, dt: float) -> StageResult:
-        """Take one step of dt, see `Substepping.step`."""
-        return self._substepping.step(self.simulation.time, dt)
-
-    @property
-    def substeps(self) -> int:
-        """Number of substeps of the last step."""
-        return self._substepping.substeps
+    def advance(self, n: int, dt: float) -> StepResult:
+        """Take one step of dt, whatever n, see `Substepping.step`."""
+        result = self._substepping.step(self.simulation.time, dt)
+        worst, name = result.unbalanced
+        step = StepResult(
+            substeps=self._substepping.substeps,
+            newton_iterations=result.newton_iterations,
+            linear_iterations=result.linear_iterations,
+            contact_iterations=result.contact_iterations,
+            residual=max(result.residual, worst) if name else result.residual,
+            contact_residual=result.contact_residual,
+            converged=result.converged and not name,
+        )
+        if not step.converged:
+            step.problems.append(
+                f"Newton stopped after {step.newton_iterations} iterations at a relative residual of {step.residual:.2e}"
+                + (f" and a contact residual of {step.contact_residual:.2e}" if self.contact.n_contacts else "")
+            )
+        if name:
+            step.problems.append(f"forces on {name} are unbalanced by {worst:.2g} of their size, beside larger forces elsewhere")
+        return step
 
     @property
     def is_linear(self) -> bool:

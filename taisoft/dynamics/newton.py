@@ -21,7 +21,7 @@ from taisoft.dynamics.frictional import PROGRESS, ROUNDING
 from taisoft.dynamics.line_search import search
 from taisoft.dynamics.multipliers import FINER, MAX_MULTIPLIERS, PAST, R_EXTRAPOLATED, R_SCALE, next_scale
 from taisoft.dynamics.residual import ELASTIC_STAGE, IMPACT, LINEARISED, STEP
-from taisoft.dynamics.stage_result import StageResult, relative
+from taisoft.dynamics.results import StageResult, relative
 from taisoft.dynamics.stage_system import Stage, StageSystem
 
 LINEAR_LIMIT = 0.01  # relative true residual above which a linearly implicit step has failed

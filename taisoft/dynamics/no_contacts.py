@@ -1,4 +1,4 @@
-"""Empty contacts of a scene without possible contact. Replaces `ContactStep` in implicit steps at no cost."""
+"""Empty contacts of a scene without possible contact. Replaces `ContactStep` at no cost."""
 
 import numpy as np
 

@@ -60,6 +60,10 @@ class SimulationState:
         """Upload the free axes."""
         upload([(self.model.free, ~self.dirichlet.constrained())])
 
+    def upload_gravity(self) -> None:
+        """Upload the scene's gravity."""
+        upload([(self.model.gravity, self.scene.gravity[None])])
+
     def upload_material(self, density: bool) -> None:
         """Upload material numbers of the bodies, and masses if a density changed."""
         m = self.model

@@ -15,8 +15,8 @@ from enum import Enum, auto
 from typing import TYPE_CHECKING
 
 from taisoft.dynamics.ccd_limits import next_length
-from taisoft.dynamics.contact import DEEP_CROSSING, DEEP_PENETRATION
-from taisoft.dynamics.stage_result import StageResult, count_all, merge
+from taisoft.dynamics.contact_measures import DEEP_CROSSING, DEEP_PENETRATION
+from taisoft.dynamics.results import StageResult, count_all, merge
 from taisoft.errors import SimulationError
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict
 
-from taisoft.dynamics import EXPLICIT, INTEGRATORS
+from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.errors import SceneError, TaisoftError
 from taisoft.scene.scene import Scene
 from taisoft.settings import check_settings

@@ -10,7 +10,7 @@ import textwrap
 
 import numpy as np
 
-from taisoft.dynamics import EXPLICIT, INTEGRATORS
+from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.errors import SimulationError, TaisoftError
 from taisoft.settings import contact_solvers
 from taisoft.stability import stable_dt

@@ -13,10 +13,12 @@ from taisoft.contact.solve import SolveResult, solve
 from taisoft.dynamics import explicit
 from taisoft.dynamics.contact import TOLERANCE, ContactStep
 from taisoft.dynamics.explicit_contact import find_acceleration, finish_verlet, keep_state, move, predict, set_free_velocities
+from taisoft.dynamics.explicit_stepper import ExplicitStepper
+from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.simulation_state import SimulationState
-from taisoft.dynamics.substeps import ExplicitStepper, SubstepResult
 from taisoft.errors import SimulationError
 from taisoft.fem.scalars import FAILED, LOWEST_J, MOST_INVERTED
+from taisoft.settings import Settings
 
 MAX_SWEEPS = 1000  # per contact solve; one that needs more is reported as not converged
 MAX_CONTACT_BATCH = 200  # maximum sub-steps per batch, between checks for interruption
@@ -30,25 +32,18 @@ class GoodState:
     v: Any
 
 
-@dataclass(frozen=True)
-class ContactSubstepResult(SubstepResult):
-    """Extremes over a batch."""
-
-    contact_iterations: int = 0  # total
-    contact_residual: float = 0.0  # maximum
-    contacts_converged: bool = True  # in every sub-step
-
-
 class ContactExplicitStepper(ExplicitStepper):
     """Take sub-steps of symplectic Euler or velocity Verlet with contacts."""
 
-    def __init__(self, simulation: SimulationState, verlet: bool, contact: ContactStep, method: str):
-        super().__init__(simulation, verlet)
-        self.contact, self.method = contact, method
+    def __init__(self, simulation: SimulationState, settings: Settings, contact: ContactStep):
+        super().__init__(simulation, settings)
+        self.contact, self.method = contact, settings.contact_solver
+        if self.method == "auto":
+            self.method = "gauss_seidel" if settings.arch == "cpu" else "coloured_gauss_seidel"
         self.max_batch = min(self.max_batch, MAX_CONTACT_BATCH)
         m, arena = simulation.model, simulation.arena
         self._good = GoodState(arena.vectors("x_good", ti.f64, m.n_nodes), arena.vectors("v_good", m.real, m.n_nodes))
-        self.contact_tolerance = TOLERANCE[simulation.runtime.precision]
+        self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
 
     def forget(self) -> None:
         """Discard the search and impulses, after the state was set."""
@@ -64,7 +59,7 @@ class ContactExplicitStepper(ExplicitStepper):
         super().restore(kept)
         self.contact.restore(kept["contact"])
 
-    def advance(self, n: int, dt: float) -> ContactSubstepResult:
+    def advance(self, n: int, dt: float) -> StepResult:
         """Take n sub-steps of dt, or fewer if prescribed nodes are released or the batch is full; at least one.
 
         If a sub-step fails, the state is the one before it.
@@ -99,14 +94,17 @@ class ContactExplicitStepper(ExplicitStepper):
             simulation.time = start + done * dt
             raise
         self.contact.penetration, self.contact.relative_penetration = depth, relative_penetration
-        return ContactSubstepResult(
-            n,
-            m.state.scalars[LOWEST_J],
-            int(m.state.scalars[MOST_INVERTED]),
-            sum(r.iterations for r in results if r),
-            max((r.residual for r in results if r), default=0.0),
-            all(r.converged for r in results if r),
+        result = StepResult(
+            steps=n,
+            min_volume_ratio=m.state.scalars[LOWEST_J],
+            n_inverted=int(m.state.scalars[MOST_INVERTED]),
+            contact_iterations=sum(r.iterations for r in results if r),
+            contact_residual=max((r.residual for r in results if r), default=0.0),
+            converged=all(r.converged for r in results if r),
         )
+        if not result.converged:
+            result.problems.append(f"the contact solver stopped at a residual of {result.contact_residual:.2e}")
+        return result
 
     def _restore(self) -> None:
         simulation = self.simulation

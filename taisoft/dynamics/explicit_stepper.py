@@ -9,14 +9,18 @@ import taichi as ti
 from taisoft.backend.arrays import Count
 from taisoft.backend.transfer import upload
 from taisoft.dynamics import explicit
+from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.fem.model import Model
 from taisoft.fem.scalars import LOWEST_J, MOST_INVERTED, STEPS_DONE
+from taisoft.settings import Settings
 
 LAUNCH_SECONDS = 0.1  # rough maximum of one launch, so that Ctrl-C takes effect
 DAMPING_POINT_SECONDS = 800e-9  # added by stiffness damping to a law's POINT_SECONDS: it projects the stiffness of each point
 MAX_BATCH = 4096
+MAX_HOLD_TIME = 0.002  # [s] maximum time that sub-steps hold a drag force, if longer than one of them
+MAX_HOLD_SUBSTEPS = 16  # maximum number of these sub-steps
 TARGET_BYTES_PER_TET = 200  # maximum memory for the targets of a batch
 
 
@@ -48,15 +52,6 @@ class SubstepWork:
         return self.held is not None
 
 
-@dataclass(frozen=True)
-class SubstepResult:
-    """Extremes over a batch."""
-
-    done: int
-    min_volume_ratio: float
-    n_inverted: int
-
-
 def largest_batch(m: Model) -> int:
     """Return the maximum number of sub-steps per launch.
 
@@ -70,8 +65,8 @@ def largest_batch(m: Model) -> int:
 class ExplicitStepper:
     """Take sub-steps of symplectic Euler or velocity Verlet."""
 
-    def __init__(self, simulation: SimulationState, verlet: bool):
-        self.simulation = simulation
+    def __init__(self, simulation: SimulationState, settings: Settings):
+        self.simulation, verlet = simulation, settings.integrator == "velocity_verlet"
         m, arena, dirichlet = simulation.model, simulation.arena, simulation.dirichlet
         n_tets = int(simulation.layout.n_tets.sum())
         self.max_batch = largest_batch(m)
@@ -108,8 +103,14 @@ class ExplicitStepper:
             self.work.reaction.fill(0.0)
 
     def numbers_changed(self) -> None:
-        """Invalidate the acceleration, after gravity or material numbers changed."""
+        """Invalidate the acceleration, after gravity, materials or loads changed."""
         self.acceleration_stale = True
+
+    loads_changed = numbers_changed
+
+    def held_steps(self, dt: float) -> int:
+        """Return the number of sub-steps of dt [s] over which a drag force is held."""
+        return max(1, min(MAX_HOLD_SUBSTEPS, int(MAX_HOLD_TIME / dt)))
 
     def _kept_fields(self) -> dict[str, Any]:
         """Fields kept from one sub-step to the next, by name, if the scene has them."""
@@ -128,7 +129,7 @@ class ExplicitStepper:
         upload([(field, kept[name]) for name, field in self._kept_fields().items()])
         self.acceleration_stale = bool(kept["stale"])
 
-    def advance(self, n: int, dt: float) -> SubstepResult:
+    def advance(self, n: int, dt: float) -> StepResult:
         """Take n sub-steps of dt, or fewer if prescribed nodes are released or the launch would last too long; at least one.
 
         A sub-step with a non-finite result raises SimulationError, and the state is the one before it; any other
@@ -149,17 +150,17 @@ class ExplicitStepper:
         except BaseException:  # Ctrl-C, raised when the launch has ended: the batch is abandoned
             self._restore_state(*kept)
             raise
-        if result.done < n:
+        if result.steps < n:
             self._restore_state(*kept)
-            if result.done > 0:  # deterministic on the CPU: repeat up to the last good sub-step
-                self._launch(result.done, dt)
+            if result.steps > 0:  # deterministic on the CPU: repeat up to the last good sub-step
+                self._launch(result.steps, dt)
             good = simulation.state()
             self._restore_state(*good)
             self._launch(1, dt)
             fault = self._describe_fault()
             self._restore_state(*good)
-            simulation.step_count += result.done
-            simulation.time += result.done * dt
+            simulation.step_count += result.steps
+            simulation.time += result.steps * dt
             raise SimulationError(f"step {simulation.step_count + 1}: {fault}")
         return result
 
@@ -178,7 +179,7 @@ class ExplicitStepper:
         self.simulation.set_state(x, v)
         self.acceleration_stale = True
 
-    def _launch(self, n: int, dt: float) -> SubstepResult:
+    def _launch(self, n: int, dt: float) -> StepResult:
         m, s = self.simulation.model, self.work
         if m.serial:
             explicit.advance_serial(m, s, n, dt, int(self.acceleration_stale))
@@ -186,7 +187,7 @@ class ExplicitStepper:
             self._launch_parallel(n, dt)
         self.acceleration_stale = False
         done, lowest, inverted = m.state.scalars.to_numpy()[STEPS_DONE : MOST_INVERTED + 1].tolist()
-        return SubstepResult(int(done), lowest, int(inverted))
+        return StepResult(int(done), min_volume_ratio=lowest, n_inverted=int(inverted))
 
     def _launch_parallel(self, n: int, dt: float) -> None:
         m, s = self.simulation.model, self.work

@@ -1,11 +1,12 @@
-"""Result of solving a stage, and merging of several results."""
+"""Results of stages and steps, and merging of several."""
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 
 
 @dataclass(frozen=True)
 class StageResult:
-    """Result of a solve. Without contacts, contacts count as converged after 0 iterations."""
+    """Result of solving an implicit stage. Without contacts, contacts count as converged after 0 iterations."""
 
     newton_iterations: int
     linear_iterations: int
@@ -15,6 +16,26 @@ class StageResult:
     contact_iterations: int = 0  # multipliers
     contact_residual: float = 0.0
     unbalanced: tuple[float, str] = (0.0, "")  # largest relative residual of a piece, and its name, if unbalanced
+
+
+@dataclass
+class StepResult:
+    """What a stepper reports of a step, or of a batch of explicit steps: totals, and extremes over the batch.
+
+    The fields mean those of `StepReport`; `min_volume_ratio` and `n_inverted` leave out the final state.
+    """
+
+    steps: int = 1
+    substeps: int = 1
+    newton_iterations: int = 0
+    linear_iterations: int = 0
+    contact_iterations: int = 0
+    residual: float = 0.0
+    contact_residual: float = 0.0
+    min_volume_ratio: float = math.inf
+    n_inverted: int = 0
+    converged: bool = True
+    problems: list[str] = field(default_factory=list)
 
 
 def relative(r: float, scale: float) -> float:

@@ -1,0 +1,163 @@
+"""Changes of a running simulation by its user: each function is a method of `Simulator`."""
+
+import warnings
+from typing import TYPE_CHECKING
+
+from taisoft.attributes import thawed
+from taisoft.errors import SimulationError
+from taisoft.queries import body_index, check_rows, nodes_of
+from taisoft.scene.changes import CHANGEABLE, change_load, change_material
+from taisoft.settings import FIXED, NAMES, Settings, check_dt
+
+if TYPE_CHECKING:
+    from taisoft.simulator import Simulator
+
+INSTEAD = {  # what to do instead of assigning to an attribute that a simulator has or might be expected to have
+    **{name: f"call sim.set_material(body, {name}=...)" for name in CHANGEABLE},
+    **{name: f"call sim.set_contact(name_a, name_b, {name}=...)" for name in ("friction", "restitution")},
+    **{name: f"call sim.set_state({name}=...)" for name in ("positions", "velocities")},
+    **{name: f"call sim.rebuild({name}=...)" for name in NAMES if name not in FIXED},
+    **dict.fromkeys(("force", "forces"), "call sim.set_force(body, index, value)"),
+    **dict.fromkeys(("traction", "tractions"), "call sim.set_traction(body, index, value)"),
+    **dict.fromkeys(("time", "step_count"), "call sim.reset() to go back to the start"),
+    **dict.fromkeys(("arch", "precision"), "make a new Simulator"),
+    "gravity": "call sim.set_gravity(gravity)",
+    "material": "call sim.set_material(body, young=...)",
+    "scene": "make a new Simulator of the other scene",
+    "settings": "call sim.rebuild(integrator=...)",
+    "plan": "it follows from the scene and the settings",
+    "stable_dt": "it follows from the scene; set sim.dt",
+    "dragged": "call sim.drag(...) or sim.release()",
+}
+
+
+def dt(self: "Simulator") -> float:
+    """Time step [s]; a new value takes effect with the next step."""
+    return self._host().dt
+
+
+def set_dt(self: "Simulator", value: float) -> None:
+    """Set dt."""
+    value = check_dt(value)
+    if value == self.dt:
+        return
+    check_stability(self.settings, value, self, stacklevel=5)
+    self._host().set_dt(value)
+
+
+def check_stability(settings: Settings, dt: float, sim: "Simulator", stacklevel: int = 4) -> None:
+    """Refuse a dt [s] above the limit of an explicit integrator, or warn if the settings allow it."""
+    if not settings.explicit or dt <= sim.stable_dt:
+        return
+    limit = sim.stable_dt
+    text = f"dt = {dt:.3g} s is above the estimated stability limit of {limit:.3g} s of {settings.integrator}"
+    if not settings.allow_unstable:
+        raise SimulationError(f"{text}: take a smaller dt (0.9 of the limit is {0.9 * limit:.3g} s) or allow_unstable=True")
+    warnings.warn(text, stacklevel=stacklevel)
+
+
+def reset(self: "Simulator") -> None:
+    """Restore the scene's initial state; changed numbers (dt, gravity, materials, loads) stay. Compiles nothing."""
+    self._open().reset()
+
+
+def set_state(self: "Simulator", positions=None, velocities=None, body: str | None = None) -> None:
+    """Set positions [m] and velocities [m/s], (n_nodes, 3) each. Velocities on constrained axes become 0.
+
+    Copies arrays; compiles nothing.
+    """
+    dynamics, rows = self._open(), nodes_of(self, body)
+    for name, value in (("positions", positions), ("velocities", velocities)):
+        if value is not None:
+            check_rows(self, name, value, rows)
+    x, v = dynamics.state.state()
+    if positions is not None:
+        x[rows] = positions
+    if velocities is not None:
+        v[rows] = velocities
+        v[dynamics.state.dirichlet.constrained()] = 0.0
+    dynamics.state.set_state(x, v)
+    dynamics.state_changed()
+
+
+def set_gravity(self: "Simulator", gravity) -> None:
+    """Change gravity (3,) [m/s^2]. Recomputes the rounding floor of the residual; compiles nothing."""
+    dynamics = self._open()
+    with thawed(self.scene):
+        self.scene.gravity = gravity
+    dynamics.state.upload_gravity()
+    dynamics.numbers_changed()
+
+
+def set_material(self: "Simulator", body: str, **numbers) -> None:
+    """Change numbers of a body's material (young, poisson, density, mass_damping, stiffness_damping); the law stays.
+
+    Copies arrays and recomputes the rounding floor of the residual and the stable dt; compiles nothing.
+    """
+    dynamics, changed = self._open(), self.scene.bodies[body_index(self, body)]
+    old, old_limit = changed.material, self._stable_dt
+    change_material(changed, numbers, self.plan.on)
+    self._stable_dt = None
+    try:
+        check_stability(self.settings, self.dt, self)
+    except SimulationError:
+        with thawed(changed):
+            changed.material, self._stable_dt = old, old_limit
+        raise
+    dynamics.state.upload_material("density" in numbers)
+    if "density" in numbers:  # a total force is spread by mass: the nodes' fractions change only by rounding
+        dynamics.upload_loads()
+    dynamics.numbers_changed()
+
+
+def set_contact(
+    self: "Simulator", name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None
+) -> None:
+    """Change the friction or restitution between two bodies, or a body and an obstacle; see `Scene.set_contact`."""
+    dynamics = self._open()
+    with thawed(self.scene):
+        self.scene.set_contact(name_a, name_b, friction=friction, restitution=restitution)
+    dynamics.changes += 1
+    if dynamics.contact is not None:
+        dynamics.contact.numbers_changed()
+
+
+def set_force(self: "Simulator", body: str, index: int, value) -> None:
+    """Change a force added by `body.add_force`, from the next step on.
+
+    index: from 0 in the order added to this body. value: total (3,), or (k,3) with one row per node [N].
+    Raises SceneError if there is no such force or the value is invalid.
+    """
+    _set_load(self, "force", body, index, value)
+
+
+def set_traction(self: "Simulator", body: str, index: int, value) -> None:
+    """Change a traction added by `body.add_traction`, from the next step on; index and errors as for `set_force`.
+
+    value: (3,) per reference area [Pa].
+    """
+    _set_load(self, "traction", body, index, value)
+
+
+def _set_load(sim: "Simulator", kind: str, body: str, index: int, value) -> None:
+    dynamics = sim._open()
+    change_load(sim.scene.bodies[body_index(sim, body)], kind, index, value)
+    dynamics.loads_changed()
+
+
+def drag(self: "Simulator", body: str, nodes, weights, target, stiffness: float) -> None:
+    """Pull a point of a body towards target (3,) [m] by a damped spring; replaces an earlier drag.
+
+    The point is the mean of nodes (k,) with weights (k,), which are normalized to sum to 1; stiffness [N/m]. The force is
+    evaluated at the start of every step. `taisoft.dynamics.drag_spring` limits stiffness and force; `dragged` holds both.
+    Raises SimulationError unless the Simulator was made with draggable=True, SceneError for an invalid point of the body.
+    """
+    spring = self._open().drag_spring
+    if spring is None:
+        raise SimulationError("bodies can be dragged only if the Simulator was made with draggable=True")
+    spring.take(body_index(self, body), nodes, weights, target, stiffness)
+
+
+def release(self: "Simulator") -> None:
+    """End the drag; does nothing if nothing is dragged."""
+    self._open().end_drag()

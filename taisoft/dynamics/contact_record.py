@@ -1,0 +1,65 @@
+"""Contacts of a problem on the host: their record, the sum of their impulses, and their rows for a checkpoint."""
+
+import numpy as np
+
+from taisoft.backend.transfer import download, upload
+from taisoft.collision.contacts import Contacts
+from taisoft.collision.pipeline import Detection
+from taisoft.contact.assemble import FoundContacts
+from taisoft.contact.problem import NODES
+from taisoft.scene.scene import Scene
+
+
+def record_contacts(detection: Detection, found: FoundContacts, impulse_fraction: float) -> Contacts:
+    """Return the record of a problem's contacts with their impulses. impulse_fraction: of a step, in which they act."""
+    f, p = found, found.problem
+    normal, tangent, r, struck, point, gap, body, feature, node, weight, arity = download(
+        [p.normal, p.tangent, p.r, f.impact_impulse, f.point, f.gap, f.body, f.feature, p.node, p.weight, p.arity], p.count[0]
+    )
+    r = r / impulse_fraction + struck
+    impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
+    return detection.record(point, normal, gap, impulse, body, feature, *_sides(node, weight, arity))
+
+
+def sum_impulses(contacts: Contacts, scene: Scene) -> np.ndarray:
+    """Return the impulse on each collider from the given contacts, (n_colliders, 3) [N s]."""
+    place = {one.name: k for k, one in enumerate(scene.colliders)}
+    total = np.zeros((len(place), 3))
+    for names, sign in ((contacts.body_a, 1.0), (contacts.body_b, -1.0)):
+        np.add.at(total, [place[name] for name in names], sign * contacts.impulse)
+    return total
+
+
+def _sides(node: np.ndarray, weight: np.ndarray, arity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and weights (n,6) of a problem's contacts, three per side, as the record stores them."""
+    n, used = len(node), np.arange(NODES) < arity[:, None]
+    side_b = used & (weight < 0.0)
+    n_a = (used & ~side_b).sum(axis=1)  # side a comes first
+    row, column = np.nonzero(used)
+    place = np.where(side_b[row, column], NODES // 2 + column - n_a[row], column)
+    nodes, weights = np.full((n, NODES), -1), np.zeros((n, NODES))
+    nodes[row, place], weights[row, place] = node[row, column], np.abs(weight[row, column])
+    return nodes, weights
+
+
+def read_rows(found: FoundContacts) -> dict[str, np.ndarray]:
+    """Return everything that a later step, or `record_contacts`, needs of a problem's contacts."""
+    fields = _fields(found)
+    return dict(zip(fields, download(list(fields.values()), found.problem.count[0])))
+
+
+def write_rows(found: FoundContacts, rows: dict[str, np.ndarray]) -> None:
+    """Restore the result of `read_rows`, of at most `capacity` contacts."""
+    n, whole = len(rows["gap"]), []
+    for name, field in _fields(found).items():
+        data = np.zeros((found.problem.capacity, *rows[name].shape[1:]), dtype=rows[name].dtype)
+        data[:n] = rows[name]
+        whole.append((field, data))
+    upload(whole)
+    found.problem.count[0] = n
+
+
+def _fields(found: FoundContacts) -> dict:
+    p, f = found.problem, found
+    parts = {"normal": p.normal, "tangent": p.tangent, "r": p.r, "node": p.node, "weight": p.weight, "arity": p.arity}
+    return parts | {"point": f.point, "gap": f.gap, "body": f.body, "feature": f.feature, "struck": f.impact_impulse}

@@ -1,0 +1,270 @@
+"""A scene on the device, and everything that steps it: state, contacts, drag spring and integrator."""
+
+import weakref
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from taisoft.backend import runtime
+from taisoft.backend.fields import FieldArena
+from taisoft.dynamics.dirichlet import DirichletConditions
+from taisoft.dynamics.drag_spring import DragSpring
+from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.dynamics.stepper import make_stepper
+from taisoft.errors import SimulationError
+from taisoft.fem.elasticity import NO_TET, measure
+from taisoft.fem.model import build_model
+from taisoft.fem.scalars import FIRST_SOFTENED, LOADS
+from taisoft.records import Energies, StepReport
+from taisoft.scene.plan import Plan
+from taisoft.scene.scene import Scene
+from taisoft.settings import Settings, check_dt
+
+if TYPE_CHECKING:
+    from taisoft.collision.pipeline import Detection
+
+
+class Dynamics:
+    """A simulated scene. `Simulator` checks arguments, and adds queries, changes and runs.
+
+    Memory and runtime are released by `release`, at the latest with the object. Raises MemoryError, SimulationError or MeshError;
+    nothing is then left allocated.
+    """
+
+    def __init__(self, scene: Scene, settings: Settings, plan: Plan):
+        self.scene, self.dt = scene, settings.dt
+        self.tangent = None  # fields of `Simulator.force_differential`; made on request
+        self.changes = 0  # count of user changes to the state or to numbers; at each the energy jumps
+        self._time_base = 0.0, 0  # time [s] and step count when dt, the state or the settings last changed
+        self.runtime = runtime.open_runtime(
+            settings.arch, settings.precision, f"the simulator of {[b.name for b in scene.bodies]}"
+        )
+        self.arena, self._owned = FieldArena(), []  # the latter have memory of their own
+        self.release = weakref.finalize(self, _release, self.arena, self.runtime, self._owned)
+        try:
+            self._build(scene, settings, plan)
+        except BaseException:
+            self.release()
+            raise
+
+    def _build(self, scene: Scene, settings: Settings, plan: Plan) -> None:
+        model, layout = build_model(scene, self.runtime, self.arena, plan.on)
+        self.state = SimulationState(scene, self.runtime, self.arena, model, layout, DirichletConditions(scene, layout))
+        self.contact = None
+        if plan.on["contact_forces"]:
+            from taisoft.dynamics.contact import ContactStep
+
+            self.contact = ContactStep(self.state, settings.self_collision, settings.explicit)
+            self._owned.append(self.contact)
+        self._self_collision = settings.self_collision
+        self._idle_detection: Detection | None = None  # of a scene without contact forces; made on request
+        self.drag_spring = DragSpring(self.state) if settings.draggable else None
+        self.stepper = make_stepper(self.state, settings, self.contact or NoContacts())
+        self._owned.append(self.stepper)
+        self.reset()
+
+    @property
+    def model(self):
+        """The `Model` of the scene."""
+        return self.state.model
+
+    # --- stepping -----------------------------------------------------------------------------------------------------
+
+    def advance(self, n: int) -> StepReport:
+        """Take up to n steps of dt, at least one: explicit steps in one launch, implicit steps one per call.
+
+        Raises SimulationError that names the step; the state stays the last good one.
+        """
+        spring, start = self.drag_spring, self.state.step_count
+        if spring is not None and spring.drag is not None:
+            held = self.stepper.held_steps(self.dt)
+            n = min(n, held)
+            # the time of a whole batch even if n is smaller: the spring's stiffness, which depends on it, must not change
+            spring.apply(held * self.dt)
+            self.stepper.loads_changed()
+        try:
+            result = self.stepper.advance(n, self.dt)
+        except SimulationError as error:
+            raise self._failure(error) from None
+        self.state.step_count = start + result.steps
+        base, count = self._time_base
+        self.state.time = base + (self.state.step_count - count) * self.dt
+        report = self._report(result)
+        problems = [*result.problems, *self._problems(report)]
+        report.problems = [f"step {self.state.step_count}: {problem}" for problem in problems]
+        return report
+
+    def _failure(self, error: SimulationError) -> SimulationError:
+        """Return a step's error with the step's number; if the state at its start was not finite, name that place instead."""
+        self.runtime.check()  # raises its own error
+        nonfinite, step = self.state.find_nonfinite(), f"step {self.state.step_count + 1}: "
+        if nonfinite is not None:
+            return SimulationError(f"{step}{nonfinite} at its start")
+        return error if str(error).startswith("step ") else SimulationError(f"{step}{error}")
+
+    def _report(self, result) -> StepReport:
+        """Return the report of a step: of its `StepResult`, and of the state and the contacts at its end."""
+        measure(self.model)
+        elastic, lowest, inverted, kinetic, gravity, _, loads = self.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
+        report = StepReport(
+            **{name: value for name, value in vars(result).items() if name != "problems"},
+            time=self.state.time,
+            kinetic=kinetic,
+            elastic=elastic,
+            gravity=gravity,
+            loads=loads,
+        )
+        report.min_volume_ratio = min(result.min_volume_ratio, lowest)
+        report.n_inverted = max(result.n_inverted, int(inverted))
+        if (contact := self.contact) is not None:
+            report.n_contacts, report.max_penetration = contact.n_contacts, contact.penetration
+            report.dropped_contacts, report.deep = contact.dropped, int(contact.is_deep)
+            report.crossings = contact.last_crossing.n_pairs
+        return report
+
+    def _problems(self, report: StepReport) -> list[str]:
+        """Describe what is wrong with the state and the contacts at the end of a step, one sentence per problem."""
+        found = []
+        if report.dropped_contacts:
+            found.append(f"{report.dropped_contacts} triangles belong to inverted tets, so their contacts are unknown")
+        if report.deep:
+            found.append(
+                f"bodies are {report.max_penetration:.3g} m deep in each other or in obstacles"
+                + (f", {report.crossings} pairs of surface triangles cross" if report.crossings else "")
+            )
+            found += [
+                f"'{a}' and '{b}' overlap by {depth:.3g} m" if a != b else f"parts of '{a}' overlap by {depth:.3g} m"
+                for a, b, depth in self.contact.last_crossing.inside
+            ]
+        if report.n_inverted:
+            found.append(f"{report.n_inverted} tets are inverted")
+        return found
+
+    # --- changes between steps ----------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Restore the scene's initial state; changed numbers (dt, gravity, materials, loads) stay. Compiles nothing."""
+        self.state.restart()
+        self.end_drag()
+        self._time_base = 0.0, 0
+        self.state_changed()
+
+    def state_changed(self) -> None:
+        """Discard the stepper's history, after the state was set."""
+        self.changes += 1
+        self.stepper.forget()
+
+    def numbers_changed(self) -> None:
+        """Update the stepper, after gravity or materials changed."""
+        self.changes += 1
+        self.stepper.numbers_changed()
+
+    def loads_changed(self) -> None:
+        """Upload the scene's loads, after they changed, and update the stepper."""
+        self.changes += 1
+        self.upload_loads()
+        self.stepper.loads_changed()
+
+    def set_dt(self, dt: float) -> None:
+        """Set dt [s] of the next step."""
+        self._time_base = self.state.time, self.state.step_count
+        self.changes += 1
+        self.dt = dt
+
+    def upload_loads(self) -> None:
+        """Copy the scene's present loads, plus the force of the drag spring, to the device."""
+        self.state.loads = None
+        (self.drag_spring.upload if self.drag_spring is not None else self.state.upload_loads)()
+
+    def end_drag(self) -> None:
+        """End the drag, if any."""
+        if self.drag_spring is not None and self.drag_spring.release():
+            self.changes += 1
+            self.stepper.loads_changed()
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether anything but the scene's own forces does work now: a drag, prescribed nodes or moving obstacles."""
+        moving = self.contact is not None and any(obstacle.path is not None for obstacle in self.scene.obstacles)
+        dragged = self.drag_spring is not None and self.drag_spring.drag is not None
+        return moving or dragged or not all(self.state.dirichlet.released())
+
+    # --- queries ------------------------------------------------------------------------------------------------------
+
+    def energies(self) -> Energies:
+        """Return the energies of the present state [J]."""
+        measure(self.model)
+        elastic, _, _, kinetic, gravity, _, loads = self.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
+        return Energies(kinetic, elastic, gravity, loads)
+
+    def first_softened(self) -> tuple[int, int] | None:
+        """Return the body and the tet first compressed so far that its material law softens; None if there is none."""
+        layout, first = self.state.layout, int(self.model.state.scalars[FIRST_SOFTENED])
+        if first == NO_TET:
+            return None
+        place = first - layout.block_start * self.runtime.lanes
+        k = int(np.flatnonzero((place >= 0) & (place < layout.n_tets))[0])
+        return k, int(place[k])
+
+    def find_contacts(self, dt: float) -> "Detection":
+        """Detect the contacts of the present state swept by dt [s]; with 0, paths are evaluated at the present time only."""
+        state = self.state
+        if self.contact is not None:
+            self.contact.search(state.time, dt)
+            return self.contact.detection
+        if self._idle_detection is None:
+            from taisoft.collision.pipeline import Detection
+
+            self._idle_detection = Detection(self.scene, state.model, state.layout, self.runtime, self._self_collision)
+            self._owned.append(self._idle_detection)
+        self._idle_detection.find(state.time, dt)
+        return self._idle_detection
+
+    @property
+    def detection(self) -> "Detection | None":
+        """The contact detection in use; None if none was needed yet."""
+        return self.contact.detection if self.contact is not None else self._idle_detection
+
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """Size of every allocated array [bytes], by name."""
+        found = self.contact or self._idle_detection
+        return self.arena.bytes | (found.field_bytes if found else {}) | self.stepper.field_bytes
+
+    # --- checkpoints --------------------------------------------------------------------------------------------------
+
+    def snapshot(self) -> dict:
+        """Return everything the next step depends on besides scene and settings, for a checkpoint."""
+        start, count = self._time_base
+        own = {"dt": self.dt, "time_base": start, "count_base": count}
+        return own | {"simulation": self.state.snapshot(), "stepper": self.stepper.snapshot()}
+
+    def restore(self, kept: dict) -> None:
+        """Restore a `snapshot`, after the scene's numbers were restored."""
+        self.upload_numbers()
+        self.dt, self._time_base = check_dt(kept["dt"]), (float(kept["time_base"]), int(kept["count_base"]))
+        self.state.restore(kept["simulation"])
+        self.stepper.restore(kept["stepper"])
+
+    def upload_numbers(self) -> None:
+        """Copy all of the scene's numbers that may change to the device."""
+        self.state.upload_gravity()
+        self.state.upload_material(density=True)
+        self.upload_loads()
+        if self.contact is not None:
+            self.contact.numbers_changed()
+
+    def continue_from(self, other: "Dynamics") -> None:
+        """Take over the state of another instance of the same scene, as `state_changed` does without history."""
+        self.state.restore(other.state.snapshot())
+        self.stepper.forget()
+        self._time_base = other.state.time, other.state.step_count
+        self.changes = other.changes + 1
+
+
+def _release(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:
+    while owned:
+        owned.pop().release()
+    arena.release()
+    claim.close()

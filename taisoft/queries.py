@@ -1,0 +1,223 @@
+"""Results and other queries of a simulator: each function is a method of `Simulator`."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from taisoft.backend import runtime
+from taisoft.backend.transfer import upload
+from taisoft.dynamics.drag_spring import Drag
+from taisoft.errors import SceneError
+from taisoft.fem import elasticity
+from taisoft.records import Energies
+from taisoft.stability import stable_dt as largest_stable_dt
+
+if TYPE_CHECKING:
+    from taisoft.collision.contacts import Contacts
+    from taisoft.collision.overlap import Overlap
+    from taisoft.simulator import Simulator
+
+
+def time(self: "Simulator") -> float:
+    """Simulated time [s]."""
+    return self._host().state.time
+
+
+def step_count(self: "Simulator") -> int:
+    """Steps of dt taken."""
+    return self._host().state.step_count
+
+
+def positions(self: "Simulator", body: str | None = None) -> np.ndarray:
+    """Return a float64 copy of a body's node positions (n_nodes, 3) [m]; without a name, of all bodies in the order added."""
+    return self._open().state.state()[0][nodes_of(self, body)].copy()
+
+
+def velocities(self: "Simulator", body: str | None = None) -> np.ndarray:
+    """Return a float64 copy of the node velocities (n_nodes, 3) [m/s]; body: as for `positions`."""
+    return self._open().state.state()[1][nodes_of(self, body)].astype(np.float64)
+
+
+def energies(self: "Simulator") -> Energies:
+    """Return the energies of the present state [J]."""
+    return self._open().energies()
+
+
+def reactions(self: "Simulator", body: str | None = None) -> np.ndarray:
+    """Return the constraint forces (n_nodes, 3) of the last step [N]: on fixed and prescribed nodes, 0 on others."""
+    return self._open().stepper.reactions()[nodes_of(self, body)]
+
+
+def stress(self: "Simulator", body: str | None = None) -> np.ndarray:
+    """Return the Cauchy stress per tet (m,3,3) [Pa], not finite in a flat tet; without a name, of all bodies as added."""
+    state = self._open().state
+    m, layout = state.model, state.layout
+    bodies = range(len(layout.n_tets)) if body is None else [body_index(self, body)]
+    sigma = np.zeros((m.n_blocks * m.lanes, 9))
+    elasticity.cauchy_stress(m, sigma)
+    first = layout.block_start * m.lanes
+    return np.concatenate([sigma[first[k] : first[k] + layout.n_tets[k]] for k in bodies]).reshape(-1, 3, 3)
+
+
+def elastic_forces(self: "Simulator") -> np.ndarray:
+    """Return the elastic forces on all nodes in the present state (n_nodes, 3) [N]."""
+    model = self._open().model
+    _, force = _tangent_fields(self)
+    elasticity.elastic_forces(model)
+    elasticity.gather_forces(model, force)
+    return force.to_numpy().astype(np.float64)
+
+
+def force_differential(self: "Simulator", displacement: np.ndarray) -> np.ndarray:
+    """Return the change of the elastic forces (df/dx) dx (n_nodes, 3) [N]; displacement: dx (n_nodes, 3) [m] of all nodes."""
+    model = self._open().model
+    check_rows(self, "displacement", displacement, slice(None))
+    dx, df = _tangent_fields(self)
+    upload([(dx, np.asarray(displacement))])
+    elasticity.force_differential(model, dx, df)
+    return df.to_numpy().astype(np.float64)
+
+
+def _tangent_fields(sim: "Simulator") -> tuple:
+    """Two fields of n_nodes 3-vectors, allocated at the first use."""
+    dynamics = sim._host()
+    if dynamics.tangent is None:
+        make, n, real = dynamics.arena.vectors, dynamics.model.n_nodes, dynamics.runtime.real
+        dynamics.tangent = make("tangent_dx", real, n), make("tangent_df", real, n)
+    return dynamics.tangent
+
+
+def stable_dt(self: "Simulator") -> float:
+    """Largest stable time step [s] of an explicit integrator about the rest shape: 2/omega_max without damping."""
+    if self._stable_dt is None:
+        self._stable_dt = largest_stable_dt(self.scene, self.settings.integrator == "velocity_verlet")
+    return self._stable_dt
+
+
+# --- contacts ---------------------------------------------------------------------------------------------------------
+
+
+def touches(self: "Simulator") -> bool:
+    """Whether contact forces are simulated."""
+    return self.plan.on["contact_forces"]
+
+
+def contact_limit(self: "Simulator", a: str, b: str) -> float:
+    """Penetration [m] of colliders a and b above which a step counts as deep. Requires contact forces (`touches`)."""
+    names = [c.name for c in self.scene.colliders]
+    return self._host().contact.measures.deep_from(names.index(a), names.index(b))
+
+
+def detect_contacts(self: "Simulator") -> "Contacts":
+    """Detect the contacts of the present state swept by dt v, with impulses 0, without taking a step.
+
+    `Scene.collision` and each body's `collision` choose the method; the plan lists which one each body and obstacle gets.
+    Memory and kernels are made at the first call. Raises MeshError if a distance field cannot be made, SimulationError
+    if positions or velocities are not finite or a buffer would grow beyond `max_capacity`.
+    """
+    return self._open().find_contacts(self.dt).contacts()
+
+
+def contacts(self: "Simulator") -> "Contacts":
+    """Return the contacts of the last step, with gaps at its start [m] and the impulses it applied [N s].
+
+    After a step that was cut into substeps, those of the last substep. Empty before the first step and if nothing can touch.
+    """
+    dynamics = self._open()
+    if dynamics.contact is not None:
+        return dynamics.contact.contacts()
+    from taisoft.collision.contacts import no_contacts
+
+    return no_contacts()
+
+
+def contact_force(self: "Simulator", name: str) -> np.ndarray:
+    """Return the total contact force (3,) on a body or an obstacle in the last step [N]."""
+    contact, scene = self._open().contact, self.scene
+    scene.surface_of(name)
+    return np.zeros(3) if contact is None else contact.force([c.name for c in scene.colliders].index(name))
+
+
+def deepest_overlap(self: "Simulator") -> "Overlap | None":
+    """Return the deepest overlapping pair in the present state and its depth [m], or None if nothing overlaps.
+
+    Slow: unlike `StepReport.max_penetration` it checks all pairs, whether or not their surfaces meet. The depth is the
+    largest over the vertices, nodes, tet centres and triangle-tet cuts of either that lie inside the other. In a sphere or
+    a capsule it is the radius minus the body's distance from the centre or axis.
+    """
+    return next(iter(self.overlaps()), None)
+
+
+def overlaps(self: "Simulator") -> "list[Overlap]":
+    """Return all overlapping pairs in the present state, deepest relative to the smaller one's size first."""
+    from taisoft.collision.overlap import find_overlaps
+
+    return find_overlaps(self._open().find_contacts(0.0))
+
+
+def intersecting_triangles(self: "Simulator") -> list[tuple[str, int, str, int]]:
+    """Return the pairs of surface triangles that intersect in the present state: name and triangle of each, each pair once.
+
+    Triangles are rows of `body.nodes.surface`, or of an obstacle's surface. Pairs within one body are included only with
+    self_collision; triangles that share a vertex are left out.
+    """
+    detection = self._open().find_contacts(0.0)
+    first, colliders = detection.topology.first, self.scene.colliders
+    pairs = detection.intersections()
+    owner = np.searchsorted(first, pairs, side="right") - 1
+    return [(colliders[a].name, int(t - first[a]), colliders[b].name, int(u - first[b])) for (t, u), (a, b) in zip(pairs, owner)]
+
+
+# --- dragging and resources -------------------------------------------------------------------------------------------
+
+
+def draggable(self: "Simulator") -> bool:
+    """Whether `drag` can be called."""
+    return self.settings.draggable
+
+
+def dragged(self: "Simulator") -> Drag | None:
+    """The present drag, with its point [m] and force [N] at the start of the last step; None if nothing is dragged."""
+    spring = self._host().drag_spring
+    return None if spring is None else spring.drag
+
+
+def compile_seconds(self: "Simulator") -> float:
+    """Time spent starting Taichi and compiling kernels for this simulator, including its construction [s]."""
+    return runtime.compile_clock() - self._compiled_before
+
+
+def field_bytes(self: "Simulator") -> dict[str, int]:
+    """Size of every allocated array [bytes], by name."""
+    return self._host().field_bytes
+
+
+def buffer_growths(self: "Simulator") -> dict[str, int]:
+    """How often each buffer of contact detection grew since the start; buffers that never grew are left out."""
+    detection = self._host().detection
+    return {name: n for name, n in detection.counts.growths.items() if n} if detection is not None else {}
+
+
+# --- arguments --------------------------------------------------------------------------------------------------------
+
+
+def body_index(sim: "Simulator", body: str) -> int:
+    """Return a body's number in its scene. Raises SceneError."""
+    return sim.scene.bodies.index(sim.scene.body(body))
+
+
+def nodes_of(sim: "Simulator", body: str | None) -> slice:
+    """Return a body's rows among all nodes; all of them without a name."""
+    return slice(None) if body is None else sim._host().state.layout.nodes(body_index(sim, body))
+
+
+def check_rows(sim: "Simulator", name: str, value, rows: slice) -> None:
+    """Raise SceneError unless value holds finite 3-vectors for those rows."""
+    dynamics, value = sim._host(), np.asarray(value)
+    expected = (len(range(*rows.indices(dynamics.model.n_nodes))), 3)
+    if value.shape != expected or value.dtype.kind not in "fiu":
+        raise SceneError(f"{name} have shape {value.shape} and type {value.dtype}: they must be {expected} numbers")
+    with np.errstate(over="ignore"):
+        bad = np.flatnonzero(~np.isfinite(value.astype(dynamics.runtime.np_real)).all(axis=1))
+    if len(bad):
+        raise SceneError(f"{name}: node {bad[0]} is not finite or too large for {dynamics.runtime.precision}")

@@ -1,0 +1,87 @@
+"""Digests of a scene's parts, which tell whether two scenes are the same, and the numbers that may change at run time."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable
+
+import numpy as np
+
+from taisoft.scene.body import Body
+from taisoft.scene.changes import LOADS
+from taisoft.scene.key_frames import NodePath, ShapePath
+from taisoft.scene.scene import Scene
+
+FEATURES = "the features that it needs"  # last entry of a fingerprint: of the plan, which follows from the parts and numbers
+
+
+def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]:
+    """Return a digest of each part of a scene that must be unchanged when a run resumes, by the part's name in messages."""
+    fingerprint = {  # in the order added, which numbers nodes
+        "bodies": json.dumps([body.name for body in scene.bodies]),
+        "obstacles": json.dumps([o.name for o in scene.obstacles]),
+    }
+    for body in scene.bodies:
+        owner = f"body '{body.name}'"
+        for part, values in _body_parts(body).items():
+            fingerprint[f"{owner}: {part}"] = digest(values)
+    for obstacle in scene.obstacles:
+        owner, shape = f"obstacle '{obstacle.name}'", obstacle.shape
+        values = [getattr(shape, field.name) for field in dataclasses.fields(shape)]
+        fingerprint[f"{owner}: shape, friction, restitution or path"] = digest(
+            [type(shape).__name__, *values, obstacle.friction, obstacle.restitution, *_path_parts(obstacle.path)]
+        )
+    fingerprint["collision settings"] = digest([json.dumps(dataclasses.asdict(scene.collision)), scene.contact_forces])
+    # features unused at the start, such as damping 0, are compiled out
+    fingerprint[FEATURES] = digest([json.dumps(features)])
+    return fingerprint
+
+
+def scene_digest(scene: Scene) -> str:
+    """Return a digest of everything comparable in a scene: its parts as a checkpoint compares them, and its numbers."""
+    loads = [load.value for body in scene.bodies for name in LOADS.values() for load in getattr(body, name)]
+    return digest(
+        [json.dumps(scene_fingerprint(scene, {})), json.dumps(run_time_numbers(scene)), scene.allow_initial_overlap, *loads]
+    )
+
+
+def _body_parts(body: Body) -> dict[str, list]:
+    """Return the values that define a body, by the part's name in messages."""
+    return {
+        "mesh": [body.mesh.vertices, body.mesh.tets],
+        "order, quadrature, law or collision": [body.order, body.quadrature_degree, body.material.law, body.collision],
+        "start": [body.position, body.velocity],
+        "constraints": [x for c in body.constraints for x in (c.nodes, c.axes, *_path_parts(c.path))],
+        "loads": [
+            *(x for t in body.tractions for x in ("traction", t.triangles)),
+            *(x for f in body.forces for x in ("force", f.nodes)),
+        ],
+    }
+
+
+def _path_parts(path: Callable | None) -> list:
+    """Return the comparable values of a path: the data of key frames; of another function only that it exists."""
+    if not isinstance(path, (NodePath, ShapePath)):
+        return [path is None]
+    frames = path.frames
+    values = [frames.times, frames.translations, frames.rotations, frames.pivot, frames.smooth, frames.release]
+    return [*values, path.starts if isinstance(path, NodePath) else path.center]
+
+
+def run_time_numbers(scene: Scene) -> dict:
+    """Return the numbers of a scene that may change at run time, except its loads."""
+    pairs = [[sorted(names), *numbers] for names, numbers in scene.contact_pairs.items()]
+    materials = [dataclasses.asdict(body.material) for body in scene.bodies]
+    return {"gravity": scene.gravity.tolist(), "materials": materials, "pairs": pairs}
+
+
+def digest(values: list) -> str:
+    """Return the SHA-256 (hex) of arrays and plain values."""
+    sha256 = hashlib.sha256()
+    for value in values:
+        if isinstance(value, np.ndarray):
+            sha256.update(f"{value.dtype.str} {value.shape} ".encode())
+            sha256.update(np.ascontiguousarray(value))
+        else:
+            sha256.update(json.dumps(value).encode())
+    return sha256.hexdigest()
