@@ -11,7 +11,7 @@ READY := $(VENV)/ready
 DOCS_READY := $(VENV)/docs-ready
 DEMO_OUT := out/hanging_beam
 
-.PHONY: demo test test-long figures docs lint clean
+.PHONY: demo test test-long figures docs wheel lint clean
 
 demo: $(READY)
 	$(BIN)/taisoft run hanging_beam --headless --out $(DEMO_OUT) --overwrite
@@ -33,6 +33,15 @@ docs: $(DOCS_READY)
 	$(BIN)/python -m pytest -q -p no:cacheprovider -p no:warnings docs
 	$(BIN)/sphinx-build -q -n -W --keep-going docs out/docs
 	@echo "Written to out/docs: open out/docs/index.html."
+
+# Builds the wheel, installs it in an environment of its own, and runs a demo from there.
+wheel: $(READY)
+	rm -rf out/wheel
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir out/wheel .
+	$(BIN)/python -m venv out/wheel/venv
+	out/wheel/venv/bin/python -m pip install --quiet --disable-pip-version-check out/wheel/*.whl
+	cd out/wheel && venv/bin/taisoft run hanging_beam --headless --seconds 0.1 --out run && venv/bin/taisoft doctor
+	@echo "Written to out/wheel: the wheel, which installs and runs."
 
 lint: $(READY)
 	$(BIN)/ruff check .
