@@ -18,10 +18,11 @@ from scenes import built, mixed_scene, rubber
 import taisoft as ts
 from taisoft.dynamics import contact_newton
 from taisoft.dynamics.contact_terms import NO_CONTACTS
-from taisoft.dynamics.elimination import FEW, SubsetLists, choose_nodes, eliminate, entries_of, solve_on
+from taisoft.dynamics.elimination import FEW, choose_nodes, eliminate, solve_on
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.stage import ELASTIC_STAGE, STAY, form_residual, move
 from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.dynamics.subset_lists import SubsetLists, entries_of
 from taisoft.fem.subset import BLOCKS, EDGES, NODES
 from taisoft.linear import block_csr, pcg
 

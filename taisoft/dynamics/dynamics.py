@@ -291,6 +291,6 @@ def make_stepper(
         from taisoft.dynamics.explicit_stepper import ExplicitStepper
 
         return ExplicitStepper(simulation, settings)
-    from taisoft.dynamics.explicit_contact import ContactExplicitStepper
+    from taisoft.dynamics.explicit_contact_stepper import ContactExplicitStepper
 
     return ContactExplicitStepper(simulation, settings, contact)

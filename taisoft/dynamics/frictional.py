@@ -12,8 +12,8 @@ nearly solves the problem with frozen disks, and that iteration need not converg
 Source: Alart and Curnier 1991 for the laws as a prox; the loop is that of the method of multipliers.
 
 Most problems, and the impacts before a step, need few multipliers. If disks and normal impulses keep changing each other
-slowly, each multiplier may leave 98 % of the laws' residual. So after EXTRAPOLATE_AFTER of them (`ContactNewton`: at once if |r|
-is only rounding) R becomes R_EXTRAPOLATED and stays, and multipliers are extrapolated from the last two
+slowly, each multiplier may leave 98 % of the laws' residual. So after EXTRAPOLATION_START of them (`ContactNewton`: at once if
+|r| is only rounding) R becomes R_EXTRAPOLATED and stays, and multipliers are extrapolated from the last two
 (Anderson 1965, in the form of Walker and Ni 2011): with f = p - lambda, the new one is p - sum t_i (p_i+1 - p_i), where t
 minimises |f - sum t_i (f_i+1 - f_i)|, each entry divided by the square root of its r-factor. Problems of a Newton iteration that
 stalls are never extrapolated: redundant contacts exchange impulses slowly there, which R up to MAX_R_SCALE speeds up.
@@ -34,7 +34,7 @@ R_SCALE, MIN_R_SCALE, MAX_R_SCALE, MANY_STEPS = 1.0, 0.3, 100.0, 5  # R over the
 LAW_INCREASE, STEADY = 1.2, 4.0  # times the previous laws' residual: above it R is halved, if larger than STEADY
 LAW_DECREASE = 0.8  # times the previous laws' residual: below it R stays
 MAX_MULTIPLIERS = 200
-EXTRAPOLATE_AFTER = 25  # multipliers
+EXTRAPOLATION_START = 25  # multipliers
 R_EXTRAPOLATED = 5.0  # R over the r-factors from then on: iterations vary little from 5 to 7 and increase outside
 FINER = 0.1  # times the |r| that ends the steps under one multiplier, from then on
 MAX_EXTRAPOLATION = 100.0  # maximum extrapolation, in steps

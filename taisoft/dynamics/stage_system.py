@@ -28,7 +28,6 @@ from taisoft.dynamics.contact_terms import (
     save_diagonal,
     update_impulses,
 )
-from taisoft.dynamics.elimination import SubsetLists
 from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised
 from taisoft.dynamics.stage import (
     AGAIN,
@@ -43,6 +42,7 @@ from taisoft.dynamics.stage import (
     negate_direction,
     set_direction_to_rest,
 )
+from taisoft.dynamics.subset_lists import SubsetLists
 from taisoft.fem.model import Model
 from taisoft.fem.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
 from taisoft.fem.subset import EVERYTHING
@@ -70,7 +70,7 @@ class Stage:
     multiplier_tolerance: float | None = None  # as `tolerance`, for the steps under one multiplier; None: the same
     absolute_tolerance: float = 0.0  # |r| [N s] that also ends the stage, regardless of the scale
     keeps_multipliers: bool = False  # do not update the multipliers
-    extrapolate_after: int = frictional.EXTRAPOLATE_AFTER  # multiplier updates
+    extrapolate_after: int = frictional.EXTRAPOLATION_START  # multiplier updates
     later_tolerance: float = 0.0  # lower bound on linear_tolerance after the first solve
 
     @property
