@@ -33,7 +33,7 @@ INSTEAD = {  # what to do instead of assigning to an attribute that a simulator 
 
 def dt(self: "Simulator") -> float:
     """Time step [s]; a new value takes effect with the next step."""
-    return self._host().dt
+    return self._dynamics.dt
 
 
 def set_dt(self: "Simulator", value: float) -> None:

@@ -33,7 +33,7 @@ class Simulator(Guarded):
     _instead = changes.INSTEAD
     settings: Settings
     _stable_dt: float | None = None  # None: not computed yet, or outdated
-    _dynamics: Dynamics | None = None  # None once closed
+    _dynamics: Dynamics | None = None  # None until it is made
 
     def __init__(
         self,
@@ -182,7 +182,6 @@ class Simulator(Guarded):
         """Release memory and runtime; a closed simulator cannot be used."""
         if self._dynamics is not None:
             self._dynamics.release()
-            self._dynamics = None
 
     def __enter__(self) -> "Simulator":
         return self
@@ -192,7 +191,7 @@ class Simulator(Guarded):
 
     def _host(self) -> Dynamics:
         """Return the dynamics for data on the host alone. Raises SimulationError after `close`."""
-        if self._dynamics is None:
+        if not self._dynamics.release.alive:
             raise SimulationError("the simulator is closed")
         return self._dynamics
 

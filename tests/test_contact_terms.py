@@ -23,7 +23,7 @@ from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, fi
 from taisoft.dynamics import contact_terms, linearised
 from taisoft.dynamics.contact_terms import NO_CONTACTS
 from taisoft.dynamics.no_contacts import NoContacts
-from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, STAY, STEP, form_residual, move
+from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, STAY, STEP, form_residual, move
 from taisoft.dynamics.stage_system import StageSystem
 from taisoft.fem.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
 from taisoft.fem.subset import EVERYTHING

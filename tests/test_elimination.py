@@ -20,7 +20,7 @@ from taisoft.dynamics import contact_newton
 from taisoft.dynamics.contact_terms import NO_CONTACTS
 from taisoft.dynamics.elimination import FEW, choose_nodes, eliminate, solve_on
 from taisoft.dynamics.no_contacts import NoContacts
-from taisoft.dynamics.residual import ELASTIC_STAGE, STAY, form_residual, move
+from taisoft.dynamics.stage import ELASTIC_STAGE, STAY, form_residual, move
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.subset_lists import SubsetLists, entries_of
 from taisoft.fem.subset import BLOCKS, EDGES, NODES

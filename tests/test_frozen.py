@@ -15,7 +15,7 @@ import pytest
 from scenes import cube, rubber
 
 import taisoft as ts
-from taisoft import simulator
+from taisoft.dynamics import dynamics
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene.refine import with_order
 
@@ -216,7 +216,7 @@ def test_only_a_simulator_that_was_made_freezes(taken, tmp_path, monkeypatch):
         with pytest.raises(SimulationError):
             ts.Simulator(scene, **settings)
     with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="late"):
-        patch.setattr(simulator, "make_stepper", fail)
+        patch.setattr(dynamics, "make_stepper", fail)
         ts.Simulator(scene, DT, "symplectic_euler", precision="f64")
     held = ts.Scene()
     held.add_body(cube(), rubber()).fix(lambda X: X[:, 0] < 0)

@@ -11,10 +11,10 @@ import pytest
 from scenes import cube, rubber
 
 import taisoft as ts
-from taisoft.dynamics import contact_newton, line_search
-from taisoft.dynamics.line_search import FAR, choose_start
+from taisoft.dynamics import contact_newton, newton
 from taisoft.dynamics.linearised import LONGEST
-from taisoft.dynamics.residual import AGAIN, STEP
+from taisoft.dynamics.newton import FAR, choose_start
+from taisoft.dynamics.stage import AGAIN, STEP
 from taisoft.dynamics.stage_system import StageSystem
 from taisoft.fem.scalars import STEP_LENGTH
 
@@ -105,7 +105,7 @@ def test_contacts_end_where_another_start_does(seen, monkeypatch, root):
     monkeypatch.setattr(StageSystem, "advance", advance)
     found, iterations, starts = [], [], []
     for far in (FAR, np.inf):
-        monkeypatch.setattr(line_search, "FAR", far)
+        monkeypatch.setattr(newton, "FAR", far)
         seen.clear()
         with beam(fixed=False, ground=True) as sim:
             sim.set_state(velocities=wild(sim, 20.0) - (0.0, 3.0, 0.0))

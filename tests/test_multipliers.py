@@ -19,7 +19,7 @@ from scenes import opened
 from taisoft.backend.fields import FieldArena
 from taisoft.contact.problem import build_node_problem, fill_field
 from taisoft.dynamics.contact_terms import PAST
-from taisoft.dynamics.multipliers import MAX_EXTRAPOLATION, MAX_R_SCALE, MIN_R_SCALE, extrapolate_multipliers, next_scale
+from taisoft.dynamics.frictional import MAX_EXTRAPOLATION, MAX_R_SCALE, MIN_R_SCALE, extrapolate_multipliers, next_scale
 
 K = 40
 

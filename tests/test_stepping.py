@@ -22,9 +22,9 @@ from scenes import driven_scene, mixed_scene, rows_of
 from scipy.linalg import block_diag
 
 import taisoft as ts
+from taisoft.dynamics.dynamics import make_stepper
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.schemes import IMPLICIT, INTEGRATORS, SCHEMES
-from taisoft.dynamics.stepper import make_stepper
 from taisoft.fem import reference
 from taisoft.fem.model import damping_table
 from taisoft.linear.block_csr import to_scipy

@@ -12,13 +12,11 @@ from dataclasses import dataclass, replace
 
 from taisoft.backend.launching import PUBLIC
 from taisoft.dynamics.elimination import eliminate
-from taisoft.dynamics.frictional import INDEFINITE, LINEAR, MULTIPLIERS, NORM, ROUNDING, SOLVED, STATUS
+from taisoft.dynamics.frictional import INDEFINITE, LINEAR, MAX_MULTIPLIERS, MULTIPLIERS, NORM, ROUNDING, SOLVED, STATUS
 from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
-from taisoft.dynamics.line_search import choose_start, search
-from taisoft.dynamics.multipliers import MAX_MULTIPLIERS
-from taisoft.dynamics.newton import DECREASE, ELIMINATION_RATIO, Newton
-from taisoft.dynamics.residual import AGAIN
+from taisoft.dynamics.newton import DECREASE, ELIMINATION_RATIO, Newton, choose_start, search
 from taisoft.dynamics.results import StageResult, relative
+from taisoft.dynamics.stage import AGAIN
 from taisoft.dynamics.stage_system import Stage, StageSystem
 
 SOLVES, FORCING = 60, 0.3  # maximum linear solves of a frictional problem, and their tolerance

@@ -1,4 +1,9 @@
-"""A scene on the device, and everything that steps it: state, contacts, drag spring and integrator."""
+"""A scene on the device, and everything that steps it: state, contacts, drag spring and integrator.
+
+Steppers are imported only when needed, since decorating kernels takes time. A stepper has `advance(n, dt) -> StepResult`;
+`forget`, `numbers_changed` and `loads_changed` to follow changes between steps; `held_steps(dt)`, the steps over which a drag
+force is held; `reactions`; `snapshot` and `restore`; `field_bytes` and `release`.
+"""
 
 import weakref
 from typing import TYPE_CHECKING
@@ -10,8 +15,8 @@ from taisoft.backend.fields import FieldArena
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.drag_spring import DragSpring
 from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.schemes import IMPLICIT
 from taisoft.dynamics.simulation_state import SimulationState
-from taisoft.dynamics.stepper import make_stepper
 from taisoft.errors import SimulationError
 from taisoft.fem.elasticity import NO_TET, measure
 from taisoft.fem.model import build_model
@@ -23,6 +28,10 @@ from taisoft.settings import Settings, check_dt
 
 if TYPE_CHECKING:
     from taisoft.collision.pipeline import Detection
+    from taisoft.dynamics.contact import ContactStep
+    from taisoft.dynamics.explicit_stepper import ExplicitStepper
+    from taisoft.dynamics.implicit import ImplicitStepper
+    from taisoft.dynamics.no_contacts import NoContacts
 
 
 class Dynamics:
@@ -268,3 +277,20 @@ def _release(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:
         owned.pop().release()
     arena.release()
     claim.close()
+
+
+def make_stepper(
+    simulation: SimulationState, settings: Settings, contact: "ContactStep | NoContacts"
+) -> "ExplicitStepper | ImplicitStepper":
+    """Return the stepper of checked settings."""
+    if settings.integrator in IMPLICIT:
+        from taisoft.dynamics.implicit import ImplicitStepper
+
+        return ImplicitStepper(simulation, settings, contact)
+    if contact.idle:
+        from taisoft.dynamics.explicit_stepper import ExplicitStepper
+
+        return ExplicitStepper(simulation, settings)
+    from taisoft.dynamics.explicit_contact_stepper import ContactExplicitStepper
+
+    return ContactExplicitStepper(simulation, settings, contact)

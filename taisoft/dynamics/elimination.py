@@ -13,7 +13,7 @@ import numpy as np
 
 from taisoft.backend.transfer import download
 from taisoft.dynamics.newton import Newton
-from taisoft.dynamics.residual import STAY
+from taisoft.dynamics.stage import STAY
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.subset_lists import entries_of
 

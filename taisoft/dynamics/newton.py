@@ -1,27 +1,29 @@
 """Newton's method for an implicit stage; with contacts, inside an augmented Lagrangian loop.
 
 Each step solves with the unprojected matrix by conjugate gradients; at negative curvature the direction follows it
-(`linear.pcg`). The step length is found by `line_search`. CG's tolerance follows Newton's progress (Eisenstat and Walker 1996,
+(`linear.pcg`). The step length is found by `search`. CG's tolerance follows Newton's progress (Eisenstat and Walker 1996,
 choice 2). If a slow step leaves a residual on few nodes, these are solved separately first, see `elimination`.
 With contacts, inner solves are inexact: the augmented Lagrangian is minimised until |r| is PROGRESS times its value after the
-multiplier update, or small enough, unless `multiplier_tolerance` or extrapolation require a smaller |r|, see `multipliers`.
+multiplier update, or small enough, unless `multiplier_tolerance` or extrapolation require a smaller |r|, see `frictional`.
 
 Convergence: |r| <= tolerance * scale, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes, impulses in r, and
 the residual of the contact laws, |p - prox(p - f u)| / |p| with f = 1 / (J diag(A)^-1 J^T), within its own tolerance. A residual
 below a few times the rounding of the forces (at rest) that a Newton step no longer halves is rounding. It corresponds to strains
 of rounding size, so the stage ends as converged and reports its actual residual. In statics the scale is the applied load
 (without any: the constraint forces), and rounding above the tolerance is not convergence.
+
+The line search goes by the slope of the merit function along a step, since opening and closing contacts, and tets that invert,
+can increase |r| in one step and decrease it in the next. A step that ends on a steep rise is shortened by secants, one that ends
+on a steep descent is doubled.
 """
 
 import math
 from collections.abc import Callable
 from typing import Any
 
-from taisoft.dynamics.frictional import PROGRESS, ROUNDING
-from taisoft.dynamics.line_search import search
-from taisoft.dynamics.multipliers import FINER, MAX_MULTIPLIERS, PAST, R_EXTRAPOLATED, R_SCALE, next_scale
-from taisoft.dynamics.residual import ELASTIC_STAGE, IMPACT, LINEARISED, STEP
+from taisoft.dynamics.frictional import FINER, MAX_MULTIPLIERS, PAST, PROGRESS, R_EXTRAPOLATED, R_SCALE, ROUNDING, next_scale
 from taisoft.dynamics.results import StageResult, relative
+from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STEP
 from taisoft.dynamics.stage_system import Stage, StageSystem
 
 LINEAR_LIMIT = 0.01  # relative true residual above which a linearly implicit step has failed
@@ -31,6 +33,9 @@ REBUILD_RATIO = 0.2  # a step that leaves a larger fraction of |r| requires a ne
 MIN_USES = {False: 1, True: 3}  # minimum steps per matrix, without and with contacts; with them mostly the active contacts change
 ELIMINATION_RATIO = 0.1  # a step that leaves a larger fraction of |r| requires elimination
 DECREASE = 0.9  # with contacts, fraction of the smallest |r| so far below which a step is accepted without its slope
+FLAT, STEEP = 0.5, 0.3  # of the initial slope: rise that shortens a step; descent that doubles it
+TRIES, LONGEST = 20, 1024.0  # trial step lengths, and the longest
+FAR = 0.5  # |r| over scale at the first iterate above which v = 0 is tried
 
 
 class Newton:
@@ -205,3 +210,46 @@ class Newton:
             self.r, self.scale = system.evaluate(STEP)
             self.newton = 1
         return self._result(solved)
+
+
+def choose_start(system: StageSystem, r: float, scale: float) -> tuple[float, float, bool]:
+    """Start from v = 0 if |r| is smaller there than at the first iterate, whose (|r|, scale) is given.
+
+    Return (|r|, scale) there, and whether it is v = 0; then y points back to the first iterate, a good first direction on the
+    matrix formed at v = 0. If tets oscillate many times in a step, as inverted ones do, continuing their motion is far from
+    balance. Statics keeps its start.
+    """
+    if r <= FAR * scale or system.is_static:
+        return r, scale, False
+    system.set_direction_to_rest()
+    trial = system.evaluate(STEP)
+    if trial[0] < r or not math.isfinite(r):
+        system.negate_direction()
+        return *trial, True
+    return *system.evaluate(AGAIN, 0.0), False
+
+
+def search(system: StageSystem, acceptable: float) -> tuple[float, float, bool]:
+    """Search the step length; return (|r|, scale, success). acceptable: |r| below which the slope is not checked."""
+    r, scale = system.evaluate(STEP)
+    length, low, at_low, high, at_high = 1.0, 0.0, system.slopes[0], math.inf, math.inf
+    slope = at_low
+    for _ in range(TRIES):
+        rise = system.slopes[1]
+        too_far = not rise <= -FLAT * slope  # also if it is not a number
+        if r < acceptable or (slope < 0.0 and not too_far and (rise >= STEEP * slope or length >= min(0.4 * high, LONGEST))):
+            return r, scale, True
+        if slope >= 0.0:
+            break
+        if too_far:
+            high, at_high = length, rise
+        else:
+            low, at_low = length, rise
+        if high == math.inf:
+            length *= 2.0
+        else:
+            secant = at_low / (at_low - at_high) if math.isfinite(at_high) else 0.5
+            length = low + (high - low) * min(max(secant, 0.1 if low == 0.0 else 0.4), 0.9)
+        r, scale = system.evaluate(AGAIN, length)
+    r, scale = system.evaluate(AGAIN, 0.0)
+    return r, scale, False

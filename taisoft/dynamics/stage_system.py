@@ -18,7 +18,8 @@ import taichi as ti
 from taisoft.backend.fields import FieldArena
 from taisoft.backend.transfer import download, upload
 from taisoft.contact.problem import RESIDUAL, find_factors
-from taisoft.dynamics import frictional, multipliers
+from taisoft.dynamics import frictional
+from taisoft.dynamics.body_balance import RoundingFloor
 from taisoft.dynamics.contact_terms import (
     NO_CONTACTS,
     StageContacts,
@@ -28,9 +29,19 @@ from taisoft.dynamics.contact_terms import (
     update_impulses,
 )
 from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised
-from taisoft.dynamics.residual import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STAY, form_residual, move
-from taisoft.dynamics.rounding import RoundingFloor
-from taisoft.dynamics.stage import StageWork, begin_stage, negate_direction, set_direction_to_rest
+from taisoft.dynamics.stage import (
+    AGAIN,
+    ELASTIC_STAGE,
+    IMPACT,
+    LINEARISED,
+    STAY,
+    StageWork,
+    begin_stage,
+    form_residual,
+    move,
+    negate_direction,
+    set_direction_to_rest,
+)
 from taisoft.dynamics.subset_lists import SubsetLists
 from taisoft.fem.model import Model
 from taisoft.fem.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
@@ -59,7 +70,7 @@ class Stage:
     multiplier_tolerance: float | None = None  # as `tolerance`, for the steps under one multiplier; None: the same
     absolute_tolerance: float = 0.0  # |r| [N s] that also ends the stage, regardless of the scale
     keeps_multipliers: bool = False  # do not update the multipliers
-    extrapolate_after: int = multipliers.EXTRAPOLATE_AFTER  # multiplier updates
+    extrapolate_after: int = frictional.EXTRAPOLATION_START  # multiplier updates
     later_tolerance: float = 0.0  # lower bound on linear_tolerance after the first solve
 
     @property
@@ -175,7 +186,7 @@ class StageSystem:
         return self._k
 
     def _begin(self, stage: Stage, kind: int) -> None:
-        self.stage, self.kind, self.r_scale, self._k = stage, kind, multipliers.R_SCALE, NO_CONTACTS
+        self.stage, self.kind, self.r_scale, self._k = stage, kind, frictional.R_SCALE, NO_CONTACTS
         self.restrict(None)
         if self.contact.n_contacts == 0:
             return
@@ -199,7 +210,7 @@ class StageSystem:
 
     def extrapolate_multipliers(self, n_remembered: int) -> None:
         """Extrapolate multipliers from the impulses and the last n_remembered updates; keep impulses and residual."""
-        multipliers.extrapolate_multipliers(self._k, n_remembered)
+        frictional.extrapolate_multipliers(self._k, n_remembered)
 
     def set_direction_to_rest(self) -> None:
         """Set y so that a full step leads to v = 0."""
@@ -249,7 +260,7 @@ class StageSystem:
         m, A, loop, limits = self.model, self.matrix, np.zeros(15), np.zeros(10)
         loop[[frictional.NORM, frictional.SCALE, frictional.LAW_RESIDUAL, frictional.INNER_TARGET, frictional.SAME_MATRIX]] = (
             r,
-            multipliers.R_SCALE,
+            frictional.R_SCALE,
             math.inf,
             frictional.PROGRESS * r,
             self._same_matrix,
