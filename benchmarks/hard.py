@@ -30,8 +30,7 @@ from taisoft.timing import load_average
 
 from .document import RESULTS, Document, check_out, default_out, header, header_text
 from .hard_cases import CASES
-from .hard_runs import Row, answer, measure, stored
-from .hard_score import faults
+from .hard_runs import Row, Runner, answer, stored
 from .hard_table import page
 
 DAY = 86_400.0  # [s]
@@ -61,7 +60,8 @@ def measured(rows: list[Row], options: argparse.Namespace, document: Document) -
             stack.enter_context(closing(FolderLock(folder)))
             store = Store(folder)
         signals.run_began()
-        measure(rows, options.arch, options.references, store, lambda: end - time.monotonic(), signals.requested, _tell)
+        runner = Runner(options.arch, store, lambda: end - time.monotonic(), signals.requested, _say)
+        runner.measure(rows, options.references)
     for text in (*page(rows), *store.damaged):
         document.add(text)
     return numbers | {
@@ -85,7 +85,7 @@ def judged(path: Path, document: Document) -> tuple[list[Row], dict]:
     return rows, numbers | {"rows": [row.data() for row in rows]}
 
 
-def _tell(text: str) -> None:
+def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
@@ -124,7 +124,7 @@ def main(argv=None) -> int:
         numbers = measured(rows, options, document)
     if out is not None:
         document.write(out, numbers)
-    return 1 if any(faults(row) for row in rows) else 0
+    return 1 if any(row.faults for row in rows) else 0
 
 
 if __name__ == "__main__":

@@ -44,6 +44,11 @@ def voxels(filled: np.ndarray, edge: float, center=(0.0, 0.0, 0.0)) -> ts.TetMes
     return ts.TetMesh(whole.vertices[used], np.searchsorted(used, tets))
 
 
+def not_finite(*states: np.ndarray) -> float:
+    """1 where some number of the states is not finite, else 0."""
+    return float(not all(np.isfinite(state).all() for state in states))
+
+
 def split(mesh: ts.TetMesh, times: int = 1) -> ts.TetMesh:
     """Every tet cut into eight, some times."""
     for _ in range(times):
