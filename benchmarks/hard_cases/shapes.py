@@ -5,7 +5,7 @@ import numpy as np
 import taisoft as ts
 from taisoft.mesh.nodes import make_nodes
 
-from ..reference_cases.record import deformation_gradients
+from ..reference_cases.record import deformation_gradients, submesh
 
 SNH, COR, SVK = "stable_neo_hookean", "corotational", "st_venant_kirchhoff"
 G = 9.81  # [m/s^2]
@@ -39,9 +39,7 @@ def turned(mesh: ts.TetMesh, angle: float, axis: int) -> ts.TetMesh:
 def voxels(filled: np.ndarray, edge: float, center=(0.0, 0.0, 0.0)) -> ts.TetMesh:
     """The filled voxels (nx,ny,nz) bool of a grid about a center [m], each cut as a cell of `box`."""
     whole = box(filled.shape, edge * np.array(filled.shape), center)
-    tets = whole.tets.reshape(-1, 6, 4)[filled.reshape(-1)].reshape(-1, 4)
-    used = np.unique(tets)
-    return ts.TetMesh(whole.vertices[used], np.searchsorted(used, tets))
+    return submesh(whole, filled.reshape(-1).repeat(6))
 
 
 def not_finite(*states: np.ndarray) -> float:
