@@ -5,7 +5,7 @@ import numpy as np
 import taisoft as ts
 
 from .case import ANALYTIC, DEEPEST, OK, PROPOSED, Case, Must, Session, implicit
-from .shapes import COR, DOWN, SNH, cube, not_finite, split, turned, voxels
+from .shapes import COR, DOWN, SNH, cube, not_finite, one_body, split, turned, voxels
 
 
 def on_slope(mesh: ts.TetMesh, material: ts.Material, angle: float, friction: float) -> ts.Scene:
@@ -83,9 +83,8 @@ def spike_in_hole(session: Session) -> dict[str, float]:
     middle = (np.arange(4) - 1.5) * 0.05
     rim = np.maximum(*np.abs(np.meshgrid(middle, middle, indexing="ij"))) > 0.05
     block = voxels(np.repeat(rim[:, None], 2, axis=1), 0.05)
-    scene = ts.Scene(gravity=DOWN)
-    soft = ts.Material(law=COR, young=1e5, poisson=0.4, density=1000.0, friction=1.0)
-    scene.add_body(mesh, soft, name="spike", position=(0.0167, -0.14, 0.0167))
+    place, soft = (0.0167, -0.14, 0.0167), {"law": COR, "young": 1e5, "poisson": 0.4, "friction": 1.0}
+    scene, _ = one_body("spike", mesh, DOWN, place, **soft)
     scene.add_obstacle(ts.MeshObstacle(block.vertices, block.surface), name="block", friction=1.0)
     with session.simulator(scene) as sim:
         (rising,) = session.watch(sim, 400, lambda: sim.velocities().mean(axis=0)[1])
@@ -110,9 +109,8 @@ def flat_mesh(edge: float, cells: tuple[int, int]) -> ts.MeshObstacle:
 
 def inner_edges(session: Session) -> dict[str, float]:
     """C3 b: a cube slides over the inner edges of a flat mesh as over a plane."""
-    scene = ts.Scene(gravity=DOWN)
-    soft = ts.Material(law=COR, young=1e5, poisson=0.3, density=1000.0, friction=0.0)
-    scene.add_body(cube(3, 0.1), soft, name="cube", position=(0, 0.05, 0.013), velocity=(1, 0, 0))
+    soft = {"law": COR, "young": 1e5, "poisson": 0.3, "friction": 0.0}
+    scene, _ = one_body("cube", cube(3, 0.1), DOWN, (0, 0.05, 0.013), (1, 0, 0), **soft)
     scene.add_obstacle(flat_mesh(0.37, (6, 3)), name="floor", friction=0.0)
     with session.simulator(scene) as sim:
         means = (lambda: sim.positions().mean(axis=0)), (lambda: sim.velocities().mean(axis=0)[0])

@@ -9,7 +9,7 @@ from taisoft.cli.info import describe
 
 from ..reference_cases.record import face, nearest
 from .case import EXPLICIT, IMPLICIT, MEASURED, OK, PROPOSED, REFUSED, Case, Must, Session, explicit, implicit, refusal
-from .shapes import COR, DOWN, SNH, box, not_finite
+from .shapes import COR, DOWN, SNH, box, not_finite, one_body
 
 NAMED = "volume of the tet that the load report names as worst, over s times the mean"
 LIMITS = {1.0: 2.22e-3, 1e-2: 2.68e-4, 1e-4: 2.67e-5}  # [s] for 1000 kg/m^3, by power iteration
@@ -27,9 +27,9 @@ def sliver_mesh(s: float) -> ts.TetMesh:
 
 def sliver_scene(law: str, s: float) -> ts.Scene:
     """The bar, clamped, under a tenth of gravity."""
-    scene = ts.Scene(gravity=(0.0, -0.981, 0.0))
-    soft = ts.Material(law=law, young=1e5, poisson=0.4, density=DENSITY, mass_damping=2.0)
-    scene.add_body(sliver_mesh(s), soft, name="bar").fix(face(0, 0.0))
+    soft = {"law": law, "young": 1e5, "poisson": 0.4, "density": DENSITY, "mass_damping": 2.0}
+    scene, bar = one_body("bar", sliver_mesh(s), (0.0, -0.981, 0.0), **soft)
+    bar.fix(face(0, 0.0))
     return scene
 
 
@@ -80,9 +80,8 @@ def depth_in_knife(points: np.ndarray, x: float) -> float:
 
 def knives(session: Session) -> dict[str, float]:
     """G2: a mat falls 0.02 m onto five knives."""
-    scene, places = ts.Scene(gravity=DOWN), 0.1 * np.arange(-2, 3)
-    soft = ts.Material(law=SNH, young=2e4, poisson=0.4, density=1000.0, friction=0.0)
-    body = scene.add_body(box((15, 1, 15), (0.6, 0.02, 0.6)), soft, name="mat", position=(0, 0.03, 0))
+    mesh, places = box((15, 1, 15), (0.6, 0.02, 0.6)), 0.1 * np.arange(-2, 3)
+    scene, body = one_body("mat", mesh, DOWN, (0, 0.03, 0), law=SNH, young=2e4, poisson=0.4, friction=0.0)
     for k, x in enumerate(places):
         scene.add_obstacle(knife(x), name=f"knife {k}", friction=0.0)
     scene.add_obstacle(ts.HalfSpace((0, -0.11, 0), (0, 1, 0)), name="plane", friction=0.0)

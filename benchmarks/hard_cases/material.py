@@ -2,7 +2,6 @@
 
 import numpy as np
 
-import taisoft as ts
 from taisoft.scene.key_frames import KeyFrames
 
 from ..reference_cases.record import face
@@ -22,7 +21,7 @@ from .case import (
     explicit,
     implicit,
 )
-from .shapes import COR, SNH, SVK, WEIGHTLESS, box, cube, not_finite, rest_at_last
+from .shapes import COR, SNH, SVK, WEIGHTLESS, box, cube, not_finite, one_body, rest_at_last
 
 LAWS = (COR, SNH)
 FINITE = "numbers that are not finite in the last state"
@@ -40,9 +39,7 @@ def start_of(name: str, X: np.ndarray) -> np.ndarray:
 
 def recover(session: Session, law: str, start: str, steps: int) -> dict[str, float]:
     """M1, M2: a free cube of 1 m from a start in which tets have no volume or a negative one, for 14 s."""
-    scene = ts.Scene(gravity=WEIGHTLESS)
-    soft = ts.Material(law=law, young=1e5, poisson=0.4, density=1000.0, mass_damping=6.0)
-    body = scene.add_body(cube(4, 1.0), soft, name="cube")
+    scene, body = one_body("cube", cube(4, 1.0), law=law, young=1e5, poisson=0.4, mass_damping=6.0)
     with session.simulator(scene) as sim:
         sim.set_state(start_of(start, body.rest_positions))
         session.go(sim, steps, every=max(1, steps // 700))
@@ -51,8 +48,7 @@ def recover(session: Session, law: str, start: str, steps: int) -> dict[str, flo
 
 def squeeze(session: Session, law: str) -> dict[str, float]:
     """M3: a cube of 0.1 m is squeezed to half its height, held, and drawn back."""
-    scene = ts.Scene(gravity=WEIGHTLESS)
-    body = scene.add_body(cube(4, 0.1), ts.Material(law=law, young=1e5, poisson=0.3, density=1000.0), name="cube")
+    scene, body = one_body("cube", cube(4, 0.1), law=law, young=1e5, poisson=0.3)
     body.fix(face(1, -0.05))
     down = [0.0, 0.0, 0.0], [0.0, -0.05, 0.0]
     body.move(face(1, 0.05), KeyFrames([0.0, 1.0, 1.5, 2.5], [down[0], down[1], down[1], down[0]]))
@@ -71,9 +67,8 @@ def squeeze(session: Session, law: str) -> dict[str, float]:
 
 def draw_and_twist(session: Session, law: str) -> dict[str, float]:
     """M4: a bar's end is drawn to four times its length, turned once and released."""
-    scene = ts.Scene(gravity=WEIGHTLESS)
-    soft = ts.Material(law=law, young=3e4, poisson=0.4, density=1000.0, mass_damping=2.0)
-    body = scene.add_body(box((10, 3, 3), (0.5, 0.15, 0.15), (0.25, 0.0, 0.0)), soft, name="bar")
+    mesh = box((10, 3, 3), (0.5, 0.15, 0.15), (0.25, 0.0, 0.0))
+    scene, body = one_body("bar", mesh, law=law, young=3e4, poisson=0.4, mass_damping=2.0)
     body.fix(face(0, 0.0))
     far, turn = [1.5, 0.0, 0.0], [2.0 * np.pi, 0.0, 0.0]
     path = KeyFrames([0.0, 1.0, 2.0], [WEIGHTLESS, far, far], [WEIGHTLESS, WEIGHTLESS, turn], release=True)

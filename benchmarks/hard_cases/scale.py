@@ -13,7 +13,7 @@ from taisoft.errors import SimulationError
 
 from ..reference_cases.record import face
 from .case import ANALYTIC, DEEPEST, INVERTED, OK, PROPOSED, REFUSED, STOPPED, Case, Must, Session, explicit, implicit
-from .shapes import COR, DOWN, SNH, WEIGHTLESS, G, box, cube, not_finite, turned
+from .shapes import COR, DOWN, SNH, G, box, cube, not_finite, one_body, turned
 
 SCALES = (1e-6, 1e-3, 1e3)
 FORCE = "force on the plane over the weight, less 1, most of the last 0.5 s"
@@ -90,12 +90,10 @@ def static_thickness(mesh: ts.TetMesh, soft: ts.Material, inside: np.ndarray) ->
 
 def scaled_bar(session: Session, law: str, scale: float, steps: int) -> tuple[np.ndarray, int]:
     """Path of the tip (k,3) over the scale [m], and the iterations, of a clamped bar of 0.5 m times the scale."""
-    scene = ts.Scene(gravity=WEIGHTLESS)
     mesh = box((10, 2, 2), scale * np.array([0.5, 0.1, 0.1]), (0.25 * scale, 0.0, 0.0))
     speed = np.zeros((mesh.n_verts, 3))
     speed[:, 1] = (mesh.vertices[:, 0] / (0.5 * scale)) ** 2
-    soft = ts.Material(law=law, young=1e5, poisson=0.4, density=1000.0)
-    body = scene.add_body(mesh, soft, name="bar", velocity=speed)
+    scene, body = one_body("bar", mesh, velocity=speed, law=law, young=1e5, poisson=0.4)
     body.fix(lambda X: X[:, 0] < 1e-6 * scale)
     tip = face(0, 0.5)(mesh.vertices / scale)
     with session.simulator(scene, dt=scale * session.variant.settings["dt"]) as sim:

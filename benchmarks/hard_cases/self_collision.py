@@ -8,7 +8,7 @@ from taisoft.scene.key_frames import KeyFrames
 
 from ..reference_cases.record import face
 from .case import ANALYTIC, DEEPEST, OK, PROPOSED, Case, Must, Session, implicit
-from .shapes import COR, SNH, WEIGHTLESS, box, not_finite, rest_at_last, voxels
+from .shapes import COR, SNH, WEIGHTLESS, box, not_finite, one_body, rest_at_last, voxels
 
 GAINED = "what steps after the release add to the momentum, over the impulses of contacts"
 LAWS = (COR, SNH)
@@ -16,9 +16,8 @@ LAWS = (COR, SNH)
 
 def mat_twist(session: Session, seed: int, seconds: float) -> dict[str, float]:
     """S1: a mat's ends turn against each other; nodes start up to 0.1 mm aside, along its normal."""
-    scene = ts.Scene(gravity=WEIGHTLESS)
     mesh = box((20, 20, 1), (1.0, 1.0, 0.02))
-    body = scene.add_body(mesh, ts.Material(law=SNH, young=2e4, poisson=0.4, density=1000.0), name="mat")
+    scene, body = one_body("mat", mesh, law=SNH, young=2e4, poisson=0.4)
     turn = np.array([np.radians(72.0) * 5.0, 0.0, 0.0])
     for side in (-0.5, 0.5):
         body.move(face(0, side), KeyFrames([0.0, 5.0], rotations=[WEIGHTLESS, np.sign(side) * turn]))
@@ -44,9 +43,7 @@ def clamp(session: Session, law: str) -> dict[str, float]:
     filled = np.ones((8, 7, 2), dtype=bool)
     filled[2:, 2:5] = False
     mesh = voxels(filled, 0.02, (0.08, 0.07, 0.02))
-    scene = ts.Scene(gravity=WEIGHTLESS)
-    soft = ts.Material(law=law, young=5e4, poisson=0.4, density=1000.0, friction=0.3, mass_damping=2.0)
-    body = scene.add_body(mesh, soft, name="clamp")
+    scene, body = one_body("clamp", mesh, law=law, young=5e4, poisson=0.4, friction=0.3, mass_damping=2.0)
     for y, way in ((0.14, -0.04), (0.0, 0.04)):
         moved = KeyFrames([0.0, 1.0, 1.5], [WEIGHTLESS, (0.0, way, 0.0), (0.0, way, 0.0)], release=True)
         body.move(lambda X, y=y: (np.abs(X[:, 0] - 0.16) < 1e-9) & (np.abs(X[:, 1] - y) < 1e-9), moved)
@@ -55,7 +52,7 @@ def clamp(session: Session, law: str) -> dict[str, float]:
         read = (lambda: mass @ sim.velocities()), (lambda: np.abs(sim.contacts().impulse).sum())
         momenta, impulses = session.watch(sim, 450, *read)
         found = rest_at_last(sim, 0.16)
-        decay = 1.0 + soft.mass_damping * sim.dt  # of an implicit Euler step without forces
+        decay = 1.0 + body.material.mass_damping * sim.dt  # of an implicit Euler step without forces
     free = np.array(momenta[151:])  # the step that ends at 1.5 s is prescribed
     made = np.linalg.norm(decay * free[1:] - free[:-1], axis=1).max() if len(free) > 1 else np.nan
     return found | {
@@ -103,9 +100,7 @@ def jack(session: Session, law: str) -> dict[str, float]:
     filled = np.zeros((5, 5, 5), dtype=bool)
     filled[:, 2, 2] = filled[2, :, 2] = filled[2, 2, :] = True
     mesh = voxels(filled.repeat(2, 0).repeat(2, 1).repeat(2, 2), 0.02)
-    scene = ts.Scene(gravity=WEIGHTLESS)
-    soft = ts.Material(law=law, young=1e4, poisson=0.4, density=1000.0, mass_damping=2.0)
-    scene.add_body(mesh, soft, name="jack")
+    scene, _ = one_body("jack", mesh, law=law, young=1e4, poisson=0.4, mass_damping=2.0)
     beyond, planes = [], []
     for axis in range(3):
         for side in (-1.0, 1.0):

@@ -1,4 +1,4 @@
-"""Meshes of the hard cases, and how far a shape is from its rest."""
+"""Meshes and scenes of the hard cases, and how far a shape is from its rest."""
 
 import numpy as np
 
@@ -40,6 +40,13 @@ def voxels(filled: np.ndarray, edge: float, center=(0.0, 0.0, 0.0)) -> ts.TetMes
     """The filled voxels (nx,ny,nz) bool of a grid about a center [m], each cut as a cell of `box`."""
     whole = box(filled.shape, edge * np.array(filled.shape), center)
     return submesh(whole, filled.reshape(-1).repeat(6))
+
+
+def one_body(name: str, mesh: ts.TetMesh, gravity=WEIGHTLESS, position=(0, 0, 0), velocity=(0, 0, 0), **material):
+    """A scene with one body, of 1000 kg/m^3 if no density is among the numbers of its material. Returns both."""
+    scene = ts.Scene(gravity=gravity)
+    stuff = ts.Material(**{"density": 1000.0} | material)
+    return scene, scene.add_body(mesh, stuff, name=name, position=position, velocity=velocity)
 
 
 def not_finite(*states: np.ndarray) -> float:

@@ -35,7 +35,7 @@ from .case import (
     refusal,
 )
 from .contact import on_slope, stack_scene
-from .shapes import COR, DOWN, SNH, WEIGHTLESS, box, cube, not_finite, voxels
+from .shapes import COR, DOWN, SNH, WEIGHTLESS, box, cube, not_finite, one_body, voxels
 
 LAWS = (COR, SNH)
 STABLE_DT = 2.240e-3  # [s] of T1's bar, by power iteration
@@ -44,9 +44,8 @@ TWIST_STEPS = (0.002, 0.01, 0.05, 0.2, 1.0)  # [s] of T2
 
 def bracket(session: Session, law: str) -> dict[str, float]:
     """T1: a clamped bar falls in explicit steps below and above the limit."""
-    scene = ts.Scene(gravity=(0.0, -0.981, 0.0))
-    soft = ts.Material(law=law, young=1e5, poisson=0.4, density=1000.0)
-    scene.add_body(box((20, 4, 4), (1.0, 0.2, 0.2)), soft, name="bar").fix(face(0, -0.5))
+    scene, bar = one_body("bar", box((20, 4, 4), (1.0, 0.2, 0.2)), (0.0, -0.981, 0.0), law=law, young=1e5, poisson=0.4)
+    bar.fix(face(0, -0.5))
     dt = session.variant.settings["dt"]
     numbers = {}
     if session.variant.settings.get("allow_unstable"):
@@ -71,9 +70,7 @@ def twist(session: Session, law: str) -> dict[str, float]:
     """T2: both ends of a rod turn by 360 degrees in 5 s, in steps from 2 ms to 1 s; each held against the finest."""
     numbers, finest, ends = {}, None, np.pi * np.array([2.0, 0.0, 0.0])
     for dt in TWIST_STEPS:
-        scene = ts.Scene(gravity=WEIGHTLESS)
-        soft = ts.Material(law=law, young=1e4, poisson=0.4, density=1000.0)
-        body = scene.add_body(box((20, 2, 2), (1.0, 0.1, 0.1)), soft, name="rod")
+        scene, body = one_body("rod", box((20, 2, 2), (1.0, 0.1, 0.1)), law=law, young=1e4, poisson=0.4)
         for side in (-0.5, 0.5):
             body.move(face(0, side), KeyFrames([0.0, 5.0], rotations=[WEIGHTLESS, np.sign(side) * ends]))
         with session.simulator(scene, dt=dt) as sim:
@@ -100,9 +97,8 @@ def ball() -> ts.TetMesh:
 
 def impact(session: Session, steps: int) -> dict[str, float]:
     """T3: a ball flies at 67 m/s against a wall."""
-    scene = ts.Scene(gravity=WEIGHTLESS)
-    rubber = ts.Material(law=SNH, young=1e7, poisson=0.45, density=1150.0, friction=0.0)
-    body = scene.add_body(ball(), rubber, name="ball", position=(0.0, 0.03, 0.0), velocity=(0.0, -67.0, 0.0))
+    rubber = {"law": SNH, "young": 1e7, "poisson": 0.45, "density": 1150.0, "friction": 0.0}
+    scene, body = one_body("ball", ball(), position=(0.0, 0.03, 0.0), velocity=(0.0, -67.0, 0.0), **rubber)
     scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="wall", friction=0.0)
     mass = lumped_mass(body)
     with session.simulator(scene) as sim:
@@ -122,9 +118,7 @@ def impact(session: Session, steps: int) -> dict[str, float]:
 
 def stiff_cube(session: Session, law: str) -> dict[str, float]:
     """T4: a cube of 1 GPa lands and rests, in steps a thousand times those of an explicit integrator."""
-    scene = ts.Scene(gravity=DOWN)
-    stiff = ts.Material(law=law, young=1e9, poisson=0.3, density=1000.0, friction=0.5)
-    scene.add_body(cube(4, 0.1), stiff, name="cube", position=(0, 0.15, 0))
+    scene, _ = one_body("cube", cube(4, 0.1), DOWN, (0, 0.15, 0), law=law, young=1e9, poisson=0.3, friction=0.5)
     scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="plane", friction=0.5)
     with session.simulator(scene) as sim:
         session.go(sim, 120)
@@ -139,9 +133,9 @@ def stiff_cube(session: Session, law: str) -> dict[str, float]:
 
 def free_spin(session: Session, law: str) -> dict[str, float]:
     """L1: a free cube flies and spins for 1e5 steps."""
-    scene, mesh = ts.Scene(gravity=WEIGHTLESS), cube(4, 0.1)
+    mesh = cube(4, 0.1)
     speed = np.cross([0.0, 0.0, 20.0], mesh.vertices) + [1.0, 0.5, 0.0]
-    body = scene.add_body(mesh, ts.Material(law=law, young=1e5, poisson=0.4, density=1000.0), name="cube", velocity=speed)
+    scene, body = one_body("cube", mesh, velocity=speed, law=law, young=1e5, poisson=0.4)
     mass = lumped_mass(body)
 
     def spin() -> np.ndarray:
