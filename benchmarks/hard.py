@@ -7,10 +7,10 @@ A case is run in all its variants: laws, integrators, precisions, starts. Each h
 and by physics: ok, degraded by what the setting itself brings about, refused before a step is done, or stopped later. Solved is
 what ended so and kept all its limits. Each variant is a process of its own, so that its peak memory is its own; wall time is
 that of its steps without compiling, the time of a step is the median. A limit is measured, analytic or proposed; of a proposed
-one that an honest baseline replaces the table tells both. Error: the largest distance of a node, at about 20 times of the run,
+one that an honest baseline replaces the table shows both. Error: the largest distance of a node, at about 20 times of the run,
 to the same run in f64 with an eighth of the step, over the case's size; "-" where that run would take long (--references runs
 them all) or has no shape to compare. --keep holds finished runs in DIR, and the same command goes on from there. --judge runs
-nothing: it holds stored results against what is asked today, and writes FILE.json and its page anew. Exit status: 0 all asked
+nothing: it judges stored results by what is asked today, and writes FILE.json and its page anew. Exit status: 0 all asked
 variants are solved, 1 some are not, or were not run.
 """
 
@@ -73,7 +73,7 @@ def measured(rows: list[Row], options: argparse.Namespace, document: Document) -
 
 
 def judged(path: Path, document: Document) -> tuple[list[Row], dict]:
-    """Stored results, held against what is asked today. Returns the rows and the numbers. Raises OutputError."""
+    """Stored results, judged by what is asked today. Returns the rows and the numbers. Raises OutputError."""
     try:
         numbers = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -1,6 +1,6 @@
 """The page of the hard cases, in Markdown: the scoreboard, what is not solved, how each must end, and every number.
 
-A variant counts as solved by what `hard_runs.Row` says; the scoreboard tells how many are, and in which column each ended.
+A variant counts as solved by what `hard_runs.Row` says; the scoreboard counts how many are, and in which column each ended.
 """
 
 from collections.abc import Iterable
@@ -77,8 +77,8 @@ def scoreboard(rows: list[Row]) -> str:
     lines = [(name, *cells(tally(own), shown)) for name, own in groups.items() if own]
     table = markdown(("cases", *shown), [*lines, (ALL, *cells(tally(rows), shown))], left=(0,))
     proposed = sum(verdict.basis == PROPOSED for row in rows for verdict in row.verdicts)
-    told = f"{RULE} {how_solved(rows)} Of the limits {proposed} are proposed, not measured elsewhere or analytic."
-    return f"{headline(rows)}\n\n{told}\n\n{table}"
+    text = f"{RULE} {how_solved(rows)} Of the limits {proposed} are proposed, not measured elsewhere or analytic."
+    return f"{headline(rows)}\n\n{text}\n\n{table}"
 
 
 def unsolved(rows: Iterable[Row]) -> str:
@@ -152,16 +152,16 @@ def _or_nothing(value: float | None, unit: float, form: str) -> str:
 
 
 def notes(rows: list[Row]) -> str:
-    """What is to be known of limits that were replaced, and what runs tell of their ends."""
+    """What is to be known of limits that were replaced, and what runs say of their ends."""
     cases: dict[str, Case] = {row.case.id: row.case for row in rows}
     parts = []
     for case in cases.values():
         own = [row for row in rows if row.case is case]
         lines = [f'* limit on "{c.quantity}" ({c.basis}): {c.note}.' for c in case.criteria if c.note]
         for row in own:
-            told = row.record["problems"] if row.record else []
-            lines += [f"* {row.variant.name}: {text}" for text in told[:3]]
-            lines += [f"* {row.variant.name}: {len(told) - 3} more sentences" for _ in told[3:4]]
+            problems = row.record["problems"] if row.record else []
+            lines += [f"* {row.variant.name}: {text}" for text in problems[:3]]
+            lines += [f"* {row.variant.name}: {len(problems) - 3} more sentences" for _ in problems[3:4]]
             lines += [f"* {row.variant.name}, reference: {why}" for why in [reference_trouble(row)] if why]
         if lines:
             parts.append(f"{case.id}, {case.name}\n\n" + "\n".join(lines))
@@ -169,7 +169,7 @@ def notes(rows: list[Row]) -> str:
 
 
 def reference_trouble(row: Row) -> str:
-    """Why a reference that was begun tells no error."""
+    """Why a reference that was begun gives no error."""
     if row.reference is not None and row.error is None:
         return f"{row.reference['status']}, " + ("; ".join(row.reference["problems"][:1]) or "at other times")
     return row.reference_left_out

@@ -110,7 +110,7 @@ def times_of(works: Iterable[list[Row]]) -> dict[str, Timing]:
 
 
 def main(argv=None) -> int:
-    """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
+    """Measure and print. Raises OutputError, or SimulationError where the arch is not available."""
     first, _, rest = __doc__.partition("\n")
     parser = argparse.ArgumentParser(prog="taisoft bench peers", description=first, epilog=rest.partition("\n\n")[2])
     parser.add_argument("--work", metavar="KEY", help=f"only those that begin so: {', '.join(work.key for work in WORKS)}")

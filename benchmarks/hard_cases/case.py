@@ -175,7 +175,7 @@ class Verdict:
 
 
 def judge(case: Case, variant: Variant, record: dict) -> list[Verdict]:
-    """A record against a variant's criteria: its end first, then what has a limit, then what is only told."""
+    """A record against a variant's criteria: its end first, then what has a limit, then what has none."""
     causes = " and ".join(record["causes"]) if record["status"] == DEGRADED else ""
     ended = f"{record['status']} by {causes}" if causes else record["status"]
     verdicts = [Verdict(END, ended, variant.must.text, passed=variant.must.met(record))]
@@ -253,7 +253,7 @@ class Session:
         return found
 
     def refuse(self, sentence: str) -> None:
-        """What was asked of a simulator was refused."""
+        """A simulator refused what it was given."""
         self._end(REFUSED, [sentence])
 
     def _end(self, status: str, problems: list[str]) -> None:

@@ -18,7 +18,7 @@ LENGTH = 0.5  # [m]
 
 
 def sliver_mesh(s: float) -> ts.TetMesh:
-    """A bar whose least volume of a tet is about s times the mean. It tells of its worst tets with a warning."""
+    """A bar whose least volume of a tet is about s times the mean. Making it warns of its worst tets."""
     good = box((10, 2, 2), (LENGTH, 0.1, 0.1), (0.25, 0.05, 0.05))
     x = good.vertices.copy()
     x[nearest(x, (0.25, 0.05, 0.05))[0], 2] = 0.05 * (2.0 - s)

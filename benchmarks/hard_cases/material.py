@@ -56,11 +56,11 @@ def squeeze(session: Session, law: str) -> dict[str, float]:
         session.go(sim, 350)
         found = rest_at_last(sim, 0.1)
         way = np.linalg.norm(sim.positions() - body.rest_positions, axis=1).max()
-    told = [text for text in session.warnings if "step " in text and "tet " in text and "softens" in text]
+    named = [text for text in session.warnings if "step " in text and "tet " in text and "softens" in text]
     return found | {
         "largest displacement at the end [m]": way,
         "smallest volume ratio of all steps": min(report.min_volume_ratio for report in session.reports),
-        "warnings of softening that name step and tet": len(told),
+        "warnings of softening that name step and tet": len(named),
         "run is ok though tets are inverted at the end": session.status == OK and found[INVERTED_LAST] > 0.0,
     }
 

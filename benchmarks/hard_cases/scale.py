@@ -144,12 +144,12 @@ def flyer(session: Session, spoilt: bool) -> dict[str, float]:
 
     alone, _, _ = run(False)
     both, steps, growth = run(True)
-    told = " ".join(session.problems)
+    sentences = " ".join(session.problems)
     return {
         "A's path off that without B [m]": np.abs(both - alone[: len(both)]).max(),
         "growth of memory": growth,
         "steps": steps,
-        "sentences that name body 'B'": "body 'B'" in told,
+        "sentences that name body 'B'": "body 'B'" in sentences,
     }
 
 

@@ -85,11 +85,11 @@ def sheets(session: Session, parts: str) -> dict[str, float]:
 
     with session.simulator(scene) as sim:
         gaps, momenta = session.watch(sim, 30, gap, lambda: np.linalg.norm(mass @ sim.velocities()))
-        told = " ".join(session.problems)
+        sentences = " ".join(session.problems)
     return {
         "least distance between the sheets' middles [m]": min(gaps),
         "momentum over that of one sheet, most": max(momenta) / (15.0 * mass[:n].sum()),
-        "sentences that name speed, thickness and a safe dt": all(word in told for word in ("thick", "dt", "m/s")),
+        "sentences that name speed, thickness and a safe dt": all(word in sentences for word in ("thick", "dt", "m/s")),
         "sentences or order kept": min(gaps) > 0.0,
         DEEPEST: session.most("max_penetration"),
     }

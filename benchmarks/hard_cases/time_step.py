@@ -51,7 +51,7 @@ def bracket(session: Session, law: str) -> dict[str, float]:
     if session.variant.settings.get("allow_unstable"):
         said = refusal(lambda: session.simulator(scene, allow_unstable=False))
         numbers["refused without allow_unstable"] = "stability limit" in said
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         sim = session.simulator(scene)
     with sim:
@@ -59,7 +59,7 @@ def bracket(session: Session, law: str) -> dict[str, float]:
         return numbers | {
             "estimated limit of dt over 2.240e-3 s, less 1": abs(sim.stable_dt / STABLE_DT - 1.0),
             "farthest point of all steps [m]": max(farthest),
-            "warned before the first step": any("stability limit" in str(one.message) for one in told),
+            "warned before the first step": any("stability limit" in str(one.message) for one in warned),
             "steps until the run was stopped": session.steps,
             "numbers that are not finite in the last state": not_finite(sim.positions()),
             "dt over the limit": dt / sim.stable_dt,
@@ -67,7 +67,7 @@ def bracket(session: Session, law: str) -> dict[str, float]:
 
 
 def twist(session: Session, law: str) -> dict[str, float]:
-    """T2: both ends of a rod turn by 360 degrees in 5 s, in steps from 2 ms to 1 s; each held against the finest."""
+    """T2: both ends of a rod turn by 360 degrees in 5 s, in steps from 2 ms to 1 s; each compared with the finest."""
     numbers, finest, ends = {}, None, np.pi * np.array([2.0, 0.0, 0.0])
     for dt in TWIST_STEPS:
         scene, body = one_body("rod", box((20, 2, 2), (1.0, 0.1, 0.1)), law=law, young=1e4, poisson=0.4)

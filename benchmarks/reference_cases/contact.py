@@ -14,7 +14,7 @@ import taisoft as ts
 from taisoft.fem.mass import lumped_masses
 from taisoft.mesh.quality import mean_surface_edge
 
-from .record import GRAVITY, Case, material, near, rotation, small, submesh, told, worst
+from .record import GRAVITY, Case, material, near, reported, rotation, small, submesh, worst
 
 EXPLICIT, IMPLICIT = "symplectic_euler", "implicit_euler"
 STEP = {EXPLICIT: 1e-3, IMPLICIT: 1e-2}  # [s] of blocks of 1e7 Pa
@@ -65,7 +65,7 @@ def incline(integrator: str, reference: dict, arch: str):
         for case in reference["value"]["cases"]:
             what, slips = f"{case['alpha_deg']:g} degrees", case["state"] == "slip"
             start = settled(sim, mu, np.radians(case["alpha_deg"]), held=slips)
-            reports = sim.run(0.5, fps=None).step_reports  # what is let go shakes at first
+            reports = sim.run(0.5, fps=None).step_reports  # a released block shakes at first
             before = sim.velocities().mean(axis=0)
             reports += sim.run(0.5, fps=None).step_reports
             way = (sim.positions() - start).mean(axis=0)
@@ -146,8 +146,8 @@ def newton(integrator: str, reference: dict, arch: str):
                 sim.step()
             v = sim.velocities("cube")[low, 1]
             limit = 2e-3 if expected == 0.0 else 1e-6
-            told_of = f"e = {text}: velocity of the base after the impact [m/s]"
-            yield worst([near("", value, expected, limit, scale=2.0) for value in (v.min(), v.max())], told_of)
+            what = f"e = {text}: velocity of the base after the impact [m/s]"
+            yield worst([near("", value, expected, limit, scale=2.0) for value in (v.min(), v.max())], what)
 
 
 def bar(integrator: str, law: str, reference: dict, arch: str):
@@ -173,7 +173,7 @@ def bar(integrator: str, law: str, reference: dict, arch: str):
     yield near("duration [s]", duration, value["duration"], 0.05)
     yield near("mean force [N]", impulse / duration, value["force"], 0.05)
     yield near("rebound velocity [m/s]", impulse / mass - 0.1, value["rebound_velocity"], 0.1)
-    yield told("of it in vibration, share of the speed", np.abs(v[:, 1] - v[:, 1].mean()).max() / 0.1)
+    yield reported("of it in vibration, share of the speed", np.abs(v[:, 1] - v[:, 1].mean()).max() / 0.1)
 
 
 def momentum(integrator: str, reference: dict, arch: str):
@@ -206,7 +206,7 @@ def momentum(integrator: str, reference: dict, arch: str):
     turned = np.linalg.norm(last[1] - first[1]) / size
     # implicit Euler itself loses the angular momentum of what turns; explicit steps lose what the gap has for a lever
     what = "change of angular momentum, over P m"
-    yield small(what, turned, 1e-3) if exact else told(what, turned)
+    yield small(what, turned, 1e-3) if exact else reported(what, turned)
 
 
 # --- a ball on a plane ------------------------------------------------------------------------------------------------
@@ -235,7 +235,7 @@ def hertz(cells: int, limit: float | None, reference: dict, arch: str):
             bears = np.linalg.norm(c.impulse, axis=1) > 0.0
             reach = np.linalg.norm(c.point[bears][:, [0, 2]], axis=1).max(initial=0.0)
             yield near(f"d = {row['d']:g} m: force [N]", -sim.contact_force("plane")[1], row["F"], limit)
-            yield told(f"d = {row['d']:g} m: radius of the nodes that bear", reach / row["a"] - 1.0)
+            yield reported(f"d = {row['d']:g} m: radius of the nodes that bear", reach / row["a"] - 1.0)
 
 
 BOTH = (IMPLICIT, EXPLICIT)

@@ -1,7 +1,7 @@
 """Motion in time on a fixed mesh, against paths that were integrated exactly: order of accuracy, energies, momenta.
 
 Orders come from the largest error over the whole path, at two steps, the second half the first. The last problem leaves
-the fixed mesh: it tells how far finer and finer ones are from the beam itself.
+the fixed mesh: it shows how far finer and finer ones are from the beam itself.
 """
 
 from collections import namedtuple
@@ -16,7 +16,7 @@ from taisoft.dynamics import EXPLICIT, INTEGRATORS
 from taisoft.errors import SimulationError
 from taisoft.fem.mass import lumped_masses
 
-from .record import LAWS, Case, Check, face, label, material, near, nearest, order, scene, small, told
+from .record import LAWS, Case, Check, face, label, material, near, nearest, order, reported, scene, small
 
 SECOND_ORDER = ("velocity_verlet", "bdf2", "implicit_midpoint")
 ORDER = {name: 2 if name in SECOND_ORDER else 1 for name in INTEGRATORS}
@@ -91,7 +91,7 @@ class Exact:
                 errors.append((_distance(x, table["probe_x"]), _distance(v, table["probe_v"])))
         (coarse_x, coarse_v), (fine_x, fine_v) = errors
         expected = _path_order(integrator, self.starts_free)
-        yield told(f"largest error of the probe, dt = 1/{2 * steps} s [m]", fine_x)
+        yield reported(f"largest error of the probe, dt = 1/{2 * steps} s [m]", fine_x)
         yield order("order in dt of the position", coarse_x, fine_x, expected, 0.12)
         if expected != ORDER[integrator]:
             yield order("order in dt of the velocity", coarse_v, fine_v, ORDER[integrator], 0.12)
@@ -183,9 +183,9 @@ def spin_block(integrator: str, reference: dict, arch: str):
     if integrator in CONSERVES:
         yield small("angular momentum L, relative drift", fine.L, 1e-9)
     else:
-        yield told(f"L, relative drift, dt = 1/{2 * steps} s", fine.L)
+        yield reported(f"L, relative drift, dt = 1/{2 * steps} s", fine.L)
         yield order("order in dt of the drift of L", coarse.L, fine.L, expected, 0.12)
-    yield told(f"energy, relative drift, dt = 1/{2 * steps} s", fine.energy)
+    yield reported(f"energy, relative drift, dt = 1/{2 * steps} s", fine.energy)
     # BDF2's dissipation is of third order and mixes with the second-order wobble
     limit = None if integrator == "bdf2" else 0.2
     yield order("order in dt of the energy's drift", coarse.energy, fine.energy, expected, limit)

@@ -1,4 +1,4 @@
-"""What a case of a reference problem is, what it finds, and what all cases share: checks, scenes, choices of nodes, small meshes.
+"""What a case of a reference problem is, what it finds, and what all cases share: checks, scenes, choices of nodes.
 
 A case gets the problem's file as a dict and the arch, computes in f64, and returns checks. Two kinds of error are kept
 apart: on the same mesh with the same element the numbers must agree to solver tolerance, and the check has a limit;
@@ -22,7 +22,7 @@ SAME_MESH = 1e-6  # relative: what the values computed on the same mesh are good
 
 @dataclass(frozen=True)
 class Check:
-    """A measured number beside its reference. error: relative unless the quantity says else; limit None: only told."""
+    """A measured number beside its reference. error: relative unless the quantity says else; limit None: only reported."""
 
     quantity: str
     measured: float
@@ -76,8 +76,8 @@ def small(quantity: str, measured: float, limit: float) -> Check:
     return Check(quantity, float(measured), 0.0, abs(float(measured)), limit)
 
 
-def told(quantity: str, error: float) -> Check:
-    """An error that is told without a limit."""
+def reported(quantity: str, error: float) -> Check:
+    """An error without a limit."""
     return Check(quantity, float(error), 0.0, abs(float(error)))
 
 

@@ -1,4 +1,4 @@
-"""Static problems: on the tabulated meshes the linear tets must give the tabulated value; the converged one is told.
+"""Static problems: on the tabulated meshes the linear tets must give the tabulated value; the converged one is reported.
 
 `linear_tet_error_curve` of a problem's file holds what a correct code gives on the same mesh. The error against the
 converged value is the mesh's own (linear tets lock in bending), so it has no limit here.
