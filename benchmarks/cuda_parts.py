@@ -58,7 +58,7 @@ def works(arch: str, quick: bool) -> Iterator[dict]:
 def _timed(work: Work, setting: Setting) -> dict:
     """Time, error and verdict of one setting, or why there is none."""
     try:
-        session = own.start(work, setting)
+        session = own.Run(work, setting)
         try:
             positions, _ = session.run(follow=True)
             _, seconds = session.run(follow=False)

@@ -7,10 +7,10 @@ A case is run in all its variants: laws, integrators, precisions, starts. Each h
 and by physics: ok, degraded by what the setting itself brings about, refused before a step is done, or stopped later. Solved is
 what ended so and kept all its limits. Each variant is a process of its own, so that its peak memory is its own; wall time is
 that of its steps without compiling, the time of a step is the median. A limit is measured, analytic or proposed; of a proposed
-one that an honest baseline replaces the table tells both. Error: the largest distance of a node, at about 20 times of the run,
+one that an honest baseline replaces the table shows both. Error: the largest distance of a node, at about 20 times of the run,
 to the same run in f64 with an eighth of the step, over the case's size; "-" where that run would take long (--references runs
 them all) or has no shape to compare. --keep holds finished runs in DIR, and the same command goes on from there. --judge runs
-nothing: it holds stored results against what is asked today, and writes FILE.json and its page anew. Exit status: 0 all asked
+nothing: it judges stored results by what is asked today, and writes FILE.json and its page anew. Exit status: 0 all asked
 variants are solved, 1 some are not, or were not run.
 """
 
@@ -30,8 +30,7 @@ from taisoft.timing import load_average
 
 from .document import RESULTS, Document, check_out, default_out, header, header_text
 from .hard_cases import CASES
-from .hard_runs import Row, answer, measure, stored
-from .hard_score import faults
+from .hard_runs import Row, Runner, answer, stored
 from .hard_table import page
 
 DAY = 86_400.0  # [s]
@@ -61,7 +60,8 @@ def measured(rows: list[Row], options: argparse.Namespace, document: Document) -
             stack.enter_context(closing(FolderLock(folder)))
             store = Store(folder)
         signals.run_began()
-        measure(rows, options.arch, options.references, store, lambda: end - time.monotonic(), signals.requested, _tell)
+        runner = Runner(options.arch, store, lambda: end - time.monotonic(), signals.requested, _say)
+        runner.measure(rows, options.references)
     for text in (*page(rows), *store.damaged):
         document.add(text)
     return numbers | {
@@ -73,7 +73,7 @@ def measured(rows: list[Row], options: argparse.Namespace, document: Document) -
 
 
 def judged(path: Path, document: Document) -> tuple[list[Row], dict]:
-    """Stored results, held against what is asked today. Returns the rows and the numbers. Raises OutputError."""
+    """Stored results, judged by what is asked today. Returns the rows and the numbers. Raises OutputError."""
     try:
         numbers = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -85,7 +85,7 @@ def judged(path: Path, document: Document) -> tuple[list[Row], dict]:
     return rows, numbers | {"rows": [row.data() for row in rows]}
 
 
-def _tell(text: str) -> None:
+def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
@@ -124,7 +124,7 @@ def main(argv=None) -> int:
         numbers = measured(rows, options, document)
     if out is not None:
         document.write(out, numbers)
-    return 1 if any(faults(row) for row in rows) else 0
+    return 1 if any(row.faults for row in rows) else 0
 
 
 if __name__ == "__main__":

@@ -1,8 +1,12 @@
-"""Runs of the hard cases: each variant, and its reference, in a process of its own, and kept by what it depends on."""
+"""Runs of the hard cases: each variant, and its reference, in a process of its own, kept by what it depends on, and judged.
+
+A variant is solved when it ended as it must and every limit is kept. Columns say how it ended: ok, degraded, refused, stopped;
+wrong is an ok end that must not be one, or that misses a limit on the answer; each variant is in one column.
+"""
 
 import hashlib
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -13,13 +17,13 @@ from taisoft.study.workers import LocalPlace, carry_out
 from taisoft.timing import machine, usable_cores
 
 from .hard_cases import CASES
-from .hard_cases.record import DEGRADED, OK, Case, Variant, Verdict, judge
-from .hard_cases.session import FINER, Session
-from .hard_score import column, faults
+from .hard_cases.case import DEGRADED, END, FINER, OK, REFUSED, STOPPED, Case, Session, Variant, Verdict, judge
 
 CHILD = (sys.executable, "-m", "taisoft", "bench", "hard", "--child")
 ANSWERED = (OK, DEGRADED)  # ends of runs that came to their ends
 CHEAP_SECONDS = 60.0  # of a reference, guessed: a longer one is run only when asked for
+WRONG, NOT_RUN = "wrong", "not run"
+COLUMNS = (OK, DEGRADED, REFUSED, STOPPED, WRONG, NOT_RUN)
 
 
 @dataclass
@@ -51,30 +55,51 @@ class Row:
         if own.shape == finer.shape and len(own):
             self.error = float(np.linalg.norm(own - finer, axis=1).max() / self.case.size)
 
+    @property
+    def column(self) -> str:
+        """How it ended."""
+        if self.record is None:
+            return NOT_RUN
+        missed = any(verdict.passed is False and not verdict.cost for verdict in self.verdicts)
+        return WRONG if self.record["status"] == OK and missed else self.record["status"]
+
+    @property
+    def faults(self) -> list[str]:
+        """Why it is not solved, in a few words each; empty where it is."""
+        if self.record is None:
+            return [NOT_RUN]
+        missed = [verdict.quantity for verdict in self.verdicts if verdict.passed is False]
+        return [self._wrong_end() if quantity == END else quantity for quantity in missed]
+
+    def _wrong_end(self) -> str:
+        must, status = self.variant.must, self.record["status"]
+        unexcused = [cause for cause in self.record["causes"] if cause not in must.causes]
+        if status in (must.end, DEGRADED) and unexcused:
+            return ", ".join(unexcused)
+        return f"{status}, must be {must.text}"
+
     def data(self) -> dict:
         """As plain data, without points."""
 
-        def bare(record: dict | None) -> dict | None:
-            return record and {key: value for key, value in record.items() if key != "points"}
-
+        run, reference = (r and {key: r[key] for key in r if key != "points"} for r in (self.record, self.reference))
         return {
             "case": self.case.id,
             "variant": self.variant.name,
             "settings": self.variant.settings,
             "must": asdict(self.variant.must),
-            "column": column(self),
-            "solved": not faults(self),
-            "run": bare(self.record),
-            "reference": bare(self.reference),
+            "column": self.column,
+            "solved": not self.faults,
+            "run": run,
+            "reference": reference,
             "error": self.error,
             "left_out": self.left_out,
             "reference_left_out": self.reference_left_out,
-            "verdicts": [verdict.record() for verdict in self.verdicts],
+            "verdicts": [asdict(verdict) for verdict in self.verdicts],
         }
 
 
 def stored(numbers: dict) -> list[Row]:
-    """All variants, with what stored results tell of them, judged anew."""
+    """All variants, with what stored results hold of them, judged anew."""
     known = {(row["case"], row["variant"]): row for row in numbers["rows"]}
     absent = {"run": None, "reference": None, "left_out": "not in the stored results", "reference_left_out": "", "error": None}
     rows = []
@@ -113,69 +138,58 @@ def sources() -> str:
     return total.hexdigest()
 
 
-def measure(
-    rows: list[Row],
-    arch: str,
-    references: bool,
-    store: Store | NoStore,
-    seconds_left: Callable[[], float],
-    asked: Callable[[], bool],
-    tell: Callable[[str], None],
-) -> None:
-    """Fill the rows: all runs first, then the references that are cheap, or all of them. Raises OutputError."""
-    _carry_out(rows, arch, 1, store, seconds_left, asked, tell)
-    finer = [
-        row
-        for row in rows
-        if row.record
-        and row.variant.reference
-        and row.record["status"] in ANSWERED
-        and (references or 2.0 * FINER * row.record["seconds"] <= CHEAP_SECONDS)
-    ]
-    _carry_out(finer, arch, FINER, store, seconds_left, asked, tell)
-    for row in rows:
-        row.compare()
-        row.judge()
+@dataclass
+class Runner:
+    """Where and how runs are made. seconds_left: of the budget; stop_requested: to begin no more; say: progress."""
 
+    arch: str
+    store: Store | NoStore
+    seconds_left: Callable[[], float]
+    stop_requested: Callable[[], bool]
+    say: Callable[[str], None]
 
-def _carry_out(rows: Iterable[Row], arch, finer, store, seconds_left, asked, tell) -> None:
-    on = [machine() | {"load": None}, code_digest(), sources(), arch]
-    requests, waiting = [], {}
-    for row in rows:
-        request = {"case": row.case.id, "variant": row.variant.name, "arch": arch, "finer": finer}
-        key = digest([request, on])[:32]
-        kept = store.read(key)
-        if kept is None:
-            requests.append((key, request))
-            waiting[key] = row
-        else:
-            _take(row, kept, finer)
+    def measure(self, rows: list[Row], references: bool) -> None:
+        """Fill the rows: all runs first, then the references that are cheap, or all of them. Raises OutputError."""
+        self._carry_out(rows, 1)
+        finer = [
+            row
+            for row in rows
+            if row.record
+            and row.variant.reference
+            and row.record["status"] in ANSWERED
+            and (references or 2.0 * FINER * row.record["seconds"] <= CHEAP_SECONDS)
+        ]
+        self._carry_out(finer, FINER)
+        for row in rows:
+            row.compare()
+            row.judge()
 
-    def done(key: str, told: dict) -> None:
-        row = waiting[key]
-        what = f"{row.case.id}, {row.variant.name}{', reference' if finer > 1 else ''}"
-        if "answer" in told:
-            _take(row, store.write(key, told["answer"]), finer)
-            tell(f"{what}: {told['answer']['status']}, {told['answer']['seconds']:.1f} s")
-        else:
-            why = told.get("error") or told["crash"]
-            _leave_out(row, why, finer)
-            tell(f"{what}: {why}")
+    def _carry_out(self, rows: list[Row], finer: int) -> None:
+        record, left_out = ("record", "left_out") if finer == 1 else ("reference", "reference_left_out")
+        on = [machine() | {"load": None}, code_digest(), sources(), self.arch]
+        requests, waiting = [], {}
+        for row in rows:
+            request = {"case": row.case.id, "variant": row.variant.name, "arch": self.arch, "finer": finer}
+            key = digest([request, on])[:32]
+            kept = self.store.read(key)
+            if kept is None:
+                requests.append((key, request))
+                waiting[key] = row
+            else:
+                setattr(row, record, kept)
 
-    left = carry_out(requests, [LocalPlace(usable_cores(), CHILD)], done, seconds_left=seconds_left, stop_requested=asked)
-    for key, why in left.items():
-        _leave_out(waiting[key], why, finer)
+        def done(key: str, result: dict) -> None:
+            row = waiting[key]
+            what = f"{row.case.id}, {row.variant.name}{', reference' if finer > 1 else ''}"
+            if "answer" in result:
+                setattr(row, record, self.store.write(key, result["answer"]))
+                self.say(f"{what}: {result['answer']['status']}, {result['answer']['seconds']:.1f} s")
+            else:
+                why = result.get("error") or result["crash"]
+                setattr(row, left_out, why)
+                self.say(f"{what}: {why}")
 
-
-def _leave_out(row: Row, why: str, finer: int) -> None:
-    if finer == 1:
-        row.left_out = why
-    else:
-        row.reference_left_out = why
-
-
-def _take(row: Row, record: dict, finer: int) -> None:
-    if finer == 1:
-        row.record = record
-    else:
-        row.reference = record
+        places = [LocalPlace(usable_cores(), CHILD)]
+        left = carry_out(requests, places, done, seconds_left=self.seconds_left, stop_requested=self.stop_requested)
+        for key, why in left.items():
+            setattr(waiting[key], left_out, why)

@@ -1,73 +1,29 @@
-"""The page of the hard cases, in Markdown: the scoreboard, what is not solved, how each must end, and every number."""
+"""The page of the hard cases, in Markdown: the scoreboard, what is not solved, how each must end, and every number.
+
+A variant counts as solved by what `hard_runs.Row` says; the scoreboard counts how many are, and in which column each ended.
+"""
 
 from collections.abc import Iterable
 
 from taisoft.output.tables import markdown
 
 from .hard_cases import GROUPS
-from .hard_cases.record import PROPOSED, Case, Must, Verdict
-from .hard_runs import Row
-from .hard_score import ALL, RULE, cells, faults, headline, how_solved, shown_columns, tally
+from .hard_cases.case import PROPOSED, Case, Must, Verdict
+from .hard_runs import COLUMNS, NOT_RUN, Row
 
+ASKED, SOLVED = "asked", "solved"
+ALL = "in all"  # the last line of a scoreboard
+RULE = (
+    "Solved is what ended as it must and kept all its limits. How each variant must end, and why, comes from the catalogue of "
+    "the cases and from physics. A refusal or a stop where there is an answer is not solved, nor is a degraded end, unless the "
+    "setting itself brings about what degraded it. Wrong: the run says ok, but must not, or misses a limit on its answer."
+)
 HEADINGS = (
-    "case",
-    "variant",
-    "run",
-    "quantity",
-    "measured",
-    "limit",
-    "basis",
-    "",
-    "steps",
-    "wall [s]",
-    "step [ms]",
-    "peak [MB]",
-    "error",
+    *("case", "variant", "run", "quantity", "measured", "limit", "basis", ""),
+    *("steps", "wall [s]", "step [ms]", "peak [MB]", "error"),
 )
 LEFT = (0, 1, 2, 3, 5, 6, 7)
 NOTHING = "-"
-
-
-def number(value: float | str | None) -> str:
-    """A value of a verdict; what is not finite is told as nan."""
-    return "nan" if value is None else value if isinstance(value, str) else f"{value:.4g}"
-
-
-def limit(verdict: Verdict) -> str:
-    """What is asked."""
-    if verdict.limit is None:
-        return NOTHING
-    if isinstance(verdict.limit, str):
-        return verdict.limit
-    sign = ">=" if verdict.at_least else "<="
-    replaced = "" if verdict.asked is None else f" (asked: {verdict.asked:g})"
-    return f"{sign} {verdict.limit:.4g}{replaced}"
-
-
-def verdict_word(verdict: Verdict) -> str:
-    """pass, FAIL, or - where there is no limit."""
-    return NOTHING if verdict.passed is None else "pass" if verdict.passed else "FAIL"
-
-
-def row_lines(row: Row) -> list[tuple[str, ...]]:
-    """The cells of a row: the first line tells the run and its cost too."""
-    if row.record is None:
-        return [(row.case.id, row.variant.name, "not run", row.left_out or NOTHING, *[NOTHING] * (len(HEADINGS) - 4))]
-    record, error = row.record, row.error
-    each, peak = record["step_seconds"], record["peak_memory_bytes"]
-    cost = (
-        str(record["steps"]),
-        f"{record['seconds']:.1f}",
-        NOTHING if each is None else f"{1e3 * each:.3g}",
-        NOTHING if peak is None else f"{peak / 1e6:.0f}",
-        NOTHING if error is None else f"{error:.1e}",
-    )
-    lines = []
-    for k, verdict in enumerate(row.verdicts):
-        first = (row.case.id, row.variant.name, record["status"]) if k == 0 else ("", "", "")
-        cells = (verdict.quantity, number(verdict.value), limit(verdict), verdict.basis, verdict_word(verdict))
-        lines.append((*first, *cells, *(cost if k == 0 else [""] * len(cost))))
-    return lines
 
 
 def page(rows: list[Row]) -> list[str]:
@@ -81,6 +37,39 @@ def page(rows: list[Row]) -> list[str]:
     return parts
 
 
+def tally(rows: Iterable[Row]) -> dict[str, int]:
+    """How many are asked, solved, and in each column."""
+    counts = dict.fromkeys((ASKED, SOLVED, *COLUMNS), 0)
+    for row in rows:
+        counts[ASKED] += 1
+        counts[SOLVED] += not row.faults
+        counts[row.column] += 1
+    return counts
+
+
+def cells(counts: dict[str, int], shown: Iterable[str]) -> list[str]:
+    """Numbers of a line of the scoreboard; a zero is left empty but of what is asked and solved."""
+    return [str(counts[name]) if counts[name] or name in (ASKED, SOLVED) else "" for name in shown]
+
+
+def shown_columns(rows: Iterable[Row]) -> list[str]:
+    """Headings of the scoreboard: all but "not run" where everything was."""
+    return [name for name in tally(rows) if name != NOT_RUN or tally(rows)[NOT_RUN]]
+
+
+def headline(rows: list[Row]) -> str:
+    """The number solved of the number asked."""
+    counts = tally(rows)
+    return f"**{counts[SOLVED]} of {counts[ASKED]} variants are solved.**"
+
+
+def how_solved(rows: Iterable[Row]) -> str:
+    """How the solved ones ended, in a sentence."""
+    counts = tally(row for row in rows if not row.faults)
+    ended = [f"{counts[name]} {name}" for name in COLUMNS if counts[name]]
+    return f"How the solved ones ended: {', '.join(ended)}." if ended else ""
+
+
 def scoreboard(rows: list[Row]) -> str:
     """The headline, and the counts of each group of cases and of all."""
     shown = shown_columns(rows)
@@ -88,17 +77,17 @@ def scoreboard(rows: list[Row]) -> str:
     lines = [(name, *cells(tally(own), shown)) for name, own in groups.items() if own]
     table = markdown(("cases", *shown), [*lines, (ALL, *cells(tally(rows), shown))], left=(0,))
     proposed = sum(verdict.basis == PROPOSED for row in rows for verdict in row.verdicts)
-    told = f"{RULE} {how_solved(rows)} Of the limits {proposed} are proposed, not measured elsewhere or analytic."
-    return f"{headline(rows)}\n\n{told}\n\n{table}"
+    text = f"{RULE} {how_solved(rows)} Of the limits {proposed} are proposed, not measured elsewhere or analytic."
+    return f"{headline(rows)}\n\n{text}\n\n{table}"
 
 
 def unsolved(rows: Iterable[Row]) -> str:
     """Each variant that is not solved, with its cause and the next idea."""
     groups: dict[str, dict[str, list[str]]] = {}  # names of variants, by case and by why they are not solved
     for row in rows:
-        if faults(row):
+        if row.faults:
             shortfalls = row.case.shortfalls_of(row.variant) if row.record is not None else []
-            why = [f"{'; '.join(faults(row))}.", *(f"Cause: {s.cause}. Next: {s.next_idea}." for s in shortfalls)]
+            why = [f"{'; '.join(row.faults)}.", *(f"Cause: {s.cause}. Next: {s.next_idea}." for s in shortfalls)]
             case = groups.setdefault(f"{row.case.id}, {row.case.name}", {})
             case.setdefault(" ".join(why), []).append(row.variant.name)
     return "\n\n".join(
@@ -119,21 +108,60 @@ def ends(rows: Iterable[Row]) -> str:
 
 
 def details(rows: Iterable[Row]) -> str:
-    """All rows."""
+    """Every quantity of every row."""
     return markdown(HEADINGS, [line for row in rows for line in row_lines(row)], LEFT)
 
 
+def row_lines(row: Row) -> list[tuple[str, ...]]:
+    """The cells of a row: the first line shows the run and its cost too."""
+    if row.record is None:
+        return [(row.case.id, row.variant.name, "not run", row.left_out or NOTHING, *[NOTHING] * (len(HEADINGS) - 4))]
+    record = row.record
+    first = (row.case.id, row.variant.name, record["status"])
+    cost = (
+        str(record["steps"]),
+        f"{record['seconds']:.1f}",
+        _or_nothing(record["step_seconds"], 1e3, ".3g"),
+        _or_nothing(record["peak_memory_bytes"], 1e-6, ".0f"),
+        _or_nothing(row.error, 1.0, ".1e"),
+    )
+    empty = ("",) * len(first), ("",) * len(cost)
+    lines = []
+    for verdict in row.verdicts:
+        value = verdict.value  # null for what is not finite
+        shown = "nan" if value is None else value if isinstance(value, str) else f"{value:.4g}"
+        passed = {None: NOTHING, True: "pass", False: "FAIL"}[verdict.passed]
+        lines.append((*first, verdict.quantity, shown, limit(verdict), verdict.basis, passed, *cost))
+        first, cost = empty
+    return lines
+
+
+def limit(verdict: Verdict) -> str:
+    """What is asked."""
+    if verdict.limit is None:
+        return NOTHING
+    if isinstance(verdict.limit, str):
+        return verdict.limit
+    sign = ">=" if verdict.at_least else "<="
+    replaced = "" if verdict.asked is None else f" (asked: {verdict.asked:g})"
+    return f"{sign} {verdict.limit:.4g}{replaced}"
+
+
+def _or_nothing(value: float | None, unit: float, form: str) -> str:
+    return NOTHING if value is None else f"{unit * value:{form}}"
+
+
 def notes(rows: list[Row]) -> str:
-    """What is to be known of limits that were replaced, and what runs tell of their ends."""
+    """What is to be known of limits that were replaced, and what runs say of their ends."""
     cases: dict[str, Case] = {row.case.id: row.case for row in rows}
     parts = []
     for case in cases.values():
         own = [row for row in rows if row.case is case]
         lines = [f'* limit on "{c.quantity}" ({c.basis}): {c.note}.' for c in case.criteria if c.note]
         for row in own:
-            told = row.record["problems"] if row.record else []
-            lines += [f"* {row.variant.name}: {text}" for text in told[:3]]
-            lines += [f"* {row.variant.name}: {len(told) - 3} more sentences" for _ in told[3:4]]
+            problems = row.record["problems"] if row.record else []
+            lines += [f"* {row.variant.name}: {text}" for text in problems[:3]]
+            lines += [f"* {row.variant.name}: {len(problems) - 3} more sentences" for _ in problems[3:4]]
             lines += [f"* {row.variant.name}, reference: {why}" for why in [reference_trouble(row)] if why]
         if lines:
             parts.append(f"{case.id}, {case.name}\n\n" + "\n".join(lines))
@@ -141,7 +169,7 @@ def notes(rows: list[Row]) -> str:
 
 
 def reference_trouble(row: Row) -> str:
-    """Why a reference that was begun tells no error."""
+    """Why a reference that was begun gives no error."""
     if row.reference is not None and row.error is None:
         return f"{row.reference['status']}, " + ("; ".join(row.reference["problems"][:1]) or "at other times")
     return row.reference_left_out

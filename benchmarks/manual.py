@@ -22,7 +22,7 @@ from taisoft.output.tables import markdown
 from .document import RESULTS
 from .hard_cases import CASES
 from .hard_runs import Row, stored
-from .hard_score import ALL, cells, faults, headline, how_solved, shown_columns, tally
+from .hard_table import ALL, cells, headline, how_solved, shown_columns, tally
 from .order_cases import HANGING
 from .order_table import DEFAULT_DEGREE, GOAL
 from .reference_cases.record import label
@@ -145,7 +145,7 @@ def hard(results: Path) -> str:
     lines = []
     for case in CASES:
         own = [row for row in rows if row.case is case]
-        why = dict.fromkeys(fault for row in own for fault in faults(row))
+        why = dict.fromkeys(fault for row in own for fault in row.faults)
         lines.append((*line(case.id, case.name, own), "; ".join(why)))
     headings = ("case", "", *shown, "wall [s]", "not solved because of")
     table = markdown(headings, [*lines, (*line("", ALL, rows), "")], left=(0, 1, len(headings) - 1))

@@ -18,7 +18,6 @@ With --work the other works of FILE.json are kept. The whole takes about 35 minu
 import argparse
 import sys
 from collections.abc import Iterable
-from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
 
@@ -30,14 +29,13 @@ from taisoft.timing import Timing, load_average
 from .again import again_text, earlier_numbers, plain
 from .document import RESULTS, Document, check_out, default_out, header, load_text
 from .elasticity_table import limit_table
-from .programs import mujoco_works, newton_works, own, pybullet_soft
+from .programs import mujoco_flex, newton_works, own, pybullet_soft
 from .programs.tried import TRIED, VERSIONS
-from .works.plot import draw
 from .works.runs import Row, measure, row_of
 from .works.scenes import WORKS, Work
-from .works.table import compare_table, comparisons, implicit_table, limits_of, run_table, tried_table
+from .works.table import compare_table, comparisons, draw, implicit_table, limits_of, run_table, tried_table
 
-PROGRAMS = (own, mujoco_works, pybullet_soft, newton_works)
+PROGRAMS = (own, mujoco_flex, pybullet_soft, newton_works)
 QUICK = ("W1 12x3x3", "W2")
 ROUNDS = 3
 
@@ -52,16 +50,13 @@ def opening(arch: str, programs: list[ModuleType]) -> tuple[str, dict]:
     return text, numbers | {"arch": arch, "left_out": left_out}
 
 
-def title(work: Work) -> str:
-    """Heading of a work's part."""
-    return f"## {work.key}: {work.title}, {work.tets:,} tets"
-
-
 def page(text: str, found: list[list[Row]], document: Document) -> dict:
     """Write the tables of all works. Returns their numbers."""
     document.add(text)
     for rows in found:
-        document.add(f"{title(rows[0].work)}\n\nMeasured {rows[0].date}.\n\n{run_table(rows)}")
+        work = rows[0].work
+        title = f"## {work.key}: {work.title}, {work.tets:,} tets"
+        document.add(f"{title}\n\nMeasured {rows[0].date}.\n\n{run_table(rows)}")
     compared = comparisons(found)
     document.add(f"## The fastest of each at equal error\n\n{compare_table(compared)}")
     if any(rows[0].work.stiff for rows in found):
@@ -69,23 +64,26 @@ def page(text: str, found: list[list[Row]], document: Document) -> dict:
     limits = [limit for rows in found for limit in limits_of(rows)]
     if limits:
         document.add(f"## Limits\n\n{limit_table(limits)}")
-    document.add(f"## What else was tried\n\nBy hand, with {VERSIONS}.\n\n{tried_table(TRIED)}")
+    document.add(f"## What else was tried\n\nBy hand, with {VERSIONS}.\n\n{tried_table()}")
     rows = [row.record() for rows in found for row in rows]
-    tried = {"versions": VERSIONS, "settings": [asdict(one) for one in TRIED]}
-    return {"runs": rows, "comparisons": compared, "limits": [limit.record() for limit in limits], "tried": tried}
+    names = "program", "work", "what", "came_out"
+    tried = [dict(zip(names, (program, *one))) for program, rows in TRIED.items() for one in rows]
+    return {"runs": rows, "comparisons": compared, "limits": [limit.record() for limit in limits]} | {
+        "tried": {"versions": VERSIONS, "settings": tried}
+    }
 
 
 def kept_rows(earlier: dict | None, works: list[Work], numbers: dict) -> dict[str, list[Row]]:
     """By key the rows that an earlier run on the same machine has of the works that are not measured now."""
     if earlier is None or any(earlier.get(name) != numbers[name] for name in ("processor", "cores", "arch")):
         return {}
-    found: dict[str, list[Row]] = {}
+    rows: dict[str, list[Row]] = {}
     anew = {work.key for work in works}
-    for work in (work for work in WORKS if work.key not in anew):
-        rows = [row_of(work, one, earlier["date"]) for one in earlier["runs"] if one["work"] == work.key]
-        if rows:
-            found[work.key] = rows
-    return found
+    left = {work.key: work for work in WORKS if work.key not in anew}
+    for one in earlier["runs"]:
+        if one["work"] in left:
+            rows.setdefault(one["work"], []).append(row_of(left[one["work"]], one, earlier["date"]))
+    return rows
 
 
 def run(
@@ -112,7 +110,7 @@ def times_of(works: Iterable[list[Row]]) -> dict[str, Timing]:
 
 
 def main(argv=None) -> int:
-    """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
+    """Measure and print. Raises OutputError, or SimulationError where the arch is not available."""
     first, _, rest = __doc__.partition("\n")
     parser = argparse.ArgumentParser(prog="taisoft bench peers", description=first, epilog=rest.partition("\n\n")[2])
     parser.add_argument("--work", metavar="KEY", help=f"only those that begin so: {', '.join(work.key for work in WORKS)}")

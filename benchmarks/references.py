@@ -3,13 +3,12 @@
 taisoft bench references [--problem NAME] [--arch cpu|cuda] [--out FILE.json]
 
 Computed in f64. The reference values lie beside the repository, in shared/references; without them there is nothing to
-compare with. Rows without a limit only tell how far a mesh or a step is off. Seconds include compiling the kernels; a
+compare with. Rows without a limit only show how far a mesh or a step is off. Seconds include compiling the kernels; a
 case with several rows shows them in its first. Exit status: 0 all passed, 1 some failed, 2 nothing to compare with.
 """
 
 import argparse
 import json
-import math
 import sys
 import time
 from collections.abc import Iterator
@@ -18,6 +17,8 @@ from pathlib import Path
 
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError
+from taisoft.output.files import write_bytes
+from taisoft.output.report import json_text
 from taisoft.timing import machine, versions
 
 from .reference_cases import CASES, PROBLEMS
@@ -30,24 +31,28 @@ FORMAT = "{:24} {:11} {:30} {:64} {:>16} {:>16} {:>8} {:>8} {:4} {:>7}"
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table; verdict: pass, FAIL, or - where there is no limit."""
+    """One line of the table: a check of a case. seconds: of the whole case in its first row, else 0."""
 
-    problem: str
-    law: str
-    mesh: str
-    quantity: str
-    measured: float
-    reference: float
-    error: float
-    limit: float | None
-    verdict: str
+    case: Case
+    check: Check
     seconds: float
 
+    @property
+    def verdict(self) -> str:
+        """pass, FAIL, or - where there is no limit."""
+        return self.check.verdict
+
+    def record(self) -> dict:
+        """As plain data."""
+        case = {"problem": self.case.problem, "law": self.case.law, "mesh": self.case.mesh}
+        return case | asdict(self.check) | {"verdict": self.verdict, "seconds": self.seconds}
+
     def __str__(self) -> str:
-        limit = "-" if self.limit is None else f"{self.limit:.1e}"
+        case, check = self.case, self.check
+        limit = "-" if check.limit is None else f"{check.limit:.1e}"
+        numbers = f"{check.measured:.9g}", f"{check.reference:.9g}", f"{check.error:.1e}", limit
         seconds = f"{self.seconds:.1f}" if self.seconds else ""
-        numbers = f"{self.measured:.9g}", f"{self.reference:.9g}", f"{self.error:.1e}", limit
-        return FORMAT.format(self.problem, self.law, self.mesh, self.quantity, *numbers, self.verdict, seconds)
+        return FORMAT.format(case.problem, case.law, case.mesh, check.quantity, *numbers, self.verdict, seconds)
 
 
 def run(case: Case, reference: dict, arch: str) -> list[Row]:
@@ -55,11 +60,7 @@ def run(case: Case, reference: dict, arch: str) -> list[Row]:
     start = time.perf_counter()
     checks = computed(lambda: case.compute(reference, arch))
     seconds = [time.perf_counter() - start] + [0.0] * (len(checks) - 1)
-    return [_row(case, check, s) for check, s in zip(checks, seconds)]
-
-
-def _row(case: Case, check: Check, seconds: float) -> Row:
-    return Row(case.problem, case.law, case.mesh, **asdict(check), verdict=check.verdict, seconds=seconds)
+    return [Row(case, check, s) for check, s in zip(checks, seconds)]
 
 
 def _missing(problems) -> str | None:
@@ -78,24 +79,12 @@ def _rows(problems, arch: str) -> Iterator[Row]:
 
 
 def _write(path: Path, arch: str, rows: list[Row]) -> None:
-    def plain(value):  # JSON knows no NaN: what could not be computed is null there
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    content = {
-        "arch": arch,
-        "precision": "f64",
-        "machine": machine(),
-        "versions": versions("taisoft", "taichi", "numpy", "scipy"),
-        "rows": [{key: plain(value) for key, value in asdict(row).items()} for row in rows],
-    }
-    try:
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path} could not be written: {error.strerror}") from error
+    where = {"machine": machine(), "versions": versions("taisoft", "taichi", "numpy", "scipy")}
+    write_bytes(path, json_text({"arch": arch, "precision": "f64", **where, "rows": [row.record() for row in rows]}).encode())
 
 
 def main(argv=None) -> int:
-    """Run the cases and print their table. Raises OutputError, or SimulationError where the arch cannot be had."""
+    """Run the cases and print their table. Raises OutputError, or SimulationError where the arch is not available."""
     parser = argparse.ArgumentParser(prog="taisoft bench references", description=__doc__.partition("\n")[0])
     parser.add_argument("--problem", choices=PROBLEMS, metavar="NAME", help=f"only this one of {', '.join(PROBLEMS)}")
     parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")

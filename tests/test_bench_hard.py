@@ -21,7 +21,7 @@ import pytest
 
 from benchmarks import hard, hard_runs
 from benchmarks.hard_cases import CASES, geometry, shapes, time_step
-from benchmarks.hard_cases.record import (
+from benchmarks.hard_cases.case import (
     DEGRADED,
     DROPPED,
     INTERRUPTED,
@@ -36,13 +36,12 @@ from benchmarks.hard_cases.record import (
     Case,
     Criterion,
     Must,
+    Session,
     Shortfall,
     Variant,
     judge,
 )
-from benchmarks.hard_cases.session import Session
 from benchmarks.hard_runs import Row, find
-from benchmarks.hard_score import faults
 from taisoft.errors import SimulationError
 from taisoft.records import RunReport, StepReport
 from taisoft.study.store import pack
@@ -102,7 +101,7 @@ def test_judgement(numbers, status, passed):
     record = {"status": status, "causes": [], "numbers": numbers}
     row = Row(case, variant, record)
     row.judge()
-    assert [verdict.passed for verdict in row.verdicts] == passed and len(faults(row)) == passed.count(False)
+    assert [verdict.passed for verdict in row.verdicts] == passed and len(row.faults) == passed.count(False)
 
 
 def test_a_run_that_cannot_be_made():
@@ -182,7 +181,7 @@ def test_quick_variants_are_solved(case, name):
     row = Row(*find(case, name))
     record = row.record = hard_runs.run(row.case, row.variant, "cpu")
     row.judge()
-    assert not faults(row) and record["peak_memory_bytes"] > 0 and (record["steps"] > 0) == (record["step_seconds"] is not None)
+    assert not row.faults and record["peak_memory_bytes"] > 0 and (record["steps"] > 0) == (record["step_seconds"] is not None)
 
 
 def test_a_reference_is_finer():
@@ -209,12 +208,12 @@ def test_the_page_tells_what_is_not_solved(monkeypatch, capsys):
     case, variant = one_case(None)
     monkeypatch.setattr(hard, "CASES", (case,))
 
-    def fill(rows, *_):
+    def fill(self, rows, references):
         for row, record in zip(rows, records):
             row.record, row.left_out = record, "" if record else "the budget was spent"
             row.judge()
 
-    monkeypatch.setattr(hard, "measure", fill)
+    monkeypatch.setattr(hard.Runner, "measure", fill)
     cost = {"causes": [], "problems": ["deep"], "steps": 3, "seconds": 1.0, "step_seconds": 0.5, "peak_memory_bytes": 10**6}
     cost["points"] = pack(np.zeros((0, 3)))
     records = [cost | {"status": OK, "numbers": {"small": 0.5, "large": 3.0}}]

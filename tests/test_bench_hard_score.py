@@ -13,7 +13,7 @@ import pytest
 from benchmarks import hard, manual
 from benchmarks.document import RESULTS
 from benchmarks.hard_cases import CASES, GROUPS
-from benchmarks.hard_cases.record import (
+from benchmarks.hard_cases.case import (
     DEGRADED,
     INVERTED,
     OK,
@@ -26,9 +26,8 @@ from benchmarks.hard_cases.record import (
     Must,
     Variant,
 )
-from benchmarks.hard_runs import Row, stored
-from benchmarks.hard_score import ASKED, COLUMNS, NOT_RUN, SOLVED, WRONG, column, faults, headline, tally
-from benchmarks.hard_table import scoreboard
+from benchmarks.hard_runs import COLUMNS, NOT_RUN, WRONG, Row, stored
+from benchmarks.hard_table import ASKED, SOLVED, headline, scoreboard, tally
 from taisoft.errors import OutputError
 
 ANSWER, COST = Criterion("off by", 1.0, PROPOSED), Criterion("seconds", 1.0, PROPOSED, cost=True)
@@ -81,7 +80,7 @@ def row_of(must: Must, status: str | None, causes=(), numbers=KEPT) -> Row:
 )
 def test_solved_or_not(must, status, causes, numbers, where, why):
     row = row_of(must, status, causes, numbers)
-    assert (column(row), faults(row)) == (where, why)
+    assert (row.column, row.faults) == (where, why)
     assert row.data()["solved"] == (not why) and row.data()["column"] == where
 
 
@@ -120,7 +119,7 @@ def test_what_was_not_run_is_asked_and_not_solved(results):
 
 
 def test_every_stored_variant_that_is_not_solved_has_a_cause(results):
-    unexplained = [row for row in stored(results) if faults(row) and row.record and not row.case.shortfalls_of(row.variant)]
+    unexplained = [row for row in stored(results) if row.faults and row.record and not row.case.shortfalls_of(row.variant)]
     assert [(row.case.id, row.variant.name) for row in unexplained] == []
 
 
@@ -128,7 +127,7 @@ def test_stored_results_are_judged_anew(results, tmp_path, capsys):
     page = next(path for path in RESULTS.glob("hard-*.md") if results["date"] in path.read_text(encoding="utf-8"))
     again = tmp_path / "hard.json"
     again.write_text(json.dumps(results | {"rows": [row | {"solved": None} for row in results["rows"]]}))
-    solved = all(not faults(row) for row in stored(results))
+    solved = all(not row.faults for row in stored(results))
     assert hard.main(["--judge", str(again)]) == (0 if solved else 1)
     why = f"`taisoft bench hard --judge {page.with_suffix('.json')}` writes it anew"
     same = json.loads(again.read_text())["rows"] == results["rows"]

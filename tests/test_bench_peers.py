@@ -190,7 +190,7 @@ def test_rows_are_measured_and_judged(capsys):
             return [Setting("broken", TAISOFT, "none", 1)]
 
         @staticmethod
-        def start(work, setting):
+        def Run(work, setting):
             raise ValueError("it is broken")
 
     rows = measure(work, [own, Broken], 1)
@@ -206,7 +206,7 @@ def test_what_takes_long_is_measured_in_one_round(seconds, build_seconds, rounds
     class Slow:
         NAME, build_time = "slow", build_seconds
         settings = staticmethod(lambda work, arch: [Setting("slow", TAISOFT, "none", 1)])
-        start = classmethod(lambda cls, work, setting: cls())
+        Run = classmethod(lambda cls, work, setting: cls())
 
         def __init__(self):
             self.build_seconds, self.unconverged = self.build_time, 0
@@ -234,7 +234,7 @@ def test_works_that_are_not_measured_again_are_kept(tmp_path, monkeypatch, capsy
         def __init__(self, work):
             self.work, self.build_seconds, self.unconverged = work, 0.1, 0
 
-        start = classmethod(lambda cls, work, setting: cls(work))
+        Run = classmethod(lambda cls, work, setting: cls(work))
 
         def run(self, follow):
             return (still(self.work) if follow else None), seconds[self.work.key] * self.work.seconds
@@ -262,7 +262,7 @@ def test_works_that_are_not_measured_again_are_kept(tmp_path, monkeypatch, capsy
 def test_explicit_steps_come_to_the_exact_path():
     work = scenes.dropped_cube()
     setting = Setting("taisoft", TAISOFT, "velocity_verlet", 16, {"precision": "f64"})
-    session = own.start(work, setting)
+    session = own.Run(work, setting)
     positions, _ = session.run(follow=True)
     session.close()
     path = references.observed(work, positions, references.masses(work, TAISOFT))
@@ -271,7 +271,7 @@ def test_explicit_steps_come_to_the_exact_path():
 
 def test_taisoft_does_a_work():
     work = small_drop()
-    session = own.start(work, Setting("taisoft", TAISOFT, "velocity_verlet", 4, {"precision": "f64"}))
+    session = own.Run(work, Setting("taisoft", TAISOFT, "velocity_verlet", 4, {"precision": "f64"}))
     positions, seconds = session.run(follow=True)
     again, _ = session.run(follow=False)
     session.close()
@@ -289,25 +289,25 @@ def adapter(name: str):
 
 
 def test_mujoco_has_both_contacts_and_both_laws_at_several_steps():
-    from benchmarks.programs import mujoco_works
+    from benchmarks.programs import mujoco_flex
 
     for work in scenes.WORKS:
-        found = mujoco_works.settings(work)
+        found = mujoco_flex.settings(work)
         implicit = [one for one in found if one.method == "discrete"]
-        assert {one.model for one in implicit} == {mujoco_works.MODEL, mujoco_works.NEO_HOOKEAN}
+        assert {one.model for one in implicit} == {mujoco_flex.MODEL, mujoco_flex.NEO_HOOKEAN}
         assert any(one.method == "euler_staggered" for one in found)
         for contact in ("passive", "solref") if work.touches else ():
-            alike = [one for one in implicit if one.model == mujoco_works.NEO_HOOKEAN and contact in one.options]
+            alike = [one for one in implicit if one.model == mujoco_flex.NEO_HOOKEAN and contact in one.options]
             assert len({one.dt for one in alike}) >= 2
         assert len({str(one) + str(one.model) + str(one.dt) for one in found}) == len(found)
 
 
 @pytest.mark.parametrize("neo_hookean", [False, True])
 def test_mujocos_forces_are_those_of_its_law(neo_hookean):
-    program = adapter("mujoco_works")
+    program = adapter("mujoco_flex")
     mujoco = program.import_mujoco()
     work, model = small_drop(), program.NEO_HOOKEAN if neo_hookean else program.MODEL
-    session = program.start(work, Setting("MuJoCo", model, "discrete", 4, {"passive": True, "radius": 1e-4}))
+    session = program.Run(work, Setting("MuJoCo", model, "discrete", 4, {"passive": True, "radius": 1e-4}))
     data, body = mujoco.MjData(session.model), work.bodies[0]
     u = 0.1 * np.random.default_rng(6).standard_normal(work.start.shape)
     u[:, 1] += 1.0  # above the ground
@@ -321,22 +321,22 @@ def test_mujocos_forces_are_those_of_its_law(neo_hookean):
 
 
 def test_mujoco_refuses_implicit_elasticity_elsewhere_than_in_discrete_steps():
-    program = adapter("mujoco_works")
+    program = adapter("mujoco_flex")
     work = scenes.hanging_beam((12, 3, 3))
     (setting,) = (one for one in program.settings(work) if one.method == "implicitfast")
     with pytest.raises(Exception, match="flex elasticity is no longer integrated implicitly"):
-        program.start(work, setting).run(follow=False)
+        program.Run(work, setting).run(follow=False)
 
 
 @pytest.mark.parametrize(
-    "name, model", [("pybullet_soft", PYBULLET), ("newton_works", NEWTON), ("mujoco_works", references.MUJOCO)]
+    "name, model", [("pybullet_soft", PYBULLET), ("newton_works", NEWTON), ("mujoco_flex", references.MUJOCO)]
 )
 def test_peers_fall_alike(name, model):
     program, work = adapter(name), small_drop()
     kinds = {(one.method, one.model, "passive" in one.options): one for one in program.settings(work) if "ipc" not in one.options}
     assert program.MODEL == model and model in {one.model for one in kinds.values()}
     for setting in kinds.values():
-        session = program.start(work, setting)
+        session = program.Run(work, setting)
         positions, _ = session.run(follow=True)
         again, _ = session.run(follow=True)
         session.close()
@@ -351,7 +351,7 @@ def test_newtons_explicit_steps_are_of_second_order():
     reference, mass = references.load(work, program.EXPLICIT_MODEL), references.masses(work, program.EXPLICIT_MODEL)
     errors = []
     for steps in (3, 6):
-        session = program.start(work, Setting("Newton", program.EXPLICIT_MODEL, "semi_implicit", steps))
+        session = program.Run(work, Setting("Newton", program.EXPLICIT_MODEL, "semi_implicit", steps))
         path = references.observed(work, session.run(follow=True)[0], mass)
         errors.append(np.linalg.norm(path - reference.path[: len(path)], axis=1).max())
     assert errors[0] < 1e-4 and np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.3)

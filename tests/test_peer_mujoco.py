@@ -3,7 +3,7 @@
 * Its masses, its elastic force on a deformed mesh and its fixed nodes are those of the exact path's beam;
 * its path is near the exact one, of first order (Euler, discrete) or better (staggered start, RK4);
 * step sizes and names outside the rules are refused, and a run that diverges is an error, not a result;
-* the table's step sizes are the largest stable ones (shown on the smallest mesh).
+* the stored step sizes are the largest stable ones (shown on the smallest mesh).
 """
 
 import numpy as np
@@ -14,14 +14,17 @@ from taisoft.errors import SceneError, SimulationError
 
 mujoco = pytest.importorskip("mujoco", minversion="4.0")
 
-from benchmarks.programs.mujoco_flex import STABLE_STEPS, build_model, run_mujoco, table_rows  # noqa: E402
+from benchmarks.programs.mujoco_flex import STABLE_STEPS, Run, run_mujoco  # noqa: E402
+from benchmarks.programs.session import Setting  # noqa: E402
+from benchmarks.works.references import MUJOCO  # noqa: E402
+from benchmarks.works.scenes import hanging_beam  # noqa: E402
 
 CELLS = (12, 3, 3)
 
 
 def test_masses_and_elastic_forces_are_those_of_the_beam():
     beam = FallingBeam(CELLS)
-    model = build_model(mujoco, beam, "euler", 1e-3)
+    model = Run(hanging_beam(CELLS), Setting("MuJoCo", MUJOCO, "euler", 10)).model
     data = mujoco.MjData(model)
     u = 0.02 * np.random.default_rng(2).standard_normal(beam.vertices.shape) * beam.free[:, None]
     data.qpos[:] = u[beam.free].ravel()
@@ -45,14 +48,11 @@ def test_error_falls_with_the_order_of_the_integrator(integrator, dt, order, lar
     assert np.log2(coarse / fine) == pytest.approx(order, abs=0.25)
 
 
-def test_result_holds_path_times_timing_and_settings():
-    r = run_mujoco(CELLS, "discrete", 0.01, seconds=0.2, repeats=2)
+def test_result_holds_path_and_times():
+    r = run_mujoco(CELLS, "discrete", 0.01, seconds=0.2)
     assert r["path"].shape == (21, 3) and np.allclose(r["t"], np.arange(21) * 0.01)
     assert np.allclose(r["path"][0], [2, 0, 0])
-    assert r["step_timing"].repeats == 40 and r["seconds_per_step"] == r["step_timing"].median
-    step = r["step_timing"]  # of 10 ms; a mean lies between the extremes, whatever else the machine does
-    assert 99 * step.minimum < r["seconds_per_simulated_second"] < 101 * step.maximum
-    assert r["settings"]["integrator"] == "mjINT_DISCRETE" and r["settings"]["timestep"] == 0.01
+    assert r["seconds_per_simulated_second"] > 0.0 and r["compile_seconds"] > 0.0
 
 
 def test_what_breaks_the_rules_is_refused():
@@ -65,9 +65,8 @@ def test_what_breaks_the_rules_is_refused():
 
 
 @pytest.mark.parametrize("integrator, steps", list(zip(("euler", "rk4"), STABLE_STEPS[CELLS])))
-def test_the_tables_steps_are_the_largest_stable_ones(integrator, steps, tmp_path, monkeypatch):
+def test_the_stored_steps_are_the_largest_stable_ones(integrator, steps, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert (integrator, steps) in table_rows(CELLS)
     assert run_mujoco(CELLS, integrator, 0.01 / steps)["error"] < 0.01
     with pytest.raises(SimulationError, match=f"MuJoCo's {integrator} with dt = .* diverges on the mesh"):
         run_mujoco(CELLS, integrator, 0.01 / (steps - 1))

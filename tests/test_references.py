@@ -98,7 +98,7 @@ def test_a_case_that_cannot_be_computed_is_a_failed_row(tmp_path):
         yield
 
     rows = references.run(replace(CASES[0], compute=broken), {}, "cpu")
-    assert [row.verdict for row in rows] == ["FAIL"] and "no such luck" in rows[0].quantity
+    assert [row.verdict for row in rows] == ["FAIL"] and "no such luck" in rows[0].check.quantity
     references._write(tmp_path / "rows.json", "cpu", rows)
     assert json.loads((tmp_path / "rows.json").read_text(encoding="utf-8"))["rows"][0]["measured"] is None
 

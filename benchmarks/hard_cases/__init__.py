@@ -1,16 +1,16 @@
 """All hard cases, group by group."""
 
-from . import contact, geometry, long_run, material, ratios, scale, self_collision, time_step
-from .record import Case
+from . import contact, geometry, material, scale, self_collision, time_step
+from .case import Case
 
 GROUPS: dict[str, tuple[Case, ...]] = {  # by the catalogue's names
     "material": material.CASES,
-    "time step": time_step.CASES,
-    "ratios": ratios.CASES,
+    "time step": time_step.TIME_STEP,
+    "ratios": scale.RATIOS,
     "contact & friction": contact.CASES,
     "self-collision": self_collision.CASES,
     "degenerate geometry": geometry.CASES,
-    "extremes of scale": scale.CASES,
-    "long run": long_run.CASES,
+    "extremes of scale": scale.SCALE,
+    "long run": time_step.LONG_RUN,
 }
 CASES: tuple[Case, ...] = tuple(case for cases in GROUPS.values() for case in cases)

@@ -1,20 +1,33 @@
-"""Materials at their worst: collapsed, mirrored and random shapes, squeezes, a bar that is drawn, twisted and let go."""
+"""Materials at their worst: collapsed, mirrored and random shapes, squeezes, a bar that is drawn, twisted and released."""
 
 import numpy as np
 
-import taisoft as ts
 from taisoft.scene.key_frames import KeyFrames
 
 from ..reference_cases.record import face
-from .record import ANALYTIC, DEGRADED, INVERTED, MEASURED, OK, PROPOSED, STOPPED, Case, Criterion, Must, Shortfall, Variant
-from .session import Session
-from .shapes import COR, SNH, SVK, WEIGHTLESS, box, cube, rest_at_last
+from .case import (
+    ANALYTIC,
+    DEGRADED,
+    EXPLICIT,
+    IMPLICIT,
+    INVERTED,
+    MEASURED,
+    OK,
+    PROPOSED,
+    STOPPED,
+    Case,
+    Must,
+    Session,
+    explicit,
+    implicit,
+)
+from .shapes import COR, SNH, SVK, WEIGHTLESS, box, cube, not_finite, one_body, rest_at_last
 
 LAWS = (COR, SNH)
+FINITE = "numbers that are not finite in the last state"
 SHAPE = "shape error at the end, over L"
 INVERTED_LAST = "inverted tets at the end"
 SMALLEST = "smallest volume ratio at the end"
-STARTS = ("plane", "mirrored", "random")
 
 
 def start_of(name: str, X: np.ndarray) -> np.ndarray:
@@ -26,58 +39,51 @@ def start_of(name: str, X: np.ndarray) -> np.ndarray:
 
 def recover(session: Session, law: str, start: str, steps: int) -> dict[str, float]:
     """M1, M2: a free cube of 1 m from a start in which tets have no volume or a negative one, for 14 s."""
-    scene = ts.Scene(gravity=WEIGHTLESS)
-    soft = ts.Material(law=law, young=1e5, poisson=0.4, density=1000.0, mass_damping=6.0)
-    body = scene.add_body(cube(4, 1.0), soft, name="cube")
+    scene, body = one_body("cube", cube(4, 1.0), law=law, young=1e5, poisson=0.4, mass_damping=6.0)
     with session.simulator(scene) as sim:
         sim.set_state(start_of(start, body.rest_positions))
         session.go(sim, steps, every=max(1, steps // 700))
-        finite = np.isfinite(sim.positions()).all() and np.isfinite(sim.velocities()).all()
-        return rest_at_last(sim, 1.0) | {"numbers that are not finite in the last state": float(not finite)}
+        return rest_at_last(sim, 1.0) | {FINITE: not_finite(sim.positions(), sim.velocities())}
 
 
 def squeeze(session: Session, law: str) -> dict[str, float]:
     """M3: a cube of 0.1 m is squeezed to half its height, held, and drawn back."""
-    scene = ts.Scene(gravity=WEIGHTLESS)
-    body = scene.add_body(cube(4, 0.1), ts.Material(law=law, young=1e5, poisson=0.3, density=1000.0), name="cube")
+    scene, body = one_body("cube", cube(4, 0.1), law=law, young=1e5, poisson=0.3)
     body.fix(face(1, -0.05))
     down = [0.0, 0.0, 0.0], [0.0, -0.05, 0.0]
     body.move(face(1, 0.05), KeyFrames([0.0, 1.0, 1.5, 2.5], [down[0], down[1], down[1], down[0]]))
     with session.simulator(scene) as sim:
         session.go(sim, 350)
         found = rest_at_last(sim, 0.1)
-        way = float(np.linalg.norm(sim.positions() - body.rest_positions, axis=1).max())
-    told = [text for text in session.warnings if "step " in text and "tet " in text and "softens" in text]
+        way = np.linalg.norm(sim.positions() - body.rest_positions, axis=1).max()
+    named = [text for text in session.warnings if "step " in text and "tet " in text and "softens" in text]
     return found | {
         "largest displacement at the end [m]": way,
         "smallest volume ratio of all steps": min(report.min_volume_ratio for report in session.reports),
-        "warnings of softening that name step and tet": float(len(told)),
-        "run is ok though tets are inverted at the end": float(session.status == OK and found[INVERTED_LAST] > 0.0),
+        "warnings of softening that name step and tet": len(named),
+        "run is ok though tets are inverted at the end": session.status == OK and found[INVERTED_LAST] > 0.0,
     }
 
 
 def draw_and_twist(session: Session, law: str) -> dict[str, float]:
-    """M4: a bar's end is drawn to four times its length, turned once and let go."""
-    scene = ts.Scene(gravity=WEIGHTLESS)
-    soft = ts.Material(law=law, young=3e4, poisson=0.4, density=1000.0, mass_damping=2.0)
-    body = scene.add_body(box((10, 3, 3), (0.5, 0.15, 0.15), (0.25, 0.0, 0.0)), soft, name="bar")
+    """M4: a bar's end is drawn to four times its length, turned once and released."""
+    mesh = box((10, 3, 3), (0.5, 0.15, 0.15), (0.25, 0.0, 0.0))
+    scene, body = one_body("bar", mesh, law=law, young=3e4, poisson=0.4, mass_damping=2.0)
     body.fix(face(0, 0.0))
     far, turn = [1.5, 0.0, 0.0], [2.0 * np.pi, 0.0, 0.0]
     path = KeyFrames([0.0, 1.0, 2.0], [WEIGHTLESS, far, far], [WEIGHTLESS, WEIGHTLESS, turn], release=True)
     body.move(face(0, 0.5), path)
     with session.simulator(scene) as sim:
         session.go(sim, 1000)
-        return rest_at_last(sim, 0.5) | {"steps that did not converge": float(session.unconverged)}
+        return rest_at_last(sim, 0.5) | {"steps that did not converge": session.unconverged}
 
 
-def _recovery(law: str, kind: str, start: str, dt: float, must: Must) -> Variant:
-    name = f"{start}, {law}, {kind}, dt {dt:g} s"
-    settings, parameters = {"dt": dt, "integrator": kind}, {"law": law, "start": start, "steps": round(14.0 / dt)}
-    return Variant(name, settings, parameters, must, reference=start != "random")
+def add_recovery(case: Case, law: str, start: str, settings: dict, must: Must) -> None:
+    """A variant of M1 or M2."""
+    name = f"{start}, {law}, {settings['integrator']}, dt {settings['dt']:g} s"
+    steps = round(14.0 / settings["dt"])
+    case.add_variant(name, settings, must, reference=start != "random", law=law, start=start, steps=steps)
 
-
-IMPLICIT, EXPLICIT = "implicit_euler", "symplectic_euler"
-FINITE = Criterion("numbers that are not finite in the last state", 0.0, ANALYTIC)
 
 RECOVERS = Must(
     OK,
@@ -98,56 +104,37 @@ DIVERGES = Must(
     (INVERTED,),
 )
 
-M1 = Case(
-    "M1",
-    "collapsed to a plane; mirrored",
-    recover,
-    tuple(
-        _recovery(law, kind, start, dt, STAYS if law == SVK else RECOVERS)
-        for law in (*LAWS, SVK)
-        for kind, dt in ((IMPLICIT, 0.02), (EXPLICIT, 1e-3))
-        for start in STARTS[:2]
-    ),
-    (
-        Criterion(SHAPE, 1e-3, MEASURED, of={"law": LAWS}),
-        Criterion(SMALLEST, 0.99, MEASURED, at_least=True, of={"law": LAWS}),
-        Criterion(INVERTED_LAST, 0.0, MEASURED, of={"law": LAWS}),
-        FINITE,
-    ),
-    size=1.0,
-    shortfalls=(
-        Shortfall(
-            "the first step starts where the polar rotation of every tet is not unique and forces jump (its two least singular "
-            "values, signed, add up to nothing), and Newton's method ends at its cap, in f64 and in parts too",
-            "bound the twist modes of the matrix where the rotation is not unique (their eigenvalues: Smith et al. 2019)",
-            of={"law": COR, "integrator": IMPLICIT, "start": "mirrored"},
-        ),
-    ),
-    quick=(f"mirrored, {COR}, {EXPLICIT}, dt 0.001 s",),
+M1 = Case("M1", "collapsed to a plane; mirrored", recover, size=1.0, quick=(f"mirrored, {COR}, {EXPLICIT}, dt 0.001 s",))
+for law in (*LAWS, SVK):
+    for settings in (implicit(0.02), explicit(1e-3)):
+        for start in ("plane", "mirrored"):
+            add_recovery(M1, law, start, settings, STAYS if law == SVK else RECOVERS)
+M1.add_limit(SHAPE, 1e-3, MEASURED, law=LAWS)
+M1.add_limit(SMALLEST, 0.99, MEASURED, at_least=True, law=LAWS)
+M1.add_limit(INVERTED_LAST, 0.0, MEASURED, law=LAWS)
+M1.add_limit(FINITE, 0.0, ANALYTIC)
+M1.add_shortfall(
+    "the first step starts where the polar rotation of every tet is not unique and forces jump (its two least singular "
+    "values, signed, add up to nothing), and Newton's method ends at its cap, in f64 and in parts too",
+    "bound the twist modes of the matrix where the rotation is not unique (their eigenvalues: Smith et al. 2019)",
+    law=COR,
+    integrator=IMPLICIT,
+    start="mirrored",
 )
 
 NOT_ASKED = "the catalogue speaks of neo-Hookean alone; corotational does not stiffen with stretch, and must recover"
-M2 = Case(
-    "M2",
-    "random vertices",
-    recover,
-    tuple(
-        _recovery(law, kind, "random", dt, DIVERGES if (law, dt) == (SNH, 1.12e-3) else RECOVERS)
-        for law in LAWS
-        for kind, dt in ((IMPLICIT, 0.01), (EXPLICIT, 2.2e-4), (EXPLICIT, 1.12e-3))
-    ),
-    (
-        Criterion(SHAPE, 1e-3, PROPOSED, of={"integrator": IMPLICIT}),
-        Criterion(INVERTED_LAST, 0.0, PROPOSED, of={"integrator": IMPLICIT}),
-        Criterion(SHAPE, 1e-3, MEASURED, of={"dt": 2.2e-4}),
-        Criterion(INVERTED_LAST, 0.0, MEASURED, of={"dt": 2.2e-4}),
-        Criterion(SHAPE, 1e-3, PROPOSED, of={"dt": 1.12e-3, "law": COR}, note=f"for dt 0.00112 s {NOT_ASKED}"),
-        Criterion(INVERTED_LAST, 0.0, PROPOSED, of={"dt": 1.12e-3, "law": COR}, note=f"for dt 0.00112 s {NOT_ASKED}"),
-        FINITE,
-    ),
-    size=1.0,
-    quick=(f"random, {SNH}, {EXPLICIT}, dt 0.00112 s",),
-)
+M2 = Case("M2", "random vertices", recover, size=1.0, quick=(f"random, {SNH}, {EXPLICIT}, dt 0.00112 s",))
+for law in LAWS:
+    for settings in (implicit(0.01), explicit(2.2e-4), explicit(1.12e-3)):
+        add_recovery(M2, law, "random", settings, DIVERGES if law == SNH and settings["dt"] == 1.12e-3 else RECOVERS)
+for basis, note, of in (
+    (PROPOSED, "", {"integrator": IMPLICIT}),
+    (MEASURED, "", {"dt": 2.2e-4}),
+    (PROPOSED, f"for dt 0.00112 s {NOT_ASKED}", {"dt": 1.12e-3, "law": COR}),
+):
+    M2.add_limit(SHAPE, 1e-3, basis, note=note, **of)
+    M2.add_limit(INVERTED_LAST, 0.0, basis, note=note, **of)
+M2.add_limit(FINITE, 0.0, ANALYTIC)
 
 BEARS = Must(OK, "both laws stay stiff when squeezed to half: the cube has an upright shape all the way, and its rest at the end")
 SNAPS = Must(
@@ -156,22 +143,14 @@ SNAPS = Must(
     "must tell of that",
     (INVERTED,),
 )
-M3 = Case(
-    "M3",
-    "squeezed past a stretch of 0.577",
-    squeeze,
-    tuple(
-        Variant(law, {"dt": 0.01, "integrator": IMPLICIT}, {"law": law}, SNAPS if law == SVK else BEARS) for law in (SVK, *LAWS)
-    ),
-    (
-        Criterion("smallest volume ratio of all steps", 0.05, PROPOSED, at_least=True, of={"law": LAWS}),
-        Criterion("largest displacement at the end [m]", 1e-4, PROPOSED, of={"law": LAWS}),
-        Criterion(INVERTED_LAST, 0.0, PROPOSED, of={"law": LAWS}),
-        Criterion("warnings of softening that name step and tet", 1.0, ANALYTIC, at_least=True, of={"law": SVK}),
-        Criterion("run is ok though tets are inverted at the end", 0.0, ANALYTIC, of={"law": SVK}),
-    ),
-    size=0.1,
-)
+M3 = Case("M3", "squeezed past a stretch of 0.577", squeeze, size=0.1)
+for law in (SVK, *LAWS):
+    M3.add_variant(law, implicit(0.01), SNAPS if law == SVK else BEARS, law=law)
+M3.add_limit("smallest volume ratio of all steps", 0.05, PROPOSED, at_least=True, law=LAWS)
+M3.add_limit("largest displacement at the end [m]", 1e-4, PROPOSED, law=LAWS)
+M3.add_limit(INVERTED_LAST, 0.0, PROPOSED, law=LAWS)
+M3.add_limit("warnings of softening that name step and tet", 1.0, ANALYTIC, at_least=True, law=SVK)
+M3.add_limit("run is ok though tets are inverted at the end", 0.0, ANALYTIC, law=SVK)
 
 RECOILS = Must(
     OK,
@@ -179,23 +158,18 @@ RECOILS = Must(
     "neo-Hookean), so that tets may turn inside out when it is let go; none may be at the end",
     (INVERTED,),
 )
-M4 = Case(
-    "M4",
-    "stretch of 4, a full turn, release",
-    draw_and_twist,
-    tuple(Variant(law, {"dt": 0.01, "integrator": IMPLICIT}, {"law": law}, RECOILS) for law in LAWS),
-    (Criterion(INVERTED_LAST, 0.0, PROPOSED), Criterion(SHAPE, 5e-3, PROPOSED)),
-    size=0.5,
-    shortfalls=(
-        Shortfall(
-            "corotational thins in proportion to stretch: with Poisson's ratio 0.4 no width is left at a stretch of 3.5, "
-            "where the rotation flips; the energy has a kink there, and from there on its minimum, in which up to 345 of 540 "
-            "tets sit: no step can drive their forces to zero, in f64 neither",
-            "count a step as converged at a kink, where zero lies between the forces of its two sides; warn as for the "
-            "softening of St. Venant-Kirchhoff",
-            of={"law": COR},
-        ),
-    ),
+M4 = Case("M4", "stretch of 4, a full turn, release", draw_and_twist, size=0.5)
+for law in LAWS:
+    M4.add_variant(law, implicit(0.01), RECOILS, law=law)
+M4.add_limit(INVERTED_LAST, 0.0, PROPOSED)
+M4.add_limit(SHAPE, 5e-3, PROPOSED)
+M4.add_shortfall(
+    "corotational thins in proportion to stretch: with Poisson's ratio 0.4 no width is left at a stretch of 3.5, "
+    "where the rotation flips; the energy has a kink there, and from there on its minimum, in which up to 345 of 540 "
+    "tets sit: no step can drive their forces to zero, in f64 neither",
+    "count a step as converged at a kink, where zero lies between the forces of its two sides; warn as for the "
+    "softening of St. Venant-Kirchhoff",
+    law=COR,
 )
 
 CASES = (M1, M2, M3, M4)

@@ -7,68 +7,58 @@ from taisoft.fem.reference import gravity_mass, lumped_mass
 from taisoft.scene.key_frames import KeyFrames
 
 from ..reference_cases.record import face
-from .record import ANALYTIC, OK, PROPOSED, Case, Criterion, Must, Shortfall, Variant
-from .session import Session
-from .shapes import COR, SNH, WEIGHTLESS, box, rest_at_last, voxels
+from .case import ANALYTIC, DEEPEST, OK, PROPOSED, Case, Must, Session, implicit
+from .shapes import COR, SNH, WEIGHTLESS, box, not_finite, one_body, rest_at_last, voxels
 
-IMPLICIT = "implicit_euler"
-DEEPEST = "deepest penetration after any step [m]"
+GAINED = "what steps after the release add to the momentum, over the impulses of contacts"
 LAWS = (COR, SNH)
 
 
 def mat_twist(session: Session, seed: int, seconds: float) -> dict[str, float]:
     """S1: a mat's ends turn against each other; nodes start up to 0.1 mm aside, along its normal."""
-    scene = ts.Scene(gravity=WEIGHTLESS)
     mesh = box((20, 20, 1), (1.0, 1.0, 0.02))
-    body = scene.add_body(mesh, ts.Material(law=SNH, young=2e4, poisson=0.4, density=1000.0), name="mat")
+    scene, body = one_body("mat", mesh, law=SNH, young=2e4, poisson=0.4)
     turn = np.array([np.radians(72.0) * 5.0, 0.0, 0.0])
     for side in (-0.5, 0.5):
         body.move(face(0, side), KeyFrames([0.0, 5.0], rotations=[WEIGHTLESS, np.sign(side) * turn]))
     free = np.abs(mesh.vertices[:, 0]) < 0.499
     aside = np.random.default_rng(seed).uniform(-1e-4, 1e-4, mesh.n_verts) * free
-    cut = []
     with session.simulator(scene) as sim:
         x = mesh.vertices.copy()
         x[:, 2] += aside
         sim.set_state(x)
-        session.go(sim, round(seconds / 0.04), lambda sim, k, report: cut.append(len(sim.intersecting_triangles())))
+        (cut,) = session.watch(sim, round(seconds / 0.04), lambda: len(sim.intersecting_triangles()))
     return {
-        "pairs of triangles that cut each other, most": float(max(cut)),
+        "pairs of triangles that cut each other, most": max(cut),
         "pairs of triangles that cut each other, over triangles": max(cut) / len(mesh.surface),
-        DEEPEST: session.deepest,
-        "inverted tets, most": float(max(report.n_inverted for report in session.reports)),
-        "steps that did not converge": float(session.unconverged),
-        "contacts, most": float(max(report.n_contacts for report in session.reports)),
+        DEEPEST: session.most("max_penetration"),
+        "inverted tets, most": session.most("n_inverted"),
+        "steps that did not converge": session.unconverged,
+        "contacts, most": session.most("n_contacts"),
     }
 
 
 def clamp(session: Session, law: str) -> dict[str, float]:
-    """S2: the arms of a C are pressed together, held and let go; without gravity."""
+    """S2: the arms of a C are pressed together, held and released; without gravity."""
     filled = np.ones((8, 7, 2), dtype=bool)
     filled[2:, 2:5] = False
     mesh = voxels(filled, 0.02, (0.08, 0.07, 0.02))
-    scene = ts.Scene(gravity=WEIGHTLESS)
-    soft = ts.Material(law=law, young=5e4, poisson=0.4, density=1000.0, friction=0.3, mass_damping=2.0)
-    body = scene.add_body(mesh, soft, name="clamp")
+    scene, body = one_body("clamp", mesh, law=law, young=5e4, poisson=0.4, friction=0.3, mass_damping=2.0)
     for y, way in ((0.14, -0.04), (0.0, 0.04)):
         moved = KeyFrames([0.0, 1.0, 1.5], [WEIGHTLESS, (0.0, way, 0.0), (0.0, way, 0.0)], release=True)
         body.move(lambda X, y=y: (np.abs(X[:, 0] - 0.16) < 1e-9) & (np.abs(X[:, 1] - y) < 1e-9), moved)
-    mass, momenta, impulses = gravity_mass(body), [], []
-
-    def look(sim, k, report):
-        momenta.append(mass @ sim.velocities())
-        impulses.append(np.abs(sim.contacts().impulse).sum())
-
+    mass = gravity_mass(body)
     with session.simulator(scene) as sim:
-        session.go(sim, 450, look)
+        read = (lambda: mass @ sim.velocities()), (lambda: np.abs(sim.contacts().impulse).sum())
+        momenta, impulses = session.watch(sim, 450, *read)
         found = rest_at_last(sim, 0.16)
-        decay = 1.0 + soft.mass_damping * sim.dt  # of an implicit Euler step without forces
-    free = np.array(momenta[151:])  # the step that ends at 1.5 s is led
-    made = float(np.linalg.norm(decay * free[1:] - free[:-1], axis=1).max()) if len(free) > 1 else np.nan
+        decay = 1.0 + body.material.mass_damping * sim.dt  # of an implicit Euler step without forces
+    free = np.array(momenta[151:])  # the step that ends at 1.5 s is prescribed
+    made = np.linalg.norm(decay * free[1:] - free[:-1], axis=1).max() if len(free) > 1 else np.nan
     return found | {
-        "contacts, most": float(max(report.n_contacts for report in session.reports)),
-        DEEPEST: session.deepest,
-        "what steps after the release add to the momentum, over the impulses of contacts": made / max(impulses),
+        "contacts, most": session.most("n_contacts"),
+        DEEPEST: session.most("max_penetration"),
+        GAINED: made / max(impulses),
     }
 
 
@@ -88,22 +78,20 @@ def sheets(session: Session, parts: str) -> dict[str, float]:
         )
         scene.add_body(both, rubber, name="both", velocity=np.repeat([toward, -toward], n, axis=0))
     mass = np.concatenate([lumped_mass(body) for body in scene.bodies])
-    gaps, momenta = [], []
 
-    def look(sim, k, report):
-        x = sim.positions()[:, 1]
-        gaps.append(x[n:].mean() - x[:n].mean())
-        momenta.append(np.linalg.norm(mass @ sim.velocities()))
+    def gap() -> float:
+        y = sim.positions()[:, 1]
+        return y[n:].mean() - y[:n].mean()
 
     with session.simulator(scene) as sim:
-        session.go(sim, 30, look)
-        told = " ".join(session.problems)
+        gaps, momenta = session.watch(sim, 30, gap, lambda: np.linalg.norm(mass @ sim.velocities()))
+        sentences = " ".join(session.problems)
     return {
         "least distance between the sheets' middles [m]": min(gaps),
         "momentum over that of one sheet, most": max(momenta) / (15.0 * mass[:n].sum()),
-        "sentences that name speed, thickness and a safe dt": float("thick" in told and "dt" in told and "m/s" in told),
-        "sentences or order kept": float(min(gaps) > 0.0),
-        DEEPEST: session.deepest,
+        "sentences that name speed, thickness and a safe dt": all(word in sentences for word in ("thick", "dt", "m/s")),
+        "sentences or order kept": min(gaps) > 0.0,
+        DEEPEST: session.most("max_penetration"),
     }
 
 
@@ -112,9 +100,7 @@ def jack(session: Session, law: str) -> dict[str, float]:
     filled = np.zeros((5, 5, 5), dtype=bool)
     filled[:, 2, 2] = filled[2, :, 2] = filled[2, 2, :] = True
     mesh = voxels(filled.repeat(2, 0).repeat(2, 1).repeat(2, 2), 0.02)
-    scene = ts.Scene(gravity=WEIGHTLESS)
-    soft = ts.Material(law=law, young=1e4, poisson=0.4, density=1000.0, mass_damping=2.0)
-    scene.add_body(mesh, soft, name="jack")
+    scene, _ = one_body("jack", mesh, law=law, young=1e4, poisson=0.4, mass_damping=2.0)
     beyond, planes = [], []
     for axis in range(3):
         for side in (-1.0, 1.0):
@@ -132,121 +118,74 @@ def jack(session: Session, law: str) -> dict[str, float]:
     with session.simulator(scene) as sim:
         session.go(sim, 650, look)
         found = rest_at_last(sim, 0.2)
-        finite = np.isfinite(sim.positions()).all()
+        lost = not_finite(sim.positions())
     return found | {
-        "numbers that are not finite in the last state": float(not finite),
+        "numbers that are not finite in the last state": lost,
         "deepest in a plane after steps that count as converged [m]": max(beyond),
-        "deepest in a plane or in itself after any step [m]": session.deepest,
-        "pairs of triangles that cross, most": float(max(report.crossings for report in session.reports)),
-        "steps that did not converge": float(session.unconverged),
-        "inverted tets, most": float(max(report.n_inverted for report in session.reports)),
+        "deepest in a plane or in itself after any step [m]": session.most("max_penetration"),
+        "pairs of triangles that cross, most": session.most("crossings"),
+        "steps that did not converge": session.unconverged,
+        "inverted tets, most": session.most("n_inverted"),
     }
 
 
-TWIST = {"dt": 0.04, "integrator": IMPLICIT, "self_collision": True}
 ROLLS = Must(OK, "a mat can be rolled up without crossing itself: incremental potential contact does so on finer meshes of it")
-S1 = Case(
-    "S1",
-    "twisted mat",
-    mat_twist,
-    tuple(
-        Variant(f"{level}, start {seed}", TWIST, {"seed": seed, "seconds": seconds}, ROLLS, reference=False)
-        for level, seconds, seeds in (("A", 2.5, range(10)), ("B", 5.0, range(1)))
-        for seed in seeds
-    ),
-    (
-        Criterion("pairs of triangles that cut each other, most", 0.0, PROPOSED, of={"seconds": 2.5}),
-        Criterion("pairs of triangles that cut each other, over triangles", 1e-3, PROPOSED, of={"seconds": 5.0}),
-        Criterion(DEEPEST, 5e-3, PROPOSED, of={"seconds": 5.0}),
-    ),
-    size=1.0,
-    shortfalls=(
-        Shortfall(
-            "from 600 degrees on (4.2 s) the roll squeezes tets to a tenth of their volume and less, steps do not converge in "
-            "parts either, tets turn inside out and triangles cross where their layer is",
-            "contacts that do not press a tet further than a bound of its volume, which gives way before it turns inside out",
-            of={"seconds": 5.0},
-        ),
-    ),
+S1 = Case("S1", "twisted mat", mat_twist)
+for level, seconds, seeds in (("A", 2.5, 10), ("B", 5.0, 1)):
+    for seed in range(seeds):
+        settings = implicit(0.04, self_collision=True)
+        S1.add_variant(f"{level}, start {seed}", settings, ROLLS, reference=False, seed=seed, seconds=seconds)
+S1.add_limit("pairs of triangles that cut each other, most", 0.0, PROPOSED, seconds=2.5)
+S1.add_limit("pairs of triangles that cut each other, over triangles", 1e-3, PROPOSED, seconds=5.0)
+S1.add_limit(DEEPEST, 5e-3, PROPOSED, seconds=5.0)
+S1.add_shortfall(
+    "from 600 degrees on (4.2 s) the roll squeezes tets to a tenth of their volume and less, steps do not converge in "
+    "parts either, tets turn inside out and triangles cross where their layer is",
+    "contacts that do not press a tet further than a bound of its volume, which gives way before it turns inside out",
+    seconds=5.0,
 )
 
-CLOSE = {"dt": 0.01, "integrator": IMPLICIT, "self_collision": True}
 CLOSES = Must(OK, "the arms touch, give way and spring back: nothing keeps them from their rest shape")
-S2 = Case(
-    "S2",
-    "closing clamp",
-    clamp,
-    tuple(
-        Variant(f"{law}, {precision}", CLOSE | {"precision": precision}, {"law": law}, CLOSES)
-        for law in LAWS
-        for precision in ("f32", "f64")
-    ),
-    (
-        Criterion("contacts, most", 1.0, ANALYTIC, at_least=True),
-        Criterion(DEEPEST, 1e-3, PROPOSED),
-        Criterion("shape error at the end, over L", 5e-3, PROPOSED),
-        Criterion(
-            "what steps after the release add to the momentum, over the impulses of contacts",
-            1e-6,
-            ANALYTIC,
-            of={"precision": "f64"},
-        ),
-    ),
-    size=0.16,
-)
+S2 = Case("S2", "closing clamp", clamp, size=0.16)
+for law in LAWS:
+    for precision in ("f32", "f64"):
+        settings = implicit(0.01, self_collision=True, precision=precision)
+        S2.add_variant(f"{law}, {precision}", settings, CLOSES, law=law)
+S2.add_limit("contacts, most", 1.0, ANALYTIC, at_least=True)
+S2.add_limit(DEEPEST, 1e-3, PROPOSED)
+S2.add_limit("shape error at the end, over L", 5e-3, PROPOSED)
+S2.add_limit(GAINED, 1e-6, ANALYTIC, precision="f64")
 
 MEET = Must(
     OK,
     "two sheets meet and part again, which shorter parts of the step can follow; the catalogue lets the step be refused, but "
     "there is an answer",
 )
-S3 = Case(
-    "S3",
-    "two sheets meet at 30 m/s",
-    sheets,
-    tuple(
-        Variant(
-            # momentum is kept as well as Newton's method balances forces
-            parts,
-            {"dt": 1 / 120, "integrator": IMPLICIT, "self_collision": parts != "two bodies", "newton_tolerance": 1e-6},
-            {"parts": parts},
-            MEET,
-        )
-        for parts in ("two bodies", "two parts of one")
-    ),
-    (
-        Criterion("least distance between the sheets' middles [m]", 0.0, ANALYTIC, at_least=True),
-        Criterion("momentum over that of one sheet, most", 1e-6, ANALYTIC),
-    ),
-    size=0.2,
-    quick=("two bodies",),
-)
+S3 = Case("S3", "two sheets meet at 30 m/s", sheets, size=0.2, quick=("two bodies",))
+for parts in ("two bodies", "two parts of one"):
+    # momentum is kept as well as Newton's method balances forces
+    settings = implicit(1 / 120, self_collision=parts != "two bodies", newton_tolerance=1e-6)
+    S3.add_variant(parts, settings, MEET, parts=parts)
+S3.add_limit("least distance between the sheets' middles [m]", 0.0, ANALYTIC, at_least=True)
+S3.add_limit("momentum over that of one sheet, most", 1e-6, ANALYTIC)
 
 FITS = Must(OK, "the jack fills 83 % of the room that the planes leave it, so that it fits without crossing itself")
-S4 = Case(
-    "S4",
-    "trash compactor",
-    jack,
-    tuple(Variant(law, CLOSE, {"law": law}, FITS, reference=False) for law in LAWS),
-    (
-        Criterion("numbers that are not finite in the last state", 0.0, PROPOSED),
-        Criterion(
-            "deepest in a plane after steps that count as converged [m]",
-            1e-3,
-            PROPOSED,
-            note="how deep the jack is in itself, which no limit is asked of, is told beside it",
-        ),
-        Criterion("shape error at the end, over L", 1e-2, PROPOSED),
-        Criterion("inverted tets at the end", 0.0, PROPOSED),
-    ),
-    size=0.2,
-    shortfalls=(
-        Shortfall(
-            "the arms, squeezed to half their room, are pushed into each other while tets there are inverted; they come free "
-            "when the planes open",
-            "contacts that do not press a tet further than a bound of its volume",
-        ),
-    ),
+S4 = Case("S4", "trash compactor", jack, size=0.2)
+for law in LAWS:
+    S4.add_variant(law, implicit(0.01, self_collision=True), FITS, reference=False, law=law)
+S4.add_limit("numbers that are not finite in the last state", 0.0, PROPOSED)
+S4.add_limit(
+    "deepest in a plane after steps that count as converged [m]",
+    1e-3,
+    PROPOSED,
+    note="how deep the jack is in itself, which no limit is asked of, is told beside it",
+)
+S4.add_limit("shape error at the end, over L", 1e-2, PROPOSED)
+S4.add_limit("inverted tets at the end", 0.0, PROPOSED)
+S4.add_shortfall(
+    "the arms, squeezed to half their room, are pushed into each other while tets there are inverted; they come free "
+    "when the planes open",
+    "contacts that do not press a tet further than a bound of its volume",
 )
 
 CASES = (S1, S2, S3, S4)

@@ -1,11 +1,11 @@
-"""Meshes of the hard cases, and how far a shape is from its rest."""
+"""Meshes and scenes of the hard cases, and how far a shape is from its rest."""
 
 import numpy as np
 
 import taisoft as ts
 from taisoft.mesh.nodes import make_nodes
 
-from ..reference_cases.record import deformation_gradients
+from ..reference_cases.record import deformation_gradients, submesh
 
 SNH, COR, SVK = "stable_neo_hookean", "corotational", "st_venant_kirchhoff"
 G = 9.81  # [m/s^2]
@@ -39,9 +39,19 @@ def turned(mesh: ts.TetMesh, angle: float, axis: int) -> ts.TetMesh:
 def voxels(filled: np.ndarray, edge: float, center=(0.0, 0.0, 0.0)) -> ts.TetMesh:
     """The filled voxels (nx,ny,nz) bool of a grid about a center [m], each cut as a cell of `box`."""
     whole = box(filled.shape, edge * np.array(filled.shape), center)
-    tets = whole.tets.reshape(-1, 6, 4)[filled.reshape(-1)].reshape(-1, 4)
-    used = np.unique(tets)
-    return ts.TetMesh(whole.vertices[used], np.searchsorted(used, tets))
+    return submesh(whole, filled.reshape(-1).repeat(6))
+
+
+def one_body(name: str, mesh: ts.TetMesh, gravity=WEIGHTLESS, position=(0, 0, 0), velocity=(0, 0, 0), **material):
+    """A scene with one body, of 1000 kg/m^3 if no density is among the numbers of its material. Returns both."""
+    scene = ts.Scene(gravity=gravity)
+    stuff = ts.Material(**{"density": 1000.0} | material)
+    return scene, scene.add_body(mesh, stuff, name=name, position=position, velocity=velocity)
+
+
+def not_finite(*states: np.ndarray) -> float:
+    """1 where some number of the states is not finite, else 0."""
+    return float(not all(np.isfinite(state).all() for state in states))
 
 
 def split(mesh: ts.TetMesh, times: int = 1) -> ts.TetMesh:

@@ -10,8 +10,6 @@
   tests every vertex against every triangle and cannot tell the sides of one, so it does not run W3 and W4.
 """
 
-from time import perf_counter
-
 import numpy as np
 
 import taisoft as ts
@@ -19,7 +17,7 @@ import taisoft as ts
 from ..exact_path import DENSITY, POISSON
 from ..works.references import NEWTON, TAISOFT, masses
 from ..works.scenes import Body, Work
-from .session import Setting, sampled
+from .session import Session, Setting
 
 NAME, MODEL = "Newton", NEWTON
 EXPLICIT_MODEL = TAISOFT  # semi_implicit has the law and the masses of taisoft's stable neo-Hookean
@@ -32,7 +30,7 @@ ON_GROUND = ((8, 5e4, 10.0, 20.0, 3e-3), (12, 7e4, 10.0, 30.0, 3e-3), (16, 1e5, 
 
 
 def problem() -> str:
-    """Why it cannot be had."""
+    """Why it is not available."""
     try:
         _import_newton()
     except ImportError:
@@ -41,7 +39,7 @@ def problem() -> str:
 
 
 def _import_newton():
-    """Newton and Warp, who would tell of every module that they compile."""
+    """Newton and Warp, without a line for every module that they compile."""
     import warp
 
     warp.config.log_level = warp.LOG_WARNING
@@ -53,16 +51,13 @@ def _import_newton():
 def settings(work: Work, arch: str = "cpu") -> list[Setting]:
     """Steps and sweeps, coarse to fine; large meshes the coarse ones only; on the ground soft and stiff springs."""
     if work.kind == "stand":
-        return [
-            Setting(NAME, MODEL, "vbd", steps, {"sweeps": sweeps, "stiffness": 1e6, "gap": gap})
-            for steps, sweeps, gap in ((1, 3, 0.06), (1, 5, 0.06), (1, 10, 0.06), (2, 5, 0.03), (1, 5, RADIUS))
-        ] + _explicit(work)
-    if work.touches:
-        tried = [(1, 20, {"stiffness": 1e5}), (1, 20, {"stiffness": 1e6}), (2, 10, {"stiffness": 1e6})]
+        gaps = ((1, 3, 0.06), (1, 5, 0.06), (1, 10, 0.06), (2, 5, 0.03), (1, 5, RADIUS))
+        implicit = [(steps, sweeps, {"stiffness": 1e6, "gap": gap}) for steps, sweeps, gap in gaps]
+    elif work.touches:
+        implicit = [(1, 20, {"stiffness": 1e5}), (1, 20, {"stiffness": 1e6}), (2, 10, {"stiffness": 1e6})]
     else:
-        sweeps = ((1, 20), (2, 10), (5, 20)) if work.tets < 1000 else ((1, 20), (2, 10)) if work.tets < 10_000 else ((1, 20),)
-        tried = [(*one, {}) for one in sweeps]
-    return [Setting(NAME, MODEL, "vbd", n, {"sweeps": sweeps} | spring) for n, sweeps, spring in tried] + _explicit(work)
+        implicit = [(1, 20, {}), (2, 10, {}), (5, 20, {})][: 3 if work.tets < 1000 else 2 if work.tets < 10_000 else 1]
+    return [Setting(NAME, MODEL, "vbd", n, {"sweeps": sweeps} | spring) for n, sweeps, spring in implicit] + _explicit(work)
 
 
 def _explicit(work: Work) -> list[Setting]:
@@ -73,27 +68,23 @@ def _explicit(work: Work) -> list[Setting]:
     return [Setting(NAME, EXPLICIT_MODEL, "semi_implicit", steps, dict(zip(GROUND, numbers))) for steps, *numbers in ON_GROUND]
 
 
-class Run:
-    """A Session."""
+class Run(Session):
+    """The graph of the launches of one SAMPLE is captured as it is built."""
 
-    unconverged = 0  # it does not tell
-
-    def __init__(self, work: Work, setting: Setting) -> None:
+    def build(self) -> None:
         newton, self.warp = _import_newton()
-
-        self.work, self.setting, start = work, setting, perf_counter()
+        work, setting = self.work, self.setting
         self.explicit = setting.method == "semi_implicit"
         builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=(0.0, -work.gravity, 0.0))
-        radius = builder.default_particle_radius = setting.options.get("radius", RADIUS)
+        builder.default_particle_radius = setting.options.get("radius", RADIUS)
         touch = {"ke": setting.options.get("stiffness", 0.0), "kd": setting.options.get("damping", 0.0)}
         slope = {"kf": setting.options["slope"]} if "slope" in setting.options else {}
         if work.ground:
             builder.add_ground_plane(cfg=newton.ModelBuilder.ShapeConfig(mu=work.friction, **touch, **slope))
-        self.free = np.concatenate([~body.fixed for body in work.bodies])
         kg = np.where(self.free, masses(work, setting.model), 0.0)
         for body, nodes in zip(work.bodies, work.slices().values()):
             if self.explicit:
-                _add_bare(builder, body, kg[nodes], radius, self.warp)
+                _add_bare(builder, body, kg[nodes], self.warp)
             else:
                 _add(builder, body, self.warp)
         for node in np.flatnonzero(~self.free):
@@ -109,25 +100,22 @@ class Run:
         self.pipeline = newton.CollisionPipeline(self.model) if work.ground else None
         self.contacts = self.pipeline.contacts() if self.pipeline else None
         self.states, self.control = [self.model.state(), self.model.state()], self.model.control()
-        self._sample()  # compiles
+        self._launch()  # compiles
         with self.warp.ScopedCapture(device="cpu") as capture:
-            self._sample()
+            self._launch()
         self.graph = capture.graph
-        self.build_seconds = perf_counter() - start
 
     def _solver(self, newton):
         if self.explicit:
             self.model.particle_grid = None  # nodes do not meet nodes
             return newton.solvers.SolverSemiImplicit(self.model, enable_tri_contact=False)
         several = len(self.work.bodies) > 1
-        meeting = {}
+        meeting = {"particle_enable_self_contact": several}
         if several:
-            meeting = {"particle_self_contact_margin": RADIUS, "particle_self_contact_gap": self.setting.options["gap"]}
-        return newton.solvers.SolverVBD(
-            self.model, iterations=self.setting.options["sweeps"], particle_enable_self_contact=several, **meeting
-        )
+            meeting |= {"particle_self_contact_margin": RADIUS, "particle_self_contact_gap": self.setting.options["gap"]}
+        return newton.solvers.SolverVBD(self.model, iterations=self.setting.options["sweeps"], **meeting)
 
-    def _sample(self) -> None:
+    def _launch(self) -> None:
         """The steps of 10 ms, which begin and end in the first of the states: a graph holds addresses."""
         now, then = self.states
         for _ in range(self.setting.steps):
@@ -140,7 +128,7 @@ class Run:
             self.warp.copy(then.particle_q, now.particle_q)
             self.warp.copy(then.particle_qd, now.particle_qd)
 
-    def run(self, follow: bool) -> tuple[np.ndarray | None, float]:
+    def reset(self) -> None:
         velocity = np.zeros((len(self.free), 3), np.float32)
         if self.explicit:
             velocity[self.free, 1] = self.work.gravity * self.setting.dt / 2  # -a(0) dt/2: at rest gravity alone accelerates
@@ -148,43 +136,28 @@ class Run:
             state.particle_q.assign(self.work.start.astype(np.float32))
             state.particle_qd.assign(velocity)
 
-        def positions() -> np.ndarray:
-            return self.states[0].particle_q.numpy().astype(float)
+    def step(self) -> None:
+        self.warp.capture_launch(self.graph)
 
-        return sampled(self.work, NAME, follow, lambda: self.warp.capture_launch(self.graph), positions)
-
-    def close(self) -> None:
-        """Nothing is held."""
-
-
-def start(work: Work, setting: Setting) -> Run:
-    """Ready to run."""
-    return Run(work, setting)
+    def positions(self) -> np.ndarray:
+        return self.states[0].particle_q.numpy().astype(float)
 
 
 def _add(builder, body: Body, warp) -> None:
     """A soft mesh with its surface, which contact between bodies needs."""
     material = ts.Material(young=body.young, poisson=POISSON)
-    builder.add_soft_mesh(
-        pos=warp.vec3(0.0),
-        rot=warp.quat_identity(),
-        scale=1.0,
-        vel=warp.vec3(0.0),
-        density=DENSITY,
-        k_mu=material.mu,
-        k_lambda=material.lam,
-        k_damp=0.0,
-        vertices=[warp.vec3(*x) for x in body.mesh.vertices],
-        indices=body.mesh.tets.ravel().tolist(),
-        add_surface_mesh_edges=True,
-    )
+    place = {"pos": warp.vec3(0.0), "rot": warp.quat_identity(), "scale": 1.0, "vel": warp.vec3(0.0)}
+    law = {"density": DENSITY, "k_mu": material.mu, "k_lambda": material.lam, "k_damp": 0.0}
+    vertices, tets = [warp.vec3(*x) for x in body.mesh.vertices], body.mesh.tets.ravel().tolist()
+    builder.add_soft_mesh(**place, **law, vertices=vertices, indices=tets, add_surface_mesh_edges=True)
 
 
-def _add_bare(builder, body: Body, kg: np.ndarray, radius: float, warp) -> None:
+def _add_bare(builder, body: Body, kg: np.ndarray, warp) -> None:
     """Nodes and tets alone: no triangles of the surface, which semi_implicit would visit in every step."""
     material, first, n = ts.Material(young=body.young, poisson=POISSON), builder.particle_count, body.mesh.n_verts
     positions, at_rest = [warp.vec3(*x) for x in body.mesh.vertices], [warp.vec3(0.0)] * n
-    builder.add_particles(pos=positions, vel=at_rest, mass=kg.tolist(), radius=[radius] * n)
+    radius = [builder.default_particle_radius] * n
+    builder.add_particles(pos=positions, vel=at_rest, mass=kg.tolist(), radius=radius)
     for tet in (first + body.mesh.tets).tolist():
         # its law has no factors that match Lame's parameters at small strain (Smith, de Goes and Kim 2018, eq. 16)
         builder.add_tetrahedron(*tet, 4 / 3 * material.mu, material.lam + 5 / 6 * material.mu, 0.0)

@@ -2,7 +2,6 @@
 
 import contextlib
 import warnings
-from time import perf_counter
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from ..elasticity_runs import lasting_steps
 from ..exact_path import DENSITY, POISSON, SAMPLE
 from ..works.references import MUJOCO, TAISOFT, Model
 from ..works.scenes import Work
-from .session import Setting
+from .session import Session, Setting
 
 NAME, MODEL = "taisoft", TAISOFT
 LAWS = {"SNH": "stable_neo_hookean", "SVK": "st_venant_kirchhoff"}
@@ -66,36 +65,29 @@ def unwarned():
         yield
 
 
-class Run:
-    """A Session."""
+class Run(Session):
+    """Steps are taken in the largest batches that a Simulator takes."""
 
-    def __init__(self, work: Work, setting: Setting) -> None:
-        self.work, self.setting, self.unconverged = work, setting, 0
-        start = perf_counter()
+    def build(self) -> None:
+        work, setting = self.work, self.setting
         with unwarned():
             self.sim = ts.Simulator(make_scene(work, setting.model), dt=setting.dt, integrator=setting.method, **setting.options)
         warm_up(self.sim)
-        self.build_seconds = perf_counter() - start
 
     def run(self, follow: bool) -> tuple[np.ndarray | None, float]:
         self.sim.reset()
         samples = round(self.work.seconds / SAMPLE)
         if not follow:
             return None, advance(self.sim, samples * self.setting.steps).seconds
-        positions, whole = [self._positions()], TimedRun()
+        positions, whole = [self.positions()], TimedRun()
         for _ in range(samples):
             whole += advance(self.sim, self.setting.steps)
-            positions.append(self._positions())
+            positions.append(self.positions())
         self.unconverged = whole.unconverged
         return np.array(positions), whole.seconds
 
-    def _positions(self) -> np.ndarray:
+    def positions(self) -> np.ndarray:
         return np.concatenate([self.sim.positions(body.name) for body in self.work.bodies])
 
     def close(self) -> None:
         self.sim.close()
-
-
-def start(work: Work, setting: Setting) -> Run:
-    """Ready to run. Raises SimulationError, or SceneError where the program refuses the setting."""
-    return Run(work, setting)

@@ -11,7 +11,6 @@ import os
 import sys
 import tempfile
 from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 
@@ -21,14 +20,14 @@ from taisoft.errors import SimulationError
 from ..exact_path import DENSITY, POISSON
 from ..works.references import PYBULLET
 from ..works.scenes import Body, Work
-from .session import Setting, sampled
+from .session import Session, Setting
 
 NAME, MODEL = "PyBullet", PYBULLET
 MARGIN = 1e-3  # m
 
 
 def problem() -> str:
-    """Why it cannot be had."""
+    """Why it is not available."""
     try:
         with _silent():
             import pybullet  # noqa: F401
@@ -47,24 +46,18 @@ def settings(work: Work, arch: str = "cpu") -> list[Setting]:
     return [Setting(NAME, MODEL, "explicit", n, options) for n in steps for options in repulsions]
 
 
-class Run:
-    """A Session."""
+class Run(Session):
+    """Each reset builds the world anew."""
 
-    unconverged = 0  # it does not tell
-
-    def __init__(self, work: Work, setting: Setting) -> None:
+    def build(self) -> None:
         with _silent():
             import pybullet
 
-            self.bullet, self.work, self.setting = pybullet, work, setting
-            self.client = pybullet.connect(pybullet.DIRECT)
-            self.bodies: list[int] = []
-            start = perf_counter()
-            self._reset()
-            self.build_seconds = perf_counter() - start
+            self.bullet, self.here = pybullet, {"physicsClientId": pybullet.connect(pybullet.DIRECT)}
+            self.reset()
 
-    def _reset(self) -> None:
-        bullet, here = self.bullet, {"physicsClientId": self.client}
+    def reset(self) -> None:
+        bullet, here = self.bullet, self.here
         bullet.resetSimulation(bullet.RESET_USE_DEFORMABLE_WORLD, **here)
         bullet.setGravity(0, -self.work.gravity, 0, **here)
         bullet.setPhysicsEngineParameter(numSubSteps=0, **here)
@@ -77,56 +70,47 @@ class Run:
         self.bodies = [self._load(body) for body in self.work.bodies]
 
     def _load(self, body: Body) -> int:
-        bullet, work, here = self.bullet, self.work, {"physicsClientId": self.client}
+        several = len(self.work.bodies) > 1
         material = ts.Material(young=body.young, poisson=POISSON)
-        mu, lam = material.mu, material.lam
-        law = {"NeoHookeanMu": 4 / 3 * mu, "NeoHookeanLambda": lam + 5 / 6 * mu, "NeoHookeanDamping": 0.0}
-        several = {"repulsionStiffness": self.setting.options["repulsion"]} if len(work.bodies) > 1 else {}
+        numbers = {
+            "mass": DENSITY * float(body.mesh.volumes.sum()),
+            "useNeoHookean": 1,
+            "NeoHookeanMu": 4 / 3 * material.mu,
+            "NeoHookeanLambda": material.lam + 5 / 6 * material.mu,
+            "NeoHookeanDamping": 0.0,
+            "collisionMargin": MARGIN,
+            "frictionCoeff": self.work.friction,
+            "useFaceContact": int(several),
+            "useSelfCollision": 0,
+        }
+        if several:
+            numbers["repulsionStiffness"] = self.setting.options["repulsion"]
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "body.vtk"
             path.write_text(_vtk(body))
-            made = bullet.loadSoftBody(
-                str(path),
-                mass=DENSITY * float(body.mesh.volumes.sum()),
-                useNeoHookean=1,
-                **law,
-                collisionMargin=MARGIN,
-                frictionCoeff=work.friction,
-                useFaceContact=int(len(work.bodies) > 1),
-                useSelfCollision=0,
-                **several,
-                **here,
-            )
+            made = self.bullet.loadSoftBody(str(path), **numbers, **self.here)
         if np.abs(self._positions_of(made) - body.mesh.vertices).max() > 1e-9:
             raise SimulationError(f"{NAME} has put the nodes of {body.name!r} in another order")
         for node in np.flatnonzero(body.fixed):
-            bullet.createSoftBodyAnchor(made, int(node), -1, -1, **here)
+            self.bullet.createSoftBodyAnchor(made, int(node), -1, -1, **self.here)
         return made
 
-    def _positions_of(self, body: int) -> np.ndarray:
-        return np.array(
-            self.bullet.getMeshData(body, -1, flags=self.bullet.MESH_DATA_SIMULATION_MESH, physicsClientId=self.client)[1]
-        )
-
     def run(self, follow: bool) -> tuple[np.ndarray | None, float]:
-        def steps() -> None:
-            for _ in range(self.setting.steps):
-                self.bullet.stepSimulation(physicsClientId=self.client)
-
-        def positions() -> np.ndarray:
-            return np.concatenate([self._positions_of(body) for body in self.bodies])
-
         with _silent():
-            self._reset()
-            return sampled(self.work, NAME, follow, steps, positions)
+            return super().run(follow)
+
+    def step(self) -> None:
+        for _ in range(self.setting.steps):
+            self.bullet.stepSimulation(**self.here)
+
+    def positions(self) -> np.ndarray:
+        return np.concatenate([self._positions_of(body) for body in self.bodies])
+
+    def _positions_of(self, body: int) -> np.ndarray:
+        return np.array(self.bullet.getMeshData(body, -1, flags=self.bullet.MESH_DATA_SIMULATION_MESH, **self.here)[1])
 
     def close(self) -> None:
-        self.bullet.disconnect(self.client)
-
-
-def start(work: Work, setting: Setting) -> Run:
-    """Ready to run."""
-    return Run(work, setting)
+        self.bullet.disconnect(**self.here)
 
 
 def _vtk(body: Body) -> str:

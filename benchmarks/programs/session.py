@@ -1,13 +1,11 @@
-"""What an adapter gives: settings of its program for a work, and a session that carries one of them out.
+"""What a program is to the works: settings it is given for a work, and a run that carries one of them out.
 
-An adapter is a module with NAME, MODEL (what it solves, of works.references), `problem()` -> why it cannot be had, "" where it
-can, `settings(work)` and `start(work, setting)` -> Session. Positions are those of all nodes of a work, body after body.
+A program is a module with NAME, MODEL (what it solves, of works.references), `problem()` -> why it is not available, "" where it
+is, `settings(work, arch)` -> list of Setting, and `Run`, a Session. Positions are those of all nodes of a work, body after body.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Protocol
 
 import numpy as np
 
@@ -34,48 +32,57 @@ class Setting:
         return SAMPLE / self.steps
 
     def __str__(self) -> str:
-        told = [f"{key} {value:g}" if isinstance(value, float) else f"{key} {value}" for key, value in self.options.items()]
-        return ", ".join([self.method, *told])
+        shown = [f"{key} {value:g}" if isinstance(value, float) else f"{key} {value}" for key, value in self.options.items()]
+        return ", ".join([self.method, *shown])
 
 
-class Session(Protocol):
-    """A program ready to do a work.
+class Session:
+    """A program ready to do a work; a subclass has `build`, `reset`, `step` and `positions`.
 
-    build_seconds: what that took [s], compiling included. unconverged: steps of the followed run that did not, by its own word.
+    build_seconds: what that took [s], compiling included. unconverged: steps of the followed run that did not, by the program's
+    own word; most say nothing.
     """
 
-    build_seconds: float
-    unconverged: int
+    unconverged = 0
+
+    def __init__(self, work: Work, setting: Setting) -> None:
+        """Raises SimulationError, or SceneError where the program refuses the setting."""
+        self.work, self.setting = work, setting
+        self.free = np.concatenate([~body.fixed for body in work.bodies])
+        start = perf_counter()
+        self.build()
+        self.build_seconds = perf_counter() - start
 
     def run(self, follow: bool) -> tuple[np.ndarray | None, float]:
         """The whole work from its start: positions (k+1,n,3) [m] every SAMPLE, where followed, and wall time of the steps [s].
 
-        Raises SimulationError where it diverges.
+        Raises SimulationError where it diverges: where a position is not finite or 1 km from the start.
         """
+        self.reset()
+        start = self.work.start
+        path, seconds = [start], 0.0
+        for k in range(round(self.work.seconds / SAMPLE)):
+            begun = perf_counter()
+            self.step()
+            seconds += perf_counter() - begun
+            now = self.positions()
+            if not np.isfinite(now).all() or np.abs(now - start).max() > 1e3:
+                raise SimulationError(f"{self.setting.program} diverges before t = {(k + 1) * SAMPLE:.2f} s")
+            if follow:
+                path.append(now)
+        return np.array(path) if follow else None, seconds
 
-    def close(self) -> None: ...
+    def build(self) -> None:
+        """Build the program's model of the work, and compile what it takes."""
 
+    def reset(self) -> None:
+        """Return to the work's start."""
 
-def finite(positions: np.ndarray, start: np.ndarray, name: str, time: float) -> np.ndarray:
-    """The positions (n,3), unless they are not finite or 1 km from the start: SimulationError."""
-    if not np.isfinite(positions).all() or np.abs(positions - start).max() > 1e3:
-        raise SimulationError(f"{name} diverges before t = {time:.2f} s")
-    return positions
+    def step(self) -> None:
+        """Take the steps of one SAMPLE."""
 
+    def positions(self) -> np.ndarray:
+        """Of all nodes (n,3) [m], in an array of their own."""
 
-def sampled(
-    work: Work, name: str, follow: bool, step: Callable[[], None], positions: Callable[[], np.ndarray]
-) -> tuple[np.ndarray | None, float]:
-    """What `Session.run` returns, of a program of that name that stands at the work's start.
-
-    step: takes the steps of one SAMPLE, which alone are timed. positions: of all nodes then (n,3) [m], in an array of their own.
-    """
-    path, seconds = [work.start], 0.0
-    for k in range(round(work.seconds / SAMPLE)):
-        begun = perf_counter()
-        step()
-        seconds += perf_counter() - begun
-        now = finite(positions(), work.start, name, (k + 1) * SAMPLE)
-        if follow:
-            path.append(now)
-    return np.array(path) if follow else None, seconds
+    def close(self) -> None:
+        """Free what the program holds."""

@@ -1,94 +1,79 @@
-"""What else was tried for the works and is not among the settings, with what came out; the page shows it as a table.
+"""What else was tried for the works and is not among the settings, and what came out; the page shows it as a table.
 
 By hand, one run each, so no times; with the versions of `VERSIONS`. Errors and depths are those of the page.
 """
 
-from dataclasses import dataclass
-
 VERSIONS = "mujoco 4.0.0, pybullet 3.2.7, newton 1.8.0, warp-lang 1.19.0, November 2026"
-
-
-@dataclass(frozen=True)
-class Tried:
-    """work: its key, or "all"."""
-
-    program: str
-    work: str
-    what: str
-    came_out: str
-
-
-TRIED: tuple[Tried, ...] = (
-    Tried("MuJoCo", "W1", "discrete with the solver Newton in place of CG", "the same path: without rows neither solver runs"),
-    Tried("MuJoCo", "all", "integrator implicit", "refused in the same words as implicitfast"),
-    Tried(
-        "MuJoCo",
-        "W2",
-        "passive contact with Euler",
-        "refused: passive flex contact requires an integrator with the effective metric: set integrator='discrete'",
+TRIED = {  # by program: (work or "all", what was tried, what came out)
+    "MuJoCo": (
+        ("W1", "discrete with the solver Newton in place of CG", "the same path: without rows neither solver runs"),
+        ("all", "integrator implicit", "refused in the same words as implicitfast"),
+        (
+            "W2",
+            "passive contact with Euler",
+            "refused: passive flex contact requires an integrator with the effective metric: set integrator='discrete'",
+        ),
+        (
+            "W4",
+            "stable neo-Hookean (elastic3d) with Euler",
+            "refused: stable Neo-Hookean elasticity requires integrator='discrete'",
+        ),
+        ("W2", "passive, SNH13, 2.5 ms, tolerance 1e-4, 1e-6 and 1e-8", "errors of 10.4, 10.3 and 10.3 %"),
+        ("W2", "rows, SNH13, 5 ms, the solver Newton in place of CG", "the same error (11.5 %), four times the time"),
+        ("W2", "rows, SNH13, 5 ms, pyramidal in place of elliptic cones", "an error of 12.0 in place of 11.5 %"),
+        (
+            "W2",
+            "rows, SNH13, 2.5 ms: solref 0.1 ms, the same with refsafe off, solimp 0.99 0.9999 0.0001, condim 1",
+            "errors of 9.0 to 9.7 %",
+        ),
+        (
+            "W2",
+            "rows, SVK, Euler of 1 ms with solimp 0.99 0.9999 0.0001, also CG, also a damping ratio of 2",
+            "errors of 8.8 to 9.0 %",
+        ),
+        ("W4", "passive, SNH13, 2.5 ms, radius 0.1, 0.5 and 1 mm", "5 to 7 mm deep: does not stand; 2.5 mm does"),
+        ("W4", "passive, SNH13, radius 5 mm, 3.3, 5 and 10 ms", "8 to 9 mm deep; at 10 ms it diverges"),
+        (
+            "W4",
+            "passive, SNH13, 2.5 ms, 100 iterations in place of 400",
+            "a third of the steps end before the tolerance: MuJoCo warns of a singular inertia",
+        ),
+        ("W4", "passive, SNH13, 2.5 ms, tolerance 1e-3 in place of 1e-4", "stands too, no faster by 5 %"),
+        ("W4", "rows, SNH13, 2.5 ms, solimp 0.99 0.9999 0.0001", "diverges before t = 0.5 s"),
+        ("W3", "passive, SNH13, 1.67 ms with a radius of 1 mm", "2.8 mm deep: does not stand"),
+        ("W3", "passive, SNH13, 1 ms, radius 0.1 mm, and tolerance 1e-3", "stand too, no faster"),
+        (
+            "all",
+            "trilinear and quadratic flexes, edge equality constraints",
+            "left out: other unknowns or another material than everyone's nodes and tets",
+        ),
     ),
-    Tried(
-        "MuJoCo",
-        "W4",
-        "stable neo-Hookean (elastic3d) with Euler",
-        "refused: stable Neo-Hookean elasticity requires integrator='discrete'",
+    "PyBullet": (
+        ("all", "a newer version", "3.2.7 is the newest on PyPI; no other solver of tets than the one used"),
+        ("W3", "5 steps in 10 ms", "180 mm deep: does not stand"),
+        ("W4", "10, 14 and 17 steps in 10 ms", "diverges at once"),
     ),
-    Tried("MuJoCo", "W2", "passive, SNH13, 2.5 ms, tolerance 1e-4, 1e-6 and 1e-8", "errors of 10.4, 10.3 and 10.3 %"),
-    Tried("MuJoCo", "W2", "rows, SNH13, 5 ms, the solver Newton in place of CG", "the same error (11.5 %), four times the time"),
-    Tried("MuJoCo", "W2", "rows, SNH13, 5 ms, pyramidal in place of elliptic cones", "an error of 12.0 in place of 11.5 %"),
-    Tried(
-        "MuJoCo",
-        "W2",
-        "rows, SNH13, 2.5 ms: solref 0.1 ms, the same with refsafe off, solimp 0.99 0.9999 0.0001, condim 1",
-        "errors of 9.0 to 9.7 %",
+    "Newton": (
+        ("all", "a newer version", "1.8.0 is the newest on PyPI"),
+        (
+            "all",
+            "launches from Python in place of a captured graph",
+            "the same path; 1.3 times the time in W4, up to 4 times in W1",
+        ),
+        (
+            "W2",
+            "semi_implicit: stiffness and damping for steps of 2.5 to 0.3 ms, radius 0.1 to 3 mm, 33 settings",
+            "the best are among the rows; stiffer contact than the lightest node bears at a dt diverges",
+        ),
+        ("W3, W4", "vbd, stiffness 1e5 and 1e6, gap 1 mm, 1 to 20 sweeps", "bodies hang in the air: steps are cut"),
+        ("W4", "vbd, 4 times 5 sweeps in 10 ms, gap 15 mm", "does as with 10 ms, not faster"),
+        ("W2", "vbd, 4 times 5 sweeps in 10 ms, stiffness 1e6", "an error of 9.3 %"),
     ),
-    Tried(
-        "MuJoCo",
-        "W2",
-        "rows, SVK, Euler of 1 ms with solimp 0.99 0.9999 0.0001, also CG, also a damping ratio of 2",
-        "errors of 8.8 to 9.0 %",
+    "ppf-contact-solver": (
+        (
+            "all",
+            "pip index versions and pip download of ppf-contact-solver and of ppf-cts",
+            "no matching distribution: it is not on PyPI, so it is left out",
+        ),
     ),
-    Tried("MuJoCo", "W4", "passive, SNH13, 2.5 ms, radius 0.1, 0.5 and 1 mm", "5 to 7 mm deep: does not stand; 2.5 mm does"),
-    Tried("MuJoCo", "W4", "passive, SNH13, radius 5 mm, 3.3, 5 and 10 ms", "8 to 9 mm deep; at 10 ms it diverges"),
-    Tried(
-        "MuJoCo",
-        "W4",
-        "passive, SNH13, 2.5 ms, 100 iterations in place of 400",
-        "a third of the steps end before the tolerance: MuJoCo warns of a singular inertia",
-    ),
-    Tried("MuJoCo", "W4", "passive, SNH13, 2.5 ms, tolerance 1e-3 in place of 1e-4", "stands too, no faster by 5 %"),
-    Tried("MuJoCo", "W4", "rows, SNH13, 2.5 ms, solimp 0.99 0.9999 0.0001", "diverges before t = 0.5 s"),
-    Tried("MuJoCo", "W3", "passive, SNH13, 1.67 ms with a radius of 1 mm", "2.8 mm deep: does not stand"),
-    Tried("MuJoCo", "W3", "passive, SNH13, 1 ms, radius 0.1 mm, and tolerance 1e-3", "stand too, no faster"),
-    Tried(
-        "MuJoCo",
-        "all",
-        "trilinear and quadratic flexes, edge equality constraints",
-        "left out: other unknowns or another material than everyone's nodes and tets",
-    ),
-    Tried("PyBullet", "all", "a newer version", "3.2.7 is the newest on PyPI; no other solver of tets than the one used"),
-    Tried("PyBullet", "W3", "5 steps in 10 ms", "180 mm deep: does not stand"),
-    Tried("PyBullet", "W4", "10, 14 and 17 steps in 10 ms", "diverges at once"),
-    Tried("Newton", "all", "a newer version", "1.8.0 is the newest on PyPI"),
-    Tried(
-        "Newton",
-        "all",
-        "launches from Python in place of a captured graph",
-        "the same path; 1.3 times the time in W4, up to 4 times in W1",
-    ),
-    Tried(
-        "Newton",
-        "W2",
-        "semi_implicit: stiffness and damping for steps of 2.5 to 0.3 ms, radius 0.1 to 3 mm, 33 settings",
-        "the best are among the rows; stiffer contact than the lightest node bears at a dt diverges",
-    ),
-    Tried("Newton", "W3, W4", "vbd, stiffness 1e5 and 1e6, gap 1 mm, 1 to 20 sweeps", "bodies hang in the air: steps are cut"),
-    Tried("Newton", "W4", "vbd, 4 times 5 sweeps in 10 ms, gap 15 mm", "does as with 10 ms, not faster"),
-    Tried("Newton", "W2", "vbd, 4 times 5 sweeps in 10 ms, stiffness 1e6", "an error of 9.3 %"),
-    Tried(
-        "ppf-contact-solver",
-        "all",
-        "pip index versions and pip download of ppf-contact-solver and of ppf-cts",
-        "no matching distribution: it is not on PyPI, so it is left out",
-    ),
-)
+}

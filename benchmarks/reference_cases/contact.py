@@ -11,8 +11,10 @@ from functools import partial
 import numpy as np
 
 import taisoft as ts
+from taisoft.fem.mass import lumped_masses
+from taisoft.mesh.quality import mean_surface_edge
 
-from .record import GRAVITY, Case, material, near, small, told, worst
+from .record import GRAVITY, Case, material, near, reported, rotation, small, submesh, worst
 
 EXPLICIT, IMPLICIT = "symplectic_euler", "implicit_euler"
 STEP = {EXPLICIT: 1e-3, IMPLICIT: 1e-2}  # [s] of blocks of 1e7 Pa
@@ -27,20 +29,20 @@ def cube(cells: int = 2) -> ts.TetMesh:
     return ts.box_mesh((cells,) * 3, (1.0, 1.0, 1.0))
 
 
-def mean_edge(mesh: ts.TetMesh) -> float:
-    """Mean edge of its surface [m], by which the contact offset is measured."""
-    x = mesh.vertices[mesh.surface]
-    return float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).mean())
-
-
 def standing(reference: dict) -> ts.Scene:
     """A unit cube on the plane y = 0; slopes are made by turning gravity."""
     s = ts.Scene(gravity=(0.0, -GRAVITY, 0.0))
     firm = replace(material(reference, "COR"), stiffness_damping=1e-3)
     s.add_body(cube(), firm, name="block", position=(0.0, 0.5, 0.0))
-    s.add_obstacle(ts.HalfSpace((0, 0, 0), UP), name="plane")
-    s.set_contact("block", "plane", friction=0.5, restitution=0.0)
+    add_plane(s, friction=0.5, restitution=0.0)
     return s
+
+
+def add_plane(s: ts.Scene, **contact) -> None:
+    """The plane y = 0, "plane". contact: numbers of its contact with the scene's first body, if not the default ones."""
+    s.add_obstacle(ts.HalfSpace((0, 0, 0), UP), name="plane")
+    if contact:
+        s.set_contact(s.bodies[0].name, "plane", **contact)
 
 
 def settled(sim: ts.Simulator, friction: float, angle: float = 0.0, held: bool = False) -> np.ndarray:
@@ -63,7 +65,7 @@ def incline(integrator: str, reference: dict, arch: str):
         for case in reference["value"]["cases"]:
             what, slips = f"{case['alpha_deg']:g} degrees", case["state"] == "slip"
             start = settled(sim, mu, np.radians(case["alpha_deg"]), held=slips)
-            reports = sim.run(0.5, fps=None).step_reports  # what is let go shakes at first
+            reports = sim.run(0.5, fps=None).step_reports  # a released block shakes at first
             before = sim.velocities().mean(axis=0)
             reports += sim.run(0.5, fps=None).step_reports
             way = (sim.positions() - start).mean(axis=0)
@@ -133,7 +135,7 @@ def newton(integrator: str, reference: dict, arch: str):
     """
     s = ts.Scene(gravity=(0.0, 0.0, 0.0))
     s.add_body(cube(), material(reference, "COR"), name="cube", position=(0, 0.501, 0), velocity=(0, -2.0, 0))
-    s.add_obstacle(ts.HalfSpace((0, 0, 0), UP), name="plane")
+    add_plane(s)
     dt = {EXPLICIT: 2e-4, IMPLICIT: 1e-3}[integrator]
     with ts.Simulator(s, dt=dt, integrator=integrator, precision="f64", arch=arch) as sim:
         low = np.flatnonzero(sim.scene.body("cube").rest_positions[:, 1] < -0.49)
@@ -144,8 +146,8 @@ def newton(integrator: str, reference: dict, arch: str):
                 sim.step()
             v = sim.velocities("cube")[low, 1]
             limit = 2e-3 if expected == 0.0 else 1e-6
-            told_of = f"e = {text}: velocity of the base after the impact [m/s]"
-            yield worst([near("", value, expected, limit, scale=2.0) for value in (v.min(), v.max())], told_of)
+            what = f"e = {text}: velocity of the base after the impact [m/s]"
+            yield worst([near("", value, expected, limit, scale=2.0) for value in (v.min(), v.max())], what)
 
 
 def bar(integrator: str, law: str, reference: dict, arch: str):
@@ -153,15 +155,14 @@ def bar(integrator: str, law: str, reference: dict, arch: str):
     value, dt = reference["value"], 2e-4
     mesh = ts.box_mesh((2, 20, 2), (0.1, 1.0, 0.1))
     s = ts.Scene(gravity=(0.0, 0.0, 0.0))
-    place = (0, 0.5 + CONTACT_OFFSET * mean_edge(mesh), 0)
+    place = (0, 0.5 + CONTACT_OFFSET * mean_surface_edge([(mesh.vertices, mesh.surface)]), 0)
     body = s.add_body(mesh, material(reference, law), name="bar", position=place, velocity=(0, -0.1, 0))
-    s.add_obstacle(ts.HalfSpace((0, 0, 0), UP), name="wall")
-    s.set_contact("bar", "wall", friction=0.0, restitution=0.0)
+    add_plane(s, friction=0.0, restitution=0.0)
     with ts.Simulator(s, dt=dt, integrator=integrator, precision="f64", arch=arch) as sim:
         forces = []
         for _ in range(round(0.09 / dt)):
             sim.step()
-            forces.append(-sim.contact_force("wall")[1])
+            forces.append(-sim.contact_force("plane")[1])
         forces = np.array(forces)
         pushed = np.flatnonzero(forces > 0.05 * value["force"])
         v = sim.velocities("bar")
@@ -172,23 +173,20 @@ def bar(integrator: str, law: str, reference: dict, arch: str):
     yield near("duration [s]", duration, value["duration"], 0.05)
     yield near("mean force [N]", impulse / duration, value["force"], 0.05)
     yield near("rebound velocity [m/s]", impulse / mass - 0.1, value["rebound_velocity"], 0.1)
-    yield told("of it in vibration, share of the speed", np.abs(v[:, 1] - v[:, 1].mean()).max() / 0.1)
+    yield reported("of it in vibration, share of the speed", np.abs(v[:, 1] - v[:, 1].mean()).max() / 0.1)
 
 
 def momentum(integrator: str, reference: dict, arch: str):
     """Two cubes that collide in free space: what their momentum does."""
     s = ts.Scene(gravity=(0.0, 0.0, 0.0))
     soft = replace(material(reference, "SNH"), friction=0.4)
-    k = np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0)
-    across = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
-    turn = np.eye(3) + np.sin(np.pi / 6) * across + (1 - np.cos(np.pi / 6)) * across @ across
     s.add_body(cube(), soft, name="left", position=(-0.6, 0, 0), velocity=(1.0, 0, 0))
-    other = ts.TetMesh(cube().vertices @ turn.T, cube().tets)
+    other = ts.TetMesh(cube().vertices @ rotation((1.0, 1.0, 0.0), np.pi / 6).T, cube().tets)
     s.add_body(other, soft, name="right", position=(0.6, 0.1, 0.05), velocity=(-0.5, 0.2, 0))
     dt = {EXPLICIT: 1e-3, IMPLICIT: 1e-2}[integrator]
     tight = {} if integrator == EXPLICIT else {"newton_tolerance": 1e-10}
     with ts.Simulator(s, dt=dt, integrator=integrator, precision="f64", arch=arch, **tight) as sim:
-        mass = np.concatenate([lumped_masses(b) for b in sim.scene.bodies])[:, None]
+        mass = lumped_masses(s)[:, None]
 
         def momenta():
             x, v = sim.positions(), sim.velocities()
@@ -208,46 +206,27 @@ def momentum(integrator: str, reference: dict, arch: str):
     turned = np.linalg.norm(last[1] - first[1]) / size
     # implicit Euler itself loses the angular momentum of what turns; explicit steps lose what the gap has for a lever
     what = "change of angular momentum, over P m"
-    yield small(what, turned, 1e-3) if exact else told(what, turned)
-
-
-def lumped_masses(body) -> np.ndarray:
-    """Lumped masses (n,) of a body's vertices [kg]."""
-    x, tets = body.mesh.vertices, body.mesh.tets
-    volume = np.linalg.det(x[tets[:, 1:]] - x[tets[:, :1]]) / 6.0
-    mass = np.zeros(len(x))
-    np.add.at(mass, tets, np.repeat(body.material.density * volume[:, None] / 4.0, 4, axis=1))
-    return mass
+    yield small(what, turned, 1e-3) if exact else reported(what, turned)
 
 
 # --- a ball on a plane ------------------------------------------------------------------------------------------------
 
 
-def half_ball(radius: float, cells: int) -> ts.TetMesh:
-    """The lower half of a ball, its flat side at y = 0."""
-    whole = ts.ball_mesh(radius, cells)
-    tets = whole.tets[whole.vertices[whole.tets].mean(axis=1)[:, 1] < 0.0]
-    used = np.unique(tets)
-    number = np.full(len(whole.vertices), -1)
-    number[used] = np.arange(len(used))
-    return ts.TetMesh(whole.vertices[used], number[tets])
-
-
 def hertz(cells: int, limit: float | None, reference: dict, arch: str):
     """Force against how far the equator has come down. Steps of 1 s are a thousand times the ball's own period: statics."""
     radius = reference["geometry"]["ball_radius"]
-    mesh = half_ball(radius, cells)
+    whole = ts.ball_mesh(radius, cells)
+    mesh = submesh(whole, whole.vertices[whole.tets].mean(axis=1)[:, 1] < 0.0)
     rows = [row for row in reference["value"]["SNH"] if row["d_over_R"] > 0.015]
     way = [0.0] + [row["d"] for row in rows]
     s = ts.Scene(gravity=(0.0, 0.0, 0.0))
-    height = radius + CONTACT_OFFSET * mean_edge(mesh)
+    height = radius + CONTACT_OFFSET * mean_surface_edge([(mesh.vertices, mesh.surface)])
     ball = s.add_body(mesh, material(reference, "SNH"), name="ball", position=(0.0, height, 0.0))
     middle = np.flatnonzero(np.abs(mesh.vertices).max(axis=1) < 1e-9)
     flat = np.flatnonzero(np.abs(mesh.vertices[:, 1]) < 1e-9)
     ball.move(flat, lambda t: (0.0, -float(np.interp(t, np.arange(len(way)), way)), 0.0), axes="y")
     ball.fix(middle, axes="xz")
-    s.add_obstacle(ts.HalfSpace((0, 0, 0), UP), name="plane")
-    s.set_contact("ball", "plane", friction=0.0, restitution=0.0)
+    add_plane(s, friction=0.0, restitution=0.0)
     with ts.Simulator(s, dt=0.5, precision="f64", arch=arch, newton_tolerance=1e-8) as sim:
         for row in rows:
             for _ in range(2):
@@ -256,7 +235,7 @@ def hertz(cells: int, limit: float | None, reference: dict, arch: str):
             bears = np.linalg.norm(c.impulse, axis=1) > 0.0
             reach = np.linalg.norm(c.point[bears][:, [0, 2]], axis=1).max(initial=0.0)
             yield near(f"d = {row['d']:g} m: force [N]", -sim.contact_force("plane")[1], row["F"], limit)
-            yield told(f"d = {row['d']:g} m: radius of the nodes that bear", reach / row["a"] - 1.0)
+            yield reported(f"d = {row['d']:g} m: radius of the nodes that bear", reach / row["a"] - 1.0)
 
 
 BOTH = (IMPLICIT, EXPLICIT)

@@ -1,8 +1,8 @@
-"""What a case of a reference problem is, what it finds, and what all cases share.
+"""What a case of a reference problem is, what it finds, and what all cases share: checks, scenes, choices of nodes.
 
 A case gets the problem's file as a dict and the arch, computes in f64, and returns checks. Two kinds of error are kept
 apart: on the same mesh with the same element the numbers must agree to solver tolerance, and the check has a limit;
-against a value converged in space the error is the mesh's own, and the check has none: it is only told.
+against a value converged in space the error is the mesh's own, and the check has none: it is only shown.
 """
 
 import math
@@ -22,7 +22,7 @@ SAME_MESH = 1e-6  # relative: what the values computed on the same mesh are good
 
 @dataclass(frozen=True)
 class Check:
-    """A measured number beside its reference. error: relative unless the quantity says else; limit None: only told."""
+    """A measured number beside its reference. error: relative unless the quantity says else; limit None: only reported."""
 
     quantity: str
     measured: float
@@ -76,8 +76,8 @@ def small(quantity: str, measured: float, limit: float) -> Check:
     return Check(quantity, float(measured), 0.0, abs(float(measured)), limit)
 
 
-def told(quantity: str, error: float) -> Check:
-    """An error that is told without a limit."""
+def reported(quantity: str, error: float) -> Check:
+    """An error without a limit."""
     return Check(quantity, float(error), 0.0, abs(float(error)))
 
 
@@ -87,12 +87,10 @@ def order(quantity: str, coarse: float, fine: float, expected: float, limit: flo
     return Check(quantity, observed, expected, abs(observed - expected), limit)
 
 
-def material(reference: dict, law: str, density: float | None = None) -> ts.Material:
-    """The problem's material with one of LAWS. density [kg/m^3] stands in where the problem has no mass."""
+def material(reference: dict, law: str) -> ts.Material:
+    """The problem's material with one of LAWS; where the problem has no mass, the density is 1 kg/m^3."""
     numbers = reference["material"]
-    return ts.Material(
-        law=LAWS[law], young=numbers["E"], poisson=numbers["nu"], density=numbers["rho"] if density is None else density
-    )
+    return ts.Material(law=LAWS[law], young=numbers["E"], poisson=numbers["nu"], density=numbers["rho"] or 1.0)
 
 
 def scene(gravity: bool = False) -> ts.Scene:
@@ -116,6 +114,18 @@ def nearest(points: np.ndarray, point) -> np.ndarray:
     """Indices of the points (n,d) nearest to a point (d,) [m]; all of them where several are equally near."""
     distance = np.linalg.norm(points - np.asarray(point, float), axis=1)
     return np.flatnonzero(distance <= distance.min() + 1e-9 * np.ptp(points))
+
+
+def submesh(mesh: ts.TetMesh, chosen: np.ndarray) -> ts.TetMesh:
+    """The chosen tets of a mesh (m,) bool, with the vertices that they use."""
+    used, tets = np.unique(mesh.tets[chosen], return_inverse=True)
+    return ts.TetMesh(mesh.vertices[used], tets.reshape(-1, 4))
+
+
+def rotation(axis, angle: float) -> np.ndarray:
+    """Rodrigues' rotation matrix (3,3) about an axis by an angle [rad]."""
+    K = np.cross(np.eye(3), np.asarray(axis, float) / np.linalg.norm(axis))
+    return np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
 
 
 def deformation_gradients(body: Body, x: np.ndarray) -> np.ndarray:

@@ -46,7 +46,8 @@ class Verdict:
 
 def judge(work: Work, model: references.Model, positions: np.ndarray) -> Verdict:
     """Of the positions (k,n,3) [m] that a program with this model gave."""
-    verdict = Verdict(max(_inverted(work, x) for x in positions))
+    parts = list(zip(work.bodies, work.slices().values()))
+    verdict = Verdict(max(sum(inverted(body.mesh, x[nodes]) for body, nodes in parts) for x in positions))
     if work.kind == "path":
         reference = references.load(work, model)
         path = references.observed(work, positions, references.masses(work, model))
@@ -69,19 +70,15 @@ def free_fall(work: Work, positions: np.ndarray) -> float | None:
     return float((height[0] - height[round(work.free_until / SAMPLE)]) / (0.5 * work.gravity * work.free_until**2))
 
 
-def _inverted(work: Work, x: np.ndarray) -> int:
-    return sum(inverted(body.mesh, x[nodes]) for body, nodes in zip(work.bodies, work.slices().values()))
-
-
 def deepest(work: Work, positions: np.ndarray) -> float:
     """The deepest overlap of two bodies, or of one and the ground, in any of the samples [m], by taisoft's own measure.
 
     In f64: no simulator of another precision may be open.
     """
     with unwarned():
-        made = ts.Simulator(make_scene(work), dt=1e-6, integrator="velocity_verlet", precision="f64")
+        sim = ts.Simulator(make_scene(work), dt=1e-6, integrator="velocity_verlet", precision="f64")
     depth = 0.0
-    with made as sim:
+    with sim:
         for x in positions:
             sim.set_state(x, np.zeros_like(x))
             depth = max([depth, *(one.depth for one in sim.overlaps())])  # of finite positions always finite

@@ -1,4 +1,4 @@
-"""All programs' settings on one work, in rounds, so that a slow minute of the machine falls on all of them."""
+"""All programs' settings on one work, in rounds, so that a slow minute of the machine falls on all of them; and the fastest."""
 
 import sys
 from collections.abc import Iterable
@@ -19,6 +19,7 @@ from .judge import Verdict, judge
 from .references import MODELS
 from .scenes import Work
 
+KEPT = ("rounds", "build_seconds", "unconverged", "failure")  # of a row, as they are in its record
 ENOUGH_SECONDS, ENOUGH_BUILDING = 10.0, 20.0  # wall time of a run, and of building for one, from which on it is not repeated
 
 
@@ -58,30 +59,22 @@ class Row:
 
     def record(self) -> dict:
         """As plain data."""
-        setting = asdict(self.setting) | {"model": str(self.setting.model), "dt": self.setting.dt}
-        verdict = self.verdict and asdict(self.verdict)
-        return {
+        same = {name: getattr(self, name) for name in (*KEPT, "date")}
+        return same | {
             "work": self.work.key,
             "tets": self.work.tets,
-            "setting": setting,
-            "rounds": self.rounds,
-            "verdict": verdict,
-            "build_seconds": self.build_seconds,
-            "unconverged": self.unconverged,
-            "failure": self.failure,
-            "date": self.date,
+            "setting": asdict(self.setting) | {"model": str(self.setting.model), "dt": self.setting.dt},
+            "verdict": self.verdict and asdict(self.verdict),
             "seconds_per_simulated_second": self.timing and asdict(self.timing),
         }
 
 
 def row_of(work: Work, record: dict, date: str) -> Row:
-    """The row that `Row.record` told of. date: where the record has none."""
-    told = record["setting"]
-    model = next(model for model in MODELS if str(model) == told["model"])
-    setting = Setting(told["program"], model, told["method"], told["steps"], told["options"])
+    """The row that `Row.record` is of. date: where the record has none."""
+    numbers = {key: value for key, value in record["setting"].items() if key != "dt"}
+    setting = Setting(**numbers | {"model": next(model for model in MODELS if str(model) == numbers["model"])})
     verdict = record["verdict"] and Verdict(**record["verdict"])
-    same = {key: record[key] for key in ("rounds", "build_seconds", "unconverged", "failure")}
-    return Row(work, setting, verdict=verdict, date=record.get("date") or date, **same)
+    return Row(work, setting, verdict=verdict, date=record.get("date") or date, **{key: record[key] for key in KEPT})
 
 
 def measure(work: Work, programs: Iterable[ModuleType], rounds: int, arch: str = "cpu") -> list[Row]:
@@ -94,8 +87,7 @@ def measure(work: Work, programs: Iterable[ModuleType], rounds: int, arch: str =
         for row in rows:
             if row.failure or (row.rounds and is_dear(row.rounds[0][0] * work.seconds, row.build_seconds[0])):
                 continue
-            told = f"{work.key}, round {number + 1} of {rounds}: {row.setting.program} {row.setting}"
-            print(told, file=sys.stderr, flush=True)
+            print(f"{work.key}, round {number + 1} of {rounds}: {row.setting.program} {row.setting}", file=sys.stderr, flush=True)
             positions = _round(row, adapters[row.setting.program])
             if positions is not None:
                 row.verdict = judge(work, row.setting.model, positions)
@@ -111,7 +103,7 @@ def _round(row: Row, program: ModuleType) -> np.ndarray | None:
     """Run a row once more. Returns the positions of a run that was followed, the first; a failure is the row's."""
     positions = None
     try:
-        session = program.start(row.work, row.setting)
+        session = program.Run(row.work, row.setting)
         try:
             row.build_seconds.append(session.build_seconds)
             if row.verdict is None:

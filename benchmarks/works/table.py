@@ -1,19 +1,22 @@
-"""Tables of the works: all runs of one, and the programs beside each other at equal error."""
+"""Tables and the picture of the works: all runs of one, the programs beside each other at equal error, error against time."""
 
-from collections.abc import Iterable
+from pathlib import Path
 
+from taisoft.output.plot import require_matplotlib, save, ticks
 from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.study.pareto import front
 
 from ..elasticity_runs import time_ratio
 from ..elasticity_table import Limit
 from ..programs import own
-from ..programs.tried import Tried
+from ..programs.tried import TRIED
 from .runs import Row, fastest_standing, fastest_within
-from .scenes import Work
 
 LEVELS = (1e-2, 1e-3, 1e-4, 1e-5)  # errors at which W1 is compared
 FASTER = 4.0  # times the best peer, on W1 at equal error
 W2_ERROR, W2_SECONDS = 0.005, 0.4
+STYLES = {"taisoft": ("#d55e00", "o"), "MuJoCo": ("#0072b2", "s"), "PyBullet": ("#009e73", "^"), "Newton": ("#cc79a7", "D")}
+COLUMNS, PANEL = 3, (4.2, 3.4)  # panels in a row, their size in inches
 
 
 def run_table(rows: list[Row]) -> str:
@@ -21,24 +24,13 @@ def run_table(rows: list[Row]) -> str:
     work = rows[0].work
     path = ("error", "good to") if work.kind == "path" else ("stands", "fell at [s]", "free fall")
     contact = ("penetration [mm]", "over an edge") if work.touches else ()
-    headings = (
-        "program",
-        "law",
-        "setting",
-        "dt [ms]",
-        "s/sim. s",
-        "spread",
-        *path,
-        *contact,
-        "inverted tets",
-        "unconverged",
-        "build [s]",
-    )
+    counts = "inverted tets", "unconverged", "build [s]"
+    headings = ("program", "law", "setting", "dt [ms]", "s/sim. s", "spread", *path, *contact, *counts)
     lines = [_line(row) for row in rows if row.timing is not None]
-    told = markdown(headings, lines, left=(0, 1, 2)) if lines else "Nothing ran to its end."
+    table = markdown(headings, lines, left=(0, 1, 2)) if lines else "Nothing ran to its end."
     failed = [(row.setting, row.failure) for row in rows if row.failure]
     failures = [f"* {setting.program} {setting}, dt = {1e3 * setting.dt:.3g} ms: {why}" for setting, why in failed]
-    return told + ("\n\n" + "\n".join(failures) if failures else "")
+    return table + ("\n\n" + "\n".join(failures) if failures else "")
 
 
 def _line(row: Row) -> tuple[str, ...]:
@@ -64,8 +56,8 @@ def _line(row: Row) -> tuple[str, ...]:
     )
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %"
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.2g} %"
 
 
 def own_and_peers(rows: list[Row]) -> tuple[list[Row], list[Row]]:
@@ -75,8 +67,7 @@ def own_and_peers(rows: list[Row]) -> tuple[list[Row], list[Row]]:
 
 
 def pairs_of(rows: list[Row]) -> list[tuple[str, Row | None, Row | None]]:
-    """At what, the fastest of taisoft and the fastest of the others; a path's at LEVELS, and of the law of
-    that one where taisoft has run it."""
+    """At what, the fastest of taisoft and of the others; a path's at LEVELS, and of the law of that one where taisoft ran it."""
     ours, others = own_and_peers(rows)
     if rows[0].work.kind == "stand":
         return [("stands", fastest_standing(ours), fastest_standing(others))]
@@ -92,37 +83,20 @@ def comparisons(works: list[list[Row]]) -> list[dict]:
     """For each work and level the fastest of taisoft and of the others, as plain data."""
     found = []
     for rows in works:
+        work = {"work": rows[0].work.key, "tets": rows[0].work.tets, "stiff": rows[0].work.stiff}
         for at, ours, theirs in pairs_of(rows):
             ratio = time_ratio(theirs, ours) if ours and theirs else None
-            found.append(
-                {
-                    "work": rows[0].work.key,
-                    "tets": rows[0].work.tets,
-                    "stiff": rows[0].work.stiff,
-                    "at": at,
-                    "taisoft": _named(ours),
-                    "others": _named(theirs),
-                    "ratio": ratio and ratio.median,
-                    "spread": ratio and spread_of(ratio),
-                }
-            )
+            times = {"ratio": ratio and ratio.median, "spread": ratio and spread_of(ratio)}
+            found.append(work | {"at": at, "taisoft": _named(ours), "others": _named(theirs)} | times)
     return found
 
 
 def compare_table(found: list[dict]) -> str:
     """A row a work and level, of `comparisons`."""
-    lines = [
-        (
-            one["work"],
-            f"{one['tets']:,}",
-            one["at"],
-            *one["taisoft"],
-            *one["others"],
-            f"{one['ratio']:.3g}" if one["ratio"] else "-",
-            percent(one["spread"]),
-        )
-        for one in found
-    ]
+    lines = []
+    for one in found:
+        times = f"{one['ratio']:.3g}" if one["ratio"] else "-", percent(one["spread"])
+        lines.append((one["work"], f"{one['tets']:,}", one["at"], *one["taisoft"], *one["others"], *times))
     headings = ("work", "tets", "at", "taisoft", "s/sim. s", "best of the others", "s/sim. s", "its time / taisoft's", "spread")
     return markdown(headings, lines, left=(0, 2, 3, 5))
 
@@ -137,11 +111,14 @@ def _named(row: Row | None) -> tuple[str, str]:
 def limits_of(rows: list[Row]) -> list[Limit]:
     """What was aimed at, of a work; nothing of the stiff ones."""
     work = rows[0].work
-    ours, _ = own_and_peers(rows)
     if work.stiff:
         return []
     if work.cells is None and work.kind == "path":
-        return _limits_of_drop(work, ours)
+        best = fastest_within(own_and_peers(rows)[0], W2_ERROR)
+        if best is None:
+            return [Limit(f"{work.key}: taisoft's settings with an error of at most {W2_ERROR:g}", 0, 1, at_least=True)]
+        what, t = f"{work.key}: s/sim. s of taisoft with an error of {best.claimed:.2g}", best.timing
+        return [Limit(what, t.median, W2_SECONDS, spread_of(t))]
     found = []
     for at, a, b in pairs_of(rows):
         found.append(Limit(f"{work.key}, {at}: settings of taisoft that do", float(a is not None), 1.0, at_least=True))
@@ -154,31 +131,56 @@ def limits_of(rows: list[Row]) -> list[Limit]:
 
 def implicit_table(works: list[list[Row]]) -> str:
     """Of stiff works every program's steps of 10 ms."""
-    lines = [
-        (
-            row.work.key,
-            row.setting.program,
-            str(row.setting),
-            str(row.setting.model),
-            *(("-", "-") if row.timing is None else (_percent(row.verdict.error), f"{row.timing.median:.3g}")),
-            row.failure,
-        )
-        for rows in works
-        for row in rows
-        if row.work.stiff and row.setting.steps == 1
-    ]
+    lines = []
+    for row in (row for rows in works for row in rows if row.work.stiff and row.setting.steps == 1):
+        found = ("-", "-") if row.timing is None else (_percent(row.verdict.error), f"{row.timing.median:.3g}")
+        setting = row.setting
+        lines.append((row.work.key, setting.program, str(setting), str(setting.model), *found, row.failure))
     return markdown(("work", "program", "setting", "law", "error", "s/sim. s", ""), lines, left=(0, 1, 2, 3, 6))
 
 
-def tried_table(tried: Iterable[Tried]) -> str:
+def tried_table() -> str:
     """What is not among the settings, and why."""
-    lines = [(one.program, one.work, one.what, one.came_out) for one in tried]
+    lines = [(program, *one) for program, rows in TRIED.items() for one in rows]
     return markdown(("program", "work", "tried", "came out"), lines, left=(0, 1, 2, 3))
 
 
-def _limits_of_drop(work: Work, ours: list[Row]) -> list[Limit]:
-    best = fastest_within(ours, W2_ERROR)
-    if best is None:
-        return [Limit(f"{work.key}: taisoft's settings with an error of at most {W2_ERROR:g}", 0, 1, at_least=True)]
-    t = best.timing
-    return [Limit(f"{work.key}: s/sim. s of taisoft with an error of {best.claimed:.2g}", t.median, W2_SECONDS, spread_of(t))]
+def draw(works: list[list[Row]], path: Path) -> None:
+    """Write a PNG of error against time, a panel a work; nothing where no path is known. Raises OutputError."""
+    works = [rows for rows in works if rows[0].work.kind == "path" and any(row.timing for row in rows)]
+    if not works:
+        return
+    require_matplotlib()
+    from matplotlib import pyplot
+
+    lines = -(-len(works) // COLUMNS)
+    figure, grid = pyplot.subplots(
+        lines, COLUMNS, figsize=(PANEL[0] * COLUMNS, PANEL[1] * lines + 0.4), squeeze=False, layout="constrained"
+    )
+    for panel in grid.flat[len(works) :]:
+        panel.set_visible(False)
+    drawn: dict = {}
+    for panel, rows in zip(grid.flat, works):
+        drawn |= _panel(panel, rows)
+    figure.legend(drawn.values(), drawn.keys(), loc="outside upper center", ncols=len(drawn), frameon=False)
+    figure.supxlabel("wall time of a simulated second [s], median")
+    figure.supylabel("error [%]")
+    save(figure, path, dpi=100)
+
+
+def _panel(panel, rows: list[Row]) -> dict:
+    timed = [row for row in rows if row.timing is not None]
+    points = [(row.timing.median, 100 * row.claimed) for row in timed]
+    handles = {}
+    for name, (colour, marker) in STYLES.items():
+        own = [p for p, row in zip(points, timed) if row.setting.program == name]
+        if own:
+            (handles[name],) = panel.plot(*zip(*own), marker, color=colour, ms=5)
+    best = [points[k] for k in front(points)]
+    (handles["front"],) = panel.step(*zip(*best), where="post", color="#888888", lw=1.0, ls="--")
+    panel.set(xscale="log", yscale="log", title=f"{rows[0].work.key}, {rows[0].work.tets:,} tets")
+    for axis, values in zip((panel.xaxis, panel.yaxis), zip(*points)):
+        ticks(axis, max(values) / min(values))
+    panel.grid(True, which="major", color="#eeeeee")
+    panel.set_axisbelow(True)
+    return handles

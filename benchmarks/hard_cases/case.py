@@ -1,0 +1,332 @@
+"""What a hard case is, how one variant of it is run, and how the run is judged.
+
+A case is data beside one function. The function gets a `Session` and a variant's parameters, runs, and returns numbers by their
+quantity; the criteria say which of them have a limit, and of which variants. Each variant says how it must end, and why: by the
+catalogue and by physics, never by what came out. A reference is the same run in f64 with an eighth of the step, looked at at the
+same times.
+"""
+
+import math
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.errors import TaisoftError
+from taisoft.output.report import peak_memory
+from taisoft.records import RunReport, StepReport
+
+MEASURED, ANALYTIC, PROPOSED = "measured", "analytic", "proposed"  # what a limit rests on
+# How a variant ends. Refused: an error before a simulator's first step is done. Stopped: an error in a later step.
+OK, DEGRADED, REFUSED, STOPPED = WORST = ("ok", "degraded", "refused", "stopped")
+FAILED = "failed"  # what a RunReport calls both
+
+# What degrades a run.
+UNCONVERGED, INVERTED, DROPPED = "unconverged steps", "inverted tets", "dropped contacts"
+PENETRATION, OVERLAP, INTERRUPTED = "penetration", "overlap at the end", "interruption"
+END = "end of the run"  # the quantity of a variant's first verdict
+DEEPEST = "deepest penetration after any step [m]"
+
+IMPLICIT, EXPLICIT = "implicit_euler", "symplectic_euler"
+FINER = 8  # steps of a reference for one of the run
+FRAMES = 20  # of a run that are kept, at most about
+
+
+@dataclass(frozen=True)
+class Must:
+    """How a variant must end: OK, DEGRADED, REFUSED or STOPPED. reason: why, in one line.
+
+    causes: what may degrade the run, because the setting itself brings it about. With OK and causes, both an ok end and one
+    that only they degrade count. Nothing else may have gone wrong in a run that is refused or stopped either.
+    """
+
+    end: str
+    reason: str
+    causes: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """As words."""
+        by = f"{DEGRADED} by {' and '.join(self.causes)}"
+        return self.end if not self.causes or self.end in (REFUSED, STOPPED) else f"ok, or {by}" if self.end == OK else by
+
+    def met(self, record: dict) -> bool:
+        """Whether a record ends so."""
+        status, causes = record["status"], set(record["causes"])
+        if not causes <= set(self.causes):
+            return False
+        if status == DEGRADED:
+            return self.end in (OK, DEGRADED) and bool(causes)  # a run that cannot say what degraded it is not excused
+        return status == self.end and not (status == OK and causes)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One run of a case. settings: arguments of ts.Simulator; parameters: of the case's function.
+
+    must: how it must end. reference: whether its shape can be compared with that of a run in f64 with an eighth of the step.
+    """
+
+    name: str
+    settings: dict[str, Any]
+    parameters: dict[str, Any]
+    must: Must
+    reference: bool = True
+
+    def has(self, of: dict[str, Any]) -> bool:
+        """Whether it has the value, or one of the values, given for every name."""
+        own = self.settings | self.parameters
+        return all(own[key] in (value if isinstance(value, tuple) else (value,)) for key, value in of.items())
+
+
+def implicit(dt: float, **more) -> dict[str, Any]:
+    """Settings of implicit Euler steps."""
+    return {"dt": dt, "integrator": IMPLICIT, **more}
+
+
+def explicit(dt: float, **more) -> dict[str, Any]:
+    """Settings of symplectic Euler steps."""
+    return {"dt": dt, "integrator": EXPLICIT, **more}
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """A number that a case must keep to.
+
+    quantity: its name among the numbers of the case's function. basis: one of MEASURED, ANALYTIC, PROPOSED. at_least: a lower
+    limit. asked: the limit that the catalogue proposes, where another, an honest baseline, replaces it. note: what that is and
+    why. of: parameters and settings of the variants it applies to, by name; empty for all. cost: a limit on time, memory or
+    iterations; a run that misses it is not solved, but its answer is not wrong.
+    """
+
+    quantity: str
+    limit: float
+    basis: str
+    at_least: bool = False
+    asked: float | None = None
+    note: str = ""
+    of: dict[str, Any] = field(default_factory=dict)
+    cost: bool = False
+
+    def met(self, value: float) -> bool:
+        """Whether a value keeps the limit; one that is not a number never does."""
+        return math.isfinite(value) and (value >= self.limit if self.at_least else value <= self.limit)
+
+
+@dataclass(frozen=True)
+class Shortfall:
+    """Why variants of a case are not solved, and what to try next. of: which variants, as in Criterion."""
+
+    cause: str
+    next_idea: str
+    of: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class Case:
+    """A hard case. size [m]: what errors are divided by. quick: variants that are cheap and solved."""
+
+    id: str
+    name: str
+    run: Callable[..., dict[str, float]]  # (session, **parameters) -> numbers by quantity
+    variants: list[Variant] = field(default_factory=list)
+    criteria: list[Criterion] = field(default_factory=list)
+    shortfalls: list[Shortfall] = field(default_factory=list)
+    size: float = 1.0
+    quick: tuple[str, ...] = ()
+
+    def add_variant(self, name: str, settings: dict[str, Any], must: Must, reference: bool = True, **parameters) -> None:
+        """Add a run, see Variant."""
+        self.variants.append(Variant(name, settings, parameters, must, reference))
+
+    def add_limit(self, quantity: str, limit: float, basis: str, at_least=False, note="", cost=False, **of) -> None:
+        """Add a criterion, see Criterion."""
+        self.criteria.append(Criterion(quantity, limit, basis, at_least, None, note, of, cost))
+
+    def add_shortfall(self, cause: str, next_idea: str, **of) -> None:
+        """Add the explanation of variants that are not solved, see Shortfall."""
+        self.shortfalls.append(Shortfall(cause, next_idea, of))
+
+    def criteria_of(self, variant: Variant) -> list[Criterion]:
+        """What is asked of one variant."""
+        return [c for c in self.criteria if variant.has(c.of)]
+
+    def shortfalls_of(self, variant: Variant) -> list[Shortfall]:
+        """Why one variant is not solved."""
+        return [s for s in self.shortfalls if variant.has(s.of)]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A quantity of a run beside its limit. value and limit: numbers, or texts where the end of the run is judged."""
+
+    quantity: str
+    value: float | str | None
+    limit: float | str | None = None
+    at_least: bool = False
+    basis: str = ""
+    asked: float | None = None
+    passed: bool | None = None  # None where there is no limit
+    cost: bool = False
+
+
+def judge(case: Case, variant: Variant, record: dict) -> list[Verdict]:
+    """A record against a variant's criteria: its end first, then what has a limit, then what has none."""
+    causes = " and ".join(record["causes"]) if record["status"] == DEGRADED else ""
+    ended = f"{record['status']} by {causes}" if causes else record["status"]
+    verdicts = [Verdict(END, ended, variant.must.text, passed=variant.must.met(record))]
+    numbers = record["numbers"]
+    criteria = case.criteria_of(variant)
+    for c in criteria:
+        value = numbers.get(c.quantity)  # null for what is not finite, absent in a run that could not be made
+        met = value is not None and c.met(value)
+        verdicts.append(Verdict(c.quantity, value, c.limit, c.at_least, c.basis, c.asked, met, c.cost))
+    judged = {c.quantity for c in criteria}
+    return verdicts + [Verdict(name, value) for name, value in numbers.items() if name not in judged]
+
+
+class Session:
+    """One variant being run. finer: 1, or FINER for its reference.
+
+    reports: of all steps so far. path: lists of points (n,3) [m] of the run, at its start, at FRAMES times and at its end.
+    """
+
+    def __init__(self, case: Case, variant: Variant, arch: str, finer: int = 1):
+        self.case, self.variant, self.arch, self.finer = case, variant, arch, finer
+        self.status = OK
+        self.causes: set[str] = set()  # what degraded its runs
+        self.problems: list[str] = []
+        self.warned: list[warnings.WarningMessage] = []
+        self.steps = 0
+        self.seconds = 0.0  # wall time of steps without compiling
+        self.step_seconds: list[float] = []  # of a step, of each advance
+        self.reports: list[StepReport] = []
+        self.path: list[np.ndarray] = []
+
+    def simulator(self, scene: ts.Scene, **changes) -> ts.Simulator:
+        """A simulator of the scene by the variant's settings, with changes; finer where this is a reference."""
+        settings = self.variant.settings | changes
+        settings["dt"] = settings["dt"] / self.finer
+        if self.finer > 1:
+            settings["precision"] = "f64"
+        return ts.Simulator(scene, arch=self.arch, **settings)
+
+    def go(self, sim: ts.Simulator, steps: int, look: Callable | None = None, every: int = 1, follow: bool = True) -> RunReport:
+        """Run so many steps of the variant's length; look(sim, number, report) before them and after every `every` of them.
+
+        follow: keep some of its states for the comparison with the reference. A run that fails says so in the result.
+        """
+        dt, total = sim.dt * self.finer, steps // every
+        kept = max(1, total // FRAMES)
+
+        def frame(sim, number, report):
+            if look is not None:
+                look(sim, number, report)
+            if follow and (number % kept == 0 or number == total):
+                self.path.append(sim.positions())
+
+        def step(report, seconds):
+            self.seconds += seconds
+            self.step_seconds.append(seconds / report.steps)
+
+        result = sim.run(steps * dt, frame, fps=1.0 / (every * dt), on_step=step)
+        self.steps += result.steps
+        self.reports += result.step_reports
+        self.causes |= causes_of(sim, result)
+        failed = STOPPED if sim.step_count else REFUSED  # the simulator's first step is done, or not
+        self._end(failed if result.status == FAILED else result.status, result.problems)
+        return result
+
+    def watch(self, sim: ts.Simulator, steps: int, *read: Callable, every: int = 1, follow: bool = True) -> list[list]:
+        """`go` with a list of what each of `read` returned, before the steps and after every `every` of them."""
+        found = [[] for _ in read]
+
+        def look(*_):
+            for values, get in zip(found, read):
+                values.append(get())
+
+        self.go(sim, steps, look, every, follow)
+        return found
+
+    def refuse(self, sentence: str) -> None:
+        """A simulator refused what it was given."""
+        self._end(REFUSED, [sentence])
+
+    def _end(self, status: str, problems: list[str]) -> None:
+        """How something ended; the worst counts."""
+        self.status = max(self.status, status, key=WORST.index)
+        self.problems += problems
+
+    @property
+    def warnings(self) -> list[str]:
+        """All warnings so far."""
+        return [str(one.message) for one in self.warned if issubclass(one.category, UserWarning)]
+
+    @property
+    def unconverged(self) -> int:
+        """Reports of steps that did not converge."""
+        return sum(not report.converged for report in self.reports)
+
+    def most(self, name: str) -> float:
+        """The largest of a number of the StepReports so far."""
+        return max((getattr(report, name) for report in self.reports), default=0)
+
+    def total(self, name: str) -> int:
+        """The sum of a number of the StepReports so far."""
+        return sum(getattr(report, name) for report in self.reports)
+
+    def record(self) -> dict:
+        """Run the variant. Returns plain data: its end, its numbers, its cost, its path."""
+        start = time.perf_counter()
+        with warnings.catch_warnings(record=True) as self.warned:
+            warnings.simplefilter("always", UserWarning)
+            try:
+                numbers = self.case.run(self, **self.variant.parameters)
+            except TaisoftError as error:
+                numbers = {}
+                self.refuse(str(error))
+        return {
+            "status": self.status,
+            "causes": sorted(self.causes),
+            "problems": list(dict.fromkeys(self.problems)),
+            "warnings": list(dict.fromkeys(self.warnings)),
+            "numbers": {name: float(value) for name, value in numbers.items()},
+            "steps": self.steps,
+            "seconds": self.seconds,
+            "total_seconds": time.perf_counter() - start,
+            "step_seconds": float(np.median(self.step_seconds)) if self.step_seconds else None,
+            **{f"{what}_iterations": self.total(f"{what}_iterations") for what in ("newton", "linear", "contact")},
+            "inverted": self.most("n_inverted"),
+            "unconverged": self.unconverged,
+            "peak_memory_bytes": peak_memory(),
+            "points": np.concatenate(self.path) if self.path else np.empty((0, 3)),
+        }
+
+
+def causes_of(sim: ts.Simulator, result: RunReport) -> set[str]:
+    """What degraded a run."""
+    steps = result.step_reports
+    found = {
+        UNCONVERGED: any(not step.converged for step in steps),
+        INVERTED: any(step.n_inverted for step in steps),
+        DROPPED: any(step.dropped_contacts for step in steps),
+        PENETRATION: any(step.deep for step in steps),
+        INTERRUPTED: result.interrupted,
+        OVERLAP: result.status == DEGRADED
+        and sim.touches
+        and any(found.depth > sim.contact_limit(found.name_a, found.name_b) for found in sim.overlaps()),
+    }
+    return {cause for cause, so in found.items() if so}
+
+
+def refusal(make: Callable[[], ts.Simulator]) -> str:
+    """The sentence with which a simulator refuses to be made; empty where it is made after all."""
+    try:
+        make().close()
+    except TaisoftError as error:
+        return str(error)
+    return ""
