@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from taisoft.output.plot import require_matplotlib, save, ticks
-from taisoft.study.pareto import front
+from taisoft.study.results import front
 
 from .runs import Row
 
