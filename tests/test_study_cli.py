@@ -148,7 +148,7 @@ def test_interrupted_then_killed_a_study_goes_on(tmp_path, capsys):
 
     process = child("study", *arguments)
     printed, told = process.communicate(timeout=200)
-    assert process.returncode == 0 and f"{len(second)} of them done before" in told
+    assert process.returncode == 0 and f"{len(second)} of them already done" in told
     last = records(out)
     assert len(last) == 4 and all(last[name] == at for name, at in second.items()) and first.items() <= second.items()
     record = json.loads((out / "study.json").read_text())

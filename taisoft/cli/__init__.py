@@ -6,8 +6,10 @@ could not be written, 130 ended by SIGINT, 143 ended by SIGTERM.
 
 import argparse
 import os
+import re
 import signal
 import sys
+import tomllib
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +17,7 @@ from dataclasses import fields
 from importlib import import_module
 
 from taisoft import __version__
-from taisoft.errors import OutputError, TaisoftError, no_memory
+from taisoft.errors import OutputError, SceneError, TaisoftError, no_memory
 from taisoft.study import Request, Setting
 
 EXIT_FAILED = 1
@@ -23,6 +25,7 @@ EXIT_BAD_INPUT = 2
 EXIT_OUTPUT = 3
 EXIT_SIGNAL = 128  # plus the signal's number: 130, 143
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+BARE_WORD = re.compile(r"[A-Za-z_]\w*")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -114,6 +117,19 @@ def printed_warnings() -> Iterator[list[str]]:
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = show
         yield texts
+
+
+def parse_scalar(text: str, assignment: str, option: str = "--set") -> float | int | bool | str | None:
+    """Parse a number, true, false or "text" in TOML syntax; a bare word is text, and none is None."""
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        if not BARE_WORD.fullmatch(text):
+            raise SceneError(f"{option} {assignment}: {text!r} is not a number, true, false, none or a word") from None
+        return None if text == "none" else text
+    if set(table) != {"value"} or not isinstance(table["value"], (float, int, bool, str)):
+        raise SceneError(f"{option} {assignment}: {text!r} is not a single number, true, false, none or a word")
+    return table["value"]
 
 
 def _parser() -> argparse.ArgumentParser:

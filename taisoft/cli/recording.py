@@ -8,7 +8,6 @@ from argparse import Namespace
 from dataclasses import dataclass
 from pathlib import Path
 
-from taisoft.cli.settings import RunSettings
 from taisoft.errors import OutputError, SceneError
 from taisoft.output.checkpoint import CheckpointWriter
 from taisoft.output.files import RESULT_FILES, OutputFolder
@@ -180,15 +179,14 @@ class Recording:
             return
         write_video(folder, fps)
 
-    def report(self, result: RunReport, sim, settings: RunSettings) -> None:
+    def report(self, result: RunReport, sim, settings: dict) -> None:
         """Write report.json and steps.csv, and remove files left by an earlier run. Raises OutputError."""
-        record = settings.as_dict() | {"dt": sim.dt}
         write_report(
             self._folder.path,
             result,
-            arch=record["arch"],
-            precision=record["precision"],
-            settings=record,
+            arch=settings["arch"],
+            precision=settings["precision"],
+            settings=settings | {"dt": sim.dt},
             plan=sim.plan.entries,
             resumed=self._resumed,
             bodies=body_records(sim.scene),

@@ -1,14 +1,19 @@
-"""`taisoft run SCENE`: load, check, build, run, save, report."""
+"""`taisoft run SCENE`: load, check, build, run, save, report.
 
+Settings come from the scene's `solver` dict, --set and the other options; the later ones override the earlier ones.
+"""
+
+import inspect
 import os
 import sys
 from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from taisoft.checkpoint import Checkpoint
-from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL, Signals, printed_warnings
+from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL, Signals, parse_scalar, printed_warnings
 from taisoft.cli.recording import (
     DisplayOptions,
     Observers,
@@ -19,8 +24,7 @@ from taisoft.cli.recording import (
     print_state,
     print_summary,
 )
-from taisoft.cli.scene_file import load_scene
-from taisoft.cli.settings import RunSettings, resolve
+from taisoft.cli.scene_file import OF_SCENE, load_scene, refuse_unknown
 from taisoft.errors import SceneError, SimulationError
 from taisoft.output.checkpoint import read_last_good
 from taisoft.output.files import check_free
@@ -32,6 +36,27 @@ from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
 from taisoft.view.ggui import display_missing, vulkan_missing
 from taisoft.view.plots import Plots
+
+RUN_KEYS = ("seconds", "fps")  # arguments of Simulator.run that a `solver` dict may hold too
+MAY_CHANGE = ("dt", "arch")  # arguments of Simulator that may change when a run is resumed
+
+
+@dataclass
+class RunSettings:
+    """Settings of a run. simulator: arguments of Simulator; seconds [s]; fps [1/s], None for a frame per step.
+
+    defaults: Simulator's own; changed: for a resumed run, the arguments that replace the checkpoint's.
+    """
+
+    simulator: dict
+    seconds: float
+    fps: float | None
+    defaults: dict
+    changed: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict:
+        """Return every setting of the run by name, given or default."""
+        return self.defaults | self.simulator | {"seconds": self.seconds, "fps": self.fps}
 
 
 def run(arguments: Namespace) -> int:
@@ -63,6 +88,57 @@ def run(arguments: Namespace) -> int:
             with _prefix_errors(arguments.scene):
                 check_length(settings.seconds, sim.dt, settings.fps)
             return _run(sim, settings, arguments, signals, warned, saved, shown)
+
+
+def resolve(solver: dict, arguments: Namespace, simulator_class: type, saved: dict | None = None) -> RunSettings:
+    """Merge the three sources; options override --set, --set overrides the scene.
+
+    saved: for a resumed run, the checkpoint's arguments of Simulator, and fps if it has it, which override the scene's.
+    Raises SceneError for an unknown key, a value that is not a TOML scalar, an option and a --set that disagree, seconds
+    and fps that are not finite and positive, or values that differ from saved, unless they may change. Simulator checks its own
+    arguments.
+    """
+    parameters = inspect.signature(simulator_class).parameters.values()
+    defaults = {parameter.name: parameter.default for parameter in parameters if parameter.name != "scene"}
+    keys = [*defaults, *RUN_KEYS]
+    refuse_unknown(solver, keys, OF_SCENE)
+    given, changed = _given(arguments, keys), []
+    merged = solver | given
+    if saved is not None:
+        for key, value in given.items():
+            if key not in (*MAY_CHANGE, "seconds") and value != saved.get(key, value):
+                raise SceneError(f"--resume {arguments.resume}: {key} is {saved[key]} there and cannot become {value} in a run")
+        changed = [key for key in MAY_CHANGE if key in given]
+        run_keys = {key: merged[key] for key in RUN_KEYS if key in merged}
+        merged = run_keys | saved | {key: given[key] for key in changed}
+    fps = merged.get("fps", 60.0)
+    return RunSettings(
+        simulator={key: value for key, value in merged.items() if key not in RUN_KEYS},
+        seconds=checks.number(merged.get("seconds", 1.0), "seconds", above=0.0),
+        fps=None if fps is None else checks.number(fps, "fps", above=0.0),
+        defaults=defaults,
+        changed=changed,
+    )
+
+
+def _given(arguments: Namespace, keys: list[str]) -> dict:
+    """Return the settings given by --set solver.KEY=VALUE and by the other options."""
+    given = {}
+    for assignment in arguments.assignments:
+        name, equals, text = assignment.partition("=")
+        head, _, key = name.strip().partition(".")
+        if not equals or head != "solver":
+            raise SceneError(f"--set {assignment}: write solver.KEY=VALUE, e.g. solver.dt=0.01")
+        refuse_unknown([key], keys, f"--set {assignment}: ")
+        given[key] = parse_scalar(text.strip(), assignment)
+    for key in ("arch", "precision", *RUN_KEYS):
+        option = getattr(arguments, key)
+        if option is None:
+            continue
+        if key in given and given[key] != option:
+            raise SceneError(f"--{key} {option} and --set solver.{key}={given[key]} disagree; give one of them")
+        given[key] = option
+    return given
 
 
 @contextmanager
@@ -128,15 +204,7 @@ def _show_window(sim: Simulator, settings: RunSettings, shown: DisplayOptions) -
     return 0
 
 
-def _run(
-    sim: Simulator,
-    settings: RunSettings,
-    arguments: Namespace,
-    signals: Signals,
-    warned: list[str],
-    saved: Checkpoint | None,
-    shown: DisplayOptions,
-) -> int:
+def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], saved, shown: DisplayOptions) -> int:
     """Run until settings.seconds; save what was computed, however the run ends."""
     observers, recording, resumed, notes = Observers(), None, None, {}
     plots = Plots(sim, shown.plots) if shown.plots or shown.window else None
@@ -174,12 +242,12 @@ def _run(
         result.problems[:0] = [f"warning: {text}" for text in warned]
         _report_failed_output(result, observers, signals)
         if recording is not None:
-            reported = observers.guard(recording.report, result, sim, settings)
+            reported = observers.guard(recording.report, result, sim, settings.as_dict())
             video = arguments.video and not signals.requested()
             video_written = not video or observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
             _report_failed_output(result, observers, signals)
             if reported and not video_written:
-                observers.guard(recording.report, result, sim, settings)  # again, with the video's errors
+                observers.guard(recording.report, result, sim, settings.as_dict())  # again, with the video's errors
         print_summary(result, sim, observers, recording)
     for error in observers.errors:
         print(f"taisoft: {error}", file=sys.stderr)

@@ -19,8 +19,10 @@ from taisoft.errors import MeshError, SceneError
 from taisoft.scene.checks import nearest
 from taisoft.scene.refine import refined, with_order
 from taisoft.scene.scene import Scene
+from taisoft.scene.solver import CHECKS, check_solver
 
 PACKAGE = Path(__file__).resolve().parents[1]
+OF_SCENE = "the scene's solver dict: "
 
 
 def shipped_files(folder: str) -> dict[str, Path]:
@@ -125,6 +127,22 @@ def _load(name: str, allow_outside: bool, requested: dict) -> tuple[Scene, dict,
     if not isinstance(solver, dict) or not all(isinstance(key, str) for key in solver):
         raise SceneError(f"{path}: solver must be a dict of Simulator arguments")
     return scene, dict(solver), set(passed)
+
+
+def check_scene_solver(solver: dict) -> None:
+    """Raise SceneError if a scene's `solver` dict has unknown keys or invalid values."""
+    refuse_unknown(solver, list(CHECKS), OF_SCENE)
+    try:
+        check_solver(**solver)
+    except SceneError as error:
+        raise SceneError(f"{OF_SCENE}{error}") from None
+
+
+def refuse_unknown(names, keys: list[str], where: str) -> None:
+    """Raise SceneError if one of the names is no key of a `solver` dict. where: start of the message."""
+    for name in names:
+        if name not in keys:
+            raise SceneError(f"{where}no setting is called {name!r}{nearest(name, keys)}; there are {', '.join(keys)}")
 
 
 def load_module(path: Path) -> ModuleType:

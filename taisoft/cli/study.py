@@ -10,9 +10,8 @@ from contextlib import ExitStack, closing
 from dataclasses import fields
 from pathlib import Path
 
-from taisoft.cli import EXIT_FAILED, EXIT_SIGNAL, Interrupted, Signals
-from taisoft.cli.scene_file import find_scene, load_scene
-from taisoft.cli.settings import check_scene_solver, parse_scalar
+from taisoft.cli import EXIT_FAILED, EXIT_SIGNAL, Interrupted, Signals, parse_scalar
+from taisoft.cli.scene_file import check_scene_solver, find_scene, load_scene
 from taisoft.errors import SceneError, TaisoftError
 from taisoft.output.files import FolderLock, check_free, make_folder
 from taisoft.output.report import machine
