@@ -122,13 +122,10 @@ class Planner:
         base = self._scene((0, None))
         found = cases(expand(complete(self._request["axes"], self._solver)), self.refusal, self.unused)
         settings = [case.setting for case in found if not case.refused]
-        seconds = self._request["seconds"] or self._solver.get("seconds", 1.0)
         plan = {
             "fixed": self.fixed,
-            "seconds": seconds,
             "cases": [asdict(case) for case in found],
             "touching": self._touches(base),
-            "names": [body.name for body in base.bodies],
             "frame": None,
             "frames": 0,
             "references": [],
@@ -137,6 +134,7 @@ class Planner:
         }
         if settings:
             target = self._request["reference_dt"] or min(s.dt for s in settings) / DT_RATIO
+            seconds = self._request["seconds"] or self._solver.get("seconds", 1.0)
             frame, frames = frame_time([*(s.dt for s in settings), 2.0 * target], seconds)
             plan |= {"frame": frame, "frames": frames} | self._references(settings, target, frame)
         return plan
