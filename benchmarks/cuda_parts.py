@@ -11,7 +11,7 @@ from taisoft import simulator
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import TaisoftError
 from taisoft.scene.scene import Scene
-from taisoft.study.timed_run import advance, warm_up
+from taisoft.study.measure import advance, warm_up
 
 from .contact_captured import patched
 from .contact_crossover import measure_crossover

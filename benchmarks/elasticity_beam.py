@@ -11,7 +11,7 @@ import taisoft as ts
 from taisoft.output.report import peak_memory
 from taisoft.scene.scene import Scene
 from taisoft.stability import stable_dt
-from taisoft.study.timed_run import TimedRun, advance, warm_up
+from taisoft.study.measure import TimedRun, advance, warm_up
 
 from .exact_path import DENSITY, GRAVITY, POISSON, SAMPLE, SIZE, YOUNG
 

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 import taisoft as ts
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.output.tables import markdown, percent, spread_of
-from taisoft.study.timed_run import warm_up
+from taisoft.study.measure import warm_up
 from taisoft.timing import Timing, summarise
 
 from .elasticity_beam import beam_scene, n_tets

@@ -16,7 +16,7 @@ import taisoft as ts
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import SimulationError
 from taisoft.scene.scene import Scene
-from taisoft.study.timed_run import TimedRun, advance, warm_up
+from taisoft.study.measure import TimedRun, advance, warm_up
 from taisoft.timing import Timing, summarise
 
 from .elasticity_beam import MARGIN, beam_scene, explicit_steps, follow_tip, n_tets

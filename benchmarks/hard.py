@@ -21,11 +21,11 @@ import time
 from contextlib import ExitStack, closing
 from pathlib import Path
 
-from taisoft.cli.signals import Signals
-from taisoft.cli.study_child import serve
+from taisoft.cli import Signals
 from taisoft.errors import OutputError
 from taisoft.output.files import FolderLock, make_folder
-from taisoft.study.store import NoStore, Store
+from taisoft.study.output import NoStore, Store
+from taisoft.study.workers import serve
 from taisoft.timing import load_average
 
 from .document import RESULTS, Document, check_out, default_out, header, header_text

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from taisoft.study.store import NoStore, Store, code_digest, digest, pack, unpack
+from taisoft.study.accuracy import pack, unpack
+from taisoft.study.output import NoStore, Store, code_digest, digest
 from taisoft.study.workers import LocalPlace, carry_out
 from taisoft.timing import machine, usable_cores
 

@@ -19,7 +19,7 @@ from taisoft.backend.fields import FieldArena
 from taisoft.backend.runtime import Runtime, compile_clock
 from taisoft.errors import SimulationError, TaisoftError
 from taisoft.static import StaticSolver
-from taisoft.study.timed_run import TimedRun, advance
+from taisoft.study.measure import TimedRun, advance
 from taisoft.timing import Timing, summarise, time_repeats
 
 from .order_cases import Case, Element, Reference, mesh_name

@@ -31,7 +31,7 @@ from taisoft.fem.terms.elasticity import HUGE, element_force
 from taisoft.linear import block_csr, pcg
 from taisoft.output.report import peak_memory
 from taisoft.scene.scene import Scene
-from taisoft.study.timed_run import advance, warm_up
+from taisoft.study.measure import advance, warm_up
 from taisoft.timing import Timing, summarise
 
 from .collision_cases import pile_setup, two_cubes

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from taisoft.cli import study_child
+from taisoft.cli.study import answer
 from taisoft.output.report import json_text
-from taisoft.study.store import pack
+from taisoft.study.accuracy import pack
 
 
 class InProcess:
@@ -20,7 +20,7 @@ class InProcess:
 
     def start(self, request: dict) -> None:
         self.requests.append(request)
-        self._answer = json.loads(json_text(study_child._answer(request)))
+        self._answer = json.loads(json_text(answer(request)))
 
     def poll(self) -> dict | None:
         answer, self._answer = self._answer, None
@@ -42,7 +42,7 @@ class Pendulum(InProcess):
 
     def start(self, request: dict) -> None:
         self.requests.append(request)
-        if request["do"] == "plan":
+        if request["action"] == "plan":
             self._answer = {"answer": self.plan}
             return
         dt = request["task"]["setting"]["dt"]

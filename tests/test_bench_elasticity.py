@@ -24,7 +24,7 @@ from benchmarks.exact_path import SAMPLE, FallingBeam, load_exact
 from taisoft.errors import OutputError, SimulationError
 from taisoft.fem.mass import lumped_masses
 from taisoft.output.tables import markdown
-from taisoft.study.timed_run import TimedRun, advance
+from taisoft.study.measure import TimedRun, advance
 
 CELLS = (12, 3, 3)
 TINY = elasticity.Extent(meshes=(CELLS,), precisions=("f32",), repeats=2, rounds=(2,), seconds=0.02)

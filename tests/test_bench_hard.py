@@ -44,7 +44,7 @@ from benchmarks.hard_cases.case import (
 from benchmarks.hard_runs import Row, find
 from taisoft.errors import SimulationError
 from taisoft.records import RunReport, StepReport
-from taisoft.study.store import pack
+from taisoft.study.accuracy import pack
 
 CATALOGUE = Path(__file__).resolve().parents[2] / "shared" / "hard_cases" / "catalogue.json"
 CHEAP = ("M1", "M2", "T1", "G1")  # whose quick variants have no contacts and take explicit steps: little to compile

@@ -14,7 +14,8 @@ import pytest
 from command import BEAM, ROOT, child, run, write
 
 import taisoft as ts
-from taisoft.cli import main, scene_file, settings
+from taisoft.cli import main, parse_scalar, scene_file
+from taisoft.cli.run import resolve
 from taisoft.errors import SceneError
 
 
@@ -118,19 +119,19 @@ def test_what_argparse_refuses(arguments, capsys):
     [("0.01", 0.01), ("1", 1), ("true", True), ("bdf2", "bdf2"), ('"bdf2"', "bdf2"), ("none", None), ("1e-3", 1e-3)],
 )
 def test_scalars(text, value):
-    parsed = settings.parse_scalar(text, "solver.x=" + text)
+    parsed = parse_scalar(text, "solver.x=" + text)
     assert parsed == value and type(parsed) is type(value)
 
 
 @pytest.mark.parametrize("text", ["", "[1]", "{a = 1}", "1\nb = 2", "1 2", "2020-01-01", "a-b", "__import__('os')"])
 def test_what_is_no_scalar(text):
     with pytest.raises(SceneError):
-        settings.parse_scalar(text, "solver.x=" + text)
+        parse_scalar(text, "solver.x=" + text)
 
 
 def test_options_win_over_set_and_set_over_the_scene():
     arguments = Namespace(arch=None, precision="f64", seconds=2.0, fps=None, assignments=["solver.dt=0.5", "solver.fps=none"])
-    resolved = settings.resolve({"dt": 0.1, "precision": "f32", "seconds": 1.0, "fps": 30}, arguments, FakeSimulator)
+    resolved = resolve({"dt": 0.1, "precision": "f32", "seconds": 1.0, "fps": 30}, arguments, FakeSimulator)
     assert resolved.simulator == {"dt": 0.5, "precision": "f64"}
     assert (resolved.seconds, resolved.fps) == (2.0, None)
     expected = {"dt": 0.5, "arch": "cpu", "precision": "f64", "newton_tolerance": None, "seconds": 2.0, "fps": None}

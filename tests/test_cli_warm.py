@@ -17,9 +17,9 @@ from command import ROOT
 
 import taisoft as ts
 from taisoft.backend.runtime import n_compiled
-from taisoft.cli import main, warm, warm_scenes
+from taisoft.cli import main, warm
 from taisoft.cli.scene_file import load_scene, shipped_files
-from taisoft.cli.warm_scenes import Structure, build, static_structures, structures
+from taisoft.cli.warm import Structure, build, static_structures, structures
 from taisoft.collision.surface import SERIAL_BELOW
 from taisoft.dynamics.elimination import solve_on
 from taisoft.dynamics.schemes import EXPLICIT
@@ -70,14 +70,14 @@ def covered() -> set:
 @pytest.mark.parametrize("name", shipped_files("demos"))
 def test_every_demo_is_in_the_table(name, covered):
     scene, solver = load_scene(name)
-    assert key(scene, **{"integrator": "implicit_euler"} | solver) in covered, "add its Structure to warm_scenes.structures"
+    assert key(scene, **{"integrator": "implicit_euler"} | solver) in covered, "add its Structure to warm.structures"
 
 
 def test_demos_compile_nothing_afterwards(tmp_path):
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
     code = (
-        "import test_cli_warm as t\nfrom taisoft.cli import main, warm_scenes\n"
-        "warm_scenes.structures, warm_scenes.static_structures = t.DEMOS.values, tuple\nmain(['warm'])"
+        "import test_cli_warm as t\nfrom taisoft.cli import main, warm\n"
+        "warm.structures, warm.static_structures = t.DEMOS.values, tuple\nmain(['warm'])"
     )
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert len(done.stdout.splitlines()) == len(DEMOS) + 1 and done.stderr == ""
@@ -127,8 +127,8 @@ def test_scenes_have_what_they_say(structure):
 @pytest.mark.parametrize("requested, simulated, static", [(None, "f32", "f64"), ("f32", "f32", "f32"), ("f64", "f64", "f64")])
 def test_precisions(requested, simulated, static, monkeypatch, capsys):
     structure, found = Structure("implicit_euler", fixed=True), []
-    monkeypatch.setattr(warm_scenes, "structures", lambda: [structure])
-    monkeypatch.setattr(warm_scenes, "static_structures", lambda: [structure])
+    monkeypatch.setattr(warm, "structures", lambda: [structure])
+    monkeypatch.setattr(warm, "static_structures", lambda: [structure])
     monkeypatch.setattr(warm, "simulate", lambda structure, precision: found.append(precision))
     monkeypatch.setattr(warm, "solve", lambda structure, precision: found.append(precision))
     assert main(["warm", *(["--precision", requested] if requested else [])]) == 0

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from toml_scenes import TURNED, floats, there_and_back
 
 import taisoft as ts
+from taisoft.cli.run import RUN_KEYS
 from taisoft.cli.scene_file import load_module, shipped_files
-from taisoft.cli.settings import RUN_KEYS
 from taisoft.scene.solver import CHECKS
 
 DEMOS = shipped_files("demos")

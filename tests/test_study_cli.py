@@ -23,6 +23,7 @@ from taisoft.cli import main
 from taisoft.cli import study as study_command
 from taisoft.cli.study import check_device
 from taisoft.errors import SceneError
+from taisoft.study import workers
 from taisoft.timing import usable_cores
 
 
@@ -61,9 +62,8 @@ def test_a_folder_with_results_of_a_run_is_left_alone(beam, tmp_path, capsys):
 
 
 def test_no_scheduler(beam, capsys, monkeypatch):
-    cluster = pytest.importorskip("taisoft.study.cluster")
     pytest.importorskip("distributed")
-    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.3)
+    monkeypatch.setattr(workers, "CONNECT_SECONDS", 0.3)
     assert study(beam, "--scheduler", "tcp://127.0.0.1:9") == 2
     assert "no Dask scheduler answers there" in capsys.readouterr().err
 
@@ -148,7 +148,7 @@ def test_interrupted_then_killed_a_study_goes_on(tmp_path, capsys):
 
     process = child("study", *arguments)
     printed, told = process.communicate(timeout=200)
-    assert process.returncode == 0 and f"{len(second)} of them done before" in told
+    assert process.returncode == 0 and f"{len(second)} of them already done" in told
     last = records(out)
     assert len(last) == 4 and all(last[name] == at for name, at in second.items()) and first.items() <= second.items()
     record = json.loads((out / "study.json").read_text())

@@ -18,8 +18,7 @@ from study_places import is_running
 pytest.importorskip("distributed")
 
 from taisoft.cli import main
-from taisoft.study.cluster import cluster_places, connect
-from taisoft.study.workers import BUDGET_SPENT, CUT_BY_BUDGET, carry_out
+from taisoft.study.workers import BUDGET_SPENT, CUT_BY_BUDGET, carry_out, cluster_places, connect
 from taisoft.timing import usable_cores
 
 SLOW = "import os, time\n\n\ndef build():\n    open({file!r}, 'a').write(f'{{os.getpid()}}\\n')\n    time.sleep(300)\n"
@@ -71,7 +70,7 @@ def test_workers_have_cores_of_their_own_and_can_be_lost(cluster, tmp_path):
     address, processes = cluster
     pids = tmp_path / "pids"
     path = write(tmp_path / "slow.py", SLOW.format(file=str(pids)))
-    request = {"do": "plan", "scene": str(path), "allow_outside": False, "request": {}}
+    request = {"action": "plan", "scene": str(path), "allow_outside": False, "request": {}}
     with connect(address) as client:
         places, machines = cluster_places(client)
         assert len(places) == 2 and len(machines) == 1

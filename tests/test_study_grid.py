@@ -6,13 +6,15 @@ import pytest
 
 from taisoft.cli.study import values_of
 from taisoft.errors import SceneError
-from taisoft.study.grid import AXES, MAX_FRAMES, Setting, cases, complete, expand, frame_time, steps_in, tasks_of
+from taisoft.study import AXES, Setting
+from taisoft.study.plan import MAX_FRAMES, cases, complete, expand, frame_time
+from taisoft.study.runner import Task, steps_in, tasks_of
 
 EXPLICIT = ("symplectic_euler", "velocity_verlet")
 
 
 def test_the_product_of_all_axes():
-    axes = complete({"dt": [0.01, 0.02], "precision": ["f32", "f64"], "refine": [0, 1]}, {"integrator": "bdf2"}, EXPLICIT)
+    axes = complete({"dt": [0.01, 0.02], "precision": ["f32", "f64"], "refine": [0, 1]}, {"integrator": "bdf2"})
     settings = expand(axes)
     assert len(settings) == len(set(settings)) == 2 * 2 * 2 * 2  # bdf2 and implicit_euler
     assert [s.dt for s in settings[:2]] == [0.02, 0.01] and {s.precision for s in settings} == {"f32", "f64"}
@@ -22,17 +24,17 @@ def test_the_product_of_all_axes():
 
 def test_what_is_not_given_is_the_scenes():
     solver = {"dt": 0.01, "integrator": "velocity_verlet", "contact_tolerance": 1e-3, "seconds": 2.0, "self_collision": True}
-    axes = complete({}, solver, EXPLICIT)
+    axes = complete({}, solver)
     assert set(axes) == set(AXES) and axes["contact_tolerance"] == [1e-3] and axes["precision"] == ["f32"]
     assert axes["integrator"] == ["velocity_verlet", "implicit_euler", "bdf2"]
     assert min(axes["dt"]) == 0.005 and max(axes["dt"]) == 0.16  # implicit steps are larger
-    assert max(complete({}, {}, EXPLICIT)["dt"]) == 1 / 30
-    assert complete({"integrator": ["bdf2"]}, solver, EXPLICIT)["integrator"] == ["bdf2"]
+    assert max(complete({}, {})["dt"]) == 1 / 30
+    assert complete({"integrator": ["bdf2"]}, solver)["integrator"] == ["bdf2"]
 
 
 def test_refused_and_equal_ones_stay_in_the_list():
     given = {"dt": [0.02, 0.01], "integrator": ["velocity_verlet", "bdf2"], "newton_tolerance": [None, 1e-3]}
-    settings = expand(complete(given, {}, ()))
+    settings = expand(complete(given, {}))
     explicit = [s for s in settings if s.integrator in EXPLICIT]
 
     def refusal(setting: Setting) -> str:
@@ -79,8 +81,8 @@ def test_a_reference_is_two_runs():
     one, refused = ({"setting": {"dt": dt}, "refused": why} for dt, why in ((0.05, ""), (0.1, "too large")))
     plan = {"frame": 0.1, "references": [{"setting": {"dt": 0.01}, "steps": 10}], "cases": [refused, one]}
     references, settings = tasks_of(plan)
-    assert [(t["steps"], t["setting"]["dt"], t["timed"]) for t in references] == [(10, 0.01, False), (5, 0.02, False)]
-    assert settings == [{"setting": {"dt": 0.05}, "steps": 2, "timed": True}]
+    assert [(t.steps, t.setting["dt"], t.timed) for t in references] == [(10, 0.01, False), (5, 0.02, False)]
+    assert settings == [Task({"dt": 0.05}, steps=2, timed=True)]
 
 
 @pytest.mark.parametrize(

@@ -16,13 +16,11 @@ import pytest
 from study_places import Pendulum
 
 from taisoft.errors import OutputError
-from taisoft.study import store
-from taisoft.study.grid import Setting
-from taisoft.study.output import check_scene, write
-from taisoft.study.results import Request
+from taisoft.study import Request, Setting, output
+from taisoft.study.accuracy import pack, unpack
+from taisoft.study.output import NoStore, Store, check_scene, write
+from taisoft.study.results import csv_of, text_of
 from taisoft.study.runner import Runner
-from taisoft.study.store import NoStore, Store, pack, unpack
-from taisoft.study.table import csv_of, text_of
 from taisoft.timing import versions
 
 DTS = (0.2, 0.1, 0.05)
@@ -169,7 +167,7 @@ def test_finished_runs_are_found_again(tmp_path):
     first = run(Pendulum(plan()), Store(tmp_path))
     place = Pendulum(plan())
     again = run(place, Store(tmp_path))
-    assert [request["do"] for request in place.requests] == ["plan"]
+    assert [request["action"] for request in place.requests] == ["plan"]
     assert text_of(again) == text_of(first)
     assert not list(tmp_path.rglob("*.part"))
 
@@ -197,7 +195,7 @@ def test_the_order_in_which_machines_are_told_does_not_count(tmp_path):
     run(Pendulum(plan()), Store(tmp_path), machines=machines)
     place = Pendulum(plan())
     run(place, Store(tmp_path), machines=machines[::-1])
-    assert [request["do"] for request in place.requests] == ["plan"]
+    assert [request["action"] for request in place.requests] == ["plan"]
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "other", "empty"])
@@ -269,8 +267,8 @@ def test_a_folder_takes_a_study_of_its_own_scene_alone(tmp_path):
 
 
 def test_code_is_of_the_packages_that_compute_too(monkeypatch):
-    own = store.code_digest()
-    assert store.code_digest() == own
+    own = output.code_digest()
+    assert output.code_digest() == own
     for other in ({"taichi": "9.9"}, {"numpy": "9.9"}):
-        monkeypatch.setattr(store, "versions", lambda *names, other=other: versions(*names) | other)
-        assert store.code_digest() != own
+        monkeypatch.setattr(output, "versions", lambda *names, other=other: versions(*names) | other)
+        assert output.code_digest() != own

@@ -16,10 +16,8 @@ from study_places import InProcess
 
 from taisoft.errors import SceneError
 from taisoft.simulator import Simulator
-from taisoft.study import measure
-from taisoft.study.grid import tasks_of
-from taisoft.study.results import Request
-from taisoft.study.runner import Runner
+from taisoft.study import Request, measure
+from taisoft.study.runner import Runner, tasks_of
 from taisoft.study.workers import LocalPlace, carry_out, local_places
 from taisoft.timing import usable_cores
 
@@ -136,7 +134,7 @@ def test_a_change_of_a_neighbour_or_of_a_refined_mesh_is_another_run(tmp_path):
     length.write_text("2.5")
     other = runner.plan()
     changed = [runner._key(first, task) != runner._key(other, task) for task in sum(tasks_of(first), [])]
-    assert changed == [bool(task["setting"]["refine"]) for task in sum(tasks_of(first), [])] and any(changed)
+    assert changed == [bool(task.setting["refine"]) for task in sum(tasks_of(first), [])] and any(changed)
 
     (tmp_path / "neighbour_of_a_study.py").write_text("YOUNG = 1e6")
     edited = runner.run(other)  # refused before anything is run
@@ -164,7 +162,7 @@ def answers_of(requests: list, places: list) -> dict:
 
 
 def request(path) -> dict:
-    return {"do": "plan", "scene": str(path), "allow_outside": False, "request": {}}
+    return {"action": "plan", "scene": str(path), "allow_outside": False, "request": {}}
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system pins no process")

@@ -7,7 +7,7 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.scene.scene import Scene
-from taisoft.study.timed_run import TimedRun, advance, warm_up
+from taisoft.study.measure import TimedRun, advance, warm_up
 
 from ..elasticity_runs import lasting_steps
 from ..exact_path import DENSITY, POISSON, SAMPLE

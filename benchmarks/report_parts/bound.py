@@ -14,7 +14,7 @@ import numpy as np
 import taisoft as ts
 from taisoft.errors import SimulationError
 from taisoft.output.tables import markdown
-from taisoft.study.timed_run import advance
+from taisoft.study.measure import advance
 
 from ..fit import exponent
 from .page import COLOURS, Claim, Extent, Part, is_near, new_figure, plot_png

@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 
 from taisoft.errors import TaisoftError
-from taisoft.study.pareto import cheapest
+from taisoft.study.results import cheapest
 from taisoft.timing import Timing, summarise
 
 from ..elasticity_runs import TAISOFT as OWN

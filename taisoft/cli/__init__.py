@@ -1,4 +1,4 @@
-"""The command `taisoft`: parses arguments and returns an exit status. Each command has its own module in this package.
+"""The command `taisoft`: parses arguments, handles signals and warnings, and returns an exit status.
 
 Exit status: 0 the run is ok or degraded, 1 the run failed, 2 bad input (refused before any file is written), 3 output
 could not be written, 130 ended by SIGINT, 143 ended by SIGTERM.
@@ -6,17 +6,26 @@ could not be written, 130 ended by SIGINT, 143 ended by SIGTERM.
 
 import argparse
 import os
+import re
+import signal
 import sys
+import tomllib
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields
 from importlib import import_module
 
 from taisoft import __version__
-from taisoft.cli.signals import Interrupted
-from taisoft.errors import OutputError, TaisoftError, no_memory
+from taisoft.errors import OutputError, SceneError, TaisoftError, no_memory
+from taisoft.study import Request, Setting
 
 EXIT_FAILED = 1
 EXIT_BAD_INPUT = 2
 EXIT_OUTPUT = 3
 EXIT_SIGNAL = 128  # plus the signal's number: 130, 143
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+BARE_WORD = re.compile(r"[A-Za-z_]\w*")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -28,7 +37,8 @@ def main(argv: list[str] | None = None) -> int:
     """
     arguments = _parser().parse_args(argv)
     try:
-        return import_module(f"taisoft.cli.{arguments.command}").command(arguments)
+        module, function = arguments.command
+        return getattr(import_module(f"taisoft.cli.{module}"), function)(arguments)
     except TaisoftError as error:
         print(f"taisoft: {error}", file=sys.stderr)
         return EXIT_OUTPUT if isinstance(error, OutputError) else EXIT_BAD_INPUT
@@ -44,150 +54,194 @@ def main(argv: list[str] | None = None) -> int:
         return EXIT_OUTPUT
 
 
+class Interrupted(BaseException):
+    """A signal arrived when there was nothing to save, so the command just exits."""
+
+    def __init__(self, signal_number: int):
+        super().__init__(signal_number)
+        self.signal_number = signal_number
+
+
+class Signals:
+    """Handles SIGINT and SIGTERM while a command runs; restores the old handlers afterwards.
+
+    `number` is the first signal's number, or None. Before `run_began()` a signal raises Interrupted, because there is
+    nothing to save yet. After it, a signal makes `requested()` return True, and the run should end and save its results.
+    ending: message printed at the first signal.
+    """
+
+    def __init__(self, ending: str = "ending after the current step and saving") -> None:
+        self._ending = ending
+        self.number: int | None = None
+        self._running = False
+        self._old_handlers: dict = {}
+
+    def __enter__(self) -> "Signals":
+        self._old_handlers = {number: signal.signal(number, self._handle) for number in SIGNALS}
+        return self
+
+    def __exit__(self, *_) -> None:
+        for number, handler in self._old_handlers.items():
+            signal.signal(number, handler)
+
+    def run_began(self) -> None:
+        """Make the first signal only request the run to end."""
+        self._running = True
+
+    def requested(self) -> bool:
+        """Return whether a signal has requested the run to end."""
+        return self.number is not None
+
+    def _handle(self, number: int, _frame) -> None:
+        if not self._running:
+            raise Interrupted(number)
+        if self.number is not None:
+            os._exit(128 + number)  # files are written by rename, so exiting here leaves none incomplete
+        self.number = number
+        # os.write, because print is not reentrant
+        os.write(2, f"\ntaisoft: {self._ending}; a second signal exits immediately\n".encode())
+
+
+@contextmanager
+def printed_warnings() -> Iterator[list[str]]:
+    """Print each warning as one sentence; yield the list of their texts, which goes into the report."""
+    texts: list[str] = []
+
+    def show(message, category, filename, lineno, file=None, line=None) -> None:
+        is_ours = category is UserWarning
+        text = str(message) if is_ours else f"{filename}, line {lineno}: {category.__name__}: {message}"
+        texts.append(text)
+        print(f"taisoft: warning: {text}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = show
+        yield texts
+
+
+def parse_scalar(text: str, assignment: str, option: str = "--set") -> float | int | bool | str | None:
+    """Parse a number, true, false or "text" in TOML syntax; a bare word is text, and none is None."""
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        if not BARE_WORD.fullmatch(text):
+            raise SceneError(f"{option} {assignment}: {text!r} is not a number, true, false, none or a word") from None
+        return None if text == "none" else text
+    if set(table) != {"value"} or not isinstance(table["value"], (float, int, bool, str)):
+        raise SceneError(f"{option} {assignment}: {text!r} is not a single number, true, false, none or a word")
+    return table["value"]
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="taisoft", description="Elastic soft bodies in Taichi.", allow_abbrev=False)
     parser.add_argument("--version", action="version", version=f"taisoft {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
-    _add_run(commands)
-    _add_scene(commands)
-    _add_study(commands)
+    def add(name: str, function: tuple[str, str], help_text: str, **options) -> argparse.ArgumentParser:
+        """Add a command. function: its module in this package, and its name there."""
+        command = commands.add_parser(name, help=help_text, allow_abbrev=False, **options)
+        command.set_defaults(command=function)
+        return command
 
-    listed = commands.add_parser("list", help="the demos, one line each")
-    listed.set_defaults(command="listing")
+    _add_run(add)
+    option = add("scene", ("files", "scene"), "write a scene, or a starting scene for a mesh, as a .toml file").add_argument
+    _add_scene_name(option, "a .toml or .py file, or a mesh (.msh, .vtu, .vtk, .mesh, .node) that falls on the ground")
+    option("--out", metavar="FILE", required=True, help="the .toml file; its meshes are written beside it")
+    option("--overwrite", action="store_true", help="replace existing files")
 
-    mesh_info = commands.add_parser("info", help="report a mesh file's counts, size, quality and problems")
-    mesh_info.add_argument("mesh", metavar="MESH", help="tetrahedra in any format that meshio reads, or a surface")
-    mesh_info.set_defaults(command="info")
+    _add_study(add)
+    add("list", ("scene_file", "list_demos"), "the demos, one line each")
 
-    tets = commands.add_parser("tetrahedralize", help="fill a surface with tets (extra 'mesh')", allow_abbrev=False)
-    tets.add_argument("surface", metavar="SURFACE", help="an .obj, .stl, .ply or .off file of triangles")
-    tets.add_argument("--out", metavar="MESH", required=True, help="the mesh file: .msh, .vtk, .vtu or .mesh")
-    tets.add_argument("--edge-length", type=float, metavar="L", help="of the tets [m] (default: a twentieth of the diagonal)")
-    tets.add_argument("--envelope", type=float, metavar="E", help="how far the surface may move [m] (default: L / 10)")
-    tets.add_argument("--weld", type=float, default=0.0, metavar="D", help="merge vertices at most this far apart [m]")
-    tets.add_argument("--overwrite", action="store_true", help="replace MESH if it exists")
-    tets.set_defaults(command="tetrahedralize")
+    option = add("info", ("files", "info"), "report a mesh file's counts, size, quality and problems").add_argument
+    option("mesh", metavar="MESH", help="tetrahedra in any format that meshio reads, or a surface")
 
-    doctor_parser = commands.add_parser("doctor", help="report what this machine offers, and how to get what is missing")
-    doctor_parser.set_defaults(command="doctor")
+    option = add("tetrahedralize", ("files", "fill"), "fill a surface with tets (extra 'mesh')").add_argument
+    option("surface", metavar="SURFACE", help="an .obj, .stl, .ply or .off file of triangles")
+    option("--out", metavar="MESH", required=True, help="the mesh file: .msh, .vtk, .vtu or .mesh")
+    option("--edge-length", type=float, metavar="L", help="of the tets [m] (default: a twentieth of the diagonal)")
+    option("--envelope", type=float, metavar="E", help="how far the surface may move [m] (default: L / 10)")
+    option("--weld", type=float, default=0.0, metavar="D", help="merge vertices at most this far apart [m]")
+    option("--overwrite", action="store_true", help="replace MESH if it exists")
 
-    warm = commands.add_parser(
+    add("doctor", ("doctor", "doctor"), "report what this machine offers, and how to get what is missing")
+
+    option = add(
         "warm",
-        help="compile the kernels of common scenes in advance",
+        ("warm", "warm"),
+        "compile the kernels of common scenes in advance",
         description="Compile the kernels of common scenes in advance, which takes a minute or two: the demos without pictures; "
         "each law in explicit, implicit_euler and bdf2 steps, with fixed nodes, on a half-space and between bodies; and for "
         "stable_neo_hookean statics, order 2, loads, prescribed nodes, damping, boxes and mesh obstacles, very flat tets, and "
         "surfaces of more than 1,500 triangles.",
-    )
-    warm.add_argument("--precision", choices=("f32", "f64"), help="of all kernels (default: simulations f32, statics f64)")
-    warm.set_defaults(command="warm")
+    ).add_argument
+    option("--precision", choices=("f32", "f64"), help="of all kernels (default: simulations f32, statics f64)")
 
-    bench_parser = commands.add_parser("bench", help="run a benchmark; without a name, list them", add_help=False)
-    bench_parser.add_argument("name", metavar="NAME", nargs="?", help="the benchmark's name")
-    bench_parser.add_argument("rest", nargs=argparse.REMAINDER, help="arguments of the benchmark itself")
-    bench_parser.set_defaults(command="bench")
+    option = add("bench", ("scene_file", "bench"), "run a benchmark; without a name, list them", add_help=False).add_argument
+    option("name", metavar="NAME", nargs="?", help="the benchmark's name")
+    option("rest", nargs=argparse.REMAINDER, help="arguments of the benchmark itself")
     return parser
 
 
-def _add_run(commands) -> None:
-    """Add the options of `taisoft run`; defaults are None to distinguish options given from those omitted."""
-    parser = commands.add_parser(
+def _add_run(add) -> None:
+    """Add `taisoft run`; defaults are None to distinguish options given from those omitted."""
+    option = add(
         "run",
-        help="run a scene: a demo's name, a .toml scene file or a .py file with build()",
+        ("run", "run"),
+        "run a scene: a demo's name, a .toml scene file or a .py file with build()",
         description="Run a scene and, with --out, write report.json, steps.csv, checkpoint.npz, frames/ and scene.usdc.",
-        allow_abbrev=False,
-    )
-    _add_scene_name(parser)
-    parser.add_argument("--arch", choices=("cpu", "cuda"), help="where to compute (default cpu)")
-    parser.add_argument("--precision", choices=("f32", "f64"), help="floating-point precision (default f32)")
-    parser.add_argument("--headless", action="store_true", help="open no window")
-    parser.add_argument("--seconds", type=float, metavar="T", help="simulated time [s] (default: the scene's, or 1)")
-    parser.add_argument("--fps", type=float, metavar="N", help="frames per simulated second (default: the scene's, or 60)")
-    parser.add_argument("--out", metavar="DIR", help="folder for the results; without it nothing is written")
-    parser.add_argument("--overwrite", action="store_true", help="replace results already in DIR")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        dest="assignments",
-        metavar="solver.KEY=VALUE",
-        help="a Simulator argument, e.g. solver.dt=0.01; may be repeated",
-    )
-    parser.add_argument(
-        "--resume", metavar="CHECKPOINT", help="continue a run of this scene from its checkpoint, until --seconds in total"
-    )
-    parser.add_argument(
-        "--checkpoint-every",
-        type=float,
-        metavar="T",
-        help="write DIR/checkpoint.npz every T of simulated time [s], not only at the end",
-    )
-    parser.add_argument("--video", action="store_true", help="also make video.mp4 from the pictures with ffmpeg (extra 'video')")
-    parser.add_argument("--no-usd", action="store_true", help="write no scene.usdc")
+    ).add_argument
+    _add_scene_name(option)
+    option("--arch", choices=("cpu", "cuda"), help="where to compute (default cpu)")
+    option("--precision", choices=("f32", "f64"), help="floating-point precision (default f32)")
+    option("--headless", action="store_true", help="open no window")
+    option("--seconds", type=float, metavar="T", help="simulated time [s] (default: the scene's, or 1)")
+    option("--fps", type=float, metavar="N", help="frames per simulated second (default: the scene's, or 60)")
+    option("--out", metavar="DIR", help="folder for the results; without it nothing is written")
+    option("--overwrite", action="store_true", help="replace results already in DIR")
+    assignment = {"action": "append", "default": [], "dest": "assignments", "metavar": "solver.KEY=VALUE"}
+    option("--set", **assignment, help="a Simulator argument, e.g. solver.dt=0.01; may be repeated")
+    option("--resume", metavar="CHECKPOINT", help="continue a run of this scene from its checkpoint, until --seconds in total")
+    every = "write DIR/checkpoint.npz every T of simulated time [s], not only at the end"
+    option("--checkpoint-every", type=float, metavar="T", help=every)
+    option("--video", action="store_true", help="also make video.mp4 from the pictures with ffmpeg (extra 'video')")
+    option("--no-usd", action="store_true", help="write no scene.usdc")
     colours = ("body", "stress", "stretch", "speed")
-    parser.add_argument("--colour", choices=colours, default="body", help="colouring of bodies in pictures and the window")
-    parser.add_argument(
-        "--layers", metavar="NAME,...", help="what they show besides bodies: wires, contacts, tractions, fixed_nodes, or none"
-    )
-    parser.add_argument(
-        "--plots", metavar="NAME,...", help="plots over time: energies, residuals, iterations, contacts, step_time"
-    )
-    parser.add_argument("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
-    parser.add_argument("--no-frames", action="store_true", help="write no pictures")
-    parser.set_defaults(command="run")
+    option("--colour", choices=colours, default="body", help="colouring of bodies in pictures and the window")
+    layers = "what they show besides bodies: wires, contacts, tractions, fixed_nodes, or none"
+    option("--layers", metavar="NAME,...", help=layers)
+    option("--plots", metavar="NAME,...", help="plots over time: energies, residuals, iterations, contacts, step_time")
+    option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
+    option("--no-frames", action="store_true", help="write no pictures")
 
 
-def _add_scene(commands) -> None:
-    """Add the options of `taisoft scene`."""
-    summary = "write a scene, or a starting scene for a mesh, as a .toml file"
-    parser = commands.add_parser("scene", help=summary, allow_abbrev=False)
-    _add_scene_name(parser, "a .toml or .py file, or a mesh (.msh, .vtu, .vtk, .mesh, .node) that falls on the ground")
-    parser.add_argument("--out", metavar="FILE", required=True, help="the .toml file; its meshes are written beside it")
-    parser.add_argument("--overwrite", action="store_true", help="replace existing files")
-    parser.set_defaults(command="scene")
-
-
-def _add_study(commands) -> None:
-    """Add the options of `taisoft study`; those of the grid are comma-separated lists."""
-    parser = commands.add_parser(
+def _add_study(add) -> None:
+    """Add `taisoft study`; the options of the grid are its axes."""
+    parser = add(
         "study",
-        help="run a scene over a grid of settings: speed against error",
+        ("study", "study"),
+        "run a scene over a grid of settings: speed against error",
         description="Run a scene over a grid of settings, each in its own process, against a reference. Lists are "
         "comma-separated; defaults are the scene's.",
-        allow_abbrev=False,
     )
-    _add_scene_name(parser)
+    option = parser.add_argument
+    _add_scene_name(option)
     grid = parser.add_argument_group("grid (comma-separated lists)")
-    for name, help_text in (
-        ("dt", "steps [s]"),
-        ("integrator", "names, such as bdf2"),
-        ("order", "of the elements of all bodies, 1 or 2"),
-        ("refine", "how many times every tet is divided into eight"),
-        ("precision", "f32, f64"),
-        ("newton-tolerance", "relative, or none: adaptive"),
-        ("linear-tolerance", "of conjugate gradients, relative, or none"),
-        ("contact-solver", "auto or a solver"),
-        ("contact-tolerance", "relative, or none"),
-        ("arch", "cpu, cuda"),
-    ):
-        grid.add_argument(f"--{name}", metavar="LIST", help=help_text)
-    parser.add_argument("--seconds", type=float, metavar="T", help="simulated time [s] (default: the scene's, or 1)")
-    parser.add_argument("--tolerance", type=float, default=0.01, metavar="X", help="acceptable error (default 0.01)")
-    parser.add_argument("--by", choices=("max", "rms"), default="max", help="error norm (default max)")
-    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="timed runs of each setting (default 3)")
-    parser.add_argument("--reference-dt", type=float, metavar="DT", help="(default: the smallest dt over 8)")
-    parser.add_argument("--reference-integrator", metavar="NAME", help="(default: one of second order that fits the scene)")
-    parser.add_argument(
-        "--reference-refine", type=int, default=0, metavar="N", help="refinements of the reference beyond the finest mesh"
-    )
-    parser.add_argument("--out", metavar="DIR", help="folder for the results; a study in it is continued")
-    parser.add_argument("--budget", type=float, default=600.0, metavar="SECONDS", help="wall time for all runs (default 600)")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes at a time, each on its own cores (default 1)")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="run on a Dask cluster, e.g. tcp://host:8786 (extra 'cluster')")
-    parser.set_defaults(command="study")
+    for axis in fields(Setting):
+        grid.add_argument(f"--{axis.name.replace('_', '-')}", metavar="LIST", help=axis.metadata["meaning"])
+    option("--seconds", type=float, metavar="T", help="simulated time [s] (default: the scene's, or 1)")
+    option("--tolerance", type=float, default=Request.tolerance, metavar="X", help="acceptable error (default %(default)s)")
+    option("--by", choices=("max", "rms"), default=Request.by, help="error norm (default %(default)s)")
+    option("--repeats", type=int, default=Request.repeats, metavar="N", help="timed runs of each setting (default %(default)s)")
+    option("--reference-dt", type=float, metavar="DT", help="(default: the smallest dt over 8)")
+    option("--reference-integrator", metavar="NAME", help="(default: one of second order that fits the scene)")
+    finer = "refinements of the reference beyond the finest mesh"
+    option("--reference-refine", type=int, default=Request.reference_refine, metavar="N", help=finer)
+    option("--out", metavar="DIR", help="folder for the results; a study in it is continued")
+    option("--budget", type=float, default=600.0, metavar="SECONDS", help="wall time for all runs (default 600)")
+    option("--workers", type=int, metavar="N", help="processes at a time, each on its own cores (default 1)")
+    option("--scheduler", metavar="ADDRESS", help="run on a Dask cluster, e.g. tcp://host:8786 (extra 'cluster')")
 
 
-def _add_scene_name(parser: argparse.ArgumentParser, others: str = "a .toml scene file or a .py file with build()") -> None:
-    parser.add_argument("scene", metavar="SCENE", help=f"a demo's name (see `taisoft list`), {others}")
-    parser.add_argument("--allow-outside", action="store_true", help="let a .toml file name mesh files outside its folder")
+def _add_scene_name(option, others: str = "a .toml scene file or a .py file with build()") -> None:
+    option("scene", metavar="SCENE", help=f"a demo's name (see `taisoft list`), {others}")
+    option("--allow-outside", action="store_true", help="let a .toml file name mesh files outside its folder")

@@ -22,7 +22,7 @@ VULKAN_PROBE = "from taichi._lib import core; print('vulkan', core.with_vulkan()
 PROBE_SECONDS = 60.0  # loading Taichi from a cold disk takes several seconds
 
 
-def command(_: Namespace) -> int:
+def doctor(_: Namespace) -> int:
     """Print one line per finding; always return 0, because a missing part is not an error."""
     lines = [
         ("taisoft", f"{__version__}, Python {platform.python_version()}"),

@@ -1,13 +1,14 @@
-"""Output of `taisoft run`: its observers and the folder of its results."""
+"""What `taisoft run` shows and writes: display options, observers of the frames, the folder of the results, the terminal."""
 
 import shlex
 import sys
+import textwrap
 import time
+from argparse import Namespace
+from dataclasses import dataclass
 from pathlib import Path
 
-from taisoft.cli.pictures import DisplayOptions
-from taisoft.cli.settings import RunSettings
-from taisoft.errors import OutputError
+from taisoft.errors import OutputError, SceneError
 from taisoft.output.checkpoint import CheckpointWriter
 from taisoft.output.files import RESULT_FILES, OutputFolder
 from taisoft.output.frames import FRAMES_NAME, FrameWriter
@@ -15,8 +16,76 @@ from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
 from taisoft.output.video import command, find_ffmpeg, picture_numbers, write_video
 from taisoft.records import RunReport
+from taisoft.running import dt_sentence
+from taisoft.scene.checks import nearest
+from taisoft.view.annotations import Annotations, text_missing
+from taisoft.view.layers import IN_PICTURES, IN_WINDOW, LAYERS
 from taisoft.view.offscreen import Offscreen
-from taisoft.view.plots import Plots
+from taisoft.view.plots import PLOTS, Plots
+
+WIDTH = 118  # of the terminal
+PROBLEMS_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class DisplayOptions:
+    """colour: as in `Offscreen`; layers: names, or None for the defaults; plots: names; caption: the scene's name, or None.
+
+    window, pictures, usd: whether there is a window, and what is written to the folder.
+    """
+
+    window: bool
+    pictures: bool
+    usd: bool
+    colour: str
+    layers: tuple[str, ...] | None
+    plots: tuple[str, ...]
+    caption: str | None
+
+    @property
+    def in_pictures(self) -> tuple[str, ...]:
+        """Layers of pictures."""
+        return IN_PICTURES if self.layers is None else self.layers
+
+    @property
+    def in_window(self) -> tuple[str, ...]:
+        """Layers of the window."""
+        return IN_WINDOW if self.layers is None else self.layers
+
+
+def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
+    """Return the requested display options. Raises SceneError for unknown names and for options that nothing would show."""
+    pictures = arguments.out is not None and not arguments.no_frames
+    layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS) or ()
+    requested = {"video": arguments.video, "caption": arguments.caption}
+    if not has_window:
+        requested |= {"layers": layers is not None, "plots": bool(plots)}
+    for option, given in requested.items():
+        if given and not pictures:
+            raise SceneError(f"--{option} needs --out, the folder to write to, and pictures, so it excludes --no-frames")
+    if pictures and (plots or arguments.caption) and text_missing():
+        raise SceneError(f"{'--plots' if plots else '--caption'}: {text_missing()}")
+    caption = Path(arguments.scene).stem if arguments.caption else None
+    return DisplayOptions(has_window, pictures, not arguments.no_usd, arguments.colour, layers, plots, caption)
+
+
+def _names(option: str, text: str | None, known) -> tuple[str, ...] | None:
+    """Return the comma-separated names in an option's value; `none` gives (), no value None. Raises SceneError."""
+    if text is None:
+        return None
+    names = tuple(name.strip() for name in text.split(",")) if text.strip() != "none" else ()
+    for name in names:
+        if name not in known:
+            hint = f"{nearest(name, known)}; there are {', '.join(known)}, and none"
+            raise SceneError(f"--{option} {text}: {name!r} is not a valid name{hint}")
+    return names
+
+
+def check_modelled(shown: DisplayOptions, sim) -> None:
+    """Raise SceneError for a layer or plot of a feature that sim does not model."""
+    if "contacts" in (shown.layers or ()) and not sim.plan.on["contact_forces"]:
+        raise SceneError(f"--layers contacts: contact forces are not modelled ({sim.plan.why('contact_forces')})")
+    Plots(sim, shown.plots)
 
 
 class Observers:
@@ -38,10 +107,6 @@ class Observers:
             if not self.errors:
                 self.guard(member.frame, sim, index)
         self.seconds += time.perf_counter() - start - (sim.compile_seconds - compiled)
-
-    def failed(self) -> bool:
-        """Return whether something could not be written."""
-        return bool(self.errors)
 
     def close(self) -> None:
         """Close all members, last first, even if some fail."""
@@ -76,33 +141,26 @@ class Recording:
         self.path, self._resumed, self._notes = Path(path), resumed, notes or {}
         self._checkpoints = CheckpointWriter(self._folder.path, every, None if resumed is None else resumed["checkpoint"])
 
-    def add_writers(
-        self,
-        observers: Observers,
-        sim,
-        fps: float | None,
-        with_usd: bool,
-        with_frames: bool,
-        shown: DisplayOptions,
-        plots: Plots | None,
-    ) -> None:
+    def add_writers(self, observers: Observers, sim, fps: float | None, shown: DisplayOptions, plots: Plots | None) -> None:
         """Add the writers of frames, USD and checkpoints to the observers.
 
         A resumed run that does not match the earlier USD file is refused before anything is removed.
         """
-        rate = fps or 1.0 / sim.dt
-        if with_usd:
-            folder, self_collision = self._folder.path, sim.settings.self_collision
-            usd = UsdWriter(folder, sim.scene, fps=rate, self_collision=self_collision, first=self._first or 0)
+        folder = self._folder.path
+        if shown.usd:
+            numbers = {"fps": fps or 1.0 / sim.dt, "self_collision": sim.settings.self_collision, "first": self._first or 0}
+            usd = UsdWriter(folder, sim.scene, **numbers)
             observers.members.append(usd)
             self._checkpoints.before = usd.flush
         if self._first is not None:
             self._folder.clear(self._first)
-        drawing = None
-        if with_frames:
+        drawing = annotate = None
+        if shown.pictures:
             drawing = Offscreen(sim.scene, colour=shown.colour, layers=shown.in_pictures)
             drawing.resume(self._notes.get("camera"))
-            observers.members.append(FrameWriter(self._folder.path, drawing, shown.annotate(plots, drawing.colouring)))
+            if shown.plots or shown.caption is not None:
+                annotate = Annotations(plots if shown.plots else None, shown.caption, drawing.colouring).draw
+            observers.members.append(FrameWriter(folder, drawing, annotate))
         self._checkpoints.notes = lambda: {"fps": fps, "camera": drawing.camera.distance if drawing else None}
         observers.members.append(self._checkpoints)
 
@@ -121,15 +179,14 @@ class Recording:
             return
         write_video(folder, fps)
 
-    def report(self, result: RunReport, sim, settings: RunSettings) -> None:
+    def report(self, result: RunReport, sim, settings: dict) -> None:
         """Write report.json and steps.csv, and remove files left by an earlier run. Raises OutputError."""
-        record = settings.as_dict() | {"dt": sim.dt}
         write_report(
             self._folder.path,
             result,
-            arch=record["arch"],
-            precision=record["precision"],
-            settings=record,
+            arch=settings["arch"],
+            precision=settings["precision"],
+            settings=settings | {"dt": sim.dt},
             plan=sim.plan.entries,
             resumed=self._resumed,
             bodies=body_records(sim.scene),
@@ -140,11 +197,9 @@ class Recording:
     def files(self) -> list[str]:
         """Return the contents of the folder: one text per file and one for all pictures."""
         paths = [path for path in (self.path / name for name in RESULT_FILES) if path.is_file()]
-        found = [f"{path} ({_size(path.stat().st_size)})" for path in paths]
-        pictures = list((self.path / FRAMES_NAME).glob("*.png"))
-        if pictures:
-            size = _size(sum(path.stat().st_size for path in pictures))
-            found.append(f"{self.path / FRAMES_NAME}/ ({len(pictures)} pictures, {size})")
+        found = [f"{path} ({_size([path])})" for path in paths]
+        if pictures := list((self.path / FRAMES_NAME).glob("*.png")):
+            found.append(f"{self.path / FRAMES_NAME}/ ({len(pictures)} pictures, {_size(pictures)})")
         return found
 
     def close(self) -> None:
@@ -152,5 +207,53 @@ class Recording:
         self._folder.close()
 
 
-def _size(n_bytes: int) -> str:
+def _size(paths: list[Path]) -> str:
+    n_bytes = sum(path.stat().st_size for path in paths)
     return f"{n_bytes / 1e6:.1f} MB" if n_bytes >= 1e5 else f"{n_bytes / 1e3:.1f} kB"
+
+
+def print_plan(sim) -> None:
+    """Print which features the scene needs, and why; report.json also says why the others are left out."""
+    on = [entry for entry in sim.plan.entries if entry["on"]]
+    off = [entry["feature"] for entry in sim.plan.entries if not entry["on"]]
+    width = max((len(entry["feature"]) for entry in on), default=0)
+    _print_lines("plan", [f"{entry['feature']:<{width}}  {entry['why']}" for entry in on])
+    _print_lines("left out", [", ".join(off) or "nothing"])
+
+
+def print_state(sim) -> None:
+    """Print time and energies of the simulator's current state."""
+    _print_lines("time", [f"{sim.time:.6g} s simulated in {sim.step_count} steps of {sim.dt:.6g} s"])
+    e = sim.energies()
+    _print_lines("energy", [f"kinetic {e.kinetic:.6g} J, elastic {e.elastic:.6g} J, gravity {e.gravity:.6g} J"])
+
+
+def print_summary(result: RunReport, sim, observers: Observers, recording: Recording | None) -> None:
+    """Print status and a changed dt, problems, time, smallest volume ratio, energies, files."""
+    print()
+    changed = dt_sentence(result)
+    early = ", ended early by a signal" if result.interrupted else ""
+    _print_lines("status", [f"{result.status}{early}{changed and '; ' + changed}"])
+    problems = [problem for problem in result.problems if not (changed and problem.startswith(f"note: {changed}"))]
+    for problem in problems[:PROBLEMS_SHOWN]:
+        _print_lines("problem", [problem])
+    if len(problems) > PROBLEMS_SHOWN:
+        _print_lines("", [f"and {len(problems) - PROBLEMS_SHOWN} more problems"])
+    print_state(sim)
+    output, compiling = f"{observers.seconds:.2f} s of it for output", f"{result.compile_seconds:.2f} s to compile"
+    _print_lines("wall", [f"{result.wall_seconds:.2f} s, {output}; plus {compiling}"])
+    if result.step_reports:
+        worst = min(result.step_reports, key=lambda report: report.min_volume_ratio)
+        _print_lines("min J", [f"{worst.min_volume_ratio:.4g} at {worst.time:.4g} s, {worst.n_inverted} tets inverted"])
+        divided = [report.substeps for report in result.step_reports if report.substeps > 1]
+        if divided:
+            _print_lines("substeps", [f"{len(divided)} steps were divided, into at most {max(divided)} substeps"])
+    if recording is not None:
+        _print_lines("files", recording.files())
+
+
+def _print_lines(name: str, texts: list[str]) -> None:
+    """Print texts in a column, the first one beside the name."""
+    for index, text in enumerate(texts):
+        first = f"{'' if index else name:<9}"
+        print(textwrap.fill(text, WIDTH, initial_indent=first, subsequent_indent=" " * 9, break_long_words=False))

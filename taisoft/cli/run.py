@@ -1,21 +1,30 @@
-"""`taisoft run SCENE`: load, check, build, run, save, report."""
+"""`taisoft run SCENE`: load, check, build, run, save, report.
 
+Settings come from the scene's `solver` dict, --set and the other options; the later ones override the earlier ones.
+"""
+
+import inspect
 import os
 import sys
 from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from taisoft.checkpoint import Checkpoint
-from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL
-from taisoft.cli.pictures import DisplayOptions, check_modelled, display_options
-from taisoft.cli.recording import Observers, Recording
-from taisoft.cli.scene_file import load_scene
-from taisoft.cli.settings import RunSettings, resolve, resolve_resumed
-from taisoft.cli.signals import Signals
-from taisoft.cli.summary import print_plan, print_state, print_summary
-from taisoft.cli.warnings import printed_warnings
+from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL, Signals, parse_scalar, printed_warnings
+from taisoft.cli.recording import (
+    DisplayOptions,
+    Observers,
+    Recording,
+    check_modelled,
+    display_options,
+    print_plan,
+    print_state,
+    print_summary,
+)
+from taisoft.cli.scene_file import OF_SCENE, load_scene, refuse_unknown
 from taisoft.errors import SceneError, SimulationError
 from taisoft.output.checkpoint import read_last_good
 from taisoft.output.files import check_free
@@ -28,17 +37,37 @@ from taisoft.simulator import Simulator
 from taisoft.view.ggui import display_missing, vulkan_missing
 from taisoft.view.plots import Plots
 
+RUN_KEYS = ("seconds", "fps")  # arguments of Simulator.run that a `solver` dict may hold too
+MAY_CHANGE = ("dt", "arch")  # arguments of Simulator that may change when a run is resumed
 
-def command(arguments: Namespace) -> int:
+
+@dataclass
+class RunSettings:
+    """Settings of a run. simulator: arguments of Simulator; seconds [s]; fps [1/s], None for a frame per step.
+
+    defaults: Simulator's own; changed: for a resumed run, the arguments that replace the checkpoint's.
+    """
+
+    simulator: dict
+    seconds: float
+    fps: float | None
+    defaults: dict
+    changed: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict:
+        """Return every setting of the run by name, given or default."""
+        return self.defaults | self.simulator | {"seconds": self.seconds, "fps": self.fps}
+
+
+def run(arguments: Namespace) -> int:
     """Run the scene and return the exit status. Bad input is refused before any file is written."""
     _check_working_folder()
     with Signals() as signals, printed_warnings() as warned:
         scene, solver = load_scene(arguments.scene, arguments.allow_outside)
-        every = _checkpoint_interval(arguments)
+        _check_checkpoint_interval(arguments)
+        shown = display_options(arguments, has_window=not arguments.headless and _window_is_possible())
+        interactive = shown.window and arguments.out is None and arguments.seconds is None
         saved: Checkpoint | None = None
-        has_window = not arguments.headless and _window_is_possible()
-        shown = display_options(arguments, has_window)
-        interactive = has_window and arguments.out is None and arguments.seconds is None
         if arguments.resume is None:
             settings = resolve(solver, arguments, Simulator)
             if arguments.out is not None:
@@ -48,7 +77,7 @@ def command(arguments: Namespace) -> int:
         else:
             saved = read_last_good(arguments.resume)
             kept = saved.settings | ({"fps": saved.notes["fps"]} if "fps" in saved.notes else {})  # frames have numbers
-            settings = resolve_resumed(solver, arguments, Simulator, kept)
+            settings = resolve(solver, arguments, Simulator, kept)
             sim = _resumed(saved, scene, settings)
         with sim:
             check_modelled(shown, sim)
@@ -58,7 +87,58 @@ def command(arguments: Namespace) -> int:
             _check_time_left(sim, settings, arguments)
             with _prefix_errors(arguments.scene):
                 check_length(settings.seconds, sim.dt, settings.fps)
-            return _run(sim, settings, arguments, signals, warned, has_window, every, saved, shown)
+            return _run(sim, settings, arguments, signals, warned, saved, shown)
+
+
+def resolve(solver: dict, arguments: Namespace, simulator_class: type, saved: dict | None = None) -> RunSettings:
+    """Merge the three sources; options override --set, --set overrides the scene.
+
+    saved: for a resumed run, the checkpoint's arguments of Simulator, and fps if it has it, which override the scene's.
+    Raises SceneError for an unknown key, a value that is not a TOML scalar, an option and a --set that disagree, seconds
+    and fps that are not finite and positive, or values that differ from saved, unless they may change. Simulator checks its own
+    arguments.
+    """
+    parameters = inspect.signature(simulator_class).parameters.values()
+    defaults = {parameter.name: parameter.default for parameter in parameters if parameter.name != "scene"}
+    keys = [*defaults, *RUN_KEYS]
+    refuse_unknown(solver, keys, OF_SCENE)
+    given, changed = _given(arguments, keys), []
+    merged = solver | given
+    if saved is not None:
+        for key, value in given.items():
+            if key not in (*MAY_CHANGE, "seconds") and value != saved.get(key, value):
+                raise SceneError(f"--resume {arguments.resume}: {key} is {saved[key]} there and cannot become {value} in a run")
+        changed = [key for key in MAY_CHANGE if key in given]
+        run_keys = {key: merged[key] for key in RUN_KEYS if key in merged}
+        merged = run_keys | saved | {key: given[key] for key in changed}
+    fps = merged.get("fps", 60.0)
+    return RunSettings(
+        simulator={key: value for key, value in merged.items() if key not in RUN_KEYS},
+        seconds=checks.number(merged.get("seconds", 1.0), "seconds", above=0.0),
+        fps=None if fps is None else checks.number(fps, "fps", above=0.0),
+        defaults=defaults,
+        changed=changed,
+    )
+
+
+def _given(arguments: Namespace, keys: list[str]) -> dict:
+    """Return the settings given by --set solver.KEY=VALUE and by the other options."""
+    given = {}
+    for assignment in arguments.assignments:
+        name, equals, text = assignment.partition("=")
+        head, _, key = name.strip().partition(".")
+        if not equals or head != "solver":
+            raise SceneError(f"--set {assignment}: write solver.KEY=VALUE, e.g. solver.dt=0.01")
+        refuse_unknown([key], keys, f"--set {assignment}: ")
+        given[key] = parse_scalar(text.strip(), assignment)
+    for key in ("arch", "precision", *RUN_KEYS):
+        option = getattr(arguments, key)
+        if option is None:
+            continue
+        if key in given and given[key] != option:
+            raise SceneError(f"--{key} {option} and --set solver.{key}={given[key]} disagree; give one of them")
+        given[key] = option
+    return given
 
 
 @contextmanager
@@ -70,14 +150,11 @@ def _prefix_errors(scene: str) -> Iterator[None]:
         raise type(error)(f"{scene}: {error}") from error
 
 
-def _checkpoint_interval(arguments: Namespace) -> float | None:
-    """Return the value of --checkpoint-every [s], or None. Raises SceneError."""
-    every = arguments.checkpoint_every
-    if every is None:
-        return None
-    if arguments.out is None:
-        raise SceneError("--checkpoint-every needs --out, the folder to write to")
-    return checks.number(every, "--checkpoint-every", above=0.0, unit="s")
+def _check_checkpoint_interval(arguments: Namespace) -> None:
+    if arguments.checkpoint_every is not None:
+        if arguments.out is None:
+            raise SceneError("--checkpoint-every needs --out, the folder to write to")
+        checks.number(arguments.checkpoint_every, "--checkpoint-every", above=0.0, unit="s")
 
 
 def _resumed(saved: Checkpoint, scene: Scene, settings: RunSettings) -> Simulator:
@@ -127,39 +204,31 @@ def _show_window(sim: Simulator, settings: RunSettings, shown: DisplayOptions) -
     return 0
 
 
-def _run(
-    sim: Simulator,
-    settings: RunSettings,
-    arguments: Namespace,
-    signals: Signals,
-    warned: list[str],
-    has_window: bool,
-    every: float | None,
-    saved: Checkpoint | None,
-    shown: DisplayOptions,
-) -> int:
+def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], saved, shown: DisplayOptions) -> int:
     """Run until settings.seconds; save what was computed, however the run ends."""
-    observers, resumed, notes = Observers(), None, {}
-    plots = Plots(sim, shown.plots) if shown.plots or has_window else None
+    observers, recording, resumed, notes = Observers(), None, None, {}
+    plots = Plots(sim, shown.plots) if shown.plots or shown.window else None
     if saved is not None:
         notes = saved.notes
         resumed = {"checkpoint": str(saved.path), "time": sim.time, "frame": first_frame(sim, settings.fps)}
     with ExitStack() as stack:
-        recording = None
         signals.run_began()
         if arguments.out is not None:
-            recording = stack.enter_context(closing(Recording(arguments.out, arguments.overwrite, resumed, every, notes)))
+            recording = Recording(arguments.out, arguments.overwrite, resumed, arguments.checkpoint_every, notes)
+            stack.enter_context(closing(recording))
         stack.callback(observers.close)
-        if has_window:
-            observers.members.append(_open_window(sim, shown, plots))
+        if shown.window:
+            from taisoft.view.window import LiveWindow
+
+            observers.members.append(LiveWindow(sim.scene, colour=shown.colour, layers=shown.in_window, plots=plots))
         if recording is not None:
-            recording.add_writers(observers, sim, settings.fps, not arguments.no_usd, not arguments.no_frames, shown, plots)
+            recording.add_writers(observers, sim, settings.fps, shown, plots)
         observers.members.append(Progress(settings.seconds, label=Path(arguments.scene).stem))
         result = sim.run(
             settings.seconds,
             on_frame=observers.on_frame,
             fps=settings.fps,
-            stop=lambda: signals.requested() or observers.failed(),
+            stop=lambda: signals.requested() or bool(observers.errors),
             resumed=resumed is not None,
             on_step=plots.take if plots is not None else None,
         )
@@ -173,32 +242,25 @@ def _run(
         result.problems[:0] = [f"warning: {text}" for text in warned]
         _report_failed_output(result, observers, signals)
         if recording is not None:
-            reported = observers.guard(recording.report, result, sim, settings)
+            reported = observers.guard(recording.report, result, sim, settings.as_dict())
             video = arguments.video and not signals.requested()
             video_written = not video or observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
             _report_failed_output(result, observers, signals)
             if reported and not video_written:
-                observers.guard(recording.report, result, sim, settings)  # again, with the video's errors
+                observers.guard(recording.report, result, sim, settings.as_dict())  # again, with the video's errors
         print_summary(result, sim, observers, recording)
-    if observers.failed():
-        for error in observers.errors:
-            print(f"taisoft: {error}", file=sys.stderr)
+    for error in observers.errors:
+        print(f"taisoft: {error}", file=sys.stderr)
+    if observers.errors:
         return EXIT_OUTPUT
     if signals.number is not None:
         return EXIT_SIGNAL + signals.number
     return EXIT_FAILED if result.status == "failed" else 0
 
 
-def _open_window(sim: Simulator, shown: DisplayOptions, plots: Plots):
-    from taisoft.view.window import LiveWindow
-
-    return LiveWindow(sim.scene, colour=shown.colour, layers=shown.in_window, plots=plots)
-
-
 def _report_failed_output(result: RunReport, observers: Observers, signals: Signals) -> None:
     """Add all output errors to the run's report: report.json may still fit on the disk when a picture did not."""
     result.problems += [error for error in observers.errors if error not in result.problems]
-    if observers.failed():
+    if observers.errors:
         result.interrupted = result.interrupted and signals.requested()
-    if observers.failed() and result.status == "ok":
-        result.status = "degraded"
+        result.status = "degraded" if result.status == "ok" else result.status

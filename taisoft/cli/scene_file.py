@@ -1,4 +1,4 @@
-"""Find and load demos, benchmarks and a user's own .toml and .py files for `taisoft run` and `taisoft bench`.
+"""Find and load demos, benchmarks and a user's own .toml and .py files; `taisoft list` and `taisoft bench`.
 
 A checkout has demos/ and benchmarks/ beside the package; an installed wheel has them inside it. A .py file is executed as
 Python: only run files you trust. A .toml file is data.
@@ -11,6 +11,7 @@ import importlib.util
 import inspect
 import sys
 import traceback
+from argparse import Namespace
 from pathlib import Path
 from types import ModuleType
 
@@ -18,8 +19,10 @@ from taisoft.errors import MeshError, SceneError
 from taisoft.scene.checks import nearest
 from taisoft.scene.refine import refined, with_order
 from taisoft.scene.scene import Scene
+from taisoft.scene.solver import CHECKS, check_solver
 
 PACKAGE = Path(__file__).resolve().parents[1]
+OF_SCENE = "the scene's solver dict: "
 
 
 def shipped_files(folder: str) -> dict[str, Path]:
@@ -48,6 +51,33 @@ def load_shipped(folder: str, name: str) -> ModuleType:
 def first_line(path: Path) -> str:
     """Return the first docstring line of a .py file without running it; empty if there is none."""
     return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition("\n")[0]
+
+
+def list_demos(_: Namespace) -> int:
+    """Print the name and first docstring line of every demo, without running any."""
+    _print_table(shipped_files("demos"))
+    return 0
+
+
+def bench(arguments: Namespace) -> int:
+    """Run main(argv) -> exit status of a benchmark, or list all of them if none is named. Raises SceneError."""
+    # files in subfolders, and files without main(), are parts of benchmarks
+    files = {name: path for name, path in shipped_files("benchmarks").items() if "." not in name}
+    benchmarks = {name: path for name, path in files.items() if "def main(" in path.read_text()}
+    if arguments.name in (None, "-h", "--help"):
+        print("usage: taisoft bench NAME [arguments of the benchmark]")
+        _print_table(benchmarks)
+        return 0
+    if arguments.name not in benchmarks:
+        hint = nearest(arguments.name, benchmarks)
+        raise SceneError(f"no benchmark is called {arguments.name!r}{hint}; there are {', '.join(benchmarks) or 'none'}")
+    return load_shipped("benchmarks", arguments.name).main(arguments.rest) or 0
+
+
+def _print_table(files: dict[str, Path]) -> None:
+    width = max(map(len, files), default=0)
+    for name, path in files.items():
+        print(f"{name:<{width}}  {first_line(path)}".rstrip())
 
 
 def find_scene(name: str) -> Path:
@@ -97,6 +127,22 @@ def _load(name: str, allow_outside: bool, requested: dict) -> tuple[Scene, dict,
     if not isinstance(solver, dict) or not all(isinstance(key, str) for key in solver):
         raise SceneError(f"{path}: solver must be a dict of Simulator arguments")
     return scene, dict(solver), set(passed)
+
+
+def check_scene_solver(solver: dict) -> None:
+    """Raise SceneError if a scene's `solver` dict has unknown keys or invalid values."""
+    refuse_unknown(solver, list(CHECKS), OF_SCENE)
+    try:
+        check_solver(**solver)
+    except SceneError as error:
+        raise SceneError(f"{OF_SCENE}{error}") from None
+
+
+def refuse_unknown(names, keys: list[str], where: str) -> None:
+    """Raise SceneError if one of the names is no key of a `solver` dict. where: start of the message."""
+    for name in names:
+        if name not in keys:
+            raise SceneError(f"{where}no setting is called {name!r}{nearest(name, keys)}; there are {', '.join(keys)}")
 
 
 def load_module(path: Path) -> ModuleType:

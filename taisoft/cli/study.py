@@ -1,33 +1,33 @@
-"""`taisoft study SCENE`: runs a scene over a grid of settings, speed against error."""
+"""`taisoft study SCENE`: runs a scene over a grid of settings, speed against error.
+
+`python -m taisoft.cli.study` is the child process that plans, or executes one run. The command itself loads no Taichi.
+"""
 
 import sys
 import time
 from argparse import Namespace
 from contextlib import ExitStack, closing
+from dataclasses import fields
 from pathlib import Path
 
-from taisoft.cli import EXIT_FAILED, EXIT_SIGNAL
-from taisoft.cli.scene_file import find_scene
-from taisoft.cli.settings import parse_scalar
-from taisoft.cli.signals import Interrupted, Signals
-from taisoft.errors import SceneError
+from taisoft.cli import EXIT_FAILED, EXIT_SIGNAL, Interrupted, Signals, parse_scalar
+from taisoft.cli.scene_file import check_scene_solver, find_scene, load_scene
+from taisoft.errors import SceneError, TaisoftError
 from taisoft.output.files import FolderLock, check_free, make_folder
 from taisoft.output.report import machine
 from taisoft.scene import checks
 from taisoft.scene.solver import check_solver
-from taisoft.study.grid import AXES
-from taisoft.study.output import FILES, check_scene, write
-from taisoft.study.results import Request, Study
+from taisoft.study import AXES, Request, mesh_name
+from taisoft.study.output import FILES, Store, check_scene, code_digest, digests, sources, write
+from taisoft.study.results import Study, text_of
 from taisoft.study.runner import Runner
-from taisoft.study.store import Store
-from taisoft.study.table import text_of
-from taisoft.study.workers import local_places
+from taisoft.study.workers import cluster_places, connect, local_places, serve
 
 INTEGER_AXES = {"order": (1, 2), "refine": (0, 1, 2, 3, 4)}
 ENDING = "ending; runs that are finished are kept"
 
 
-def command(arguments: Namespace) -> int:
+def study(arguments: Namespace) -> int:
     """Run the study and return the exit status: 1 if no run of the grid has both a time and an error."""
     request = parse_request(arguments)
     find_scene(request.scene)
@@ -52,17 +52,17 @@ def command(arguments: Namespace) -> int:
         return _report_study(runner.run(plan), arguments, signals)
 
 
-def _report_study(study: Study, arguments: Namespace, signals: Signals) -> int:
+def _report_study(results: Study, arguments: Namespace, signals: Signals) -> int:
     """Print and write the results; return the exit status."""
-    print(text_of(study), end="")
+    print(text_of(results), end="")
     if arguments.out is not None:
-        if note := write(study, Path(arguments.out)):
+        if note := write(results, Path(arguments.out)):
             _print_status(note)
         files = [name for name in FILES if (Path(arguments.out) / name).exists()]
         print(f"\nwritten to {arguments.out}: {', '.join(files)}, runs/")
-    if signals.number is not None and study.ended:  # a signal while the table is written leaves a complete study
+    if signals.number is not None and results.ended:  # a signal while the table is written leaves a complete study
         return EXIT_SIGNAL + signals.number
-    return 0 if study.comparable_rows() else EXIT_FAILED
+    return 0 if results.comparable_rows() else EXIT_FAILED
 
 
 def check_device(plan: dict, workers: int) -> None:
@@ -77,8 +77,6 @@ def _places(arguments: Namespace, request: Request, stack: ExitStack) -> tuple[l
         return local_places(1 if arguments.workers is None else arguments.workers), [machine()]
     if arguments.workers is not None:
         raise SceneError("--workers sets this machine's processes, and --scheduler has its own workers: give one of them")
-    from taisoft.study.cluster import cluster_places, connect
-
     client = stack.enter_context(closing(connect(arguments.scheduler)))
     request.scene = str(Path(request.scene).absolute()) if request.scene.endswith((".py", ".toml")) else request.scene
     return cluster_places(client)
@@ -86,27 +84,13 @@ def _places(arguments: Namespace, request: Request, stack: ExitStack) -> tuple[l
 
 def parse_request(arguments: Namespace) -> Request:
     """Return the request given by the options. Raises SceneError for invalid values."""
-    axes = {}
-    for key in AXES:
-        if (text := getattr(arguments, key)) is not None:
-            axes[key] = values_of(key, text)
+    axes = {key: values_of(key, text) for key in AXES if (text := getattr(arguments, key)) is not None}
     for key in ("seconds", "reference_dt", "tolerance"):
         if (value := getattr(arguments, key)) is not None:
             checks.number(value, f"--{key.replace('_', '-')}", above=0.0)
     checks.whole(arguments.repeats, "--repeats", tuple(range(1, 101)))
     checks.whole(arguments.reference_refine, "--reference-refine", INTEGER_AXES["refine"])
-    return Request(
-        arguments.scene,
-        axes,
-        arguments.allow_outside,
-        arguments.seconds,
-        arguments.reference_dt,
-        arguments.reference_integrator,
-        arguments.reference_refine,
-        arguments.repeats,
-        arguments.tolerance,
-        arguments.by,
-    )
+    return Request(axes=axes, **{f.name: getattr(arguments, f.name) for f in fields(Request) if f.name != "axes"})
 
 
 def values_of(key: str, text: str) -> list:
@@ -128,3 +112,40 @@ def values_of(key: str, text: str) -> list:
 
 def _print_status(text: str) -> None:
     print(f"taisoft: {text}", file=sys.stderr, flush=True)
+
+
+def answer(request: dict) -> dict:
+    """Answer {"action": "plan" or "run", ...} in the child process: {"answer": plan or record} or {"error": sentence}."""
+    from taisoft.checkpoint import scene_digest
+    from taisoft.study.measure import measure
+    from taisoft.study.plan import make_plan
+
+    scenes: dict[str, str] = {}  # digest of each variant that was loaded
+    name, allow_outside = request["scene"], request["allow_outside"]
+
+    def variant(refine, order):
+        scene = load_scene(name, allow_outside, refine, order)[0]
+        scenes[mesh_name({"refine": refine, "order": order})] = scene_digest(scene)
+        return scene
+
+    try:
+        if request["action"] == "plan":
+            _, solver = load_scene(name, allow_outside, refine=0)
+            check_scene_solver(solver)
+            plan = make_plan(variant, solver, request["request"])
+            # include the files' content: nothing else distinguishes paths that are functions
+            return {"answer": plan | {"scenes": scenes, "sources": sources(find_scene(name)), "code": code_digest()}}
+        if code_digest() != request["code"]:
+            return {"error": "taisoft, Taichi or NumPy there differs from the one that planned the study"}
+        task = request["task"]
+        scene = variant(task["setting"]["refine"], task["setting"]["order"])
+        found = digests(find_scene(name), request["sources"])
+        if scenes != {mesh_name(task["setting"]): request["digest"]} or found != request["sources"]:
+            return {"error": "the scene there differs from the planned one: it was changed meanwhile, or is another file"}
+        return {"answer": measure(scene, task)}
+    except TaisoftError as error:
+        return {"error": str(error)}
+
+
+if __name__ == "__main__":
+    serve(answer)

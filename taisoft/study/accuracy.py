@@ -8,14 +8,15 @@ is its order in time. For the finest mesh it is also at least a third of the dis
 order in the mesh width), or all of it if the motion is not smooth.
 """
 
+import base64
+import zlib
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from taisoft.errors import SimulationError
-from taisoft.study.grid import mesh_name
-from taisoft.study.store import unpack
+from taisoft.study import mesh_name
 from taisoft.timing import Timing, summarise
 
 COINCIDENCE = 1e-9  # distance over the body's size below which two nodes coincide
@@ -93,15 +94,25 @@ class Row:
         return None if pair is None else max(pair)
 
 
+def pack(values: np.ndarray) -> dict:
+    """Encode an array of float64 as text, losslessly, for a run's record."""
+    data = zlib.compress(np.ascontiguousarray(values, dtype="<f8").tobytes(), 1)
+    return {"shape": list(values.shape), "zlib_base64": base64.b64encode(data).decode()}
+
+
+def unpack(packed: dict) -> np.ndarray:
+    """Decode an array from `pack`. Raises ValueError for invalid data."""
+    try:
+        data = zlib.decompress(base64.b64decode(packed["zlib_base64"], validate=True))
+        return np.frombuffer(data, dtype="<f8").reshape(packed["shape"])
+    except (zlib.error, KeyError, TypeError) as error:
+        raise ValueError(f"{type(error).__name__}: {error}") from None
+
+
 def distance(path: np.ndarray, other: np.ndarray, excursion: float) -> Error:
     """Return the error between two paths (k,n,3) [m], relative to the excursion [m]."""
     squared = ((path - other) ** 2).sum(axis=2)
     return Error(float(np.sqrt(squared.mean())) / excursion, float(np.sqrt(squared.max())) / excursion)
-
-
-def excursion(path: np.ndarray) -> float:
-    """Return the largest distance of any node of the path (k,n,3) from its start [m]."""
-    return float(np.sqrt(((path - path[0]) ** 2).sum(axis=2).max()))
 
 
 def make_reference(fine: dict, coarse: dict, kind: str, order_in_time: int) -> Reference:
@@ -114,25 +125,25 @@ def make_reference(fine: dict, coarse: dict, kind: str, order_in_time: int) -> R
             setting, reason = record["task"]["setting"], record["problems"][-1]
             raise SimulationError(f"the reference {setting['integrator']}, dt = {setting['dt']:.3g} s, failed: {reason}")
     path = unpack(fine["path"])
-    largest = excursion(path)
-    if largest == 0.0:
+    excursion = float(np.sqrt(((path - path[0]) ** 2).sum(axis=2).max()))
+    if excursion == 0.0:
         raise SimulationError("nothing moves in the reference, so errors relative to its motion are undefined")
-    difference = distance(unpack(coarse["path"]), path, largest)
+    difference = distance(unpack(coarse["path"]), path, excursion)
     divisor = 2.0**order_in_time - 1.0
     energies = np.array(fine["energies"])
     return Reference(
-        fine["task"]["setting"],
-        path,
-        largest,
-        Error(difference.rms / divisor, difference.max / divisor),
-        energies.sum(axis=1),
-        float(np.ptp(energies, axis=0).max()),
-        np.array(fine["momentum"]),
-        fine["bodies"],
-        kind,
-        [text for record in (fine, coarse) for text in record["problems"] if not text.startswith("note")],
-        fine["steps"],
-        order_in_time,
+        setting=fine["task"]["setting"],
+        path=path,
+        excursion=excursion,
+        own_error=Error(difference.rms / divisor, difference.max / divisor),
+        energy=energies.sum(axis=1),
+        energy_scale=float(np.ptp(energies, axis=0).max()),
+        momentum=np.array(fine["momentum"]),
+        bodies=fine["bodies"],
+        kind=kind,
+        problems=[text for record in (fine, coarse) for text in record["problems"] if not text.startswith("note")],
+        steps=fine["steps"],
+        order_in_time=order_in_time,
     )
 
 
@@ -141,22 +152,15 @@ def finest_own_error(finest: Reference, others: list[Reference]) -> tuple[Error,
     others = [other for other in others if other is not finest]
     if not others:
         return finest.own_error, "its error in time alone"
-    other = max(others, key=lambda one: _closeness(one, finest))
-    # order_in_time is 1 where contacts or paths reduce the order of the method
-    difference, smooth = compare(other, finest), finest.order_in_time == 2
-    divisor = RICHARDSON if smooth else 1.0
+
+    def closeness(one: Reference) -> tuple:  # the same element order first, then the most refined mesh
+        return one.setting["order"] == finest.setting["order"], one.setting["refine"], one.path.shape[1], one.kind == finest.kind
+
+    other = max(others, key=closeness)
+    smooth = finest.order_in_time == 2  # it is 1 where contacts or paths reduce the order of the method
+    difference, divisor = error_in_space(other.path, other.bodies, finest), RICHARDSON if smooth else 1.0
     own = Error(max(finest.own_error.rms, difference.rms / divisor), max(finest.own_error.max, difference.max / divisor))
     return own, f"{'a third of ' if smooth else ''}the distance to the reference with {mesh_name(other.setting)}"
-
-
-def _closeness(one: Reference, finest: Reference) -> tuple:
-    """Sort key, largest for the mesh closest to the finest: the same element order first, then the most refined."""
-    return one.setting["order"] == finest.setting["order"], one.setting["refine"], one.path.shape[1], one.kind == finest.kind
-
-
-def compare(coarse: Reference, finest: Reference) -> Error:
-    """Return the error between two references, at the nodes that both have."""
-    return error_in_space(coarse.path, coarse.bodies, finest)
 
 
 def error_in_space(path: np.ndarray, bodies: list, finest: Reference) -> Error:
@@ -185,34 +189,20 @@ def shared_nodes(start: np.ndarray, bodies: list, other: np.ndarray, others: lis
 
 def row_of(record: dict, reference: Reference | None) -> Row:
     """Compare a finished run with the reference on its mesh; without a reference the errors stay None."""
-    task = record["task"]
-    row = Row(
-        task["setting"],
-        record["status"],
-        "; ".join(record["problems"]),
-        record["seconds"],
-        record.get("compile_seconds"),
-        record["threads"],
-        record["cores"],
-        record["machine"]["name"],
-        record["nodes"],
-        record["tets"],
-        record.get("steps"),
-        unconverged=record.get("unconverged"),
-    )
+    row = Row(record["task"]["setting"], record["status"], "; ".join(record["problems"]), machine=record["machine"]["name"])
+    for name in ("seconds", "compile_seconds", "threads", "cores", "nodes", "tets", "steps", "unconverged"):
+        setattr(row, name, record.get(name))
     if extremes := record.get("extremes"):
-        row.inverted = _maximum(extremes, "n_inverted")
-        row.contact_residual = _maximum(extremes, "contact_residual")
-        deepest = _maximum(extremes, "max_penetration")
+        row.inverted, row.contact_residual = (extremes[name].get("max") for name in ("n_inverted", "contact_residual"))
+        deepest = extremes["max_penetration"].get("max")
         row.penetration = None if deepest is None else deepest / record["smallest_edge"]
     if record["path"] is None or reference is None:
         return row
-    energy, momentum = np.array(record["energies"], float).sum(axis=1), np.array(record["momentum"], float)
     row.in_time, row.in_time_sure = distance(unpack(record["path"]), reference.path, reference.excursion), reference.own_error
-    row.energy_kept = record["keeps_energy"]
+    energy, row.energy_kept = np.array(record["energies"], float).sum(axis=1), record["keeps_energy"]
     expected = energy[0] if row.energy_kept else reference.energy
     row.energy = _relative(np.abs(energy - expected).max(), reference.energy_scale)
-    row.momentum = _momentum_error(record, momentum, reference)
+    row.momentum = _momentum_error(record, np.array(record["momentum"], float), reference)
     return row
 
 
@@ -234,7 +224,3 @@ def _momentum_error(record: dict, momentum: np.ndarray, reference: Reference) ->
 
 def _relative(value: float, scale: float) -> float | None:
     return float(value / scale) if scale > 0.0 else None
-
-
-def _maximum(extremes: dict, name: str):
-    return extremes[name].get("max")

@@ -1,7 +1,11 @@
-"""One run of a study, in its own process: recorded once at the frames, then timed from the start without recording."""
+"""One run of a study, in its own process: recorded once at the frames, then timed from the start without recording.
+
+Benchmarks time whole runs with `warm_up` and `advance` too.
+"""
 
 import time
 import warnings
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,15 +14,55 @@ from taisoft.errors import SimulationError, TaisoftError
 from taisoft.fem.reference import gravity_mass, lumped_mass, traction_forces
 from taisoft.mesh.quality import edge_lengths
 from taisoft.output.report import extremes, machine, peak_memory, versions
-from taisoft.records import RunReport
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
-from taisoft.study.store import pack
-from taisoft.study.timed_run import advance
+from taisoft.study import simulator_arguments
+from taisoft.study.accuracy import pack
 from taisoft.timing import load_average, usable_cores
 
+WARM_STEPS = 3  # enough for a multistep integrator to compile all its kernels
 MAX_REPEATED_SECONDS = 20.0  # a run with a longer wall time is not repeated: the recorded run gives its time
+ITERATIONS = ("newton_iterations", "linear_iterations", "contact_iterations")
 SHORT_SECONDS, MAX_RUNS = 0.5, 25  # short runs are repeated until their total time [s] or their number reaches these
+
+
+@dataclass
+class TimedRun:
+    """Totals of some steps. seconds: wall time without compiling [s]; inverted: maximum inverted tets in one report."""
+
+    steps: int = 0
+    seconds: float = 0.0
+    unconverged: int = 0
+    inverted: int = 0
+    newton_iterations: int = 0
+    linear_iterations: int = 0
+
+    def __add__(self, other: "TimedRun") -> "TimedRun":
+        sums = {k: a + b for (k, a), b in zip(vars(self).items(), vars(other).values())}
+        return TimedRun(**sums | {"inverted": max(self.inverted, other.inverted)})
+
+
+def advance(sim: Simulator, steps: int) -> TimedRun:
+    """Take `steps` steps in the largest batches that sim.advance allows, as sim.run does between two frames."""
+    timed = TimedRun(steps)
+    compiled, start = sim.compile_seconds, time.perf_counter()
+    done = 0
+    while done < steps:
+        report = sim.advance(steps - done)
+        done += report.steps
+        timed.unconverged += not report.converged
+        timed.inverted = max(timed.inverted, report.n_inverted)
+        timed.newton_iterations += report.newton_iterations
+        timed.linear_iterations += report.linear_iterations
+    timed.seconds = time.perf_counter() - start - (sim.compile_seconds - compiled)
+    return timed
+
+
+def warm_up(sim: Simulator) -> None:
+    """Compile the kernels that steps need, then reset to the start."""
+    for _ in range(WARM_STEPS):
+        sim.step()
+    sim.reset()
 
 
 def measure(scene: Scene, task: dict) -> dict:
@@ -27,8 +71,9 @@ def measure(scene: Scene, task: dict) -> dict:
     task: `setting`, `fixed` (further arguments of Simulator), `frame` [s], `frames`, `steps` (per frame), `repeats` (minimum
     number of timed runs, 0 for none).
     """
-    setting = {key: value for key, value in task["setting"].items() if key not in ("refine", "order")}
-    record = {"task": task} | _scene_facts(scene, setting["integrator"], task) | _environment()
+    setting = simulator_arguments(task["setting"])
+    record = {"task": task, "machine": machine(), "versions": versions(), "cores": usable_cores(), "load": load_average()}
+    record |= _scene_facts(scene, task)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         record |= _run(scene, setting | task["fixed"], task)
@@ -36,27 +81,24 @@ def measure(scene: Scene, task: dict) -> dict:
     return record | {"load_at_the_end": load_average(), "peak_memory_bytes": peak_memory(), "threads": runtime.threads()}
 
 
-def _environment() -> dict:
-    return {"machine": machine(), "versions": versions(), "cores": usable_cores(), "load": load_average()}
-
-
-def _scene_facts(scene: Scene, integrator: str, task: dict) -> dict:
+def _scene_facts(scene: Scene, task: dict) -> dict:
     """Return what is known before the run: sizes, and which conservation laws hold."""
     bodies = scene.bodies
-    damped = any(b.material.mass_damping or b.material.stiffness_damping for b in bodies)
-    prescribed = any(c.path is not None for b in bodies for c in b.constraints)
-    prescribed = prescribed or any(o.path is not None for o in scene.obstacles)
+    mass_damped = any(b.material.mass_damping for b in bodies)
+    damped = mass_damped or any(b.material.stiffness_damping for b in bodies)
+    prescribed = any(c.path is not None for b in bodies for c in b.constraints) or any(
+        o.path is not None for o in scene.obstacles
+    )
     loaded = any(b.tractions or b.forces for b in bodies)
-    pushes = scene.pushes(task["fixed"].get("self_collision", False))
-    free = not any(b.constraints for b in bodies) and not any(b.material.mass_damping for b in bodies)
-    free = free and not (pushes and scene.obstacles)
+    touches = scene.pushes(task["fixed"].get("self_collision", False))
+    free = not (any(b.constraints for b in bodies) or mass_damped or (touches and scene.obstacles))
     return {
         "bodies": [[b.name, b.n_nodes] for b in bodies],
         "nodes": sum(b.n_nodes for b in bodies),
         "tets": sum(b.mesh.n_tets for b in bodies),
         "orders": sorted({b.order for b in bodies}),
         "smallest_edge": min(float(edge_lengths(b.mesh.vertices, b.mesh.tets).min()) for b in bodies),  # [m]
-        "keeps_energy": not (damped or prescribed or loaded or pushes),
+        "keeps_energy": not (damped or prescribed or loaded or touches),
         "momentum_rate": _total_load(scene).tolist() if free else None,  # [N]
     }
 
@@ -85,36 +127,28 @@ def _run(scene: Scene, simulator: dict, task: dict) -> dict:
 def _record_and_time(sim: Simulator, task: dict) -> dict:
     observer, length = Observer(sim), task["frame"] * task["frames"]
     result = sim.run(length, on_frame=observer.frame, fps=1.0 / task["frame"])
+    reports = result.step_reports
     numbers = {
         "status": result.status,
         "problems": result.problems,
         "steps": result.steps,
-        "reports": len(result.step_reports),
-        "extremes": extremes(result.step_reports),
+        "reports": len(reports),
+        "extremes": extremes(reports),
         "explicit": sim.settings.explicit,
         "dt": sim.dt,
-        **_counts(result),
+        "unconverged": sum(not r.converged for r in reports),
+        **{key: sum(getattr(r, key) for r in reports) for key in ITERATIONS},
         "seconds": [],
         "path": None,
     }
-    if result.status == "failed":
-        return numbers | {"compile_seconds": sim.compile_seconds}
-    if task["repeats"]:
+    if result.status != "failed":
         try:
-            numbers["seconds"] = list(_timed(sim, task, (result.wall_seconds - observer.seconds) / length))
+            if task["repeats"]:
+                numbers["seconds"] = list(_timed(sim, task, (result.wall_seconds - observer.seconds) / length))
+            numbers |= observer.numbers()
         except SimulationError as error:  # a repeat may still fail, because threads change the order of sums
             return numbers | {"status": "failed", "problems": [*result.problems, f"in a repeated run: {error}"]}
-    return numbers | observer.numbers() | {"compile_seconds": sim.compile_seconds}
-
-
-def _counts(result: RunReport) -> dict:
-    reports = result.step_reports
-    return {
-        "unconverged": sum(not r.converged for r in reports),
-        "newton_iterations": sum(r.newton_iterations for r in reports),
-        "linear_iterations": sum(r.linear_iterations for r in reports),
-        "contact_iterations": sum(r.contact_iterations for r in reports),
-    }
+    return numbers | {"compile_seconds": sim.compile_seconds}
 
 
 def _timed(sim: Simulator, task: dict, recorded: float):
@@ -138,9 +172,7 @@ class Observer:
         self.seconds = 0.0
         mass = lumped_mass if sim.settings.explicit else gravity_mass
         self._mass = np.concatenate([mass(body) for body in sim.scene.bodies])
-        self._path: list[np.ndarray] = []
-        self._energies: list[tuple] = []
-        self._momentum: list[np.ndarray] = []
+        self._path, self._energies, self._momentum = [], [], []
 
     def frame(self, sim: Simulator, _index: int, _report) -> None:
         """Record a frame; pass to Simulator.run as on_frame."""
@@ -148,10 +180,9 @@ class Observer:
         self._path.append(sim.positions())
         e = sim.energies()
         self._energies.append((e.kinetic, e.elastic, e.gravity))
-        self._momentum.append(self._mass @ sim.velocities())
+        self._momentum.append((self._mass @ sim.velocities()).tolist())
         self.seconds += time.perf_counter() - start - (sim.compile_seconds - compiled)
 
     def numbers(self) -> dict:
         """Return plain data: energies (k,3) [J], momentum (k,3) [kg m/s], path (k,n,3) [m] packed."""
-        momentum = np.array(self._momentum).tolist()
-        return {"energies": np.array(self._energies).tolist(), "momentum": momentum, "path": pack(np.array(self._path))}
+        return {"energies": self._energies, "momentum": self._momentum, "path": pack(np.array(self._path))}

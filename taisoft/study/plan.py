@@ -6,24 +6,98 @@ different equations, so each kind gets its own reference. With several meshes or
 the error in space of all runs.
 """
 
+import itertools
 import math
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from fractions import Fraction
 
 from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.errors import SceneError, TaisoftError
 from taisoft.scene.scene import Scene
 from taisoft.settings import check_settings
 from taisoft.stability import stable_dt
-from taisoft.study.grid import AXES, Setting, cases, complete, expand, frame_time, mesh_name
+from taisoft.study import AXES, DEFAULTS, Setting, mesh_name
 
+IMPLICIT_DEFAULT = ("implicit_euler", "bdf2")
+DT_FACTORS = {False: (2.0, 1.0, 0.5, 0.25), True: (0.5, 1.0, 4.0, 8.0, 16.0)}  # of the scene's dt; key: explicit integrator
+FIRST_AXES = ("refine", "order", "arch", "precision", "integrator", "contact_solver")  # of a table, those that vary slowest
+MAX_FRAMES = 48  # at which runs are compared
+MIN_FRAMES = 4
+MAX_DENOMINATOR = 10_000  # of the ratio of two time steps; above it they have no common multiple
 DT_RATIO = 8  # the study's smallest dt over the reference's
 STABLE_FRACTION = 0.9  # of the stable step, for a reference's coarser run
 EXPLICIT_DT_RATIO = 16  # explicit references may use steps this many times smaller than requested: they are cheap
-
 SECOND_ORDER = ("velocity_verlet", "bdf2", "implicit_midpoint")
 
 Variant = Callable[[int, int | None], Scene]  # (refine, order) -> scene
+
+
+@dataclass(frozen=True)
+class Case:
+    """A combination, and why it is not run (empty if it is)."""
+
+    setting: Setting
+    refused: str = ""
+
+
+def complete(given: dict[str, list], solver: dict) -> dict[str, list]:
+    """Return all axes: as given, else from the scene's solver dict; dt and integrator default to several around the scene's."""
+    own = DEFAULTS | {"dt": 1 / 60, "integrator": "implicit_euler"} | solver
+    axes = {key: [own[key]] for key in AXES}
+    axes["integrator"] = list(dict.fromkeys([own["integrator"], *IMPLICIT_DEFAULT]))
+    axes["dt"] = [factor * own["dt"] for factor in DT_FACTORS[own["integrator"] in EXPLICIT]]
+    return axes | given
+
+
+def expand(axes: dict[str, list]) -> list[Setting]:
+    """Return the product of all axes, the last one varying fastest, dt from large to small."""
+    axes = axes | {"dt": sorted(axes["dt"], reverse=True)}
+    keys = [*FIRST_AXES, *(key for key in AXES if key not in FIRST_AXES and key != "dt"), "dt"]
+    return [Setting(**dict(zip(keys, values))) for values in itertools.product(*(axes[key] for key in keys))]
+
+
+def cases(
+    settings: Iterable[Setting], refusal: Callable[[Setting], str], unused: Callable[[Setting], dict[str, str]]
+) -> list[Case]:
+    """Return a case for every setting; of settings that differ only in unused axes, only the first is run.
+
+    refusal: why a setting cannot be run, or an empty text. unused: axes that a setting does not use -> why.
+    """
+    found: list[Case] = []
+    first: dict[tuple, Setting] = {}
+    for setting in settings:
+        reason = refusal(setting)
+        if not reason:
+            unused_axes = unused(setting)
+            same = first.setdefault(tuple(v for name, v in asdict(setting).items() if name not in unused_axes), setting)
+            differing = [name for name in unused_axes if getattr(setting, name) != getattr(same, name)]
+            reason = f"the same run as one above: {unused_axes[differing[0]]}" if differing else ""
+        found.append(Case(setting, reason))
+    return found
+
+
+def frame_time(steps: Iterable[float], seconds: float) -> tuple[float, int]:
+    """Return the time between two frames [s], a multiple of every time step [s], and the number of frames.
+
+    The last frame is near `seconds` [s]. Raises SceneError if the steps have no common multiple that leaves MIN_FRAMES frames.
+    """
+    steps = sorted(set(steps))
+    ratios = [Fraction(step / steps[0]).limit_denominator(MAX_DENOMINATOR) for step in steps]
+    listed = ", ".join(f"{step:.6g}" for step in steps)
+    if any(abs(float(ratio) * steps[0] - step) > 1e-9 * step for step, ratio in zip(steps, ratios)):
+        raise SceneError(f"the steps {listed} s have no common multiple: use steps that are multiples of one another")
+    common = steps[0] * math.lcm(*(r.numerator for r in ratios)) / math.gcd(*(r.denominator for r in ratios))
+    if common > seconds / MIN_FRAMES * (1.0 + 1e-9):
+        raise SceneError(
+            f"the steps {listed} s coincide only every {common:.6g} s, less than {MIN_FRAMES} times in {seconds:g} s: use steps "
+            "that are multiples of one another, or a larger --seconds"
+        )
+    every = math.ceil(seconds / common / MAX_FRAMES - 1e-9)
+    # prefer a multiple near this one whose last frame is at `seconds`
+    whole = round(seconds / common)
+    every = next((k for k in range(every, 2 * every + 1) if whole % k == 0 and whole // k >= MIN_FRAMES), every)
+    return every * common, max(1, round(seconds / (every * common)))
 
 
 def make_plan(variant: Variant, solver: dict, request: dict) -> dict:
@@ -32,7 +106,7 @@ def make_plan(variant: Variant, solver: dict, request: dict) -> dict:
 
 
 class Planner:
-    """Plans the runs of a scene's variants; scenes and stability limits are computed once."""
+    """Plans the runs of a scene's variants; scenes and stability limits are computed once. A mesh is (refine, order)."""
 
     def __init__(self, variant: Variant, solver: dict, request: dict):
         self._variant, self._solver, self._request = variant, solver, request
@@ -42,21 +116,16 @@ class Planner:
         # all other entries of the solver dict apply to every run
         left_out = (*AXES, "seconds", "fps", "draggable")
         self.fixed = {key: value for key, value in solver.items() if key not in left_out}
-        self.self_collision = self.fixed.get("self_collision", False)
 
     def plan(self) -> dict:
         """Return the plan; see `make_plan`."""
-        base = self._scene(0, None)
-        axes = complete(self._request["axes"], self._solver, EXPLICIT)
-        found = cases(expand(axes), self.refusal, self.unused)
+        base = self._scene((0, None))
+        found = cases(expand(complete(self._request["axes"], self._solver)), self.refusal, self.unused)
         settings = [case.setting for case in found if not case.refused]
-        seconds = self._request["seconds"] or self._solver.get("seconds", 1.0)
         plan = {
             "fixed": self.fixed,
-            "seconds": seconds,
-            "cases": [{"setting": asdict(case.setting), "refused": case.refused} for case in found],
-            "touching": base.pushes(self.self_collision),
-            "names": [body.name for body in base.bodies],
+            "cases": [asdict(case) for case in found],
+            "touching": self._touches(base),
             "frame": None,
             "frames": 0,
             "references": [],
@@ -65,22 +134,20 @@ class Planner:
         }
         if settings:
             target = self._request["reference_dt"] or min(s.dt for s in settings) / DT_RATIO
+            seconds = self._request["seconds"] or self._solver.get("seconds", 1.0)
             frame, frames = frame_time([*(s.dt for s in settings), 2.0 * target], seconds)
             plan |= {"frame": frame, "frames": frames} | self._references(settings, target, frame)
         return plan
 
     def refusal(self, setting: Setting) -> str:
         """Return why a setting cannot be run, or an empty text."""
-        scene = self._scene_or_reason(*setting.mesh)
-        if isinstance(scene, str):
-            return scene
         try:
-            self._check(scene, setting)
+            self._check(self._scene(setting.mesh), setting)
         except TaisoftError as error:
             return str(error)
         if setting.integrator not in EXPLICIT or self.fixed.get("allow_unstable"):
             return ""
-        limit = self._limit(*setting.mesh, setting.integrator)
+        limit = self._limit(setting.mesh, setting.integrator)
         if setting.dt <= limit:
             return ""
         return f"dt = {setting.dt:.3g} s is above the stability limit of {setting.integrator}, {limit:.3g} s"
@@ -90,53 +157,48 @@ class Planner:
         unused_axes = {}
         if setting.integrator in EXPLICIT:
             unused_axes |= dict.fromkeys(("newton_tolerance", "linear_tolerance"), f"{setting.integrator} solves no equations")
-        if not self._scene(*setting.mesh).pushes(self.self_collision):
+        if not self._touches(self._scene(setting.mesh)):
             unused_axes |= dict.fromkeys(("contact_solver", "contact_tolerance"), "nothing can come into contact in this scene")
         return unused_axes
 
     def _references(self, settings: list[Setting], target: float, frame: float) -> dict:
         """Return the references of the settings' meshes, and the index of the one for errors in space, or None."""
         extra = self._request["reference_refine"]
-        groups = list(dict.fromkeys(self._group(setting) for setting in settings))
+        groups = list(dict.fromkeys((setting.mesh, self._kind(setting)) for setting in settings))
         space = None
-        if extra or len({(refine, order) for refine, order, _ in groups}) > 1:
-            finest = max(refine for refine, _, _ in groups) + extra
-            order = max((order for _, order, _ in groups), key=lambda order: order or 0)
-            kinds = [kind for _, o, kind in groups if o == order]
-            group = (finest, order, "implicit" if "implicit" in kinds else kinds[0])
+        if extra or len({mesh for mesh, _ in groups}) > 1:
+            finest = max(refine for (refine, _), _ in groups) + extra
+            order = max((order for (_, order), _ in groups), key=lambda order: order or 0)
+            kinds = [kind for (_, o), kind in groups if o == order]
+            group = (finest, order), "implicit" if "implicit" in kinds else kinds[0]
             groups = list(dict.fromkeys([*groups, group]))
             space = groups.index(group)
-        return {"references": [self._reference(*group, target, frame) for group in groups], "space": space}
+        return {"references": [self._reference(mesh, kind, target, frame) for mesh, kind in groups], "space": space}
 
-    def _group(self, setting: Setting) -> tuple[int, int | None, str]:
-        """Return a key shared by settings that solve the same equations in time."""
-        scene = self._scene(*setting.mesh)
-        quadratic = any(body.order == 2 for body in scene.bodies)
-        kind = "" if not quadratic else "explicit" if setting.integrator in EXPLICIT else "implicit"
-        return *setting.mesh, kind
+    def _kind(self, setting: Setting) -> str:
+        """Return what distinguishes settings on one mesh that solve different equations in time."""
+        quadratic = any(body.order == 2 for body in self._scene(setting.mesh).bodies)
+        return "" if not quadratic else "explicit" if setting.integrator in EXPLICIT else "implicit"
 
-    def _reference(self, refine: int, order: int | None, kind: str, target: float, frame: float) -> dict:
-        """Return one reference as plain data. Raises SceneError naming it, because the user may not have requested it."""
+    def _reference(self, mesh: tuple, kind: str, target: float, frame: float) -> dict:
+        """Return a setting with its steps per frame, an even number. Errors name it: the user may not have requested it."""
+        refine, order = mesh
         try:
-            return self._reference_on(refine, order, kind, target, frame)
+            scene = self._scene(mesh)
+            integrator = self._integrator(scene, mesh, kind, target)
+            steps = 2 * math.ceil(frame / target / 2 - 1e-9)
+            if integrator in EXPLICIT:
+                limit = STABLE_FRACTION * self._limit(mesh, integrator)
+                if 2.0 * target > limit and self._request["reference_dt"]:
+                    raise SceneError(
+                        f"--reference-dt {target:g}: the reference is also run with twice the step, and {integrator} allows at "
+                        f"most {limit:.3g} s"
+                    )
+                steps = max(steps, 2 * math.ceil(frame / limit))
+            setting = Setting(frame / steps, integrator, order, refine, "f64")
+            self._check(scene, setting)
         except TaisoftError as error:
             raise SceneError(f"the reference ({mesh_name({'refine': refine, 'order': order})}): {error}") from error
-
-    def _reference_on(self, refine: int, order: int | None, kind: str, target: float, frame: float) -> dict:
-        """Return a setting with its steps per frame, an even number."""
-        scene = self._scene(refine, order)
-        integrator = self._integrator(scene, refine, order, kind, target)
-        steps = 2 * math.ceil(frame / target / 2 - 1e-9)
-        if integrator in EXPLICIT:
-            limit = STABLE_FRACTION * self._limit(refine, order, integrator)
-            if 2.0 * target > limit and self._request["reference_dt"]:
-                raise SceneError(
-                    f"--reference-dt {target:g}: the reference is also run with twice the step, and {integrator} allows at most "
-                    f"{limit:.3g} s"
-                )
-            steps = max(steps, 2 * math.ceil(frame / limit))
-        setting = Setting(frame / steps, integrator, order, refine, "f64")
-        self._check(scene, setting)
         order_in_time = 2 if integrator in SECOND_ORDER and self._is_smooth(scene) else 1
         return {"setting": asdict(setting), "kind": kind, "order_in_time": order_in_time, "steps": steps}
 
@@ -145,48 +207,47 @@ class Planner:
         materials = [body.material for body in scene.bodies]
         prescribed = any(c.path is not None for body in scene.bodies for c in body.constraints)
         damped = any(material.mass_damping or material.stiffness_damping for material in materials)
-        return not (prescribed or damped or scene.pushes(self.self_collision))
+        return not (prescribed or damped or self._touches(scene))
 
-    def _integrator(self, scene: Scene, refine: int, order: int | None, kind: str, target: float) -> str:
+    def _integrator(self, scene: Scene, mesh: tuple, kind: str, target: float) -> str:
         requested = self._request["reference_integrator"]
         if requested is not None:
             if requested not in INTEGRATORS:
                 raise SceneError(f"--reference-integrator {requested}: it must be one of {', '.join(INTEGRATORS)}")
-            if kind and (kind == "explicit") != (requested in EXPLICIT):
-                instead = "velocity_verlet" if kind == "explicit" else "bdf2"
-                self._notes.append(
-                    f"{kind} steps of quadratic tets use the reference {instead}, because {requested} has another mass matrix"
-                )
-                return instead
-            return requested
+            if not kind or (kind == "explicit") == (requested in EXPLICIT):
+                return requested
+            instead = "velocity_verlet" if kind == "explicit" else "bdf2"
+            self._notes.append(
+                f"{kind} steps of quadratic tets use the reference {instead}, because {requested} has another mass matrix"
+            )
+            return instead
         if kind == "explicit":
             return "velocity_verlet"
-        if scene.pushes(self.self_collision):
+        if self._touches(scene):
             return "bdf2"
-        limit = STABLE_FRACTION * self._limit(refine, order, "velocity_verlet")
+        limit = STABLE_FRACTION * self._limit(mesh, "velocity_verlet")
         return "velocity_verlet" if not kind and limit > 2.0 * target / EXPLICIT_DT_RATIO else "implicit_midpoint"
 
     def _check(self, scene: Scene, setting: Setting) -> None:
         defaults = {"self_collision": False, "allow_unstable": False, "draggable": False} | self.fixed
         check_settings(scene, **setting.simulator(), **defaults)
 
-    def _limit(self, refine: int, order: int | None, integrator: str) -> float:
-        key = (refine, order, integrator)
-        if key not in self._limits:
-            self._limits[key] = stable_dt(self._scene(refine, order), integrator == "velocity_verlet")
-        return self._limits[key]
+    def _touches(self, scene: Scene) -> bool:
+        return scene.pushes(self.fixed.get("self_collision", False))
 
-    def _scene(self, refine: int, order: int | None) -> Scene:
-        scene = self._scene_or_reason(refine, order)
+    def _limit(self, mesh: tuple, integrator: str) -> float:
+        if (mesh, integrator) not in self._limits:
+            self._limits[mesh, integrator] = stable_dt(self._scene(mesh), integrator == "velocity_verlet")
+        return self._limits[mesh, integrator]
+
+    def _scene(self, mesh: tuple) -> Scene:
+        """Return the scene with a mesh. Raises SceneError if it cannot be built, which is tried once."""
+        if mesh not in self._scenes:
+            try:
+                self._scenes[mesh] = self._variant(*mesh)
+            except TaisoftError as error:
+                self._scenes[mesh] = str(error)
+        scene = self._scenes[mesh]
         if isinstance(scene, str):
             raise SceneError(scene)
         return scene
-
-    def _scene_or_reason(self, refine: int, order: int | None) -> Scene | str:
-        """Return the scene, or why it cannot be built."""
-        if (refine, order) not in self._scenes:
-            try:
-                self._scenes[refine, order] = self._variant(refine, order)
-            except TaisoftError as error:
-                self._scenes[refine, order] = str(error)
-        return self._scenes[refine, order]

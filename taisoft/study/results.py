@@ -1,31 +1,41 @@
-"""The request for a study and its results."""
+"""Results of a study: the Pareto front of time against error, and all numbers as Markdown, CSV and plain data."""
 
+import csv
+import io
+import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 
-from taisoft.study import pareto
-from taisoft.study.accuracy import Reference, Row
-from taisoft.study.grid import AXES
+from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.study import AXES, Request, describe, mesh_name
+from taisoft.study.accuracy import Error, Reference, Row
+
+ALWAYS_SHOWN = ("integrator", "dt")  # axes that have a column even if they do not vary
+LEFT_ALIGNED = ("", "integrator", "status", "precision", "contact solver")
+Point = tuple[float, float]  # time, error; smaller is better in both
 
 
-@dataclass
-class Request:
-    """Request for a study. axes: name -> values, only the axes given; by: the error used, "max" or "rms"."""
+def front(points: Sequence[Point]) -> list[int]:
+    """Return indices of the points that no other dominates, by rising time. Equal points are all included or none; nan never."""
+    known = [k for k, p in enumerate(points) if not any(map(math.isnan, p))]
+    found: list[int] = []
+    lowest = math.inf
+    for k in sorted(known, key=lambda k: points[k]):
+        if points[k][1] < lowest or (found and points[k] == points[found[-1]]):
+            found.append(k)
+            lowest = min(lowest, points[k][1])
+    return found
 
-    scene: str
-    axes: dict[str, list] = field(default_factory=dict)
-    allow_outside: bool = False
-    seconds: float | None = None
-    reference_dt: float | None = None
-    reference_integrator: str | None = None
-    reference_refine: int = 0
-    repeats: int = 3
-    tolerance: float = 0.01
-    by: str = "max"
 
-    def for_plan(self) -> dict:
-        """Return what the plan depends on."""
-        keys = ("axes", "seconds", "reference_dt", "reference_integrator", "reference_refine")
-        return {key: getattr(self, key) for key in keys}
+def cheapest(points: Sequence[Point], tolerance: float) -> int | None:
+    """Return the index of the fastest point within the tolerance, the more exact at equal times; None if there is none."""
+    return next((k for k in front(points) if points[k][1] <= tolerance), None)
+
+
+def nearest(points: Sequence[Point]) -> int | None:
+    """Return the index of the point of least error, the fastest of equal ones; None without points."""
+    found = front(points)
+    return next((k for k in found if points[k][1] == points[found[-1]][1]), None)
 
 
 @dataclass
@@ -54,72 +64,191 @@ class Study:
         """Return the rows that have a time and an error."""
         return [row for row in self.rows if row.seconds and row.resolved_error(self.request.by) is not None]
 
-    def points(self) -> list[tuple[float, float]]:
+    def points(self) -> list[Point]:
         """Return (time, error) of the comparable rows."""
         return [(row.timing.median, row.resolved_error(self.request.by)) for row in self.comparable_rows()]
 
     def front(self) -> list[Row]:
         """Return the rows of the Pareto front, by rising time."""
-        return [self.comparable_rows()[k] for k in pareto.front(self.points())]
+        return [self.comparable_rows()[k] for k in front(self.points())]
 
     def cheapest(self) -> Row | None:
         """Return the fastest row within the tolerance, or None."""
-        k = pareto.cheapest(self.points(), self.request.tolerance)
+        k = cheapest(self.points(), self.request.tolerance)
         return None if k is None else self.comparable_rows()[k]
 
     def nearest(self) -> Row | None:
         """Return the row of least error, or None."""
-        k = pareto.nearest(self.points())
+        k = nearest(self.points())
         return None if k is None else self.comparable_rows()[k]
 
 
-def describe(task: dict) -> str:
-    """Return a short description of a setting: integrator, dt, precision, and the rest if not default."""
-    setting = task["setting"]
-    words = [setting["integrator"], f"dt = {setting['dt']:.4g} s", setting["precision"]]
-    if setting["order"] is not None:
-        words.append(f"order {setting['order']}")
-    if setting["refine"]:
-        words.append(f"refine {setting['refine']}")
-    defaults = {"contact_solver": "auto", "arch": "cpu"}
-    rest = [key for key in AXES if key not in ("dt", "integrator", "precision", "order", "refine")]
-    words += [f"{key} {setting[key]}" for key in rest if setting[key] != defaults.get(key)]
-    return ("" if task.get("timed", True) else "reference ") + ", ".join(words)
+def text_of(study: Study) -> str:
+    """Return the whole study in Markdown: answer, table, runs not done, references, notes."""
+    parts = [f"# {study.request.scene}: speed against error", _answer(study)]
+    if study.ended:
+        resume = "The same command continues it." if study.kept else "Without --out nothing is kept."
+        needed = "if it takes longer than the whole budget, it needs a larger --budget"
+        parts.append(" ".join([f"Not complete: {study.ended}. {resume}", *(f"Cut: {run}; {needed}." for run in study.cut)]))
+    if ran := [row for row in study.rows if row.status in ("ok", "degraded", "failed")]:
+        parts.append(_run_table(study, ran))
+    parts += [_reasons(study, status) for status in ("failed", "degraded", "refused", "left out")]
+    parts.append(_method(study))
+    if study.notes:
+        parts.append("Notes:\n\n" + "\n".join(f"* {note}" for note in study.notes))
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def plain(study: Study) -> dict:
-    """Return a study as plain data for study.json."""
+def _answer(study: Study) -> str:
+    """Return a sentence naming the cheapest setting within the tolerance, or else the one of least error."""
+    by, tolerance = study.request.by, study.request.tolerance
+
+    def label(row: Row) -> str:
+        error = _format_error(*row.error(by))
+        return f"{describe(row.setting)}, {row.timing.median:.3g} s per simulated second, error {error}"
+
+    if (row := study.cheapest()) is not None:
+        caveat = "" if row.status == "ok" else f"; its run is {row.status}"
+        return f"Cheapest within {tolerance:.3g} ({by} error): {label(row)}{caveat}."
+    if (row := study.nearest()) is not None:
+        own, option = row.error(by)[1], "--reference-refine" if study.space is not None else "--reference-dt"
+        below = f" Errors below {own:.2g} are not resolved; {option} gives a better reference."
+        return f"No setting is within {tolerance:.3g} ({by} error); the nearest: {label(row)}.{below if own > tolerance else ''}"
+    return "No setting has both a time and an error."
+
+
+def _run_table(study: Study, rows: list[Row]) -> str:
+    """Return a table with one row per run; * marks the front. Axes that do not vary are left out."""
     front = study.front()
-    rows = [
-        asdict(row)
-        | {
-            "seconds_per_simulated_second": row.timing,
-            "error": row.resolved_error(study.request.by),
-            "on_front": row in front,
-            "below_reference": below_reference(row, study.request.by),
-        }
-        for row in study.rows
-    ]
-    references = [
-        {
-            "setting": r.setting,
-            "steps": r.steps,
-            "excursion": r.excursion,
-            "own_error": r.own_error,
-            "kind": r.kind,
-            "order_in_time": r.order_in_time,
-            "problems": r.problems,
-            "in_space": r is study.space,
-        }
+    columns = {"": lambda r: "*" if r in front else ""}
+    for key in AXES:
+        if key in ALWAYS_SHOWN or len({row.setting[key] for row in rows}) > 1:
+            columns["dt [s]" if key == "dt" else key.replace("_", " ")] = lambda r, key=key: _axis(r.setting[key])
+    columns["s/sim. s"] = lambda r: f"{r.timing.median:.3g}" if r.seconds else ""
+    columns["spread"] = lambda r: percent(spread_of(r.timing)) if r.seconds else ""
+    if any(row.in_space is not None for row in rows):
+        titles = {"in_time": ("error in time, max", "rms in time"), "in_space": ("error in space, max", "rms in space")}
+    else:
+        titles = {"in_time": ("error, max", "rms")}
+    for name, pair in titles.items():
+        for title, by in zip(pair, ("max", "rms")):
+            columns[title] = lambda r, name=name, by=by: _error(getattr(r, name), getattr(r, f"{name}_sure"), by)
+    columns["energy drift" if any(row.energy_kept for row in rows) else "energy error"] = lambda r: _number(r.energy)
+    columns["momentum"] = lambda r: _number(r.momentum)
+    if study.plan["touching"]:
+        columns["penetration/edge"] = lambda r: _number(r.penetration)
+        columns["contact residual"] = lambda r: _number(r.contact_residual)
+    columns |= {"unconverged": lambda r: _count(r.unconverged), "inverted": lambda r: _count(r.inverted)}
+    columns["status"] = lambda r: r.status
+    left = [k for k, name in enumerate(columns) if name in LEFT_ALIGNED]
+    return markdown(list(columns), [[cell(row) for cell in columns.values()] for row in rows], left=left)
+
+
+def _method(study: Study) -> str:
+    """Return what the errors refer to, the references' own errors, and how times were measured."""
+    lines = [
+        f"* reference {describe(r.setting)}: largest excursion {r.excursion:.4g} m, own error {r.own_error.max:.2g} (max), "
+        f"{r.own_error.rms:.2g} (rms), from dt and 2 dt, assuming order {r.order_in_time}"
         for r in study.references
     ]
-    cheapest, nearest = study.cheapest(), study.nearest()
+    own = next((row.in_space_sure for row in study.rows if row.in_space_sure is not None), None)
+    if study.space is not None and own is not None:
+        lines.append(
+            f"* errors in space are relative to the reference with {mesh_name(study.space.setting)}; its own error is "
+            f"{own.max:.2g} (max), {own.rms:.2g} (rms): {study.space_error_source}"
+        )
+    frame, frames = study.plan["frame"], study.plan["frames"]
+    threads = sorted({row.threads for row in study.rows if row.threads})
+    cores = f"{' or '.join(map(str, threads)) or 'no'} thread{'s' if threads != [1] else ''}, {study.workers} at a time"
+    counts = sorted({len(row.seconds) for row in study.rows if row.seconds}) or [0]
+    repeats = str(counts[0]) if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+    summary = (
+        f"{frame * frames if frame else 0.0:g} s simulated, compared at {frames} frames. Errors are distances over the "
+        "reference's largest excursion; `<` marks one below the reference's own error. Times are medians of "
+        f"{repeats} runs on {cores}, without compilation; spread is the interquartile range over the median; * marks the front."
+    )
+    return summary + ("\n\nReferences:\n\n" + "\n".join(lines) if lines else "")
+
+
+def _reasons(study: Study, status: str) -> str:
+    """Return a list of settings with the reason for their status, grouped by reason."""
+    by_reason: dict[str, list[dict]] = {}
+    for row in study.rows:
+        if row.status == status:
+            by_reason.setdefault(row.reason, []).append(row.setting)
+    lines = [f"* {_describe_settings(settings)}: {reason}" for reason, settings in by_reason.items()]
+    return f"{status.capitalize()}:\n\n" + "\n".join(lines) if lines else ""
+
+
+def _describe_settings(settings: list[dict]) -> str:
+    """Return a short description of settings, as a product of axes if they form one."""
+    values = {key: list(dict.fromkeys(s[key] for s in settings)) for key in AXES}
+    if len(settings) > 2 and len(settings) == math.prod(map(len, values.values())):
+        varying = [f"{key} {' | '.join(map(_axis, options))}" for key, options in values.items() if len(options) > 1]
+        return f"{settings[0]['integrator']}, " * (len(values["integrator"]) == 1) + ", ".join(varying)
+    return "; ".join(map(describe, settings))
+
+
+def _format_error(error: float, own: float) -> str:
+    return f"< {own:.2g}" if error < own else f"{error:.3g}"
+
+
+def _error(error: Error | None, own: Error | None, by: str) -> str:
+    return "" if error is None else _format_error(getattr(error, by), getattr(own, by))
+
+
+def _axis(value) -> str:
+    return "adaptive" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.2g}"
+
+
+def _count(value: int | None) -> str:
+    return "" if value is None else str(value)
+
+
+def csv_of(study: Study) -> str:
+    """Return all numbers as CSV (RFC 4180), one row per combination; unknown values are empty."""
+    text = io.StringIO(newline="")
+    writer, front = csv.writer(text), study.front()
+    for number, row in enumerate(study.rows):
+        cells = _cells(row, row in front) | {"error_by": study.request.by}
+        if number == 0:
+            writer.writerow(cells)
+        writer.writerow("" if value is None else value for value in cells.values())
+    return text.getvalue()
+
+
+def _cells(row: Row, on_front: bool) -> dict:
+    timing, record = row.timing, asdict(row)
+    cells = row.setting | {"status": row.status, "reason": row.reason, "on_front": on_front}
+    cells |= {"seconds_per_simulated_second": timing and timing.median, "spread": timing and spread_of(timing)}
+    cells |= {"repeats": len(row.seconds)}
+    for name in ("in_time", "in_space"):
+        error, own = record[name] or {}, record[f"{name}_sure"] or {}
+        for by in ("max", "rms"):
+            cells |= {f"error_{name}_{by}": error.get(by), f"reference_{name}_{by}": own.get(by)}
+    numbers = ("energy", "energy_kept", "momentum", "penetration", "contact_residual", "unconverged", "inverted")
+    return cells | {key: record[key] for key in (*numbers, "compile_seconds", "steps", "nodes", "tets", "threads", "machine")}
+
+
+def plain_of(study: Study) -> dict:
+    """Return a study as plain data for study.json."""
+    by, front, cheapest, nearest = study.request.by, study.front(), study.cheapest(), study.nearest()
+    reference_keys = ("setting", "steps", "excursion", "own_error", "kind", "order_in_time", "problems")
+    rows = []
+    for row in study.rows:
+        pair = row.error(by)
+        derived = {"seconds_per_simulated_second": row.timing, "error": row.resolved_error(by), "on_front": row in front}
+        rows.append(asdict(row) | derived | {"below_reference": pair is not None and pair[0] < pair[1]})
     return {
         "request": asdict(study.request),
         "frame": study.plan["frame"],
         "frames": study.plan["frames"],
         "rows": rows,
-        "references": references,
+        "references": [{k: getattr(r, k) for k in reference_keys} | {"in_space": r is study.space} for r in study.references],
         "cheapest": cheapest and cheapest.setting,
         "nearest": nearest and nearest.setting,
         "notes": study.notes,
@@ -130,9 +259,3 @@ def plain(study: Study) -> dict:
         "scene_digest": study.plan["scenes"]["refine 0"],
         "code_digest": study.plan["code"],
     }
-
-
-def below_reference(row: Row, by: str) -> bool:
-    """Return whether the row's error is below its reference's own error."""
-    pair = row.error(by)
-    return pair is not None and pair[0] < pair[1]

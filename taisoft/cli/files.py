@@ -1,0 +1,152 @@
+"""`taisoft info`, `tetrahedralize` and `scene`: describe a mesh file, fill a surface with tets, write a scene file."""
+
+import math
+import shlex
+import warnings
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+
+from taisoft.cli import Signals, printed_warnings
+from taisoft.cli.scene_file import load_scene
+from taisoft.errors import OutputError
+from taisoft.mesh.files import WRITERS, check_ending, read_mesh, write_mesh
+from taisoft.mesh.quality import edge_lengths, mean_ratio
+from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface
+from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.mesh.tetrahedralize import tetrahedralize
+from taisoft.scene.material import Material
+from taisoft.scene.obstacles import HalfSpace
+from taisoft.scene.scene import Scene
+from taisoft.scene.toml_writer import write_scene
+
+POOR_QUALITY = 0.1  # mean ratio below which a tet stiffens its surroundings and slows the solver noticeably
+MILLIMETRES_ABOVE = 20.0  # longest side in file units: soft bodies of more than 20 m are rare, parts of 20 mm are not
+TINY_BELOW = 1e-3  # soft bodies under 1 mm are rare
+DROP = 0.25  # over the body's height
+RELATIVE_STIFFNESS = 100.0  # Young's modulus over the pressure under the body: it sags by about 1 %
+DENSITY = 1000.0  # [kg/m^3]
+GROUND = "ground"
+MESH_SUFFIXES = (*WRITERS, ".node", ".ele")
+
+
+def info(arguments: Namespace) -> int:
+    """Print counts, size, likely unit, quality and problems. Raises MeshError if the file is not a mesh."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # they are listed as problems below
+        if Path(arguments.mesh).suffix.lower() in FORMATS:
+            lines = _describe_surface(read_surface(arguments.mesh))
+        else:
+            lines = describe(read_mesh(arguments.mesh))
+    _print_lines(arguments.mesh, lines)
+    return 0
+
+
+def fill(arguments: Namespace) -> int:
+    """Fill a surface with tets, write the mesh, print its properties. Bad arguments are refused before the mesher starts."""
+    out = Path(arguments.out)
+    check_ending(out)
+    if out.exists() and not arguments.overwrite:
+        raise OutputError(f"{out}: the file exists; --overwrite replaces it")
+    if not out.parent.is_dir():
+        raise OutputError(f"{out}: there is no folder {out.parent}")
+    with Signals(), printed_warnings():
+        surface = read_surface(arguments.surface, weld=arguments.weld)
+        mesh = tetrahedralize(surface, arguments.edge_length, arguments.envelope)
+        write_mesh(out, mesh)
+    _print_lines(out, describe(mesh))
+    return 0
+
+
+def scene(arguments: Namespace) -> int:
+    """Write the scene file and the files it needs, and print their names. Raises SceneError if no file can hold the scene."""
+    path = Path(arguments.scene)
+    with printed_warnings():
+        if path.suffix.lower() in MESH_SUFFIXES:
+            made, solver = _drop_scene(read_mesh(path), path.stem)
+        else:
+            made, solver = load_scene(arguments.scene, arguments.allow_outside)
+    for written in write_scene(arguments.out, made, solver, arguments.overwrite):
+        print(written)
+    return 0
+
+
+def describe(mesh: TetMesh) -> list[tuple[str, str]]:
+    """Return (name, text) lines about a mesh; lengths in the file's own unit."""
+    lengths = edge_lengths(mesh.vertices, mesh.tets)
+    quality = mean_ratio(lengths, mesh.volumes)
+    poor = np.count_nonzero(quality < POOR_QUALITY)
+    counts = f"{mesh.n_verts} vertices, {mesh.n_tets} tets, {len(mesh.surface)} surface triangles, {_pieces(mesh.n_components)}"
+    ratios = f"{quality.min():.3f} (tet {quality.argmin()}) to {quality.max():.3f}, median {np.median(quality):.3f}"
+    return [
+        *_size_lines(counts, mesh.vertices),
+        ("volume", f"{mesh.volumes.sum():.6g}"),
+        _edge_line(lengths),
+        ("quality", f"mean ratio {ratios}; 1 is a regular tet, {poor} are below {POOR_QUALITY}"),
+        *_problem_lines(mesh.warnings),
+    ]
+
+
+def _describe_surface(surface: SurfaceMesh) -> list[tuple[str, str]]:
+    """Return (name, text) lines about a surface, why it does not bound a solid, and how to fill it with tets."""
+    a, b, c = np.moveaxis(surface.vertices[surface.triangles], 1, 0)
+    lengths = np.concatenate([np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))])
+    counts = f"{len(surface.vertices)} vertices, {len(surface.triangles)} triangles, {_pieces(surface.n_pieces)}; no tets"
+    command = shlex.join([surface.source, "--out", f"{Path(surface.source).stem}.msh"])
+    return [
+        *_size_lines(counts, surface.vertices),
+        ("area", f"{surface.area:.6g}"),
+        ("volume", f"{surface.volume:.6g}" if surface.closed else "none, it is open"),
+        _edge_line(lengths),
+        *_problem_lines([*surface.warnings, *surface.faults()]),
+        ("next", f"fill it with tets: taisoft tetrahedralize {command}"),
+    ]
+
+
+def _pieces(number: int) -> str:
+    return "1 piece" if number == 1 else f"{number} pieces"
+
+
+def _size_lines(counts: str, vertices: np.ndarray) -> list[tuple[str, str]]:
+    """Return counts, bounding box, and a guess of the unit; taisoft itself reads every file as metres."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    box, longest = [_triple(values) for values in (low, high, high - low)], float((high - low).max())
+    unit = f"metres, probably (longest side {longest:.4g} m)"
+    if longest > MILLIMETRES_ABOVE:
+        unit = f"read as metres, the longest side is {longest:.4g} m; probably millimetres: scale by 0.001"
+    elif longest < TINY_BELOW:
+        unit = f"read as metres, the longest side is {longest:.4g} m; very small: is the file scaled?"
+    return [("counts", counts), ("box", f"{box[0]} to {box[1]}, size {box[2]}"), ("unit", unit)]
+
+
+def _edge_line(lengths: np.ndarray) -> tuple[str, str]:
+    return "edges", f"{lengths.min():.4g} to {lengths.max():.4g}, median {np.median(lengths):.4g}"
+
+
+def _problem_lines(texts: list[str]) -> list[tuple[str, str]]:
+    return [("" if i else "problems", text) for i, text in enumerate(texts or ["none"])]
+
+
+def _triple(values: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.5g}" for value in values) + ")"
+
+
+def _print_lines(title, lines: list[tuple[str, str]]) -> None:
+    print(title)
+    for name, text in lines:
+        print(f"  {name:<10} {text}")
+
+
+def _drop_scene(mesh: TetMesh, name: str) -> tuple[Scene, dict]:
+    """Return a scene in which the mesh, of rubber with stiffness scaled to its size, falls on the ground; and its solver dict."""
+    made = Scene(gravity=(0.0, -9.81, 0.0))
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    height = float((high - low)[1])
+    young = float(f"{RELATIVE_STIFFNESS * DENSITY * 9.81 * height:.0e}")  # one digit
+    rubber = Material(young=young, poisson=0.4, density=DENSITY, friction=0.5)
+    made.add_body(mesh, rubber, name="body" if name == GROUND else name, position=(0.0, DROP * height - float(low[1]), 0.0))
+    made.add_obstacle(HalfSpace((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), name=GROUND, friction=0.5)
+    fall = math.sqrt(2.0 * DROP * height / 9.81)  # [s]
+    fps = 50.0 if fall > 0.05 else float(np.ceil(2.5 / fall))
+    return made, {"dt": 0.5 / fps, "seconds": 100.0 / fps, "fps": fps}
