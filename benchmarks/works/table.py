@@ -4,7 +4,7 @@ from pathlib import Path
 
 from taisoft.output.plot import require_matplotlib, save, ticks
 from taisoft.output.tables import markdown, percent, spread_of
-from taisoft.study.pareto import front
+from taisoft.study.results import front
 
 from ..elasticity_runs import time_ratio
 from ..elasticity_table import Limit

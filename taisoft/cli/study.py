@@ -116,7 +116,7 @@ def _print_status(text: str) -> None:
 
 def answer(request: dict) -> dict:
     """Answer {"action": "plan" or "run", ...} in the child process: {"answer": plan or record} or {"error": sentence}."""
-    from taisoft.checkpoint import scene_digest
+    from taisoft.scene.fingerprint import scene_digest
     from taisoft.study.measure import measure
     from taisoft.study.plan import make_plan
 

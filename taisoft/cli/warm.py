@@ -16,7 +16,7 @@ import numpy as np
 import taisoft as ts
 from taisoft import compile_message
 from taisoft.backend.runtime import n_compiled
-from taisoft.dynamics import EXPLICIT
+from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import SimulationError
 from taisoft.mesh.shapes import box_mesh, sheet_mesh
 from taisoft.scene.key_frames import KeyFrames
@@ -63,7 +63,7 @@ def simulate(structure: "Structure", precision: str) -> None:
         while sim.step_count < count:
             sim.advance(count - sim.step_count)
         if implicit:
-            sim._stepper.compile_hard_steps()
+            sim._dynamics.stepper.compile_hard_steps()
             if not sim.touches:
                 sim.dt = LONG_DT  # so long that stiffness dominates inertia
                 sim.set_state(SQUEEZE * sim.positions())  # needs projected stiffness and a line search
