@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taisoft.attributes import Guarded, SimulationAttributeError, thawed
-from taisoft.backend.transfer import upload
+from taisoft.backend.arrays import upload
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure

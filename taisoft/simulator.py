@@ -8,7 +8,7 @@ import numpy as np
 
 from taisoft.attributes import thawed
 from taisoft.backend import runtime
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.dynamics import make_stepper
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.drag_spring import DragSpring, batch

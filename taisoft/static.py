@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena, upload
 from taisoft.backend.runtime import Runtime, open_kind, open_runtime
-from taisoft.backend.transfer import upload
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.no_contacts import NoContacts

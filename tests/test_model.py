@@ -13,7 +13,7 @@ from oracle import Oracle
 from scenes import COR, SNH, SVK, built, driven_scene, mixed_scene
 
 import taisoft as ts
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.fem import elasticity
 from taisoft.fem.mass import gravity_masses, lumped_masses, mass_matrix
 from taisoft.fem.model import body_loads, build_model

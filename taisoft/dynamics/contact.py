@@ -7,8 +7,7 @@ motion was too fast for the previous search.
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
-from taisoft.backend.transfer import download, upload
+from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.crossings import CROSSED, CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.collision.pipeline import Detection

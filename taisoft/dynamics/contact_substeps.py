@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.transfer import download
+from taisoft.backend.arrays import download
 from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.problem import find_factors
 from taisoft.contact.solve import SolveResult, solve

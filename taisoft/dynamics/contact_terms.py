@@ -12,7 +12,7 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.contact.assemble import FoundContacts, gap_minus_target
 from taisoft.contact.problem import CHANGED, NODES, RESIDUAL, SIZE, residual_of

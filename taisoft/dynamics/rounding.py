@@ -5,7 +5,7 @@ The rounding of F causes forces as large as those of a strain of eps; the roundi
 
 import numpy as np
 
-from taisoft.backend.transfer import download
+from taisoft.backend.arrays import download
 from taisoft.fem.model import Model
 
 

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
-from taisoft.backend.transfer import download, upload
+from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.contact.problem import RESIDUAL, find_factors
 from taisoft.dynamics import frictional, multipliers
 from taisoft.dynamics.contact_terms import (

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.transfer import upload
+from taisoft.backend.arrays import Count, upload
 from taisoft.dynamics import explicit
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.backend.transfer import download, upload
+from taisoft.backend.arrays import download, upload
 from taisoft.fem import reference
 from taisoft.scene.scene import Scene
 

@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import Count, FieldArena, download
 from taisoft.backend.runtime import Runtime, threads
-from taisoft.backend.transfer import download
 from taisoft.fem import reference
 from taisoft.fem.laws import LAWS
 from taisoft.fem.mass import MassMatrix, gravity_masses, lumped_masses, upload_mass_matrix

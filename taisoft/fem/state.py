@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import Runtime
 from taisoft.fem.scalars import N_COLUMNS, N_SCALARS
 

@@ -13,10 +13,8 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import Count, FieldArena, download
 from taisoft.backend.runtime import kernel
-from taisoft.backend.transfer import download
 from taisoft.errors import SimulationError
 from taisoft.fem.model import MATRIX_BLOCKS, Model, model_graph
 from taisoft.fem.subset import block_of, edge_of, first_block_of, last_block_of, n_edges_of, n_nodes_of, node_of
