@@ -12,7 +12,7 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
 from taisoft.fem.scalars import ELASTIC, GRAVITY, KINETIC, LOADS
 from taisoft.records import Energies
-from taisoft.scene.changes import CHANGEABLE, change_material
+from taisoft.scene.plan import CHANGEABLE, change_material
 from taisoft.settings import Settings, check_dt
 from taisoft.stability import stable_dt
 

@@ -24,9 +24,8 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError, SimulationError
 from taisoft.files import replacing
 from taisoft.scene.body import Body
-from taisoft.scene.changes import LOADS, change_load
 from taisoft.scene.key_frames import NodePath, ShapePath
-from taisoft.scene.numbers import Numbers, first_difference, scene_numbers
+from taisoft.scene.plan import LOADS, Numbers, change_load, first_difference, scene_numbers
 from taisoft.scene.scene import Material, Scene
 
 KIND, FORMAT = "taisoft checkpoint", 7  # increment FORMAT with every change of a file's content

@@ -3,7 +3,7 @@
 from taisoft.access import StateAccess
 from taisoft.dynamics.drag_spring import Drag, DragSpring
 from taisoft.errors import SimulationError
-from taisoft.scene.changes import change_load
+from taisoft.scene.plan import change_load
 
 
 class Loading(StateAccess):

@@ -10,9 +10,9 @@ from taisoft.contact import SOLVERS
 from taisoft.dynamics import EXPLICIT, INTEGRATORS, scheme_of
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
+from taisoft.scene.checks import MAX_TOLERANCE
 from taisoft.scene.plan import Plan, make_plan
 from taisoft.scene.scene import Scene
-from taisoft.scene.solver import MAX_TOLERANCE
 
 EXPLICIT_CONTACT = SOLVERS
 IMPLICIT_CONTACT = ("augmented_lagrangian",)

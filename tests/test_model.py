@@ -17,8 +17,7 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.fem import elasticity
 from taisoft.fem.mass import gravity_masses, lumped_masses, mass_matrix
 from taisoft.fem.model import body_loads, build_model
-from taisoft.scene.changes import change_material
-from taisoft.scene.plan import make_plan
+from taisoft.scene.plan import change_material, make_plan
 
 
 @pytest.fixture(scope="module", params=[1, "both"])

@@ -10,7 +10,7 @@ from taisoft.cli.scene_file import load_scene
 from taisoft.cli.warnings import printed_warnings
 from taisoft.mesh.files import WRITERS, read_mesh
 from taisoft.mesh.tet_mesh import TetMesh
-from taisoft.scene.material import Material
+from taisoft.scene.body import Material
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.scene.scene import Scene
 from taisoft.scene.toml_writer import write_scene

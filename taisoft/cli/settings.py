@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 
 from taisoft.errors import SceneError
 from taisoft.scene import checks
-from taisoft.scene.checks import nearest
-from taisoft.scene.solver import CHECKS, check_solver
+from taisoft.scene.checks import SOLVER_CHECKS, check_solver, nearest
 
 OF_SCENE = "the scene's solver dict: "
 RUN_KEYS = ("seconds", "fps")  # arguments of Simulator.run that a `solver` dict may hold too
@@ -115,7 +114,7 @@ def parse_scalar(text: str, assignment: str, option: str = "--set") -> float | i
 
 def check_scene_solver(solver: dict) -> None:
     """Raise SceneError if a scene's `solver` dict has unknown keys or invalid values."""
-    _refuse_unknown(solver, list(CHECKS), OF_SCENE)
+    _refuse_unknown(solver, list(SOLVER_CHECKS), OF_SCENE)
     try:
         check_solver(**solver)
     except SceneError as error:

@@ -14,7 +14,7 @@ from taisoft.errors import SceneError
 from taisoft.output.files import FolderLock, check_free, make_folder
 from taisoft.output.report import machine
 from taisoft.scene import checks
-from taisoft.scene.solver import check_solver
+from taisoft.scene.checks import check_solver
 from taisoft.study.grid import AXES
 from taisoft.study.output import FILES, check_scene, write
 from taisoft.study.results import Request, Study

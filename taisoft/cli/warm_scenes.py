@@ -12,9 +12,10 @@ import numpy as np
 from taisoft.dynamics import EXPLICIT
 from taisoft.mesh.shapes import box_mesh, sheet_mesh
 from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.scene.body import LAWS
 from taisoft.scene.key_frames import KeyFrames
 from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle
-from taisoft.scene.scene import LAWS, Material, Scene
+from taisoft.scene.scene import Material, Scene
 
 IMPLICIT = ("implicit_euler", "bdf2")  # the common ones
 STATIC = ""  # in place of an integrator

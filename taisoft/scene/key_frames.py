@@ -35,13 +35,11 @@ class KeyFrames:
 
     def __post_init__(self):
         what = "key frames"
-        try:
-            k = max(len(self.times), 1)
-        except TypeError:
-            k = 1
+        k = max(checks.length(self.times), 1)
         times = checks.array(self.times, f"{what}: times", ((k,),))
-        if (np.diff(times) <= 0).any():
-            first = int(np.argmax(np.diff(times) <= 0))
+        descends = np.diff(times) <= 0
+        if descends.any():
+            first = int(np.argmax(descends))
             raise SceneError(f"{what}: times must ascend, but {times[first + 1]:g} follows {times[first]:g}")
         if self.translations is None and self.rotations is None:
             raise SceneError(f"{what}: translations or rotations are needed")
@@ -55,10 +53,7 @@ class KeyFrames:
             if np.abs(validated["rotations"]).max() > MAX_ANGLE:
                 raise SceneError(f"{what}: rotations must be at most {MAX_ANGLE:g} rad about each axis")
             validated["_turns"] = _turns(validated["rotations"])
-        for field, value in validated.items():
-            value.setflags(write=False)
-            # The only way to store a validated value in a frozen record.
-            object.__setattr__(self, field, value)
+        checks.store(self, **validated)
 
     def __call__(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Return translation (3,) [m] and rotation (3,3) at time t [s]."""
