@@ -9,8 +9,9 @@ from taisoft.attributes import Guarded, SimulationAttributeError, thawed
 from taisoft.backend.arrays import upload
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SceneError, SimulationError
-from taisoft.fem.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces, measure
-from taisoft.fem.scalars import ELASTIC, GRAVITY, KINETIC, LOADS
+from taisoft.fem.measure import measure
+from taisoft.fem.state import ELASTIC, GRAVITY, KINETIC, LOADS
+from taisoft.fem.terms.elasticity import cauchy_stress, elastic_forces, force_differential, gather_forces
 from taisoft.records import Energies
 from taisoft.scene.plan import CHANGEABLE, change_material
 from taisoft.settings import Settings, check_dt

@@ -15,10 +15,10 @@ from taisoft.dynamics.drag_spring import DragSpring, batch
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SceneError, SimulationError, no_memory
-from taisoft.fem.elasticity import NO_TET, measure
 from taisoft.fem.laws import LAWS
+from taisoft.fem.measure import NO_TET, measure
 from taisoft.fem.model import build_model
-from taisoft.fem.scalars import FIRST_SOFTENED, LOADS
+from taisoft.fem.state import FIRST_SOFTENED, LOADS
 from taisoft.records import RunReport, StepReport
 from taisoft.resuming import Resuming
 from taisoft.running import run

@@ -13,9 +13,9 @@ from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage_result import StageResult
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.errors import SceneError, SimulationError
-from taisoft.fem.elasticity import measure
+from taisoft.fem.measure import measure
 from taisoft.fem.model import Layout, build_model
-from taisoft.fem.scalars import ELASTIC, N_INVERTED
+from taisoft.fem.state import ELASTIC, N_INVERTED
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
 

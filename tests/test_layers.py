@@ -28,12 +28,11 @@ ORDER = (
     ("backend.launching",),
     ("backend.runtime",),
     ("mesh", "scene"),
-    ("fem.scalars", "fem.math3", "fem.subset"),
-    ("fem.laws", "fem.lanes", "fem.reference", "fem.node_graph"),
+    ("fem.state", "fem.math3", "fem.node_graph"),
+    ("fem.laws", "fem.lanes", "fem.reference"),
     ("fem.terms",),
-    ("fem.mass", "fem.state"),
     ("fem.model",),
-    ("fem.elasticity", "stability"),
+    ("fem.measure", "stability"),
     ("linear",),
     ("collision", "contact"),
     ("dynamics",),
@@ -60,7 +59,7 @@ def parts_of(path: Path) -> tuple[str, ...]:
 
 
 def place_of(parts: tuple[str, ...]) -> str | None:
-    """The entry of ORDER that holds a module, such as "fem.laws" for ("fem", "laws", "projection"); None if there is none."""
+    """The entry of ORDER that holds a module, such as "fem.laws" for ("fem", "laws", "evaluate"); None if there is none."""
     return next((name for n in (2, 1) if (name := ".".join(parts[:n])) in LEVEL), None)
 
 

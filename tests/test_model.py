@@ -14,9 +14,9 @@ from scenes import COR, SNH, SVK, built, driven_scene, mixed_scene
 
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
-from taisoft.fem import elasticity
-from taisoft.fem.mass import gravity_masses, lumped_masses, mass_matrix
 from taisoft.fem.model import body_loads, build_model
+from taisoft.fem.reference import gravity_masses, lumped_masses, mass_matrix
+from taisoft.fem.terms import elasticity
 from taisoft.scene.plan import change_material, make_plan
 
 

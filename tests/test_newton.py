@@ -13,7 +13,7 @@ import taisoft as ts
 from taisoft.dynamics import implicit, scheme_of
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.stage_system import Stage, StageSystem
-from taisoft.fem.scalars import MIN_J
+from taisoft.fem.state import MIN_J
 
 
 def beam(order: int, **settings) -> ts.Simulator:

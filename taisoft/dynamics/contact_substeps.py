@@ -16,7 +16,7 @@ from taisoft.dynamics.explicit_contact import find_acceleration, finish_verlet, 
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.substeps import ExplicitStepper, SubstepResult
 from taisoft.errors import SimulationError
-from taisoft.fem.scalars import FAILED, LOWEST_J, MOST_INVERTED
+from taisoft.fem.state import FAILED, LOWEST_J, MOST_INVERTED
 
 MAX_SWEEPS = 1000  # per contact solve; one that needs more is reported as not converged
 MAX_CONTACT_BATCH = 200  # maximum sub-steps per batch, between checks for interruption

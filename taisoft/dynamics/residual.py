@@ -10,8 +10,8 @@ from taisoft.backend.runtime import kernel
 from taisoft.dynamics.contact_terms import impulse_on_node
 from taisoft.dynamics.impact import impact_residual
 from taisoft.dynamics.stage import place_node, residual_parts, set_change, squares
-from taisoft.fem.scalars import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
-from taisoft.fem.subset import n_nodes_of, node_of
+from taisoft.fem.node_graph import n_nodes_of, node_of
+from taisoft.fem.state import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.fem.terms import elasticity
 from taisoft.linear.pcg import dot64, total
 

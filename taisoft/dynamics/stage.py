@@ -7,8 +7,8 @@ import taichi as ti
 
 from taisoft.backend.arrays import Count
 from taisoft.backend.runtime import kernel
-from taisoft.fem.mass import mass_times
-from taisoft.fem.terms import mass_damping, stiffness_damping
+from taisoft.fem.lanes import mass_times
+from taisoft.fem.terms import rayleigh_damping
 from taisoft.linear.block_csr import row_times
 from taisoft.linear.pcg import PcgWork
 
@@ -73,7 +73,7 @@ def set_change(m: ti.template(), w: ti.template(), i, c, beta):
     """Set c (v - v_hat), plus beta a v with mass damping, for node i."""
     change = c * (stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64))
     if ti.static(m.damped):
-        change += beta * ti.cast(mass_damping.rate(m, i), ti.f64) * ti.cast(m.state.v[i], ti.f64)
+        change += beta * ti.cast(rayleigh_damping.mass_rate(m, i), ti.f64) * ti.cast(m.state.v[i], ti.f64)
     w.change[i] = change
 
 
@@ -88,7 +88,7 @@ def residual_parts(m: ti.template(), w: ti.template(), i, beta):
         else:
             internal += term.force(m, i)
     if ti.static(m.stiffness_damping):
-        damping += stiffness_damping.force(m, i, row_times(m, w.damper, i, m.state.v))
+        damping += rayleigh_damping.stiffness_force(m, i, row_times(m, w.damper, i, m.state.v))
     inertia = ti.cast(mass_times(m, i, w.change), m.real)
     return inertia - ti.cast(beta, m.real) * (internal + loads + damping), inertia, internal, loads
 

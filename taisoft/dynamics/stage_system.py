@@ -32,8 +32,8 @@ from taisoft.dynamics.rounding import RoundingFloor
 from taisoft.dynamics.stage import StageWork, begin_stage, negate_direction, set_direction_to_rest
 from taisoft.dynamics.subset_lists import SubsetLists
 from taisoft.fem.model import Model
-from taisoft.fem.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
-from taisoft.fem.subset import EVERYTHING
+from taisoft.fem.node_graph import EVERYTHING
+from taisoft.fem.state import END_SLOPE, START_SLOPE, STEP_LENGTH
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
 

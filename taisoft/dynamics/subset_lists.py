@@ -5,7 +5,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.fem.model import Model
-from taisoft.fem.subset import BLOCKS, EDGES, NODES, Subset
+from taisoft.fem.node_graph import BLOCKS, EDGES, NODES, Subset
 from taisoft.linear.block_csr import BlockCsr
 
 

@@ -11,7 +11,7 @@ from taisoft.dynamics import explicit
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.fem.model import Model
-from taisoft.fem.scalars import LOWEST_J, MOST_INVERTED, STEPS_DONE
+from taisoft.fem.state import LOWEST_J, MOST_INVERTED, STEPS_DONE
 
 LAUNCH_SECONDS = 0.1  # rough maximum of one launch, so that Ctrl-C takes effect
 DAMPING_POINT_SECONDS = 800e-9  # added by stiffness damping to a law's POINT_SECONDS: it projects the stiffness of each point

@@ -17,7 +17,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.fem.model import Model
-from taisoft.fem.subset import EVERYTHING, Subset
+from taisoft.fem.node_graph import EVERYTHING, Subset
 from taisoft.linear.block_csr import BLOCK, BlockCsr
 from taisoft.linear.coupling import NO_COUPLING, Coupling
 

@@ -13,7 +13,7 @@ from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.thickness import coarse_bending
 from taisoft.scene import checks
 from taisoft.scene.collision import CONTACT_MODES
-from taisoft.scene.key_frames import KeyFrames
+from taisoft.scene.key_frames import KeyFrames, NodePath
 
 LAWS = ("st_venant_kirchhoff", "corotational", "stable_neo_hookean")
 NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock, so that they bend far too little
@@ -249,7 +249,7 @@ class Body(Guarded):
         nodes = checks.selection(where, self.rest_positions, what, "node", repeats=False)
         mask = checks.axes(axes, what)
         if isinstance(path, KeyFrames):
-            path = path.of_nodes(self.rest_positions[nodes] + self.position)
+            path = NodePath(path, self.rest_positions[nodes] + self.position)
         if not callable(path):
             raise SceneError(f"{what}: path must be a function of time, not {path!r}")
         try:

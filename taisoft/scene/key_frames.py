@@ -74,23 +74,13 @@ class KeyFrames:
             rotation = rotation * from_rotvec(weight * self._turns[i])
         return translation, rotation.as_matrix()
 
-    def of_nodes(self, starts: np.ndarray) -> "NodePath":
-        """Return the path of nodes that start at `starts` (k,3) [m]."""
-        return NodePath(self, starts)
-
-    def of_shape(self, center: np.ndarray) -> "ShapePath":
-        """Return the path of an obstacle whose pivot is center (3,) [m]. Raises SceneError if release is set."""
-        if self.release:
-            raise SceneError("key frames: release is for nodes; an obstacle cannot be released")
-        return ShapePath(self, center)
-
 
 @dataclass(frozen=True, eq=False)
 class NodePath:
     """Key frames as a path for nodes: t [s] -> displacement (3,) or (k,3) [m], or None once the nodes are released."""
 
     frames: KeyFrames
-    starts: np.ndarray  #: (k,3) [m]
+    starts: np.ndarray  #: (k,3) [m], start positions
 
     def __call__(self, t: float) -> np.ndarray | None:
         if self.frames.release and t >= self.frames.times[-1]:
@@ -108,6 +98,10 @@ class ShapePath:
 
     frames: KeyFrames
     center: np.ndarray  #: (3,) [m], the shape's pivot
+
+    def __post_init__(self):
+        if self.frames.release:
+            raise SceneError("key frames: release is for nodes; an obstacle cannot be released")
 
     def __call__(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         translation, rotation = self.frames(t)

@@ -16,7 +16,7 @@ from taisoft.errors import MeshError, SceneError
 from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
 from taisoft.mesh.shapes import box_mesh
 from taisoft.scene import checks
-from taisoft.scene.key_frames import KeyFrames
+from taisoft.scene.key_frames import KeyFrames, ShapePath
 
 DEGENERATE = 1e-9  # a triangle has no area if its smallest height is below this times its longest edge
 UNIT_TOLERANCE = 8 * np.finfo(np.float64).eps  # squared lengths this close to 1 are kept, so normals read back unchanged
@@ -177,9 +177,8 @@ class MeshObstacle(Shape):
         bad = np.argwhere((triangles < 0) | (triangles >= len(vertices)))
         if len(bad):
             t, vertex = bad[0, 0], triangles[tuple(bad[0])]
-            raise SceneError(
-                f"mesh obstacle: triangle {t}: vertex {vertex} does not exist ({len(vertices)} vertices, counted from 0)"
-            )
+            there_are = f"({len(vertices)} vertices, counted from 0)"
+            raise SceneError(f"mesh obstacle: triangle {t}: vertex {vertex} does not exist {there_are}")
         triangles = np.array(triangles, dtype=np.int64)
         flat = np.flatnonzero(~(normals_and_heights(vertices, triangles)[1] > DEGENERATE))
         if len(flat):
@@ -234,10 +233,8 @@ def _unit_box() -> tuple[np.ndarray, np.ndarray]:
 
 def surface_numbers(friction, restitution, what: str) -> tuple[float, float]:
     """Return validated friction and restitution as floats. what: start of the message. Raises SceneError."""
-    return (
-        checks.number(friction, f"{what}: friction", minimum=0.0),
-        checks.number(restitution, f"{what}: restitution", minimum=0.0, maximum=1.0),
-    )
+    friction = checks.number(friction, f"{what}: friction", minimum=0.0)
+    return friction, checks.number(restitution, f"{what}: restitution", minimum=0.0, maximum=1.0)
 
 
 @guarded_record(
@@ -264,7 +261,7 @@ class Obstacle:
                 f"{what}: shape must be a HalfSpace, Sphere, Box, Capsule or MeshObstacle, not {type(self.shape).__name__}"
             )
         friction, restitution = surface_numbers(self.friction, self.restitution, what)
-        path = self.path.of_shape(self.shape.pivot) if isinstance(self.path, KeyFrames) else self.path
+        path = ShapePath(self.path, self.shape.pivot) if isinstance(self.path, KeyFrames) else self.path
         checks.store(self, friction=friction, restitution=restitution, path=path)
         if self.path is not None and not callable(self.path):
             raise SceneError(f"{what}: path must be a function of time, not {self.path!r}")
@@ -281,18 +278,15 @@ class Obstacle:
         try:
             translation, rotation = self.path(t)
         except Exception as error:
-            raise SceneError(
-                f"{what} must give (translation, rotation) and failed at t = {t:g}: {type(error).__name__}: {error}"
-            ) from error
+            cause = f"{type(error).__name__}: {error}"
+            raise SceneError(f"{what} must give (translation, rotation) and failed at t = {t:g}: {cause}") from error
         translation = checks.array(translation, f"{what}'s translation at t = {t:g}", ((3,),))
         rotation = checks.array(rotation, f"{what}'s rotation at t = {t:g}", ((3, 3),))
         with np.errstate(over="ignore", invalid="ignore"):
             rigid = np.abs(rotation.T @ rotation - np.eye(3)).max() <= RIGID_TOLERANCE and np.linalg.det(rotation) > 0
         if not rigid:
-            raise SceneError(
-                f"{what}'s rotation at t = {t:g} must be orthonormal to {RIGID_TOLERANCE:g} with determinant 1, "
-                f"not {rotation.tolist()}"
-            )
+            rule = f"must be orthonormal to {RIGID_TOLERANCE:g} with determinant 1, not {rotation.tolist()}"
+            raise SceneError(f"{what}'s rotation at t = {t:g} {rule}")
         return translation, rotation
 
     def points_at(self, t: float, points: np.ndarray) -> np.ndarray:
