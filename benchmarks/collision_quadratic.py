@@ -3,7 +3,7 @@
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.pipeline import MERGED, Detection
 from taisoft.collision.reduction import FOUND, KEPT, LEFT, UNKNOWN, is_same

@@ -12,7 +12,7 @@ import numpy as np
 import taichi as ti
 
 import taisoft as ts
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime, compile_clock
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.pipeline import Detection

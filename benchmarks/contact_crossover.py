@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime
 from taisoft.contact.problem import NODES, ContactProblem, build_node_problem, find_factors, index_nodes
 from taisoft.output.tables import markdown

@@ -15,7 +15,7 @@ from time import perf_counter
 import numpy as np
 
 import taisoft as ts
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime, compile_clock
 from taisoft.errors import SimulationError, TaisoftError
 from taisoft.static import StaticSolver

@@ -14,7 +14,7 @@ from time import perf_counter
 import numpy as np
 
 import taisoft as ts
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import compile_clock, open_runtime
 from taisoft.scene.scene import Scene
 from taisoft.static import StaticSolver

@@ -15,7 +15,7 @@ import numpy as np
 import taichi as ti
 
 import taisoft as ts
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel, open_runtime, threads
 
 from .collision_runs import clock

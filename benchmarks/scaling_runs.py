@@ -24,10 +24,9 @@ from taisoft import simulator
 from taisoft.backend.runtime import compile_clock, kernel, open_runtime, threads
 from taisoft.dynamics import stage_system
 from taisoft.fem import model
-from taisoft.fem.elasticity import elastic_forces
 from taisoft.fem.lanes import broadcast
-from taisoft.fem.scalars import LOWEST_J
-from taisoft.fem.terms.elasticity import HUGE, element_force
+from taisoft.fem.state import LOWEST_J
+from taisoft.fem.terms.elasticity import HUGE, elastic_forces, element_force
 from taisoft.linear import block_csr, pcg
 from taisoft.output.report import peak_memory
 from taisoft.scene.scene import Scene

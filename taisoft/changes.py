@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from taisoft.attributes import thawed
 from taisoft.errors import SimulationError
 from taisoft.queries import body_index, check_rows, nodes_of
-from taisoft.scene.changes import CHANGEABLE, change_load, change_material
+from taisoft.scene.plan import CHANGEABLE, change_load, change_material
 from taisoft.settings import FIXED, NAMES, Settings, check_dt
 
 if TYPE_CHECKING:

@@ -22,9 +22,8 @@ from taisoft import __version__
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError, SimulationError
 from taisoft.files import replacing
-from taisoft.scene.changes import LOADS, change_load
 from taisoft.scene.fingerprint import FEATURES, digest, run_time_numbers, scene_fingerprint
-from taisoft.scene.numbers import Numbers, first_difference, scene_numbers
+from taisoft.scene.plan import LOADS, Numbers, change_load, first_difference, scene_numbers
 from taisoft.scene.scene import Material, Scene
 from taisoft.settings import NAMES, plan_of
 

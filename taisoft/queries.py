@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taisoft.backend import runtime
-from taisoft.backend.transfer import upload
+from taisoft.backend.arrays import upload
 from taisoft.dynamics.drag_spring import Drag
 from taisoft.errors import SceneError
-from taisoft.fem import elasticity
+from taisoft.fem.terms import elasticity
 from taisoft.records import Energies
 from taisoft.stability import stable_dt as largest_stable_dt
 

@@ -10,9 +10,9 @@ from taisoft.contact import SOLVERS as EXPLICIT_CONTACT
 from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS, is_multistep
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
+from taisoft.scene.checks import MAX_TOLERANCE
 from taisoft.scene.plan import Plan, make_plan
 from taisoft.scene.scene import Scene
-from taisoft.scene.solver import MAX_TOLERANCE
 
 IMPLICIT_CONTACT = ("augmented_lagrangian",)
 CONTACT_SOLVERS = ("auto", *EXPLICIT_CONTACT, *IMPLICIT_CONTACT)

@@ -11,7 +11,7 @@ import scipy.sparse.linalg as spl
 
 from taisoft.errors import SceneError
 from taisoft.fem import reference
-from taisoft.fem.mass import lumped_masses
+from taisoft.fem.reference import lumped_masses
 from taisoft.scene.scene import Body, Scene
 
 MAX_WEIGHT_STRAIN = 0.5  # strain of a body under its own weight above which its scale is questioned

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena, upload
 from taisoft.backend.runtime import Runtime, open_kind, open_runtime
-from taisoft.backend.transfer import upload
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.no_contacts import NoContacts
@@ -14,9 +13,9 @@ from taisoft.dynamics.results import StageResult
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.errors import SceneError, SimulationError
-from taisoft.fem.elasticity import measure
+from taisoft.fem.measure import measure
 from taisoft.fem.model import Layout, build_model
-from taisoft.fem.scalars import ELASTIC, N_INVERTED
+from taisoft.fem.state import ELASTIC, N_INVERTED
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
 

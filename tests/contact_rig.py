@@ -3,7 +3,7 @@
 import contact_oracle as oracle
 import numpy as np
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import open_runtime
 from taisoft.contact import problem
 

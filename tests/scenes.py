@@ -11,7 +11,7 @@ from oracle import Oracle
 from oracle_elements import mesh_nodes
 
 import taisoft as ts
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime
 from taisoft.fem.model import Layout, Model, build_model
 from taisoft.scene.plan import make_plan

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 from lanes import opened
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.collision.boxes import update_boxes
 from taisoft.collision.candidates import Candidates
 from taisoft.collision.surface import build_surface, make_topology

@@ -16,9 +16,10 @@ import taisoft as ts
 from benchmarks.contact_captured import GOAL
 from benchmarks.contact_crossover import measure_crossover
 from taisoft.backend.runtime import open_runtime
-from taisoft.fem import elasticity
-from taisoft.fem.scalars import ELASTIC
-from taisoft.fem.subset import EVERYTHING
+from taisoft.fem.measure import measure
+from taisoft.fem.node_graph import EVERYTHING
+from taisoft.fem.state import ELASTIC
+from taisoft.fem.terms import elasticity
 from taisoft.linear import block_csr
 
 GPU = pytest.mark.cuda
@@ -39,7 +40,7 @@ def test_operator(arch, precision):
         x = rig.oracle.rest @ np.array([[0.6, 0.1, 0.0], [-0.15, 1.2, 0.05], [0.0, 0.1, 0.7]])
         x = x + 0.05 * rng.standard_normal(x.shape)
         rig.model.state.x.from_numpy(x)
-        elasticity.measure(rig.model)
+        measure(rig.model)
         assert rig.model.state.scalars.to_numpy()[ELASTIC] == pytest.approx(rig.oracle.energy(x), rel=100 * rig.eps)
         force = rig.vectors("force")
         elasticity.elastic_forces(rig.model)

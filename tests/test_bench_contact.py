@@ -39,7 +39,7 @@ from benchmarks.contact_runs import (
 )
 from benchmarks.contact_table import CONTACTS, PILE, STEP_SCENE, count_table, find_limits
 from benchmarks.report_parts import phases
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import open_runtime
 from taisoft.contact import SOLVERS
 from taisoft.contact.graph import node_graph

@@ -22,7 +22,7 @@ from benchmarks.elasticity_runs import Row, lasting_steps, make_rows, measure_ro
 from benchmarks.elasticity_table import Limit, slug
 from benchmarks.exact_path import SAMPLE, FallingBeam, load_exact
 from taisoft.errors import OutputError, SimulationError
-from taisoft.fem.mass import lumped_masses
+from taisoft.fem.reference import lumped_masses
 from taisoft.output.tables import markdown
 from taisoft.study.measure import TimedRun, advance
 

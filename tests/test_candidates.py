@@ -12,7 +12,7 @@ import taichi as ti
 from surfaces import brute_pairs, pairs_of, place, surface_of
 from test_bvh import colliders, scatter
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.collision.candidates import NEEDED, SLACK, TOTAL, Buffer, PairRows, entries, pairs
 from taisoft.collision.surface import ACTIVE
 from taisoft.errors import SimulationError

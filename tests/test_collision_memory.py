@@ -19,7 +19,7 @@ from surfaces import pairs_of, place, surface_of
 from test_bvh import colliders, scatter
 
 import taisoft as ts
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision import surface
 from taisoft.collision.bvh import Bvh

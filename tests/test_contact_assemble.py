@@ -12,7 +12,7 @@ import taichi as ti
 from rotations import rotation
 
 import taisoft as ts
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel, open_runtime
 from taisoft.contact.assemble import SELF_CONTACT, _warm_impulse, build_found, gap_minus_target, keep_impulses
 from taisoft.contact.problem import build_node_problem, fill_field

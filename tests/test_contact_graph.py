@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import open_runtime
 from taisoft.contact import colouring, problem
 from taisoft.contact.graph import colour_greedy, colour_random, groups, matrix_graph, node_graph

@@ -25,8 +25,8 @@ from taisoft.dynamics.contact_terms import NO_CONTACTS
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, STAY, STEP, form_residual, move
 from taisoft.dynamics.stage_system import StageSystem
-from taisoft.fem.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
-from taisoft.fem.subset import EVERYTHING
+from taisoft.fem.node_graph import EVERYTHING
+from taisoft.fem.state import END_SLOPE, START_SLOPE, STEP_LENGTH
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import to_scipy, unpacked
 from taisoft.linear.coupling import add_products, clear_products, form_product, gather_products, prepare_terms

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from scenes import SNH, SVK, built, mixed_scene
 
-from taisoft.fem import elasticity
-from taisoft.fem.scalars import ELASTIC, GRAVITY, MIN_J, N_INVERTED
-from taisoft.fem.subset import EVERYTHING
+from taisoft.fem.measure import measure
+from taisoft.fem.node_graph import EVERYTHING
+from taisoft.fem.state import ELASTIC, GRAVITY, MIN_J, N_INVERTED
+from taisoft.fem.terms import elasticity
 from taisoft.linear import block_csr
 
 SQUEEZE = np.array([[0.6, 0.1, 0.0], [-0.15, 1.2, 0.05], [0.0, 0.1, 0.7]])
@@ -70,7 +71,7 @@ def test_energies_and_volume_ratios(rig, squeezed):
     of_mass = rig.oracle.kinetic(v, explicit=False), rig.oracle.weight(squeezed, explicit=False)
     expected = (rig.oracle.energy(squeezed), *rig.oracle.volume_ratios(squeezed), *of_mass)
     rig.model.state.scalars.fill(-1.0)
-    elasticity.measure(rig.model)
+    measure(rig.model)
     # sums are in f64, but the rest shape, masses and gravity are stored in the model's precision
     assert rig.model.state.scalars.to_numpy()[: GRAVITY + 1] == pytest.approx(expected, rel=10 * rig.eps, abs=10 * rig.eps)
 
@@ -89,7 +90,7 @@ def test_no_force_at_rest(rig, where):
         Q = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
         x = x @ (Q * np.linalg.det(Q)).T
     force = elastic_force(rig, x)
-    elasticity.measure(rig.model)
+    measure(rig.model)
     largest = max(part.material.young for part in rig.oracle.parts)  # times about 1 m^2: the force of a strain of 1
     rounding = rig.eps + (1e-11 if where == "far" else 0.0)
     assert np.abs(force).max() < 10 * rounding * largest
@@ -103,7 +104,7 @@ def test_forces_are_minus_the_gradient_of_the_energy(rig, squeezed):
     elastic_force(rig, squeezed)
     for step in (h, -h):
         rig.model.state.x.from_numpy(squeezed + step * way)
-        elasticity.measure(rig.model)
+        measure(rig.model)
         energies.append(rig.model.state.scalars[ELASTIC])
     slope = (energies[0] - energies[1]) / (2 * h)
     assert abs(slope) > 1e4  # [N]
@@ -119,7 +120,7 @@ def test_a_tet_inverted_at_one_point_is_inverted(rig):
     low, count = rig.oracle.volume_ratios(x)
     assert count == (J <= 0).any(axis=1).sum() > 0 and (J <= 0).sum(axis=1).max() == 1
     rig.model.state.x.from_numpy(x)
-    elasticity.measure(rig.model)
+    measure(rig.model)
     assert rig.model.state.scalars[MIN_J] == pytest.approx(low, abs=10 * rig.eps) and rig.model.state.scalars[N_INVERTED] == count
 
 
@@ -206,7 +207,7 @@ def test_parallel_kernels_are_reproducible(rig, squeezed):
         block_csr.assemble(rig.model, rig.matrix, EVERYTHING, False)
         elasticity.elastic_forces(rig.model)
         elasticity.gather_forces(rig.model, rig.force)
-        elasticity.measure(rig.model)
+        measure(rig.model)
         fields = (rig.matrix.value, rig.matrix.diagonal, rig.force, rig.model.state.scalars)
         return [field.to_numpy() for field in fields]
 

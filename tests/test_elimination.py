@@ -23,7 +23,7 @@ from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.stage import ELASTIC_STAGE, STAY, form_residual, move
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.subset_lists import SubsetLists, entries_of
-from taisoft.fem.subset import BLOCKS, EDGES, NODES
+from taisoft.fem.node_graph import BLOCKS, EDGES, NODES
 from taisoft.linear import block_csr, pcg
 
 BETA = 0.01  # [s]

@@ -29,7 +29,7 @@ from png import decode
 from pxr import Sdf, Usd
 
 import taisoft as ts
-from taisoft.backend import fields
+from taisoft.backend import arrays
 from taisoft.checkpoint import read_checkpoint
 from taisoft.output.checkpoint import CheckpointWriter
 from taisoft.output.files import LOCK_NAME, OutputFolder
@@ -370,8 +370,8 @@ def test_too_little_memory(tmp_path, more, needed):
 
 
 def test_too_little_memory_for_the_fields(monkeypatch):
-    monkeypatch.setattr(fields, "SMALL", 0)
-    monkeypatch.setattr(fields, "available_memory", lambda: 17)
+    monkeypatch.setattr(arrays, "SMALL", 0)
+    monkeypatch.setattr(arrays, "available_memory", lambda: 17)
     with pytest.raises(ts.SimulationError, match=r"not enough memory for the array '\w+': .*: 17 bytes"):
         ts.Simulator(small_scene(), 0.01, "symplectic_euler")
     monkeypatch.undo()

@@ -14,11 +14,9 @@ import pytest
 import taichi as ti
 from lanes import opened
 
-from taisoft.backend import lane_pool, runtime
-from taisoft.backend.arrays import DTYPES
-from taisoft.backend.fields import FieldArena
+from taisoft.backend import runtime
+from taisoft.backend.arrays import DTYPES, ENTRIES, FieldArena, download, size_class, upload
 from taisoft.backend.runtime import kernel
-from taisoft.backend.transfer import download, upload
 from taisoft.errors import SimulationError
 
 SHAPES = [(7,), (5, 3), (4, 3, 2)]  # of scalars
@@ -45,7 +43,7 @@ def test_names_and_bytes():
 def test_memory_that_there_is_not(monkeypatch):
     with opened("f64"):
         arena = FieldArena()
-        monkeypatch.setattr("taisoft.backend.fields.available_memory", lambda: 2**21)
+        monkeypatch.setattr("taisoft.backend.arrays.available_memory", lambda: 2**21)
         with pytest.raises(SimulationError, match="not enough memory for the array 'x': .* are needed, available: "):
             arena.field("x", ti.f64, 2**19)
         with pytest.raises(SimulationError, match="not enough memory for the array 'y'"):
@@ -155,10 +153,10 @@ def test_lane_buffers(precision, real):
 def test_a_lane_buffer_beyond_the_pool():
     with opened("f32"):
         arena = FieldArena()
-        large = arena.lanes("large", ti.f32, lane_pool.ENTRIES + 1)
+        large = arena.lanes("large", ti.f32, ENTRIES + 1)
         small = arena.lanes("small", ti.f32, 10)
         assert large.memory is not small.memory and large.at == 0 and large.mask > small.mask
-        write_lanes(large.memory, lane_pool.ENTRIES - 3, 4, 2.0)
+        write_lanes(large.memory, ENTRIES - 3, 4, 2.0)
         assert sum_lanes(large.memory, 0, large.count) == 8.0
         arena.release()
 
@@ -167,7 +165,7 @@ def test_large_lane_buffers_share_fields(monkeypatch):
     """So kernels compiled for one serve the next. Two at a time have two; a larger one takes the place of those that lie idle."""
     runtime._kind = None  # a new Taichi, whose pool has none yet
     with opened("f32"):
-        monkeypatch.setattr(lane_pool, "ENTRIES", 0)
+        monkeypatch.setattr("taisoft.backend.arrays.ENTRIES", 0)
         arenas = [FieldArena() for _ in range(3)]
 
         def take(k: int, count: int):
@@ -196,8 +194,8 @@ def test_large_lane_buffers_share_fields(monkeypatch):
 
 def test_a_lane_buffer_has_a_quarter_to_spare_at_most():
     for count in [*range(1, 300), 2**24 + 1, 1_234_567_891]:
-        assert count <= lane_pool.size_class(count) <= max(1.25 * count, count + 1)
-    assert len({lane_pool.size_class(k) for k in range(1, 2**16)}) <= 4 * 17
+        assert count <= size_class(count) <= max(1.25 * count, count + 1)
+    assert len({size_class(k) for k in range(1, 2**16)}) <= 4 * 17
 
 
 def test_released_arrays_give_their_memory_back():

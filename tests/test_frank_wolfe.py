@@ -15,7 +15,7 @@ import pytest
 import taichi as ti
 from lanes import opened
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision import shapes
 from taisoft.collision.frank_wolfe import deepest_point

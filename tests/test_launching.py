@@ -18,8 +18,7 @@ import taichi as ti
 from lanes import opened
 
 from taisoft.backend import launching, runtime
-from taisoft.backend.arrays import Count
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.fem.laws import corotational, stable_neo_hookean
 

@@ -23,19 +23,16 @@ ORDER = (
     ("errors", "records", "files", "memory", "timing", "compile_message"),
     ("attributes",),
     ("backend.private",),
-    ("backend.tracing", "backend.arrays", "backend.lane_pool"),
+    ("backend.tracing", "backend.arrays"),
     ("backend.structure",),
     ("backend.launching",),
     ("backend.runtime",),
-    ("backend.transfer",),
-    ("backend.fields",),
     ("mesh", "scene"),
-    ("fem.scalars", "fem.math3", "fem.subset"),
-    ("fem.laws", "fem.lanes", "fem.reference", "fem.node_graph"),
+    ("fem.state", "fem.math3", "fem.node_graph"),
+    ("fem.laws", "fem.lanes", "fem.reference"),
     ("fem.terms",),
-    ("fem.mass", "fem.state"),
     ("fem.model",),
-    ("fem.elasticity", "stability"),
+    ("fem.measure", "stability"),
     ("linear",),
     ("collision", "contact"),
     ("dynamics.schemes",),
@@ -64,7 +61,7 @@ def parts_of(path: Path) -> tuple[str, ...]:
 
 
 def place_of(parts: tuple[str, ...]) -> str | None:
-    """The entry of ORDER that holds a module, such as "fem.laws" for ("fem", "laws", "projection"); None if there is none."""
+    """The entry of ORDER that holds a module, such as "fem.laws" for ("fem", "laws", "evaluate"); None if there is none."""
     return next((name for n in (2, 1) if (name := ".".join(parts[:n])) in LEVEL), None)
 
 

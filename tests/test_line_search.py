@@ -16,7 +16,7 @@ from taisoft.dynamics.linearised import LONGEST
 from taisoft.dynamics.newton import FAR, choose_start
 from taisoft.dynamics.stage import AGAIN, STEP
 from taisoft.dynamics.stage_system import StageSystem
-from taisoft.fem.scalars import STEP_LENGTH
+from taisoft.fem.state import STEP_LENGTH
 
 ADVANCE = StageSystem.advance
 

@@ -17,9 +17,9 @@ from scenes import COR, SNH, SVK, built, cube, mixed_scene, rubber
 import taisoft as ts
 from taisoft.backend import runtime
 from taisoft.dynamics.explicit_stepper import LAUNCH_SECONDS, MAX_BATCH, largest_batch
-from taisoft.fem.elasticity import NO_TET, measure
 from taisoft.fem.laws import LAWS
-from taisoft.fem.scalars import FIRST_SOFTENED, GRAVITY
+from taisoft.fem.measure import NO_TET, measure
+from taisoft.fem.state import FIRST_SOFTENED, GRAVITY
 
 LARGE = 34_560  # tets of the largest mesh whose runs are timed, `taisoft bench elasticity`
 

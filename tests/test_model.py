@@ -13,12 +13,11 @@ from oracle import Oracle
 from scenes import COR, SNH, SVK, built, driven_scene, mixed_scene
 
 import taisoft as ts
-from taisoft.backend.fields import FieldArena
-from taisoft.fem import elasticity
-from taisoft.fem.mass import gravity_masses, lumped_masses, mass_matrix
+from taisoft.backend.arrays import FieldArena
 from taisoft.fem.model import body_loads, build_model
-from taisoft.scene.changes import change_material
-from taisoft.scene.plan import make_plan
+from taisoft.fem.reference import gravity_masses, lumped_masses, mass_matrix
+from taisoft.fem.terms import elasticity
+from taisoft.scene.plan import change_material, make_plan
 
 
 @pytest.fixture(scope="module", params=[1, "both"])

@@ -16,7 +16,7 @@ import pytest
 import taichi as ti
 from scenes import opened
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.contact.problem import build_node_problem, fill_field
 from taisoft.dynamics.contact_terms import PAST
 from taisoft.dynamics.frictional import MAX_EXTRAPOLATION, MAX_R_SCALE, MIN_R_SCALE, extrapolate_multipliers, next_scale

@@ -11,7 +11,7 @@ import taichi as ti
 from surfaces import place, surface_of
 from test_bvh import colliders, scatter
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.boxes import list_near
 from taisoft.collision.bvh import Bvh

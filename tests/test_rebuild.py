@@ -16,6 +16,7 @@ from scenes import RELEASE, driven_scene
 
 import taisoft as ts
 from taisoft.backend import runtime
+from taisoft.backend.arrays import LanePool
 from taisoft.errors import SimulationError
 
 
@@ -31,7 +32,7 @@ def assert_same(a: tuple, b: tuple) -> None:
 def test_the_state_is_carried_over_and_the_next_step_is_that_of_a_new_simulator():
     scene = beam_scene(cells=(3, 1, 1))
     with ts.Simulator(scene, dt=0.004, integrator="symplectic_euler") as sim:
-        buffers = len(runtime.lane_pool()._taken)
+        buffers = len(LanePool.current._taken)
         sim.advance(20)
         sim.set_gravity((0.0, -5.0, 1.0))
         sim.set_material("beam", young=2e4)
@@ -40,7 +41,7 @@ def test_the_state_is_carried_over_and_the_next_step_is_that_of_a_new_simulator(
         assert_same(told(sim), before)
         assert sim.settings.integrator == "bdf2" and sim.dt == 0.01
         gc.collect()
-        assert len(runtime.lane_pool()._taken) == buffers + 1  # forces as before, and the stiffness of implicit steps
+        assert len(LanePool.current._taken) == buffers + 1  # forces as before, and the stiffness of implicit steps
         same = scene.snapshot()
         same.gravity, same.bodies[0].material = sim.scene.gravity, sim.scene.bodies[0].material
         with ts.Simulator(same, dt=0.01, integrator="bdf2") as other:

@@ -11,7 +11,7 @@ import pytest
 import taichi as ti
 from lanes import opened
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.collision.contacts import contact_fields
 from taisoft.collision.reduction import FOUND, LEFT, SAME_NORMAL, UNDECIDED, reduce_contacts, reduction_fields
 

@@ -13,7 +13,7 @@ from lanes import opened
 from taichi._lib import core
 
 from taisoft.backend import launching, runtime
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel, open_runtime
 from taisoft.errors import SimulationError
 

@@ -15,7 +15,8 @@ import pytest
 
 from taisoft.errors import SceneError
 from taisoft.mesh.shapes import box_mesh
-from taisoft.scene.scene import LAWS, Material, Scene
+from taisoft.scene.body import LAWS
+from taisoft.scene.scene import Material, Scene
 
 MESH = box_mesh((2, 2, 2), (1.0, 1.0, 1.0))
 

@@ -16,7 +16,7 @@ from toml_scenes import TURNED, floats, there_and_back
 import taisoft as ts
 from taisoft.cli.run import RUN_KEYS
 from taisoft.cli.scene_file import load_module, shipped_files
-from taisoft.scene.solver import CHECKS
+from taisoft.scene.checks import SOLVER_CHECKS
 
 DEMOS = shipped_files("demos")
 
@@ -76,7 +76,7 @@ EVERY_SETTING = {
 
 
 def test_everything_comes_back(tmp_path):
-    assert set(EVERY_SETTING) == set(CHECKS)
+    assert set(EVERY_SETTING) == set(SOLVER_CHECKS)
     there_and_back(tmp_path / "all.toml", everything(), EVERY_SETTING)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["all.toml", "all_mesh0.msh"]  # shared by two bodies
     text = (tmp_path / "all.toml").read_text()
@@ -87,7 +87,7 @@ def test_everything_comes_back(tmp_path):
 
 def test_settings_are_those_of_the_simulator():
     names = set(inspect.signature(ts.Simulator).parameters) - {"scene"}
-    assert set(CHECKS) == names | set(RUN_KEYS)
+    assert set(SOLVER_CHECKS) == names | set(RUN_KEYS)
 
 
 def test_numbers_of_numpy_are_written_as_plain_ones(tmp_path):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from surfaces import folded, place, separation, sheet, soup, surface_of
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.self_collision import Intersections
 from taisoft.collision.spatial_hash import SpatialHash

@@ -12,7 +12,7 @@ from rotations import rotation
 from scenes import built, rubber
 
 import taisoft as ts
-from taisoft.fem import elasticity
+from taisoft.fem.terms import elasticity
 
 FLAT = 1e-4  # volume of the worst tet over the mean
 

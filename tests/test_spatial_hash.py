@@ -16,7 +16,7 @@ import pytest
 from surfaces import brute_pairs, pairs_of, place, soup, surface_of
 from test_bvh import EMPTY, colliders, scatter
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.collision.spatial_hash import COUNTABLE, MAX_CELLS, N_LARGE, SpatialHash, grid_size
 from taisoft.errors import SimulationError
 

@@ -12,11 +12,12 @@ from rotations import rotation
 from scenes import built, driven_scene
 
 from taisoft.backend.runtime import kernel
-from taisoft.fem.elasticity import elastic_forces, measure
+from taisoft.fem.measure import measure
 from taisoft.fem.model import damping_table
-from taisoft.fem.scalars import ELASTIC, GRAVITY, LOADS
-from taisoft.fem.subset import EVERYTHING
-from taisoft.fem.terms import TERMS, dead_loads, elasticity, gravity, mass_damping, stiffness_damping
+from taisoft.fem.node_graph import EVERYTHING
+from taisoft.fem.state import ELASTIC, GRAVITY, LOADS
+from taisoft.fem.terms import TERMS, dead_loads, elasticity, gravity, rayleigh_damping
+from taisoft.fem.terms.elasticity import elastic_forces
 from taisoft.linear import block_csr
 from taisoft.linear.block_csr import row_times
 
@@ -37,8 +38,8 @@ def damping_of(m: ti.template(), damper: ti.template(), mass: ti.template(), sti
     """Forces of both dampers on every node."""
     ti.loop_config(serialize=True)
     for i in range(m.n_nodes):
-        mass[i] = mass_damping.force(m, i, m.state.v[i])
-        stiffness[i] = stiffness_damping.force(m, i, row_times(m, damper, i, m.state.v))
+        mass[i] = rayleigh_damping.mass_force(m, i, m.state.v[i])
+        stiffness[i] = rayleigh_damping.stiffness_force(m, i, row_times(m, damper, i, m.state.v))
 
 
 @pytest.fixture(scope="module", params=[1, 2])

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 import taisoft as ts
-from taisoft.fem.mass import lumped_masses
+from taisoft.fem.reference import lumped_masses
 from taisoft.mesh.quality import mean_surface_edge
 
 from .record import GRAVITY, Case, material, near, reported, rotation, small, submesh, worst

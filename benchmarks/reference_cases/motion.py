@@ -14,7 +14,7 @@ import numpy as np
 import taisoft as ts
 from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.errors import SimulationError
-from taisoft.fem.mass import lumped_masses
+from taisoft.fem.reference import lumped_masses
 
 from .record import LAWS, Case, Check, face, label, material, near, nearest, order, reported, scene, small
 

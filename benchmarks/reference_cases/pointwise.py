@@ -6,7 +6,7 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
-from taisoft.fem.mass import lumped_masses
+from taisoft.fem.reference import lumped_masses
 
 from .record import GRAVITY, LAWS, Case, deformation_gradients, face, material, near, rotation, scene, small, worst
 

@@ -1,17 +1,33 @@
-"""Arrays of a simulator. Kernels take them as arguments, so compiled code does not depend on their size or owner.
+"""The arrays of a simulator: allocated and counted by name, refused if they do not fit into memory, released together.
 
-On the CPU the memory is a NumPy array, which the host accesses directly; on CUDA it is Taichi's.
+Kernels take arrays as arguments, so compiled code does not depend on their size or owner. On the CPU the memory of an array is
+a NumPy array, which the host accesses directly; on CUDA it is Taichi's.
+
+Buffers that kernels write in SIMD lanes (element forces and stiffness blocks, which nodes then gather) are ranges of one Taichi
+field instead. LLVM merges four adjacent stores into one only if it can prove that their addresses are adjacent, and vectorises
+the rest of a kernel from such stores. The address of an array argument is reloaded before every store, which prevents the proof;
+that of a field is loaded once. The field is the first one created after Taichi starts and always has the same size, since
+compiled code and its key in the disk cache depend on the field's number and size. A buffer too large for it gets a separate
+field, for which kernels are compiled. That field is kept for later buffers, which can then use the same kernels, until a larger
+one replaces it.
 """
 
 import math
-from typing import Annotated
+import weakref
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import taichi as ti
 
 from taisoft.backend.private import impl
+from taisoft.errors import SimulationError
+from taisoft.memory import available_memory, format_bytes
 
 DTYPES = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u8: np.uint8}
+SMALL = 2**20  # bytes up to which available memory is not checked
+ENTRIES = 2**24  # of the shared field: enough for forces and stiffness of 250,000 linear tets
+OWN_MASK = 2**30 - 1  # index mask of a separate field, and its largest number of entries
 
 # Annotation of a number that kernels read from a record of arrays at run time. Other numbers, flags and modules of such a record
 # are compile-time structure: a kernel is compiled for each set of them.
@@ -37,11 +53,12 @@ class Array:
 
     def __init__(self, dtype, shape: tuple[int, ...], n: int, on_host: bool):
         self.dtype, self.n, self.shape = dtype, n, shape
-        self.host = np.empty(self.full_shape, dtype=DTYPES[dtype]) if on_host else None
+        self.host = self.device = None
         if on_host:
+            self.host = np.empty(self.full_shape, dtype=DTYPES[dtype])
             self.host.fill(0)  # touch the pages, so that later checks of available memory count them
-        # as scalars, because Taichi never frees arrays of vectors
-        self.device = None if on_host else ti.ndarray(dtype, (math.prod(self.full_shape),))
+        else:  # as scalars, because Taichi never frees arrays of vectors
+            self.device = ti.ndarray(dtype, (math.prod(self.full_shape),))
 
     @property
     def full_shape(self) -> tuple[int, ...]:
@@ -123,3 +140,155 @@ class View:
         for index, extent in zip(rest, self._extents):
             at = at * extent + index
         return impl.subscript(None, self._flat, at)
+
+
+@dataclass(frozen=True, eq=False)
+class Lanes:
+    """A buffer: entries [at, at + count) of `memory`, a Taichi field or an `Array`. mask: index mask."""
+
+    memory: Any
+    at: int
+    count: int
+    mask: int
+
+
+class LanePool:
+    """The shared field with its allocated ranges, and the separate fields of large buffers."""
+
+    current: ClassVar["LanePool | None"] = None  # of the running Taichi; None on CUDA, which uses threads instead of SIMD lanes
+
+    def __init__(self, dtype):
+        self.memory = ti.field(dtype)
+        place(self.memory, ENTRIES)
+        self._dtype = dtype
+        self._taken: dict[int, int] = {}  # first entry -> one past the last
+        self._large: dict[Any, tuple[int, Any]] = {}  # field -> number of entries, SNode tree
+        self._busy: set = set()  # the large fields in use
+
+    def take(self, count: int) -> Lanes:
+        """Allocate the lowest free range, or a separate field. It is freed when the returned object is collected.
+
+        Raises RuntimeError if memory does not suffice.
+        """
+        at = 0
+        for first in sorted(self._taken):
+            if first - at >= count:
+                break
+            at = self._taken[first]
+        if at + count > ENTRIES:
+            return self._take_large(count)
+        size = -(-count // 64) * 64  # align ranges to cache lines
+        self._taken[at] = at + size
+        lanes = Lanes(self.memory, at, count, ENTRIES - 1)
+        weakref.finalize(lanes, self._taken.pop, at, None)
+        return lanes
+
+    def _take_large(self, count: int) -> Lanes:
+        idle = [(entries, field) for field, (entries, _) in self._large.items() if field not in self._busy]
+        fitting = [entry for entry in idle if entry[0] >= count]
+        if fitting:
+            _, field = min(fitting, key=lambda entry: entry[0])
+        else:  # the new field also replaces the idle ones
+            for tree in [self._large.pop(field)[1] for _, field in idle]:
+                if tree.prog is impl.get_runtime().prog:  # trees of an earlier initialisation of Taichi are already freed
+                    tree.destroy()
+            field, entries = ti.field(self._dtype), size_class(count)
+            self._large[field] = entries, place(field, entries)
+        self._busy.add(field)
+        lanes = Lanes(field, 0, count, OWN_MASK)
+        weakref.finalize(lanes, self._busy.discard, field)
+        return lanes
+
+
+def size_class(count: int) -> int:
+    """Round count up to 4, 5, 6 or 7 times a power of two, at most a quarter more, so that few sizes occur."""
+    unit = 1 << max(count.bit_length() - 3, 0)
+    return -(-count // unit) * unit
+
+
+def place(field: Any, count: int) -> Any:
+    """Allocate a field with `count` entries. Returns its SNode tree: Taichi frees only whole trees."""
+    builder = ti.FieldsBuilder()
+    builder.dense(ti.i, count).place(field)
+    return builder.finalize()
+
+
+class FieldArena:
+    """Allocator of one simulator's arrays. bytes: size of each array, by name."""
+
+    def __init__(self) -> None:
+        self.bytes: dict[str, int] = {}
+        self._lanes: list[Lanes] = []
+        self._arrays: weakref.WeakSet[Array] = weakref.WeakSet()
+
+    def field(self, name: str, dtype, shape: tuple[int, ...] | int, data: np.ndarray | None = None) -> Array:
+        """Allocate scalars, filled from data if given, else with zeros."""
+        return self._allocate(name, dtype, shape, 0, data)
+
+    def vectors(self, name: str, dtype, shape: int, data: np.ndarray | None = None, n: int = 3) -> Array:
+        """Allocate n-vectors, filled from data (shape, n) if given, else with zeros."""
+        return self._allocate(name, dtype, shape, n, data)
+
+    def lanes(self, name: str, dtype, count: int) -> Lanes:
+        """Allocate a buffer that kernels write in SIMD lanes; its initial contents are undefined."""
+        if LanePool.current is None:
+            return Lanes(self.field(name, dtype, count), 0, count, OWN_MASK)
+        needed = self._checked_bytes(name, dtype, count, OWN_MASK)
+        try:
+            lanes = LanePool.current.take(count)
+        except RuntimeError:
+            raise SimulationError(self._memory_message(name, needed, available_memory())) from None
+        self.bytes[name] = needed
+        self._lanes.append(lanes)
+        return lanes
+
+    def _allocate(self, name: str, dtype, shape, n: int, data: np.ndarray | None) -> Array:
+        shape = (shape,) if isinstance(shape, int) else tuple(shape)
+        numbers = max(n, 1) * math.prod(shape[1:])
+        needed = self._checked_bytes(name, dtype, shape[0] * numbers, index_mask(n, shape[1:]) * numbers)
+        on_host = ti.cfg.arch != ti.cuda
+        try:
+            array = Array(dtype, shape, n, on_host)
+        except (MemoryError, RuntimeError):  # RuntimeError has the text of Taichi's C++ layer
+            raise SimulationError(self._memory_message(name, needed, available_memory() if on_host else None)) from None
+        if data is not None:
+            array.from_numpy(data)
+        self.bytes[name] = needed
+        self._arrays.add(array)
+        return array
+
+    def _checked_bytes(self, name: str, dtype, count: int, max_count: int) -> int:
+        """Return the bytes of count numbers. Raises SimulationError if count exceeds max_count or memory does not suffice."""
+        if name in self.bytes:
+            raise ValueError(f"array '{name}' is allocated twice")
+        if count > max_count:
+            raise SimulationError(f"array '{name}' needs {count} numbers, more than the {max_count} that fit")
+        needed = count * np.dtype(DTYPES[dtype]).itemsize
+        free = available_memory() if ti.cfg.arch != ti.cuda and needed > SMALL else None
+        if free is not None and needed > free:
+            raise SimulationError(self._memory_message(name, needed, free))
+        return needed
+
+    def _memory_message(self, name: str, needed: int, free: int | None) -> str:
+        return f"not enough memory for the array '{name}': {format_bytes(needed)} are needed, available: {format_bytes(free)}"
+
+    def release(self) -> None:
+        """Free all memory, including that of arrays still referenced: kernels must not be launched with them."""
+        self._lanes.clear()
+        for array in self._arrays:
+            array.release()
+        self._arrays.clear()
+        self.bytes.clear()
+
+
+def upload(pairs: list[tuple[Array, np.ndarray]]) -> None:
+    """Copy data into arrays of the same shape. Raises ValueError for a wrong shape, before anything is written."""
+    for array, data in pairs:
+        array.check(data)
+    for array, data in pairs:
+        array.from_numpy(data)
+
+
+def download(arrays: list[Array], rows: int | None = None) -> list[np.ndarray]:
+    """Copy arrays to NumPy; only the first `rows` rows if given."""
+    return [array.to_numpy(rows) for array in arrays]

@@ -7,10 +7,11 @@ rebuilt around those arguments, so the kernel's source reads as if it had receiv
 A record may contain records and tuples of records. Only the fields named by a kernel and the functions it calls are passed.
 
 A launch through Taichi looks up the type of every argument. A launch here whose records are known only sets numbers and
-addresses in a context that is created once. This relies on Taichi 1.7.4, the version that taisoft requires: see `tracing`.
+addresses in a context that is created once. This relies on Taichi 1.7.4: see `tracing`.
 """
 
 import dataclasses
+import functools
 import inspect
 import operator
 import weakref
@@ -38,17 +39,13 @@ class Compiled:
         generated = generate(function, {n: s for n, s in zip(names, structures) if s is not None})
         self._setters, dummies = [], []  # setters: (argument index, slot, kind) of non-template parameters
         self._leaves: list[tuple[int, int]] = []  # (first slot, argument index) of each template
-        slot = 0
         for index, (structure, annotation) in enumerate(zip(structures, annotations)):
             if structure is None:
-                self._setters.append((index, (slot,), _setter(annotation)))
+                self._setters.append((index, (len(dummies),), _setter(annotation)))
                 dummies.append(examples[index] if examples[index] is not None else 0)
-                slot += 1
-                continue
-            self._leaves.append((slot, index))
-            kinds = list(leaf_structures(structure))
-            dummies += [_dummy(kind) for kind in kinds]
-            slot += len(kinds)
+            else:
+                self._leaves.append((len(dummies), index))
+                dummies += [_dummy(kind) for kind in leaf_structures(structure)]
         self._public = ti.kernel(generated) if PUBLIC else None
         if PUBLIC:
             return
@@ -155,7 +152,7 @@ class Kernels:
     def forget(self) -> None:
         """Drop everything compiled: Taichi has been re-initialised."""
         self._compiled: dict[tuple, Compiled] = {}
-        self._ready: dict[tuple, tuple] = {}  # key of the arguments -> compiled kernel, context, weak references
+        self._ready: dict[tuple, tuple] = {}  # key of the arguments -> compiled kernel, context, `_references`
 
     @property
     def n_compiled(self) -> int:
@@ -174,7 +171,7 @@ class Kernels:
     def _key(self, arguments: tuple) -> tuple:
         """Key of the arguments: the identity of each record or array, the value of each constant."""
         key = [
-            (a, kind) if _is_constant[kind := type(a := arguments[k])] else id(a)  # 1, 1.0 and True are equal
+            (a, kind) if _is_constant(kind := type(a := arguments[k])) else id(a)  # 1, 1.0 and True are equal
             for k in self._templates
         ]
         for k in self._arrays:
@@ -185,18 +182,15 @@ class Kernels:
         """As `find`, but compile the kernel if it is new for the structure of these arguments."""
         names = self._names_for(arguments)
         structures = [structure_of(a, names) if k in self._templates else None for k, a in enumerate(arguments)]
-        kind = tuple([(a.dtype, a.ndim) for a in (arguments[k] for k in self._arrays)])
-        compiled = self._compiled.get((tuple(structures), kind))
-        if compiled is None:
+        kind = tuple(structures), tuple([(arguments[k].dtype, arguments[k].ndim) for k in self._arrays])
+        if kind not in self._compiled:
             examples = [a if k in self._arrays else None for k, a in enumerate(arguments)]
-            compiled = Compiled(self._function, self._names, self._annotations, structures, examples)
-            self._compiled[tuple(structures), kind] = compiled
-        key = self._key(arguments)
+            self._compiled[kind] = Compiled(self._function, self._names, self._annotations, structures, examples)
+        compiled, key = self._compiled[kind], self._key(arguments)
         # a context that holds Taichi's own arrays can be launched only once
         context = compiled.context(arguments) if ti.cfg.arch != ti.cuda else None
-        ready = compiled, context, self._references(key, arguments)
-        self._ready[key] = ready
-        return ready
+        self._ready[key] = compiled, context, self._references(key, arguments)
+        return self._ready[key]
 
     def _names_for(self, arguments: tuple) -> set[str]:
         seen: set = set()
@@ -210,9 +204,9 @@ class Kernels:
         return names
 
     def _references(self, key: tuple, arguments: tuple) -> list:
-        """References beside the entry `key`: weak ones that remove it as soon as a record or array of its is collected.
+        """Weak references that remove the entry `key` as soon as one of its records or arrays is collected.
 
-        Anything else that is known by its id is held, so that no other object takes that id.
+        Modules, functions and all else that is keyed by its id are held, so that no other object takes that id.
         """
         ready = self._ready
         return [
@@ -223,12 +217,7 @@ class Kernels:
         ]
 
 
-class _Constants(dict):
-    """Whether arguments of a type are keyed by value. A dict, because a launch checks every argument."""
-
-    def __missing__(self, kind: type) -> bool:
-        self[kind] = issubclass(kind, (bool, int, float, str, tuple))
-        return self[kind]
-
-
-_is_constant = _Constants()
+@functools.cache
+def _is_constant(kind: type) -> bool:
+    """Whether arguments of a type are keyed by value. Cached, because a launch asks for every argument."""
+    return issubclass(kind, (bool, int, float, str, tuple))

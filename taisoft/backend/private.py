@@ -1,24 +1,13 @@
 """All that taisoft uses of Taichi 1.7.4 beyond its public interface; a later version must be checked against this list."""
 
-from taichi._lib import core
-from taichi.lang import impl, kernel_impl
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
-from taichi.lang.enums import AutodiffMode
-from taichi.lang.expr import Expr
-from taichi.lang.kernel_impl import Kernel, template
-from taichi.types import ndarray_type, primitive_types
-from taichi.ui.utils import get_field_info
-
-__all__ = [
-    "ASTTransformerContext",
-    "AutodiffMode",
-    "Expr",
-    "Kernel",
-    "core",
-    "get_field_info",
-    "impl",
-    "kernel_impl",
-    "ndarray_type",
-    "primitive_types",
-    "template",
-]
+from taichi._lib import core as core
+from taichi.lang import impl as impl
+from taichi.lang import kernel_impl as kernel_impl
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext as ASTTransformerContext
+from taichi.lang.enums import AutodiffMode as AutodiffMode
+from taichi.lang.expr import Expr as Expr
+from taichi.lang.kernel_impl import Kernel as Kernel
+from taichi.lang.kernel_impl import template as template
+from taichi.types import ndarray_type as ndarray_type
+from taichi.types import primitive_types as primitive_types
+from taichi.ui.utils import get_field_info as get_field_info

@@ -18,7 +18,7 @@ import taichi as ti
 
 from taisoft import compile_message
 from taisoft.backend import tracing  # noqa: F401  tracing: before any function is decorated
-from taisoft.backend.lane_pool import LanePool
+from taisoft.backend.arrays import LanePool
 from taisoft.backend.launching import Kernels
 from taisoft.backend.private import impl
 from taisoft.errors import SimulationError
@@ -37,23 +37,21 @@ _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initia
 _program = None  # Taichi's program object of that initialisation
 _totals = {"compile": 0.0, "kernels": 0}
 _all_kernels: list[Kernels] = []
-_pool: LanePool | None = None
 
 
 class Runtime:
     """A claim on the process's Taichi runtime; `close` releases it.
 
     arch: "cpu" | "cuda"; precision: "f32" | "f64"; real: the Taichi type of everything but positions; lanes: number of
-    elements processed together (SIMD lanes on the CPU; 1 on CUDA, where threads run in parallel instead).
+    elements processed together (SIMD lanes on the CPU; 1 on CUDA, where threads run in parallel instead). owner: in messages.
     """
 
-    def __init__(self, arch: str, precision: str):
-        self.arch, self.precision = arch, precision
+    def __init__(self, arch: str, precision: str, owner: str):
+        self.arch, self.precision, self.owner = arch, precision, owner
         self.real = PRECISIONS[precision]
         self.np_real = np.float32 if precision == "f32" else np.float64
         self.eps = float(np.finfo(self.np_real).eps)
         self.lanes = 4 if arch == "cpu" else 1
-        self.owner = ""
         self._program = _program
 
     def check(self) -> None:
@@ -99,10 +97,8 @@ def open_runtime(arch: str, precision: str, owner: str = "a simulator") -> Runti
         _kind = None  # stays None if the initialisation fails
         _initialise(arch, precision)
         _kind = kind
-    runtime = Runtime(arch, precision)
-    runtime.owner = owner
-    _open.append(runtime)
-    return runtime
+    _open.append(Runtime(arch, precision, owner))
+    return _open[-1]
 
 
 def _cache_folder() -> str:
@@ -119,7 +115,7 @@ def _cache_folder() -> str:
 
 
 def _initialise(arch: str, precision: str) -> None:
-    global _program, _pool
+    global _program
     clock = time.perf_counter()
     try:
         os.getcwd()
@@ -150,16 +146,11 @@ def _initialise(arch: str, precision: str) -> None:
     _program = impl.get_runtime().prog
     for kernels in _all_kernels:  # they refer to the previous program
         kernels.forget()
-    _pool = LanePool(PRECISIONS[precision]) if arch == "cpu" else None
+    LanePool.current = LanePool(PRECISIONS[precision]) if arch == "cpu" else None
     _totals["compile"] += time.perf_counter() - clock
     actual = "cuda" if ti.cfg.arch == ti.cuda else "cpu"
     if actual != arch:
         raise SimulationError(f"arch '{arch}' is not available on this machine (Taichi fell back to '{actual}')")
-
-
-def lane_pool() -> LanePool | None:
-    """The lane pool of the current initialisation; None on CUDA, which uses threads instead of SIMD lanes."""
-    return _pool
 
 
 def threads() -> int:

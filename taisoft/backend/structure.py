@@ -22,9 +22,6 @@ from taisoft.backend.tracing import source_of
 RECORD, ARRAY, COUNT, TUPLE, CONSTANT = range(5)
 
 
-# --- names that a kernel uses -------------------------------------------------------------------------------------------
-
-
 def names_in(function: Callable, seen: set) -> set[str]:
     """All names, attributes included, used by a function and by the functions it can reach by name."""
     function = inspect.unwrap(function)
@@ -77,9 +74,6 @@ def holders(value: Any) -> Iterator[Any]:
             yield from holders(getattr(value, field.name))
 
 
-# --- structure ----------------------------------------------------------------------------------------------------------
-
-
 def structure_of(value: Any, names: set[str]) -> tuple:
     """The part of an argument that code depends on: equal for arguments that can share one compiled kernel."""
     if isinstance(value, Array):
@@ -96,20 +90,8 @@ def structure_of(value: Any, names: set[str]) -> tuple:
     return CONSTANT, type(value), value
 
 
-def leaves_of(value: Any, structure: tuple) -> Iterator[Array | int]:
-    """The arrays and numbers of an argument that become arguments of the compiled kernel, in order."""
-    if structure[0] in (ARRAY, COUNT):
-        yield value
-    elif structure[0] == TUPLE:
-        for item, part in zip(value, structure[1]):
-            yield from leaves_of(item, part)
-    elif structure[0] == RECORD:
-        for name, part in structure[2]:
-            yield from leaves_of(getattr(value, name), part)
-
-
 def leaf_structures(structure: tuple) -> Iterator[tuple]:
-    """The structures of the leaves, in the order of `leaves_of`."""
+    """The structures of the arrays and numbers of an argument that become arguments of the compiled kernel, in order."""
     if structure[0] in (ARRAY, COUNT):
         yield structure
     elif structure[0] == TUPLE:
@@ -118,6 +100,18 @@ def leaf_structures(structure: tuple) -> Iterator[tuple]:
     elif structure[0] == RECORD:
         for _, part in structure[2]:
             yield from leaf_structures(part)
+
+
+def leaves_of(value: Any, structure: tuple) -> Iterator[Array | int]:
+    """These arrays and numbers, in the order of `leaf_structures`."""
+    if structure[0] in (ARRAY, COUNT):
+        yield value
+    elif structure[0] == TUPLE:
+        for item, part in zip(value, structure[1]):
+            yield from leaves_of(item, part)
+    elif structure[0] == RECORD:
+        for name, part in structure[2]:
+            yield from leaves_of(getattr(value, name), part)
 
 
 def rebuild(structure: tuple, leaves: Iterator[Any]) -> Any:
@@ -143,9 +137,6 @@ def _annotation(structure: tuple) -> Any:
         return ti.i32
     dtype, n, _ = structure[1]
     return ti.types.ndarray(dtype=ti.types.vector(n, dtype) if n else dtype, ndim=1)
-
-
-# --- source -------------------------------------------------------------------------------------------------------------
 
 
 _numbers = itertools.count()  # of generated functions

@@ -16,7 +16,7 @@ from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.tetrahedralize import tetrahedralize
-from taisoft.scene.material import Material
+from taisoft.scene.body import Material
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.scene.scene import Scene
 from taisoft.scene.toml_writer import write_scene

@@ -16,10 +16,9 @@ from pathlib import Path
 from types import ModuleType
 
 from taisoft.errors import MeshError, SceneError
-from taisoft.scene.checks import nearest
+from taisoft.scene.checks import check_solver, nearest
 from taisoft.scene.refine import refined, with_order
 from taisoft.scene.scene import Scene
-from taisoft.scene.solver import CHECKS, check_solver
 
 PACKAGE = Path(__file__).resolve().parents[1]
 OF_SCENE = "the scene's solver dict: "
@@ -131,7 +130,7 @@ def _load(name: str, allow_outside: bool, requested: dict) -> tuple[Scene, dict,
 
 def check_scene_solver(solver: dict) -> None:
     """Raise SceneError if a scene's `solver` dict has unknown keys or invalid values."""
-    refuse_unknown(solver, list(CHECKS), OF_SCENE)
+    refuse_unknown(solver, list(SOLVER_CHECKS), OF_SCENE)
     try:
         check_solver(**solver)
     except SceneError as error:

@@ -16,7 +16,7 @@ from taisoft.errors import SceneError, TaisoftError
 from taisoft.output.files import FolderLock, check_free, make_folder
 from taisoft.output.report import machine
 from taisoft.scene import checks
-from taisoft.scene.solver import check_solver
+from taisoft.scene.checks import check_solver
 from taisoft.study import AXES, Request, mesh_name
 from taisoft.study.output import FILES, Store, check_scene, code_digest, digests, sources, write
 from taisoft.study.results import Study, text_of

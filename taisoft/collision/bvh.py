@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import Runtime, kernel
 from taisoft.collision.candidates import Buffer, Candidates, PairRows, pairs, sum_parts
 from taisoft.collision.surface import Surface, Topology, dvec, may_touch

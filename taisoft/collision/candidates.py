@@ -11,7 +11,7 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.surface import Surface
 from taisoft.errors import SimulationError

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + local edge); vertex and collider;

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.backend.transfer import download
+from taisoft.backend.arrays import download
 from taisoft.collision.analytic import AnalyticObstacles
 from taisoft.collision.surface import Surface, Topology
 from taisoft.fem.model import Layout

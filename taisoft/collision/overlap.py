@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.backend.transfer import download
+from taisoft.backend.arrays import download
 from taisoft.collision.pipeline import Detection
 from taisoft.mesh.solid_overlap import ALLOWED, Solid, overlap_depth
 from taisoft.mesh.triangle_queries import distances, segment_distance

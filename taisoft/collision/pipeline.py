@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
-from taisoft.backend.transfer import download, upload
 from taisoft.collision.analytic import NO_SHAPES, AnalyticObstacles, find_analytic
 from taisoft.collision.boxes import move_obstacles, take_prescribed, update_surface
 from taisoft.collision.bvh import Bvh, Trees

@@ -12,8 +12,7 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.contacts import ContactFields
 from taisoft.collision.surface import ivec

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.analytic import MIN_EXTRA_DEPTH, is_surface_minimum
 from taisoft.collision.boxes import list_near, sum_pairs

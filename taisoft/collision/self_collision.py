@@ -7,9 +7,8 @@ Present positions are used, without the motion during the step.
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena, download
 from taisoft.backend.runtime import kernel
-from taisoft.backend.transfer import download
 from taisoft.collision.candidates import Buffer, Candidates, pairs, sum_parts
 from taisoft.collision.features import corner
 from taisoft.collision.surface import Surface, part_first

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import Buffer, Candidates, entries, sort_row, sum_parts
 from taisoft.collision.surface import ACTIVE, Surface, boxes_overlap, ivec, may_touch, part_first

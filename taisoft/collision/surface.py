@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import Runtime
 
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than starting the others (about 50 us a loop)

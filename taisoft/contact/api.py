@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.contact import SOLVERS, augmented_lagrangian, numpy_prox
 from taisoft.contact.colouring import store

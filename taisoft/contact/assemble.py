@@ -15,10 +15,8 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import Count, FieldArena, upload
 from taisoft.backend.runtime import kernel
-from taisoft.backend.transfer import upload
 from taisoft.contact.problem import ContactProblem, to_frame, to_world
 from taisoft.contact.prox import dvec, prox, tangents
 from taisoft.scene.scene import Scene

@@ -17,10 +17,8 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import Count, FieldArena, upload
 from taisoft.backend.runtime import kernel
-from taisoft.backend.transfer import upload
 from taisoft.contact.prox import dvec, prox, scaled
 
 NODES = 6  # maximum nodes of a contact, three on each side

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taisoft.backend.transfer import download
-from taisoft.fem.elasticity import gather_forces
+from taisoft.backend.arrays import download
 from taisoft.fem.model import Model
+from taisoft.fem.terms.elasticity import gather_forces
 from taisoft.mesh.topology import connected_pieces
 from taisoft.scene.scene import Scene
 

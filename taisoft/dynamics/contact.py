@@ -7,8 +7,7 @@ motion was too fast for the previous search.
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
-from taisoft.backend.transfer import download
+from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.pipeline import Detection
 from taisoft.contact.assemble import (

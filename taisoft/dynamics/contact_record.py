@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from taisoft.backend.transfer import download, upload
+from taisoft.backend.arrays import download, upload
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.pipeline import Detection
 from taisoft.contact.assemble import FoundContacts

@@ -12,13 +12,13 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.contact.assemble import FoundContacts, gap_minus_target
 from taisoft.contact.problem import CHANGED, NODES, RESIDUAL, SIZE, residual_of
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
 from taisoft.fem.model import Model
-from taisoft.fem.subset import n_nodes_of, node_of
+from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.linear.block_csr import BLOCK
 from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from taisoft.errors import SimulationError
 from taisoft.fem.model import Layout
-from taisoft.scene.scene import Constraint, Scene
+from taisoft.scene.body import Constraint
+from taisoft.scene.scene import Scene
 
 
 @dataclass

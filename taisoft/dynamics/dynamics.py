@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taisoft.backend import runtime
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.drag_spring import DragSpring
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.schemes import IMPLICIT
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
-from taisoft.fem.elasticity import NO_TET, measure
+from taisoft.fem.measure import NO_TET, measure
 from taisoft.fem.model import build_model
-from taisoft.fem.scalars import FIRST_SOFTENED, LOADS
+from taisoft.fem.state import FIRST_SOFTENED, LOADS
 from taisoft.records import Energies, StepReport
 from taisoft.scene.plan import Plan
 from taisoft.scene.scene import Scene

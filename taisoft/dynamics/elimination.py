@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from taisoft.backend.transfer import download
+from taisoft.backend.arrays import download
 from taisoft.dynamics.newton import Newton
 from taisoft.dynamics.stage import STAY
 from taisoft.dynamics.stage_system import Stage, StageSystem

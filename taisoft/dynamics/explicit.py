@@ -11,8 +11,8 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.fem.lanes import broadcast
-from taisoft.fem.scalars import FAILED, INVERTED_NOW, LOWEST_J, MOST_INVERTED, STEPS_DONE
-from taisoft.fem.terms import elasticity, mass_damping
+from taisoft.fem.state import FAILED, INVERTED_NOW, LOWEST_J, MOST_INVERTED, STEPS_DONE
+from taisoft.fem.terms import elasticity, rayleigh_damping
 from taisoft.fem.terms.elasticity import EXPLODED, HUGE
 
 
@@ -48,7 +48,7 @@ def euler_velocity(m: ti.template(), i, dt):
     a = acceleration(m, i)
     v = m.state.v[i] + dt * a
     if ti.static(m.damped):
-        v -= dt * mass_damping.rate(m, i) * m.state.v[i]
+        v -= dt * rayleigh_damping.mass_rate(m, i) * m.state.v[i]
     return v
 
 
@@ -65,7 +65,7 @@ def verlet_half(m: ti.template(), s: ti.template(), i, dt):
     """Return the velocity after the first half kick."""
     v = m.state.v[i]
     if ti.static(m.damped):
-        v *= mass_damping.decay(m, i, 0.5 * dt)
+        v *= rayleigh_damping.mass_decay(m, i, 0.5 * dt)
     return v + 0.5 * dt * s.acceleration[i]
 
 
@@ -89,7 +89,7 @@ def verlet_kick(m: ti.template(), s: ti.template(), i, dt):
         half = s.half_velocity[i]
     v = half + 0.5 * dt * a
     if ti.static(m.damped):
-        v *= mass_damping.decay(m, i, 0.5 * dt)
+        v *= rayleigh_damping.mass_decay(m, i, 0.5 * dt)
     s.acceleration[i] = a
     m.state.v[i] = v
     return v
@@ -140,7 +140,7 @@ def compute_reactions(m: ti.template(), s: ti.template(), dt):
             v = m.state.v[i]
             if ti.static(not s.verlet):
                 v = s.held_velocity[k]
-            f += mass_damping.force(m, i, v)
+            f += rayleigh_damping.mass_force(m, i, v)
         s.reaction[k] = (1.0 - m.free[i]) * (mass * (m.state.v[i] - s.held_velocity[k]) / dt - f)
 
 

@@ -24,7 +24,7 @@ from taisoft.dynamics.explicit import (
     verlet_half,
     verlet_kick,
 )
-from taisoft.fem.scalars import FAILED, INVERTED_NOW, MOST_INVERTED
+from taisoft.fem.state import FAILED, INVERTED_NOW, MOST_INVERTED
 from taisoft.fem.terms import elasticity
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.transfer import download
+from taisoft.backend.arrays import download
 from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.problem import find_factors
 from taisoft.contact.solve import SolveResult, solve
@@ -17,7 +17,7 @@ from taisoft.dynamics.explicit_stepper import ExplicitStepper
 from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
-from taisoft.fem.scalars import FAILED, LOWEST_J, MOST_INVERTED
+from taisoft.fem.state import FAILED, LOWEST_J, MOST_INVERTED
 from taisoft.settings import Settings
 
 MAX_SWEEPS = 1000  # per contact solve; one that needs more is reported as not converged

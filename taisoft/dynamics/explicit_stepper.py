@@ -6,14 +6,13 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.transfer import upload
+from taisoft.backend.arrays import Count, upload
 from taisoft.dynamics import explicit
 from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.fem.model import Model
-from taisoft.fem.scalars import LOWEST_J, MOST_INVERTED, STEPS_DONE
+from taisoft.fem.state import LOWEST_J, MOST_INVERTED, STEPS_DONE
 from taisoft.settings import Settings
 
 LAUNCH_SECONDS = 0.1  # rough maximum of one launch, so that Ctrl-C takes effect

@@ -30,9 +30,9 @@ import taichi as ti
 from taisoft.backend.runtime import kernel
 from taisoft.contact.problem import to_world
 from taisoft.contact.prox import dvec
-from taisoft.fem.mass import mass_times
-from taisoft.fem.scalars import OTHER_SUM, SUM
-from taisoft.fem.terms import mass_damping
+from taisoft.fem.lanes import mass_times
+from taisoft.fem.state import OTHER_SUM, SUM
+from taisoft.fem.terms import rayleigh_damping
 from taisoft.linear.block_csr import block_times
 from taisoft.linear.pcg import total
 
@@ -54,7 +54,7 @@ def impact_residual(m: ti.template(), A: ti.template(), k: ti.template(), i, tau
     """
     inertia = ti.cast(1.0, m.real)
     if ti.static(m.damped):
-        inertia += ti.cast(tau, m.real) * mass_damping.rate(m, i)
+        inertia += ti.cast(tau, m.real) * rayleigh_damping.mass_rate(m, i)
     velocity_jump, mass = (m.state.x[i] - k.x_linear[i]) / tau, m.mass[i]
     if ti.static(m.consistent):
         mass = m.mass_matrix.diagonal[i]

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import taichi as ti
 
+from taisoft.backend.arrays import download, upload
 from taisoft.backend.runtime import kernel
-from taisoft.backend.transfer import download, upload
 from taisoft.dynamics.body_balance import LIMIT, BodyBalance
 from taisoft.dynamics.contact import TOLERANCE, ContactStep
 from taisoft.dynamics.contact_newton import solve

@@ -19,7 +19,7 @@ from taisoft.dynamics.contact_terms import (
     update_contact,
 )
 from taisoft.dynamics.stage import place_node
-from taisoft.fem.scalars import OTHER_SUM, STEP_LENGTH, SUM
+from taisoft.fem.state import OTHER_SUM, STEP_LENGTH, SUM
 from taisoft.linear.block_csr import block_times, partial_row_times
 from taisoft.linear.pcg import dot64, total
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from taisoft.backend.transfer import download
+from taisoft.backend.arrays import download
 from taisoft.contact.assemble import FoundContacts
 from taisoft.contact.restitution import find_rebounds
 from taisoft.dynamics.simulation_state import SimulationState

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
-from taisoft.backend.transfer import download, upload
 from taisoft.dynamics.dirichlet import DirichletConditions
-from taisoft.fem.mass import gravity_masses, lumped_masses, upload_mass_matrix
-from taisoft.fem.model import Layout, Model, body_loads, damping_table, material_table
+from taisoft.fem.model import Layout, Model, body_loads, damping_table, material_table, upload_mass_matrix
+from taisoft.fem.reference import gravity_masses, lumped_masses
 from taisoft.scene.scene import Scene
 
 

@@ -14,10 +14,10 @@ from taisoft.backend.arrays import Count
 from taisoft.backend.runtime import kernel
 from taisoft.dynamics.contact_terms import impulse_on_node
 from taisoft.dynamics.impact import impact_residual
-from taisoft.fem.mass import mass_times
-from taisoft.fem.scalars import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
-from taisoft.fem.subset import n_nodes_of, node_of
-from taisoft.fem.terms import elasticity, mass_damping, stiffness_damping
+from taisoft.fem.lanes import mass_times
+from taisoft.fem.node_graph import n_nodes_of, node_of
+from taisoft.fem.state import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
+from taisoft.fem.terms import elasticity, rayleigh_damping
 from taisoft.linear.block_csr import row_times
 from taisoft.linear.pcg import PcgWork, dot64, total
 
@@ -85,7 +85,7 @@ def set_change(m: ti.template(), w: ti.template(), i, c, beta):
     """Set c (v - v_hat), plus beta a v with mass damping, for node i."""
     change = c * (stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64))
     if ti.static(m.damped):
-        change += beta * ti.cast(mass_damping.rate(m, i), ti.f64) * ti.cast(m.state.v[i], ti.f64)
+        change += beta * ti.cast(rayleigh_damping.mass_rate(m, i), ti.f64) * ti.cast(m.state.v[i], ti.f64)
     w.change[i] = change
 
 
@@ -100,7 +100,7 @@ def residual_parts(m: ti.template(), w: ti.template(), i, beta):
         else:
             internal += term.force(m, i)
     if ti.static(m.stiffness_damping):
-        damping += stiffness_damping.force(m, i, row_times(m, w.damper, i, m.state.v))
+        damping += rayleigh_damping.stiffness_force(m, i, row_times(m, w.damper, i, m.state.v))
     inertia = ti.cast(mass_times(m, i, w.change), m.real)
     return inertia - ti.cast(beta, m.real) * (internal + loads + damping), inertia, internal, loads
 

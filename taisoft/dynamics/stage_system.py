@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
-from taisoft.backend.transfer import download, upload
+from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.contact.problem import RESIDUAL, find_factors
 from taisoft.dynamics import frictional
 from taisoft.dynamics.body_balance import RoundingFloor
@@ -44,8 +43,8 @@ from taisoft.dynamics.stage import (
 )
 from taisoft.dynamics.subset_lists import SubsetLists
 from taisoft.fem.model import Model
-from taisoft.fem.scalars import END_SLOPE, START_SLOPE, STEP_LENGTH
-from taisoft.fem.subset import EVERYTHING
+from taisoft.fem.node_graph import EVERYTHING
+from taisoft.fem.state import END_SLOPE, START_SLOPE, STEP_LENGTH
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
 

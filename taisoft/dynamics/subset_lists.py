@@ -3,10 +3,9 @@
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
-from taisoft.backend.transfer import download, upload
+from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.fem.model import Model
-from taisoft.fem.subset import BLOCKS, EDGES, NODES, Subset
+from taisoft.fem.node_graph import BLOCKS, EDGES, NODES, Subset
 from taisoft.linear.block_csr import BlockCsr
 
 

@@ -7,7 +7,7 @@ For order 1, c_a are the unit vectors, one point suffices, and F = Ds Dm^-1.
 
 import taichi as ti
 
-from taisoft.backend.tracing import arithmetic
+from taisoft.fem.math3 import ddot, dot, matmul_tn
 
 
 @ti.func
@@ -69,23 +69,11 @@ def derivatives_at(m: ti.template(), g: ti.template(), q, real: ti.template()):
 def gradient_at(m: ti.template(), g: ti.template(), E, M, q, real: ti.template()):
     """Gradient with respect to rest positions at quadrature point q: F if E holds the differences of x. M: `rest_gradients`."""
     if ti.static(g.order == 1):
-        return edges_times(E, M)
+        return matmul_tn(E, M)  # E holds D by columns
     else:
         C = derivatives_at(m, g, q, real)
-        D = [
-            E[r] * C[c]
-            + E[3 + r] * C[3 + c]
-            + E[6 + r] * C[6 + c]
-            + E[9 + r] * C[9 + c]
-            + E[12 + r] * C[12 + c]
-            + E[15 + r] * C[15 + c]
-            + E[18 + r] * C[18 + c]
-            + E[21 + r] * C[21 + c]
-            + E[24 + r] * C[24 + c]
-            for c in ti.static(range(3))
-            for r in ti.static(range(3))
-        ]
-        return edges_times(D, M)
+        D = [ddot(E[r::3], C[c::3]) for c in ti.static(range(3)) for r in ti.static(range(3))]
+        return matmul_tn(D, M)
 
 
 @ti.func
@@ -110,12 +98,6 @@ def deformation_gradient(m: ti.template(), g: ti.template(), X, N, q):
         return [ti.cast(F[k], m.real) for k in ti.static(range(9))]
 
 
-@arithmetic
-def edges_times(D, M):
-    """D M with D by columns: entry 3 c + r."""
-    return [D[i] * M[j] + D[3 + i] * M[3 + j] + D[6 + i] * M[6 + j] for i in ti.static(range(3)) for j in ti.static(range(3))]
-
-
 @ti.func
 def zero_forces(m: ti.template(), g: ti.template()):
     """Zero-initialised accumulator for `add_forces`."""
@@ -126,11 +108,7 @@ def zero_forces(m: ti.template(), g: ti.template()):
 def add_forces(m: ti.template(), g: ti.template(), S: ti.template(), P, M, q):
     """Add the contribution of stress P at quadrature point q to S, forces per volume: entry 3 (a - 1) + i, nodes a >= 1."""
     w = weight_at(m, g, q, m.real)
-    H = [
-        w * (P[3 * i] * M[3 * c] + P[3 * i + 1] * M[3 * c + 1] + P[3 * i + 2] * M[3 * c + 2])
-        for c in ti.static(range(3))
-        for i in ti.static(range(3))
-    ]
+    H = [w * dot(P[3 * i : 3 * i + 3], M[3 * c : 3 * c + 3]) for c in ti.static(range(3)) for i in ti.static(range(3))]
     if ti.static(g.order == 1):
         for k in ti.static(range(9)):
             S[k] += H[k]
@@ -169,6 +147,19 @@ def store_forces(m: ti.template(), g: ti.template(), b, S):
                 m.state.element_force[base + ((3 * a + i) * m.lanes + q)] = f[q]
         for q in ti.static(range(m.lanes)):
             m.state.element_force[base + (i * m.lanes + q)] = -total[q]
+
+
+@ti.func
+def mass_times(m: ti.template(), i, u: ti.template()):
+    """(M u)_i in f64, u a field of nodal 3-vectors."""
+    s = ti.Vector([0.0, 0.0, 0.0], ti.f64)
+    if ti.static(m.consistent):
+        s = ti.cast(m.mass_matrix.diagonal[i], ti.f64) * ti.cast(u[i], ti.f64)
+        for k in range(m.mass_matrix.row_start[i], m.mass_matrix.row_start[i + 1]):
+            s += ti.cast(m.mass_matrix.value[k], ti.f64) * ti.cast(u[m.mass_matrix.column[k]], ti.f64)
+    else:
+        s = ti.cast(m.mass[i], ti.f64) * ti.cast(u[i], ti.f64)
+    return s
 
 
 @ti.func

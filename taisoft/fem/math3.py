@@ -13,38 +13,6 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
 @arithmetic
-def matmul(A, B):
-    """A B."""
-    return [
-        A[3 * i] * B[j] + A[3 * i + 1] * B[3 + j] + A[3 * i + 2] * B[6 + j]
-        for i in ti.static(range(3))
-        for j in ti.static(range(3))
-    ]
-
-
-@arithmetic
-def matmul_nt(A, B):
-    """A B^T."""
-    return [
-        A[3 * i] * B[3 * j] + A[3 * i + 1] * B[3 * j + 1] + A[3 * i + 2] * B[3 * j + 2]
-        for i in ti.static(range(3))
-        for j in ti.static(range(3))
-    ]
-
-
-@arithmetic
-def matmul_tn(A, B):
-    """A^T B."""
-    return [A[i] * B[j] + A[3 + i] * B[3 + j] + A[6 + i] * B[6 + j] for i in ti.static(range(3)) for j in ti.static(range(3))]
-
-
-@arithmetic
-def transform(A, x):
-    """A x."""
-    return [A[3 * i] * x[0] + A[3 * i + 1] * x[1] + A[3 * i + 2] * x[2] for i in ti.static(range(3))]
-
-
-@arithmetic
 def dot(a, b):
     """a . b of two 3-vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -57,19 +25,39 @@ def cross(a, b):
 
 
 @arithmetic
+def transform(A, x):
+    """A x."""
+    return [dot(A[3 * i : 3 * i + 3], x) for i in ti.static(range(3))]
+
+
+@arithmetic
+def matmul(A, B):
+    """A B."""
+    return [dot(A[3 * i : 3 * i + 3], B[j::3]) for i in ti.static(range(3)) for j in ti.static(range(3))]
+
+
+@arithmetic
+def matmul_nt(A, B):
+    """A B^T."""
+    return [dot(A[3 * i : 3 * i + 3], B[3 * j : 3 * j + 3]) for i in ti.static(range(3)) for j in ti.static(range(3))]
+
+
+@arithmetic
+def matmul_tn(A, B):
+    """A^T B."""
+    return [dot(A[i::3], B[j::3]) for i in ti.static(range(3)) for j in ti.static(range(3))]
+
+
+@arithmetic
+def add_to_diagonal(A, t):
+    """A + t I."""
+    return [A[k] + (t if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
+
+
+@arithmetic
 def cofactor(F):
-    """Cofactor matrix of F, dJ/dF."""
-    return [
-        F[4] * F[8] - F[5] * F[7],
-        F[5] * F[6] - F[3] * F[8],
-        F[3] * F[7] - F[4] * F[6],
-        F[2] * F[7] - F[1] * F[8],
-        F[0] * F[8] - F[2] * F[6],
-        F[1] * F[6] - F[0] * F[7],
-        F[1] * F[5] - F[2] * F[4],
-        F[2] * F[3] - F[0] * F[5],
-        F[0] * F[4] - F[1] * F[3],
-    ]
+    """Cofactor matrix of F, dJ/dF. Each row is the cross product of the two others."""
+    return cross(F[3:6], F[6:9]) + cross(F[6:9], F[0:3]) + cross(F[0:3], F[3:6])
 
 
 @arithmetic
@@ -91,23 +79,14 @@ def cofactor_differential(F, D):
 @arithmetic
 def determinant(F):
     """det F, from the same products as the cofactor, so that the compiler can share them."""
-    return F[0] * (F[4] * F[8] - F[5] * F[7]) + F[1] * (F[5] * F[6] - F[3] * F[8]) + F[2] * (F[3] * F[7] - F[4] * F[6])
+    return dot(F, cross(F[3:6], F[6:9]))
 
 
 @arithmetic
 def ddot(A, B):
     """A : B, the sum of the products of the entries."""
-    return (
-        A[0] * B[0]
-        + A[1] * B[1]
-        + A[2] * B[2]
-        + A[3] * B[3]
-        + A[4] * B[4]
-        + A[5] * B[5]
-        + A[6] * B[6]
-        + A[7] * B[7]
-        + A[8] * B[8]
-    )
+    half = A[0] * B[0] + A[1] * B[1] + A[2] * B[2] + A[3] * B[3] + A[4] * B[4]
+    return half + A[5] * B[5] + A[6] * B[6] + A[7] * B[7] + A[8] * B[8]
 
 
 @arithmetic
@@ -147,10 +126,7 @@ def signed_svd(F, sweeps: ti.template()):
 
 @ti.func
 def _rotate_columns(A: ti.template(), V: ti.template(), p: ti.template(), q: ti.template()):
-    app = A[p] * A[p] + A[3 + p] * A[3 + p] + A[6 + p] * A[6 + p]
-    aqq = A[q] * A[q] + A[3 + q] * A[3 + q] + A[6 + q] * A[6 + q]
-    apq = A[p] * A[q] + A[3 + p] * A[3 + q] + A[6 + p] * A[6 + q]
-    c, s = _jacobi_angle(app, aqq, apq)
+    c, s = _jacobi_angle(dot(A[p::3], A[p::3]), dot(A[q::3], A[q::3]), dot(A[p::3], A[q::3]))
     for r in ti.static(range(3)):
         ap, aq = c * A[3 * r + p] - s * A[3 * r + q], s * A[3 * r + p] + c * A[3 * r + q]
         vp, vq = c * V[3 * r + p] - s * V[3 * r + q], s * V[3 * r + p] + c * V[3 * r + q]
@@ -161,9 +137,7 @@ def _rotate_columns(A: ti.template(), V: ti.template(), p: ti.template(), q: ti.
 @ti.func
 def _sort_columns(A: ti.template(), V: ti.template(), p: ti.template(), q: ti.template()):
     """Swap two columns of A and V if the later one is longer; one changes sign, so V stays a rotation."""
-    app = A[p] * A[p] + A[3 + p] * A[3 + p] + A[6 + p] * A[6 + p]
-    aqq = A[q] * A[q] + A[3 + q] * A[3 + q] + A[6 + q] * A[6 + q]
-    swap = aqq > app
+    swap = dot(A[q::3], A[q::3]) > dot(A[p::3], A[p::3])
     for r in ti.static(range(3)):
         ap, aq = ti.select(swap, A[3 * r + q], A[3 * r + p]), ti.select(swap, -A[3 * r + p], A[3 * r + q])
         vp, vq = ti.select(swap, V[3 * r + q], V[3 * r + p]), ti.select(swap, -V[3 * r + p], V[3 * r + q])
@@ -174,26 +148,24 @@ def _sort_columns(A: ti.template(), V: ti.template(), p: ti.template(), q: ti.te
 @arithmetic
 def _left_frame(A):
     """Orthonormal frame (a rotation) of A's nearly orthogonal, sorted columns, and their signed lengths."""
-    s0 = ti.sqrt(A[0] * A[0] + A[3] * A[3] + A[6] * A[6])
+    s0 = ti.sqrt(dot(A[0::3], A[0::3]))
     is_zero = s0 <= 0.0
     d0 = ti.select(is_zero, 1.0 + 0.0 * s0, s0)
     u = [ti.select(is_zero, 1.0 + 0.0 * s0, A[0] / d0), A[3] / d0, A[6] / d0]
-    projection = u[0] * A[1] + u[1] * A[4] + u[2] * A[7]
-    w = [A[1] - projection * u[0], A[4] - projection * u[1], A[7] - projection * u[2]]
-    s1 = ti.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    projection = dot(u, A[1::3])
+    w = [A[3 * k + 1] - projection * u[k] for k in ti.static(range(3))]
+    s1 = ti.sqrt(dot(w, w))
     # below this the second column's direction is rounding noise, so any direction orthogonal to u will do
     is_rank_one = s1 <= 1e-30 + 0.0 * s1
     use_x = abs(u[0]) < 0.6
     e = [ti.select(use_x, 1.0 + 0.0 * s1, 0.0 * s1), ti.select(use_x, 0.0 * s1, 1.0 + 0.0 * s1)]
     n = [-e[1] * u[2], e[0] * u[2], e[1] * u[0] - e[0] * u[1]]  # u x (e0, e1, 0), orthogonal to u
-    m = [u[1] * n[2] - u[2] * n[1], u[2] * n[0] - u[0] * n[2], u[0] * n[1] - u[1] * n[0]]
-    length = ti.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
-    d1 = ti.select(is_rank_one, length, s1)
+    m = cross(u, n)
+    d1 = ti.select(is_rank_one, ti.sqrt(dot(m, m)), s1)
     t = [ti.select(is_rank_one, m[k], w[k]) / d1 for k in ti.static(range(3))]
-    b = [u[1] * t[2] - u[2] * t[1], u[2] * t[0] - u[0] * t[2], u[0] * t[1] - u[1] * t[0]]
-    s2 = b[0] * A[2] + b[1] * A[5] + b[2] * A[8]
+    b = cross(u, t)
     U = [u[0], t[0], b[0], u[1], t[1], b[1], u[2], t[2], b[2]]
-    return U, [s0, t[0] * A[1] + t[1] * A[4] + t[2] * A[7], s2]
+    return U, [s0, dot(t, A[1::3]), dot(b, A[2::3])]
 
 
 @ti.func

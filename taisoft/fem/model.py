@@ -12,13 +12,10 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import Runtime, threads
-from taisoft.backend.transfer import download
 from taisoft.fem import reference
 from taisoft.fem.laws import LAWS
-from taisoft.fem.mass import MassMatrix, gravity_masses, lumped_masses, upload_mass_matrix
 from taisoft.fem.node_graph import PAIRS, NodeGraph, node_graph
 from taisoft.fem.state import State, build_state
 from taisoft.fem.terms import terms_of
@@ -49,6 +46,16 @@ class Group:
     force_at: Count  # offset in State.element_force
     matrix_at: Count  # offset in the assembly buffer
     points_at: Count  # first row in Model.points
+
+
+@dataclass(frozen=True, eq=False)
+class MassMatrix:
+    """Symmetric mass matrix [kg] with the stiffness pattern and one number per node pair, the same for each axis."""
+
+    row_start: Any  # (n_nodes + 1) i32
+    column: Any  # (2 n_pairs) i32, ascending in each row, no diagonal
+    value: Any  # (2 n_pairs)
+    diagonal: Any  # (n_nodes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,35 +110,24 @@ class Layout:
 
 
 def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
-    bodies = scene.bodies
+    bodies, laws = scene.bodies, list(LAWS)
     n_tets = np.array([b.mesh.n_tets for b in bodies])
     blocks = -(-n_tets // lanes)
     block_start = np.zeros(len(bodies), dtype=np.int64)
-    kinds = sorted({(b.order, b.quadrature_degree, list(LAWS).index(b.material.law)) for b in bodies})
-    rules = sorted({degree for order, degree, _ in kinds if order == 2})
+    kind_of = [(b.order, b.quadrature_degree, laws.index(b.material.law)) for b in bodies]
+    n_points = {degree: len(reference.quadrature(degree).weights) for _, degree, _ in kind_of}
     groups, block, nodes_at, force_at, matrix_at = [], 0, 0, 0, 0
-    for order, degree, law in kinds:
+    for kind in sorted(set(kind_of)):
+        order, degree, law = kind
         first = block
-        for k, body in enumerate(bodies):
-            if (body.order, body.quadrature_degree, list(LAWS).index(body.material.law)) == (order, degree, law):
+        for k in range(len(bodies)):
+            if kind_of[k] == kind:
                 block_start[k] = block
                 block += int(blocks[k])
         n_nodes, count = len(reference.unit_mass(order)), (block - first) * lanes
-        points_at = sum(len(reference.quadrature(r).weights) for r in rules if r < degree) if order == 2 else 0
-        groups.append(
-            Group(
-                list(LAWS.values())[law],
-                order,
-                n_nodes,
-                len(reference.quadrature(degree).weights),
-                first,
-                block,
-                nodes_at,
-                force_at,
-                matrix_at,
-                points_at,
-            )
-        )
+        points_at = sum(n for other, n in n_points.items() if 1 < other < degree)  # order 1 has degree 1 and no table
+        offsets = first, block, nodes_at, force_at, matrix_at, points_at
+        groups.append(Group(LAWS[laws[law]], order, n_nodes, n_points[degree], *offsets))
         nodes_at += count * n_nodes
         force_at += count * n_nodes * 3
         matrix_at += (block - first) * MATRIX_BLOCKS[order] * 9
@@ -253,7 +249,9 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     rules = tuple(reference.quadrature(d) for d in sorted({b.quadrature_degree for b in scene.bodies if b.order == 2}))
     table = _rule_table(rules) if rules else None
     rest_lanes = lane_layout(Dm_inv.reshape(-1, 9), lanes).astype(npr if strain_real == real else np.float64)
-    mass = arena.field("mass", real, n_nodes, lumped_masses(scene).astype(npr))
+    weight = mass = arena.field("mass", real, n_nodes, reference.lumped_masses(scene).astype(npr))
+    if on["consistent_weight"]:
+        weight = arena.field("gravity_mass", real, n_nodes, reference.gravity_masses(scene).astype(npr))
     model = Model(
         real=real,
         strain_real=strain_real,
@@ -274,9 +272,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         gather_start=arena.field("gather_start", ti.i32, n_nodes + 1, start),
         gather_entry=arena.field("gather_entry", ti.i32, len(entry), entry),
         mass=mass,
-        gravity_mass=(
-            arena.field("gravity_mass", real, n_nodes, gravity_masses(scene).astype(npr)) if on["consistent_weight"] else mass
-        ),
+        gravity_mass=weight,
         mass_matrix=None,
         free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
         gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),
@@ -304,6 +300,14 @@ def _build_mass_matrix(scene: Scene, model: Model, arena: FieldArena, npr: type)
     )
     upload_mass_matrix(scene, mass)
     return mass
+
+
+def upload_mass_matrix(scene: Scene, mass: MassMatrix) -> None:
+    """Fill the device matrix from the bodies' densities."""
+    M = reference.mass_matrix(scene)
+    start, column = download([mass.row_start, mass.column])
+    rows = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    upload([(mass.value, np.asarray(M[rows, column]).reshape(-1)), (mass.diagonal, M.diagonal())])
 
 
 def damping_table(scene: Scene) -> np.ndarray:

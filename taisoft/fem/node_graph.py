@@ -1,16 +1,20 @@
-"""Graph of the nodes that share an element: the sparsity pattern of every matrix over nodes."""
+"""Graph of the nodes that share an element, which is the sparsity pattern of every matrix over nodes, and subsets of it.
+
+A subset restricts a stage to the nodes that move in it, and to the edges and elements that touch them. A kernel takes a `Subset`
+as a template: for EVERYTHING it loops over all nodes, edges and blocks of elements.
+"""
 
 from dataclasses import dataclass
+from itertools import combinations, product
+from typing import Any
 
 import numpy as np
+import taichi as ti
 
-from taisoft.mesh.topology import EDGES
+from taisoft.mesh import topology
 
 # Pairs of an element's nodes, the lower first. Order 2: corner-corner (as order 1), corner-midpoint, midpoint-midpoint.
-PAIRS = {
-    1: EDGES,
-    2: (*EDGES, *((a, b) for a in range(4) for b in range(4, 10)), *((a, b) for a in range(4, 10) for b in range(a + 1, 10))),
-}
+PAIRS = {1: topology.EDGES, 2: (*topology.EDGES, *product(range(4), range(4, 10)), *combinations(range(4, 10), 2))}
 
 
 @dataclass(frozen=True)
@@ -44,3 +48,66 @@ def node_graph(pairs: np.ndarray, n_nodes: int) -> NodeGraph:
         lower=position[len(key) :],
         pair=pair.reshape(-1),
     )
+
+
+NODES, EDGES, BLOCKS = range(3)  # indices into `count`; from BLOCKS on: start of each group's blocks, then the total
+
+
+@dataclass(frozen=True, eq=False)
+class Subset:
+    """Ascending lists of indices; None: all."""
+
+    count: Any = None  # (3 + n_groups) i32
+    node: Any = None  # i32
+    edge: Any = None  # i32: pairs of nodes that share an element, at least one of them in the list
+    block: Any = None  # i32: blocks of elements with a node in the list, by group
+
+    @property
+    def restricted(self) -> bool:
+        """Whether the subset is given by lists."""
+        return self.node is not None
+
+
+EVERYTHING = Subset()
+
+
+@ti.func
+def count_of(subset: ti.template(), k: ti.template(), everything):
+    """Entry k of a subset's count: NODES, EDGES or an end of a group's blocks; `everything` if it is not restricted."""
+    n = everything
+    if ti.static(subset.restricted):
+        n = subset.count[k]
+    return n
+
+
+@ti.func
+def n_nodes_of(m: ti.template(), subset: ti.template()):
+    """Number of nodes in a subset."""
+    return count_of(subset, NODES, m.n_nodes)
+
+
+@ti.func
+def node_of(subset: ti.template(), j):
+    """The j-th node of a subset."""
+    i = j
+    if ti.static(subset.restricted):
+        i = subset.node[j]
+    return i
+
+
+@ti.func
+def edge_of(subset: ti.template(), j):
+    """The j-th node pair of a subset."""
+    e = j
+    if ti.static(subset.restricted):
+        e = subset.edge[j]
+    return e
+
+
+@ti.func
+def block_of(subset: ti.template(), j):
+    """The j-th block of a subset."""
+    b = j
+    if ti.static(subset.restricted):
+        b = subset.block[j]
+    return b

@@ -4,6 +4,11 @@ Order 1: N_a = l_a. Order 2: N_a = l_a (2 l_a - 1) at the corners, N_ab = 4 l_a 
 straight at rest, so grad l_k and the Jacobian of the rest shape are constant over a tet.
 Integrals over a tet are V times a weighted sum over points: for order 1 the centre, since F is constant; for order 2 four
 points, exact for degree 2 (Hammer, Stroud 1956), or fourteen, exact for degree 5 (Walkington 2000).
+
+Masses are lumped in explicit steps, and in implicit steps consistent in quadratic bodies. Lumping hardly shifts the frequencies
+of quadratic tets but distributes their weight wrongly (it is not int rho N_a g dV). Implicit steps solve linear systems anyway,
+so they use the consistent matrix there. Linear bodies stay lumped: in a scene with a quadratic body their rows have zeros off
+the diagonal.
 """
 
 from dataclasses import dataclass
@@ -14,7 +19,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from taisoft.mesh.topology import EDGES
-from taisoft.scene.scene import Body
+from taisoft.scene.scene import Body, Scene
 
 HRZ_FRACTIONS = {1: (1 / 4, 0.0), 2: (1 / 36, 4 / 27)}  # fraction of a tet's mass at a corner, at a mid-edge node
 # by degree, symmetric rules: (weight of each point, one point of the orbit); the rule of 4 is exact for degree 5
@@ -125,6 +130,22 @@ def consistent_mass(body: Body) -> sp.csr_matrix:
     values = body.material.density * body.mesh.volumes[:, None, None] * unit_mass(body.order)
     rows, columns = np.broadcast_arrays(elements[:, :, None], elements[:, None, :])
     return sp.csr_matrix((values.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(body.n_nodes,) * 2)
+
+
+def lumped_masses(scene: Scene) -> np.ndarray:
+    """Lumped masses (n_nodes,) [kg], bodies in order."""
+    return np.concatenate([lumped_mass(b) for b in scene.bodies])
+
+
+def gravity_masses(scene: Scene) -> np.ndarray:
+    """Masses used for weight, int rho N_a dV, (n_nodes,) [kg]."""
+    return np.concatenate([gravity_mass(b) for b in scene.bodies])
+
+
+def mass_matrix(scene: Scene) -> sp.csr_matrix:
+    """Mass matrix of implicit steps (n_nodes, n_nodes) [kg]: consistent for bodies of order 2, else lumped."""
+    parts = [consistent_mass(b) if b.order == 2 else sp.diags(lumped_mass(b)) for b in scene.bodies]
+    return sp.block_diag(parts, format="csr")
 
 
 def traction_forces(body: Body, triangles: np.ndarray, traction: np.ndarray) -> np.ndarray:

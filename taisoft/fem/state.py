@@ -1,4 +1,7 @@
-"""State: positions, velocities and the scratch of kernels over one model. All other model arrays are constant."""
+"""State: positions, velocities and the scratch of kernels over one model. All other model arrays are constant.
+
+Kernels return scalars to the host in `State.scalars`; below are their indices, and the columns of the sums in `State.partial`.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,10 +9,20 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import Runtime
-from taisoft.fem.scalars import N_COLUMNS, N_SCALARS
+
+# Of a state: energies [J], smallest J = det F, number of inverted tets; the first tet, by blocks and lanes, so compressed that
+# its law softens; the potential of its dead loads [J]
+ELASTIC, MIN_J, N_INVERTED, KINETIC, GRAVITY, FIRST_SOFTENED, LOADS = range(7)
+# Of a batch of substeps; INVERTED_NOW of the present one; FAILED: 1 if a velocity is not finite or a tet has exploded
+STEPS_DONE, LOWEST_J, MOST_INVERTED, INVERTED_NOW, FAILED = range(7, 12)
+# r.y at the start and end of a Newton step (negative is downhill); length of the step taken by a linearised stage
+START_SLOPE, END_SLOPE, STEP_LENGTH = range(12, 15)
+N_SCALARS = 15
+
+N_NORMS = 5  # first columns: norms of a residual
+SUM, OTHER_SUM, N_COLUMNS = 5, 6, 8  # further columns; `measure` uses the columns of its scalars
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +34,7 @@ class State:
     element_force: Any  # forces of each tet on its nodes [N], per block (node, axis, lane): a `Lanes` buffer
     element_force_at: Count  # first entry of that buffer
     element_force_mask: int  # index mask of that buffer
-    scalars: Any  # (N_SCALARS) f64: results for the host, indexed by `scalars`
+    scalars: Any  # (N_SCALARS) f64: results for the host, indexed by ELASTIC and so on
     partial: Any  # (chunks, N_COLUMNS) f64: partial sums, added in a fixed order
 
 

@@ -13,14 +13,12 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.backend.arrays import Count
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import Count, FieldArena, download
 from taisoft.backend.runtime import kernel
-from taisoft.backend.transfer import download
 from taisoft.errors import SimulationError
 from taisoft.fem.model import MATRIX_BLOCKS, Model, model_graph
-from taisoft.fem.subset import block_of, edge_of, first_block_of, last_block_of, n_edges_of, n_nodes_of, node_of
-from taisoft.fem.terms import mass_damping, stiffness_damping
+from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n_nodes_of, node_of
+from taisoft.fem.terms import rayleigh_damping
 from taisoft.linear.element_blocks import element_blocks, pair_terms
 
 # A block is a 12-vector, column by column, each padded with a zero: entry (r, c) is at 4 c + r. All entries share one address,
@@ -105,10 +103,10 @@ def assemble(m: ti.template(), A: ti.template(), subset: ti.template(), projecte
     """Assemble the rows of a subset of A = K(x) [N/m]. projected: with positive semi-definite element contributions."""
     for n, g in ti.static(enumerate(m.groups)):
         ti.loop_config(serialize=m.serial)
-        for j in range(first_block_of(g, n, subset), last_block_of(g, n, subset)):
+        for j in range(count_of(subset, BLOCKS + n, g.first), count_of(subset, BLOCKS + n + 1, g.last)):
             element_blocks(m, g, A, block_of(subset, j), projected)
     ti.loop_config(serialize=m.serial)
-    for j in range(n_edges_of(A, subset)):
+    for j in range(count_of(subset, EDGES, A.n_edges)):
         gather_edge(m, A, edge_of(subset, j))
     ti.loop_config(serialize=m.serial)
     for j in range(n_nodes_of(m, subset)):
@@ -145,8 +143,8 @@ def to_system(m: ti.template(), A: ti.template(), damper: ti.template(), subset:
         i = node_of(subset, j)
         k, inertia, damping = ti.cast(beta * beta, m.real), ti.cast(c, m.real), ti.cast(0.0, m.real)
         if ti.static(m.damped):
-            inertia += ti.cast(beta, m.real) * mass_damping.rate(m, i)
-            damping = ti.cast(beta, m.real) * stiffness_damping.rate(m, i)
+            inertia += ti.cast(beta, m.real) * rayleigh_damping.mass_rate(m, i)
+            damping = ti.cast(beta, m.real) * rayleigh_damping.stiffness_rate(m, i)
         mass = m.mass[i]
         if ti.static(m.consistent):
             mass = m.mass_matrix.diagonal[i]

@@ -19,7 +19,7 @@ from taisoft.fem.lanes import (
     store_lanes,
     volumes,
 )
-from taisoft.fem.laws.projection import dpk1_projected, prepare_projected
+from taisoft.fem.laws import dpk1_projected, prepare_projected
 from taisoft.fem.model import MATRIX_BLOCKS
 from taisoft.fem.node_graph import PAIRS
 from taisoft.fem.reference import Quadrature, shape_derivatives

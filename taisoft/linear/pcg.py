@@ -15,9 +15,9 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.backend.fields import FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.fem.model import Model
-from taisoft.fem.subset import EVERYTHING, Subset
+from taisoft.fem.node_graph import EVERYTHING, Subset
 from taisoft.linear.block_csr import BLOCK, BlockCsr
 from taisoft.linear.coupling import NO_COUPLING, Coupling
 

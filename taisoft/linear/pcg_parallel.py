@@ -3,8 +3,8 @@
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.fem.scalars import OTHER_SUM, SUM
-from taisoft.fem.subset import n_nodes_of, node_of
+from taisoft.fem.node_graph import n_nodes_of, node_of
+from taisoft.fem.state import OTHER_SUM, SUM
 from taisoft.linear.block_csr import block_times, partial_row_times, row_times
 from taisoft.linear.coupling import form_product, gather_products, has_terms, prepare_terms
 from taisoft.linear.pcg import (

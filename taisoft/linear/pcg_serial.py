@@ -11,7 +11,7 @@ Comput. 2(1), 1981.
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.fem.subset import n_nodes_of, node_of
+from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.linear.block_csr import block_times, partial_row_times, partial_row_times_backward
 from taisoft.linear.coupling import add_products, clear_products, gather_products, has_terms, prepare_terms
 from taisoft.linear.pcg import (

@@ -1,4 +1,4 @@
-"""Describe an elastic body as plain data: mesh, material, constraints, loads and contact geometry."""
+"""Describe an elastic body as plain data: mesh, material with its elastic law, constraints, loads and contact geometry."""
 
 import warnings
 from collections.abc import Callable
@@ -13,16 +13,56 @@ from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.thickness import coarse_bending
 from taisoft.scene import checks
 from taisoft.scene.collision import CONTACT_MODES
-from taisoft.scene.key_frames import KeyFrames
-from taisoft.scene.material import Material
+from taisoft.scene.key_frames import KeyFrames, NodePath
 
+LAWS = ("st_venant_kirchhoff", "corotational", "stable_neo_hookean")
 NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock, so that they bend far too little
 QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # by element order: degrees of polynomials integrated exactly, the default first
-_FREE, _FIXED, _MOVED = 0, 1, 2
 _READ_ONLY = ("name", "mesh", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes")  # other data depend on these
 USE_A_COPY = "change a copy made by scene.snapshot() and make a new Simulator of it"
 _SET_FORCE = f"call sim.set_force(body, index, value) for an existing one; otherwise {USE_A_COPY}"
 _SET_TRACTION = f"call sim.set_traction(body, index, value) for an existing one; otherwise {USE_A_COPY}"
+
+
+@guarded_record("material", "make another one by dataclasses.replace, or call sim.set_material(body, {name}=...) in a simulation")
+@dataclass(frozen=True)
+class Material:
+    """An elastic material with damping and surface parameters. Raises SceneError for values outside the rules below."""
+
+    law: str = "stable_neo_hookean"  #: "st_venant_kirchhoff", "corotational" or "stable_neo_hookean"
+    young: float = 1e6  #: Young's modulus [Pa], > 0
+    poisson: float = 0.3  #: Poisson's ratio, in the open interval (-1, 0.5)
+    density: float = 1000.0  #: [kg/m^3], > 0
+    friction: float = 0.5  #: Coulomb's coefficient, >= 0
+    restitution: float = 0.0  #: ratio of the normal speeds after and before an impact, 0 to 1
+    mass_damping: float = 0.0  #: [1/s], >= 0
+    stiffness_damping: float = 0.0  #: [s], >= 0
+
+    def __post_init__(self):
+        checks.choice(self.law, "material: law", LAWS)
+        limits = {
+            "young": {"above": 0.0, "unit": "Pa"},
+            "poisson": {},
+            "density": {"above": 0.0, "unit": "kg/m^3"},
+            "friction": {"minimum": 0.0},
+            "restitution": {"minimum": 0.0, "maximum": 1.0},
+            "mass_damping": {"minimum": 0.0, "unit": "1/s"},
+            "stiffness_damping": {"minimum": 0.0, "unit": "s"},
+        }
+        numbers = {k: checks.number(getattr(self, k), f"material: {k}", **limit) for k, limit in limits.items()}
+        checks.store(self, **numbers)
+        if not -1.0 < self.poisson < 0.5:
+            raise SceneError(f"material: poisson must lie in the open interval (-1, 0.5), not {self.poisson:g}")
+
+    @property
+    def mu(self) -> float:
+        """Lamé's second parameter, the shear modulus [Pa]."""
+        return self.young / (2.0 * (1.0 + self.poisson))
+
+    @property
+    def lam(self) -> float:
+        """Lamé's first parameter [Pa]."""
+        return self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
 
 
 @guarded_record("constraint", "add another one by body.fix or body.move")
@@ -36,7 +76,7 @@ class Constraint:
     where: Callable | None = None  #: the function that selected the nodes, if any: it can select again on another mesh
 
     def __post_init__(self):
-        _make_read_only(self.nodes, self.axes)
+        checks.store(self, nodes=self.nodes, axes=self.axes)
 
 
 @guarded_record("traction", "call sim.set_traction(body, index, value) in a simulation")
@@ -48,7 +88,7 @@ class Traction:
     value: np.ndarray  #: (3,) force per reference area [Pa]
 
     def __post_init__(self):
-        _make_read_only(self.triangles, self.value)
+        checks.store(self, triangles=self.triangles, value=self.value)
 
 
 @guarded_record("force", "call sim.set_force(body, index, value) in a simulation")
@@ -61,7 +101,7 @@ class NodalForce:
     where: Callable | None = None  #: as in `Constraint`
 
     def __post_init__(self):
-        _make_read_only(self.nodes, self.value)
+        checks.store(self, nodes=self.nodes, value=self.value)
 
 
 class Body(Guarded):
@@ -93,31 +133,17 @@ class Body(Guarded):
         "tractions": _SET_TRACTION,
     }
 
-    def __init__(
-        self,
-        name: str,
-        mesh: TetMesh,
-        material: Material,
-        position,
-        velocity,
-        order: int,
-        quadrature_degree: int | None,
-        collision: str = "auto",
-    ):
+    def __init__(self, name: str, mesh, material, position, velocity, order, quadrature_degree, collision):
         what = f"body {name!r}"
         if not isinstance(mesh, TetMesh):
             raise SceneError(f"{what}: mesh must be a TetMesh, not {type(mesh).__name__}")
-        self.name = name
-        self.mesh = mesh
-        self.material = material
+        self.name, self.mesh, self.material = name, mesh, material
         self.order = checks.whole(order, f"{what}: order", tuple(QUADRATURE_DEGREES))
         degrees = QUADRATURE_DEGREES[self.order]
         degree = degrees[0] if quadrature_degree is None else quadrature_degree
         self.quadrature_degree = checks.whole(degree, f"{what}: quadrature_degree of order {self.order}", degrees)
         self.nodes: Nodes = make_nodes(mesh, self.order)
-        self.position = position
-        self.velocity = velocity
-        self.collision = collision
+        self.position, self.velocity, self.collision = position, velocity, collision
         self.constraints: list[Constraint] = []
         self.tractions: list[Traction] = []
         self.forces: list[NodalForce] = []
@@ -125,6 +151,19 @@ class Body(Guarded):
 
     def _label(self) -> str:
         return f"body {self.name!r}"
+
+    def _check_position(self, value) -> np.ndarray:
+        return checks.array(value, f"{self._label()}: position", ((3,),))
+
+    def _check_velocity(self, value) -> np.ndarray:
+        return checks.array(value, f"{self._label()}: velocity", ((3,), (self.n_nodes, 3)))
+
+    def _check_collision(self, value) -> str:
+        return checks.choice(value, f"{self._label()}: collision", CONTACT_MODES)
+
+    position = checks.attribute("position", _check_position, "Initial translation (3,) [m].")
+    velocity = checks.attribute("velocity", _check_velocity, "Initial velocity (3,) or (n,3) [m/s].")
+    collision = checks.attribute("collision", _check_collision, "Contact geometry, one of CONTACT_MODES.")
 
     @property
     def rest_positions(self) -> np.ndarray:
@@ -144,48 +183,15 @@ class Body(Guarded):
     @material.setter
     def material(self, value: Material) -> None:
         if not isinstance(value, Material):
-            raise SceneError(f"body {self.name!r}: material must be a Material, not {type(value).__name__}")
+            raise SceneError(f"{self._label()}: material must be a Material, not {type(value).__name__}")
         self._material = value
         if self._sealed:  # add_body and the simulator issue their own warnings
             self.warn_locking(stacklevel=3)
 
-    @property
-    def position(self) -> np.ndarray:
-        """Initial translation (3,) [m]. Setting it raises SceneError unless it is three finite numbers."""
-        return self._position
-
-    @position.setter
-    def position(self, value) -> None:
-        self._position = self._checked_position(value)
-
-    @property
-    def velocity(self) -> np.ndarray:
-        """Initial velocity (3,) or (n,3) [m/s]. Setting it raises SceneError unless it is finite and has one of these shapes."""
-        return self._velocity
-
-    @velocity.setter
-    def velocity(self, value) -> None:
-        self._velocity = self._checked_velocity(value)
-
-    def _checked_position(self, value) -> np.ndarray:
-        return checks.array(value, f"body {self.name!r}: position", ((3,),))
-
-    def _checked_velocity(self, value) -> np.ndarray:
-        return checks.array(value, f"body {self.name!r}: velocity", ((3,), (self.n_nodes, 3)))
-
     def check(self) -> None:
         """Raise SceneError if in-place changes made the arrays of position or velocity invalid."""
-        self._checked_position(self.position)
-        self._checked_velocity(self.velocity)
-
-    @property
-    def collision(self) -> str:
-        """Contact geometry, one of CONTACT_MODES. Setting it raises SceneError for anything else."""
-        return self._collision
-
-    @collision.setter
-    def collision(self, value: str) -> None:
-        self._collision = checks.choice(value, f"body {self.name!r}: collision", CONTACT_MODES)
+        self._check_position(self.position)
+        self._check_velocity(self.velocity)
 
     @property
     def contact_mode(self) -> str:
@@ -201,7 +207,7 @@ class Body(Guarded):
         poisson = self.material.poisson
         if self.order == 1 and poisson > NEARLY_INCOMPRESSIBLE:
             warnings.warn(
-                f"body {self.name!r}: poisson = {poisson:g} is above {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend "
+                f"{self._label()}: poisson = {poisson:g} is above {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend "
                 "far too little: order=2 locks less",
                 UserWarning,
                 stacklevel=stacklevel + 1,
@@ -213,7 +219,7 @@ class Body(Guarded):
             layers = max(1, round(found.layers))
             times = float(f"{found.stiffness:.1g}")  # only about one digit of the estimate is accurate
             warnings.warn(
-                f"body {self.name!r}: about {layers} linear {'tet lies' if layers == 1 else 'tets lie'} through its thickness, "
+                f"{self._label()}: about {layers} linear {'tet lies' if layers == 1 else 'tets lie'} through its thickness, "
                 f"and it bends about {times:.0f} times too stiffly: order=2 bends correctly",
                 UserWarning,
                 stacklevel=stacklevel + 1,
@@ -226,9 +232,9 @@ class Body(Guarded):
         axes: the fixed directions, such as "y" or "xz". Raises SceneError if no node is chosen or one is moved already.
         """
         self._check_open("fix")
-        what = f"body {self.name!r}: fix"
+        what = f"{self._label()}: fix"
         nodes = checks.selection(where, self.rest_positions, what, "node")
-        return self._add_constraint(Constraint(nodes, checks.axes(axes, what), where=_callable_or_none(where)), _FIXED, what)
+        return self._add_constraint(Constraint(nodes, checks.axes(axes, what), None, _callable_or_none(where)), what)
 
     def move(self, where, path: Callable | KeyFrames, axes: str = "xyz") -> Constraint:
         """Move nodes along a prescribed path.
@@ -239,11 +245,11 @@ class Body(Guarded):
         moved already, or the path is invalid.
         """
         self._check_open("move")
-        what = f"body {self.name!r}: move"
+        what = f"{self._label()}: move"
         nodes = checks.selection(where, self.rest_positions, what, "node", repeats=False)
         mask = checks.axes(axes, what)
         if isinstance(path, KeyFrames):
-            path = path.of_nodes(self.rest_positions[nodes] + self.position)
+            path = NodePath(path, self.rest_positions[nodes] + self.position)
         if not callable(path):
             raise SceneError(f"{what}: path must be a function of time, not {path!r}")
         try:
@@ -253,7 +259,7 @@ class Body(Guarded):
         if start is None:
             raise SceneError(f"{what}: the path must give a displacement at t = 0, not None")
         checks.array(start, f"{what}: the path's displacement at t = 0", ((3,), (len(nodes), 3)))
-        return self._add_constraint(Constraint(nodes, mask, path, _callable_or_none(where)), _MOVED, what)
+        return self._add_constraint(Constraint(nodes, mask, path, _callable_or_none(where)), what)
 
     def add_traction(self, where, traction) -> Traction:
         """Apply a dead load per reference area to surface triangles.
@@ -263,7 +269,7 @@ class Body(Guarded):
         finite.
         """
         self._check_open("add_traction")
-        what = f"body {self.name!r}: add_traction"
+        what = f"{self._label()}: add_traction"
         centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
         triangles = checks.selection(where, centroids, what, "surface triangle")
         load = Traction(triangles, checks.array(traction, f"{what}: traction", ((3,),)))
@@ -277,33 +283,25 @@ class Body(Guarded):
         nodes [N]. Raises SceneError if no node is chosen or numbers are not finite.
         """
         self._check_open("add_force")
-        what = f"body {self.name!r}: add_force"
+        what = f"{self._label()}: add_force"
         nodes = checks.selection(where, self.rest_positions, what, "node")
         load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,), (len(nodes), 3))), _callable_or_none(where))
         list.append(self.forces, load)
         return load
 
-    def _add_constraint(self, constraint: Constraint, kind: int, what: str) -> Constraint:
+    def _add_constraint(self, constraint: Constraint, what: str) -> Constraint:
         """Add a constraint. Raises SceneError if a node and axis is constrained already; only repeated fixes are allowed."""
-        kinds = np.full((self.n_nodes, 3), _FREE, dtype=np.int8)  # kind of constraint of each node and axis
         for earlier in self.constraints:
-            kinds[np.ix_(earlier.nodes, earlier.axes)] = _FIXED if earlier.path is None else _MOVED
-        before = kinds[np.ix_(constraint.nodes, constraint.axes)]
-        clash = np.argwhere((before != _FREE) if kind == _MOVED else (before == _MOVED))
-        if len(clash):
-            row, column = clash[0]
-            axis = "xyz"[np.flatnonzero(constraint.axes)[column]]
-            verb = "fixed" if before[row, column] == _FIXED else "moved"
-            raise SceneError(f"{what}: node {constraint.nodes[row]} is already {verb} along {axis}")
+            if earlier.path is None and constraint.path is None:
+                continue
+            axes = np.flatnonzero(earlier.axes & constraint.axes)
+            nodes = constraint.nodes[np.isin(constraint.nodes, earlier.nodes)]
+            if len(axes) and len(nodes):
+                verb = "fixed" if earlier.path is None else "moved"
+                raise SceneError(f"{what}: node {nodes[0]} is already {verb} along {'xyz'[axes[0]]}")
         list.append(self.constraints, constraint)
         return constraint
 
 
 def _callable_or_none(where) -> Callable | None:
     return where if callable(where) else None
-
-
-def _make_read_only(*arrays: np.ndarray) -> None:
-    """Make the arrays of a record read-only, since copies of a scene share it."""
-    for array in arrays:
-        array.setflags(write=False)

@@ -1,6 +1,12 @@
-"""Validate values given to a scene. Each check returns the converted value or raises SceneError with one sentence."""
+"""Validate values given to a scene and its `solver` dict: arguments of Simulator, and the run's seconds and fps.
+
+Each check returns the converted value or raises SceneError with one sentence that starts with `what`. The Simulator itself
+validates names of integrators and contact solvers and their combinations.
+"""
 
 import difflib
+import operator
+from collections.abc import Callable
 from numbers import Real
 
 import numpy as np
@@ -8,15 +14,11 @@ import numpy as np
 from taisoft.errors import SceneError
 
 LARGEST, SMALLEST = float(np.finfo(np.float32).max), float(np.finfo(np.float32).tiny)  # limits of 32-bit floats
+MAX_TOLERANCE = {"newton_tolerance": 0.1}  # a residual of a tenth of the forces is no solution; others: 1
 
 
-def number(
-    value, what: str, *, above: float | None = None, minimum: float | None = None, maximum: float | None = None, unit: str = ""
-) -> float:
-    """Return value as a finite float in the 32-bit range, > above, >= minimum, <= maximum where given.
-
-    what: start of the message.
-    """
+def number(value, what: str, *, above=None, minimum=None, maximum=None, unit: str = "") -> float:
+    """Return value as a finite float in the 32-bit range, > above, >= minimum, <= maximum where given."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         raise SceneError(f"{what} must be a number, not {value!r}")
     try:
@@ -25,15 +27,10 @@ def number(
         result = float("inf")
     if not np.isfinite(result):
         raise SceneError(f"{what} must be finite, not {value!r}")
-    rules = []
-    if above is not None:
-        rules.append((result > above, f"greater than {above:g}"))
-    if minimum is not None:
-        rules.append((result >= minimum, f"at least {minimum:g}"))
-    if maximum is not None:
-        rules.append((result <= maximum, f"at most {maximum:g}"))
-    if not all(kept for kept, _ in rules):
-        rule = " and ".join(text for _, text in rules)
+    rules = (("greater than", operator.gt, above), ("at least", operator.ge, minimum), ("at most", operator.le, maximum))
+    rules = [rule for rule in rules if rule[2] is not None]
+    if not all(holds(result, limit) for _, holds, limit in rules):
+        rule = " and ".join(f"{words} {limit:g}" for words, _, limit in rules)
         raise SceneError(f"{what} must be {rule}{unit and ' ' + unit}, not {value!r}")
     if abs(result) > LARGEST or (above == 0.0 and result < SMALLEST):
         raise SceneError(f"{what} is {result:g}, too {'large' if abs(result) > 1.0 else 'small'} for a 32-bit float")
@@ -45,8 +42,8 @@ def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
     shapes_text = " or ".join(str(shape) for shape in shapes)
     try:
         result = np.asarray(value)
-    except (ValueError, TypeError, OverflowError) as error:
-        raise SceneError(f"{what} must be numbers of shape {shapes_text}, not {value!r}") from error
+    except (ValueError, TypeError, OverflowError):
+        result = np.empty(0, dtype=object)
     if result.dtype.kind not in "fiu":
         raise SceneError(f"{what} must be numbers of shape {shapes_text}, not {value!r}")
     if result.shape not in shapes:
@@ -59,6 +56,14 @@ def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
     if len(bad):
         raise SceneError(f"{what}: entry {bad[0].tolist()} is {result[tuple(bad[0])]:g}, too large for a 32-bit float")
     return result
+
+
+def length(value) -> int:
+    """Return the number of rows of a value that should be an array; 0 if it has none."""
+    try:
+        return len(value)
+    except TypeError:
+        return 0
 
 
 def choice(value, what: str, allowed: tuple[str, ...]) -> str:
@@ -83,11 +88,20 @@ def flag(value, what: str) -> bool:
     return value
 
 
-def whole(value, what: str, allowed: tuple[int, ...]) -> int:
+def whole(value, what: str, allowed: tuple[int, ...] | range) -> int:
     """Return value as an int if it is one of the allowed integers."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value not in allowed:
-        raise SceneError(f"{what} must be {' or '.join(map(str, allowed))}, not {value!r}")
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or int(value) not in allowed:
+        is_range = isinstance(allowed, range)
+        rule = f"a whole number from {allowed[0]} to {allowed[-1]}" if is_range else " or ".join(map(str, allowed))
+        raise SceneError(f"{what} must be {rule}, not {value!r}")
     return int(value)
+
+
+def text(value, what: str) -> str:
+    """Return value if it is a string."""
+    if not isinstance(value, str):
+        raise SceneError(f"{what} must be a text, not {value!r}")
+    return value
 
 
 def name(value, what: str, taken: list[str]) -> str:
@@ -109,8 +123,8 @@ def axes(value, what: str) -> np.ndarray:
 def selection(where, points: np.ndarray, what: str, items: str, *, repeats: bool = True) -> np.ndarray:
     """Return the ids (k,) int64 of the chosen items, k > 0.
 
-    where: ids, a bool mask (n,), or a callable that gets a copy of points (n,3) and returns such a mask. what: start of
-    the message. items: singular noun for the items. repeats: True drops repeated ids, False refuses them.
+    where: ids, a bool mask (n,), or a callable that gets a copy of points (n,3) and returns such a mask. items: singular noun
+    for the items. repeats: True drops repeated ids, False refuses them.
     """
     n = len(points)
     if callable(where):
@@ -152,3 +166,54 @@ def _ids(where, n: int, what: str, items: str) -> np.ndarray:
     if len(bad):
         raise SceneError(f"{what}: {items} {ids[bad[0]]} does not exist (there are {n}, counted from 0)")
     return ids
+
+
+def store(record, **values) -> None:
+    """Set fields of a frozen record to validated values; arrays become read-only, since copies of a scene share them."""
+    for field, value in values.items():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+        object.__setattr__(record, field, value)
+
+
+def attribute(name: str, check: Callable, doc: str) -> property:
+    """Return a property of a class that stores check(owner, value) when a value is assigned to it."""
+
+    def assign(owner, value) -> None:
+        setattr(owner, f"_{name}", check(owner, value))
+
+    return property(operator.attrgetter(f"_{name}"), assign, doc=doc)
+
+
+def _positive(value, what: str) -> None:
+    number(value, what, above=0.0)
+
+
+def _tolerance(value, what: str) -> None:
+    limit = MAX_TOLERANCE.get(what.rpartition(".")[2], 1.0)
+    if value is not None and number(value, what, above=0.0) >= limit:
+        raise SceneError(f"{what} must be below {limit:g}, not {value!r}")
+
+
+SOLVER_CHECKS = {  # key of the `solver` dict -> check
+    "dt": _positive,
+    "integrator": text,
+    "contact_solver": text,
+    "self_collision": flag,
+    "precision": lambda value, what: choice(value, what, ("f32", "f64")),
+    "arch": lambda value, what: choice(value, what, ("cpu", "cuda")),
+    "allow_unstable": flag,
+    "draggable": flag,
+    "newton_tolerance": _tolerance,
+    "linear_tolerance": _tolerance,
+    "contact_tolerance": _tolerance,
+    "seconds": _positive,
+    "fps": lambda value, what: value is None or _positive(value, what),
+}
+
+
+def check_solver(**solver) -> dict:
+    """Return the settings unchanged. Raises SceneError, whose text starts with the key. Keys must be in SOLVER_CHECKS."""
+    for key, value in solver.items():
+        SOLVER_CHECKS[key](value, key)
+    return solver

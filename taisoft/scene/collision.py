@@ -41,24 +41,16 @@ class CollisionSettings:
         validated = {
             "cell_ratio": checks.number(self.cell_ratio, f"{what}: cell_ratio", above=0.0),
             "k_dop": checks.whole(self.k_dop, f"{what}: k_dop", (6, 14, 18)),
-            "field_cells": _count(self.field_cells, f"{what}: field_cells", 8, 256),
+            "field_cells": checks.whole(self.field_cells, f"{what}: field_cells", range(8, 257)),
         }
         if self.margin is not None:
             validated["margin"] = checks.number(self.margin, f"{what}: margin", minimum=0.0, unit="m")
         for field in ("initial_capacity", "max_capacity"):
             if getattr(self, field) is not None:
-                validated[field] = _count(getattr(self, field), f"{what}: {field}", 64, 2**31 - 1)
+                validated[field] = checks.whole(getattr(self, field), f"{what}: {field}", range(64, 2**31))
         if validated.get("initial_capacity", 0) > validated.get("max_capacity", 2**31):
             raise SceneError(f"{what}: initial_capacity {self.initial_capacity} must not exceed max_capacity {self.max_capacity}")
-        for field, value in validated.items():
-            # The only way to store a validated value in a frozen record.
-            object.__setattr__(self, field, value)
-
-
-def _count(value, what: str, minimum: int, maximum: int) -> int:
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or not minimum <= value <= maximum:
-        raise SceneError(f"{what} must be a whole number from {minimum} to {maximum}, not {value!r}")
-    return int(value)
+        checks.store(self, **validated)
 
 
 def has_sharp_edges(nodes: Nodes) -> bool:

@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 
 from taisoft.scene.body import Body
-from taisoft.scene.changes import LOADS
 from taisoft.scene.key_frames import NodePath, ShapePath
+from taisoft.scene.plan import LOADS
 from taisoft.scene.scene import Scene
 
 FEATURES = "the features that it needs"  # last entry of a fingerprint: of the plan, which follows from the parts and numbers

@@ -35,13 +35,11 @@ class KeyFrames:
 
     def __post_init__(self):
         what = "key frames"
-        try:
-            k = max(len(self.times), 1)
-        except TypeError:
-            k = 1
+        k = max(checks.length(self.times), 1)
         times = checks.array(self.times, f"{what}: times", ((k,),))
-        if (np.diff(times) <= 0).any():
-            first = int(np.argmax(np.diff(times) <= 0))
+        descends = np.diff(times) <= 0
+        if descends.any():
+            first = int(np.argmax(descends))
             raise SceneError(f"{what}: times must ascend, but {times[first + 1]:g} follows {times[first]:g}")
         if self.translations is None and self.rotations is None:
             raise SceneError(f"{what}: translations or rotations are needed")
@@ -55,10 +53,7 @@ class KeyFrames:
             if np.abs(validated["rotations"]).max() > MAX_ANGLE:
                 raise SceneError(f"{what}: rotations must be at most {MAX_ANGLE:g} rad about each axis")
             validated["_turns"] = _turns(validated["rotations"])
-        for field, value in validated.items():
-            value.setflags(write=False)
-            # The only way to store a validated value in a frozen record.
-            object.__setattr__(self, field, value)
+        checks.store(self, **validated)
 
     def __call__(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Return translation (3,) [m] and rotation (3,3) at time t [s]."""
@@ -79,23 +74,13 @@ class KeyFrames:
             rotation = rotation * from_rotvec(weight * self._turns[i])
         return translation, rotation.as_matrix()
 
-    def of_nodes(self, starts: np.ndarray) -> "NodePath":
-        """Return the path of nodes that start at `starts` (k,3) [m]."""
-        return NodePath(self, starts)
-
-    def of_shape(self, center: np.ndarray) -> "ShapePath":
-        """Return the path of an obstacle whose pivot is center (3,) [m]. Raises SceneError if release is set."""
-        if self.release:
-            raise SceneError("key frames: release is for nodes; an obstacle cannot be released")
-        return ShapePath(self, center)
-
 
 @dataclass(frozen=True, eq=False)
 class NodePath:
     """Key frames as a path for nodes: t [s] -> displacement (3,) or (k,3) [m], or None once the nodes are released."""
 
     frames: KeyFrames
-    starts: np.ndarray  #: (k,3) [m]
+    starts: np.ndarray  #: (k,3) [m], start positions
 
     def __call__(self, t: float) -> np.ndarray | None:
         if self.frames.release and t >= self.frames.times[-1]:
@@ -113,6 +98,10 @@ class ShapePath:
 
     frames: KeyFrames
     center: np.ndarray  #: (3,) [m], the shape's pivot
+
+    def __post_init__(self):
+        if self.frames.release:
+            raise SceneError("key frames: release is for nodes; an obstacle cannot be released")
 
     def __call__(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         translation, rotation = self.frames(t)

@@ -16,7 +16,7 @@ from taisoft.errors import MeshError, SceneError
 from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
 from taisoft.mesh.shapes import box_mesh
 from taisoft.scene import checks
-from taisoft.scene.key_frames import KeyFrames
+from taisoft.scene.key_frames import KeyFrames, ShapePath
 
 DEGENERATE = 1e-9  # a triangle has no area if its smallest height is below this times its longest edge
 UNIT_TOLERANCE = 8 * np.finfo(np.float64).eps  # squared lengths this close to 1 are kept, so normals read back unchanged
@@ -48,17 +48,11 @@ class Shape:
         """Return vertices (n,3) [m] and outward-oriented triangles (t,3) int64; None for a shape without triangles."""
         return None
 
-    def _vector(self, field: str) -> np.ndarray:
-        return self._store(field, checks.array(getattr(self, field), f"{self.word}: {field}", ((3,),)))
-
-    def _radius(self) -> None:
-        # The only way to store a validated value in a frozen record.
-        object.__setattr__(self, "radius", checks.number(self.radius, f"{self.word}: radius", above=0.0, unit="m"))
-
-    def _store(self, field: str, value: np.ndarray) -> np.ndarray:
-        value.setflags(write=False)
-        object.__setattr__(self, field, value)
-        return value
+    def _check(self, *vectors: str) -> None:
+        """Validate these (3,) fields, and the radius if there is one."""
+        checks.store(self, **{field: checks.array(getattr(self, field), f"{self.word}: {field}", ((3,),)) for field in vectors})
+        if hasattr(self, "radius"):
+            checks.store(self, radius=checks.number(self.radius, f"{self.word}: radius", above=0.0, unit="m"))
 
 
 @guarded_record("half-space", MAKE_ANOTHER)
@@ -72,8 +66,8 @@ class HalfSpace(Shape):
     word: ClassVar[str] = "half-space"
 
     def __post_init__(self):
-        self._vector("point")
-        self._store("normal", _unit(self._vector("normal"), "half-space: normal must not be zero"))
+        self._check("point", "normal")
+        checks.store(self, normal=_unit(self.normal, "half-space: normal must not be zero"))
 
     @property
     def pivot(self) -> np.ndarray:
@@ -96,8 +90,7 @@ class Sphere(Shape):
     word: ClassVar[str] = "sphere"
 
     def __post_init__(self):
-        self._vector("center")
-        self._radius()
+        self._check("center")
 
     def size(self) -> np.ndarray:
         """Return (radius, 0, 0) [m]."""
@@ -115,8 +108,8 @@ class Box(Shape):
     word: ClassVar[str] = "box"
 
     def __post_init__(self):
-        self._vector("center")
-        if not (self._vector("half_extents") > 0).all():
+        self._check("center", "half_extents")
+        if not (self.half_extents > 0).all():
             raise SceneError(f"box: half_extents must be greater than 0 m, not {self.half_extents.tolist()}")
 
     def size(self) -> np.ndarray:
@@ -141,9 +134,8 @@ class Capsule(Shape):
     word: ClassVar[str] = "capsule"
 
     def __post_init__(self):
-        axis = self._vector("b") - self._vector("a")
-        _unit(axis, "capsule: a and b must not be the same point (that is a sphere)")
-        self._radius()
+        self._check("a", "b")
+        _unit(self.b - self.a, "capsule: a and b must not be the same point (that is a sphere)")
 
     @property
     def pivot(self) -> np.ndarray:
@@ -174,11 +166,7 @@ class MeshObstacle(Shape):
     word: ClassVar[str] = "mesh obstacle"
 
     def __post_init__(self):
-        try:
-            n = len(self.vertices)
-        except TypeError:
-            n = 0
-        vertices = checks.array(self.vertices, "mesh obstacle: vertices", ((max(n, 3), 3),))
+        vertices = checks.array(self.vertices, "mesh obstacle: vertices", ((max(checks.length(self.vertices), 3), 3),))
         rule = "mesh obstacle: triangles must be integers of shape (t, 3) with t > 0"
         try:
             triangles = np.asarray(self.triangles)
@@ -189,9 +177,8 @@ class MeshObstacle(Shape):
         bad = np.argwhere((triangles < 0) | (triangles >= len(vertices)))
         if len(bad):
             t, vertex = bad[0, 0], triangles[tuple(bad[0])]
-            raise SceneError(
-                f"mesh obstacle: triangle {t}: vertex {vertex} does not exist ({len(vertices)} vertices, counted from 0)"
-            )
+            there_are = f"({len(vertices)} vertices, counted from 0)"
+            raise SceneError(f"mesh obstacle: triangle {t}: vertex {vertex} does not exist {there_are}")
         triangles = np.array(triangles, dtype=np.int64)
         flat = np.flatnonzero(~(normals_and_heights(vertices, triangles)[1] > DEGENERATE))
         if len(flat):
@@ -203,8 +190,7 @@ class MeshObstacle(Shape):
             opposite_half_edges(triangles)
         except MeshError as error:
             raise SceneError(f"mesh obstacle: {error}") from None
-        self._store("vertices", vertices)
-        self._store("triangles", triangles)
+        checks.store(self, vertices=vertices, triangles=triangles)
 
     @property
     def pivot(self) -> np.ndarray:
@@ -247,10 +233,8 @@ def _unit_box() -> tuple[np.ndarray, np.ndarray]:
 
 def surface_numbers(friction, restitution, what: str) -> tuple[float, float]:
     """Return validated friction and restitution as floats. what: start of the message. Raises SceneError."""
-    return (
-        checks.number(friction, f"{what}: friction", minimum=0.0),
-        checks.number(restitution, f"{what}: restitution", minimum=0.0, maximum=1.0),
-    )
+    friction = checks.number(friction, f"{what}: friction", minimum=0.0)
+    return friction, checks.number(restitution, f"{what}: restitution", minimum=0.0, maximum=1.0)
 
 
 @guarded_record(
@@ -276,10 +260,9 @@ class Obstacle:
             raise SceneError(
                 f"{what}: shape must be a HalfSpace, Sphere, Box, Capsule or MeshObstacle, not {type(self.shape).__name__}"
             )
-        for field, value in zip(("friction", "restitution"), surface_numbers(self.friction, self.restitution, what)):
-            object.__setattr__(self, field, value)
-        if isinstance(self.path, KeyFrames):
-            object.__setattr__(self, "path", self.path.of_shape(self.shape.pivot))
+        friction, restitution = surface_numbers(self.friction, self.restitution, what)
+        path = ShapePath(self.path, self.shape.pivot) if isinstance(self.path, KeyFrames) else self.path
+        checks.store(self, friction=friction, restitution=restitution, path=path)
         if self.path is not None and not callable(self.path):
             raise SceneError(f"{what}: path must be a function of time, not {self.path!r}")
         self.pose(0.0)
@@ -295,18 +278,15 @@ class Obstacle:
         try:
             translation, rotation = self.path(t)
         except Exception as error:
-            raise SceneError(
-                f"{what} must give (translation, rotation) and failed at t = {t:g}: {type(error).__name__}: {error}"
-            ) from error
+            cause = f"{type(error).__name__}: {error}"
+            raise SceneError(f"{what} must give (translation, rotation) and failed at t = {t:g}: {cause}") from error
         translation = checks.array(translation, f"{what}'s translation at t = {t:g}", ((3,),))
         rotation = checks.array(rotation, f"{what}'s rotation at t = {t:g}", ((3, 3),))
         with np.errstate(over="ignore", invalid="ignore"):
             rigid = np.abs(rotation.T @ rotation - np.eye(3)).max() <= RIGID_TOLERANCE and np.linalg.det(rotation) > 0
         if not rigid:
-            raise SceneError(
-                f"{what}'s rotation at t = {t:g} must be orthonormal to {RIGID_TOLERANCE:g} with determinant 1, "
-                f"not {rotation.tolist()}"
-            )
+            rule = f"must be orthonormal to {RIGID_TOLERANCE:g} with determinant 1, not {rotation.tolist()}"
+            raise SceneError(f"{what}'s rotation at t = {t:g} {rule}")
         return translation, rotation
 
     def points_at(self, t: float, points: np.ndarray) -> np.ndarray:

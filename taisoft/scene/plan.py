@@ -1,10 +1,24 @@
-"""Plan which features a scene needs, and why. Disabled features allocate no memory and launch no kernels."""
+"""What a simulator models of a scene, and what may change while it runs.
 
-from dataclasses import dataclass, field
+The plan lists which features a scene needs, and why. Disabled features allocate no memory and launch no kernels. Numbers of
+features that are enabled may change at run time, in the simulator's own copy of the scene.
+"""
 
+import dataclasses
+import reprlib
+from dataclasses import dataclass, field, replace
+
+from taisoft.attributes import thawed
+from taisoft.errors import SceneError
+from taisoft.scene import checks
+from taisoft.scene.body import LAWS, Body
 from taisoft.scene.collision import has_sharp_edges
 from taisoft.scene.obstacles import Box, MeshObstacle
-from taisoft.scene.scene import LAWS, Scene
+from taisoft.scene.scene import Scene
+
+CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping")  # numbers of a material
+LOADS = {"force": "forces", "traction": "tractions"}  # kind of load -> the body's list of them
+Numbers = dict[str, float | list | None]  # of a scene, by name
 
 
 @dataclass
@@ -18,10 +32,6 @@ class Plan:
         """Map each feature to whether it is modelled."""
         return {e["feature"]: e["on"] for e in self.entries}
 
-    def why(self, feature: str) -> str:
-        """Return why a feature is or is not modelled."""
-        return next(e["why"] for e in self.entries if e["feature"] == feature)
-
     def add(self, feature: str, on: bool, why: str, why_not: str) -> None:
         """Add a feature with the reason for its state."""
         self.entries.append({"feature": feature, "on": bool(on), "why": why if on else why_not})
@@ -34,38 +44,34 @@ def _shorten(names: list[str]) -> str:
 def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: bool = False, draggable: bool = False) -> Plan:
     """Plan the features for a scene, the kind of integrator, self-collision, and draggable bodies."""
     plan = Plan()
-    laws = {name: [b.name for b in scene.bodies if b.material.law == name] for name in LAWS}
-    for law, names in laws.items():
-        plan.add(f"law:{law}", bool(names), f"used by {_shorten(names)}", "no body uses it")
 
-    def bodies(test) -> list[str]:
-        return [b.name for b in scene.bodies if test(b)]
+    def add_if_any(feature: str, test, why: str, why_not: str) -> None:
+        names = [b.name for b in scene.bodies if test(b)]
+        plan.add(feature, bool(names), f"{why} {_shorten(names)}", why_not)
 
-    quadratic = bodies(lambda b: b.order == 2)
-    plan.add("quadratic_tets", bool(quadratic), f"bodies of order 2: {_shorten(quadratic)}", "every body is of order 1")
+    for law in LAWS:
+        add_if_any(f"law:{law}", lambda b, law=law: b.material.law == law, "used by", "no body uses it")
+    quadratic = [b.name for b in scene.bodies if b.order == 2]
+    add_if_any("quadratic_tets", lambda b: b.order == 2, "bodies of order 2:", "every body is of order 1")
     plan.add(
         "consistent_weight",
-        bool(quadratic) and not explicit,
+        quadratic and not explicit,
         "gravity on quadratic tets acts as int rho N g dV",
         "explicit steps take gravity as an acceleration" if quadratic else "on linear tets it is the lumped mass",
     )
     plan.add(
         "consistent_mass",
-        bool(quadratic) and not explicit,
+        quadratic and not explicit,
         f"quadratic tets of {_shorten(quadratic)} in implicit steps",
         "explicit steps need a diagonal mass" if quadratic else "the mass of linear tets is lumped",
     )
-    loaded = bodies(lambda b: b.tractions or b.forces)
+    loaded = [b.name for b in scene.bodies if b.tractions or b.forces]
     why = f"tractions or forces on {_shorten(loaded)}" if loaded else "bodies can be dragged"
-    plan.add("loads", bool(loaded) or draggable, why, "no traction and no force")
-    fixed = bodies(lambda b: any(c.path is None for c in b.constraints))
-    plan.add("fixed_nodes", bool(fixed), f"on {_shorten(fixed)}", "no node is fixed")
-    moved = bodies(lambda b: any(c.path is not None for c in b.constraints))
-    plan.add("moving_nodes", bool(moved), f"paths on {_shorten(moved)}", "no node follows a path")
-    dragged = bodies(lambda b: b.material.mass_damping > 0)
-    plan.add("mass_damping", bool(dragged), f"material of {_shorten(dragged)}", "every mass_damping is 0")
-    viscous = bodies(lambda b: b.material.stiffness_damping > 0)
-    plan.add("stiffness_damping", bool(viscous), f"material of {_shorten(viscous)}", "every stiffness_damping is 0")
+    plan.add("loads", loaded or draggable, why, "no traction and no force")
+    add_if_any("fixed_nodes", lambda b: any(c.path is None for c in b.constraints), "on", "no node is fixed")
+    add_if_any("moving_nodes", lambda b: any(c.path is not None for c in b.constraints), "paths on", "no node follows a path")
+    for damping in ("mass_damping", "stiffness_damping"):
+        add_if_any(damping, lambda b, d=damping: getattr(b.material, d) > 0, "material of", f"every {damping} is 0")
     plan.add("assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only")
     plan.add("past_states", multistep, "the integrator uses the two previous steps", "a one-step integrator")
     plan.add(
@@ -105,3 +111,75 @@ def _add_collision(plan: Plan, scene: Scene, self_collision: bool) -> None:
         f"{_shorten([c.name for c in scene.colliders])} can touch" if several else "it can touch itself",
         "one body, and nothing that it could touch" if scene.contact_forces else "the scene's contact_forces are off",
     )
+
+
+def change_material(body: Body, numbers: dict[str, float], on: dict[str, bool]) -> None:
+    """Replace numbers of a body's material. The law and damping that is compiled out cannot change at run time.
+
+    on: the plan's switches. Warnings point to the line of the caller's caller. Raises SceneError.
+    """
+    what = f"body {body.name!r}"
+    for name, value in numbers.items():
+        if name not in CHANGEABLE:
+            hint = checks.nearest(name, CHANGEABLE)
+            raise SceneError(f"{what}: {name} cannot change while it runs{hint}; {', '.join(CHANGEABLE)} can")
+        if name in on and not on[name] and value != 0.0:
+            rule = "was 0 everywhere at the start and is not modelled; start with a small value to change it later"
+            raise SceneError(f"{what}: {name} {rule}")
+    try:
+        material = replace(body.material, **numbers)
+    except SceneError as error:
+        raise SceneError(f"{what}: {error}") from None
+    with thawed(body):
+        body.material = material
+    if "poisson" in numbers:
+        body.warn_locking(stacklevel=3)
+
+
+def change_load(body: Body, kind: str, index: int, value) -> None:
+    """Set the value of a body's load `index`, counted from 0 in the order added. kind: a key of LOADS.
+
+    value: (3,) [N], or (k,3) for the k nodes of a force; (3,) [Pa] for a traction. Raises SceneError.
+    """
+    loads, what = getattr(body, LOADS[kind]), f"body {body.name!r}: set_{kind}"
+    if not loads:
+        raise SceneError(f"{what}: it has no {kind}: give it one of 0 by body.add_{kind} before the Simulator is made")
+    old = loads[checks.whole(index, f"{what}: index", range(len(loads)))]
+    shapes = ((3,), (len(old.nodes), 3)) if kind == "force" else ((3,),)
+    new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", shapes))
+    with thawed(body):
+        getattr(body, LOADS[kind])[index] = new
+
+
+def scene_numbers(scene: Scene) -> Numbers:
+    """Return as plain data gravity, all material numbers, load values, and friction and restitution set for pairs."""
+    numbers: Numbers = {"gravity": scene.gravity.tolist()}
+    for body in scene.bodies:
+        for name, value in dataclasses.asdict(body.material).items():
+            if name != "law":
+                numbers[f"body {body.name!r}: {name}"] = value
+        for kind, loads in LOADS.items():
+            for i, load in enumerate(getattr(body, loads)):
+                numbers[f"body {body.name!r}: {kind} {i}"] = load.value.tolist()
+    for names, (friction, restitution) in scene.contact_pairs.items():
+        pair = " and ".join(repr(name) for name in sorted(names))
+        numbers |= {f"contact of {pair}: friction": friction, f"contact of {pair}: restitution": restitution}
+    return numbers
+
+
+def first_difference(before: Numbers, now: Numbers) -> str:
+    """Return a sentence about the first difference between two scenes' numbers; "" if there is none."""
+    for name in before | now:
+        old, new = before.get(name), now.get(name)
+        if old == new:
+            continue
+        if _is_nested(old) and _is_nested(new) and len(old) == len(new):  # one force per node
+            row = next(i for i, pair in enumerate(zip(old, new)) if pair[0] != pair[1])
+            name, old, new = f"{name}, row {row}", old[row], new[row]
+        old, new = ("not set" if value is None else reprlib.repr(value) for value in (old, new))
+        return f"{name} is {new} in this scene and was {old} at the start of the saved run"
+    return ""
+
+
+def _is_nested(value) -> bool:
+    return isinstance(value, list) and bool(value) and isinstance(value[0], list)

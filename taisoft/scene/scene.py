@@ -14,12 +14,9 @@ from taisoft.attributes import Guarded, thawed
 from taisoft.errors import SceneError
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
-from taisoft.scene.body import USE_A_COPY, Body, Constraint, NodalForce, Traction
+from taisoft.scene.body import USE_A_COPY, Body, Material
 from taisoft.scene.collision import CollisionSettings
-from taisoft.scene.material import LAWS, Material
 from taisoft.scene.obstacles import Obstacle, Shape, surface_numbers
-
-__all__ = ["LAWS", "Body", "Constraint", "Material", "NodalForce", "Scene", "Traction"]
 
 
 class Scene(Guarded):
@@ -49,47 +46,29 @@ class Scene(Guarded):
         self.obstacles: list[Obstacle] = []
         self.contact_pairs: dict[frozenset[str], tuple[float | None, float | None]] = {}
         self.collision = CollisionSettings()
-        self.allow_initial_overlap = False
-        self.contact_forces = True
+        self.allow_initial_overlap, self.contact_forces = False, True
         self._seal(Scene.__init__)
 
-    @property
-    def gravity(self) -> np.ndarray:
-        """Acceleration of gravity (3,) [m/s^2]."""
-        return self._gravity
+    def _check_gravity(self, value) -> np.ndarray:
+        return checks.array(value, "scene: gravity", ((3,),))
 
-    @gravity.setter
-    def gravity(self, value) -> None:
-        self._gravity = checks.array(value, "scene: gravity", ((3,),))
-
-    @property
-    def collision(self) -> CollisionSettings:
-        """Settings of the contact search."""
-        return self._collision
-
-    @collision.setter
-    def collision(self, value: CollisionSettings) -> None:
+    def _check_collision(self, value) -> CollisionSettings:
         if not isinstance(value, CollisionSettings):
             raise SceneError(f"scene: collision must be CollisionSettings, not {type(value).__name__}")
-        self._collision = value
+        return value
 
-    @property
-    def allow_initial_overlap(self) -> bool:
-        """Whether initial overlap is allowed. Otherwise a Simulator refuses overlaps deeper than 1e-6 of the smaller size."""
-        return self._allow_initial_overlap
-
-    @allow_initial_overlap.setter
-    def allow_initial_overlap(self, value: bool) -> None:
-        self._allow_initial_overlap = checks.flag(value, "scene: allow_initial_overlap")
-
-    @property
-    def contact_forces(self) -> bool:
-        """Whether contacts exert forces. Otherwise bodies pass through each other, and contacts are detected only on request."""
-        return self._contact_forces
-
-    @contact_forces.setter
-    def contact_forces(self, value: bool) -> None:
-        self._contact_forces = checks.flag(value, "scene: contact_forces")
+    gravity = checks.attribute("gravity", _check_gravity, "Acceleration of gravity (3,) [m/s^2].")
+    collision = checks.attribute("collision", _check_collision, "Settings of the contact search.")
+    allow_initial_overlap = checks.attribute(
+        "allow_initial_overlap",
+        lambda _, value: checks.flag(value, "scene: allow_initial_overlap"),
+        "Whether initial overlap is allowed. Otherwise a Simulator refuses overlaps deeper than 1e-6 of the smaller size.",
+    )
+    contact_forces = checks.attribute(
+        "contact_forces",
+        lambda _, value: checks.flag(value, "scene: contact_forces"),
+        "Whether contacts exert forces. Otherwise bodies pass through each other, and contacts are detected only on request.",
+    )
 
     def pushes(self, self_collision: bool) -> bool:
         """Return whether contact forces can occur. self_collision: whether bodies collide with themselves."""
@@ -115,7 +94,7 @@ class Scene(Guarded):
 
     def check(self) -> None:
         """Raise SceneError if in-place changes made an array, such as gravity, invalid."""
-        checks.array(self.gravity, "scene: gravity", ((3,),))
+        self._check_gravity(self.gravity)
         for body in self.bodies:
             body.check()
 

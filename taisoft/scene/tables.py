@@ -97,12 +97,12 @@ class Table:
         """Return the table under a key."""
         return Table(self.file, key_path(self.place, key), self.values[key], known, required)
 
-    def named(self, key: str) -> list[str]:
-        """Return the names of the tables under a key, in order; empty if the key is missing."""
-        values = self.values.get(key, {})
+    def named(self, key: str) -> "Table":
+        """Return the table under a key that holds tables with names of their own; it is empty if the key is missing."""
+        values, place = self.values.get(key, {}), key_path(self.place, key)
         if not isinstance(values, dict):
-            raise self.error(key, f"must be tables [{key_path(self.place, key)}.NAME], not {value_text(values)}")
-        return list(values)
+            raise self.error(key, f"must be tables [{place}.NAME], not {value_text(values)}")
+        return Table(self.file, place, values, list(values))
 
     def listed(self, key: str, known: list[str], required: list[str] | tuple = ()) -> "list[Table]":
         """Return the tables of the list under a key; empty if the key is missing."""
@@ -113,21 +113,26 @@ class Table:
 
     def checked(self, key: str):
         """Return the value of a key. Raises SceneError if a list holds, at any depth, anything but int and float numbers."""
-        self._check_numbers(self.values[key], key_path(self.place, key))
-        return self.values[key]
 
-    def _check_numbers(self, value, place: str) -> None:
-        for i, entry in enumerate(value if isinstance(value, list) else ()):
-            if isinstance(entry, list):
-                self._check_numbers(entry, f"{place}[{i}]")
-            elif isinstance(entry, bool) or not isinstance(entry, (int, float)):
-                raise SceneError(f"{self.file}: {place}[{i}] must be a number, not {value_text(entry)}")
+        def check(value, place: str) -> None:
+            for i, entry in enumerate(value if isinstance(value, list) else ()):
+                if isinstance(entry, list):
+                    check(entry, f"{place}[{i}]")
+                elif isinstance(entry, bool) or not isinstance(entry, (int, float)):
+                    raise SceneError(f"{self.file}: {place}[{i}] must be a number, not {value_text(entry)}")
+
+        check(self.values[key], key_path(self.place, key))
+        return self.values[key]
 
     def make(self, function: Callable, *prefixes: str, keys: list[str] | None = None, **others):
         """Call function(**others) with the values of `keys`, by default all, as further arguments; its errors are located."""
         given = {key: self.checked(key) for key in (self.known if keys is None else keys) if key in self.values}
         with self.located_errors(*prefixes):
             return function(**given, **others)
+
+    def made(self, key: str, function: Callable, *prefixes: str):
+        """Return what a function makes of the table under a key, whose keys are the function's arguments."""
+        return self.table(key, *arguments_of(function)).make(function, *prefixes)
 
     @contextmanager
     def located_errors(self, *prefixes: str) -> Iterator[None]:

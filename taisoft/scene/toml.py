@@ -17,6 +17,7 @@ triangles by centroid, boundary included. Keys and defaults are those of the Pyt
 
 import re
 import tomllib
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -27,21 +28,19 @@ from taisoft.mesh.files import WRITERS, read_mesh
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
-from taisoft.scene.body import Body
+from taisoft.scene.body import Body, Material
 from taisoft.scene.collision import CollisionSettings
 from taisoft.scene.key_frames import KeyFrames
-from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Sphere
 from taisoft.scene.scene import Scene
-from taisoft.scene.solver import CHECKS, check_solver
 from taisoft.scene.tables import Table, arguments_of, check_values, value_text
 
 MESHES = {"box": box_mesh, "sheet": sheet_mesh, "ball": ball_mesh}
 SHAPES = {"half_space": HalfSpace, "sphere": Sphere, "box": Box, "capsule": Capsule, "mesh": MeshObstacle}
 METHODS = {"fix": Body.fix, "move": Body.move, "traction": Body.add_traction, "force": Body.add_force}
-ITEMS = {"traction": "triangles"}  # what a method selects, if not nodes
 SCENE_KEYS = ("gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene at top level
 TOP_KEYS = [*SCENE_KEYS, "collision", "solver", "materials", "bodies", "obstacles", "contacts"]
+SURFACE_KEYS = ("friction", "restitution")
 STANDALONE = (*WRITERS, ".node", ".ele")  # formats whose files reference no other files
 NONE_TEXT = "none"
 
@@ -50,44 +49,52 @@ def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
     """Return the scene in a TOML file, and its `solver` dict: the given arguments of Simulator, seconds and fps.
 
     path: the file. allow_outside: allow mesh files outside its folder and in any format that meshio reads. Raises SceneError
-    or MeshError with the file, the key path, and the rule.
+    or MeshError with the file, the key path, and the rule. Warnings point to the line of the caller.
     """
     try:
         file = Path(path)
     except TypeError as error:
         raise SceneError(f"read_scene: path must be a file's name, not {path!r}") from error
-    tables = Table(file, "", _parsed(file), TOP_KEYS, ["bodies"])
-    scene = Scene()
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        scene, solver = _read(Table(file, "", _parsed(file), TOP_KEYS, ["bodies"]), allow_outside)
+    for warning in found:
+        warnings.warn(warning.message, stacklevel=2)
+    return scene, solver
+
+
+def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
+    scene, solver = Scene(), {}
     for key in SCENE_KEYS:
         if key in tables:
             value = tables.checked(key)
             with tables.located_errors("scene: "):
                 setattr(scene, key, value)
     if "collision" in tables:
-        table = tables.table("collision", *arguments_of(CollisionSettings))
-        scene.collision = table.make(CollisionSettings, "collision settings: ")
-    solver = {}
+        scene.collision = tables.made("collision", CollisionSettings, "collision settings: ")
     if "solver" in tables:
-        solver = tables.table("solver", list(CHECKS)).make(_solver)
-    materials = {name: _material(table) for name, table in _named_tables(tables, "materials", *arguments_of(Material))}
-    if not tables.named("bodies"):
+        solver = tables.table("solver", list(checks.SOLVER_CHECKS)).make(_solver)
+    parent = tables.named("materials")
+    materials = {name: parent.made(name, Material, "material: ") for name in parent.known}
+    bodies = tables.named("bodies")
+    if not bodies.known:
         raise tables.error("bodies", "must hold a table [bodies.NAME]")
     known, _ = arguments_of(Scene.add_body, "name")
     meshes: dict[str, TetMesh] = {}  # bodies with equal mesh tables share one mesh
-    for name, table in _named_tables(tables, "bodies", [*known, *METHODS], ["material", "mesh"]):
+    for name in bodies.known:
+        table = bodies.table(name, [*known, *METHODS], ["material", "mesh"])
         mesh_text = str(table.values["mesh"])
         meshes[mesh_text] = meshes.get(mesh_text) or _mesh(table, allow_outside)
         _add_body(scene, name, table, materials, meshes[mesh_text])
-    if obstacles := tables.named("obstacles"):
-        parent = tables.table("obstacles", obstacles)
-        for name in obstacles:
-            _add_obstacle(scene, name, parent)
+    obstacles = tables.named("obstacles")
+    for name in obstacles.known:
+        _add_obstacle(scene, name, obstacles)
     _set_contacts(scene, tables)
     return scene, solver
 
 
 def _solver(**values) -> dict:
-    return check_solver(**{key: None if value == NONE_TEXT else value for key, value in values.items()})
+    return checks.check_solver(**{key: None if value == NONE_TEXT else value for key, value in values.items()})
 
 
 def _parsed(file: Path) -> dict:
@@ -111,44 +118,26 @@ def _parsed(file: Path) -> dict:
     return tables
 
 
-def _named_tables(tables: Table, key: str, known: list[str], required: list[str]) -> list[tuple[str, Table]]:
-    """Return (name, table) for all tables under a key."""
-    if not (names := tables.named(key)):
-        return []
-    parent = tables.table(key, names)
-    return [(name, parent.table(name, known, required)) for name in names]
-
-
-def _material(table: Table) -> Material:
-    return table.make(Material, "material: ")
-
-
 def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Material], mesh: TetMesh) -> None:
     material = table.values["material"]
-    if isinstance(material, str):
-        if material not in materials:
-            raise table.error(
-                "material", f"{value_text(material)} is not among the materials{checks.nearest(material, materials)}"
-            )
+    if not isinstance(material, str):
+        material = table.made("material", Material, "material: ")
+    elif material in materials:
         material = materials[material]
     else:
-        material = _material(table.table("material", *arguments_of(Material)))
+        near = checks.nearest(material, materials)
+        raise table.error("material", f"{value_text(material)} is not among the materials{near}")
     keys, _ = arguments_of(Scene.add_body, "name", "mesh", "material")
     body = table.make(scene.add_body, f"body {name!r}: ", "scene: ", keys=keys, mesh=mesh, material=material, name=name)
-    for key in METHODS:
-        _call(body, table, key)
-
-
-def _call(body: Body, table: Table, key: str) -> None:
-    """Call the body's method for each table under a key. In the file its argument `where` is called nodes or triangles."""
-    method, items = METHODS[key], ITEMS.get(key, "nodes")
-    known, required = ([items if k == "where" else k for k in keys] for keys in arguments_of(method))
-    for one in table.listed(key, known, required):
-        extra = {"where": _selection(one, items)}
-        if "path" in known:
-            extra["path"] = _key_frames(one)
-        others = [k for k in known if k not in (items, "path")]
-        one.make(getattr(body, method.__name__), f"body {body.name!r}: {method.__name__}: ", keys=others, **extra)
+    for key, method in METHODS.items():  # the argument `where` is called nodes or triangles in the file
+        items = "triangles" if key == "traction" else "nodes"
+        known, required = ([items if k == "where" else k for k in keys] for keys in arguments_of(method))
+        for one in table.listed(key, known, required):
+            extra = {"where": _selection(one, items)}
+            if "path" in known:
+                extra["path"] = one.made("path", KeyFrames, "key frames: ")
+            others = [k for k in known if k not in (items, "path")]
+            one.make(getattr(body, method.__name__), f"body {name!r}: {method.__name__}: ", keys=others, **extra)
 
 
 def _mesh(table: Table, allow_outside: bool) -> TetMesh:
@@ -221,43 +210,29 @@ def _selection(table: Table, key: str):
         if not (low <= high).all():
             raise box.error("min", "must not exceed max")
         return lambda X: ((X >= low) & (X <= high)).all(axis=1)
-    half = choice.table("half_space", *arguments_of(HalfSpace)).make(HalfSpace, "half-space: ")
+    half = choice.made("half_space", HalfSpace, "half-space: ")
     return lambda X: (X - half.point) @ half.normal <= 0.0
 
 
-def _key_frames(table: Table) -> KeyFrames:
-    return table.table("path", *arguments_of(KeyFrames)).make(KeyFrames, "key frames: ")
-
-
 def _add_obstacle(scene: Scene, name: str, obstacles: Table) -> None:
-    others = arguments_of(Scene.add_obstacle)[0]
-    known = dict.fromkeys([*others, *(key for shape in SHAPES.values() for key in arguments_of(shape)[0])])
-    known.pop("name")
-    kind = _kind(obstacles.table(name, list(known)), SHAPES)
+    others = arguments_of(Scene.add_obstacle, "name")[0]
+    known = list(dict.fromkeys([*others, *(key for shape in SHAPES.values() for key in arguments_of(shape)[0])]))
+    kind = _kind(obstacles.table(name, known), SHAPES)
     keys, required = arguments_of(SHAPES[kind])
     table = obstacles.table(name, [key for key in known if key in keys or key in others], required)
-    shape = table.make(SHAPES[kind], f"{SHAPES[kind].word}: ", keys=keys)
-    extra = {"path": _key_frames(table)} if "path" in table else {}
-    table.make(
-        scene.add_obstacle,
-        f"obstacle {name!r}: ",
-        "scene: ",
-        "key frames: ",
-        keys=["friction", "restitution"],
-        shape=shape,
-        name=name,
-        **extra,
-    )
+    made = {"shape": table.make(SHAPES[kind], f"{SHAPES[kind].word}: ", keys=keys), "name": name}
+    if "path" in table:
+        made["path"] = table.made("path", KeyFrames, "key frames: ")
+    table.make(scene.add_obstacle, f"obstacle {name!r}: ", "scene: ", "key frames: ", keys=list(SURFACE_KEYS), **made)
 
 
 def _set_contacts(scene: Scene, tables: Table) -> None:
     """Set friction and restitution of pairs, each pair once."""
-    numbers = ["friction", "restitution"]
-    for table in tables.listed("contacts", ["between", *numbers], ["between"]):
+    for table in tables.listed("contacts", ["between", *SURFACE_KEYS], ["between"]):
         pair = table.values["between"]
         if not isinstance(pair, list) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
             raise table.error("between", "must be a list of two names")
         if frozenset(pair) in scene.contact_pairs:
             raise table.error("between", f"names {value_text(pair[0])} and {value_text(pair[1])}, which an earlier table did")
         prefix = f"scene: contact of {pair[0]!r} and {pair[1]!r}: "
-        table.make(scene.set_contact, prefix, "scene: ", keys=numbers, name_a=pair[0], name_b=pair[1])
+        table.make(scene.set_contact, prefix, "scene: ", keys=list(SURFACE_KEYS), name_a=pair[0], name_b=pair[1])

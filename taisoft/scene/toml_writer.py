@@ -16,13 +16,12 @@ from taisoft.files import write_bytes
 from taisoft.mesh.files import write_mesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene.body import Body
-from taisoft.scene.checks import nearest
-from taisoft.scene.key_frames import KeyFrames, NodePath, ShapePath
+from taisoft.scene.checks import SOLVER_CHECKS, check_solver, nearest
+from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.scene import Scene
-from taisoft.scene.solver import CHECKS, check_solver
 from taisoft.scene.tables import key_path, key_text, quote
-from taisoft.scene.toml import NONE_TEXT, SCENE_KEYS, SHAPES
+from taisoft.scene.toml import NONE_TEXT, SCENE_KEYS, SHAPES, SURFACE_KEYS
 
 MAX_LINE = 100  # maximum number of characters of numbers in a line
 FOREIGN_PATH = "rotates along a path made for {}, which a file cannot store: pass the ts.KeyFrames themselves"
@@ -63,20 +62,18 @@ def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh])
     materials = {}
     for body in scene.bodies:
         materials.setdefault(body.material, f"material{len(materials)}")
-    collision = dataclasses.asdict(scene.collision)
     order = [one.name for one in scene.colliders]
     present = (pair for pair in scene.contact_pairs if pair <= set(order))  # bodies may have been removed since
-    pairs = sorted(sorted(order.index(name) for name in pair) for pair in present)
     contacts = []
-    for pair in pairs:
+    for pair in sorted(sorted(order.index(name) for name in pair) for pair in present):
         names = [order[pair[0]], order[pair[-1]]]
-        numbers = zip(("friction", "restitution"), scene.contact_pairs[frozenset(names)])
+        numbers = zip(SURFACE_KEYS, scene.contact_pairs[frozenset(names)])
         contacts.append({"between": names} | {key: value for key, value in numbers if value is not None})
     return {
         **{key: getattr(scene, key) for key in SCENE_KEYS},
-        "collision": {key: value for key, value in collision.items() if value is not None},
+        "collision": _fields(scene.collision),
         "solver": _solver(solver),
-        "materials": {name: dataclasses.asdict(material) for material, name in materials.items()},
+        "materials": {name: _fields(material) for material, name in materials.items()},
         "bodies": {body.name: _body(body, materials[body.material], stem, meshes) for body in scene.bodies},
         "obstacles": {obstacle.name: _obstacle(obstacle) for obstacle in scene.obstacles},
         "contacts": contacts,
@@ -89,8 +86,9 @@ def _solver(solver: dict) -> dict:
         value = value.item() if isinstance(value, np.generic) else value
         plain[key] = float(value) if isinstance(value, Real) and not isinstance(value, int) else value
     for key in plain:
-        if key not in CHECKS:
-            raise SceneError(f"solver: no setting is called {key!r}{nearest(str(key), CHECKS)}; there are {', '.join(CHECKS)}")
+        if key not in SOLVER_CHECKS:
+            there_are = f"{nearest(str(key), SOLVER_CHECKS)}; there are {', '.join(SOLVER_CHECKS)}"
+            raise SceneError(f"solver: no setting is called {key!r}{there_are}")
     try:
         check_solver(**plain)
     except SceneError as error:
@@ -114,7 +112,7 @@ def _body(body: Body, material: str, stem: str, meshes: dict[str, TetMesh]) -> d
             own = np.array_equal(c.path.starts, body.rest_positions[c.nodes] + body.position)
             if not own and c.path.frames.rotations is not None:  # without rotations the start does not matter
                 raise SceneError(f"body {body.name!r}: {FOREIGN_PATH.format('nodes that start elsewhere')}")
-            table["move"].append(entry | {"path": _frames(c.path.frames)})
+            table["move"].append(entry | {"path": _fields(c.path.frames)})
         else:
             raise SceneError(f"body {body.name!r}: moves along a function, which a file cannot store: use ts.KeyFrames")
     for load in body.tractions:
@@ -128,8 +126,9 @@ def _ids(ids: np.ndarray, n: int):
     return "all" if np.array_equal(ids, np.arange(n)) else ids
 
 
-def _frames(frames: KeyFrames) -> dict:
-    values = {field.name: getattr(frames, field.name) for field in dataclasses.fields(frames)}
+def _fields(record) -> dict:
+    """Return the fields of a record that are not None."""
+    values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
     return {key: value for key, value in values.items() if value is not None}
 
 
@@ -138,8 +137,7 @@ def _obstacle(obstacle: Obstacle) -> dict:
     kind = next((name for name, known in SHAPES.items() if known is type(shape)), None)
     if kind is None:
         raise SceneError(f"obstacle {obstacle.name!r}: a file cannot store a {type(shape).__name__}")
-    table = {"shape": kind} | {field.name: getattr(shape, field.name) for field in dataclasses.fields(shape)}
-    table |= {"friction": obstacle.friction, "restitution": obstacle.restitution}
+    table = {"shape": kind} | _fields(shape) | {key: getattr(obstacle, key) for key in SURFACE_KEYS}
     if obstacle.path is None:
         return table
     if not isinstance(obstacle.path, ShapePath):
@@ -147,7 +145,7 @@ def _obstacle(obstacle: Obstacle) -> dict:
     frames, own = obstacle.path.frames, np.array_equal(obstacle.path.center, shape.pivot)
     if not own and frames.rotations is not None and frames.pivot is not None:  # otherwise the center does not matter
         raise SceneError(f"obstacle {obstacle.name!r}: {FOREIGN_PATH.format('a shape with another center')}")
-    return table | {"path": _frames(frames)}
+    return table | {"path": _fields(frames)}
 
 
 def toml_of(tables: dict) -> str:
@@ -157,7 +155,11 @@ def toml_of(tables: dict) -> str:
 
 def _lines(table: dict, place: str) -> list[str]:
     subtables = {key: value for key, value in table.items() if isinstance(value, dict) or _is_tables(value)}
-    lines = [f"{key_text(key)} = {_toml(value)}" for key, value in table.items() if key not in subtables and not _empty(value)]
+    lines = [
+        f"{key_text(key)} = {_toml(value)}"
+        for key, value in table.items()
+        if key not in subtables and not (isinstance(value, list) and not value)
+    ]
     for key, value in subtables.items():
         path = key_path(place, key)
         for subtable in value if isinstance(value, list) else [value]:
@@ -170,10 +172,6 @@ def _lines(table: dict, place: str) -> list[str]:
 
 def _is_tables(value) -> bool:
     return isinstance(value, list) and bool(value) and isinstance(value[0], dict)
-
-
-def _empty(value) -> bool:
-    return isinstance(value, list) and not value
 
 
 def _toml(value) -> str:

@@ -1,7 +1,7 @@
 """The plan of a study: every combination with its refusal, the frames, and the references. Made in a child process.
 
 A reference runs the same mesh in f64 with small second-order steps; a second run with twice the step estimates its own error.
-With quadratic elements, implicit steps use a consistent mass and explicit ones a lumped mass (see `taisoft.fem.mass`): they solve
+With quadratic elements, implicit steps use a consistent mass and explicit ones a lumped mass (see `fem.reference`): they solve
 different equations, so each kind gets its own reference. With several meshes or orders, the finest one's reference also gives
 the error in space of all runs.
 """

@@ -11,7 +11,19 @@ taken from the signed SVD instead. Weak: R is not unique there, so the stress ju
 import taichi as ti
 
 from taisoft.backend.tracing import arithmetic
-from taisoft.fem.math3 import cofactor, cross, ddot, determinant, dot, matmul, matmul_nt, matmul_tn, signed_svd, transform
+from taisoft.fem.math3 import (
+    add_to_diagonal,
+    cofactor,
+    cross,
+    ddot,
+    determinant,
+    dot,
+    matmul,
+    matmul_nt,
+    matmul_tn,
+    signed_svd,
+    transform,
+)
 
 NAME = "corotational"
 SOFTENS_BELOW = 0.0
@@ -24,12 +36,6 @@ SVD_BELOW = 0.04  # relative size of the denominator below which the closed form
 def constants(mu: float, lam: float) -> tuple[float, float, float, float]:
     """(mu, lambda, 0, 0) [Pa]."""
     return mu, lam, 0.0, 0.0
-
-
-@ti.func
-def _svd_rotation(F):
-    U, s, V = signed_svd(F, 5)
-    return matmul_nt(U, V)
 
 
 @arithmetic
@@ -54,7 +60,7 @@ def rotation(F):
     """R of the polar decomposition, det R = +1; any finite F is valid."""
     C = matmul_tn(F, F)
     G = cofactor(F)
-    J = F[0] * G[0] + F[1] * G[1] + F[2] * G[2]
+    J = dot(F, G)
     Ic = C[0] + C[4] + C[8]
     c0 = 2.0 * ddot(C, C) - Ic * Ic
     f = ti.sqrt(3.0 * Ic)  # above the root, and close to it if the stretches are nearly equal
@@ -75,7 +81,8 @@ def rotation(F):
     scale = ti.sqrt(3.0 / ti.max(ddot(N, N), 1e-30))
     R = [scale * N[k] for k in ti.static(range(9))]
     if _any(use_svd):
-        Q = _svd_rotation(F)
+        U, _, V = signed_svd(F, 5)
+        Q = matmul_nt(U, V)
         for k in ti.static(range(9)):
             R[k] = ti.select(use_svd, Q[k], R[k])
     return R
@@ -142,27 +149,19 @@ def block(F, S, ga, gb):
     d = 2.0 * S[18] * dot(ga, gb)
     l = [S[19] * Rb[k] for k in ti.static(range(3))]
     # dR g_b = w x R g_b with w = K (R g_a x e_k), so the matrix over k is -[R g_b]x K [R g_a]x
-    N = [cross([S[9 + 3 * i], S[10 + 3 * i], S[11 + 3 * i]], Ra) for i in ti.static(range(3))]
+    N = [cross(S[9 + 3 * i : 12 + 3 * i], Ra) for i in ti.static(range(3))]
     c = [S[20] * Rb[k] for k in ti.static(range(3))]
     rotated = [
         c[(i + 2) % 3] * N[(i + 1) % 3][k] - c[(i + 1) % 3] * N[(i + 2) % 3][k]
         for i in ti.static(range(3))
         for k in ti.static(range(3))
     ]
-    return [
-        rotated[3 * i + k] + l[i] * Ra[k] + (d if ti.static(i == k) else 0.0)
-        for i in ti.static(range(3))
-        for k in ti.static(range(3))
-    ]
+    return add_to_diagonal([rotated[k] + l[k // 3] * Ra[k % 3] for k in ti.static(range(9))], d)
 
 
 @arithmetic
 def hessian_eigen(s, p):
-    """Second derivatives in the SVD frame [Pa].
-
-    Returns the 3x3 block over the stretches s (nine entries), and the eigenvalues of the symmetric and of the antisymmetric
-    modes of the pairs (0,1), (0,2), (1,2).
-    """
+    """Second derivatives in the SVD frame [Pa], over the stretches s: see `laws`."""
     A = [(2.0 * p[0] if ti.static(i == j) else 0.0) + p[1] + 0.0 * s[0] for i in ti.static(range(3)) for j in ti.static(range(3))]
     symmetric = [2.0 * p[0] + 0.0 * s[0], 2.0 * p[0] + 0.0 * s[0], 2.0 * p[0] + 0.0 * s[0]]
     factor = 2.0 * p[1] * (s[0] + s[1] + s[2] - 3.0) - 4.0 * p[0]

@@ -8,9 +8,10 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel, open_kind, open_runtime
 from taisoft.errors import SceneError
-from taisoft.fem.laws import LAWS
-from taisoft.fem.laws.projection import dpk1_projected, prepare_projected
+from taisoft.fem.laws import LAWS, dpk1_projected, prepare_projected
 from taisoft.scene.scene import Material
+
+ARRAY = ti.types.ndarray()
 
 
 @ti.func
@@ -26,14 +27,7 @@ def _store(out: ti.template(), b, A, lanes: ti.template()):
 
 
 @kernel
-def _evaluate(
-    law: ti.template(),
-    lanes: ti.template(),
-    F: ti.types.ndarray(),
-    p: ti.types.ndarray(),
-    psi: ti.types.ndarray(),
-    P: ti.types.ndarray(),
-):
+def _evaluate(law: ti.template(), lanes: ti.template(), F: ARRAY, p: ARRAY, psi: ARRAY, P: ARRAY):
     for b in range(F.shape[0]):
         G = _load(F, b, lanes)
         c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(4))]
@@ -45,15 +39,7 @@ def _evaluate(
 
 
 @kernel
-def _differential(
-    law: ti.template(),
-    projected: ti.template(),
-    lanes: ti.template(),
-    F: ti.types.ndarray(),
-    p: ti.types.ndarray(),
-    D: ti.types.ndarray(),
-    P: ti.types.ndarray(),
-):
+def _differential(law: ti.template(), projected: ti.template(), lanes: ti.template(), F: ARRAY, p: ARRAY, D: ARRAY, P: ARRAY):
     for b in range(F.shape[0]):
         G = _load(F, b, lanes)
         H = _load(D, b, lanes)

@@ -9,7 +9,7 @@ reflection), so compressed bodies collapse.
 import taichi as ti
 
 from taisoft.backend.tracing import arithmetic
-from taisoft.fem.math3 import ddot, dot, matmul, matmul_nt, matmul_tn, transform
+from taisoft.fem.math3 import add_to_diagonal, ddot, dot, matmul, matmul_nt, matmul_tn, transform
 
 NAME = "st_venant_kirchhoff"
 SOFTENS_BELOW = 0.6  # stretch that triggers a warning, slightly above 1/sqrt(3)
@@ -33,7 +33,7 @@ def _green_strain(F):
 def _second_pk(E, p):
     """S = 2 mu E + lambda tr(E) I [Pa]."""
     t = p[1] * (E[0] + E[4] + E[8])
-    return [2.0 * p[0] * E[k] + (t if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
+    return add_to_diagonal([2.0 * p[0] * E[k] for k in ti.static(range(9))], t)
 
 
 @arithmetic
@@ -65,11 +65,7 @@ def dpk1(F, S, D):
     """Differential of the stress along D [Pa], with S = prepare(F, p): D S + F dS."""
     B = matmul_tn(F, D)
     t = S[10] * (B[0] + B[4] + B[8])
-    T = [
-        S[9] * (B[3 * i + j] + B[3 * j + i]) + (t if ti.static(i == j) else 0.0)
-        for i in ti.static(range(3))
-        for j in ti.static(range(3))
-    ]
+    T = add_to_diagonal([S[9] * (B[3 * i + j] + B[3 * j + i]) for i in ti.static(range(3)) for j in ti.static(range(3))], t)
     first, second = matmul(D, S), matmul(F, T)
     return [first[k] + second[k] for k in ti.static(range(9))]
 
@@ -81,20 +77,12 @@ def block(F, S, ga, gb):
     c, d = dot(ga, gb), dot(ga, transform(S, gb))
     m = [S[9] * Fa[k] for k in ti.static(range(3))]
     l = [S[10] * Fb[k] for k in ti.static(range(3))]
-    return [
-        c * S[11 + 3 * i + k] + m[i] * Fb[k] + l[i] * Fa[k] + (d if ti.static(i == k) else 0.0)
-        for i in ti.static(range(3))
-        for k in ti.static(range(3))
-    ]
+    return add_to_diagonal([c * S[11 + k] + m[k // 3] * Fb[k % 3] + l[k // 3] * Fa[k % 3] for k in ti.static(range(9))], d)
 
 
 @arithmetic
 def hessian_eigen(s, p):
-    """Second derivatives in the SVD frame [Pa].
-
-    Returns the 3x3 block over the stretches s (nine entries), and the eigenvalues of the symmetric and of the antisymmetric
-    modes of the pairs (0,1), (0,2), (1,2).
-    """
+    """Second derivatives in the SVD frame [Pa], over the stretches s: see `laws`."""
     h = 0.5 * p[1] * (s[0] * s[0] + s[1] * s[1] + s[2] * s[2] - 3.0)
     A = [
         p[1] * s[i] * s[j] + ((p[0] * (3.0 * s[i] * s[i] - 1.0) + h) if ti.static(i == j) else 0.0)

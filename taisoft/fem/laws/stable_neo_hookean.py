@@ -47,7 +47,7 @@ def psi(F, p):
 def pk1(F, p):
     """First Piola-Kirchhoff stress [Pa]; any F is valid. Source: the paper's eq. 18."""
     G = cofactor(F)
-    J = F[0] * G[0] + F[1] * G[1] + F[2] * G[2]
+    J = dot(F, G)
     a = p[0] - p[0] / (ddot(F, F) + 1.0)
     b = p[1] * (J - p[2])
     return [a * F[k] + b * G[k] for k in ti.static(range(9))]
@@ -57,7 +57,7 @@ def pk1(F, p):
 def prepare(F, p):
     """Precompute for `dpk1` and `block`: the cofactor of F and the factors of the four terms."""
     G = cofactor(F)
-    J = F[0] * G[0] + F[1] * G[1] + F[2] * G[2]
+    J = dot(F, G)
     q = 1.0 / (ddot(F, F) + 1.0)
     return G + [p[0] - p[0] * q, 2.0 * p[0] * q * q, p[1], p[1] * (J - p[2])]
 
@@ -95,11 +95,7 @@ def block(F, S, ga, gb):
 
 @arithmetic
 def hessian_eigen(s, p):
-    """Second derivatives in the SVD frame [Pa].
-
-    Returns the 3x3 block over the stretches s (nine entries), and the eigenvalues of the symmetric and of the antisymmetric
-    modes of the pairs (0,1), (0,2), (1,2).
-    """
+    """Second derivatives in the SVD frame [Pa], over the stretches s: see `laws`."""
     Ic = s[0] * s[0] + s[1] * s[1] + s[2] * s[2]
     q = 1.0 / (Ic + 1.0)
     a, f = p[0] - p[0] * q, 2.0 * p[0] * q * q

@@ -7,8 +7,8 @@ A term is a module with
     force(m, i)       on node i at the present x [N]; for elasticity, after its elements have been summed
     energy(m, i)      node i's part of its potential [J], in f64; elasticity has `element_energy` instead
 and is listed in TERMS, which explicit steps, Newton's method, statics and reports iterate over. Dampers have no potential, and
-integrators treat them differently; their files hold their rates and forces. The drag spring of the window is constant over a
-step and is therefore applied as a dead load (`dynamics.drag_spring`).
+integrators treat them differently: `rayleigh_damping` holds their rates and forces. The drag spring of the window is constant
+over a step and is therefore applied as a dead load (`dynamics.drag_spring`).
 """
 
 from taisoft.fem.terms import dead_loads, elasticity, gravity

@@ -1,11 +1,14 @@
 """Elasticity: f_a = -sum_e V sum_q w_q P(F_q) grad N_a, psi = sum_e V sum_q w_q psi(F_q).
 
 Each tet writes its nodal forces to a buffer, and each node gathers them in a fixed order, so the result does not depend on
-threading. The blocks -df/dx are in `linear.element_blocks`, the differential is `elasticity.force_differential`.
+threading. The blocks -df/dx are in `linear.element_blocks`. The differential, without assembly, is Algorithm 8 of She, "Soft Body
+Simulation" (University of Copenhagen), at every quadrature point, with two corrections: dH = -V dP(F; dF) M^T with M = Dm^-1
+(M^-T there), and the fourth corner's force belongs to vertex 0.
 """
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
 from taisoft.fem.lanes import (
     add_forces,
     broadcast,
@@ -22,10 +25,10 @@ from taisoft.fem.lanes import (
     weight_at,
     zero_forces,
 )
-from taisoft.fem.laws.projection import dpk1_projected, prepare_projected
-from taisoft.fem.math3 import determinant, matmul_tn
-from taisoft.fem.scalars import FAILED, INVERTED_NOW, LOWEST_J
-from taisoft.fem.subset import block_of, first_block_of, last_block_of
+from taisoft.fem.laws import dpk1_projected, prepare_projected
+from taisoft.fem.math3 import determinant, matmul_nt, matmul_tn
+from taisoft.fem.node_graph import BLOCKS, EVERYTHING, block_of, count_of
+from taisoft.fem.state import FAILED, INVERTED_NOW, LOWEST_J
 
 SWITCH, LOAD, ACCELERATION = None, False, False
 HUGE = 1e30  # above any volume ratio
@@ -97,7 +100,7 @@ def sum_elements(m: ti.template(), subset: ti.template()):
     """Run `element_force` over all blocks of a subset, as top-level loops of a kernel."""
     for n, g in ti.static(enumerate(m.groups)):
         ti.loop_config(serialize=m.serial)
-        for j in range(first_block_of(g, n, subset), last_block_of(g, n, subset)):
+        for j in range(count_of(subset, BLOCKS + n, g.first), count_of(subset, BLOCKS + n + 1, g.last)):
             element_force(m, g, False, block_of(subset, j))
 
 
@@ -148,3 +151,67 @@ def element_energy(m: ti.template(), g: ti.template(), b):
             minor = ti.min(minor, D[0], D[0] * D[4] - D[1] * D[3], determinant(D))
     one = broadcast(ti.cast(1, ti.i32), m.lanes)
     return energy, lowest, ti.select(minor <= 0.0, one, one - 1)
+
+
+@kernel
+def elastic_forces(m: ti.template()):
+    """Fill the element force buffer from x; `gather_forces` sums it over nodes."""
+    sum_elements(m, EVERYTHING)
+
+
+@kernel
+def force_differential(m: ti.template(), dx: ti.template(), df: ti.template()):
+    """Compute df = (df/dx)(x) dx, matrix-free: (n_nodes) 3-vectors, dx [m], df [N]."""
+    for g in ti.static(m.groups):
+        ti.loop_config(serialize=m.serial)
+        for b in range(g.first, g.last):
+            X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
+            dX = differences(m, g, dx, b, m.real)
+            M = rest_gradients(m, b, m.real)
+            p = law_constants(m, b, m.real)
+            S = zero_forces(m, g)
+            for q in range(g.n_points):
+                F = deformation_gradient(m, g, X, N, q)
+                dF = gradient_at(m, g, dX, M, q, m.real)
+                K = g.law.prepare(F, p)
+                dP = g.law.dpk1(F, K, dF)
+                add_forces(m, g, S, dP, M, q)
+            store_forces(m, g, b, S)
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        df[i] = force(m, i)
+
+
+@kernel
+def gather_forces(m: ti.template(), f: ti.template()):
+    """Compute f (n_nodes) [N], the sum of the tets' forces."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        f[i] = force(m, i)
+
+
+@kernel
+def cauchy_stress(m: ti.template(), sigma: ti.types.ndarray()):
+    """Compute the mean of sigma = P F^T / J over each deformed tet, (n_blocks * lanes, 9) [Pa]; not finite for flat tets."""
+    for g in ti.static(m.groups):
+        ti.loop_config(serialize=m.serial)
+        for b in range(g.first, g.last):
+            X = differences(m, g, m.state.x, b, ti.f64)
+            M = rest_gradients(m, b, ti.f64)
+            p = law_constants(m, b, ti.f64)
+            volume_ratio = broadcast(ti.cast(0.0, ti.f64), m.lanes)  # deformed volume / rest volume: sum of w_q J_q
+            for k in range(9):
+                for q in ti.static(range(m.lanes)):
+                    sigma[b * m.lanes + q, k] = 0.0
+            for q in range(g.n_points):
+                F = gradient_at(m, g, X, M, q, ti.f64)
+                w = weight_at(m, g, q, ti.f64)
+                P = g.law.pk1(F, p)
+                T = matmul_nt(P, F)
+                volume_ratio += w * determinant(F)
+                for k in ti.static(range(9)):
+                    for l in ti.static(range(m.lanes)):
+                        sigma[b * m.lanes + l, k] += w * T[k][l]
+            for k in range(9):
+                for q in ti.static(range(m.lanes)):
+                    sigma[b * m.lanes + q, k] /= volume_ratio[q]

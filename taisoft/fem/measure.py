@@ -1,0 +1,75 @@
+"""Energies and volume ratios of the present state."""
+
+import taichi as ti
+
+from taisoft.backend.runtime import kernel
+from taisoft.fem.lanes import broadcast, mass_times
+from taisoft.fem.state import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, LOADS, MIN_J, N_INVERTED
+from taisoft.fem.terms import dead_loads, elasticity, gravity
+from taisoft.fem.terms.elasticity import HUGE
+
+NO_TET = 2**31 - 1  # above any tet index
+SCALARS = (ELASTIC, MIN_J, N_INVERTED, KINETIC, GRAVITY, LOADS, FIRST_SOFTENED)
+
+
+@ti.func
+def _lane_sum(values):
+    total = values[0]
+    for q in ti.static(range(1, values.n)):
+        total += values[q]
+    return total
+
+
+@ti.func
+def _lane_min(values):
+    low = values[0]
+    for q in ti.static(range(1, values.n)):
+        low = ti.min(low, values[q])
+    return low
+
+
+@kernel(cse=False)
+def measure(m: ti.template()):
+    """Compute energies and volume ratios of the present state, in f64 with sums in a fixed order.
+
+    They are written to `State.scalars` at SCALARS; FIRST_SOFTENED is NO_TET if there is none.
+    """
+    ti.loop_config(serialize=m.serial)
+    for c in range(m.chunks):
+        energy = broadcast(ti.cast(0.0, ti.f64), m.lanes)
+        lowest = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
+        inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
+        no_tets = broadcast(ti.cast(NO_TET, ti.i32), m.lanes)
+        softened = no_tets
+        blocks_per_chunk = (m.n_blocks + m.chunks - 1) // m.chunks
+        for g in ti.static(m.groups):
+            for b in range(ti.max(g.first, c * blocks_per_chunk), ti.min(g.last, (c + 1) * blocks_per_chunk)):
+                psi, J, soft = elasticity.element_energy(m, g, b)
+                energy += psi
+                lowest = ti.min(lowest, J)
+                inverted += elasticity.count_inverted(m, b, J)
+                tets = ti.Vector([b * m.lanes + q for q in ti.static(range(m.lanes))])
+                softened = ti.min(softened, ti.select(soft == 1, tets, no_tets))
+        m.state.partial[c, ELASTIC] = _lane_sum(energy)
+        m.state.partial[c, MIN_J] = _lane_min(lowest)
+        m.state.partial[c, N_INVERTED] = ti.cast(_lane_sum(inverted), ti.f64)
+        kinetic, weight, loads = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        nodes_per_chunk = (m.n_nodes + m.chunks - 1) // m.chunks
+        for i in range(c * nodes_per_chunk, ti.min(m.n_nodes, (c + 1) * nodes_per_chunk)):
+            kinetic += 0.5 * ti.cast(m.state.v[i], ti.f64).dot(mass_times(m, i, m.state.v))
+            weight += gravity.energy(m, i)
+            if ti.static(m.loaded):
+                loads += dead_loads.energy(m, i)
+        m.state.partial[c, KINETIC], m.state.partial[c, GRAVITY], m.state.partial[c, LOADS] = kinetic, weight, loads
+        m.state.partial[c, FIRST_SOFTENED] = ti.cast(_lane_min(softened), ti.f64)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for k in ti.static(SCALARS):
+            total = m.state.partial[0, k]
+            for c in range(1, m.chunks):
+                value = m.state.partial[c, k]
+                if ti.static(k == MIN_J or k == FIRST_SOFTENED):
+                    total = ti.min(total, value)
+                else:
+                    total += value
+            m.state.scalars[k] = total
