@@ -12,12 +12,11 @@ from taisoft.backend.transfer import download, upload
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.crossings import CROSSED, CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.collision.pipeline import Detection
-from taisoft.contact.assemble import (
+from taisoft.contact.build import (
     SELF_CONTACT,
-    build_found,
     build_pair_numbers,
     fill,
-    find_impact,
+    has_impact,
     keep_impulses,
     scale_impulses,
     upload_pair_numbers,
@@ -96,15 +95,9 @@ class ContactStep:
 
     def _allocate(self, capacity: int) -> None:
         arena, m = FieldArena(), self.simulation.model
-        problem = build_node_problem(arena, capacity, m.n_nodes, m.serial)
-        self.found = build_found(arena, problem)
+        self.problem = build_node_problem(arena, capacity, m.n_nodes, m.serial)  # of the last step begun
         self._arena.release()
         self._arena, self._last_time, self._indexed = arena, 0.0, False
-
-    @property
-    def problem(self):
-        """The `ContactProblem` of the last step begun."""
-        return self.found.problem
 
     @property
     def n_contacts(self) -> int:
@@ -121,7 +114,7 @@ class ContactStep:
 
     def _contact_fields(self) -> dict:
         """Fields of the last step's contacts, for the warm start of the next step and for `contacts`."""
-        p, f = self.problem, self.found
+        p = self.problem
         return {
             "normal": p.normal,
             "tangent": p.tangent,
@@ -129,11 +122,11 @@ class ContactStep:
             "node": p.node,
             "weight": p.weight,
             "arity": p.arity,
-            "point": f.point,
-            "gap": f.gap,
-            "body": f.body,
-            "feature": f.feature,
-            "struck": f.impact_impulse,
+            "point": p.point,
+            "gap": p.gap,
+            "body": p.body,
+            "feature": p.feature,
+            "struck": p.impact_impulse,
         }
 
     def snapshot(self) -> dict:
@@ -229,12 +222,12 @@ class ContactStep:
         self.dropped = max(self.dropped, d.counts.unmapped)
         if n > self.problem.capacity:
             self._allocate(2 * n)
-        f = self.found
-        keep_impulses(f)
+        p = self.problem
+        keep_impulses(p)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
-        fill(f, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
+        fill(p, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
         if n or self._indexed:  # an empty index needs no update
-            index_nodes(f.problem)
+            index_nodes(p)
             self._indexed = n > 0
         self._last_time, self._impulse_fraction, self.had_impact = dt, 1.0, False
         return n
@@ -247,7 +240,7 @@ class ContactStep:
 
     def detect_impact(self, dt: float) -> bool:
         """Return, and set `had_impact` to, whether surfaces without impulse so far meet in the step of dt that has begun."""
-        self.had_impact = bool(find_impact(self.found, dt, self.contact_offset))
+        self.had_impact = bool(has_impact(self.problem, dt, self.contact_offset))
         return self.had_impact
 
     def detect_rebounds(self, dt: float) -> bool:
@@ -258,7 +251,7 @@ class ContactStep:
         if (self._flight_gravity != scene.gravity).any():  # energy lost under another gravity is unknown
             self._flight_gravity = scene.gravity.copy()
             self.flight[:] = 0.0
-        found = find_rebounds(self.found, self.simulation.model.gravity, self.flight, dt, self.contact_offset) > 0
+        found = find_rebounds(self.problem, self.simulation.model.gravity, self.flight, dt, self.contact_offset) > 0
         self.had_impact = self.had_impact or found
         return found
 
@@ -267,9 +260,9 @@ class ContactStep:
         if not self._has_restitution:
             return
         scene, first = self.simulation.scene, self.simulation.layout.node_start[:-1]
-        added, f, p = dt**2 if dissipative else 0.0, self.found, self.problem
+        added, p = dt**2 if dissipative else 0.0, self.problem
         self.flight += np.where(self.flight > 0.0, added, dt**2)
-        r, struck, body = download([p.r, f.impact_impulse, f.body], self.n_contacts)
+        r, struck, body = download([p.r, p.impact_impulse, p.body], self.n_contacts)
         self.flight[body[(r != 0.0).any(axis=1)]] = 0.0
         self.flight[body[(struck != 0.0).any(axis=1)]] = dt**2
         constrained = np.logical_or.reduceat(self.simulation.dirichlet.constrained().any(axis=1), first)
@@ -372,7 +365,7 @@ class ContactStep:
         self._searched = self._measured_end = None
         self._find(time, dt, path=self._path)
         self._searched, self._searched_dt = (time, dt), dt
-        searched = set(map(tuple, download([self.found.feature], self.n_contacts)[0].tolist()))
+        searched = set(map(tuple, download([self.problem.feature], self.n_contacts)[0].tolist()))
         kept = download([self.detection.kept], self.detection.counts.contacts)[0]
         found = self.detection.buffer.data.feature.to_numpy()[kept]
         return not searched.issuperset(map(tuple, found.tolist()))
@@ -417,10 +410,10 @@ class ContactStep:
 
     def contacts(self) -> Contacts:
         """Return the contacts of the last step with their impulses."""
-        f, p = self.found, self.problem
+        p = self.problem
         n = p.count[0]
         normal, tangent, r, struck, point, gap, body, feature, node, weight, arity = download(
-            [p.normal, p.tangent, p.r, f.impact_impulse, f.point, f.gap, f.body, f.feature, p.node, p.weight, p.arity], n
+            [p.normal, p.tangent, p.r, p.impact_impulse, p.point, p.gap, p.body, p.feature, p.node, p.weight, p.arity], n
         )
         r = r / self._impulse_fraction + struck
         impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)

@@ -135,9 +135,9 @@ class StageSystem:
 
     def _allocate_contacts(self) -> None:
         """Allocate storage for the contacts of this step."""
-        if self._stage_contacts is None or self._stage_contacts.found is not self.contact.found:
+        if self._stage_contacts is None or self._stage_contacts.problem is not self.contact.problem:
             arena = FieldArena()
-            self._stage_contacts = build_stage_contacts(arena, self.model, self.contact.found, self.x_start)
+            self._stage_contacts = build_stage_contacts(arena, self.model, self.contact.problem, self.x_start)
             self._contact_arena.release()
             self._contact_arena = arena
 
