@@ -82,8 +82,8 @@ class StageSystem:
     ):
         """prescribed: nodes that follow a path. x_start: (n_nodes) 3-vectors f64, positions at the start of the step."""
         self.model, self.contact, self.x_start = model, contact, x_start
-        self.matrix: BlockCsr = block_csr.build_block_csr(model, arena, model.real)
-        self.damper = block_csr.sibling(self.matrix, model, arena, model.real, "damping") if model.stiffness_damping else None
+        self.matrix: BlockCsr = block_csr.build_block_csr(model, arena)
+        self.damper = block_csr.sibling(self.matrix, model, arena, "damping") if model.stiffness_damping else None
         n, k = model.n_nodes, len(prescribed)
         self.work = StageWork(
             x_hat=arena.vectors("x_hat", ti.f64, n),
