@@ -115,7 +115,7 @@ def solve(
     while True:
         n = min(batch, max_iterations - done)
         if m.serial:
-            iterate_kernel(m, A, coupling, w, n, tolerance, int(done == 0), int(same_matrix))
+            iterate_kernel(m, A, coupling, w, n, tolerance, 0 if done else 1 + same_matrix)
         else:
             if done == 0:
                 start_parallel(m, A, coupling, w, int(same_matrix))
@@ -129,21 +129,16 @@ def solve(
 @ti.func
 def precondition(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), i, same_matrix):
     """Set diagonal and preconditioner of node i, unless it has those of the last solve."""
+    changed = True
     if ti.static(k.width > 0):
-        if same_matrix == 0 or has_terms(k, i):
+        changed = same_matrix == 0 or has_terms(k, i)
+        if changed:
             A.diagonal[i] = prepare_terms(m, k, i)
-            _set_blocks(m, w, i, A.diagonal[i])
-    else:
-        _set_blocks(m, w, i, A.diagonal[i])
-
-
-@ti.func
-def _set_blocks(m: ti.template(), w: ti.template(), i, D):
-    """Set the inverse of P of node i from its diagonal block D; if serial, also P and 2 P - D."""
-    w.inverse[i], P = definite_inverse(m, D, m.free[i])
-    if ti.static(m.serial):
-        w.block[i] = P
-        w.mirror[i] = 2.0 * P - D
+    if changed:
+        w.inverse[i], P = definite_inverse(m, A.diagonal[i], m.free[i])
+        if ti.static(m.serial):
+            w.block[i] = P
+            w.mirror[i] = 2.0 * P - A.diagonal[i]
 
 
 @ti.func
@@ -166,20 +161,13 @@ def total(m: ti.template(), column: ti.template()):
 
 @kernel
 def iterate_kernel(
-    m: ti.template(),
-    A: ti.template(),
-    k: ti.template(),
-    w: ti.template(),
-    n: ti.i32,
-    tolerance: ti.f64,
-    begin: ti.i32,
-    same_matrix: ti.i32,
+    m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), n: ti.i32, tolerance: ti.f64, begin: ti.i32
 ):
-    """Run up to n iterations, from y = 0 if begin is 1."""
+    """Run up to n iterations. begin: 0 to go on, 1 to start from y = 0, 2 to start with the last solve's matrix."""
     ti.loop_config(serialize=True)
     for _ in range(1):
-        if begin != 0:
-            start_serial(m, A, k, w, same_matrix)
+        if begin > 0:
+            start_serial(m, A, k, w, begin - 1)
         count, _status = iterate_serial(m, A, k, w, n, tolerance)
         w.state[COUNT] = w.state[COUNT] + count
 
