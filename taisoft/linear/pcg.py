@@ -27,15 +27,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.fem.model import Model
 from taisoft.fem.scalars import OTHER_SUM, SUM
 from taisoft.fem.subset import EVERYTHING, Subset, n_nodes_of, node_of
-from taisoft.linear.block_csr import (
-    BLOCK,
-    BlockCsr,
-    block_times,
-    definite_inverse,
-    partial_row_times,
-    partial_row_times_backward,
-    row_times,
-)
+from taisoft.linear.block_csr import BLOCK, BlockCsr, block_times, definite_inverse, partial_row_times, partial_row_times_backward
 from taisoft.linear.coupling import (
     NO_COUPLING,
     add_products,
@@ -184,8 +176,7 @@ def start_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.tem
         add_products(m, k, i, s)
         t = block_times(w.block[i], s)
         w.r[i], w.q[i] = s, t
-        w.z[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
-        w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)
+        w.y[i], w.z[i] = ti.Vector.zero(m.real, 3), ti.Vector.zero(m.real, 3)
         rz += dot64(s, t)
     w.state[RZ], w.state[RZ_START], w.state[STEP] = rz, rz, 0.0
     w.state[COUNT], w.state[STATUS] = 0.0, RUNNING
@@ -225,8 +216,7 @@ def iterate_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
             i = node_of(w.subset, at)
             # from here on w.q holds (P + L)^-1 (t - (2 P - D) p), which the following rows need
             p, t = w.p[i], w.z[i]
-            below = _row_below(m, A, k, i, w.q)
-            s = block_times(w.inverse[i], t - block_times(w.mirror[i], p) - below)
+            s = block_times(w.inverse[i], t - block_times(w.mirror[i], p) - _row_below(m, A, k, i, w.q))
             add_products(m, k, i, s)
             w.q[i] = s
             curvature += dot64(t, p + s)
@@ -299,12 +289,11 @@ def iterate_once(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.tem
         if w.state[STATUS] == RUNNING:
             for at in range(_chunk_start(m, w, c), _chunk_start(m, w, c + 1)):
                 i = node_of(w.subset, at)
-                product = ti.Vector([0.0, 0.0, 0.0], m.real)
+                product = partial_row_times(m, A, A.row_start[i], A.row_start[i + 1], w.p)
                 if ti.static(k.width > 0):
-                    product = partial_row_times(m, A, A.row_start[i], A.row_start[i + 1], w.p)
                     product += block_times(k.base[i], w.p[i]) + gather_products(m, k, i)
                 else:
-                    product = row_times(m, A, i, w.p)
+                    product += block_times(A.diagonal[i], w.p[i])
                 q = m.free[i] * product
                 w.q[i] = q
                 s += dot64(w.p[i], q)
