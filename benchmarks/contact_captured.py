@@ -13,7 +13,8 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.contact import SOLVERS, numpy_prox
+from taisoft.contact import SOLVERS
+from taisoft.contact.augmented_lagrangian import find_residual
 from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.problem import NODES, ContactProblem
 from taisoft.contact.solve import solve
@@ -99,8 +100,7 @@ def make_judge(p: ContactProblem) -> Callable[[np.ndarray], float]:
     k = int(p.count[0])
     J, b, mu = contact_jacobian(p), p.b.to_numpy()[:k].ravel(), p.friction.to_numpy()[:k]
     W = (J @ sp.diags(p.inverse_mass.to_numpy().ravel()) @ J.T).tocsr()
-    factors = numpy_prox.find_factors(W)
-    return lambda r: numpy_prox.residual(W, b, mu, factors, r)
+    return lambda r: find_residual(W, b, mu, r)
 
 
 # --- the solvers ------------------------------------------------------------------------------------------------------

@@ -6,9 +6,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from taisoft.contact.colouring import colour_parallel, graph_of
-from taisoft.contact.graph import colour_greedy, colour_random
-from taisoft.contact.problem import ContactProblem, index_nodes
+from taisoft.contact.colouring import colour_contacts, colour_greedy, colour_random, graph_of
+from taisoft.contact.problem import ContactProblem
 from taisoft.output.tables import markdown
 
 from .contact_captured import clock
@@ -46,8 +45,7 @@ def proper(graph: sp.csr_matrix, colour: np.ndarray) -> bool:
 
 
 def _parallel(p: ContactProblem) -> np.ndarray:
-    index_nodes(p)
-    colour_parallel(p)
+    colour_contacts(p)
     return p.colour.to_numpy()[: int(p.count[0])]
 
 

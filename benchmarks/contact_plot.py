@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taisoft.contact.graph import groups
+from taisoft.contact.colouring import groups
 from taisoft.output.plot import require_matplotlib, save, ticks
 from taisoft.view.offscreen import Offscreen
 

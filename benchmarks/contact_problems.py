@@ -18,9 +18,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from taisoft.backend.runtime import open_runtime
-from taisoft.contact import api, augmented_lagrangian, numpy_prox
-from taisoft.contact.colouring import store
-from taisoft.contact.graph import colour_greedy, matrix_graph
+from taisoft.contact import api, augmented_lagrangian
+from taisoft.contact.colouring import colour_greedy, matrix_graph, store
 from taisoft.contact.solve import solve
 
 PROBLEMS = Path(__file__).resolve().parents[1].parent / "shared" / "contact_problems"
@@ -151,7 +150,7 @@ def counted_operations(problem: Problem) -> Iterator[list[int]]:
 def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
     """All solvers that sweep; the first is plain Gauss-Seidel, in whose time the others are told."""
     W, b, mu = problem.W, problem.b, problem.mu
-    with api._problem(W, b, mu, np.zeros((len(mu), 3))) as p:
+    with api._problem(W, b, mu) as p:
         store(p, colour_greedy(matrix_graph(W)))
         orders = {True: p.order.to_numpy(), False: np.zeros(p.capacity, dtype=np.int32)}
         orders[False][: len(mu)] = np.arange(len(mu))
@@ -166,7 +165,7 @@ def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
             for n in SWEEPS:
                 start(method)
                 solve(p, method, 0.1 * NONE, n, momentum=momentum)
-                after.append(numpy_prox.residual(W, b, mu, numpy_prox.find_factors(W), p.r.to_numpy()[: len(mu)]))
+                after.append(augmented_lagrangian.find_residual(W, b, mu, p.r.to_numpy()[: len(mu)]))
             residuals[name] = tuple(after)
             start(method)
             found[name] = solve(p, method, GOAL, SWEEPS[-1], momentum=momentum)
@@ -199,11 +198,11 @@ def host_rows(problem: Problem, repeats: int) -> list[Row]:
     none, sweeps = np.zeros((len(mu), 3)), SWEEPS[-1]
 
     def plain():
-        with api._problem(W, b, mu, none) as p:
+        with api._problem(W, b, mu) as p:
             return solve(p, "gauss_seidel", -1.0, sweeps, momentum=False)
 
     def auto(goal: float, most: int):
-        with api._problem(W, b, mu, none) as p:
+        with api._problem(W, b, mu) as p:
             swept = solve(p, "gauss_seidel", goal, min(most, api.AUTO_SWEEPS))
             r = p.r.to_numpy()[: len(mu)]
         if swept.converged or most <= api.AUTO_SWEEPS:
@@ -216,8 +215,7 @@ def host_rows(problem: Problem, repeats: int) -> list[Row]:
         return r, 0, history
 
     for name, run in (("augmented_lagrangian", lagrangian), ("auto", auto)):
-        factor = numpy_prox.find_factors(W)
-        residuals = tuple(numpy_prox.residual(W, b, mu, factor, run(0.1 * NONE, n)[0]) for n in (*SWEEPS[:2], 150))
+        residuals = tuple(augmented_lagrangian.find_residual(W, b, mu, run(0.1 * NONE, n)[0]) for n in (*SWEEPS[:2], 150))
         with counted_operations(problem) as told:
             _, swept, history = run(GOAL, SWEEPS[-1])
         took = seconds({"solve": lambda run=run: run(GOAL, SWEEPS[-1]), "1000": plain}, repeats)

@@ -42,7 +42,7 @@ from benchmarks.report_parts import phases
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import open_runtime
 from taisoft.contact import SOLVERS
-from taisoft.contact.graph import node_graph
+from taisoft.contact.colouring import node_graph
 from taisoft.errors import OutputError
 
 SCENE = "cube_on_box"

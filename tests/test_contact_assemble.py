@@ -14,7 +14,7 @@ from rotations import rotation
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel, open_runtime
-from taisoft.contact.assemble import SELF_CONTACT, _warm_impulse, build_found, gap_minus_target, keep_impulses
+from taisoft.contact.build import SELF_CONTACT, _warm_impulse, gap_minus_target, keep_impulses
 from taisoft.contact.problem import build_node_problem, fill_field
 from taisoft.contact.restitution import explicit_opening
 
@@ -74,15 +74,15 @@ def rows(field, n: int) -> np.ndarray:
 
 def test_frames_and_pairs(begun):
     sim, n = begun
-    p, f, names = sim._dynamics.contact.problem, sim._dynamics.contact.found, [c.name for c in sim.scene.colliders]
-    normal, t1, body = rows(p.normal, n), rows(p.tangent, n), rows(f.body, n)
+    p, names = sim._dynamics.contact.problem, [c.name for c in sim.scene.colliders]
+    normal, t1, body = rows(p.normal, n), rows(p.tangent, n), rows(p.body, n)
     pairs = {tuple(names[k] for k in row) for row in body}
     assert pairs == {("block", "brick"), ("block", "table"), ("other", "lift")} and n >= 12
     for a, b in ((normal, t1), (t1, np.cross(normal, t1))):
         assert np.abs(np.linalg.norm(a, axis=1) - 1).max() < 1e-14 and np.abs((a * b).sum(axis=1)).max() < 1e-14
     expected = np.array([sim.scene.contact_numbers(names[a], names[b]) for a, b in body])
     assert np.allclose(rows(p.friction, n), expected[:, 0], rtol=1e-15) and len(set(expected[:, 0])) == 3
-    assert np.allclose(rows(f.restitution, n), expected[:, 1], rtol=1e-15) and len(set(expected[:, 1])) == 2
+    assert np.allclose(rows(p.restitution, n), expected[:, 1], rtol=1e-15) and len(set(expected[:, 1])) == 2
     assert np.array_equal(rows(p.order, n), np.arange(n))
 
 
@@ -91,8 +91,8 @@ def test_numbers_that_change(begun):
     before = sim.scene.contact_numbers("block", "table")
     sim.set_contact("table", "block", friction=0.05, restitution=0.9)
     sim._dynamics.contact.begin(sim.time, DT)
-    on = (rows(sim._dynamics.contact.found.body, n) == [0, 3]).all(axis=1)
-    friction, restitution = rows(sim._dynamics.contact.problem.friction, n), rows(sim._dynamics.contact.found.restitution, n)
+    on = (rows(sim._dynamics.contact.problem.body, n) == [0, 3]).all(axis=1)
+    friction, restitution = rows(sim._dynamics.contact.problem.friction, n), rows(sim._dynamics.contact.problem.restitution, n)
     assert (friction[on] == 0.05).all() and (restitution[on] == 0.9).all()
     assert 0 < on.sum() < n and (friction[~on] != 0.05).all()
     sim.set_contact("block", "table", *before)
@@ -101,13 +101,13 @@ def test_numbers_that_change(begun):
 def test_nodes_and_weights(begun):
     """Weighted nodes of a side, and what they are told to be: the two points of a contact."""
     sim, n = begun
-    p, f, x = sim._dynamics.contact.problem, sim._dynamics.contact.found, sim.positions()
+    p, x = sim._dynamics.contact.problem, sim.positions()
     node, weight, arity = rows(p.node, n), rows(p.weight, n), rows(p.arity, n)
     used = np.arange(6) < arity[:, None]
     assert (weight[used] != 0).all() and arity.min() >= 1 and all(len(set(r[u])) == u.sum() for r, u in zip(node, used))
     start = np.cumsum([0] + [b.n_nodes for b in sim.scene.bodies])
     owner = np.searchsorted(start, node, side="right") - 1
-    body, half = rows(f.body, n), 0.5 * rows(f.gap, n)[:, None] * rows(p.normal, n)
+    body, half = rows(p.body, n), 0.5 * rows(p.gap, n)[:, None] * rows(p.normal, n)
     for side, sign in ((0, 1.0), (1, -1.0)):
         mine = used & (sign * weight > 0)
         soft = body[:, side] < len(sim.scene.bodies)
@@ -115,26 +115,26 @@ def test_nodes_and_weights(begun):
         share = np.where(mine, np.abs(weight), 0.0)
         assert np.abs(share.sum(axis=1)[soft] - 1).max() < 1e-12
         points = np.einsum("kj,kjx->kx", share, x[np.where(mine, node, 0)])
-        assert np.abs(points - (rows(f.point, n) + sign * half))[soft].max() < 1e-9
+        assert np.abs(points - (rows(p.point, n) + sign * half))[soft].max() < 1e-9
 
 
 def test_ways_of_obstacles(begun):
     """Where the obstacle's point of a contact is a step later."""
     sim, n = begun
-    p, f, t = sim._dynamics.contact.problem, sim._dynamics.contact.found, sim.time
-    point = rows(f.point, n) - 0.5 * rows(f.gap, n)[:, None] * rows(p.normal, n)
+    p, t = sim._dynamics.contact.problem, sim.time
+    point = rows(p.point, n) - 0.5 * rows(p.gap, n)[:, None] * rows(p.normal, n)
     expected = np.zeros((n, 3))
     for k, obstacle in enumerate(sim.scene.obstacles):
-        on = rows(f.body, n)[:, 1] == len(sim.scene.bodies) + k
+        on = rows(p.body, n)[:, 1] == len(sim.scene.bodies) + k
         shift, turn = obstacle.pose(t)
         material = (point[on] - obstacle.shape.pivot - shift) @ turn + obstacle.shape.pivot
         expected[on] = obstacle.points_at(t + DT, material) - point[on]
         assert on.sum() >= 2 and np.abs(expected[on]).max() > 1e-4
-    assert np.abs(rows(f.obstacle_displacement, n) - expected).max() < 1e-12
+    assert np.abs(rows(p.obstacle_displacement, n) - expected).max() < 1e-12
     v = sim.velocities()
     relative = np.einsum("kj,kjx->kx", rows(p.weight, n) * (np.arange(6) < rows(p.arity, n)[:, None]), v[rows(p.node, n)])
     approach = ((relative - expected / DT) * rows(p.normal, n)).sum(axis=1)
-    assert np.abs(rows(f.approach, n) - approach).max() < 1e-9 and np.abs(approach).max() > 0.1
+    assert np.abs(rows(p.approach, n) - approach).max() < 1e-9 and np.abs(approach).max() > 0.1
 
 
 def test_warm_start(begun):
@@ -145,12 +145,12 @@ def test_warm_start(begun):
     before, dt = sim.contacts(), 0.5 * DT
     assert (np.linalg.norm(before.impulse, axis=1) > 0).sum() >= 8
     n = sim._dynamics.contact.begin(sim.time, dt)
-    p, f = sim._dynamics.contact.problem, sim._dynamics.contact.found
+    p = sim._dynamics.contact.problem
     key = {(a, b, tuple(ids)): k for k, (a, b, ids) in enumerate(zip(before.body_a, before.body_b, before.feature.tolist()))}
-    names, feature, r = [c.name for c in sim.scene.colliders], rows(f.feature, n), rows(p.r, n)
+    names, feature, r = [c.name for c in sim.scene.colliders], rows(p.feature, n), rows(p.r, n)
     frame = np.stack([rows(p.normal, n), rows(p.tangent, n), np.cross(rows(p.normal, n), rows(p.tangent, n))], axis=1)
     met = 0
-    for c, (a, b) in enumerate(rows(f.body, n)):
+    for c, (a, b) in enumerate(rows(p.body, n)):
         k = key.get((names[a], names[b], tuple(feature[c, 1:])))
         z = np.zeros(3) if k is None else 0.5 * frame[c] @ before.impulse[k]
         wanted = np.array([max(z[0], 0), *z[1:]])
@@ -181,14 +181,14 @@ def find_goals(
     out: ti.types.ndarray(),
 ):
     """force: what the explicit step's forces change the velocity by [m/s], a share `kicked` of it before the impact."""
-    for c in range(f.problem.count[0]):
+    for c in range(f.count[0]):
         opening = explicit_opening(f, c, dt, contact_offset, f.approach[c] + force, kicked)
         out[c] = gap_minus_target(f, c, dt, contact_offset, fast, slow, fastest, opening)
 
 
 @kernel
 def find_warm(f: ti.template(), out: ti.types.ndarray()):
-    for c in range(f.problem.count[0]):
+    for c in range(f.count[0]):
         r = _warm_impulse(f, c)
         for k in ti.static(range(3)):
             out[c, k] = r[k]
@@ -197,7 +197,7 @@ def find_warm(f: ti.template(), out: ti.types.ndarray()):
 @pytest.fixture(scope="module")
 def found():
     machine, arena = open_runtime("cpu", "f64", "a test"), FieldArena()
-    yield build_found(arena, build_node_problem(arena, 64, 4, True))
+    yield build_node_problem(arena, 64, 4, True)
     arena.release()
     machine.close()
 
@@ -222,7 +222,7 @@ def test_how_far_a_contact_is_from_its_goal(found, fast, slow):
     gap, restitution, approach, expected = np.array(cases).T
     for field, values in ((found.gap, gap), (found.restitution, restitution), (found.approach, approach)):
         fill_field(field, values)
-    found.problem.count[0] = len(cases)
+    found.count[0] = len(cases)
     out = np.zeros(len(cases))
     fill_field(found.body, np.tile([0, 1], (len(cases), 1)))
     find_goals(found, dt, h, fast, slow, fastest, 0.0, 0.0, out)
@@ -241,7 +241,7 @@ def test_how_far_a_contact_is_from_its_goal(found, fast, slow):
 
 def test_the_nearest_contact_of_the_same_feature(found):
     """Some features more than once, all of them in a table that is half full."""
-    rng, n, p = np.random.default_rng(0), 60, found.problem
+    rng, n, p = np.random.default_rng(0), 60, found
     feature = np.stack([rng.integers(0, 2, n), rng.integers(0, 6, n), rng.integers(0, 3, n)], axis=1)
     point, impulse = rng.standard_normal((n, 3)), rng.standard_normal((n, 3))
     normal = rng.standard_normal((n, 3))

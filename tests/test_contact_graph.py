@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import open_runtime
 from taisoft.contact import colouring, problem
-from taisoft.contact.graph import colour_greedy, colour_random, groups, matrix_graph, node_graph
+from taisoft.contact.colouring import colour_greedy, colour_random, groups, matrix_graph, node_graph
 
 N_NODES, CAPACITY = 120, 700
 
@@ -136,10 +136,13 @@ def test_colours_of_the_kernels(problems, k):
 def test_colours_of_the_host_in_a_problem(problems, way):
     made = oracle.random_contacts(5, 80, N_NODES)
     put(problems[0], made)
-    colouring.colour_contacts(problems[0], way, seed=4)
-    colour, graph = problems[0].colour.to_numpy()[:80], node_graph(*_of(made))
-    assert is_colouring(graph, colour)
-    assert np.array_equal(colour, colour_greedy(graph) if way == "greedy" else colour_random(graph, 4))
+    graph = colouring.graph_of(problems[0])
+    stored = colour_greedy(graph) if way == "greedy" else colour_random(graph, 4)
+    colouring.store(problems[0], stored)
+    colour = problems[0].colour.to_numpy()[:80]
+    assert is_colouring(node_graph(*_of(made)), colour) and np.array_equal(colour, stored)
+    order, start = groups(colour)
+    assert np.array_equal(problems[0].order.to_numpy()[:80], order) and problems[0].count[1] == len(start) - 1
 
 
 def test_no_contacts(problems):

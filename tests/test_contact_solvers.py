@@ -23,8 +23,7 @@ from hypothesis import strategies as st
 import taisoft as ts
 from taisoft.contact import SOLVERS, augmented_lagrangian
 from taisoft.contact.api import METHODS
-from taisoft.contact.colouring import colour_contacts, store
-from taisoft.contact.graph import colour_greedy, matrix_graph
+from taisoft.contact.colouring import colour_contacts, colour_greedy, matrix_graph, store
 from taisoft.contact.solve import solve
 
 REFERENCES = (

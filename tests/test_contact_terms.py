@@ -18,7 +18,6 @@ from scenes import built, cube, rubber
 
 import taisoft as ts
 from taisoft.backend.runtime import kernel
-from taisoft.contact.assemble import build_found
 from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, find_factors, index_nodes
 from taisoft.dynamics import contact_terms, linearised
 from taisoft.dynamics.contact_terms import NO_CONTACTS
@@ -82,16 +81,15 @@ def rig(request):
         arity = contacts.arity.copy()
         arity[::5] = (contacts.weight[::5] > 0).sum(axis=1)  # against an obstacle
         p = build_node_problem(arena, K + 3, m.n_nodes, True)
-        f = build_found(arena, p)
         solver = StageSystem(m, arena, made.machine.eps, np.zeros(0, dtype=int), NoContacts())
-        k = contact_terms.build_stage_contacts(arena, m, f, arena.vectors("x_start", ti.f64, m.n_nodes))
+        k = contact_terms.build_stage_contacts(arena, m, p, arena.vectors("x_start", ti.f64, m.n_nodes))
         for name in ("node", "weight", "normal", "tangent"):
             fill_field(getattr(p, name), getattr(contacts, name))
         obstacle_displacement = np.where((np.arange(K) % 5 == 0)[:, None], 1e-3 * rng.standard_normal((K, 3)), 0.0)
         friction = np.where(np.arange(K) % 7 == 0, 0.0, 0.5)
         gap = rng.uniform(-2, 3, K) * GOAL[0]
         apart = np.tile([0, 1], (K, 1))  # contacts of a body with itself have other goals
-        fields = (p.arity, p.friction, f.gap, f.obstacle_displacement, f.body)
+        fields = (p.arity, p.friction, p.gap, p.obstacle_displacement, p.body)
         for field, values in zip(fields, (arity, friction, gap, obstacle_displacement, apart)):
             fill_field(field, values)
         p.count[0] = K
@@ -123,7 +121,6 @@ def rig(request):
             made=made,
             m=m,
             p=p,
-            f=f,
             k=k,
             solver=solver,
             work=solver.work,

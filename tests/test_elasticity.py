@@ -32,8 +32,8 @@ def rig(request):
     with built(scene, request.param) as made:
         made.model = made.model if double else made.parallel
         made.force, made.way, made.product = made.vectors("force"), made.vectors("way"), made.vectors("product")
-        made.matrix = block_csr.build_block_csr(made.model, made.arena, made.model.real)
-        made.damper = block_csr.sibling(made.matrix, made.model, made.arena, made.model.real, "damper")
+        made.matrix = block_csr.build_block_csr(made.model, made.arena)
+        made.damper = block_csr.sibling(made.matrix, made.model, made.arena, "damper")
         yield made
 
 

@@ -22,7 +22,7 @@ METHODS = ("serial", "parallel")
 @pytest.fixture(scope="module", params=["f64", "f32"])
 def rig(request):
     with built(mixed_scene(order="both"), request.param) as made:
-        made.matrix = block_csr.build_block_csr(made.model, made.arena, made.model.real)
+        made.matrix = block_csr.build_block_csr(made.model, made.arena)
         made.work = pcg.build_pcg(made.model, made.arena)
         rng = np.random.default_rng(1)
         x = made.oracle.rest * [0.8, 1.1, 0.9] + 0.05 * rng.standard_normal(made.oracle.rest.shape)

@@ -142,7 +142,7 @@ def test_height_is_the_square_of_restitution(sim, restitution, dt, height):
 def test_comes_to_rest(sim):
     sim.set_contact("cube", "ground", friction=0.5, restitution=0.5)
     go(sim, 1.0)
-    assert np.abs(sim.velocities("cube")).max() < 1e-4 and not sim._dynamics.contact.found.impact_impulse.to_numpy().any()
+    assert np.abs(sim.velocities("cube")).max() < 1e-4 and not sim._dynamics.contact.problem.impact_impulse.to_numpy().any()
     assert sim.contact_force("cube")[1] == pytest.approx(G, rel=1e-3)
 
 

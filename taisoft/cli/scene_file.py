@@ -16,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 
 from taisoft.errors import MeshError, SceneError
-from taisoft.scene.checks import check_solver, nearest
+from taisoft.scene.checks import SOLVER_CHECKS, check_solver, nearest
 from taisoft.scene.refine import refined, with_order
 from taisoft.scene.scene import Scene
 

@@ -1,3 +1,3 @@
 """The frictional contact problem and its solvers: impulses from contacts."""
 
-SOLVERS = ("gauss_seidel", "jacobi", "hybrid", "coloured_gauss_seidel")  # one module each
+SOLVERS = ("gauss_seidel", "jacobi", "hybrid", "coloured_gauss_seidel")  # methods of `sweeps`

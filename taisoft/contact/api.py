@@ -9,10 +9,9 @@ import scipy.sparse as sp
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import open_kind, open_runtime
-from taisoft.contact import SOLVERS, augmented_lagrangian, numpy_prox
-from taisoft.contact.colouring import store
-from taisoft.contact.graph import colour_greedy, matrix_graph
-from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_field, fill_matrix_problem
+from taisoft.contact import SOLVERS, augmented_lagrangian
+from taisoft.contact.colouring import colour_greedy, matrix_graph, store
+from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_matrix_problem
 from taisoft.contact.solve import solve
 from taisoft.errors import SceneError
 from taisoft.scene.checks import array, choice, number
@@ -57,12 +56,14 @@ def solve_contact_problem(
     number(tolerance, "tolerance", above=0.0)
     if isinstance(max_iterations, bool) or not isinstance(max_iterations, (int, np.integer)) or max_iterations < 1:
         raise SceneError(f"max_iterations must be a whole number of at least 1, not {max_iterations!r}")
-    start = np.zeros((len(mu), 3))
-    if method == "auto":
-        r, history = _auto(W, b, mu, start, tolerance, int(max_iterations))
-    else:
-        r, history = _run(method, W, b, mu, start, tolerance, int(max_iterations))
-    residual = numpy_prox.residual(W, b, mu, numpy_prox.find_factors(W), r)
+    auto, limit = method == "auto", int(max_iterations)
+    first, sweeps = ("gauss_seidel", min(AUTO_SWEEPS, limit)) if auto else (method, limit)
+    r, history = _run(first, W, b, mu, np.zeros((len(mu), 3)), tolerance, sweeps)
+    remaining = limit + 1 - len(history)
+    if auto and remaining and history[-1] > tolerance:
+        r, outer = _run("augmented_lagrangian", W, b, mu, r, tolerance, remaining)
+        history += outer[1:]
+    residual = augmented_lagrangian.find_residual(W, b, mu, r)
     return ContactSolution(r.ravel(), residual, history, len(history) - 1, residual <= tolerance)
 
 
@@ -92,42 +93,27 @@ def _checked(W, b, mu) -> tuple[sp.csr_matrix, np.ndarray, np.ndarray]:
     return W, b, mu
 
 
-def _run(
-    method: str, W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray, tolerance: float, max_iterations: int
-) -> tuple[np.ndarray, list[float]]:
+def _run(method: str, W, b, mu, r: np.ndarray, tolerance: float, max_iterations: int) -> tuple[np.ndarray, list[float]]:
     """Impulses (k,3) from the start r, and the residual at the start and after each iteration."""
     if not len(mu):
         return r, [0.0]
     if method == "augmented_lagrangian":
         return augmented_lagrangian.solve(W, b, mu, r, tolerance, max_iterations)
-    with _problem(W, b, mu, r) as p:
+    with _problem(W, b, mu) as p:
         if method == "coloured_gauss_seidel":
             store(p, colour_greedy(matrix_graph(W)))
         result = solve(p, method, KERNEL_TOLERANCE * tolerance, max_iterations, every=1, history=True)
         return p.r.to_numpy(len(mu)), result.history
 
 
-def _auto(
-    W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray, tolerance: float, max_iterations: int
-) -> tuple[np.ndarray, list[float]]:
-    """Gauss-Seidel sweeps, then outer iterations with the rest of max_iterations."""
-    r, history = _run("gauss_seidel", W, b, mu, r, tolerance, min(AUTO_SWEEPS, max_iterations))
-    remaining = max_iterations - len(history) + 1
-    if history[-1] <= tolerance or not remaining:
-        return r, history
-    r, outer = _run("augmented_lagrangian", W, b, mu, r, tolerance, remaining)
-    return r, history + outer[1:]
-
-
 @contextmanager
-def _problem(W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray, r: np.ndarray) -> Iterator[ContactProblem]:
-    """The problem in fields, on the open runtime or a new one."""
+def _problem(W: sp.csr_matrix, b: np.ndarray, mu: np.ndarray) -> Iterator[ContactProblem]:
+    """The problem in fields with zero impulses, on the open runtime or a new one."""
     arch, precision = open_kind() or ("cpu", "f64")
     runtime = open_runtime(arch, precision, "solve_contact_problem")
     try:
         W = W.tobsr((3, 3))
         p = build_matrix_problem(FieldArena(), len(mu), len(W.indices), arch == "cpu")
-        fill_field(p.r, r)
         fill_matrix_problem(p, W, b, mu)
         yield p
     finally:

@@ -7,24 +7,61 @@ with the derivative of the prox, including that of the disk's radius in q_n. Ful
 nonsmooth system may have to rise before the contacts that slip, stick and separate are found; a line search delays that.
 If full steps fail, a second attempt damps them. If that fails too, rho shrinks: the smaller it is, the closer r+ is to r and the
 easier to find. rho grows again on success.
+The problem is that of `problem`, in NumPy, with impulses r (k,3).
 Sources: Alart and Curnier 1991 for the laws as a prox and their derivative; Rockafellar 1976 for the outer iteration.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
-from taisoft.contact.graph import matrix_graph
-from taisoft.contact.numpy_prox import find_factors, natural_map, prox, relative
+from taisoft.contact.colouring import matrix_graph
 
 DENSE = 90  # largest island, in rows, with a dense solve; that of a larger one may run on several threads
 RHO_START, RHO_MAX, RHO_MIN = 1e4, 1e7, 1e-2
 MAX_STEPS = 10  # Newton steps of an outer iteration
 REDUCTION = 1e-2  # of |G| in an outer iteration
 MAX_HALVINGS = 6
+
+
+# --- the problem ------------------------------------------------------------------------------------------------------
+
+
+def find_factors(W: sp.spmatrix) -> np.ndarray:
+    """r-factors (k,2) of normal and tangents from the diagonal of W (3k,3k); 0 where the diagonal is not positive."""
+    d = W.diagonal().reshape(-1, 3)
+    d = np.stack([d[:, 0], d[:, 1:].max(axis=1, initial=0.0)], axis=1)
+    return np.divide(1.0, d, out=np.zeros_like(d), where=d > 0.0)
+
+
+def prox(z: np.ndarray, friction: np.ndarray) -> np.ndarray:
+    """Project z (k,3) to admissible impulses (k,3): first the normal part, then the tangential part onto its friction disk."""
+    normal = np.maximum(z[:, 0], 0.0)
+    size, radius = np.hypot(z[:, 1], z[:, 2]), friction * normal
+    scale = np.divide(radius, size, out=np.ones_like(size), where=size > radius)
+    return np.column_stack([normal, scale * z[:, 1], scale * z[:, 2]])
+
+
+def natural_map(W, b: np.ndarray, friction: np.ndarray, factor: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """r - prox(r - f (W r + b)), (k,3)."""
+    u = (W @ r.ravel() + b).reshape(-1, 3)
+    return r - prox(r - factor[:, [0, 1, 1]] * u, friction)
+
+
+def relative(changed: float, size: float) -> float:
+    """Residual from |r - prox(r - f u)| and |r|; 1 if r is 0 but not a solution."""
+    return changed / size if size > 0.0 else float(changed != 0.0)
+
+
+def find_residual(W, b: np.ndarray, friction: np.ndarray, r: np.ndarray) -> float:
+    """|r - prox(r - f (W r + b))| / |r|."""
+    return float(relative(np.linalg.norm(natural_map(W, b, friction, find_factors(W), r)), np.linalg.norm(r)))
+
+
+# --- the method -------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -38,18 +75,18 @@ class _Island:
     b: np.ndarray  # (3k,)
     friction: np.ndarray  # (k,)
     factor: np.ndarray  # (k,2)
-    r: np.ndarray  # (k,3)
     rho: float = RHO_START
-    changed: float = 0.0  # |r - prox(r - f u)|
-    size: float = 0.0  # |r|
+    r: np.ndarray = field(init=False)  # (k,3)
+    changed: float = field(init=False)  # |r - prox(r - f u)|
+    size: float = field(init=False)  # |r|
 
     @property
     def residual(self) -> float:
         return relative(self.changed, self.size)
 
-    def measure(self) -> None:
-        self.changed = float(np.linalg.norm(natural_map(self.W, self.b, self.friction, self.factor, self.r)))
-        self.size = float(np.linalg.norm(self.r))
+    def take(self, r: np.ndarray) -> None:
+        self.r, self.size = r, float(np.linalg.norm(r))
+        self.changed = float(np.linalg.norm(natural_map(self.W, self.b, self.friction, self.factor, r)))
 
 
 def solve(
@@ -92,8 +129,8 @@ def _islands(W: sp.csr_matrix, b: np.ndarray, friction: np.ndarray, r: np.ndarra
         part = W[rows][:, rows].tobsr((3, 3))
         row = np.repeat(np.arange(len(contact)), np.diff(part.indptr))
         diagonal = np.flatnonzero(part.indices == row)
-        islands.append(_Island(contact, part, row, diagonal, b[rows], friction[contact], factor[contact], r[contact]))
-        islands[-1].measure()
+        islands.append(_Island(contact, part, row, diagonal, b[rows], friction[contact], factor[contact]))
+        islands[-1].take(r[contact])
     return islands
 
 
@@ -102,15 +139,14 @@ def _advance(i: _Island) -> None:
     q, converged = _newton(i, damped=False)
     if not converged:
         q, converged = _newton(i, damped=True)
-    previous, changed, size, residual = i.r, i.changed, i.size, i.residual
-    i.r = prox(q, i.friction)
-    i.measure()
+    previous, residual = i.r, i.residual
+    i.take(prox(q, i.friction))
     better = i.residual <= residual
     # with a small rho the proximal step approaches the solution in its own norm, even if the residual rises
     if converged and (better or i.rho <= 100.0):
         i.rho = min(RHO_MAX, i.rho * (10.0 if better else 3.0))
     elif not i.residual < 0.5 * residual:
-        i.r, i.changed, i.size = previous, changed, size
+        i.take(previous)
         i.rho = max(RHO_MIN, 0.1 * i.rho)
 
 

@@ -1,8 +1,14 @@
-"""Parallel colouring of the contacts, and their groups for coloured Gauss-Seidel.
+"""Colours of the contacts, and their groups for coloured Gauss-Seidel: contacts that act on the same node must not be relaxed in
+parallel.
 
-Jones and Plassmann 1993: a contact takes the first free colour once all its neighbours of higher priority are coloured. The
-result is first-fit in the order of the priorities, independent of threads. Priorities are hashes, which keeps the longest chain
-of waiting contacts short. A step colours its contacts once, before the first sweep.
+An edge of the contact graph joins two contacts that share a movable node (report, algorithm 6); obstacles and fully prescribed
+nodes add no edges. For a W given as a matrix, an edge is a nonzero block off the diagonal, in either triangle.
+    colour_contacts  in kernels, once a step: Jones and Plassmann 1993. A contact takes the first free colour once all its
+                     neighbours of higher priority are coloured. The result is first-fit in the order of the priorities,
+                     independent of threads. Priorities are hashes, which keeps the longest chain of waiting contacts short;
+    colour_greedy    on the host: networkx, largest degree first or another of its strategies;
+    colour_random    on the host: Vivace, Fratarcangeli, Tibaldo and Pellacini 2016. Random tentative colours, kept if no
+                     neighbour of lower index has the same; an exhausted palette grows by one colour.
 """
 
 import numpy as np
@@ -10,11 +16,103 @@ import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.contact.graph import UNCOLOURED, colour_greedy, colour_random, groups, matrix_graph, node_graph
 from taisoft.contact.problem import NODES, ContactProblem, fill_field, index_nodes
 from taisoft.errors import SimulationError
 
+UNCOLOURED = -1
 BITS = 30  # colours tested at a time, as bits of an integer
+
+
+# --- on the host ------------------------------------------------------------------------------------------------------
+
+
+def node_graph(node: np.ndarray, arity: np.ndarray, inverse_mass: np.ndarray) -> sp.csr_matrix:
+    """Adjacency (k,k), bool, of contacts over nodes.
+
+    node: (k, NODES), the first arity[c] are used; inverse_mass: (n_nodes, 3) [1/kg].
+    """
+    k = len(arity)
+    used = np.arange(node.shape[1]) < arity[:, None]
+    contact, nodes = np.broadcast_to(np.arange(k)[:, None], node.shape)[used], node[used]
+    free = np.any(inverse_mass[nodes] != 0.0, axis=1)
+    touches = sp.csr_matrix((np.ones(free.sum(), dtype=np.int32), (contact[free], nodes[free])), shape=(k, len(inverse_mass)))
+    return _without_loops(touches @ touches.T)
+
+
+def graph_of(p: ContactProblem) -> sp.csr_matrix:
+    """Adjacency matrix of the contacts of a problem over nodes."""
+    k = int(p.count[0])
+    return node_graph(p.node.to_numpy(k), p.arity.to_numpy(k), p.inverse_mass.to_numpy())
+
+
+def matrix_graph(W: sp.spmatrix) -> sp.csr_matrix:
+    """Adjacency (k,k), bool, of the contacts of W (3k,3k)."""
+    W = W.tocoo()
+    k, used = W.shape[0] // 3, W.data != 0.0
+    blocks = sp.csr_matrix((np.ones(used.sum(), dtype=np.int32), (W.row[used] // 3, W.col[used] // 3)), shape=(k, k))
+    return _without_loops(blocks + blocks.T)
+
+
+def _without_loops(joined: sp.spmatrix) -> sp.csr_matrix:
+    joined = joined.tocoo()
+    off = joined.row != joined.col
+    return sp.csr_matrix((np.ones(off.sum(), dtype=bool), (joined.row[off], joined.col[off])), shape=joined.shape)
+
+
+def colour_greedy(graph: sp.csr_matrix, strategy: str = "largest_first") -> np.ndarray:
+    """Colours (k,) from 0 by networkx.greedy_color."""
+    import networkx as nx  # imported here: it takes 0.1 s, and few scenes need it
+
+    colours = nx.greedy_color(nx.from_scipy_sparse_array(graph), strategy=strategy)
+    return np.array([colours[c] for c in range(graph.shape[0])], dtype=np.int32)
+
+
+def colour_random(graph: sp.csr_matrix, seed: int = 0, shrink: float = 3.0) -> np.ndarray:
+    """Colours (k,) from 0 by Vivace; palettes start with degree / shrink colours."""
+    k = graph.shape[0]
+    generator = np.random.default_rng(seed)
+    edges = sp.triu(graph).tocoo()
+    a, b = edges.row, edges.col
+    degree = np.diff(graph.indptr)
+    size = np.maximum(1, np.ceil(degree / shrink)).astype(int)  # of the palettes; degree + 1 suffices
+    number = np.arange(int(degree.max(initial=0)) + 2)
+    taken = np.zeros((k, len(number)), dtype=bool)
+    colour = np.full(k, UNCOLOURED, dtype=np.int32)
+    while True:
+        uncoloured = np.flatnonzero(colour == UNCOLOURED)
+        if not len(uncoloured):
+            return np.unique(colour, return_inverse=True)[1].astype(np.int32)  # numbers the colours without gaps
+        free = (number < size[uncoloured, None]) & ~taken[uncoloured]
+        exhausted = ~free.any(axis=1)
+        size[uncoloured[exhausted]] += 1
+        uncoloured, free = uncoloured[~exhausted], free[~exhausted]
+        tentative = np.full(k, UNCOLOURED)
+        tentative[uncoloured] = np.argmax(np.where(free, generator.random(free.shape), -1.0), axis=1)
+        keep = tentative != UNCOLOURED
+        # of two equal colours the lower index keeps its own: if neither did, two equal palettes of one colour would loop forever
+        keep[b[keep[a] & (tentative[a] == tentative[b])]] = False
+        colour[keep] = tentative[keep]
+        for one, other in ((a, b), (b, a)):
+            kept = keep[one]
+            taken[other[kept], colour[one[kept]]] = True
+
+
+def groups(colour: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Group contacts by colour: (order (k,), start (colours + 1,)), ascending within a colour."""
+    order = np.argsort(colour, kind="stable").astype(np.int32)
+    start = np.concatenate([[0], np.cumsum(np.bincount(colour))]).astype(np.int32)
+    return order, start
+
+
+def store(p: ContactProblem, colour: np.ndarray) -> None:
+    """Set the colours (k,) of the problem's contacts and group them."""
+    order, start = groups(colour)
+    for field, values in ((p.colour, colour), (p.order, order), (p.colour_start, start)):
+        fill_field(field, values)
+    p.count[1] = len(start) - 1
+
+
+# --- in kernels -------------------------------------------------------------------------------------------------------
 
 
 @ti.func
@@ -27,44 +125,25 @@ def _priority(c):
 
 
 @ti.func
-def _is_movable(p: ti.template(), i):
-    return (p.inverse_mass[i] != 0.0).any()
-
-
-@ti.func
-def _is_waiting(p: ti.template(), c):
-    """Whether a neighbour of higher priority is uncoloured."""
-    waiting, mine = False, _priority(c)
-    for k in range(p.arity[c]):
-        i = p.node[c, k]
-        if _is_movable(p, i):
-            for e in range(p.entry_start[i], p.entry_start[i + 1]):
-                d = p.entry[e] // NODES
-                if _priority(d) > mine:
-                    if p.colour[d] == UNCOLOURED:
-                        waiting = True
-    return waiting
-
-
-@ti.func
 def _first_free(p: ti.template(), c):
-    """The lowest colour that no neighbour of higher priority has."""
-    result, low, mine = UNCOLOURED, 0, _priority(c)
-    while result == UNCOLOURED:
+    """The lowest colour that no neighbour of higher priority has; UNCOLOURED if one of these is uncoloured."""
+    result, low, waiting = UNCOLOURED, 0, False
+    while result == UNCOLOURED and not waiting:
         taken = 0
         for k in range(p.arity[c]):
             i = p.node[c, k]
-            if _is_movable(p, i):
+            if (p.inverse_mass[i] != 0.0).any():
                 for e in range(p.entry_start[i], p.entry_start[i + 1]):
                     d = p.entry[e] // NODES
-                    offset = p.colour[d] - low
-                    if _priority(d) > mine:
-                        if offset >= 0 and offset < BITS:
-                            taken |= 1 << offset
+                    if _priority(d) > _priority(c):
+                        colour = p.colour[d]
+                        if colour == UNCOLOURED:
+                            waiting = True
+                        elif colour >= low and colour < low + BITS:
+                            taken |= 1 << (colour - low)
         for bit in range(BITS):
-            if result == UNCOLOURED:
-                if (taken >> bit) & 1 == 0:
-                    result = low + bit
+            if result == UNCOLOURED and not waiting and (taken >> bit) & 1 == 0:
+                result = low + bit
         low += BITS
     return result
 
@@ -83,8 +162,8 @@ def _colour_round(p: ti.template()) -> ti.i32:
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         if p.colour[c] == UNCOLOURED:
-            if not _is_waiting(p, c):
-                p.colour[c] = _first_free(p, c)
+            p.colour[c] = _first_free(p, c)
+            if p.colour[c] != UNCOLOURED:
                 coloured += 1
     return coloured
 
@@ -111,8 +190,9 @@ def _group(p: ti.template()):
         p.count[1] = colours
 
 
-def colour_parallel(p: ContactProblem) -> None:
-    """Colour and group the contacts of a problem over nodes, on the device. Requires `index_nodes`."""
+def colour_contacts(p: ContactProblem) -> None:
+    """Colour and group the contacts of a problem over nodes, once before the sweeps."""
+    index_nodes(p)
     remaining = int(p.count[0])
     _clear_colours(p)
     while remaining:
@@ -121,36 +201,3 @@ def colour_parallel(p: ContactProblem) -> None:
             raise SimulationError(f"{remaining} contacts could not be coloured")
         remaining -= coloured
     _group(p)
-
-
-def colour_contacts(p: ContactProblem, colouring: str = "parallel", seed: int = 0) -> None:
-    """Group the contacts for coloured Gauss-Seidel, once before the sweeps.
-
-    colouring: "parallel" (only over nodes), "greedy" or "random" (with `seed`).
-    """
-    if colouring == "parallel":
-        index_nodes(p)
-        colour_parallel(p)
-        return
-    graph = graph_of(p)
-    store(p, colour_greedy(graph) if colouring == "greedy" else colour_random(graph, seed))
-
-
-def graph_of(p: ContactProblem) -> sp.csr_matrix:
-    """Adjacency matrix of the problem's contacts, on the host."""
-    k = int(p.count[0])
-    if not p.matrix:
-        return node_graph(p.node.to_numpy(k), p.arity.to_numpy(k), p.inverse_mass.to_numpy())
-    start = p.row_start.to_numpy(k + 1)
-    n = int(start[-1])
-    blocks = p.block.to_numpy(n).reshape(-1, 3, 3)
-    return matrix_graph(sp.bsr_matrix((blocks, p.column.to_numpy(n), start), shape=(3 * k, 3 * k)))
-
-
-def store(p: ContactProblem, colour: np.ndarray) -> None:
-    """Set the colours (k,) of the problem's contacts and group them."""
-    k = len(colour)
-    order, start = groups(colour)
-    for field, values in ((p.colour, colour), (p.order, order), (p.colour_start, start)):
-        fill_field(field, values)
-    p.count[1] = len(start) - 1 if k else 0

@@ -22,7 +22,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.contact.prox import dvec, prox, scaled
 
 NODES = 6  # maximum nodes of a contact, three on each side
-CHANGED, SIZE, RESIDUAL, BEST, STEP, SWEEPS, CHECKS, AGE, MOMENTUM, VERDICT = range(10)  # in `state`; AGE: sweeps since `best`
+RESIDUAL, BEST, STEP, SWEEPS, CHECKS, AGE, MOMENTUM, WEIGHT, VERDICT = range(9)  # in `state`, see `solve`
 HISTORY = 1024  # residuals kept per launch
 CHUNKS = 256  # partial sums over the contacts, so that a sum does not depend on threads
 
@@ -34,116 +34,116 @@ class ContactProblem:
     capacity: Count
     serial: bool  # whether loops run on one thread
     matrix: bool  # whether W is given as a matrix
-    n_nodes: Count
     count: Any  # (2) i32: contacts, colours
     friction: Any  # f64
     b: Any  # 3-vectors [m/s]: u without impulses; (normal, t1, t2)
     factor: Any  # 2-vectors: r-factors of normal and tangents [kg]; 0 if nothing can move
     r: Any  # 3-vectors: impulses [N s]
-    relaxation: Any  # f64: largest fraction of the r-factors that a sweep uses; set by its solver
+    # of the solvers
+    relaxation: Any  # f64: largest fraction of the r-factors that a sweep uses
     best: Any  # 3-vectors: the best impulses so far
     sweep_start: Any  # 3-vectors: impulses at the start of the sweep
     previous: Any  # 3-vectors: impulses after the previous sweep, before extrapolation
     term: Any  # 2-vectors: contributions of each contact to two sums
     partial: Any  # (CHUNKS) 2-vectors: sums over chunks of the contacts
     order: Any  # i32: contacts in sweep order
-    colour: Any  # i32: of each contact, see `graph`
+    colour: Any  # i32: of each contact, see `colouring`
     colour_start: Any  # (capacity + 1) i32: start of each colour in `order`
-    state: Any  # (10) f64: two sums, residual, that of `best`, fraction of the r-factors, counts; see `r_factor`, `momentum`
+    state: Any  # (9) f64: residual, that of `best`, fraction of the r-factors; see `solve`
     history: Any  # (HISTORY) f64: residuals at the checks of a launch
-    # W over nodes
-    node: Any  # (capacity, NODES) i32, the first arity[c] are in use
-    arity: Any  # i32
-    weight: Any  # (capacity, NODES) f64: positive on side a, negative on side b
-    normal: Any  # 3-vectors: from b to a
-    tangent: Any  # 3-vectors: t1; t2 = normal x t1
-    inverse_mass: Any  # (n_nodes) 3-vectors [1/kg], 0 on constrained axes
-    w: Any  # (n_nodes) 3-vectors [m/s]: M^-1 J^T r
-    entry_start: Any  # (n_nodes + 1) i32: contacts of each node
-    entry: Any  # i32: NODES * contact + index of the node in it
     # W as a matrix
-    row_start: Any  # (capacity + 1) i32
-    column: Any  # i32
-    block: Any  # (blocks, 9) f64
+    row_start: Any = None  # (capacity + 1) i32
+    column: Any = None  # i32
+    block: Any = None  # (blocks, 9) f64
+    # W over nodes
+    n_nodes: Count = 0
+    node: Any = None  # (capacity, NODES) i32, the first arity[c] are in use
+    arity: Any = None  # i32
+    weight: Any = None  # (capacity, NODES) f64: positive on side a, negative on side b
+    normal: Any = None  # 3-vectors: from b to a
+    tangent: Any = None  # 3-vectors: t1; t2 = normal x t1
+    inverse_mass: Any = None  # (n_nodes) 3-vectors [1/kg], 0 on constrained axes
+    w: Any = None  # (n_nodes) 3-vectors [m/s]: M^-1 J^T r
+    entry_start: Any = None  # (n_nodes + 1) i32: contacts of each node
+    entry: Any = None  # i32: NODES * contact + index of the node in it
+    # of detected contacts, see `build`
+    body: Any = None  # 2-vectors i32: colliders
+    feature: Any = None  # 3-vectors i32
+    point: Any = None  # 3-vectors [m]
+    gap: Any = None  # f64 [m]
+    obstacle_displacement: Any = None  # 3-vectors: obstacle's displacement at the contact in the step [m]
+    approach: Any = None  # f64: normal velocity at the start of the step, negative if surfaces approach [m/s]
+    restitution: Any = None  # f64
+    min_velocity: Any = None  # f64: least normal velocity after the impact, set only in steps with one [m/s]
+    min_opening: Any = None  # f64: least opening of the gap in the step, 0 without restitution [m]
+    impact_impulse: Any = None  # 3-vectors: impulse of the impact before the step [N s]
+    previous_feature: Any = None  # 3-vectors i32: of the previous step
+    previous_point: Any = None  # 3-vectors
+    previous_impulse: Any = None  # 3-vectors, world frame
+    n_slots: Count = 0  # size of the hash table, a power of two
+    slot: Any = None  # (n_slots) i32: hash table of the previous step's contacts, -1 if empty
 
 
 def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: bool) -> ContactProblem:
     """Allocate a problem for contacts between the nodes of a model."""
-
-    def vectors(name: str, count: int = capacity):
-        return arena.vectors(f"problem_{name}", ti.f64, count)
-
-    def ints(name: str, shape):
-        return arena.field(f"problem_{name}", ti.i32, shape)
-
+    n, n_slots = capacity, 1 << (2 * capacity - 1).bit_length()
+    vectors = "normal tangent point obstacle_displacement impact_impulse previous_point previous_impulse"
     return ContactProblem(
-        **_common(arena, capacity, serial),
-        matrix=False,
+        n,
+        serial,
+        False,
         n_nodes=n_nodes,
-        node=ints("node", (capacity, NODES)),
-        arity=ints("arity", capacity),
-        weight=arena.field("problem_weight", ti.f64, (capacity, NODES)),
-        normal=vectors("normal"),
-        tangent=vectors("tangent"),
-        inverse_mass=vectors("inverse_mass", n_nodes),
-        w=vectors("w", n_nodes),
-        entry_start=ints("entry_start", n_nodes + 1),
-        entry=ints("entry", NODES * capacity),
-        row_start=None,
-        column=None,
-        block=None,
+        n_slots=n_slots,
+        **_solver_fields(arena, n),
+        **_fields(arena, "node", ti.i32, (n, NODES)),
+        **_fields(arena, "weight", ti.f64, (n, NODES)),
+        **_fields(arena, "arity", ti.i32, n),
+        **_fields(arena, vectors, ti.f64, n, 3),
+        **_fields(arena, "gap approach restitution min_velocity min_opening", ti.f64, n),
+        **_fields(arena, "body", ti.i32, n, 2),
+        **_fields(arena, "feature previous_feature", ti.i32, n, 3),
+        **_fields(arena, "inverse_mass w", ti.f64, n_nodes, 3),
+        **_fields(arena, "entry_start", ti.i32, n_nodes + 1),
+        **_fields(arena, "entry", ti.i32, NODES * n),
+        **_fields(arena, "slot", ti.i32, n_slots),
     )
 
 
 def build_matrix_problem(arena: FieldArena, n: int, n_blocks: int, serial: bool) -> ContactProblem:
     """Allocate a problem for n contacts and a W of n_blocks 3x3 blocks."""
-
-    def ints(name: str, count: int):
-        return arena.field(f"problem_{name}", ti.i32, count)
-
     return ContactProblem(
-        **_common(arena, n, serial),
-        matrix=True,
-        n_nodes=0,
-        node=None,
-        arity=None,
-        weight=None,
-        normal=None,
-        tangent=None,
-        inverse_mass=None,
-        w=None,
-        entry_start=None,
-        entry=None,
-        row_start=ints("row_start", n + 1),
-        column=ints("column", n_blocks),
-        block=arena.field("problem_block", ti.f64, (n_blocks, 9)),
+        n,
+        serial,
+        True,
+        **_solver_fields(arena, n),
+        **_fields(arena, "row_start", ti.i32, n + 1),
+        **_fields(arena, "column", ti.i32, n_blocks),
+        **_fields(arena, "block", ti.f64, (n_blocks, 9)),
     )
 
 
-def _common(arena: FieldArena, capacity: int, serial: bool) -> dict[str, Any]:
-    def vectors(name: str, n: int = 3):
-        return arena.vectors(f"problem_{name}", ti.f64, capacity, n=n)
-
+def _solver_fields(arena: FieldArena, n: int) -> dict[str, Any]:
+    """Fields that both forms of W need."""
     return {
-        "capacity": capacity,
-        "serial": serial,
-        "count": arena.field("problem_count", ti.i32, 2),
-        "friction": arena.field("problem_friction", ti.f64, capacity),
-        "b": vectors("b"),
-        "factor": vectors("factor", 2),
-        "r": vectors("r"),
-        "relaxation": arena.field("problem_relaxation", ti.f64, capacity),
-        "best": vectors("best"),
-        "sweep_start": vectors("sweep_start"),
-        "previous": vectors("previous"),
-        "term": vectors("term", 2),
-        "partial": arena.vectors("problem_partial", ti.f64, CHUNKS, n=2),
-        "order": arena.field("problem_order", ti.i32, capacity),
-        "colour": arena.field("problem_colour", ti.i32, capacity),
-        "colour_start": arena.field("problem_colour_start", ti.i32, capacity + 1),
-        "state": arena.field("problem_state", ti.f64, 10),
-        "history": arena.field("problem_history", ti.f64, HISTORY),
+        **_fields(arena, "count", ti.i32, 2),
+        **_fields(arena, "friction relaxation", ti.f64, n),
+        **_fields(arena, "b r best sweep_start previous", ti.f64, n, 3),
+        **_fields(arena, "factor term", ti.f64, n, 2),
+        **_fields(arena, "partial", ti.f64, CHUNKS, 2),
+        **_fields(arena, "order colour", ti.i32, n),
+        **_fields(arena, "colour_start", ti.i32, n + 1),
+        **_fields(arena, "state", ti.f64, VERDICT + 1),
+        **_fields(arena, "history", ti.f64, HISTORY),
     }
+
+
+def _fields(arena: FieldArena, names: str, dtype, shape, components: int = 0) -> dict[str, Any]:
+    """Allocate scalars, or vectors of so many components, by name."""
+
+    def allocate(name: str):
+        return arena.vectors(name, dtype, shape, n=components) if components else arena.field(name, dtype, shape)
+
+    return {name: allocate(f"problem_{name}") for name in names.split()}
 
 
 def fill_field(field, values: np.ndarray) -> None:
@@ -155,18 +155,15 @@ def fill_field(field, values: np.ndarray) -> None:
 
 def fill_matrix_problem(p: ContactProblem, W: sp.spmatrix, b: np.ndarray, friction: np.ndarray) -> None:
     """Upload W (3k,3k), b (3k,) and coefficients of friction (k,) to a problem large enough; keep its impulses."""
-    blocks, k = sp.bsr_matrix(W, blocksize=(3, 3)), len(friction)
-    blocks.sort_indices()
+    W, k = sp.bsr_matrix(W, blocksize=(3, 3)), len(friction)
+    W.sort_indices()
     p.count[0] = k
-    for field, values in (
-        (p.row_start, blocks.indptr),
-        (p.column, blocks.indices),
-        (p.block, blocks.data.reshape(-1, 9)),
-        (p.b, b.reshape(k, 3)),
-        (p.friction, friction),
-        (p.order, np.arange(k)),
-    ):
-        fill_field(field, values)
+    fill_field(p.row_start, W.indptr)
+    fill_field(p.column, W.indices)
+    fill_field(p.block, W.data.reshape(-1, 9))
+    fill_field(p.b, b.reshape(k, 3))
+    fill_field(p.friction, friction)
+    fill_field(p.order, np.arange(k))
     find_factors(p)
 
 
@@ -235,16 +232,16 @@ def natural_map(p: ti.template(), c):
     """(|r - prox(r - f u)|^2, |r|^2) of contact c."""
     r = p.r[c]
     d = r - prox(r - scaled(p.factor[c], velocity(p, c)), p.friction[c])
-    return d.dot(d), r.dot(r)
+    return ti.Vector([d.dot(d), r.dot(r)], ti.f64)
 
 
 @ti.func
-def residual_of(changed, size):
-    """Relative residual from the two sums; 1 if r is 0 but not a solution, or not a number."""
+def residual_of(sums):
+    """Relative residual from the sums of `natural_map`; 1 if r is 0 but not a solution, or not a number."""
     result = ti.cast(0.0, ti.f64)
-    if size > 0.0:
-        result = ti.sqrt(changed / size)
-    elif not changed == 0.0:
+    if sums[1] > 0.0:
+        result = ti.sqrt(sums[0] / sums[1])
+    elif not sums[0] == 0.0:
         result = 1.0
     return result
 
@@ -256,17 +253,6 @@ def find_velocities(p: ti.template()):
         ti.loop_config(serialize=p.serial)
         for i in range(p.n_nodes):
             p.w[i] = gather_velocity(p, i)
-
-
-@ti.func
-def residual(p: ti.template()):
-    """The residual of the present impulses, summed in order; w is up to date."""
-    changed, size = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-    for c in range(p.count[0]):
-        d, s = natural_map(p, c)
-        changed += d
-        size += s
-    return residual_of(changed, size)
 
 
 @ti.func

@@ -11,8 +11,8 @@ dvec = ti.types.vector(3, ti.f64)
 
 
 @ti.func
-def tangents(n):
-    """Two unit vectors that form a right-handed frame with the unit vector n."""
+def tangent(n):
+    """A unit vector perpendicular to the unit vector n."""
     a = dvec(0.0)
     smallest = ti.abs(n).min()
     if ti.abs(n[0]) == smallest:
@@ -22,8 +22,7 @@ def tangents(n):
     else:
         a[2] = 1.0
     t = n.cross(a)
-    t1 = t / t.norm()
-    return t1, n.cross(t1)
+    return t / t.norm()
 
 
 @ti.func

@@ -22,44 +22,43 @@ nothing and has no fixed nodes; for others no loss is assumed. The loss of the f
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.contact.assemble import contact_offset_of
+from taisoft.contact.build import contact_offset_of
 
 NEGLIGIBLE_OPENING = 0.01  # of the contact offset: a rebound that opens the gap less in a step is ignored
 
 
 @ti.func
-def explicit_opening(f: ti.template(), c, dt, common_offset, free, kick_fraction):
+def explicit_opening(p: ti.template(), c, dt, common_offset, free, kick_fraction):
     """Least opening of contact c in an explicit step due to restitution [m], 0 without; free: u* along the normal [m/s].
 
     kick_fraction: fraction of the step's velocity change u* - u_n that precedes the impact.
     """
-    opening, u = ti.cast(0.0, ti.f64), (1.0 - kick_fraction) * f.approach[c] + kick_fraction * free
-    if f.restitution[c] > 0.0 and u < 0.0 and f.gap[c] - contact_offset_of(f, c, common_offset) + dt * free < 0.0:
-        opening = ti.max(0.0, dt * (free - u - f.restitution[c] * u))
+    opening, u = ti.cast(0.0, ti.f64), (1.0 - kick_fraction) * p.approach[c] + kick_fraction * free
+    if p.restitution[c] > 0.0 and u < 0.0 and p.gap[c] - contact_offset_of(p, c, common_offset) + dt * free < 0.0:
+        opening = ti.max(0.0, dt * (free - u - p.restitution[c] * u))
     return opening
 
 
 @kernel
 def find_rebounds(
-    f: ti.template(), gravity: ti.template(), flight: ti.types.ndarray(), dt: ti.f64, common_offset: ti.f64
+    p: ti.template(), gravity: ti.template(), flight: ti.types.ndarray(), dt: ti.f64, common_offset: ti.f64
 ) -> ti.i32:
     """Set `min_velocity` and `min_opening` of every contact for an implicit step of dt. Return the number of rebounds.
 
     gravity: field of one 3-vector [m/s^2]. flight: (n_colliders) f64, sum of dt^2 over the steps of a collider's flight [s^2], 0
     if it is not in flight. A contact without a rebound may close, or approach as fast as it separates now, which takes no work.
     """
-    (p,) = ti.static((f.problem,))
     rebounds = 0
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
-            u, e, contact_offset = f.approach[c], f.restitution[c], contact_offset_of(f, c, common_offset)
-            distance = ti.max(0.0, f.gap[c] - contact_offset)
-            a, b = f.body[c][0], f.body[c][1]
+            u, e, contact_offset = p.approach[c], p.restitution[c], contact_offset_of(p, c, common_offset)
+            distance = ti.max(0.0, p.gap[c] - contact_offset)
+            a, b = p.body[c][0], p.body[c][1]
             gravity_n = p.normal[c].dot(ti.cast(gravity[0], ti.f64))
             closing = ti.max(0.0, -gravity_n * (ti.cast(flight[a] > 0.0, ti.f64) - ti.cast(flight[b] > 0.0, ti.f64)))
             velocity, opening = -ti.max(distance / dt, u), ti.cast(0.0, ti.f64)
-            if e > 0.0 and u < 0.0 and f.gap[c] - contact_offset + dt * (u - dt * closing) < 0.0:
+            if e > 0.0 and u < 0.0 and p.gap[c] - contact_offset + dt * (u - dt * closing) < 0.0:
                 impact_speed = ti.min(dt * closing - u, ti.sqrt(u * u + ti.abs(flight[a] - flight[b]) * closing * closing))
                 w_squared = e * e * (impact_speed * impact_speed + 2.0 * closing * distance) - 2.0 * closing * distance
                 w = ti.sqrt(ti.max(0.0, w_squared))
@@ -67,5 +66,5 @@ def find_rebounds(
                 if opened > NEGLIGIBLE_OPENING * contact_offset:
                     velocity, opening = w, opened
                     rebounds += 1
-            f.min_velocity[c], f.min_opening[c] = velocity, opening
+            p.min_velocity[c], p.min_opening[c] = velocity, opening
     return rebounds

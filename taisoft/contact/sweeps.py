@@ -1,180 +1,163 @@
-"""Sweep until the residual is small: on one thread in one kernel, or in parallel loops.
+"""One relaxation of every contact by each method, and the fraction of its r-factors that a contact may use in it.
 
-solver: the module of a solver, with
-    relaxation(p, c, with_momentum)   fraction of its r-factors that contact c uses; with_momentum: 0 or 1,
-    sweep(p)                          one sweep on this thread; the old r is left in `sweep_start`,
-    sweep_parallel(p, colours)        the same on all threads, called from the host.
-On a CPU one thread is faster: it takes 0.15 us per contact and sweep. A parallel loop costs some 30 us to start, a sweep has two
-to twenty of them, and memory bandwidth limits two threads to little more than the speed of one.
+gauss_seidel (report, algorithm 2)          one contact after another in `order`, using the impulses already updated;
+coloured_gauss_seidel (algorithm 7)         one colour after another, all contacts of a colour in parallel, see `colouring`.
+    They share no movable node, so their changes of w are added, as in sequential order. (Line 15 of the report averages them,
+    which solves a different problem.) The result is that of Gauss-Seidel in the order of the colours, which is also what runs
+    on one thread;
+jacobi (algorithm 4)                        all contacts in parallel, using the impulses of the last sweep, in the friction
+    disk too;
+hybrid (algorithm 5)                        Jacobi, but the friction disk uses the new normal impulse.
+
+The fraction keeps a sweep from overshooting. With B the blocks of F^1/2 W F^1/2, F the r-factors, a step of the fraction s along
+the velocity lowers the energy of the impulses if s B <= 1. For contacts relaxed sequentially only the diagonal block counts:
+s = 1 / |B_cc|. It is needed only with momentum, which amplifies overshoot. For contacts relaxed in parallel the whole row counts:
+s_c = 1 / sum_d |B_cd| (block Gershgorin). This adapts to the local density of contacts; a single number from the largest
+eigenvalue of F W would slow all contacts down to the worst one.
+The norms are upper bounds: sqrt(|B|_1 |B|_inf) for a matrix, absolute values of the weights over nodes.
 """
-
-from types import ModuleType
 
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.contact import momentum, r_factor
-from taisoft.contact.problem import (
-    BEST,
-    CHANGED,
-    CHECKS,
-    CHUNKS,
-    RESIDUAL,
-    SIZE,
-    ContactProblem,
-    find_velocities,
-    gather_velocity,
-    natural_map,
-    residual,
-    residual_of,
-)
+from taisoft.contact.problem import NODES, STEP, ContactProblem, add_impulse, own_block, velocity
+from taisoft.contact.prox import dvec, into_disk, prox, scaled
+
+SIMULTANEOUS = ("jacobi", "hybrid")  # methods that relax all contacts with the impulses of the last sweep
+BATCH = 4  # colours per launch: a launch costs more than a loop in it
+
+
+# --- sweeps -----------------------------------------------------------------------------------------------------------
 
 
 @ti.func
-def refresh(p: ti.template()):
-    """Recompute w from the impulses, on this thread."""
-    if ti.static(not p.matrix):
-        for i in range(p.n_nodes):
-            p.w[i] = gather_velocity(p, i)
+def sweep(p: ti.template(), method: ti.template()):
+    """Relax every contact once, on this thread; leave the old impulses in `sweep_start`."""
+    if ti.static(method in SIMULTANEOUS):
+        for c in range(p.count[0]):
+            p.sweep_start[c] = _relaxed(p, c, method)
+        for c in range(p.count[0]):
+            _swap(p, c)
+    else:
+        for k in range(p.count[0]):
+            _relax(p, p.order[k])
 
 
-# --- on one thread ----------------------------------------------------------------------------------------------------
+def sweep_parallel(p: ContactProblem, method: str) -> None:
+    """As `sweep`, on all threads, for any method but gauss_seidel."""
+    if method in SIMULTANEOUS:
+        _relax_all(p, method)
+    else:
+        for first in range(0, int(p.count[1]), BATCH):
+            _relax_colours(p, first)
 
 
 @ti.func
-def _begin(p: ti.template(), solver: ti.template(), with_momentum):
-    refresh(p)
-    p.state[RESIDUAL] = residual(p)
-    r_factor.begin(p)
+def _relax(p: ti.template(), c):
+    """Apply one prox step to contact c and add the change of its impulse to its nodes."""
+    r = p.r[c]
+    p.sweep_start[c] = r
+    new = prox(_step(p, c), p.friction[c])
+    add_impulse(p, c, new - r)
+    p.r[c] = new
+
+
+@ti.func
+def _relaxed(p: ti.template(), c, method: ti.template()):
+    """Impulse of contact c after one prox step."""
+    z = _step(p, c)
+    new = prox(z, p.friction[c])
+    if ti.static(method == "jacobi"):
+        new = into_disk([new[0], z[1], z[2]], p.friction[c] * p.r[c][0])
+    return new
+
+
+@ti.func
+def _step(p: ti.template(), c):
+    """Impulse of contact c after a step against its velocity, before the projection."""
+    return p.r[c] - scaled(p.state[STEP] * p.relaxation[c] * p.factor[c], velocity(p, c))
+
+
+@ti.func
+def _swap(p: ti.template(), c):
+    """Swap the new impulse of contact c, held in sweep_start, with its present one."""
+    new = p.sweep_start[c]
+    p.sweep_start[c] = p.r[c]
+    p.r[c] = new
+
+
+@kernel
+def _relax_all(p: ti.template(), method: ti.template()):
     for c in range(p.count[0]):
-        p.relaxation[c] = solver.relaxation(p, c, with_momentum)
-        p.previous[c] = p.r[c]
-        p.best[c] = p.r[c]
+        p.sweep_start[c] = _relaxed(p, c, method)
+    for c in range(p.count[0]):
+        _swap(p, c)
+
+
+@kernel
+def _relax_colours(p: ti.template(), first: ti.i32):
+    """Relax the contacts of BATCH colours from `first` on, each colour on all threads."""
+    for q in ti.static(range(BATCH)):
+        for k in range(_colour_start(p, first + q), _colour_start(p, first + q + 1)):
+            _relax(p, p.order[k])
 
 
 @ti.func
-def _extrapolate(p: ti.template()):
+def _colour_start(p: ti.template(), colour):
+    """Start of a colour in `order`; the end of the last colour for any later one."""
+    return p.colour_start[ti.min(colour, p.count[1])]
+
+
+# --- fraction of the r-factors ----------------------------------------------------------------------------------------
+
+
+@ti.func
+def relaxation(p: ti.template(), c, method: ti.template(), with_momentum):
+    """Fraction of its r-factors, in (0, 1], that contact c uses; with_momentum: 0 or 1."""
     total = ti.cast(0.0, ti.f64)
-    for c in range(p.count[0]):
-        total += momentum.restart_test(p, c)
-    weight = momentum.momentum_weight(p, total)
-    for c in range(p.count[0]):
-        momentum.extrapolate_impulse(p, c, weight)
-
-
-@kernel
-def run_serial(
-    p: ti.template(),
-    solver: ti.template(),
-    first: ti.i32,
-    sweeps: ti.i32,
-    every: ti.i32,
-    tolerance: ti.f64,
-    with_momentum: ti.i32,
-):
-    """Run up to `sweeps` sweeps with a residual check after each `every`; first: 1 at the start of a solve."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        p.state[CHECKS] = 0.0
-        if first == 1:
-            _begin(p, solver, with_momentum)
-        done = 0
-        while done < sweeps and not p.state[RESIDUAL] <= tolerance:
-            n = ti.min(every, sweeps - done)
-            for _k in range(n):
-                solver.sweep(p)
-                if with_momentum == 1:
-                    _extrapolate(p)
-                refresh(p)
-            done += n
-            p.state[RESIDUAL] = residual(p)
-            r_factor.accept_or_reject(p, ti.cast(n, ti.f64))
-            for c in range(p.count[0]):
-                r_factor.apply_verdict(p, c)
-            if p.state[RESIDUAL] == p.state[BEST]:
-                refresh(p)
-
-
-# --- on all threads ---------------------------------------------------------------------------------------------------
-
-
-@kernel
-def _begin_parallel(p: ti.template(), solver: ti.template(), with_momentum: ti.i32):
-    for c in range(p.count[0]):
-        p.relaxation[c] = solver.relaxation(p, c, with_momentum)
-        p.previous[c] = p.r[c]
+    if ti.static(method in SIMULTANEOUS):
+        total = _row_norm(p, c)
+    elif with_momentum == 1:
+        a = _roots(p, c)
+        total = _norm(own_block(p, c), a, a)
+    return ti.min(1.0, ti.select(total > 0.0, 1.0 / total, 1.0))
 
 
 @ti.func
-def _sum_chunk(p: ti.template(), k):
-    """Sum the terms of chunk k, in order."""
-    n = p.count[0]
-    total = ti.Vector([0.0, 0.0], ti.f64)
-    for c in range(k * n // CHUNKS, (k + 1) * n // CHUNKS):
-        total += p.term[c]
-    p.partial[k] = total
-
-
-@ti.func
-def _total(p: ti.template()):
-    total = ti.Vector([0.0, 0.0], ti.f64)
-    for k in range(CHUNKS):
-        total += p.partial[k]
+def _row_norm(p: ti.template(), c):
+    """sum_d |B_cd|."""
+    total = ti.cast(0.0, ti.f64)
+    a = _roots(p, c)
+    if ti.static(p.matrix):
+        for k in range(p.row_start[c], p.row_start[c + 1]):
+            B = ti.Matrix.zero(ti.f64, 3, 3)
+            for i, j in ti.static(ti.ndrange(3, 3)):
+                B[i, j] = p.block[k, 3 * i + j]
+            total += _norm(B, a, _roots(p, p.column[k]))
+    else:
+        for k in range(p.arity[c]):
+            i = p.node[c, k]
+            weights = ti.cast(0.0, ti.f64)
+            for e in range(p.entry_start[i], p.entry_start[i + 1]):
+                d = p.entry[e] // NODES
+                weights += ti.abs(p.weight[d, p.entry[e] % NODES]) * _roots(p, d).max()
+            total += ti.abs(p.weight[c, k]) * p.inverse_mass[i].max() * a.max() * weights
     return total
 
 
-@kernel
-def _check(p: ti.template(), first: ti.i32, sweeps: ti.i32):
-    """Check the residual and save or restore the impulses; w must be up to date."""
-    for c in range(p.count[0]):
-        d, s = natural_map(p, c)
-        p.term[c] = [d, s]
-    for k in range(CHUNKS):
-        _sum_chunk(p, k)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sums = _total(p)
-        p.state[CHANGED], p.state[SIZE] = sums[0], sums[1]
-        p.state[RESIDUAL] = residual_of(sums[0], sums[1])
-        if first == 1:
-            r_factor.begin(p)
-        else:
-            r_factor.accept_or_reject(p, ti.cast(sweeps, ti.f64))
-    for c in range(p.count[0]):
-        r_factor.apply_verdict(p, c)
+@ti.func
+def _roots(p: ti.template(), c):
+    """Square roots of the r-factors of contact c, by component."""
+    n, t = ti.sqrt(p.factor[c][0]), ti.sqrt(p.factor[c][1])
+    return dvec(n, t, t)
 
 
-@kernel
-def _extrapolate_parallel(p: ti.template()):
-    for c in range(p.count[0]):
-        p.term[c] = [momentum.restart_test(p, c), 0.0]
-    for k in range(CHUNKS):
-        _sum_chunk(p, k)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        p.state[CHANGED] = momentum.momentum_weight(p, _total(p)[0])
-    for c in range(p.count[0]):
-        momentum.extrapolate_impulse(p, c, p.state[CHANGED])
-
-
-def run_parallel(
-    p: ContactProblem, solver: ModuleType, first: int, sweeps: int, every: int, tolerance: float, with_momentum: int
-) -> None:
-    """As `run_serial`, on all threads; the host reads the residual."""
-    p.state[CHECKS] = 0.0
-    if first:
-        find_velocities(p)
-        _begin_parallel(p, solver, with_momentum)
-        _check(p, 1, 0)
-    done, colours = 0, int(p.count[1])
-    while done < sweeps and not p.state[RESIDUAL] <= tolerance:
-        n = min(every, sweeps - done)
-        for _ in range(n):
-            solver.sweep_parallel(p, colours)
-            if with_momentum:
-                _extrapolate_parallel(p)
-            find_velocities(p)
-        done += n
-        _check(p, 0, n)
-        if p.state[RESIDUAL] == p.state[BEST]:
-            find_velocities(p)
+@ti.func
+def _norm(B, a, b):
+    """Upper bound of the 2-norm of diag(a) B diag(b)."""
+    columns, rows = dvec(0.0), dvec(0.0)
+    for i, j in ti.static(ti.ndrange(3, 3)):
+        size = ti.abs(a[i] * B[i, j] * b[j])
+        columns[j] += size
+        rows[i] += size
+    return ti.sqrt(columns.max() * rows.max())

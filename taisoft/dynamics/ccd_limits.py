@@ -16,7 +16,7 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.collision.surface import dvec
-from taisoft.contact.assemble import obstacle_displacement_at
+from taisoft.contact.build import obstacle_displacement_at
 
 MAX_CLOSING = 0.5  # of the thinner side's thickness: how far a contact may close in one step
 DEPTH, CLOSING_RATIO, SPEED, WHICH, RELATIVE_PENETRATION = range(5)  # indices into the result of `measure_closing`

@@ -10,12 +10,11 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.pipeline import Detection
-from taisoft.contact.assemble import (
+from taisoft.contact.build import (
     SELF_CONTACT,
-    build_found,
     build_pair_numbers,
     fill,
-    find_impact,
+    has_impact,
     keep_impulses,
     scale_impulses,
     upload_pair_numbers,
@@ -80,8 +79,7 @@ class ContactStep:
 
     def _allocate(self, capacity: int) -> None:
         arena, m = FieldArena(), self.simulation.model
-        problem = build_node_problem(arena, capacity, m.n_nodes, m.serial)
-        self.found = build_found(arena, problem)
+        self.problem = build_node_problem(arena, capacity, m.n_nodes, m.serial)  # of the last step begun
         self._arena.release()
         self._arena, self._last_time, self._indexed = arena, 0.0, False
 
@@ -89,11 +87,6 @@ class ContactStep:
     def flight(self) -> np.ndarray:
         """Flight times of the colliders [s^2], see `Rebounds`."""
         return self.rebounds.flight
-
-    @property
-    def problem(self):
-        """The `ContactProblem` of the last step begun."""
-        return self.found.problem
 
     @property
     def n_contacts(self) -> int:
@@ -124,14 +117,14 @@ class ContactStep:
             "met": self.had_impact,
             "dropped": self.dropped,
             "flight": self.flight.copy(),
-            "rows": read_rows(self.found),
+            "rows": read_rows(self.problem),
         }
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`."""
         if kept["capacity"] != self.problem.capacity:
             self._allocate(int(kept["capacity"]))
-        write_rows(self.found, kept["rows"])
+        write_rows(self.problem, kept["rows"])
         self._last_time, self._impulse_fraction, self._step_dt = (float(kept[name]) for name in ("last_time", "share", "span"))
         self._impulse_sum, self.penetration = kept["sum"], float(kept["penetration"])
         self.relative_penetration = float(kept["relative_penetration"])
@@ -193,12 +186,12 @@ class ContactStep:
         self.dropped = max(self.dropped, d.counts.unmapped)
         if n > self.problem.capacity:
             self._allocate(2 * n)
-        f = self.found
-        keep_impulses(f)
+        p = self.problem
+        keep_impulses(p)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
-        fill(f, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
+        fill(p, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
         if n or self._indexed:  # an empty index needs no update
-            index_nodes(f.problem)
+            index_nodes(p)
             self._indexed = n > 0
         self._last_time, self._impulse_fraction, self.had_impact = dt, 1.0, False
         return n
@@ -211,20 +204,20 @@ class ContactStep:
 
     def detect_impact(self, dt: float) -> bool:
         """Return, and set `had_impact` to, whether surfaces without impulse so far meet in the step of dt that has begun."""
-        self.had_impact = bool(find_impact(self.found, dt, self.contact_offset))
+        self.had_impact = bool(has_impact(self.problem, dt, self.contact_offset))
         return self.had_impact
 
     def detect_rebounds(self, dt: float) -> bool:
         """Return whether surfaces rebound in the implicit step of dt that has begun; if so, set `had_impact`."""
         if self.n_contacts == 0:
             return False
-        found = self.rebounds.detect(self.found, dt, self.contact_offset)
+        found = self.rebounds.detect(self.problem, dt, self.contact_offset)
         self.had_impact = self.had_impact or found
         return found
 
     def count_flight(self, dt: float, dissipative: bool) -> None:
         """Update the flight times after a substep of dt, see `Rebounds.count_flight`."""
-        self.rebounds.count_flight(self.found, self.n_contacts, dt, dissipative)
+        self.rebounds.count_flight(self.problem, self.n_contacts, dt, dissipative)
 
     def start_step(self, dt: float) -> None:
         """Begin a step of dt."""
@@ -302,7 +295,7 @@ class ContactStep:
         self._searched = self._measured_end = None
         self._find(time, dt, path=self._path)
         self._searched, self._searched_dt = (time, dt), dt
-        searched = set(map(tuple, download([self.found.feature], self.n_contacts)[0].tolist()))
+        searched = set(map(tuple, download([self.problem.feature], self.n_contacts)[0].tolist()))
         kept = download([self.detection.kept], self.detection.counts.contacts)[0]
         found = self.detection.buffer.data.feature.to_numpy()[kept]
         return not searched.issuperset(map(tuple, found.tolist()))
@@ -330,7 +323,7 @@ class ContactStep:
 
     def contacts(self) -> Contacts:
         """Return the contacts of the last step with their impulses."""
-        return record_contacts(self.detection, self.found, self._impulse_fraction)
+        return record_contacts(self.detection, self.problem, self._impulse_fraction)
 
     @property
     def field_bytes(self) -> dict[str, int]:

@@ -5,16 +5,14 @@ import numpy as np
 from taisoft.backend.arrays import download, upload
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.pipeline import Detection
-from taisoft.contact.assemble import FoundContacts
-from taisoft.contact.problem import NODES
+from taisoft.contact.problem import NODES, ContactProblem
 from taisoft.scene.scene import Scene
 
 
-def record_contacts(detection: Detection, found: FoundContacts, impulse_fraction: float) -> Contacts:
+def record_contacts(detection: Detection, p: ContactProblem, impulse_fraction: float) -> Contacts:
     """Return the record of a problem's contacts with their impulses. impulse_fraction: of a step, in which they act."""
-    f, p = found, found.problem
     normal, tangent, r, struck, point, gap, body, feature, node, weight, arity = download(
-        [p.normal, p.tangent, p.r, f.impact_impulse, f.point, f.gap, f.body, f.feature, p.node, p.weight, p.arity], p.count[0]
+        [p.normal, p.tangent, p.r, p.impact_impulse, p.point, p.gap, p.body, p.feature, p.node, p.weight, p.arity], p.count[0]
     )
     r = r / impulse_fraction + struck
     impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
@@ -42,24 +40,23 @@ def _sides(node: np.ndarray, weight: np.ndarray, arity: np.ndarray) -> tuple[np.
     return nodes, weights
 
 
-def read_rows(found: FoundContacts) -> dict[str, np.ndarray]:
+def read_rows(p: ContactProblem) -> dict[str, np.ndarray]:
     """Return everything that a later step, or `record_contacts`, needs of a problem's contacts."""
-    fields = _fields(found)
-    return dict(zip(fields, download(list(fields.values()), found.problem.count[0])))
+    fields = _fields(p)
+    return dict(zip(fields, download(list(fields.values()), p.count[0])))
 
 
-def write_rows(found: FoundContacts, rows: dict[str, np.ndarray]) -> None:
+def write_rows(p: ContactProblem, rows: dict[str, np.ndarray]) -> None:
     """Restore the result of `read_rows`, of at most `capacity` contacts."""
     n, whole = len(rows["gap"]), []
-    for name, field in _fields(found).items():
-        data = np.zeros((found.problem.capacity, *rows[name].shape[1:]), dtype=rows[name].dtype)
+    for name, field in _fields(p).items():
+        data = np.zeros((p.capacity, *rows[name].shape[1:]), dtype=rows[name].dtype)
         data[:n] = rows[name]
         whole.append((field, data))
     upload(whole)
-    found.problem.count[0] = n
+    p.count[0] = n
 
 
-def _fields(found: FoundContacts) -> dict:
-    p, f = found.problem, found
+def _fields(p: ContactProblem) -> dict:
     parts = {"normal": p.normal, "tangent": p.tangent, "r": p.r, "node": p.node, "weight": p.weight, "arity": p.arity}
-    return parts | {"point": f.point, "gap": f.gap, "body": f.body, "feature": f.feature, "struck": f.impact_impulse}
+    return parts | {"point": p.point, "gap": p.gap, "body": p.body, "feature": p.feature, "struck": p.impact_impulse}

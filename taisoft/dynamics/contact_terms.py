@@ -14,8 +14,8 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.contact.assemble import FoundContacts, gap_minus_target
-from taisoft.contact.problem import CHANGED, NODES, RESIDUAL, SIZE, residual_of
+from taisoft.contact.build import gap_minus_target
+from taisoft.contact.problem import NODES, RESIDUAL, ContactProblem, residual_of
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import n_nodes_of, node_of
@@ -49,7 +49,6 @@ class StageContacts:
     """Contact data for the kernels of a stage and of its linear solve."""
 
     problem: Any  # ContactProblem
-    found: Any  # FoundContacts
     work: ContactStageWork
     coupling: Coupling  # of J^T D J
     x_start: Any  # (n_nodes) 3-vectors f64: positions at which gaps were measured [m]
@@ -63,7 +62,7 @@ class StageContacts:
         return self.problem is not None
 
 
-NO_CONTACTS = StageContacts(None, None, None, NO_COUPLING, *[None] * 4)
+NO_CONTACTS = StageContacts(None, None, NO_COUPLING, *[None] * 4)
 
 
 @kernel
@@ -74,21 +73,21 @@ def begin_contacts(
 
     impact: whether the contacts' velocity must be `min_velocity`, regardless of gaps. gap_targets (4,): of `ContactStep`.
     """
-    p, f, w = ti.static((k.problem, k.found, k.work))
+    p, w = ti.static((k.problem, k.work))
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        offset = -(beta / dt) * f.obstacle_displacement[c]
+        offset = -(beta / dt) * p.obstacle_displacement[c]
         if ti.static(not impact):  # in an impact x_hat is x_start
             for j in range(p.arity[c]):
                 i = p.node[c, j]
                 offset += p.weight[c, j] * (k.x_start[i] - s.x_hat[i])
         w.tangential_offset[c] = offset
         if ti.static(impact):
-            w.gap_minus_target[c] = -beta * f.min_velocity[c] - (beta / dt) * p.normal[c].dot(f.obstacle_displacement[c])
+            w.gap_minus_target[c] = -beta * p.min_velocity[c] - (beta / dt) * p.normal[c].dot(p.obstacle_displacement[c])
         else:
             offset_target, fast, slow, fastest = gap_targets[0], gap_targets[1], gap_targets[2], gap_targets[3]
-            gap_to_target = gap_minus_target(f, c, dt, offset_target, fast, slow, fastest, f.min_opening[c])
-            w.gap_minus_target[c] = gap_to_target - p.normal[c].dot(f.obstacle_displacement[c])
+            gap_to_target = gap_minus_target(p, c, dt, offset_target, fast, slow, fastest, p.min_opening[c])
+            w.gap_minus_target[c] = gap_to_target - p.normal[c].dot(p.obstacle_displacement[c])
 
 
 @ti.func
@@ -178,12 +177,10 @@ def impulse_on_node(k: ti.template(), i):
 def sum_residual(k: ti.template()):
     """Compute the residual of the laws over all contacts."""
     p, w = ti.static((k.problem, k.work))
-    changed, size = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    sums = ti.Vector([0.0, 0.0], ti.f64)
     for c in range(p.count[0]):
-        changed += w.prox_residual[c][0]
-        size += w.prox_residual[c][1]
-    p.state[CHANGED], p.state[SIZE] = changed, size
-    p.state[RESIDUAL] = residual_of(changed, size)
+        sums += w.prox_residual[c]
+    p.state[RESIDUAL] = residual_of(sums)
 
 
 @kernel
@@ -218,9 +215,9 @@ def save_diagonal(m: ti.template(), A: ti.template(), k: ti.template(), subset: 
             p.inverse_mass[i][a] = ti.cast(m.free[i][a], ti.f64) / d
 
 
-def build_stage_contacts(arena: FieldArena, model: Model, found: FoundContacts, x_start: Any) -> StageContacts:
-    """Allocate storage for the contacts of `found`. x_start: (n_nodes) 3-vectors f64, filled by the caller."""
-    p, n, real = found.problem, model.n_nodes, model.real
+def build_stage_contacts(arena: FieldArena, model: Model, problem: ContactProblem, x_start: Any) -> StageContacts:
+    """Allocate storage for the contacts of `problem`. x_start: (n_nodes) 3-vectors f64, filled by the caller."""
+    p, n, real = problem, model.n_nodes, model.real
     work = ContactStageWork(
         arena.vectors("multiplier", ti.f64, p.capacity),
         arena.field("friction_radius", ti.f64, p.capacity),
@@ -240,19 +237,18 @@ def build_stage_contacts(arena: FieldArena, model: Model, found: FoundContacts, 
         arena,
         real,
         n,
-        p.count,
         p.node,
-        p.arity,
-        p.weight,
-        p.entry_start,
-        p.entry,
-        work.block,
-        work.active,
-        arena.vectors("base_diagonal", real, n, n=BLOCK),
+        count=p.count,
+        arity=p.arity,
+        weight=p.weight,
+        entry_start=p.entry_start,
+        entry=p.entry,
+        block=work.block,
+        active=work.active,
+        base=arena.vectors("base_diagonal", real, n, n=BLOCK),
     )
     return StageContacts(
         p,
-        found,
         work,
         coupling,
         x_start,

@@ -7,7 +7,7 @@ velocity, which moves the nodes. M is lumped, so M^-1 is diagonal (report, secti
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.contact.assemble import gap_minus_target
+from taisoft.contact.build import gap_minus_target, relative_velocity
 from taisoft.contact.problem import impulse_on, to_frame
 from taisoft.contact.prox import dvec
 from taisoft.contact.restitution import explicit_opening
@@ -67,7 +67,7 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
 def set_free_velocities(
     m: ti.template(),
     s: ti.template(),
-    f: ti.template(),
+    p: ti.template(),
     dt: ti.f64,
     contact_offset: ti.f64,
     penetration_correction: ti.f64,
@@ -76,19 +76,15 @@ def set_free_velocities(
 ):
     """Compute b of every contact from v*, and the inverse masses."""
     kick_before_impact = ti.static(0.0 if s.verlet else 0.5)
-    (p,) = ti.static((f.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         p.inverse_mass[i] = ti.cast(m.free[i], ti.f64) / ti.cast(m.mass[i], ti.f64)
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        v = -f.obstacle_displacement[c] / dt
-        for j in range(p.arity[c]):
-            v += p.weight[c, j] * ti.cast(m.state.v[p.node[c, j]], ti.f64)
-        b = to_frame(p, c, v)
-        rise = explicit_opening(f, c, dt, contact_offset, b[0], kick_before_impact)
+        b = to_frame(p, c, relative_velocity(p, m, c, dt))
+        rise = explicit_opening(p, c, dt, contact_offset, b[0], kick_before_impact)
         p.b[c] = dvec(
-            b[0] + gap_minus_target(f, c, dt, contact_offset, penetration_correction, offset_correction, max_speed, rise) / dt,
+            b[0] + gap_minus_target(p, c, dt, contact_offset, penetration_correction, offset_correction, max_speed, rise) / dt,
             b[1],
             b[2],
         )

@@ -127,7 +127,7 @@ class ContactExplicitStepper(ExplicitStepper):
         result = None
         if n:
             p = contact.problem
-            set_free_velocities(m, s, contact.found, dt, *contact.gap_targets)
+            set_free_velocities(m, s, p, dt, *contact.gap_targets)
             find_factors(p)
             if self.method == "coloured_gauss_seidel":
                 colour_contacts(p)

@@ -26,8 +26,7 @@ from taisoft.contact.problem import RESIDUAL
 from taisoft.contact.prox import dvec
 from taisoft.dynamics.contact_terms import PAST, open_disk, set_multiplier, sum_residual, update_contact
 from taisoft.dynamics.linearised import contact_slope, move_node_along, node_residual, node_slope, step_length
-from taisoft.linear import pcg_serial
-from taisoft.linear.pcg import NEGATIVE
+from taisoft.linear.pcg import NEGATIVE, iterate_serial, start_serial
 from taisoft.linear.pcg import RUNNING as PCG_RUNNING
 
 R_SCALE, MIN_R_SCALE, MAX_R_SCALE, MANY_STEPS = 1.0, 0.3, 100.0, 5  # R over the r-factors: start, bounds; steps that halve it
@@ -225,14 +224,14 @@ def solve_frictional(
                 status = FAILED
             else:
                 if loop[IN_SOLVE] == 0.0:
-                    pcg_serial.start(m, A, k.coupling, s.pcg, ti.cast(loop[SAME_MATRIX], ti.i32))
+                    start_serial(m, A, k.coupling, s.pcg, ti.cast(loop[SAME_MATRIX], ti.i32))
                     loop[SAME_MATRIX] = 1.0
                     loop[SOLVE_ITERATIONS] = 0.0
                 n = ti.min(max_work - work, max_cg - ti.cast(loop[SOLVE_ITERATIONS], ti.i32))
                 tolerance = limits[LINEAR_TOLERANCE]
                 if loop[SOLVES] > 0.0:
                     tolerance = ti.max(tolerance, limits[LATER_TOLERANCE])
-                count, stop = pcg_serial.iterations(m, A, k.coupling, s.pcg, n, tolerance)
+                count, stop = iterate_serial(m, A, k.coupling, s.pcg, n, tolerance)
                 loop[SOLVE_ITERATIONS] = loop[SOLVE_ITERATIONS] + count
                 loop[LINEAR] = loop[LINEAR] + count
                 work += count + 1

@@ -73,7 +73,7 @@ def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f
 
     norms: as in `form_residual`; the scale is the momentum of all nodes at the largest speed change of a contact.
     """
-    p, f = ti.static((k.problem, k.found))
+    (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         m.state.x[i] = k.x_start[i] + tau * ti.cast(s.v_hat[i], ti.f64)
@@ -83,9 +83,9 @@ def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f
     for _ in range(1):
         speed, mass = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         for c in range(p.count[0]):
-            f.impact_impulse[c] = p.r[c]
+            p.impact_impulse[c] = p.r[c]
             p.r[c] = dvec(0.0)
-            speed = ti.max(speed, f.min_velocity[c] - f.approach[c])
+            speed = ti.max(speed, p.min_velocity[c] - p.approach[c])
         for i in range(m.n_nodes):
             mass += ti.cast(m.mass[i], ti.f64) ** 2
         for j in ti.static(range(5)):
@@ -96,7 +96,7 @@ def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f
 @kernel
 def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f64, out: ti.types.ndarray()):
     """Store the jump in s.change. out: E'(0) minus the recoverable energy, and E'' of E(s)."""
-    p, f = ti.static((k.problem, k.found))
+    (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         s.change[i] = (m.state.x[i] - k.x_linear[i]) / tau
@@ -113,20 +113,20 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
     for _ in range(1):
         slope = total(m, SUM)
         for c in range(p.count[0]):
-            u_fixed = -(SPREAD / tau) * f.obstacle_displacement[c]
+            u_fixed = -(SPREAD / tau) * p.obstacle_displacement[c]
             for j in range(p.arity[c]):
                 i = p.node[c, j]
                 u_fixed += p.weight[c, j] * (1.0 - ti.cast(m.free[i], ti.f64)) * ti.cast(s.v_hat[i], ti.f64)
             slope += to_world(p, c, p.r[c]).dot(u_fixed)
-            if f.min_opening[c] > 0.0:
-                slope -= 0.5 * p.r[c][0] * ti.max(0.0, f.min_velocity[c] + f.approach[c])
+            if p.min_opening[c] > 0.0:
+                slope -= 0.5 * p.r[c][0] * ti.max(0.0, p.min_velocity[c] + p.approach[c])
         out[0], out[1] = slope, total(m, OTHER_SUM)
 
 
 @kernel
 def apply_impact(m: ti.template(), s: ti.template(), k: ti.template(), fraction: ti.f64):
     """Apply that fraction of the jump to v_hat; restore the last step's impulses, and set `impact_impulse` to the impact's."""
-    p, f = ti.static((k.problem, k.found))
+    (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         m.state.x[i] = k.x_start[i]
@@ -134,8 +134,8 @@ def apply_impact(m: ti.template(), s: ti.template(), k: ti.template(), fraction:
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         struck = fraction * p.r[c]
-        p.r[c] = f.impact_impulse[c]
-        f.impact_impulse[c] = struck
+        p.r[c] = p.impact_impulse[c]
+        p.impact_impulse[c] = struck
 
 
 @kernel
@@ -150,12 +150,12 @@ def start_from(m: ti.template(), s: ti.template(), still: ti.f64):
 @kernel
 def rebound_work(k: ti.template(), beta: ti.f64) -> ti.f64:
     """Return the work of contacts constrained to their rebound displacement, at the end of the step [J]."""
-    p, f, w = ti.static((k.problem, k.found, k.work))
+    p, w = ti.static((k.problem, k.work))
     work = ti.cast(0.0, ti.f64)
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
-            if f.min_opening[c] > 0.0:
+            if p.min_opening[c] > 0.0:
                 displacement = w.tangential_offset[c]
                 for j in range(p.arity[c]):
                     displacement += p.weight[c, j] * k.displacement[p.node[c, j]]
@@ -164,12 +164,11 @@ def rebound_work(k: ti.template(), beta: ti.f64) -> ti.f64:
 
 
 @kernel
-def release_contacts(f: ti.template()):
+def release_contacts(p: ti.template()):
     """Release all contacts from their rebound displacement."""
-    (p,) = ti.static((f.problem,))
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        f.min_opening[c] = 0.0
+        p.min_opening[c] = 0.0
 
 
 def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":
@@ -190,11 +189,11 @@ def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":
     slack = max(0.0, -fraction * (slope + 0.5 * fraction * curvature))  # 0 except for rounding if the jump is scaled down
     apply_impact(m, w, k, fraction)
     if fraction < 1.0:
-        release_contacts(k.found)
+        release_contacts(k.problem)
     results = [impact]
     while True:
         start_from(m, w, float(stage.linearised))
         results.append(solve(system, replace(stage, beta=stage.dt, prescribed_fraction=1.0)))
         if rebound_work(k, stage.dt) <= slack:
             return count_all(merge([impact, results[-1]]), results[1:-1])
-        release_contacts(k.found)
+        release_contacts(k.problem)

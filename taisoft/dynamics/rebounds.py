@@ -3,7 +3,7 @@
 import numpy as np
 
 from taisoft.backend.arrays import download
-from taisoft.contact.assemble import FoundContacts
+from taisoft.contact.problem import ContactProblem
 from taisoft.contact.restitution import find_rebounds
 from taisoft.dynamics.simulation_state import SimulationState
 
@@ -24,7 +24,7 @@ class Rebounds:
         """Update for changed coefficients of restitution."""
         self._any = self._simulation.scene.bounces
 
-    def detect(self, found: FoundContacts, dt: float, contact_offset: float) -> bool:
+    def detect(self, problem: ContactProblem, dt: float, contact_offset: float) -> bool:
         """Return whether surfaces rebound in the step of dt [s] that has begun."""
         scene = self._simulation.scene
         if not self._any:
@@ -32,16 +32,16 @@ class Rebounds:
         if (self._gravity != scene.gravity).any():  # energy lost under another gravity is unknown
             self._gravity = scene.gravity.copy()
             self.flight[:] = 0.0
-        return find_rebounds(found, self._simulation.model.gravity, self.flight, dt, contact_offset) > 0
+        return find_rebounds(problem, self._simulation.model.gravity, self.flight, dt, contact_offset) > 0
 
-    def count_flight(self, found: FoundContacts, n: int, dt: float, dissipative: bool) -> None:
+    def count_flight(self, problem: ContactProblem, n: int, dt: float, dissipative: bool) -> None:
         """Update `flight` after a substep of dt with n contacts. dissipative: whether free flight loses energy, as with
         implicit Euler."""
         if not self._any:
             return
         scene, layout, dirichlet = self._simulation.scene, self._simulation.layout, self._simulation.dirichlet
         self.flight += np.where(self.flight > 0.0, dt**2 if dissipative else 0.0, dt**2)
-        r, struck, body = download([found.problem.r, found.impact_impulse, found.body], n)
+        r, struck, body = download([problem.r, problem.impact_impulse, problem.body], n)
         self.flight[body[(r != 0.0).any(axis=1)]] = 0.0
         self.flight[body[(struck != 0.0).any(axis=1)]] = dt**2
         constrained = np.logical_or.reduceat(dirichlet.constrained().any(axis=1), layout.node_start[:-1])

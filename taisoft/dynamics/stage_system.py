@@ -92,8 +92,8 @@ class StageSystem:
     ):
         """prescribed: nodes that follow a path. x_start: (n_nodes) 3-vectors f64, positions at the start of the step."""
         self.model, self.contact, self.x_start = model, contact, x_start
-        self.matrix: BlockCsr = block_csr.build_block_csr(model, arena, model.real)
-        self.damper = block_csr.sibling(self.matrix, model, arena, model.real, "damping") if model.stiffness_damping else None
+        self.matrix: BlockCsr = block_csr.build_block_csr(model, arena)
+        self.damper = block_csr.sibling(self.matrix, model, arena, "damping") if model.stiffness_damping else None
         n, k = model.n_nodes, len(prescribed)
         self.work = StageWork(
             x_hat=arena.vectors("x_hat", ti.f64, n),
@@ -145,9 +145,9 @@ class StageSystem:
 
     def _allocate_contacts(self) -> None:
         """Allocate storage for the contacts of this step."""
-        if self._stage_contacts is None or self._stage_contacts.found is not self.contact.found:
+        if self._stage_contacts is None or self._stage_contacts.problem is not self.contact.problem:
             arena = FieldArena()
-            self._stage_contacts = build_stage_contacts(arena, self.model, self.contact.found, self.x_start)
+            self._stage_contacts = build_stage_contacts(arena, self.model, self.contact.problem, self.x_start)
             self._contact_arena.release()
             self._contact_arena = arena
 

@@ -24,6 +24,7 @@ from taisoft.linear.element_blocks import element_blocks, pair_terms
 # A block is a 12-vector, column by column, each padded with a zero: entry (r, c) is at 4 c + r. All entries share one address,
 # and a column times a number is one SIMD instruction.
 BLOCK = 12
+SINGULAR = 1e-12  # of the product of its diagonal: a block with a smaller determinant counts as singular
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,58 +45,55 @@ class BlockCsr:
     edge_entry: Any  # i32: index into element, lanes times the first entry plus the lane
     edge_upper: Any  # (n_edges) i32: index of K_ij in value
     edge_lower: Any  # (n_edges) i32: index of K_ji
-    term_start: Any  # this and the next two only for quadratic tets, see `element_blocks.pair_terms`
-    term_pair: Any
-    term_factor: Any
+    term_start: Any = None  # this and the next two only for quadratic tets, see `element_blocks.pair_terms`
+    term_pair: Any = None
+    term_factor: Any = None
 
 
-def build_block_csr(model: Model, arena: FieldArena, real, prefix: str = "stiffness") -> BlockCsr:
+def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") -> BlockCsr:
     """Build the pattern and gather table from the model's tets. `assemble` fills the values."""
     graph, base = model_graph(model)
-    n_edges = len(graph.ends)
     if base.max(initial=0) > np.iinfo(np.int32).max - 9 * model.lanes:
         raise SimulationError(f"{int(model.volume.shape[0]) * model.lanes} tets are too many to assemble a stiffness matrix")
-    order = np.argsort(graph.pair, kind="stable")
-    edge_start = np.concatenate([[0], np.cumsum(np.bincount(graph.pair, minlength=n_edges))])
-    size = sum((g.last - g.first) * MATRIX_BLOCKS[g.order] * 9 for g in model.groups)
-    element = arena.lanes(f"{prefix}_element", real, size * model.lanes)
-    terms = {"term_start": None, "term_pair": None, "term_factor": None}
+    n_edges, rules = len(graph.ends), {}
 
-    def ints(name: str, data: np.ndarray):
-        return arena.field(f"{prefix}_{name}", ti.i32, data.shape, data.astype(np.int32))
+    def copied(name: str, data: np.ndarray, dtype=ti.i32):
+        return arena.field(f"{prefix}_{name}", dtype, data.shape, data)
 
     if model.points is not None:
         start, pairs, factors = pair_terms(model.rules)
-        factors = arena.field(
-            f"{prefix}_term_factor", real, factors.shape, factors.astype(np.float32 if real == ti.f32 else np.float64)
-        )
-        terms = {"term_start": ints("term_start", start), "term_pair": ints("term_pair", pairs), "term_factor": factors}
+        rules["term_start"], rules["term_pair"] = copied("term_start", start), copied("term_pair", pairs)
+        rules["term_factor"] = copied("term_factor", factors, model.real)
+    size = sum((g.last - g.first) * MATRIX_BLOCKS[g.order] * 9 for g in model.groups)
+    element = arena.lanes(f"{prefix}_element", model.real, size * model.lanes)
     return BlockCsr(
         n_edges=n_edges,
-        row_start=ints("row_start", graph.row_start),
-        row_upper=ints("row_upper", graph.row_upper),
-        column=ints("column", graph.column),
-        value=arena.vectors(f"{prefix}_value", real, 2 * n_edges, n=BLOCK),
-        diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
-        row_sum=arena.vectors(f"{prefix}_row_sum", real, 1, n=4),
+        row_start=copied("row_start", graph.row_start),
+        row_upper=copied("row_upper", graph.row_upper),
+        column=copied("column", graph.column),
+        **_values(model, arena, prefix, n_edges),
+        row_sum=arena.vectors(f"{prefix}_row_sum", model.real, 1, n=4),
         element=element.memory,
         element_at=element.at // model.lanes,
         element_mask=element.mask // model.lanes,
-        edge_start=ints("edge_start", edge_start),
-        edge_entry=ints("edge_entry", base[order]),
-        edge_upper=ints("edge_upper", graph.upper),
-        edge_lower=ints("edge_lower", graph.lower),
-        **terms,
+        edge_start=copied("edge_start", np.concatenate([[0], np.cumsum(np.bincount(graph.pair, minlength=n_edges))])),
+        edge_entry=copied("edge_entry", base[np.argsort(graph.pair, kind="stable")]),
+        edge_upper=copied("edge_upper", graph.upper),
+        edge_lower=copied("edge_lower", graph.lower),
+        **rules,
     )
 
 
-def sibling(matrix: BlockCsr, model: Model, arena: FieldArena, real, prefix: str) -> BlockCsr:
+def sibling(matrix: BlockCsr, model: Model, arena: FieldArena, prefix: str) -> BlockCsr:
     """A second matrix that shares pattern and element buffer but has its own values."""
-    return replace(
-        matrix,
-        value=arena.vectors(f"{prefix}_value", real, 2 * matrix.n_edges, n=BLOCK),
-        diagonal=arena.vectors(f"{prefix}_diagonal", real, model.n_nodes, n=BLOCK),
-    )
+    return replace(matrix, **_values(model, arena, prefix, matrix.n_edges))
+
+
+def _values(model: Model, arena: FieldArena, prefix: str, n_edges: int) -> dict[str, Any]:
+    return {
+        "value": arena.vectors(f"{prefix}_value", model.real, 2 * n_edges, n=BLOCK),
+        "diagonal": arena.vectors(f"{prefix}_diagonal", model.real, model.n_nodes, n=BLOCK),
+    }
 
 
 @kernel
@@ -174,6 +172,31 @@ def block_times(B, x):
     """A block times a 3-vector."""
     y = padded_times(B, x)
     return ti.Vector([y[0], y[1], y[2]])
+
+
+@ti.func
+def definite_inverse(m: ti.template(), D, free):
+    """Inverse of P on the free axes, and P: D, or a diagonal of absolute row sums if D is not positive definite."""
+    P, inverse = D, ti.Vector([0.0 for _ in ti.static(range(BLOCK))], m.real)
+    B = ti.Matrix.zero(ti.f64, 3, 3)  # f64, to invert blocks whose stiffness differs much between directions
+    for r in ti.static(range(3)):
+        for c in ti.static(range(3)):
+            free_rc = free[r] * free[c]
+            B[r, c] = free_rc * D[4 * c + r] + (1.0 - free_rc if ti.static(r == c) else 0.0)
+    minor = B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
+    det, size = B.determinant(), B[0, 0] * B[1, 1] * B[2, 2]
+    if not (B[0, 0] > 0.0 and minor > 0.0 and det > SINGULAR * size):
+        P = inverse
+        for r in ti.static(range(3)):
+            d = ti.max(abs(B[r, 0]) + abs(B[r, 1]) + abs(B[r, 2]), 1e-30)
+            for c in ti.static(range(3)):
+                B[r, c] = d if ti.static(r == c) else 0.0
+            P[5 * r] = ti.cast(d, m.real)
+    C = B.inverse()
+    for r in ti.static(range(3)):
+        for c in ti.static(range(3)):
+            inverse[4 * c + r] = free[r] * free[c] * ti.cast(C[r, c], m.real)
+    return inverse, P
 
 
 @ti.func

@@ -19,42 +19,35 @@ class Coupling:
     """Terms c with nodes node[c, 0..arity[c]), and for each node its entries = width * c + index in the term."""
 
     width: int
-    count: Any  # i32: count[0] terms
-    node: Any  # (capacity, width) i32
-    arity: Any  # (capacity) i32
-    weight: Any  # (capacity, width) f64
-    entry_start: Any  # (n_nodes + 1) i32
-    entry: Any  # i32, ascending for each node
-    block: Any  # (capacity) 12-vectors
-    active: Any  # (capacity) i32: 0 if the block is 0
-    base: Any  # (n_nodes) 12-vectors: the matrix's diagonal without the terms
-    n_active: Any  # (n_nodes) i32: active terms of each node, listed from entry_start on in term and term_weight
-    term: Any  # (capacity * width) i32
-    term_weight: Any  # (capacity * width): the node's weight in the term
-    product: Any  # (capacity) 4-vectors: D J x of each term, the last entry 0
+    count: Any = None  # i32: count[0] terms
+    node: Any = None  # (capacity, width) i32
+    arity: Any = None  # (capacity) i32
+    weight: Any = None  # (capacity, width) f64
+    entry_start: Any = None  # (n_nodes + 1) i32
+    entry: Any = None  # i32, ascending for each node
+    block: Any = None  # (capacity) 12-vectors
+    active: Any = None  # (capacity) i32: 0 if the block is 0
+    base: Any = None  # (n_nodes) 12-vectors: the matrix's diagonal without the terms
+    n_active: Any = None  # (n_nodes) i32: active terms of each node, listed from entry_start on in term and term_weight
+    term: Any = None  # (capacity * width) i32
+    term_weight: Any = None  # (capacity * width): the node's weight in the term
+    product: Any = None  # (capacity) 4-vectors: D J x of each term, the last entry 0
 
 
-NO_COUPLING = Coupling(0, *[None] * 13)
+NO_COUPLING = Coupling(0)
 
 
-def build_coupling(arena, real, n_nodes: int, count, node, arity, weight, entry_start, entry, block, active, base) -> Coupling:
-    """Build terms over existing fields of nodes, weights and blocks, which the caller fills."""
+def build_coupling(arena, real, n_nodes: int, node, **fields) -> Coupling:
+    """Build terms over existing fields of nodes, weights and blocks (all up to `base`), which the caller fills."""
     capacity, width = node.shape
     return Coupling(
         width,
-        count,
-        node,
-        arity,
-        weight,
-        entry_start,
-        entry,
-        block,
-        active,
-        base,
-        arena.field("coupling_n_active", ti.i32, n_nodes),
-        arena.field("coupling_term", ti.i32, capacity * width),
-        arena.field("coupling_term_weight", real, capacity * width),
-        arena.vectors("coupling_product", real, capacity, n=4),
+        node=node,
+        **fields,
+        n_active=arena.field("coupling_n_active", ti.i32, n_nodes),
+        term=arena.field("coupling_term", ti.i32, capacity * width),
+        term_weight=arena.field("coupling_term_weight", real, capacity * width),
+        product=arena.vectors("coupling_product", real, capacity, n=4),
     )
 
 
@@ -82,18 +75,20 @@ def prepare_terms(m: ti.template(), k: ti.template(), i):
 
 @ti.func
 def clear_products(m: ti.template(), k: ti.template()):
-    """Set the products of all terms to 0."""
-    for c in range(k.count[0]):
-        k.product[c] = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
+    """Set the products of all terms, if there can be any, to 0."""
+    if ti.static(k.width > 0):
+        for c in range(k.count[0]):
+            k.product[c] = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
 
 
 @ti.func
 def add_products(m: ti.template(), k: ti.template(), i, x):
-    """Add the contribution of x at node i to the products of its terms."""
-    first = k.entry_start[i]
-    for e in range(first, first + k.n_active[i]):
-        c = k.term[e]
-        k.product[c] += padded_times(k.block[c], k.term_weight[e] * x)
+    """Add the contribution of x at node i to the products of its terms, if there can be any."""
+    if ti.static(k.width > 0):
+        first = k.entry_start[i]
+        for e in range(first, first + k.n_active[i]):
+            c = k.term[e]
+            k.product[c] += padded_times(k.block[c], k.term_weight[e] * x)
 
 
 @ti.func

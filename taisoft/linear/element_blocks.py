@@ -78,14 +78,12 @@ def scatter_terms(m: ti.template(), A: ti.template(), base, at, row):
     """Add the scratch blocks A_kl of quadrature point `row` to the node pairs of a quadratic tet."""
     for n in range(6):
         B = [load_lanes(m, A.element, at + (9 * n + e)) for e in ti.static(range(9))]
-        for u in range(A.term_start[2 * n], A.term_start[2 * n + 1]):
-            w, out = A.term_factor[row, u], base + 9 * A.term_pair[u]
-            for e in ti.static(range(9)):
-                store_lanes(m, A.element, out + e, load_lanes(m, A.element, out + e) + w * B[e])
-        for u in range(A.term_start[2 * n + 1], A.term_start[2 * n + 2]):
-            w, out = A.term_factor[row, u], base + 9 * A.term_pair[u]
-            for e in ti.static(range(9)):
-                store_lanes(m, A.element, out + e, load_lanes(m, A.element, out + e) + w * B[3 * (e % 3) + e // 3])
+        for transposed in ti.static(range(2)):
+            for u in range(A.term_start[2 * n + transposed], A.term_start[2 * n + transposed + 1]):
+                w, out = A.term_factor[row, u], base + 9 * A.term_pair[u]
+                for e in ti.static(range(9)):
+                    entry = B[ti.static(3 * (e % 3) + e // 3 if transposed else e)]
+                    store_lanes(m, A.element, out + e, load_lanes(m, A.element, out + e) + w * entry)
 
 
 @ti.func
