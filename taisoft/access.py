@@ -18,8 +18,8 @@ from taisoft.stability import stable_dt
 
 if TYPE_CHECKING:
     from taisoft.collision.contacts import Contacts
+    from taisoft.collision.detector import Detection
     from taisoft.collision.overlap import Overlap
-    from taisoft.collision.pipeline import Detection
     from taisoft.dynamics.contact import ContactStep
 
 _REBUILT = (
@@ -186,7 +186,7 @@ class StateAccess(Guarded):
             self._contact.search(simulation.time, dt)
             return self._contact.detection
         if self._idle_detection is None:
-            from taisoft.collision.pipeline import Detection
+            from taisoft.collision.detector import Detection
 
             within = self.settings.self_collision
             self._idle_detection = Detection(simulation.scene, simulation.model, simulation.layout, self._runtime, within)

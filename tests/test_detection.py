@@ -13,7 +13,7 @@ from rotations import rotation
 
 from taisoft.collision import surface
 from taisoft.collision.contacts import KINDS
-from taisoft.collision.pipeline import Detection
+from taisoft.collision.detector import Detection
 from taisoft.errors import SimulationError
 
 

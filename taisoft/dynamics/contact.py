@@ -10,8 +10,8 @@ import taichi as ti
 from taisoft.backend.fields import FieldArena
 from taisoft.backend.transfer import download, upload
 from taisoft.collision.contacts import Contacts
-from taisoft.collision.crossings import CROSSED, CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
-from taisoft.collision.pipeline import Detection
+from taisoft.collision.detector import Detection
+from taisoft.collision.intersections import CROSSED, CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.contact.assemble import (
     SELF_CONTACT,
     build_found,

@@ -12,11 +12,13 @@ convex; may stop early at a kink of phi inside the triangle, but never at a high
 
 import taichi as ti
 
+from taisoft.collision.features import choose, corner, opposite, unit
 from taisoft.collision.surface import dvec
-from taisoft.collision.triangles import choose
 
 MAX_STEPS, MAX_TRIALS = 24, 6  # maximum steps, and maximum trials per line search
 GAP_TOLERANCE = 1e-7  # of the triangle's size: Frank-Wolfe gap at convergence
+ALIGNMENT_SINE = 0.26  # sine of 15 degrees: tolerance of grad phi in the conditions of a minimum
+MIN_EXTRA_DEPTH = 1e-5  # of a triangle's size: depth below its corners from which its deepest point is a contact
 
 
 @ti.func
@@ -129,3 +131,36 @@ def deepest_point(field: ti.template(), k, A, B, C, phi_corner):
                 phi = value
         step += 1
     return w, phi
+
+
+@ti.func
+def is_surface_minimum(s: ti.template(), t, w, n, x):
+    """1 if the deepest point x of triangle t, weights w, is also a local minimum of the whole surface that faces n.
+
+    To within ALIGNMENT_SINE, n must oppose the triangle's normal at an interior point and be perpendicular to the edge at a point
+    on an edge: at a kink of phi, as in the middle of a box, no gradient gives the exit direction. On an edge, the neighbour must
+    not lie deeper, and only the triangle that owns the edge accepts.
+    """
+    facing = s.normal[t]
+    valid = 1
+    zero_corner = -1
+    for j in ti.static(range(3)):
+        if w[j] <= 0.0:
+            zero_corner = j
+    if zero_corner >= 0:
+        k = (zero_corner + 1) % 3  # the edge opposite the corner of zero weight
+        valid = (s.owns[t] >> (3 + k)) & 1
+        along = unit(corner(s, t, k + 1) - corner(s, t, k))
+        if ti.abs(along.dot(n)) > ALIGNMENT_SINE:
+            valid = 0
+        v = s.neighbour[t, k]
+        if v >= 0:
+            facing += s.normal[v]
+            e = s.x[opposite(s, v, s.triangle[t, k], s.triangle[t, (k + 1) % 3])] - x
+            if e.dot(n) < -0.05 * e.norm():
+                valid = 0
+        if facing.dot(n) >= 0.0:
+            valid = 0
+    elif facing.cross(n).norm() > ALIGNMENT_SINE or facing.dot(n) > 0.0:
+        valid = 0
+    return valid
