@@ -165,8 +165,7 @@ def _obstacle_contacts(s: ti.template(), o: ti.template(), t, k, margin, out: ti
                 accepted = (s.owns[t] >> j) & 1
             elif kind != HALF_SPACE:
                 v, value = deepest_point(o, k, A, B, C, phi)
-                for i in ti.static(range(3)):
-                    w[i] = v[i]
+                w = 1.0 * v
                 accepted = int(value < phi.min() - ti.cast(MIN_EXTRA_DEPTH, ti.f64) * reach and w.max() < 1.0 - 1e-6)
             p, move = w[0] * A + w[1] * B + w[2] * C, w[0] * a + w[1] * b + w[2] * c
             value, g = o.sample(k, p)

@@ -25,7 +25,7 @@ from taisoft.backend.fields import FieldArena
 from taisoft.backend.runtime import Runtime, kernel
 from taisoft.collision.candidates import WHOLE, Buffer, Candidates, entries, is_candidate, sort_row, sum_parts
 from taisoft.collision.colliders import Topology
-from taisoft.collision.surface import ACTIVE, Surface, dvec, list_near, part_first
+from taisoft.collision.surface import ACTIVE, Surface, dvec, integers, list_near, part_first
 
 LEAVES = {"cpu": 64, "cuda": 8}  # triangles per chunk: the fastest of 4 to 256 on the CPU, small on CUDA for enough threads
 ROW_PER_TRIANGLE = 24  # row entries, initial capacity
@@ -104,7 +104,6 @@ class Trees:
     slabs: int  # k / 2
     directions: tuple[tuple[int, int, int], ...]
     n_chunks: Count
-    n_top: Count
     link: Any  # i32
     root: Any  # i32
     chunk: Any  # i32
@@ -159,17 +158,6 @@ def _nodes_below(b: ti.template(), node):
 
 
 @ti.func
-def _refit_leaf(s: ti.template(), b: ti.template(), node, padding):
-    """Set a leaf's slabs from its triangle at both ends of the step."""
-    t = -1 - b.link[node]
-    if ti.static(b.slabs == 3):
-        b.lo[node], b.hi[node] = s.lo[t], s.hi[t]
-    else:
-        lo, hi = b.bounds(s, t, WHOLE, padding)
-        b.lo[node], b.hi[node] = lo, hi
-
-
-@ti.func
 def _refit_inner(b: ti.template(), node):
     """Set a node's slabs from those of its children: the first one follows it, the second one follows the first one's subtree."""
     other = node + (b.link[node] + 3) // 4 * 2
@@ -177,9 +165,9 @@ def _refit_inner(b: ti.template(), node):
     b.hi[node] = ti.max(b.hi[node + 1], b.hi[other])
 
 
-@ti.func
-def _refit_chunks(s: ti.template(), b: ti.template(), margin):
-    """Refit all nodes in the chunks."""
+@kernel
+def refit(s: ti.template(), b: ti.template(), margin: ti.f64, n_top: ti.i32):
+    """Refit all nodes in the chunks, then the first n_top of those above them one by one."""
     ti.loop_config(serialize=s.serial_cheap)
     for task in range(b.n_chunks * s.cheap_spread):
         if task % s.cheap_spread == 0:
@@ -187,25 +175,17 @@ def _refit_chunks(s: ti.template(), b: ti.template(), margin):
             n = _nodes_below(b, first)
             for k in range(n):
                 node = first + n - 1 - k
-                if b.link[node] < 0:
-                    _refit_leaf(s, b, node, ti.cast(0.5, ti.f64) * margin)
-                else:
+                t = -1 - b.link[node]
+                if t < 0:
                     _refit_inner(b, node)
-
-
-@kernel
-def refit(s: ti.template(), b: ti.template(), margin: ti.f64):
-    """Refit all nodes in the chunks, then those above them one by one."""
-    _refit_chunks(s, b, margin)
+                elif ti.static(b.slabs == 3):
+                    b.lo[node], b.hi[node] = s.lo[t], s.hi[t]
+                else:
+                    lo, hi = b.bounds(s, t, WHOLE, ti.cast(0.5, ti.f64) * margin)
+                    b.lo[node], b.hi[node] = lo, hi
     ti.loop_config(serialize=True)
-    for k in range(b.n_top):
+    for k in range(n_top):
         _refit_inner(b, b.top[k])
-
-
-@kernel
-def refit_chunks(s: ti.template(), b: ti.template(), margin: ti.f64):
-    """Refit all nodes in the chunks."""
-    _refit_chunks(s, b, margin)
 
 
 @kernel
@@ -266,24 +246,17 @@ class Bvh:
         self.surface, self.margin = surface, margin
         self.tables = t = build_trees(x[topology.triangle].mean(axis=1), topology.first, leaves or LEAVES[runtime.arch])
 
-        def fields(names: tuple[str, ...]) -> dict:
-            data = {name: getattr(t, name) if len(getattr(t, name)) else np.zeros(1) for name in names}
-            return {name: arena.field(f"bvh_{name}", ti.i32, len(x), x.astype(np.int32)) for name, x in data.items()}
-
         slabs = {name: arena.vectors(f"bvh_{name}", ti.f64, max(len(t.link), 1), n=k_dop // 2) for name in ("lo", "hi")}
-        indices = fields(("link", "root", "chunk", "top"))
-        self.trees = Trees(k_dop // 2, DIRECTIONS[k_dop], len(t.chunk), len(t.top), **indices, **slabs)
+        indices = {name: integers(arena, f"bvh_{name}", getattr(t, name)) for name in ("link", "root", "chunk", "top")}
+        self.trees = Trees(k_dop // 2, DIRECTIONS[k_dop], len(t.chunk), **indices, **slabs)
         self.by_levels = runtime.arch != "cpu"  # else one thread refits the nodes above the chunks, in one launch
         self._limits, self._arena = (capacity or ROW_PER_TRIANGLE * surface.n_triangles + 64, max_capacity), arena
         self.rows: Buffer | None = None  # allocated at the first call of `find`
 
     def near(self) -> Trees:
         """Refit the trees to the present boxes and return them, for queries."""
-        if not self.by_levels:
-            refit(self.surface, self.trees, self.margin)
-            return self.trees
-        refit_chunks(self.surface, self.trees, self.margin)
-        first = self.tables.top_first
+        first = self.tables.top_first if self.by_levels else []
+        refit(self.surface, self.trees, self.margin, 0 if self.by_levels else len(self.tables.top))
         for begin, end in zip(first[:-1], first[1:]):
             refit_level(self.trees, int(begin), int(end))
         return self.trees

@@ -126,16 +126,9 @@ def sort_row(entry: ti.template(), first, last):
         for i in range(first + step, last):
             value = entry[i]
             j = i - step
-            shifting = 1
-            while shifting == 1:
-                if j >= first:
-                    if entry[j] > value:
-                        entry[j + step] = entry[j]
-                        j -= step
-                    else:
-                        shifting = 0
-                else:
-                    shifting = 0
+            while j >= first and entry[ti.max(j, first)] > value:
+                entry[j + step] = entry[j]
+                j -= step
             entry[j + step] = value
         step //= 3
 

@@ -40,14 +40,8 @@ class Topology:
 
 def make_topology(parts: list[tuple[np.ndarray, np.ndarray]]) -> Topology:
     """Combine the surfaces of all colliders. parts: for each, (t,3) triangles and the (v,) nodes of their vertices."""
-    triangle, body, node, first, vertex_first = [], [], [], [0], [0]
-    for k, (triangles, nodes) in enumerate(parts):
-        triangle.append(triangles + vertex_first[-1])
-        body.append(np.full(len(triangles), k))
-        node.append(nodes)
-        first.append(first[-1] + len(triangles))
-        vertex_first.append(vertex_first[-1] + len(nodes))
-    t = np.concatenate(triangle).reshape(-1, 3)
+    first, vertex_first = (np.cumsum([0, *(len(part[k]) for part in parts)]) for k in range(2))
+    t = np.concatenate([triangles + start for (triangles, _), start in zip(parts, vertex_first)]).reshape(-1, 3)
     neighbour, edge_owned = _edge_neighbours(t)
     corners = t.reshape(-1)
     order = np.argsort(corners, kind="stable")
@@ -58,18 +52,9 @@ def make_topology(parts: list[tuple[np.ndarray, np.ndarray]]) -> Topology:
     owner[used] = ring[start[:-1][used]]  # the first triangle around a vertex
     corner_owned = owner[t] == np.arange(len(t))[:, None]
     bits = np.concatenate([corner_owned, edge_owned], axis=1) @ (1 << np.arange(6))
-    return Topology(
-        t,
-        np.concatenate(body),
-        np.array(first),
-        np.array(vertex_first),
-        np.concatenate(node),
-        neighbour,
-        bits,
-        start,
-        ring,
-        *_adjacent_vertices(t, vertex_first[-1]),
-    )
+    body, node = np.repeat(np.arange(len(parts)), np.diff(first)), np.concatenate([nodes for _, nodes in parts])
+    adjacent = _adjacent_vertices(t, vertex_first[-1])
+    return Topology(t, body, first, vertex_first, node, neighbour, bits, start, ring, *adjacent)
 
 
 def _adjacent_vertices(t: np.ndarray, n_verts: int) -> tuple[np.ndarray, np.ndarray]:
@@ -82,15 +67,12 @@ def _adjacent_vertices(t: np.ndarray, n_verts: int) -> tuple[np.ndarray, np.ndar
 def _edge_neighbours(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return neighbours (t,3) across the edges, -1 at open and non-manifold edges; (t,3) bool: the triangle owns the edge."""
     ends = np.sort(np.stack([t, np.roll(t, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    new = np.ones(len(order), dtype=bool)
-    new[1:] = (ends[order[1:]] != ends[order[:-1]]).any(axis=1)
-    starts = np.flatnonzero(new)
-    counts = np.diff(np.append(starts, len(order)))
-    neighbour = np.full(len(order), -1)
+    code = ends @ [t.max(initial=0) + 1, 1]
+    order = np.argsort(code, kind="stable")
+    _, starts, counts = np.unique(code[order], return_index=True, return_counts=True)
+    neighbour, owned = np.full(len(order), -1), np.zeros(len(order), dtype=bool)
     a, b = order[starts[counts == 2]], order[starts[counts == 2] + 1]
     neighbour[a], neighbour[b] = b // 3, a // 3
-    owned = np.zeros(len(order), dtype=bool)
     owned[order[starts]] = True  # the lowest triangle, since the sort is stable
     return neighbour.reshape(-1, 3), owned.reshape(-1, 3)
 

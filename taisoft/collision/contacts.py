@@ -22,7 +22,7 @@ from taisoft.backend.arrays import Count
 from taisoft.backend.fields import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import Parts
-from taisoft.collision.surface import dvec, ivec
+from taisoft.collision.surface import cell_of, dvec, ivec
 
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + local edge); vertex and collider;
 # triangle and collider
@@ -31,6 +31,7 @@ KINDS = ("vertex_face", "edge_edge", "vertex_field", "face_field")
 
 SAME_NORMAL = 0.996  # cosine of 5 degrees
 UNKNOWN, KEPT, DROPPED = 0, 1, 2
+PERIOD = (2**20,) * 3  # cells along each axis after which their indices repeat
 FOUND, LEFT, UNDECIDED, MASK = 0, 1, 2, 3  # indices into the count; LEFT: kept contacts; MASK: buckets in use, minus one
 
 
@@ -150,21 +151,17 @@ def gather_contacts(
             integers[i, q] = out.body[at][q]
 
 
-def gather(out: ContactFields, index: Any, n: int) -> dict[str, np.ndarray]:
-    """Download the contacts at the buffer indices index[:n], (n, ...) each: point, normal, gap, body, feature, and nodes and
-    weights (n,6) of both sides."""
+def gather(out: ContactFields, index: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Download the contacts at the buffer indices index[:n], in order of colliders and feature: an order independent of threads
+    and chunks, so that a solver meets the same one in the next step.
+
+    Returns (n,13) point, normal, weights (6) and gap; (n,11) colliders (2), feature (3), nodes (6).
+    """
     floats, integers = np.zeros((n, 13)), np.zeros((n, 11), dtype=np.int32)
     if n:
         gather_contacts(out, index, n, floats, integers)
-    return {
-        "point": floats[:, :3],
-        "normal": floats[:, 3:6],
-        "weights": floats[:, 6:12],
-        "gap": floats[:, 12],
-        "body": integers[:, :2],
-        "feature": integers[:, 2:5],
-        "nodes": integers[:, 5:],
-    }
+    order = np.lexsort(integers[:, 4::-1].T)
+    return floats[order], integers[order]
 
 
 # --- reduction -----------------------------------------------------------------------------------------------
@@ -195,16 +192,6 @@ def reduction_fields(arena: FieldArena, capacity: int, chunks: int, serial: bool
     sizes |= {"bucket_start": buckets, "bucket_end": buckets}
     fields = {name: arena.field(f"reduction_{name}", ti.i32, size) for name, size in sizes.items()}
     return ReductionFields(buckets, serial, spread, **fields)
-
-
-@ti.func
-def _cell(p, inverse):
-    """Cell of a point, wrapped to small indices."""
-    cell = ivec(0)
-    for q in ti.static(range(3)):
-        k = ti.floor(p[q] * inverse)
-        cell[q] = ti.cast(k - 1048576.0 * ti.floor(k / 1048576.0), ti.i32)
-    return cell
 
 
 @ti.func
@@ -239,7 +226,7 @@ def _fill_cells(r: ti.template(), out: ti.template(), inverse):
                 i, at = r.first[c] + k, c * out.part + k
                 r.place[i] = at
                 r.state[at] = UNKNOWN
-                b = _bucket(r, _cell(out.data.point[at], inverse))
+                b = _bucket(r, cell_of(out.data.point[at], inverse, PERIOD))
                 r.bucket[i] = b
                 ti.atomic_add(r.bucket_end[b], 1)
     ti.loop_config(serialize=True)
@@ -278,7 +265,7 @@ def is_earlier(out: ti.template(), a, b):
 def _decide(r: ti.template(), out: ti.template(), at, inverse, tolerance):
     """State of the contact at a buffer index, from the states of the earlier ones near it."""
     p = out.point[at]
-    lo, hi = _cell(p - tolerance, inverse), _cell(p + tolerance, inverse)
+    lo, hi = cell_of(p - tolerance, inverse, PERIOD), cell_of(p + tolerance, inverse, PERIOD)
     n = ti.select(lo == hi, 1, 2)
     state = KEPT
     k = 0

@@ -85,10 +85,7 @@ def deepest_point(field: ti.template(), k, A, B, C, phi_corner):
     """Barycentric coordinates (3,) and phi of the deepest point of triangle A B C (3,) [m]. phi_corner: (3,) at its corners."""
     at = _argmin(phi_corner)
     w = dvec(ti.cast(at == 0, ti.f64), ti.cast(at == 1, ti.f64), ti.cast(at == 2, ti.f64))
-    before, last = dvec(0.0), dvec(0.0)  # weights two steps and one step ago
-    for j in ti.static(range(3)):
-        before[j] = w[j]
-        last[j] = w[j]
+    before, last = 1.0 * w, 1.0 * w  # weights two steps and one step ago
     size = ti.max((A - B).norm(), (B - C).norm(), (C - A).norm())
     tiny = ti.cast(GAP_TOLERANCE, ti.f64) * size
     x = choose(at, A, B, C)
@@ -109,8 +106,7 @@ def deepest_point(field: ti.template(), k, A, B, C, phi_corner):
                         for j in ti.static(range(3)):
                             direction[j] = ti.cast(j == target, ti.f64) - ti.cast(j == source, ti.f64)
                 elif step % 3 == 2:
-                    for j in ti.static(range(3)):
-                        direction[j] = w[j] - before[j]
+                    direction = w - before
                 if best == 0.0 and direction.dot(slope) < 0.0:
                     max_step, end = _max_step(w, direction)
                     d = direction[0] * A + direction[1] * B + direction[2] * C
@@ -124,9 +120,7 @@ def deepest_point(field: ti.template(), k, A, B, C, phi_corner):
                     w[j] = ti.max(w[j] + best * direction[j], 0.0)
                     if j == end and best >= max_step:
                         w[j] = 0.0
-                total = w.sum()
-                for j in ti.static(range(3)):
-                    w[j] /= total
+                w /= w.sum()
                 x = w[0] * A + w[1] * B + w[2] * C
                 phi = value
         step += 1

@@ -234,15 +234,12 @@ class Detection:
 
     def contacts(self) -> Contacts:
         """Return the contacts of the last search, with impulses 0."""
-        found = gather(self.buffer.data, self._reduction.kept, self._reduction.count[LEFT])
-        body, feature = found["body"], found["feature"]
-        # an order independent of threads and chunks, so that a solver meets the same one in the next step
-        order = np.lexsort((feature[:, 2], feature[:, 1], feature[:, 0], body[:, 1], body[:, 0]))
-        names = ("point", "normal", "gap", "body", "feature", "nodes", "weights")
-        point, normal, gap, body, feature, nodes, weights = (found[name][order] for name in names)
+        floats, integers = gather(self.buffer.data, self._reduction.kept, self._reduction.count[LEFT])
+        nodes, none = integers[:, 5:], np.zeros((len(floats), 3))
         nodes = np.where(nodes >= 0, np.append(self.topology.node, -1)[nodes], -1)
-        weights = np.where(nodes >= 0, weights, 0.0)
-        return self.record(point, normal, gap, np.zeros((len(gap), 3)), body, feature, nodes, weights)
+        weights = np.where(nodes >= 0, floats[:, 6:12], 0.0)
+        geometry = (x.copy() for x in (floats[:, :3], floats[:, 3:6], floats[:, 12]))
+        return self.record(*geometry, none, integers[:, :2], integers[:, 2:5], nodes, weights)
 
     def record(self, point, normal, gap, impulse, body, feature, nodes, weights) -> Contacts:
         """Return a record of contact arrays (k, ...), with collider names, friction and restitution. body: (k,2) colliders."""

@@ -59,15 +59,9 @@ class DistanceFields:
         for c in range(8):
             i, j, m = c >> 2, (c >> 1) & 1, c & 1
             f = ti.cast(self.phi[base + (i * n[1] + j) * n[2] + m], ti.f64)
-            a, da = 1.0 - fraction[0], ti.cast(-1.0, ti.f64)
-            if i == 1:
-                a, da = fraction[0], ti.cast(1.0, ti.f64)
-            b, db = 1.0 - fraction[1], ti.cast(-1.0, ti.f64)
-            if j == 1:
-                b, db = fraction[1], ti.cast(1.0, ti.f64)
-            d, dd = 1.0 - fraction[2], ti.cast(-1.0, ti.f64)
-            if m == 1:
-                d, dd = fraction[2], ti.cast(1.0, ti.f64)
+            a, da = ti.select(i == 1, fraction[0], 1.0 - fraction[0]), 2.0 * ti.cast(i, ti.f64) - 1.0
+            b, db = ti.select(j == 1, fraction[1], 1.0 - fraction[1]), 2.0 * ti.cast(j, ti.f64) - 1.0
+            d, dd = ti.select(m == 1, fraction[2], 1.0 - fraction[2]), 2.0 * ti.cast(m, ti.f64) - 1.0
             value += a * b * d * f
             g += dvec(da * b * d, a * db * d, a * b * dd) * f
         return value + ti.sqrt(outside), g / self.spacing[k]
@@ -174,8 +168,7 @@ def _field_contacts(
             accepted = phi.min() - reach <= 2.0 * (margin + motion)
             if accepted:
                 v, value = deepest_point(f, k, A, B, C, phi)
-                for i in ti.static(range(3)):
-                    w[i] = v[i]
+                w = 1.0 * v
                 accepted = value < phi.min() - ti.cast(MIN_EXTRA_DEPTH, ti.f64) * reach and w.max() < 1.0 - 1e-6
         if accepted:
             x = w[0] * corner(s, t, 0) + w[1] * corner(s, t, 1) + w[2] * corner(s, t, 2)
@@ -191,10 +184,7 @@ def _field_contacts(
                     if i == j:
                         phi[i] = value
                         accepted = (s.owns[t] >> i) & 1 == 1
-                for i in ti.static(range(3)):
-                    A[i] = ti.select(j == 0, X[i], A[i])
-                    B[i] = ti.select(j == 1, X[i], B[i])
-                    C[i] = ti.select(j == 2, X[i], C[i])
+                A, B, C = ti.select(j == 0, X, A), ti.select(j == 1, X, B), ti.select(j == 2, X, C)
                 if accepted:
                     n = G.transpose() @ f.gradient(k, X)
                     length = n.norm()

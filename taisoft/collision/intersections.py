@@ -137,17 +137,6 @@ def closest_segments(p0, p1, q0, q1):
 
 
 @ti.func
-def _crossing(p, q, a, b, c):
-    """Intersect segment p q with the plane of a triangle: 1 and the parameter in [0, 1], or 0 and 0."""
-    n = (b - a).cross(c - a)
-    above, below = (p - a).dot(n), (q - a).dot(n)
-    crosses, s = 0, ti.cast(0.0, ti.f64)
-    if (above > 0.0 and below < 0.0) or (above < 0.0 and below > 0.0):
-        crosses, s = 1, above / (above - below)
-    return crosses, s
-
-
-@ti.func
 def _is_clear_of_plane(corners, first, size):
     """Whether one triangle (rows from `first` on) lies strictly on one side of the other's plane."""
     other = 3 - first
@@ -193,9 +182,11 @@ def _intersect(corners):
             test = 1
             if k < 6:
                 q = _corner(corners, first + (k + 1) % 3)
-                crosses, s = _crossing(p, q, a, b, c)
-                test = crosses
-                p += s * (q - p)
+                n = (b - a).cross(c - a)
+                above, below = (p - a).dot(n), (q - a).dot(n)
+                test = int((above > 0.0 and below < 0.0) or (above < 0.0 and below > 0.0))
+                if test == 1:  # the edge crosses the plane
+                    p += above / (above - below) * (q - p)
             if test == 1:
                 w, _ = closest_on_triangle(p, a, b, c)
                 offset = p - (w[0] * a + w[1] * b + w[2] * c)
@@ -228,14 +219,6 @@ def triangles_intersect(a0, a1, a2, b0, b1, b2):
     return result
 
 
-@ti.func
-def intersect(s: ti.template(), t, u):
-    """1 if triangles t and u of the surface intersect or touch, else 0."""
-    return triangles_intersect(
-        corner(s, t, 0), corner(s, t, 1), corner(s, t, 2), corner(s, u, 0), corner(s, u, 1), corner(s, u, 2)
-    )
-
-
 @kernel(cse=False)
 def find_intersections(s: ti.template(), rows: ti.template(), out: ti.template()):
     """Find the pairs t < u of the rows that intersect, in ascending order within each part and over the parts."""
@@ -247,10 +230,12 @@ def find_intersections(s: ti.template(), rows: ti.template(), out: ti.template()
             for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):
                 for e in range(rows.start[t], rows.end[t]):
                     u = rows.entry[e]
-                    if t < u and intersect(s, t, u) == 1:
-                        if at < last:
-                            out.data[at] = ti.Vector([t, u], ti.i32)
-                        at += 1
+                    if t < u:
+                        a0, a1, a2 = corner(s, t, 0), corner(s, t, 1), corner(s, t, 2)
+                        if triangles_intersect(a0, a1, a2, corner(s, u, 0), corner(s, u, 1), corner(s, u, 2)) == 1:
+                            if at < last:
+                                out.data[at] = ti.Vector([t, u], ti.i32)
+                            at += 1
             out.used[c] = at - c * out.part
     ti.loop_config(serialize=True)
     for _ in range(1):

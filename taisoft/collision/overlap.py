@@ -111,20 +111,6 @@ class Inside:
     room: float
 
 
-@dataclass(frozen=True)
-class _Separation:
-    """A point (3,) that was at a distance [m] outside a surface with vertices x (v,3) [m]."""
-
-    point: np.ndarray
-    x: np.ndarray
-    distance: float
-
-    def still_outside(self, point: np.ndarray, x: np.ndarray) -> bool:
-        """Whether the point cannot have entered since."""
-        moved = np.abs(x - self.x - (point - self.point)).max()
-        return bool(np.sqrt(3.0) * moved < self.distance)
-
-
 class Containment:
     """Inner points of a scene's colliders, and a test for those inside other colliders."""
 
@@ -175,7 +161,7 @@ class Containment:
         own, other = self._owner[:, None], self._solid
         self._testable = (self._soft[own] | self._soft[other]) & self._closed[other]  # (points, solid): whether to test
         self._testable &= (own != other) | (self._self_on & (self._n_parts[other] > 1))
-        self._separations: dict[tuple[int, int], _Separation] = {}
+        self._separations: dict[tuple[int, int], tuple] = {}  # point and surface when last apart, and their distance [m]
         self._corners = self._inner_points = np.zeros((0, 3))  # last triangles, and the inner points behind them
         self._ready = True
 
@@ -230,9 +216,10 @@ class Containment:
         """Test inner point k against collider b; None if it lies outside."""
         topology, own = self._topology, int(self._owner[k])
         vertices = x[topology.vertex_first[b] : topology.vertex_first[b + 1]]
-        separation = self._separations.get((k, b))
-        if separation is not None and separation.still_outside(point, vertices):
-            return None
+        if (k, b) in self._separations:
+            old_point, old_vertices, distance = self._separations[k, b]
+            if np.sqrt(3.0) * np.abs(vertices - old_vertices - (point - old_point)).max() < distance:  # it cannot have entered
+                return None
         first, last = topology.first[b : b + 2]
         corners = x[topology.triangle[first:last]]
         if own == b:
@@ -241,7 +228,7 @@ class Containment:
         if are_inside(corners, point[None])[0]:
             self._separations.pop((k, b), None)
             return Inside(own, b, distance, float(self._room[k]))
-        self._separations[k, b] = _Separation(point, vertices.copy(), distance)
+        self._separations[k, b] = point, vertices.copy(), distance
         return None
 
 

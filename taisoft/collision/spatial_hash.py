@@ -17,7 +17,7 @@ from taisoft.backend.arrays import Count
 from taisoft.backend.fields import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import Buffer, Candidates, entries, sort_row, sum_parts
-from taisoft.collision.surface import ACTIVE, Surface, ivec, may_touch, part_first
+from taisoft.collision.surface import ACTIVE, Surface, cell_of, ivec, may_touch, part_first
 
 LARGE = 512  # cells above which a triangle counts as large
 COUNTABLE = 2.0**50  # cells from the origin beyond which f64 cannot distinguish neighbouring cells
@@ -62,17 +62,6 @@ def grid_size(extent: np.ndarray, cell: float, n_triangles: int) -> tuple[int, i
 
 
 @ti.func
-def _cell_of(g: ti.template(), x, inverse):
-    """Wrapped cell of a point within COUNTABLE cells of the origin."""
-    cell = ivec(0)
-    for q in ti.static(range(3)):
-        n = ti.cast(g.size[q], ti.f64)
-        k = ti.floor(x[q] * inverse)
-        cell[q] = ti.cast(k - n * ti.floor(k / n), ti.i32)
-    return cell
-
-
-@ti.func
 def _cells_of(s: ti.template(), g: ti.template(), t, inverse):
     """First wrapped cell of a triangle's box, and the number it covers along each axis; (0, 0, 0) for a large one."""
     lo, hi = s.lo[t], s.hi[t]
@@ -85,7 +74,7 @@ def _cells_of(s: ti.template(), g: ti.template(), t, inverse):
         cells *= ti.min(ti.floor(hi[q] * inverse) - ti.floor(lo[q] * inverse) + 1.0, ti.cast(g.size[q], ti.f64))
     first = ivec(0)
     if farthest < COUNTABLE and cells <= LARGE:
-        first = _cell_of(g, lo, inverse)
+        first = cell_of(lo, inverse, g.size)
         for q in ti.static(range(3)):
             span = ti.floor(hi[q] * inverse) - ti.floor(lo[q] * inverse) + 1.0
             count[q] = ti.cast(ti.min(span, ti.cast(g.size[q], ti.f64)), ti.i32)

@@ -99,7 +99,7 @@ def build_surface(
     vectors |= dict.fromkeys(("body_lo", "body_hi"), bodies)
     zeros = {"active": n, "count": 4, "part": chunks, "near": chunks * bodies, "sharp": n, "inside": v}
     # triangles are rows, not vectors: the compiler confuses run-time and fixed component indices within one kernel
-    fields = {name: _integers(arena, f"surface_{name}", data) for name, data in tables.items()}
+    fields = {name: integers(arena, f"surface_{name}", data) for name, data in tables.items()}
     fields |= {name: arena.vectors(f"surface_{name}", ti.f64, max(count, 1)) for name, count in vectors.items()}
     fields |= {name: arena.field(f"surface_{name}", ti.i32, max(count, 1)) for name, count in zeros.items()}
     for name in ("thickness", "edge"):
@@ -113,7 +113,7 @@ def build_surface(
         chunks=chunks,
         spread=1 if serial else SPREAD[runtime.arch],
         cheap_spread=1 if serial_cheap else SPREAD[runtime.arch],
-        mode=_integers(arena, "contact_mode", properties["mode"]),
+        mode=integers(arena, "contact_mode", properties["mode"]),
         rest=arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None),
         area=arena.field("surface_area", ti.f64, max(n, 1)),
         exit_direction=arena.vectors("surface_exit_direction", ti.f64, max(v, 1)),
@@ -121,7 +121,7 @@ def build_surface(
     )
 
 
-def _integers(arena: FieldArena, name: str, data: np.ndarray):
+def integers(arena: FieldArena, name: str, data: np.ndarray):
     """Allocate and fill an i32 field, with one row of zeros for no data, since no field may be empty."""
     data = np.asarray(data)
     data = (data if len(data) else np.zeros((1, *data.shape[1:]))).astype(np.int32)
@@ -132,6 +132,17 @@ def _integers(arena: FieldArena, name: str, data: np.ndarray):
 def part_first(c, n, parts: ti.template()):
     """Return the start of part c of a list of n entries divided into equal parts."""
     return c * (n // parts) + ti.min(c, n % parts)
+
+
+@ti.func
+def cell_of(x, inverse, size: ti.template()):
+    """Cell (3,) i32 of a point in a periodic grid of `size` cells along each axis; inverse: of a cell's edge [1/m]."""
+    cell = ivec(0)
+    for q in ti.static(range(3)):
+        n = ti.cast(size[q], ti.f64)
+        k = ti.floor(x[q] * inverse)
+        cell[q] = ti.cast(k - n * ti.floor(k / n), ti.i32)
+    return cell
 
 
 @ti.func
