@@ -170,14 +170,14 @@ class Detection:
 
     def _place_obstacles(self, time: float, dt: float) -> None:
         """Place the obstacles at a time [s] and at the end of the step; static ones are placed once."""
-        first, self._placed = not self._placed, True
-        starts = self.topology.vertex_first[len(self.scene.bodies) :]
+        first, starts = not self._placed, self.topology.vertex_first[len(self.scene.bodies) :]
         for o, begin, end in zip(self.scene.obstacles, starts[:-1], starts[1:]):
             if end > begin and (first or o.path is not None):
                 now, then = (o.points_at(t, self._rest[begin:end]) for t in (time, time + dt))
                 move_obstacles(self.surface, begin, now, then - now)
         if self._analytic and (first or any(o.path is not None for _, o in self._analytic)):
             place_analytic(self.shapes, self._analytic, time, dt)
+        self._placed = True
 
     def _nonfinite(self) -> str:
         x, move = download([self.surface.x, self.surface.move])

@@ -42,16 +42,21 @@ TINY = 1e-9  # of lengths: rounding
 
 
 @ti.func
+def _height(s: ti.template(), p, u, m):
+    """Height [m] of point p over the higher of the faces at edge m of triangle u."""
+    d = p - corner(s, u, m)
+    height = d.dot(s.normal[u])
+    if s.neighbour[u, m] >= 0:
+        height = ti.max(height, d.dot(s.normal[s.neighbour[u, m]]))
+    return height
+
+
+@ti.func
 def _is_behind(s: ti.template(), i, length, u, m, fraction):
     """1 if vertex i, of an edge of the given length, lies behind both faces at edge m of triangle u, or before them by at most
     the given fraction of the length."""
-    d = s.x[i] - corner(s, u, m)
-    slack = fraction * length + ti.cast(TINY, ti.f64) * (length + d.norm())
-    behind = int(d.dot(s.normal[u]) <= slack)
-    v = s.neighbour[u, m]
-    if v >= 0:
-        behind &= int(d.dot(s.normal[v]) <= slack)
-    return behind
+    slack = fraction * length + ti.cast(TINY, ti.f64) * (length + (s.x[i] - corner(s, u, m)).norm())
+    return int(_height(s, s.x[i], u, m) <= slack)
 
 
 @ti.func
@@ -74,11 +79,7 @@ def _is_past_end(s: ti.template(), t, k, position, length, gap, q):
 def _is_freed(s: ti.template(), p, i, u, m, gap):
     """1 if the exit displacement of vertex i also frees point p of its edge, `gap` < 0 deep below edge m of triangle u: the depth
     left is below FREED of that. A point deeper than SHALLOW counts as freed: it is far from where i entered."""
-    d = p + s.exit_direction[i] - corner(s, u, m)
-    depth = -d.dot(s.normal[u])
-    v = s.neighbour[u, m]
-    if v >= 0:
-        depth = ti.min(depth, -d.dot(s.normal[v]))
+    depth = -_height(s, p + s.exit_direction[i], u, m)
     shallow = ti.cast(SHALLOW, ti.f64) * (corner(s, u, m + 1) - corner(s, u, m)).norm()
     return int(depth < -ti.cast(FREED, ti.f64) * gap) | int(-gap > shallow)
 
