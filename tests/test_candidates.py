@@ -1,7 +1,6 @@
 """What broad phases share, serial and parallel, f32 and f64 as the precision of the rest:
 
 * the list of active triangles is that of those whose box meets the box of another collider that they may touch, in order;
-* rows made of pairs hold both directions, ascending, whatever the order of the pairs and the parts they lie in;
 * a buffer counts what its largest part and all parts need; one that was too small has grown to hold it, and never beyond its
   limit; where it may not grow so far it says what is needed, in how many parts, and what is allowed.
 """
