@@ -5,8 +5,8 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.collision.pipeline import MERGED, Detection
-from taisoft.collision.reduction import FOUND, KEPT, LEFT, UNKNOWN, is_same
+from taisoft.collision.contacts import FOUND, KEPT, LEFT, UNKNOWN, is_same
+from taisoft.collision.detector import MERGED, Detection
 
 
 @kernel

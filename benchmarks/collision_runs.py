@@ -15,7 +15,7 @@ import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime, compile_clock
 from taisoft.collision.bvh import Bvh
-from taisoft.collision.pipeline import Detection
+from taisoft.collision.detector import Detection
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.fem.model import build_model
 from taisoft.scene.plan import make_plan

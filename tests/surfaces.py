@@ -8,9 +8,9 @@ import numpy as np
 from lanes import opened
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.collision.boxes import update_boxes
 from taisoft.collision.candidates import Candidates
-from taisoft.collision.surface import build_surface, make_topology
+from taisoft.collision.colliders import make_topology
+from taisoft.collision.surface import build_surface, update_boxes
 
 
 @contextmanager
@@ -32,7 +32,9 @@ def surface_of(
     move = np.zeros_like(x) if move is None else move
     arena = FieldArena()
     with opened(precision) as machine:
-        surface = build_surface(topology, x, soft, self_on, *[np.full(len(soft), np.inf)] * 2, machine, arena, serial)
+        properties = {"soft": soft, "self_on": self_on, "mode": np.zeros(len(soft))}
+        properties |= dict.fromkeys(("thickness", "edge"), np.full(len(soft), np.inf))
+        surface = build_surface(topology, x, properties, machine, arena, serial)
         made = SimpleNamespace(
             surface=surface, topology=topology, soft=soft, self_on=self_on, margin=margin, arena=arena, machine=machine
         )

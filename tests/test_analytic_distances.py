@@ -13,7 +13,7 @@ from lanes import opened
 
 import taisoft as ts
 from taisoft.backend.runtime import kernel
-from taisoft.collision import shapes
+from taisoft.collision import analytic
 from taisoft.collision.surface import dvec
 
 SHAPES = {
@@ -32,7 +32,7 @@ def distances(
     kind: ti.i32, a: ti.f64, b: ti.f64, c: ti.f64, X: ti.types.ndarray(dtype=ti.f64), out: ti.types.ndarray(dtype=ti.f64)
 ):
     for i in range(X.shape[0]):
-        phi, g = shapes.distance(kind, dvec(a, b, c), dvec(X[i, 0], X[i, 1], X[i, 2]))
+        phi, g = analytic.distance(kind, dvec(a, b, c), dvec(X[i, 0], X[i, 1], X[i, 2]))
         out[i, 0] = phi
         for k in ti.static(range(3)):
             out[i, 1 + k] = g[k]

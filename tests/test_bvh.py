@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from surfaces import brute_pairs, pairs_of, place, sheet, soup, surface_of
 
-from taisoft.collision.bvh import DIRECTIONS, Bvh
+from taisoft.collision.bvh import DIRECTIONS, Bvh, build_trees
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.collision.trees import build_trees
 from taisoft.errors import SimulationError
 
 EMPTY = (np.zeros((3, 3)), np.zeros((0, 3), dtype=int))
@@ -152,10 +151,10 @@ def test_buffers_grow_or_stop(rig):
     scatter(np.random.default_rng(7), rig, 0)
     expected = brute_pairs(rig)
     tree = Bvh(rig.surface, rig.topology, rig.x0, rig.margin, rig.machine, _arena(rig), capacity=64)
-    assert np.array_equal(pairs_of(tree.find()), expected) and tree.pairs.growths and tree.rows.rows.growths
+    assert np.array_equal(pairs_of(tree.find()), expected) and tree.rows.growths
     tree.release()
     tree = Bvh(rig.surface, rig.topology, rig.x0, rig.margin, rig.machine, _arena(rig), capacity=64, max_capacity=65)
-    with pytest.raises(SimulationError, match="bvh_pairs: [0-9]+ entries are needed .* allows 65"):
+    with pytest.raises(SimulationError, match="bvh_rows: [0-9]+ entries are needed .* allows 65"):
         tree.find()
     tree.release()
 
@@ -179,18 +178,16 @@ def test_trees_hold_every_triangle_once(leaves):
         assert len(left[0]) == (n + 1) // 2 and len(right[0]) == n // 2
         return left[0] + right[0], max(left[1], right[1])
 
-    deepest = 0
     for k, n in enumerate(counts):
         assert (t.root[k] < 0) == (n == 0)
         if n:
             inside, depth = triangles(t.root[k])
             assert sorted(inside) == list(range(first[k], first[k + 1])) and depth == np.ceil(np.log2(n))
-            deepest = max(deepest, depth)
-    assert t.depth == deepest
     covered = []
-    for node, body in zip(t.chunk, t.chunk_body):
-        inside, depth = triangles(node)
-        assert len(inside) <= leaves and depth <= t.chunk_depth and first[body] <= min(inside) <= max(inside) < first[body + 1]
+    for node in t.chunk:
+        inside, _ = triangles(node)
+        body = np.searchsorted(first, min(inside), side="right") - 1
+        assert len(inside) <= leaves and max(inside) < first[body + 1]
         covered += inside
     assert sorted(covered) == list(range(first[-1]))
     above = {i for i in np.flatnonzero(t.link > 0) if (t.link[i] + 1) // 2 > leaves}

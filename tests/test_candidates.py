@@ -1,7 +1,6 @@
 """What broad phases share, serial and parallel, f32 and f64 as the precision of the rest:
 
 * the list of active triangles is that of those whose box meets the box of another collider that they may touch, in order;
-* rows made of pairs hold both directions, ascending, whatever the order of the pairs and the parts they lie in;
 * a buffer counts what its largest part and all parts need; one that was too small has grown to hold it, and never beyond its
   limit; where it may not grow so far it says what is needed, in how many parts, and what is allowed.
 """
@@ -9,11 +8,12 @@
 import numpy as np
 import pytest
 import taichi as ti
-from surfaces import brute_pairs, pairs_of, place, surface_of
+from surfaces import brute_pairs, place, surface_of
 from test_bvh import colliders, scatter
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.collision.candidates import NEEDED, SLACK, TOTAL, Buffer, PairRows, entries, pairs
+from taisoft.collision.candidates import NEEDED, SLACK, TOTAL, Buffer, entries
+from taisoft.collision.intersections import pairs
 from taisoft.collision.surface import ACTIVE
 from taisoft.errors import SimulationError
 
@@ -37,7 +37,7 @@ def used_buffer(arena, needs: list[int], capacity: int, most: int | None) -> Buf
     """A buffer of a part for each need."""
     buffer = Buffer("things", entries, capacity, most, len(needs), arena)
     buffer.used.from_numpy(np.array(needs, dtype=np.int32))
-    buffer.sum_up()
+    buffer.count.from_numpy(np.array([max(needs), sum(needs)]))
     return buffer
 
 
@@ -63,41 +63,12 @@ def test_active_triangles(rig):
     assert parts > 10
 
 
-@pytest.mark.parametrize("chunks", [1, 7])
-def test_rows_of_pairs(rig, arena, chunks):
-    rng = np.random.default_rng(3)
-    n = rig.surface.n_triangles
-    rows = PairRows(rig.surface, arena, 64, None)
-    found = Buffer("found", pairs, 4000, None, chunks, arena)
-    for density in (0.0, 1e-3, 0.05):
-        expected = np.argwhere(np.triu(rng.random((n, n)) < density, 1))
-        some = rng.permutation(expected)
-        some = np.where(rng.random((len(some), 1)) < 0.5, some, some[:, ::-1])
-        part_of = rng.integers(0, chunks, len(some))
-        data = np.full((found.capacity, 2), 10**9, dtype=np.int32)  # beyond the ends of the parts is nothing to be read
-        for c in range(chunks):
-            data[c * found.part : c * found.part + (part_of == c).sum()] = some[part_of == c]
-        found.data.from_numpy(data)
-        found.used.from_numpy(np.bincount(part_of, minlength=chunks).astype(np.int32))
-        assert np.array_equal(pairs_of(rows.from_pairs(found)), expected)
-    assert rows.rows.growths == 1 and rows.rows.count[NEEDED] == 2 * len(expected)
-    rows.release()
-    rows = PairRows(rig.surface, FieldArena(), 64, 100)
-    with pytest.raises(SimulationError, match=f"candidate_rows: {2 * len(expected)} entries are needed .* allows 100$"):
-        rows.from_pairs(found)
-    for buffer in (rows, found):
-        buffer.release()
-
-
 def test_a_buffer_that_is_large_enough_stays(rig, arena):
     buffer = used_buffer(arena, [3, 0, 5], 15, None)
     data = buffer.data
     assert (buffer.count[NEEDED], buffer.count[TOTAL]) == (5, 8)
     assert not buffer.grow_if_full() and buffer.data is data and buffer.growths == 0
     assert buffer.capacity == 15 and buffer.bytes == 60
-    buffer.clear()
-    buffer.sum_up()
-    assert (buffer.count[NEEDED], buffer.count[TOTAL]) == (0, 0) and not buffer.grow_if_full()
     buffer.release()
 
 

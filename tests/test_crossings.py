@@ -13,8 +13,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import taisoft as ts
-from taisoft.collision.crossings import CROSSED
-from taisoft.collision.pipeline import Detection
+from taisoft.collision.detector import Detection
+from taisoft.collision.intersections import CROSSED
 
 RUBBER = ts.Material(young=1e5)
 

@@ -14,7 +14,7 @@ from scenes import rows_of
 
 from taisoft.collision import surface
 from taisoft.collision.contacts import KINDS
-from taisoft.collision.pipeline import Detection
+from taisoft.collision.detector import Detection
 from taisoft.errors import SimulationError
 
 

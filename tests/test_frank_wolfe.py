@@ -17,8 +17,8 @@ from lanes import opened
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.collision import shapes
-from taisoft.collision.frank_wolfe import deepest_point
+from taisoft.collision import analytic
+from taisoft.collision.deepest_point import deepest_point
 from taisoft.collision.surface import dvec
 
 array = ti.types.ndarray(dtype=ti.f64)
@@ -35,7 +35,7 @@ class Distances:
 
     @ti.func
     def sample(self, k, p):
-        phi, g = shapes.distance(k, self.size[k], p)
+        phi, g = analytic.distance(k, self.size[k], p)
         if k == TORUS:
             ring = dvec(p[0], 0.0, p[2])
             away = p - self.size[k][0] * ring / ring.norm()

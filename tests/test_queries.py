@@ -13,35 +13,28 @@ from test_bvh import colliders, scatter
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.collision.boxes import list_near
 from taisoft.collision.bvh import Bvh
-from taisoft.collision.queries import EDGES, WHOLE, list_triangles, query_box
+from taisoft.collision.candidates import EDGES, WHOLE
 from taisoft.collision.spatial_hash import SpatialHash
+from taisoft.collision.surface import list_near
 
 ROOM = 300
 
 
 @kernel
 def list_all(
-    s: ti.template(),
-    near: ti.template(),
-    sharp: ti.template(),
-    q: ti.i32,
-    half: ti.f64,
-    room: ti.i32,
-    entry: ti.template(),
-    count: ti.template(),
+    s: ti.template(), near: ti.template(), q: ti.i32, half: ti.f64, room: ti.i32, entry: ti.template(), count: ti.template()
 ):
     """count[t, b]: triangles of collider b near corner q of t, -1 where b is not near; entry: the same, at (t, b, 0) and on."""
     ti.loop_config(serialize=True)
     for t in range(s.n_triangles):
         for b in range(s.n_bodies):
             count[t, b] = -1
-        lo, hi = query_box(s, near, t, q, half)
+        lo, hi = near.bounds(s, t, q, half)
         for k in range(list_near(s, 0, s.body[t])):
             b = s.near[k]
             begin = (t * s.n_bodies + b) * ROOM
-            count[t, b] = list_triangles(s, near, sharp, b, t, q, lo, hi, entry, begin, begin + room)
+            count[t, b] = near.list_triangles(s, b, t, q, lo, hi, entry, begin, begin + room)
 
 
 @pytest.fixture(scope="module", params=[("f64", True), ("f32", False)], ids=str)
@@ -56,7 +49,7 @@ def rig(request):
             "slabs": Bvh(s, made.topology, made.x, made.margin, made.machine, arenas[1], k_dop=14, leaves=5),
             "rows": SpatialHash(s, arenas[2], 0.3, np.ones(3)),
         }
-        made.sharp = made.arena.field("sharp", ti.i32, s.n_triangles, rng.choice([0, 8, 9], s.n_triangles).astype(np.int32))
+        s.sharp.from_numpy(rng.choice([0, 8, 9], s.n_triangles))
         made.entry = made.arena.field("entries", ti.i32, s.n_triangles * s.n_bodies * ROOM)
         made.count = made.arena.field("counts", ti.i32, (s.n_triangles, s.n_bodies))
         yield made
@@ -69,7 +62,7 @@ def listed(made, source: str, q: int, room: int = ROOM) -> tuple[np.ndarray, np.
     s, near = made.surface, made.sources[source]
     near.margin = made.margin
     made.entry.fill(-7)
-    list_all(s, near.near(), made.sharp, q, 0.5 * made.margin, room, made.entry, made.count)
+    list_all(s, near.near(), q, 0.5 * made.margin, room, made.entry, made.count)
     count = made.count.to_numpy()
     entry = made.entry.to_numpy().reshape(s.n_triangles, s.n_bodies, ROOM)
     inside = np.arange(ROOM) < np.minimum(count, room)[:, :, None]
@@ -92,7 +85,7 @@ def expected(made, q: int, grown: float) -> np.ndarray:
     same = body[:, None] == body[None]
     meet &= np.where(same, made.self_on[body][:, None] & ~shared, made.soft[body][:, None] | made.soft[body][None])
     if q == EDGES:
-        sharp = made.sharp.to_numpy()
+        sharp = made.surface.sharp.to_numpy()
         meet &= (sharp != 0) & (np.triu(np.ones_like(meet), 1) | (sharp & 7 == 0))
     return np.argwhere(meet)
 

@@ -12,8 +12,8 @@ import taichi as ti
 from lanes import opened
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.collision.contacts import contact_fields
-from taisoft.collision.reduction import FOUND, LEFT, SAME_NORMAL, UNDECIDED, reduce_contacts, reduction_fields
+from taisoft.collision.candidates import Parts
+from taisoft.collision.contacts import FOUND, LEFT, SAME_NORMAL, UNDECIDED, contact_fields, reduce_contacts, reduction_fields
 
 CAPACITY = 2**13
 LIMIT = np.arccos(SAME_NORMAL)  # [rad]
@@ -26,6 +26,7 @@ class Reducer:
         self.arena, self.chunks, self.part = FieldArena(), chunks, CAPACITY // chunks
         self.out = contact_fields(self.arena, CAPACITY)
         self.used = self.arena.field("used", ti.i32, chunks)
+        self.parts = Parts(self.out, self.used, None, self.part, chunks)
         self.fields = reduction_fields(self.arena, CAPACITY, chunks, serial)
 
     def __call__(self, contacts: tuple[np.ndarray, ...], tolerance: float, cell: float, seed: int = 0) -> np.ndarray:
@@ -43,7 +44,7 @@ class Reducer:
             field.from_numpy(whole)
         self.used.from_numpy(used)
         r = self.fields
-        reduce_contacts(r, self.out, self.used, self.part, tolerance, cell)
+        reduce_contacts(r, self.parts, tolerance, cell)
         assert (r.count[FOUND], r.count[UNDECIDED]) == (k, 0)
         return np.searchsorted(places, r.kept.to_numpy()[: r.count[LEFT]])
 

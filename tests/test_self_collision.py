@@ -13,9 +13,8 @@ from surfaces import folded, place, separation, sheet, soup, surface_of
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.collision.bvh import Bvh
-from taisoft.collision.self_collision import Intersections
+from taisoft.collision.intersections import TOUCHING, Intersections
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.collision.triangles import TOUCHING
 from taisoft.errors import SimulationError
 
 

@@ -19,7 +19,8 @@ from lanes import opened
 from surfaces import separation
 
 from taisoft.backend.runtime import kernel
-from taisoft.collision import triangles
+from taisoft.collision import features
+from taisoft.collision.intersections import closest_segments, triangles_intersect
 from taisoft.collision.surface import dvec
 
 array = ti.types.ndarray(dtype=ti.f64)
@@ -33,7 +34,7 @@ def corner(X: ti.template(), i, k):
 @kernel
 def nearest_on_triangles(X: array, out: array):
     for i in range(X.shape[0]):
-        w, region = triangles.closest_on_triangle(corner(X, i, 0), corner(X, i, 1), corner(X, i, 2), corner(X, i, 3))
+        w, region = features.closest_on_triangle(corner(X, i, 0), corner(X, i, 1), corner(X, i, 2), corner(X, i, 3))
         for k in ti.static(range(3)):
             out[i, k] = w[k]
         out[i, 3] = region
@@ -43,9 +44,9 @@ def nearest_on_triangles(X: array, out: array):
 def nearest_of_segments(X: array, out: array):
     for i in range(X.shape[0]):
         p0, p1, q0, q1 = corner(X, i, 0), corner(X, i, 1), corner(X, i, 2), corner(X, i, 3)
-        s, t, parallel = triangles.closest_segments(p0, p1, q0, q1)
+        s, t, parallel = closest_segments(p0, p1, q0, q1)
         out[i, 0], out[i, 1], out[i, 2] = s, t, parallel
-        s_line, t_line, _ = triangles.closest_lines(p0, p1, q0, q1)
+        s_line, t_line, _ = features.closest_lines(p0, p1, q0, q1)
         out[i, 3], out[i, 4] = s_line, t_line
 
 
@@ -53,7 +54,7 @@ def nearest_of_segments(X: array, out: array):
 def intersections(X: array, out: array):
     for i in range(X.shape[0]):
         a0, a1, a2 = corner(X, i, 0), corner(X, i, 1), corner(X, i, 2)
-        out[i, 0] = triangles.triangles_intersect(a0, a1, a2, corner(X, i, 3), corner(X, i, 4), corner(X, i, 5))
+        out[i, 0] = triangles_intersect(a0, a1, a2, corner(X, i, 3), corner(X, i, 4), corner(X, i, 5))
 
 
 @pytest.fixture(scope="module", params=["f64", "f32"], autouse=True)

@@ -4,24 +4,71 @@ A vertex near the obstacle is a contact if the normal lies in its normal cone. A
 it in the step, always is, even if its surface is inside out. A triangle adds its deepest point if that lies deeper than its
 corners, as under a ball. A triangle is skipped if phi at its centre, minus its radius and its motion in the step, exceeds the
 margin, since |grad phi| <= 1.
+
+phi and its gradient in a shape's own frame, phi negative inside: half-space: y. Sphere: |p| - r. Box: half extents h; outside the
+distance to its surface, inside the largest p_i - h_i. Capsule: a segment along x of half length h, radius r. If the gradient is
+not unique (at a centre, on a segment, on a box's diagonal planes), one of the possible unit vectors is returned.
 """
 
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count
+from taisoft.backend.arrays import Count, FieldArena, upload
 from taisoft.backend.runtime import kernel
-from taisoft.collision import shapes
 from taisoft.collision.candidates import sum_parts
-from taisoft.collision.contacts import FACE_FIELD, VERTEX_FIELD, write_contact
-from taisoft.collision.features import corner, in_normal_cone, opposite, unit, vertices_of
-from taisoft.collision.frank_wolfe import deepest_point
+from taisoft.collision.contacts import write_point_contact
+from taisoft.collision.deepest_point import MIN_EXTRA_DEPTH, deepest_point, is_surface_minimum
+from taisoft.collision.features import corner, in_normal_cone
 from taisoft.collision.surface import dvec, ivec, part_first
+from taisoft.scene.obstacles import Obstacle
 
-ALIGNMENT_SINE = 0.26  # sine of 15 degrees: tolerance of grad phi in the conditions of a minimum
-MIN_EXTRA_DEPTH = 1e-5  # of a triangle's size: depth below its corners from which its deepest point is a contact
+HALF_SPACE, SPHERE, BOX, CAPSULE = 0, 1, 2, 3
+
+
+@ti.func
+def _from_core(d, r):
+    """Distance to a sphere or capsule and its gradient; d: offset from its centre or segment."""
+    length = d.norm()
+    g = dvec(0.0, 1.0, 0.0)
+    if length > 0.0:
+        g = d / length
+    return length - r, g
+
+
+@ti.func
+def _box_distance(p, h):
+    q = ti.abs(p) - h
+    sign = dvec(1.0)
+    for k in ti.static(range(3)):
+        if p[k] < 0.0:
+            sign[k] = -1.0
+    phi, g = q.max(), dvec(0.0)
+    if phi > 0.0:
+        out = ti.max(q, 0.0)
+        phi = out.norm()
+        g = sign * out / phi
+    else:
+        for k in ti.static(range(3)):
+            if q[k] == phi and g.dot(g) == 0.0:
+                g[k] = sign[k]
+    return phi, g
+
+
+@ti.func
+def distance(kind, size, p):
+    """Signed distance [m] and unit gradient (3,) of a shape of that kind and size (3,) [m] at p (3,) [m], in its frame."""
+    phi, g = p[1], dvec(0.0, 1.0, 0.0)
+    if kind == SPHERE:
+        phi, g = _from_core(p, size[0])
+    elif kind == BOX:
+        phi, g = _box_distance(p, size)
+    elif kind == CAPSULE:
+        x = ti.min(ti.max(p[0], -size[0]), size[0])
+        phi, g = _from_core(p - dvec(x, 0.0, 0.0), size[1])
+    return phi, g
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,48 +92,44 @@ class AnalyticObstacles:
     @ti.func
     def sample(self, k, p):
         """phi [m] and its gradient at p in the frame of obstacle k."""
-        return shapes.distance(self.kind[k], self.size[k], p)
+        return distance(self.kind[k], self.size[k], p)
 
 
 NO_SHAPES = AnalyticObstacles(0, *[None] * 7)
 
 
+def build_analytic(obstacles: list[tuple[int, Obstacle]], arena: FieldArena) -> AnalyticObstacles:
+    """Allocate the fields of these obstacles, given with their colliders, and upload all but their frames."""
+    shapes, n = [o.shape for _, o in obstacles], len(obstacles)
+    bodies, kinds = np.array([k for k, _ in obstacles], dtype=np.int32), np.array([x.kind for x in shapes], dtype=np.int32)
+    rows = {"origin": n, "rotation": 3 * n, "next_origin": n, "next_rotation": 3 * n}
+    return AnalyticObstacles(
+        n,
+        arena.field("obstacle_body", ti.i32, n, bodies),
+        arena.field("obstacle_kind", ti.i32, n, kinds),
+        arena.vectors("obstacle_size", ti.f64, n, np.array([x.size() for x in shapes])),
+        *(arena.vectors(f"obstacle_{name}", ti.f64, count) for name, count in rows.items()),
+    )
+
+
+def obstacle_frame(obstacle: Obstacle, t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return origin (3,) [m] and rotation (3,3) of an obstacle's own frame at time t [s]."""
+    translation, rotation = obstacle.pose(t)
+    return obstacle.shape.pivot + translation, rotation @ obstacle.shape.frame()
+
+
+def place_analytic(fields: AnalyticObstacles, obstacles: list[tuple[int, Obstacle]], time: float, dt: float) -> None:
+    """Upload the frames of the obstacles at a time [s] and at the end of the step."""
+    pairs, f = [], fields
+    for t, origin, rotation in ((time, f.origin, f.rotation), (time + dt, f.next_origin, f.next_rotation)):
+        frames = [obstacle_frame(o, t) for _, o in obstacles]
+        pairs += [(origin, np.array([x for x, _ in frames])), (rotation, np.concatenate([r for _, r in frames]))]
+    upload(pairs)
+
+
 @ti.func
 def _rows(f: ti.template(), k):
     return ti.Matrix.rows([f[3 * k], f[3 * k + 1], f[3 * k + 2]])
-
-
-@ti.func
-def is_surface_minimum(s: ti.template(), t, w, n, x):
-    """1 if the deepest point x of triangle t, weights w, is also a local minimum of the whole surface that faces n.
-
-    To within ALIGNMENT_SINE, n must oppose the triangle's normal at an interior point and be perpendicular to the edge at a point
-    on an edge: at a kink of phi, as in the middle of a box, no gradient gives the exit direction. On an edge, the neighbour must
-    not lie deeper, and only the triangle that owns the edge accepts.
-    """
-    facing = s.normal[t]
-    valid = 1
-    zero_corner = -1
-    for j in ti.static(range(3)):
-        if w[j] <= 0.0:
-            zero_corner = j
-    if zero_corner >= 0:
-        k = (zero_corner + 1) % 3  # the edge opposite the corner of zero weight
-        valid = (s.owns[t] >> (3 + k)) & 1
-        along = unit(corner(s, t, k + 1) - corner(s, t, k))
-        if ti.abs(along.dot(n)) > ALIGNMENT_SINE:
-            valid = 0
-        v = s.neighbour[t, k]
-        if v >= 0:
-            facing += s.normal[v]
-            e = s.x[opposite(s, v, s.triangle[t, k], s.triangle[t, (k + 1) % 3])] - x
-            if e.dot(n) < -0.05 * e.norm():
-                valid = 0
-        if facing.dot(n) >= 0.0:
-            valid = 0
-    elif facing.cross(n).norm() > ALIGNMENT_SINE or facing.dot(n) > 0.0:
-        valid = 0
-    return valid
 
 
 @ti.func
@@ -118,10 +161,9 @@ def _obstacle_contacts(s: ti.template(), o: ti.template(), t, k, margin, out: ti
             accepted = 0
             if j < 3:
                 accepted = (s.owns[t] >> j) & 1
-            elif kind != shapes.HALF_SPACE:
+            elif kind != HALF_SPACE:
                 v, value = deepest_point(o, k, A, B, C, phi)
-                for i in ti.static(range(3)):
-                    w[i] = v[i]
+                w = 1.0 * v
                 accepted = int(value < phi.min() - ti.cast(MIN_EXTRA_DEPTH, ti.f64) * reach and w.max() < 1.0 - 1e-6)
             p, move = w[0] * A + w[1] * B + w[2] * C, w[0] * a + w[1] * b + w[2] * c
             value, g = o.sample(k, p)
@@ -134,71 +176,29 @@ def _obstacle_contacts(s: ti.template(), o: ti.template(), t, k, margin, out: ti
                 valid = 0
                 if j < 3:
                     valid = in_normal_cone(s, s.triangle[t, j], n)
-                    if kind == shapes.HALF_SPACE and value + ti.min(move.dot(g), 0.0) < 0.0:
+                    if kind == HALF_SPACE and value + ti.min(move.dot(g), 0.0) < 0.0:
                         valid = 1
                 else:
                     valid = is_surface_minimum(s, t, w, n, x)
-                if valid == 1 and j < 3:
-                    i = s.triangle[t, j]
-                    write_contact(
-                        out,
-                        at,
-                        end,
-                        s.body[t],
-                        o.body[k],
-                        ivec(VERTEX_FIELD, i, o.body[k]),
-                        x,
-                        n,
-                        value,
-                        ivec(i, -1, -1),
-                        dvec(1.0, 0.0, 0.0),
-                        ivec(-1),
-                        dvec(0.0),
-                    )
-                    at += 1
-                elif valid == 1:
-                    face = vertices_of(s, t)
-                    write_contact(
-                        out,
-                        at,
-                        end,
-                        s.body[t],
-                        o.body[k],
-                        ivec(FACE_FIELD, t, o.body[k]),
-                        x,
-                        n,
-                        value,
-                        face,
-                        w,
-                        ivec(-1),
-                        dvec(0.0),
-                    )
+                if valid == 1:
+                    write_point_contact(s, out, at, end, t, j, w, o.body[k], x, n, value, ivec(-1), dvec(0.0))
                     at += 1
     return at
 
 
 @kernel(cse=False)
-def find_analytic(
-    s: ti.template(),
-    o: ti.template(),
-    margin: ti.f64,
-    out: ti.template(),
-    used: ti.template(),
-    count: ti.template(),
-    part: ti.i32,
-    append: ti.i32,
-):
+def find_analytic(s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.template(), append: ti.i32):
     """Write contacts of the soft bodies' triangles with all analytic obstacles; they are appended if `append` is 1."""
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):
         if task % s.spread == 0:
             c = task // s.spread
-            at, end = c * part + append * used[c], (c + 1) * part
+            at, end = c * out.part + append * out.used[c], (c + 1) * out.part
             for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):
                 if s.soft[s.body[t]] == 1 and (s.lo[t] <= s.hi[t]).all():
                     for k in range(o.count):
-                        at = _obstacle_contacts(s, o, t, k, margin, out, at, end)
-            used[c] = at - c * part
+                        at = _obstacle_contacts(s, o, t, k, margin, out.data, at, end)
+            out.used[c] = at - c * out.part
     ti.loop_config(serialize=True)
     for _ in range(1):
-        sum_parts(used, count, s.chunks)
+        sum_parts(out)

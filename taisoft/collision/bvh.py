@@ -1,13 +1,14 @@
 """Candidates by a chunked bounding volume hierarchy of k-DOPs, the report's alternative to the spatial hash.
 
-Each collider has a tree over its triangles, built once (`trees.py`). A chunk is a subtree of at most `leaves` triangles. Every
-search refits the slabs: chunks in parallel, then the nodes above them. `queries.py` then finds the triangles near one vertex or
-triangle. If all pairs are requested, each chunk is traversed against the trees; the larger of two nodes is opened, so a stack
-needs no more entries than both trees have levels. Memory for pairs is allocated at their first request.
+Each collider has a balanced binary tree over its triangles, built once on the host, top-down and all nodes of a level at once:
+the triangles of a node are sorted along the longest extent of their centroids and split in the middle. The nodes of a subtree
+are consecutive, the first child follows its parent, and the trees follow each other in the order of the colliders. A chunk is a
+subtree of at most `leaves` triangles. Every search refits the slabs: chunks in parallel, then the nodes above them. The trees
+are then traversed for the triangles near one corner or one triangle.
 
 Slabs bound each triangle at the start and at the end of the step, grown by half the margin. k = 6 gives the boxes of the spatial
 hash and so its candidates; 14 (with the space diagonals) and 18 (with the face diagonals) give fewer. Weak: the trees keep
-the order of the first positions, and each chunk is tested against the root of every collider that may follow its own.
+the order of the first positions, and a query visits the root of every collider whose box meets that of its own.
 
 Source: report, section 2.3.2, algorithm 1 and figure 7; Schmidtke and Erleben, Chunked bounding volume hierarchies for fast
 digital prototyping using volumetric meshes, 2018.
@@ -21,12 +22,12 @@ import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import Runtime, kernel
-from taisoft.collision.candidates import Buffer, Candidates, PairRows, pairs, sum_parts
-from taisoft.collision.surface import Surface, Topology, dvec, may_touch
-from taisoft.collision.trees import TreeTables, build_trees
+from taisoft.collision.candidates import WHOLE, Buffer, Candidates, entries, is_candidate, sort_row, sum_parts
+from taisoft.collision.colliders import Topology
+from taisoft.collision.surface import ACTIVE, Surface, dvec, integers, list_near, part_first
 
 LEAVES = {"cpu": 64, "cuda": 8}  # triangles per chunk: the fastest of 4 to 256 on the CPU, small on CUDA for enough threads
-PAIRS_PER_TRIANGLE = 24  # initial capacity
+ROW_PER_TRIANGLE = 24  # row entries, initial capacity
 
 AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 DIRECTIONS = {  # k -> normals of the slabs
@@ -36,53 +37,57 @@ DIRECTIONS = {  # k -> normals of the slabs
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Trees:
-    """Fields of the trees, for kernels; the tables are described in `TreeTables`."""
+@dataclass(frozen=True)
+class TreeTables:
+    """Trees on the host."""
 
-    slabs: int  # k / 2
-    directions: tuple[tuple[int, int, int], ...]
-    n_chunks: Count
-    n_top: Count
-    levels: Count  # size of a stack
-    parts: int
-    link: Any  # i32
-    root: Any  # i32
-    chunk: Any  # i32
-    chunk_body: Any  # i32
-    top: Any  # i32
-    lo: Any  # (nodes) vectors f64, one entry per slab [m], scaled by the length of its direction
-    hi: Any
-    stack: Any  # (parts * levels) 2-vectors i32
-    walked: bool = True  # queried by traversal, unlike rows
+    link: np.ndarray  # (nodes,) number of nodes of the subtree; for a leaf -1 - its triangle
+    root: np.ndarray  # (colliders,) -1 if there is no triangle
+    chunk: np.ndarray  # roots of the chunks, ascending
+    top: np.ndarray  # nodes above the chunks, the deepest first
+    top_first: np.ndarray  # start of each level of those, then their number
 
 
-def place_trees(t: TreeTables, k: int, parts: int, arena: FieldArena) -> Trees:
-    """Allocate and fill the fields of the trees."""
-    levels = t.chunk_depth + t.depth + 1
+def build_trees(centroid: np.ndarray, first: np.ndarray, leaves: int) -> TreeTables:
+    """Build balanced trees over centroids (t,3) of triangles. first: (colliders + 1,) first triangle of each collider."""
+    count, start = np.diff(first), np.asarray(first[:-1])
+    nodes = np.maximum(2 * count - 1, 0)
+    node = np.cumsum(nodes) - nodes
+    link = np.zeros(int(nodes.sum()), dtype=np.int64)
+    root = np.where(count > 0, node, -1)
+    used = count > 0
+    start, count, node, order = start[used], count[used], node[used], np.arange(first[-1])
+    above = np.ones(len(count), dtype=bool)  # whether the node lies above the chunks
+    chunks, levels = [], []
+    while len(count):
+        begins = above & (count <= leaves)
+        chunks.append(node[begins])
+        above &= ~begins
+        levels.append(node[above])
+        leaf = count == 1
+        link[node[leaf]] = -1 - order[start[leaf]]
+        start, count, node, above = (a[~leaf] for a in (start, count, node, above))
+        link[node] = 2 * count - 1
+        _split(order, start, count, centroid)
+        left = (count + 1) // 2
+        start, count = np.concatenate([start, start + left]), np.concatenate([left, count - left])
+        node, above = np.concatenate([node + 1, node + 2 * left]), np.tile(above, 2)
+    levels = [x for x in levels if len(x)][::-1]
+    chunk, top = (np.concatenate([[], *x]).astype(np.int64) for x in (chunks, levels))
+    return TreeTables(link, root, np.sort(chunk), top, np.cumsum([0, *map(len, levels)]))
 
-    def ints(name: str, data: np.ndarray):
-        return arena.field(f"bvh_{name}", ti.i32, max(len(data), 1), (data if len(data) else np.zeros(1)).astype(np.int32))
 
-    def slabs(name: str):
-        return arena.vectors(f"bvh_{name}", ti.f64, max(len(t.link), 1), n=k // 2)
-
-    return Trees(
-        k // 2,
-        DIRECTIONS[k],
-        len(t.chunk),
-        len(t.top),
-        levels,
-        parts,
-        ints("link", t.link),
-        ints("root", t.root),
-        ints("chunk", t.chunk),
-        ints("chunk_body", t.chunk_body),
-        ints("top", t.top),
-        slabs("lo"),
-        slabs("hi"),
-        arena.vectors("bvh_stack", ti.i32, parts * levels, n=2),
-    )
+def _split(order: np.ndarray, start: np.ndarray, count: np.ndarray, centroid: np.ndarray) -> None:
+    """Sort each range order[start : start + count] along the longest extent of its centroids, in place."""
+    if len(count) == 0:
+        return
+    offset = np.cumsum(count) - count
+    which = np.repeat(np.arange(len(count)), count)
+    at = np.arange(len(which)) - offset[which] + start[which]
+    points = centroid[order[at]]
+    extent = np.maximum.reduceat(points, offset) - np.minimum.reduceat(points, offset)
+    key = points[np.arange(len(which)), extent.argmax(axis=1)[which]]
+    order[at] = order[at[np.lexsort((key, which))]]
 
 
 @ti.func
@@ -91,86 +96,95 @@ def _project(b: ti.template(), x):
     return ti.Vector([x[q] if q < 3 else x.dot(dvec(b.directions[q])) for q in ti.static(range(b.slabs))], ti.f64)
 
 
-@ti.func
-def slabs_of(s: ti.template(), b: ti.template(), t, q, padding):
-    """Slabs of corner q of triangle t at both ends of the step, of all of t if q > 2, padded by `padding` [m]."""
-    lo, hi = ti.Vector([ti.math.inf] * b.slabs, ti.f64), ti.Vector([-ti.math.inf] * b.slabs, ti.f64)
-    if s.lo[t][0] <= s.hi[t][0]:  # finite
-        for k in range(3):
-            if q > 2 or q == k:
-                i = s.triangle[t, k]
-                begin = _project(b, s.x[i])
-                end = _project(b, s.x[i] + s.move[i])
-                lo, hi = ti.min(lo, begin, end), ti.max(hi, begin, end)
-        for k in ti.static(range(b.slabs)):
-            grown = padding
-            if ti.static(k >= 3):
-                grown = padding * dvec(b.directions[k]).norm()
-            lo[k] -= grown
-            hi[k] += grown
-    return lo, hi
+@dataclass(frozen=True, eq=False)
+class Trees:
+    """Fields of the trees, for kernels; the tables are described in `TreeTables`."""
+
+    slabs: int  # k / 2
+    directions: tuple[tuple[int, int, int], ...]
+    n_chunks: Count
+    link: Any  # i32
+    root: Any  # i32
+    chunk: Any  # i32
+    top: Any  # i32
+    lo: Any  # (nodes) vectors f64, one entry per slab [m], scaled by the length of its direction
+    hi: Any
+
+    @ti.func
+    def bounds(self, s: ti.template(), t, q, padding):
+        """Slabs of corner q of triangle t at both ends of the step, of all of t if q > 2, padded by `padding`: half the reach."""
+        lo, hi = ti.Vector([ti.math.inf] * self.slabs, ti.f64), ti.Vector([-ti.math.inf] * self.slabs, ti.f64)
+        if s.lo[t][0] <= s.hi[t][0]:  # finite
+            for k in range(3):
+                if q > 2 or q == k:
+                    i = s.triangle[t, k]
+                    begin = _project(self, s.x[i])
+                    end = _project(self, s.x[i] + s.move[i])
+                    lo, hi = ti.min(lo, begin, end), ti.max(hi, begin, end)
+            for k in ti.static(range(self.slabs)):
+                grown = padding
+                if ti.static(k >= 3):
+                    grown = padding * dvec(self.directions[k]).norm()
+                lo[k] -= grown
+                hi[k] += grown
+        return lo, hi
+
+    @ti.func
+    def list_triangles(self, s: ti.template(), other, t, q, lo, hi, entry: ti.template(), begin, last):
+        """List the triangles of collider `other` near a query, as `Candidates.list_triangles` does."""
+        at, node = begin, self.root[other]
+        end = node + _nodes_below(self, node)
+        while node < end:
+            size = self.link[node]
+            step = ti.max(size, 1)
+            if (lo <= self.hi[node]).all() and (self.lo[node] <= hi).all():
+                step = 1  # to the first child, or past the leaf
+                if size < 0:
+                    if is_candidate(s, t, q, -1 - size) == 1:
+                        if at < last:
+                            entry[at] = -1 - size
+                        at += 1
+            node += step
+        if at <= last:
+            sort_row(entry, begin, at)
+        return at - begin
 
 
 @ti.func
-def _refit_leaf(s: ti.template(), b: ti.template(), node, padding):
-    """Set a leaf's slabs from its triangle at both ends of the step."""
-    t = -1 - b.link[node]
-    if ti.static(b.slabs == 3):
-        b.lo[node], b.hi[node] = s.lo[t], s.hi[t]
-    else:
-        lo, hi = slabs_of(s, b, t, 3, padding)
-        b.lo[node], b.hi[node] = lo, hi
-
-
-@ti.func
-def _second_child(b: ti.template(), node):
-    """Return the second child; the first one follows its parent."""
-    return node + (b.link[node] + 3) // 4 * 2
-
-
-@ti.func
-def _refit_inner(b: ti.template(), node):
-    """Set a node's slabs from those of its children."""
-    other = _second_child(b, node)
-    b.lo[node] = ti.min(b.lo[node + 1], b.lo[other])
-    b.hi[node] = ti.max(b.hi[node + 1], b.hi[other])
-
-
-@ti.func
-def nodes_below(b: ti.template(), node):
+def _nodes_below(b: ti.template(), node):
     """Number of nodes of a subtree, including its root."""
     return ti.max(b.link[node], 1)
 
 
 @ti.func
-def _refit_chunks(s: ti.template(), b: ti.template(), margin):
-    """Refit all nodes in the chunks."""
+def _refit_inner(b: ti.template(), node):
+    """Set a node's slabs from those of its children: the first one follows it, the second one follows the first one's subtree."""
+    other = node + (b.link[node] + 3) // 4 * 2
+    b.lo[node] = ti.min(b.lo[node + 1], b.lo[other])
+    b.hi[node] = ti.max(b.hi[node + 1], b.hi[other])
+
+
+@kernel
+def refit(s: ti.template(), b: ti.template(), margin: ti.f64, n_top: ti.i32):
+    """Refit all nodes in the chunks, then the first n_top of those above them one by one."""
     ti.loop_config(serialize=s.serial_cheap)
     for task in range(b.n_chunks * s.cheap_spread):
         if task % s.cheap_spread == 0:
             first = b.chunk[task // s.cheap_spread]
-            n = nodes_below(b, first)
+            n = _nodes_below(b, first)
             for k in range(n):
                 node = first + n - 1 - k
-                if b.link[node] < 0:
-                    _refit_leaf(s, b, node, ti.cast(0.5, ti.f64) * margin)
-                else:
+                t = -1 - b.link[node]
+                if t < 0:
                     _refit_inner(b, node)
-
-
-@kernel
-def refit(s: ti.template(), b: ti.template(), margin: ti.f64):
-    """Refit all nodes in the chunks, then those above them one by one."""
-    _refit_chunks(s, b, margin)
+                elif ti.static(b.slabs == 3):
+                    b.lo[node], b.hi[node] = s.lo[t], s.hi[t]
+                else:
+                    lo, hi = b.bounds(s, t, WHOLE, ti.cast(0.5, ti.f64) * margin)
+                    b.lo[node], b.hi[node] = lo, hi
     ti.loop_config(serialize=True)
-    for k in range(b.n_top):
+    for k in range(n_top):
         _refit_inner(b, b.top[k])
-
-
-@kernel
-def refit_chunks(s: ti.template(), b: ti.template(), margin: ti.f64):
-    """Refit all nodes in the chunks."""
-    _refit_chunks(s, b, margin)
 
 
 @kernel
@@ -180,65 +194,34 @@ def refit_level(b: ti.template(), first: ti.i32, last: ti.i32):
         _refit_inner(b, b.top[k])
 
 
-@ti.func
-def _walk(s: ti.template(), b: ti.template(), part, root_a, root_b, pair: ti.template(), begin, last):
-    """Append the pairs of leaves below two nodes. Return the index after the last one, beyond `last` if they did not fit.
-
-    The second leaf of a pair comes after the first, so that each pair of a tree against itself is found once; the trees follow
-    each other in the order of the colliders, so this holds for different trees too.
-    """
-    i, j, at = root_a, root_b, begin
-    bottom = part * b.levels
-    depth = 0
-    walking = 1
-    while walking == 1:
-        split = 0
-        if j + nodes_below(b, j) > i and (b.lo[i] <= b.hi[j]).all() and (b.lo[j] <= b.hi[i]).all():
-            if b.link[i] < 0 and b.link[j] < 0:
-                t, u = -1 - b.link[i], -1 - b.link[j]
-                if j > i and may_touch(s, t, u) == 1:
-                    if at < last:
-                        pair[at] = ti.Vector([t, u], ti.i32)
-                    at += 1
-            else:
-                split = 1
-        if split == 1:  # descend into one child, push the other
-            if b.link[i] >= b.link[j]:
-                b.stack[bottom + depth] = ti.Vector([_second_child(b, i), j], ti.i32)
-                i += 1
-            else:
-                b.stack[bottom + depth] = ti.Vector([i, _second_child(b, j)], ti.i32)
-                j += 1
-            depth += 1
-        elif depth > 0:
-            depth -= 1
-            i, j = b.stack[bottom + depth][0], b.stack[bottom + depth][1]
-        else:
-            walking = 0
-    return at
-
-
 @kernel
-def walk_trees(s: ti.template(), b: ti.template(), pair: ti.template(), used: ti.template(), total: ti.template(), part: ti.i32):
-    """Find the triangle pairs whose slabs overlap, each once. Neighbouring chunks go to different parts to balance the load."""
+def list_rows(s: ti.template(), b: ti.template(), start: ti.template(), end: ti.template(), out: ti.template(), padding: ti.f64):
+    """Write the row of each active triangle; each chunk of them fills its own part of the entries."""
     ti.loop_config(serialize=s.serial)
-    for task in range(b.parts * s.spread):
+    for t in range(s.n_triangles):
+        start[t] = 0
+        end[t] = 0
+    ti.loop_config(serialize=s.serial)
+    for task in range(s.chunks * s.spread):
         if task % s.spread == 0:
             c = task // s.spread
-            at = c * part
-            for k in range((b.n_chunks - c + b.parts - 1) // b.parts):
-                chunk = c + k * b.parts
-                own = b.chunk_body[chunk]
-                for other in range(own, s.n_bodies):
-                    may_collide = s.self_on[own]
-                    if other != own:
-                        may_collide = s.soft[own] | s.soft[other]
-                    if may_collide == 1 and b.root[other] >= 0:
-                        at = _walk(s, b, c, b.chunk[chunk], b.root[other], pair, at, (c + 1) * part)
-            used[c] = at - c * part
+            at, last, own, n_near = c * out.part, (c + 1) * out.part, -1, 0
+            for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
+                t = s.active[j]
+                if s.body[t] != own:
+                    own = s.body[t]
+                    n_near = list_near(s, c, own)
+                begin = at
+                lo, hi = b.bounds(s, t, WHOLE, padding)
+                for k in range(n_near):
+                    at += b.list_triangles(s, s.near[c * s.n_bodies + k], t, WHOLE, lo, hi, out.data, at, last)
+                if at <= last:
+                    start[t] = begin
+                    end[t] = at
+            out.used[c] = at - c * out.part
     ti.loop_config(serialize=True)
     for _ in range(1):
-        sum_parts(used, total, b.parts)
+        sum_parts(out)
 
 
 class Bvh:
@@ -258,50 +241,43 @@ class Bvh:
         max_capacity: int | None = None,
     ):
         """x: (n_verts, 3) [m], the positions that the trees are built for. k_dop: 6, 14 or 18. leaves: most triangles per chunk.
-        capacity: initial pairs; max_capacity: limit of pairs and of row entries. None for the default."""
+        capacity: initial row entries; max_capacity: their limit. None for the default."""
         self.surface, self.margin = surface, margin
-        self.tables = build_trees(x[topology.triangle].mean(axis=1), topology.first, leaves or LEAVES[runtime.arch])
-        self.trees = place_trees(self.tables, k_dop, surface.chunks, arena)
+        self.tables = t = build_trees(x[topology.triangle].mean(axis=1), topology.first, leaves or LEAVES[runtime.arch])
+
+        slabs = {name: arena.vectors(f"bvh_{name}", ti.f64, max(len(t.link), 1), n=k_dop // 2) for name in ("lo", "hi")}
+        indices = {name: integers(arena, f"bvh_{name}", getattr(t, name)) for name in ("link", "root", "chunk", "top")}
+        self.trees = Trees(k_dop // 2, DIRECTIONS[k_dop], len(t.chunk), **indices, **slabs)
         self.by_levels = runtime.arch != "cpu"  # else one thread refits the nodes above the chunks, in one launch
-        self._limits, self._arena = (capacity, max_capacity), arena
-        self.pairs: Buffer | None = None
-        self.rows: PairRows | None = None
+        self._limits, self._arena = (capacity or ROW_PER_TRIANGLE * surface.n_triangles + 64, max_capacity), arena
+        self.rows: Buffer | None = None  # allocated at the first call of `find`
 
     def near(self) -> Trees:
-        """Refit the trees to the present boxes and return them, for `queries.py`."""
-        if not self.by_levels:
-            refit(self.surface, self.trees, self.margin)
-            return self.trees
-        refit_chunks(self.surface, self.trees, self.margin)
-        first = self.tables.top_first
+        """Refit the trees to the present boxes and return them, for queries."""
+        first = self.tables.top_first if self.by_levels else []
+        refit(self.surface, self.trees, self.margin, 0 if self.by_levels else len(self.tables.top))
         for begin, end in zip(first[:-1], first[1:]):
             refit_level(self.trees, int(begin), int(end))
         return self.trees
 
     def find(self) -> Candidates:
-        """Return the candidates of the present boxes. Raise SimulationError if a buffer would outgrow its limit."""
+        """Return the rows of the present boxes. Raise SimulationError if a buffer would outgrow its limit."""
         self.near()
-        if self.pairs is None:
-            self._allocate_pairs()
+        s, arena = self.surface, self._arena
+        if self.rows is None:
+            self._start, self._end = (arena.field(f"bvh_row_{name}", ti.i32, max(s.n_triangles, 1)) for name in ("start", "end"))
+            self.rows = Buffer("bvh_rows", entries, *self._limits, s.chunks, arena)
         while True:
-            found = self.pairs
-            walk_trees(self.surface, self.trees, found.data, found.used, found.count, found.part)
-            if not found.grow_if_full():
-                return self.rows.from_pairs(found)
-
-    def _allocate_pairs(self) -> None:
-        s, (capacity, max_capacity) = self.surface, self._limits
-        n = s.n_triangles
-        self.pairs = Buffer("bvh_pairs", pairs, capacity or PAIRS_PER_TRIANGLE * n + 64, max_capacity, s.chunks, self._arena)
-        self.rows = PairRows(s, self._arena, capacity or 2 * PAIRS_PER_TRIANGLE * n + 64, max_capacity)
+            list_rows(s, self.trees, self._start, self._end, self.rows.parts, 0.5 * self.margin)
+            if not self.rows.grow_if_full():
+                return Candidates(self._start, self._end, self.rows.data)
 
     @property
     def buffers(self) -> tuple[Buffer, ...]:
         """The growing buffers."""
-        return () if self.pairs is None else (self.pairs, self.rows.rows)
+        return () if self.rows is None else (self.rows,)
 
     def release(self) -> None:
         """Free the memory of the buffers."""
-        if self.pairs is not None:
-            self.pairs.release()
-            self.rows.release()
+        for buffer in self.buffers:
+            buffer.release()

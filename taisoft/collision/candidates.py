@@ -1,8 +1,12 @@
-"""Candidates of either broad phase: for every triangle, the row of triangles whose boxes overlap its own.
+"""Buffers that grow, and candidates of a broad phase: for every triangle, the row of triangles whose boxes overlap its own.
 
 Rows hold both directions of a pair and ascend, so that results do not depend on threads or on the order of cells or trees. A
 buffer has one part of equal size per chunk of the work. If a part is too small, the search still counts to its end, the buffer
 grows to the required size, and the search is repeated: a truncated list is never used.
+
+The contact search does not read whole rows: it asks for the triangles near one corner, or near one triangle, by `bounds` and
+`list_triangles`, which rows (`Candidates`) and trees (`taisoft.collision.bvh.Trees`) both have. The box swept by a corner during
+the step, padded by half the reach, is small, and the list is needed only while one query is processed.
 """
 
 from collections.abc import Callable
@@ -11,31 +15,28 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena
-from taisoft.backend.runtime import kernel
-from taisoft.collision.surface import Surface
+from taisoft.backend.arrays import Count, FieldArena
+from taisoft.collision.surface import may_touch
 from taisoft.errors import SimulationError
 
 SLACK = 1.5  # a full buffer grows to this times the required size
 NEEDED, TOTAL = 0, 1  # indices into a buffer's count
+EDGES, WHOLE = 3, 4  # queries for a whole triangle instead of a corner: triangles with matching edges, and all triangles near it
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
-    """Row of triangle t: entry[start[t]:end[t]], the triangles that it may touch and whose boxes overlap its own, ascending."""
+class Parts:
+    """A buffer for kernels: part c holds the entries data[c * part : c * part + used[c]]."""
 
-    start: Any  # (n_triangles) i32
-    end: Any  # (n_triangles) i32
-    entry: Any  # i32
-    walked: bool = False  # queried by rows, unlike trees
+    data: Any  # an array, or a record of arrays
+    used: Any  # (chunks) i32
+    count: Any  # (2) i32: entries needed by the largest part, and by all parts together
+    part: Count  # capacity of each part
+    chunks: int
 
 
 class Buffer:
-    """A field of entries in `chunks` equal parts that grows when one is too small.
-
-    make(arena, capacity) allocates the data. count: (2) i32, entries needed by the largest part and by all parts together;
-    used: (chunks) i32, entries of each part.
-    """
+    """A field of entries in `chunks` equal parts that grows when one is too small. make(arena, capacity) allocates the data."""
 
     def __init__(self, name: str, make: Callable, capacity: int, max_capacity: int | None, chunks: int, arena: FieldArena):
         self.name, self._make, self.max_capacity, self.chunks = name, make, max_capacity, chunks
@@ -53,7 +54,17 @@ class Buffer:
         data = self._make(arena, part * self.chunks)  # if this runs out of memory, the old data stay
         if self._arena is not None:
             self._arena.release()
-        self._arena, self.data, self.part = arena, data, part
+        self._arena, self.parts = arena, Parts(data, self.used, self.count, part, self.chunks)
+
+    @property
+    def data(self) -> Any:
+        """The entries."""
+        return self.parts.data
+
+    @property
+    def part(self) -> int:
+        """Capacity of each part."""
+        return self.parts.part
 
     @property
     def capacity(self) -> int:
@@ -83,14 +94,6 @@ class Buffer:
         self._allocate(int(SLACK * required))
         return True
 
-    def clear(self) -> None:
-        """Empty every part."""
-        self.used.fill(0)
-
-    def sum_up(self) -> None:
-        """Set `count` from `used`."""
-        sum_used(self.used, self.count, self.chunks)
-
     def release(self) -> None:
         """Free the memory."""
         self._arena.release()
@@ -101,28 +104,15 @@ def entries(arena: FieldArena, capacity: int):
     return arena.field("entry", ti.i32, capacity)
 
 
-def pairs(arena: FieldArena, capacity: int):
-    """Allocate a field of pairs."""
-    return arena.vectors("pair", ti.i32, capacity, n=2)
-
-
 @ti.func
-def sum_parts(used: ti.template(), count: ti.template(), chunks: ti.template()):
-    """Set `count`: the entries of the largest part, and of all parts."""
+def sum_parts(p: ti.template()):
+    """Set `count` of a buffer: the entries of the largest part, and of all parts."""
     largest, total = 0, 0
-    for c in range(chunks):
-        largest = ti.max(largest, used[c])
-        total += used[c]
-    count[NEEDED] = largest
-    count[TOTAL] = total
-
-
-@kernel
-def sum_used(used: ti.template(), count: ti.template(), chunks: ti.template()):
-    """`sum_parts` as a kernel."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(used, count, chunks)
+    for c in range(p.chunks):
+        largest = ti.max(largest, p.used[c])
+        total += p.used[c]
+    p.count[NEEDED] = largest
+    p.count[TOTAL] = total
 
 
 @ti.func
@@ -135,98 +125,57 @@ def sort_row(entry: ti.template(), first, last):
         for i in range(first + step, last):
             value = entry[i]
             j = i - step
-            shifting = 1
-            while shifting == 1:
-                if j >= first:
-                    if entry[j] > value:
-                        entry[j + step] = entry[j]
-                        j -= step
-                    else:
-                        shifting = 0
-                else:
-                    shifting = 0
+            while j >= first and entry[ti.max(j, first)] > value:
+                entry[j + step] = entry[j]
+                j -= step
             entry[j + step] = value
         step //= 3
 
 
-@kernel
-def pair_rows(
-    s: ti.template(),
-    pair: ti.template(),
-    used: ti.template(),
-    part: ti.i32,
-    chunks: ti.template(),
-    serial: ti.template(),
-    start: ti.template(),
-    end: ti.template(),
-    count: ti.template(),
-):
-    """Compute starts and lengths of the rows of pairs in both directions; count[NEEDED] is the sum of the lengths."""
-    ti.loop_config(serialize=serial)
-    for t in range(s.n_triangles):
-        end[t] = 0
-    ti.loop_config(serialize=serial)
-    for task in range(chunks * s.spread):
-        if task % s.spread == 0:
-            c = task // s.spread
-            for k in range(c * part, c * part + used[c]):
-                ti.atomic_add(end[pair[k][0]], 1)
-                ti.atomic_add(end[pair[k][1]], 1)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        total = 0
-        for t in range(s.n_triangles):
-            start[t] = total
-            total += end[t]
-            end[t] = start[t]
-        count[NEEDED] = total
-        count[TOTAL] = total
+@ti.func
+def is_candidate(s: ti.template(), t, q, u):
+    """1 if t may touch triangle u and, if q is EDGES, their edges may cross. t has a sharp edge in that case; if both have one,
+    only t < u is accepted."""
+    accepted = 1
+    if q == EDGES:
+        accepted = int(s.sharp[u] != 0) & int(u > t or s.sharp[u] & 7 == 0)
+    if accepted == 1 and s.body[t] == s.body[u]:
+        accepted = may_touch(s, t, u)
+    return accepted
 
 
-@kernel
-def fill_rows(
-    s: ti.template(),
-    pair: ti.template(),
-    used: ti.template(),
-    part: ti.i32,
-    chunks: ti.template(),
-    serial: ti.template(),
-    start: ti.template(),
-    end: ti.template(),
-    entry: ti.template(),
-):
-    """Write both directions of every pair into its rows and sort them."""
-    ti.loop_config(serialize=serial)
-    for task in range(chunks * s.spread):
-        if task % s.spread == 0:
-            c = task // s.spread
-            for k in range(c * part, c * part + used[c]):
-                a, b = pair[k][0], pair[k][1]
-                entry[ti.atomic_add(end[a], 1)] = b
-                entry[ti.atomic_add(end[b], 1)] = a
-    ti.loop_config(serialize=serial)
-    for t in range(s.n_triangles):
-        sort_row(entry, start[t], end[t])
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Row of triangle t: entry[start[t]:end[t]], the triangles that it may touch and whose boxes overlap its own, ascending."""
 
+    start: Any  # (n_triangles) i32
+    end: Any  # (n_triangles) i32
+    entry: Any  # i32
 
-class PairRows:
-    """Convert a buffer of pairs, each listed once, into rows."""
+    @ti.func
+    def bounds(self, s: ti.template(), t, q, padding):
+        """Box of corner q of triangle t, or of all of t, at both ends of the step, padded by `padding`: half the reach [m]."""
+        lo, hi = s.lo[t], s.hi[t]
+        if q < 3 and lo[0] <= hi[0]:
+            i = s.triangle[t, q]
+            a, b = s.x[i], s.x[i] + s.move[i]
+            lo, hi = ti.min(a, b) - padding, ti.max(a, b) + padding
+        return lo, hi
 
-    def __init__(self, surface: Surface, arena: FieldArena, capacity: int, max_capacity: int | None):
-        n = max(surface.n_triangles, 1)
-        self.surface = surface
-        self.start, self.end = arena.field("pair_rows_start", ti.i32, n), arena.field("pair_rows_end", ti.i32, n)
-        self.rows = Buffer("candidate_rows", entries, capacity, max_capacity, 1, arena)
+    @ti.func
+    def list_triangles(self, s: ti.template(), other, t, q, lo, hi, entry: ti.template(), begin, last):
+        """List the triangles of collider `other` near corner q of triangle t, or near all of t if q is EDGES or WHOLE.
 
-    def from_pairs(self, found: Buffer) -> Candidates:
-        """Return rows of the pairs in a buffer, both directions, ascending."""
-        s = self.surface
-        arguments = (found.data, found.used, found.part, found.chunks, s.serial, self.start, self.end)
-        pair_rows(s, *arguments, self.rows.count)
-        self.rows.grow_if_full()
-        fill_rows(s, *arguments, self.rows.data)
-        return Candidates(self.start, self.end, self.rows.data)
-
-    def release(self) -> None:
-        """Free the memory."""
-        self.rows.release()
+        lo, hi: of `bounds`. They are written to entry[begin:last] in ascending order. Return their number, which may be more
+        than fit.
+        """
+        at = begin
+        for e in range(self.start[t], self.end[t]):
+            u = self.entry[e]
+            if s.body[u] == other:
+                if is_candidate(s, t, q, u) == 1:
+                    if (lo <= s.hi[u]).all() and (s.lo[u] <= hi).all():
+                        if at < last:
+                            entry[at] = u
+                        at += 1
+        return at - begin

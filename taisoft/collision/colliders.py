@@ -1,11 +1,11 @@
 """Surfaces, frames and sizes of the scene's colliders (bodies, then obstacles) for contact detection, on the host."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from taisoft.collision.surface import Topology, make_topology
 from taisoft.errors import MeshError
 from taisoft.fem.model import Layout
-from taisoft.mesh.quality import mean_surface_edge
 from taisoft.mesh.sdf_grid import SdfGrid, cached_sdf_grid
 from taisoft.scene.body import Body
 from taisoft.scene.collision import principal_extents
@@ -13,6 +13,68 @@ from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle, Obstacle
 from taisoft.scene.scene import Scene
 
 MIN_THICKNESS = 0.25  # of the mean surface edge: minimum thickness of a mesh obstacle, since open meshes have none
+
+
+@dataclass(frozen=True)
+class Topology:
+    """Triangles on the host. Vertices are numbered over all colliders, surface vertices only.
+
+    triangle: (t,3) vertices; body: (t,) collider, ascending; first: (n_bodies + 1,) first triangle of each collider;
+    vertex_first: (n_bodies + 1,) first vertex; node: (v,) the model's node, -1 for obstacles; neighbour: (t,3) triangle across
+    the edge from corner k to k + 1, -1 if there is none; owns: (t,) bits 0-2 corners, 3-5 edges that this triangle handles on
+    behalf of all that share them; ring_start, ring: triangles around each vertex; around_start, around: adjacent vertices.
+    """
+
+    triangle: np.ndarray
+    body: np.ndarray
+    first: np.ndarray
+    vertex_first: np.ndarray
+    node: np.ndarray
+    neighbour: np.ndarray
+    owns: np.ndarray
+    ring_start: np.ndarray
+    ring: np.ndarray
+    around_start: np.ndarray
+    around: np.ndarray
+
+
+def make_topology(parts: list[tuple[np.ndarray, np.ndarray]]) -> Topology:
+    """Combine the surfaces of all colliders. parts: for each, (t,3) triangles and the (v,) nodes of their vertices."""
+    first, vertex_first = (np.cumsum([0, *(len(part[k]) for part in parts)]) for k in range(2))
+    t = np.concatenate([triangles + start for (triangles, _), start in zip(parts, vertex_first)]).reshape(-1, 3)
+    neighbour, edge_owned = _edge_neighbours(t)
+    corners = t.reshape(-1)
+    order = np.argsort(corners, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=vertex_first[-1]))])
+    ring = order // 3
+    owner = np.full(vertex_first[-1], -1)
+    used = start[1:] > start[:-1]
+    owner[used] = ring[start[:-1][used]]  # the first triangle around a vertex
+    corner_owned = owner[t] == np.arange(len(t))[:, None]
+    bits = np.concatenate([corner_owned, edge_owned], axis=1) @ (1 << np.arange(6))
+    body, node = np.repeat(np.arange(len(parts)), np.diff(first)), np.concatenate([nodes for _, nodes in parts])
+    adjacent = _adjacent_vertices(t, vertex_first[-1])
+    return Topology(t, body, first, vertex_first, node, neighbour, bits, start, ring, *adjacent)
+
+
+def _adjacent_vertices(t: np.ndarray, n_verts: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the start of each vertex's list (n_verts + 1,), and the adjacent vertices, ascending."""
+    ends = t[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    code = np.unique(np.concatenate([ends, ends[:, ::-1]]) @ [n_verts, 1])
+    return np.searchsorted(code, np.arange(n_verts + 1) * n_verts), code % max(n_verts, 1)
+
+
+def _edge_neighbours(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return neighbours (t,3) across the edges, -1 at open and non-manifold edges; (t,3) bool: the triangle owns the edge."""
+    ends = np.sort(np.stack([t, np.roll(t, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    code = ends @ [t.max(initial=0) + 1, 1]
+    order = np.argsort(code, kind="stable")
+    _, starts, counts = np.unique(code[order], return_index=True, return_counts=True)
+    neighbour, owned = np.full(len(order), -1), np.zeros(len(order), dtype=bool)
+    a, b = order[starts[counts == 2]], order[starts[counts == 2] + 1]
+    neighbour[a], neighbour[b] = b // 3, a // 3
+    owned[order[starts]] = True  # the lowest triangle, since the sort is stable
+    return neighbour.reshape(-1, 3), owned.reshape(-1, 3)
 
 
 def body_grid(body: Body, cells: int, margin: float) -> SdfGrid:
@@ -39,12 +101,6 @@ def collider_surfaces(scene: Scene, layout: Layout) -> tuple[Topology, np.ndarra
         parts.append((triangles, np.full(len(vertices), -1)))
         rest.append(vertices)
     return make_topology(parts), np.concatenate(rest)
-
-
-def obstacle_frame(obstacle: Obstacle, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return origin (3,) [m] and rotation (3,3) of an obstacle's own frame at time t [s]."""
-    translation, rotation = obstacle.pose(t)
-    return obstacle.shape.pivot + translation, rotation @ obstacle.shape.frame()
 
 
 def prescribed_vertices(topology: Topology, nodes: np.ndarray, moves: np.ndarray) -> np.ndarray:
@@ -80,10 +136,3 @@ def _surface_thickness(x: np.ndarray, triangles: np.ndarray) -> float:
     cross = np.cross(b - a, c - a)
     volume, area = abs(np.einsum("ij,ij->", a, cross)) / 6.0, 0.5 * np.linalg.norm(cross, axis=1).sum()
     return min(float(principal_extents(x, triangles).min()), 4.0 * volume / area)
-
-
-def collider_edge(collider: Body | Obstacle) -> float:
-    """Return the mean surface edge of a body [m]; infinite for an obstacle, however fine."""
-    if isinstance(collider, Body):
-        return mean_surface_edge([(collider.nodes.positions, collider.nodes.surface)])
-    return np.inf

@@ -1,8 +1,15 @@
-"""Contacts of surfaces that touch or will touch within the step, as fields for kernels and as a record for the host.
+"""Contacts of surfaces that touch or will touch within the step: fields for kernels, a record for the host, and their reduction.
 
 A contact has a side a and a side b, each a point on up to three nodes with weights that sum to 1; an obstacle is always b and
 has no nodes. The normal is a unit vector from b to a; the gap is the signed distance of the two points along it, negative in
 penetration. A feature identifies the pair of mesh features in contact, and persists while they stay in contact.
+
+The reduction merges contacts of one pair of bodies that are within a tolerance, with one normal (report, section 3.1.3). In the
+order of kind, feature and position in the buffer, a contact is kept unless an earlier kept one is within the tolerance: the
+result of two nested loops. Here each contact is compared only with those in the cells around it, so the cost is linear. Cells
+hash into buckets. A cell is wider than twice the tolerance, and every cell within the tolerance is searched, so the result does
+not depend on the placement of the cells. Rounds are repeated until all contacts are decided: a contact is kept once all its
+earlier neighbours are dropped, and dropped once an earlier neighbour is kept.
 """
 
 from dataclasses import dataclass
@@ -11,13 +18,20 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena
+from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
+from taisoft.collision.candidates import Parts
+from taisoft.collision.surface import cell_of, dvec, ivec
 
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + local edge); vertex and collider;
 # triangle and collider
 VERTEX_FACE, EDGE_EDGE, VERTEX_FIELD, FACE_FIELD = 0, 1, 2, 3
 KINDS = ("vertex_face", "edge_edge", "vertex_field", "face_field")
+
+SAME_NORMAL = 0.996  # cosine of 5 degrees
+UNKNOWN, KEPT, DROPPED = 0, 1, 2
+PERIOD = (2**20,) * 3  # cells along each axis after which their indices repeat
+FOUND, LEFT, UNDECIDED, MASK = 0, 1, 2, 3  # indices into the count; LEFT: kept contacts; MASK: buckets in use, minus one
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,43 +74,18 @@ class Contacts:
 
 def no_contacts() -> Contacts:
     """Return an empty record."""
-    names, integers = np.zeros(0, dtype=object), np.zeros((0, 2), dtype=np.int64)
-    vectors, numbers = np.zeros((0, 3)), np.zeros(0)
-    return Contacts(
-        vectors,
-        vectors,
-        numbers,
-        vectors,
-        names,
-        names,
-        np.zeros((0, 6), dtype=np.int64),
-        np.zeros((0, 6)),
-        names,
-        integers,
-        numbers,
-        numbers,
-        0,
-        0,
-    )
+    names, numbers, vectors = np.zeros(0, dtype=object), np.zeros(0), np.zeros((0, 3))
+    nodes, feature = np.zeros((0, 6), dtype=np.int64), np.zeros((0, 2), dtype=np.int64)
+    geometry = (vectors, vectors, numbers, vectors, names, names, nodes, np.zeros((0, 6)))
+    return Contacts(*geometry, names, feature, numbers, numbers, found=0, unmapped=0)
 
 
 def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:
     """Allocate a buffer for `capacity` contacts."""
-
-    def vectors(name: str, dtype, n: int = 3):
-        return arena.vectors(f"contact_{name}", dtype, capacity, n=n)
-
-    return ContactFields(
-        vectors("point", ti.f64),
-        vectors("normal", ti.f64),
-        arena.field("contact_gap", ti.f64, capacity),
-        vectors("body", ti.i32, 2),
-        vectors("feature", ti.i32),
-        vectors("nodes_a", ti.i32),
-        vectors("nodes_b", ti.i32),
-        vectors("weights_a", ti.f64),
-        vectors("weights_b", ti.f64),
-    )
+    vectors = dict.fromkeys(("point", "normal", "weights_a", "weights_b"), (ti.f64, 3))
+    vectors |= dict.fromkeys(("feature", "nodes_a", "nodes_b"), (ti.i32, 3)) | {"body": (ti.i32, 2)}
+    fields = {name: arena.vectors(f"contact_{name}", dtype, capacity, n=n) for name, (dtype, n) in vectors.items()}
+    return ContactFields(gap=arena.field("contact_gap", ti.f64, capacity), **fields)
 
 
 @ti.func
@@ -133,6 +122,16 @@ def write_contact(out: ti.template(), at, last, body_a, body_b, feature, point_a
             out.weights_b[at][q] = ti.select(sign > 0.0, weights_b[q], weights_a[q])
 
 
+@ti.func
+def write_point_contact(s: ti.template(), out: ti.template(), at, last, t, j, w, other, point, n, gap, nodes_b, weights_b):
+    """Write the contact of corner j of triangle t with collider `other`; if j is 3, of its point of weights w (3,)."""
+    feature, nodes, weights = ivec(FACE_FIELD, t, other), ivec(s.triangle[t, 0], s.triangle[t, 1], s.triangle[t, 2]), dvec(w)
+    if j < 3:
+        i = s.triangle[t, j]
+        feature, nodes, weights = ivec(VERTEX_FIELD, i, other), ivec(i, -1, -1), dvec(1.0, 0.0, 0.0)
+    write_contact(out, at, last, s.body[t], other, feature, point, n, gap, nodes, weights, nodes_b, weights_b)
+
+
 @kernel
 def gather_contacts(
     out: ti.template(), index: ti.template(), n: ti.i32, floats: ti.types.ndarray(), integers: ti.types.ndarray()
@@ -151,18 +150,190 @@ def gather_contacts(
             integers[i, q] = out.body[at][q]
 
 
-def gather(out: ContactFields, index: Any, n: int) -> dict[str, np.ndarray]:
-    """Download the contacts at the buffer indices index[:n], (n, ...) each: point, normal, gap, body, feature, and nodes and
-    weights (n,6) of both sides."""
+def gather(out: ContactFields, index: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Download the contacts at the buffer indices index[:n], in order of colliders and feature: an order independent of threads
+    and chunks, so that a solver meets the same one in the next step.
+
+    Returns (n,13) point, normal, weights (6) and gap; (n,11) colliders (2), feature (3), nodes (6).
+    """
     floats, integers = np.zeros((n, 13)), np.zeros((n, 11), dtype=np.int32)
     if n:
         gather_contacts(out, index, n, floats, integers)
-    return {
-        "point": floats[:, :3],
-        "normal": floats[:, 3:6],
-        "weights": floats[:, 6:12],
-        "gap": floats[:, 12],
-        "body": integers[:, :2],
-        "feature": integers[:, 2:5],
-        "nodes": integers[:, 5:],
-    }
+    order = np.lexsort(integers[:, 4::-1].T)
+    return floats[order], integers[order]
+
+
+# --- reduction -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class ReductionFields:
+    """Workspace of the reduction. The first count[LEFT] entries of `kept` are the kept contacts' buffer indices, ascending."""
+
+    buckets: Count  # a power of two; the number in use grows with the number of contacts
+    serial: bool
+    spread: int  # as of the surface
+    place: Any  # (capacity) i32: buffer index of the i-th contact found
+    bucket: Any  # (capacity) i32: bucket of the i-th contact
+    bucket_start: Any  # (buckets) i32: range of its entries in `member`
+    bucket_end: Any
+    member: Any  # (capacity) i32: buffer indices, by bucket
+    state: Any  # (capacity) i32: state of the contact at each buffer index
+    kept: Any  # (capacity) i32
+    count: Any  # (4) i32
+    first: Any  # (chunks) i32: number of the first contact of each part
+
+
+def reduction_fields(arena: FieldArena, capacity: int, chunks: int, serial: bool, spread: int = 1) -> ReductionFields:
+    """Allocate the workspace for `capacity` contacts in `chunks` parts."""
+    buckets = 1 << max(capacity - 1, 63).bit_length()
+    sizes = dict.fromkeys(("place", "bucket", "member", "state", "kept"), capacity) | {"count": 4, "first": chunks}
+    sizes |= {"bucket_start": buckets, "bucket_end": buckets}
+    fields = {name: arena.field(f"reduction_{name}", ti.i32, size) for name, size in sizes.items()}
+    return ReductionFields(buckets, serial, spread, **fields)
+
+
+@ti.func
+def _bucket(r: ti.template(), cell):
+    x, y, z = ti.cast(cell[0], ti.i64), ti.cast(cell[1], ti.i64), ti.cast(cell[2], ti.i64)
+    h = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)  # Teschner et al. 2003
+    return ti.cast((h ^ (h >> 15)) & r.count[MASK], ti.i32)
+
+
+@ti.func
+def _fill_cells(r: ti.template(), out: ti.template(), inverse):
+    """Number the contacts over all parts and enter them into the cells."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        total = 0
+        for k in range(out.chunks):
+            r.first[k] = total
+            total += out.used[k]
+        r.count[FOUND] = total
+        mask = 63
+        while mask + 1 < total:
+            mask = 2 * mask + 1
+        r.count[MASK] = mask
+    ti.loop_config(serialize=r.serial)
+    for b in range(r.count[MASK] + 1):
+        r.bucket_end[b] = 0
+    ti.loop_config(serialize=r.serial)
+    for task in range(out.chunks * r.spread):
+        if task % r.spread == 0:
+            c = task // r.spread
+            for k in range(out.used[c]):
+                i, at = r.first[c] + k, c * out.part + k
+                r.place[i] = at
+                r.state[at] = UNKNOWN
+                b = _bucket(r, cell_of(out.data.point[at], inverse, PERIOD))
+                r.bucket[i] = b
+                ti.atomic_add(r.bucket_end[b], 1)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        total = 0
+        for b in range(r.count[MASK] + 1):
+            r.bucket_start[b] = total
+            total += r.bucket_end[b]
+            r.bucket_end[b] = r.bucket_start[b]
+    ti.loop_config(serialize=r.serial)
+    for i in range(r.count[FOUND]):
+        r.member[ti.atomic_add(r.bucket_end[r.bucket[i]], 1)] = r.place[i]
+
+
+@ti.func
+def is_same(out: ti.template(), a, b, tolerance):
+    """Whether the contacts at a and b are to be merged."""
+    result = False
+    if (out.body[a] == out.body[b]).all():
+        d = out.point[a] - out.point[b]
+        result = d.dot(d) <= tolerance * tolerance and out.normal[a].dot(out.normal[b]) >= ti.cast(SAME_NORMAL, ti.f64)
+    return result
+
+
+@ti.func
+def is_earlier(out: ti.template(), a, b):
+    """1 if the contact at a precedes that at b: by kind, exact ones first, then by feature, then by buffer index."""
+    result = int(a < b)
+    for q in ti.static((2, 1, 0)):
+        if out.feature[a][q] != out.feature[b][q]:
+            result = int(out.feature[a][q] < out.feature[b][q])
+    return result
+
+
+@ti.func
+def _decide(r: ti.template(), out: ti.template(), at, inverse, tolerance):
+    """State of the contact at a buffer index, from the states of the earlier ones near it."""
+    p = out.point[at]
+    lo, hi = cell_of(p - tolerance, inverse, PERIOD), cell_of(p + tolerance, inverse, PERIOD)
+    n = ti.select(lo == hi, 1, 2)
+    state = KEPT
+    k = 0
+    while state != DROPPED and k < n[0] * n[1] * n[2]:
+        z, y, x = k % n[2], (k // n[2]) % n[1], k // (n[2] * n[1])
+        cell = ivec(ti.select(x == 0, lo[0], hi[0]), ti.select(y == 0, lo[1], hi[1]), ti.select(z == 0, lo[2], hi[2]))
+        b = _bucket(r, cell)
+        for m in range(r.bucket_start[b], r.bucket_end[b]):
+            other = r.member[m]
+            d = p - out.point[other]
+            if d.dot(d) <= tolerance * tolerance:  # this test rejects most
+                if is_earlier(out, other, at) == 1:
+                    other_state = r.state[other]
+                    if other_state != DROPPED and is_same(out, at, other, tolerance):
+                        if other_state == KEPT:
+                            state = DROPPED
+                        elif state == KEPT:
+                            state = UNKNOWN
+        k += 1
+    return state
+
+
+@ti.func
+def _decide_all(r: ti.template(), out: ti.template(), inverse, tolerance):
+    """Run one round: decide every contact that can be decided."""
+    r.count[UNDECIDED] = 0
+    ti.loop_config(serialize=r.serial)
+    for i in range(r.count[FOUND]):
+        at = r.place[i]
+        if r.state[at] == UNKNOWN:
+            state = _decide(r, out, at, inverse, tolerance)
+            if state == UNKNOWN:
+                ti.atomic_add(r.count[UNDECIDED], 1)
+            else:
+                r.state[at] = state
+
+
+@ti.func
+def _list_kept(r: ti.template()):
+    """List the kept contacts in order, once all are decided."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        n = 0
+        if r.count[UNDECIDED] == 0:
+            for i in range(r.count[FOUND]):
+                if r.state[r.place[i]] == KEPT:
+                    r.kept[n] = r.place[i]
+                    n += 1
+        r.count[LEFT] = n
+
+
+@kernel
+def begin_reduction(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64):
+    """Enter the contacts into the cells and run the first round; more are needed only while contacts are undecided."""
+    _fill_cells(r, out, inverse)
+    _decide_all(r, out.data, inverse, tolerance)
+    _list_kept(r)
+
+
+@kernel
+def decide(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64):
+    """Run a further round."""
+    _decide_all(r, out.data, inverse, tolerance)
+    _list_kept(r)
+
+
+def reduce_contacts(r: ReductionFields, out: Parts, tolerance: float, cell: float) -> None:
+    """Fill r.kept and r.count for a buffer of contacts. tolerance [m]; cell: edge of the cells [m], at least 2.5 tolerances."""
+    inverse = 1.0 / max(cell, 2.5 * tolerance)
+    begin_reduction(r, out, inverse, tolerance)
+    while r.count[UNDECIDED] > 0:
+        decide(r, out, inverse, tolerance)

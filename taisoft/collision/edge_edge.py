@@ -1,4 +1,6 @@
-"""Contacts of two crossing edges: at the nearest points of their lines, along the normal n perpendicular to both.
+"""Contacts by proximity of deformed surfaces: of vertices (`vertex_face`), then of two crossing edges.
+
+Edges: contacts lie at the nearest points of their lines, along the normal n perpendicular to both.
 
 n must lie in the normal cones of both edges. Penetrating edges have shifted along each other, so they may cross slightly beyond
 an end. Skip an edge pair when an endpoint's vertex contact already separates it. Pairs that do not cross are tested again at
@@ -8,11 +10,22 @@ be wrong.
 
 import taichi as ti
 
+from taisoft.backend.runtime import kernel
+from taisoft.collision.candidates import EDGES, sum_parts
 from taisoft.collision.contacts import EDGE_EDGE, write_contact
-from taisoft.collision.features import BY_FACES, EDGE_SLACK, corner, edge_in_normal_cone, edge_normal, in_normal_cone, unit
-from taisoft.collision.surface import INSIDE_BITS, dvec, ivec
-from taisoft.collision.triangles import closest_lines
-from taisoft.collision.vertex_face import max_self_depth
+from taisoft.collision.features import (
+    BY_FACES,
+    EDGE_SLACK,
+    closest_lines,
+    corner,
+    edge_in_normal_cone,
+    edge_normal,
+    in_normal_cone,
+    mark_sharp_edges,
+    unit,
+)
+from taisoft.collision.surface import ACTIVE, INSIDE_BITS, dvec, ivec, list_near, part_first, sum_pairs
+from taisoft.collision.vertex_face import max_self_depth, vertex_contacts
 
 # Penetrating edges have shifted along each other and may cross beyond an end, by at most MAX_MISS depths and MAX_OVERHANG lengths
 # of the edge; the surfaces are elsewhere farther out
@@ -29,16 +42,21 @@ TINY = 1e-9  # of lengths: rounding
 
 
 @ti.func
+def _height(s: ti.template(), p, u, m):
+    """Height [m] of point p over the higher of the faces at edge m of triangle u."""
+    d = p - corner(s, u, m)
+    height = d.dot(s.normal[u])
+    if s.neighbour[u, m] >= 0:
+        height = ti.max(height, d.dot(s.normal[s.neighbour[u, m]]))
+    return height
+
+
+@ti.func
 def _is_behind(s: ti.template(), i, length, u, m, fraction):
     """1 if vertex i, of an edge of the given length, lies behind both faces at edge m of triangle u, or before them by at most
     the given fraction of the length."""
-    d = s.x[i] - corner(s, u, m)
-    slack = fraction * length + ti.cast(TINY, ti.f64) * (length + d.norm())
-    behind = int(d.dot(s.normal[u]) <= slack)
-    v = s.neighbour[u, m]
-    if v >= 0:
-        behind &= int(d.dot(s.normal[v]) <= slack)
-    return behind
+    slack = fraction * length + ti.cast(TINY, ti.f64) * (length + (s.x[i] - corner(s, u, m)).norm())
+    return int(_height(s, s.x[i], u, m) <= slack)
 
 
 @ti.func
@@ -61,11 +79,7 @@ def _is_past_end(s: ti.template(), t, k, position, length, gap, q):
 def _is_freed(s: ti.template(), p, i, u, m, gap):
     """1 if the exit displacement of vertex i also frees point p of its edge, `gap` < 0 deep below edge m of triangle u: the depth
     left is below FREED of that. A point deeper than SHALLOW counts as freed: it is far from where i entered."""
-    d = p + s.exit_direction[i] - corner(s, u, m)
-    depth = -d.dot(s.normal[u])
-    v = s.neighbour[u, m]
-    if v >= 0:
-        depth = ti.min(depth, -d.dot(s.normal[v]))
+    depth = -_height(s, p + s.exit_direction[i], u, m)
     shallow = ti.cast(SHALLOW, ti.f64) * (corner(s, u, m + 1) - corner(s, u, m)).norm()
     return int(depth < -ti.cast(FREED, ti.f64) * gap) | int(-gap > shallow)
 
@@ -137,10 +151,9 @@ def _max_depth(s: ti.template(), t, k, u, m, f, g, la, lb):
 
 
 @ti.func
-def edge_contact(s: ti.template(), mode: ti.template(), t, k, u, m, margin, out: ti.template(), start, end):
+def edge_contact(s: ti.template(), t, k, u, m, margin, out: ti.template(), start, end):
     """Write the contact of edge k of triangle t with edge m of triangle u if they cross now, or cross and penetrate at the end of
-    the step, as a fold that slides over an edge does. The gap is that of the same points at the start. mode: as in
-    `find_proximity`. Return the new count."""
+    the step, as a fold that slides over an edge does. The gap is that of the same points at the start. Return the new count."""
     at = start
     for at_end in range(2):
         valid = int(at == start)
@@ -182,7 +195,7 @@ def edge_contact(s: ti.template(), mode: ti.template(), t, k, u, m, margin, out:
                     if valid == 1 and at_end == 0:
                         valid = 1 - _is_past_end(s, t1, k1, position, length, gap, ti.select(side, a0 + f * da, b0 + g * db))
                     if valid == 1 and at_end == 0:
-                        by_faces = int(mode[s.body[t2]] == BY_FACES) | int(s.body[t1] == s.body[t2])
+                        by_faces = int(s.mode[s.body[t2]] == BY_FACES) | int(s.body[t1] == s.body[t2])
                         p = ti.select(side, b0 + g * db, a0 + f * da)
                         valid = 1 - _covered_by_end(s, t1, k1, p, position, length, gap, t2, k2, along, by_faces)
                 if valid == 1:
@@ -193,20 +206,93 @@ def edge_contact(s: ti.template(), mode: ti.template(), t, k, u, m, margin, out:
                     if g_in != g:
                         middle = b0 + g_in * db + 0.5 * gap * n
                     f, g = f_in, g_in
-                    write_contact(
-                        out,
-                        at,
-                        end,
-                        s.body[t],
-                        s.body[u],
-                        ivec(EDGE_EDGE, 3 * t + k, 3 * u + m),
-                        middle + 0.5 * gap * n,
-                        n,
-                        gap,
-                        ivec(s.triangle[t, k], s.triangle[t, (k + 1) % 3], -1),
-                        dvec(1.0 - f, f, 0.0),
-                        ivec(s.triangle[u, m], s.triangle[u, (m + 1) % 3], -1),
-                        dvec(1.0 - g, g, 0.0),
-                    )
+                    feature = ivec(EDGE_EDGE, 3 * t + k, 3 * u + m)
+                    nodes_t = ivec(s.triangle[t, k], s.triangle[t, (k + 1) % 3], -1)
+                    nodes_u = ivec(s.triangle[u, m], s.triangle[u, (m + 1) % 3], -1)
+                    w_t, w_u, point = dvec(1.0 - f, f, 0.0), dvec(1.0 - g, g, 0.0), middle + 0.5 * gap * n
+                    write_contact(out, at, end, s.body[t], s.body[u], feature, point, n, gap, nodes_t, w_t, nodes_u, w_u)
                     at += 1
     return at
+
+
+@ti.func
+def can_cross(a, b):
+    """1 if two edges can cross: one is sharp, the other sharp or flat. a, b: bits of `mark_sharp_edges`, shifted to the edge."""
+    return ((a & (b >> 3)) | ((a >> 3) & b)) & 1
+
+
+@ti.func
+def _vertices(s: ti.template(), near: ti.template(), row: ti.template(), margin, padding, out: ti.template()):
+    """Write the contacts of vertices, the first in each part of the buffer."""
+    ti.loop_config(serialize=s.serial)
+    for task in range(s.chunks * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
+            at, end, begin = c * out.part, (c + 1) * out.part, c * row.part
+            own, n_near, max_row, pairs = -1, 0, 0, 0
+            for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
+                t = s.active[j]
+                if s.body[t] != own:
+                    own = s.body[t]
+                    n_near = list_near(s, c, own)
+                for q in range(3):
+                    if (s.owns[t] >> q) & 1:
+                        lo, hi = near.bounds(s, t, q, padding)
+                        for k in range(n_near):
+                            other = s.near[c * s.n_bodies + k]
+                            if s.mode[other] == BY_FACES or other == own:
+                                n = near.list_triangles(s, other, t, q, lo, hi, row.data, begin, begin + row.part)
+                                max_row, pairs = ti.max(max_row, n), pairs + n
+                                if 0 < n <= row.part:
+                                    i = s.triangle[t, q]
+                                    at = vertex_contacts(s, row.data, begin, begin + n, i, own, margin, out.data, at, end)
+            out.used[c], row.used[c], s.part[c] = at - c * out.part, max_row, pairs
+
+
+@ti.func
+def _edges(s: ti.template(), near: ti.template(), row: ti.template(), margin, padding, out: ti.template()):
+    """Append the contacts of edges. They depend on the vertices found inside."""
+    ti.loop_config(serialize=s.serial)
+    for task in range(s.chunks * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
+            at, end, begin = c * out.part + out.used[c], (c + 1) * out.part, c * row.part
+            own, n_near, max_row, pairs = -1, 0, row.used[c], s.part[c]
+            for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
+                t = s.active[j]
+                if s.body[t] != own:
+                    own = s.body[t]
+                    n_near = list_near(s, c, own)
+                if s.sharp[t] & 7 != 0:
+                    lo, hi = near.bounds(s, t, EDGES, padding)
+                    for k in range(n_near):
+                        other = s.near[c * s.n_bodies + k]
+                        n = near.list_triangles(s, other, t, EDGES, lo, hi, row.data, begin, begin + row.part)
+                        max_row, pairs = ti.max(max_row, n), pairs + n
+                        if n <= row.part:
+                            for e in range(9 * n):
+                                u, k_t, k_u = row.data[begin + e // 9], e % 9 // 3, e % 3
+                                if can_cross(s.sharp[t] >> k_t, s.sharp[u] >> k_u) == 1:
+                                    t1, k1, t2, k2 = t, k_t, u, k_u
+                                    if u < t:
+                                        t1, k1, t2, k2 = u, k_u, t, k_t
+                                    at = edge_contact(s, t1, k1, t2, k2, margin, out.data, at, end)
+            out.used[c], row.used[c], s.part[c] = at - c * out.part, max_row, pairs
+
+
+@kernel(cse=False)
+def find_proximity(
+    s: ti.template(), near: ti.template(), row: ti.template(), margin: ti.f64, padding: ti.f64, out: ti.template()
+):
+    """Write all contacts by proximity, the first in the buffer `out`.
+
+    near: trees or rows of a broad phase; row: buffer of the triangles near one query; padding: half the reach [m].
+    """
+    mark_sharp_edges(s)
+    _vertices(s, near, row, margin, padding, out)
+    _edges(s, near, row, margin, padding, out)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        sum_parts(out)
+        sum_parts(row)
+        sum_pairs(s, 0)

@@ -16,7 +16,7 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import Buffer, Candidates, entries, sort_row, sum_parts
-from taisoft.collision.surface import ACTIVE, Surface, boxes_overlap, ivec, may_touch, part_first
+from taisoft.collision.surface import ACTIVE, Surface, cell_of, ivec, may_touch, part_first
 
 LARGE = 512  # cells above which a triangle counts as large
 COUNTABLE = 2.0**50  # cells from the origin beyond which f64 cannot distinguish neighbouring cells
@@ -27,6 +27,30 @@ SCAN = 256  # parts of the prefix scan
 N_LARGE, N_ENTRIES = 0, 1  # indices into Grid.count
 
 
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Fields of the grid."""
+
+    nx: Count  # cells along each axis
+    ny: Count
+    nz: Count
+    n_cells: Count
+    cell_start: Any  # (n_cells) i32: members of each cell
+    cell_end: Any
+    scan: Any  # (SCAN) i32: sums of the parts of the scan
+    first_cell: Any  # (n_triangles) 3-vectors i32: of the cells that a box covers
+    cell_count: Any  # (n_triangles) 3-vectors i32: along each axis, 0 for large ones
+    large: Any  # i32: large triangles, the first count[N_LARGE] entries
+    count: Any  # (2) i32
+    start: Any  # (n_triangles) i32: rows
+    end: Any
+
+    @property
+    def size(self) -> tuple[int, int, int]:
+        """Cells along each axis."""
+        return self.nx, self.ny, self.nz
+
+
 def grid_size(extent: np.ndarray, cell: float, n_triangles: int) -> tuple[int, int, int]:
     """Return the cells along each axis, powers of two: enough for the extent (3,) [m], but not many more than triangles."""
     max_cells = min(MAX_CELLS, max(512, CELLS_PER_TRIANGLE * n_triangles))
@@ -34,17 +58,6 @@ def grid_size(extent: np.ndarray, cell: float, n_triangles: int) -> tuple[int, i
     while sum(bits) > math.log2(max_cells):
         bits[bits.index(max(bits))] -= 1
     return tuple(2**b for b in bits)
-
-
-@ti.func
-def _cell_of(g: ti.template(), x, inverse):
-    """Wrapped cell of a point within COUNTABLE cells of the origin."""
-    cell = ivec(0)
-    for q in ti.static(range(3)):
-        n = ti.cast(g.size[q], ti.f64)
-        k = ti.floor(x[q] * inverse)
-        cell[q] = ti.cast(k - n * ti.floor(k / n), ti.i32)
-    return cell
 
 
 @ti.func
@@ -60,7 +73,7 @@ def _cells_of(s: ti.template(), g: ti.template(), t, inverse):
         cells *= ti.min(ti.floor(hi[q] * inverse) - ti.floor(lo[q] * inverse) + 1.0, ti.cast(g.size[q], ti.f64))
     first = ivec(0)
     if farthest < COUNTABLE and cells <= LARGE:
-        first = _cell_of(g, lo, inverse)
+        first = cell_of(lo, inverse, g.size)
         for q in ti.static(range(3)):
             span = ti.floor(hi[q] * inverse) - ti.floor(lo[q] * inverse) + 1.0
             count[q] = ti.cast(ti.min(span, ti.cast(g.size[q], ti.f64)), ti.i32)
@@ -68,18 +81,15 @@ def _cells_of(s: ti.template(), g: ti.template(), t, inverse):
 
 
 @ti.func
-def _bucket(g: ti.template(), first, count, k):
-    """Index in memory of the k-th cell of a box."""
-    z = k % count[2]
-    y = (k // count[2]) % count[1]
-    x = k // (count[2] * count[1])
-    # sizes are powers of two
-    return _index(g, (first + ivec(x, y, z)) & ivec(g.size[0] - 1, g.size[1] - 1, g.size[2] - 1))
+def _index(g: ti.template(), cell):
+    return (cell[0] * g.size[1] + cell[1]) * g.size[2] + cell[2]
 
 
 @ti.func
-def _index(g: ti.template(), cell):
-    return (cell[0] * g.size[1] + cell[1]) * g.size[2] + cell[2]
+def _bucket(g: ti.template(), first, count, k):
+    """Index in memory of the k-th cell of a box."""
+    cell = first + ivec(k // (count[2] * count[1]), (k // count[2]) % count[1], k % count[2])
+    return _index(g, cell & ivec(g.size[0] - 1, g.size[1] - 1, g.size[2] - 1))  # sizes are powers of two
 
 
 @kernel
@@ -150,33 +160,18 @@ def scatter_cells(s: ti.template(), g: ti.template(), member: ti.template()):
 
 
 @ti.func
-def _append(entry: ti.template(), at, last, u):
-    """Write an entry if it fits; the caller counts it regardless."""
-    if at < last:
-        entry[at] = u
-
-
-@ti.func
 def _is_pair(s: ti.template(), t, u):
     """1 if two triangles' boxes overlap and they may touch."""
-    found = 0
-    if u != t:
-        if boxes_overlap(s, t, u):
-            found = may_touch(s, t, u)
+    found = 0  # axis by axis: the first one separates most boxes
+    if u != t and s.lo[t][0] <= s.hi[u][0] and s.lo[u][0] <= s.hi[t][0]:
+        if s.lo[t][1] <= s.hi[u][1] and s.lo[u][1] <= s.hi[t][1]:
+            if s.lo[t][2] <= s.hi[u][2] and s.lo[u][2] <= s.hi[t][2]:
+                found = may_touch(s, t, u)
     return found
 
 
 @kernel
-def find_rows(
-    s: ti.template(),
-    g: ti.template(),
-    member: ti.template(),
-    entry: ti.template(),
-    used: ti.template(),
-    total: ti.template(),
-    part: ti.i32,
-    inverse: ti.f64,
-):
+def find_rows(s: ti.template(), g: ti.template(), member: ti.template(), out: ti.template()):
     """Write each active triangle's row, sorted; each chunk fills its own part of the entries."""
     ti.loop_config(serialize=s.serial)
     for t in range(s.n_triangles):
@@ -186,8 +181,7 @@ def find_rows(
     for task in range(s.chunks * s.spread):
         if task % s.spread == 0:
             c = task // s.spread
-            last = (c + 1) * part
-            at = c * part
+            at, last = c * out.part, (c + 1) * out.part
             for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
                 t = s.active[i]
                 begin = at
@@ -201,74 +195,23 @@ def find_rows(
                         if s.body[u] != own or self_on == 1:
                             if _is_pair(s, t, u) == 1:
                                 if _index(g, ti.select(s.lo[t] >= s.lo[u], first, g.first_cell[u])) == bucket:
-                                    _append(entry, at, last, u)
+                                    if at < last:
+                                        out.data[at] = u
                                     at += 1
-                if count[0] == 0:
-                    for j in range(s.count[ACTIVE]):
-                        u = s.active[j]
-                        if _is_pair(s, t, u) == 1:
-                            _append(entry, at, last, u)
-                            at += 1
-                else:
-                    for j in range(g.count[N_LARGE]):
-                        u = g.large[j]
-                        if _is_pair(s, t, u) == 1:
-                            _append(entry, at, last, u)
-                            at += 1
+                for j in range(ti.select(count[0] == 0, s.count[ACTIVE], g.count[N_LARGE])):
+                    u = ti.select(count[0] == 0, s.active[j], g.large[j])
+                    if _is_pair(s, t, u) == 1:
+                        if at < last:
+                            out.data[at] = u
+                        at += 1
                 if at <= last:
                     g.start[t] = begin
                     g.end[t] = at
-                    sort_row(entry, begin, at)
-            used[c] = at - c * part
+                    sort_row(out.data, begin, at)
+            out.used[c] = at - c * out.part
     ti.loop_config(serialize=True)
     for _ in range(1):
-        sum_parts(used, total, s.chunks)
-
-
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """Fields of the grid."""
-
-    nx: Count  # cells along each axis
-    ny: Count
-    nz: Count
-    n_cells: Count
-    cell_start: Any  # (n_cells) i32: members of each cell
-    cell_end: Any
-    scan: Any  # (SCAN) i32: sums of the parts of the scan
-    first_cell: Any  # (n_triangles) 3-vectors i32: of the cells that a box covers
-    cell_count: Any  # (n_triangles) 3-vectors i32: along each axis, 0 for large ones
-    large: Any  # i32: large triangles, the first count[N_LARGE] entries
-    count: Any  # (2) i32
-    start: Any  # (n_triangles) i32: rows
-    end: Any
-
-    @property
-    def size(self) -> tuple[int, int, int]:
-        """Cells along each axis."""
-        return self.nx, self.ny, self.nz
-
-
-def _make_grid(size: tuple[int, int, int], n: int, arena: FieldArena) -> Grid:
-    """Allocate the grid for n triangles."""
-    cells = size[0] * size[1] * size[2]
-
-    def ints(name: str, count: int):
-        return arena.field(f"hash_{name}", ti.i32, count)
-
-    return Grid(
-        *size,
-        cells,
-        ints("cell_start", cells),
-        ints("cell_end", cells),
-        ints("scan", SCAN),
-        arena.vectors("hash_first_cell", ti.i32, n),
-        arena.vectors("hash_cell_count", ti.i32, n),
-        ints("large", n),
-        ints("count", 2),
-        ints("start", n),
-        ints("end", n),
-    )
+        sum_parts(out)
 
 
 class SpatialHash:
@@ -284,9 +227,13 @@ class SpatialHash:
         max_capacity: int | None = None,
     ):
         """extent: typical extent (3,) [m]. capacity, max_capacity: initial and maximum entries; None for the default."""
-        n = surface.n_triangles
-        self.surface, self.cell = surface, cell
-        self.grid = _make_grid(grid_size(extent, cell, n), max(n, 1), arena)
+        self.surface, self.cell, n = surface, cell, max(surface.n_triangles, 1)
+        size = grid_size(extent, cell, surface.n_triangles)
+        cells = size[0] * size[1] * size[2]
+        counts = {"cell_start": cells, "cell_end": cells, "scan": SCAN, "large": n, "count": 2, "start": n, "end": n}
+        fields = {name: arena.field(f"hash_{name}", ti.i32, count) for name, count in counts.items()}
+        fields |= {name: arena.vectors(f"hash_{name}", ti.i32, n) for name in ("first_cell", "cell_count")}
+        self.grid = Grid(*size, cells, **fields)
         self.members = Buffer("hash_cells", entries, capacity or 8 * n + 64, max_capacity, 1, arena)
         self.rows = Buffer("hash_rows", entries, capacity or ENTRIES_PER_TRIANGLE * n + 64, max_capacity, surface.chunks, arena)
 
@@ -299,14 +246,11 @@ class SpatialHash:
         self.members.grow_if_full()
         scatter_cells(s, g, self.members.data)
         while True:
-            rows = self.rows
-            find_rows(s, g, self.members.data, rows.data, rows.used, rows.count, rows.part, inverse)
-            if not rows.grow_if_full():
-                return Candidates(g.start, g.end, rows.data)
+            find_rows(s, g, self.members.data, self.rows.parts)
+            if not self.rows.grow_if_full():
+                return Candidates(g.start, g.end, self.rows.data)
 
-    def near(self) -> Candidates:
-        """The same, for `queries.py`."""
-        return self.find()
+    near = find  # queries read the rows
 
     @property
     def buffers(self) -> tuple[Buffer, ...]:

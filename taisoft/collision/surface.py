@@ -1,6 +1,9 @@
-"""Surface triangles of all colliders in one list: soft bodies first, then obstacles that have faces.
+"""Surface triangles of all colliders in one list on the device: soft bodies first, then obstacles that have faces.
 
-Positions and boxes are f64 in either precision, since a gap is a small difference of large numbers. `boxes.py` fills them.
+Positions and boxes are f64 in either precision, since a gap is a small difference of large numbers. A triangle's box bounds it
+at the start and at the end of the step and is grown by half the margin, so that two triangles whose distance falls below the
+margin have overlapping boxes. A triangle with a non-finite coordinate has an empty box, which overlaps nothing. Active triangles
+are those that can have a partner.
 """
 
 from dataclasses import dataclass
@@ -10,7 +13,8 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena
-from taisoft.backend.runtime import Runtime
+from taisoft.backend.runtime import Runtime, kernel
+from taisoft.collision.colliders import Topology
 
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than starting the others (about 50 us a loop)
 # The same for loops with little work per iteration: boxes, tree refit, sharp edges, reduction. Measured with two cores: equal at
@@ -26,32 +30,9 @@ dvec = ti.types.vector(3, ti.f64)
 ivec = ti.types.vector(3, ti.i32)
 
 
-@dataclass(frozen=True)
-class Topology:
-    """Triangles on the host. Vertices are numbered over all colliders, surface vertices only.
-
-    triangle: (t,3) vertices; body: (t,) collider, ascending; first: (n_bodies + 1,) first triangle of each collider;
-    vertex_first: (n_bodies + 1,) first vertex; node: (v,) the model's node, -1 for obstacles; neighbour: (t,3) triangle across
-    the edge from corner k to k + 1, -1 if there is none; owns: (t,) bits 0-2 corners, 3-5 edges that this triangle handles on
-    behalf of all that share them; ring_start, ring: triangles around each vertex; around_start, around: adjacent vertices.
-    """
-
-    triangle: np.ndarray
-    body: np.ndarray
-    first: np.ndarray
-    vertex_first: np.ndarray
-    node: np.ndarray
-    neighbour: np.ndarray
-    owns: np.ndarray
-    ring_start: np.ndarray
-    ring: np.ndarray
-    around_start: np.ndarray
-    around: np.ndarray
-
-
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Fields of the triangles, for kernels; the tables are described in `Topology`."""
+    """Fields of the triangles, for kernels. triangle to around are the tables of `Topology`."""
 
     n_triangles: Count
     n_verts: Count
@@ -61,18 +42,19 @@ class Surface:
     chunks: int
     spread: int  # loop iterations per chunk, see SPREAD
     cheap_spread: int  # the same for cheap loops
-    triangle: Any  # (n_triangles, 3) i32
-    body: Any  # i32
-    node: Any  # i32
-    neighbour: Any  # (n_triangles, 3) i32
-    owns: Any  # i32
-    ring_start: Any  # i32
-    ring: Any  # i32
-    around_start: Any  # i32
-    around: Any  # i32
+    triangle: Any
+    body: Any
+    node: Any
+    neighbour: Any
+    owns: Any
+    ring_start: Any
+    ring: Any
+    around_start: Any
+    around: Any
+    first_of: Any  # (n_bodies + 1) i32: first triangle of each collider
     soft: Any  # (n_bodies) i32: 1 for soft bodies
     self_on: Any  # (n_bodies) i32: 1 if a body is tested against itself
-    first_of: Any  # (n_bodies + 1) i32
+    mode: Any  # (n_bodies) i32: contact mode, see `features`
     thickness: Any  # (n_bodies) f64: thickness [m], inf for half-spaces
     edge: Any  # (n_bodies) f64: mean surface edges of the bodies [m], inf for obstacles
     rest: Any  # (n_verts) 3-vectors f64: rest positions [m]
@@ -82,147 +64,67 @@ class Surface:
     hi: Any
     normal: Any  # 3-vectors f64: unit normals of the triangles at x, 0 for degenerate ones
     area: Any  # f64: twice their areas [m^2]
-    body_lo: Any  # (n_bodies) 3-vectors f64
+    body_lo: Any  # (n_bodies) 3-vectors f64: boxes of the colliders [m]
     body_hi: Any
     active: Any  # i32: triangles whose box meets another collider's, ascending; the first count[ACTIVE] are valid
     count: Any  # (4) i32: numbers of NONFINITE and ACTIVE triangles, and of (query, nearby triangle) PAIRS
     part: Any  # (chunks) i32: count of each chunk
     near: Any  # (chunks * n_bodies) i32: colliders near each chunk's current collider
+    sharp: Any  # (n_triangles) i32: edge bits, see `mark_sharp_edges`
     inside: Any  # (n_verts) i32: bit k % INSIDE_BITS is set if the vertex is in collider k and has contacts that move it out
     exit_direction: Any  # (n_verts) 3-vectors f64: summed exit displacements of those contacts [m]
-
-
-def make_topology(parts: list[tuple[np.ndarray, np.ndarray]]) -> Topology:
-    """Combine the surfaces of all colliders. parts: for each, (t,3) triangles and the (v,) nodes of their vertices."""
-    triangle, body, node, first, vertex_first = [], [], [], [0], [0]
-    for k, (triangles, nodes) in enumerate(parts):
-        triangle.append(triangles + vertex_first[-1])
-        body.append(np.full(len(triangles), k))
-        node.append(nodes)
-        first.append(first[-1] + len(triangles))
-        vertex_first.append(vertex_first[-1] + len(nodes))
-    t = np.concatenate(triangle).reshape(-1, 3)
-    neighbour, edge_owned = _edge_neighbours(t)
-    corners = t.reshape(-1)
-    order = np.argsort(corners, kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=vertex_first[-1]))])
-    ring = order // 3
-    owner = np.full(vertex_first[-1], -1)
-    used = start[1:] > start[:-1]
-    owner[used] = ring[start[:-1][used]]  # the first triangle around a vertex
-    corner_owned = owner[t] == np.arange(len(t))[:, None]
-    bits = np.concatenate([corner_owned, edge_owned], axis=1) @ (1 << np.arange(6))
-    return Topology(
-        t,
-        np.concatenate(body),
-        np.array(first),
-        np.array(vertex_first),
-        np.concatenate(node),
-        neighbour,
-        bits,
-        start,
-        ring,
-        *_adjacent_vertices(t, vertex_first[-1]),
-    )
-
-
-def _adjacent_vertices(t: np.ndarray, n_verts: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the start of each vertex's list (n_verts + 1,), and the adjacent vertices, ascending."""
-    ends = t[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    code = np.unique(np.concatenate([ends, ends[:, ::-1]]) @ [n_verts, 1])
-    return np.searchsorted(code, np.arange(n_verts + 1) * n_verts), code % max(n_verts, 1)
-
-
-def _edge_neighbours(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return neighbours (t,3) across the edges, -1 at open and non-manifold edges; (t,3) bool: the triangle owns the edge."""
-    ends = np.sort(np.stack([t, np.roll(t, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    new = np.ones(len(order), dtype=bool)
-    new[1:] = (ends[order[1:]] != ends[order[:-1]]).any(axis=1)
-    starts = np.flatnonzero(new)
-    counts = np.diff(np.append(starts, len(order)))
-    neighbour = np.full(len(order), -1)
-    a, b = order[starts[counts == 2]], order[starts[counts == 2] + 1]
-    neighbour[a], neighbour[b] = b // 3, a // 3
-    owned = np.zeros(len(order), dtype=bool)
-    owned[order[starts]] = True  # the lowest triangle, since the sort is stable
-    return neighbour.reshape(-1, 3), owned.reshape(-1, 3)
 
 
 def build_surface(
     topology: Topology,
     rest: np.ndarray,
-    soft: np.ndarray,
-    self_on: np.ndarray,
-    thickness: np.ndarray,
-    edge: np.ndarray,
+    properties: dict[str, np.ndarray],
     runtime: Runtime,
     arena: FieldArena,
     serial: bool | None = None,
 ) -> Surface:
-    """Allocate and fill the fields. rest: (v,3) [m]; soft, self_on: (n_bodies,) bool; thickness, edge: (n_bodies,) [m].
+    """Allocate and fill the fields. rest: (v,3) [m]; properties: soft, self_on, mode, thickness and edge, (n_bodies,) each.
     serial: None decides by size."""
-    t, i = topology, ti.i32
-    n, v, bodies = len(t.triangle), len(t.node), len(soft)
+    t, bodies = topology, len(properties["soft"])
+    n, v = len(t.triangle), len(t.node)
     serial_cheap = serial
     if serial is None:
         serial, serial_cheap = (runtime.arch == "cpu" and n < limit for limit in (SERIAL_BELOW, SERIAL_CHEAP_BELOW))
     chunks = 1 if serial else CHUNKS[runtime.arch]
-
-    def ints(name: str, data: np.ndarray):
-        return arena.field(f"surface_{name}", i, max(len(data), 1), _non_empty(data))
-
-    def rows(name: str, data: np.ndarray):
-        # not a vector field: the compiler confuses run-time and fixed component indices within one kernel
-        return arena.field(f"surface_{name}", i, (max(len(data), 1), 3), _non_empty(data))
-
-    def vectors(name: str, count: int):
-        return arena.vectors(f"surface_{name}", ti.f64, max(count, 1))
-
+    tables = {name: getattr(t, name) for name in ("triangle", "body", "node", "neighbour", "owns")}
+    tables |= {name: getattr(t, name) for name in ("ring_start", "ring", "around_start", "around")}
+    tables |= {name: properties[name] for name in ("soft", "self_on")} | {"first_of": t.first}
+    vectors = dict.fromkeys(("x", "move"), v) | dict.fromkeys(("lo", "hi", "normal"), n)
+    vectors |= dict.fromkeys(("body_lo", "body_hi"), bodies)
+    zeros = {"active": n, "count": 4, "part": chunks, "near": chunks * bodies, "sharp": n, "inside": v}
+    # triangles are rows, not vectors: the compiler confuses run-time and fixed component indices within one kernel
+    fields = {name: integers(arena, f"surface_{name}", data) for name, data in tables.items()}
+    fields |= {name: arena.vectors(f"surface_{name}", ti.f64, max(count, 1)) for name, count in vectors.items()}
+    fields |= {name: arena.field(f"surface_{name}", ti.i32, max(count, 1)) for name, count in zeros.items()}
+    for name in ("thickness", "edge"):
+        fields[name] = arena.field(f"surface_{name}", ti.f64, max(bodies, 1), properties[name] if bodies else None)
     return Surface(
-        n,
-        v,
-        bodies,
-        serial,
-        serial_cheap,
-        chunks,
-        *(1 if one else SPREAD[runtime.arch] for one in (serial, serial_cheap)),
-        rows("triangle", t.triangle),
-        ints("body", t.body),
-        ints("node", t.node),
-        rows("neighbour", t.neighbour),
-        ints("owns", t.owns),
-        ints("ring_start", t.ring_start),
-        ints("ring", t.ring),
-        ints("around_start", t.around_start),
-        ints("around", t.around),
-        ints("soft", soft),
-        ints("self_on", self_on),
-        ints("first_of", t.first),
-        arena.field("surface_thickness", ti.f64, max(bodies, 1), thickness if bodies else None),
-        arena.field("surface_edge", ti.f64, max(bodies, 1), edge if bodies else None),
-        arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None),
-        vectors("x", v),
-        vectors("move", v),
-        vectors("lo", n),
-        vectors("hi", n),
-        vectors("normal", n),
-        arena.field("surface_area", ti.f64, max(n, 1)),
-        vectors("body_lo", bodies),
-        vectors("body_hi", bodies),
-        arena.field("surface_active", i, max(n, 1)),
-        arena.field("surface_count", i, 4),
-        arena.field("surface_part", i, chunks),
-        arena.field("surface_near", i, chunks * max(bodies, 1)),
-        arena.field("surface_inside", i, max(v, 1)),
-        vectors("exit_direction", v),
+        n_triangles=n,
+        n_verts=v,
+        n_bodies=bodies,
+        serial=serial,
+        serial_cheap=serial_cheap,
+        chunks=chunks,
+        spread=1 if serial else SPREAD[runtime.arch],
+        cheap_spread=1 if serial_cheap else SPREAD[runtime.arch],
+        mode=integers(arena, "contact_mode", properties["mode"]),
+        rest=arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None),
+        area=arena.field("surface_area", ti.f64, max(n, 1)),
+        exit_direction=arena.vectors("surface_exit_direction", ti.f64, max(v, 1)),
+        **fields,
     )
 
 
-def _non_empty(data: np.ndarray) -> np.ndarray:
-    """Convert to i32 with at least one row, since no field may be empty."""
+def integers(arena: FieldArena, name: str, data: np.ndarray):
+    """Allocate and fill an i32 field, with one row of zeros for no data, since no field may be empty."""
     data = np.asarray(data)
-    return (data if len(data) else np.zeros((1, *data.shape[1:]))).astype(np.int32)
+    data = (data if len(data) else np.zeros((1, *data.shape[1:]))).astype(np.int32)
+    return arena.field(name, ti.i32, data.shape, data)
 
 
 @ti.func
@@ -232,24 +134,14 @@ def part_first(c, n, parts: ti.template()):
 
 
 @ti.func
-def boxes_overlap(s: ti.template(), t, u):
-    """Whether the boxes of two triangles share a point."""
-    found = False  # axis by axis: the first one separates most boxes
-    if s.lo[t][0] <= s.hi[u][0] and s.lo[u][0] <= s.hi[t][0]:
-        if s.lo[t][1] <= s.hi[u][1] and s.lo[u][1] <= s.hi[t][1]:
-            found = s.lo[t][2] <= s.hi[u][2] and s.lo[u][2] <= s.hi[t][2]
-    return found
-
-
-@ti.func
-def share_vertex(s: ti.template(), t, u):
-    """Whether two triangles have a vertex in common."""
-    found = 0
-    for k in range(3):
-        i = s.triangle[t, k]
-        if i == s.triangle[u, 0] or i == s.triangle[u, 1] or i == s.triangle[u, 2]:
-            found = 1
-    return found
+def cell_of(x, inverse, size: ti.template()):
+    """Cell (3,) i32 of a point in a periodic grid of `size` cells along each axis; inverse: of a cell's edge [1/m]."""
+    cell = ivec(0)
+    for q in ti.static(range(3)):
+        n = ti.cast(size[q], ti.f64)
+        k = ti.floor(x[q] * inverse)
+        cell[q] = ti.cast(k - n * ti.floor(k / n), ti.i32)
+    return cell
 
 
 @ti.func
@@ -261,5 +153,182 @@ def may_touch(s: ti.template(), t, u):
     if a != b:
         result = s.soft[a] | s.soft[b]
     elif s.self_on[a] == 1:
-        result = 1 - share_vertex(s, t, u)
+        result = 1
+        for k in range(3):
+            i = s.triangle[t, k]
+            if i == s.triangle[u, 0] or i == s.triangle[u, 1] or i == s.triangle[u, 2]:
+                result = 0
     return result
+
+
+# --- positions, boxes and active triangles -------------------------------------------------------------------
+
+
+@kernel
+def move_obstacles(s: ti.template(), first: ti.i32, x: ti.types.ndarray(), move: ti.types.ndarray()):
+    """Set positions x and displacements move, (n,3) f64 [m], of an obstacle's vertices, from vertex `first` on."""
+    ti.loop_config(serialize=s.serial_cheap)
+    for i in range(x.shape[0]):
+        for q in ti.static(range(3)):
+            s.x[first + i][q] = x[i, q]
+            s.move[first + i][q] = move[i, q]
+
+
+@ti.func
+def _move_soft(
+    s: ti.template(), x: ti.template(), v: ti.template(), has_prescribed: ti.template(), prescribed: ti.template(), dt
+):
+    """Set positions and displacements of the soft bodies: prescribed ones where given, else v dt."""
+    ti.loop_config(serialize=s.serial_cheap)
+    for i in range(s.n_verts):
+        if s.node[i] >= 0:
+            s.x[i] = x[s.node[i]]
+            move = dt * ti.cast(v[s.node[i]], ti.f64)
+            if ti.static(has_prescribed):
+                for q in ti.static(range(3)):
+                    if prescribed[i][q] == prescribed[i][q]:
+                        move[q] = prescribed[i][q]
+            s.move[i] = move
+
+
+@ti.func
+def _box_triangles(s: ti.template(), margin):
+    """Compute boxes, normals and areas of the triangles, and count the non-finite ones."""
+    s.count[NONFINITE] = 0
+    half = ti.cast(0.5, ti.f64) * margin
+    ti.loop_config(serialize=s.serial_cheap)
+    for t in range(s.n_triangles):
+        i, j, k = s.triangle[t, 0], s.triangle[t, 1], s.triangle[t, 2]
+        a, b, c = s.x[i], s.x[j], s.x[k]
+        a1, b1, c1 = a + s.move[i], b + s.move[j], c + s.move[k]
+        n = (b - a).cross(c - a)
+        length = n.norm()
+        s.area[t] = length
+        s.normal[t] = ti.select(length > 0.0, n / length, 0.0)
+        finite = 1
+        for q in ti.static(range(3)):  # 0 times a non-finite number is nan
+            zero = 0.0 * a[q] + 0.0 * b[q] + 0.0 * c[q] + 0.0 * a1[q] + 0.0 * b1[q] + 0.0 * c1[q]
+            if not zero == 0.0:
+                finite = 0
+        lo, hi = dvec(ti.math.inf), dvec(-ti.math.inf)
+        if finite == 1:
+            lo = ti.min(a, b, c, a1, b1, c1) - half
+            hi = ti.max(a, b, c, a1, b1, c1) + half
+        else:
+            ti.atomic_add(s.count[NONFINITE], 1)
+        s.lo[t], s.hi[t] = lo, hi
+
+
+@ti.func
+def _box_bodies(s: ti.template()):
+    """Compute the boxes of the colliders."""
+    ti.loop_config(serialize=s.serial_cheap)
+    for task in range(s.n_bodies * s.cheap_spread):
+        if task % s.cheap_spread == 0:
+            b = task // s.cheap_spread
+            lo, hi = dvec(ti.math.inf), dvec(-ti.math.inf)
+            for t in range(s.first_of[b], s.first_of[b + 1]):
+                lo, hi = ti.min(lo, s.lo[t]), ti.max(hi, s.hi[t])
+            s.body_lo[b], s.body_hi[b] = lo, hi
+
+
+@ti.func
+def list_near(s: ti.template(), c, own):
+    """List, ascending from s.near[c * n_bodies], the colliders that collider `own` may touch and whose boxes overlap its own,
+    including itself if it is tested against itself. Return their number."""
+    n = 0
+    for b in range(s.n_bodies):
+        accepted = 0
+        if b == own:
+            accepted = s.self_on[own]
+        elif s.soft[own] | s.soft[b]:
+            accepted = int((s.body_lo[own] <= s.body_hi[b]).all()) & int((s.body_lo[b] <= s.body_hi[own]).all())
+        if accepted == 1:
+            s.near[c * s.n_bodies + n] = b
+            n += 1
+    return n
+
+
+@ti.func
+def sum_pairs(s: ti.template(), append):
+    """Sum the tested pairs of all parts; if `append` is 1, add them to the previous sum."""
+    total = append * s.count[PAIRS]
+    for c in range(s.chunks):
+        total += s.part[c]
+    s.count[PAIRS] = total
+
+
+@ti.func
+def _can_have_partner(s: ti.template(), t, first, last):
+    """1 if the box of a triangle overlaps that of a collider in s.near[first:last], its own included."""
+    own, lo, hi = s.body[t], s.lo[t], s.hi[t]
+    found = 0
+    if (lo <= hi).all():
+        k = first
+        while found == 0 and k < last:
+            b = s.near[k]
+            if b == own:
+                found = 1
+            elif lo[0] <= s.body_hi[b][0] and s.body_lo[b][0] <= hi[0]:
+                found = int((lo <= s.body_hi[b]).all()) & int((s.body_lo[b] <= hi).all())
+            k += 1
+    return found
+
+
+@ti.func
+def _list_active(s: ti.template()):
+    """List the triangles that can have a partner, in ascending order."""
+    ti.loop_config(serialize=s.serial_cheap)
+    for task in range(s.chunks * s.cheap_spread):
+        if task % s.cheap_spread == 0:
+            c = task // s.cheap_spread
+            first, near = part_first(c, s.n_triangles, s.chunks), c * s.n_bodies
+            n, n_near, own = 0, 0, -1
+            for t in range(first, part_first(c + 1, s.n_triangles, s.chunks)):
+                if s.body[t] != own:
+                    own = s.body[t]
+                    n_near = list_near(s, c, own)
+                if _can_have_partner(s, t, near, near + n_near) == 1:
+                    s.active[first + n] = t
+                    n += 1
+            s.part[c] = n
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        total = 0
+        for k in range(s.chunks):
+            base = part_first(k, s.n_triangles, s.chunks)
+            for j in range(s.part[k]):  # entries move left only, so none is overwritten before it is read
+                s.active[total + j] = s.active[base + j]
+            total += s.part[k]
+        s.count[ACTIVE] = total
+
+
+@kernel
+def update_boxes(s: ti.template(), margin: ti.f64):
+    """Update the boxes of triangles and colliders from x and move, the normals, and the active triangles."""
+    _box_triangles(s, margin)
+    _box_bodies(s)
+    _list_active(s)
+
+
+@kernel
+def update_surface(
+    s: ti.template(),
+    x: ti.template(),
+    v: ti.template(),
+    has_prescribed: ti.template(),
+    prescribed: ti.template(),
+    dt: ti.f64,
+    margin: ti.f64,
+    active: ti.template(),
+):
+    """Set the soft bodies' positions x (n_nodes) [m] and displacements in a step of dt [s] from the model, and update the boxes.
+
+    prescribed: (n_verts) 3-vectors, displacements [m], nan where free, read if has_prescribed. active: whether to list the
+    active triangles too.
+    """
+    _move_soft(s, x, v, has_prescribed, prescribed, dt)
+    _box_triangles(s, margin)
+    if ti.static(active):
+        _box_bodies(s)
+        _list_active(s)

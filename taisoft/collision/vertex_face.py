@@ -1,8 +1,8 @@
 """Contacts of a vertex with a face, an edge or a corner of another surface, both deformed.
 
-Each vertex is tested against the triangles of one other collider near its swept path (`queries.py`). Outside, each local minimum
-of the distance is a contact: two above a groove, one across a flat edge between two triangles. Inside, each face through which
-the vertex can exit is a contact; faces that meet in a ridge or a tip share one exit direction, over that ridge or tip. A face
+Each vertex is tested against the triangles of one other collider near its swept path. Outside, each local minimum of the
+distance is a contact: two above a groove, one across a flat edge between two triangles. Inside, each face through which the
+vertex can exit is a contact; faces that meet in a ridge or a tip share one exit direction, over that ridge or tip. A face
 counts only if its normal lies in the vertex's normal cone or, if no face's normal does, if the vertex normal opposes it. So a
 vertex under a block never exits through the far side of a thin sheet.
 """
@@ -11,7 +11,10 @@ import taichi as ti
 
 from taisoft.collision.contacts import VERTEX_FACE, write_contact
 from taisoft.collision.features import (
+    CORNER,
+    EDGE,
     ROUNDING,
+    closest_on_triangle,
     corner,
     edge_normal,
     in_normal_cone,
@@ -23,7 +26,6 @@ from taisoft.collision.features import (
     vertices_of,
 )
 from taisoft.collision.surface import INSIDE_BITS, dvec, ivec
-from taisoft.collision.triangles import CORNER, EDGE, closest_on_triangle
 
 RIDGE_DEPTH_RATIO = 2.0  # largest ratio of the depths behind the faces of a ridge that share an exit direction
 GROOVE_DEPTH_RATIO = 10.0  # largest depth behind a groove's second wall, beyond the margin, in depths behind the first
@@ -114,12 +116,6 @@ def _form_ridge(s: ti.template(), p, u, n_u, v, n_v, slack):
 
 
 @ti.func
-def closing(s: ti.template(), i, u, w, n):
-    """Approach [m] of vertex i to the point w of triangle u along n during the step; 0 if they separate."""
-    return ti.max(-(s.move[i] - moved(s, u, w)).dot(n), 0.0)
-
-
-@ti.func
 def vertex_contacts(s: ti.template(), entry: ti.template(), first, last, i, own, margin, out: ti.template(), start, end):
     """Write contacts of vertex i of collider `own` with triangles entry[first:last], all of one collider. Return the new count.
 
@@ -187,7 +183,7 @@ def vertex_contacts(s: ti.template(), entry: ti.template(), first, last, i, own,
                 u = stored[q]
         q += 1
         relation, n, h, distance, w, own_near = classify(s, i, u)
-        near = distance - closing(s, i, u, w, n) <= margin
+        near = distance - ti.max(-(s.move[i] - moved(s, u, w)).dot(n), 0.0) <= margin
         accepted = 0
         if phase == 0:
             if own_near == 0 and distance <= min_distance * one_plus:
@@ -252,20 +248,7 @@ def vertex_contacts(s: ti.template(), entry: ti.template(), first, last, i, own,
             if state == INSIDE:
                 s.inside[i] |= 1 << (other % INSIDE_BITS)
                 s.exit_direction[i] -= gap * n
-            write_contact(
-                out,
-                at,
-                end,
-                own,
-                other,
-                ivec(VERTEX_FACE, i, u),
-                p,
-                n,
-                gap,
-                ivec(i, -1, -1),
-                dvec(1.0, 0.0, 0.0),
-                vertices_of(s, u),
-                w,
-            )
+            feature, vertex, alone = ivec(VERTEX_FACE, i, u), ivec(i, -1, -1), dvec(1.0, 0.0, 0.0)
+            write_contact(out, at, end, own, other, feature, p, n, gap, vertex, alone, vertices_of(s, u), w)
             at += 1
     return at

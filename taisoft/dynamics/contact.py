@@ -9,7 +9,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.contacts import Contacts
-from taisoft.collision.pipeline import Detection
+from taisoft.collision.detector import Detection
 from taisoft.contact.build import (
     SELF_CONTACT,
     build_pair_numbers,

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from taisoft.collision.crossings import CROSSED, CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
-from taisoft.collision.pipeline import Detection
+from taisoft.collision.detector import Detection
+from taisoft.collision.intersections import CROSSED, CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.dynamics.ccd_limits import MAX_CLOSING, SPEED, WHICH, measure_closing
 
 DEEP_PENETRATION = 0.02  # of the finer side's mean surface edge: penetration reported as a problem

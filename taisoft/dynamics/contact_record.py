@@ -4,7 +4,7 @@ import numpy as np
 
 from taisoft.backend.arrays import download, upload
 from taisoft.collision.contacts import Contacts
-from taisoft.collision.pipeline import Detection
+from taisoft.collision.detector import Detection
 from taisoft.contact.problem import NODES, ContactProblem
 from taisoft.scene.scene import Scene
 

@@ -27,7 +27,7 @@ from taisoft.scene.scene import Scene
 from taisoft.settings import Settings, check_dt
 
 if TYPE_CHECKING:
-    from taisoft.collision.pipeline import Detection
+    from taisoft.collision.detector import Detection
     from taisoft.dynamics.contact import ContactStep
     from taisoft.dynamics.explicit_stepper import ExplicitStepper
     from taisoft.dynamics.implicit import ImplicitStepper
@@ -223,7 +223,7 @@ class Dynamics:
             self.contact.search(state.time, dt)
             return self.contact.detection
         if self._idle_detection is None:
-            from taisoft.collision.pipeline import Detection
+            from taisoft.collision.detector import Detection
 
             self._idle_detection = Detection(self.scene, state.model, state.layout, self.runtime, self._self_collision)
             self._owned.append(self._idle_detection)

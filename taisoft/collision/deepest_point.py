@@ -12,11 +12,13 @@ convex; may stop early at a kink of phi inside the triangle, but never at a high
 
 import taichi as ti
 
+from taisoft.collision.features import choose, corner, opposite, unit
 from taisoft.collision.surface import dvec
-from taisoft.collision.triangles import choose
 
 MAX_STEPS, MAX_TRIALS = 24, 6  # maximum steps, and maximum trials per line search
 GAP_TOLERANCE = 1e-7  # of the triangle's size: Frank-Wolfe gap at convergence
+ALIGNMENT_SINE = 0.26  # sine of 15 degrees: tolerance of grad phi in the conditions of a minimum
+MIN_EXTRA_DEPTH = 1e-5  # of a triangle's size: depth below its corners from which its deepest point is a contact
 
 
 @ti.func
@@ -83,10 +85,7 @@ def deepest_point(field: ti.template(), k, A, B, C, phi_corner):
     """Barycentric coordinates (3,) and phi of the deepest point of triangle A B C (3,) [m]. phi_corner: (3,) at its corners."""
     at = _argmin(phi_corner)
     w = dvec(ti.cast(at == 0, ti.f64), ti.cast(at == 1, ti.f64), ti.cast(at == 2, ti.f64))
-    before, last = dvec(0.0), dvec(0.0)  # weights two steps and one step ago
-    for j in ti.static(range(3)):
-        before[j] = w[j]
-        last[j] = w[j]
+    before, last = 1.0 * w, 1.0 * w  # weights two steps and one step ago
     size = ti.max((A - B).norm(), (B - C).norm(), (C - A).norm())
     tiny = ti.cast(GAP_TOLERANCE, ti.f64) * size
     x = choose(at, A, B, C)
@@ -107,8 +106,7 @@ def deepest_point(field: ti.template(), k, A, B, C, phi_corner):
                         for j in ti.static(range(3)):
                             direction[j] = ti.cast(j == target, ti.f64) - ti.cast(j == source, ti.f64)
                 elif step % 3 == 2:
-                    for j in ti.static(range(3)):
-                        direction[j] = w[j] - before[j]
+                    direction = w - before
                 if best == 0.0 and direction.dot(slope) < 0.0:
                     max_step, end = _max_step(w, direction)
                     d = direction[0] * A + direction[1] * B + direction[2] * C
@@ -122,10 +120,41 @@ def deepest_point(field: ti.template(), k, A, B, C, phi_corner):
                     w[j] = ti.max(w[j] + best * direction[j], 0.0)
                     if j == end and best >= max_step:
                         w[j] = 0.0
-                total = w.sum()
-                for j in ti.static(range(3)):
-                    w[j] /= total
+                w /= w.sum()
                 x = w[0] * A + w[1] * B + w[2] * C
                 phi = value
         step += 1
     return w, phi
+
+
+@ti.func
+def is_surface_minimum(s: ti.template(), t, w, n, x):
+    """1 if the deepest point x of triangle t, weights w, is also a local minimum of the whole surface that faces n.
+
+    To within ALIGNMENT_SINE, n must oppose the triangle's normal at an interior point and be perpendicular to the edge at a point
+    on an edge: at a kink of phi, as in the middle of a box, no gradient gives the exit direction. On an edge, the neighbour must
+    not lie deeper, and only the triangle that owns the edge accepts.
+    """
+    facing = s.normal[t]
+    valid = 1
+    zero_corner = -1
+    for j in ti.static(range(3)):
+        if w[j] <= 0.0:
+            zero_corner = j
+    if zero_corner >= 0:
+        k = (zero_corner + 1) % 3  # the edge opposite the corner of zero weight
+        valid = (s.owns[t] >> (3 + k)) & 1
+        along = unit(corner(s, t, k + 1) - corner(s, t, k))
+        if ti.abs(along.dot(n)) > ALIGNMENT_SINE:
+            valid = 0
+        v = s.neighbour[t, k]
+        if v >= 0:
+            facing += s.normal[v]
+            e = s.x[opposite(s, v, s.triangle[t, k], s.triangle[t, (k + 1) % 3])] - x
+            if e.dot(n) < -0.05 * e.norm():
+                valid = 0
+        if facing.dot(n) >= 0.0:
+            valid = 0
+    elif facing.cross(n).norm() > ALIGNMENT_SINE or facing.dot(n) > 0.0:
+        valid = 0
+    return valid

@@ -9,35 +9,23 @@ from dataclasses import dataclass, field
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena, download, upload
+from taisoft.backend.arrays import FieldArena, download
 from taisoft.backend.runtime import Runtime
-from taisoft.collision.analytic import NO_SHAPES, AnalyticObstacles, find_analytic
-from taisoft.collision.boxes import move_obstacles, take_prescribed, update_surface
+from taisoft.collision.analytic import NO_SHAPES, build_analytic, find_analytic, place_analytic
 from taisoft.collision.bvh import Bvh, Trees
 from taisoft.collision.candidates import Buffer, Candidates, entries
-from taisoft.collision.colliders import (
-    body_grid,
-    collider_edge,
-    collider_surfaces,
-    collider_thickness,
-    obstacle_frame,
-    prescribed_vertices,
-)
-from taisoft.collision.contacts import KINDS, Contacts, contact_fields, gather
-from taisoft.collision.containment import Containment, Inside
-from taisoft.collision.crossings import find_crossings
+from taisoft.collision.colliders import body_grid, collider_surfaces, collider_thickness, prescribed_vertices
+from taisoft.collision.contacts import FOUND, KINDS, LEFT, Contacts, contact_fields, gather, reduce_contacts, reduction_fields
+from taisoft.collision.distance_field import DistanceFields, build_fields, find_in_fields
+from taisoft.collision.edge_edge import find_proximity
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
-from taisoft.collision.proximity import find_proximity
-from taisoft.collision.reduction import FOUND, LEFT, ReductionFields, reduce_contacts, reduction_fields
-from taisoft.collision.sdf import DistanceFields, build_fields, find_in_fields
-from taisoft.collision.self_collision import Intersections
+from taisoft.collision.intersections import Intersections, find_crossings
+from taisoft.collision.overlap import Containment, Inside
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, Surface, build_surface
+from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, move_obstacles, update_surface
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.model import Layout, Model
 from taisoft.mesh.quality import mean_surface_edge
-from taisoft.mesh.sdf_grid import SdfGrid
-from taisoft.scene.body import Body
 from taisoft.scene.obstacles import MeshObstacle
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
@@ -64,17 +52,6 @@ class Counts:
     growths: dict[str, int] = field(default_factory=dict)  # how often each buffer has grown since the start
 
 
-def _checked_margin(margin: float, bodies: list[Body], edges: np.ndarray) -> float:
-    """Return the margin [m]. Raise SceneError if it exceeds a body's mean surface edge: all its triangles would be neighbours."""
-    for body, mean in zip(bodies, edges):
-        if margin > mean:
-            raise SceneError(
-                f"collision settings: margin = {margin:g} m is larger than the mean surface edge of body '{body.name}', "
-                f"{mean:.3g} m"
-            )
-    return margin
-
-
 class Detection:
     """Find the contacts of a scene. edge: mean surface edge of the soft bodies at rest; margin, reach: as in `find` [m]."""
 
@@ -90,31 +67,34 @@ class Detection:
         """Allocate what the scene needs. serial: None decides by size. Raise MeshError if a distance field cannot be made."""
         self.scene, self.model, self.layout = scene, model, layout
         settings, bodies, obstacles = scene.collision, scene.bodies, scene.obstacles
-        self.edge = mean_surface_edge([(b.nodes.positions, b.nodes.surface) for b in bodies])
-        self.edges = np.array([collider_edge(c) for c in scene.colliders])
-        self.margin = MARGIN * self.edge if settings.margin is None else _checked_margin(settings.margin, bodies, self.edges)
+        rest_surfaces = [(b.nodes.positions, b.nodes.surface) for b in bodies]
+        self.edge = mean_surface_edge(rest_surfaces)
+        self.edges = np.array([mean_surface_edge([x]) for x in rest_surfaces] + [np.inf] * len(obstacles))
+        self.margin = self._checked_margin()
         self.reach = self.margin + DEPTH * self.edge  # boxes grow by half of it
         self.topology, self._rest = collider_surfaces(scene, layout)
         self._has_pairs = self_collision or int((np.diff(self.topology.first) > 0).sum()) > 1
         self._proximity = self._has_pairs and make_plan(scene, False, False, self_collision).on["proximity"]
-        grids = self._grids() if self._has_pairs else []  # before any allocation, since this may fail
+        on_field = [b if self._has_pairs and b.contact_mode == "distance_field" else None for b in bodies]
+        # before any allocation, since this may fail
+        grids = [b and body_grid(b, settings.field_cells, 2.0 * self.margin) for b in on_field] + [None] * len(obstacles)
         self._arena = arena = FieldArena()
         soft = np.arange(len(scene.colliders)) < len(bodies)
         self.thickness = np.array([collider_thickness(c, self.edge) for c in scene.colliders])
         self._analytic = [(len(bodies) + k, o) for k, o in enumerate(obstacles) if not isinstance(o.shape, MeshObstacle)]
-        contact_modes = [BY_FACES if b.contact_mode == "proximity" else BY_FIELD for b in bodies]
-        contact_modes += [BY_FACES if isinstance(o.shape, MeshObstacle) else BY_EDGES for o in obstacles]
-        self.surface: Surface = build_surface(
-            self.topology, self._rest, soft, soft & self_collision, self.thickness, self.edges, runtime, arena, serial
-        )
-        s = self.surface
+        modes = [BY_FACES if b.contact_mode == "proximity" else BY_FIELD for b in bodies]
+        modes += [BY_FACES if isinstance(o.shape, MeshObstacle) else BY_EDGES for o in obstacles]
+        properties = {"soft": soft, "self_on": soft & self_collision, "mode": np.array(modes)}
+        properties |= {"thickness": self.thickness, "edge": self.edges}
+        self.surface = s = build_surface(self.topology, self._rest, properties, runtime, arena, serial)
         self.broad = self._make_broad(runtime) if self._has_pairs else None
-        self._contact_mode = arena.field("contact_mode", ti.i32, len(contact_modes), np.array(contact_modes, dtype=np.int32))
-        self._sharp = arena.field("surface_sharp", ti.i32, max(s.n_triangles, 1))
         self._unmapped = arena.field("unmapped", ti.i32, 1)
         self._crossing_parts = arena.vectors("crossed", ti.f64, s.chunks)
-        self._fields = self._make_fields(grids, runtime) if any(grids) else None
-        self.shapes = self._make_shapes() if self._analytic else NO_SHAPES
+        self._fields: DistanceFields | None = None
+        if any(grids):
+            starts = self.topology.first, layout.node_start
+            self._fields = build_fields(bodies, grids, model.state.x, *starts, runtime, arena)
+        self.shapes = build_analytic(self._analytic, arena) if self._analytic else NO_SHAPES
         self._prescribed_moves = None  # prescribed displacements of vertices, allocated at first use
         initial = min(int(np.diff(self.topology.first).max(initial=1)), MAX_INITIAL_ROW) * s.chunks
         limits = (settings.initial_capacity or initial, settings.max_capacity)
@@ -122,68 +102,36 @@ class Detection:
         capacity = settings.initial_capacity or CONTACTS_PER_TRIANGLE * s.n_triangles + 64
         self.buffer = Buffer("contacts", contact_fields, capacity, settings.max_capacity, s.chunks, arena)
         self._reduction_arena = FieldArena()
-        self._reduction: ReductionFields | None = None
+        self._reduction = None
         self._intersections: Intersections | None = None
         self._containment = Containment(scene, self.topology, layout, self._rest, self._analytic, self_collision)
         self._placed = False  # whether obstacles have been placed
         self._broad_result: Trees | Candidates | None = None  # broad-phase result of the last search
         self.counts = Counts(triangles=s.n_triangles)
 
+    def _checked_margin(self) -> float:
+        """The margin [m]. Raise SceneError if it exceeds a body's mean surface edge: all its triangles would be neighbours."""
+        margin = self.scene.collision.margin
+        for body, mean in zip(self.scene.bodies, self.edges):
+            if margin is not None and margin > mean:
+                raise SceneError(
+                    f"collision settings: margin = {margin:g} m is larger than the mean surface edge of body '{body.name}', "
+                    f"{mean:.3g} m"
+                )
+        return MARGIN * self.edge if margin is None else margin
+
     def _make_broad(self, runtime: Runtime) -> SpatialHash | Bvh:
-        settings, s = self.scene.collision, self.surface
-        limits = (settings.initial_capacity, settings.max_capacity)
-        kind = settings.broad_phase
+        settings, s, topology, kind = self.scene.collision, self.surface, self.topology, self.scene.collision.broad_phase
+        limits = settings.initial_capacity, settings.max_capacity
+        shift = [b.position for b in self.scene.bodies] + [np.zeros(3)] * len(self.scene.obstacles)
+        x = self._rest + np.repeat(shift, np.diff(topology.vertex_first), axis=0)
         if kind == "auto":  # on the CPU trees were faster at every size measured, but their roots are compared pairwise
             few_colliders = len(self.scene.colliders) <= MANY_COLLIDERS
             kind = "bvh" if runtime.arch == "cpu" and few_colliders else "spatial_hash"
         if kind == "bvh":
-            x = self._rest + self._start_shift()
-            return Bvh(
-                s, self.topology, x, self.reach, runtime, self._arena, settings.k_dop, capacity=limits[0], max_capacity=limits[1]
-            )
-        extent = np.ptp((self._rest + self._start_shift())[self.topology.triangle].reshape(-1, 3), axis=0)
+            return Bvh(s, topology, x, self.reach, runtime, self._arena, settings.k_dop, None, *limits)
+        extent = np.ptp(x[topology.triangle].reshape(-1, 3), axis=0)
         return SpatialHash(s, self._arena, settings.cell_ratio * self.edge, extent, *limits)
-
-    def _start_shift(self) -> np.ndarray:
-        """Return the initial displacement of each vertex from rest, (v,3) [m]."""
-        shift = [b.position for b in self.scene.bodies] + [np.zeros(3)] * len(self.scene.obstacles)
-        return np.repeat(shift, np.diff(self.topology.vertex_first), axis=0)
-
-    def _grids(self) -> list[SdfGrid | None]:
-        """Return the signed distance grid of each collider, or None."""
-        cells, margin = self.scene.collision.field_cells, 2.0 * self.margin
-        grids = [body_grid(b, cells, margin) if b.contact_mode == "distance_field" else None for b in self.scene.bodies]
-        return grids + [None] * len(self.scene.obstacles)
-
-    def _make_fields(self, grids: list[SdfGrid | None], runtime: Runtime) -> DistanceFields:
-        return build_fields(
-            self.scene.bodies,
-            grids,
-            self.model.state.x,
-            self.topology.first,
-            self.layout.node_start,
-            runtime.real,
-            runtime.np_real,
-            self._arena,
-        )
-
-    def _make_shapes(self) -> AnalyticObstacles:
-        arena, n = self._arena, len(self._analytic)
-
-        def vectors(name: str, count: int, data: np.ndarray | None = None):
-            return arena.vectors(f"obstacle_{name}", ti.f64, count, data)
-
-        shapes = [o.shape for _, o in self._analytic]
-        return AnalyticObstacles(
-            n,
-            arena.field("obstacle_body", ti.i32, n, np.array([k for k, _ in self._analytic], dtype=np.int32)),
-            arena.field("obstacle_kind", ti.i32, n, np.array([x.kind for x in shapes], dtype=np.int32)),
-            vectors("size", n, np.array([x.size() for x in shapes])),
-            vectors("origin", n),
-            vectors("rotation", 3 * n),
-            vectors("next_origin", n),
-            vectors("next_rotation", 3 * n),
-        )
 
     # --- a search -------------------------------------------------------------------------------------------------
 
@@ -204,13 +152,39 @@ class Detection:
     def _move(self, time: float, dt: float, prescribed: tuple[np.ndarray, np.ndarray] | None = None, path=None) -> None:
         """Update positions and displacements of the surface, and the boxes."""
         s, m = self.surface, self.model
-        self._place_obstacles(time, dt)
+        try:
+            self._place_obstacles(time, dt)
+        except SceneError as error:
+            raise SimulationError(str(error)) from None
         has_prescribed = prescribed is not None and len(prescribed[0]) > 0
+        if has_prescribed:
+            if self._prescribed_moves is None:
+                self._prescribed_moves = self._arena.vectors("surface_prescribed", ti.f64, s.n_verts)
+            self._prescribed_moves.from_numpy(prescribed_vertices(self.topology, *prescribed))
         v, span = (m.state.v, dt) if path is None else (path, 1.0)
-        prescribed_moves = self._upload_prescribed(*prescribed) if has_prescribed else s.move
-        update_surface(s, m.state.x, v, has_prescribed, prescribed_moves, span, self.reach, self._has_pairs)
+        moves = self._prescribed_moves if has_prescribed else s.move
+        update_surface(s, m.state.x, v, has_prescribed, moves, span, self.reach, self._has_pairs)
         if s.count[NONFINITE]:
             raise SimulationError(self._nonfinite())
+
+    def _place_obstacles(self, time: float, dt: float) -> None:
+        """Place the obstacles at a time [s] and at the end of the step; static ones are placed once."""
+        first, starts = not self._placed, self.topology.vertex_first[len(self.scene.bodies) :]
+        for o, begin, end in zip(self.scene.obstacles, starts[:-1], starts[1:]):
+            if end > begin and (first or o.path is not None):
+                now, then = (o.points_at(t, self._rest[begin:end]) for t in (time, time + dt))
+                move_obstacles(self.surface, begin, now, then - now)
+        if self._analytic and (first or any(o.path is not None for _, o in self._analytic)):
+            place_analytic(self.shapes, self._analytic, time, dt)
+        self._placed = True
+
+    def _nonfinite(self) -> str:
+        x, move = download([self.surface.x, self.surface.move])
+        bad = int(np.argmin((np.isfinite(x) & np.isfinite(x + move)).all(axis=1)))
+        k = int(np.searchsorted(self.topology.vertex_first, bad, side="right")) - 1
+        node = self.topology.node[bad] - self.layout.node_start[k] if k < len(self.scene.bodies) else bad
+        name = self.scene.colliders[k].name
+        return f"body '{name}', node {node}: position or velocity is not finite, so no contact can be found"
 
     def _near(self) -> Trees | Candidates | None:
         """Run the broad phase; None if no two surfaces can touch."""
@@ -226,18 +200,17 @@ class Detection:
 
     def _fill_buffer(self, near: Trees | Candidates | None) -> None:
         """Write the contacts before reduction, as many as fit."""
-        s, b, row = self.surface, self.buffer, self._near_buffer
-        out, append, padding = (b.data, b.used, b.count, b.part), 0, 0.5 * self.reach
+        s, out, append, padding = self.surface, self.buffer.parts, 0, 0.5 * self.reach
         if near is not None:
-            rows = (row.data, row.used, row.count, row.part)
+            row = self._near_buffer.parts
             if self._proximity:
-                find_proximity(s, near, self._contact_mode, self._sharp, *rows, self.margin, padding, *out)
+                find_proximity(s, near, row, self.margin, padding, out)
                 append = 1
             if self._fields is not None:
-                find_in_fields(s, near, self._fields, self._sharp, *rows, self.margin, padding, *out, append, self._unmapped)
+                find_in_fields(s, near, self._fields, row, self.margin, padding, out, append, self._unmapped)
                 append = 1
         if self.shapes.count:
-            find_analytic(s, self.shapes, self.margin, *out, append)
+            find_analytic(s, self.shapes, self.margin, out, append)
 
     def _reduce(self) -> None:
         """Reduce the contacts and update the counts."""
@@ -247,7 +220,7 @@ class Detection:
             self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.serial_cheap, self.surface.cheap_spread)
             self._reduction_arena.release()
             self._reduction_arena = arena
-        reduce_contacts(self._reduction, b.data, b.used, b.part, MERGED * self.edge, REDUCTION_CELL * self.edge)
+        reduce_contacts(self._reduction, b.parts, MERGED * self.edge, REDUCTION_CELL * self.edge)
         count, surface = self.counts, self.surface.count
         if self._has_pairs:
             count.active, count.pairs = surface[ACTIVE], surface[PAIRS]
@@ -256,83 +229,25 @@ class Detection:
         count.found, count.contacts = self._reduction.count[FOUND], self._reduction.count[LEFT]
         count.growths = {b.name: b.growths for b in self._buffers()}
 
-    def _place_obstacles(self, time: float, dt: float) -> None:
-        """Place the obstacles at a time [s] and at the end of the step; static ones are placed once."""
-        try:
-            self._update_obstacles(time, dt)
-        except SceneError as error:
-            raise SimulationError(str(error)) from None
-
-    def _update_obstacles(self, time: float, dt: float) -> None:
-        first = not self._placed
-        start = len(self.scene.bodies)
-        for k, o in enumerate(self.scene.obstacles):
-            vertices = slice(self.topology.vertex_first[start + k], self.topology.vertex_first[start + k + 1])
-            if vertices.stop > vertices.start and (first or o.path is not None):
-                now, then = o.points_at(time, self._rest[vertices]), o.points_at(time + dt, self._rest[vertices])
-                move_obstacles(self.surface, vertices.start, now, then - now)
-        if self._analytic and (first or any(o.path is not None for _, o in self._analytic)):
-            s, now, then = self.shapes, *([obstacle_frame(o, t) for _, o in self._analytic] for t in (time, time + dt))
-            upload(
-                [
-                    (s.origin, np.array([x for x, _ in now])),
-                    (s.rotation, np.concatenate([r for _, r in now])),
-                    (s.next_origin, np.array([x for x, _ in then])),
-                    (s.next_rotation, np.concatenate([r for _, r in then])),
-                ]
-            )
-        self._placed = True
-
-    def _upload_prescribed(self, nodes: np.ndarray, moves: np.ndarray):
-        """Upload the prescribed displacements of vertices and return their field."""
-        if self._prescribed_moves is None:
-            self._prescribed_moves = self._arena.vectors("surface_prescribed", ti.f64, self.surface.n_verts)
-        take_prescribed(self.surface, self._prescribed_moves, prescribed_vertices(self.topology, nodes, moves))
-        return self._prescribed_moves
-
-    def _nonfinite(self) -> str:
-        x, move = download([self.surface.x, self.surface.move])
-        bad = int(np.argmin((np.isfinite(x) & np.isfinite(x + move)).all(axis=1)))
-        k = int(np.searchsorted(self.topology.vertex_first, bad, side="right")) - 1
-        node = self.topology.node[bad] - self.layout.node_start[k] if k < len(self.scene.bodies) else bad
-        name = self.scene.colliders[k].name
-        return f"body '{name}', node {node}: position or velocity is not finite, so no contact can be found"
-
     # --- results --------------------------------------------------------------------------------------------------
 
     def contacts(self) -> Contacts:
         """Return the contacts of the last search, with impulses 0."""
-        found = gather(self.buffer.data, self._reduction.kept, self._reduction.count[LEFT])
-        body, feature = found["body"], found["feature"]
-        # an order independent of threads and chunks, so that a solver meets the same one in the next step
-        order = np.lexsort((feature[:, 2], feature[:, 1], feature[:, 0], body[:, 1], body[:, 0]))
-        names = ("point", "normal", "gap", "body", "feature", "nodes", "weights")
-        point, normal, gap, body, feature, nodes, weights = (found[name][order] for name in names)
+        floats, integers = gather(self.buffer.data, self._reduction.kept, self._reduction.count[LEFT])
+        nodes, none = integers[:, 5:], np.zeros((len(floats), 3))
         nodes = np.where(nodes >= 0, np.append(self.topology.node, -1)[nodes], -1)
-        weights = np.where(nodes >= 0, weights, 0.0)
-        return self.record(point, normal, gap, np.zeros((len(gap), 3)), body, feature, nodes, weights)
+        weights = np.where(nodes >= 0, floats[:, 6:12], 0.0)
+        geometry = (x.copy() for x in (floats[:, :3], floats[:, 3:6], floats[:, 12]))
+        return self.record(*geometry, none, integers[:, :2], integers[:, 2:5], nodes, weights)
 
     def record(self, point, normal, gap, impulse, body, feature, nodes, weights) -> Contacts:
         """Return a record of contact arrays (k, ...), with collider names, friction and restitution. body: (k,2) colliders."""
         names = np.array([c.name for c in self.scene.colliders], dtype=object)
         pairs, pair = np.unique(body, axis=0, return_inverse=True)
         numbers = np.array([self.scene.contact_numbers(names[a], names[b]) for a, b in pairs]).reshape(-1, 2)[pair.reshape(-1)]
-        return Contacts(
-            point,
-            normal,
-            gap,
-            impulse,
-            names[body[:, 0]],
-            names[body[:, 1]],
-            nodes,
-            weights,
-            np.array(KINDS, dtype=object)[feature[:, 0]],
-            feature[:, 1:],
-            numbers[:, 0],
-            numbers[:, 1],
-            self.counts.found,
-            self.counts.unmapped,
-        )
+        kinds, labels = np.array(KINDS, dtype=object), (names[body[:, 0]], names[body[:, 1]])
+        what = (nodes, weights, kinds[feature[:, 0]], feature[:, 1:], numbers[:, 0], numbers[:, 1])
+        return Contacts(point, normal, gap, impulse, *labels, *what, self.counts.found, self.counts.unmapped)
 
     @property
     def kept(self):
@@ -352,8 +267,7 @@ class Detection:
         """Return (3,) f64: how deeply surfaces cross at the positions of the last search, see `find_crossings`."""
         depths, buffer = np.zeros(3), self._near_buffer
         while self._broad_result is not None and self.counts.active:
-            near = (buffer.data, buffer.used, buffer.count, buffer.part)
-            find_crossings(self.surface, self._broad_result, self._sharp, *near, 0.5 * self.reach, self._crossing_parts, depths)
+            find_crossings(self.surface, self._broad_result, buffer.parts, 0.5 * self.reach, self._crossing_parts, depths)
             if not buffer.grow_if_full():
                 break
         return depths

@@ -4,7 +4,7 @@ A point near body B maps to B's material space through the tet behind the neares
 X = X0 + F^-1 (x - x0). There phi is interpolated on a grid. In the world the normal is F^-T grad phi, normalised (a covector),
 and the gap phi / |F^-T grad phi|. Vertices of A are contacts if the normal lies in their normal cone. A triangle adds its deepest
 point if that is deeper than its corners: one Frank-Wolfe solve per (triangle, body), skipped if phi at the corners excludes it.
-Weak: a grid rounds edges (crossing sharp edges are left to `proximity`), and far from rest phi is no longer a distance.
+Weak: a grid rounds edges (crossing sharp edges are left to `edge_edge`), and far from rest phi is no longer a distance.
 """
 
 from dataclasses import dataclass
@@ -14,16 +14,12 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.backend.runtime import kernel
-from taisoft.collision.analytic import MIN_EXTRA_DEPTH, is_surface_minimum
-from taisoft.collision.boxes import list_near, sum_pairs
-from taisoft.collision.candidates import sum_parts
-from taisoft.collision.contacts import FACE_FIELD, VERTEX_FIELD, write_contact
-from taisoft.collision.features import corner, in_normal_cone, moved, unit, vertices_of
-from taisoft.collision.frank_wolfe import deepest_point
-from taisoft.collision.queries import WHOLE, list_triangles, query_box
-from taisoft.collision.surface import ACTIVE, dvec, ivec, part_first
-from taisoft.collision.triangles import choose, closest_on_triangle
+from taisoft.backend.runtime import Runtime, kernel
+from taisoft.collision.candidates import WHOLE, sum_parts
+from taisoft.collision.contacts import write_point_contact
+from taisoft.collision.deepest_point import MIN_EXTRA_DEPTH, deepest_point, is_surface_minimum
+from taisoft.collision.features import choose, closest_on_triangle, corner, in_normal_cone, moved, unit, vertices_of
+from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near, part_first, sum_pairs
 from taisoft.mesh.sdf_grid import SdfGrid
 from taisoft.scene.body import Body
 
@@ -63,15 +59,9 @@ class DistanceFields:
         for c in range(8):
             i, j, m = c >> 2, (c >> 1) & 1, c & 1
             f = ti.cast(self.phi[base + (i * n[1] + j) * n[2] + m], ti.f64)
-            a, da = 1.0 - fraction[0], ti.cast(-1.0, ti.f64)
-            if i == 1:
-                a, da = fraction[0], ti.cast(1.0, ti.f64)
-            b, db = 1.0 - fraction[1], ti.cast(-1.0, ti.f64)
-            if j == 1:
-                b, db = fraction[1], ti.cast(1.0, ti.f64)
-            d, dd = 1.0 - fraction[2], ti.cast(-1.0, ti.f64)
-            if m == 1:
-                d, dd = fraction[2], ti.cast(1.0, ti.f64)
+            a, da = ti.select(i == 1, fraction[0], 1.0 - fraction[0]), 2.0 * ti.cast(i, ti.f64) - 1.0
+            b, db = ti.select(j == 1, fraction[1], 1.0 - fraction[1]), 2.0 * ti.cast(j, ti.f64) - 1.0
+            d, dd = ti.select(m == 1, fraction[2], 1.0 - fraction[2]), 2.0 * ti.cast(m, ti.f64) - 1.0
             value += a * b * d * f
             g += dvec(da * b * d, a * db * d, a * b * dd) * f
         return value + ti.sqrt(outside), g / self.spacing[k]
@@ -95,37 +85,30 @@ def build_fields(
     x: Any,
     first: np.ndarray,
     node_start: np.ndarray,
-    real: Any,
-    npr: type,
+    runtime: Runtime,
     arena: FieldArena,
 ) -> DistanceFields:
-    """Upload the grids (one or None per collider; None for obstacles) and the tets behind the bodies' triangles."""
+    """Upload the grids, at least one (None for colliders without), and the tets behind the bodies' triangles."""
     used = [g for g in grids if g is not None]
-    of_body = np.cumsum([g is not None for g in grids]) - 1
-    of_body = np.where([g is not None for g in grids], of_body, -1)
-    n = max(int(first[-1]), 1)
-    behind, tet_corner, inverse = np.zeros((n, 4)), np.zeros((n, 3)), np.zeros((n, 3, 3))
+    has_grid = np.array([g is not None for g in grids])
+    n, count = max(int(first[-1]), 1), len(used)
+    behind, tet_corner, inverse = np.zeros((n, 4), dtype=np.int32), np.zeros((n, 3)), np.zeros((n, 3, 3))
     for k, body in enumerate(bodies):
         rows, tets = slice(first[k], first[k + 1]), body.nodes.surface_tets
         rest = body.nodes.positions[tets]
         behind[rows], tet_corner[rows] = tets + node_start[k], rest[:, 0]
         inverse[rows] = np.linalg.inv((rest[:, 1:] - rest[:, :1]).transpose(0, 2, 1))
-    count = max(len(used), 1)
-    blank = np.zeros((1, 3))
+    phi = np.concatenate([g.phi.reshape(-1) for g in used])
+    starts = np.cumsum([0, *(g.phi.size for g in used[:-1])]).astype(np.int32)
     return DistanceFields(
-        arena.field("field_of_body", ti.i32, len(grids), of_body.astype(np.int32)),
-        arena.vectors("field_origin", ti.f64, count, np.array([g.origin for g in used]) if used else blank),
-        arena.vectors("field_spacing", ti.f64, count, np.array([g.spacing for g in used]) if used else blank),
-        arena.vectors("field_points", ti.i32, count, np.array([g.phi.shape for g in used] if used else blank).astype(np.int32)),
-        arena.field("field_first", ti.i32, count, np.cumsum([0, *(g.phi.size for g in used)])[:count].astype(np.int32)),
-        arena.field(
-            "field_phi",
-            real,
-            max(sum(g.phi.size for g in used), 1),
-            np.concatenate([g.phi.reshape(-1) for g in used]).astype(npr) if used else None,
-        ),
+        arena.field("field_of_body", ti.i32, len(grids), np.where(has_grid, np.cumsum(has_grid) - 1, -1)),
+        arena.vectors("field_origin", ti.f64, count, np.array([g.origin for g in used])),
+        arena.vectors("field_spacing", ti.f64, count, np.array([g.spacing for g in used])),
+        arena.vectors("field_points", ti.i32, count, np.array([g.phi.shape for g in used], dtype=np.int32)),
+        arena.field("field_first", ti.i32, count, starts),
+        arena.field("field_phi", runtime.real, len(phi), phi.astype(runtime.np_real)),
         x,
-        arena.vectors("field_behind", ti.i32, n, behind.astype(np.int32), n=4),
+        arena.vectors("field_behind", ti.i32, n, behind, n=4),
         arena.vectors("field_corner", ti.f64, n, tet_corner),
         arena.vectors("field_inverse", ti.f64, 3 * n, inverse.reshape(-1, 3)),
     )
@@ -170,7 +153,7 @@ def _field_contacts(
 ):
     """Write contacts of triangle t with the field of the body of entry[first:last]. Return the count, and 1 if no tet maps."""
     at, unmapped = start, 0
-    own, other = s.body[t], s.body[entry[first]]
+    other = s.body[entry[first]]
     k = f.of_body[other]
     A, B, C = dvec(0.0), dvec(0.0), dvec(0.0)  # corners in material space
     phi = dvec(0.0)
@@ -185,8 +168,7 @@ def _field_contacts(
             accepted = phi.min() - reach <= 2.0 * (margin + motion)
             if accepted:
                 v, value = deepest_point(f, k, A, B, C, phi)
-                for i in ti.static(range(3)):
-                    w[i] = v[i]
+                w = 1.0 * v
                 accepted = value < phi.min() - ti.cast(MIN_EXTRA_DEPTH, ti.f64) * reach and w.max() < 1.0 - 1e-6
         if accepted:
             x = w[0] * corner(s, t, 0) + w[1] * corner(s, t, 1) + w[2] * corner(s, t, 2)
@@ -202,10 +184,7 @@ def _field_contacts(
                     if i == j:
                         phi[i] = value
                         accepted = (s.owns[t] >> i) & 1 == 1
-                for i in ti.static(range(3)):
-                    A[i] = ti.select(j == 0, X[i], A[i])
-                    B[i] = ti.select(j == 1, X[i], B[i])
-                    C[i] = ti.select(j == 2, X[i], C[i])
+                A, B, C = ti.select(j == 0, X, A), ti.select(j == 1, X, B), ti.select(j == 2, X, C)
                 if accepted:
                     n = G.transpose() @ f.gradient(k, X)
                     length = n.norm()
@@ -213,34 +192,15 @@ def _field_contacts(
                     n = unit(n)
                     a, b, c = corner(s, u, 0), corner(s, u, 1), corner(s, u, 2)
                     v, _ = closest_on_triangle(x - gap * n, a, b, c)
-                    tu, tt = vertices_of(s, u), vertices_of(s, t)
                     approach = (moved(s, t, w) - moved(s, u, v)).dot(n)
                     if length > 0.0 and gap + ti.min(approach, 0.0) <= margin:
-                        i = s.triangle[t, ti.min(j, 2)]
                         valid = 0
                         if j < 3:
-                            valid = in_normal_cone(s, i, n)
+                            valid = in_normal_cone(s, s.triangle[t, j], n)
                         else:
                             valid = is_surface_minimum(s, t, w, n, x)
-                        if valid == 1 and j < 3:
-                            write_contact(
-                                out,
-                                at,
-                                end,
-                                own,
-                                other,
-                                ivec(VERTEX_FIELD, i, other),
-                                x,
-                                n,
-                                gap,
-                                ivec(i, -1, -1),
-                                dvec(1.0, 0.0, 0.0),
-                                tu,
-                                v,
-                            )
-                            at += 1
-                        elif valid == 1:
-                            write_contact(out, at, end, own, other, ivec(FACE_FIELD, t, other), x, n, gap, tt, w, tu, v)
+                        if valid == 1:
+                            write_point_contact(s, out, at, end, t, j, w, other, x, n, gap, vertices_of(s, u), v)
                             at += 1
         j += 1
     return at, unmapped
@@ -251,17 +211,10 @@ def find_in_fields(
     s: ti.template(),
     near: ti.template(),
     f: ti.template(),
-    sharp: ti.template(),
     row: ti.template(),
-    longest: ti.template(),
-    needed: ti.template(),
-    capacity: ti.i32,
     margin: ti.f64,
     padding: ti.f64,
     out: ti.template(),
-    used: ti.template(),
-    count: ti.template(),
-    part: ti.i32,
     append: ti.i32,
     unmapped: ti.template(),
 ):
@@ -272,26 +225,26 @@ def find_in_fields(
     for task in range(s.chunks * s.spread):
         if task % s.spread == 0:
             c = task // s.spread
-            at, end, begin = c * part + append * used[c], (c + 1) * part, c * capacity
-            own, n_near, max_row, pairs, n_unmapped = -1, 0, append * longest[c], 0, 0
+            at, end, begin = c * out.part + append * out.used[c], (c + 1) * out.part, c * row.part
+            own, n_near, max_row, pairs, n_unmapped = -1, 0, append * row.used[c], 0, 0
             for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
                 t = s.active[i]
                 if s.body[t] != own:
                     own = s.body[t]
                     n_near = list_near(s, c, own)
-                lo, hi = query_box(s, near, t, WHOLE, padding)
+                lo, hi = near.bounds(s, t, WHOLE, padding)
                 for k in range(n_near):
                     other = s.near[c * s.n_bodies + k]
                     if f.of_body[other] >= 0 and other != own:
-                        n = list_triangles(s, near, sharp, other, t, WHOLE, lo, hi, row, begin, begin + capacity)
+                        n = near.list_triangles(s, other, t, WHOLE, lo, hi, row.data, begin, begin + row.part)
                         max_row, pairs = ti.max(max_row, n), pairs + n
-                        if 0 < n <= capacity:
-                            at, failed = _field_contacts(s, f, row, begin, begin + n, t, margin, out, at, end)
+                        if 0 < n <= row.part:
+                            at, failed = _field_contacts(s, f, row.data, begin, begin + n, t, margin, out.data, at, end)
                             n_unmapped += failed
-            used[c], longest[c], s.part[c] = at - c * part, max_row, pairs
+            out.used[c], row.used[c], s.part[c] = at - c * out.part, max_row, pairs
             ti.atomic_add(unmapped[0], n_unmapped)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        sum_parts(used, count, s.chunks)
-        sum_parts(longest, needed, s.chunks)
+        sum_parts(out)
+        sum_parts(row)
         sum_pairs(s, append)
