@@ -9,9 +9,8 @@ from taisoft.contact.graph import groups
 from taisoft.output.plot import require_matplotlib, save, ticks
 from taisoft.view.offscreen import Offscreen
 
-from .contact_captured import THREADED, contact_jacobian
-from .contact_crossover import Point
-from .contact_runs import Film
+from .contact_colouring import Point
+from .contact_runs import THREADED, Film, contact_jacobian
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#555555")
 BANDS = ("#0072b2", "#d55e00")  # of groups in turn
@@ -97,12 +96,7 @@ def figure_20(panels, film: Film) -> None:
     panels[2].legend(fontsize="small", frameon=False)
     for panel, what in zip(panels, ("sweeps (fig. 20)", "solve [ms] (fig. 20)", "contacts")):
         panel.set(title=f"{film.scene}: {what}", xlabel="time [s]")
-        _lines(panel)
-
-
-def _lines(panel) -> None:
-    panel.grid(True, which="major", color="#eeeeee")
-    panel.set_axisbelow(True)
+        panel.grid(True, which="major", color="#eeeeee")
 
 
 def _crossover(panel, points: list[Point]) -> None:
@@ -112,7 +106,7 @@ def _crossover(panel, points: list[Point]) -> None:
         panel.plot(contacts, [1e3 * one(p).median for p in points], "o-", color=colour, ms=4, label=f"{name}, a solve")
         panel.plot(contacts, [1e3 * one(p).per_sweep for p in points], "s:", color=colour, ms=4, label=f"{name}, a sweep")
     panel.set(xscale="log", yscale="log", xlabel="contacts", title="Gauss-Seidel on two plates [ms]")
-    _lines(panel)
+    panel.grid(True, which="major", color="#eeeeee")
     ticks(panel.xaxis, panel.get_xlim()[1] / panel.get_xlim()[0])
     panel.set_ylim(top=100 * panel.get_ylim()[1])  # room for the legend
     panel.legend(fontsize="small", frameon=False, loc="upper left")

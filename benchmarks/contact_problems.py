@@ -10,8 +10,8 @@ each solver fares on all of them.
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -94,10 +94,6 @@ class Row:
         cost = (str(self.iterations), f"{self.time:.2f}", f"{self.operations:.3f}") if reached else ("-", "-", "-")
         residuals = (f"{r:.1e}" for r in self.residuals)
         return self.problem, str(self.contacts), self.solver, *residuals, *cost, self.verdict
-
-    def record(self) -> dict:
-        """As plain data."""
-        return asdict(self)
 
 
 def load(name: str) -> Problem:
@@ -271,8 +267,5 @@ def summary(rows: list[Row]) -> str:
 
 def measure(names: tuple[str, ...], repeats: int) -> list[Row]:
     """All rows of these problems, in f64 on the processor: Taichi must not be open in another kind."""
-    runtime = open_runtime("cpu", "f64", "the benchmark of contact problems")
-    try:
+    with closing(open_runtime("cpu", "f64", "the benchmark of contact problems")):
         return list(compute(names, repeats))
-    finally:
-        runtime.close()

@@ -8,7 +8,6 @@ The machine should do nothing else meanwhile: the table tells the load at each s
 cores, and its parts can be made one by one. Exit status: 0, or 1 where a benchmark ended with another status.
 """
 
-import argparse
 import subprocess
 import sys
 import time
@@ -17,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from taisoft.output.files import make_folder
-from taisoft.output.tables import markdown
 from taisoft.timing import load_average
 
-from .document import RESULTS, default_out, load_text
+from .document import RESULTS, default_out, load_text, table
+from .runner import make_parser, progress
 
 # name -> what of it is written: a page with numbers (json), a picture beside it (png), or a folder of both (folder)
 WRITES = {
@@ -66,14 +65,13 @@ def make(names: Iterable[str], quick: bool, results: Path, logs: Path) -> list[E
                 command(name, quick, results), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, check=False
             )
         ended.append(Ended(name, done.returncode, time.monotonic() - start, load))
-        print(f"{name}: status {done.returncode}, {ended[-1].seconds:.0f} s", file=sys.stderr, flush=True)
+        progress(f"{name}: status {done.returncode}, {ended[-1].seconds:.0f} s")
     return ended
 
 
 def main(argv=None) -> int:
     """Make them. Raises OutputError."""
-    first, _, rest = __doc__.partition("\n")
-    parser = argparse.ArgumentParser(prog="taisoft bench figures", description=first, epilog=rest.partition("\n\n")[2])
+    parser = make_parser("figures", __doc__)
     parser.add_argument("--only", action="append", choices=WRITES, metavar="NAME", help=f"one of {', '.join(WRITES)}; repeatable")
     parser.add_argument("--quick", action="store_true", help="small cases; give --results too, the manual takes no quick ones")
     parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="default benchmarks/results")
@@ -86,8 +84,8 @@ def main(argv=None) -> int:
     if results == RESULTS:
         done = subprocess.run([sys.executable, "-m", "taisoft", "bench", "manual"], stdin=subprocess.DEVNULL, check=False)
         ended.append(Ended("manual", done.returncode, 0.0, load_average()))
-    rows = [(one.name, str(one.status), f"{one.seconds:.0f}", load_text(one.load)) for one in ended]
-    print(markdown(("benchmark", "exit status", "seconds", "load at its start"), rows, left=(0,)))
+    columns = [("<benchmark", "{.name}"), ("exit status", "{.status}"), ("seconds", "{.seconds:.0f}")]
+    print(table(ended, [*columns, ("load at its start", lambda one: load_text(one.load))]))
     return 0 if all(one.status == 0 for one in ended) else 1
 
 

@@ -6,11 +6,8 @@ without the building of the scene and the compiling of its kernels. One of many 
 the first solution without the first launch of each kernel, and has no spread.
 """
 
-import sys
-import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from time import perf_counter
 
 import numpy as np
 
@@ -22,9 +19,10 @@ from taisoft.static import StaticSolver
 from taisoft.study.timed_run import TimedRun, advance
 from taisoft.timing import Timing, summarise, time_repeats
 
-from .order_cases import Case, Element, Reference, mesh_name
+from .order_cases import Case, Element, Reference
 from .reference_cases.motion import parabola_vertex
-from .reference_cases.record import nearest
+from .reference_cases.record import label, nearest
+from .runner import progress, timed, unwarned
 
 TOLERANCE = 1e-6  # of |residual| / |load|
 FALL_SECONDS = 1.2  # the first swing is over
@@ -91,13 +89,6 @@ class Statics:
         self._arena.release()
 
 
-@dataclass(frozen=True)
-class Swing:
-    """What a motion left; lowest: uy of the tip [m] and its time [s]."""
-
-    lowest: tuple[float, float]
-
-
 class Fall:
     """A fall that can be run again and again."""
 
@@ -117,7 +108,7 @@ class Fall:
         if whole.unconverged:
             raise SimulationError(f"{whole.unconverged} of {whole.steps} steps did not converge")
         when, low = parabola_vertex(np.array(heights), self._case.dt)
-        row.measured = self._case.read(self._body, Swing((low, when))).tolist()
+        row.measured = [low, when]
 
     def again(self) -> None:
         """Run from the start."""
@@ -138,7 +129,7 @@ def measure_case(case: Case, meshes: dict[Element, tuple], rounds: int, runtime:
             for cells in chain:
                 row = Row(case.name, case.law, element.order, element.degree, element.points, tuple(cells))
                 rows.append(row)
-                print(f"{case.name}: {mesh_name(element, cells)}", file=sys.stderr, flush=True)
+                progress(f"{case.name}: order {element.order}, {element.points} points, {label(cells)}")
                 _prepare(case, element, row, runs, runtime)
         reference = case.reference or own_reference(case, rows)
         for row in rows:
@@ -154,15 +145,12 @@ def _prepare(case: Case, element: Element, row: Row, runs: list[tuple], runtime:
     """Build, solve once and write down what was found; the run joins `runs`."""
     compiled = compile_clock()
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # order 1 locks where nu is near 1/2: this is what is measured
+        with unwarned():  # order 1 locks where nu is near 1/2: this is what is measured
             scene = case.build(row.cells, element)
         row.tets, row.nodes = scene.bodies[0].mesh.n_tets, len(scene.bodies[0].rest_positions)
         run = (Statics if case.dt is None else Fall)(case, scene, runtime)
         runs.append((run, row))  # from here on it is closed at the end
-        start, before = perf_counter(), compile_clock()
-        run.first(row)
-        seconds = perf_counter() - start - (compile_clock() - before)
+        _, seconds = timed(lambda: run.first(row))
         if seconds > ENOUGH_SECONDS:
             row.rounds.append(seconds)
     except TaisoftError as error:

@@ -38,6 +38,7 @@ from taisoft.output.tables import markdown
 from taisoft.timing import machine, time_repeats, versions
 
 from .regression_cases import CASES, Case, Found
+from .runner import add_arch, make_parser, progress
 
 STORE = Path(__file__).resolve().parent / "data" / "regression.json"
 ERROR_MARGIN, COUNT_MARGIN, COUNT_LEAST, MEMORY_MARGIN = 0.05, 0.05, 2, 1e-3
@@ -120,19 +121,9 @@ def row(case: Case, new: Entry, old: Entry | None, seconds: float) -> tuple[str,
     """A line of the table."""
     counts = ", ".join(f"{n:,} {name}" for name, n in new.counts.items())
     verdict = "new" if old is None else "CHANGED" if differences(case, new, old) else "same"
-    before = ("-", "-") if old is None else (f"{old.error:.3e}", f"{old.time:.3g}")
-    return (
-        case.name,
-        case.precision,
-        f"{new.error:.3e}",
-        before[0],
-        counts,
-        f"{new.field_bytes:,}",
-        f"{new.time:.3g}",
-        before[1],
-        verdict,
-        f"{seconds:.0f}",
-    )
+    error, taken = ("-", "-") if old is None else (f"{old.error:.3e}", f"{old.time:.3g}")
+    numbers = f"{new.error:.3e}", error, counts, f"{new.field_bytes:,}", f"{new.time:.3g}", taken
+    return case.name, case.precision, *numbers, verdict, f"{seconds:.0f}"
 
 
 HEADINGS = ("case", "", "error", "stored", "counts", "bytes", "time", "stored", "", "s")
@@ -140,16 +131,10 @@ HEADINGS = ("case", "", "error", "stored", "counts", "bytes", "time", "stored", 
 
 def main(argv=None) -> int:
     """Compute, compare and print. Raises OutputError, or SimulationError where the arch cannot be had."""
-    first, _, rest = __doc__.partition("\n")
-    parser = argparse.ArgumentParser(
-        prog="taisoft bench regression",
-        description=first,
-        epilog=rest.partition("\n\n")[2],
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser("regression", __doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--update", action="store_true", help="store what is found")
     parser.add_argument("--case", metavar="NAME", help="only those whose name begins so")
-    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
+    add_arch(parser)
     options = parser.parse_args(argv)
     cases = [case for case in CASES if case.name.startswith(options.case or "")]
     if not cases:
@@ -160,7 +145,7 @@ def main(argv=None) -> int:
         print(f"taisoft bench regression: nothing is stored for {options.arch} of {', '.join(missing)}: --update stores it")
         return 2
     for case in cases:
-        print(case.name, file=sys.stderr, flush=True)
+        progress(case.name)
         begin, old = time.perf_counter(), stored.get(case.name)
         unit = baseline()
         reference = case.reference(options.arch) if options.update or old is None else old.reference

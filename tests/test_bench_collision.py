@@ -14,6 +14,7 @@ import pytest
 
 import taisoft as ts
 from benchmarks import collision, collision_runs
+from benchmarks.collision import best_cell, cell_table, crossover_text, find_limits, row_table
 from benchmarks.collision_cases import (
     CUBES,
     DEEP_PENETRATION,
@@ -43,7 +44,7 @@ from benchmarks.collision_runs import (
     measure_film,
     measure_row,
 )
-from benchmarks.collision_table import best_cell, cell_table, crossover_text, crossovers, find_limits, row_table
+from benchmarks.document import crossovers
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError
 
@@ -114,7 +115,7 @@ def test_a_search_in_phases_is_the_search(runtime):
         scene.collision = ts.CollisionSettings(initial_capacity=64)
         return scene
 
-    with Rig(Setup("small", "little room", build, setup.motion), "proximity", runtime) as rig:
+    with Rig(Setup("small", build, setup.motion), "proximity", runtime) as rig:
         rig.place(1.0)
         rig.phases()
         kept, found = rig.detection.contacts(), rig.detection.counts.found

@@ -15,11 +15,28 @@ import pytest
 
 import taisoft as ts
 from benchmarks import document, elasticity, elasticity_runs
-from benchmarks.elasticity_beam import beam_scene, follow_tip, measure_memory, steps_within_limit
-from benchmarks.elasticity_cost import Cost, cost_limits, cost_table, measure_costs
-from benchmarks.elasticity_frames import Frames, frame_limits, frame_table, measure_frames
-from benchmarks.elasticity_runs import Row, lasting_steps, make_rows, measure_rows, time_ratio
-from benchmarks.elasticity_table import Limit, slug
+from benchmarks.document import Limit, slug
+from benchmarks.elasticity_runs import (
+    Row,
+    beam_scene,
+    follow_tip,
+    lasting_steps,
+    make_rows,
+    measure_memory,
+    measure_rows,
+    steps_within_limit,
+    time_ratio,
+)
+from benchmarks.elasticity_steps import (
+    Cost,
+    Frames,
+    cost_limits,
+    cost_table,
+    frame_limits,
+    frame_table,
+    measure_costs,
+    measure_frames,
+)
 from benchmarks.exact_path import SAMPLE, FallingBeam, load_exact
 from taisoft.errors import OutputError, SimulationError
 from taisoft.fem.mass import lumped_masses

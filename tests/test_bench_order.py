@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from benchmarks import order, order_runs
+from benchmarks.order import Reach, compare, find_limits, row_table, time_to
 from benchmarks.order_cases import CASES, HANGING, HEAVY, LINEAR, QUADRATIC, QUADRATIC_14, STRIP, Reference
 from benchmarks.order_runs import Row, judge, measure_case, own_reference
-from benchmarks.order_table import Reach, compare, find_limits, row_table, time_to
 from benchmarks.reference_cases.record import GRAVITY
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError

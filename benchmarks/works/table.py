@@ -4,8 +4,8 @@ from collections.abc import Iterable
 
 from taisoft.output.tables import markdown, percent, spread_of
 
+from ..document import Limit
 from ..elasticity_runs import time_ratio
-from ..elasticity_table import Limit
 from ..programs import own
 from ..programs.tried import Tried
 from .runs import Row, fastest_standing, fastest_within
