@@ -1,23 +1,22 @@
 """Collision detection: time of a search, of its phases, of its broad phases and reductions, against size and over frames.
 
-taisoft bench collision [--quick] [--arch cpu|cuda] [--precision f32|f64] [--out FILE.json] [--plot FILE.png]
+taisoft bench collision [--quick] [--arch cpu|cuda] [--precision f32|f64] [--out FILE.json]
 
-Configurations: piles of 27 touching cubes, two cubes, and the report's scenes; bodies are hit by the proximity of their
-surfaces or through distance fields. A time is the median over rounds of one phase, or of a whole search (boxes, candidates,
-contacts, reduction), with nothing copied to the host; spread is the distance between the quartiles over the median. The first
-search, which compiles the kernels and lets the buffers grow, is told apart. Figures named are those of the report. The older
-code's times are quoted: of a whole step, contacts and solver, on this class of machine. Exit status: 0, or 1 where a limit
-is not met. --quick has small meshes, few rounds and frames, and no limit. The whole takes about fifteen minutes on two cores.
+Configurations: piles of 27 touching cubes, two cubes, and the report's scenes; bodies are hit by the proximity of their surfaces
+or through distance fields. A time is the median over rounds of one phase, or of a whole search (boxes, candidates, contacts,
+reduction), with nothing copied to the host; spread is the distance between the quartiles over the median. The first search, which
+compiles the kernels and lets the buffers grow, is told apart. Figures named are those of the report, which `taisoft bench report`
+draws. The older code's times are quoted: of a whole step, contacts and solver, on this class of machine. Exit status: 0, or 1
+where a limit is not met. --quick has small meshes, few rounds and frames, and no limit. The whole takes about fifteen minutes on
+two cores.
 """
 
 import sys
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 
 from taisoft.backend.runtime import Runtime, open_runtime
-from taisoft.output.plot import log_ticks, require_matplotlib, save
 from taisoft.output.tables import percent, spread_of
 
 from .collision_cases import CUBES, FRAMES, LARGE_PILE, OLDER, PILES, RATIOS, REPORT, SHEET, SWEPT, cubes_setup, pile_setup
@@ -42,7 +41,6 @@ QUICK_FRAMES = 3
 LIMITS = {pile_setup(6).name: 8.0, pile_setup(LARGE_PILE).name: 80.0}  # [ms] of a whole search, f32 on two cores
 WANTED_GAIN = 1000.0  # of the sheet and cube over the older code
 REPORTS_BEST = 2.2  # ratio of cell to edge that the report found
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 
 
 def measure(quick: bool, runtime: Runtime, document: Document) -> dict:
@@ -195,93 +193,17 @@ def find_limits(rows: list[Row], films: list[Film]) -> list[Limit]:
     return [*limits, Limit("reductions that kept other contacts than two nested loops", unequal, 0)]
 
 
-# --- the picture --------------------------------------------------------------------------------------------------------
-
-
-def draw(found: dict, path: Path) -> None:
-    """Write a PNG, a panel for each of the report's figures on collision. Raises OutputError where it cannot be written."""
-    require_matplotlib()
-    from matplotlib import pyplot
-
-    piles, films = [r for r in found["piles"] if r.whole], found["films"]
-    broad_phases = list(zip((HASH, *TREES), COLOURS))
-
-    def line(panel, x, seconds, style: str, colour: str, label: str | None = None, **more) -> None:
-        panel.plot(x, [1e3 * s for s in seconds], style, color=colour, label=label, **more)
-
-    def frames(panel, of: list[tuple[list[float], str, str]]) -> None:
-        for (seconds, style, label), colour in zip(of, COLOURS):
-            line(panel, range(len(seconds)), seconds, style, colour, label)
-        panel.set_ylim(bottom=0)
-
-    def sizes(panel, seconds, size: str = "tets") -> None:
-        for geometry, colour in zip(GEOMETRIES, COLOURS):
-            own = [r for r in piles if r.geometry == geometry]
-            line(panel, [getattr(r, size) for r in own], map(seconds, own), "o-", colour, geometry)
-        panel.set(xscale="log", yscale="log")
-
-    def reductions(panel) -> None:
-        own = [r for r in piles if r.geometry == GEOMETRIES[0] and r.quadratic]
-        tets = [r.tets for r in own]
-        line(panel, tets, [r.phase("reduction") for r in own], "o-", COLOURS[0], "O(n)")
-        line(panel, tets, [np.median(r.quadratic) for r in own], "s:", COLOURS[1], "O(n^2)")
-        panel.set(xscale="log", yscale="log")
-
-    def broad(panel) -> None:
-        sweeps = found["broad"]
-        for name, colour in broad_phases:
-            line(panel, [s.tets for s in sweeps], [s.median(name) for s in sweeps], "o-", colour, name, ms=4)
-        panel.set(xscale="log", yscale="log")
-
-    def cells(panel) -> None:
-        for own, colour in zip(by_scene(found["cells"]).values(), COLOURS):
-            times = [s.median(HASH) for s in own]
-            line(panel, [s.at for s in own], times, "o-", colour, f"{own[0].tets:,} tets", ms=4)
-            line(panel, [best_cell(own).at], [min(times)], "*", colour, ms=13)
-        panel.axvline(REPORTS_BEST, color="#555555", lw=0.9, ls="--", label="the report's best")
-        panel.set(yscale="log")
-
-    contacts = [(film.numbers["contacts"], "-", f"{film.setup}, {film.geometry}") for film in films]
-    reduced = [
-        (films[0].numbers[name], style, label)
-        for name, style, label in (("reduction", "-", "O(n)"), ("quadratic", ":", "O(n^2)"))
-    ]
-    panels = (
-        ("contacts of each frame (fig. 11)", "frame", lambda p: frames(p, contacts)),
-        ("contacts against tets (fig. 12)", "tets", lambda p: sizes(p, lambda r: r.phase("contacts"))),
-        ("reduction of each frame (fig. 13)", "frame", lambda p: frames(p, reduced)),
-        ("reduction against tets (fig. 14)", "tets", reductions),
-        (
-            "broad phase of each frame (fig. 17)",
-            "frame",
-            lambda p: frames(p, [(films[-1].numbers[n], "-", n) for n, _ in broad_phases]),
-        ),
-        ("broad phase against tets (fig. 17)", "tets", broad),
-        ("cell of the hash (fig. 18)", "cell / mean edge", cells),
-        ("whole search of a pile", "surface triangles", lambda p: sizes(p, lambda r: r.timing.median, "triangles")),
-    )
-    figure, grid = pyplot.subplots(2, 4, figsize=(16.8, 6.4), layout="constrained")
-    for panel, (title, below, plot) in zip(grid.flat, panels):
-        plot(panel)
-        panel.set(title=title, xlabel=below, ylabel="ms")
-        panel.grid(True, which="major", color="#eeeeee")
-        panel.set_axisbelow(True)
-        log_ticks(panel)
-        panel.legend(fontsize="small", frameon=False)
-    save(figure, path)
-
-
 def main(argv=None) -> int:
     """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
     parser = make_parser("collision", __doc__)
     parser.add_argument("--quick", action="store_true", help="small meshes, few rounds and frames, no limit")
     parser.add_argument("--precision", choices=("f32", "f64"), default="f32", help="of all but positions (default f32)")
-    options = parse_options(parser, argv, "the report's figures")
+    options = parse_options(parser, argv)
     document, numbers = begin("Collision detection", options.arch, options.precision)
     with closing(open_runtime(options.arch, options.precision, "the benchmark of collision detection")) as runtime:
         found = measure(options.quick, runtime, document)
     limits = [] if options.quick else find_limits(found["piles"] + found["scenes"], found["films"])
-    return document.finish(options, numbers | found, limits, lambda path: draw(found, path))
+    return document.finish(options, numbers | found, limits)
 
 
 if __name__ == "__main__":

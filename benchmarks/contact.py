@@ -1,18 +1,17 @@
 """Contact: solvers beside each other on the problems of whole scenes, colourings, the cost of steps, problems of rigid scenes.
 
-taisoft bench contact [--quick] [--arch cpu|cuda] [--out FILE.json] [--plot FILE.png]
+taisoft bench contact [--quick] [--arch cpu|cuda] [--out FILE.json]
 taisoft bench contact --capture DIR [--baseline FOLDER] [--only SCENE] [--quick]
 taisoft bench contact --replay DIR [--baseline FOLDER] [--only SCENE] [--out FILE.json]
 taisoft bench contact --drops [--baseline FOLDER] [--only SCENE] [--out FILE.json] [--quick]
 taisoft bench contact --free [--baseline FOLDER] [--only CASE] [--out FILE.json] [--quick]
 
-Scenes are demos, in f32; figures named are those of the report. Of each frame of an explicit run the contact problem is taken
-where its solve would begin, and solved to a residual of 1e-4 by every solver, in turns, from the impulses of the step before and
-from none. The residual told is worked out in NumPy. A solve's time holds its colouring; a solver's loops run on one thread on the
-CPU, or, where that is said, on all. A number is a median, its range in brackets; spread is the distance between the quartiles
-over the median. Compiling is apart. Exit status: 0, or 1 where a limit is not met. --quick has one scene, few frames, and no
-limit.
-The whole takes about six minutes on two cores.
+Scenes are demos, in f32; figures named are those of the report, which `taisoft bench report` draws. Of each frame of an explicit
+run the contact problem is taken where its solve would begin, and solved to a residual of 1e-4 by every solver, in turns, from the
+impulses of the step before and from none. The residual told is worked out in NumPy. A solve's time holds its colouring; a
+solver's loops run on one thread on the CPU, or, where that is said, on all. A number is a median, its range in brackets; spread
+is the distance between the quartiles over the median. Compiling is apart. Exit status: 0, or 1 where a limit is not met. --quick
+has one scene, few frames, and no limit. The whole takes about six minutes on two cores.
 
 --capture runs twelve scenes and keeps the states before every fifth of their implicit steps and before the ten slowest; --replay
 solves each of them again, in f32 and f64, to 1e-4, and in halves where that does not converge, and compares with the same step
@@ -50,7 +49,6 @@ from .contact_colouring import (
     measure_crossover,
 )
 from .contact_drops import DROPS
-from .contact_plot import Snapshot, draw, take_snapshot
 from .contact_runs import (
     COLD,
     GOAL,
@@ -83,15 +81,21 @@ PILE, PILE_SECONDS, PILE_LIMIT = "cube_pile", 2.0, 3.0  # simulated; wall second
 SWEEP_LIMIT = 0  # problems of the films that the default solver of the CPU leaves above GOAL
 
 
-def measure(quick: bool, arch: str, document: Document) -> tuple[dict, list[Snapshot]]:
-    """Everything, printed as it comes, by name; and what is drawn of the scenes."""
+def measure(quick: bool, arch: str, document: Document) -> dict:
+    """Everything, printed as it comes, by name."""
     found: dict = {"films": [], "steps": [], "runs": [], "colourings": []}
-    snapshots = [_explicit(name, quick, arch, found) for name in DEMOS[: 1 if quick else None]]
+    demos = DEMOS[: 1 if quick else None]
+    for name in demos:  # film, step and colourings of a scene with one simulator
+        with open_explicit(name, arch) as sim:
+            found["films"].append(measure_film(name, sim, QUICK_FRAMES if quick else FRAMES, Solvers(threads=not quick)))
+            to_impulses(sim)
+            found["colourings"] += colour_all(name, sim._contact.problem, QUICK_SEEDS if quick else SEEDS)[0]
+            found["steps"].append(measure_step(name, sim, QUICK_STEPS if quick else STEPS))
     document.add(f"## Explicit steps (figs. 19, 20)\n\n{count_table(found['films'])}\n\n{solver_table(found['films'])}")
     document.add(f"## The whole explicit step\n\n{step_table(found['steps'])}")
-    for name, seconds in [(s.scene, QUICK_RUN_SECONDS if quick else RUN_SECONDS) for s in snapshots]:
+    for name in demos:
         with open_scene(name, arch) as sim:
-            found["runs"].append(measure_run(name, sim, seconds))
+            found["runs"].append(measure_run(name, sim, QUICK_RUN_SECONDS if quick else RUN_SECONDS))
     if not quick:
         with open_scene(PILE, arch) as sim:
             found["runs"].append(measure_run(PILE, sim, PILE_SECONDS))
@@ -103,20 +107,7 @@ def measure(quick: bool, arch: str, document: Document) -> tuple[dict, list[Snap
     table, text = crossover_table(found["crossover"]), crossover_text(found["crossover"], arch)
     document.add(f"## Serial and coloured Gauss-Seidel\n\n{table}\n\n{text}")
     found["problems"] = _problems(quick, document)
-    return found, snapshots
-
-
-def _explicit(name: str, quick: bool, arch: str, found: dict) -> Snapshot:
-    """Film, step and colourings of a scene, all with one simulator."""
-    with open_explicit(name, arch) as sim:
-        solvers = Solvers(threads=not quick)
-        found["films"].append(measure_film(name, sim, QUICK_FRAMES if quick else FRAMES, solvers))
-        to_impulses(sim)
-        colourings, colours = colour_all(name, sim._contact.problem, QUICK_SEEDS if quick else SEEDS)
-        found["colourings"] += colourings
-        snapshot = take_snapshot(name, sim, colours)
-        found["steps"].append(measure_step(name, sim, QUICK_STEPS if quick else STEPS))
-    return snapshot
+    return found
 
 
 def _problems(quick: bool, document: Document) -> list[contact_problems.Row]:
@@ -226,7 +217,7 @@ def main(argv=None) -> int:
     parser.add_argument("--free", action="store_true", help="take steps without contacts, and solve statics")
     parser.add_argument("--baseline", type=Path, metavar="FOLDER", help="another version")
     parser.add_argument("--only", action="append", metavar="SCENE", help="one of those scenes alone; repeatable")
-    options = parse_options(parser, argv, "the report's figures 19 and 20")
+    options = parse_options(parser, argv)
     known = DROPS if options.drops else FREE_NAMES if options.free else SCENES
     if unknown := [name for name in options.only or () if name not in known]:
         parser.error(f"argument --only: '{unknown[0]}' is none of {', '.join(known)}")
@@ -245,11 +236,11 @@ def main(argv=None) -> int:
         return document.finish(options, numbers | {"runs": runs}, limits)
     document, numbers = begin("Contact", options.arch, "f32")
     compiled = compile_clock()
-    found, snapshots = measure(options.quick, options.arch, document)
+    found = measure(options.quick, options.arch, document)
     numbers["compile_seconds"] = compile_clock() - compiled
     document.add(f"Compiling in all: {numbers['compile_seconds']:.0f} s; load at the end: {load_average() or 0:.1f}")
     limits = [] if options.quick else find_limits(found)
-    return document.finish(options, numbers | found, limits, lambda path: draw(found, snapshots, path))
+    return document.finish(options, numbers | found, limits)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,8 @@ from taisoft.contact import api, augmented_lagrangian, numpy_prox
 from taisoft.contact.colouring import store
 from taisoft.contact.graph import colour_greedy, matrix_graph
 from taisoft.contact.solve import solve
+
+from .runner import patched
 
 PROBLEMS = Path(__file__).resolve().parents[1].parent / "shared" / "contact_problems"
 SWEEPS = (10, 100, 1000)
@@ -137,11 +140,12 @@ def counted_operations(problem: Problem) -> Iterator[list[int]]:
         told.append(int(share * 4 * problem.sweep_cost))
         return look(q, *rest)
 
-    np.linalg.solve, module.splu, module._linearise = count_dense, count_sparse, count_look
-    try:
+    with (
+        patched(np.linalg, "solve", count_dense),
+        patched(module, "splu", count_sparse),
+        patched(module, "_linearise", count_look),
+    ):
         yield told
-    finally:
-        np.linalg.solve, module.splu, module._linearise = dense, sparse, look
 
 
 def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
@@ -152,38 +156,25 @@ def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
         orders = {True: p.order.to_numpy(), False: np.zeros(p.capacity, dtype=np.int32)}
         orders[False][: len(mu)] = np.arange(len(mu))
 
-        def start(method: str) -> None:
+        def sweep(method: str, momentum: bool, goal: float = GOAL, most: int = SWEEPS[-1]):
             p.order.from_numpy(orders[method == "coloured_gauss_seidel"])
             p.r.fill(0.0)
+            return solve(p, method, goal, most, momentum=momentum)
 
-        residuals, found, calls = {}, {}, {}
-        for name, (method, momentum) in SWEEPERS.items():
-            after = []
-            for n in SWEEPS:
-                start(method)
-                solve(p, method, 0.1 * NONE, n, momentum=momentum)
-                after.append(numpy_prox.residual(W, b, mu, numpy_prox.find_factors(W), p.r.to_numpy()[: len(mu)]))
-            residuals[name] = tuple(after)
-            start(method)
-            found[name] = solve(p, method, GOAL, SWEEPS[-1], momentum=momentum)
+        def residual_after(n: int, method: str, momentum: bool) -> float:
+            sweep(method, momentum, 0.1 * NONE, n)
+            return numpy_prox.residual(W, b, mu, numpy_prox.find_factors(W), p.r.to_numpy()[: len(mu)])
 
-            def run(method=method, momentum=momentum):
-                start(method)
-                return solve(p, method, GOAL, SWEEPS[-1], momentum=momentum)
-
-            calls[name] = run
-
-        def yardstick():
-            start("gauss_seidel")
-            return solve(p, "gauss_seidel", -1.0, SWEEPS[-1], momentum=False)
-
-        took = seconds({**calls, "1000": yardstick}, repeats)
+        residuals = {name: tuple(residual_after(n, *how) for n in SWEEPS) for name, how in SWEEPERS.items()}
+        found = {name: sweep(*how) for name, how in SWEEPERS.items()}
+        calls = {name: partial(sweep, *how) for name, how in SWEEPERS.items()}
+        took = seconds({**calls, "1000": lambda: sweep("gauss_seidel", False, -1.0)}, repeats)
     rows = []
     for name, (_, momentum) in SWEEPERS.items():
         done = found[name]
         # a look at the residual is a product too, after every fifth sweep; momentum takes about 40 operations a contact
-        sweep = problem.sweep_cost * 1.2 + (40 * len(mu) if momentum else 0)
-        share = done.iterations * sweep / (SWEEPS[-1] * problem.sweep_cost)
+        cost = problem.sweep_cost * 1.2 + (40 * len(mu) if momentum else 0)
+        share = done.iterations * cost / (SWEEPS[-1] * problem.sweep_cost)
         reached = done.iterations if done.converged else None
         rows.append(Row(problem.name, len(mu), name, residuals[name], reached, took[name] / took["1000"], share))
     return rows

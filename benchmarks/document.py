@@ -143,7 +143,8 @@ def table(rows: Iterable, columns: Columns, notes: Iterable[str] = ()) -> str:
     lines = [[cell.format(row) if isinstance(cell, str) else cell(row) for _, cell in columns] for row in rows]
     left = [k for k, (heading, _) in enumerate(columns) if heading.startswith("<")]
     text = markdown([heading.removeprefix("<") for heading, _ in columns], lines, left)
-    return "\n".join([text, *(f"{'' if k else chr(10)}* {note}" for k, note in enumerate(notes))])
+    bullets = "".join(f"\n* {note}" for note in notes)
+    return f"{text}\n{bullets}" if bullets else text
 
 
 def ms(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""The falling beam, taisoft beside MuJoCo: cost of a step, alone and in sim.run, time and error of whole runs, memory.
+"""The falling beam, taisoft beside MuJoCo: cost of a step, alone and in sim.run, time and error of whole runs.
 
 taisoft bench elasticity [--arch cpu|cuda] [--quick] [--no-peers] [--out [FILE.json]]
 
@@ -21,7 +21,7 @@ from taisoft.output.tables import percent, spread_of
 from taisoft.timing import Timing, load_average
 
 from .document import RESULTS, Document, Limit, begin, check_out, default_out, limit_table, load_text, table
-from .elasticity_runs import MUJOCO, TAISOFT, Row, make_rows, measure_memory, measure_rows, n_tets, time_ratio
+from .elasticity_runs import MUJOCO, TAISOFT, Row, make_rows, measure_rows, n_tets, time_ratio
 from .elasticity_steps import cost_limits, cost_table, frame_limits, frame_table, measure_costs, measure_frames
 from .exact_path import MESHES, SECONDS
 from .programs.mujoco_flex import run_mujoco
@@ -29,7 +29,6 @@ from .runner import add_arch, make_parser
 
 TARGET_MESH = MESHES[-1]  # whose implicit runs have targets
 SPEED_TARGET, ERROR_TARGET = 3.0, 0.0015  # MuJoCo's time over ours, at least; error of a path, at most
-MEMORY_LIMIT = 1000.0  # bytes of fields per tet, f32
 # What is set beside each other: our integrator, theirs, and the steps theirs takes for one of the first in its rows:
 # explicit ones at their largest steps, implicit ones at 10 ms, and theirs at a quarter of that, nearer to our error.
 PAIRS = (
@@ -140,31 +139,6 @@ def run_limits(rows: list[Row]) -> list[Limit]:
     return limits
 
 
-def memory_table(rows: list[dict]) -> str:
-    """A row a simulator."""
-
-    def number(name: str, scale: float, form: str):
-        return lambda row: "-" if row[name] is None else f"{row[name] / scale:{form}}"
-
-    columns = (
-        ("tets", "{[tets]:,}"),
-        ("<integrator", "{[integrator]}"),
-        ("fields [MB]", number("field_bytes", 1e6, ".1f")),
-        ("bytes/tet", number("bytes_per_tet", 1, ".0f")),
-        ("peak of the process [MB]", number("peak_bytes", 1e6, ".1f")),
-    )
-    return table(rows, columns)
-
-
-def memory_limits(rows: list[dict]) -> list[Limit]:
-    """The limit on the bytes of the fields."""
-    return [
-        Limit(f"bytes of fields per tet, {row['integrator']}, {row['tets']:,} tets, f32", row["bytes_per_tet"], MEMORY_LIMIT)
-        for row in rows
-        if row["bytes_per_tet"] is not None
-    ]
-
-
 def peer_problem() -> str | None:
     """Why MuJoCo cannot be compared with, in a sentence, or None."""
     try:
@@ -180,7 +154,6 @@ def measure(extent: Extent, arch: str, peers: bool) -> tuple[Document, dict]:
     device = cuda().removeprefix("yes: ") if arch == "cuda" else None
     where = f"taisoft on {device}, MuJoCo on the processor" if device else "both programs on the processor"
     document.add(f"{where}, and there on one thread each")
-    memory = measure_memory(extent.meshes, arch)  # first: the process's peak is then taisoft's own
     problem = peer_problem() if peers else "left out with --no-peers"
     if problem:
         document.add(f"MuJoCo is not compared with: {problem}.")
@@ -203,13 +176,12 @@ def measure(extent: Extent, arch: str, peers: bool) -> tuple[Document, dict]:
         if pairs := compare(rows):
             document.add(compare_table(pairs))
         runs += rows
-    document.add("## Memory, f32\n\n" + memory_table(memory))
-    limits = cost_limits(costs) + frame_limits(frames) + run_limits(runs) + memory_limits(memory)
+    limits = cost_limits(costs) + frame_limits(frames) + run_limits(runs)
     document.add("## Limits\n\n" + limit_table(limits))
     load = load_average()
     document.add(f"Load at the end: {load_text(load)}")
     numbers |= {"device": device, "arch": arch, "load_at_the_end": load, "mujoco_left_out": problem}
-    return document, numbers | {"cost": costs, "frames": frames, "runs": runs, "memory": memory, "limits": limits}
+    return document, numbers | {"cost": costs, "frames": frames, "runs": runs, "limits": limits}
 
 
 def main(argv=None) -> int:

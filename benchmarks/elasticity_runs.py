@@ -16,7 +16,6 @@ import numpy as np
 import taisoft as ts
 from taisoft.dynamics import EXPLICIT
 from taisoft.errors import SimulationError
-from taisoft.output.report import peak_memory
 from taisoft.scene.scene import Scene
 from taisoft.stability import stable_dt
 from taisoft.study.timed_run import TimedRun, advance, warm_up
@@ -69,25 +68,6 @@ def follow_tip(sim: ts.Simulator, steps: int, samples: int) -> tuple[np.ndarray,
         whole += advance(sim, steps)
         path.append(sim.positions("beam")[tip].mean(axis=0))
     return np.array(path), whole
-
-
-def measure_memory(meshes, arch: str, integrators=("velocity_verlet", "bdf2")) -> list[dict]:
-    """Bytes of the fields per tet in f32, by default of an explicit and an implicit simulator, and the peak of the process."""
-    rows = [{"tets": 0, "integrator": "before", "field_bytes": 0, "bytes_per_tet": None, "peak_bytes": peak_memory()}]
-    for cells in meshes:
-        for integrator in integrators:
-            dt = SAMPLE / steps_within_limit(cells)
-            with ts.Simulator(beam_scene(cells), dt=dt, integrator=integrator, precision="f32", arch=arch) as sim:
-                warm_up(sim)
-                total = sum(sim.field_bytes.values())
-            found = {
-                "tets": n_tets(cells),
-                "integrator": integrator,
-                "field_bytes": total,
-                "bytes_per_tet": total / n_tets(cells),
-            }
-            rows.append(found | {"peak_bytes": peak_memory()})
-    return rows
 
 
 # --- runs ---------------------------------------------------------------------------------------------------------------

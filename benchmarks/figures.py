@@ -25,8 +25,8 @@ from .runner import make_parser, progress
 WRITES = {
     "references": ("json",),
     "elasticity": ("json",),
-    "collision": ("json", "png"),
-    "contact": ("json", "png"),
+    "collision": ("json",),
+    "contact": ("json",),
     "order": ("json", "png"),
     "scaling": ("json", "png"),
     "peers": ("json",),

@@ -6,7 +6,6 @@ without the building of the scene and the compiling of its kernels. One of many 
 the first solution without the first launch of each kernel, and has no spread.
 """
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
@@ -17,12 +16,12 @@ from taisoft.backend.runtime import Runtime, compile_clock
 from taisoft.errors import SimulationError, TaisoftError
 from taisoft.static import StaticSolver
 from taisoft.study.timed_run import TimedRun, advance
-from taisoft.timing import Timing, summarise, time_repeats
+from taisoft.timing import Timing, summarise
 
 from .order_cases import Case, Element, Reference
 from .reference_cases.motion import parabola_vertex
 from .reference_cases.record import label, nearest
-from .runner import progress, timed, unwarned
+from .runner import progress, repeated, timed, unwarned
 
 TOLERANCE = 1e-6  # of |residual| / |load|
 FALL_SECONDS = 1.2  # the first swing is over
@@ -163,15 +162,7 @@ def _time(runs: list[tuple], rounds: int) -> None:
     for _ in range(rounds):
         for run, row in runs:
             if not row.failure and sum(row.rounds) < ENOUGH_SECONDS:
-                row.rounds.append(float(np.median(_repeat(run.again))))
-
-
-def _repeat(call: Callable[[], None]) -> list[float]:
-    """Seconds of one call after another, until their sum or number is enough for a round; at least one."""
-    seconds: list[float] = []
-    while not seconds or (sum(seconds) < ROUND_SECONDS and len(seconds) < ROUND_RUNS):
-        seconds.append(time_repeats(call, 1).median)
-    return seconds
+                row.rounds.append(float(np.median(repeated(run.again, ROUND_RUNS, ROUND_SECONDS, least=1))))
 
 
 def own_reference(case: Case, rows: list[Row]) -> Reference:

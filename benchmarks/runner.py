@@ -45,15 +45,16 @@ def add_arch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
 
 
-def parse_options(parser: argparse.ArgumentParser, argv: list[str] | None, drawn: str) -> argparse.Namespace:
-    """--arch, --out and --plot, which is to draw what `drawn` says, beside the parser's own options; the files can be written."""
+def parse_options(parser: argparse.ArgumentParser, argv: list[str] | None, drawn: str = "") -> argparse.Namespace:
+    """--arch, --out and, where something is drawn, --plot, beside the parser's own options; the files can be written."""
     add_arch(parser)
     parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help=f"draw {drawn}")
+    if drawn:
+        parser.add_argument("--plot", type=Path, metavar="FILE.png", help=f"draw {drawn}")
     options = parser.parse_args(argv)
     check_out(options.out, ".json")
-    check_out(options.plot, ".png")
-    if options.plot:
+    if drawn and options.plot:
+        check_out(options.plot, ".png")
         require_matplotlib()
     return options
 

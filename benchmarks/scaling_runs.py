@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from time import perf_counter
 
 import numpy as np
@@ -175,12 +176,6 @@ def _element_seconds(sim: ts.Simulator, n: int) -> float:
     return (clock() - begin) / n
 
 
-def implicit(row: Row, size: int) -> None:
-    """Steps without contacts."""
-    with _open(row, beam, size, "bdf2", DT) as sim:
-        _implicit_steps(row, sim)
-
-
 def explicit_contact(row: Row, size: int) -> None:
     """Steps with contacts, each with a search and a solve."""
     with _open(row, cubes_on_ground, size, "symplectic_euler", None) as sim:
@@ -188,12 +183,6 @@ def explicit_contact(row: Row, size: int) -> None:
         row.field_bytes = group_bytes(sim)
         sweep = floor_bytes(("sweep",), sim.field_bytes) * row.counts["contacts"] / sim._contact.problem.capacity
         row.moved = floor_bytes(("elements", "update"), sim.field_bytes) + sweep * row.counts["sweeps"]
-
-
-def implicit_contact(row: Row, size: int) -> None:
-    """Steps with contacts inside the Newton loop."""
-    with _open(row, cubes_on_ground, size, "implicit_euler", DT) as sim:
-        _implicit_steps(row, sim)
 
 
 def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
@@ -212,18 +201,18 @@ def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
     return places
 
 
-def _implicit_steps(row: Row, sim: ts.Simulator) -> None:
-    """Time implicit steps. Bytes: those of residuals, matrices and iterations of CG, without what contacts add."""
-    watch = _one_by_one(row, sim, implicit_places(sim))
-    fields, steps = sim.field_bytes, len(row.samples)
-    row.field_bytes = group_bytes(sim)
-    residuals, matrices = watch.calls["form_residual"], watch.calls["assemble"]
-    row.counts |= {"residuals": residuals / steps, "matrices": matrices / steps}
-    row.moved = (
-        row.counts["residuals"] * floor_bytes(("elements", "residual"), fields)
-        + row.counts["matrices"] * floor_bytes(("blocks", "edges", "system"), fields)
-        + row.counts["linear"] * floor_bytes(("iteration",), fields)
-    )
+def implicit(build: Callable[[int], Scene], integrator: str, row: Row, size: int) -> None:
+    """Implicit steps, with contacts inside the Newton loop or without. Bytes: without what contacts add."""
+    with _open(row, build, size, integrator, DT) as sim:
+        watch = _one_by_one(row, sim, implicit_places(sim))
+        fields, steps = sim.field_bytes, len(row.samples)
+        row.field_bytes = group_bytes(sim)
+        row.counts |= {"residuals": watch.calls["form_residual"] / steps, "matrices": watch.calls["assemble"] / steps}
+        row.moved = (
+            row.counts["residuals"] * floor_bytes(("elements", "residual"), fields)
+            + row.counts["matrices"] * floor_bytes(("blocks", "edges", "system"), fields)
+            + row.counts["linear"] * floor_bytes(("iteration",), fields)
+        )
 
 
 def _one_by_one(row: Row, sim: ts.Simulator, places: list[tuple[str, object, str]]) -> Stopwatch:
@@ -275,8 +264,8 @@ def search(row: Row, size: int) -> None:
 KINDS: dict[str, Callable[[Row, int], None]] = {
     EXPLICIT: explicit,
     ON_ONE: explicit_on_one,
-    "implicit": implicit,
+    "implicit": partial(implicit, beam, "bdf2"),
     "search": search,
     "explicit contact": explicit_contact,
-    "implicit contact": implicit_contact,
+    "implicit contact": partial(implicit, cubes_on_ground, "implicit_euler"),
 }

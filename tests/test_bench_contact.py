@@ -4,7 +4,7 @@
 * colourings are proper and need no fewer colours than contacts meet at a node;
 * a step is told in parts, each call's time counted once; steps of a run with their iterations;
 * the plates of the crossover lie on each other as they say; both solvers solve them;
-* limits are met or not; the whole prints, writes and draws, and a limit that is not met is the exit status.
+* limits are met or not; the whole prints and writes, and a limit that is not met is the exit status.
 """
 
 import json
@@ -29,7 +29,6 @@ from benchmarks.contact_colouring import (
     measure_crossover,
     proper,
 )
-from benchmarks.contact_plot import Snapshot, take_snapshot
 from benchmarks.contact_problems import PLAIN
 from benchmarks.contact_problems import Row as ProblemRow
 from benchmarks.contact_runs import (
@@ -54,6 +53,7 @@ from benchmarks.contact_runs import (
     to_impulses,
 )
 from benchmarks.report_parts import phases
+from benchmarks.report_parts.solvers import take_snapshot
 from benchmarks.runner import REST, Stopwatch, patched
 from taisoft.backend.fields import FieldArena
 from taisoft.backend.runtime import open_runtime
@@ -304,19 +304,16 @@ def test_counts_beside_the_report_and_the_crossover():
 
 @pytest.fixture
 def faked(monkeypatch):
-    colours = {way: np.arange(4) % 2 for way in ("random", "greedy")}
-    snapshots = [Snapshot(SCENE, np.zeros((4, 4, 3), np.uint8), np.eye(4, dtype=bool), colours)]
     found = [made()]
-    monkeypatch.setattr(contact, "measure", lambda quick, arch, document: (found[0], snapshots))
+    monkeypatch.setattr(contact, "measure", lambda quick, arch, document: found[0])
     return found
 
 
-def test_the_whole_writes_and_draws(faked, tmp_path, capsys):
-    pytest.importorskip("matplotlib")
-    out, plot = tmp_path / "new" / "a.json", tmp_path / "a.png"
-    assert contact.main(["--out", str(out), "--plot", str(plot)]) == 0
+def test_the_whole_writes_what_it_prints(faked, tmp_path, capsys):
+    out = tmp_path / "new" / "a.json"
+    assert contact.main(["--out", str(out)]) == 0
     printed, numbers = capsys.readouterr().out, json.loads(out.read_text())
-    assert out.with_suffix(".md").read_text().strip() in printed and plot.read_bytes()[:4] == b"\x89PNG"
+    assert out.with_suffix(".md").read_text().strip() in printed
     assert numbers["films"][0]["outcomes"][WARM][SERIAL][0]["sweeps"] == 5 and len(numbers["limits"]) == 6
     assert "## Limits" in printed and "NOT met" not in printed
 

@@ -16,7 +16,7 @@ import pytest
 from command import ROOT
 
 from benchmarks import cuda_check
-from benchmarks.cuda_check import TABLES, Part, check, main, make_parts, parse_test, part_text
+from benchmarks.cuda_check import TABLES, Outcome, Part, check, main, make_parts, parse_test, part_text
 from benchmarks.cuda_parts import JOBS, run_job
 from benchmarks.runner import RESULT
 

@@ -5,11 +5,14 @@ with many contacts, of which the report expects more than it measures.
 """
 
 from contextlib import closing
+from dataclasses import dataclass
 
 import numpy as np
 
 from taisoft.backend.runtime import open_runtime
+from taisoft.contact.graph import groups
 from taisoft.timing import summarise
+from taisoft.view.offscreen import Offscreen
 
 from ..contact import CONTACTS, count_table, solver_table
 from ..contact_colouring import (
@@ -24,10 +27,9 @@ from ..contact_colouring import (
     crossover_text,
     measure_crossover,
 )
-from ..contact_plot import figure_19, figure_20, take_snapshot
-from ..contact_runs import COLOURED, SERIAL, THREADED, Film, Solvers, measure_film, open_explicit, to_impulses
+from ..contact_runs import COLOURED, SERIAL, THREADED, Film, Solvers, contact_jacobian, measure_film, open_explicit, to_impulses
 from ..document import ms
-from .page import Claim, Extent, Part, clearly_less, is_near, new_figure, plot_png
+from .page import COLOURS, Claim, Extent, Part, clearly_less, is_near, new_figure, plot_png
 
 COLOURED_SCENE = "two_cubes_two_boxes"
 REPORTS_CONTACTS, COLOURS_FOUND = REPORT[COLOURED_SCENE]
@@ -38,6 +40,9 @@ PLATES = (8, 32, 96)  # cells of two plates on each other: some 130 to 17,000 co
 JACOBI, HYBRID = "jacobi", "hybrid"
 SPIKE = 5.0  # times the median: a frame that counts as a spike
 MOSTLY = 0.9  # of the frames in which what is by far the fastest is faster
+BANDS = COLOURS[:2]  # of groups in turn
+WAYS = ("random", "greedy")  # of the grouped Jacobians
+PICTURE = (640, 520)  # pixels of a scene
 NEAR = 0.25  # of a number of the report's, within which ours counts as its
 
 
@@ -87,6 +92,48 @@ def colour_claims(found: list[Colouring]) -> list[Claim]:
 
 def _listed(values) -> str:
     return " and ".join(f"{v:g}" for v in values)
+
+
+@dataclass
+class Snapshot:
+    """A scene at one moment. image (h,w,3); touched (k, n_nodes) bool: which contact pushes which node; colours: way -> (k,)."""
+
+    scene: str
+    image: np.ndarray
+    touched: np.ndarray
+    colours: dict[str, np.ndarray]
+
+
+def take_snapshot(scene: str, sim, colours: dict[str, np.ndarray]) -> Snapshot:
+    """The present picture of a simulator and its contact Jacobian, of nodes that some contact pushes."""
+    J = contact_jacobian(sim._contact.problem).tocoo()
+    touched = np.zeros((J.shape[0] // 3, J.shape[1] // 3), dtype=bool)
+    touched[J.row // 3, J.col // 3] = True
+    image = Offscreen(sim.scene, PICTURE, renderer="software").image(sim)
+    return Snapshot(scene, image, touched[:, touched.any(axis=0)], colours)
+
+
+def figure_19(panels, s: Snapshot) -> None:
+    """The scene, its Jacobian, and that with its rows grouped by colour; groups have two tints in turn."""
+    panels[0].imshow(s.image)
+    panels[0].set_axis_off()
+    panels[0].set_title(f"{s.scene} (as fig. 19)")
+    _spy(panels[1], s.touched, np.zeros(len(s.touched), dtype=int), f"contact Jacobian: {len(s.touched)} contacts")
+    for panel, way in zip(panels[2:], WAYS):
+        order, start = groups(s.colours[way])
+        band = np.repeat(np.arange(len(start) - 1), np.diff(start))
+        _spy(panel, s.touched[order], band % len(BANDS), f"grouped, {way}: {len(start) - 1} colours")
+        for at in start[1:-1]:
+            panel.axhline(at - 0.5, color="#bbbbbb", lw=0.6, zorder=0)
+
+
+def _spy(panel, touched: np.ndarray, band: np.ndarray, title: str) -> None:
+    row, column = np.nonzero(touched)
+    size = min(30.0, 4e4 / touched.size + 2.0)
+    panel.scatter(column, row, s=size, marker="s", linewidths=0, c=np.array(BANDS)[band[row]])
+    panel.set(title=title, xlabel="nodes that are pushed", ylabel="contacts")
+    panel.set_xlim(-0.5, touched.shape[1] - 0.5)
+    panel.set_ylim(touched.shape[0] - 0.5, -0.5)
 
 
 def measure_colours(extent: Extent) -> Part:
@@ -201,9 +248,22 @@ def more_contacts(points: list[Point]) -> Claim:
 
 
 def draw(film: Film) -> bytes:
-    """Figure 20."""
+    """Figure 20: sweeps and time of each solver over frames, and the contacts."""
     figure, (panels,) = new_figure(3)
-    figure_20(panels, film)
+    for name, colour in zip(film.solvers, COLOURS):
+        style = {"color": colour, "label": name, "lw": 1.2, "ls": "--" if name.endswith(THREADED) else "-"}
+        if not name.endswith(THREADED):  # threads change no sweeps
+            panels[0].plot(film.time, [o.sweeps for o in film.of(name)], **style)
+        panels[1].plot(film.time, [1e3 * o.median for o in film.of(name)], **style)
+    panels[2].plot(film.time, film.contacts, color=COLOURS[0], label="contacts")
+    panels[2].plot(film.time, film.found, ":", color=COLOURS[1], label="before reduction")
+    panels[0].set_ylim(bottom=0)
+    panels[1].set_yscale("log")
+    panels[2].set_ylim(bottom=0)
+    panels[2].legend(fontsize="small", frameon=False)
+    for panel, what in zip(panels, ("sweeps (fig. 20)", "solve [ms] (fig. 20)", "contacts")):
+        panel.set(title=f"{film.scene}: {what}", xlabel="time [s]")
+        panel.grid(True, which="major", color="#eeeeee")
     handles, labels = panels[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small", frameon=False)
     return plot_png(figure)
