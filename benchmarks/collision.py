@@ -4,11 +4,11 @@ taisoft bench collision [--quick] [--arch cpu|cuda] [--precision f32|f64] [--out
 
 Configurations: piles of 27 touching cubes, two cubes, and the report's scenes; bodies are hit by the proximity of their surfaces
 or through distance fields. A time is the median over rounds of one phase, or of a whole search (boxes, candidates, contacts,
-reduction), with nothing copied to the host; spread is the distance between the quartiles over the median. The first search, which
-compiles the kernels and lets the buffers grow, is told apart. Figures named are those of the report, which `taisoft bench report`
-draws. The older code's times are quoted: of a whole step, contacts and solver, on this class of machine. Exit status: 0, or 1
-where a limit is not met. --quick has small meshes, few rounds and frames, and no limit. The whole takes about fifteen minutes on
-two cores.
+reduction), with nothing copied to the host; spread is the distance between the quartiles over the median. The first search,
+which compiles the kernels and lets the buffers grow, is timed apart. Figures named are those of the report, which `taisoft bench
+report` draws. The older code's times are quoted: of a whole step, contacts and solver, on this class of machine. Exit status: 0,
+or 1 where a limit is not met. --quick has small meshes, few rounds and frames, and no limit. The whole takes about fifteen
+minutes on two cores.
 """
 
 import sys
@@ -70,7 +70,7 @@ def measure(quick: bool, runtime: Runtime, document: Document) -> dict:
 
 
 def row_table(rows: list[Row]) -> str:
-    """A row a configuration and geometry; what failed is told below."""
+    """A row a configuration and geometry; failures below."""
 
     def phase(name: str):
         return lambda r: ms(r.phase(name)) if r.whole else "-"

@@ -1,7 +1,7 @@
 """What `collision.py` measures: searches for contacts phase by phase, frame by frame, broad phases and reductions beside others.
 
 A search's phases are timed between synchronisations, in one round after another; the first search of a configuration, which
-compiles the kernels and lets the buffers grow, is told apart.
+compiles the kernels and lets the buffers grow, is timed apart.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -197,7 +197,7 @@ class Rig:
         self._arena.release()
 
     def place(self, share: float) -> None:
-        """Put the nodes where the motion has them, `share` of the film done."""
+        """Put the nodes where the motion has them, a fraction of the film done."""
         x = start(self.scene) if self.setup.motion is None else self.setup.motion(self.scene, share)
         self.model.state.x.from_numpy(x)
 
@@ -244,7 +244,7 @@ class Rig:
 
 
 def measure_row(setup: Setup, geometry: str, runtime: Runtime, rounds: int) -> Row:
-    """A configuration's search: what it goes through, and its phases. What fails is told in the row."""
+    """A configuration's search: what it goes through, and its phases. A failure is kept in the row."""
     row = Row(setup.name, geometry)
     try:
         with Rig(setup, geometry, runtime) as rig:

@@ -8,7 +8,7 @@ taisoft bench contact --free [--baseline FOLDER] [--only CASE] [--out FILE.json]
 
 Scenes are demos, in f32; figures named are those of the report, which `taisoft bench report` draws. Of each frame of an explicit
 run the contact problem is taken where its solve would begin, and solved to a residual of 1e-4 by every solver, in turns, from the
-impulses of the step before and from none. The residual told is worked out in NumPy. A solve's time holds its colouring; a
+impulses of the step before and from none. Residuals are computed in NumPy. A solve's time holds its colouring; a
 solver's loops run on one thread on the CPU, or, where that is said, on all. A number is a median, its range in brackets; spread
 is the distance between the quartiles over the median. Compiling is apart. Exit status: 0, or 1 where a limit is not met. --quick
 has one scene, few frames, and no limit. The whole takes about six minutes on two cores.
@@ -22,8 +22,8 @@ Scenes whose meshes are not there are left out. Capturing takes about ten minute
 --drops runs bodies that fall and come to rest, among them four real meshes: Newton and CG iterations a step, steps that did not
 converge, and times, beside those of the older version. It takes two minutes, with version 0.1 beside it six.
 
---free takes steps without contacts, of beams with and without inverted tets, and solves statics, versions in turns; told are the
-steps and solves that converge in every version. It takes two minutes, with version 0.1 beside it six.
+--free takes steps without contacts, of beams with and without inverted tets, and solves statics, versions in turns; steps and
+solves count that converge in every version. It takes two minutes, with version 0.1 beside it six.
 """
 
 import sys

@@ -33,7 +33,7 @@ FALL, SHAKE = -0.04, 0.02  # [m/s]
 class Colouring:
     """A way to colour one scene's contacts, the same as often as there are seeds or rounds.
 
-    least: colours that any colouring needs, as many contacts share one node. numbers: colours; largest: contacts of the
+    least: colours that any colouring needs, since so many contacts meet at one node. numbers: colours; largest: contacts of the
     largest colour; seconds: the graph included.
     """
 

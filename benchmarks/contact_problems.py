@@ -4,7 +4,7 @@ A section of `taisoft bench contact`. The problems are from Siconos' test data a
 shared/contact_problems, with the residuals of plain serial Gauss-Seidel as yardstick. Cost is told as a share of what 1000 sweeps
 of plain Gauss-Seidel take: time, the two run in turns, and floating-point operations (18 a block of W and sweep, 2/3 n^3 for a
 dense factorisation, what its fill says for a sparse one). Verdicts: Gauss-Seidel must be no worse than twice the yardstick; the
-best solver of every problem must reach 1e-6 at less than the cost of those sweeps, in operations and in time. A summary tells how
+best solver of every problem must reach 1e-6 at less than the cost of those sweeps, in operations and in time. A summary says how
 each solver fares on all of them.
 """
 
@@ -74,7 +74,7 @@ class Row:
     """One solver on one problem.
 
     residuals: after 10, 100, 1000 sweeps (outer iterates of the augmented Lagrangian; "auto" sweeps 100 times, then those).
-    iterations: until 1e-6, None where it is not reached. time, operations: until then, as a share of 1000 plain sweeps.
+    iterations: until 1e-6, None where it is not reached. time, operations: until then, over that of 1000 plain sweeps.
     """
 
     problem: str
@@ -121,23 +121,22 @@ def seconds(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, f
 @contextmanager
 def counted_operations(problem: Problem) -> Iterator[list[int]]:
     """A list whose entries add up to the operations of the augmented Lagrangian meanwhile."""
-    told: list[int] = []
+    operations: list[int] = []
     module, dense = augmented_lagrangian, np.linalg.solve
     sparse, look = module.splu, module._linearise
 
     def count_dense(A, b):
-        told.append(2 * len(A) ** 3 // 3 + 2 * len(A) ** 2)
+        operations.append(2 * len(A) ** 3 // 3 + 2 * len(A) ** 2)
         return dense(A, b)
 
     def count_sparse(A):
         made = sparse(A)
         lower, upper = np.diff(made.L.tocsc().indptr), np.diff(made.U.tocsr().indptr)
-        told.append(int(2 * (lower * upper).sum() + 2 * (lower.sum() + upper.sum())))
+        operations.append(int(2 * (lower * upper).sum() + 2 * (lower.sum() + upper.sum())))
         return made
 
     def count_look(q, *rest):  # with W' q and the blocks of the linearised equations, 3x3 by 3x3
-        share = len(q) / problem.W.shape[0]
-        told.append(int(share * 4 * problem.sweep_cost))
+        operations.append(int(len(q) / problem.W.shape[0] * 4 * problem.sweep_cost))
         return look(q, *rest)
 
     with (
@@ -145,11 +144,11 @@ def counted_operations(problem: Problem) -> Iterator[list[int]]:
         patched(module, "splu", count_sparse),
         patched(module, "_linearise", count_look),
     ):
-        yield told
+        yield operations
 
 
 def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
-    """All solvers that sweep; the first is plain Gauss-Seidel, in whose time the others are told."""
+    """All solvers that sweep; the first is plain Gauss-Seidel, the unit of the others' time."""
     W, b, mu = problem.W, problem.b, problem.mu
     with api._problem(W, b, mu, np.zeros((len(mu), 3))) as p:
         store(p, colour_greedy(matrix_graph(W)))
@@ -174,9 +173,9 @@ def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
         done = found[name]
         # a look at the residual is a product too, after every fifth sweep; momentum takes about 40 operations a contact
         cost = problem.sweep_cost * 1.2 + (40 * len(mu) if momentum else 0)
-        share = done.iterations * cost / (SWEEPS[-1] * problem.sweep_cost)
+        relative = done.iterations * cost / (SWEEPS[-1] * problem.sweep_cost)
         reached = done.iterations if done.converged else None
-        rows.append(Row(problem.name, len(mu), name, residuals[name], reached, took[name] / took["1000"], share))
+        rows.append(Row(problem.name, len(mu), name, residuals[name], reached, took[name] / took["1000"], relative))
     return rows
 
 
@@ -205,13 +204,13 @@ def host_rows(problem: Problem, repeats: int) -> list[Row]:
     for name, run in (("augmented_lagrangian", lagrangian), ("auto", auto)):
         factor = numpy_prox.find_factors(W)
         residuals = tuple(numpy_prox.residual(W, b, mu, factor, run(0.1 * NONE, n)[0]) for n in (*SWEEPS[:2], 150))
-        with counted_operations(problem) as told:
+        with counted_operations(problem) as counted:
             _, swept, history = run(GOAL, SWEEPS[-1])
         took = seconds({"solve": lambda run=run: run(GOAL, SWEEPS[-1]), "1000": plain}, repeats)
-        operations = sum(told) + swept * (1.2 * problem.sweep_cost + 40 * len(mu))
-        share = operations / (SWEEPS[-1] * problem.sweep_cost)
+        operations = sum(counted) + swept * (1.2 * problem.sweep_cost + 40 * len(mu))
+        relative = operations / (SWEEPS[-1] * problem.sweep_cost)
         reached = swept + len(history) - 1 if history[-1] <= GOAL else None
-        rows.append(Row(problem.name, len(mu), name, residuals, reached, took["solve"] / took["1000"], share))
+        rows.append(Row(problem.name, len(mu), name, residuals, reached, took["solve"] / took["1000"], relative))
     return rows
 
 
@@ -220,7 +219,7 @@ def judged(rows: list[Row]) -> list[Row]:
     yardstick = YARDSTICK[rows[0].problem]
     able = [row for row in rows if row.iterations is not None]
     best = min(able, key=lambda row: row.cost).solver if able else None
-    told = []
+    judged_rows = []
     for row in rows:
         verdict = []
         if row.solver.startswith("gauss_seidel"):
@@ -228,8 +227,8 @@ def judged(rows: list[Row]) -> list[Row]:
             verdict.append("yardstick: pass" if kept else "yardstick: FAIL")
         if row.solver == best:
             verdict.append("best: pass" if row.cost <= 1.0 else "best: FAIL")
-        told.append(replace(row, verdict=", ".join(verdict)))
-    return told if best else [replace(row, verdict="FAIL: nothing reaches 1e-6") for row in told]
+        judged_rows.append(replace(row, verdict=", ".join(verdict)))
+    return judged_rows if best else [replace(row, verdict="FAIL: nothing reaches 1e-6") for row in judged_rows]
 
 
 def compute(names: tuple[str, ...] = tuple(YARDSTICK), repeats: int = 5) -> Iterator[Row]:

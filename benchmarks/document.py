@@ -81,7 +81,7 @@ def header(title: str, *how: str, packages: tuple[str, ...] = ("taichi", "numpy"
 
 
 def header_text(title: str, numbers: dict, *how: str) -> str:
-    """What stored numbers tell of where and how they were measured."""
+    """Where and how stored numbers were measured."""
     return (
         f"# {title}\n\n{', '.join([numbers['processor'], str(numbers['cores']) + ' cores', *how])}, "
         f"load {load_text(numbers['load'])} at the start; {numbers['date']}\n"
@@ -180,8 +180,8 @@ def crossovers(at: Sequence[float], a: Sequence[float], b: Sequence[float]) -> l
     found, ratio = [], np.log(np.asarray(a) / np.asarray(b))
     for k in range(len(at) - 1):
         if ratio[k] * ratio[k + 1] < 0:
-            share = ratio[k] / (ratio[k] - ratio[k + 1])
-            found.append(math.exp((1 - share) * math.log(at[k]) + share * math.log(at[k + 1])))
+            t = ratio[k] / (ratio[k] - ratio[k + 1])
+            found.append(math.exp((1 - t) * math.log(at[k]) + t * math.log(at[k + 1])))
     return found
 
 
@@ -205,7 +205,7 @@ class Limit:
 
     @property
     def close(self) -> bool:
-        """Whether the spread is as large as the distance to the limit: another run may tell otherwise."""
+        """Whether the spread is as large as the distance to the limit: another run may find otherwise."""
         return self.spread is not None and abs(self.value - self.limit) <= self.spread * abs(self.value)
 
     def record(self) -> dict:

@@ -127,8 +127,8 @@ def lasting_steps(scene: Scene, integrator: str, arch: str, seconds: float) -> t
             except SimulationError:
                 failures.append(f"{1e3 * sim.dt:.3f} ms (at t = {sim.time:.2f} s)")
                 continue
-            told = f"from {MARGIN} of the limit at rest on, dt = {', '.join(failures)} diverged" if failures else ""
-            return steps, told
+            note = f"from {MARGIN} of the limit at rest on, dt = {', '.join(failures)} diverged" if failures else ""
+            return steps, note
     raise SimulationError(f"{integrator}: even dt = {1e3 * sim.dt:.3f} ms does not last {seconds} s")
 
 

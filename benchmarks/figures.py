@@ -4,7 +4,7 @@ taisoft bench figures [--only NAME] [--quick] [--results DIR] [--logs DIR]
 
 Runs the benchmarks one after the other, each in a process of its own, and writes their pages into benchmarks/results, named
 after the machine; what they print goes to DIR/NAME.log. A benchmark that fails or misses a limit does not stop the next one.
-The machine should do nothing else meanwhile: the table tells the load at each start. The whole takes about three hours on two
+The machine should do nothing else meanwhile: the table shows the load at each start. The whole takes about three hours on two
 cores, and its parts can be made one by one. Exit status: 0, or 1 where a benchmark ended with another status.
 """
 

@@ -92,8 +92,8 @@ def order_times(results: Path) -> str:
 def peers(results: Path) -> str:
     """taisoft beside other programs at equal error, without the stiff beams."""
     numbers = newest(results, "peers")
-    told = [numbers["versions"][name] for name in ("mujoco", "pybullet", "newton")]
-    programs = "MuJoCo {}, PyBullet {}, Newton {}".format(*told)
+    used = [numbers["versions"][name] for name in ("mujoco", "pybullet", "newton")]
+    programs = "MuJoCo {}, PyBullet {}, Newton {}".format(*used)
     shown = [one for one in numbers["comparisons"] if not one["stiff"]]
     return compare_table(shown) + measured_on(numbers, programs)
 

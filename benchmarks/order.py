@@ -4,7 +4,7 @@ taisoft bench order [--quick] [--case NAME] [--arch cpu|cuda] [--out FILE.json] 
 
 Computed in f64. Every case is solved on some meshes with linear tets (order 1) and with quadratic ones (order 2, four
 quadrature points; some with fourteen). A time is the median over rounds of the whole solution from the rest shape, on
-kernels that an earlier solution has compiled; the first launches are told apart, as "compile". Spread is the distance
+kernels that an earlier solution has compiled; the first launches are timed apart, as "compile". Spread is the distance
 between the quartiles over the median. Errors are relative, the largest of the numbers read, and "< " marks one below what
 the reference is good to. The time to 1 % error is read off between two meshes, straight in the logarithms; where all
 meshes lie on one side of 1 % it is a bound, marked > or <=, and nothing is extrapolated. Exit status: 0, or 1 where a limit
@@ -32,7 +32,7 @@ from .reference_cases.record import label
 from .runner import make_parser, parse_options
 
 ROUNDS, QUICK_ROUNDS, QUICK_MESHES = 5, 1, 2
-GOALS = (0.1, 0.03, 0.01)  # errors whose times are told
+GOALS = (0.1, 0.03, 0.01)  # errors whose times are compared
 GOAL = GOALS[-1]  # the one that cases are summed up by
 WANTED_RATIO = 20.0  # of the hanging beam's times to that error, order 1 over order 2
 ELASTICA_LIMIT = 0.005  # error of order 2 on its finest mesh
@@ -94,8 +94,8 @@ def time_to(errors: Sequence[float], seconds: Sequence[float], goal: float) -> R
     k = above[-1]
     if k == len(errors) - 1:
         return Reach(seconds[k], ">")
-    share = math.log(errors[k] / goal) / math.log(errors[k] / max(errors[k + 1], LEAST_ERROR))
-    return Reach(math.exp((1 - share) * math.log(seconds[k]) + share * math.log(seconds[k + 1])), "=")
+    t = math.log(errors[k] / goal) / math.log(errors[k] / max(errors[k + 1], LEAST_ERROR))
+    return Reach(math.exp((1 - t) * math.log(seconds[k]) + t * math.log(seconds[k + 1])), "=")
 
 
 def claimed(row: Row, reference: Reference) -> float:
@@ -140,7 +140,7 @@ def _ratio_bound(slow: Reach | None, fast: Reach | None) -> str:
 
 
 def row_table(rows: list[Row], reference: Reference) -> str:
-    """A row a mesh; what failed is told below."""
+    """A row a mesh; failures below."""
 
     def error(row: Row) -> str:
         if row.error is None:
@@ -250,9 +250,9 @@ def case_text(case: Case, rows: list[Row], reference: Reference) -> str:
     """A section: what the case is judged by, and its rows."""
     values = ", ".join(f"{x:.7g}" for x in reference.values) or "none"
     good = f", good to {reference.uncertainty:.2%}" if reference.uncertainty else ""
-    told = f"{case.quantity}; reference: {values}{good}; {reference.source}."
+    judged_by = f"{case.quantity}; reference: {values}{good}; {reference.source}."
     note = f"\nNote: {case.note}." if case.note else ""
-    return f"## {case.name}: {case.title}, {case.law}\n\n{told}{note}\n\n{row_table(rows, reference)}"
+    return f"## {case.name}: {case.title}, {case.law}\n\n{judged_by}{note}\n\n{row_table(rows, reference)}"
 
 
 def chosen_meshes(case: Case, quick: bool) -> dict:

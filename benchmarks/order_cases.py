@@ -40,7 +40,7 @@ LINEAR, QUADRATIC, QUADRATIC_14 = Element(1), Element(2, 2), Element(2, 4)
 
 @dataclass(frozen=True)
 class Reference:
-    """What a case is judged by. values: of its first numbers; those beyond are only told. source: where they are from.
+    """What a case is judged by. values: of its first numbers; those beyond are only shown. source: where they are from.
 
     uncertainty: relative, of the least sure value.
     """
@@ -55,7 +55,7 @@ class Case:
     """One problem with one law, and the cells of its meshes, coarse to fine, for each element.
 
     reference None: with `extrapolated` what the last three order-2 meshes lead to, each of which halves the cells of the one
-    before; otherwise no errors are told. dt: step of a motion [s]; None for an equilibrium.
+    before; otherwise there are no errors. dt: step of a motion [s]; None for an equilibrium.
     """
 
     name: str
@@ -281,7 +281,7 @@ CASES = (
         read=None,
         meshes=MOTION_MESHES,
         dt=0.01,
-        note="BDF2 with steps of 10 ms up to 1.2 s; the time is that of all steps; when the tip is lowest is only told, and to "
+        note="BDF2 with steps of 10 ms up to 1.2 s; the time is that of all steps; when the tip is lowest is only shown, and to "
         "be compared with 1.100 s, good to 0.7 %",
     ),
 )

@@ -2,7 +2,7 @@
 
 taisoft bench report [--quick] [--arch cpu|cuda] [--only NAME] [--out DIR]
 
-The page is DIR/README.md, with its pictures and all numbers (report.json) beside it. Scenes are ours: the report's text tells
+The page is DIR/README.md, with its pictures and all numbers (report.json) beside it. Scenes are ours: the report's text gives
 few sizes, and neither its machine nor its materials. A verdict follows from the numbers: a claim holds or not, and a part agrees,
 disagrees, or partly agrees. Times are medians; spread is the distance between the quartiles over the median; compiling is apart.
 A second run into the same folder says which times have not come again within the spreads. Exit status: 0, or 1 where a part could
@@ -56,14 +56,14 @@ def measure_part(name: str, extent: Extent) -> Part:
 
 def page_text(head: str, numbers: dict, parts: list[Part], again: str) -> str:
     """The whole page."""
-    told = (
+    opening = (
         f"{head}\nload {load_text(numbers['load_at_the_end'])} at the end; {numbers['seconds']:.0f} s in all, "
         f"{numbers['compile_seconds']:.0f} s of them "
         f"compiling{'; a quick run, with fewer scenes, sizes and rounds' if numbers['quick'] else ''}.\n\nMade by `taisoft bench "
         "report`; nothing on this page is written by hand. Claims are the report's in our words, and hold or not by the numbers "
         "beside them. Times are medians; spread is the distance between the quartiles over the median."
     )
-    return "\n\n".join([told, summary_table(parts), *map(part_text, parts), short_text(parts), again]) + "\n"
+    return "\n\n".join([opening, summary_table(parts), *map(part_text, parts), short_text(parts), again]) + "\n"
 
 
 def write(folder: Path, head: str, numbers: dict, parts: list[Part]) -> None:

@@ -109,7 +109,7 @@ WORK = (("<work", "{.kind}"), ("tets", "{.tets:,}"))
 
 
 def time_table(rows: Sequence[Row]) -> str:
-    """Time of a step or a search; what failed is told below."""
+    """Time of a step or a search; failures below."""
     columns = (
         *WORK,
         ("threads", "{.threads}"),

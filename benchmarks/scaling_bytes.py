@@ -2,7 +2,7 @@
 
 A loop over the whole mesh must read each array that it uses from memory once and write each that it makes once: that is its
 floor, counted from the sizes of the fields. What a loop reads again, gathers by indices from a cache line that it uses in part,
-or fetches before it writes, is not counted; so a small mesh that stays in the caches exceeds a copy, and a share of 100 % of a
+or fetches before it writes, is not counted; so a small mesh that stays in the caches exceeds a copy, and 100 % of a
 copy means that a step is as fast as memory lets it be. LOOPS names what each loop reads and writes. Contacts: a sweep reads the
 numbers of every contact, reads and writes its impulse, and reads and writes the velocities `w` of the nodes.
 """

@@ -141,12 +141,12 @@ def explicit(row: Row, size: int) -> None:
         steps = max(1, min(MOST_STEPS, round(SAMPLE_SECONDS / a_few)))
         sim.dt = min(sim.dt, LONGEST_FALL / steps)
         _element_seconds(sim, steps)  # compiles
-        share = []
+        fractions = []
         for _ in range(SAMPLES):  # in turn, so that a slow moment of the machine falls on both
             sim.reset()
             row.samples.append(advance(sim, steps).seconds / steps)
-            share.append(min(1.0, _element_seconds(sim, steps) / row.samples[-1]))
-        elements = float(np.median(share)) * row.timing.median
+            fractions.append(min(1.0, _element_seconds(sim, steps) / row.samples[-1]))
+        elements = float(np.median(fractions)) * row.timing.median
         row.phases = {"elements": elements, "nodes": row.timing.median - elements}
         row.field_bytes = group_bytes(sim)
         row.moved = floor_bytes(("drift", "elements", "nodes"), sim.field_bytes)

@@ -159,7 +159,7 @@ def speed_table(found: dict[str, dict]) -> str:
 
 
 def count_table(found: dict[str, dict]) -> str:
-    """Kernels compiled, which old versions cannot tell, files in the cache, memory."""
+    """Kernels compiled, unknown of old versions, files in the cache, memory."""
     versions, rows = list(found.values()), []
 
     def count(n: int | None) -> str:

@@ -36,13 +36,13 @@ LOOSE = 0.1  # by which a measured exponent may miss that of theory
 
 @dataclass(frozen=True)
 class Limit:
-    """A cube's largest stable step. told: `stable_dt`; both [s]."""
+    """A cube's largest stable step. stable_dt: as the simulator has it; both [s]."""
 
     cells: int
     young: float
     density: float
     measured: float
-    told: float
+    stable_dt: float
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def claims_of(youngs: list[Limit], sizes: list[Limit], densities: list[Limit], r
     implicit = [r for r in runs if r.integrator == IMPLICIT]
     beyond = [r for r in explicit if r.factor > 1.0]
     good = [r.stable and r.status == "ok" for r in implicit]
-    apart = max(abs(x.measured / x.told - 1.0) for x in (*youngs, *sizes, *densities))
+    apart = max(abs(x.measured / x.stable_dt - 1.0) for x in (*youngs, *sizes, *densities))
     square = is_near(by_size, 2.0, LOOSE)
     return [
         Claim(
@@ -189,11 +189,11 @@ def _implicit_text(implicit: list[Long], good: list[bool]) -> str:
     """How far the implicit runs went, and those that did not end as they should."""
     factors = ", ".join(f"{f:g}" for f in dict.fromkeys(r.factor for r in implicit))
     bad = [f"E = {r.young:.0e} Pa at {r.factor:g}: reach {r.reach:.3g}, {r.status}" for r, ok in zip(implicit, good) if not ok]
-    told = (
+    text = (
         f"implicit Euler at {factors} times that limit stays within {BOUNDED:g} times the stretch that it begins with, and ends "
         f"ok, in {sum(good)} of {len(good)} runs; the farthest goes to {max(r.reach for r in implicit):.3g} times"
     )
-    return f"{told}. {'; '.join(bad)}." if bad else f"{told}. No limit was found."
+    return f"{text}. {'; '.join(bad)}." if bad else f"{text}. No limit was found."
 
 
 def limit_table(limits: list[Limit]) -> str:
@@ -203,8 +203,8 @@ def limit_table(limits: list[Limit]) -> str:
         ("density", "{.density:g}"),
         ("h [m]", "1/{.cells}"),
         ("by runs [ms]", lambda x: f"{1e3 * x.measured:.4g}"),
-        ("stable_dt [ms]", lambda x: f"{1e3 * x.told:.4g}"),
-        ("runs / told", lambda x: f"{x.measured / x.told:.4f}"),
+        ("stable_dt [ms]", lambda x: f"{1e3 * x.stable_dt:.4g}"),
+        ("runs / told", lambda x: f"{x.measured / x.stable_dt:.4f}"),
         ("dt / (h (density / E)^1/2)", lambda x: f"{x.measured * x.cells * np.sqrt(x.young / x.density):.3f}"),
     )
     return table(limits, columns)
@@ -225,7 +225,7 @@ def draw(youngs: list[Limit], sizes: list[Limit], runs: list[Long]) -> bytes:
     """The limit over E and over h, and how far runs go."""
     figure, ((over_young, over_size, reach),) = new_figure(3)
     over_young.plot([x.young for x in youngs], [1e3 * x.measured for x in youngs], "o", color=COLOURS[0], label="by runs")
-    over_young.plot([x.young for x in youngs], [1e3 * x.told for x in youngs], "-", color=COLOURS[1], label="stable_dt")
+    over_young.plot([x.young for x in youngs], [1e3 * x.stable_dt for x in youngs], "-", color=COLOURS[1], label="stable_dt")
     over_young.set(title="largest stable step over E", xlabel="E [Pa]", ylabel="ms", xscale="log", yscale="log")
     h, dt = np.array([1.0 / x.cells for x in sizes]), np.array([1e3 * x.measured for x in sizes])
     over_size.plot(h, dt, "o", color=COLOURS[0], label="by runs")

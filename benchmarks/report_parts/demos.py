@@ -170,8 +170,8 @@ def show(scene: Scene, arch: str, rounds: int) -> DemoRun:
                 sim.run(seconds, fps=fps, on_step=on_step)
             rounds_spent.append(sum(steps))
         tets = sum(body.mesh.n_tets for body in sim.scene.bodies)
-        told = f"{sim.settings.integrator}, dt = {1e3 * sim.dt:.3g} ms"
-    return DemoRun(scene, tets, seconds, told, result, problem, numbers, small_png(image), rounds_spent)
+        settings_text = f"{sim.settings.integrator}, dt = {1e3 * sim.dt:.3g} ms"
+    return DemoRun(scene, tets, seconds, settings_text, result, problem, numbers, small_png(image), rounds_spent)
 
 
 def claim_of(shown: DemoRun) -> Claim:
@@ -179,9 +179,9 @@ def claim_of(shown: DemoRun) -> Claim:
     s, r = shown.scene, shown.result
     heights = ", ".join(f"{y:.3f}" for y in shown.numbers)
     times = ", ".join(f"{t:.3g}" for t in s.moments)
-    told = f"{s.what} {heights} m at {times} s; the run is {r.status}"
-    told += "; its own check passed." if not shown.problem else f"; its check failed: {shown.problem}."
-    return Claim(f"{s.where}: {s.said}.", shown.good and s.shows(shown.numbers), told)
+    text = f"{s.what} {heights} m at {times} s; the run is {r.status}"
+    text += "; its own check passed." if not shown.problem else f"; its check failed: {shown.problem}."
+    return Claim(f"{s.where}: {s.said}.", shown.good and s.shows(shown.numbers), text)
 
 
 def hours_claim(seconds: float, simulated: float) -> Claim:

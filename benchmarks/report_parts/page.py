@@ -167,5 +167,5 @@ def summary_table(parts: Sequence[Part]) -> str:
 
 def short_text(parts: Sequence[Part]) -> str:
     """What falls short, part by part."""
-    lines = [f"* {part.title}: {told}" for part in parts for told in ([part.failure] if part.failure else part.short)]
+    lines = [f"* {part.title}: {text}" for part in parts for text in ([part.failure] if part.failure else part.short)]
     return "## What falls short\n\n" + ("\n".join(lines) if lines else "Nothing that this run knows of.")

@@ -101,7 +101,7 @@ def claims_of(found: list[Shares]) -> list[Claim]:
     own = next(s for s in found if (s.integrator, s.contact_mode) == REPORTS_WAY)
     others = [s for s in found if s is not own]
 
-    def told(share) -> str:
+    def beside_others(share) -> str:
         beside = "; ".join(f"{percent(share(s))} in {s.integrator}, {s.contact_mode}" for s in others)
         return f"{percent(share(own))} in {own.integrator} through distance fields, as there" + (f" ({beside})" if others else "")
 
@@ -110,7 +110,7 @@ def claims_of(found: list[Shares]) -> list[Claim]:
         Claim(
             "collision detection is where most of the time goes.",
             own.search > 0.5,
-            f"the search takes {told(lambda s: s.search)}.",
+            f"the search takes {beside_others(lambda s: s.search)}.",
             "Where it is less than half, it is compiled code beside other compiled code: the linear systems of implicit steps, "
             "the contact solve and the report of explicit ones."
             if any(s.search <= 0.5 for s in found)
@@ -119,7 +119,7 @@ def claims_of(found: list[Shares]) -> list[Claim]:
         Claim(
             "within it the contact points, by Frank-Wolfe, take most.",
             own.points > 0.5,
-            f"of the search they take {told(lambda s: s.points)}.",
+            f"of the search they take {beside_others(lambda s: s.points)}.",
         ),
         Claim(
             "reducing contacts and updating the tree are significant too.",
