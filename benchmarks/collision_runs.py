@@ -1,11 +1,9 @@
 """What `collision.py` measures: searches for contacts phase by phase, frame by frame, broad phases and reductions beside others.
 
 A search's phases are timed between synchronisations, in one round after another; the first search of a configuration, which
-compiles the kernels and lets the buffers grow, is told apart.
+compiles the kernels and lets the buffers grow, is timed apart.
 """
 
-import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
@@ -13,23 +11,23 @@ import taichi as ti
 
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
-from taisoft.backend.runtime import Runtime, compile_clock
+from taisoft.backend.runtime import Runtime, compile_clock, kernel
 from taisoft.collision.bvh import Bvh
-from taisoft.collision.detector import Detection
+from taisoft.collision.contacts import FOUND, KEPT, LEFT, UNKNOWN, is_same
+from taisoft.collision.detector import MERGED, Detection
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.fem.model import build_model
 from taisoft.scene.plan import make_plan
 from taisoft.timing import Timing, summarise
 
 from .collision_cases import FPS, FRAMES, Setup, start
-from .collision_quadratic import Quadratic
+from .runner import clock, repeated
 
 PHASES = ("boxes", "candidates", "contacts", "reduction")
 GEOMETRIES = ("proximity", "distance_field")
 HASH, TREES = "spatial_hash", ("bvh 6", "bvh 14", "bvh 18")
 DT = 1 / FPS
 ROUNDS, QUICK_ROUNDS = 15, 2
-ENOUGH_SECONDS = 3.0  # of rounds: slow searches are repeated less often
 FRAME_ROUNDS = 3
 TURNS = 3  # in which the rounds of broad phases beside each other are taken
 
@@ -41,7 +39,7 @@ class Row:
 
     setup: str
     geometry: str
-    tets: int
+    tets: int = 0
     triangles: int = 0
     active: int = 0
     pairs: int = 0
@@ -88,10 +86,6 @@ class Film:
         for name, value in numbers.items():
             self.numbers.setdefault(name, []).append(value)
 
-    def record(self) -> dict:
-        """As plain data."""
-        return asdict(self)
-
 
 @dataclass
 class Sweep:
@@ -109,32 +103,82 @@ class Sweep:
         """Of one broad phase [s]."""
         return float(np.median(self.rounds[name]))
 
-    def record(self) -> dict:
-        """As plain data."""
-        return asdict(self)
+
+# --- the quadratic reduction ---------------------------------------------------------------------------------------------
 
 
-def clock() -> float:
-    """Now [s], when the machine has done all it was told."""
-    ti.sync()
-    return time.perf_counter()
+@kernel
+def reduce_by_pairs(
+    r: ti.template(), out: ti.template(), order: ti.types.ndarray(), state: ti.template(), kept: ti.template(), tolerance: ti.f64
+):
+    """Two nested loops over the list that a search has left: a contact is kept unless an earlier kept one is the same."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        n = 0
+        for i in range(r.count[FOUND]):
+            at = order[i]
+            state[i] = KEPT
+            j = 0
+            while j < n and state[i] == KEPT:
+                if is_same(out, at, kept[j], tolerance):
+                    state[i] = UNKNOWN
+                j += 1
+            if state[i] == KEPT:
+                kept[n] = at
+                n += 1
+        state[r.count[FOUND]] = n
 
 
-def repeated(call: Callable[[], object], rounds: int) -> list[float]:
-    """Wall seconds of calls, fewer of slow ones; what should be warm must be warmed before."""
-    seconds: list[float] = []
-    while len(seconds) < rounds and (len(seconds) < 2 or sum(seconds) < ENOUGH_SECONDS):
-        begin = clock()
-        call()
-        seconds.append(clock() - begin)
-    return seconds
+class Quadratic:
+    """The reduction by two nested loops, of a detection's last search."""
+
+    def __init__(self, detection: Detection):
+        self._detection, self._arena = detection, FieldArena()
+        self._capacity = n = detection.buffer.capacity
+        self._known: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._state, self._kept = (self._arena.field(name, ti.i32, n + 1) for name in ("state", "kept"))
+
+    def fits(self) -> bool:
+        """Whether there is room for what the detection may find now."""
+        return self._capacity == self._detection.buffer.capacity
+
+    def reduce(self) -> None:
+        """Decide every contact anew."""
+        d = self._detection
+        reduce_by_pairs(d._reduction, d.buffer.data, self._order(), self._state, self._kept, MERGED * d.edge)
+
+    def _order(self) -> np.ndarray:
+        """Places of the contacts in the order in which they are kept: by kind and feature, then by place. Made once a search."""
+        d = self._detection
+        place = d._reduction.place.to_numpy()[: d._reduction.count[FOUND]]
+        feature = d.buffer.data.feature.to_numpy()[place]
+        known = self._known
+        if known is None or not (np.array_equal(known[0], place) and np.array_equal(known[1], feature)):
+            order = place[np.lexsort((place, feature[:, 2], feature[:, 1], feature[:, 0]))]
+            self._known = known = (place, feature, order.astype(np.int32))
+        return known[2]
+
+    def same(self) -> bool:
+        """Whether it kept what the detection's own reduction kept."""
+        r = self._detection._reduction
+        found, left = r.count[FOUND], r.count[LEFT]
+        if self._state.to_numpy()[found] != left:
+            return False
+        return np.array_equal(np.sort(self._kept.to_numpy()[:left]), np.sort(r.kept.to_numpy()[:left]))
+
+    def release(self) -> None:
+        """Give the memory back."""
+        self._arena.release()
+
+
+# --- searches -----------------------------------------------------------------------------------------------------------
 
 
 class Rig:
     """A configuration's model and detection, with the phases of a search apart; closed by `with`."""
 
     def __init__(self, setup: Setup, geometry: str, runtime: Runtime):
-        self.setup, self.geometry, self.runtime = setup, geometry, runtime
+        self.setup, self.runtime = setup, runtime
         self.scene = setup.build(geometry)
         self._arena, self._others, self._quadratic = FieldArena(), [], None
         self.model, layout = build_model(
@@ -153,7 +197,7 @@ class Rig:
         self._arena.release()
 
     def place(self, share: float) -> None:
-        """Put the nodes where the motion has them, `share` of the film done."""
+        """Put the nodes where the motion has them, a fraction of the film done."""
         x = start(self.scene) if self.setup.motion is None else self.setup.motion(self.scene, share)
         self.model.state.x.from_numpy(x)
 
@@ -200,8 +244,8 @@ class Rig:
 
 
 def measure_row(setup: Setup, geometry: str, runtime: Runtime, rounds: int) -> Row:
-    """A configuration's search: what it goes through, and its phases. What fails is told in the row."""
-    row = Row(setup.name, geometry, 0)
+    """A configuration's search: what it goes through, and its phases. A failure is kept in the row."""
+    row = Row(setup.name, geometry)
     try:
         with Rig(setup, geometry, runtime) as rig:
             row.tets, row.triangles = rig.tets, rig.detection.surface.n_triangles

@@ -1,18 +1,17 @@
 """Contact: solvers beside each other on the problems of whole scenes, colourings, the cost of steps, problems of rigid scenes.
 
-taisoft bench contact [--quick] [--arch cpu|cuda] [--out FILE.json] [--plot FILE.png]
+taisoft bench contact [--quick] [--arch cpu|cuda] [--out FILE.json]
 taisoft bench contact --capture DIR [--baseline FOLDER] [--only SCENE] [--quick]
 taisoft bench contact --replay DIR [--baseline FOLDER] [--only SCENE] [--out FILE.json]
 taisoft bench contact --drops [--baseline FOLDER] [--only SCENE] [--out FILE.json] [--quick]
 taisoft bench contact --free [--baseline FOLDER] [--only CASE] [--out FILE.json] [--quick]
 
-Scenes are demos, in f32; figures named are those of the report. Of each frame of an explicit run the contact problem is taken
-where its solve would begin, and solved to a residual of 1e-4 by every solver, in turns, from the impulses of the step before and
-from none. The residual told is worked out in NumPy. A solve's time holds its colouring; a solver's loops run on one thread on the
-CPU, or, where that is said, on all. A number is a median, its range in brackets; spread is the distance between the quartiles
-over the median. Compiling is apart. Exit status: 0, or 1 where a limit is not met. --quick has one scene, few frames, and no
-limit.
-The whole takes about six minutes on two cores.
+Scenes are demos, in f32; figures named are those of the report, which `taisoft bench report` draws. Of each frame of an explicit
+run the contact problem is taken where its solve would begin, and solved to a residual of 1e-4 by every solver, in turns, from the
+impulses of the step before and from none. Residuals are computed in NumPy. A solve's time holds its colouring; a
+solver's loops run on one thread on the CPU, or, where that is said, on all. A number is a median, its range in brackets; spread
+is the distance between the quartiles over the median. Compiling is apart. Exit status: 0, or 1 where a limit is not met. --quick
+has one scene, few frames, and no limit. The whole takes about six minutes on two cores.
 
 --capture runs twelve scenes and keeps the states before every fifth of their implicit steps and before the ten slowest; --replay
 solves each of them again, in f32 and f64, to 1e-4, and in halves where that does not converge, and compares with the same step
@@ -23,78 +22,92 @@ Scenes whose meshes are not there are left out. Capturing takes about ten minute
 --drops runs bodies that fall and come to rest, among them four real meshes: Newton and CG iterations a step, steps that did not
 converge, and times, beside those of the older version. It takes two minutes, with version 0.1 beside it six.
 
---free takes steps without contacts, of beams with and without inverted tets, and solves statics, versions in turns; told are the
-steps and solves that converge in every version. It takes two minutes, with version 0.1 beside it six.
+--free takes steps without contacts, of beams with and without inverted tets, and solves statics, versions in turns; steps and
+solves count that converge in every version. It takes two minutes, with version 0.1 beside it six.
 """
 
-import argparse
 import sys
+from contextlib import closing
 from pathlib import Path
 
+import numpy as np
+
 from taisoft.backend.runtime import compile_clock, open_runtime
-from taisoft.timing import load_average
+from taisoft.output.tables import markdown
+from taisoft.timing import load_average, summarise
 
 from . import contact_problems
-from .contact_captured import GOAL, Solvers
-from .contact_colours import QUICK_SEEDS, SEEDS, colour_all, colour_table
-from .contact_crossover import QUICK_SIZES, SIZES, crossover_table, crossover_text, measure_crossover
+from .contact_colouring import (
+    QUICK_SEEDS,
+    QUICK_SIZES,
+    SEEDS,
+    SIZES,
+    colour_all,
+    colour_table,
+    crossover_table,
+    crossover_text,
+    measure_crossover,
+)
 from .contact_drops import DROPS
-from .contact_drops_table import drops
-from .contact_free_table import NAMES
-from .contact_free_table import measure as measure_free
-from .contact_plot import Snapshot, draw, take_snapshot
-from .contact_replay import capture, replay
-from .contact_runs import measure_film, measure_run, measure_step, open_explicit, open_scene, to_impulses
+from .contact_runs import (
+    COLD,
+    GOAL,
+    PARTS,
+    WARM,
+    Film,
+    Run,
+    Solvers,
+    StepCost,
+    measure_film,
+    measure_run,
+    measure_step,
+    open_explicit,
+    open_scene,
+    to_impulses,
+)
 from .contact_states import SCENES
-from .contact_table import PILE, PILE_SECONDS, count_table, find_limits, problem_table, run_table, solver_table, step_table
-from .document import Document, header
-from .elasticity_table import limit_table
-from .order import parse_options
+from .contact_versions import FREE_NAMES, capture, drops, free, replay
+from .document import Document, Limit, begin, ms, ranged, table, timed_cells, timed_limit
+from .runner import REST, make_parser, parse_options
 
 DEMOS = ("cube_on_box", "two_cubes_two_boxes")  # figures 20 and 19
 FRAMES, QUICK_FRAMES = 90, 6
 STEPS, QUICK_STEPS = 400, 40
 RUN_SECONDS, QUICK_RUN_SECONDS = 2.0, 0.4
 QUICK_PROBLEMS, REPEATS = ("Rover1039", "Rover4396"), 3
+CONTACTS = {"cube_on_box": 198, "two_cubes_two_boxes": 286}  # of the report's figures 20 and 19
+STEP_SCENE, STEP_LIMIT = "cube_on_box", 2.0  # [ms] an explicit step, f32, to a residual of GOAL
+PILE, PILE_SECONDS, PILE_LIMIT = "cube_pile", 2.0, 3.0  # simulated; wall seconds per simulated second
+SWEEP_LIMIT = 0  # problems of the films that the default solver of the CPU leaves above GOAL
 
 
-def measure(quick: bool, arch: str, document: Document) -> tuple[dict, list[Snapshot]]:
-    """Everything, printed as it comes, by name; and what is drawn of the scenes."""
+def measure(quick: bool, arch: str, document: Document) -> dict:
+    """Everything, printed as it comes, by name."""
     found: dict = {"films": [], "steps": [], "runs": [], "colourings": []}
-    snapshots = [_explicit(name, quick, arch, found) for name in DEMOS[: 1 if quick else None]]
+    demos = DEMOS[: 1 if quick else None]
+    for name in demos:  # film, step and colourings of a scene with one simulator
+        with open_explicit(name, arch) as sim:
+            found["films"].append(measure_film(name, sim, QUICK_FRAMES if quick else FRAMES, Solvers(threads=not quick)))
+            to_impulses(sim)
+            found["colourings"] += colour_all(name, sim._dynamics.contact.problem, QUICK_SEEDS if quick else SEEDS)[0]
+            found["steps"].append(measure_step(name, sim, QUICK_STEPS if quick else STEPS))
     document.add(f"## Explicit steps (figs. 19, 20)\n\n{count_table(found['films'])}\n\n{solver_table(found['films'])}")
     document.add(f"## The whole explicit step\n\n{step_table(found['steps'])}")
-    for name, seconds in [(s.scene, QUICK_RUN_SECONDS if quick else RUN_SECONDS) for s in snapshots]:
+    for name in demos:
         with open_scene(name, arch) as sim:
-            found["runs"].append(measure_run(name, sim, seconds))
+            found["runs"].append(measure_run(name, sim, QUICK_RUN_SECONDS if quick else RUN_SECONDS))
     if not quick:
         with open_scene(PILE, arch) as sim:
             found["runs"].append(measure_run(PILE, sim, PILE_SECONDS))
             found["colourings"] += colour_all(PILE, sim._dynamics.contact.problem, SEEDS)[0]
     document.add(f"## Implicit steps\n\n{run_table(found['runs'])}")
     document.add(f"## Colours (fig. 19)\n\n{colour_table(found['colourings'])}")
-    runtime = open_runtime(arch, "f32", "the benchmark of contacts")
-    try:
+    with closing(open_runtime(arch, "f32", "the benchmark of contacts")) as runtime:
         found["crossover"] = measure_crossover(QUICK_SIZES if quick else SIZES, runtime)
-    finally:
-        runtime.close()
     table, text = crossover_table(found["crossover"]), crossover_text(found["crossover"], arch)
     document.add(f"## Serial and coloured Gauss-Seidel\n\n{table}\n\n{text}")
     found["problems"] = _problems(quick, document)
-    return found, snapshots
-
-
-def _explicit(name: str, quick: bool, arch: str, found: dict) -> Snapshot:
-    """Film, step and colourings of a scene, all with one simulator."""
-    with open_explicit(name, arch) as sim:
-        solvers = Solvers(threads=not quick)
-        found["films"].append(measure_film(name, sim, QUICK_FRAMES if quick else FRAMES, solvers))
-        to_impulses(sim)
-        colourings, colours = colour_all(name, sim._dynamics.contact.problem, QUICK_SEEDS if quick else SEEDS)
-        found["colourings"] += colourings
-        snapshot = take_snapshot(name, sim, colours)
-        found["steps"].append(measure_step(name, sim, QUICK_STEPS if quick else STEPS))
-    return snapshot
+    return found
 
 
 def _problems(quick: bool, document: Document) -> list[contact_problems.Row]:
@@ -104,35 +117,99 @@ def _problems(quick: bool, document: Document) -> list[contact_problems.Row]:
         document.add(f"Left out: {absent}.")
         return []
     rows = contact_problems.measure(names, 1 if quick else REPEATS)
-    document.add(f"{problem_table(rows)}\n\n{contact_problems.summary(rows)}")
+    rows_text = markdown(contact_problems.HEADINGS, [row.cells for row in rows], left=(0, 2, 9))
+    document.add(f"{rows_text}\n\n{contact_problems.summary(rows)}")
     return rows
 
 
-def replay_states(options: argparse.Namespace) -> int:
-    """Solve captured states again, and compare. Exit status."""
-    document, (text, numbers) = Document(), header("Captured steps with contacts", options.arch)
-    document.add(text)
-    found, limits = replay(options.replay, options.baseline, options.only, document)
-    if options.out:
-        document.write(options.out, numbers | {"rows": found, "limits": [limit.record() for limit in limits]})
-    return 0 if all(limit.met for limit in limits) else 1
+# --- tables and limits --------------------------------------------------------------------------------------------------
 
 
-def run_whole(options: argparse.Namespace) -> int:
-    """Run whole scenes, and compare. Exit status."""
-    title, run = ("Bodies that fall in implicit steps", drops) if options.drops else ("Without contacts", measure_free)
-    document, (text, numbers) = Document(), header(title, options.arch, "f32")
-    document.add(text)
-    found, limits = run(options.baseline, options.only, options.quick, document)
-    if options.out:
-        document.write(options.out, numbers | {"runs": found, "limits": [limit.record() for limit in limits]})
-    return 0 if all(limit.met for limit in limits) else 1
+def count_table(films: list[Film]) -> str:
+    """Contacts of each film beside those of the report."""
+    columns = (
+        ("<scene", "{.scene}"),
+        ("tets", "{.tets}"),
+        ("dt [ms]", lambda f: ms(f.dt)),
+        ("stable [ms]", lambda f: ms(f.stable_dt)),
+        ("frames", lambda f: str(len(f.time))),
+        ("contacts", lambda f: ranged(f.contacts)),
+        ("before reduction", lambda f: ranged(f.found)),
+        ("the report's", lambda f: str(CONTACTS.get(f.scene, "-"))),
+        ("fewer by", lambda f: f"{1 - np.median(f.contacts) / CONTACTS[f.scene]:.0%}" if f.scene in CONTACTS else "-"),
+    )
+    return table(films, columns)
+
+
+def solver_table(films: list[Film]) -> str:
+    """A row a scene and solver: medians over frames, and the worst."""
+    lines = []
+    for f in films:
+        for name in f.solvers:
+            warm, cold = f.of(name), f.of(name, COLD)
+            seconds = [o.median for o in warm]
+            sweeps = ranged([o.sweeps for o in warm]), ranged([o.sweeps for o in cold])
+            times = *timed_cells(seconds), ms(max(seconds)), ms(np.median([o.median for o in cold]))
+            residual = max(o.residual for o in warm + cold)
+            lines.append((f.scene, name, *sweeps, *times, f"{residual:.1e}", f"{f.missed([name])} of {2 * len(warm)}"))
+    headings = ("scene", "solver", f"sweeps {WARM}", COLD, f"ms {WARM}", "spread", "most", COLD, "worst residual", "not solved")
+    return markdown(headings, lines, left=(0, 1))
+
+
+def run_table(runs: list[Run]) -> str:
+    """A row an implicit run: medians over steps with contacts; problems below."""
+    columns = [("<scene", "{.scene}"), ("<steps", "{.settings}"), ("with contacts", lambda r: str(len(r.seconds)))]
+    counts = (("contacts", "contacts"), ("multipliers", "outer"), ("Newton", "newton"), ("CG", "linear"))
+    columns += [(heading, lambda r, name=name: ranged(getattr(r, name))) for heading, name in counts]
+    columns += [
+        ("ms", lambda r: timed_cells(r.seconds)[0] if r.seconds else "-"),
+        ("spread", lambda r: timed_cells(r.seconds)[1] if r.seconds else "-"),
+        ("wall s per simulated s", lambda r: f"{r.wall / r.simulated:.3g}" if r.simulated else "-"),
+        ("status", "{.status}"),
+    ]
+    return table(runs, columns, [f"{r.scene}: {text}" for r in runs for text in r.problems])
+
+
+def step_table(costs: list[StepCost]) -> str:
+    """Whole explicit steps and their parts, medians."""
+    columns = [
+        ("<scene", "{.scene}"),
+        ("<solver", "{.solver}"),
+        ("steps", lambda c: str(len(c.whole))),
+        ("contacts", lambda c: ranged(c.contacts)),
+        ("sweeps", lambda c: ranged(c.sweeps)),
+        ("worst residual", "{.residual:.1e}"),
+        ("step [ms]", lambda c: timed_cells(c.whole)[0]),
+        ("spread", lambda c: timed_cells(c.whole)[1]),
+    ]
+    return table(
+        costs, columns + [(f"{part} [ms]", lambda c, part=part: ms(np.median(c.parts[part]))) for part in (*PARTS, REST)]
+    )
+
+
+def find_limits(found: dict) -> list[Limit]:
+    """What is wanted of a step, of the pile, of the films' solves and of the problems' verdicts. found: see `measure`."""
+    cost = next((c for c in found["steps"] if c.scene == STEP_SCENE), None)
+    t = summarise(cost.whole) if cost else None
+    pile = next((r for r in found["runs"] if r.scene == PILE), None)
+    wall = pile.wall / pile.simulated if pile and pile.simulated else np.nan
+    bad = np.nan if pile is None else float(pile.status != "ok")
+    missed = sum(f.missed(f.solvers[:1]) for f in found["films"]) if found["films"] else np.nan
+    limits = [
+        timed_limit(f"{STEP_SCENE}, explicit, f32: a whole step [ms], median of {t.repeats if t else 0}", t, STEP_LIMIT, 1e3),
+        Limit(f"{STEP_SCENE}, explicit: the worst residual of these steps", cost.residual if cost else np.nan, GOAL),
+        Limit(f"{PILE}, {pile.settings if pile else 'implicit'}, f32: wall s per simulated s", wall, PILE_LIMIT),
+        Limit(f"{PILE}: runs that do not end ok", bad, 0),
+        Limit(f"films: solves of gauss_seidel above {GOAL:g}, judged in NumPy", missed, SWEEP_LIMIT),
+    ]
+    if found["problems"]:
+        limits.append(Limit("contact problems: verdicts that fail", sum("FAIL" in row.verdict for row in found["problems"]), 0))
+    return limits
 
 
 def main(argv=None) -> int:
     """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
-    first, _, rest = __doc__.partition("\n")
-    parser = argparse.ArgumentParser(prog="taisoft bench contact", description=first, epilog=rest.partition("\n\n")[2])
+    parser = make_parser("contact", __doc__)
     parser.add_argument("--quick", action="store_true", help="one scene, few frames and sizes, no limit")
     parser.add_argument("--capture", type=Path, metavar="DIR", help="keep states of implicit steps with contacts")
     parser.add_argument("--replay", type=Path, metavar="DIR", help="solve such states again")
@@ -140,8 +217,8 @@ def main(argv=None) -> int:
     parser.add_argument("--free", action="store_true", help="take steps without contacts, and solve statics")
     parser.add_argument("--baseline", type=Path, metavar="FOLDER", help="another version")
     parser.add_argument("--only", action="append", metavar="SCENE", help="one of those scenes alone; repeatable")
-    options = parse_options(parser, argv, "the report's figures 19 and 20")
-    known = DROPS if options.drops else NAMES if options.free else SCENES
+    options = parse_options(parser, argv)
+    known = DROPS if options.drops else FREE_NAMES if options.free else SCENES
     if unknown := [name for name in options.only or () if name not in known]:
         parser.error(f"argument --only: '{unknown[0]}' is none of {', '.join(known)}")
     if options.capture:
@@ -149,27 +226,21 @@ def main(argv=None) -> int:
             print(line, flush=True)
         return 0
     if options.replay:
-        return replay_states(options)
+        document, numbers = begin("Captured steps with contacts", options.arch)
+        rows, limits = replay(options.replay, options.baseline, options.only, document)
+        return document.finish(options, numbers | {"rows": rows}, limits)
     if options.drops or options.free:
-        return run_whole(options)
-    document, (text, numbers) = Document(), header("Contact", options.arch, "f32")
-    document.add(text)
+        title, run = ("Bodies that fall in implicit steps", drops) if options.drops else ("Without contacts", free)
+        document, numbers = begin(title, options.arch, "f32")
+        runs, limits = run(options.baseline, options.only, options.quick, document)
+        return document.finish(options, numbers | {"runs": runs}, limits)
+    document, numbers = begin("Contact", options.arch, "f32")
     compiled = compile_clock()
-    found, snapshots = measure(options.quick, options.arch, document)
-    numbers |= {"arch": options.arch, "quick": options.quick, "load_at_the_end": load_average()}
+    found = measure(options.quick, options.arch, document)
     numbers["compile_seconds"] = compile_clock() - compiled
-    document.add(f"Compiling in all: {numbers['compile_seconds']:.0f} s; load at the end: {numbers['load_at_the_end'] or 0:.1f}")
-    limits = [] if options.quick else find_limits(found, GOAL)
-    if limits:
-        document.add("## Limits\n\n" + limit_table(limits))
-    if options.out:
-        numbers |= {name: [x.record() for x in some] for name, some in found.items()}
-        numbers["limits"] = [limit.record() for limit in limits]
-        document.write(options.out, numbers)
-    if options.plot:
-        draw(found, snapshots, options.plot)
-        print(f"written: {options.plot}")
-    return 0 if all(limit.met for limit in limits) else 1
+    document.add(f"Compiling in all: {numbers['compile_seconds']:.0f} s; load at the end: {load_average() or 0:.1f}")
+    limits = [] if options.quick else find_limits(found)
+    return document.finish(options, numbers | found, limits)
 
 
 if __name__ == "__main__":

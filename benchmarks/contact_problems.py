@@ -4,14 +4,15 @@ A section of `taisoft bench contact`. The problems are from Siconos' test data a
 shared/contact_problems, with the residuals of plain serial Gauss-Seidel as yardstick. Cost is told as a share of what 1000 sweeps
 of plain Gauss-Seidel take: time, the two run in turns, and floating-point operations (18 a block of W and sweep, 2/3 n^3 for a
 dense factorisation, what its fill says for a sparse one). Verdicts: Gauss-Seidel must be no worse than twice the yardstick; the
-best solver of every problem must reach 1e-6 at less than the cost of those sweeps, in operations and in time. A summary tells how
+best solver of every problem must reach 1e-6 at less than the cost of those sweeps, in operations and in time. A summary says how
 each solver fares on all of them.
 """
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,8 @@ from taisoft.backend.runtime import open_runtime
 from taisoft.contact import api, augmented_lagrangian
 from taisoft.contact.colouring import colour_greedy, matrix_graph, store
 from taisoft.contact.solve import solve
+
+from .runner import patched
 
 PROBLEMS = Path(__file__).resolve().parents[1].parent / "shared" / "contact_problems"
 SWEEPS = (10, 100, 1000)
@@ -70,7 +73,7 @@ class Row:
     """One solver on one problem.
 
     residuals: after 10, 100, 1000 sweeps (outer iterates of the augmented Lagrangian; "auto" sweeps 100 times, then those).
-    iterations: until 1e-6, None where it is not reached. time, operations: until then, as a share of 1000 plain sweeps.
+    iterations: until 1e-6, None where it is not reached. time, operations: until then, over that of 1000 plain sweeps.
     """
 
     problem: str
@@ -93,10 +96,6 @@ class Row:
         cost = (str(self.iterations), f"{self.time:.2f}", f"{self.operations:.3f}") if reached else ("-", "-", "-")
         residuals = (f"{r:.1e}" for r in self.residuals)
         return self.problem, str(self.contacts), self.solver, *residuals, *cost, self.verdict
-
-    def record(self) -> dict:
-        """As plain data."""
-        return asdict(self)
 
 
 def load(name: str) -> Problem:
@@ -121,74 +120,61 @@ def seconds(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, f
 @contextmanager
 def counted_operations(problem: Problem) -> Iterator[list[int]]:
     """A list whose entries add up to the operations of the augmented Lagrangian meanwhile."""
-    told: list[int] = []
+    operations: list[int] = []
     module, dense = augmented_lagrangian, np.linalg.solve
     sparse, look = module.splu, module._linearise
 
     def count_dense(A, b):
-        told.append(2 * len(A) ** 3 // 3 + 2 * len(A) ** 2)
+        operations.append(2 * len(A) ** 3 // 3 + 2 * len(A) ** 2)
         return dense(A, b)
 
     def count_sparse(A):
         made = sparse(A)
         lower, upper = np.diff(made.L.tocsc().indptr), np.diff(made.U.tocsr().indptr)
-        told.append(int(2 * (lower * upper).sum() + 2 * (lower.sum() + upper.sum())))
+        operations.append(int(2 * (lower * upper).sum() + 2 * (lower.sum() + upper.sum())))
         return made
 
     def count_look(q, *rest):  # with W' q and the blocks of the linearised equations, 3x3 by 3x3
-        share = len(q) / problem.W.shape[0]
-        told.append(int(share * 4 * problem.sweep_cost))
+        operations.append(int(len(q) / problem.W.shape[0] * 4 * problem.sweep_cost))
         return look(q, *rest)
 
-    np.linalg.solve, module.splu, module._linearise = count_dense, count_sparse, count_look
-    try:
-        yield told
-    finally:
-        np.linalg.solve, module.splu, module._linearise = dense, sparse, look
+    with (
+        patched(np.linalg, "solve", count_dense),
+        patched(module, "splu", count_sparse),
+        patched(module, "_linearise", count_look),
+    ):
+        yield operations
 
 
 def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
-    """All solvers that sweep; the first is plain Gauss-Seidel, in whose time the others are told."""
+    """All solvers that sweep; the first is plain Gauss-Seidel, the unit of the others' time."""
     W, b, mu = problem.W, problem.b, problem.mu
     with api._problem(W, b, mu) as p:
         store(p, colour_greedy(matrix_graph(W)))
         orders = {True: p.order.to_numpy(), False: np.zeros(p.capacity, dtype=np.int32)}
         orders[False][: len(mu)] = np.arange(len(mu))
 
-        def start(method: str) -> None:
+        def sweep(method: str, momentum: bool, goal: float = GOAL, most: int = SWEEPS[-1]):
             p.order.from_numpy(orders[method == "coloured_gauss_seidel"])
             p.r.fill(0.0)
+            return solve(p, method, goal, most, momentum=momentum)
 
-        residuals, found, calls = {}, {}, {}
-        for name, (method, momentum) in SWEEPERS.items():
-            after = []
-            for n in SWEEPS:
-                start(method)
-                solve(p, method, 0.1 * NONE, n, momentum=momentum)
-                after.append(augmented_lagrangian.find_residual(W, b, mu, p.r.to_numpy()[: len(mu)]))
-            residuals[name] = tuple(after)
-            start(method)
-            found[name] = solve(p, method, GOAL, SWEEPS[-1], momentum=momentum)
+        def residual_after(n: int, method: str, momentum: bool) -> float:
+            sweep(method, momentum, 0.1 * NONE, n)
+            return augmented_lagrangian.find_residual(W, b, mu, p.r.to_numpy()[: len(mu)])
 
-            def run(method=method, momentum=momentum):
-                start(method)
-                return solve(p, method, GOAL, SWEEPS[-1], momentum=momentum)
-
-            calls[name] = run
-
-        def yardstick():
-            start("gauss_seidel")
-            return solve(p, "gauss_seidel", -1.0, SWEEPS[-1], momentum=False)
-
-        took = seconds({**calls, "1000": yardstick}, repeats)
+        residuals = {name: tuple(residual_after(n, *how) for n in SWEEPS) for name, how in SWEEPERS.items()}
+        found = {name: sweep(*how) for name, how in SWEEPERS.items()}
+        calls = {name: partial(sweep, *how) for name, how in SWEEPERS.items()}
+        took = seconds({**calls, "1000": lambda: sweep("gauss_seidel", False, -1.0)}, repeats)
     rows = []
     for name, (_, momentum) in SWEEPERS.items():
         done = found[name]
         # a look at the residual is a product too, after every fifth sweep; momentum takes about 40 operations a contact
-        sweep = problem.sweep_cost * 1.2 + (40 * len(mu) if momentum else 0)
-        share = done.iterations * sweep / (SWEEPS[-1] * problem.sweep_cost)
+        cost = problem.sweep_cost * 1.2 + (40 * len(mu) if momentum else 0)
+        relative = done.iterations * cost / (SWEEPS[-1] * problem.sweep_cost)
         reached = done.iterations if done.converged else None
-        rows.append(Row(problem.name, len(mu), name, residuals[name], reached, took[name] / took["1000"], share))
+        rows.append(Row(problem.name, len(mu), name, residuals[name], reached, took[name] / took["1000"], relative))
     return rows
 
 
@@ -216,13 +202,13 @@ def host_rows(problem: Problem, repeats: int) -> list[Row]:
 
     for name, run in (("augmented_lagrangian", lagrangian), ("auto", auto)):
         residuals = tuple(augmented_lagrangian.find_residual(W, b, mu, run(0.1 * NONE, n)[0]) for n in (*SWEEPS[:2], 150))
-        with counted_operations(problem) as told:
+        with counted_operations(problem) as counted:
             _, swept, history = run(GOAL, SWEEPS[-1])
         took = seconds({"solve": lambda run=run: run(GOAL, SWEEPS[-1]), "1000": plain}, repeats)
-        operations = sum(told) + swept * (1.2 * problem.sweep_cost + 40 * len(mu))
-        share = operations / (SWEEPS[-1] * problem.sweep_cost)
+        operations = sum(counted) + swept * (1.2 * problem.sweep_cost + 40 * len(mu))
+        relative = operations / (SWEEPS[-1] * problem.sweep_cost)
         reached = swept + len(history) - 1 if history[-1] <= GOAL else None
-        rows.append(Row(problem.name, len(mu), name, residuals, reached, took["solve"] / took["1000"], share))
+        rows.append(Row(problem.name, len(mu), name, residuals, reached, took["solve"] / took["1000"], relative))
     return rows
 
 
@@ -231,7 +217,7 @@ def judged(rows: list[Row]) -> list[Row]:
     yardstick = YARDSTICK[rows[0].problem]
     able = [row for row in rows if row.iterations is not None]
     best = min(able, key=lambda row: row.cost).solver if able else None
-    told = []
+    judged_rows = []
     for row in rows:
         verdict = []
         if row.solver.startswith("gauss_seidel"):
@@ -239,8 +225,8 @@ def judged(rows: list[Row]) -> list[Row]:
             verdict.append("yardstick: pass" if kept else "yardstick: FAIL")
         if row.solver == best:
             verdict.append("best: pass" if row.cost <= 1.0 else "best: FAIL")
-        told.append(replace(row, verdict=", ".join(verdict)))
-    return told if best else [replace(row, verdict="FAIL: nothing reaches 1e-6") for row in told]
+        judged_rows.append(replace(row, verdict=", ".join(verdict)))
+    return judged_rows if best else [replace(row, verdict="FAIL: nothing reaches 1e-6") for row in judged_rows]
 
 
 def compute(names: tuple[str, ...] = tuple(YARDSTICK), repeats: int = 5) -> Iterator[Row]:
@@ -269,8 +255,5 @@ def summary(rows: list[Row]) -> str:
 
 def measure(names: tuple[str, ...], repeats: int) -> list[Row]:
     """All rows of these problems, in f64 on the processor: Taichi must not be open in another kind."""
-    runtime = open_runtime("cpu", "f64", "the benchmark of contact problems")
-    try:
+    with closing(open_runtime("cpu", "f64", "the benchmark of contact problems")):
         return list(compute(names, repeats))
-    finally:
-        runtime.close()

@@ -46,19 +46,11 @@ def rubber(**changes) -> ts.Material:
     return ts.Material(**({"young": 2e5, "poisson": 0.4, "density": 1000.0, "friction": 0.5} | changes))
 
 
-def on_ground(name: str) -> ts.Scene:
+def landing(name: str, obstacle=GROUND) -> ts.Scene:
     """Just before it lands with 1 m/s."""
     scene = ts.Scene(gravity=DOWN)
     scene.add_body(figure(name, 0.01), rubber(), name="figure", velocity=(0, -1, 0))
-    scene.add_obstacle(GROUND, name="ground", friction=0.5)
-    return scene
-
-
-def on_box(name: str) -> ts.Scene:
-    """Just before it lands on a box that is smaller."""
-    scene = ts.Scene(gravity=DOWN)
-    scene.add_body(figure(name, 0.01), rubber(), name="figure", velocity=(0, -1, 0))
-    scene.add_obstacle(ts.Box((0, -0.2, 0), (0.25, 0.2, 0.25)), name="box", friction=0.5)
+    scene.add_obstacle(obstacle, name="obstacle", friction=0.5)
     return scene
 
 
@@ -73,12 +65,12 @@ def on_another(name: str) -> ts.Scene:
     return scene
 
 
-def cloth() -> ts.Scene:
+def cloth(height: float = 0.102, friction: float = 0.3) -> ts.Scene:
     """A cloth of 2 mm falls on a sphere."""
     scene = ts.Scene(gravity=DOWN)
-    material = ts.Material(young=1e5, poisson=0.3, density=500.0, friction=0.3)
-    scene.add_body(ts.sheet_mesh((20, 20), (0.5, 0.002, 0.5)), material, name="cloth", position=(0, 0.102, 0))
-    scene.add_obstacle(ts.Sphere((0, 0, 0), 0.1), name="sphere", friction=0.3)
+    material = ts.Material(young=1e5, poisson=0.3, density=500.0, friction=friction)
+    scene.add_body(ts.sheet_mesh((20, 20), (0.5, 0.002, 0.5)), material, name="cloth", position=(0, height, 0))
+    scene.add_obstacle(ts.Sphere((0, 0, 0), 0.1), name="sphere", friction=friction)
     return scene
 
 
@@ -123,18 +115,21 @@ def demo(name: str) -> ts.Scene:
     return runpy.run_path(str(ROOT / "demos" / f"{name}.py"))["build"]()
 
 
+BUNNY, ARMADILLO = "bunny.msh", "Armadillo13K.msh"
+SMALL_BOX = ts.Box((0, -0.2, 0), (0.25, 0.2, 0.25))  # smaller than what lands on it
+EULER = IMPLICIT | {"dt": 0.01}
 # name: (scene, settings, steps, steps before the first that counts)
 SCENES: dict[str, tuple[Callable[[], ts.Scene], dict, int, int]] = {
-    "bunny on ground": (lambda: on_ground("bunny.msh"), IMPLICIT | {"dt": 0.01}, 40, 0),
-    "bunny on box": (lambda: on_box("bunny.msh"), IMPLICIT | {"dt": 0.01}, 40, 0),
-    "bunny on bunny": (lambda: on_another("bunny.msh"), IMPLICIT | {"dt": 0.01}, 40, 0),
-    "Armadillo on ground": (lambda: on_ground("Armadillo13K.msh"), IMPLICIT | {"dt": 0.01}, 40, 0),
-    "Armadillo on box": (lambda: on_box("Armadillo13K.msh"), IMPLICIT | {"dt": 0.01}, 40, 0),
-    "Armadillo on Armadillo": (lambda: on_another("Armadillo13K.msh"), IMPLICIT | {"dt": 0.01}, 20, 0),
+    "bunny on ground": (lambda: landing(BUNNY), EULER, 40, 0),
+    "bunny on box": (lambda: landing(BUNNY, SMALL_BOX), EULER, 40, 0),
+    "bunny on bunny": (lambda: on_another(BUNNY), EULER, 40, 0),
+    "Armadillo on ground": (lambda: landing(ARMADILLO), EULER, 40, 0),
+    "Armadillo on box": (lambda: landing(ARMADILLO, SMALL_BOX), EULER, 40, 0),
+    "Armadillo on Armadillo": (lambda: on_another(ARMADILLO), EULER, 20, 0),
     "cloth on sphere": (cloth, {"integrator": "bdf2", "dt": 1 / 120}, 60, 0),
-    "cube pile": (lambda: demo("cube_pile"), IMPLICIT | {"dt": 0.01}, 60, 15),
+    "cube pile": (lambda: demo("cube_pile"), EULER, 60, 15),
     "twisted mat": (mat, IMPLICIT | {"dt": 0.02, "self_collision": True}, 60, 200),
-    "squeeze": (lambda: demo("squeeze"), IMPLICIT | {"dt": 0.01}, 60, 40),
+    "squeeze": (lambda: demo("squeeze"), EULER, 60, 40),
     "gripper": (gripper, {"integrator": "bdf2", "dt": 0.01}, 60, 20),
     "soft on stiff": (slabs, IMPLICIT | {"dt": 1 / 120}, 60, 0),
 }
@@ -142,18 +137,15 @@ SCENES: dict[str, tuple[Callable[[], ts.Scene], dict, int, int]] = {
 
 def can_build(name: str) -> bool:
     """Whether the mesh that a scene needs is here."""
-    mesh = {"bunny": "bunny.msh", "Armadillo": "Armadillo13K.msh"}.get(name.split()[0])
+    mesh = {"bunny": BUNNY, "Armadillo": ARMADILLO}.get(name.split()[0])
     return mesh is None or (MESHES / mesh).is_file()
 
 
-def state_of(sim: ts.Simulator):
-    """Positions and what goes with them: the attribute has had another name."""
-    return sim._simulation if hasattr(sim, "_simulation") else sim._world
-
-
-def kept_of(sim: ts.Simulator) -> dict:
-    """All that the next step rests on."""
-    return {"world": state_of(sim).snapshot(), "stepper": sim._stepper.snapshot()}
+def parts_of(sim: ts.Simulator) -> tuple:
+    """The stepper and the state, whose names depend on the version."""
+    if hasattr(sim, "_dynamics"):
+        return sim._dynamics.stepper, sim._dynamics.state
+    return sim._stepper, sim._simulation if hasattr(sim, "_simulation") else sim._world
 
 
 def capture(name: str, file: Path, quick: bool) -> None:
@@ -167,7 +159,8 @@ def capture(name: str, file: Path, quick: bool) -> None:
         while sim.step_count < before:
             sim.advance(before - sim.step_count)
         for k in range(steps):
-            kept = kept_of(sim)
+            stepper, state = parts_of(sim)
+            kept = {"world": state.snapshot(), "stepper": stepper.snapshot()}
             report = sim.advance(1)
             found.append((report.newton_iterations, k, kept))
     slow = {k for _, k, _ in sorted(found, key=lambda one: -one[0])[:SLOWEST]}
@@ -187,7 +180,8 @@ def replay(file: Path, precision: str, tolerance: float, reference: Path | None)
         sim = ts.Simulator(build(), **settings, precision=precision)
     with sim:
         scale = float(np.mean([edge(body.mesh) for body in sim.scene.bodies]))
-        sim._stepper.tolerance = sim._stepper.contact_tolerance = tolerance
+        stepper = parts_of(sim)[0]
+        stepper.tolerance = stepper.contact_tolerance = tolerance
         for k, state in enumerate(data["states"]):
             row, x = solve(sim, state["kept"], sim.dt, 1 if reference and known is None else MOST_HALVES)
             row |= {"scene": data["scene"], "step": state["step"], "captured": state["captured"]}
@@ -207,7 +201,7 @@ def edge(mesh: ts.TetMesh) -> float:
 
 def solve(sim: ts.Simulator, kept: dict, dt: float, most: int) -> tuple[dict, np.ndarray]:
     """A stage of dt from a state, in halves where it does not converge; and the positions it ends with."""
-    stepper, world = sim._stepper, state_of(sim)
+    stepper, world = parts_of(sim)
     take = next(getattr(stepper, name) for name in ("take_substep", "take", "_try_part") if hasattr(stepper, name))
     halves, newton, linear, first, seconds, launched = 1, 0, 0, None, 0.0, 0
     while True:
@@ -259,13 +253,9 @@ def fitting(kept: dict, own: dict) -> dict:
     return found
 
 
-def main(task: str, *rest: str) -> None:
-    """One task."""
-    if task == "capture":
-        capture(rest[0], Path(rest[1]), rest[2:] == ("quick",))
-    else:
-        replay(Path(rest[0]), rest[1], float(rest[2]), Path(rest[3]) if len(rest) > 3 else None)
-
-
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    task, first, second, *rest = sys.argv[1:]
+    if task == "capture":
+        capture(first, Path(second), rest == ["quick"])
+    else:
+        replay(Path(first), second, float(rest[0]), Path(rest[1]) if rest[1:] else None)

@@ -17,15 +17,18 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 from taisoft.output.files import make_folder, write_bytes
 from taisoft.output.report import json_text
 
-from .cuda_parts import JOBS, RESULT, parse_result, run_job
-from .cuda_table import part_text
-from .document import header
+from .cuda_parts import JOBS, run_job
+from .document import header, table
+from .runner import RESULT, make_parser, parse_result
 
 ROOT = Path(__file__).resolve().parent.parent
 BUDGET = 470.0  # seconds for all parts: ten less than eight minutes
@@ -116,9 +119,89 @@ def gpu_name() -> str:
     return "; ".join((done.stdout or done.stderr).strip().splitlines()[:4])
 
 
+# --- tables, one a part -------------------------------------------------------------------------------------------------
+
+
+def part_text(o: Outcome) -> str:
+    """A part of the page, with what its process printed last where it failed."""
+    body = TABLES[o.part.name](o.found) if o.found else "It found nothing."
+    head = f"## {o.part.title}\n\nEnded: {o.ended}, {o.seconds:.0f} s."
+    return "\n\n".join([head, body, *([f"```\n{o.tail}\n```"] if o.tail else [])])
+
+
+def tests_text(found: list[dict]) -> str:
+    """How many tests ended how, and those that did not pass."""
+    counts = Counter(one["result"] for one in found)
+    bad = [f"* {one['test']}: {one['result']}" for one in found if one["result"] != "passed"]
+    return "\n".join([", ".join(f"{n} {what}" for what, n in sorted(counts.items())) + ".", *(["", *bad] if bad else [])])
+
+
+def cell(name: str, form: str = "", scale: float = 1.0):
+    """A number of a result; empty where there is none or the measurement failed."""
+    return lambda one: "" if one.get(name) is None else f"{one[name] * scale if scale != 1.0 else one[name]:{form}}"
+
+
+def or_failure(fill: Callable[[dict], str]):
+    """The first cell that a failure leaves empty says why."""
+    return lambda one: one["failure"] if "failure" in one else fill(one)
+
+
+def error_of(one: dict) -> str:
+    """The error of a work, or whether it stands."""
+    if "failure" in one:
+        return ""
+    return f"{100 * one['error']:.2g} %" if one["error"] is not None else "stands" if one["stands"] else "does not stand"
+
+
+COLUMNS: dict[str, tuple] = {
+    "works": (
+        ("<work", cell("work")),
+        ("tets", cell("tets", ",")),
+        ("<setting", cell("setting")),
+        ("<arch", cell("arch")),
+        ("s/sim. s", or_failure(cell("seconds", ".3g"))),
+        ("error", error_of),
+        ("inverted", cell("inverted")),
+        ("unconverged", cell("unconverged")),
+        ("build [s]", cell("build_seconds", ".3g")),
+    ),
+    "sweeps": (
+        ("contacts", cell("contacts", ",")),
+        ("colours", cell("colours")),
+        ("serial [ms]", cell("serial_ms", ".3g")),
+        ("coloured [ms]", cell("coloured_ms", ".3g")),
+        ("serial / coloured", lambda one: f"{one['serial_ms'] / one['coloured_ms']:.3g}"),
+        ("sweeps", cell("serial_sweeps")),
+        ("coloured", cell("coloured_sweeps")),
+        ("residual", lambda one: f"{max(one['serial_residual'], one['coloured_residual']):.1e}"),
+    ),
+    "sizes": (
+        ("tets", cell("tets", ",")),
+        ("<integrator", cell("integrator")),
+        ("step [ms]", or_failure(cell("step_ms", ".3g"))),
+        ("ns/tet", lambda one: "" if "failure" in one else f"{1e6 * one['step_ms'] / one['tets']:.3g}"),
+        ("Newton/CG", lambda one: "" if "failure" in one else f"{one['newton']}/{one['linear']}"),
+        ("unconverged", cell("unconverged")),
+        ("fields [MiB]", cell("field_bytes", ".0f", 2.0**-20)),
+        ("build [s]", cell("build_seconds", ".3g")),
+        ("compile [s]", cell("compile_seconds", ".3g")),
+    ),
+    "reruns": (
+        ("<scene", cell("scene")),
+        ("<integrator", cell("integrator")),
+        ("runs", cell("reruns")),
+        ("largest difference / excursion", cell("spread", ".1e")),
+    ),
+}
+TABLES = {"tests": tests_text} | {name: partial(table, columns=columns) for name, columns in COLUMNS.items()}
+
+
+# --- the whole ----------------------------------------------------------------------------------------------------------
+
+
 def write_page(folder: Path, head: str, numbers: dict, outcomes: list[Outcome], waiting: list[Part]) -> None:
     """The page and its numbers as far as they are known."""
-    parts = [head, *(part_text(o.part.title, o.part.name, o.ended, o.seconds, o.found, o.tail) for o in outcomes)]
+    parts = [head, *map(part_text, outcomes)]
     if waiting:
         parts.append("Not yet run: " + ", ".join(part.name for part in waiting) + ".")
     write_bytes(folder / "cuda-check.md", ("\n\n".join(parts) + "\n").encode())
@@ -146,8 +229,7 @@ def check(parts: list[Part], budget: float, folder: Path, arch: str) -> list[Out
 
 def main(argv=None) -> int:
     """Check and write the page. Raises OutputError."""
-    first, _, rest = __doc__.partition("\n")
-    parser = argparse.ArgumentParser(prog="taisoft bench cuda_check", description=first, epilog=rest.partition("\n\n")[2])
+    parser = make_parser("cuda_check", __doc__)
     parser.add_argument("--arch", choices=("cuda", "cpu"), default="cuda", help="cpu checks the checking itself")
     parser.add_argument("--budget", type=float, default=BUDGET, metavar="SECONDS", help=f"for all parts (default {BUDGET:.0f})")
     parser.add_argument("--quick", action="store_true", help="small sizes")

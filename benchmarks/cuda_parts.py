@@ -1,7 +1,7 @@
 """What `cuda_check.py` measures, each part in a process of its own, which prints a result as soon as it has it."""
 
-import json
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from time import perf_counter
 
 import numpy as np
@@ -13,12 +13,11 @@ from taisoft.errors import TaisoftError
 from taisoft.scene.scene import Scene
 from taisoft.study.measure import advance, warm_up
 
-from .contact_captured import patched
-from .contact_crossover import measure_crossover
-from .elasticity_beam import MARGIN, beam_scene
+from .contact_colouring import measure_crossover
+from .elasticity_runs import MARGIN, beam_scene
 from .programs import own
 from .programs.session import Setting
-from .scaling import RESULT
+from .runner import patched, say
 from .scaling_runs import cubes_on_ground
 from .works.judge import judge
 from .works.references import MUJOCO, TAISOFT
@@ -32,15 +31,10 @@ SIZES, QUICK_SIZES = (37, 58), (6,)  # cells across a beam of 20 n^3 tets: 1.0 a
 RERUNS = 3
 
 
-def parse_result(line: str) -> dict | None:
-    """What a line of a part's output found, None for any other line."""
-    return json.loads(line.removeprefix(RESULT)) if line.startswith(RESULT) else None
-
-
 def run_job(name: str, arch: str, quick: bool) -> None:
     """Print the results of a part."""
     for found in JOBS[name][2](arch, quick):
-        print(RESULT + json.dumps(found), flush=True)
+        say(found)
 
 
 def works(arch: str, quick: bool) -> Iterator[dict]:
@@ -80,11 +74,8 @@ def _timed(work: Work, setting: Setting) -> dict:
 def sweeps(arch: str, quick: bool) -> Iterator[dict]:
     """Coloured against serial Gauss-Seidel on two plates, the numbers of contacts rising."""
     for n in QUICK_PLATES if quick else PLATES:
-        runtime = open_runtime(arch, "f32", "the check of solvers")
-        try:
+        with closing(open_runtime(arch, "f32", "the check of solvers")) as runtime:
             (point,) = measure_crossover((n,), runtime)
-        finally:
-            runtime.close()
         yield {"contacts": point.contacts, "colours": point.colours} | {
             f"{name}_{what}": value
             for name, one in (("serial", point.serial), ("coloured", point.coloured))

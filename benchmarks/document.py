@@ -1,18 +1,29 @@
-"""What every benchmark does with its results: header, text as it comes, and files named after the machine."""
+"""What every benchmark does with its results: a page of tables and limits; numbers beside it; a look at an earlier run."""
 
+import argparse
+import json
+import math
 import os
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, is_dataclass
 from datetime import datetime
 from pathlib import Path
+
+import numpy as np
 
 import taisoft as ts
 from taisoft.errors import OutputError
 from taisoft.output.files import make_folder, write_bytes
 from taisoft.output.report import json_text
-from taisoft.timing import machine, versions
-
-from .elasticity_table import slug
+from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.timing import Timing, load_average, machine, summarise, versions
 
 RESULTS = Path(__file__).resolve().parent / "results"
+SAME = ("processor", "cores", "arch", "quick")  # what two runs must share to be compared
+
+
+# --- the page -----------------------------------------------------------------------------------------------------------
 
 
 class Document:
@@ -32,21 +43,45 @@ class Document:
 
     def write(self, out: Path, numbers: dict) -> None:
         """The numbers into `out`, a .json file, and the page beside it. Raises OutputError where they cannot be written."""
-        write_bytes(out, json_text(numbers).encode())
+        write_bytes(out, json_text(plain(numbers)).encode())
         write_bytes(out.with_suffix(".md"), self.text().encode())
         print(f"written: {out} and {out.with_suffix('.md').name}")
+
+    def finish(
+        self, options: argparse.Namespace, numbers: dict, limits: Sequence["Limit"] = (), draw: Callable | None = None
+    ) -> int:
+        """Add the limits, write what `options` ask for, and return the exit status: 1 where a limit is not met.
+
+        draw: writes the picture of --plot into a path.
+        """
+        if limits:
+            self.add("## Limits\n\n" + limit_table(limits))
+        if options.out:
+            chosen = {name: value for name, value in vars(options).items() if name in ("arch", "precision", "quick")}
+            numbers = chosen | {"load_at_the_end": load_average()} | numbers
+            self.write(options.out, numbers | {"limits": list(limits)})
+        if draw and options.plot:
+            draw(options.plot)
+            print(f"written: {options.plot}")
+        return 0 if all(limit.met for limit in limits) else 1
+
+
+def begin(title: str, *how: str, packages: tuple[str, ...] = ("taichi", "numpy", "scipy")) -> tuple[Document, dict]:
+    """A document that begins with what is measured where and how, and the same as data."""
+    document, (text, numbers) = Document(), header(title, *how, packages=packages)
+    document.add(text)
+    return document, numbers
 
 
 def header(title: str, *how: str, packages: tuple[str, ...] = ("taichi", "numpy", "scipy")) -> tuple[str, dict]:
     """What is measured where and how, as text and as data."""
     found = machine() | {"date": datetime.now().isoformat(timespec="minutes")}
-    used = {"taisoft": ts.__version__, **versions(*packages)}
-    numbers = found | {"versions": used}
+    numbers = found | {"versions": {"taisoft": ts.__version__, **versions(*packages)}}
     return header_text(title, numbers, *how), numbers
 
 
 def header_text(title: str, numbers: dict, *how: str) -> str:
-    """What stored numbers tell of where and how they were measured."""
+    """Where and how stored numbers were measured."""
     return (
         f"# {title}\n\n{', '.join([numbers['processor'], str(numbers['cores']) + ' cores', *how])}, "
         f"load {load_text(numbers['load'])} at the start; {numbers['date']}\n"
@@ -57,6 +92,20 @@ def header_text(title: str, numbers: dict, *how: str) -> str:
 def load_text(value: float | None) -> str:
     """A load average."""
     return "unknown" if value is None else f"{value:.1f}"
+
+
+def plain(value):
+    """As plain data: records and dataclasses as dicts, in lists and dicts too."""
+    if hasattr(value, "record"):
+        return plain(value.record())
+    if is_dataclass(value):
+        return asdict(value)
+    if isinstance(value, dict):
+        return {key: plain(one) for key, one in value.items()}
+    return [plain(one) for one in value] if isinstance(value, list | tuple) else value
+
+
+# --- files --------------------------------------------------------------------------------------------------------------
 
 
 def check_out(path: Path | None, suffix: str) -> None:
@@ -73,3 +122,157 @@ def default_out(arch: str, what: str, suffix: str = ".json") -> Path:
     """results/<what>-<machine><suffix> beside this file; without a suffix a folder."""
     where = machine()
     return RESULTS / f"{what}-{slug(where['processor'])}-{where['cores']}-cores{'-cuda' if arch == 'cuda' else ''}{suffix}"
+
+
+def slug(text: str) -> str:
+    """The text as part of a file's name: lower case, trade marks dropped, everything else but letters and digits a dash."""
+    text = re.sub(r"\((r|tm|c)\)", "", text.lower())
+    return re.sub(r"[^a-z0-9]+", "-", text).strip("-")
+
+
+# --- tables -------------------------------------------------------------------------------------------------------------
+
+Columns = Sequence[tuple[str, str | Callable[..., str]]]
+
+
+def table(rows: Iterable, columns: Columns, notes: Iterable[str] = ()) -> str:
+    """A line for each row, and each note as a bullet below.
+
+    columns: heading, aligned left where it begins with "<", and cell: a format string of the row, or a function of it.
+    """
+    lines = [[cell.format(row) if isinstance(cell, str) else cell(row) for _, cell in columns] for row in rows]
+    left = [k for k, (heading, _) in enumerate(columns) if heading.startswith("<")]
+    text = markdown([heading.removeprefix("<") for heading, _ in columns], lines, left)
+    bullets = "".join(f"\n* {note}" for note in notes)
+    return f"{text}\n{bullets}" if bullets else text
+
+
+def ms(seconds: float) -> str:
+    """Milliseconds, three digits."""
+    return f"{1e3 * seconds:.3g}"
+
+
+def timed_cells(seconds: Iterable[float]) -> tuple[str, str]:
+    """Median [ms] and spread of times as cells."""
+    t = summarise(seconds)
+    return ms(t.median), percent(spread_of(t))
+
+
+def ranged(values: Sequence[float]) -> str:
+    """Median, least and most."""
+    return f"{np.median(values):g} ({min(values):g} to {max(values):g})" if len(values) else "-"
+
+
+def exponent(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
+    """p of y ~ x^p by least squares in the logarithms, and how far the farthest point lies off the fit, relative to y.
+
+    Not numbers for fewer than two x, or where some y is 0.
+    """
+    if len(set(x)) < 2 or min(y) <= 0.0:
+        return math.nan, math.nan
+    a, b = np.log(np.asarray(x, float)), np.log(np.asarray(y, float))
+    p, c = np.polyfit(a, b, 1)
+    return float(p), float(np.expm1(np.abs(b - (p * a + c)).max()))
+
+
+def crossovers(at: Sequence[float], a: Sequence[float], b: Sequence[float]) -> list[float]:
+    """Where the faster of two becomes the slower: straight in the logarithms between neighbours; never beyond the ends."""
+    found, ratio = [], np.log(np.asarray(a) / np.asarray(b))
+    for k in range(len(at) - 1):
+        if ratio[k] * ratio[k + 1] < 0:
+            t = ratio[k] / (ratio[k] - ratio[k + 1])
+            found.append(math.exp((1 - t) * math.log(at[k]) + t * math.log(at[k + 1])))
+    return found
+
+
+# --- limits -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A number beside its limit. spread: of the number, relative; None for one that does not vary. at_least: a lower limit."""
+
+    what: str
+    value: float
+    limit: float
+    spread: float | None = None
+    at_least: bool = False
+
+    @property
+    def met(self) -> bool:
+        """Whether the number keeps the limit; one that is not a number never does."""
+        return self.value >= self.limit if self.at_least else self.value <= self.limit
+
+    @property
+    def close(self) -> bool:
+        """Whether the spread is as large as the distance to the limit: another run may find otherwise."""
+        return self.spread is not None and abs(self.value - self.limit) <= self.spread * abs(self.value)
+
+    def record(self) -> dict:
+        """As plain data."""
+        return asdict(self) | {"met": self.met, "close": self.close}
+
+    def row(self) -> tuple[str, ...]:
+        """Cells of limit_table."""
+        verdict = ("met" if self.met else "NOT met") + (", within the spread" if self.close else "")
+        return (
+            self.what,
+            f"{self.value:.4g}",
+            percent(self.spread),
+            f"{'>=' if self.at_least else '<='} {self.limit:.4g}",
+            verdict,
+        )
+
+
+def timed_limit(what: str, t: Timing | None, limit: float, scale: float = 1.0, at_least: bool = False) -> Limit:
+    """The limit on a time's median, `scale` to its unit; without a time it is not met."""
+    return Limit(what, scale * t.median if t else math.nan, limit, spread_of(t) if t else None, at_least)
+
+
+def limit_table(limits: Iterable[Limit]) -> str:
+    """A row a limit."""
+    return markdown(("limit", "measured", "spread", "wanted", "verdict"), [x.row() for x in limits], left=(0, 3, 4))
+
+
+# --- an earlier run -----------------------------------------------------------------------------------------------------
+
+
+def earlier_numbers(path: Path | None) -> dict | None:
+    """What an earlier run wrote there, None where there is nothing that can be read."""
+    try:
+        return None if path is None else json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def agrees(one: dict, two: dict) -> bool:
+    """Whether two timings, as plain data, lie no farther apart than their spreads together."""
+    apart = abs(one["median"] - two["median"])
+    return apart <= one["spread"] * one["median"] + two["spread"] * two["median"]
+
+
+def again_text(earlier: dict | None, times: dict[str, Timing], numbers: dict) -> str:
+    """How the times of an earlier run into the same file compare; earlier: its numbers, None where there are none."""
+    head = "## Beside an earlier run\n\n"
+    if earlier is None:
+        return head + "There was no earlier run here."
+    differing = [name for name in SAME if earlier.get(name) != numbers.get(name)]
+    if differing:
+        return head + f"The earlier run here had another {' and '.join(differing)}."
+    before = earlier.get("times", {})
+    pairs = [(name, before[name], now) for name, now in plain(times).items() if name in before]
+    rows = [
+        (
+            name,
+            ms(was["median"]),
+            percent(was["spread"]),
+            ms(now["median"]),
+            percent(now["spread"]),
+            f"{now['median'] / was['median']:.2f}",
+        )
+        for name, was, now in pairs
+        if not agrees(was, now)
+    ]
+    text = f"{len(pairs) - len(rows)} of {len(pairs)} times agree with those of {earlier['date']} within the spreads of both."
+    headings = ("time", "then [ms]", "spread", "now [ms]", "spread", "now / then")
+    return head + text + ("\n\nThe others:\n\n" + markdown(headings, rows, left=(0,)) if rows else "")

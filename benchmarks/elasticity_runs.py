@@ -1,11 +1,12 @@
-"""Whole runs of the falling beam over a second: time and error, taisoft and MuJoCo in turn so that noise hits both.
+"""The falling beam of exact_path.py in taisoft, and whole runs of it over a second: time and error, taisoft and MuJoCo in turn.
 
 A round opens, runs and closes each program's each integrator once, so that a slow minute of the machine falls on all;
 ratios are taken round by round. A time is that of a whole run: MuJoCo's steps in pieces of 10 ms, taisoft's through
-sim.advance in the largest batches it takes, without compiling. The first round also follows the tip.
+sim.advance in the largest batches it takes, without compiling. The first round also follows the tip. Below
+model.PARALLEL_FROM tets or PARALLEL_THREADS threads taisoft steps on one thread of the CPU, and so does MuJoCo.
 """
 
-import sys
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from time import perf_counter
@@ -16,16 +17,60 @@ import taisoft as ts
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import SimulationError
 from taisoft.scene.scene import Scene
+from taisoft.stability import stable_dt
 from taisoft.study.measure import TimedRun, advance, warm_up
 from taisoft.timing import Timing, summarise
 
-from .elasticity_beam import MARGIN, beam_scene, explicit_steps, follow_tip, n_tets
-from .exact_path import FOLDING_STARTS, SAMPLE, load_exact
+from .exact_path import DENSITY, FOLDING_STARTS, GRAVITY, POISSON, SAMPLE, SIZE, YOUNG, load_exact
 from .programs.mujoco_flex import STABLE_STEPS, run_mujoco
+from .runner import progress
 
+LAWS = {"SNH": "stable_neo_hookean", "SVK": "st_venant_kirchhoff", "COR": "corotational"}
+MARGIN = 0.9  # of the largest stable step about the rest shape
 IMPLICIT = ("bdf2", "implicit_midpoint", "implicit_euler", "linearly_implicit_euler")
 TAISOFT, MUJOCO = "taisoft", "MuJoCo"
 ROUND_SECONDS, ROUND_RUNS = 0.3, 10  # a round repeats a run until this wall time or this number is reached
+
+
+# --- the beam -----------------------------------------------------------------------------------------------------------
+
+
+def n_tets(cells) -> int:
+    """Number of tets, five a cell."""
+    return 5 * math.prod(cells)
+
+
+def beam_scene(cells, law: str = "SVK") -> Scene:
+    """The beam, clamped at its left end face, straight and at rest. law: one of LAWS."""
+    scene = ts.Scene(gravity=(0.0, -GRAVITY, 0.0))
+    rubber = ts.Material(law=LAWS[law], young=YOUNG, poisson=POISSON, density=DENSITY)
+    beam = scene.add_body(ts.box_mesh(cells, SIZE), rubber, name="beam")
+    beam.fix(lambda X: X[:, 0] < -SIZE[0] / 2 + 1e-9)
+    return scene
+
+
+def explicit_steps(scene: Scene) -> int:
+    """Smallest number of explicit steps in 10 ms whose dt is at most MARGIN of the limit."""
+    return math.ceil(SAMPLE / (MARGIN * stable_dt(scene, verlet=True)))
+
+
+def steps_within_limit(cells) -> int:
+    """Those of the beam; one limit for all laws."""
+    return explicit_steps(beam_scene(cells))
+
+
+def follow_tip(sim: ts.Simulator, steps: int, samples: int) -> tuple[np.ndarray, TimedRun]:
+    """Path (samples + 1, 3) [m] of the mean of the end face's nodes, every `steps` steps from the start, and the stretch."""
+    sim.reset()
+    tip = np.flatnonzero(sim.scene.body("beam").rest_positions[:, 0] > SIZE[0] / 2 - 1e-9)
+    path, whole = [sim.positions("beam")[tip].mean(axis=0)], TimedRun()
+    for _ in range(samples):
+        whole += advance(sim, steps)
+        path.append(sim.positions("beam")[tip].mean(axis=0))
+    return np.array(path), whole
+
+
+# --- runs ---------------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -82,8 +127,8 @@ def lasting_steps(scene: Scene, integrator: str, arch: str, seconds: float) -> t
             except SimulationError:
                 failures.append(f"{1e3 * sim.dt:.3f} ms (at t = {sim.time:.2f} s)")
                 continue
-            told = f"from {MARGIN} of the limit at rest on, dt = {', '.join(failures)} diverged" if failures else ""
-            return steps, told
+            note = f"from {MARGIN} of the limit at rest on, dt = {', '.join(failures)} diverged" if failures else ""
+            return steps, note
     raise SimulationError(f"{integrator}: even dt = {1e3 * sim.dt:.3f} ms does not last {seconds} s")
 
 
@@ -112,7 +157,7 @@ def measure_rows(rows: list[Row], cells, arch: str, rounds: int, seconds: float)
         for row in rows:
             if row.failure:
                 continue
-            print(f"{row.tets:,} tets, round {number + 1} of {rounds}: {row.program} {row.integrator}", file=sys.stderr)
+            progress(f"{row.tets:,} tets, round {number + 1} of {rounds}: {row.program} {row.integrator}")
             try:
                 (_taisoft_round if row.program == TAISOFT else _mujoco_round)(row, cells, arch, seconds, number == 0)
             except SimulationError as error:

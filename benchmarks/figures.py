@@ -4,11 +4,10 @@ taisoft bench figures [--only NAME] [--quick] [--results DIR] [--logs DIR]
 
 Runs the benchmarks one after the other, each in a process of its own, and writes their pages into benchmarks/results, named
 after the machine; what they print goes to DIR/NAME.log. A benchmark that fails or misses a limit does not stop the next one.
-The machine should do nothing else meanwhile: the table tells the load at each start. The whole takes about three hours on two
+The machine should do nothing else meanwhile: the table shows the load at each start. The whole takes about three hours on two
 cores, and its parts can be made one by one. Exit status: 0, or 1 where a benchmark ended with another status.
 """
 
-import argparse
 import subprocess
 import sys
 import time
@@ -17,17 +16,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from taisoft.output.files import make_folder
-from taisoft.output.tables import markdown
 from taisoft.timing import load_average
 
-from .document import RESULTS, default_out, load_text
+from .document import RESULTS, default_out, load_text, table
+from .runner import make_parser, progress
 
 # name -> what of it is written: a page with numbers (json), a picture beside it (png), or a folder of both (folder)
 WRITES = {
     "references": ("json",),
     "elasticity": ("json",),
-    "collision": ("json", "png"),
-    "contact": ("json", "png"),
+    "collision": ("json",),
+    "contact": ("json",),
     "order": ("json", "png"),
     "scaling": ("json", "png"),
     "peers": ("json",),
@@ -66,14 +65,13 @@ def make(names: Iterable[str], quick: bool, results: Path, logs: Path) -> list[E
                 command(name, quick, results), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, check=False
             )
         ended.append(Ended(name, done.returncode, time.monotonic() - start, load))
-        print(f"{name}: status {done.returncode}, {ended[-1].seconds:.0f} s", file=sys.stderr, flush=True)
+        progress(f"{name}: status {done.returncode}, {ended[-1].seconds:.0f} s")
     return ended
 
 
 def main(argv=None) -> int:
     """Make them. Raises OutputError."""
-    first, _, rest = __doc__.partition("\n")
-    parser = argparse.ArgumentParser(prog="taisoft bench figures", description=first, epilog=rest.partition("\n\n")[2])
+    parser = make_parser("figures", __doc__)
     parser.add_argument("--only", action="append", choices=WRITES, metavar="NAME", help=f"one of {', '.join(WRITES)}; repeatable")
     parser.add_argument("--quick", action="store_true", help="small cases; give --results too, the manual takes no quick ones")
     parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="default benchmarks/results")
@@ -86,8 +84,8 @@ def main(argv=None) -> int:
     if results == RESULTS:
         done = subprocess.run([sys.executable, "-m", "taisoft", "bench", "manual"], stdin=subprocess.DEVNULL, check=False)
         ended.append(Ended("manual", done.returncode, 0.0, load_average()))
-    rows = [(one.name, str(one.status), f"{one.seconds:.0f}", load_text(one.load)) for one in ended]
-    print(markdown(("benchmark", "exit status", "seconds", "load at its start"), rows, left=(0,)))
+    columns = [("<benchmark", "{.name}"), ("exit status", "{.status}"), ("seconds", "{.seconds:.0f}")]
+    print(table(ended, [*columns, ("load at its start", lambda one: load_text(one.load))]))
     return 0 if all(one.status == 0 for one in ended) else 1
 
 

@@ -7,7 +7,6 @@ results of a benchmark, so that no measured number is typed by hand. A table is 
 writes nothing. Exit status: 0, or with --check 1 where a page differs from the results.
 """
 
-import argparse
 import json
 import re
 import sys
@@ -19,13 +18,14 @@ from taisoft.errors import OutputError
 from taisoft.output.files import write_bytes
 from taisoft.output.tables import markdown
 
-from .document import RESULTS
+from .document import RESULTS, table
 from .hard_cases import CASES
 from .hard_runs import Row, stored
 from .hard_table import ALL, cells, headline, how_solved, shown_columns, tally
+from .order import DEFAULT_DEGREE, GOAL
 from .order_cases import HANGING
-from .order_table import DEFAULT_DEGREE, GOAL
 from .reference_cases.record import label
+from .runner import make_parser
 from .works.table import compare_table
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -48,9 +48,11 @@ def newest(results: Path, benchmark: str) -> dict:
     return max(found, key=lambda numbers: numbers["date"])
 
 
-def measured_on(numbers: dict) -> str:
-    """Where and with what numbers were measured, in a line."""
-    return f"{numbers['processor']}, {numbers['cores']} cores, {numbers['arch']}, {numbers['precision']}, {numbers['date'][:10]}"
+def measured_on(numbers: dict, *more: str) -> str:
+    """Where and with what numbers were measured, in a line below a table."""
+    known = [numbers[name] for name in ("arch", "precision") if name in numbers]
+    where = ", ".join([numbers["processor"], f"{numbers['cores']} cores", *known, numbers["date"][:10]])
+    return f"\n\nMeasured on: {'; '.join([where, *more])}."
 
 
 def order_errors(results: Path) -> str:
@@ -63,19 +65,15 @@ def order_errors(results: Path) -> str:
         own = [row for row in rows if (row["order"], row["degree"], row["cells"]) == (order, degree, cells)]
         return f"{own[0]['measured'][0] / exact - 1:+.3%}" if own else ""
 
-    lines = [
-        (
-            ORDERS[row["order"]],
-            label(row["cells"]),
-            f"{row['tets']:,}",
-            f"{row['nodes']:,}",
-            error(row["order"], row["degree"], row["cells"]),
-            error(row["order"], 4, row["cells"]),
-        )
-        for row in rows
-        if row["degree"] == DEFAULT_DEGREE[row["order"]]
-    ]
-    return markdown(("tets", "cells", "number", "nodes", "error", "with 14 points"), lines, left=(0, 1))
+    columns = (
+        ("<tets", lambda row: ORDERS[row["order"]]),
+        ("<cells", lambda row: label(row["cells"])),
+        ("number", "{[tets]:,}"),
+        ("nodes", "{[nodes]:,}"),
+        ("error", lambda row: error(row["order"], row["degree"], row["cells"])),
+        ("with 14 points", lambda row: error(row["order"], 4, row["cells"])),
+    )
+    return table([row for row in rows if row["degree"] == DEFAULT_DEGREE[row["order"]]], columns)
 
 
 def order_times(results: Path) -> str:
@@ -88,18 +86,16 @@ def order_times(results: Path) -> str:
         if c["goal"] == GOAL and all(reach is not None and reach["bound"] == "=" for reach in reached):
             times = [f"{reach['seconds']:.3g}" for reach in reached]
             lines.append((titles[c["case"]], *times, f"{c['ratio']['median']:.2g}"))
-    table = markdown(("case", "linear [s]", "quadratic [s]", "speed-up"), lines, left=(0,))
-    return f"{table}\n\nMeasured on: {measured_on(numbers)}."
+    return markdown(("case", "linear [s]", "quadratic [s]", "speed-up"), lines, left=(0,)) + measured_on(numbers)
 
 
 def peers(results: Path) -> str:
     """taisoft beside other programs at equal error, without the stiff beams."""
     numbers = newest(results, "peers")
-    told = [numbers["versions"][name] for name in ("mujoco", "pybullet", "newton")]
-    programs = "MuJoCo {}, PyBullet {}, Newton {}".format(*told)
-    where = f"{numbers['processor']}, {numbers['cores']} cores, {numbers['arch']}, {numbers['date'][:10]}; {programs}"
+    used = [numbers["versions"][name] for name in ("mujoco", "pybullet", "newton")]
+    programs = "MuJoCo {}, PyBullet {}, Newton {}".format(*used)
     shown = [one for one in numbers["comparisons"] if not one["stiff"]]
-    return f"{compare_table(shown)}\n\nMeasured on: {where}."
+    return compare_table(shown) + measured_on(numbers, programs)
 
 
 def collision(results: Path) -> str:
@@ -113,7 +109,7 @@ def collision(results: Path) -> str:
             times = [f"{1e3 * median(one['whole']):.3g}" for one in (row, other)]
             lines.append((setup, *[f"{row[name]:,}" for name in ("tets", "triangles", "pairs", "contacts")], *times))
     headings = ("scene", "tets", "triangles", "pairs of near ones", "contacts", "proximity [ms]", "distance fields [ms]")
-    return f"{markdown(headings, lines, left=(0,))}\n\nMeasured on: {measured_on(numbers)}."
+    return markdown(headings, lines, left=(0,)) + measured_on(numbers)
 
 
 def scaling(results: Path) -> str:
@@ -129,7 +125,7 @@ def scaling(results: Path) -> str:
         sizes = [f"{row['tets']:,}" for row in (own[0], own[-1])]
         lines.append((growth["kind"], sizes[0], each[0], sizes[1], each[1], f"{growth['step']:.2f}", f"{memory:.0f}"))
     headings = ("step or search", "tets", "ns/tet", "tets", "ns/tet", "exponent of the time", "fields there [B/tet]")
-    return f"{markdown(headings, lines, left=(0,))}\n\nMeasured on: {measured_on(numbers)}."
+    return markdown(headings, lines, left=(0,)) + measured_on(numbers)
 
 
 def hard(results: Path) -> str:
@@ -148,9 +144,8 @@ def hard(results: Path) -> str:
         why = dict.fromkeys(fault for row in own for fault in row.faults)
         lines.append((*line(case.id, case.name, own), "; ".join(why)))
     headings = ("case", "", *shown, "wall [s]", "not solved because of")
-    table = markdown(headings, [*lines, (*line("", ALL, rows), "")], left=(0, 1, len(headings) - 1))
-    where = f"{numbers['processor']}, {numbers['cores']} cores, {numbers['arch']}, {numbers['date'][:10]}"
-    return f"{headline(rows)} {how_solved(rows)}\n\n{table}\n\nMeasured on: {where}."
+    text = markdown(headings, [*lines, (*line("", ALL, rows), "")], left=(0, 1, len(headings) - 1))
+    return f"{headline(rows)} {how_solved(rows)}\n\n{text}" + measured_on(numbers)
 
 
 TABLES: dict[str, Callable[[Path], str]] = {  # by marker
@@ -186,8 +181,7 @@ def pages() -> list[Path]:
 
 def main(argv=None) -> int:
     """Write the pages anew, or say which differ from the results. Raises OutputError."""
-    first, _, rest = __doc__.partition("\n")
-    parser = argparse.ArgumentParser(prog="taisoft bench manual", description=first, epilog=rest.partition("\n\n")[2])
+    parser = make_parser("manual", __doc__)
     parser.add_argument("--check", action="store_true", help="write nothing")
     options = parser.parse_args(argv)
     differing = 0

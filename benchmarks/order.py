@@ -4,7 +4,7 @@ taisoft bench order [--quick] [--case NAME] [--arch cpu|cuda] [--out FILE.json] 
 
 Computed in f64. Every case is solved on some meshes with linear tets (order 1) and with quadratic ones (order 2, four
 quadrature points; some with fourteen). A time is the median over rounds of the whole solution from the rest shape, on
-kernels that an earlier solution has compiled; the first launches are told apart, as "compile". Spread is the distance
+kernels that an earlier solution has compiled; the first launches are timed apart, as "compile". Spread is the distance
 between the quartiles over the median. Errors are relative, the largest of the numbers read, and "< " marks one below what
 the reference is good to. The time to 1 % error is read off between two meshes, straight in the logarithms; where all
 meshes lie on one side of 1 % it is a bound, marked > or <=, and nothing is extrapolated. Exit status: 0, or 1 where a limit
@@ -12,32 +12,247 @@ is not met. --quick has the hanging beam alone, unless another case is named, tw
 takes about ten minutes on two cores.
 """
 
-import argparse
+import math
 import sys
-from dataclasses import asdict
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 from taisoft.backend.runtime import open_runtime
-from taisoft.output.plot import require_matplotlib
-from taisoft.timing import load_average
+from taisoft.errors import OutputError
+from taisoft.output.plot import require_matplotlib, save, ticks
+from taisoft.output.tables import percent, spread_of
+from taisoft.timing import Timing, summarise
 
-from .document import Document, check_out, header
-from .elasticity_table import limit_table
+from .document import Document, Limit, begin, table
 from .order_cases import CASES, HANGING, LINEAR, QUADRATIC, Case, Reference
-from .order_plot import draw
 from .order_runs import Row, measure_case
-from .order_table import GOAL, GOALS, compare, compare_table, find_limits, row_table
+from .reference_cases.record import label
+from .runner import make_parser, parse_options
 
 ROUNDS, QUICK_ROUNDS, QUICK_MESHES = 5, 1, 2
+GOALS = (0.1, 0.03, 0.01)  # errors whose times are compared
+GOAL = GOALS[-1]  # the one that cases are summed up by
+WANTED_RATIO = 20.0  # of the hanging beam's times to that error, order 1 over order 2
+ELASTICA_LIMIT = 0.005  # error of order 2 on its finest mesh
+LEAST_ERROR = 1e-12  # what no error at all counts as among logarithms
+DEFAULT_DEGREE = {1: None, 2: 2}  # of the quadrature of the elements that are compared
+STYLES = {  # (order, degree) -> label, colour, marker, line
+    (1, None): ("order 1", "#d55e00", "o", "-"),
+    (2, 2): ("order 2, 4 points", "#0072b2", "s", "-"),
+    (2, 4): ("order 2, 14 points", "#009e73", "^", ":"),
+}
+COLUMNS, PANEL = 3, (4.2, 3.2)  # panels in a row, their size in inches
+SURE = 1e-5  # the lowest error that is drawn, for references that are exact
+
+
+# --- times to an error --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Time to an error [s]. bound: "=" read off between two meshes; "<=" the coarsest is below it; ">" the finest is above."""
+
+    seconds: float
+    bound: str
+
+    def __str__(self) -> str:
+        return f"{'' if self.bound == '=' else self.bound + ' '}{self.seconds:.3g} s"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Times of both orders to an error in one case. ratio: order 1 over order 2, of every round; bound: "=", ">", "<" or "?"."""
+
+    case: str
+    law: str
+    goal: float
+    reach: dict[int, Reach | None]
+    ratio: Timing | None
+    bound: str
+
+    def texts(self) -> tuple[str, str, str, str]:
+        """Both times, the ratio and its spread."""
+        times = (str(self.reach[order] or "-") for order in DEFAULT_DEGREE)
+        if self.ratio is None:
+            return *times, "-", ""
+        return *times, f"{'' if self.bound == '=' else self.bound + ' '}{self.ratio.median:.3g}", percent(spread_of(self.ratio))
+
+
+def time_to(errors: Sequence[float], seconds: Sequence[float], goal: float) -> Reach | None:
+    """When meshes, coarse to fine, with these errors (k,) and times (k,) [s] get down to an error for good.
+
+    Straight in the logarithms between the last mesh above the goal and the next one; never beyond a mesh. None without
+    meshes.
+    """
+    if not len(errors):
+        return None
+    above = [k for k, error in enumerate(errors) if error > goal]
+    if not above:
+        return Reach(seconds[0], "<=")
+    k = above[-1]
+    if k == len(errors) - 1:
+        return Reach(seconds[k], ">")
+    t = math.log(errors[k] / goal) / math.log(errors[k] / max(errors[k + 1], LEAST_ERROR))
+    return Reach(math.exp((1 - t) * math.log(seconds[k]) + t * math.log(seconds[k + 1])), "=")
+
+
+def claimed(row: Row, reference: Reference) -> float:
+    """The row's error, but not below what the reference is good to."""
+    return max(row.error, reference.uncertainty)
+
+
+def chain(rows: list[Row], order: int) -> list[Row]:
+    """The rows of an order, with its default quadrature, that have an error and a time."""
+    return [r for r in rows if (r.order, r.degree) == (order, DEFAULT_DEGREE[order]) and r.error is not None and r.rounds]
+
+
+def compare(case: Case, rows: list[Row], reference: Reference, goal: float = GOAL) -> Comparison:
+    """Times to an error, and their ratio in each round that all meshes took part in; unknown below what can be claimed."""
+    chains = {order: chain(rows, order) for order in DEFAULT_DEGREE}
+    errors = {order: [claimed(r, reference) for r in found] for order, found in chains.items()}
+
+    def reach(order: int, seconds: list[float]) -> Reach | None:
+        return time_to(errors[order], seconds, goal) if goal > reference.uncertainty else None
+
+    times = {order: reach(order, [r.timing.median for r in found]) for order, found in chains.items()}
+    bound = _ratio_bound(times[1], times[2])
+    if bound == "?":
+        return Comparison(case.name, case.law, goal, times, None, bound)
+    ratios = []
+    for k in range(min(len(r.rounds) for found in chains.values() for r in found)):
+        slow, fast = (reach(order, [r.rounds[k] for r in found]).seconds for order, found in chains.items())
+        ratios.append(slow / fast)
+    return Comparison(case.name, case.law, goal, times, summarise(ratios), bound)
+
+
+def _ratio_bound(slow: Reach | None, fast: Reach | None) -> str:
+    """What is known of slow / fast: "=", a lower bound ">", an upper bound "<", or nothing "?"."""
+    if slow is None or fast is None:
+        return "?"
+    at_least = slow.bound in "=>" and fast.bound in ("=", "<=")
+    at_most = slow.bound in ("=", "<=") and fast.bound in "=>"
+    return {(True, True): "=", (True, False): ">", (False, True): "<", (False, False): "?"}[at_least, at_most]
+
+
+# --- tables and limits --------------------------------------------------------------------------------------------------
+
+
+def row_table(rows: list[Row], reference: Reference) -> str:
+    """A row a mesh; failures below."""
+
+    def error(row: Row) -> str:
+        if row.error is None:
+            return "-"
+        return ("< " if row.error < reference.uncertainty else "") + f"{100 * claimed(row, reference):.3g}"
+
+    columns = (
+        ("<law", "{.law}"),
+        ("order", "{.order}"),
+        ("points", "{.points}"),
+        ("<cells", lambda row: label(row.cells)),
+        ("tets", "{.tets:,}"),
+        ("nodes", "{.nodes:,}"),
+        ("measured", lambda row: ", ".join(f"{x:.6g}" for x in row.measured) or "-"),
+        ("error [%]", error),
+        ("Newton", "{.newton}"),
+        ("CG", "{.linear:,}"),
+        ("solve [s]", lambda row: f"{row.timing.median:.4g}" if row.rounds else "-"),
+        ("spread", lambda row: percent(spread_of(row.timing)) if row.rounds else ""),
+        ("rounds", lambda row: str(len(row.rounds) or "-")),
+        ("compile [s]", "{.compile_seconds:.1f}"),
+        ("fields [MB]", lambda row: f"{row.field_bytes / 1e6:.1f}"),
+    )
+    return table(rows, columns, [f"order {r.order}, {label(r.cells)}: {r.failure}" for r in rows if r.failure])
+
+
+def compare_table(comparisons: list[Comparison]) -> str:
+    """A row a case and error."""
+    columns = [("<case", "{.case}"), ("<law", "{.law}"), ("error", "{.goal:.0%}")]
+    for k, heading in enumerate(("order 1", "order 2", "order 1 / order 2", "spread")):
+        columns.append((heading, lambda c, k=k: c.texts()[k]))
+    return table(comparisons, columns)
+
+
+def find_limits(comparisons: list[Comparison], rows: list[Row]) -> list[Limit]:
+    """The wanted ratio of the hanging beam, and the errors of order 2 against the elastica."""
+    limits = []
+    for c in comparisons:
+        if c.case == HANGING and c.goal == GOAL:
+            known = c.ratio is not None and c.bound in "=>"
+            what = f"{c.case}: order 1's time to {c.goal:.0%} error / order 2's"
+            value, spread = (c.ratio.median, spread_of(c.ratio)) if known else (math.nan, None)
+            limits.append(Limit(what, value, WANTED_RATIO, spread, at_least=True))
+    for name in dict.fromkeys(row.case for row in rows if row.case.startswith("elastica")):
+        own = [row for row in rows if row.case == name and (row.order, row.degree) == (2, DEFAULT_DEGREE[2])]
+        value = math.nan if not own or own[-1].error is None else 100 * own[-1].error
+        limits.append(Limit(f"{name}: error of order 2, finest mesh [%]", value, 100 * ELASTICA_LIMIT))
+    return limits
+
+
+# --- the picture --------------------------------------------------------------------------------------------------------
+
+
+def draw(cases: list[tuple[Case, list[Row], Reference]], path: Path) -> None:
+    """Write a PNG of all cases with their rows. Raises OutputError where it cannot be written or drawn."""
+    require_matplotlib()
+    from matplotlib import pyplot
+
+    cases = [found for found in cases if any(r.error is not None and r.rounds for r in found[1])]
+    if not cases:
+        raise OutputError(f"{path}: there is nothing to draw, since no mesh has an error")
+    columns = min(COLUMNS, len(cases))
+    lines = math.ceil(len(cases) / columns)
+    size = PANEL[0] * columns, PANEL[1] * lines + 0.5
+    figure, grid = pyplot.subplots(lines, columns, figsize=size, squeeze=False, layout="constrained")
+    for panel in grid.flat[len(cases) :]:
+        panel.set_visible(False)
+    drawn: dict = {}
+    for panel, (case, rows, reference) in zip(grid.flat, cases):
+        drawn |= _panel(panel, case, rows, reference)
+    figure.legend(drawn.values(), drawn.keys(), loc="outside upper center", ncols=min(len(drawn), 2 * columns), frameon=False)
+    figure.supxlabel("time of a solution [s], median of the rounds")
+    figure.supylabel("error [%]")
+    save(figure, path)
+
+
+def _panel(panel, case: Case, rows: list[Row], reference: Reference) -> dict:
+    """One case; returns label -> handle of its lines."""
+    handles = {}
+    for (order, degree), (name, colour, marker, line) in STYLES.items():
+        own = [r for r in rows if (r.order, r.degree) == (order, degree) and r.error is not None and r.rounds]
+        if own:
+            seconds = [r.timing.median for r in own]
+            errors = [100 * max(claimed(r, reference), SURE) for r in own]
+            (handles[name],) = panel.plot(seconds, errors, line, color=colour, marker=marker, ms=5, lw=1.6)
+    handles[f"{GOAL:.0%} error"] = panel.axhline(100 * GOAL, color="#555555", lw=0.9, ls="--")
+    if reference.uncertainty > 0.0:
+        floor = 100 * reference.uncertainty
+        handles["below the reference's own error"] = panel.axhspan(floor / 1e3, floor, color="#dddddd", lw=0)
+    panel.set(xscale="log", yscale="log", title=f"{case.title}, {case.law}")
+    shown = [r for r in rows if r.error is not None and r.rounds]
+    errors = [100 * max(claimed(r, reference), SURE) for r in shown] + [100 * GOAL]
+    panel.set_ylim(min(errors) / 1.6, max(errors) * 1.6)
+    ticks(panel.yaxis, max(errors) / min(errors))
+    seconds = [r.timing.median for r in shown]
+    panel.set_xlim(min(seconds) / 1.6, max(seconds) * 1.6)
+    ticks(panel.xaxis, max(seconds) / min(seconds))
+    panel.grid(True, which="major", color="#eeeeee")
+    panel.set_axisbelow(True)
+    return handles
+
+
+# --- the whole ----------------------------------------------------------------------------------------------------------
 
 
 def case_text(case: Case, rows: list[Row], reference: Reference) -> str:
     """A section: what the case is judged by, and its rows."""
     values = ", ".join(f"{x:.7g}" for x in reference.values) or "none"
     good = f", good to {reference.uncertainty:.2%}" if reference.uncertainty else ""
-    told = f"{case.quantity}; reference: {values}{good}; {reference.source}."
+    judged_by = f"{case.quantity}; reference: {values}{good}; {reference.source}."
     note = f"\nNote: {case.note}." if case.note else ""
-    return f"## {case.name}: {case.title}, {case.law}\n\n{told}{note}\n\n{row_table(rows, reference)}"
+    return f"## {case.name}: {case.title}, {case.law}\n\n{judged_by}{note}\n\n{row_table(rows, reference)}"
 
 
 def chosen_meshes(case: Case, quick: bool) -> dict:
@@ -47,71 +262,38 @@ def chosen_meshes(case: Case, quick: bool) -> dict:
     return {element: case.meshes[element][:QUICK_MESHES] for element in (LINEAR, QUADRATIC)}
 
 
-def measure(cases: list[Case], quick: bool, arch: str, document: Document) -> tuple[dict, list]:
-    """Everything, printed as it comes. Returns the numbers, and (case, rows, reference) of each case."""
-    text, numbers = header("First- and second-order tets: error against time")
-    document.add(text)
+def measure(cases: list[Case], quick: bool, arch: str, document: Document) -> tuple[list, list[Comparison]]:
+    """Everything, printed as it comes: (case, rows, reference) of each case, and the comparisons."""
     found, comparisons = [], []
-    runtime = open_runtime(arch, "f64", "the benchmark of orders")
-    try:
+    with closing(open_runtime(arch, "f64", "the benchmark of orders")) as runtime:
         for case in cases:
             rows, reference = measure_case(case, chosen_meshes(case, quick), QUICK_ROUNDS if quick else ROUNDS, runtime)
             found.append((case, rows, reference))
             document.add(case_text(case, rows, reference))
             if reference.values:
-                comparisons += [compare(case, rows, reference, goal) for goal in GOALS]
-                document.add("Time to an error:\n\n" + compare_table(comparisons[-len(GOALS) :]))
-    finally:
-        runtime.close()
-    document.add(f"## Time to {GOAL:.0%} error")
-    document.add(compare_table([c for c in comparisons if c.goal == GOAL]))
-    limits = [] if quick else find_limits(comparisons, [row for _, rows, _ in found for row in rows])
-    if limits:
-        document.add("## Limits")
-        document.add(limit_table(limits))
-    numbers |= {
-        "arch": arch,
-        "precision": "f64",
-        "quick": quick,
-        "load_at_the_end": load_average(),
-        "references": {case.name: asdict(reference) for case, _, reference in found},
-        "rows": [row.record() for _, rows, _ in found for row in rows],
-        "comparisons": [c.record() for c in comparisons],
-        "limits": [x.record() for x in limits],
-    }
-    return numbers, found
-
-
-def parse_options(parser: argparse.ArgumentParser, argv: list[str] | None, drawn: str) -> argparse.Namespace:
-    """--arch, --out and --plot, which is to draw what `drawn` says, beside the parser's own options; the files can be written."""
-    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help=f"draw {drawn}")
-    options = parser.parse_args(argv)
-    check_out(options.out, ".json")
-    check_out(options.plot, ".png")
-    if options.plot:
-        require_matplotlib()
-    return options
+                own = [compare(case, rows, reference, goal) for goal in GOALS]
+                document.add("Time to an error:\n\n" + compare_table(own))
+                comparisons += own
+    document.add(f"## Time to {GOAL:.0%} error\n\n" + compare_table([c for c in comparisons if c.goal == GOAL]))
+    return found, comparisons
 
 
 def main(argv=None) -> int:
     """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
-    first, _, rest = __doc__.partition("\n")
     names = [case.name for case in CASES]
-    parser = argparse.ArgumentParser(prog="taisoft bench order", description=first, epilog=rest.partition("\n\n")[2])
+    parser = make_parser("order", __doc__)
     parser.add_argument("--quick", action="store_true", help="two meshes an order, one round")
     parser.add_argument("--case", choices=names, metavar="NAME", help=f"only this one of {', '.join(names)}")
     options = parse_options(parser, argv, "error against time, a panel a case")
     name = options.case or (HANGING if options.quick else None)
-    document = Document()
-    numbers, found = measure([c for c in CASES if name in (None, c.name)], options.quick, options.arch, document)
-    if options.out:
-        document.write(options.out, numbers)
-    if options.plot:
-        draw(found, options.plot)
-        print(f"written: {options.plot}")
-    return 0 if all(limit["met"] for limit in numbers["limits"]) else 1
+    document, numbers = begin("First- and second-order tets: error against time")
+    cases = [case for case in CASES if name in (None, case.name)]
+    found, comparisons = measure(cases, options.quick, options.arch, document)
+    rows = [row for _, rows, _ in found for row in rows]
+    numbers |= {"precision": "f64", "references": {case.name: reference for case, _, reference in found}}
+    numbers |= {"rows": rows, "comparisons": comparisons}
+    limits = [] if options.quick else find_limits(comparisons, rows)
+    return document.finish(options, numbers, limits, lambda path: draw(found, path))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import numpy as np
 import taisoft as ts
 from taisoft.scene.scene import Body
 
-from .reference_cases.record import GRAVITY, LAWS, face, label, nearest, scene
+from .reference_cases.record import GRAVITY, LAWS, face, nearest, scene
 from .reference_cases.statics import cook_panel
 
 
@@ -40,7 +40,7 @@ LINEAR, QUADRATIC, QUADRATIC_14 = Element(1), Element(2, 2), Element(2, 4)
 
 @dataclass(frozen=True)
 class Reference:
-    """What a case is judged by. values: of its first numbers; those beyond are only told. source: where they are from.
+    """What a case is judged by. values: of its first numbers; those beyond are only shown. source: where they are from.
 
     uncertainty: relative, of the least sure value.
     """
@@ -55,7 +55,7 @@ class Case:
     """One problem with one law, and the cells of its meshes, coarse to fine, for each element.
 
     reference None: with `extrapolated` what the last three order-2 meshes lead to, each of which halves the cells of the one
-    before; otherwise no errors are told. dt: step of a motion [s]; None for an equilibrium.
+    before; otherwise there are no errors. dt: step of a motion [s]; None for an equilibrium.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Case:
     mesh: Callable[[tuple], ts.TetMesh]
     material: dict  # young, poisson, density
     clamped: Callable[[np.ndarray], np.ndarray]  # choice of nodes
-    read: Callable[[Body, object], np.ndarray]  # (body, state) -> numbers; state: StaticResult or a motion's path
+    read: Callable[[Body, object], np.ndarray] | None  # None: a motion's lowest uy of the tip [m] and its time [s]
     meshes: dict[Element, tuple]
     reference: Reference | None = None
     gravity: bool = True
@@ -118,11 +118,6 @@ def _torque(body: Body, state) -> np.ndarray:
     return np.cross(state.positions(body.name)[end], state.reactions(body.name)[end])[:, :1].sum(axis=0)
 
 
-def _lowest(body: Body, path) -> np.ndarray:
-    """Lowest displacement of the tip [m] and its time [s]."""
-    return np.array(path.lowest)
-
-
 # --- meshes -----------------------------------------------------------------------------------------------------------
 
 
@@ -151,40 +146,53 @@ PANEL = {"geometry": {"thickness_z": 10.0, "corner_points_xy": ((0, 0), (48, 44)
 HEAVY = 8.0 * 1.2e6 * STRIP[1] ** 2 / (12.0 * GRAVITY * STRIP[0] ** 3)
 
 
-def _hanging(name: str, title: str, law: str, reference: Reference | None, young: float = 1e6, **more) -> Case:
-    """The beam 4 x 1 x 1 m, clamped at its left end, bends under its own weight."""
-    more = {"meshes": FINER_MESHES, "material": RUBBER | {"young": young}} | more
+def _beam(name: str, title: str, law: str, reference: Reference | None, young: float = 1e6, **more) -> Case:
+    """The beam 4 x 1 x 1 m, clamped at its left end, bends under its own weight, unless `more` says otherwise."""
+    own = {
+        "quantity": "uy of the tip [m]",
+        "read": displacement((2, 0, 0), 1),
+        "meshes": FINER_MESHES,
+        "material": RUBBER | {"young": young},
+    }
+    return Case(name, title, law, mesh=_box(BEAM), clamped=face(0, -2.0), reference=reference, **own | more)
+
+
+def _elastica(name: str, title: str, values: tuple, source: str, density: float = 1.0, **more) -> Case:
+    """A strip clamped at its left end."""
+    material, read = {"young": 1.2e6, "poisson": 0.0, "density": density}, displacement((10, 0, 0), 0, 1)
     return Case(
         name,
         title,
-        law,
-        "uy of the tip [m]",
-        _box(BEAM),
-        clamped=face(0, -2.0),
-        read=displacement((2, 0, 0), 1),
-        reference=reference,
+        "SVK",
+        "ux, uy of the tip [m]",
+        _box(STRIP, True),
+        material,
+        face(0, 0.0),
+        read,
+        STRIP_MESHES,
+        Reference(values, 1e-3, source),
         **more,
     )
 
 
 HANGING = "hanging_beam"  # the case with a wanted ratio
 CASES = (
-    _hanging(
+    _beam(
         HANGING,
         "hanging beam",
         "SNH",
         Reference((-2.70947892267,), 4.3e-4, BRICKS),
         meshes=BEAM_MESHES | {QUADRATIC_14: ((6, 1, 1), (11, 2, 2))},
     ),
-    _hanging("hanging_beam_cor", "hanging beam", "COR", Reference((-2.6807151797,), 3e-4, BRICKS)),
-    _hanging(
+    _beam("hanging_beam_cor", "hanging beam", "COR", Reference((-2.6807151797,), 3e-4, BRICKS)),
+    _beam(
         "hanging_beam_svk",
         "hanging beam, E = 2 MPa",
         "SVK",
         Reference((-1.73061189475,), 5.8e-3, BRICKS + ", two meshes only: not converged"),
         young=2e6,
     ),
-    _hanging(
+    _beam(
         "hanging_beam_svk_1MPa",
         "hanging beam, E = 1 MPa",
         "SVK",
@@ -193,7 +201,7 @@ CASES = (
         note="no value converged in space exists: this law softens where the clamp squeezes it, and fine meshes lose the "
         "equilibrium below the whole load; coarse ones have one because they are too stiff",
     ),
-    _hanging(
+    _beam(
         "hanging_beam_nu0.499",
         "hanging beam, nu = 0.499",
         "SNH",
@@ -218,17 +226,14 @@ CASES = (
         gravity=False,
         load=lambda panel: panel.add_traction(face(0, 48.0), (0.0, 6.25, 0.0)),
     ),
-    Case(
+    _beam(
         "twist",
         "bar twisted by 90 degrees",
         "SNH",
-        "torque [N m]",
-        _box(BEAM),
-        RUBBER,
-        face(0, -2.0),
-        _torque,
-        {LINEAR: ((8, 2, 2), (16, 4, 4), (32, 8, 8)), QUADRATIC: ((4, 1, 1), (8, 2, 2), (16, 4, 4))},
         Reference((21464.5387028,), 2.4e-3, BRICKS),
+        quantity="torque [N m]",
+        read=_torque,
+        meshes={LINEAR: ((8, 2, 2), (16, 4, 4), (32, 8, 8)), QUADRATIC: ((4, 1, 1), (8, 2, 2), (16, 4, 4))},
         gravity=False,
         load=_turned,
     ),
@@ -246,32 +251,15 @@ CASES = (
         gravity=False,
         load=_pulled(1.0, 0.01, BAR[1] * BAR[2]),
     ),
-    Case(
+    _elastica(
         "elastica_shear",
         "elastica, end shear",
-        "SVK",
-        "ux, uy of the tip [m]",
-        _box(STRIP, True),
-        {"young": 1.2e6, "poisson": 0.0, "density": 1.0},
-        face(0, 0.0),
-        displacement((10, 0, 0), 0, 1),
-        STRIP_MESHES,
-        Reference((-3.28941242247, 6.69964181278), 1e-3, ELASTICA),
+        (-3.28941242247, 6.69964181278),
+        ELASTICA,
         gravity=False,
         load=_pulled(10.0, 4.0, STRIP[1] * STRIP[2]),
     ),
-    Case(
-        "elastica_weight",
-        "elastica, own weight",
-        "SVK",
-        "ux, uy of the tip [m]",
-        _box(STRIP, True),
-        {"young": 1.2e6, "poisson": 0.0, "density": HEAVY},
-        face(0, 0.0),
-        displacement((10, 0, 0), 0, 1),
-        STRIP_MESHES,
-        Reference((-2.75575265862, -6.40630717422), 1e-3, HEAVY_ELASTICA),
-    ),
+    _elastica("elastica_weight", "elastica, own weight", (-2.75575265862, -6.40630717422), HEAVY_ELASTICA, HEAVY),
     Case(
         "soft_sheet",
         "soft sheet",
@@ -284,24 +272,16 @@ CASES = (
         {LINEAR: ((18, 1, 8), (38, 2, 18), (56, 3, 26)), QUADRATIC: ((6, 1, 2), (10, 1, 4), (20, 1, 10))},
         Reference((-0.484115899582,), 3e-4, BRICKS),
     ),
-    Case(
+    _beam(
         "beam_fall",
         "falling beam, first swing",
         "SNH",
-        "lowest uy of the tip [m], its time [s]",
-        _box(BEAM),
-        RUBBER,
-        face(0, -2.0),
-        _lowest,
-        MOTION_MESHES,
         Reference((-3.774,), 3.2e-3, FALL),
+        quantity="lowest uy of the tip [m], its time [s]",
+        read=None,
+        meshes=MOTION_MESHES,
         dt=0.01,
-        note="BDF2 with steps of 10 ms up to 1.2 s; the time is that of all steps; when the tip is lowest is only told, and to "
+        note="BDF2 with steps of 10 ms up to 1.2 s; the time is that of all steps; when the tip is lowest is only shown, and to "
         "be compared with 1.100 s, good to 0.7 %",
     ),
 )
-
-
-def mesh_name(element: Element, cells) -> str:
-    """How rows and messages call a mesh."""
-    return f"order {element.order}, {element.points} points, {label(cells)}"

@@ -6,11 +6,7 @@ without the building of the scene and the compiling of its kernels. One of many 
 the first solution without the first launch of each kernel, and has no spread.
 """
 
-import sys
-import warnings
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from time import perf_counter
 
 import numpy as np
 
@@ -20,11 +16,12 @@ from taisoft.backend.runtime import Runtime, compile_clock
 from taisoft.errors import SimulationError, TaisoftError
 from taisoft.static import StaticSolver
 from taisoft.study.measure import TimedRun, advance
-from taisoft.timing import Timing, summarise, time_repeats
+from taisoft.timing import Timing, summarise
 
-from .order_cases import Case, Element, Reference, mesh_name
+from .order_cases import Case, Element, Reference
 from .reference_cases.motion import parabola_vertex
-from .reference_cases.record import nearest
+from .reference_cases.record import label, nearest
+from .runner import progress, repeated, timed, unwarned
 
 TOLERANCE = 1e-6  # of |residual| / |load|
 FALL_SECONDS = 1.2  # the first swing is over
@@ -91,13 +88,6 @@ class Statics:
         self._arena.release()
 
 
-@dataclass(frozen=True)
-class Swing:
-    """What a motion left; lowest: uy of the tip [m] and its time [s]."""
-
-    lowest: tuple[float, float]
-
-
 class Fall:
     """A fall that can be run again and again."""
 
@@ -117,7 +107,7 @@ class Fall:
         if whole.unconverged:
             raise SimulationError(f"{whole.unconverged} of {whole.steps} steps did not converge")
         when, low = parabola_vertex(np.array(heights), self._case.dt)
-        row.measured = self._case.read(self._body, Swing((low, when))).tolist()
+        row.measured = [low, when]
 
     def again(self) -> None:
         """Run from the start."""
@@ -138,7 +128,7 @@ def measure_case(case: Case, meshes: dict[Element, tuple], rounds: int, runtime:
             for cells in chain:
                 row = Row(case.name, case.law, element.order, element.degree, element.points, tuple(cells))
                 rows.append(row)
-                print(f"{case.name}: {mesh_name(element, cells)}", file=sys.stderr, flush=True)
+                progress(f"{case.name}: order {element.order}, {element.points} points, {label(cells)}")
                 _prepare(case, element, row, runs, runtime)
         reference = case.reference or own_reference(case, rows)
         for row in rows:
@@ -154,15 +144,12 @@ def _prepare(case: Case, element: Element, row: Row, runs: list[tuple], runtime:
     """Build, solve once and write down what was found; the run joins `runs`."""
     compiled = compile_clock()
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # order 1 locks where nu is near 1/2: this is what is measured
+        with unwarned():  # order 1 locks where nu is near 1/2: this is what is measured
             scene = case.build(row.cells, element)
         row.tets, row.nodes = scene.bodies[0].mesh.n_tets, len(scene.bodies[0].rest_positions)
         run = (Statics if case.dt is None else Fall)(case, scene, runtime)
         runs.append((run, row))  # from here on it is closed at the end
-        start, before = perf_counter(), compile_clock()
-        run.first(row)
-        seconds = perf_counter() - start - (compile_clock() - before)
+        _, seconds = timed(lambda: run.first(row))
         if seconds > ENOUGH_SECONDS:
             row.rounds.append(seconds)
     except TaisoftError as error:
@@ -175,15 +162,7 @@ def _time(runs: list[tuple], rounds: int) -> None:
     for _ in range(rounds):
         for run, row in runs:
             if not row.failure and sum(row.rounds) < ENOUGH_SECONDS:
-                row.rounds.append(float(np.median(_repeat(run.again))))
-
-
-def _repeat(call: Callable[[], None]) -> list[float]:
-    """Seconds of one call after another, until their sum or number is enough for a round; at least one."""
-    seconds: list[float] = []
-    while not seconds or (sum(seconds) < ROUND_SECONDS and len(seconds) < ROUND_RUNS):
-        seconds.append(time_repeats(call, 1).median)
-    return seconds
+                row.rounds.append(float(np.median(repeated(run.again, ROUND_RUNS, ROUND_SECONDS, least=1))))
 
 
 def own_reference(case: Case, rows: list[Row]) -> Reference:

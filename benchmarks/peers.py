@@ -26,9 +26,18 @@ from taisoft.output.plot import require_matplotlib
 from taisoft.output.report import json_text
 from taisoft.timing import Timing, load_average
 
-from .again import again_text, earlier_numbers, plain
-from .document import RESULTS, Document, check_out, default_out, header, load_text
-from .elasticity_table import limit_table
+from .document import (
+    RESULTS,
+    Document,
+    again_text,
+    check_out,
+    default_out,
+    earlier_numbers,
+    header,
+    limit_table,
+    load_text,
+    plain,
+)
 from .programs import mujoco_flex, newton_works, own, pybullet_soft
 from .programs.tried import TRIED, VERSIONS
 from .works.runs import Row, measure, row_of

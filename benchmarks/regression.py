@@ -2,7 +2,7 @@
 
 taisoft bench regression [--update] [--case NAME] [--arch cpu|cuda]
 
-The numbers lie in benchmarks/data/regression.json, those of each arch apart. They tell of drifts that limits elsewhere let
+The numbers lie in benchmarks/data/regression.json, those of each arch apart. They show drifts that limits elsewhere let
 through: an error that has doubled within its limit, a solver that needs more iterations. A number counts as the same within
 
     errors      5 % of the stored one, plus what another order of sums may make of it: 1e-5 in f32, 1e-9 in f64, or the case's own
@@ -15,7 +15,7 @@ rounds otherwise, which moves the last digits, and an iteration that stops at a 
 stored counts as changed too: --update stores what is found, after the differences have been printed for review. References
 that are no formulas are computed then, and kept.
 
-Times are told, and never judged: as a ratio to products of a sparse matrix with a vector (1 = 100 of 20,000 rows of 27), on one
+Times are shown, and never judged: as a ratio to products of a sparse matrix with a vector (1 = 100 of 20,000 rows of 27), on one
 thread of the same machine in the same run. These gather and multiply as steps do, so that the ratio changes less between machines
 than seconds, or a ratio to a product of dense matrices, which are another kind of work. Exit status: 0, 1 where a number has
 changed, 2 where none is stored.
@@ -38,6 +38,7 @@ from taisoft.output.tables import markdown
 from taisoft.timing import machine, time_repeats, versions
 
 from .regression_cases import CASES, Case, Found
+from .runner import add_arch, make_parser, progress
 
 STORE = Path(__file__).resolve().parent / "data" / "regression.json"
 ERROR_MARGIN, COUNT_MARGIN, COUNT_LEAST, MEMORY_MARGIN = 0.05, 0.05, 2, 1e-3
@@ -57,7 +58,7 @@ class Entry:
 
 
 def baseline() -> float:
-    """Seconds of the unit that times are told in: the best of several, on one thread."""
+    """Seconds of the unit of times: the best of several, on one thread."""
     matrix = sp.diags([1.0] * (2 * BESIDE + 1), range(-BESIDE, BESIDE + 1), shape=(ROWS, ROWS), format="csr")
     x = np.ones(ROWS)
 
@@ -120,19 +121,9 @@ def row(case: Case, new: Entry, old: Entry | None, seconds: float) -> tuple[str,
     """A line of the table."""
     counts = ", ".join(f"{n:,} {name}" for name, n in new.counts.items())
     verdict = "new" if old is None else "CHANGED" if differences(case, new, old) else "same"
-    before = ("-", "-") if old is None else (f"{old.error:.3e}", f"{old.time:.3g}")
-    return (
-        case.name,
-        case.precision,
-        f"{new.error:.3e}",
-        before[0],
-        counts,
-        f"{new.field_bytes:,}",
-        f"{new.time:.3g}",
-        before[1],
-        verdict,
-        f"{seconds:.0f}",
-    )
+    error, taken = ("-", "-") if old is None else (f"{old.error:.3e}", f"{old.time:.3g}")
+    numbers = f"{new.error:.3e}", error, counts, f"{new.field_bytes:,}", f"{new.time:.3g}", taken
+    return case.name, case.precision, *numbers, verdict, f"{seconds:.0f}"
 
 
 HEADINGS = ("case", "", "error", "stored", "counts", "bytes", "time", "stored", "", "s")
@@ -140,40 +131,34 @@ HEADINGS = ("case", "", "error", "stored", "counts", "bytes", "time", "stored", 
 
 def main(argv=None) -> int:
     """Compute, compare and print. Raises OutputError, or SimulationError where the arch cannot be had."""
-    first, _, rest = __doc__.partition("\n")
-    parser = argparse.ArgumentParser(
-        prog="taisoft bench regression",
-        description=first,
-        epilog=rest.partition("\n\n")[2],
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = make_parser("regression", __doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--update", action="store_true", help="store what is found")
     parser.add_argument("--case", metavar="NAME", help="only those whose name begins so")
-    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
+    add_arch(parser)
     options = parser.parse_args(argv)
     cases = [case for case in CASES if case.name.startswith(options.case or "")]
     if not cases:
         parser.error(f"no case begins with {options.case!r}; there are {', '.join(case.name for case in CASES)}")
-    stored, entries, lines, told = load(options.arch, STORE), {}, [], []
+    stored, entries, lines, changes = load(options.arch, STORE), {}, [], []
     missing = [case.name for case in cases if case.name not in stored]
     if missing and not options.update:
         print(f"taisoft bench regression: nothing is stored for {options.arch} of {', '.join(missing)}: --update stores it")
         return 2
     for case in cases:
-        print(case.name, file=sys.stderr, flush=True)
+        progress(case.name)
         begin, old = time.perf_counter(), stored.get(case.name)
         unit = baseline()
         reference = case.reference(options.arch) if options.update or old is None else old.reference
         new = entries[case.name] = make_entry(case.run(options.arch), reference, unit)
         lines.append(row(case, new, old, time.perf_counter() - begin))
-        told += [f"* {case.name}: {change} ({case.what})" for change in (differences(case, new, old) if old else ())]
+        changes += [f"* {case.name}: {change} ({case.what})" for change in (differences(case, new, old) if old else ())]
     print(markdown(HEADINGS, lines, left=(0, 1, 4, 8)))
-    print("\n".join(["", *(told or ["nothing has changed"])]))
+    print("\n".join(["", *(changes or ["nothing has changed"])]))
     if options.update:
         store(entries, options.arch, STORE)
         print(f"written: {STORE}")
         return 0
-    return 1 if told else 0
+    return 1 if changes else 0
 
 
 if __name__ == "__main__":

@@ -7,25 +7,26 @@ stacks of flush cubes do, are not among them.
 """
 
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
-from time import perf_counter
 
 import numpy as np
 
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
-from taisoft.backend.runtime import compile_clock, open_runtime
+from taisoft.backend.runtime import open_runtime
 from taisoft.scene.scene import Scene
 from taisoft.static import StaticSolver
 
 from .collision_cases import DEEP_PENETRATION, SHEET, cubes_setup
 from .collision_runs import Rig
 from .contact_runs import SETTINGS
-from .elasticity_beam import LAWS
+from .elasticity_runs import LAWS
 from .hard_cases.contact import on_slope
 from .hard_cases.shapes import SNH, G, box
 from .reference_cases.record import face
+from .runner import timed
 
 # of a reference: share of the step, and what contacts are solved to even in the step in which sliding ends
 FINER = {"dt": 1 / 8, "contact_tolerance": 1e-5, "newton_tolerance": 1e-6}
@@ -61,18 +62,11 @@ class Case:
     quick: bool = False
 
 
-def timed(call: Callable[[], object]) -> tuple[object, float]:
-    """What a call returns and its seconds without compiling."""
-    begin, compiled = perf_counter(), compile_clock()
-    result = call()
-    return result, perf_counter() - begin - (compile_clock() - compiled)
-
-
 # --- motions ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class DirichletConditions:
+class Motion:
     """A scene run for some seconds. read: simulator -> the numbers that are judged; settings: of the simulator, precision left
     out."""
 
@@ -106,9 +100,9 @@ class DirichletConditions:
         return found.measured
 
 
-def dirichlet(name, what, precision, build, seconds, read, exact=None, quick=False, slack=None, **settings) -> Case:
+def motion(name, what, precision, build, seconds, read, exact=None, quick=False, slack=None, **settings) -> Case:
     """A case that is a motion. exact: the numbers as they should be, where there is a formula."""
-    one = DirichletConditions(build, seconds, read, settings)
+    one = Motion(build, seconds, read, settings)
     reference = one.finer if exact is None else lambda arch: list(exact)
     return Case(name, what, precision, partial(one.run, precision), reference, slack or ROUNDING[precision], quick)
 
@@ -149,7 +143,7 @@ def demo(name: str, precision: str, seconds: float) -> Case:
 
     own = {key: value for key, value in load_scene(name)[1].items() if key in SETTINGS}
     what = f"mean way of the last body after {seconds:g} s; by steps of an eighth in f64"
-    return dirichlet(f"demo {name}", what, precision, lambda: load_scene(name)[0], seconds, way, **own)
+    return motion(f"demo {name}", what, precision, lambda: load_scene(name)[0], seconds, way, **own)
 
 
 # --- the others -------------------------------------------------------------------------------------------------------
@@ -157,32 +151,27 @@ def demo(name: str, precision: str, seconds: float) -> Case:
 
 def static(tolerance: float, order: int, arch: str) -> Found:
     """The equilibrium of the beam: way of its nodes."""
-    runtime, arena, scene = open_runtime(arch, "f64", "the regression cases"), FieldArena(), beam("SNH", order=order)
-    try:
-        solver = StaticSolver(scene, runtime, arena, tolerance, 0.0)
-        result, seconds = timed(solver.solve)
-        measured = (result.positions() - scene.bodies[0].rest_positions).mean(axis=0)
-        counts = {"newton": result.iterations, "linear": result.linear_iterations}
-        status = "ok" if result.converged else "not converged"
-        return Found(measured.tolist(), counts, status, sum(arena.bytes.values()), seconds)
-    finally:
-        arena.release()
-        runtime.close()
+    arena, scene = FieldArena(), beam("SNH", order=order)
+    with closing(open_runtime(arch, "f64", "the regression cases")) as runtime:
+        try:
+            result, seconds = timed(StaticSolver(scene, runtime, arena, tolerance, 0.0).solve)
+            measured = (result.positions() - scene.bodies[0].rest_positions).mean(axis=0)
+            counts = {"newton": result.iterations, "linear": result.linear_iterations}
+            status = "ok" if result.converged else "not converged"
+            return Found(measured.tolist(), counts, status, sum(arena.bytes.values()), seconds)
+        finally:
+            arena.release()
 
 
 def search(setup, arch: str) -> Found:
     """A search for contacts: the least gap."""
-    runtime = open_runtime(arch, "f32", "the regression cases")
-    try:
-        with Rig(setup, "proximity", runtime) as rig:
-            rig.search()
-            _, seconds = timed(rig.search)
-            d = rig.detection
-            counts = {name: int(getattr(d.counts, name)) for name in ("triangles", "active", "found", "contacts")}
-            counts["pairs"] = rig.n_pairs()
-            return Found([float(d.contacts().gap.min())], counts, "ok", sum(d.field_bytes.values()), seconds)
-    finally:
-        runtime.close()
+    with closing(open_runtime(arch, "f32", "the regression cases")) as runtime, Rig(setup, "proximity", runtime) as rig:
+        rig.search()
+        _, seconds = timed(rig.search)
+        d = rig.detection
+        counts = {name: int(getattr(d.counts, name)) for name in ("triangles", "active", "found", "contacts")}
+        counts["pairs"] = rig.n_pairs()
+        return Found([float(d.contacts().gap.min())], counts, "ok", sum(d.field_bytes.values()), seconds)
 
 
 def random_problem(n: int = 120) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -246,19 +235,19 @@ SLOPE = "way down the slope after 0.4 s; by the formula of a rigid cube"
 GAP = "least gap; as built"
 
 CASES: tuple[Case, ...] = (  # those of one precision follow each other: another one starts Taichi anew
-    dirichlet("explicit beam SNH", TIP, "f32", beam, 0.2, way, quick=True, **FALL),
-    dirichlet("explicit beam COR", TIP, "f32", partial(beam, "COR"), 0.2, way, **FALL),
-    dirichlet("explicit beam SVK", TIP, "f32", partial(beam, "SVK"), 0.2, way, **FALL),
-    dirichlet("implicit beam SNH", TIP, "f32", beam, 0.2, way, quick=True, **SWING),
-    dirichlet("explicit slope", SLOPE, "f32", cube_on_slope, 0.4, way_down, slid(0.4), integrator="symplectic_euler", dt=8e-4),
+    motion("explicit beam SNH", TIP, "f32", beam, 0.2, way, quick=True, **FALL),
+    motion("explicit beam COR", TIP, "f32", partial(beam, "COR"), 0.2, way, **FALL),
+    motion("explicit beam SVK", TIP, "f32", partial(beam, "SVK"), 0.2, way, **FALL),
+    motion("implicit beam SNH", TIP, "f32", beam, 0.2, way, quick=True, **SWING),
+    motion("explicit slope", SLOPE, "f32", cube_on_slope, 0.4, way_down, slid(0.4), integrator="symplectic_euler", dt=8e-4),
     demo("cube_on_box", "f32", 0.5),
     Case("search, two cubes", GAP, "f32", partial(search, cubes_setup(3)), lambda _: [-DEEP_PENETRATION / 3], 1e-6, quick=True),
     Case("search, sheet and cube", GAP, "f32", partial(search, SHEET), lambda arch: [-2e-4], 1e-6),
     Case("self-collision", GAP, "f32", self_collision, lambda arch: [2 * RADIUS - THICK], 1e-9),
-    dirichlet("implicit slope", SLOPE, "f64", cube_on_slope, 0.4, way_down, slid(0.4), integrator="implicit_euler", dt=0.01),
-    dirichlet("implicit beam COR", TIP, "f64", partial(beam, "COR"), 0.2, way, **SWING),
-    dirichlet("implicit beam SVK", TIP, "f64", partial(beam, "SVK"), 0.2, way, **SWING),
-    dirichlet("quadratic beam", TIP, "f64", partial(beam, "SNH", (4, 1, 1), 2), 0.2, way, **SWING),
+    motion("implicit slope", SLOPE, "f64", cube_on_slope, 0.4, way_down, slid(0.4), integrator="implicit_euler", dt=0.01),
+    motion("implicit beam COR", TIP, "f64", partial(beam, "COR"), 0.2, way, **SWING),
+    motion("implicit beam SVK", TIP, "f64", partial(beam, "SVK"), 0.2, way, **SWING),
+    motion("quadratic beam", TIP, "f64", partial(beam, "SNH", (4, 1, 1), 2), 0.2, way, **SWING),
     *(
         Case(
             f"static beam, order {order}",

@@ -2,7 +2,7 @@
 
 taisoft bench report [--quick] [--arch cpu|cuda] [--only NAME] [--out DIR]
 
-The page is DIR/README.md, with its pictures and all numbers (report.json) beside it. Scenes are ours: the report's text tells
+The page is DIR/README.md, with its pictures and all numbers (report.json) beside it. Scenes are ours: the report's text gives
 few sizes, and neither its machine nor its materials. A verdict follows from the numbers: a claim holds or not, and a part agrees,
 disagrees, or partly agrees. Times are medians; spread is the distance between the quartiles over the median; compiling is apart.
 A second run into the same folder says which times have not come again within the spreads. Exit status: 0, or 1 where a part could
@@ -10,7 +10,6 @@ not be measured; a verdict, whatever it is, is no failure. --quick has fewer sce
 unless --out says where to write. The whole takes about twelve minutes on two cores.
 """
 
-import argparse
 import os
 import sys
 import time
@@ -25,20 +24,20 @@ from taisoft.output.plot import require_matplotlib
 from taisoft.output.report import json_text
 from taisoft.timing import load_average
 
-from .again import again_text, earlier_numbers, plain
-from .document import default_out, header
-from .report_parts import bound, broad, colours, demos, phases, points, reduction, solvers
+from .document import again_text, default_out, earlier_numbers, header, load_text, plain
+from .report_parts import bound, demos, phases, points, search, solvers
 from .report_parts.page import Extent, Part, part_text, short_text, summary_table
+from .runner import add_arch, make_parser
 
 PARTS: dict[str, Callable[[Extent], Part]] = {
     "demos": demos.measure,
     "phases": phases.measure,
     "points": points.measure,
-    "reduction": reduction.measure,
-    "broad": broad.measure,
-    "cells": broad.measure_cells,
-    "colours": colours.measure,
-    "solvers": solvers.measure,
+    "reduction": search.measure_reduction,
+    "broad": search.measure_broad_phases,
+    "cells": search.measure_cells,
+    "colours": solvers.measure_colours,
+    "solvers": solvers.measure_solvers,
     "bound": bound.measure,
 }
 PAGE, NUMBERS = "README.md", "report.json"
@@ -57,21 +56,14 @@ def measure_part(name: str, extent: Extent) -> Part:
 
 def page_text(head: str, numbers: dict, parts: list[Part], again: str) -> str:
     """The whole page."""
-    load = numbers["load_at_the_end"]
-    end = "unknown" if load is None else f"{load:.1f}"
-    told = (
-        f"{head}\nload {end} at the end; {numbers['seconds']:.0f} s in all, {numbers['compile_seconds']:.0f} s of them "
+    opening = (
+        f"{head}\nload {load_text(numbers['load_at_the_end'])} at the end; {numbers['seconds']:.0f} s in all, "
+        f"{numbers['compile_seconds']:.0f} s of them "
         f"compiling{'; a quick run, with fewer scenes, sizes and rounds' if numbers['quick'] else ''}.\n\nMade by `taisoft bench "
         "report`; nothing on this page is written by hand. Claims are the report's in our words, and hold or not by the numbers "
         "beside them. Times are medians; spread is the distance between the quartiles over the median."
     )
-    return "\n\n".join([told, summary_table(parts), *map(part_text, parts), short_text(parts), again]) + "\n"
-
-
-def check_out(folder: Path) -> None:
-    """Raises OutputError, before minutes of measuring, where the page could not be written."""
-    if not os.access(make_folder(folder), os.W_OK):
-        raise OutputError(f"cannot write to the folder {folder}")
+    return "\n\n".join([opening, summary_table(parts), *map(part_text, parts), short_text(parts), again]) + "\n"
 
 
 def write(folder: Path, head: str, numbers: dict, parts: list[Part]) -> None:
@@ -88,9 +80,8 @@ def write(folder: Path, head: str, numbers: dict, parts: list[Part]) -> None:
 
 def main(argv=None) -> int:
     """Measure and write. Raises OutputError, or SimulationError where the arch cannot be had."""
-    first, _, rest = __doc__.partition("\n")
-    parser = argparse.ArgumentParser(prog="taisoft bench report", description=first, epilog=rest.partition("\n\n")[2])
-    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
+    parser = make_parser("report", __doc__)
+    add_arch(parser)
     parser.add_argument("--quick", action="store_true", help="fewer scenes, sizes and rounds")
     parser.add_argument("--only", choices=tuple(PARTS), metavar="NAME", help=f"one of {', '.join(PARTS)}")
     parser.add_argument("--out", type=Path, metavar="DIR", help="default of the whole: benchmarks/results/report-<machine>")
@@ -98,7 +89,8 @@ def main(argv=None) -> int:
     folder = options.out or (None if options.quick or options.only else default_out(options.arch, "report", suffix=""))
     require_matplotlib("the page's plots")
     if folder is not None:
-        check_out(folder)
+        if not os.access(make_folder(folder), os.W_OK):  # before minutes of measuring
+            raise OutputError(f"cannot write to the folder {folder}")
     head, numbers = header("The report, measured again", options.arch)
     begin, compiled = time.perf_counter(), compile_clock()
     parts = []

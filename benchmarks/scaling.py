@@ -13,50 +13,44 @@ The whole took ten minutes on two cores that others used, too.
 """
 
 import argparse
-import json
-import os
-import subprocess
+import math
 import sys
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import taisoft
-from taisoft.errors import SimulationError
-from taisoft.timing import load_average
+from taisoft.errors import OutputError, SimulationError
+from taisoft.output.plot import require_matplotlib, save, ticks
+from taisoft.output.tables import percent, spread_of
 
-from .again import again_text, earlier_numbers, plain
-from .document import Document, header
-from .order import parse_options
-from .scaling_bytes import Copy, measure_copy
-from .scaling_plot import draw
+from .document import again_text, begin, earlier_numbers, exponent, plain, table
+from .runner import make_parser, parse_options, parse_result, progress, run_python, say
+from .scaling_bytes import GROUPS, Copy, copy_rate, measure_copy
 from .scaling_runs import EXPLICIT, KINDS, ON_ONE, PRECISION, Row, measure
-from .scaling_table import copy_table, growth_table, growths, memory_table, phase_table, rate_table, time_table
 
 SIZES, QUICK_SIZES, CUDA_SIZE = (1_000, 4_000, 16_000, 64_000, 200_000), (500, 2_000), 1_000_000
 COPY = "copy"
-RESULT = "result: "  # before what a child found, among what Taichi prints
+COLOURS = ("#0072b2", "#56b4e9", "#d55e00", "#009e73", "#cc79a7", "#e69f00")
+PANEL = (4.6, 3.6)  # inches
+
+
+# --- processes ----------------------------------------------------------------------------------------------------------
 
 
 def answer(job: str, arch: str) -> None:
     """A child's part: measure "copy", or "kind:size", and print what was found."""
     kind, _, size = job.rpartition(":")
-    found = [asdict(copy) for copy in measure_copy(arch)] if job == COPY else measure(kind, int(size), arch).record()
-    print(RESULT + json.dumps(found), flush=True)
+    say(plain(measure_copy(arch) if job == COPY else measure(kind, int(size), arch)))
 
 
 def ask(job: str, arch: str) -> list | dict | str:
     """What a child finds, or a sentence about why it found nothing."""
-    print(job, file=sys.stderr, flush=True)
-    path = os.pathsep.join([str(Path(taisoft.__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")])
-    command = [sys.executable, "-m", "taisoft", "bench", "scaling", "--child", job, "--arch", arch]
-    done = subprocess.run(
-        command, stdin=subprocess.DEVNULL, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path}, check=False
-    )
-    found = [line for line in done.stdout.splitlines() if line.startswith(RESULT)]
-    if done.returncode == 0 and found:
-        return json.loads(found[-1].removeprefix(RESULT))
-    return (done.stderr.strip().splitlines() or [f"its process ended with status {done.returncode}"])[-1]
+    progress(job)
+    try:
+        lines = run_python(job, "-m", "taisoft", "bench", "scaling", "--child", job, "--arch", arch)
+    except SimulationError as error:
+        return str(error)
+    return [found for line in lines if (found := parse_result(line)) is not None][-1]
 
 
 def measure_all(kinds: list[str], sizes: list[int], arch: str) -> Iterator[Row]:
@@ -71,18 +65,162 @@ def measure_all(kinds: list[str], sizes: list[int], arch: str) -> Iterator[Row]:
             yield row
 
 
-def report(rows: list[Row], copies: list[Copy], document: Document) -> dict:
-    """The tables, printed, and the numbers."""
-    found = growths(rows)
-    document.add("## Phases\n\n" + phase_table(rows))
-    document.add("## Memory\n\n" + memory_table(rows))
-    document.add("## Bytes moved\n\n" + copy_table(copies) + "\n\n" + rate_table(rows, copies))
-    document.add("## Exponents over the tets\n\n" + growth_table(found))
-    return {
-        "rows": [row.record() for row in rows],
-        "copies": [asdict(copy) for copy in copies],
-        "exponents": [growth.record() for growth in found],
-    }
+# --- tables -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Exponents over the tets: of the time of a step by a fit through all meshes and between the last two, of what it takes to
+    set up, of the fields' bytes; nan where there are fewer than two meshes."""
+
+    kind: str
+    meshes: int
+    step: float
+    step_at_last: float
+    setup: float
+    memory: float
+
+
+def measured(rows: Sequence[Row]) -> list[Row]:
+    """The rows that have times."""
+    return [row for row in rows if row.samples]
+
+
+def growths(rows: Sequence[Row]) -> list[Growth]:
+    """One of each kind of work, in the order of the rows."""
+    found = []
+    for kind in dict.fromkeys(row.kind for row in measured(rows)):
+        own = sorted((row for row in measured(rows) if row.kind == kind), key=lambda row: row.tets)
+        tets, step = [row.tets for row in own], [row.timing.median for row in own]
+        found.append(
+            Growth(
+                kind,
+                len(own),
+                exponent(tets, step)[0],
+                exponent(tets[-2:], step[-2:])[0],
+                exponent(tets, [r.setup_seconds for r in own])[0],
+                exponent(tets, [sum(r.field_bytes.values()) for r in own])[0],
+            )
+        )
+    return found
+
+
+WORK = (("<work", "{.kind}"), ("tets", "{.tets:,}"))
+
+
+def time_table(rows: Sequence[Row]) -> str:
+    """Time of a step or a search; failures below."""
+    columns = (
+        *WORK,
+        ("threads", "{.threads}"),
+        ("ms", lambda row: f"{1e3 * row.timing.median:.4g}"),
+        ("spread", lambda row: percent(spread_of(row.timing))),
+        ("ns/tet", lambda row: f"{1e9 * row.timing.median / row.tets:.4g}"),
+        ("<of each, on average", lambda row: ", ".join(f"{value:,.4g} {name}" for name, value in row.counts.items() if value)),
+        ("set up [s]", "{.setup_seconds:.2f}"),
+        ("compile [s]", "{.compile_seconds:.1f}"),
+    )
+    return table(measured(rows), columns, [f"{row.kind}, {row.tets:,} tets: {row.failure}" for row in rows if row.failure])
+
+
+def phase_table(rows: Sequence[Row]) -> str:
+    """Share of each phase."""
+
+    def shares(row: Row) -> str:
+        whole = sum(row.phases.values())
+        return ", ".join(f"{name} {seconds / whole:.0%}" for name, seconds in row.phases.items())
+
+    return table(measured(rows), (*WORK, ("<share of each phase", shares)))
+
+
+def memory_table(rows: Sequence[Row]) -> str:
+    """Bytes of the fields per tet by group, and the most that the process held."""
+
+    def group(name: str):
+        return lambda row: f"{row.field_bytes[name] / row.tets:,.0f}" if row.field_bytes.get(name) else ""
+
+    columns = (
+        *WORK,
+        *((name, group(name)) for name in GROUPS),
+        ("fields [B/tet]", lambda row: f"{sum(row.field_bytes.values()) / row.tets:,.0f}"),
+        ("peak [MB]", lambda row: "-" if row.peak is None else f"{row.peak / 1e6:,.0f}"),
+        ("above the start [B/tet]", lambda row: "-" if row.peak is None else f"{(row.peak - row.base) / row.tets:,.0f}"),
+    )
+    return table(measured(rows), columns)
+
+
+def rate_table(rows: Sequence[Row], copies: Sequence[Copy]) -> str:
+    """Bytes that a step moves at least, per second, against a copy on as many threads."""
+
+    def rate(row: Row) -> float:
+        return row.moved / row.timing.median
+
+    columns = (
+        *WORK,
+        ("moved [MB]", lambda row: f"{row.moved / 1e6:,.3g}"),
+        ("B/tet", lambda row: f"{row.moved / row.tets:,.4g}"),
+        ("GB/s", lambda row: f"{rate(row) / 1e9:.3g}"),
+        ("copy [GB/s]", lambda row: f"{copy_rate(copies, row.threads) / 1e9:.3g}"),
+        ("of the copy", lambda row: f"{rate(row) / copy_rate(copies, row.threads):.0%}"),
+    )
+    return table(measured(rows), columns)
+
+
+def copy_table(copies: Sequence[Copy]) -> str:
+    """A row a copy."""
+    return table(copies, (("<copy by", "{.by}"), ("threads", "{.threads}"), ("GB/s", lambda c: f"{c.rate / 1e9:.3g}")))
+
+
+def growth_table(found: Sequence[Growth]) -> str:
+    """A row a kind of work."""
+
+    def number(name: str):
+        return lambda g: "-" if math.isnan(getattr(g, name)) else f"{getattr(g, name):.2f}"
+
+    names = {"time": "step", "of it, last two": "step_at_last", "set up": "setup", "fields": "memory"}
+    columns = [("<work", "{.kind}"), ("meshes", "{.meshes}"), *((heading, number(name)) for heading, name in names.items())]
+    return table(found, columns)
+
+
+# --- the picture --------------------------------------------------------------------------------------------------------
+
+
+def draw(rows: Sequence[Row], copies: Sequence[Copy], path: Path) -> None:
+    """Write a PNG. Raises OutputError where it cannot be written or drawn."""
+    require_matplotlib()
+    from matplotlib import pyplot
+
+    rows = measured(rows)
+    if not rows:
+        raise OutputError(f"{path}: there is nothing to draw, since nothing could be measured")
+    panels: tuple[tuple[str, Callable[[Row], float]], ...] = (
+        ("time of a step or a search [ns/tet]", lambda row: 1e9 * row.timing.median / row.tets),
+        ("moved at least [GB/s]", lambda row: 1e-9 * row.moved / row.timing.median),
+        ("fields [B/tet]", lambda row: sum(row.field_bytes.values()) / row.tets),
+    )
+    figure, axes = pyplot.subplots(1, 3, figsize=(3 * PANEL[0], PANEL[1] + 0.4), layout="constrained")
+    for axis, (title, value) in zip(axes, panels):
+        for kind, colour in zip(KINDS, COLOURS, strict=True):
+            own = sorted((row for row in rows if row.kind == kind), key=lambda row: row.tets)
+            if not own:
+                continue
+            axis.plot([row.tets for row in own], [value(row) for row in own], "o-", color=colour, ms=4, lw=1.5, label=kind)
+        axis.set(xscale="log", yscale="log", title=title, xlabel="tets")
+        values = [value(row) for row in rows]
+        ticks(axis.yaxis, max(values) / min(values))
+        ticks(axis.xaxis, max(row.tets for row in rows) / min(row.tets for row in rows))
+        axis.xaxis.set_major_formatter("{x:,.0f}")
+        axis.grid(True, which="major", color="#eeeeee")
+        axis.set_axisbelow(True)
+    for n in sorted({copy.threads for copy in copies}):
+        line = axes[1].axhline(1e-9 * copy_rate(copies, n), color="#555555", lw=0.9, ls="--" if n == 1 else ":")
+        line.set_label(f"a copy, {n} thread{'s' if n > 1 else ''}")
+    handles, labels = axes[1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8)
+    save(figure, path)
+
+
+# --- the whole ----------------------------------------------------------------------------------------------------------
 
 
 def size_list(text: str) -> list[int]:
@@ -98,8 +236,7 @@ def size_list(text: str) -> list[int]:
 
 def main(argv=None) -> int:
     """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
-    first, _, rest = __doc__.partition("\n")
-    parser = argparse.ArgumentParser(prog="taisoft bench scaling", description=first, epilog=rest.partition("\n\n")[2])
+    parser = make_parser("scaling", __doc__)
     parser.add_argument("--quick", action="store_true", help="two small meshes of each kind")
     parser.add_argument("--sizes", type=size_list, metavar="LIST", help="numbers of tets; the nearest meshes are taken")
     parser.add_argument("--kind", choices=KINDS, metavar="NAME", help=f"only this one of {', '.join(KINDS)}")
@@ -109,23 +246,23 @@ def main(argv=None) -> int:
         answer(options.child, options.arch)
         return 0
     sizes = options.sizes or list(QUICK_SIZES if options.quick else (*SIZES, *((CUDA_SIZE,) if options.arch == "cuda" else ())))
-    document, (text, numbers) = Document(), header("Scaling", options.arch, PRECISION)
-    document.add(text)
+    document, numbers = begin("Scaling", options.arch, PRECISION)
     copies = ask(COPY, options.arch)
     if isinstance(copies, str):
         raise SimulationError(copies)
     copies = [Copy(**copy) for copy in copies]
     rows = list(measure_all([options.kind] if options.kind else list(KINDS), sizes, options.arch))
+    found = growths(rows)
     document.add("## Time\n\n" + time_table(rows))
-    numbers |= {"arch": options.arch, "precision": PRECISION, "quick": options.quick} | report(rows, copies, document)
-    times = {f"{row.kind}, {row.tets:,} tets": row.timing for row in rows if row.samples}
+    document.add("## Phases\n\n" + phase_table(rows))
+    document.add("## Memory\n\n" + memory_table(rows))
+    document.add("## Bytes moved\n\n" + copy_table(copies) + "\n\n" + rate_table(rows, copies))
+    document.add("## Exponents over the tets\n\n" + growth_table(found))
+    numbers |= {"arch": options.arch, "precision": PRECISION, "quick": options.quick}
+    times = {f"{row.kind}, {row.tets:,} tets": row.timing for row in measured(rows)}
     document.add(again_text(earlier_numbers(options.out), times, numbers))
-    numbers |= {"load_at_the_end": load_average(), "times": plain(times)}
-    if options.out:
-        document.write(options.out, numbers)
-    if options.plot:
-        draw(rows, copies, options.plot)
-        print(f"written: {options.plot}")
+    numbers |= {"rows": rows, "copies": copies, "exponents": found, "times": times}
+    document.finish(options, numbers, (), lambda path: draw(rows, copies, path))
     return 1 if any(row.failure for row in rows) else 0
 
 

@@ -2,11 +2,12 @@
 
 A loop over the whole mesh must read each array that it uses from memory once and write each that it makes once: that is its
 floor, counted from the sizes of the fields. What a loop reads again, gathers by indices from a cache line that it uses in part,
-or fetches before it writes, is not counted; so a small mesh that stays in the caches exceeds a copy, and a share of 100 % of a
+or fetches before it writes, is not counted; so a small mesh that stays in the caches exceeds a copy, and 100 % of a
 copy means that a step is as fast as memory lets it be. LOOPS names what each loop reads and writes. Contacts: a sweep reads the
 numbers of every contact, reads and writes its impulse, and reads and writes the velocities `w` of the nodes.
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -18,10 +19,13 @@ import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel, open_runtime, threads
 
-from .collision_runs import clock
+from .runner import repeated
 
 ELEMENTS = ("x", "nodes", "Dm_inv", "volume", "block_body")
 GATHER = ("element_force", "gather_start", "gather_entry", "mass", "free")
+PCG = ("pcg_y", "pcg_r", "pcg_z", "pcg_p", "pcg_q")
+EDGES = tuple(f"stiffness_{name}" for name in ("element", "edge_start", "edge_entry", "edge_upper", "edge_lower"))
+PROBLEM = tuple(f"problem_{name}" for name in ("node", "arity", "weight", "normal", "tangent", "b", "friction", "factor", "r"))
 LOOPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # reads, writes
     # an explicit step
     "drift": (("x", "v", "acceleration"), ("x", "v")),
@@ -31,35 +35,15 @@ LOOPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # reads, writes
     # an implicit one
     "residual": ((*GATHER, "x", "x_hat", "v_hat"), ("change", "residual", "pcg_rhs")),
     "blocks": (ELEMENTS, ("stiffness_element",)),
-    "edges": (
-        ("stiffness_element", "stiffness_edge_start", "stiffness_edge_entry", "stiffness_edge_upper", "stiffness_edge_lower"),
-        ("stiffness_value",),
-    ),
+    "edges": (EDGES, ("stiffness_value",)),
     "system": (("stiffness_value", "mass"), ("stiffness_value", "stiffness_diagonal")),
-    "iteration": (
-        (
-            "stiffness_value",
-            "stiffness_column",
-            "stiffness_row_start",
-            "stiffness_diagonal",
-            "pcg_inverse",
-            "pcg_y",
-            "pcg_r",
-            "pcg_z",
-            "pcg_p",
-            "pcg_q",
-        ),
-        ("pcg_y", "pcg_r", "pcg_z", "pcg_p", "pcg_q"),
-    ),
+    "iteration": ((*(f"stiffness_{name}" for name in ("value", "column", "row_start", "diagonal")), "pcg_inverse", *PCG), PCG),
     # a search: boxes of triangles, and those of a tree or the cells of a grid
     "boxes": (("surface_triangle", "surface_x", "surface_move"), ("surface_lo", "surface_hi", "surface_normal", "surface_area")),
     "tree": (("surface_lo", "surface_hi", "bvh_link"), ("bvh_lo", "bvh_hi")),
     "cells": (("surface_lo", "surface_hi"), ("hash_first_cell", "hash_cell_count")),
     # a sweep over as many contacts as there is room for
-    "sweep": (
-        tuple(f"problem_{name}" for name in ("node", "arity", "weight", "normal", "tangent", "b", "friction", "factor", "r")),
-        ("problem_r",),
-    ),
+    "sweep": (PROBLEM, ("problem_r",)),
 }
 GROUPS = ("elements and nodes", "matrix", "search", "contacts")
 COPY_BYTES, COPY_ROUNDS = 2**28, 7  # of one of the two arrays: larger than any cache
@@ -124,12 +108,8 @@ def measure_copy(arch: str, n_bytes: int = COPY_BYTES) -> list[Copy]:
 
 
 def _best(n_bytes: int, call: Callable[[], object]) -> float:
-    seconds = []
-    for _ in range(COPY_ROUNDS + 1):
-        begin = clock()
-        call()
-        seconds.append(clock() - begin)
-    return 2 * n_bytes / min(seconds[1:])  # the first compiles, or has its pages made
+    call()  # compiles, or has its pages made
+    return 2 * n_bytes / min(repeated(call, COPY_ROUNDS, math.inf))
 
 
 def copy_rate(copies: Iterable[Copy], n_threads: int) -> float:

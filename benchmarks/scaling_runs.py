@@ -13,7 +13,9 @@ the clock cost a little. The first steps, which compile and let buffers grow, ar
 
 import math
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from time import perf_counter
 
 import numpy as np
@@ -34,11 +36,11 @@ from taisoft.study.measure import advance, warm_up
 from taisoft.timing import Timing, summarise
 
 from .collision_cases import pile_setup, two_cubes
-from .collision_runs import Rig, clock, repeated
-from .contact_captured import patched
-from .contact_runs import REST, Stopwatch, explicit_places
-from .elasticity_beam import MARGIN, beam_scene, n_tets
-from .elasticity_cost import LONGEST_FALL, MOST_STEPS, SAMPLE_SECONDS
+from .collision_runs import Rig
+from .contact_runs import explicit_places
+from .elasticity_runs import MARGIN, beam_scene, n_tets
+from .elasticity_steps import LONGEST_FALL, MOST_STEPS, SAMPLE_SECONDS
+from .runner import Stopwatch, clock, patched, repeated, timed
 from .scaling_bytes import floor_bytes, group_bytes
 
 DT, TINY_DT = 0.01, 1e-6  # [s] of implicit steps; of explicit ones until their limit is known
@@ -108,21 +110,15 @@ def cubes_on_ground(size: int) -> Scene:
     return scene
 
 
-def pile_cells(size: int) -> int:
-    """Cells along the edges of the cubes of a pile."""
-    return max(1, round((size / (27 * 6)) ** (1 / 3)))
-
-
 def _open(row: Row, build: Callable[[int], Scene], size: int, integrator: str, dt: float | None) -> ts.Simulator:
     """A scene's simulator; its numbers go into the row. dt None: MARGIN of the largest stable one."""
     begin = perf_counter()
-    scene = build(size)
-    sim = ts.Simulator(scene, dt=dt or TINY_DT, integrator=integrator, precision=PRECISION, arch=row.arch)
+    sim = ts.Simulator(build(size), dt=dt or TINY_DT, integrator=integrator, precision=PRECISION, arch=row.arch)
     if dt is None:
         sim.dt = MARGIN * sim.stable_dt
     row.setup_seconds = perf_counter() - begin - sim.compile_seconds
     m = sim._dynamics.state.model
-    row.tets = sum(body.mesh.n_tets for body in scene.bodies)
+    row.tets = sum(body.mesh.n_tets for body in sim.scene.bodies)
     row.nodes, row.threads = m.n_nodes, 1 if m.serial else threads()
     return sim
 
@@ -144,12 +140,12 @@ def explicit(row: Row, size: int) -> None:
         steps = max(1, min(MOST_STEPS, round(SAMPLE_SECONDS / a_few)))
         sim.dt = min(sim.dt, LONGEST_FALL / steps)
         _element_seconds(sim, steps)  # compiles
-        share = []
+        fractions = []
         for _ in range(SAMPLES):  # in turn, so that a slow moment of the machine falls on both
             sim.reset()
             row.samples.append(advance(sim, steps).seconds / steps)
-            share.append(min(1.0, _element_seconds(sim, steps) / row.samples[-1]))
-        elements = float(np.median(share)) * row.timing.median
+            fractions.append(min(1.0, _element_seconds(sim, steps) / row.samples[-1]))
+        elements = float(np.median(fractions)) * row.timing.median
         row.phases = {"elements": elements, "nodes": row.timing.median - elements}
         row.field_bytes = group_bytes(sim)
         row.moved = floor_bytes(("drift", "elements", "nodes"), sim.field_bytes)
@@ -179,13 +175,6 @@ def _element_seconds(sim: ts.Simulator, n: int) -> float:
     return (clock() - begin) / n
 
 
-def implicit(row: Row, size: int) -> None:
-    """Steps without contacts."""
-    with _open(row, beam, size, "bdf2", DT) as sim:
-        watch = _one_by_one(row, sim, implicit_places(sim))
-        _end_implicit(row, sim, watch)
-
-
 def explicit_contact(row: Row, size: int) -> None:
     """Steps with contacts, each with a search and a solve."""
     with _open(row, cubes_on_ground, size, "symplectic_euler", None) as sim:
@@ -195,43 +184,34 @@ def explicit_contact(row: Row, size: int) -> None:
         row.moved = floor_bytes(("elements", "update"), sim.field_bytes) + sweep * row.counts["sweeps"]
 
 
-def implicit_contact(row: Row, size: int) -> None:
-    """Steps with contacts inside the Newton loop."""
-    with _open(row, cubes_on_ground, size, "implicit_euler", DT) as sim:
-        watch = _one_by_one(row, sim, implicit_places(sim))
-        _end_implicit(row, sim, watch)
-
-
 def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
     """Where the parts of the simulator's implicit steps are called, for `Stopwatch.on`."""
     places = [
-        ("residual", stage_system, "move"),
-        ("residual", stage_system, "update_impulses"),
-        ("residual", stage_system, "form_residual"),
-        ("matrix", block_csr, "assemble"),
-        ("matrix", block_csr, "to_system"),
+        *(("residual", stage_system, name) for name in ("move", "update_impulses", "form_residual")),
+        *(("matrix", block_csr, name) for name in ("assemble", "to_system")),
         ("matrix", stage_system, "save_diagonal"),
         ("linear solve", pcg, "solve"),
         ("report", simulator, "measure"),
     ]
     contact = sim._dynamics.contact
     if contact is not None:
-        places += [("search", contact.detection, "find"), ("search", contact, "_measure_closing"), ("problem", contact, "begin")]
+        places += [("search", contact.detection, "find"), ("search", contact.measures, "closing"), ("problem", contact, "begin")]
         places.append(("problem", stage_system, "find_factors"))
     return places
 
 
-def _end_implicit(row: Row, sim: ts.Simulator, watch: Stopwatch) -> None:
-    """Bytes of an implicit step: those of its residuals, matrices and iterations of CG without what contacts add."""
-    fields, steps = sim.field_bytes, len(row.samples)
-    row.field_bytes = group_bytes(sim)
-    residuals, matrices = watch.calls["form_residual"], watch.calls["assemble"]
-    row.counts |= {"residuals": residuals / steps, "matrices": matrices / steps}
-    row.moved = (
-        row.counts["residuals"] * floor_bytes(("elements", "residual"), fields)
-        + row.counts["matrices"] * floor_bytes(("blocks", "edges", "system"), fields)
-        + row.counts["linear"] * floor_bytes(("iteration",), fields)
-    )
+def implicit(build: Callable[[int], Scene], integrator: str, row: Row, size: int) -> None:
+    """Implicit steps, with contacts inside the Newton loop or without. Bytes: without what contacts add."""
+    with _open(row, build, size, integrator, DT) as sim:
+        watch = _one_by_one(row, sim, implicit_places(sim))
+        fields, steps = sim.field_bytes, len(row.samples)
+        row.field_bytes = group_bytes(sim)
+        row.counts |= {"residuals": watch.calls["form_residual"] / steps, "matrices": watch.calls["assemble"] / steps}
+        row.moved = (
+            row.counts["residuals"] * floor_bytes(("elements", "residual"), fields)
+            + row.counts["matrices"] * floor_bytes(("blocks", "edges", "system"), fields)
+            + row.counts["linear"] * floor_bytes(("iteration",), fields)
+        )
 
 
 def _one_by_one(row: Row, sim: ts.Simulator, places: list[tuple[str, object, str]]) -> Stopwatch:
@@ -246,14 +226,9 @@ def _one_by_one(row: Row, sim: ts.Simulator, places: list[tuple[str, object, str
         row.failure = "not every step converged"
     row.counts = {name: float(np.mean([getattr(report, own) for report in reports])) for name, own in COUNTS.items()}
     _warm(sim)
-    watch, parts = Stopwatch(), []
+    watch = Stopwatch()
     with watch.on(places):
-        for _ in row.samples:
-            watch.spent.clear()
-            begin = clock()
-            sim.step()
-            whole = clock() - begin
-            parts.append(dict(watch.spent) | {REST: whole - sum(watch.spent.values())})
+        parts = [watch.parts_of(sim.step) for _ in row.samples]
     row.phases = {part: float(np.median([one.get(part, 0.0) for one in parts])) for part in {p: 0 for one in parts for p in one}}
     return watch
 
@@ -267,11 +242,10 @@ def _warm(sim: ts.Simulator) -> None:
 
 def search(row: Row, size: int) -> None:
     """Whole searches, and their phases."""
-    runtime = open_runtime(row.arch, PRECISION, "the benchmark of scaling")
-    try:
-        compiled, begin = compile_clock(), perf_counter()
-        with Rig(pile_setup(pile_cells(size)), "proximity", runtime) as rig:
-            row.setup_seconds = perf_counter() - begin - (compile_clock() - compiled)
+    setup = pile_setup(max(1, round((size / (27 * 6)) ** (1 / 3))))
+    with closing(open_runtime(row.arch, PRECISION, "the benchmark of scaling")) as runtime:
+        rig, row.setup_seconds = timed(lambda: Rig(setup, "proximity", runtime))
+        with rig:
             row.tets, row.nodes = rig.tets, rig.model.n_nodes
             row.threads = 1 if rig.detection.surface.serial else threads()
             for _ in range(2):
@@ -284,15 +258,13 @@ def search(row: Row, size: int) -> None:
             row.field_bytes = {"search": sum(found.values())}
             broad = "tree" if "bvh_link" in found else "cells"
             row.moved = floor_bytes(("boxes", broad), found) + found["contacts"] * counts.found / rig.detection.buffer.capacity
-    finally:
-        runtime.close()
 
 
 KINDS: dict[str, Callable[[Row, int], None]] = {
     EXPLICIT: explicit,
     ON_ONE: explicit_on_one,
-    "implicit": implicit,
+    "implicit": partial(implicit, beam, "bdf2"),
     "search": search,
     "explicit contact": explicit_contact,
-    "implicit contact": implicit_contact,
+    "implicit contact": partial(implicit, cubes_on_ground, "implicit_euler"),
 }

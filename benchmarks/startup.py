@@ -14,26 +14,38 @@ warm processes and of how fast kernels are (a beam of 34,560 tets, sheets that l
 takes about eight minutes then. Exit status: 0, or 1 where a limit is not met or a process failed.
 """
 
-import argparse
 import json
 import resource
 import sys
 import tempfile
 import time
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 
 import numpy as np
 
-from taisoft.timing import load_average
+from taisoft.output.tables import markdown
 
-from .document import Document, check_out, header
-from .elasticity_table import limit_table
-from .startup_table import OTHER, SLOWER, count_table, find_limits, settings_table, speed_table, table
-from .versions import HERE, Version
+from .document import Limit, begin, check_out
+from .runner import HERE, Version, make_parser, progress
 
 CHILD = Path(__file__).with_name("startup_child.py")
 SIZES = {"beam": (3, 4, 5, 6), "cube": (4, 5, 6, 7)}  # cells, and those of another size in each round
 TIMES = 20
+OTHER = "warm, other size"
+SLOWER = {  # than the baseline, at most
+    "symplectic_euler step": 1.2,
+    "implicit_euler step": 1.25,
+    "energies": 1.15,
+    "force differential": 1.15,
+    "search, 704 triangles": 1.15,
+    "search, 2,528 triangles": 1.15,
+    "contact step, 704 triangles": 1.15,
+    "contact step, 2,528 triangles": 1.15,
+}
+CROSSING = "1,964 triangles"  # the first sheet that is searched by all threads
+SCENES, IN_ONE = tuple(SIZES), ("first", "second", "other size")
 SPEED_CELLS, SPEED_SHEETS, SPEED_ROUNDS = 12, (12, 24), 5
 # in processes of their own: task -> its arguments, and those of --quick
 TASKS = {
@@ -61,7 +73,7 @@ def measure(versions: list[Version], quick: bool) -> list[dict]:
         for own, waiting in zip(found, measure_waiting(versions, name, quick)):
             own[name] = waiting
     for what, task in TASKS.items():
-        tell(what)
+        progress(what)
         for own, version in zip(found, versions):
             own[what] = ask(version, what, *task[quick])[0]
     for own, speed in zip(found, measure_speed(versions, quick)):
@@ -75,17 +87,17 @@ def measure_waiting(versions: list[Version], name: str, quick: bool) -> list[dic
     Each round takes another mesh size: a version that compiles for every size is warm at one that it has had.
     """
     cells, *others = SIZES[name]
-    tell(f"{name}, cold")
+    progress(f"{name}, cold")
     found = [{"cold": ask(version, "first", name, cells)[1], "warm": [], OTHER: [], "new files": []} for version in versions]
     for other in others[:1] if quick else others:
-        tell(f"{name}, warm, then {other} cells")
+        progress(f"{name}, warm, then {other} cells")
         for own, version in zip(found, versions):
             own["warm"].append(ask(version, "first", name, cells)[1])
         for own, version in zip(found, versions):
             before = version.files()
             own[OTHER].append(ask(version, "first", name, other)[1])
             own["new files"].append(len(version.files() - before))
-    tell(f"{name}, one process")
+    progress(f"{name}, one process")
     for own, version in zip(found, versions):
         own |= {what: median(own[what]) for what in ("warm", OTHER)}
         own["one process"] = ask(version, "again", name, cells, others[0])[0]
@@ -97,7 +109,7 @@ def measure_speed(versions: list[Version], quick: bool) -> list[dict[str, list[f
     """Of each version, times [s] by round."""
     found: list[dict[str, list[float]]] = [{what: [] for what in SLOWER} for _ in versions]
     for k in range(1 if quick else SPEED_ROUNDS):
-        tell(f"speed, round {k + 1}")
+        progress(f"speed, round {k + 1}")
         for version, times in zip(versions, found):
             for what, seconds in ask(version, "speed", 2 if quick else SPEED_CELLS, *SPEED_SHEETS)[0].items():
                 times[what].append(seconds)
@@ -110,37 +122,130 @@ def median(times: list[dict]) -> dict:
     return middle | {"walls": [one["wall"] for one in times]}
 
 
-def tell(what: str) -> None:
-    """What is being measured, to who waits."""
-    print(what, file=sys.stderr, flush=True)
+# --- tables and limits --------------------------------------------------------------------------------------------------
+
+
+def waiting_table(found: dict[str, dict]) -> str:
+    """A row for each thing a user waits for, a column for each version."""
+
+    def row(label: str, *keys: str) -> tuple[str, ...]:
+        times = [reduce(getitem, keys, one) for one in found.values()]
+        return label, *(f"{t['wall']:.3g} ({t['cpu']:.3g})" for t in times)
+
+    rows = []
+    for name in SCENES:
+        rows += [row(f"{name}, {what}", name, what) for what in ("cold", "warm", OTHER)]
+        rows += [row(f"{name}, {what} in one process", name, "one process", what) for what in IN_ONE]
+    rows += [row(f"static solve, {what}", "statics", str(k)) for k, what in enumerate(("first", "second", "third"))]
+    rows.append(row("nine static solves", "identify"))
+    return markdown(("wall (CPU) [s]", *found), rows, left=(0,))
+
+
+def settings_table(found: dict[str, dict]) -> str:
+    """What changes of an open simulator cost."""
+    versions = list(found.values())
+    rows = [(what, *(f"{1e3 * one['settings'][what]:.2f}" for one in versions)) for what in versions[0]["settings"]]
+    return markdown(("cube with contacts, wall [ms]", *found), rows, left=(0,))
+
+
+def speed_table(found: dict[str, dict]) -> str:
+    """How fast kernels are, with the range over rounds."""
+
+    def cell(times: np.ndarray) -> str:
+        return f"{np.median(times):.3g} ({times.min():.3g} to {times.max():.3g})"
+
+    rows = [(what, *(cell(1e3 * np.array(one["speed"][what])) for one in found.values())) for what in SLOWER]
+    return markdown(("wall [ms], median (range over rounds)", *found), rows, left=(0,))
+
+
+def count_table(found: dict[str, dict]) -> str:
+    """Kernels compiled, unknown of old versions, files in the cache, memory."""
+    versions, rows = list(found.values()), []
+
+    def count(n: int | None) -> str:
+        return "unknown" if n is None else str(n)
+
+    for name in SCENES:
+        for what in IN_ONE:
+            counts = [count(one[name]["one process"][what]["compiled"]) for one in versions]
+            rows.append((f"{name}: kernels compiled, {what}", *counts))
+        rows.append((f"{name}: new files, {OTHER}, by round", *(", ".join(map(str, one[name]["new files"])) for one in versions)))
+        rows.append((growth_of(versions[0], name), *(f"{growth(one[name]['memory']):.1f}" for one in versions)))
+    for size in versions[0]["surfaces"]:
+        rows.append((f"sheet: kernels compiled, {size}", *(count(one["surfaces"][size]) for one in versions)))
+    each = [growth(one["keep"]) / one["keep"]["times"] for one in versions]
+    rows.append(("closed simulator that is kept: resident memory [MB]", *(f"{mb:.1f}" for mb in each)))
+    return markdown(("count", *found), rows, left=(0,))
+
+
+def growth(memory: dict) -> float:
+    """Of resident memory [MB]."""
+    return memory["end"] - memory["start"]
+
+
+def growth_of(one: dict, name: str) -> str:
+    """What `growth` of a scene is over."""
+    return f"{name}: growth of resident memory over {one[name]['memory']['times']} simulators [MB]"
+
+
+def find_limits(now: dict, old: dict | None) -> list[Limit]:
+    """What start-up must keep."""
+    limits = [Limit("cube: cold, from process start to the tenth step [s]", now["cube"]["cold"]["wall"], 15.0)]
+    for name in SCENES:
+        one = now[name]["one process"]
+        for what in ("second", "other size"):
+            limits.append(Limit(f"{name}: kernels compiled, {what}", one[what]["compiled"], 0))
+        limits.append(Limit(f"{name}: new files in the cache, other size", max(now[name]["new files"]), 0))
+        limits.append(Limit(growth_of(now, name), growth(now[name]["memory"]), 10.0))
+    _, *later = now["surfaces"]
+    for size in later:
+        if size != CROSSING:  # there the search takes other kernels
+            limits.append(Limit(f"sheet: kernels compiled, {size}", now["surfaces"][size], 0))
+    kept = now["keep"]
+    limits.append(Limit(f"growth of resident memory over {kept['times']} kept closed simulators [MB]", growth(kept), 10.0))
+    return limits + (compare(now, old) if old else [])
+
+
+def compare(now: dict, old: dict) -> list[Limit]:
+    """The limits that are shares of the baseline's times."""
+    limits = []
+    for name in SCENES:
+        second = [one[name]["one process"]["second"]["wall"] for one in (now, old)]
+        limits.append(Limit(f"{name}: second simulator over the baseline's", second[0] / second[1], 0.1))
+        walls = [one[name][OTHER]["walls"] for one in (now, old)]
+        limits.append(Limit(f"{name}: {OTHER}, over the baseline's", ratio(*walls), 0.5))
+    static = now["statics"]["1"]["wall"] / old["statics"]["1"]["wall"]
+    limits.append(Limit("second static solve over the baseline's", static, 0.15))
+    limits.append(Limit("nine static solves over the baseline's", now["identify"]["wall"] / old["identify"]["wall"], 0.1))
+    for what, most in SLOWER.items():
+        limits.append(Limit(f"{what} over the baseline's", ratio(now["speed"][what], old["speed"][what]), most))
+    return limits
+
+
+def ratio(now: list[float], old: list[float]) -> float:
+    """Median over rounds of the ratio within a round."""
+    return float(np.median(np.array(now) / np.array(old)))
 
 
 def main(argv=None) -> int:
     """Measure and print. Raises SimulationError where a process fails, OutputError where a file cannot be written."""
-    first, _, rest = __doc__.partition("\n")
-    parser = argparse.ArgumentParser(prog="taisoft bench startup", description=first, epilog=rest.partition("\n\n")[2])
+    parser = make_parser("startup", __doc__)
     parser.add_argument("--quick", action="store_true", help="one round, small meshes, two simulators for memory, no limit")
     parser.add_argument("--baseline", type=Path, metavar="FOLDER", help="another version of taisoft to compare with")
     parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
     options = parser.parse_args(argv)
     check_out(options.out, ".json")
-    document, (text, numbers) = Document(), header("Start-up", "arch cpu")
-    document.add(text)
+    document, numbers = begin("Start-up", "arch cpu")
     with tempfile.TemporaryDirectory() as caches:
         folders = {label: folder for label, folder in (("this version", HERE), ("baseline", options.baseline)) if folder}
         versions = [Version(one.resolve(), Path(caches) / label.replace(" ", "_")) for label, one in folders.items()]
         found = dict(zip(folders, measure(versions, options.quick)))
-    document.add("## Waiting\n\n" + table(found))
+    document.add("## Waiting\n\n" + waiting_table(found))
     document.add("## Counts\n\n" + count_table(found))
     document.add("## Changes\n\n" + settings_table(found))
     document.add("## Speed\n\n" + speed_table(found))
     limits = [] if options.quick else find_limits(found["this version"], found.get("baseline"))
-    if limits:
-        document.add("## Limits\n\n" + limit_table(limits))
-    if options.out:
-        numbers |= {"quick": options.quick, "load_at_the_end": load_average(), "limits": [limit.record() for limit in limits]}
-        document.write(options.out, numbers | found)
-    return 0 if all(limit.met for limit in limits) else 1
+    return document.finish(options, numbers | found, limits)
 
 
 if __name__ == "__main__":

@@ -66,7 +66,7 @@ def timed(what: Callable) -> dict[str, float]:
 
 
 def compiled() -> int | None:
-    """How many kernels have been compiled so far, None where the version cannot tell."""
+    """How many kernels have been compiled so far, None where the version does not count them."""
     try:
         from taisoft.backend.runtime import n_compiled
     except ImportError:

@@ -13,8 +13,8 @@ from following import follow, simulator
 from scenes import SNH, SVK, built, driven_scene, mixed_scene
 
 import taisoft as ts
-from benchmarks.contact_captured import GOAL
-from benchmarks.contact_crossover import measure_crossover
+from benchmarks.contact_colouring import measure_crossover
+from benchmarks.contact_runs import GOAL
 from taisoft.backend.runtime import open_runtime
 from taisoft.fem.measure import measure
 from taisoft.fem.node_graph import EVERYTHING

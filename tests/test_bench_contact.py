@@ -4,7 +4,7 @@
 * colourings are proper and need no fewer colours than contacts meet at a node;
 * a step is told in parts, each call's time counted once; steps of a run with their iterations;
 * the plates of the crossover lie on each other as they say; both solvers solve them;
-* limits are met or not; the whole prints, writes and draws, and a limit that is not met is the exit status.
+* limits are met or not; the whole prints and writes, and a limit that is not met is the exit status.
 """
 
 import json
@@ -14,31 +14,47 @@ import contact_oracle as oracle
 import numpy as np
 import pytest
 
-from benchmarks import contact, contact_captured, contact_crossover, contact_drops_table, contact_free_table, contact_runs
-from benchmarks.contact_captured import COLOURED, GOAL, SERIAL, Outcome, Solvers, contact_jacobian, patched, shown
-from benchmarks.contact_colours import REPORT, Colouring, colour_all, colour_table, proper
-from benchmarks.contact_crossover import Point, build_plates, crossover_text, find_under, grid, measure_crossover
-from benchmarks.contact_plot import Snapshot, take_snapshot
+from benchmarks import contact, contact_colouring, contact_runs, contact_versions, runner
+from benchmarks.contact import CONTACTS, PILE, STEP_SCENE, count_table, find_limits
+from benchmarks.contact_colouring import (
+    REPORT,
+    Colouring,
+    Point,
+    build_plates,
+    colour_all,
+    colour_table,
+    crossover_text,
+    find_under,
+    grid,
+    measure_crossover,
+    proper,
+)
 from benchmarks.contact_problems import PLAIN
 from benchmarks.contact_problems import Row as ProblemRow
 from benchmarks.contact_runs import (
     COLD,
+    COLOURED,
+    GOAL,
     PARTS,
-    REST,
+    SERIAL,
     WARM,
     Film,
+    Outcome,
     Run,
+    Solvers,
     StepCost,
-    Stopwatch,
+    contact_jacobian,
     measure_film,
     measure_run,
     measure_step,
     open_explicit,
     open_scene,
+    shown,
     to_impulses,
 )
-from benchmarks.contact_table import CONTACTS, PILE, STEP_SCENE, count_table, find_limits
 from benchmarks.report_parts import phases
+from benchmarks.report_parts.solvers import take_snapshot
+from benchmarks.runner import REST, Stopwatch, patched
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import open_runtime
 from taisoft.contact import SOLVERS
@@ -62,7 +78,7 @@ def sim():
 
 
 def test_every_solver_gets_the_same_problem_and_is_judged_rightly(sim, monkeypatch):
-    judged, plain = [], contact_captured.make_judge
+    judged, plain = [], contact_runs.make_judge
 
     def logged(p):
         judge, contacts, W = plain(p), read(p), None
@@ -76,7 +92,7 @@ def test_every_solver_gets_the_same_problem_and_is_judged_rightly(sim, monkeypat
 
         return judge_too
 
-    monkeypatch.setattr(contact_captured, "make_judge", logged)
+    monkeypatch.setattr(contact_runs, "make_judge", logged)
     film = measure_film(SCENE, sim, 6, Solvers(threads=False))
     assert film.tets == 215 and 0 < film.dt < film.stable_dt and film.solvers == list(SOLVERS)
     assert 2 <= len(film.time) == len(film.contacts) <= 6 and np.all(np.diff(film.time) > 0)
@@ -149,7 +165,7 @@ def test_a_step_in_parts(sim):
 
 def test_a_call_inside_another_counts_once(monkeypatch):
     now = [0.0]
-    monkeypatch.setattr(contact_runs, "clock", lambda: now[0])
+    monkeypatch.setattr(runner, "clock", lambda: now[0])
     watch = Stopwatch()
 
     def wait(seconds):
@@ -204,7 +220,7 @@ def test_both_solve_the_plates(sim):
         runtime.close()
     assert point.contacts == len(contacts.arity) and 3 <= point.colours < point.contacts
     assert max(point.serial.residual, point.coloured.residual) <= GOAL and min(point.serial.sweeps, point.coloured.sweeps) > 0
-    assert len(point.serial.seconds) == contact_crossover.ROUNDS and min(point.coloured.colouring) > 0
+    assert len(point.serial.seconds) == contact_colouring.ROUNDS and min(point.coloured.colouring) > 0
     exact = oracle.gauss_seidel(contacts.W, contacts.b, contacts.friction, 50)
     assert oracle.residual(contacts.W, contacts.b, contacts.friction, exact) < GOAL
 
@@ -272,12 +288,12 @@ def made(scenes=(SCENE, "two_cubes_two_boxes"), ms=1.9, wall=2.9, status="ok", r
 
 
 def test_limits():
-    assert [limit.met for limit in find_limits(made(), GOAL)] == [True] * 6
-    bad = find_limits(made(ms=2.1, wall=3.1, status="degraded", residual=2e-4, verdict="best: FAIL"), GOAL)
+    assert [limit.met for limit in find_limits(made())] == [True] * 6
+    bad = find_limits(made(ms=2.1, wall=3.1, status="degraded", residual=2e-4, verdict="best: FAIL"))
     assert [limit.met for limit in bad] == [False, True, False, False, False, False]
     assert bad[4].value == 8 and STEP_SCENE in bad[0].what
     nothing = {"films": [], "steps": [], "runs": [], "problems": []}
-    assert not any(limit.met for limit in find_limits(nothing, GOAL))
+    assert not any(limit.met for limit in find_limits(nothing))
 
 
 def test_counts_beside_the_report_and_the_crossover():
@@ -290,19 +306,16 @@ def test_counts_beside_the_report_and_the_crossover():
 
 @pytest.fixture
 def faked(monkeypatch):
-    colours = {way: np.arange(4) % 2 for way in ("random", "greedy")}
-    snapshots = [Snapshot(SCENE, np.zeros((4, 4, 3), np.uint8), np.eye(4, dtype=bool), colours)]
     found = [made()]
-    monkeypatch.setattr(contact, "measure", lambda quick, arch, document: (found[0], snapshots))
+    monkeypatch.setattr(contact, "measure", lambda quick, arch, document: found[0])
     return found
 
 
-def test_the_whole_writes_and_draws(faked, tmp_path, capsys):
-    pytest.importorskip("matplotlib")
-    out, plot = tmp_path / "new" / "a.json", tmp_path / "a.png"
-    assert contact.main(["--out", str(out), "--plot", str(plot)]) == 0
+def test_the_whole_writes_what_it_prints(faked, tmp_path, capsys):
+    out = tmp_path / "new" / "a.json"
+    assert contact.main(["--out", str(out)]) == 0
     printed, numbers = capsys.readouterr().out, json.loads(out.read_text())
-    assert out.with_suffix(".md").read_text().strip() in printed and plot.read_bytes()[:4] == b"\x89PNG"
+    assert out.with_suffix(".md").read_text().strip() in printed
     assert numbers["films"][0]["outcomes"][WARM][SERIAL][0]["sweeps"] == 5 and len(numbers["limits"]) == 6
     assert "## Limits" in printed and "NOT met" not in printed
 
@@ -348,7 +361,7 @@ def test_captured_states_are_solved_again(tmp_path, capsys):
 def test_bodies_that_fall(tmp_path, capsys):
     """The first steps of a cube at rest, this version beside itself: the same iterations."""
     out = tmp_path / "drops.json"
-    here = str(contact_drops_table.HERE)
+    here = str(contact_versions.HERE)
     assert contact.main(["--drops", "--quick", "--only", "cube at rest", "--baseline", here, "--out", str(out)]) == 0
     runs = json.loads(out.read_text())["runs"]
     this, older = (runs[label]["cube at rest"] for label in ("this", "older"))
@@ -358,14 +371,14 @@ def test_bodies_that_fall(tmp_path, capsys):
         label: {name: own["cube at rest"] | {"seconds": [times] * 5} for name in ("bunny", "cloth")}
         for label, own, times in (("this", runs["this"], 1.0), ("older", runs["older"], 4.0))
     }
-    met = {limit.what: limit.met for limit in contact_drops_table.limits_of(whole)}
+    met = {limit.what: limit.met for limit in contact_versions.drop_limits(whole)}
     assert met["bunny: time of the older version over this one's"] and not met["cloth: time of the older version over this one's"]
     assert len(met) == 6 and sum(met.values()) == 4
 
 
 def test_steps_without_contacts(tmp_path, capsys):
     """A few steps and static solves, this version beside itself; what one version alone converges in is not told."""
-    out, here = tmp_path / "free.json", str(contact_free_table.HERE)
+    out, here = tmp_path / "free.json", str(contact_versions.HERE)
     names = ["beam, BDF2", "static beams"]
     only = [word for name in names for word in ("--only", name)]
     assert contact.main(["--free", "--quick", *only, "--baseline", here, "--out", str(out)]) == 0
@@ -377,9 +390,9 @@ def test_steps_without_contacts(tmp_path, capsys):
     assert capsys.readouterr().out.count("| beam, BDF2") == 2
     older |= {"converged": [True, False, True], "newton": [1, 1, 1]}
     own = {"this": [this], "older": [older]}
-    assert contact_free_table.total(own, "this", "newton")[0] == this["newton"][0] + this["newton"][2]
-    limits = {limit.what: limit for limit in contact_free_table.limits_of({"static beams": own})}
+    assert contact_versions.total(own, "this", "newton")[0] == this["newton"][0] + this["newton"][2]
+    limits = {limit.what: limit for limit in contact_versions.free_limits({"static beams": own})}
     more = limits["static beams: Newton iterations over the older version's"]
     assert more.value == (this["newton"][0] + this["newton"][2]) / 2 and not more.met
-    inverted = contact_free_table.limits_of({"inverted beam, BDF2": {"this": [this]}})
+    inverted = contact_versions.free_limits({"inverted beam, BDF2": {"this": [this]}})
     assert [limit.value for limit in inverted] == [sum(this["newton"]) / 3]

@@ -15,11 +15,27 @@ import pytest
 
 import taisoft as ts
 from benchmarks import document, elasticity, elasticity_runs
-from benchmarks.elasticity_beam import beam_scene, follow_tip, measure_memory, steps_within_limit
-from benchmarks.elasticity_cost import Cost, cost_limits, cost_table, measure_costs
-from benchmarks.elasticity_frames import Frames, frame_limits, frame_table, measure_frames
-from benchmarks.elasticity_runs import Row, lasting_steps, make_rows, measure_rows, time_ratio
-from benchmarks.elasticity_table import Limit, slug
+from benchmarks.document import Limit, slug
+from benchmarks.elasticity_runs import (
+    Row,
+    beam_scene,
+    follow_tip,
+    lasting_steps,
+    make_rows,
+    measure_rows,
+    steps_within_limit,
+    time_ratio,
+)
+from benchmarks.elasticity_steps import (
+    Cost,
+    Frames,
+    cost_limits,
+    cost_table,
+    frame_limits,
+    frame_table,
+    measure_costs,
+    measure_frames,
+)
 from benchmarks.exact_path import SAMPLE, FallingBeam, load_exact
 from taisoft.errors import OutputError, SimulationError
 from taisoft.fem.reference import lumped_masses
@@ -195,7 +211,6 @@ def tiny(monkeypatch):
     monkeypatch.setattr(elasticity, "QUICK", TINY)
     monkeypatch.setattr(elasticity, "measure_costs", lambda *a: measure_costs(*a, ("SVK",), ("velocity_verlet",)))
     monkeypatch.setattr(elasticity, "measure_frames", lambda *a: measure_frames(*a, ("velocity_verlet",)))
-    monkeypatch.setattr(elasticity, "measure_memory", lambda *a: measure_memory(*a, integrators=("velocity_verlet",)))
     monkeypatch.setattr(
         elasticity, "make_rows", lambda cells, arch, peers, seconds: [Row(540, *r) for r in rows if peers or r[0] == "taisoft"]
     )
@@ -222,16 +237,9 @@ def test_the_whole_with_a_peer(tiny, lent, tmp_path, monkeypatch, capsys):
     assert (frames["tets"], frames["steps"], len(frames["run"]), len(frames["alone"])) == (540, 84, 2, 2)
     assert frames["ratio"]["minimum"] > 0
     assert numbers["arch"] == "cpu" and numbers["quick"] is True and numbers["mujoco_left_out"] is None
-    assert numbers["memory"][1]["bytes_per_tet"] == pytest.approx(144, rel=0.2)
     shown, kept = capsys.readouterr().out, (tmp_path / "new" / "e.md").read_text()
     assert kept.strip() in shown
-    for part in (
-        "| MuJoCo ",
-        "2.0000% | (1.0000%)",
-        "## Memory",
-        "bytes of fields per tet, velocity_verlet, 540 tets",
-        "cores, load",
-    ):
+    for part in ("| MuJoCo ", "2.0000% | (1.0000%)", "cores, load"):
         assert part in kept
 
 
@@ -242,7 +250,6 @@ def test_the_whole_without_a_peer(tiny, monkeypatch, capsys):
     monkeypatch.setattr(elasticity, "run_mujoco", absent)
     monkeypatch.setattr(elasticity, "QUICK", replace(TINY, precisions=()))
     monkeypatch.setattr(elasticity, "measure_frames", lambda *a: [])
-    monkeypatch.setattr(elasticity, "measure_memory", lambda *a: [])
     assert elasticity.main(["--quick"]) == 0
     shown = capsys.readouterr().out
     assert "MuJoCo is not compared with: the comparison needs the package mujoco.\n" in shown

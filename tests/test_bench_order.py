@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from benchmarks import order, order_runs
+from benchmarks.order import Reach, compare, find_limits, row_table, time_to
 from benchmarks.order_cases import CASES, HANGING, HEAVY, LINEAR, QUADRATIC, QUADRATIC_14, STRIP, Reference
 from benchmarks.order_runs import Row, judge, measure_case, own_reference
-from benchmarks.order_table import Reach, compare, find_limits, row_table, time_to
 from benchmarks.reference_cases.record import GRAVITY
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError
@@ -310,7 +310,7 @@ def test_the_whole_writes_and_draws_what_it_prints(faked, tmp_path, capsys, monk
 
 def test_a_limit_that_is_not_met_is_the_exit_status(faked, monkeypatch, capsys):
     """Around times that give a ratio of 1, which is not the wanted one."""
-    monkeypatch.setattr(order_runs, "time_repeats", lambda call, repeats: type("T", (), {"median": 1.0}))
+    monkeypatch.setattr(order_runs, "repeated", lambda *arguments, **named: [1.0])
     same = {LINEAR: ((2, 2, 2), (8, 8, 8)), QUADRATIC: ((1, 1, 1), (2, 2, 2))}
     monkeypatch.setattr(order, "CASES", [replace(BEAM, meshes=same)])
     assert order.main([]) == 1

@@ -15,16 +15,13 @@ import pytest
 from matplotlib import image as pictures
 
 from benchmarks import document, report
-from benchmarks.again import again_text, agrees
 from benchmarks.collision_cases import cubes_setup
 from benchmarks.collision_runs import HASH, PHASES, TREES, Rig, Row, Sweep
 from benchmarks.collision_runs import Film as SearchFilm
-from benchmarks.contact_captured import COLOURED, THREADED, Outcome
-from benchmarks.contact_colours import Colouring
-from benchmarks.contact_crossover import Point
-from benchmarks.contact_runs import COLD, PARTS, REST, WARM, Film
-from benchmarks.fit import exponent
-from benchmarks.report_parts import bound, broad, colours, demos, phases, plain, points, reduction, solvers
+from benchmarks.contact_colouring import Colouring, Point
+from benchmarks.contact_runs import COLD, COLOURED, PARTS, THREADED, WARM, Film, Outcome
+from benchmarks.document import again_text, agrees, exponent
+from benchmarks.report_parts import bound, demos, phases, points, search, solvers
 from benchmarks.report_parts.page import (
     AGREE,
     DISAGREE,
@@ -38,6 +35,7 @@ from benchmarks.report_parts.page import (
     small_png,
     verdict_of,
 )
+from benchmarks.runner import REST
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError
 from taisoft.mesh.sdf_grid import SdfGrid
@@ -117,20 +115,20 @@ def film_of(**numbers) -> SearchFilm:
 def test_broad_phases():
     before = film_of(**{HASH: (1.0, 1.1), TREES[-1]: (2.0, 2.1)})
     crossing = [sweep(1000, 2.0, 1.0), sweep(5000, 1.5, 1.2), sweep(12000, 2.0, 2.6), sweep(80000, 3.0, 9.0)]
-    assert holds(broad.claims_of(before, crossing)) == [True, True, True]
+    assert holds(search.broad_claims(before, crossing)) == [True, True, True]
     slower = [sweep(s.tets, 2.0, 1.0) for s in crossing]
-    claims = broad.claims_of(film_of(**{HASH: (1.0, 3.0), TREES[-1]: (2.0, 2.0)}), slower)
+    claims = search.broad_claims(film_of(**{HASH: (1.0, 3.0), TREES[-1]: (2.0, 2.0)}), slower)
     assert holds(claims) == [False, True, False] and "50% of 2 frames" in claims[0].found and "do not cross" in claims[2].found
     early = [sweep(100, 2.0, 1.0), sweep(1000, 1.0, 2.0), sweep(80000, 3.0, 9.0)]
-    assert holds(broad.claims_of(before, early)) == [True, False, False]
+    assert holds(search.broad_claims(before, early)) == [True, False, False]
 
 
 def test_cells():
     def cells(best: float) -> list[Sweep]:
         return [replace(sweep(1250, 1.0 + abs(np.log(r / best)), 1.0), at=r, setup="cubes 5") for r in (0.5, 2.2, 6.0)]
 
-    assert holds(broad.cell_claims(cells(2.2))) == [True, True]
-    assert holds(broad.cell_claims(cells(0.5))) == [False, False]
+    assert holds(search.cell_claims(cells(2.2))) == [True, True]
+    assert holds(search.cell_claims(cells(0.5))) == [False, False]
 
 
 def test_reductions():
@@ -140,9 +138,9 @@ def test_reductions():
 
     film = film_of(reduction=(1.0, 1.1), quadratic=(2.0, 6.0), found=(10, 20))
     rows = [row(n, 1e-6 * n, 1e-7 * n**2) for n in (1000, 3000, 9000)]
-    assert holds(reduction.claims_of(rows, film)) == [True, True, False, True]
+    assert holds(search.reduction_claims(rows, film)) == [True, True, False, True]
     flat = [row(n, 1e-3, 1e-7 * n) for n in (1000, 3000, 9000)]
-    assert holds(reduction.claims_of(flat, film_of(reduction=(1.0, 9.0), quadratic=(2.0, 2.0), found=(10, 20)))) == [
+    assert holds(search.reduction_claims(flat, film_of(reduction=(1.0, 9.0), quadratic=(2.0, 2.0), found=(10, 20)))) == [
         False,
         False,
         True,
@@ -188,8 +186,8 @@ def test_colours():
         numbers = {"greedy": [greedy], "random": list(random), "parallel": [greedy]}
         return [Colouring("two", way, contacts, 9, n, [1], [1.0]) for way, n in numbers.items()]
 
-    assert holds(colours.claims_of(made(286, 95, (120, 125, 131)))) == [True, True, True, True]
-    assert holds(colours.claims_of(made(72, 10, (10, 10)))) == [False, False, False, False]
+    assert holds(solvers.colour_claims(made(286, 95, (120, 125, 131)))) == [True, True, True, True]
+    assert holds(solvers.colour_claims(made(72, 10, (10, 10)))) == [False, False, False, False]
 
 
 def test_solvers():
@@ -210,11 +208,11 @@ def test_solvers():
         COLOURED: ((5, 6), (4.0, 4.0)),
         COLOURED + THREADED: ((5, 6), (5.0, 5.0)),
     }
-    assert holds(solvers.claims_of(film(198, **like), plates(0.5))) == [True, True, True, True, False, True]
+    assert holds(solvers.solver_claims(film(198, **like), plates(0.5))) == [True, True, True, True, False, True]
     rare = {name: ((*sweeps, sweeps[0]), (*seconds, seconds[0])) for name, (sweeps, seconds) in like.items()}
-    assert holds(solvers.claims_of(film(198, **rare), [])) == [True, True, True, True, True]  # one spike of three frames
+    assert holds(solvers.solver_claims(film(198, **rare), [])) == [True, True, True, True, True]  # one spike of three frames
     unlike = like | {"gauss_seidel": ((5, 99), (0.5, 9.0)), "hybrid": ((20, 80), (8.0, 8.0))}
-    claims = solvers.claims_of(film(30, **unlike), plates(2.0))
+    claims = solvers.solver_claims(film(30, **unlike), plates(2.0))
     assert holds(claims) == [False, False, False, False, False, False]
 
 
@@ -235,16 +233,16 @@ def grid_of(phi) -> SdfGrid:
 def test_the_interpreted_loop_finds_the_deepest_point():
     slope = np.array([0.3, -0.2, 0.5])
     flat = grid_of(lambda X: X @ slope - 0.1)
-    value, gradient = plain.sample(flat, np.array([0.123, -0.456, 0.789]))
+    value, gradient = points.sample(flat, np.array([0.123, -0.456, 0.789]))
     assert value == pytest.approx(np.dot([0.123, -0.456, 0.789], slope) - 0.1) and np.allclose(gradient, slope)
     corners = np.array([(0.5, 0.0, 0.0), (-0.5, 0.2, 0.1), (0.0, 0.3, -0.6)])
-    w, phi = plain.deepest_point(flat, corners)
+    w, phi = points.deepest_point(flat, corners)
     assert np.array_equal(w, (0, 0, 1)) and phi == pytest.approx((corners @ slope - 0.1).min())
     ball = grid_of(lambda X: np.linalg.norm(X, axis=-1) - 0.5)
     around = np.array([(0.4, 0.3, 0.0), (-0.4, 0.3, 0.1), (0.0, 0.3, -0.5)])
-    w, phi = plain.deepest_point(ball, around)
+    w, phi = points.deepest_point(ball, around)
     rng = np.random.default_rng(0).dirichlet((1, 1, 1), 4000)
-    least = min(plain.sample(ball, X)[0] for X in rng @ around)
+    least = min(points.sample(ball, X)[0] for X in rng @ around)
     assert least - 1e-9 <= phi <= least + 0.01 and w.min() >= 0 and w.sum() == pytest.approx(1.0)
 
 
@@ -252,8 +250,8 @@ def test_the_interpreted_loop_does_what_the_search_does():
     runtime = open_runtime("cpu", "f32", "a test of the report")
     try:
         with Rig(cubes_setup(2), points.CONTACT_MODES, runtime) as rig:
-            made = points.measure_size(rig, 2, plain.PlainPoints(rig))
-            pairs = plain.candidate_pairs(rig)
+            made = points.measure_size(rig, 2, points.PlainPoints(rig))
+            pairs = points.candidate_pairs(rig)
             body = rig.detection.topology.body
             assert len(pairs) == rig.n_pairs() == made.pairs and (body[pairs[:, 0]] != body[pairs[:, 1]]).all()
     finally:

@@ -17,10 +17,10 @@ import taisoft as ts
 from benchmarks import scaling
 from benchmarks.collision_cases import Setup, pile, pile_setup
 from benchmarks.collision_runs import Rig
-from benchmarks.fit import exponent
+from benchmarks.document import exponent
+from benchmarks.scaling import growths, time_table
 from benchmarks.scaling_bytes import GROUPS, LOOPS, Copy, copy_rate, floor_bytes, group_bytes, measure_copy
 from benchmarks.scaling_runs import EXPLICIT, KINDS, ON_ONE, Row, beam, cubes_on_ground, measure
-from benchmarks.scaling_table import growths, time_table
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError
 
@@ -74,7 +74,7 @@ def test_every_field_that_is_counted_is_there():
     runtime = open_runtime("cpu", "f32")
     try:
         for build in (pile_setup(1).build, hashed):
-            with Rig(Setup("pile", "", build), "proximity", runtime) as rig:
+            with Rig(Setup("pile", build), "proximity", runtime) as rig:
                 known |= set(rig.detection.field_bytes)
     finally:
         runtime.close()

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import startup, startup_child, startup_table
-from benchmarks.versions import Version
+from benchmarks import startup, startup_child
+from benchmarks.runner import Version
 from taisoft.errors import SimulationError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -43,7 +43,7 @@ def test_a_step_is_a_step():
 
 def test_a_larger_surface(version):
     few, again, many, more = startup.ask(version, "surfaces", *startup.TASKS["surfaces"][0])[0].items()
-    assert (few[0], many[0]) == ("224 triangles", startup_table.CROSSING) and few[1] > many[1] > 0 == again[1] == more[1]
+    assert (few[0], many[0]) == ("224 triangles", startup.CROSSING) and few[1] > many[1] > 0 == again[1] == more[1]
 
 
 def test_memory_of_simulators(version):
@@ -55,7 +55,7 @@ def test_memory_of_simulators(version):
 def test_speed(version, monkeypatch):
     monkeypatch.setattr(startup, "SPEED_SHEETS", (2, 3))
     labels = {f"{what}, {startup_child.triangles(n)}" for what in ("search", "contact step") for n in (2, 3)}
-    wanted = {name for name in startup_table.SLOWER if "triangles" not in name} | labels
+    wanted = {name for name in startup.SLOWER if "triangles" not in name} | labels
     monkeypatch.setattr(startup, "SLOWER", wanted)
     (found,) = startup.measure_speed([version], quick=True)
     assert found.keys() == wanted and all(len(seconds) == 1 and seconds[0] > 0 for seconds in found.values())
@@ -64,7 +64,7 @@ def test_speed(version, monkeypatch):
 @pytest.mark.filterwarnings("ignore:body")  # too few tets through the thickness, on purpose
 def test_sheets_have_the_sizes_of_the_limits():
     for cells in startup.SPEED_SHEETS:
-        assert f"search, {startup_child.triangles(cells)}" in startup_table.SLOWER
+        assert f"search, {startup_child.triangles(cells)}" in startup.SLOWER
         scene = startup_child.sheet(cells)
         assert startup_child.triangles(cells) == f"{sum(len(body.nodes.surface) for body in scene.bodies):,} triangles"
 
@@ -90,7 +90,7 @@ def test_versions_take_turns(monkeypatch):
     firsts = [(task[0], task[3]) for task in tasks if task[1] == "first"]
     assert firsts == [(name, n) for n in (4, 4, 5, 4, 6, 4, 7) for name in ("new", "old")]
     assert new["new files"] == [0, 0, 0] and old["new files"] == [1, 1, 1]
-    assert startup_table.ratio(*(one[startup_table.OTHER]["walls"] for one in (new, old))) == 0.5
+    assert startup.ratio(*(one[startup.OTHER]["walls"] for one in (new, old))) == 0.5
 
 
 def test_a_child_that_fails(version):

@@ -16,9 +16,9 @@ import pytest
 from command import ROOT
 
 from benchmarks import cuda_check
-from benchmarks.cuda_check import Part, check, main, make_parts, parse_test
-from benchmarks.cuda_parts import JOBS, RESULT, run_job
-from benchmarks.cuda_table import TABLES, part_text
+from benchmarks.cuda_check import TABLES, Outcome, Part, check, main, make_parts, parse_test, part_text
+from benchmarks.cuda_parts import JOBS, run_job
+from benchmarks.runner import RESULT
 
 SCRIPT = ROOT / "benchmarks" / "cuda_check.sh"
 RERUN = {"scene": "beam", "integrator": "bdf2", "reruns": 3, "spread": 1.5e-6}
@@ -120,7 +120,7 @@ def test_time_limits_are_within_the_budget():
 
 @pytest.mark.parametrize("name", TABLES)
 def test_tables(name):
-    text = part_text("Title", name, "ok", 3.2, FOUND[name], "")
+    text = part_text(Outcome(Part(name, "Title", (), 0.0), "ok", 3.2, FOUND[name]))
     shown = {"tests": "failed", "works": "it diverged", "sweeps": "34", "sizes": "not enough memory", "reruns": "1.5e-06"}
     assert shown[name] in text and "Ended: ok, 3 s." in text
 

@@ -6,17 +6,16 @@ they grow by orders of magnitude, so that where between the two the line is draw
 `stable_dt` enters; it stands beside.
 """
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
 
 import taisoft as ts
 from taisoft.errors import SimulationError
-from taisoft.output.tables import markdown
 from taisoft.study.measure import advance
 
-from ..fit import exponent
+from ..document import exponent, table
+from ..runner import unwarned
 from .page import COLOURS, Claim, Extent, Part, is_near, new_figure, plot_png
 
 EXPLICIT, IMPLICIT = "symplectic_euler", "implicit_euler"
@@ -37,13 +36,13 @@ LOOSE = 0.1  # by which a measured exponent may miss that of theory
 
 @dataclass(frozen=True)
 class Limit:
-    """A cube's largest stable step. told: `stable_dt`; both [s]."""
+    """A cube's largest stable step. stable_dt: as the simulator has it; both [s]."""
 
     cells: int
     young: float
     density: float
     measured: float
-    told: float
+    stable_dt: float
 
 
 @dataclass(frozen=True)
@@ -73,8 +72,7 @@ class Cube:
         body.fix(lambda X: X[:, 0] < -0.5 + 1e-9)
         explicit = integrator == EXPLICIT
         self.cells, self.rest, self.young, self.density = cells, body.rest_positions, young, DENSITY
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
+        with unwarned():
             self.sim = ts.Simulator(scene, 1e-5, integrator, precision="f64", arch=arch, allow_unstable=explicit)
 
     def __enter__(self) -> "Cube":
@@ -86,14 +84,12 @@ class Cube:
     def set(self, young: float = YOUNG, density: float = DENSITY) -> None:
         """Another material."""
         self.young, self.density = young, density
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
+        with unwarned():
             self.sim.set_material("cube", young=young, density=density)
 
     def _begin(self, dt: float, positions: np.ndarray | None = None, velocities: np.ndarray | None = None) -> None:
         self.sim.reset()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
+        with unwarned():
             self.sim.dt = dt
         self.sim.set_state(positions, velocities)
 
@@ -154,7 +150,7 @@ def claims_of(youngs: list[Limit], sizes: list[Limit], densities: list[Limit], r
     implicit = [r for r in runs if r.integrator == IMPLICIT]
     beyond = [r for r in explicit if r.factor > 1.0]
     good = [r.stable and r.status == "ok" for r in implicit]
-    apart = max(abs(x.measured / x.told - 1.0) for x in (*youngs, *sizes, *densities))
+    apart = max(abs(x.measured / x.stable_dt - 1.0) for x in (*youngs, *sizes, *densities))
     square = is_near(by_size, 2.0, LOOSE)
     return [
         Claim(
@@ -193,47 +189,43 @@ def _implicit_text(implicit: list[Long], good: list[bool]) -> str:
     """How far the implicit runs went, and those that did not end as they should."""
     factors = ", ".join(f"{f:g}" for f in dict.fromkeys(r.factor for r in implicit))
     bad = [f"E = {r.young:.0e} Pa at {r.factor:g}: reach {r.reach:.3g}, {r.status}" for r, ok in zip(implicit, good) if not ok]
-    told = (
+    text = (
         f"implicit Euler at {factors} times that limit stays within {BOUNDED:g} times the stretch that it begins with, and ends "
         f"ok, in {sum(good)} of {len(good)} runs; the farthest goes to {max(r.reach for r in implicit):.3g} times"
     )
-    return f"{told}. {'; '.join(bad)}." if bad else f"{told}. No limit was found."
+    return f"{text}. {'; '.join(bad)}." if bad else f"{text}. No limit was found."
 
 
 def limit_table(limits: list[Limit]) -> str:
     """A row a cube and material."""
-    lines = [
-        (
-            f"{x.young:.0e}",
-            f"{x.density:g}",
-            f"1/{x.cells}",
-            f"{1e3 * x.measured:.4g}",
-            f"{1e3 * x.told:.4g}",
-            f"{x.measured / x.told:.4f}",
-            f"{x.measured * x.cells * np.sqrt(x.young / x.density):.3f}",
-        )
-        for x in limits
-    ]
-    headings = ("E [Pa]", "density", "h [m]", "by runs [ms]", "stable_dt [ms]", "runs / told", "dt / (h (density / E)^1/2)")
-    return markdown(headings, lines)
+    columns = (
+        ("E [Pa]", "{.young:.0e}"),
+        ("density", "{.density:g}"),
+        ("h [m]", "1/{.cells}"),
+        ("by runs [ms]", lambda x: f"{1e3 * x.measured:.4g}"),
+        ("stable_dt [ms]", lambda x: f"{1e3 * x.stable_dt:.4g}"),
+        ("runs / told", lambda x: f"{x.measured / x.stable_dt:.4f}"),
+        ("dt / (h (density / E)^1/2)", lambda x: f"{x.measured * x.cells * np.sqrt(x.young / x.density):.3f}"),
+    )
+    return table(limits, columns)
 
 
 def run_table(runs: list[Long]) -> str:
     """A row a Young's modulus and integrator, the reach at each factor."""
-    lines = []
-    for integrator in dict.fromkeys(r.integrator for r in runs):
-        own = [r for r in runs if r.integrator == integrator]
-        for young in dict.fromkeys(r.young for r in own):
-            told = [f"{r.factor:g}: {r.reach:.3g} {r.status}" for r in own if r.young == young]
-            lines.append((integrator, f"{young:.0e}", ", ".join(told)))
-    return markdown(("steps", "E [Pa]", "dt / limit: largest displacement / that at the start, status"), lines, left=(0, 2))
+
+    def reaches(kind: tuple[str, float]) -> str:
+        return ", ".join(f"{r.factor:g}: {r.reach:.3g} {r.status}" for r in runs if (r.integrator, r.young) == kind)
+
+    heading = "<dt / limit: largest displacement / that at the start, status"
+    kinds = dict.fromkeys((r.integrator, r.young) for r in runs)
+    return table(kinds, (("<steps", "{[0]}"), ("E [Pa]", "{[1]:.0e}"), (heading, reaches)))
 
 
 def draw(youngs: list[Limit], sizes: list[Limit], runs: list[Long]) -> bytes:
     """The limit over E and over h, and how far runs go."""
     figure, ((over_young, over_size, reach),) = new_figure(3)
     over_young.plot([x.young for x in youngs], [1e3 * x.measured for x in youngs], "o", color=COLOURS[0], label="by runs")
-    over_young.plot([x.young for x in youngs], [1e3 * x.told for x in youngs], "-", color=COLOURS[1], label="stable_dt")
+    over_young.plot([x.young for x in youngs], [1e3 * x.stable_dt for x in youngs], "-", color=COLOURS[1], label="stable_dt")
     over_young.set(title="largest stable step over E", xlabel="E [Pa]", ylabel="ms", xscale="log", yscale="log")
     h, dt = np.array([1.0 / x.cells for x in sizes]), np.array([1e3 * x.measured for x in sizes])
     over_size.plot(h, dt, "o", color=COLOURS[0], label="by runs")

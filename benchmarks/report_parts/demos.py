@@ -12,10 +12,11 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.cli.scene_file import load_module, shipped_files, shipped_folder
-from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.output.tables import percent, spread_of
 from taisoft.records import RunReport
 from taisoft.timing import Timing, summarise
 
+from ..document import table
 from .page import Claim, Extent, Part, small_png
 
 ROUNDS = 3
@@ -162,24 +163,15 @@ def show(scene: Scene, arch: str, rounds: int) -> DemoRun:
 
             sim.reset()
             if k == 0:
-                image, result = gallery.film(
-                    sim,
-                    scene.moments,
-                    size,
-                    view,
-                    seconds,
-                    fps,
-                    scene.layers,
-                    lambda sim: numbers.append(scene.number(sim)),
-                    on_step,
-                )
+                shots = scene.moments, size, view, seconds, fps, scene.layers
+                image, result = gallery.film(sim, *shots, lambda sim: numbers.append(scene.number(sim)), on_step)
                 problem = _problem(module, sim, result)
             else:
                 sim.run(seconds, fps=fps, on_step=on_step)
             rounds_spent.append(sum(steps))
         tets = sum(body.mesh.n_tets for body in sim.scene.bodies)
-        told = f"{sim.settings.integrator}, dt = {1e3 * sim.dt:.3g} ms"
-    return DemoRun(scene, tets, seconds, told, result, problem, numbers, small_png(image), rounds_spent)
+        settings_text = f"{sim.settings.integrator}, dt = {1e3 * sim.dt:.3g} ms"
+    return DemoRun(scene, tets, seconds, settings_text, result, problem, numbers, small_png(image), rounds_spent)
 
 
 def claim_of(shown: DemoRun) -> Claim:
@@ -187,9 +179,9 @@ def claim_of(shown: DemoRun) -> Claim:
     s, r = shown.scene, shown.result
     heights = ", ".join(f"{y:.3f}" for y in shown.numbers)
     times = ", ".join(f"{t:.3g}" for t in s.moments)
-    told = f"{s.what} {heights} m at {times} s; the run is {r.status}"
-    told += "; its own check passed." if not shown.problem else f"; its check failed: {shown.problem}."
-    return Claim(f"{s.where}: {s.said}.", shown.good and s.shows(shown.numbers), told)
+    text = f"{s.what} {heights} m at {times} s; the run is {r.status}"
+    text += "; its own check passed." if not shown.problem else f"; its check failed: {shown.problem}."
+    return Claim(f"{s.where}: {s.said}.", shown.good and s.shows(shown.numbers), text)
 
 
 def hours_claim(seconds: float, simulated: float) -> Claim:
@@ -203,39 +195,20 @@ def hours_claim(seconds: float, simulated: float) -> Claim:
 
 def demo_table(shown: list[DemoRun]) -> str:
     """A row a demo."""
-    lines = []
-    for s in shown:
-        t = s.timing
-        contacts = max((r.n_contacts for r in s.result.step_reports), default=0)
-        lines.append(
-            (
-                s.scene.demo,
-                s.scene.where,
-                f"{s.tets:,}",
-                s.settings,
-                f"{s.seconds:g}",
-                f"{contacts}",
-                f"{t.median:.3g}",
-                percent(spread_of(t)),
-                f"{s.result.compile_seconds:.1f}",
-                s.result.status,
-                "failed" if s.problem else "passed",
-            )
-        )
-    headings = (
-        "demo",
-        "in the report",
-        "tets",
-        "steps",
-        "simulated [s]",
-        "contacts at most",
-        "wall s per simulated s",
-        "spread",
-        "compile [s]",
-        "status",
-        "own check",
+    columns = (
+        ("<demo", "{.scene.demo}"),
+        ("<in the report", "{.scene.where}"),
+        ("tets", "{.tets:,}"),
+        ("<steps", "{.settings}"),
+        ("simulated [s]", "{.seconds:g}"),
+        ("contacts at most", lambda s: str(max((r.n_contacts for r in s.result.step_reports), default=0))),
+        ("wall s per simulated s", lambda s: f"{s.timing.median:.3g}"),
+        ("spread", lambda s: percent(spread_of(s.timing))),
+        ("compile [s]", "{.result.compile_seconds:.1f}"),
+        ("<status", "{.result.status}"),
+        ("<own check", lambda s: "failed" if s.problem else "passed"),
     )
-    return markdown(headings, lines, left=(0, 1, 3, 9, 10))
+    return table(shown, columns)
 
 
 def measure(extent: Extent) -> Part:

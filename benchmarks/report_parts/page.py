@@ -6,14 +6,15 @@ of a part is "agree" where all its claims hold, "disagree" where none does, else
 
 import io
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from taisoft.output.plot import log_ticks, require_matplotlib
-from taisoft.output.tables import markdown, percent, spread_of
-from taisoft.timing import Timing, summarise
+from taisoft.timing import Timing
+
+from ..document import plain, table
 
 AGREE, PARTLY, DISAGREE, MISSING = "agree", "partly", "disagree", "not measured"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#555555")
@@ -73,9 +74,7 @@ class Part:
 
     def record(self) -> dict:
         """As plain data, without the pictures."""
-        kept = {name: value for name, value in vars(self).items() if name not in ("pictures", "claims", "times")}
-        claims, times = [asdict(c) for c in self.claims], {name: asdict(t) for name, t in self.times.items()}
-        return kept | {"verdict": self.verdict, "claims": claims, "times": times, "pictures": sorted(self.pictures)}
+        return plain(vars(self) | {"verdict": self.verdict, "pictures": sorted(self.pictures)})
 
 
 def verdict_of(holds: Sequence[bool]) -> str:
@@ -91,17 +90,6 @@ def verdict_of(holds: Sequence[bool]) -> str:
 def is_near(value: float, wanted: float, tolerance: float) -> bool:
     """Whether |value - wanted| <= tolerance; never of what is not a number."""
     return math.isfinite(value) and abs(value - wanted) <= tolerance
-
-
-def ms(seconds: float) -> str:
-    """Milliseconds, three digits."""
-    return f"{1e3 * seconds:.3g}"
-
-
-def timed(seconds: Iterable[float]) -> tuple[str, str]:
-    """Median [ms] and spread as cells of a table."""
-    t = summarise(seconds)
-    return ms(t.median), percent(spread_of(t))
 
 
 def clearly_less(a: Sequence[float], b: Sequence[float]) -> bool:
@@ -163,20 +151,21 @@ def part_text(part: Part) -> str:
 
 def claim_text(claim: Claim) -> str:
     """A line for what is said, what was found, and why."""
-    why = f" {claim.why}" if claim.why else ""
-    return f"* The report: {claim.said} **{'Agree' if claim.holds else 'Disagree'}**: {claim.found}{why}"
+    return f"* The report: {claim.said} **{'Agree' if claim.holds else 'Disagree'}**: {claim.found} {claim.why}".rstrip()
 
 
 def summary_table(parts: Sequence[Part]) -> str:
     """A row a part: the verdict, and how many claims hold."""
-    rows = [(p.title, p.where, p.verdict, f"{sum(c.holds for c in p.claims)} of {len(p.claims)}") for p in parts]
-    return markdown(("experiment", "in the report", "verdict", "claims that hold"), rows, left=(0, 1, 2))
+    columns = (
+        ("<experiment", "{.title}"),
+        ("<in the report", "{.where}"),
+        ("<verdict", "{.verdict}"),
+        ("claims that hold", lambda p: f"{sum(c.holds for c in p.claims)} of {len(p.claims)}"),
+    )
+    return table(parts, columns)
 
 
 def short_text(parts: Sequence[Part]) -> str:
     """What falls short, part by part."""
-    lines = [f"* {part.title}: {told}" for part in parts for told in ([part.failure] if part.failure else part.short)]
+    lines = [f"* {part.title}: {text}" for part in parts for text in ([part.failure] if part.failure else part.short)]
     return "## What falls short\n\n" + ("\n".join(lines) if lines else "Nothing that this run knows of.")
-
-
-# --- a second run -----------------------------------------------------------------------------------------------------

@@ -4,21 +4,20 @@ The parts of a step are timed between synchronisations, which a plain step does 
 scene is taken from its first impulse on, when the search has something to find.
 """
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
 
 import taisoft as ts
 from taisoft.cli.scene_file import load_scene
-from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.output.tables import percent, spread_of
 from taisoft.stability import stable_dt
 from taisoft.timing import summarise
 
 from ..collision_runs import PHASES
-from ..contact_captured import clock, patched
-from ..contact_runs import PARTS, REST, SETTINGS, Stopwatch, explicit_places, to_first_impulse
+from ..contact_runs import PARTS, SETTINGS, explicit_places, to_impulses
+from ..document import ms, table
+from ..runner import REST, Stopwatch
 from .page import COLOURS, Claim, Extent, Part, new_figure, plot_png
 
 SCENE = "sheet_and_cube"
@@ -62,18 +61,11 @@ class Shares:
         return self.total(POINTS) / self.search
 
 
-@contextmanager
-def watched(watch: Stopwatch, sim: ts.Simulator) -> Iterator[None]:
+def watched(watch: Stopwatch, sim: ts.Simulator):
     """The stopwatch takes the parts of the simulator's steps meanwhile, those of a search apart."""
     detection = sim._dynamics.contact.detection
-    with ExitStack() as stack:
-        if sim.settings.explicit:
-            stack.enter_context(watch.on(explicit_places(sim)))
-        else:
-            stack.enter_context(patched(detection, "find", watch.timed(detection.find, SEARCH)))
-        for phase, name in CALLS.items():
-            stack.enter_context(patched(detection, name, watch.timed(getattr(detection, name), phase)))
-        yield
+    places = explicit_places(sim) if sim.settings.explicit else [(SEARCH, detection, "find")]
+    return watch.on(places + [(phase, detection, name) for phase, name in CALLS.items()])
 
 
 def open_demo(integrator: str, contact_mode: str, arch: str) -> ts.Simulator:
@@ -90,20 +82,16 @@ def open_demo(integrator: str, contact_mode: str, arch: str) -> ts.Simulator:
 def measure_shares(integrator: str, contact_mode: str, extent: Extent) -> Shares:
     """Time the parts of steps from the first impulse on."""
     with open_demo(integrator, contact_mode, extent.arch) as sim:
-        to_first_impulse(sim)
+        to_impulses(sim)
         sim.step()  # compiles what the first contact needs
         parts = (*PHASES, OTHER, *(name for name in PARTS if name != SEARCH and sim.settings.explicit), REST)
         shares, watch = Shares(integrator, contact_mode, sim.dt, {part: [] for part in parts}), Stopwatch()
         with watched(watch, sim):
             for _ in range(extent.of(*STEPS[integrator])):
-                watch.spent.clear()
-                begin = clock()
-                sim.step()
-                whole = clock() - begin
-                watch.spent[OTHER] = watch.spent.pop(SEARCH, 0.0)
-                watch.spent[REST] = whole - sum(watch.spent.values())
+                spent = watch.parts_of(sim.step)
+                spent[OTHER] = spent.pop(SEARCH, 0.0)
                 for part in parts:
-                    shares.parts[part].append(watch.spent[part])
+                    shares.parts[part].append(spent.get(part, 0.0))
     return shares
 
 
@@ -113,7 +101,7 @@ def claims_of(found: list[Shares]) -> list[Claim]:
     own = next(s for s in found if (s.integrator, s.contact_mode) == REPORTS_WAY)
     others = [s for s in found if s is not own]
 
-    def told(share) -> str:
+    def beside_others(share) -> str:
         beside = "; ".join(f"{percent(share(s))} in {s.integrator}, {s.contact_mode}" for s in others)
         return f"{percent(share(own))} in {own.integrator} through distance fields, as there" + (f" ({beside})" if others else "")
 
@@ -122,7 +110,7 @@ def claims_of(found: list[Shares]) -> list[Claim]:
         Claim(
             "collision detection is where most of the time goes.",
             own.search > 0.5,
-            f"the search takes {told(lambda s: s.search)}.",
+            f"the search takes {beside_others(lambda s: s.search)}.",
             "Where it is less than half, it is compiled code beside other compiled code: the linear systems of implicit steps, "
             "the contact solve and the report of explicit ones."
             if any(s.search <= 0.5 for s in found)
@@ -131,7 +119,7 @@ def claims_of(found: list[Shares]) -> list[Claim]:
         Claim(
             "within it the contact points, by Frank-Wolfe, take most.",
             own.points > 0.5,
-            f"of the search they take {told(lambda s: s.points)}.",
+            f"of the search they take {beside_others(lambda s: s.points)}.",
         ),
         Claim(
             "reducing contacts and updating the tree are significant too.",
@@ -146,13 +134,16 @@ def claims_of(found: list[Shares]) -> list[Claim]:
 
 def share_table(found: list[Shares]) -> str:
     """A row a part of each kind of step: median, spread, share of the time of all steps."""
-    lines = []
-    for s in found:
-        for part, seconds in s.parts.items():
-            t = summarise(seconds)
-            spread = percent(spread_of(t)) if t.median else ""
-            lines.append((s.integrator, s.contact_mode, part, f"{1e3 * t.median:.3g}", spread, percent(s.total(part))))
-    return markdown(("steps", "hit by", "part", "ms", "spread", "share of a step"), lines, left=(0, 1, 2))
+    rows = [(s, part, summarise(seconds)) for s in found for part, seconds in s.parts.items()]
+    columns = (
+        ("<steps", "{[0].integrator}"),
+        ("<hit by", "{[0].contact_mode}"),
+        ("<part", "{[1]}"),
+        ("ms", lambda row: ms(row[2].median)),
+        ("spread", lambda row: percent(spread_of(row[2])) if row[2].median else ""),
+        ("share of a step", lambda row: percent(row[0].total(row[1]))),
+    )
+    return table(rows, columns)
 
 
 def draw(found: list[Shares]) -> bytes:

@@ -1,34 +1,112 @@
 """Figures 11 and 12 of the report: time of the contact points per frame and over tets, on all threads, on one, and interpreted.
 
-One thread is a child process pinned to one core, so that Taichi has no other. The interpreted loop is that of `plain.py`.
+One thread is a child process pinned to one core, so that Taichi has no other. The interpreted loop is the report's first program:
+Python, one pair of triangles after the other. Each of two triangles whose boxes meet goes to the material space of the other's
+tet, by the barycentric coordinates of its corners there, and Frank-Wolfe with steps 2 / (i + 2) looks for its deepest point in
+the signed distances at rest (report, section 2.3.2). Weak, as there: a tet far from the triangle maps it all the same, so most
+points are found many times. Pairs, distances and places are those of a `Rig`, so that both do the same work.
 """
 
-import json
 import os
-import subprocess
-import sys
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
 from taisoft.backend.runtime import open_runtime, threads
+from taisoft.collision.colliders import body_grid
 from taisoft.collision.surface import SERIAL_BELOW
 from taisoft.errors import SimulationError
-from taisoft.output.tables import markdown
+from taisoft.mesh.sdf_grid import SdfGrid
 from taisoft.timing import summarise, usable_cores
 
 from ..collision_cases import Setup, cubes_setup, pile_setup
-from ..collision_runs import Rig, clock, repeated
-from ..fit import exponent
-from .page import COLOURS, Claim, Extent, Part, clearly_less, ms, new_figure, plot_png, timed
-from .plain import PlainPoints, candidate_pairs
+from ..collision_runs import Rig
+from ..document import exponent, ms, table, timed_cells
+from ..runner import clock, parse_result, repeated, run_python, say
+from .page import COLOURS, Claim, Extent, Part, clearly_less, new_figure, plot_png
 
+FRANK_WOLFE_STEPS, CLOSED = 32, 1e-4  # at most; gap, in lengths of the triangle, at which it ends
 CONTACT_MODES = "distance_field"  # the report's way
 FILM, FRAMES = ("cubes 9", "cubes 5"), (20, 4)  # of figure 11: a cube turns on another; the first has 1,944 triangles
 SIZES = ("cubes 5", "cubes 9", "cubes 11", "cubes 15", "cubes 20", "pile 6"), ("cubes 2", "cubes 5")  # full, quick
 ROUNDS, PLAIN_ROUNDS = (15, 3), 2
 MOST_PLAIN = 15_000  # pairs above which the interpreted loop is left out
 TENFOLD, FLAT = 10.0, 0.1  # what the report gained; exponent of a time that does not grow
+
+
+# --- interpreted --------------------------------------------------------------------------------------------------------
+
+
+def candidate_pairs(rig: Rig) -> np.ndarray:
+    """(k, 2) triangles of two bodies whose boxes meet, each pair once."""
+    rows, n = rig.detection.broad.find(), rig.detection.surface.n_triangles
+    start, end, entry = (field.to_numpy() for field in (rows.start, rows.end, rows.entry))
+    own = np.repeat(np.arange(n), (end - start)[:n])
+    other = np.concatenate([entry[a:b] for a, b in zip(start[:n], end[:n])]) if len(own) else np.zeros(0, int)
+    body = rig.detection.topology.body
+    return np.column_stack([own, other])[(own < other) & (body[own] != body[other])]
+
+
+def sample(grid: SdfGrid, X: np.ndarray) -> tuple[float, np.ndarray]:
+    """Signed distance [m] and its gradient (3,) at a material point (3,), trilinear; outside of the grid, at its border."""
+    at = np.clip((X - grid.origin) / grid.spacing, 0.0, np.array(grid.phi.shape) - 1.0)
+    i = np.minimum(at.astype(int), np.array(grid.phi.shape) - 2)
+    u, v, w = at - i
+    f = grid.phi[i[0] : i[0] + 2, i[1] : i[1] + 2, i[2] : i[2] + 2]
+    a = f[0] * (1 - u) + f[1] * u
+    b = a[0] * (1 - v) + a[1] * v
+    along_x = ((f[1] - f[0])[0] * (1 - v) + (f[1] - f[0])[1] * v) @ (1 - w, w)
+    along_y = (a[1] - a[0]) @ (1 - w, w)
+    return float(b @ (1 - w, w)), np.array([along_x, along_y, b[1] - b[0]]) / grid.spacing
+
+
+def deepest_point(grid: SdfGrid, corners: np.ndarray) -> tuple[np.ndarray, float]:
+    """Weights (3,) and signed distance [m] of the deepest point that Frank-Wolfe finds in a triangle (3,3) of material points."""
+    values = [sample(grid, X)[0] for X in corners]
+    w = np.eye(3)[int(np.argmin(values))]
+    best, least = w, min(values)
+    size = max(np.linalg.norm(corners[k] - corners[k - 1]) for k in range(3))
+    for i in range(FRANK_WOLFE_STEPS):
+        phi, gradient = sample(grid, w @ corners)
+        if phi < least:
+            best, least = w, phi
+        slope = corners @ gradient
+        k = int(np.argmin(slope))
+        if w @ slope - slope[k] <= CLOSED * size:
+            break
+        w = w + 2.0 / (i + 2.0) * (np.eye(3)[k] - w)
+    return best, least
+
+
+class PlainPoints:
+    """Contact points of a rig's pairs by the plain loop."""
+
+    def __init__(self, rig: Rig):
+        d = rig.detection
+        self._rig, self._body, self._triangle = rig, d.topology.body, d.topology.triangle
+        bodies = rig.scene.bodies
+        self._grids = [body_grid(b, rig.scene.collision.field_cells, 2.0 * d.margin) for b in bodies]
+        starts = np.cumsum([0] + [b.n_nodes for b in bodies])
+        self._behind = np.concatenate([b.nodes.surface_tets + n for b, n in zip(bodies, starts)])
+        self._rest = np.concatenate([b.nodes.positions for b in bodies])
+
+    def find(self, pairs: np.ndarray) -> list[tuple[int, int, np.ndarray, float]]:
+        """(triangle, the other, weights (3,), signed distance [m]) of each whose deepest point is nearer than the margin."""
+        x, margin, found = self._rig.model.state.x.to_numpy(), self._rig.detection.margin, []
+        surface = x[self._rig.detection.topology.node]
+        for pair in pairs:
+            for t, u in (pair, pair[::-1]):
+                tet = self._behind[u]
+                world = np.vstack([x[tet].T, np.ones(4)])  # of barycentric coordinates: corners, and their sum
+                weights = np.linalg.solve(world, np.vstack([surface[self._triangle[t]].T, np.ones(3)]))
+                w, phi = deepest_point(self._grids[self._body[u]], weights.T @ self._rest[tet])
+                if phi <= margin:
+                    found.append((int(t), int(u), w, phi))
+        return found
+
+
+# --- measured -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -101,18 +179,15 @@ def measure_film(rig: Rig, frames: int, rounds: int, plain: PlainPoints | None) 
 def measure_here(quick: bool, arch: str, plain: bool) -> Measured:
     """Everything in this process, on the threads that it has."""
     k = int(quick)
-    runtime = open_runtime(arch, "f32", "the report's contact points")
-    n = threads()
-    found = Measured("GPU" if arch == "cuda" else f"{n} thread{'s' * (n > 1)}", [], [])
-    try:
+    with closing(open_runtime(arch, "f32", "the report's contact points")) as runtime:
+        n = threads()
+        found = Measured("GPU" if arch == "cuda" else f"{n} thread{'s' * (n > 1)}", [], [])
         for name in SIZES[k]:
             with Rig(setup_of(name), CONTACT_MODES, runtime) as rig:
                 loop = PlainPoints(rig) if plain else None
                 found.sizes.append(measure_size(rig, ROUNDS[k], loop))
                 if name == FILM[k]:
                     found.frames, found.plain_frames = measure_film(rig, FRAMES[k], ROUNDS[k], loop)
-    finally:
-        runtime.close()
     return found
 
 
@@ -122,21 +197,18 @@ CHILD = "from taisoft.cli.scene_file import load_shipped; load_shipped('benchmar
 
 
 def answer(quick: bool) -> None:
-    """In the child: everything on its first core alone, told as JSON in its last line."""
+    """In the child: everything on its first core alone."""
     os.sched_setaffinity(0, usable_cores()[:1])
-    print(json.dumps(asdict(measure_here(quick, "cpu", plain=False))))
+    say(asdict(measure_here(quick, "cpu", plain=False)))
 
 
 def measure_on_one_thread(quick: bool) -> Measured:
     """The same in a child process. Raises SimulationError where it fails."""
     if not hasattr(os, "sched_setaffinity"):
         raise SimulationError("this system pins no process to one core, so that one thread cannot be measured")
-    done = subprocess.run([sys.executable, "-c", CHILD.format(quick)], capture_output=True, text=True)
-    if done.returncode:
-        told = done.stderr.strip().splitlines() or ["no reason given"]
-        raise SimulationError(f"the process on one thread failed: {told[-1]}")
-    told = json.loads(done.stdout.splitlines()[-1])
-    return Measured(**told | {"sizes": [Points(**p) for p in told["sizes"]]})
+    lines = run_python("the process on one thread", "-c", CHILD.format(quick))
+    found = parse_result(lines[-1])
+    return Measured(**found | {"sizes": [Points(**p) for p in found["sizes"]]})
 
 
 # --- what it says -----------------------------------------------------------------------------------------------------
@@ -198,29 +270,20 @@ def claims_of(many: Measured, one: Measured) -> list[Claim]:
 
 def size_table(many: Measured, one: Measured) -> str:
     """A row a configuration."""
-    lines = []
-    for p, q in zip(many.sizes, one.sizes):
-        plain = timed(p.plain) if p.plain else ("-", "-")
-        gain = f"{np.median(p.plain) / np.median(p.seconds):,.0f}" if p.plain else "-"
-        depth = f"{1e3 * p.deepest:.4f}", f"{1e3 * p.plain_deepest:.4f}" if p.plain else "-"
-        sizes = (f"{n:,}" for n in (p.tets, p.triangles, p.pairs))
-        lines.append((p.setup, *sizes, *timed(p.seconds), *timed(q.seconds), *plain, gain, *depth))
-    headings = (
-        "scene",
-        "tets",
-        "triangles",
-        "pairs",
-        f"{many.where} [ms]",
-        "spread",
-        f"{one.where} [ms]",
-        "spread",
-        "interpreted [ms]",
-        "spread",
-        "times faster",
-        "deepest [mm]",
-        "interpreted",
+    columns = (
+        ("<scene", "{[0].setup}"),
+        *((name, f"{{[0].{name}:,}}") for name in ("tets", "triangles", "pairs")),
+        (f"{many.where} [ms]", lambda pair: timed_cells(pair[0].seconds)[0]),
+        ("spread", lambda pair: timed_cells(pair[0].seconds)[1]),
+        (f"{one.where} [ms]", lambda pair: timed_cells(pair[1].seconds)[0]),
+        ("spread", lambda pair: timed_cells(pair[1].seconds)[1]),
+        ("interpreted [ms]", lambda pair: timed_cells(pair[0].plain)[0] if pair[0].plain else "-"),
+        ("spread", lambda pair: timed_cells(pair[0].plain)[1] if pair[0].plain else "-"),
+        ("times faster", lambda pair: f"{np.median(pair[0].plain) / np.median(pair[0].seconds):,.0f}" if pair[0].plain else "-"),
+        ("deepest [mm]", lambda pair: f"{1e3 * pair[0].deepest:.4f}"),
+        ("interpreted", lambda pair: f"{1e3 * pair[0].plain_deepest:.4f}" if pair[0].plain else "-"),
     )
-    return markdown(headings, lines, left=(0,))
+    return table(zip(many.sizes, one.sizes), columns)
 
 
 def draw(many: Measured, one: Measured) -> bytes:

@@ -6,8 +6,8 @@ from taisoft.output.plot import require_matplotlib, save, ticks
 from taisoft.output.tables import markdown, percent, spread_of
 from taisoft.study.results import front
 
+from ..document import Limit
 from ..elasticity_runs import time_ratio
-from ..elasticity_table import Limit
 from ..programs import own
 from ..programs.tried import TRIED
 from .runs import Row, fastest_standing, fastest_within

@@ -1,0 +1,223 @@
+"""Coloured Gauss-Seidel: colourings of contact graphs beside each other, and where it overtakes the serial one on all threads.
+
+The crossover's problems are made up: two plates of n x n cells, one on the other. The vertices of each touch the triangles of the
+other, which is turned by ten degrees; the upper plate falls, and all nodes move a little at random. So the number of contacts is
+free, about 2 n^2, and a contact has four nodes.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+import taichi as ti
+
+from taisoft.backend.arrays import FieldArena
+from taisoft.backend.runtime import Runtime
+from taisoft.contact.colouring import colour_contacts, colour_greedy, colour_random, graph_of
+from taisoft.contact.problem import NODES, ContactProblem, build_node_problem, find_factors, index_nodes
+
+from .contact_runs import COLOURED, SERIAL, THREADED, Outcome, Solvers
+from .document import crossovers, ms, table
+from .runner import clock
+
+SEEDS, QUICK_SEEDS = 15, 3  # of random colourings
+ROUNDS = 3  # of solvers, and of the colourings that give one result
+REPORT = {"two_cubes_two_boxes": (286, {"greedy": 95, "random": 125})}  # contacts, colours
+SIZES, QUICK_SIZES = (4, 8, 16, 32, 64, 128, 192), (8, 16)  # cells along a plate
+TURN, FRICTION, SEED = np.radians(10.0), 0.5, 1
+FALL, SHAKE = -0.04, 0.02  # [m/s]
+
+
+@dataclass(frozen=True)
+class Colouring:
+    """A way to colour one scene's contacts, the same as often as there are seeds or rounds.
+
+    least: colours that any colouring needs, since so many contacts meet at one node. numbers: colours; largest: contacts of the
+    largest colour; seconds: the graph included.
+    """
+
+    scene: str
+    way: str
+    contacts: int
+    least: int
+    numbers: list[int]
+    largest: list[int]
+    seconds: list[float]
+
+
+def proper(graph: sp.csr_matrix, colour: np.ndarray) -> bool:
+    """Whether no two neighbours have one colour."""
+    joined = graph.tocoo()
+    return bool((colour >= 0).all() and (colour[joined.row] != colour[joined.col]).all())
+
+
+def _parallel(p: ContactProblem) -> np.ndarray:
+    index_nodes(p)
+    colour_contacts(p)
+    return p.colour.to_numpy()[: int(p.count[0])]
+
+
+def colour_all(scene: str, p: ContactProblem, seeds: int) -> tuple[list[Colouring], dict[str, np.ndarray]]:
+    """Colourings of the contacts that `p` holds, and a colour (k,) of each way."""
+    graph, k, made, colours = graph_of(p), int(p.count[0]), [], {}
+    start, movable = p.entry_start.to_numpy(), (p.inverse_mass.to_numpy() != 0.0).any(axis=1)
+    least = int(np.diff(start)[movable].max())
+    _parallel(p)  # compiles
+    ways = {
+        "greedy": lambda _: colour_greedy(graph_of(p)),
+        "random": lambda seed: colour_random(graph_of(p), seed),
+        "parallel": lambda _: _parallel(p),
+    }
+    for name, way in ways.items():
+        numbers, largest, seconds = [], [], []
+        for seed in range(seeds if name == "random" else ROUNDS):
+            begin = clock()
+            colour = way(seed)
+            seconds.append(clock() - begin)
+            if not proper(graph, colour):
+                raise ArithmeticError(f"{scene}: the {name} colouring gives neighbours one colour")
+            sizes = np.bincount(colour)
+            numbers.append(len(sizes))
+            largest.append(int(sizes.max()))
+            colours.setdefault(name, colour)
+        made.append(Colouring(scene, name, k, least, numbers, largest, seconds))
+    return made, colours
+
+
+def colour_table(colourings: list[Colouring]) -> str:
+    """A row a scene and way, those of the report below."""
+
+    def counts(values: list[int]) -> str:
+        low, high = min(values), max(values)
+        return f"{np.median(values):g}" + ("" if low == high else f" ({low} to {high})")
+
+    lines = []
+    for c in colourings:
+        each = f"{c.contacts / np.median(c.numbers):.1f}"
+        lines.append((c.scene, c.way, c.contacts, c.least, counts(c.numbers), each, counts(c.largest), ms(np.median(c.seconds))))
+    for scene in dict.fromkeys(c.scene for c in colourings):
+        contacts, found = REPORT.get(scene, (0, {}))
+        lines += [(f"{scene}, the report", way, contacts, "-", n, f"{contacts / n:.1f}", "-", "-") for way, n in found.items()]
+    headings = ("<scene", "<colouring", "contacts", "at one node", "colours", "contacts a colour", "largest", "ms")
+    return table(lines, [(heading, f"{{[{k}]}}") for k, heading in enumerate(headings)])
+
+
+# --- serial and coloured ------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Point:
+    """Both solvers on one problem, from no impulses to the tolerance."""
+
+    contacts: int
+    colours: int
+    serial: Outcome
+    coloured: Outcome
+
+
+def grid(n: int) -> np.ndarray:
+    """Vertices ((n + 1)^2, 2) of a square of n x n unit cells round the origin, row by row."""
+    x = np.arange(n + 1) - 0.5 * n
+    return np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def find_under(points: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which of points (k,2) lie on the square, and the vertices (m,3) and weights (m,3) of the triangles under those."""
+    place = points + 0.5 * n
+    on = np.flatnonzero(((place >= 0) & (place <= n)).all(axis=1))
+    cell = np.minimum(place[on].astype(int), n - 1)
+    u, v = (place[on] - cell).T
+    low = cell[:, 0] * (n + 1) + cell[:, 1]
+    below = u >= v  # of the diagonal
+    corner = np.where(below, low + n + 1, low + 1)
+    weights = np.stack([1 - np.maximum(u, v), np.abs(u - v), np.minimum(u, v)], axis=1)
+    return on, np.stack([low, corner, low + n + 2], axis=1), weights
+
+
+def build_plates(n: int, runtime: Runtime, arena: FieldArena) -> ContactProblem:
+    """The problem of two plates, in fields of the arena, without impulses."""
+    rng, flat = np.random.default_rng(SEED), grid(n)
+    c, s = np.cos(TURN), np.sin(TURN)
+    turn = np.array([[c, -s], [s, c]])
+    first = len(flat)  # node of the upper plate
+    up, under, under_weight = find_under(flat @ turn.T, n)
+    down, over, over_weight = find_under(flat @ turn, n)
+    k, one = len(up) + len(down), np.ones
+    node, weight = np.zeros((k, NODES), np.int32), np.zeros((k, NODES))
+    node[: len(up), :4] = np.column_stack([first + up, under])  # side a, the upper, comes first
+    weight[: len(up), :4] = np.column_stack([one(len(up)), -under_weight])
+    node[len(up) :, :4] = np.column_stack([first + over, down])
+    weight[len(up) :, :4] = np.column_stack([over_weight, -one(len(down))])
+    v = SHAKE * rng.standard_normal((2 * first, 3))
+    v[first:, 1] += FALL
+    u = np.einsum("cj,cja->ca", weight, v[node])
+    p = build_node_problem(arena, k, 2 * first, runtime.arch == "cpu")
+    p.count[0] = k
+    normal, tangent = np.tile([0.0, 1.0, 0.0], (k, 1)), np.tile([1.0, 0.0, 0.0], (k, 1))
+    across = -u[:, 2]  # along normal x tangent
+    for held, values in (
+        (p.node, node),
+        (p.arity, np.full(k, 4, np.int32)),
+        (p.weight, weight),
+        (p.normal, normal),
+        (p.tangent, tangent),
+        (p.inverse_mass, one((2 * first, 3))),
+        (p.b, np.column_stack([u[:, 1], u[:, 0], across])),
+        (p.friction, np.full(k, FRICTION)),
+        (p.order, np.arange(k, dtype=np.int32)),
+    ):
+        held.from_numpy(np.ascontiguousarray(values))
+    index_nodes(p)
+    find_factors(p)
+    return p
+
+
+def measure_crossover(sizes, runtime: Runtime) -> list[Point]:
+    """Both solvers on plates of these numbers of cells."""
+    points = []
+    for n in sizes:
+        arena = FieldArena()
+        try:
+            p = build_plates(n, runtime, arena)
+            solvers, names = Solvers(threads=True), (SERIAL, COLOURED + (THREADED if p.serial else ""))
+            start = np.zeros((p.capacity, 3))
+            solvers.outcomes(p, start, 1, names)  # compiles
+            found = solvers.outcomes(p, start, ROUNDS, names)
+            points.append(Point(int(p.count[0]), int(p.count[1]), *(found[name] for name in names)))
+        finally:
+            ti.sync()
+            arena.release()
+    return points
+
+
+def crossover_table(points: list[Point]) -> str:
+    """A row a problem."""
+    columns = (
+        ("contacts", "{.contacts:,}"),
+        ("colours", "{.colours}"),
+        ("sweeps, serial", "{.serial.sweeps}"),
+        ("coloured", "{.coloured.sweeps}"),
+        ("residual, serial", "{.serial.residual:.1e}"),
+        ("coloured", "{.coloured.residual:.1e}"),
+        ("solve, serial [ms]", lambda p: ms(p.serial.median)),
+        ("coloured [ms]", lambda p: ms(p.coloured.median)),
+        ("of it colouring [ms]", lambda p: ms(np.median(p.coloured.colouring))),
+        ("sweep, serial [ms]", lambda p: ms(p.serial.per_sweep)),
+        ("coloured [ms]", lambda p: ms(p.coloured.per_sweep)),
+    )
+    return table(points, columns)
+
+
+def crossover_text(points: list[Point], arch: str) -> str:
+    """A sentence for whole solves and one for sweeps."""
+    contacts, lines = [p.contacts for p in points], []
+    for what, of in (("a whole solve, colouring included", lambda o: o.median), ("a sweep", lambda o: o.per_sweep)):
+        serial, coloured = [of(p.serial) for p in points], [of(p.coloured) for p in points]
+        places = crossovers(contacts, serial, coloured)
+        if places:
+            found = f"crossover at {', '.join(f'{x:,.0f}' for x in places)} contacts"
+        else:
+            faster = "serial" if serial[0] < coloured[0] else "coloured"
+            found = f"no crossover up to {contacts[-1]:,} contacts, {faster} Gauss-Seidel is faster throughout"
+        lines.append(f"* {arch}, {what}: {found}")
+    return "\n".join(lines)
