@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.mesh.files import read_mesh
-from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface
-from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.mesh.tet_mesh import TetMesh, edge_lengths, mean_ratio
 
 POOR_QUALITY = 0.1  # mean ratio below which a tet stiffens its surroundings and slows the solver noticeably
 MILLIMETRES_ABOVE = 20.0  # longest side in file units: soft bodies of more than 20 m are rare, parts of 20 mm are not

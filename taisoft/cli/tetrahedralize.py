@@ -8,8 +8,7 @@ from taisoft.cli.signals import Signals
 from taisoft.cli.warnings import printed_warnings
 from taisoft.errors import OutputError
 from taisoft.mesh.files import check_ending, write_mesh
-from taisoft.mesh.surface_mesh import read_surface
-from taisoft.mesh.tetrahedralize import tetrahedralize
+from taisoft.mesh.surface_mesh import read_surface, tetrahedralize
 
 
 def command(arguments: Namespace) -> int:

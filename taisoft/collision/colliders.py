@@ -5,8 +5,8 @@ import numpy as np
 from taisoft.collision.surface import Topology, make_topology
 from taisoft.errors import MeshError
 from taisoft.fem.model import Layout
-from taisoft.mesh.quality import mean_surface_edge
-from taisoft.mesh.sdf_grid import SdfGrid, cached_sdf_grid
+from taisoft.mesh.sdf import SdfGrid, cached_sdf_grid
+from taisoft.mesh.tet_mesh import mean_surface_edge
 from taisoft.scene.body import Body
 from taisoft.scene.collision import principal_extents
 from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle, Obstacle

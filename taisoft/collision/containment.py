@@ -1,7 +1,7 @@
 """Find, step after step, the parts of colliders that lie inside another collider, even if no surfaces cross.
 
 Contacts and crossings exist only where surfaces meet. A body wholly inside another has none, nor has an exact duplicate. So every
-connected part of a collider has an inner point, see `taisoft.mesh.inner_points`. The few inner points in another collider's box
+connected part of a collider has an inner point, see `taisoft.mesh.solids`. The few inner points in another collider's box
 are tested by winding numbers, and retested only after something has moved by the distance that separated them.
 """
 
@@ -13,8 +13,7 @@ from taisoft.backend.transfer import download
 from taisoft.collision.analytic import AnalyticObstacles
 from taisoft.collision.surface import Surface, Topology
 from taisoft.fem.model import Layout
-from taisoft.mesh.inner_points import connected_parts, inner_depths, inner_tets
-from taisoft.mesh.winding import are_inside, distances, is_closed
+from taisoft.mesh.solids import are_inside, connected_parts, distances, inner_depths, inner_tets, is_closed
 from taisoft.scene.body import Body
 from taisoft.scene.obstacles import Capsule, Obstacle, Sphere
 from taisoft.scene.scene import Scene

@@ -9,8 +9,7 @@ import numpy as np
 
 from taisoft.backend.transfer import download
 from taisoft.collision.pipeline import Detection
-from taisoft.mesh.solid_overlap import ALLOWED, Solid, overlap_depth
-from taisoft.mesh.triangle_queries import distances, segment_distance
+from taisoft.mesh.solids import ALLOWED, Solid, distances, overlap_depth, segment_distance
 from taisoft.scene.obstacles import Capsule, HalfSpace, Sphere
 
 

@@ -36,8 +36,8 @@ from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, Surface, build_surface
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.model import Layout, Model
-from taisoft.mesh.quality import mean_surface_edge
-from taisoft.mesh.sdf_grid import SdfGrid
+from taisoft.mesh.sdf import SdfGrid
+from taisoft.mesh.tet_mesh import mean_surface_edge
 from taisoft.scene.body import Body
 from taisoft.scene.obstacles import MeshObstacle
 from taisoft.scene.plan import make_plan

@@ -24,7 +24,7 @@ from taisoft.collision.frank_wolfe import deepest_point
 from taisoft.collision.queries import WHOLE, list_triangles, query_box
 from taisoft.collision.surface import ACTIVE, dvec, ivec, part_first
 from taisoft.collision.triangles import choose, closest_on_triangle
-from taisoft.mesh.sdf_grid import SdfGrid
+from taisoft.mesh.sdf import SdfGrid
 from taisoft.scene.body import Body
 
 MIN_DET_F = 1e-3  # det F below which a tet is not used for the mapping

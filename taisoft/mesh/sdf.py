@@ -1,4 +1,4 @@
-"""Compute exact signed distances from a closed triangle surface at grid or scattered points; negative inside.
+"""Exact signed distances from a closed triangle surface, negative inside: at scattered points, and on grids, which are cached.
 
 Distance: blocks of grid points are halved down to single points, each with the triangles that can be nearest to a point
 in it. Let u bound the distances of all points in a block with centre q and half diagonal s from above. A triangle can be
@@ -9,23 +9,110 @@ Sign: from the pseudonormal of the nearest feature: the face normal, the sum of 
 angle-weighted sum at a vertex (Baerentzen & Aanaes 2005, Signed distance computation using the angle weighted
 pseudonormal, IEEE TVCG 11(3)). Parts of the surface that touch only at a vertex have separate pseudonormals there; the part
 that faces the point decides. Weak: a self-intersecting surface has no well-defined inside; the nearest sheet gives the sign.
+Grids are cached on disk under the SHA-256 of their inputs. A damaged file is computed again; if the folder is not writable,
+nothing is cached.
 """
 
-from collections.abc import Iterator
+import hashlib
+import os
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import scipy
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
-from taisoft.errors import MeshError
-from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
+from taisoft.errors import MeshError, OutputError
+from taisoft.files import cache_folders, replacing
+from taisoft.mesh.topology import linked_groups, normals_and_heights, opposite_half_edges
 
-MAX_PAIRS = 1 << 19  # maximum number of block-triangle pairs processed at once, about 100 bytes each
+FORMAT = 1  # version of cached grids; increase it when their numbers or meaning change
+MIN_CELLS = 8  # smallest number of cells across a side
+MIN_PADDING = 2  # cells beyond the surface on every side
+MAX_POINTS = 2_000_000  # default limit on the number of grid points
+_ROUNDING = 1e-9  # fraction of a cell ignored when the number of cells is rounded up
+_CHUNK = 1 << 16  # maximum number of points, or pairs of a block and a triangle, processed at once, about 800 bytes each
 _SLACK = 1e-9  # relative to the size: bounds are widened by this against rounding
 _SCATTERED_PAIRS = 1 << 15  # maximum number of point-triangle pairs processed at once for scattered points
 _BATCH = 64  # points evaluated exactly at once, before checking whether any other point can lie deeper
+
+
+@dataclass(frozen=True, eq=False)
+class SdfGrid:
+    """Signed distances at the points origin + (i, j, k) * spacing. Arrays are read-only."""
+
+    origin: np.ndarray  # (3,) [m]
+    spacing: np.ndarray  # (3,) [m]
+    phi: np.ndarray  # (nx,ny,nz) float64 [m], negative inside
+
+    def __post_init__(self):
+        for array in (self.origin, self.spacing, self.phi):
+            array.setflags(write=False)
+
+
+def sdf_grid(
+    vertices: np.ndarray, triangles: np.ndarray, cells: int = 32, max_points: int = MAX_POINTS, margin: float = 0.0
+) -> SdfGrid:
+    """Compute exact signed distances on a grid around a closed surface.
+
+    vertices: (n,3) [m]. triangles: (t,3) int, normals outward; every edge has two. cells: along the longest side; other
+    sides get cells of about that size, but at least 8. max_points: limit on the number of grid points. margin: minimum
+    distance [m] from the surface to the grid's border, which is at least two cells. Raises MeshError for an open surface,
+    triangles without area, and a grid above max_points.
+    """
+    vertices, triangles = _arrays(vertices, triangles)
+    origin, spacing, shape = _layout(vertices[np.unique(triangles)], cells, max_points, margin)
+    axes = [origin[a] + spacing[a] * np.arange(shape[a]) for a in range(3)]
+    return SdfGrid(origin, spacing, signed_distances(vertices, triangles, axes))
+
+
+def cached_sdf_grid(
+    vertices: np.ndarray, triangles: np.ndarray, cells: int = 32, max_points: int = MAX_POINTS, margin: float = 0.0
+) -> SdfGrid:
+    """Return `sdf_grid` of the same arguments, read from the cache or computed and stored there."""
+    vertices, triangles = _arrays(vertices, triangles)
+    origin, spacing, shape = _layout(vertices[np.unique(triangles)], cells, max_points, margin)
+    inputs = f"{FORMAT} {len(vertices)} {len(triangles)} {int(cells)} {float(margin).hex()}\n".encode()
+    path = cache_folder() / f"{hashlib.sha256(inputs + vertices.tobytes() + triangles.tobytes()).hexdigest()}.npz"
+    with suppress(Exception):  # a damaged archive raises many kinds of errors, some from the decompression modules
+        # Open here, because np.load leaves an unreadable file open.
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
+            phi = file["phi"]
+        if phi.shape == shape and phi.dtype == np.float64 and np.isfinite(phi).all():
+            return SdfGrid(origin, spacing, phi)
+    grid = sdf_grid(vertices, triangles, cells, max_points, margin)
+    with suppress(OSError, OutputError):  # the folder is not writable
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as part, open(part, "wb") as file:
+            np.savez(file, phi=grid.phi)
+    return grid
+
+
+def cache_folder() -> Path:
+    """Return the folder of cached grids."""
+    return next(cache_folders(), Path(os.devnull)) / "sdf"  # os.devnull cannot contain files
+
+
+def _arrays(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(triangles, dtype=np.int64)
+
+
+def _layout(vertices: np.ndarray, cells: int, max_points: int, margin: float):
+    """Return origin (3,) [m], spacing (3,) [m] and shape of the grid of `sdf_grid` around vertices (n,3) [m]."""
+    low, side = vertices.min(axis=0), np.ptp(vertices, axis=0)
+    if not side.min() > 0:
+        raise MeshError("sdf_grid: the surface is flat and has no inside")
+    n_cells = np.maximum(np.ceil(side / (side.max() / cells) - _ROUNDING), MIN_CELLS)
+    spacing = side / n_cells
+    pad = np.maximum(np.ceil(margin / spacing - _ROUNDING), MIN_PADDING)
+    shape = tuple(int(n) for n in n_cells + 2 * pad + 1)
+    count = int(np.prod(shape, dtype=object))
+    if count > max_points:
+        raise MeshError(
+            f"sdf_grid: {cells} cells along the longest side and a margin of {margin:g} m need {count} points "
+            f"({' x '.join(map(str, shape))}); at most {max_points} are allowed"
+        )
+    return low - pad * spacing, spacing, shape
 
 
 def signed_distances(vertices: np.ndarray, triangles: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
@@ -96,7 +183,7 @@ class _Surface:
         opposite = opposite_half_edges(triangles)
         if (opposite < 0).any():
             t, k = np.argwhere(opposite < 0)[0]
-            edge = tuple(sorted((int(triangles[t, k]), int(triangles[t, (k + 1) % 3]))))
+            edge = tuple(sorted(triangles[t, [k, (k + 1) % 3]].tolist()))
             raise MeshError(
                 f"a distance field needs a closed surface: edge {edge} belongs to triangle {t} alone "
                 f"({int((opposite < 0).sum())} such edges)"
@@ -117,10 +204,8 @@ class _Surface:
     def _parts(opposite: np.ndarray) -> np.ndarray:
         """Return a label (3t,) for each corner, equal for corners of one vertex connected through shared edges."""
         # Corner k starts half-edge k and ends its opposite, so it is the corner after that one in the other triangle.
-        n = opposite.size
         neighbour = opposite // 3 * 3 + (opposite + 1) % 3
-        graph = coo_matrix((np.ones(n, dtype=np.int8), (np.arange(n), neighbour.reshape(-1))), shape=(n, n))
-        return connected_components(graph, directed=False)[1]
+        return linked_groups(np.arange(opposite.size), neighbour.reshape(-1), opposite.size)[1]
 
     def _at_corners(self, part: np.ndarray) -> np.ndarray:
         """Return angle-weighted sums (t,3,3) of the normals of the triangles around each corner."""
@@ -197,7 +282,8 @@ class _Search:
         self._squared = np.empty(len(points))
         self._slack = _SLACK * float(np.linalg.norm(points[-1] - points[0]))
         tree = scipy.spatial.cKDTree(surface.centroid)
-        for chunk in self._chunks(len(points)):
+        for first in range(0, len(points), _CHUNK):
+            chunk = slice(first, first + _CHUNK)
             self._triangle[chunk] = tree.query(points[chunk])[1]
             self._squared[chunk] = surface.nearest(points[chunk], self._triangle[chunk])[0]
         self._levels = [self._level(0, np.sqrt(self._squared).reshape([len(a) for a in axes]))]
@@ -207,7 +293,7 @@ class _Search:
                 coarse = np.maximum.reduceat(coarse, np.arange(0, coarse.shape[axis], 2), axis=axis)
             self._levels.append(self._level(len(self._levels), coarse))
 
-    def _level(self, level: int, upper: np.ndarray) -> "_Level":
+    def _level(self, level: int, upper: np.ndarray) -> _Level:
         """Return the blocks of 2^level points along each axis. upper: bounds of their points' distances [m]."""
         centres, half = [], np.zeros(())
         for axis, x in enumerate(self._axes):
@@ -217,17 +303,13 @@ class _Search:
             half = half[..., None] + (0.5 * (high - low)) ** 2
         return _Level(upper, centres, (upper + np.sqrt(half) + self._slack).reshape(-1))
 
-    @staticmethod
-    def _chunks(count: int) -> Iterator[slice]:
-        return (slice(i, i + MAX_PAIRS // 8) for i in range(0, count, MAX_PAIRS // 8))
-
     def run(self) -> np.ndarray:
         """Return signed distances (nx,ny,nz) [m]."""
         n = len(self._surface.centroid)
         stack = [(len(self._levels) - 1, np.zeros(n, dtype=np.int64), np.arange(n))]
         while stack:  # depth first, with a bounded number of pairs at a time
             level, block, triangle = stack.pop()
-            if len(block) > MAX_PAIRS // 8:
+            if len(block) > _CHUNK:
                 half = len(block) // 2
                 stack += [(level, block[:half], triangle[:half]), (level, block[half:], triangle[half:])]
             elif level:
@@ -235,7 +317,8 @@ class _Search:
             else:
                 self._improve(block, triangle)
         phi = np.empty(len(self._points))
-        for chunk in self._chunks(len(phi)):
+        for first in range(0, len(phi), _CHUNK):
+            chunk = slice(first, first + _CHUNK)
             triangle = self._triangle[chunk]
             squared, offset, feature = self._surface.nearest(self._points[chunk], triangle)
             phi[chunk] = np.where(self._surface.sides(offset, triangle, feature) < 0, -1.0, 1.0) * np.sqrt(squared)
