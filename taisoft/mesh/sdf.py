@@ -1,10 +1,8 @@
 """Exact signed distances from a closed triangle surface, negative inside: at scattered points, and on grids, which are cached.
 
-Distance: blocks of grid points are halved down to single points, each with the triangles that can be nearest to a point
-in it. Let u bound the distances of all points in a block with centre q and half diagonal s from above. A triangle can be
-nearest only if its distance from q is at most u + s. The triangle's bounding disc around its centroid bounds that distance
-from below, much more tightly than a ball if many triangles are about equally far. u comes from the triangle with the
-nearest centroid (k-d tree).
+Distance: the triangle with the nearest centroid (k-d tree) bounds a point's distance by u. A triangle can be nearer only if
+its bounding ball around the centroid is within u, which a k-d tree finds. Most of these are then excluded by the triangle's
+bounding disc, a much tighter bound than the ball if many triangles are about equally far.
 Sign: from the pseudonormal of the nearest feature: the face normal, the sum of the two face normals at an edge, or the
 angle-weighted sum at a vertex (Baerentzen & Aanaes 2005, Signed distance computation using the angle weighted
 pseudonormal, IEEE TVCG 11(3)). Parts of the surface that touch only at a vertex have separate pseudonormals there; the part
@@ -31,10 +29,9 @@ MIN_CELLS = 8  # smallest number of cells across a side
 MIN_PADDING = 2  # cells beyond the surface on every side
 MAX_POINTS = 2_000_000  # default limit on the number of grid points
 _ROUNDING = 1e-9  # fraction of a cell ignored when the number of cells is rounded up
-_CHUNK = 1 << 16  # maximum number of points, or pairs of a block and a triangle, processed at once, about 800 bytes each
-_SLACK = 1e-9  # relative to the size: bounds are widened by this against rounding
-_SCATTERED_PAIRS = 1 << 15  # maximum number of point-triangle pairs processed at once for scattered points
+_CHUNK = 512  # points evaluated at once, each with some hundred triangles near it
 _BATCH = 64  # points evaluated exactly at once, before checking whether any other point can lie deeper
+_SLACK = 1e-9  # relative to the size: bounds are widened by this against rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,55 +118,50 @@ def signed_distances(vertices: np.ndarray, triangles: np.ndarray, axes: list[np.
     vertices: (n,3) float64 [m]. triangles: (t,3) int64, normals outward. axes: ascending coordinates (nx,), (ny,), (nz,)
     [m]. Raises MeshError for a surface that is open, inconsistently oriented, or has triangles without area.
     """
-    return _Search(_Surface(vertices, triangles), axes).run()
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    return signed_distances_at(vertices, triangles, points.reshape(-1, 3)).reshape(points.shape[:3])
 
 
 def signed_distances_at(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return signed distances (k,) float64 [m] at points (k,3), negative inside; surface as in `signed_distances`."""
-    search = _PointSearch(_Surface(vertices, triangles), points)
-    return search.signed(np.arange(len(points)))
+    surface, phi = _Surface(vertices, triangles), np.empty(len(points))
+    for first in range(0, len(points), _CHUNK):
+        chunk = points[first : first + _CHUNK]
+        phi[first : first + _CHUNK] = surface.signed(chunk, surface.upper(chunk))
+    return phi
 
 
 def greatest_depth(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> float:
     """Return the largest depth [m] of points (k,3) inside, 0 if none is inside; surface as in `signed_distances`."""
-    search = _PointSearch(_Surface(vertices, triangles), points)
-    order = np.argsort(-search.upper, kind="stable")
+    surface = _Surface(vertices, triangles)
+    upper = surface.upper(points)
+    order = np.argsort(-upper, kind="stable")
     deepest = 0.0
     for first in range(0, len(order), _BATCH):
         batch = order[first : first + _BATCH]
-        if search.upper[batch[0]] <= deepest:  # no other can lie deeper
+        if upper[batch[0]] <= deepest:  # no other can lie deeper
             break
-        deepest = max(deepest, -float(search.signed(batch).min()))
+        deepest = max(deepest, -float(surface.signed(points[batch], upper[batch]).min()))
     return deepest
 
 
-class _PointSearch:
-    """Distance queries at points (k,3). upper: (k,) [m], upper bounds of their distances."""
+class BallTree:
+    """Balls, found by one k-d tree for each size class: large balls widen only their own search."""
 
-    def __init__(self, surface: "_Surface", points: np.ndarray):
-        self.surface, self.points, self.tree = surface, points, scipy.spatial.cKDTree(surface.centroid)
-        first = self.tree.query(points)[1].astype(np.int64) if len(points) else np.zeros(0, dtype=np.int64)
-        self.upper = np.sqrt(surface.nearest(points, first)[0])
+    def __init__(self, centres: np.ndarray, radii: np.ndarray):
+        """centres: (n,3) [m]. radii: (n,) [m]."""
+        classes = np.floor(np.log2(np.maximum(radii, np.finfo(float).tiny)))
+        groups = [np.flatnonzero(classes == size_class) for size_class in np.unique(classes)]
+        self._groups = [(rows, scipy.spatial.cKDTree(centres[rows]), radii[rows].max()) for rows in groups]
 
-    def signed(self, rows: np.ndarray) -> np.ndarray:
-        """Return signed distances [m] of the points in rows."""
-        surface = self.surface
-        if not len(rows):
-            return np.zeros(0)
-        # a triangle can be nearer only if its centroid is within the bound plus the triangle's radius
-        reach = (1.0 + _SLACK) * (self.upper[rows] + surface.radius.max())
-        nearby = self.tree.query_ball_point(self.points[rows], reach, return_sorted=True)
-        counts = np.array([len(candidates) for candidates in nearby])
-        result = []
-        for chunk in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(np.cumsum(counts) // _SCATTERED_PAIRS)) + 1):
-            starts = np.concatenate([[0], np.cumsum(counts[chunk])[:-1]])
-            point_row, triangle = np.repeat(rows[chunk], counts[chunk]), np.concatenate(nearby[chunk]).astype(np.int64)
-            squared, offset, feature = surface.nearest(self.points[point_row], triangle)
-            equal = np.flatnonzero(squared == np.repeat(np.minimum.reduceat(squared, starts), counts[chunk]))
-            best = equal[np.searchsorted(equal, starts)]  # ties take the first triangle
-            inside = surface.sides(offset[best], triangle[best], feature[best]) < 0.0
-            result.append(np.where(inside, -1.0, 1.0) * np.sqrt(squared[best]))
-        return np.concatenate(result)
+    def pairs(self, points: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pairs of a point and a ball, their indices, at most reach (p,) [m] apart, and some that are farther."""
+        found = [np.zeros((2, 0), dtype=np.int64)]
+        for rows, tree, radius in self._groups:
+            lists = tree.query_ball_point(points, (1.0 + _SLACK) * (reach + radius))
+            ball = np.concatenate([np.zeros(0), *lists]).astype(np.int64)
+            found.append(np.stack([np.repeat(np.arange(len(lists)), [len(near) for near in lists]), rows[ball]]))
+        return tuple(np.concatenate(found, axis=1))
 
 
 class _Surface:
@@ -193,6 +185,8 @@ class _Surface:
         self.edges = np.roll(self.corners, -1, axis=1) - self.corners
         self.centroid = self.corners.mean(axis=1)
         self.radius = np.linalg.norm(self.corners - self.centroid[:, None], axis=2).max(axis=1)
+        self._tree, self._balls = scipy.spatial.cKDTree(self.centroid), BallTree(self.centroid, self.radius)
+        self._slack = _SLACK * float(np.linalg.norm(np.ptp(self.corners, axis=(0, 1))))
         # (t,7,3): pseudonormals of the face, its three edges and its three corners, of any length.
         at_edges = self.normals[:, None] + self.normals[opposite // 3]
         part = self._parts(opposite)
@@ -215,6 +209,24 @@ class _Surface:
         weighted = angle[:, None] * np.repeat(self.normals, 3, axis=0)
         total = np.stack([np.bincount(part, weighted[:, x]) for x in range(3)], axis=1)
         return total[part].reshape(-1, 3, 3)
+
+    def upper(self, points: np.ndarray) -> np.ndarray:
+        """Return upper bounds (p,) [m] of the distances of points (p,3)."""
+        triangle = self._tree.query(points)[1] if len(points) else np.zeros(0, dtype=np.int64)
+        return np.sqrt(self.nearest(points, triangle)[0])
+
+    def signed(self, points: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        """Return signed distances (p,) [m] of points (p,3), p > 0, with these upper bounds."""
+        point, triangle = self._balls.pairs(points, upper)
+        near = np.flatnonzero(self.bound(points[point], triangle) <= upper[point] * (1.0 + _SLACK) + self._slack)
+        near = near[np.lexsort((triangle[near], point[near]))]
+        point, triangle = point[near], triangle[near]
+        squared, offset, feature = self.nearest(points[point], triangle)
+        starts = np.searchsorted(point, np.arange(len(points)))
+        equal = np.flatnonzero(squared == np.minimum.reduceat(squared, starts)[point])
+        best = equal[np.searchsorted(equal, starts)]  # ties take the first triangle
+        inside = self.sides(offset[best], triangle[best], feature[best]) < 0.0
+        return np.where(inside, -1.0, 1.0) * np.sqrt(squared[best])
 
     def sides(self, offset: np.ndarray, triangle: np.ndarray, feature: np.ndarray) -> np.ndarray:
         """Return (p,) values below 0 for points inside. offset, feature: returned by `nearest` for the triangles (p,)."""
@@ -261,89 +273,3 @@ class _Surface:
             np.where(face[:, None], height[:, None] * normal, offset),
             np.where(face, 0, feature),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class _Level:
-    """Blocks of grid points of one size."""
-
-    upper: np.ndarray  # (bx,by,bz) [m]: upper bound of the distances of the block's points
-    centres: list[np.ndarray]  # three arrays (bx,), (by,), (bz,) [m]
-    reach: np.ndarray  # (bx*by*bz,) [m]: triangles farther from the centre are not nearest to any point of the block
-
-
-class _Search:
-    """Hierarchical search for the nearest triangle of every grid point."""
-
-    def __init__(self, surface: _Surface, axes: list[np.ndarray]):
-        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        self._surface, self._axes, self._points = surface, axes, points
-        self._triangle = np.empty(len(points), dtype=np.int64)
-        self._squared = np.empty(len(points))
-        self._slack = _SLACK * float(np.linalg.norm(points[-1] - points[0]))
-        tree = scipy.spatial.cKDTree(surface.centroid)
-        for first in range(0, len(points), _CHUNK):
-            chunk = slice(first, first + _CHUNK)
-            self._triangle[chunk] = tree.query(points[chunk])[1]
-            self._squared[chunk] = surface.nearest(points[chunk], self._triangle[chunk])[0]
-        self._levels = [self._level(0, np.sqrt(self._squared).reshape([len(a) for a in axes]))]
-        while self._levels[-1].reach.size > 1:
-            coarse = self._levels[-1].upper
-            for axis in range(3):
-                coarse = np.maximum.reduceat(coarse, np.arange(0, coarse.shape[axis], 2), axis=axis)
-            self._levels.append(self._level(len(self._levels), coarse))
-
-    def _level(self, level: int, upper: np.ndarray) -> _Level:
-        """Return the blocks of 2^level points along each axis. upper: bounds of their points' distances [m]."""
-        centres, half = [], np.zeros(())
-        for axis, x in enumerate(self._axes):
-            first = np.arange(upper.shape[axis]) << level
-            low, high = x[first], x[np.minimum(first + (1 << level), len(x)) - 1]
-            centres.append(0.5 * (low + high))
-            half = half[..., None] + (0.5 * (high - low)) ** 2
-        return _Level(upper, centres, (upper + np.sqrt(half) + self._slack).reshape(-1))
-
-    def run(self) -> np.ndarray:
-        """Return signed distances (nx,ny,nz) [m]."""
-        n = len(self._surface.centroid)
-        stack = [(len(self._levels) - 1, np.zeros(n, dtype=np.int64), np.arange(n))]
-        while stack:  # depth first, with a bounded number of pairs at a time
-            level, block, triangle = stack.pop()
-            if len(block) > _CHUNK:
-                half = len(block) // 2
-                stack += [(level, block[:half], triangle[:half]), (level, block[half:], triangle[half:])]
-            elif level:
-                stack.append((level - 1, *self._children(level - 1, block, triangle)))
-            else:
-                self._improve(block, triangle)
-        phi = np.empty(len(self._points))
-        for first in range(0, len(phi), _CHUNK):
-            chunk = slice(first, first + _CHUNK)
-            triangle = self._triangle[chunk]
-            squared, offset, feature = self._surface.nearest(self._points[chunk], triangle)
-            phi[chunk] = np.where(self._surface.sides(offset, triangle, feature) < 0, -1.0, 1.0) * np.sqrt(squared)
-        return phi.reshape([len(a) for a in self._axes])
-
-    def _children(self, level: int, block: np.ndarray, triangle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pairs of child blocks at `level` and triangles that can be nearest to one of their points."""
-        fine, parent = self._levels[level], np.unravel_index(block, self._levels[level + 1].upper.shape)
-        pairs = []
-        for corner in range(8):
-            ijk = [2 * p + (corner >> (2 - a) & 1) for a, p in enumerate(parent)]
-            exists = np.logical_and.reduce([i < n for i, n in zip(ijk, fine.upper.shape)])
-            ijk, candidates = [i[exists] for i in ijk], triangle[exists]
-            child = np.ravel_multi_index(ijk, fine.upper.shape)
-            centre = np.stack([x[i] for x, i in zip(fine.centres, ijk)], axis=1)
-            is_near = self._surface.bound(centre, candidates) <= fine.reach[child]
-            pairs.append((child[is_near], candidates[is_near]))
-        return tuple(np.concatenate(column) for column in zip(*pairs))
-
-    def _improve(self, point: np.ndarray, triangle: np.ndarray) -> None:
-        """Update the nearest triangles by the pairs' distances; ties take the first triangle."""
-        squared = self._surface.nearest(self._points[point], triangle)[0]
-        order = np.lexsort((triangle, squared, point))
-        point, triangle, squared = point[order], triangle[order], squared[order]
-        first = np.ones(len(point), dtype=bool)
-        first[1:] = point[1:] != point[:-1]
-        first &= squared < self._squared[point]
-        self._squared[point[first]], self._triangle[point[first]] = squared[first], triangle[first]

@@ -21,10 +21,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy
 
 from taisoft.errors import MeshError
-from taisoft.mesh.sdf import greatest_depth
+from taisoft.mesh.sdf import BallTree, greatest_depth
 from taisoft.mesh.topology import EDGES, TET_FACES, connected_pieces, normals_and_heights, triangle_edges
 
 ALLOWED = 1e-6  # largest depth that is not an overlap, over the smaller solid's size
@@ -186,21 +185,15 @@ def cut_depths(triangles: np.ndarray, tets: np.ndarray, slack: float) -> tuple[n
 
 
 def _near_boxes(lo_a: np.ndarray, hi_a: np.ndarray, lo_b: np.ndarray, hi_b: np.ndarray) -> np.ndarray:
-    """Return the pairs (k,2) of boxes that meet. One k-d tree per size class of b: large boxes widen only their search."""
+    """Return the pairs (k,2) of boxes that meet."""
     middle_a, middle_b = 0.5 * (lo_a + hi_a), 0.5 * (lo_b + hi_b)
-    reach_a, reach_b = np.linalg.norm(hi_a - middle_a, axis=1), np.linalg.norm(hi_b - middle_b, axis=1)
+    reach, tree = np.linalg.norm(hi_a - middle_a, axis=1), BallTree(middle_b, np.linalg.norm(hi_b - middle_b, axis=1))
     pairs = [np.zeros((0, 2), dtype=np.int64)]
-    size_classes = np.floor(np.log2(np.maximum(reach_b, np.finfo(float).tiny)))
-    for size_class in np.unique(size_classes):
-        rows = np.flatnonzero(size_classes == size_class)
-        tree, reach = scipy.spatial.cKDTree(middle_b[rows]), reach_b[rows].max()
-        for first in range(0, len(middle_a), _TET_PAIRS):
-            chunk = slice(first, first + _TET_PAIRS)
-            lists = tree.query_ball_point(middle_a[chunk], (1.0 + 1e-9) * (reach_a[chunk] + reach))
-            a = first + np.repeat(np.arange(len(lists)), [len(near) for near in lists])
-            b = rows[np.concatenate([np.zeros(0, dtype=np.int64), *lists]).astype(np.int64)]
-            meet = ((lo_a[a] <= hi_b[b]) & (lo_b[b] <= hi_a[a])).all(axis=1)
-            pairs.append(np.stack([a[meet], b[meet]], axis=1))
+    for first in range(0, len(middle_a), _TET_PAIRS):
+        a, b = tree.pairs(middle_a[first : first + _TET_PAIRS], reach[first : first + _TET_PAIRS])
+        a = a + first
+        meet = ((lo_a[a] <= hi_b[b]) & (lo_b[b] <= hi_a[a])).all(axis=1)
+        pairs.append(np.stack([a[meet], b[meet]], axis=1))
     return np.concatenate(pairs)
 
 
