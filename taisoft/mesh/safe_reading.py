@@ -22,7 +22,7 @@ from taisoft.errors import MeshError
 
 UTF16 = "the file is UTF-16 text; save it as UTF-8"
 HEAD = 64  # characters inspected to detect UTF-16 text
-SECONDS, SECONDS_PER_BYTE = 20.0, 1e-5  # time limit of a reader; the slowest reads 1 MB/s
+SECONDS, SECONDS_PER_BYTE = 15.0, 1e-5  # time limit of a reader; the slowest reads 1 MB/s
 MEMORY, MEMORY_PER_BYTE = 2 << 30, 200  # limit of a reader's address space [bytes]; text becomes Python objects
 MAX_READS_PAST_END = 100  # allowed reads past the end of a file, where some of meshio's readers loop forever
 QUALITY = 10.0  # fTetWild's target upper bound of the tets' AMIPS energy: 3 for a regular tet
