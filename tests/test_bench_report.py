@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib import image as pictures
-from taisoft.mesh.sdf import SdfGrid
 
 from benchmarks import document, report
 from benchmarks.again import again_text, agrees
@@ -41,6 +40,7 @@ from benchmarks.report_parts.page import (
 )
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError
+from taisoft.mesh.sdf import SdfGrid
 from taisoft.timing import summarise
 
 SPREAD = (0.98, 1.0, 1.02)  # of rounds about their median

@@ -10,9 +10,9 @@ import json
 import numpy as np
 import pytest
 from contact_cases import Case, P, cases
-from taisoft.mesh.sdf import signed_distances
 
 import taisoft as ts
+from taisoft.mesh.sdf import signed_distances
 
 CASES = cases()
 

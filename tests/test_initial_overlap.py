@@ -10,10 +10,10 @@
 import numpy as np
 import pytest
 from rotations import rotation
-from taisoft.mesh.sdf import signed_distances, signed_distances_at
 
 import taisoft as ts
 from taisoft.collision.overlap import find_overlaps
+from taisoft.mesh.sdf import signed_distances, signed_distances_at
 
 FAR = np.array([0.0, 50.0, 0.0])  # [m] where a body is out of the way
 SOFT = ts.Material(young=1e6)

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
+
+import taisoft as ts
 from taisoft.mesh.sdf import greatest_depth, signed_distances_at
 from taisoft.mesh.solids import (
     ALLOWED,
@@ -29,8 +31,6 @@ from taisoft.mesh.solids import (
     segment_distance,
     solid_depths,
 )
-
-import taisoft as ts
 
 
 def box(n: int, size=(1, 1, 1), pattern="five") -> ts.TetMesh:

@@ -7,9 +7,9 @@ The pairs, distances and places are those of a `Rig`, so that both do the same w
 """
 
 import numpy as np
-from taisoft.mesh.sdf import SdfGrid
 
 from taisoft.collision.colliders import body_grid
+from taisoft.mesh.sdf import SdfGrid
 
 from ..collision_runs import Rig
 
