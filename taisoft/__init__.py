@@ -21,7 +21,7 @@ _MODULES = {  # public name -> the module that defines it
     "write_mesh": "taisoft.mesh.files",
     "SurfaceMesh": "taisoft.mesh.surface_mesh",
     "read_surface": "taisoft.mesh.surface_mesh",
-    "tetrahedralize": "taisoft.mesh.tetrahedralize",
+    "tetrahedralize": "taisoft.mesh.surface_mesh",
     "Material": "taisoft.scene.scene",
     "Body": "taisoft.scene.scene",
     "Scene": "taisoft.scene.scene",

@@ -38,7 +38,7 @@ from benchmarks.report_parts.page import (
 from benchmarks.runner import REST
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError
-from taisoft.mesh.sdf_grid import SdfGrid
+from taisoft.mesh.sdf import SdfGrid
 from taisoft.timing import summarise
 
 SPREAD = (0.98, 1.0, 1.02)  # of rounds about their median

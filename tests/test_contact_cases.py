@@ -12,7 +12,7 @@ import pytest
 from contact_cases import Case, P, cases
 
 import taisoft as ts
-from taisoft.mesh.signed_distance import signed_distances
+from taisoft.mesh.sdf import signed_distances
 
 CASES = cases()
 

@@ -13,7 +13,7 @@ from rotations import rotation
 
 import taisoft as ts
 from taisoft.collision.overlap import find_overlaps
-from taisoft.mesh.signed_distance import signed_distances, signed_distances_at
+from taisoft.mesh.sdf import signed_distances, signed_distances_at
 
 FAR = np.array([0.0, 50.0, 0.0])  # [m] where a body is out of the way
 SOFT = ts.Material(young=1e6)

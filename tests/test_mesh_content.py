@@ -14,7 +14,7 @@ from test_mesh_files import MESH, write_by_meshio
 from toml_scenes import MESH as SCENE
 
 import taisoft as ts
-from taisoft.mesh.content import utf16_head
+from taisoft.mesh.safe_reading import utf16_head
 
 TEXT = {"binary": False}
 MESHES = {

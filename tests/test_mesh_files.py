@@ -329,7 +329,7 @@ def check_survives(path: Path) -> None:
     assert time.process_time() - start < 5.0
 
 
-MANY = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+MANY = settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @MANY

@@ -17,7 +17,7 @@ from rotations import rotation
 from usd_stage import faults
 
 import taisoft as ts
-from taisoft.mesh.half_edges import opposite_half_edges
+from taisoft.mesh.topology import opposite_half_edges
 from taisoft.output.appearance import OBSTACLE_COLOUR
 from taisoft.output.obstacle_surface import HALF_SIDE, obstacle_surfaces
 from taisoft.output.usd import UsdWriter, join_chunks

@@ -11,7 +11,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.errors import SceneError
-from taisoft.mesh.half_edges import opposite_half_edges
+from taisoft.mesh.topology import opposite_half_edges
 from taisoft.scene.obstacles import Shape
 
 TETRA = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], dtype=float)

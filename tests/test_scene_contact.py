@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from taisoft.errors import SceneError
-from taisoft.mesh.half_edges import opposite_half_edges
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.mesh.topology import opposite_half_edges
 from taisoft.scene.collision import CollisionSettings, _largest_convex_angle, has_sharp_edges
 from taisoft.scene.obstacles import Box, HalfSpace, Sphere
 from taisoft.scene.scene import Material, Scene

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from taisoft.errors import MeshError
-from taisoft.mesh import sdf_grid as module
-from taisoft.mesh.sdf_grid import cache_folder, cached_sdf_grid, sdf_grid
+from taisoft.mesh import sdf as module
+from taisoft.mesh.sdf import cache_folder, cached_sdf_grid, sdf_grid
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.mesh.tet_mesh import TetMesh
 

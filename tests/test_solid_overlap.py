@@ -15,12 +15,22 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 import taisoft as ts
-from taisoft.mesh.inner_points import connected_parts, inner_depths, inner_tets
-from taisoft.mesh.signed_distance import greatest_depth, signed_distances_at
-from taisoft.mesh.solid_overlap import ALLOWED, Solid, overlap_depth
-from taisoft.mesh.tet_cuts import cut_depths
-from taisoft.mesh.triangle_queries import distances, nearest_hit, segment_distance
-from taisoft.mesh.winding import are_inside, is_closed, solid_depths
+from taisoft.mesh.sdf import greatest_depth, signed_distances_at
+from taisoft.mesh.solids import (
+    ALLOWED,
+    Solid,
+    are_inside,
+    connected_parts,
+    cut_depths,
+    distances,
+    inner_depths,
+    inner_tets,
+    is_closed,
+    nearest_hit,
+    overlap_depth,
+    segment_distance,
+    solid_depths,
+)
 
 
 def box(n: int, size=(1, 1, 1), pattern="five") -> ts.TetMesh:

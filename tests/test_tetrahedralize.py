@@ -20,7 +20,7 @@ from test_surface_mesh import BALL, VOLUME, T, X
 import taisoft as ts
 from taisoft.cli import main
 from taisoft.errors import MeshError
-from taisoft.mesh import tetrahedralize as module
+from taisoft.mesh import safe_reading, surface_mesh
 
 
 @pytest.mark.parametrize("scale, shift, flipped", [(1.0, 0.0, False), (1e-3, 50.0, True)])
@@ -43,13 +43,13 @@ def test_what_cannot_be_meshed_is_told(monkeypatch):
     with pytest.raises(MeshError, match="needs a SurfaceMesh"):
         ts.tetrahedralize(BALL)
     with monkeypatch.context() as patch:
-        patch.setattr(module, "find_spec", lambda name: None)
+        patch.setattr(surface_mesh, "find_spec", lambda name: None)
         with pytest.raises(MeshError, match=r"ball.obj: .* needs the package wildmeshing: pip install 'taisoft\[mesh\]'"):
             ts.tetrahedralize(surface)
-    monkeypatch.setattr(module, "find_spec", lambda name: True)
+    monkeypatch.setattr(surface_mesh, "find_spec", lambda name: True)
     say = "import sys; sys.exit('terminate called\\nout of luck\\n')"
     Popen = subprocess.Popen
-    monkeypatch.setattr(module.subprocess, "Popen", lambda command, **more: Popen([command[0], "-c", say], **more))
+    monkeypatch.setattr(safe_reading.subprocess, "Popen", lambda command, **more: Popen([command[0], "-c", say], **more))
     with pytest.raises(MeshError, match="ball.obj: the mesher failed: out of luck"):
         ts.tetrahedralize(surface)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from taisoft.errors import MeshError
 from taisoft.fem.model import Layout
-from taisoft.mesh.sdf_grid import SdfGrid, cached_sdf_grid
+from taisoft.mesh.sdf import SdfGrid, cached_sdf_grid
 from taisoft.scene.body import Body
 from taisoft.scene.collision import principal_extents
 from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle, Obstacle

@@ -20,7 +20,7 @@ from taisoft.collision.contacts import write_point_contact
 from taisoft.collision.deepest_point import MIN_EXTRA_DEPTH, deepest_point, is_surface_minimum
 from taisoft.collision.features import choose, closest_on_triangle, corner, in_normal_cone, moved, unit, vertices_of
 from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near, part_first, sum_pairs
-from taisoft.mesh.sdf_grid import SdfGrid
+from taisoft.mesh.sdf import SdfGrid
 from taisoft.scene.body import Body
 
 MIN_DET_F = 1e-3  # det F below which a tet is not used for the mapping

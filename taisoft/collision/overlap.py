@@ -4,7 +4,7 @@ Contact detection finds features that can touch in a step and misses deep penetr
 testing all pairs of bodies and obstacles.
 
 In later steps, contacts and crossings exist only where surfaces meet. A body wholly inside another has none, nor has an exact
-duplicate. So every connected part of a collider has an inner point, see `taisoft.mesh.inner_points`. The few inner points in
+duplicate. So every connected part of a collider has an inner point, see `taisoft.mesh.solids`. The few inner points in
 another collider's box are tested by winding numbers, and retested only after something has moved by the distance that separated
 them.
 """
@@ -19,10 +19,18 @@ from taisoft.collision.analytic import AnalyticObstacles
 from taisoft.collision.colliders import Topology
 from taisoft.collision.surface import Surface
 from taisoft.fem.model import Layout
-from taisoft.mesh.inner_points import connected_parts, inner_depths, inner_tets
-from taisoft.mesh.solid_overlap import ALLOWED, Solid, overlap_depth
-from taisoft.mesh.triangle_queries import distances, segment_distance
-from taisoft.mesh.winding import are_inside, is_closed
+from taisoft.mesh.solids import (
+    ALLOWED,
+    Solid,
+    are_inside,
+    connected_parts,
+    distances,
+    inner_depths,
+    inner_tets,
+    is_closed,
+    overlap_depth,
+    segment_distance,
+)
 from taisoft.scene.body import Body
 from taisoft.scene.obstacles import Capsule, HalfSpace, Obstacle, Sphere
 from taisoft.scene.scene import Scene

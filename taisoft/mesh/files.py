@@ -1,7 +1,10 @@
-"""Read and write tetrahedral meshes.
+"""Read and write tetrahedral meshes in files.
 
-Gmsh and TetGen files are read by `gmsh.py` and `tetgen.py`, which report the place of an error. Every other format is read
-by meshio through `safe_meshio.py`.
+Gmsh's and TetGen's files are read by `formats.py`, every other format by meshio in a child process (`safe_reading.py`).
+
+Second-order tets in a file have ten nodes, four corners and then one on each edge. Only the corners enter the mesh:
+second-order bodies have straight edges at rest and mid-edge nodes of their own. Curved edges are reported. Formats differ in
+the order of the edges, and readers do not always know it, so the order is inferred from the nodes' positions.
 """
 
 import contextlib
@@ -14,13 +17,10 @@ import numpy as np
 
 from taisoft.errors import MeshError
 from taisoft.files import replacing
-from taisoft.mesh.content import read_content
-from taisoft.mesh.gmsh import read_gmsh
-from taisoft.mesh.quality import edge_lengths
-from taisoft.mesh.safe_meshio import read_safely
-from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh, merge_labels
-from taisoft.mesh.tetgen import read_tetgen
-from taisoft.mesh.tetra10 import curved_edge_warnings
+from taisoft.mesh.formats import read_gmsh, read_tetgen
+from taisoft.mesh.safe_reading import Blocks, read_by_meshio, read_content
+from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh, edge_lengths, merge_labels
+from taisoft.mesh.topology import EDGES
 
 TETS = ("tetra", "tetra10")
 BOUNDARY = ("vertex", "line", "line3", "triangle", "triangle6")  # boundary markers that meshers add; ignored with a warning
@@ -34,21 +34,11 @@ SURFACES = {
     ".ply": rb"^[ \t]*element[ \t]+face[ \t]+(\d+)",
 }
 
-# Where a format declares counts: a file of n bytes cannot hold more than n items.
-_COUNTS = {
-    ".vtk": rb"(?:POINTS|CELLS|CELL_TYPES|OFFSETS|CONNECTIVITY)\s+(\d+)",
-    ".vtu": rb"NumberOf(?:Points|Cells)\s*=\s*\"(\d+)",
-    ".mesh": rb"(?:Vertices|Edges|Triangles|Quadrilaterals|Tetrahedra|Hexahedra|Prisms|Pyramids)\s+(\d+)",
-    ".vol": rb"(?:points|volumeelements|surfaceelements\w*|edgesegments\w*)\s+(\d+)",
-    ".su2": rb"N(?:POIN|ELEM)\s*=\s*(\d+)",
-    ".xml": rb"size\s*=\s*\"(\d+)",
-    ".dat": rb"\b(?:NODES|ELEMENTS|N|E)\s*=\s*(\d+)",
-    ".tec": rb"\b(?:NODES|ELEMENTS|N|E)\s*=\s*(\d+)",
-    ".msh": rb"\$(?:Nodes|Elements)\s+(\d+)[ \t\r]*\n",
-}
+# A count of 0 in a file's text, on which meshio's readers fail with an unclear error.
+_ZERO_COUNT = re.compile(rb"(?:POINTS\s+|CELLS\s+(?:1\s+)?|NumberOf(?:Points|Cells)\s*=\s*\")0+\b")
 
-# The declared counts that must not be 0 in a mesh.
-_REQUIRED = {".vtk": rb"(?:POINTS\s+|CELLS\s+(?:1\s+)?)(\d+)", ".vtu": rb"NumberOf(?:Points|Cells)\s*=\s*\"(\d+)"}
+STRAIGHT = 1e-6  # tolerated distance of a node from its edge's midpoint, over the edge's length
+KNOWN_ORDER = 0.25  # largest median of that ratio for which the inferred node order is accepted
 
 _PLURALS = {"vertex": "vertices", "line": "lines", "triangle": "triangles", "quad": "quads", "hexahedron": "hexahedra"}
 
@@ -68,17 +58,17 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None) ->
     name = str(file)
     data = read_content(file)
     ending = file.suffix.lower()
-    found = None
     if ending in SURFACES:
         found = _count_faces(ending, data)
         raise MeshError(f"{name}: no tetrahedra; {found} found; make a volume mesh first: taisoft tetrahedralize")
+    mesh = None
     if ending == ".msh" and data.lstrip()[:1] == b"$":
-        found = read_gmsh(name, data)
+        mesh = read_gmsh(name, data)
     elif ending in (".node", ".ele"):
-        found = read_tetgen(file)
-    points, cells = found or _read_by_meshio(file, name, data)
+        mesh = read_tetgen(file)
+    points, cells = mesh or _read_by_meshio(file, data)
     blocks, notes = _tet_blocks(name, cells)
-    return _clean_mesh(name, np.asarray(points), blocks, notes, fix_orientation, weld)
+    return _clean_mesh(name, points, blocks, notes, fix_orientation, weld)
 
 
 def write_mesh(path, mesh: TetMesh) -> None:
@@ -117,26 +107,19 @@ def _count_faces(ending: str, data: bytes) -> str:
     return _format_counts({"triangle": len(found)})
 
 
-def _read_by_meshio(file: Path, name: str, data: bytes):
-    """Return points and element blocks read by meshio. Raises MeshError for a broken file."""
-    ending = file.suffix.lower()
-    extensions = meshio.extension_to_filetypes
-    if not any("".join(file.suffixes[-n:]).lower() in extensions for n in (1, 2)):
-        raise MeshError(f"{name}: not a supported mesh: the ending {ending!r} is not known")
-    for found in re.finditer(_COUNTS.get(ending, rb"(?!)"), data):
-        if int(found[1][:30]) > len(data):
-            line = data.count(b"\n", 0, found.start(1)) + 1
-            raise MeshError(f"{name}: line {line} declares {found[1][:30].decode()} items, but the file has {len(data)} bytes")
+def _read_by_meshio(file: Path, data: bytes) -> tuple[np.ndarray, Blocks]:
+    known = meshio.extension_to_filetypes
+    if not any("".join(file.suffixes[-n:]).lower() in known for n in (1, 2)):
+        raise MeshError(f"{file}: not a supported mesh: the ending {file.suffix.lower()!r} is not known")
     try:
-        mesh = read_safely(file, name, data)
+        return read_by_meshio(file, data, "mesh")
     except MeshError as error:
-        if any(int(found[1][:30]) == 0 for found in re.finditer(_REQUIRED.get(ending, rb"(?!)"), data)):
-            raise MeshError(f"{name}: no tetrahedra; the file declares 0 points or cells") from error
+        if file.suffix.lower() in (".vtk", ".vtu") and _ZERO_COUNT.search(data):
+            raise MeshError(f"{file}: no tetrahedra; the file declares 0 points or cells") from error
         raise
-    return mesh.points, [(block.type, np.asarray(block.data)) for block in mesh.cells]
 
 
-def _tet_blocks(name: str, cells: list[tuple[str, np.ndarray]]) -> tuple[list[np.ndarray], list[str]]:
+def _tet_blocks(name: str, cells: Blocks) -> tuple[list[np.ndarray], list[str]]:
     """Return the blocks of tets, (m,4) or (m,10), and warnings about other elements."""
     counts: dict[str, int] = {}
     for kind, nodes in cells:
@@ -157,11 +140,7 @@ def _tet_blocks(name: str, cells: list[tuple[str, np.ndarray]]) -> tuple[list[np
 
 def _format_counts(counts: dict[str, int]) -> str:
     """Format counts by element type, such as "3 quads, 1 line"."""
-    parts = []
-    for kind, count in counts.items():
-        plural = _PLURALS.get(kind, f"{kind} elements")
-        parts.append(f"{count} {kind if count == 1 else plural}")
-    return ", ".join(parts)
+    return ", ".join(f"{n} {kind if n == 1 else _PLURALS.get(kind, f'{kind} elements')}" for kind, n in counts.items())
 
 
 def _clean_mesh(name, points, blocks, notes, fix_orientation, weld) -> TetMesh:
@@ -190,7 +169,7 @@ def _clean_mesh(name, points, blocks, notes, fix_orientation, weld) -> TetMesh:
         bad = np.argwhere((cells < 0) | (cells >= len(points)))
         if len(bad):
             raise MeshError(f"{name}: second-order tet {bad[0, 0]}: node {cells[tuple(bad[0])]} does not exist")
-        notes += curved_edge_warnings(name, points, cells)
+        notes += _curved_edge_warnings(name, points, cells)
         unused[cells] = False
     if unused.any():
         notes.append(f"{unused.sum()} vertices of no tet are left out, the first is vertex {unused.argmax()} of the file")
@@ -199,6 +178,32 @@ def _clean_mesh(name, points, blocks, notes, fix_orientation, weld) -> TetMesh:
         points, tets, note = _weld(name, points, tets, weld)
         notes += note
     return TetMesh(points, tets, fix_orientation, source=name, notes=tuple(notes))
+
+
+def _curved_edge_warnings(name: str, points: np.ndarray, cells: np.ndarray) -> list[str]:
+    """Return a warning if edges of second-order tets (m,10) are curved. Raises MeshError if nodes do not lie on the edges."""
+    corners, nodes = points[cells[:, :4]], points[cells[:, 4:]]
+    a, b = np.array(EDGES).T
+    midpoints = 0.5 * (corners[:, a] + corners[:, b])
+    length = np.linalg.norm(corners[:, a] - corners[:, b], axis=2)
+    length[length == 0] = np.inf  # a tet without volume, refused later by TetMesh
+    deviation = np.array([np.linalg.norm(nodes[:, k, None] - midpoints, axis=2) / length for k in range(6)])  # (node, tet, edge)
+    typical = np.median(deviation, axis=1)
+    edge = typical.argmin(axis=1)
+    if len(set(edge.tolist())) < 6 or typical.min(axis=1).max() > KNOWN_ORDER:
+        raise MeshError(f"{name}: the tets' ten nodes are not four corners and then one on each edge")
+    deviation = deviation[np.arange(6), :, edge]  # (6,m)
+    curved = np.argwhere(deviation > STRAIGHT)
+    if not len(curved):
+        return []
+    ends = np.sort(cells[:, :4][:, EDGES], axis=2)[:, edge]
+    n = len(np.unique(ends[curved[:, 1], curved[:, 0]], axis=0))
+    k, e = np.unravel_index(int(deviation.argmax()), deviation.shape)
+    first, second = ends[e, k].tolist()
+    return [
+        f"{n} edges of second-order tets are curved and become straight; the largest deviation is {deviation[k, e]:.2g} of the "
+        f"edge's length, between vertices {first} and {second} of the file"
+    ]
 
 
 def _weld(name: str, points: np.ndarray, tets: np.ndarray, weld) -> tuple[np.ndarray, np.ndarray, list[str]]:

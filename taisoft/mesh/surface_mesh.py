@@ -1,27 +1,35 @@
-"""Read triangle surfaces from modelling programs, weld them, and find faults that keep them from bounding a solid."""
+"""Read triangle surfaces from modelling programs, find faults that keep them from bounding a solid, and fill them with tets.
+
+.ply and .stl files are read by meshio. It refuses .obj files with fewer texture coordinates than positions, and of .off files it
+knows neither polygons and colours nor headers such as COFF or OFF8, so these two have readers here.
+Tets are made by fTetWild (package wildmeshing, MPL 2.0, installed by the extra `mesh`). It accepts faulty surfaces, stays within
+an envelope around them, and finds the inside by winding numbers.
+Sources: Geomview manual, "OFF Files"; Hu, Schneider, Wang, Zorin, Panozzo 2020, Fast tetrahedral meshing in the wild.
+"""
 
 import re
+import tempfile
 import warnings
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from numbers import Real
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from taisoft.attributes import MeshAttributeError, guarded_record
 from taisoft.errors import MeshError
-from taisoft.mesh.content import one_line, read_content
-from taisoft.mesh.safe_meshio import read_safely
-from taisoft.mesh.tet_mesh import merge_labels
-from taisoft.mesh.topology import triangle_edges
+from taisoft.mesh.safe_reading import content_lines, one_line, read_by_meshio, read_content, run_child
+from taisoft.mesh.tet_mesh import TetMesh, merge_labels
+from taisoft.mesh.topology import connected_pieces, linked_groups, triangle_edges
 
 FORMATS = (".obj", ".stl", ".ply", ".off")
 HEAD = re.compile(r"(?:ST)?C?N?OFF(\d*)$")  # of .off; some programs write no space before the counts
 INWARD = "all normals point inward; flip them"
 MAKE_ANOTHER = "make a new one, such as ts.SurfaceMesh(0.9 * surface.vertices, surface.triangles)"
 FLAT = 1e-12  # a triangle has no area if its area is below this times its longest edge squared
+EDGES_PER_DIAGONAL = 20  # default edge length of tets: the diagonal over this
+ENVELOPE = 0.1  # default envelope over the edge length
 
 
 @guarded_record("surface", MAKE_ANOTHER, MeshAttributeError)
@@ -50,8 +58,7 @@ class SurfaceMesh:
             raise MeshError(f"{self.source}: triangle {t}: vertex {triangles[t, k]} does not exist ({len(vertices)} vertices)")
         for field_name, array in (("vertices", vertices), ("triangles", triangles.astype(np.int64))):
             array.setflags(write=False)
-            # The only way to store a validated value in a frozen record.
-            object.__setattr__(self, field_name, array)
+            object.__setattr__(self, field_name, array)  # the only way to store a value in a frozen record
 
     def _as_array(self, what: str, kinds: str, description: str) -> np.ndarray:
         """Return the field as an array (n,3) of these kinds with at least one row."""
@@ -90,48 +97,37 @@ class SurfaceMesh:
     @property
     def n_pieces(self) -> int:
         """Number of parts that share no vertex."""
-        used, inverse = np.unique(self.triangles, return_inverse=True)
-        return _components(len(used), inverse.reshape(-1, 3)[:, [0, 1]], inverse.reshape(-1, 3)[:, [1, 2]])
+        used, corner = np.unique(self.triangles, return_inverse=True)
+        return int(connected_pieces(corner.reshape(-1, 3), len(used))[0])
 
     def faults(self) -> list[str]:
         """Return what keeps the surface from bounding a solid, one sentence with a remedy for each fault."""
-        ends = self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        distinct, edge, counts = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
-        net_direction = np.bincount(edge.ravel(), np.where(ends[:, 0] < ends[:, 1], 1, -1), minlength=len(distinct))
+        edges, counts, net_direction = triangle_edges(self.triangles)
+        single, crowded = edges[counts == 1], edges[counts > 2]
+        mismatched = edges[(counts == 2) & (net_direction != 0)]
         found = []
-        open_edges = distinct[counts == 1]
-        if len(open_edges):
-            rims, inverse = np.unique(open_edges, return_inverse=True)
-            holes = _components(len(rims), inverse.reshape(-1, 2))
+        if len(single):
+            rims, end = np.unique(single, return_inverse=True)
+            holes = linked_groups(*end.reshape(-1, 2).T, len(rims))[0]
             found.append(
-                f"{holes} {'hole' if holes == 1 else 'holes'}: {len(open_edges)} edges belong to one triangle, the first is "
-                f"{_edge_text(open_edges[0])}; fill holes in a modelling program, or read with a larger weld if they are cracks"
+                f"{holes} {'hole' if holes == 1 else 'holes'}: {len(single)} edges belong to one triangle, the first is "
+                f"{_edge_text(single)}; fill holes in a modelling program, or read with a larger weld if they are cracks"
             )
-        non_manifold = distinct[counts > 2]
-        if len(non_manifold):
+        if len(crowded):
             found.append(
-                f"{len(non_manifold)} edges belong to more than two triangles, the first is {_edge_text(non_manifold[0])}; "
+                f"{len(crowded)} edges belong to more than two triangles, the first is {_edge_text(crowded)}; "
                 "remove inner walls and duplicate triangles"
             )
-        mismatched = (counts == 2) & (net_direction != 0)
-        if mismatched.any():
+        if len(mismatched):
             found.append(
-                f"{mismatched.sum()} edges have two triangles of opposite orientation, the first is "
-                f"{_edge_text(distinct[mismatched][0])}; make the normals consistent"
+                f"{len(mismatched)} edges have two triangles of opposite orientation, the first is "
+                f"{_edge_text(mismatched)}; make the normals consistent"
             )
-        if not found and self.volume < 0.0:
-            found.append(INWARD)
-        return found
+        return [INWARD] if not found and self.volume < 0.0 else found
 
 
-def _edge_text(edge: np.ndarray) -> str:
-    return f"({edge[0]}, {edge[1]})"
-
-
-def _components(n: int, *pairs: np.ndarray) -> int:
-    links = np.concatenate(pairs)
-    graph = coo_matrix((np.ones(len(links), dtype=np.int8), (links[:, 0], links[:, 1])), shape=(n, n))
-    return int(connected_components(graph, directed=False)[0])
+def _edge_text(edges: np.ndarray) -> str:
+    return f"({edges[0, 0]}, {edges[0, 1]})"
 
 
 def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
@@ -152,7 +148,14 @@ def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
         raise MeshError(f"{name}: weld must be a distance of at least 0 m, not {weld!r}")
     data = read_content(file)
     reader = {".obj": _read_obj, ".off": _read_off}.get(ending)
-    points, triangles = reader(name, data) if reader else _read_by_meshio(file, name, data)
+    if reader:
+        points, polygons = reader(name, data)
+    else:
+        points, blocks = read_by_meshio(file, data, "surface")
+        polygons = [nodes for kind, nodes in blocks if kind in ("triangle", "quad") or "polygon" in kind]
+    # Split each polygon as a fan around its first corner.
+    fans = [nodes[:, [0, k, k + 1]] for nodes in polygons for k in range(1, nodes.shape[1] - 1)]
+    triangles = np.concatenate([np.empty((0, 3), dtype=np.int64), *fans])
     return _clean(SurfaceMesh(points, triangles, name), float(weld))
 
 
@@ -182,47 +185,36 @@ def _clean(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
     return SurfaceMesh(points[used], inverse.reshape(-1, 3), name, notes)
 
 
-def _fans(polygons: list[np.ndarray]) -> np.ndarray:
-    """Return triangles (t,3) of polygons (m,k), each split as a fan around its first corner."""
-    parts = [p[:, [0, k, k + 1]] for p in polygons for k in range(1, p.shape[1] - 1)]
-    return np.concatenate(parts).astype(np.int64) if parts else np.empty((0, 3), dtype=np.int64)
-
-
-def _read_obj(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Read positions and faces of a Wavefront file; meshio refuses files with fewer texture coordinates than positions."""
+def _read_obj(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return positions and polygons, (1,k) each, of a Wavefront file."""
     points, polygons = [], []
-    for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
-        words = _split_line(line)
+    for number, words in content_lines(name, data):
         try:
-            if words[:1] == ["v"]:
+            if words[0] == "v":
                 x, y, z = words[1:4]
                 points.append((float(x), float(y), float(z)))
-            elif words[:1] == ["f"]:
+            elif words[0] == "f":
                 corners = [int(word.split("/", 1)[0]) for word in words[1:]]
                 if len(corners) < 3 or 0 in corners or max(map(abs, corners)) > len(data):
                     raise ValueError
                 polygons.append(np.array([[k - 1 if k > 0 else len(points) + k for k in corners]]))
         except (ValueError, OverflowError):
-            raise MeshError(f"{name}: line {number} cannot be read: {one_line(line)!r}") from None
-    return np.array(points, dtype=np.float64).reshape(-1, 3), _fans(polygons)
+            raise MeshError(f"{name}: line {number} cannot be read: {one_line(' '.join(words))!r}") from None
+    return np.array(points, dtype=np.float64).reshape(-1, 3), polygons
 
 
-def _read_off(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Read positions and faces of an Object File Format file: OFF, counts of vertices and faces, one line each, # comments.
+def _read_off(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return positions and polygons, (1,k) each, of an Object File Format file.
 
-    Data after a vertex's position and a face's corners, such as colours, are skipped.
-    Source: Geomview manual, "OFF Files".
+    OFF, counts of vertices and faces, then one line each. Data after a position or a face, such as colours, are skipped.
     """
-    lines = [(i, words) for i, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1) if (words := _split_line(line))]
-    if not lines:
-        raise MeshError(f"{name}: the file is empty")
-    number, words = lines[0]
+    (number, words), *rows = content_lines(name, data)
     head = HEAD.match(words[0])
     if not head:
         raise MeshError(f"{name}: line {number}: not a supported surface: expected OFF, not {one_line(words[0])!r}")
-    counts, rows = [*filter(None, head.groups()), *words[1:]], lines[1:]
+    counts = [*filter(None, head.groups()), *words[1:]]
     if not counts and rows:
-        (number, counts), rows = rows[0], rows[1:]
+        (number, counts), *rows = rows
     try:
         n_points, n_faces = int(counts[0]), int(counts[1])
         if min(n_points, n_faces) < 0:
@@ -232,9 +224,9 @@ def _read_off(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     if n_points + n_faces > len(rows):
         raise MeshError(f"{name}: line {number} declares {n_points} vertices and {n_faces} faces, but {len(rows)} lines follow")
     points, polygons = [], []
-    for k, (number, words) in enumerate(rows[: n_points + n_faces]):
+    for number, words in rows[: n_points + n_faces]:
         try:
-            if k < n_points:
+            if len(points) < n_points:
                 x, y, z = words[:3]
                 points.append((float(x), float(y), float(z)))
                 continue
@@ -243,28 +235,66 @@ def _read_off(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
             if n_corners < 3 or len(corners) < n_corners:
                 raise ValueError
         except ValueError:
-            what = "three coordinates" if k < n_points else "a number of at least 3 corners and as many vertices"
+            what = "three coordinates" if len(points) < n_points else "a number of at least 3 corners and as many vertices"
             raise MeshError(f"{name}: line {number}: expected {what}, not {one_line(' '.join(words))!r}") from None
         missing = [corner for corner in corners if not 0 <= corner < n_points]
         if missing:
             raise MeshError(f"{name}: line {number}: vertex {missing[0]} does not exist ({n_points} vertices)")
         polygons.append(np.array([corners]))
-    return np.array(points, dtype=np.float64).reshape(-1, 3), _fans(polygons)
+    return np.array(points, dtype=np.float64).reshape(-1, 3), polygons
 
 
-def _split_line(line: str) -> list[str]:
-    return line.split("#", 1)[0].split()
+def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envelope: float | None = None) -> TetMesh:
+    """Return a tetrahedral mesh of the volume enclosed by a surface.
+
+    edge_length: approximate edge length of the tets [m]; None for a twentieth of the diagonal. envelope: largest distance [m]
+    of the new surface from the old one; None for a tenth of edge_length. Warns of the surface's faults. Raises MeshError if the
+    extra `mesh` is missing, nothing is enclosed, or the mesher fails.
+    """
+    if not isinstance(surface, SurfaceMesh):
+        raise MeshError(f"tetrahedralize needs a SurfaceMesh (see read_surface), not {type(surface).__name__}")
+    name, diagonal = surface.source, float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+    edge_length = _checked_length(name, "edge_length", edge_length, diagonal / EDGES_PER_DIAGONAL, diagonal)
+    envelope = _checked_length(name, "envelope", envelope, ENVELOPE * edge_length, diagonal)
+    if find_spec("wildmeshing") is None:
+        raise MeshError(f"{name}: tetrahedralize needs the package wildmeshing: pip install 'taisoft[mesh]'")
+    faults = surface.faults()
+    for text in faults:
+        warnings.warn(f"{name}: {text}", UserWarning, stacklevel=2)
+    inward = faults == [INWARD]
+    triangles = surface.triangles[:, ::-1] if inward else surface.triangles
+    vertices, tets = _run_mesher(name, surface.vertices, triangles, edge_length / diagonal, envelope / diagonal)
+    if len(tets) == 0:
+        raise MeshError(f"{name}: the surface encloses nothing: no tets were made")
+    edges = vertices[tets[:, 1:]] - vertices[tets[:, :1]]
+    inverted = np.linalg.det(edges) < 0
+    tets[inverted] = tets[inverted][:, [0, 2, 1, 3]]
+    used, inverse = np.unique(tets, return_inverse=True)
+    mesh = TetMesh(vertices[used], inverse.reshape(-1, 4), source=name)
+    volume_error = abs(mesh.volumes.sum() - abs(surface.volume))
+    if (inward or not faults) and volume_error > envelope * surface.area:
+        raise MeshError(
+            f"{name}: the tets fill {mesh.volumes.sum():.4g} m^3 of {abs(surface.volume):.4g}, a larger difference than an "
+            f"envelope of {envelope:.3g} m allows: use a smaller edge_length"
+        )
+    return mesh
 
 
-def _read_by_meshio(file: Path, name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    counts = re.finditer(rb"^element (\w{1,20}) (\d+)", data, re.MULTILINE) if file.suffix.lower() == ".ply" else ()
-    for found in counts:
-        if int(found[2][:30]) > len(data):
-            what = f"{found[2][:30].decode()} of element {found[1].decode()}"
-            raise MeshError(f"{name}: the header declares {what}, but the file has {len(data)} bytes")
-    mesh = read_safely(file, name, data, "surface")
-    try:
-        blocks = [np.asarray(b.data) for b in mesh.cells if b.type in ("triangle", "quad") or "polygon" in b.type]
-        return np.asarray(mesh.points), _fans([b for b in blocks if b.ndim == 2])
-    except (ValueError, OverflowError) as error:  # rows of different lengths
-        raise MeshError(f"{name}: not a supported surface ({one_line(str(error))})") from error
+def _checked_length(name: str, what: str, value, default: float, diagonal: float) -> float:
+    if value is None:
+        return default
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not 0.0 < value < diagonal:
+        raise MeshError(f"{name}: {what} must be a length above 0 and below the diagonal, {diagonal:.4g} m, not {value!r}")
+    return float(value)
+
+
+def _run_mesher(name: str, vertices: np.ndarray, triangles: np.ndarray, length: float, envelope: float):
+    """Return vertices (n,3) and tets (m,4). length, envelope: fractions of the diagonal."""
+    center = vertices.mean(axis=0)  # centre the surface: far from the origin digits are lost
+    with tempfile.TemporaryDirectory(prefix="taisoft-") as folder:
+        np.savez(Path(folder, "surface.npz"), vertices=vertices - center, triangles=triangles, numbers=(length, envelope))
+        try:
+            found = run_child(folder, "mesh")
+        except MeshError as error:
+            raise MeshError(f"{name}: the mesher failed: {error}") from None
+    return found["vertices"] + center, found["tets"]

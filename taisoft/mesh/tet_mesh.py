@@ -10,13 +10,10 @@ import warnings
 
 import numpy as np
 import scipy
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from taisoft.attributes import Guarded, MeshAttributeError
 from taisoft.errors import MeshError
-from taisoft.mesh.quality import edge_lengths, mean_ratio
-from taisoft.mesh.topology import Faces, connected_pieces, first_repeated_tet, joint_edges, joint_vertices
+from taisoft.mesh.topology import EDGES, Faces, connected_pieces, first_repeated_tet, joint_edges, joint_vertices, linked_groups
 
 DEGENERATE = 1e-9  # a tet has no volume if it is below this times its longest edge cubed
 NEARLY_FLAT = 0.02  # mean ratio below which a tet causes a warning; grids and common meshers stay above
@@ -70,10 +67,9 @@ class TetMesh(Guarded):
         return f"mesh of {self.source}" if self.source else "mesh"
 
     def _frozen_error(self, name: str) -> MeshAttributeError:
-        """Return the error for any assignment: a mesh is frozen, since volumes and surface follow from vertices and tets."""
-        return self._error(
-            f"{self._label()}: {name} cannot change: make a new mesh, such as ts.TetMesh(0.9 * mesh.vertices, mesh.tets)"
-        )
+        """Return the error for any assignment: volumes and surface follow from vertices and tets."""
+        instead = "make a new mesh, such as ts.TetMesh(0.9 * mesh.vertices, mesh.tets)"
+        return self._error(f"{self._label()}: {name} cannot change: {instead}")
 
     def __setstate__(self, state: dict) -> None:
         super().__setstate__(state)
@@ -101,75 +97,66 @@ class TetMesh(Guarded):
                 f"its strains are accurate to {np.finfo(np.float64).eps * distance / size:.0e} at best; centre it to improve this"
             )
 
+    def _named(self, text: str) -> str:
+        return f"{self.source}: {text}" if self.source else text
+
     def _mesh_error(self, text: str) -> MeshError:
-        return MeshError(f"{self.source}: {text}" if self.source else text)
+        return MeshError(self._named(text))
 
     def _warn(self, text: str) -> None:
         self.warnings.append(text)
-        warnings.warn(f"{self.source}: {text}" if self.source else text, UserWarning, stacklevel=4)
+        warnings.warn(self._named(text), UserWarning, stacklevel=4)
 
-    def _checked_vertices(self, vertices) -> np.ndarray:
-        """Return an (n,3) float64 copy of finite coordinates."""
-        array = self._as_array(vertices, "vertices", "fiu", "numbers")
-        if array.size == 0:
-            raise self._mesh_error("the mesh has no vertices")
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise self._mesh_error(f"vertices must have shape (n, 3), not {array.shape}")
-        array = np.array(array, dtype=np.float64, order="C")
-        bad = np.argwhere(~np.isfinite(array))
-        if len(bad):
-            raise self._mesh_error(f"vertex {bad[0, 0]} coordinate {bad[0, 1]} is not finite")
-        bad = np.argwhere(np.abs(array) > LARGEST_COORDINATE)
-        if len(bad):
-            value = array[tuple(bad[0])]
-            raise self._mesh_error(f"vertex {bad[0, 0]} coordinate {bad[0, 1]} is {value:g} m, too large for a 32-bit float")
-        return array
-
-    def _checked_tets(self, tets) -> np.ndarray:
-        """Return an (m,4) int64 copy: valid indices, no repeated vertex in a tet, no duplicate tet, no unused vertex."""
-        array = self._as_array(tets, "tets", "iu", "integers")
-        if array.size == 0:
-            raise self._mesh_error("the mesh has no tetrahedra")
-        if array.ndim != 2 or array.shape[1] != 4:
-            raise self._mesh_error(f"tets must have shape (m, 4), not {array.shape}")
-        self._check_indices(array)
-        array = np.array(array, dtype=np.int64, order="C")
-        corners = np.sort(array, axis=1)
-        twice = (corners[:, 1:] == corners[:, :-1]).any(axis=1)
-        if twice.any():
-            e = int(np.argmax(twice))
-            raise self._mesh_error(f"tet {e} names a vertex twice: {tuple(array[e].tolist())}")
-        pair = first_repeated_tet(array)
-        if pair:
-            corners = tuple(array[pair[0]].tolist())
-            raise self._mesh_error(f"tets {pair[0]} and {pair[1]} have the same four vertices {corners}")
-        used = np.zeros(self.n_verts, dtype=bool)
-        used[array] = True
-        if not used.all():
-            raise self._mesh_error(
-                f"vertex {int(np.argmin(used))} belongs to no tet and would have no mass ({int((~used).sum())} such vertices)"
-            )
-        return array
-
-    def _as_array(self, values, what: str, kinds: str, kinds_text: str) -> np.ndarray:
+    def _checked_array(self, values, what: str, width: int, kinds: str, kinds_text: str) -> np.ndarray:
+        """Return the values as an array (n, width) of these kinds with at least one row."""
         try:
             array = np.asarray(values)
         except (ValueError, TypeError, OverflowError) as error:
             raise self._mesh_error(f"{what} must be an array of {kinds_text} ({error})") from error
         if array.size and array.dtype.kind not in kinds:
             raise self._mesh_error(f"{what} must be {kinds_text}, not of type {array.dtype}")
+        if array.size == 0:
+            raise self._mesh_error(f"the mesh has no {'vertices' if width == 3 else 'tetrahedra'}")
+        if array.ndim != 2 or array.shape[1] != width:
+            raise self._mesh_error(f"{what} must have shape ({'n' if width == 3 else 'm'}, {width}), not {array.shape}")
         return array
 
-    def _check_indices(self, tets: np.ndarray) -> None:
+    def _checked_vertices(self, vertices) -> np.ndarray:
+        """Return an (n,3) float64 copy of finite coordinates."""
+        array = self._checked_array(vertices, "vertices", 3, "fiu", "numbers")
+        array = np.array(array, dtype=np.float64, order="C")
+        for bad, rule in (
+            (~np.isfinite(array), "is not finite"),
+            (np.abs(array) > LARGEST_COORDINATE, "is {:g} m, too large for a 32-bit float"),
+        ):
+            if bad.any():
+                i, k = np.argwhere(bad)[0]
+                raise self._mesh_error(f"vertex {i} coordinate {k} {rule.format(array[i, k])}")
+        return array
+
+    def _checked_tets(self, tets) -> np.ndarray:
+        """Return an (m,4) int64 copy: valid indices, no repeated vertex in a tet, no duplicate tet, no unused vertex."""
+        array = self._checked_array(tets, "tets", 4, "iu", "integers")
         n = self.n_verts
-        bad = np.argwhere((tets < 0) | (tets >= n))
-        if not len(bad):
-            return
-        e, vertex = int(bad[0, 0]), int(tets[tuple(bad[0])])
-        hint = ""
-        if tets.min() == 1 and tets.max() == n:
-            hint = f"; all indices are 1 to {n}: they seem to count from 1, subtract 1"
-        raise self._mesh_error(f"tet {e}: vertex {vertex} does not exist ({n} vertices, counted from 0){hint}")
+        bad = np.argwhere((array < 0) | (array >= n))
+        if len(bad):
+            text = f"tet {bad[0, 0]}: vertex {array[tuple(bad[0])]} does not exist ({n} vertices, counted from 0)"
+            if array.min() == 1 and array.max() == n:
+                text += f"; all indices are 1 to {n}: they seem to count from 1, subtract 1"
+            raise self._mesh_error(text)
+        array = np.array(array, dtype=np.int64, order="C")
+        corners = np.sort(array, axis=1)
+        twice = (corners[:, 1:] == corners[:, :-1]).any(axis=1)
+        if twice.any():
+            e = int(np.argmax(twice))
+            raise self._mesh_error(f"tet {e} names a vertex twice: {tuple(array[e].tolist())}")
+        if pair := first_repeated_tet(array):
+            corners = tuple(array[pair[0]].tolist())
+            raise self._mesh_error(f"tets {pair[0]} and {pair[1]} have the same four vertices {corners}")
+        unused = np.setdiff1d(np.arange(n), array)
+        if len(unused):
+            raise self._mesh_error(f"vertex {unused[0]} belongs to no tet and would have no mass ({len(unused)} such vertices)")
+        return array
 
     def _oriented_volumes(self, fix_orientation: bool) -> np.ndarray:
         """Return positive volumes (m,) [m^3]; set `flipped` and reorient those tets."""
@@ -255,6 +242,27 @@ class TetMesh(Guarded):
             )
 
 
+def edge_lengths(vertices: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    """Return the lengths (m,6) [m] of every tet's edges, in the order of EDGES. vertices: (n,3) [m]. tets: (m,4) int."""
+    corners = vertices[tets]
+    return np.stack([np.linalg.norm(corners[:, a] - corners[:, b], axis=1) for a, b in EDGES], axis=1)
+
+
+def mean_ratio(lengths: np.ndarray, volumes: np.ndarray) -> np.ndarray:
+    """Return the mean ratio (m,) of tets, 12 (3 V)^(2/3) / sum of squared edge lengths: 1 if regular, 0 if flat.
+
+    lengths: (m,6) [m], of the edges. volumes: (m,) [m^3], positive.
+    Source: Liu, Joe 1994, Relationship between tetrahedron shape measures, BIT 34.
+    """
+    return 12.0 * np.cbrt(3.0 * volumes) ** 2 / (lengths**2).sum(axis=1)
+
+
+def mean_surface_edge(surfaces: list[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Return the mean edge length [m] over all triangles. surfaces: pairs of vertices (n,3) [m] and triangles (t,3)."""
+    lengths = [np.linalg.norm(x[t] - x[np.roll(t, -1, axis=1)], axis=2).reshape(-1) for x, t in surfaces]
+    return float(np.concatenate(lengths).mean())
+
+
 def merge_labels(points: np.ndarray, tolerance: float) -> np.ndarray:
     """Return labels (n,), from 0: points at most `tolerance` [m] apart, directly or through others, share a label.
 
@@ -265,9 +273,7 @@ def merge_labels(points: np.ndarray, tolerance: float) -> np.ndarray:
     labels = labels.ravel()
     if tolerance > 0 and _may_be_near(distinct, tolerance):
         pairs = scipy.spatial.cKDTree(distinct).query_pairs(tolerance, output_type="ndarray")
-        n = len(distinct)
-        graph = coo_matrix((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-        labels = connected_components(graph, directed=False)[1][labels]
+        labels = linked_groups(*pairs.T, len(distinct))[1][labels]
     first, inverse = np.unique(labels, return_index=True, return_inverse=True)[1:]
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))

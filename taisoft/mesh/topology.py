@@ -1,13 +1,28 @@
-"""Compute the connectivity of tetrahedra: edges, faces, surface, parts and joints, without loops over elements."""
+"""Connectivity of tets and triangles: edges, faces, surface, neighbours, parts and joints, without loops over elements.
+
+Half-edge 3t + k runs from corner k of triangle t to corner (k + 1) mod 3.
+"""
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from taisoft.errors import MeshError
+
 # Face k lies opposite corner k; in this order its normal points out of a positive tet, det(x1-x0, x2-x0, x3-x0) > 0.
 TET_FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
 
 EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners of a tet's six edges; edges k and 5-k are opposite
+HALF_EDGES = np.array([(0, 1), (1, 2), (2, 0)])  # corners of a triangle's half-edges
+
+
+def _group_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a stable order that makes equal rows adjacent, and the start in it and size of each group of equal rows."""
+    order = np.lexsort(rows.T[::-1])
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    starts = np.flatnonzero(new)
+    return order, starts, np.diff(np.append(starts, len(order)))
 
 
 class Faces:
@@ -20,13 +35,7 @@ class Faces:
     def __init__(self, tets: np.ndarray):
         """tets: (m,4) int, positively oriented."""
         self.triangles = tets[:, TET_FACES].reshape(-1, 3)
-        corners = np.sort(self.triangles, axis=1)
-        self.order = np.lexsort((corners[:, 2], corners[:, 1], corners[:, 0]))
-        corners = corners[self.order]
-        new = np.ones(len(corners), dtype=bool)
-        new[1:] = (corners[1:] != corners[:-1]).any(axis=1)
-        self.starts = np.flatnonzero(new)
-        self.counts = np.diff(np.append(self.starts, len(corners)))
+        self.order, self.starts, self.counts = _group_rows(np.sort(self.triangles, axis=1))
 
     def surface(self) -> np.ndarray:
         """Return the rows of `triangles` that belong to one tet only, in the order of the tets."""
@@ -49,16 +58,76 @@ def distinct_edges(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(np.divmod(keys, n), axis=1), of_tet.reshape(-1, 6)
 
 
+def triangle_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the distinct edges (e,2) of triangles (t,3), ascending pairs in lexicographic order, and for each edge (e,) its
+    number of triangles, and how many more of them traverse it upwards than downwards."""
+    ends = triangles[:, HALF_EDGES].reshape(-1, 2)
+    edges, edge, counts = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return edges, counts, np.bincount(edge.ravel(), np.where(ends[:, 0] < ends[:, 1], 1, -1), minlength=len(edges))
+
+
+def opposite_half_edges(triangles: np.ndarray) -> np.ndarray:
+    """Return (t,3) int64: the opposite half-edge of half-edge k of each triangle, -1 at a border.
+
+    triangles: (t,3) int, vertex ids from 0. Raises MeshError if an edge has more than two triangles, or two triangles that
+    traverse it in the same direction.
+    """
+    ends = triangles[:, HALF_EDGES].reshape(-1, 2).astype(np.int64)
+    order, starts, counts = _group_rows(np.sort(ends, axis=1))
+    if (counts > 2).any():
+        k = int(np.argmax(counts > 2))
+        owners = np.sort(order[starts[k] : starts[k] + counts[k]] // 3)
+        raise MeshError(
+            f"edge {_sorted_ends(ends[order[starts[k]]])} belongs to {counts[k]} triangles "
+            f"({', '.join(map(str, owners[:5].tolist()))}{', ...' if len(owners) > 5 else ''}); an edge may have at most two"
+        )
+    first = starts[counts == 2]
+    a, b = order[first], order[first + 1]
+    same = ends[a, 0] == ends[b, 0]
+    if same.any():
+        k = int(np.argmax(same))
+        s, t = sorted((int(a[k]) // 3, int(b[k]) // 3))
+        raise MeshError(
+            f"triangles {s} and {t} traverse their edge {_sorted_ends(ends[a[k]])} in the same direction: one of them has the "
+            "wrong orientation"
+        )
+    opposite = np.full(len(ends), -1, dtype=np.int64)
+    opposite[a], opposite[b] = b, a
+    return opposite.reshape(-1, 3)
+
+
+def _sorted_ends(edge: np.ndarray) -> tuple:
+    return tuple(sorted(edge.tolist()))
+
+
+def normals_and_heights(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit normals (t,3), zero for triangles without area, and the smallest height over the longest edge (t,).
+
+    vertices: (n,3) [m]. triangles: (t,3) int; seen from the tip of the normal, corners run counter-clockwise.
+    """
+    x = vertices[triangles]
+    edges = np.roll(x, -1, axis=1) - x
+    longest = np.linalg.norm(edges, axis=2).max(axis=1)
+    # Scale by the longest edge first: the area of a tiny triangle underflows.
+    scaled = edges / np.where(longest > 0, longest, 1.0)[:, None, None]
+    area = np.cross(scaled[:, 0], scaled[:, 1])
+    twice = np.linalg.norm(area, axis=1)
+    return area / np.where(twice > 0, twice, 1.0)[:, None], twice
+
+
 def first_repeated_tet(tets: np.ndarray) -> tuple[int, int] | None:
     """Return the first pair of tets with the same four vertices, or None. tets: (m,4) int."""
-    corners = np.sort(tets, axis=1)
-    order = np.lexsort(corners.T[::-1])
-    same = (corners[order[1:]] == corners[order[:-1]]).all(axis=1)
-    if not same.any():
+    order, starts, counts = _group_rows(np.sort(tets, axis=1))
+    if (counts == 1).all():
         return None
-    k = int(np.argmax(same))
-    a, b = sorted((int(order[k]), int(order[k + 1])))
+    first = starts[np.argmax(counts > 1)]
+    a, b = sorted(order[first : first + 2].tolist())
     return a, b
+
+
+def linked_groups(a: np.ndarray, b: np.ndarray, n: int) -> tuple[int, np.ndarray]:
+    """Return the number of groups that links a - b (k,) make of n items, and the group (n,) of each, from 0."""
+    return connected_components(coo_matrix((np.ones(len(a), dtype=np.int8), (a, b)), shape=(n, n)), directed=False)
 
 
 def connected_pieces(elements: np.ndarray, n_verts: int) -> tuple[int, np.ndarray]:
@@ -66,20 +135,13 @@ def connected_pieces(elements: np.ndarray, n_verts: int) -> tuple[int, np.ndarra
 
     Elements that share a vertex are connected; a vertex without elements is a separate part.
     """
-    rows = np.repeat(elements[:, 0], elements.shape[1] - 1)
-    graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, elements[:, 1:].ravel())), shape=(n_verts, n_verts))
-    return connected_components(graph, directed=False)
-
-
-def triangle_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct edges (e,2) of triangles (t,3), with ascending vertices, and each edge's number of triangles (e,)."""
-    return np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    return linked_groups(np.repeat(elements[:, 0], elements.shape[1] - 1), elements[:, 1:].ravel(), n_verts)
 
 
 def joint_edges(surface: np.ndarray) -> np.ndarray:
     """Return surface edges (k,2) with more than two triangles, where parts are joined only by an edge. surface: (t,3) int."""
-    distinct, counts = triangle_edges(surface)
-    return distinct[counts > 2]
+    edges, counts, _ = triangle_edges(surface)
+    return edges[counts > 2]
 
 
 def joint_vertices(tets: np.ndarray, faces: Faces) -> np.ndarray:
@@ -88,22 +150,17 @@ def joint_vertices(tets: np.ndarray, faces: Faces) -> np.ndarray:
     The graph has a node for every corner of every tet and connects corners that two tets share through a face. A vertex
     with more than one component is a joint. Only surface vertices can be joints, so only their corners are included.
     """
-    n_verts = int(tets.max()) + 1
-    on_surface = np.zeros(n_verts, dtype=bool)
+    on_surface = np.zeros(int(tets.max()) + 1, dtype=bool)
     on_surface[faces.triangles[faces.surface()]] = True
-    pairs = faces.pairs()
     # For each vertex of a face, its corner in the tet. Both sides are sorted by vertex so that columns agree.
     sides = []
-    for rows in pairs.T:
-        triangles = faces.triangles[rows]
+    for rows in faces.pairs().T:
         corners = 4 * (rows // 4)[:, None] + TET_FACES[rows % 4]
-        by_vertex = np.argsort(triangles, axis=1)
+        by_vertex = np.argsort(faces.triangles[rows], axis=1)
         sides.append(np.take_along_axis(corners, by_vertex, axis=1).ravel())
     vertex_of = tets.ravel()
     keep = on_surface[vertex_of[sides[0]]]
-    a, b = sides[0][keep], sides[1][keep]
-    n = len(vertex_of)
-    labels = connected_components(coo_matrix((np.ones(len(a), dtype=np.int8), (a, b)), shape=(n, n)), directed=False)[1]
+    labels = linked_groups(sides[0][keep], sides[1][keep], len(vertex_of))[1]
     used = on_surface[vertex_of]
     fans = np.unique(np.stack([vertex_of[used], labels[used]], axis=1), axis=0)[:, 0]
     vertices, counts = np.unique(fans, return_counts=True)

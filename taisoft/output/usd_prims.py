@@ -9,7 +9,7 @@ import re
 
 import numpy as np
 
-from taisoft.mesh.half_edges import opposite_half_edges
+from taisoft.mesh.topology import opposite_half_edges
 from taisoft.output.appearance import OBSTACLE_COLOUR, body_colour, compact_surface, linear_rgb
 from taisoft.output.obstacle_surface import ObstacleSurface, obstacle_surfaces
 from taisoft.output.usd_view import ViewTrack

@@ -13,8 +13,8 @@ import numpy as np
 
 from taisoft.attributes import guarded_record
 from taisoft.errors import MeshError, SceneError
-from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
 from taisoft.mesh.nodes import Nodes
+from taisoft.mesh.topology import normals_and_heights, opposite_half_edges
 from taisoft.scene import checks
 
 BROAD_PHASES = ("auto", "spatial_hash", "bvh")

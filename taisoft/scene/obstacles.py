@@ -13,8 +13,8 @@ import numpy as np
 
 from taisoft.attributes import guarded_record
 from taisoft.errors import MeshError, SceneError
-from taisoft.mesh.half_edges import normals_and_heights, opposite_half_edges
 from taisoft.mesh.shapes import box_mesh
+from taisoft.mesh.topology import normals_and_heights, opposite_half_edges
 from taisoft.scene import checks
 from taisoft.scene.key_frames import KeyFrames, ShapePath
 

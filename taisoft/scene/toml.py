@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.errors import SceneError
-from taisoft.mesh.content import UTF16, utf16_head
 from taisoft.mesh.files import WRITERS, read_mesh
+from taisoft.mesh.safe_reading import UTF16, utf16_head
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks

@@ -12,7 +12,7 @@ import numpy as np
 from taisoft.backend import runtime
 from taisoft.errors import SimulationError, TaisoftError
 from taisoft.fem.reference import gravity_mass, lumped_mass, traction_forces
-from taisoft.mesh.quality import edge_lengths
+from taisoft.mesh.tet_mesh import edge_lengths
 from taisoft.output.report import extremes, machine, peak_memory, versions
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator

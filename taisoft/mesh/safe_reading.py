@@ -1,0 +1,231 @@
+"""Read files that may be broken: their bytes and lines, and any format by meshio in a child process.
+
+On a broken file meshio may end the program, print, raise any exception, loop forever, or allocate far more memory than the file
+can fill; the mesher fTetWild prints a lot and may end its process. So both run in a child process, meshio with bounded time and
+memory. Arrays pass in .npz files, without pickle. The child imports neither Taichi nor SciPy and starts in about 0.2 s.
+"""
+
+import builtins
+import contextlib
+import io
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from codecs import BOM_UTF8
+from pathlib import Path
+
+import numpy as np
+
+from taisoft.errors import MeshError
+
+UTF16 = "the file is UTF-16 text; save it as UTF-8"
+HEAD = 64  # characters inspected to detect UTF-16 text
+SECONDS, SECONDS_PER_BYTE = 15.0, 1e-5  # time limit of a reader; the slowest reads 1 MB/s
+MEMORY, MEMORY_PER_BYTE = 2 << 30, 200  # limit of a reader's address space [bytes]; text becomes Python objects
+MAX_READS_PAST_END = 100  # allowed reads past the end of a file, where some of meshio's readers loop forever
+QUALITY = 10.0  # fTetWild's target upper bound of the tets' AMIPS energy: 3 for a regular tet
+MAX_ITERATIONS = 80  # its maximum number of optimisation iterations
+
+Blocks = list[tuple[str, np.ndarray]]  # element blocks: meshio's type name, (k,nodes) indices from 0
+
+
+def read_content(file: Path) -> bytes:
+    """Return the file's bytes without a UTF-8 byte-order mark. Raises MeshError if unreadable, blank or UTF-16 (XML excepted)."""
+    try:
+        if not file.exists():
+            raise MeshError(f"{file}: there is no such file")
+        if not file.is_file():
+            raise MeshError(f"{file}: this is not a file")
+        data = file.read_bytes()
+    except (OSError, ValueError) as error:
+        raise MeshError(f"{str(file)!r}: the file cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if data.startswith(BOM_UTF8) and b"\0" not in data:  # a binary .stl header may start with the same bytes
+        data = data[len(BOM_UTF8) :]
+    if not data.strip():
+        raise MeshError(f"{file}: the file is empty")
+    if (head := utf16_head(data)) and not head.startswith("<"):  # XML readers decode UTF-16
+        raise MeshError(f"{file}: {UTF16}")
+    return data
+
+
+def utf16_head(data: bytes) -> str:
+    """Return the first characters of UTF-16 text, with or without a byte-order mark; "" if data is not UTF-16 text."""
+    for codec, mark in (("utf-16-le", b"\xff\xfe"), ("utf-16-be", b"\xfe\xff")):
+        text = data.removeprefix(mark)[:HEAD].decode(codec, "ignore").strip()
+        if all(c.isprintable() or c.isspace() for c in text) and (data.startswith(mark) or text.isascii()):
+            return text
+    return ""
+
+
+def content_lines(name: str, data: bytes) -> list[tuple[int, list[str]]]:
+    """Return number and words of each line that is not empty; # begins a comment."""
+    text = data.decode("utf-8", "replace").splitlines()
+    lines = [(number, words) for number, line in enumerate(text, 1) if (words := line.split("#", 1)[0].split())]
+    if not lines:
+        raise MeshError(f"{name}: the file is empty")
+    return lines
+
+
+def one_line(text: str) -> str:
+    """Return the text on one line with single spaces, shortened to 120 characters."""
+    text = " ".join(text.split())
+    return text if len(text) <= 120 else text[:117] + "..."
+
+
+def read_by_meshio(file: Path, data: bytes, kind: str) -> tuple[np.ndarray, Blocks]:
+    """Return points and element blocks of a file. data: its content. kind: "mesh" or "surface", for messages.
+
+    Raises MeshError for every failure of meshio.
+    """
+    seconds = SECONDS + SECONDS_PER_BYTE * len(data)
+    with tempfile.TemporaryDirectory(prefix="taisoft-") as folder:
+        source = file.absolute()
+        if not data.startswith(b"<") and file.stat().st_size != len(data):  # only XML readers accept a byte-order mark
+            source = Path(folder, file.name)
+            source.write_bytes(data)
+        try:
+            found = run_child(folder, "read", str(source), str(seconds), seconds=seconds)
+        except MeshError as error:
+            raise MeshError(f"{file}: not a supported {kind} ({error})") from None
+    return found["points"], [(str(name), found[f"cells{i}"]) for i, name in enumerate(found["kinds"])]
+
+
+def run_child(folder: str, task: str, *arguments: str, seconds: float | None = None) -> dict[str, np.ndarray]:
+    """Run a task of `main` in a child process inside a folder; return the arrays that it writes to result.npz there.
+
+    Raises MeshError with the last line that the child prints if it fails or takes more than `seconds`.
+    """
+    path = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH")]
+    child = subprocess.Popen(
+        [sys.executable, "-P", "-m", __name__, task, *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path)), "OPENBLAS_NUM_THREADS": "1"},
+    )
+    try:
+        printed = child.communicate(timeout=seconds)[1].decode("utf-8", "replace").strip()
+    except subprocess.TimeoutExpired:
+        raise MeshError(f"not done after {seconds:.0f} s") from None
+    finally:  # do not leave the process running after a signal
+        child.kill()
+        child.wait()
+    result = Path(folder, "result.npz")
+    if child.returncode != 0 or not result.is_file():
+        raise MeshError(one_line(printed.rsplit("\n", 1)[-1]) or f"exit status {child.returncode}")
+    with np.load(result, allow_pickle=False) as found:
+        return dict(found)
+
+
+def main(task: str, *arguments: str) -> None:
+    """Run a task in the child process: "read" a file by meshio, or "mesh" the surface in surface.npz by fTetWild."""
+    np.savez("result.npz", **{"read": _read, "mesh": _mesh}[task](*arguments))
+
+
+def _mesh() -> dict[str, np.ndarray]:
+    import wildmeshing
+
+    with np.load("surface.npz", allow_pickle=False) as surface:
+        vertices, triangles, (length, envelope) = surface["vertices"], surface["triangles"], surface["numbers"]
+    mesher = wildmeshing.Tetrahedralizer(
+        stop_quality=QUALITY, max_its=MAX_ITERATIONS, edge_length_r=float(length), epsilon=float(envelope)
+    )
+    mesher.set_log_level(6)
+    mesher.set_mesh(vertices, triangles.astype(np.int32))
+    mesher.tetrahedralize()
+    points, tets, _ = mesher.get_tet_mesh()
+    return {"vertices": np.asarray(points, dtype=np.float64), "tets": np.asarray(tets, dtype=np.int64)}
+
+
+def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
+    """Read a file by meshio; exit with one line that says why it failed, without repeating the file: it may be confidential."""
+    import meshio
+
+    data = Path(path).read_bytes()
+    _limit_resources(MEMORY + MEMORY_PER_BYTE * len(data), int(float(seconds)) + 1)
+    builtins.open = _open_bounded
+    meshio._common.Console.print = lambda *_, **__: None  # it parses file content as markup, which may fail
+    try:
+        with np.errstate(all="ignore"):
+            mesh = _first_fitting(path, data)
+            arrays = [np.asarray(mesh.points), *(np.asarray(block.data) for block in mesh.cells)]
+        if any(array.dtype.hasobject for array in arrays):
+            raise meshio.ReadError("rows of different lengths")
+    except ImportError as error:
+        sys.exit(f"its format needs the Python package {error.name or error}")
+    except MemoryError:
+        sys.exit("it declares more data than it can hold")
+    except (Exception, SystemExit) as error:
+        text = str(error) if isinstance(error, meshio.ReadError) else f"{type(error).__name__}: {error}"
+        sys.exit(_without_content(text, data.lower()) or "its structure is broken")
+    kinds = np.array([block.type for block in mesh.cells], dtype=str)
+    return {"points": arrays[0], "kinds": kinds} | {f"cells{i}": cells for i, cells in enumerate(arrays[1:])}
+
+
+def _limit_resources(memory: int, seconds: int) -> None:
+    with contextlib.suppress(ImportError, ValueError):  # other systems than Linux lack the module or the limits
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))  # ends an orphan too
+
+
+def _first_fitting(path: str, data: bytes):
+    """Return the mesh in the first format that fits. Raises the error of the last reader.
+
+    Replaces `meshio.read`, which prints the readers' errors, wrapped at the terminal's width, and ends the program.
+    """
+    import meshio
+    from meshio._helpers import _filetypes_from_path, reader_map
+
+    formats = _filetypes_from_path(Path(path))
+    if path.lower().endswith(".msh"):
+        formats = ["ansys" if data.lstrip().startswith(b"(") else "gmsh"]
+    readers = [reader_map[name] for name in formats if name in reader_map]
+    if not readers:
+        raise meshio.ReadError(f"such files can only be written: {', '.join(formats)}")
+    for reader in readers[:-1]:
+        with contextlib.suppress(meshio.ReadError):
+            return reader(path)
+    return readers[-1](path)
+
+
+def _without_content(message: str, content: bytes) -> str:
+    """Return a message on one line without quoted text and words of the file's content, given in lower case."""
+    plain = re.sub(r"(['\"`]).*?\1", "...", message, flags=re.DOTALL)
+    return " ".join("..." if len(word) > 3 and word.lower().encode() in content else word for word in plain.split())
+
+
+class _BoundedFile(io.BufferedReader):
+    """File that raises EOFError after too many reads past its end."""
+
+    _empty_reads = 0
+
+    def _checked(self, found: bytes) -> bytes:
+        self._empty_reads = 0 if found else self._empty_reads + 1
+        if self._empty_reads > MAX_READS_PAST_END:
+            raise EOFError("the file ends too early")
+        return found
+
+    def read(self, *size) -> bytes:
+        return self._checked(super().read(*size))
+
+    def read1(self, *size) -> bytes:  # called by TextIOWrapper
+        return self._checked(super().read1(*size))
+
+    def readline(self, *size) -> bytes:
+        return self._checked(super().readline(*size))
+
+
+def _open_bounded(file, mode: str = "r", *arguments, **options):
+    if not set(mode) <= set("rbt"):
+        return open(file, mode, *arguments, **options)
+    stream = _BoundedFile(io.FileIO(file))
+    return stream if "b" in mode else io.TextIOWrapper(stream, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
