@@ -12,8 +12,8 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.cli.scene_file import load_module
+from taisoft.files import write_bytes
 from taisoft.output.camera import Camera
-from taisoft.output.files import write_bytes
 from taisoft.output.frames import png_bytes
 from taisoft.view.layers import IN_PICTURES
 from taisoft.view.offscreen import Offscreen

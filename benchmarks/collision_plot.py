@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from taisoft.output.plot import log_ticks, require_matplotlib, save
+from taisoft.output.tables import log_ticks, require_matplotlib, save
 
 from .collision_runs import GEOMETRIES, HASH, TREES, Film, Row, Sweep
 from .collision_table import REPORTS_BEST, best_cell

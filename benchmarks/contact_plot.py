@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.contact.graph import groups
-from taisoft.output.plot import require_matplotlib, save, ticks
+from taisoft.output.tables import require_matplotlib, save, ticks
 from taisoft.view.offscreen import Offscreen
 
 from .contact_captured import THREADED, contact_jacobian

@@ -20,7 +20,8 @@ import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from taisoft.output.files import make_folder, write_bytes
+from taisoft.files import write_bytes
+from taisoft.output.files import make_folder
 from taisoft.output.report import json_text
 
 from .cuda_parts import JOBS, RESULT, parse_result, run_job

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import taisoft as ts
 from taisoft.errors import OutputError
-from taisoft.output.files import make_folder, write_bytes
+from taisoft.files import write_bytes
+from taisoft.output.files import make_folder
 from taisoft.output.report import json_text
 from taisoft.timing import machine, versions
 

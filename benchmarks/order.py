@@ -18,7 +18,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from taisoft.backend.runtime import open_runtime
-from taisoft.output.plot import require_matplotlib
+from taisoft.output.tables import require_matplotlib
 from taisoft.timing import load_average
 
 from .document import Document, check_out, header

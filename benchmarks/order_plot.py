@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 from taisoft.errors import OutputError
-from taisoft.output.plot import require_matplotlib, save, ticks
+from taisoft.output.tables import require_matplotlib, save, ticks
 
 from .order_cases import Case, Reference
 from .order_runs import Row

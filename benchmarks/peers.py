@@ -22,9 +22,9 @@ from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
 
-from taisoft.output.files import write_bytes
-from taisoft.output.plot import require_matplotlib
+from taisoft.files import write_bytes
 from taisoft.output.report import json_text
+from taisoft.output.tables import require_matplotlib
 from taisoft.timing import Timing, load_average
 
 from .again import again_text, earlier_numbers, plain

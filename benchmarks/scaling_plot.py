@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from taisoft.errors import OutputError
-from taisoft.output.plot import require_matplotlib, save, ticks
+from taisoft.output.tables import require_matplotlib, save, ticks
 
 from .scaling_bytes import Copy, copy_rate
 from .scaling_runs import KINDS, Row

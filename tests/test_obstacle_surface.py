@@ -18,8 +18,7 @@ from usd_stage import faults
 
 import taisoft as ts
 from taisoft.mesh.half_edges import opposite_half_edges
-from taisoft.output.appearance import OBSTACLE_COLOUR
-from taisoft.output.obstacle_surface import HALF_SIDE, obstacle_surfaces
+from taisoft.output.appearance import HALF_SIDE, OBSTACLE_COLOUR, obstacle_surfaces
 from taisoft.output.usd import UsdWriter, join_chunks
 from taisoft.view.ggui import vulkan_missing
 from taisoft.view.offscreen import Offscreen

@@ -11,8 +11,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from taisoft.output.plot import log_ticks, require_matplotlib
-from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.output.tables import log_ticks, markdown, percent, require_matplotlib, spread_of
 from taisoft.timing import Timing, summarise
 
 AGREE, PARTLY, DISAGREE, MISSING = "agree", "partly", "disagree", "not measured"

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from taisoft.output.plot import require_matplotlib, save, ticks
+from taisoft.output.tables import require_matplotlib, save, ticks
 from taisoft.study.pareto import front
 
 from .runs import Row

@@ -8,12 +8,10 @@ from pathlib import Path
 from taisoft.cli.pictures import DisplayOptions
 from taisoft.cli.settings import RunSettings
 from taisoft.errors import OutputError
-from taisoft.output.checkpoint import CheckpointWriter
-from taisoft.output.files import RESULT_FILES, OutputFolder
-from taisoft.output.frames import FRAMES_NAME, FrameWriter
+from taisoft.output.files import RESULT_FILES, CheckpointWriter, OutputFolder
+from taisoft.output.frames import FRAMES_NAME, FrameWriter, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
 from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
-from taisoft.output.video import command, find_ffmpeg, picture_numbers, write_video
 from taisoft.records import RunReport
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.plots import Plots
@@ -116,7 +114,7 @@ class Recording:
         if not picture_numbers(folder):
             return
         if find_ffmpeg() is None:
-            line = shlex.join(command(folder, fps))
+            line = shlex.join(ffmpeg_command(folder, fps))
             print(f"taisoft: no video without ffmpeg (pip install 'taisoft[video]'); the command is: {line}", file=sys.stderr)
             return
         write_video(folder, fps)

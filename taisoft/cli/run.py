@@ -17,9 +17,8 @@ from taisoft.cli.signals import Signals
 from taisoft.cli.summary import print_plan, print_state, print_summary
 from taisoft.cli.warnings import printed_warnings
 from taisoft.errors import SceneError, SimulationError
-from taisoft.output.checkpoint import read_last_good
-from taisoft.output.files import check_free
-from taisoft.output.progress import Progress
+from taisoft.output.files import check_free, read_last_good
+from taisoft.output.report import Progress
 from taisoft.records import RunReport
 from taisoft.running import check_length, first_frame
 from taisoft.scene import checks

@@ -4,9 +4,9 @@ import json
 from pathlib import Path
 
 from taisoft.errors import OutputError
-from taisoft.output.files import write_bytes
-from taisoft.output.plot import require_matplotlib
+from taisoft.files import write_bytes
 from taisoft.output.report import json_text
+from taisoft.output.tables import require_matplotlib
 from taisoft.study.plot import draw
 from taisoft.study.results import Study, plain
 from taisoft.study.table import csv_of, text_of

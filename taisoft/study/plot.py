@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taisoft.output.plot import require_matplotlib, save, ticks
+from taisoft.output.tables import require_matplotlib, save, ticks
 from taisoft.study.accuracy import Row
 from taisoft.study.results import Study
 

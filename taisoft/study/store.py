@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from taisoft import __version__
-from taisoft.output.files import make_folder, write_bytes
+from taisoft.files import write_bytes
+from taisoft.output.files import make_folder
 from taisoft.output.report import json_text
 from taisoft.timing import versions
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.errors import OutputError, SimulationError, TaisoftError
-from taisoft.output.files import make_folder, write_bytes
+from taisoft.files import write_bytes
+from taisoft.output.files import make_folder
 from taisoft.output.frames import png_bytes
 from taisoft.records import StepReport
 from taisoft.running import timed_advance

@@ -10,8 +10,7 @@ import numpy as np
 
 from taisoft.backend.runtime import open_kind
 from taisoft.errors import OutputError
-from taisoft.output.appearance import start_positions
-from taisoft.output.camera import MAX_WIDENING, Camera
+from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
 from taisoft.view.colouring import Colouring
 from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
 from taisoft.view.layers import IN_PICTURES, Layers

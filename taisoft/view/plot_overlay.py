@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.output.history import CAPACITY
-from taisoft.view.plots import GRID_LINES, PLOTS, Curves, Plots
+from taisoft.view.plots import CAPACITY, GRID_LINES, PLOTS, Curves, Plots
 
 BOX, TEXT, GAP, LINE, TITLE = 230, 200, 8, 17, 34  # widths; heights of a line of text and of title and borders [pixels]
 FRAME_COLOUR, GRID_COLOUR = (0.45, 0.46, 0.48), (0.84, 0.85, 0.86)  # sRGB

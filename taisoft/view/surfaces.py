@@ -10,9 +10,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from taisoft.output.appearance import OBSTACLE_COLOUR, body_colour
-from taisoft.output.obstacle_surface import ObstacleSurface, obstacle_surfaces
-from taisoft.output.polygons import subdivide
+from taisoft.output.appearance import OBSTACLE_COLOUR, ObstacleSurface, body_colour, obstacle_surfaces, subdivide
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB

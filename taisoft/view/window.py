@@ -12,8 +12,7 @@ import numpy as np
 import taichi as ti
 
 from taisoft.errors import OutputError
-from taisoft.output.appearance import start_positions
-from taisoft.output.camera import MAX_WIDENING, Camera
+from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
 from taisoft.view.colouring import Colouring
 from taisoft.view.ggui import Canvas
 from taisoft.view.layers import IN_FRONT, IN_WINDOW, Layers
