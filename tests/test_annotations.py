@@ -19,7 +19,7 @@ from taisoft.view.annotations import Annotations
 from taisoft.view.colouring import Colouring
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.plots import PLOTS, QUANTITIES
-from taisoft.view.surfaces import Surfaces
+from taisoft.view.scene_view import Surfaces
 
 SIZE = (640, 360)
 

@@ -22,7 +22,7 @@ from taisoft.output.appearance import HALF_SIDE, OBSTACLE_COLOUR, obstacle_surfa
 from taisoft.output.usd import UsdWriter, join_chunks
 from taisoft.view.ggui import vulkan_missing
 from taisoft.view.offscreen import Offscreen
-from taisoft.view.surfaces import Surfaces
+from taisoft.view.scene_view import Surfaces
 
 BALL = ts.ball_mesh(0.5, 4)
 BALL_VOLUME = np.abs(np.linalg.det(np.diff(BALL.vertices[BALL.tets], axis=1))).sum() / 6

@@ -13,7 +13,7 @@ import pytest
 
 from taisoft.errors import SceneError
 from taisoft.records import Energies, StepReport
-from taisoft.view.plot_overlay import MAX_SEGMENTS, cells, drawing, write
+from taisoft.view.annotations import MAX_SEGMENTS, cells, drawing, write
 from taisoft.view.plots import CAPACITY, GRID_LINES, PLOTS, QUANTITIES, Plots, curves_of
 
 

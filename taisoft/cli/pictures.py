@@ -8,8 +8,8 @@ from taisoft.errors import SceneError
 from taisoft.scene.checks import nearest
 from taisoft.view.annotations import Annotations, text_missing
 from taisoft.view.colouring import Colouring
-from taisoft.view.layers import IN_PICTURES, IN_WINDOW, LAYERS
 from taisoft.view.plots import PLOTS, Plots
+from taisoft.view.scene_view import IN_PICTURES, IN_WINDOW, LAYERS
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 The left button drags the body under the cursor, and orbits elsewhere or with Ctrl; the right one zooms, the middle one pans.
 Space: pause or continue. S or right arrow: one step. R: back to the initial state. V: other colours. W, C, T, F: wires, contacts,
 tractions, fixed nodes. G: plots over time. P: record pictures. Escape or the close button: quit. Sliders and buttons are in the
-panel, see `taisoft.view.panel`.
+panel, see `taisoft.view.controls`.
 """
 
 import time
@@ -12,17 +12,13 @@ import numpy as np
 import taichi as ti
 
 from taisoft.errors import OutputError
-from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
-from taisoft.view.colouring import Colouring
+from taisoft.view.annotations import PlotOverlay
+from taisoft.view.colouring import BACKGROUND_TOP
+from taisoft.view.controls import MouseDrag, Panel, pick
 from taisoft.view.ggui import Canvas
-from taisoft.view.layers import IN_FRONT, IN_WINDOW, Layers
 from taisoft.view.loop import Loop
-from taisoft.view.panel import Panel
-from taisoft.view.picking import MouseDrag, pick
-from taisoft.view.plot_overlay import PlotOverlay
 from taisoft.view.plots import Plots
-from taisoft.view.shading import BACKGROUND_TOP
-from taisoft.view.surfaces import Surfaces
+from taisoft.view.scene_view import IN_FRONT, IN_WINDOW, SceneView
 
 SIZE = (1280, 720)
 PANEL = (0.012, 0.02, 0.27, 0.94)  # left, top, width, height as fractions of the window's initial size
@@ -46,36 +42,24 @@ KEYS = {
 }
 
 
-class LiveWindow:
+class LiveWindow(SceneView):
     """A window that shows a scene; also an observer, with `frame` and `close`, for `Simulator.run`.
 
-    scene: its bodies and obstacles are read once; size: (width, height) in pixels; camera: if None, one that frames all bodies
-    and moves back to keep them in view until the user moves it; tall: make room for sliders in the panel; colour and layers:
-    initial ones, as for `Offscreen`; plots: those that can be shown. `pressed` holds the actions, values of KEYS, requested by
-    keys up to the last draw. Raises OutputError, before anything is opened, if a display or a Vulkan driver is missing or the
-    process has a window already.
+    scene, colour, layers: as for `SceneView`; the user may change colours and layers, and move the camera, which then follows the
+    bodies no more. tall: make room for sliders in the panel; plots: those that can be shown. `pressed` holds the actions, values
+    of KEYS, requested by keys up to the last draw. Raises OutputError, before anything is opened, if a display or a Vulkan driver
+    is missing or the process has a window already.
     """
 
     def __init__(
-        self,
-        scene,
-        size: tuple[int, int] = SIZE,
-        camera: Camera | None = None,
-        tall: bool = False,
-        colour: str = "body",
-        layers: tuple[str, ...] = IN_WINDOW,
-        plots: Plots | None = None,
+        self, scene, tall: bool = False, colour: str = "body", layers: tuple[str, ...] = IN_WINDOW, plots: Plots | None = None
     ):
-        self.camera = camera or Camera.framing(start_positions(scene), size)
-        self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # largest automatic distance [m]; 0: fixed camera
-        self._surfaces = Surfaces(scene)
-        self.layers = Layers(scene, layers)
-        self._overlay = PlotOverlay(plots, size) if plots is not None else None
-        self.colouring = Colouring(scene, self._surfaces, colour)
-        self._canvas = Canvas(self._surfaces, size, visible=True, n_segments=self.layers.n_segments + 1)
+        super().__init__(scene, SIZE, None, colour, layers)
+        self._overlay = PlotOverlay(plots, SIZE) if plots is not None else None
+        self._canvas = Canvas(self.surfaces, SIZE, visible=True, n_segments=self.layers.n_segments + 1)
         self._panel_rectangle = PANEL if tall else SHORT_PANEL
         # GGUI positions the panel once, by the window's size at that time, and does not report where the user moves it
-        self._panel_pixels = tuple(f * n for f, n in zip(self._panel_rectangle, (*size, *size)))
+        self._panel_pixels = tuple(f * n for f, n in zip(self._panel_rectangle, (*SIZE, *SIZE)))
         self._cursor: tuple[float, float] | None = None  # at the last picture
         self._mode = ""  # of the present mouse drag: "turn", "zoom", "shift", "drag", or "panel", which GGUI handles
         self._recorded_size: tuple[int, int] | None = None  # of the last recorded picture
@@ -94,12 +78,13 @@ class LiveWindow:
         panel: sliders and buttons below the lines; record: called with the picture, uint8 (height, width, 3), without the panel.
         """
         window = self._canvas.window
-        self._surfaces.with_markers = self.layers.shown["fixed_nodes"]
-        bodies = self._surfaces.of_bodies(sim)
-        self.camera = self.camera.widened(bodies[0], window.get_window_shape(), self._widest)
-        x, normals = self._surfaces.with_obstacles(bodies, sim.time, self.camera.position)
-        self._canvas.draw(x, normals, self.camera, tuple(BACKGROUND_TOP), self.colouring.base(sim), self._lines(sim))
         size = window.get_window_shape()
+        x, colours, (ends, line_colours) = self._drawn(sim, size)
+        if self.drag is not None:
+            dragged = self.camera.nearer(self.drag.line(sim), IN_FRONT)
+            ends = np.concatenate([dragged, ends])
+            line_colours = np.concatenate([np.tile(DRAG_COLOUR, (2, 1)), line_colours])
+        self._canvas.draw(x, colours, self.camera, tuple(BACKGROUND_TOP), (ends, line_colours))
         # GGUI shows an empty window after a picture was taken of it at another size than the present one
         if record is not None or self._recorded_size not in (None, size):
             picture = self._canvas.pixels(0, 0, *size)  # before the panel is declared, which would else be in the picture
@@ -126,14 +111,6 @@ class LiveWindow:
     def close(self) -> None:
         """Destroy the window; a second call does nothing."""
         self._canvas.close()
-
-    def _lines(self, sim) -> tuple[np.ndarray, np.ndarray]:
-        """Return the ends and colours of the lines over the picture."""
-        ends, colours = self.layers.lines(sim, self.camera)
-        if self.drag is None:
-            return ends, colours
-        dragged = self.camera.nearer(self.drag.line(sim), IN_FRONT)
-        return np.concatenate([dragged, ends]), np.concatenate([np.tile(DRAG_COLOUR, (2, 1)), colours])
 
     def _read_keys(self) -> None:
         self.pressed.clear()
