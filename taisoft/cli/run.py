@@ -191,7 +191,7 @@ def _run(
 def _open_window(sim: Simulator, shown: DisplayOptions, plots: Plots):
     from taisoft.view.window import LiveWindow
 
-    return LiveWindow(sim.scene, colour=shown.colour, layers=shown.in_window, plots=plots)
+    return LiveWindow(sim.scene, plots, colour=shown.colour, layers=shown.in_window)
 
 
 def _report_failed_output(result: RunReport, observers: Observers, signals: Signals) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.view.colouring import TITLES, UNITS, Colouring, colours_of
-from taisoft.view.plots import CAPACITY, GRID_LINES, PLOTS, Curves, Plots
+from taisoft.view.plots import CAPACITY, ENERGIES, GRID_LINES, PLOTS, Curves, Plots
 
 HEIGHT = 720.0  # of the picture that lengths refer to
 MARGIN, WIDTH = 16, 300  # of the plots
@@ -139,9 +139,8 @@ class Annotations:
 
     def _draw_caption(self, sim, index: int, size: tuple[float, float]) -> None:
         energies = sim.energies()
-        values = {"kinetic": energies.kinetic, "elastic": energies.elastic, "gravity": energies.gravity}
         bottom = size[1] - MARGIN
-        text = "   ".join(f"{name} {value:.4g} J" for name, value in values.items())
+        text = "   ".join(f"{name} {getattr(energies, name):.4g} J" for name in ENERGIES)
         self._write(MARGIN, bottom, f"frame {index}   t = {sim.time:.4f} s   {text}", TEXT_SIZE, INK, anchor="lb", halo=True)
         self._write(MARGIN, bottom - TEXT_SIZE - 8, self._name, TITLE_SIZE, INK, anchor="lb", halo=True)
         legend = self._colouring.legend() if self._colouring is not None else []

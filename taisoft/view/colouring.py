@@ -50,8 +50,7 @@ class Colouring:
 
     def choose_next(self) -> None:
         """Colour by the next of UNITS."""
-        kinds = list(UNITS)
-        self.choose(kinds[(kinds.index(self.kind) + 1) % len(kinds)])
+        self.choose(following(tuple(UNITS), self.kind))
 
     @property
     def low(self) -> float:
@@ -100,6 +99,11 @@ class Colouring:
             F = (corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1) @ Dm_inv
             parts.append(np.sqrt(np.linalg.eigvalsh(F.transpose(0, 2, 1) @ F)[:, 2]))
         return np.concatenate(parts)
+
+
+def following(names: tuple[str, ...], name: str) -> str:
+    """Return the name after this one, cyclically."""
+    return names[(names.index(name) + 1) % len(names)]
 
 
 def colours_of(fractions: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ from taisoft.errors import SimulationError, TaisoftError
 from taisoft.output.camera import Camera
 from taisoft.settings import contact_solvers
 from taisoft.stability import stable_dt
-from taisoft.view.colouring import TITLES, Colouring
+from taisoft.view.colouring import TITLES, Colouring, following
 from taisoft.view.plots import PLOTS, Plots
 from taisoft.view.scene_view import Layers
 
@@ -111,8 +111,10 @@ class Panel:
         if self._sim.draggable:
             self._strength = gui.slider_float(f"drag {self.strength:.3g} weights###pull", self._strength, *STRENGTH_DECADES)
             drag = self._sim.dragged
-            force, max_force = (np.linalg.norm(drag.force), drag.max_force) if drag is not None else (0.0, 0.0)
-            gui.text(f"drag force {force:.3g} N of at most {max_force:.3g}" if drag is not None else "no body is dragged")
+            force = "no body is dragged"
+            if drag is not None:
+                force = f"drag force {np.linalg.norm(drag.force):.3g} N of at most {drag.max_force:.3g}"
+            gui.text(force)
         if gui.button(f"colour: {TITLES[self._colouring.kind]}###colour"):
             self._colouring.choose_next()
         for text, colour in self._colouring.legend():
@@ -148,13 +150,13 @@ class Panel:
     def _choose_solver(self, gui) -> None:
         """Declare two buttons that cycle through the choices, and one that applies them, which compiles for seconds."""
         if gui.button(f"integrator: {self._integrator}###integrator"):
-            self._integrator = _next(INTEGRATORS, self._integrator)
+            self._integrator = following(INTEGRATORS, self._integrator)
         solvers = ("auto", *contact_solvers(self._integrator))
         if self._solver not in solvers:
             self._solver = "auto"
         if self._sim.plan.on["contact_forces"] and len(solvers) > 2:
             if gui.button(f"contacts: {self._solver}###contact solver"):
-                self._solver = _next(solvers, self._solver)
+                self._solver = following(solvers, self._solver)
         present = self._sim.settings
         if (self._integrator, self._solver) == (present.integrator, present.contact_solver):
             gui.text("in use")
@@ -218,11 +220,6 @@ class Panel:
             except SimulationError:
                 sim.dt = 0.5 * sim.dt
         self._set_dt()
-
-
-def _next(names: tuple[str, ...], name: str) -> str:
-    """Return the name after this one, cyclically."""
-    return names[(names.index(name) + 1) % len(names)]
 
 
 def changed(new: float, old: float) -> bool:

@@ -26,9 +26,9 @@ MAX_DECADES = 12  # of a logarithmic axis; smaller values, and zero, lie on its 
 
 
 CAPACITY = 256  # bins, an even number
-ENERGIES = ("kinetic", "elastic", "gravity", "total")  # [J], changes since the start
+ENERGIES = ("kinetic", "elastic", "gravity")  # [J]
 SOLVERS = ("newton_residual", "contact_residual", "newton_iterations", "linear_iterations", "contact_iterations", "n_contacts")
-QUANTITIES = (*ENERGIES, *SOLVERS, "step_time")  # the last is wall time [ms]
+QUANTITIES = (*ENERGIES, "total", *SOLVERS, "step_time")  # energies as changes since the start, wall time in [ms]
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Plot:
 
 PLOTS = {
     "energies": Plot(
-        "energy change", "J", tuple(Series(name, name, colour) for name, colour in zip(ENERGIES, (BLUE, ORANGE, GREEN, DARK)))
+        "energy change", "J", tuple(Series(name, name, colour) for name, colour in zip(QUANTITIES, (BLUE, ORANGE, GREEN, DARK)))
     ),
     "residuals": Plot(
         "residuals",
@@ -110,8 +110,7 @@ class History:
     def start(self, sim) -> None:
         """Clear the history; energies are recorded relative to sim's present ones."""
         self._clear()
-        energies = sim.energies()
-        self._start_energies[:], self.begin = (energies.kinetic, energies.elastic, energies.gravity), sim.time
+        self._start_energies, self.begin = _energies(sim.energies()), sim.time
         self._append(sim.time, np.where(np.arange(len(QUANTITIES)) < 4, 0.0, np.nan))
 
     def take(self, report: StepReport, seconds: float, explicit: bool, touching: bool) -> None:
@@ -119,7 +118,7 @@ class History:
 
         seconds: its total wall time [s]; touching: whether contact forces are simulated. Quantities not simulated are NaN.
         """
-        energies = np.array([report.kinetic, report.elastic, report.gravity]) - self._start_energies
+        energies = _energies(report) - self._start_energies
         solved, touched = (np.nan if explicit else 1.0), (1.0 if touching else np.nan)
         row = np.array(
             [
@@ -157,6 +156,10 @@ class History:
         self._low[:half] = np.fmin(self._low[0 : self._n : 2], self._low[1 : self._n : 2])
         self._high[:half] = np.fmax(self._high[0 : self._n : 2], self._high[1 : self._n : 2])
         self._n, self._steps_per_bin = half, 2 * self._steps_per_bin
+
+
+def _energies(record) -> np.ndarray:
+    return np.array([getattr(record, name) for name in ENERGIES])
 
 
 @dataclass(frozen=True)
