@@ -123,7 +123,7 @@ class UsdWriter:
         if self._joined is None:
             raise OutputError(f"cannot continue writing {self.path}: an earlier write failed")
         try:
-            _set_range(chunk, frames[0], frames[-1])
+            chunk.startTimeCode, chunk.endTimeCode = float(frames[0]), float(frames[-1])
             path = self.chunks / f"points_{frames[0]:05d}.usdc"
             with replacing(path) as part:
                 _write_checked(path, chunk, lambda: chunk.Export(str(part), args={"format": "usdc"}))
@@ -176,7 +176,7 @@ class _Joined:
             if time <= last:
                 self.layer.SetTimeSample(path, time, chunk.QueryTimeSample(path, time))
         self.first = chunk.startTimeCode if self.first is None else self.first
-        _set_range(self.layer, self.first, max(last, self.layer.endTimeCode))
+        self.layer.startTimeCode, self.layer.endTimeCode = float(self.first), float(max(last, self.layer.endTimeCode))
         try:
             _write_checked(self.path, chunk, self.layer.Save)
         except OutputError:
@@ -235,10 +235,6 @@ def _structure(layer) -> list[str]:
     """Return the names of a layer's bodies and obstacles, and the paths of its time-varying attributes."""
     root = layer.GetPrimAtPath(ROOT)
     return [*(child.name for child in root.nameChildren), *_sampled(layer)] if root else []
-
-
-def _set_range(layer, first: float, last: float) -> None:
-    layer.startTimeCode, layer.endTimeCode = float(first), float(last)
 
 
 def _write_checked(path: Path, layer, write) -> None:

@@ -8,6 +8,7 @@ text only in sub-windows. It positions each once, by name, in units of the windo
 contains its position and size, which change with the window and the visible plots.
 """
 
+import functools
 import math
 import time
 from collections.abc import Iterator
@@ -66,7 +67,6 @@ class Annotations:
         self._plots, self._name, self._colouring = plots, name, colouring
         self._names = plots.visible() if plots is not None else []  # fixed now: a window may change what is visible
         self._font_file = Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"
-        self._fonts: dict = {}
 
     def draw(self, picture: np.ndarray, sim, index: int) -> np.ndarray:
         """Return an annotated copy of a picture, uint8 (height, width, 3), of sim's present state; index: frame number."""
@@ -127,8 +127,7 @@ class Annotations:
         self._write(x0 + 3, y0 + 2, curves.ends[1], SMALL_SIZE - 2, FAINT, halo=True)
         self._write(x0 + 3, y1 - 2, curves.ends[0], SMALL_SIZE - 2, FAINT, anchor="lb", halo=True)
         self._write(x0, y1 + 2, f"{curves.times[0]:.4g}", SMALL_SIZE - 2, FAINT)
-        end = f"{curves.times[1]:.4g} s"
-        self._write(x1, y1 + 2, end, SMALL_SIZE - 2, FAINT, anchor="ra")
+        self._write(x1, y1 + 2, f"{curves.times[1]:.4g} s", SMALL_SIZE - 2, FAINT, anchor="ra")
         x = x1
         for name, value, colour in reversed(curves.legend):
             text = name if len(curves.legend) > 1 else value
@@ -150,8 +149,7 @@ class Annotations:
     def _draw_colour_bar(self, legend: list[tuple[str, np.ndarray]], bottom: float) -> None:
         """Draw the colour bar from low to high, its limits below it, and the name of its quantity above."""
         width, height = BAR
-        steps = np.linspace(0.0, 1.0, width + 1)
-        colours = colours_of(steps)
+        colours = colours_of(np.linspace(0.0, 1.0, width + 1))
         top = bottom - TEXT_SIZE - height
         for k in range(width):
             left, high, right, low = self._at(MARGIN + k, top, MARGIN + k + 1, top + height)
@@ -180,25 +178,24 @@ class Annotations:
         """Write text at x, y. anchor: the part of the text at that point, in Pillow's notation; halo: outline the letters."""
         edge = {"stroke_width": round(1.5 * self._unit), "stroke_fill": (*PAPER, 200)} if halo else {}
         position = tuple((self._unit * np.array([x, y]) - self._origin).tolist())
-        self._pen.text(position, text, (*colour, 255), self._font(size), anchor, **edge)
+        self._pen.text(position, text, (*colour, 255), _font(self._font_file, round(size * self._unit)), anchor, **edge)
 
     def _width(self, text: str, size: float) -> float:
-        return self._font(size).getlength(text) / self._unit
+        return _font(self._font_file, round(size * self._unit)).getlength(text) / self._unit
 
-    def _font(self, size: float):
-        pixels = max(1, round(size * self._unit))
-        if pixels not in self._fonts:
-            from PIL import ImageFont
 
-            self._fonts[pixels] = ImageFont.truetype(str(self._font_file), pixels)
-        return self._fonts[pixels]
+@functools.cache
+def _font(file: Path, pixels: int):
+    from PIL import ImageFont
+
+    return ImageFont.truetype(str(file), max(1, pixels))
 
 
 def _pieces(points: np.ndarray) -> list[np.ndarray]:
     """Split a line (k,2) at its gaps, which are rows of NaN; return the pieces of two or more points."""
-    gaps = np.flatnonzero(np.isnan(points).any(axis=1))
-    parts = np.split(points, gaps)
-    return [part for part in (p[~np.isnan(p).any(axis=1)] for p in parts) if len(part) > 1]
+    gap = np.isnan(points).any(axis=1)
+    parts = (part[~np.isnan(part).any(axis=1)] for part in np.split(points, np.flatnonzero(gap)))
+    return [part for part in parts if len(part) > 1]
 
 
 def _bytes(colour) -> tuple[int, int, int]:
