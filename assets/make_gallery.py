@@ -12,11 +12,11 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.cli.scene_file import load_module
+from taisoft.files import write_bytes
 from taisoft.output.camera import Camera
-from taisoft.output.files import write_bytes
 from taisoft.output.frames import png_bytes
-from taisoft.view.layers import IN_PICTURES
 from taisoft.view.offscreen import Offscreen
+from taisoft.view.scene_view import IN_PICTURES
 
 ASSETS = Path(__file__).resolve().parent
 GAP = 4  # white pixels between two moments

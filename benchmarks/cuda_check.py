@@ -23,7 +23,8 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
-from taisoft.output.files import make_folder, write_bytes
+from taisoft.files import write_bytes
+from taisoft.output.files import make_folder
 from taisoft.output.report import json_text
 
 from .cuda_parts import JOBS, run_job

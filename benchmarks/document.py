@@ -14,7 +14,8 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.errors import OutputError
-from taisoft.output.files import make_folder, write_bytes
+from taisoft.files import write_bytes
+from taisoft.output.files import make_folder
 from taisoft.output.report import json_text
 from taisoft.output.tables import markdown, percent, spread_of
 from taisoft.timing import Timing, load_average, machine, summarise, versions

@@ -15,7 +15,7 @@ from pathlib import Path
 from statistics import median
 
 from taisoft.errors import OutputError
-from taisoft.output.files import write_bytes
+from taisoft.files import write_bytes
 from taisoft.output.tables import markdown
 
 from .document import RESULTS, table

@@ -21,8 +21,7 @@ from pathlib import Path
 
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError
-from taisoft.output.plot import require_matplotlib, save, ticks
-from taisoft.output.tables import percent, spread_of
+from taisoft.output.tables import percent, require_matplotlib, save, spread_of, ticks
 from taisoft.timing import Timing, summarise
 
 from .document import Document, Limit, begin, table

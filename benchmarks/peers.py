@@ -21,9 +21,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 
-from taisoft.output.files import write_bytes
-from taisoft.output.plot import require_matplotlib
+from taisoft.files import write_bytes
 from taisoft.output.report import json_text
+from taisoft.output.tables import require_matplotlib
 from taisoft.timing import Timing, load_average
 
 from .document import (

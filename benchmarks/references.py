@@ -17,7 +17,7 @@ from pathlib import Path
 
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError
-from taisoft.output.files import write_bytes
+from taisoft.files import write_bytes
 from taisoft.output.report import json_text
 from taisoft.timing import machine, versions
 

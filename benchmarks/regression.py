@@ -32,7 +32,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from taisoft.errors import OutputError
-from taisoft.output.files import write_bytes
+from taisoft.files import write_bytes
 from taisoft.output.report import json_text
 from taisoft.output.tables import markdown
 from taisoft.timing import machine, time_repeats, versions

@@ -22,7 +22,7 @@ import taisoft
 from taisoft.backend.runtime import compile_clock
 from taisoft.errors import SimulationError
 from taisoft.output.files import make_folder
-from taisoft.output.plot import require_matplotlib
+from taisoft.output.tables import require_matplotlib
 
 from .document import check_out
 

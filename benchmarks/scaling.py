@@ -20,8 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from taisoft.errors import OutputError, SimulationError
-from taisoft.output.plot import require_matplotlib, save, ticks
-from taisoft.output.tables import percent, spread_of
+from taisoft.output.tables import percent, require_matplotlib, save, spread_of, ticks
 
 from .document import again_text, begin, earlier_numbers, exponent, plain, table
 from .runner import make_parser, parse_options, parse_result, progress, run_python, say

@@ -11,7 +11,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "assets")]
 from make_gallery import film  # noqa: E402
 
 import taisoft as ts  # noqa: E402
-from taisoft.output.files import write_bytes  # noqa: E402
+from taisoft.files import write_bytes  # noqa: E402
 from taisoft.output.frames import png_bytes  # noqa: E402
 
 GROUND = ts.HalfSpace((0, 0, 0), (0, 1, 0))

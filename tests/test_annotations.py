@@ -14,13 +14,12 @@ from test_plots import filled
 from test_view import body_mask
 
 from taisoft.errors import OutputError
-from taisoft.output.history import QUANTITIES
 from taisoft.view import annotations
 from taisoft.view.annotations import Annotations
 from taisoft.view.colouring import Colouring
 from taisoft.view.offscreen import Offscreen
-from taisoft.view.plots import PLOTS
-from taisoft.view.surfaces import Surfaces
+from taisoft.view.plots import PLOTS, QUANTITIES
+from taisoft.view.scene_view import Surfaces
 
 SIZE = (640, 360)
 

@@ -21,7 +21,7 @@ from scenes import cube, driven_scene
 
 import taisoft as ts
 from taisoft import checkpoint
-from taisoft.output.checkpoint import CHECKPOINT_NAME, PREVIOUS_NAME, CheckpointWriter, read_last_good
+from taisoft.output.files import CHECKPOINT_NAME, PREVIOUS_NAME, CheckpointWriter, read_last_good
 
 
 def scene(height: float, obstacle: str = "wall:left") -> ts.Scene:

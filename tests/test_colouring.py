@@ -15,7 +15,7 @@ import taisoft as ts
 from taisoft.errors import OutputError
 from taisoft.view.colouring import COLOURS, Colouring, round_up
 from taisoft.view.offscreen import Offscreen
-from taisoft.view.surfaces import MARKER_COLOUR, Surfaces
+from taisoft.view.scene_view import MARKER_COLOUR, Surfaces
 
 
 @pytest.mark.parametrize("order", [1, 2])

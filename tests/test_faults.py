@@ -31,8 +31,7 @@ from pxr import Sdf, Usd
 import taisoft as ts
 from taisoft.backend import arrays
 from taisoft.checkpoint import read_checkpoint
-from taisoft.output.checkpoint import CheckpointWriter
-from taisoft.output.files import LOCK_NAME, OutputFolder
+from taisoft.output.files import LOCK_NAME, CheckpointWriter, OutputFolder
 
 RESULTS = {"report.json", "steps.csv", "checkpoint.npz", "scene.usdc", "frames"}
 
@@ -235,7 +234,7 @@ import numpy as np
 from fake_simulator import beam_scene
 from taisoft.checkpoint import read_checkpoint, write_checkpoint
 from taisoft.errors import SimulationError
-from taisoft.output.checkpoint import CheckpointWriter, read_last_good
+from taisoft.output.files import CheckpointWriter, read_last_good
 from taisoft.output.report import write_report
 from taisoft.records import RunReport, StepReport
 

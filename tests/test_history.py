@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from taisoft.output.history import QUANTITIES, History
 from taisoft.records import Energies, StepReport
+from taisoft.view.plots import QUANTITIES, History
 
 COLUMN = {name: k for k, name in enumerate(QUANTITIES)}
 

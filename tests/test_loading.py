@@ -15,7 +15,7 @@ from taisoft.backend.runtime import compile_clock
 from taisoft.checkpoint import read_checkpoint
 from taisoft.errors import SceneError
 from taisoft.output.camera import Camera
-from taisoft.view.layers import Layers
+from taisoft.view.scene_view import Layers
 
 FIRST = [(0.0, 0.0, 0.0), (1.0, 2.0, 0.0), (0.0, 30.0, 0.0)]  # of the two forces and the traction
 EACH = np.arange(12.0).reshape(4, 3)  # [N] for each node of the second force

@@ -18,12 +18,11 @@ from usd_stage import faults
 
 import taisoft as ts
 from taisoft.mesh.topology import opposite_half_edges
-from taisoft.output.appearance import OBSTACLE_COLOUR
-from taisoft.output.obstacle_surface import HALF_SIDE, obstacle_surfaces
+from taisoft.output.appearance import HALF_SIDE, OBSTACLE_COLOUR, obstacle_surfaces
 from taisoft.output.usd import UsdWriter, join_chunks
 from taisoft.view.ggui import vulkan_missing
 from taisoft.view.offscreen import Offscreen
-from taisoft.view.surfaces import Surfaces
+from taisoft.view.scene_view import Surfaces
 
 BALL = ts.ball_mesh(0.5, 4)
 BALL_VOLUME = np.abs(np.linalg.det(np.diff(BALL.vertices[BALL.tets], axis=1))).sum() / 6

@@ -21,11 +21,11 @@ DRAW = (
 import numpy as np
 from taisoft.output.camera import Camera
 from taisoft.view.ggui import Canvas
-from taisoft.view.surfaces import Surfaces
+from taisoft.view.scene_view import Surfaces
 camera, surfaces = Camera.framing(sim.positions()), Surfaces(scene)
 canvas = Canvas(surfaces, (64, 36), visible=False, n_segments=3)
 one = np.ones((2, 3))
-canvas.draw(*surfaces.of_bodies(sim), camera, (1.0, 1.0, 1.0), lines=(sim.positions()[:2], one))
+canvas.draw(surfaces.of_bodies(sim)[0], surfaces.colours, camera, (1.0, 1.0, 1.0), (sim.positions()[:2], one))
 canvas.draw_over(np.array([[0.1, 0.1, 0.3, 0.2]]), one[:, :2], one, (2, 5), (0.9, 0.9, 0.9))
 print(canvas.pixels(0, 0, 64, 36).std() > 5)
 canvas.close()

@@ -18,7 +18,8 @@ from pathlib import Path
 import pytest
 
 from taisoft.errors import OutputError
-from taisoft.output.files import LOCK_NAME, OutputFolder, make_folder, replacing, write_bytes
+from taisoft.files import replacing, write_bytes
+from taisoft.output.files import LOCK_NAME, OutputFolder, make_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 

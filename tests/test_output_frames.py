@@ -12,9 +12,9 @@ import pytest
 from fake_simulator import FakeSimulator, beam_scene
 from png import decode
 
-from taisoft.output import progress
+from taisoft.output import report
 from taisoft.output.frames import FrameWriter, png_bytes
-from taisoft.output.progress import Progress
+from taisoft.output.report import Progress
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (7, 5, 3), (48, 64, 3)])
@@ -63,7 +63,7 @@ class Terminal(io.StringIO):
 def clock(monkeypatch):
     """Wall time that moves by 2 s a look."""
     looks = iter(range(0, 1000, 2))
-    monkeypatch.setattr(progress.time, "perf_counter", lambda: float(next(looks)))
+    monkeypatch.setattr(report.time, "perf_counter", lambda: float(next(looks)))
 
 
 def advance(bar):

@@ -26,11 +26,10 @@ from pxr import Tf, Usd, UsdGeom, UsdLux, UsdShade
 from usd_stage import check_frames, faults
 
 from taisoft.errors import OutputError
-from taisoft.output.appearance import start_positions
-from taisoft.output.camera import Camera
+from taisoft.output.camera import Camera, start_positions
 from taisoft.output.nodal_fields import NodalMean, contact_impulses, von_mises
 from taisoft.output.usd import UsdWriter, join_chunks
-from taisoft.output.usd_prims import prim_names
+from taisoft.output.usd_scene import prim_names
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = ("1 cube", "1_cube", "ü", "x" * 300, "material")

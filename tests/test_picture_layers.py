@@ -12,9 +12,8 @@ from test_view import SIZE, body_mask, needs_vulkan
 
 from taisoft.errors import OutputError
 from taisoft.output.camera import Camera
-from taisoft.view.layers import IMPULSE_COLOUR, LAYERS, NORMAL_COLOUR, TRACTION_COLOUR
-from taisoft.view.offscreen import Offscreen
-from taisoft.view.raster import rasterise, stroke
+from taisoft.view.offscreen import Offscreen, rasterise, stroke
+from taisoft.view.scene_view import IMPULSE_COLOUR, LAYERS, NORMAL_COLOUR, TRACTION_COLOUR
 
 LARGE = (640, 360)
 

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from taisoft.errors import SceneError
-from taisoft.output.history import CAPACITY, QUANTITIES
 from taisoft.records import Energies, StepReport
-from taisoft.view.plot_overlay import MAX_SEGMENTS, cells, drawing, write
-from taisoft.view.plots import GRID_LINES, PLOTS, Plots, curves_of
+from taisoft.view.annotations import MAX_SEGMENTS, cells, drawing, write
+from taisoft.view.plots import CAPACITY, GRID_LINES, PLOTS, QUANTITIES, Plots, curves_of
 
 
 class Settled:

@@ -13,9 +13,8 @@ from command import run
 
 from taisoft.cli.recording import Recording
 from taisoft.errors import OutputError
-from taisoft.output import video
-from taisoft.output.frames import png_bytes
-from taisoft.output.video import VIDEO_NAME, command, find_ffmpeg, write_video
+from taisoft.output import frames
+from taisoft.output.frames import VIDEO_NAME, ffmpeg_command, find_ffmpeg, png_bytes, write_video
 
 needs_ffmpeg = pytest.mark.skipif(find_ffmpeg() is None, reason="there is no ffmpeg")
 
@@ -50,8 +49,8 @@ def test_a_failure_is_told(tmp_path):
 
 
 def test_without_ffmpeg(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(video, "find_spec", lambda name: None)
-    monkeypatch.setattr(video.shutil, "which", lambda name: None)
+    monkeypatch.setattr(frames, "find_spec", lambda name: None)
+    monkeypatch.setattr(frames.shutil, "which", lambda name: None)
     assert find_ffmpeg() is None
     out = tmp_path / "out"
     recording = Recording(str(out), overwrite=False)
@@ -61,7 +60,7 @@ def test_without_ffmpeg(tmp_path, monkeypatch, capsys):
     recording.video(30.0)
     recording.close()
     said = capsys.readouterr().err
-    assert "pip install 'taisoft[video]'" in said and shlex.join(command(out, 30.0)) in said and "-framerate 30 " in said
+    assert "pip install 'taisoft[video]'" in said and shlex.join(ffmpeg_command(out, 30.0)) in said and "-framerate 30 " in said
     with pytest.raises(OutputError, match="cannot be made without ffmpeg"):
         write_video(out, 30.0)
 

@@ -24,9 +24,8 @@ from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, SimulationError
 from taisoft.output.camera import BORDER, FILL, Camera
 from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
-from taisoft.view.offscreen import Offscreen
-from taisoft.view.raster import MAX_COORDINATE, rasterise
-from taisoft.view.surfaces import MARKER_COLOUR, Surfaces, smoothing_groups, vertex_normals
+from taisoft.view.offscreen import MAX_COORDINATE, Offscreen, rasterise
+from taisoft.view.scene_view import MARKER_COLOUR, Surfaces, smoothing_groups, vertex_normals
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZE = (320, 180)

@@ -18,9 +18,9 @@ from test_view import SIZE, body_mask, needs_vulkan
 
 from taisoft.output.camera import Camera
 from taisoft.records import StepReport
-from taisoft.view.layers import Layers
-from taisoft.view.loop import Loop
-from taisoft.view.picking import MouseDrag, nearest_hit, pick
+from taisoft.view.controls import MouseDrag, nearest_hit, pick
+from taisoft.view.scene_view import Layers
+from taisoft.view.window import Loop
 
 WATCH = """
 import os, sys

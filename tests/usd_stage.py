@@ -3,7 +3,7 @@
 import numpy as np
 from pxr import Usd, UsdValidation
 
-from taisoft.output.usd_prims import prim_names
+from taisoft.output.usd_scene import prim_names
 
 
 def faults(stage) -> list[str]:

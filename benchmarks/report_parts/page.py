@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from taisoft.output.plot import log_ticks, require_matplotlib
+from taisoft.output.tables import log_ticks, require_matplotlib
 from taisoft.timing import Timing
 
 from ..document import plain, table

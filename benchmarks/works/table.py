@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from taisoft.output.plot import require_matplotlib, save, ticks
-from taisoft.output.tables import markdown, percent, spread_of
+from taisoft.output.tables import markdown, percent, require_matplotlib, save, spread_of, ticks
 from taisoft.study.results import front
 
 from ..document import Limit

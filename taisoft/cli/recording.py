@@ -9,19 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from taisoft.errors import OutputError, SceneError
-from taisoft.output.checkpoint import CheckpointWriter
-from taisoft.output.files import RESULT_FILES, OutputFolder
-from taisoft.output.frames import FRAMES_NAME, FrameWriter
+from taisoft.output.files import RESULT_FILES, CheckpointWriter, OutputFolder
+from taisoft.output.frames import FRAMES_NAME, FrameWriter, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
 from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
-from taisoft.output.video import command, find_ffmpeg, picture_numbers, write_video
 from taisoft.records import RunReport
 from taisoft.running import dt_sentence
 from taisoft.scene.checks import nearest
 from taisoft.view.annotations import Annotations, text_missing
-from taisoft.view.layers import IN_PICTURES, IN_WINDOW, LAYERS
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.plots import PLOTS, Plots
+from taisoft.view.scene_view import IN_PICTURES, IN_WINDOW, LAYERS
 
 WIDTH = 118  # of the terminal
 PROBLEMS_SHOWN = 5
@@ -174,7 +172,7 @@ class Recording:
         if not picture_numbers(folder):
             return
         if find_ffmpeg() is None:
-            line = shlex.join(command(folder, fps))
+            line = shlex.join(ffmpeg_command(folder, fps))
             print(f"taisoft: no video without ffmpeg (pip install 'taisoft[video]'); the command is: {line}", file=sys.stderr)
             return
         write_video(folder, fps)

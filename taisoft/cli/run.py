@@ -26,9 +26,8 @@ from taisoft.cli.recording import (
 )
 from taisoft.cli.scene_file import OF_SCENE, load_scene, refuse_unknown
 from taisoft.errors import SceneError, SimulationError
-from taisoft.output.checkpoint import read_last_good
-from taisoft.output.files import check_free
-from taisoft.output.progress import Progress
+from taisoft.output.files import check_free, read_last_good
+from taisoft.output.report import Progress
 from taisoft.records import RunReport
 from taisoft.running import check_length, first_frame
 from taisoft.scene import checks
@@ -220,7 +219,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
         if shown.window:
             from taisoft.view.window import LiveWindow
 
-            observers.members.append(LiveWindow(sim.scene, colour=shown.colour, layers=shown.in_window, plots=plots))
+            observers.members.append(LiveWindow(sim.scene, plots, colour=shown.colour, layers=shown.in_window))
         if recording is not None:
             recording.add_writers(observers, sim, settings.fps, shown, plots)
         observers.members.append(Progress(settings.seconds, label=Path(arguments.scene).stem))

@@ -1,11 +1,9 @@
-"""A perspective camera aimed at a target point: framing, orbiting, projection, clipping."""
+"""A perspective camera aimed at a target point: framing, orbiting, projection, and clipping of triangles and lines."""
 
 import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-
-from taisoft.output.polygons import clip_polygon
 
 UP = np.array([0.0, 1.0, 0.0])
 MAX_ELEVATION = 89.0  # [deg]; at 90 "up" is undefined
@@ -14,6 +12,25 @@ BORDER = 0.06  # fraction of the picture, both sides together, kept free when th
 MAX_WIDENING = 4.0  # largest distance over the first one; a body that flies away finally leaves the picture
 GUARD_BAND = 50.0  # half-size of the clipping region in half-sizes of the picture; triangles that cross it are cut
 NEAR, FAR = 0.02, 50.0  # clipping planes in units of the distance to the target
+
+
+def start_positions(scene) -> np.ndarray:
+    """Return the initial positions of the nodes of all bodies, (n,3) [m]."""
+    return np.concatenate([body.rest_positions + body.position for body in scene.bodies])
+
+
+def clip_polygon(polygon: np.ndarray, k: int = 0) -> np.ndarray:
+    """Clip a convex polygon to the side of a plane where the height is not negative (Sutherland and Hodgman 1974).
+
+    polygon: (n,m), one row per corner; column k is the height above the plane; all columns are interpolated.
+    """
+    kept = []
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0)):
+        if a[k] >= 0:
+            kept.append(a)
+        if a[k] * b[k] < 0:
+            kept.append(a + a[k] / (a[k] - b[k]) * (b - a))
+    return np.array(kept).reshape(-1, polygon.shape[1])
 
 
 @dataclass(frozen=True)
@@ -57,6 +74,11 @@ class Camera:
         return np.array([right, np.cross(right, self.forward), self.forward])
 
     @property
+    def slope(self) -> float:
+        """Half the height of the picture over the depth."""
+        return math.tan(math.radians(self.fov) / 2)
+
+    @property
     def clipping(self) -> tuple[float, float]:
         """Distances of the near and the far clipping plane [m]."""
         return NEAR * self.distance, FAR * self.distance
@@ -71,7 +93,7 @@ class Camera:
     def _distance(self, points: np.ndarray, size: tuple[int, int], fraction: float) -> float:
         """Return the distance [m] from the target at which points (n,3) fill a fraction of the picture's width or height."""
         right, up, forward = self.axes @ (np.asarray(points) - self.target).T
-        half = fraction * math.tan(math.radians(self.fov) / 2)  # half-height over distance
+        half = fraction * self.slope
         needed = np.maximum(np.abs(right) / (half * size[0] / size[1]), np.abs(up) / half) - forward
         return float(np.max(needed, initial=0.0, where=np.isfinite(needed)))
 
@@ -83,12 +105,11 @@ class Camera:
         size: width and height of the picture. New vertices follow the given ones; triangles that are not finite are dropped.
         """
         right, up, depth = (np.where(np.isfinite(x), x, np.nan) - self.position).dot(self.axes.T).T
-        half_height = GUARD_BAND * math.tan(math.radians(self.fov) / 2) * depth
+        half_height = GUARD_BAND * self.slope * depth
         half_width = half_height * size[0] / size[1]
         near = depth - self.clipping[0] * (1.0 + 1e-6)
-        inside = np.stack(  # positive on each plane's inner side
-            [near, half_width - right, half_width + right, half_height - up, half_height + up], axis=1
-        )
+        planes = [near, half_width - right, half_width + right, half_height - up, half_height + up]
+        inside = np.stack(planes, axis=1)  # positive on each plane's inner side
         with np.errstate(invalid="ignore"):
             within = inside[triangles] > 0  # (t, corners, planes)
         whole = within.all(axis=(1, 2))
@@ -108,21 +129,16 @@ class Camera:
 
     def clipped_lines(self, ends: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Clip lines, ends (2k,3) [m] and colours (2k,3), at the near plane; lines that are not finite are dropped."""
-        a, b = ends[0::2], ends[1::2]
-        near = self.clipping[0] * (1.0 + 1e-6)
-        first, second = ((end - self.position) @ self.forward - near for end in (a, b))
+        lines = np.concatenate([ends, colours], axis=1).reshape(-1, 2, 6)
+        height = ((ends - self.position) @ self.forward - self.clipping[0] * (1.0 + 1e-6)).reshape(-1, 2)
         with np.errstate(invalid="ignore"):
-            kept = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1) & (np.maximum(first, second) > 0)
-        lines = np.concatenate([a, colours[0::2], b, colours[1::2]], axis=1)[kept]
-        first, second = first[kept], second[kept]
-        crossing = np.minimum(first, second) < 0
-        weight = (first[crossing] / (first[crossing] - second[crossing]))[:, None]
-        cut = lines[crossing, :6] + weight * (lines[crossing, 6:] - lines[crossing, :6])
-        ahead = (first[crossing] > 0)[:, None]
-        lines[crossing, :6] = np.where(ahead, lines[crossing, :6], cut)
-        lines[crossing, 6:] = np.where(ahead, cut, lines[crossing, 6:])
-        lines = lines.reshape(-1, 6)
-        return lines[:, :3], lines[:, 3:]
+            kept = np.isfinite(ends).reshape(-1, 6).all(axis=1) & (height.max(axis=1) > 0)
+        lines, height = lines[kept], height[kept]
+        crossing = np.flatnonzero(height.min(axis=1) < 0)
+        a, b = lines[crossing].transpose(1, 0, 2)
+        h, behind = height[crossing], height[crossing].argmin(axis=1)
+        lines[crossing, behind] = a + (h[:, 0] / (h[:, 0] - h[:, 1]))[:, None] * (b - a)
+        return lines[..., :3].reshape(-1, 3), lines[..., 3:].reshape(-1, 3)
 
     def orbit(self, azimuth: float, elevation: float) -> "Camera":
         """Return the camera turned about the target by angles [deg]; elevation is limited to MAX_ELEVATION."""
@@ -135,7 +151,7 @@ class Camera:
 
     def pan(self, right: float, up: float) -> "Camera":
         """Return the camera moved in the picture's plane, in units of the picture's height at the target."""
-        height = 2 * self.distance * math.tan(math.radians(self.fov) / 2)
+        height = 2 * self.distance * self.slope
         return replace(self, target=self.target + height * (right * self.axes[0] + up * self.axes[1]))
 
     def ray(self, at: tuple[float, float], size: tuple[int, int]) -> np.ndarray:
@@ -143,7 +159,7 @@ class Camera:
 
         size: width and height of the picture, in any unit.
         """
-        half = math.tan(math.radians(self.fov) / 2)
+        half = self.slope
         right, up = half * (2 * at[0] - 1) * size[0] / size[1], half * (2 * at[1] - 1)
         direction = np.array([right, up, 1.0]) @ self.axes
         return direction / np.linalg.norm(direction)
@@ -159,7 +175,7 @@ class Camera:
         """
         width, height = size
         local = (np.asarray(points) - self.position) @ self.axes.T
-        focal = height / 2 / math.tan(math.radians(self.fov) / 2)
+        focal = height / 2 / self.slope
         depth = local[:, 2]
         scale = focal / np.where(depth > 0, depth, np.inf)
         return np.column_stack([width / 2 + scale * local[:, 0], height / 2 - scale * local[:, 1], depth])

@@ -1,49 +1,47 @@
-"""The output folder of a run. It has one writer; its files are complete or absent (`taisoft/files.py`).
+"""The output folder of a run, and its checkpoint. The folder has one writer; its files are complete or absent.
 
 The folder's lock is an advisory kernel lock (flock) on a file that holds the writer's process id. The kernel releases it when
-the writer dies.
+the writer dies. `checkpoint.npz` is the run's last good state, written at its end and, if requested, at intervals before. The
+previous one is kept as `checkpoint.previous.npz`, so that a run can resume if the last one cannot be read.
 """
 
 import os
 import re
-from contextlib import suppress
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from taisoft.errors import OutputError
-from taisoft.files import part_path, publish, replacing, write_bytes, write_error
-
-__all__ = [
-    "LOCK_NAME",
-    "RESULT_FILES",
-    "RESULT_FOLDERS",
-    "FolderLock",
-    "OutputFolder",
-    "check_free",
-    "make_folder",
-    "part_path",
-    "publish",
-    "replacing",
-    "write_bytes",
-    "write_error",
-]
+from taisoft.checkpoint import Checkpoint, read_checkpoint
+from taisoft.errors import OutputError, SimulationError
+from taisoft.files import link_file, part_path
 
 LOCK_NAME = "taisoft.lock"
-RESULT_FILES = ("report.json", "steps.csv", "scene.usdc", "checkpoint.npz", "checkpoint.previous.npz", "video.mp4")
+CHECKPOINT_NAME, PREVIOUS_NAME = "checkpoint.npz", "checkpoint.previous.npz"
+RESULT_FILES = ("report.json", "steps.csv", "scene.usdc", CHECKPOINT_NAME, PREVIOUS_NAME, "video.mp4")
 REPORT_FILES = ("report.json", "steps.csv")  # removed at once: beside the results of another run they would be wrong
 # Left by a killed writer: see `taisoft.files.part_path`; USD adds temporary files with a suffix of its own
 TEMPORARY = re.compile(r"\.\d+-\d+\.part$|\.usdc\.\d+-\d+\.[A-Za-z0-9]{6}$")
 RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc"}  # folder -> pattern of a run's files in it
 
 
+@contextmanager
+def output_errors(failure: str) -> Iterator[None]:
+    """Turn an OSError in the block into an OutputError: the failure and the system's reason."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{failure}: {error.strerror or error}") from error
+
+
 def make_folder(path: str | Path) -> Path:
     """Create a folder with its parents, or accept an existing one. Raises OutputError."""
     path = Path(path)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        raise OutputError(f"cannot use {path} as a folder: a file has that name") from None
-    except OSError as error:
-        raise OutputError(f"cannot create the folder {path}: {error.strerror or error}") from error
+    with output_errors(f"cannot create the folder {path}"):
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            raise OutputError(f"cannot use {path} as a folder: a file has that name") from None
     return path
 
 
@@ -71,36 +69,30 @@ class OutputFolder:
         self.path = make_folder(path).absolute()  # a later change of the working directory must not move the output
         self._lock = FolderLock(self.path)
         try:
-            self._old = check_free(path, overwrite) if first is None else {}
-            _clear_parts(self.path)
-            if first is None:
-                _remove(self.path, *REPORT_FILES)
-                _clear_frames(self.path, 0)
-            _probe(self.path)
-        except OSError as error:
-            self.close()
-            raise OutputError(f"cannot write to the output folder {path}: {error.strerror or error}") from error
+            with output_errors(f"cannot write to the output folder {path}"):
+                self._old = check_free(path, overwrite) if first is None else {}
+                _clear_parts(self.path)
+                if first is None:
+                    _remove(self.path, *REPORT_FILES)
+                    _clear_frames(self.path, 0)
+                _probe(self.path)
         except BaseException:
             self.close()
             raise
 
     def clear(self, first: int) -> None:
         """Remove report.json, and an earlier run's frames and chunks from number `first` on. Raises OutputError."""
-        try:
+        with output_errors(f"cannot write to the output folder {self.path}"):
             _remove(self.path, "report.json")
             _clear_frames(self.path, first)
-        except OSError as error:
-            raise OutputError(f"cannot write to the output folder {self.path}: {error.strerror or error}") from error
 
     def discard_stale(self) -> None:
         """Remove an earlier run's result files that this run did not replace, so that the folder holds one run."""
         for name, identity in self._old.items():
             file = self.path / name
             if identity is not None and file.exists() and _identity(file) == identity:
-                try:
+                with output_errors(f"cannot remove the earlier run's {file}"):
                     file.unlink()
-                except OSError as error:
-                    raise OutputError(f"cannot remove the earlier run's {file}: {error.strerror or error}") from error
 
     def close(self) -> None:
         """Release the lock. A second call does nothing."""
@@ -121,43 +113,35 @@ class FolderLock:
     """A folder's lock, held until `close`. Raises OutputError if another process holds it or it cannot be taken."""
 
     def __init__(self, folder: Path):
-        self._folder = folder
-        self._descriptor: int | None = _lock_folder(folder)
+        import fcntl  # POSIX only
+
+        self._path, self._descriptor = folder / LOCK_NAME, None
+        while self._descriptor is None:
+            with output_errors(f"cannot write to the output folder {folder}"):
+                descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # the last holder may have removed this file between open and flock: then the lock is of no use
+                if self._path.exists() and os.fstat(descriptor).st_ino == self._path.stat().st_ino:
+                    os.ftruncate(descriptor, 0)
+                    os.write(descriptor, f"{os.getpid()}\n".encode())
+                    self._descriptor = descriptor
+            except BlockingIOError:
+                holder = os.read(descriptor, 32).decode(errors="replace").strip() or "unknown"
+                raise OutputError(f"process {holder} is writing to the output folder {folder} (lock {self._path})") from None
+            except OSError as error:
+                raise OutputError(f"cannot lock the output folder {folder}: {error.strerror or error}") from error
+            finally:
+                if self._descriptor is None:
+                    os.close(descriptor)
 
     def close(self) -> None:
         """Release the lock. A second call does nothing."""
         if self._descriptor is not None:
             with suppress(OSError):  # the folder may be gone; closing the descriptor frees the lock anyway
-                (self._folder / LOCK_NAME).unlink()
+                self._path.unlink()
             os.close(self._descriptor)
             self._descriptor = None
-
-
-def _lock_folder(folder: Path) -> int:
-    """Take the folder's lock and write the process id into it; return the open descriptor that holds it."""
-    import fcntl  # POSIX only
-
-    path = folder / LOCK_NAME
-    while True:
-        try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise OutputError(f"cannot write to the output folder {folder}: {error.strerror or error}") from error
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # the last holder may have removed this file between open and flock: then the lock is of no use
-            if path.exists() and os.fstat(descriptor).st_ino == path.stat().st_ino:
-                os.ftruncate(descriptor, 0)
-                os.write(descriptor, f"{os.getpid()}\n".encode())
-                return descriptor
-            os.close(descriptor)
-        except BlockingIOError:
-            holder = os.read(descriptor, 32).decode(errors="replace").strip() or "unknown"
-            os.close(descriptor)
-            raise OutputError(f"process {holder} is writing to the output folder {folder} (lock {path})") from None
-        except OSError as error:
-            os.close(descriptor)
-            raise OutputError(f"cannot lock the output folder {folder}: {error.strerror or error}") from error
 
 
 def _identity(file: Path) -> tuple[int, int]:
@@ -168,21 +152,16 @@ def _identity(file: Path) -> tuple[int, int]:
 
 def _results(folder: Path) -> dict[str, tuple[int, int] | None]:
     """Return an earlier run's results: file name -> identity, and subfolder name -> None."""
-    found: dict[str, tuple[int, int] | None] = {}
-    for name in RESULT_FILES:
-        if (folder / name).exists():
-            found[name] = _identity(folder / name)
-    for name, pattern in RESULT_FOLDERS.items():
-        if any((folder / name).glob(pattern)):
-            found[f"{name}/"] = None
-    return found
+    files = {name: _identity(folder / name) for name in RESULT_FILES if (folder / name).exists()}
+    return files | {f"{name}/": None for name, pattern in RESULT_FOLDERS.items() if any((folder / name).glob(pattern))}
 
 
 def _clear_frames(folder: Path, first: int) -> None:
     """Remove an earlier run's frames from number `first` on, and chunks whose first frame is among them."""
     for name, pattern in RESULT_FOLDERS.items():
         for file in (folder / name).glob(pattern):
-            if first == 0 or _number(file) >= first:
+            number = file.stem.removeprefix("points_")
+            if first == 0 or (number.isdecimal() and int(number) >= first):
                 file.unlink()
 
 
@@ -202,12 +181,6 @@ def _clear_parts(folder: Path) -> None:
             file.unlink()
 
 
-def _number(file: Path) -> int:
-    """Return the number of a frame, or of a chunk's first frame; -1 if the name has none."""
-    text = file.stem.removeprefix("points_")
-    return int(text) if text.isdecimal() else -1
-
-
 def _probe(folder: Path) -> None:
     """Check that a file can be created and removed here, and that no result's name is taken by a folder or file."""
     for name in RESULT_FILES:
@@ -221,3 +194,63 @@ def _probe(folder: Path) -> None:
         part.write_bytes(b"taisoft\n")
     finally:
         part.unlink(missing_ok=True)
+
+
+class CheckpointWriter:
+    """Observer that writes folder/checkpoint.npz.
+
+    every: simulated time between checkpoints, which are written at frames [s]; None: only at the end. resumed: the checkpoint
+    from which the run resumes; if it is the folder's own it is kept as the previous one, that of another run is not. before:
+    called before each checkpoint at an interval, to flush the run's other files. notes: returns data to store with the state.
+    """
+
+    def __init__(self, folder: str | Path, every: float | None = None, resumed: str | Path | None = None):
+        self.path, self.every = Path(folder) / CHECKPOINT_NAME, every
+        self.before: Callable[[], None] = lambda: None
+        self.notes: Callable[[], dict] = dict
+        self._last: float | None = None  # simulated time of the last checkpoint, or of the start
+        self._previous = self.path.with_name(PREVIOUS_NAME)
+        resumed = None if resumed is None else Path(resumed).resolve()
+        self._own = resumed == self.path.resolve()  # whether the existing file is of this run
+        self._from_previous = resumed == self._previous.resolve()  # then it is the only good one
+
+    def frame(self, sim, _index: int) -> None:
+        """Write a checkpoint if one is due. Raises OutputError."""
+        if self._last is None:
+            self._last = sim.time
+        elif self.every is not None and sim.time - self._last >= self.every * (1.0 - 1e-9):
+            self.before()
+            self.write(sim)
+
+    def write(self, sim) -> None:
+        """Write sim's present state. Raises OutputError; the existing checkpoint then remains."""
+        with output_errors(f"cannot write {self._previous}"):
+            if self._own:
+                link_file(self.path, self._previous)
+            elif not self._from_previous:  # it is of another run
+                self._previous.unlink(missing_ok=True)
+        sim.save_checkpoint(self.path, self.notes())
+        self._last, self._own = sim.time, True
+
+    def close(self) -> None:
+        """Do nothing; part of the observer interface."""
+
+
+def read_last_good(path: str | Path) -> Checkpoint:
+    """Return the checkpoint in a file or, if that cannot be read, the previous one beside it, with a warning that names both.
+
+    Raises SimulationError if neither can be read, with the reasons of both.
+    """
+    path = Path(path)
+    previous = path.with_name(PREVIOUS_NAME)
+    try:
+        return read_checkpoint(path)
+    except SimulationError as error:
+        if path.name != CHECKPOINT_NAME or not previous.is_file():
+            raise
+        try:
+            found = read_checkpoint(previous)
+        except SimulationError as other:
+            raise SimulationError(f"{error}; nor can the previous one be used: {other}") from None
+        warnings.warn(f"{error}; resuming from the previous checkpoint instead, {previous}", UserWarning, stacklevel=2)
+        return found

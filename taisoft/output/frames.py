@@ -1,16 +1,26 @@
-"""Write `frames/00000.png ...`: one picture per frame, each file complete or absent."""
+"""Pictures of a run: `frames/00000.png ...`, one per frame, and `video.mp4`, encoded from them. Each file is complete or absent.
 
+The video is encoded by ffmpeg: the one on PATH, else that of the extra `video`.
+"""
+
+import shutil
 import struct
+import subprocess
 import zlib
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
-from taisoft.output.files import make_folder, write_bytes
+from taisoft.errors import OutputError
+from taisoft.files import replacing, write_bytes
+from taisoft.output.files import make_folder
 
-FRAMES_NAME = "frames"
-_COMPRESSION = 4  # zlib level, 1 to 9: higher levels take twice the time for hardly fewer bytes
+FRAMES_NAME, VIDEO_NAME = "frames", "video.mp4"
+COMPRESSION = 4  # zlib level, 1 to 9: higher levels take twice the time for hardly fewer bytes
+TIMEOUT = 600.0  # of the encoding [s]
+ENCODING = "-c:v libx264 -crf 18 -pix_fmt yuv420p -vf pad=ceil(iw/2)*2:ceil(ih/2)*2 -movflags +faststart -f mp4"
 
 
 class FrameWriter:
@@ -48,9 +58,48 @@ def png_bytes(image: np.ndarray) -> bytes:
     filtered[0, 1:] = rows[0]
     np.subtract(rows[1:], rows[:-1], out=filtered[1:, 1:])  # modulo 256, as the format requires
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits, RGB, not interlaced
-    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(filtered, _COMPRESSION)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(kind, data) for kind, data in chunks)
+    png = b"\x89PNG\r\n\x1a\n"
+    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(filtered, COMPRESSION)), (b"IEND", b"")):
+        png += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return png
 
 
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+def find_ffmpeg() -> str | None:
+    """Return the path of ffmpeg, or None if there is none."""
+    found = shutil.which("ffmpeg")
+    if found is None and find_spec("imageio_ffmpeg") is not None:
+        import imageio_ffmpeg
+
+        try:
+            found = imageio_ffmpeg.get_ffmpeg_exe()
+        except RuntimeError:  # the package has no binary for this platform
+            return None
+    return found
+
+
+def picture_numbers(folder: Path) -> list[int]:
+    """Return the numbers of a run's pictures in folder/frames."""
+    return [int(path.stem) for path in (folder / FRAMES_NAME).glob("*.png") if path.stem.isdecimal()]
+
+
+def ffmpeg_command(folder: Path, fps: float, ffmpeg: str = "ffmpeg", out: Path | None = None) -> list[str]:
+    """Return the ffmpeg command that encodes the pictures in folder/frames at fps [1/s], for common players and browsers."""
+    pattern = str(folder / FRAMES_NAME).replace("%", "%%") + "/%05d.png"
+    pictures = ["-framerate", f"{fps:g}", "-start_number", str(min(picture_numbers(folder))), "-i", pattern]
+    return [ffmpeg, "-y", "-loglevel", "error", "-xerror", *pictures, *ENCODING.split(), str(out or folder / VIDEO_NAME)]
+
+
+def write_video(folder: Path, fps: float) -> None:
+    """Write folder/video.mp4 from the pictures in folder/frames. Raises OutputError."""
+    ffmpeg, path = find_ffmpeg(), folder / VIDEO_NAME
+    if ffmpeg is None:
+        raise OutputError(f"{path} cannot be made without ffmpeg: pip install 'taisoft[video]'")
+    options = {"stdin": subprocess.DEVNULL, "capture_output": True, "timeout": TIMEOUT, "check": False}
+    with replacing(path) as part:
+        try:  # in a session of its own: Ctrl-C goes to the run, which ends ffmpeg
+            result = subprocess.run(ffmpeg_command(folder, fps, ffmpeg, part), start_new_session=True, **options)
+        except subprocess.TimeoutExpired as error:
+            raise OutputError(f"{path} cannot be made: {error}") from error
+        if result.returncode != 0:
+            lines = result.stderr.decode("utf-8", "replace").strip().splitlines()
+            raise OutputError(f"{path} cannot be made: ffmpeg says: {lines[-1] if lines else result.returncode}")

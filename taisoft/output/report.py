@@ -1,4 +1,4 @@
-"""Write `report.json` and `steps.csv`: the result of a run, its settings and its machine.
+"""Reports of a run: its progress on a stream, and its result in `report.json` and `steps.csv`, with settings and machine.
 
 report.json holds the RunReport, with extremes over the steps in place of the steps; steps.csv holds one StepReport per row.
 JSON has no NaN: numbers that are not finite are null there, and counted in the extremes.
@@ -12,52 +12,36 @@ import math
 import os
 import platform
 import sys
+import time
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
-from taisoft.output.files import write_bytes
+from taisoft.files import write_bytes
 from taisoft.records import RunReport, StepReport
 from taisoft.timing import processor
 from taisoft.timing import versions as installed
 
 PACKAGES = ("taichi", "numpy", "scipy", "usd-core")
+LINE_EVERY = 5.0  # time between lines of progress if the stream is not a terminal [s]
+COLUMNS = [f.name for f in dataclasses.fields(StepReport)]
+NUMERIC = [f.name for f in dataclasses.fields(StepReport) if f.type in (int, float) and f.name != "time"]
 
 
-def write_report(
-    folder: str | Path,
-    result: RunReport,
-    *,
-    arch: str,
-    precision: str,
-    settings: dict,
-    plan: list[dict],
-    resumed: dict | None = None,
-    bodies: list[dict] | None = None,
-    buffer_growths: dict[str, int] | None = None,
-) -> None:
+def write_report(folder: str | Path, result: RunReport, *, resumed: dict | None = None, **entries) -> None:
     """Write report.json and steps.csv into folder. Raises OutputError.
 
-    settings: every resolved setting of the run, by name; plan: the entries of the simulator's plan. Values may be
-    plain, NumPy, paths or dataclasses; anything else is written as its text. resumed: the checkpoint that the run resumed from,
-    with its `time` [s]; rows up to that time in the folder's steps.csv are kept, while the report covers only the steps since.
-    bodies: see `body_records`. buffer_growths: how often each buffer of contact detection grew.
+    resumed: the checkpoint that the run resumed from, with its `time` [s]; rows up to that time in the folder's steps.csv are
+    kept, while the report covers only the steps since. entries: what else the report holds, such as every resolved setting of
+    the run. Values may be plain, NumPy, paths or dataclasses; anything else is written as its text.
     """
     folder = Path(folder)
     earlier = [] if resumed is None else _rows_until(folder / "steps.csv", resumed["time"])
     write_bytes(folder / "steps.csv", steps_csv(result.step_reports, earlier).encode())
-    record = run_record(result) | {
-        "resumed": resumed,
-        "arch": arch,
-        "precision": precision,
-        "settings": settings,
-        "plan": plan,
-        "bodies": bodies or [],
-        "buffer_growths": buffer_growths or {},
-        "versions": versions(),
-        "machine": machine(),
-        "peak_memory_bytes": peak_memory(),
-    }
+    record = {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.name != "step_reports"}
+    record |= {"extremes": extremes(result.step_reports), "resumed": resumed, **entries}
+    record |= {"versions": versions(), "machine": machine(), "peak_memory_bytes": peak_memory()}
     write_bytes(folder / "report.json", json_text(record).encode())
 
 
@@ -77,12 +61,6 @@ def body_records(scene) -> list[dict]:
     ]
 
 
-def run_record(result: RunReport) -> dict:
-    """Return a RunReport as a dict, with `extremes` over the steps instead of the steps."""
-    record = {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.name != "step_reports"}
-    return record | {"extremes": extremes(result.step_reports)}
-
-
 def extremes(reports: list[StepReport]) -> dict:
     """Return, per numeric field of StepReport, min and max of the finite values, their times [s], and the count of other values.
 
@@ -92,44 +70,35 @@ def extremes(reports: list[StepReport]) -> dict:
         return {}
     times = np.array([r.time for r in reports])
     found: dict = {"reports": len(reports), "not_converged": sum(not r.converged for r in reports)}
-    for name in _numeric_fields():
+    for name in NUMERIC:
         values = np.array([getattr(r, name) for r in reports], dtype=float)
         finite = np.flatnonzero(np.isfinite(values))
         entry: dict = {"not_finite": len(values) - len(finite)}
         if len(finite):
             low, high = finite[values[finite].argmin()], finite[values[finite].argmax()]
-            integral = all(isinstance(getattr(reports[k], name), int) for k in (low, high))
-            entry |= {"min": values[low], "max": values[high], "time_of_min": times[low], "time_of_max": times[high]}
-            if integral:
-                entry |= {"min": int(values[low]), "max": int(values[high])}
+            kind = int if all(isinstance(getattr(reports[k], name), int) for k in (low, high)) else float
+            entry |= {"min": kind(values[low]), "max": kind(values[high])}
+            entry |= {"time_of_min": times[low], "time_of_max": times[high]}
         found[name] = entry
     return found
 
 
-def steps_csv(reports: list[StepReport], earlier: list[list[str]] | None = None) -> str:
+def steps_csv(reports: list[StepReport], earlier: list[list[str]]) -> str:
     """Return the reports as CSV text (RFC 4180): a header, earlier rows, and a row per report; problems are joined with '; '."""
     text = io.StringIO(newline="")
     writer = csv.writer(text)
-    names = _columns()
-    writer.writerow(names)
-    writer.writerows(earlier or [])
+    writer.writerows([COLUMNS, *earlier])
     for report in reports:
-        row = {name: getattr(report, name) for name in names}
-        row["problems"] = "; ".join(report.problems)
-        writer.writerow(row.values())
+        writer.writerow([getattr(report, name) if name != "problems" else "; ".join(report.problems) for name in COLUMNS])
     return text.getvalue()
 
 
-def _columns() -> list[str]:
-    return [f.name for f in dataclasses.fields(StepReport)]
-
-
-def _rows_until(path: Path, time: float) -> list[list[str]]:
-    """Return the rows of an earlier run's steps.csv up to a time [s]; none if there is no such file with these columns."""
+def _rows_until(path: Path, end: float) -> list[list[str]]:
+    """Return the rows of an earlier run's steps.csv up to time `end` [s]; none if there is no such file with these columns."""
     try:
         with open(path, newline="", encoding="utf-8") as file:
             header, *rows = csv.reader(file)
-        return [row for row in rows if float(row[0]) <= time * (1.0 + 1e-12)] if header == _columns() else []
+        return [row for row in rows if float(row[0]) <= end * (1.0 + 1e-12)] if header == COLUMNS else []
     except (OSError, ValueError, IndexError, csv.Error):
         return []
 
@@ -162,12 +131,6 @@ def peak_memory() -> int | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
-def _numeric_fields() -> list[str]:
-    blank = StepReport(time=0.0)
-    names = [f.name for f in dataclasses.fields(StepReport) if f.name != "time"]
-    return [n for n in names if isinstance(getattr(blank, n), int | float) and not isinstance(getattr(blank, n), bool)]
-
-
 def _plain(value):
     """Convert a value to JSON types."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -183,3 +146,64 @@ def _plain(value):
     if value is None or isinstance(value, bool | int | str):
         return value
     return str(value)
+
+
+class Progress:
+    """Observer that shows the progress of a run of `seconds` [s] of simulated time on a stream (stderr by default).
+
+    On a terminal it is a bar with steps/s and the remaining time, elsewhere a line every few seconds.
+    """
+
+    def __init__(self, seconds: float, label: str = "run", stream: TextIO | None = None):
+        self.seconds, self.label = seconds, label
+        self.stream = sys.stderr if stream is None else stream
+        self._started: float | None = None  # wall time of the first frame; construction and compilation come before
+        self._first_time = self._last_line = 0.0
+        self._first_step = 0
+        self._bar = _bar(seconds, label, self.stream) if self.stream.isatty() else None
+
+    def frame(self, sim, index: int) -> None:
+        """Show sim.time and the speed since the first frame."""
+        now = time.perf_counter()
+        if self._started is None:
+            self._started, self._first_time, self._first_step = now, sim.time, sim.step_count
+            self._last_line = now
+        text = self._speed(sim, now - self._started)
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=min(sim.time, self.seconds), note=text)
+        elif now - self._last_line >= LINE_EVERY:
+            self._last_line = now
+            print(f"{self.label}: {sim.time:.3f} of {self.seconds:g} s, {text}", file=self.stream, flush=True)
+
+    def close(self) -> None:
+        """Stop the bar; a second call does nothing."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    def _speed(self, sim, elapsed: float) -> str:
+        done = sim.time - self._first_time
+        if elapsed <= 0 or done <= 0:
+            return "starting"
+        rate = (sim.step_count - self._first_step) / elapsed
+        left = max(self.seconds - sim.time, 0.0) * elapsed / done
+        return f"{rate:.4g} steps/s, {_clock(left)} left"
+
+
+def _bar(seconds: float, label: str, stream: TextIO):
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    label_text, done = TextColumn("{task.description}"), TextColumn("{task.completed:.2f} of {task.total:g} s")
+    columns = label_text, BarColumn(bar_width=30), done, TextColumn("{task.fields[note]}")
+    bar = Progress(*columns, console=Console(file=stream), refresh_per_second=5, transient=False)
+    bar.add_task(label, total=seconds, note="starting")
+    bar.start()
+    return bar
+
+
+def _clock(seconds: float) -> str:
+    """Format seconds as h:mm:ss or m:ss."""
+    minutes, second = divmod(round(seconds), 60)
+    hours, minute = divmod(minutes, 60)
+    return f"{hours}:{minute:02d}:{second:02d}" if hours else f"{minute}:{second:02d}"

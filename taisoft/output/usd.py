@@ -14,7 +14,7 @@ the linear triangles and tets that its elements are cut into, with all its nodes
 Both carry `primvars:vonMisesStress` [Pa]. If there can be contacts, the surface also carries `primvars:contactImpulse` [N s], the
 impulse of the last step before the frame on each point. `nodal_fields.py` defines both.
 An obstacle is `/World/<name>` with `surface` and `material`; its points change over time if it follows a path. A half-space
-whose square lies entirely within others is left out. `/View` holds a camera and lights (`usd_view.py`).
+whose square lies entirely within others is left out. `/View` holds a camera and lights (`usd_scene.py`).
 """
 
 import re
@@ -24,10 +24,10 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.errors import OutputError
-from taisoft.output.files import make_folder, part_path, publish, replacing, write_error
+from taisoft.files import part_path, publish, replacing
+from taisoft.output.files import make_folder, output_errors
 from taisoft.output.nodal_fields import NodalMean, contact_impulses, von_mises
-from taisoft.output.usd_prims import IMPULSE, ROOT, STRESS, scene_layer
-from taisoft.output.usd_view import TRANSLATE
+from taisoft.output.usd_scene import IMPULSE, ROOT, STRESS, TRANSLATE, scene_layer
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
@@ -80,11 +80,12 @@ class UsdWriter:
 
     def frame(self, sim, index: int) -> None:
         """Record sim's state as frame index; index must ascend. Raises OutputError."""
-        from pxr import Gf
+        from pxr import Gf, Sdf
 
         moved = [(track, surface.at(sim.time).astype(np.float32)) for track, surface in self._moving]  # first, since it may raise
         if self._chunk is None:
-            self._chunk = _copy(self._template)
+            self._chunk = Sdf.Layer.CreateAnonymous(".usdc")
+            self._chunk.TransferContent(self._template)
         x = sim.positions()
         points, fields = x.astype(np.float32), {STRESS: von_mises(self._mean(sim.stress())).astype(np.float32)}
         if self._touching:
@@ -122,8 +123,10 @@ class UsdWriter:
         if self._joined is None:
             raise OutputError(f"cannot continue writing {self.path}: an earlier write failed")
         try:
-            _set_range(chunk, frames[0], frames[-1])
-            _export(chunk, self.chunks / f"points_{frames[0]:05d}.usdc")
+            chunk.startTimeCode, chunk.endTimeCode = float(frames[0]), float(frames[-1])
+            path = self.chunks / f"points_{frames[0]:05d}.usdc"
+            with replacing(path) as part:
+                _write_checked(path, chunk, lambda: chunk.Export(str(part), args={"format": "usdc"}))
             self._joined.append(chunk)
         except Exception:
             self._joined.discard()
@@ -143,7 +146,10 @@ def join_chunks(folder: str | Path) -> Path:
     joined = None
     for path in paths:
         chunk = _opened(path)
-        joined = joined or _Joined(target, _without_samples(chunk))
+        if joined is None:
+            joined = _Joined(target, chunk)
+            for attribute, time in _samples(joined.layer):
+                joined.layer.EraseTimeSample(attribute, time)
         joined.append(chunk)
     joined.publish()
     _remove_chunks(chunks)
@@ -166,12 +172,11 @@ class _Joined:
         last = chunk.endTimeCode if end is None else min(chunk.endTimeCode, end - 1)
         if last < chunk.startTimeCode:
             return
-        for path in _sampled(chunk):
-            for time in chunk.ListTimeSamplesForPath(path):
-                if time <= last:
-                    self.layer.SetTimeSample(path, time, chunk.QueryTimeSample(path, time))
+        for path, time in _samples(chunk):
+            if time <= last:
+                self.layer.SetTimeSample(path, time, chunk.QueryTimeSample(path, time))
         self.first = chunk.startTimeCode if self.first is None else self.first
-        _set_range(self.layer, self.first, max(last, self.layer.endTimeCode))
+        self.layer.startTimeCode, self.layer.endTimeCode = float(self.first), float(max(last, self.layer.endTimeCode))
         try:
             _write_checked(self.path, chunk, self.layer.Save)
         except OutputError:
@@ -185,33 +190,17 @@ class _Joined:
             return
         self.layer = None
         try:
-            publish(self.part, self.path)
-        except OSError as error:
+            with output_errors(f"cannot write {self.path}"):
+                publish(self.part, self.path)
+        except OutputError:
             self.discard()
-            raise write_error(self.path, error) from error
+            raise
 
     def discard(self) -> None:
         """Discard the layer and its temporary file."""
         self.layer = None
         with suppress(OSError):  # the folder may be unreachable
             self.part.unlink()
-
-
-def _copy(layer):
-    from pxr import Sdf
-
-    copy = Sdf.Layer.CreateAnonymous(".usdc")
-    copy.TransferContent(layer)
-    return copy
-
-
-def _without_samples(layer):
-    """Return a copy of a chunk without its frames, from which the joined scene starts."""
-    copy = _copy(layer)
-    for path in _sampled(copy):
-        for time in copy.ListTimeSamplesForPath(path):
-            copy.EraseTimeSample(path, time)
-    return copy
 
 
 def _sampled(layer) -> list:
@@ -221,6 +210,11 @@ def _sampled(layer) -> list:
     found = []
     layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(path) if path.name in TIME_VARYING else None)
     return [path for path in found if path.IsPropertyPath()]
+
+
+def _samples(layer) -> list[tuple]:
+    """Return the path and time of every time sample of a layer of this module."""
+    return [(path, time) for path in _sampled(layer) for time in layer.ListTimeSamplesForPath(path)]
 
 
 def _chunk_paths(chunks: Path) -> list[Path]:
@@ -243,16 +237,6 @@ def _structure(layer) -> list[str]:
     return [*(child.name for child in root.nameChildren), *_sampled(layer)] if root else []
 
 
-def _set_range(layer, first: float, last: float) -> None:
-    layer.startTimeCode, layer.endTimeCode = float(first), float(last)
-
-
-def _export(layer, path: Path) -> None:
-    """Write a layer under a temporary name, then publish it. Raises OutputError."""
-    with replacing(path) as part:
-        _write_checked(path, layer, lambda: layer.Export(str(part), args={"format": "usdc"}))
-
-
 def _write_checked(path: Path, layer, write) -> None:
     """Call write(), and turn a failure of USD, an exception or False, into an OutputError with the size of the frames."""
     try:
@@ -261,20 +245,16 @@ def _write_checked(path: Path, layer, write) -> None:
         reason = "USD gives no reason"
     except Exception as error:
         reason = _last_line(error)
-    n_bytes = sum(
-        np.asarray(layer.QueryTimeSample(p, t)).nbytes for p in _sampled(layer) for t in layer.ListTimeSamplesForPath(p)
-    )
+    n_bytes = sum(np.asarray(layer.QueryTimeSample(*sample)).nbytes for sample in _samples(layer))
     raise OutputError(f"cannot write {path} ({n_bytes} bytes of new frames): {reason}")
 
 
 def _remove_chunks(chunks: Path) -> None:
-    try:
+    with output_errors(f"cannot remove the chunks in {chunks}"):
         for path in chunks.glob("points_*.usdc"):
             path.unlink()
         if not any(chunks.iterdir()):
             chunks.rmdir()
-    except OSError as error:
-        raise OutputError(f"cannot remove the chunks in {chunks}: {error.strerror or error}") from error
 
 
 def _last_line(error: Exception) -> str:

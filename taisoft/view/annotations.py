@@ -1,10 +1,19 @@
-"""Captions (below) and plots (at the right) on pictures of a run, drawn by Pillow, of the extra `plot`.
+"""Captions and plots over pictures and the live window.
 
-All lengths are for a picture 720 pixels high and scale with it. Annotations are drawn at twice their size and averaged.
+On pictures, a caption (below) and plots (at the right) are drawn by Pillow, of the extra `plot`. All lengths are for a picture
+720 pixels high and scale with it. Annotations are drawn at twice their size and averaged.
+
+In the window, plots are a column at the right edge, each a box with curves beside its numbers, which are GGUI text. GGUI writes
+text only in sub-windows. It positions each once, by name, in units of the window's initial size. So the name of a sub-window
+contains its position and size, which change with the window and the visible plots.
 """
 
+import functools
+import math
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -12,7 +21,7 @@ import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.view.colouring import TITLES, UNITS, Colouring, colours_of
-from taisoft.view.plots import Curves, Plots
+from taisoft.view.plots import CAPACITY, ENERGIES, GRID_LINES, PLOTS, Curves, Plots
 
 HEIGHT = 720.0  # of the picture that lengths refer to
 MARGIN, WIDTH = 16, 300  # of the plots
@@ -25,6 +34,15 @@ INK, FAINT, FRAME, PAPER = (38, 41, 46), (112, 116, 122), (160, 163, 168), (252,
 GRID = (222, 224, 226)
 OPACITY = 0.86  # of the plots' background
 BAR = (220, 12)  # width and height of the colour bar
+
+# in the window
+BOX, TEXT, GAP, LINE, TITLE = 230, 200, 8, 17, 34  # widths; heights of a line of text and of title and borders [pixels]
+FRAME_COLOUR, GRID_COLOUR = (0.45, 0.46, 0.48), (0.84, 0.85, 0.86)  # sRGB
+BOX_COLOUR = (0.97, 0.975, 0.98)
+REFRESH = 0.2  # time between updates of the curves [s]
+LIGHTER = 0.55  # blend of a curve's colour towards white for its numbers, which have a dark background
+MAX_BOXES = len(PLOTS)
+MAX_SEGMENTS = sum(4 + 2 * GRID_LINES + len(plot.series) * 2 * CAPACITY for plot in PLOTS.values())
 
 
 def text_missing() -> str:
@@ -49,7 +67,6 @@ class Annotations:
         self._plots, self._name, self._colouring = plots, name, colouring
         self._names = plots.visible() if plots is not None else []  # fixed now: a window may change what is visible
         self._font_file = Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"
-        self._fonts: dict = {}
 
     def draw(self, picture: np.ndarray, sim, index: int) -> np.ndarray:
         """Return an annotated copy of a picture, uint8 (height, width, 3), of sim's present state; index: frame number."""
@@ -110,8 +127,7 @@ class Annotations:
         self._write(x0 + 3, y0 + 2, curves.ends[1], SMALL_SIZE - 2, FAINT, halo=True)
         self._write(x0 + 3, y1 - 2, curves.ends[0], SMALL_SIZE - 2, FAINT, anchor="lb", halo=True)
         self._write(x0, y1 + 2, f"{curves.times[0]:.4g}", SMALL_SIZE - 2, FAINT)
-        end = f"{curves.times[1]:.4g} s"
-        self._write(x1, y1 + 2, end, SMALL_SIZE - 2, FAINT, anchor="ra")
+        self._write(x1, y1 + 2, f"{curves.times[1]:.4g} s", SMALL_SIZE - 2, FAINT, anchor="ra")
         x = x1
         for name, value, colour in reversed(curves.legend):
             text = name if len(curves.legend) > 1 else value
@@ -122,9 +138,8 @@ class Annotations:
 
     def _draw_caption(self, sim, index: int, size: tuple[float, float]) -> None:
         energies = sim.energies()
-        values = {"kinetic": energies.kinetic, "elastic": energies.elastic, "gravity": energies.gravity}
         bottom = size[1] - MARGIN
-        text = "   ".join(f"{name} {value:.4g} J" for name, value in values.items())
+        text = "   ".join(f"{name} {getattr(energies, name):.4g} J" for name in ENERGIES)
         self._write(MARGIN, bottom, f"frame {index}   t = {sim.time:.4f} s   {text}", TEXT_SIZE, INK, anchor="lb", halo=True)
         self._write(MARGIN, bottom - TEXT_SIZE - 8, self._name, TITLE_SIZE, INK, anchor="lb", halo=True)
         legend = self._colouring.legend() if self._colouring is not None else []
@@ -134,8 +149,7 @@ class Annotations:
     def _draw_colour_bar(self, legend: list[tuple[str, np.ndarray]], bottom: float) -> None:
         """Draw the colour bar from low to high, its limits below it, and the name of its quantity above."""
         width, height = BAR
-        steps = np.linspace(0.0, 1.0, width + 1)
-        colours = colours_of(steps)
+        colours = colours_of(np.linspace(0.0, 1.0, width + 1))
         top = bottom - TEXT_SIZE - height
         for k in range(width):
             left, high, right, low = self._at(MARGIN + k, top, MARGIN + k + 1, top + height)
@@ -164,26 +178,107 @@ class Annotations:
         """Write text at x, y. anchor: the part of the text at that point, in Pillow's notation; halo: outline the letters."""
         edge = {"stroke_width": round(1.5 * self._unit), "stroke_fill": (*PAPER, 200)} if halo else {}
         position = tuple((self._unit * np.array([x, y]) - self._origin).tolist())
-        self._pen.text(position, text, (*colour, 255), self._font(size), anchor, **edge)
+        self._pen.text(position, text, (*colour, 255), _font(self._font_file, round(size * self._unit)), anchor, **edge)
 
     def _width(self, text: str, size: float) -> float:
-        return self._font(size).getlength(text) / self._unit
+        return _font(self._font_file, round(size * self._unit)).getlength(text) / self._unit
 
-    def _font(self, size: float):
-        pixels = max(1, round(size * self._unit))
-        if pixels not in self._fonts:
-            from PIL import ImageFont
 
-            self._fonts[pixels] = ImageFont.truetype(str(self._font_file), pixels)
-        return self._fonts[pixels]
+@functools.cache
+def _font(file: Path, pixels: int):
+    from PIL import ImageFont
+
+    return ImageFont.truetype(str(file), max(1, pixels))
 
 
 def _pieces(points: np.ndarray) -> list[np.ndarray]:
     """Split a line (k,2) at its gaps, which are rows of NaN; return the pieces of two or more points."""
-    gaps = np.flatnonzero(np.isnan(points).any(axis=1))
-    parts = np.split(points, gaps)
-    return [part for part in (p[~np.isnan(p).any(axis=1)] for p in parts) if len(part) > 1]
+    gap = np.isnan(points).any(axis=1)
+    parts = (part[~np.isnan(part).any(axis=1)] for part in np.split(points, np.flatnonzero(gap)))
+    return [part for part in parts if len(part) > 1]
 
 
 def _bytes(colour) -> tuple[int, int, int]:
     return tuple(round(255 * float(c)) for c in colour)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A plot in the window. box, text: left, top, width, height in pixels."""
+
+    curves: Curves
+    box: tuple[int, int, int, int]
+    text: tuple[int, int, int, int]
+
+    def contains(self, x: float, y: float) -> bool:
+        """Return whether a pixel lies in the plot."""
+        return any(a <= x <= a + w and b <= y <= b + h for a, b, w, h in (self.box, self.text))
+
+
+class PlotOverlay:
+    """The visible plots in the window, updated when the choice or the window changes, and otherwise every REFRESH seconds.
+
+    opened: initial size of the window, (width, height) in pixels.
+    """
+
+    def __init__(self, plots: Plots, opened: tuple[int, int]):
+        self.plots, self.cells, self._opened = plots, [], opened
+        self._drawing = drawing([], (1, 1))
+        self._drawn_for, self._drawn_at = None, -math.inf  # plots and size of the drawing; its time [s]
+
+    def draw(self, canvas, gui, size: tuple[int, int]) -> None:
+        """Draw boxes and lines by a `Canvas`, and numbers by GGUI."""
+        content, now = (self.plots.visible(), size), time.perf_counter()
+        if content != self._drawn_for or now - self._drawn_at >= REFRESH:
+            self.cells = cells(self.plots, size)
+            self._drawing, self._drawn_for, self._drawn_at = drawing(self.cells, size), content, now
+        if self.cells:
+            canvas.draw_over(*self._drawing, (MAX_BOXES, MAX_SEGMENTS), BOX_COLOUR)
+            write(gui, self.cells, self._opened)
+
+    def contains(self, x: float, y: float) -> bool:
+        """Return whether a pixel, counted from the upper left corner, lies in one of the plots."""
+        return any(cell.contains(x, y) for cell in self.cells)
+
+
+def cells(plots: Plots, size: tuple[int, int]) -> list[Cell]:
+    """Lay out the visible plots from the top down, as many as fit in a window of size (width, height)."""
+    found, top = [], GAP
+    for curves in [plots.curves(name) for name in plots.visible()]:
+        height = TITLE + LINE * (len(curves.legend) + 2)
+        left = size[0] - GAP - BOX
+        if top + height > size[1] or left - TEXT < 0:
+            break
+        found.append(Cell(curves, (left, top, BOX, height), (left - TEXT, top, TEXT, height)))
+        top += height + GAP
+    return found
+
+
+def drawing(shown: list[Cell], size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the boxes (k,4), ends of lines (2n,2) and their colours (2n,3) to pass to `Canvas.draw_over`."""
+    boxes, ends, colours = np.empty((len(shown), 4)), [np.empty((0, 2))], [np.empty((0, 3))]
+    for k, cell in enumerate(shown):
+        left, top, width, height = cell.box
+        boxes[k] = left / size[0], 1 - (top + height) / size[1], (left + width) / size[0], 1 - top / size[1]
+        across = [np.array([(0.0, y), (1.0, y)]) for y in cell.curves.grid]
+        frame = np.array([(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)], dtype=float)
+        lines = [(GRID_COLOUR, line) for line in across] + cell.curves.lines + [(FRAME_COLOUR, frame)]
+        for colour, points in lines:
+            pairs = np.stack([points[:-1], points[1:]], axis=1)
+            pairs = pairs[np.isfinite(pairs).all(axis=(1, 2))].reshape(-1, 2)
+            ends.append(boxes[k, :2] + pairs * (boxes[k, 2:] - boxes[k, :2]))
+            colours.append(np.tile(colour, (len(pairs), 1)))
+    return boxes, np.concatenate(ends), np.concatenate(colours)
+
+
+def write(gui, shown: list[Cell], opened: tuple[int, int]) -> None:
+    """Write the numbers of the plots in sub-windows of GGUI; opened: as for `PlotOverlay`."""
+    for cell in shown:
+        curves, (left, top, width, height) = cell.curves, cell.text
+        rectangle = left / opened[0], top / opened[1], width / opened[0], height / opened[1]
+        with gui.sub_window(f"{curves.title}##{cell.text}", *rectangle) as page:
+            for name, value, colour in curves.legend:
+                lighter = tuple(LIGHTER + (1 - LIGHTER) * c for c in colour)
+                page.text(f"{name:9}{value:>13}", color=lighter)
+            page.text(f"axis {curves.ends[0]} to {curves.ends[1]}")
+            page.text(f"time {curves.times[0]:.4g} to {curves.times[1]:.4g} s")

@@ -1,18 +1,23 @@
-"""Colours of bodies by a quantity at their nodes: von Mises stress, largest principal stretch, or speed.
+"""Colours of drawn vertices: by a quantity at the nodes (von Mises stress, largest principal stretch or speed), and shading.
 
 The scale begins at 0 (stretch: at 1). It ends at 1, 2 or 5 times a power of ten above a running maximum of the 99 % quantile over
 the nodes; a quantile, since stress in a nearly flat tet is unbounded. The running maximum decays slowly, and the end is lowered
 only when it is clearly too high. So the scale does not flicker, and recovers after an impact.
+
+Shading is computed per drawn vertex on the host, so that it is the same for every renderer:
+colour = base * (hemisphere of sky and ground light + key light + fill light) * darkening at grazing angles, which emphasizes
+silhouettes. The lamps move with the camera, so that every view is lit alike.
 """
 
 import math
+from functools import cached_property
 
 import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.fem.reference import inverse_rest_edges
+from taisoft.output.camera import Camera
 from taisoft.output.nodal_fields import NodalMean, von_mises
-from taisoft.view.surfaces import Surfaces
 
 UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s"}
 TITLES = {"body": "own colour", "stress": "von Mises stress", "stretch": "largest stretch", "speed": "speed"}
@@ -23,14 +28,17 @@ MIN_SPAN = {"stress": 1.0, "stretch": 1e-3, "speed": 1e-3}  # smallest span of t
 # sRGB, from low to high
 COLOURS = np.array([(0.27, 0.42, 0.80), (0.33, 0.70, 0.78), (0.72, 0.82, 0.45), (0.97, 0.70, 0.27), (0.82, 0.20, 0.17)])
 
+LAMPS = ((np.array([-0.35, 0.60, 0.72]), 0.72), (np.array([0.85, 0.15, 0.45]), 0.22))  # direction (right, up, back), strength
+SKY, GROUND = np.array([0.44, 0.46, 0.49]), np.array([0.26, 0.25, 0.24])
+EDGE_DARKENING = 0.22
+BACKGROUND_TOP, BACKGROUND_BOTTOM = np.array([0.95, 0.955, 0.96]), np.array([0.80, 0.81, 0.82])  # sRGB
+
 
 class Colouring:
-    """Colours of drawn vertices by one of UNITS. Raises OutputError for another name."""
+    """Unshaded colours of the drawn vertices of `Surfaces`, by one of UNITS. Raises OutputError for another name."""
 
-    def __init__(self, scene, surfaces: Surfaces, kind: str = "body"):
+    def __init__(self, scene, surfaces, kind: str = "body"):
         self._bodies, self._surfaces = scene.bodies, surfaces
-        self._nodal_mean: NodalMean | None = None  # made when stress or stretch is first shown
-        self._Dm_inv: list[np.ndarray] = []  # per body, made when stretch is first shown
         self.choose(kind)
 
     def choose(self, kind: str) -> None:
@@ -42,8 +50,7 @@ class Colouring:
 
     def choose_next(self) -> None:
         """Colour by the next of UNITS."""
-        kinds = list(UNITS)
-        self.choose(kinds[(kinds.index(self.kind) + 1) % len(kinds)])
+        self.choose(following(tuple(UNITS), self.kind))
 
     @property
     def low(self) -> float:
@@ -53,10 +60,8 @@ class Colouring:
     def values(self, sim) -> np.ndarray:
         """Return the quantity at the nodes of all bodies (n_nodes,) in sim's present state."""
         if self.kind == "stress":
-            return von_mises(self._mean()(sim.stress()))
-        if self.kind == "stretch":
-            return self._mean()(self._stretches(sim))
-        return np.linalg.norm(sim.velocities(), axis=1)
+            return von_mises(self._mean(sim.stress()))
+        return self._mean(self._stretches(sim)) if self.kind == "stretch" else np.linalg.norm(sim.velocities(), axis=1)
 
     def base(self, sim) -> np.ndarray:
         """Return unshaded colours (n,3) of all drawn vertices, sRGB."""
@@ -64,7 +69,10 @@ class Colouring:
             return self._surfaces.colours
         above = self.values(sim) - self.low
         finite = above[np.isfinite(above)]
-        self._update_scale(float(np.quantile(finite, QUANTILE)) if len(finite) else 0.0)
+        value = float(np.quantile(finite, QUANTILE)) if len(finite) else 0.0
+        self._peak = max(value, DECAY * self._peak, MIN_SPAN[self.kind])
+        if self._peak > self.span or round_up(LOWER_MARGIN * self._peak) < self.span:
+            self.span = round_up(self._peak)
         return self._surfaces.coloured(colours_of(np.nan_to_num(above / self.span)))
 
     def legend(self) -> list[tuple[str, np.ndarray]]:
@@ -75,26 +83,27 @@ class Colouring:
         texts = [f"{self.low + fraction * self.span:10.4g} {UNITS[self.kind]}" for fraction in fractions]
         return list(zip(texts, colours_of(fractions)))
 
+    @cached_property
     def _mean(self) -> NodalMean:
-        if self._nodal_mean is None:
-            self._nodal_mean = NodalMean(self._bodies)
-        return self._nodal_mean
+        return NodalMean(self._bodies)
 
-    def _update_scale(self, value: float) -> None:
-        self._peak = max(value, DECAY * self._peak, MIN_SPAN[self.kind])
-        if self._peak > self.span or round_up(LOWER_MARGIN * self._peak) < self.span:
-            self.span = round_up(self._peak)
+    @cached_property
+    def _Dm_inv(self) -> list[np.ndarray]:
+        return [inverse_rest_edges(b.mesh.vertices, b.mesh.tets)[0] for b in self._bodies]
 
     def _stretches(self, sim) -> np.ndarray:
         """Return the largest principal stretch of every tet (m,); for quadratic tets that of the linear tet of the corners."""
-        if not self._Dm_inv:
-            self._Dm_inv = [inverse_rest_edges(b.mesh.vertices, b.mesh.tets)[0] for b in self._bodies]
         parts = []
         for body, Dm_inv in zip(self._bodies, self._Dm_inv):
             corner = sim.positions(body.name)[body.mesh.tets]
             F = (corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1) @ Dm_inv
             parts.append(np.sqrt(np.linalg.eigvalsh(F.transpose(0, 2, 1) @ F)[:, 2]))
         return np.concatenate(parts)
+
+
+def following(names: tuple[str, ...], name: str) -> str:
+    """Return the name after this one, cyclically."""
+    return names[(names.index(name) + 1) % len(names)]
 
 
 def colours_of(fractions: np.ndarray) -> np.ndarray:
@@ -107,3 +116,25 @@ def round_up(value: float) -> float:
     """Round a value up to 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(value))
     return next((k * power for k in (1.0, 2.0, 5.0) if k * power >= value * (1.0 - 1e-12)), 10.0 * power)
+
+
+def lit_colours(x: np.ndarray, normals: np.ndarray, base: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return shaded colours (n,3) in [0, 1] of vertices x (n,3) with unit normals (n,3) and base colours (n,3) for a camera."""
+    right, up, forward = camera.axes
+    frame = np.array([right, up, -forward])
+    light = GROUND + (SKY - GROUND) * (0.5 + 0.5 * normals[:, 1:2])
+    for lamp, strength in LAMPS:
+        direction = (lamp / np.linalg.norm(lamp)) @ frame
+        light = light + strength * np.clip(normals @ direction, 0.0, None)[:, None]
+    to_eye = camera.position - x
+    to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
+    grazing = (1.0 - np.abs(np.einsum("ij,ij->i", normals, to_eye))) ** 3
+    return np.clip(base * light * (1.0 - EDGE_DARKENING * grazing)[:, None], 0.0, 1.0)
+
+
+def background(size: tuple[int, int]) -> np.ndarray:
+    """Return a neutral vertical gradient, uint8 (height, width, 3), for size (width, height)."""
+    width, height = size
+    mix = np.linspace(0.0, 1.0, height)[:, None] ** 1.5
+    column = BACKGROUND_TOP + (BACKGROUND_BOTTOM - BACKGROUND_TOP) * mix
+    return np.repeat(np.round(255 * column).astype(np.uint8)[:, None], width, axis=1)

@@ -4,6 +4,11 @@ Taichi ends the process, past any `except`, when it opens a window without a dis
 initialised again while a window is open. So requirements are checked first, a process holds one window at a time, and an open
 window holds a claim on the runtime. A closing window also writes `imgui.ini`, the position of its panel, in the working folder;
 that file is removed unless it existed before.
+
+The methods of `ti.ui` take Taichi fields and copy them into the renderer's array by kernels. Taichi compiles those for every size
+of a field and stores them on disk, so every mesh would cost compile time at its first picture and fill the cache. `VertexBuffer`
+fills the array in NumPy and passes it to the same renderer, so nothing is compiled. This relies on internals of Taichi 1.7.4, the
+version that taisoft requires.
 """
 
 import contextlib
@@ -16,16 +21,18 @@ from pathlib import Path
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.private import core
+from taisoft.backend.private import core, get_field_info
 from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError
 from taisoft.output.camera import Camera
-from taisoft.view.shading import lit_colours
-from taisoft.view.surfaces import Surfaces
-from taisoft.view.vertex_buffer import VertexBuffer, draw_flat_lines, draw_flat_triangles, draw_lines, draw_mesh
+from taisoft.view.scene_view import Surfaces
 
 LINE_WIDTH = 2.0  # pixels
 FLAT_WIDTH = 0.002  # of 2D lines over the picture, in units of its height
+
+POSITION, NORMAL, COLOUR, ALPHA = slice(0, 3), slice(3, 6), slice(8, 11), 11  # columns of vertices; 6 and 7 are for textures
+WIDTH = 12
+GREY = (0.5, 0.5, 0.5)  # replaced by vertex colours
 
 _holder: list[str] = []  # name of the holder of the process's one window
 
@@ -71,6 +78,26 @@ def _future_panel_file() -> Path | None:
     return None if path.exists() else path
 
 
+class VertexBuffer:
+    """Vertices in the layout of Taichi's renderer, with x, normals and colours, each (n,3) and initially zero.
+
+    2D drawings use the first two columns of x. The renderer gets the address of the array, which lives as long as the buffer.
+    """
+
+    def __init__(self, n: int) -> None:
+        self._data = np.zeros((n, WIDTH), dtype=np.float32)
+        self._data[:, ALPHA] = 1.0
+        self.x, self.normals, self.colours = self._data[:, POSITION], self._data[:, NORMAL], self._data[:, COLOUR]
+
+    def __len__(self) -> int:
+        return len(self._data)
+
+    @property
+    def info(self):
+        """Address and type of the array, for Taichi's renderer."""
+        return get_field_info(self._data)
+
+
 class Canvas:
     """The process's one Taichi window, on the screen or only in memory, which draws the scene's surfaces.
 
@@ -110,21 +137,11 @@ class Canvas:
             self.close()
             raise OutputError(f"cannot open a window: Taichi says: {error}") from error
 
-    def draw(
-        self,
-        x: np.ndarray,
-        normals: np.ndarray,
-        camera: Camera,
-        background: tuple[float, float, float],
-        base: np.ndarray | None = None,
-        lines: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> None:
-        """Draw the surfaces with vertices x [m] and unit normals, (n,3) each; background: RGB in [0, 1].
+    def draw(self, x: np.ndarray, colours: np.ndarray, camera: Camera, background: tuple, lines: tuple) -> None:
+        """Draw the surfaces with vertices x [m] and lit colours, (n,3) each; background: RGB in [0, 1].
 
-        base: unshaded colours (n,3) that replace the surfaces' own; lines: ends (2k,3) [m] and colours (2k,3), of which the first
-        n_segments lines are drawn.
+        lines: ends (2k,3) [m] and colours (2k,3), of which the first n_segments lines are drawn.
         """
-        colours = lit_colours(x, normals, self._surfaces.colours if base is None else base, camera)
         # relative to the target, since single precision is too coarse for a scene far from the origin
         self._vertices.x[:], self._vertices.colours[:] = x - camera.target, colours
         eye = ti.ui.Camera()
@@ -132,23 +149,19 @@ class Canvas:
         eye.lookat(0.0, 0.0, 0.0)
         eye.up(0.0, 1.0, 0.0)
         eye.fov(camera.fov)
-        near, far = camera.clipping
-        eye.z_near(near)
-        eye.z_far(far)
+        eye.z_near(camera.clipping[0])
+        eye.z_far(camera.clipping[1])
         self._canvas.set_background_color(background)
         self._scene.set_camera(eye)
         self._scene.ambient_light((1.0, 1.0, 1.0))  # the colours are lit already
-        draw_mesh(self._scene, self._vertices, self._indices)
-        if lines is not None:
-            self._draw_lines(camera, *lines)
-        self._canvas.scene(self._scene)
-
-    def _draw_lines(self, camera: Camera, ends: np.ndarray, colours: np.ndarray) -> None:
+        vertices, indices = self._vertices.info, get_field_info(self._indices)  # two-sided, with vertex colours
+        self._scene.scene.mesh(vertices, True, indices, GREY, True, len(self._indices), 0, len(self._vertices), 0, False)
+        ends, line_colours = lines
         n = min(len(ends), len(self._ends))
-        if n == 0:
-            return
-        self._ends.x[:n], self._ends.colours[:n] = ends[:n] - camera.target, colours[:n]
-        draw_lines(self._scene, self._ends, self._line_width, n)
+        if n > 0:
+            self._ends.x[:n], self._ends.colours[:n] = ends[:n] - camera.target, line_colours[:n]
+            self._scene.scene.lines(self._ends.info, get_field_info(None), True, GREY, self._line_width, n, 0, n, 0)
+        self._canvas.scene(self._scene)
 
     def draw_over(
         self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray, capacity: tuple[int, int], box_colour: tuple
@@ -160,19 +173,15 @@ class Canvas:
         """
         if self._flat_boxes is None:
             self._flat_boxes, self._flat_lines = VertexBuffer(6 * capacity[0]), VertexBuffer(2 * capacity[1])
-        if self._flat_ends is not ends:
-            self._fill_flat(boxes, ends, colours)
+        if self._flat_ends is not ends:  # unused boxes and lines get zero size
+            left, bottom, right, top = boxes.T
+            corners = [(left, bottom), (right, bottom), (right, top), (left, bottom), (right, top), (left, top)]
+            self._flat_boxes.x[:], self._flat_lines.x[:] = 0.0, 0.0
+            self._flat_boxes.x[: 6 * len(boxes), :2] = np.array(corners).transpose(2, 0, 1).reshape(-1, 2)
+            self._flat_lines.x[: len(ends), :2], self._flat_lines.colours[: len(ends)] = ends, colours
             self._flat_ends = ends
-        draw_flat_triangles(self._canvas, self._flat_boxes, box_colour)
-        draw_flat_lines(self._canvas, self._flat_lines, FLAT_WIDTH)
-
-    def _fill_flat(self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray) -> None:
-        """Fill the buffers of `draw_over`; unused boxes and lines get zero size."""
-        left, bottom, right, top = boxes.T
-        corners = [(left, bottom), (right, bottom), (right, top), (left, bottom), (right, top), (left, top)]
-        self._flat_boxes.x[:], self._flat_lines.x[:] = 0.0, 0.0
-        self._flat_boxes.x[: 6 * len(boxes), :2] = np.array(corners).transpose(2, 0, 1).reshape(-1, 2)
-        self._flat_lines.x[: len(ends), :2], self._flat_lines.colours[: len(ends)] = ends, colours
+        self._canvas.canvas.triangles(self._flat_boxes.info, get_field_info(None), False, box_colour)
+        self._canvas.canvas.lines(self._flat_lines.info, get_field_info(None), True, GREY, FLAT_WIDTH)
 
     def pixels(self, left: int, top: int, right: int, bottom: int) -> np.ndarray:
         """Return a part of the drawn picture, uint8 (bottom - top, right - left, 3), first row on top."""

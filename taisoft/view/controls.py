@@ -1,32 +1,41 @@
-"""Sliders and buttons of the panel. Sliders change run-time data, so nothing is recompiled.
+"""What changes a simulation in the live window: the panel's sliders and buttons, and dragging a body with the mouse.
 
-They set dt, gravity along its initial direction, Young's modulus of one body or of all, friction of all pairs, and the strength
-of a drag. GGUI identifies a slider by the part of its label after ###, so the part before can show the value while it moves.
+Sliders change run-time data, so nothing is recompiled. They set dt, gravity along its initial direction, Young's modulus of one
+body or of all, friction of all pairs, and the strength of a drag. GGUI identifies a slider by the part of its label after ###, so
+the part before can show the value while it moves.
+
+A drag acts on a patch of nodes around the nearest surface triangle on the cursor's ray, rather than on the triangle. So its force
+is spread over enough mass for a stiff spring, and does not crush the tets at the point. The patch is measured at rest, so that it
+does not grow while the body is stretched.
 """
 
 import itertools
 import math
 import textwrap
+from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.dynamics.drag_spring import EARTH
 from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.errors import SimulationError, TaisoftError
+from taisoft.output.camera import Camera
 from taisoft.settings import contact_solvers
 from taisoft.stability import stable_dt
-from taisoft.view.colouring import TITLES, Colouring
-from taisoft.view.layers import Layers
+from taisoft.view.colouring import TITLES, Colouring, following
 from taisoft.view.plots import PLOTS, Plots
+from taisoft.view.scene_view import Layers
 
 SAFETY = 0.95  # upper end of the dt slider of explicit integrators, as a fraction of the stable dt
 MAX_DT = 0.1  # upper end of the dt slider of implicit integrators [s]
 MIN_DT = 0.01  # lower end of the dt slider, in units of the initial dt
 YOUNG_DECADES = 2.0  # range of Young's modulus to either side of the initial one
-EARTH = 9.81  # reference for the gravity slider of a scene without gravity [m/s^2]
 MAX_GRAVITY = 3.0  # in units of the initial gravity
 MAX_FRICTION = 1.5
 STRENGTH_DECADES = (-0.5, 2.5)  # of the drag force over the body's weight, for a displacement as long as the body's diagonal
 COLUMNS = 46  # characters that fit the panel's width
+PATCH = 0.1  # radius in units of the diagonal of the body's bounding box at rest
+MIN_NODES = 4  # with fewer nodes in the patch, only the triangle's corners are dragged
 HELP = (
     "Left drag: drag a body, or turn",
     "Ctrl + left: turn",
@@ -102,8 +111,10 @@ class Panel:
         if self._sim.draggable:
             self._strength = gui.slider_float(f"drag {self.strength:.3g} weights###pull", self._strength, *STRENGTH_DECADES)
             drag = self._sim.dragged
-            force, max_force = (np.linalg.norm(drag.force), drag.max_force) if drag is not None else (0.0, 0.0)
-            gui.text(f"drag force {force:.3g} N of at most {max_force:.3g}" if drag is not None else "no body is dragged")
+            force = "no body is dragged"
+            if drag is not None:
+                force = f"drag force {np.linalg.norm(drag.force):.3g} N of at most {drag.max_force:.3g}"
+            gui.text(force)
         if gui.button(f"colour: {TITLES[self._colouring.kind]}###colour"):
             self._colouring.choose_next()
         for text, colour in self._colouring.legend():
@@ -139,13 +150,13 @@ class Panel:
     def _choose_solver(self, gui) -> None:
         """Declare two buttons that cycle through the choices, and one that applies them, which compiles for seconds."""
         if gui.button(f"integrator: {self._integrator}###integrator"):
-            self._integrator = _next(INTEGRATORS, self._integrator)
+            self._integrator = following(INTEGRATORS, self._integrator)
         solvers = ("auto", *contact_solvers(self._integrator))
         if self._solver not in solvers:
             self._solver = "auto"
         if self._sim.plan.on["contact_forces"] and len(solvers) > 2:
             if gui.button(f"contacts: {self._solver}###contact solver"):
-                self._solver = _next(solvers, self._solver)
+                self._solver = following(solvers, self._solver)
         present = self._sim.settings
         if (self._integrator, self._solver) == (present.integrator, present.contact_solver):
             gui.text("in use")
@@ -211,11 +222,93 @@ class Panel:
         self._set_dt()
 
 
-def _next(names: tuple[str, ...], name: str) -> str:
-    """Return the name after this one, cyclically."""
-    return names[(names.index(name) + 1) % len(names)]
-
-
 def changed(new: float, old: float) -> bool:
     """Return whether a slider was moved, beyond GGUI's rounding to single precision."""
     return abs(new - old) > 1e-5 * max(1.0, abs(old))
+
+
+@dataclass(frozen=True)
+class Hit:
+    """A point (3,) [m] on a body's surface, in the triangle of nodes (3,) with barycentric weights (3,)."""
+
+    body: int
+    nodes: np.ndarray
+    weights: np.ndarray
+    point: np.ndarray
+
+
+def nearest_hit(origin: np.ndarray, direction: np.ndarray, x: np.ndarray, triangles: np.ndarray) -> tuple[int, np.ndarray] | None:
+    """Return the first triangle hit by a ray from origin, and the point's barycentric weights (3,); None if there is no hit.
+
+    triangles: (t,3); x: their vertices (n,3). Triangles are hit from both sides. Source: Moeller and Trumbore 1997.
+    """
+    a, b, c = (x[triangles[:, k]] for k in range(3))
+    e, f = b - a, c - a
+    p = np.cross(direction, f)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        inverse = 1.0 / np.einsum("ti,ti->t", e, p)
+        s = origin - a
+        u = np.einsum("ti,ti->t", s, p) * inverse
+        q = np.cross(s, e)
+        v = q @ direction * inverse
+        t_ray = np.einsum("ti,ti->t", f, q) * inverse
+        is_hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t_ray > 0) & np.isfinite(t_ray)
+    if not is_hit.any():
+        return None
+    t = int(np.argmin(np.where(is_hit, t_ray, np.inf)))
+    return t, np.array([1 - u[t] - v[t], u[t], v[t]])
+
+
+def pick(sim, camera: Camera, cursor: tuple[float, float], size: tuple[int, int]) -> Hit | None:
+    """Return the point of a body under the cursor, or None.
+
+    cursor: in [0, 1] from the window's lower left corner; size: (width, height) of the window.
+    """
+    direction, best, distance = camera.ray(cursor, size), None, np.inf
+    for k, body in enumerate(sim.scene.bodies):
+        x, surface = sim.positions(body.name), np.asarray(body.nodes.surface)
+        found = nearest_hit(camera.position, direction, x, surface)
+        if found is None:
+            continue
+        point = found[1] @ x[surface[found[0]]]
+        depth = float(np.linalg.norm(point - camera.position))
+        if depth < distance:
+            best, distance = Hit(k, surface[found[0]], found[1], point), depth
+    return best
+
+
+class MouseDrag:
+    """A mouse drag of a hit point towards the cursor, in the plane through the point that is parallel to the picture."""
+
+    def __init__(self, sim, hit: Hit):
+        body = sim.scene.bodies[hit.body]
+        self.body = body.name
+        rest = np.asarray(body.rest_positions)
+        self._diagonal = float(np.linalg.norm(rest.max(axis=0) - rest.min(axis=0)))
+        self._mass = float(body.material.density * body.mesh.volumes.sum())
+        self.nodes, self.weights = _patch(rest, hit, PATCH * self._diagonal)
+        self._plane = hit.point
+        self._offset = self.weights @ sim.positions(body.name)[self.nodes] - hit.point
+
+    def drag(self, sim, camera: Camera, cursor: tuple[float, float], size: tuple[int, int], strength: float) -> None:
+        """Drag the point towards the cursor.
+
+        strength: force over the body's weight, for a displacement as long as the diagonal of its bounding box.
+        """
+        ray, forward = camera.ray(cursor, size), camera.forward
+        self.target = camera.position + ray * ((self._plane - camera.position) @ forward / (ray @ forward))
+        stiffness = strength * self._mass * EARTH / self._diagonal
+        sim.drag(self.body, self.nodes, self.weights, self.target + self._offset, stiffness)
+
+    def line(self, sim) -> np.ndarray:
+        """Return the line from the dragged point to the cursor's, (2,3) [m]."""
+        return np.array([self.weights @ sim.positions(self.body)[self.nodes] - self._offset, self.target])
+
+
+def _patch(rest: np.ndarray, hit: Hit, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    distance = np.linalg.norm(rest - hit.weights @ rest[hit.nodes], axis=1) / radius
+    nodes = np.flatnonzero(distance < 1.0)
+    if len(nodes) < MIN_NODES:
+        return hit.nodes, hit.weights
+    weights = (1.0 - distance[nodes] ** 2) ** 2
+    return nodes, weights / weights.sum()

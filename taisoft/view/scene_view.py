@@ -1,23 +1,64 @@
-"""Triangles of a picture: the bodies' surfaces, split at sharp edges, markers of fixed nodes, and obstacles.
+"""What pictures and the window show of a scene: triangles of surfaces, lines over them, and the camera that follows the bodies.
 
 A drawn vertex belongs to one node and one smoothing group: the triangles around that node that are connected over edges
 bent by less than CREASE at rest. Its normal is the area-weighted mean over that group. So a ball looks round and a box
 keeps its edges, in every deformed state. A second-order face is drawn as four flat triangles between its six nodes.
 Obstacles are drawn with back-face culling, so that a bin's walls show only their inner sides.
+
+Lines are wireframes of the bodies' surfaces, contacts with normals and impulses, and arrows of tractions. They are moved along
+their rays towards the eye, so that they cover the same pixels: wireframes just enough to lie in front of their own surface,
+contacts and arrows so far that nothing hides them.
 """
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from taisoft.output.appearance import OBSTACLE_COLOUR, body_colour
-from taisoft.output.obstacle_surface import ObstacleSurface, obstacle_surfaces
-from taisoft.output.polygons import subdivide
+from taisoft.errors import OutputError
+from taisoft.mesh.topology import triangle_edges
+from taisoft.output.appearance import OBSTACLE_COLOUR, ObstacleSurface, body_colour, obstacle_surfaces, subdivide
+from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
+from taisoft.view.colouring import Colouring, lit_colours
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
 MARKER_SIZE = 0.16  # radius in units of the mean edge length of the body's surface
 MAX_MARKERS = 500  # per body; of more fixed nodes, evenly selected ones are shown
+
+LAYERS = ("wires", "contacts", "tractions", "fixed_nodes")
+IN_WINDOW, IN_PICTURES = ("tractions", "fixed_nodes"), ("fixed_nodes",)  # shown by default
+MAX_MARK_LINES = 4000  # largest number of lines of contacts and arrows, besides the wires
+ON_SURFACE, IN_FRONT = 0.996, 0.1  # fractions of the distance from the eye
+NORMAL, IMPULSE, ARROW, HEAD = 0.04, 0.15, 0.10, 0.3  # lengths relative to the scene's size; HEAD relative to its arrow
+MAX_ARROWS = 60  # of one traction
+DECAY = 0.99  # factor on the running maximum of impulses per picture
+WIRE_COLOUR, NORMAL_COLOUR = np.array([0.12, 0.14, 0.18]), np.array([0.10, 0.55, 0.25])  # sRGB
+IMPULSE_COLOUR, TRACTION_COLOUR = np.array([0.85, 0.12, 0.12]), np.array([0.55, 0.15, 0.65])
+
+
+class SceneView:
+    """A scene as it is drawn: its surfaces, their colours, its layers, and a camera.
+
+    scene: read once; size: (width, height) in pixels; camera: fixed if given, else it frames all bodies at the start and moves
+    back, never nearer, when a body would leave the picture; colour: of the bodies, one of UNITS; layers: names of visible
+    LAYERS. Raises OutputError for unknown names.
+    """
+
+    def __init__(self, scene, size: tuple[int, int], camera: Camera | None, colour: str, layers: tuple[str, ...]):
+        self.camera = camera or Camera.framing(start_positions(scene), size)
+        self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # largest automatic distance [m]; 0: fixed camera
+        self.surfaces = Surfaces(scene)
+        self.layers = Layers(scene, layers)
+        self.colouring = Colouring(scene, self.surfaces, colour)
+
+    def _drawn(self, sim, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Move the camera back if needed; return vertices and lit colours (n,3), and the lines of the layers."""
+        self.surfaces.with_markers = self.layers.shown["fixed_nodes"]
+        bodies = self.surfaces.of_bodies(sim)
+        self.camera = self.camera.widened(bodies[0], size, self._widest)
+        x, normals = self.surfaces.with_obstacles(bodies, sim.time, self.camera.position)
+        colours = lit_colours(x, normals, self.colouring.base(sim), self.camera)
+        return x, colours, self.layers.lines(sim, self.camera)
 
 
 class Surfaces:
@@ -29,19 +70,15 @@ class Surfaces:
 
     def __init__(self, scene):
         self._bodies = [_BodySurface(body, body_colour(k)) for k, body in enumerate(scene.bodies)]
-        self._ends = np.cumsum([body.n_nodes for body in scene.bodies])[:-1]  # end of each body's nodes, but the last one's
+        self._starts = np.cumsum([0] + [body.n_nodes for body in scene.bodies[:-1]])  # of each body's nodes
         self._obstacles = [_RigidSurface(surface) for surface in obstacle_surfaces(scene)]
-        triangles, colours, n = [], [], 0
-        starts = np.concatenate([[0], self._ends])
-        nodes = [np.where(body.nodes >= 0, body.nodes + start, -1) for body, start in zip(self._bodies, starts)]
+        nodes = [np.where(body.nodes >= 0, body.nodes + start, -1) for body, start in zip(self._bodies, self._starts)]
         self._nodes = np.concatenate(nodes)  # of the bodies' drawn vertices, numbered over all bodies; -1 for markers
-        for part in (*self._bodies, *self._obstacles):
-            triangles.append(part.triangles + n)
-            colours.append(part.colours)
-            n += len(part.colours)
         self.with_markers = True  # of fixed nodes
-        self.triangles = np.concatenate(triangles).astype(np.int32)
-        self.colours = np.concatenate(colours)
+        parts = [*self._bodies, *self._obstacles]
+        firsts = np.cumsum([0] + [len(part.colours) for part in parts])
+        self.triangles = np.concatenate([part.triangles + n for part, n in zip(parts, firsts)]).astype(np.int32)
+        self.colours = np.concatenate([part.colours for part in parts])
 
     def coloured(self, colours: np.ndarray) -> np.ndarray:
         """Return colours (n,3) of all drawn vertices, given colours (n_nodes,3) of the bodies' nodes."""
@@ -52,7 +89,7 @@ class Surfaces:
 
     def of_bodies(self, sim) -> tuple[np.ndarray, np.ndarray]:
         """Return positions [m] and unit normals of the bodies' drawn vertices in sim's present state, each float64 (n,3)."""
-        x = np.split(sim.positions(), self._ends)
+        x = np.split(sim.positions(), self._starts[1:])
         return _concatenated([body.vertices(own, self.with_markers) for body, own in zip(self._bodies, x)])
 
     def with_obstacles(self, bodies: tuple[np.ndarray, np.ndarray], t: float, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -63,26 +100,74 @@ class Surfaces:
         return _concatenated([bodies, *(obstacle.vertices(t, eye) for obstacle in self._obstacles)])
 
 
+class Layers:
+    """Optional layers beside the surfaces.
+
+    shown: name -> whether it is visible, initially those in `names`; n_segments: largest number of lines that `lines` returns.
+    Raises OutputError for an unknown name.
+    """
+
+    def __init__(self, scene, names: tuple[str, ...] = IN_WINDOW):
+        for name in names:
+            if name not in LAYERS:
+                raise OutputError(f"layer '{name}' is unknown: it must be one of {', '.join(LAYERS)}")
+        self.shown = {name: name in names for name in LAYERS}
+        starts = np.cumsum([0] + [body.n_nodes for body in scene.bodies])
+        self._edges = np.concatenate([triangle_edges(np.asarray(b.nodes.surface))[0] + n for b, n in zip(scene.bodies, starts)])
+        self.n_segments = len(self._edges) + MAX_MARK_LINES
+        self._size = float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
+        self._peak = 0.0  # [N s]
+        self._loaded = [  # per traction, nodes (k,3) of the triangles that get an arrow
+            body.mesh.surface[t.triangles[:: -(-len(t.triangles) // MAX_ARROWS)]] + n
+            for body, n in zip(scene.bodies, starts)
+            for t in body.tractions
+        ]
+
+    def lines(self, sim, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ends (2k,3) [m] of the lines, as drawn for this camera, and their colours (2k,3)."""
+        x = sim.positions()
+        marks = self._contact_lines(sim) if self.shown["contacts"] else []
+        if self.shown["tractions"]:
+            tractions = [t.value for body in sim.scene.bodies for t in body.tractions]  # the present values
+            longest = max((float(np.linalg.norm(t)) for t in tractions), default=0.0) or 1.0
+            for corners, traction in zip(self._loaded, tractions):
+                arrow = ARROW * self._size / longest * traction
+                marks.append((_arrows(x[corners].mean(axis=1), arrow, camera), TRACTION_COLOUR))
+        marks = [(camera.nearer(ends, IN_FRONT), colour) for ends, colour in marks]
+        if self.shown["wires"]:  # last, since lines beyond the renderer's limit are dropped from the end
+            marks.append((camera.nearer(x[self._edges].reshape(-1, 3), ON_SURFACE), WIRE_COLOUR))
+        ends = [np.empty((0, 3)), *(part for part, _ in marks)]
+        return np.concatenate(ends), np.concatenate([np.empty((0, 3)), *(np.tile(c, (len(part), 1)) for part, c in marks)])
+
+    def _contact_lines(self, sim) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return lines of normals with a fixed length, and of impulses relative to the recent maximum."""
+        found = sim.contacts()
+        k = slice(0, MAX_MARK_LINES // 4)
+        point, normal, impulse = found.point[k], found.normal[k], found.impulse[k]
+        self._peak = max(DECAY * self._peak, float(np.linalg.norm(impulse, axis=1).max(initial=0.0)))
+        relative = impulse / self._peak if self._peak > 0.0 else 0.0 * impulse
+        return [
+            (_segments(point, point + NORMAL * self._size * normal), NORMAL_COLOUR),
+            (_segments(point, point + IMPULSE * self._size * relative), IMPULSE_COLOUR),
+        ]
+
+
 def _concatenated(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([x for x, _ in parts]), np.concatenate([n for _, n in parts])
 
 
 class _BodySurface:
     def __init__(self, body, colour: np.ndarray):
-        self.name = body.name
-        surface = np.asarray(body.nodes.surface)
-        rest = np.asarray(body.rest_positions)
-        self._nodes, corners = smoothing_groups(rest, surface)
+        surface, rest = np.asarray(body.nodes.surface), np.asarray(body.rest_positions)
+        self._nodes, self._corners = smoothing_groups(rest, surface)
         edges = rest[surface] - rest[np.roll(surface, 1, axis=1)]
         self._radius = MARKER_SIZE * float(np.linalg.norm(edges, axis=2).mean())
         self._marked = _fixed_surface_nodes(body, surface)
-        ball, ball_triangles = _coarse_ball()
-        self._ball = ball
-        starts = len(self._nodes) + len(ball) * np.arange(len(self._marked))
+        self._ball, ball_triangles = _coarse_ball()
+        counts = len(self._nodes), len(self._ball) * len(self._marked)
+        starts = len(self._nodes) + len(self._ball) * np.arange(len(self._marked))
         markers = (starts[:, None, None] + ball_triangles).reshape(-1, 3)
-        self._corners = corners
-        self.triangles = np.concatenate([corners, markers])
-        counts = (len(self._nodes), len(ball) * len(self._marked))
+        self.triangles = np.concatenate([self._corners, markers])
         self.colours = np.repeat([colour, MARKER_COLOUR], counts, axis=0)
         self.nodes = np.concatenate([self._nodes, np.full(counts[1], -1)])  # of each drawn vertex; -1 for markers
 
@@ -176,3 +261,16 @@ def _coarse_ball() -> tuple[np.ndarray, np.ndarray]:
         points, triangles = subdivide(points, triangles)
         points = _unit(points)
     return points, triangles
+
+
+def _segments(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the ends (2k,3) of lines from a (k,3) to b (k,3)."""
+    return np.stack([a, b], axis=1).reshape(-1, 3)
+
+
+def _arrows(tips: np.ndarray, arrow: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the lines of arrows (3,) that end at tips (k,3): a shaft and two head strokes in the picture's plane."""
+    side = np.cross(arrow, camera.forward)
+    return np.concatenate(
+        [_segments(tips - arrow, tips)] + [_segments(tips - HEAD * (arrow + s * 0.5 * side), tips) for s in (-1.0, 1.0)]
+    )
