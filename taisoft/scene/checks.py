@@ -185,14 +185,14 @@ def attribute(name: str, check: Callable, doc: str) -> property:
     return property(operator.attrgetter(f"_{name}"), assign, doc=doc)
 
 
-def _positive(value, what: str) -> None:
-    number(value, what, above=0.0)
+def _positive(value, what: str, unit: str = "s") -> None:
+    number(value, what, above=0.0, unit=unit)
 
 
 def _tolerance(value, what: str) -> None:
     limit = MAX_TOLERANCE.get(what.rpartition(".")[2], 1.0)
     if value is not None and number(value, what, above=0.0) >= limit:
-        raise SceneError(f"{what} must be below {limit:g}, not {value!r}")
+        raise SceneError(f"{what} must be below {limit:g}, or None for the default, not {value!r}")
 
 
 SOLVER_CHECKS = {  # key of the `solver` dict -> check
@@ -208,7 +208,7 @@ SOLVER_CHECKS = {  # key of the `solver` dict -> check
     "linear_tolerance": _tolerance,
     "contact_tolerance": _tolerance,
     "seconds": _positive,
-    "fps": lambda value, what: value is None or _positive(value, what),
+    "fps": lambda value, what: value is None or _positive(value, what, "1/s"),
 }
 
 
