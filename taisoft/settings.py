@@ -51,7 +51,7 @@ def check_settings(scene: Scene, **given) -> Settings:
     if not scene.bodies:
         raise SceneError("the scene holds no body")
     scene.check()
-    settings = Settings(**given)
+    settings = Settings(**given | {"dt": check_dt(given.get("dt", Settings.dt))})
     try:
         checks.check_solver(**dataclasses.asdict(settings))
     except SceneError as error:
@@ -59,7 +59,7 @@ def check_settings(scene: Scene, **given) -> Settings:
     _check_name("integrator", settings.integrator, INTEGRATORS)
     _check_name("contact_solver", settings.contact_solver, CONTACT_SOLVERS)
     _check_contact_solver(settings, scene.pushes(settings.self_collision))
-    return dataclasses.replace(settings, dt=float(settings.dt))
+    return settings
 
 
 def plan_of(scene: Scene, integrator: str, self_collision: bool, draggable: bool) -> Plan:

@@ -24,7 +24,7 @@ BAD = [
     ('material = "rubber"', 'material = "ruber"', "beam.material 'ruber' is not among the materials (did you mean rubber?)"),
     ('material = "rubber"', "material = 3", "bodies.beam.material must be a table, not 3"),
     ('material = "rubber"', "", "bodies.beam.material is missing"),
-    ("dt = 0.01", "dt = 0", "solver.dt must be greater than 0 s, not 0"),
+    ("dt = 0.01", "dt = 0", "solver.dt must be greater than 0, not 0"),
     ("dt = 0.01", "dt = -0.01", "solver.dt must be greater than 0"),
     ("dt = 0.01", "dt = inf", "solver.dt must be finite, not inf"),
     ("dt = 0.01", 'dt = "none"', "solver.dt must be a number, not None"),

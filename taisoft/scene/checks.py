@@ -185,8 +185,8 @@ def attribute(name: str, check: Callable, doc: str) -> property:
     return property(operator.attrgetter(f"_{name}"), assign, doc=doc)
 
 
-def _positive(value, what: str, unit: str = "s") -> None:
-    number(value, what, above=0.0, unit=unit)
+def _positive(value, what: str) -> None:
+    number(value, what, above=0.0)
 
 
 def _tolerance(value, what: str) -> None:
@@ -208,7 +208,7 @@ SOLVER_CHECKS = {  # key of the `solver` dict -> check
     "linear_tolerance": _tolerance,
     "contact_tolerance": _tolerance,
     "seconds": _positive,
-    "fps": lambda value, what: value is None or _positive(value, what, "1/s"),
+    "fps": lambda value, what: value is None or _positive(value, what),
 }
 
 
