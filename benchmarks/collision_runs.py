@@ -17,8 +17,8 @@ from taisoft.collision.contacts import FOUND, KEPT, LEFT, UNKNOWN, is_same
 from taisoft.collision.detector import MERGED, Detection
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.fem.model import build_model
+from taisoft.machine import Timing, summarise
 from taisoft.scene.plan import make_plan
-from taisoft.timing import Timing, summarise
 
 from .collision_cases import FPS, FRAMES, Setup, start
 from .runner import clock, repeated

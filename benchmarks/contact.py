@@ -33,8 +33,8 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.backend.runtime import compile_clock, open_runtime
+from taisoft.machine import load_average, summarise
 from taisoft.output.tables import markdown
-from taisoft.timing import load_average, summarise
 
 from . import contact_problems
 from .contact_colouring import (

@@ -15,10 +15,10 @@ import numpy as np
 import taisoft as ts
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
+from taisoft.machine import Timing, load_average, machine, summarise, versions
 from taisoft.output.files import make_folder
 from taisoft.output.report import json_text
 from taisoft.output.tables import markdown, percent, spread_of
-from taisoft.timing import Timing, load_average, machine, summarise, versions
 
 RESULTS = Path(__file__).resolve().parent / "results"
 SAME = ("processor", "cores", "arch", "quick")  # what two runs must share to be compared

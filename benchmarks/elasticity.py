@@ -17,8 +17,8 @@ from pathlib import Path
 
 from taisoft.cli.doctor import cuda
 from taisoft.errors import SimulationError
+from taisoft.machine import Timing, load_average
 from taisoft.output.tables import percent, spread_of
-from taisoft.timing import Timing, load_average
 
 from .document import RESULTS, Document, Limit, begin, check_out, default_out, limit_table, load_text, table
 from .elasticity_runs import MUJOCO, TAISOFT, Row, make_rows, measure_rows, n_tets, time_ratio

@@ -16,10 +16,10 @@ import numpy as np
 import taisoft as ts
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import SimulationError
+from taisoft.machine import Timing, summarise
 from taisoft.scene.scene import Scene
 from taisoft.stability import stable_dt
 from taisoft.study.measure import TimedRun, advance, warm_up
-from taisoft.timing import Timing, summarise
 
 from .exact_path import DENSITY, FOLDING_STARTS, GRAVITY, POISSON, SAMPLE, SIZE, YOUNG, load_exact
 from .programs.mujoco_flex import STABLE_STEPS, run_mujoco

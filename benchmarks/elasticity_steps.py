@@ -12,9 +12,9 @@ from dataclasses import asdict, dataclass, field
 
 import taisoft as ts
 from taisoft.dynamics.schemes import EXPLICIT
+from taisoft.machine import Timing, summarise
 from taisoft.output.tables import percent, spread_of
 from taisoft.study.measure import advance, warm_up
-from taisoft.timing import Timing, summarise
 
 from .document import Limit, table
 from .elasticity_runs import LAWS, beam_scene, n_tets, steps_within_limit

@@ -15,8 +15,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from taisoft.machine import load_average
 from taisoft.output.files import make_folder
-from taisoft.timing import load_average
 
 from .document import RESULTS, default_out, load_text, table
 from .runner import make_parser, progress

@@ -23,10 +23,10 @@ from pathlib import Path
 
 from taisoft.cli import Signals
 from taisoft.errors import OutputError
+from taisoft.machine import load_average
 from taisoft.output.files import FolderLock, make_folder
 from taisoft.study.output import NoStore, Store
 from taisoft.study.workers import serve
-from taisoft.timing import load_average
 
 from .document import RESULTS, Document, check_out, default_out, header, header_text
 from .hard_cases import CASES

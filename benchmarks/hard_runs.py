@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from taisoft.machine import machine, usable_cores
 from taisoft.study.accuracy import pack, unpack
 from taisoft.study.output import NoStore, Store, code_digest, digest
 from taisoft.study.workers import LocalPlace, carry_out
-from taisoft.timing import machine, usable_cores
 
 from .hard_cases import CASES
 from .hard_cases.case import DEGRADED, END, FINER, OK, REFUSED, STOPPED, Case, Session, Variant, Verdict, judge

@@ -21,8 +21,8 @@ from pathlib import Path
 
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError
+from taisoft.machine import Timing, summarise
 from taisoft.output.tables import percent, require_matplotlib, save, spread_of, ticks
-from taisoft.timing import Timing, summarise
 
 from .document import Document, Limit, begin, table
 from .order_cases import CASES, HANGING, LINEAR, QUADRATIC, Case, Reference

@@ -14,9 +14,9 @@ import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime, compile_clock
 from taisoft.errors import SimulationError, TaisoftError
+from taisoft.machine import Timing, summarise
 from taisoft.static import StaticSolver
 from taisoft.study.measure import TimedRun, advance
-from taisoft.timing import Timing, summarise
 
 from .order_cases import Case, Element, Reference
 from .reference_cases.motion import parabola_vertex

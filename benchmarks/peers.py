@@ -22,9 +22,9 @@ from pathlib import Path
 from types import ModuleType
 
 from taisoft.files import write_bytes
+from taisoft.machine import Timing, load_average
 from taisoft.output.report import json_text
 from taisoft.output.tables import require_matplotlib
-from taisoft.timing import Timing, load_average
 
 from .document import (
     RESULTS,

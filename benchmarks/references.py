@@ -18,8 +18,8 @@ from pathlib import Path
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
+from taisoft.machine import machine, versions
 from taisoft.output.report import json_text
-from taisoft.timing import machine, versions
 
 from .reference_cases import CASES, PROBLEMS
 from .reference_cases.record import Case, Check, computed

@@ -33,9 +33,9 @@ import scipy.sparse as sp
 
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
+from taisoft.machine import machine, time_repeats, versions
 from taisoft.output.report import json_text
 from taisoft.output.tables import markdown
-from taisoft.timing import machine, time_repeats, versions
 
 from .regression_cases import CASES, Case, Found
 from .runner import add_arch, make_parser, progress

@@ -20,10 +20,10 @@ import taisoft as ts
 from taisoft.backend.runtime import compile_clock
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
+from taisoft.machine import load_average
 from taisoft.output.files import make_folder
 from taisoft.output.report import json_text
 from taisoft.output.tables import require_matplotlib
-from taisoft.timing import load_average
 
 from .document import again_text, default_out, earlier_numbers, header, load_text, plain
 from .report_parts import bound, demos, phases, points, search, solvers

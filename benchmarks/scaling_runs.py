@@ -30,10 +30,10 @@ from taisoft.fem.lanes import broadcast
 from taisoft.fem.state import LOWEST_J
 from taisoft.fem.terms.elasticity import HUGE, elastic_forces, element_force
 from taisoft.linear import block_csr, pcg
+from taisoft.machine import Timing, summarise
 from taisoft.output.report import peak_memory
 from taisoft.scene.scene import Scene
 from taisoft.study.measure import advance, warm_up
-from taisoft.timing import Timing, summarise
 
 from .collision_cases import pile_setup, two_cubes
 from .collision_runs import Rig

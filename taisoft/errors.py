@@ -23,7 +23,7 @@ class SimulationError(TaisoftError):
 
 def no_memory(what: str, error: MemoryError) -> SimulationError:
     """Return the SimulationError for a MemoryError; NumPy's text gives the requested size."""
-    from taisoft.memory import available_memory, format_bytes  # rarely needed, and every module imports this one
+    from taisoft.machine import available_memory, format_bytes  # rarely needed, and every module imports this one
 
     reason = str(error).rstrip(".") or "the system refused more"
     return SimulationError(f"not enough memory for {what}: {reason}; available: {format_bytes(available_memory())}")

@@ -10,7 +10,6 @@ from taisoft.contact import SOLVERS as EXPLICIT_CONTACT
 from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS, is_multistep
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
-from taisoft.scene.checks import MAX_TOLERANCE
 from taisoft.scene.plan import Plan, make_plan
 from taisoft.scene.scene import Scene
 
@@ -42,8 +41,6 @@ class Settings:
 
 
 NAMES = tuple(field.name for field in dataclasses.fields(Settings))
-FLAGS = ("self_collision", "allow_unstable", "draggable")
-TOLERANCES = ("newton_tolerance", "linear_tolerance", "contact_tolerance")
 FIXED = ("dt", "precision", "arch")  # settings that `Simulator.rebuild` is not for: dt is assigned, the others never change
 
 
@@ -54,20 +51,15 @@ def check_settings(scene: Scene, **given) -> Settings:
     if not scene.bodies:
         raise SceneError("the scene holds no body")
     scene.check()
-    settings = Settings(**given)
+    settings = Settings(**given | {"dt": check_dt(given.get("dt", Settings.dt))})
+    try:
+        checks.check_solver(**dataclasses.asdict(settings))
+    except SceneError as error:
+        raise SimulationError(str(error)) from None
     _check_name("integrator", settings.integrator, INTEGRATORS)
     _check_name("contact_solver", settings.contact_solver, CONTACT_SOLVERS)
-    for name in FLAGS:
-        if not isinstance(getattr(settings, name), bool):
-            raise SimulationError(f"{name} = {getattr(settings, name)!r}: it must be True or False")
-    for name in TOLERANCES:
-        _check_tolerance(name, getattr(settings, name))
     _check_contact_solver(settings, scene.pushes(settings.self_collision))
-    for name, allowed in (("precision", ("f32", "f64")), ("arch", ("cpu", "cuda"))):
-        if getattr(settings, name) not in allowed:
-            a, b = allowed
-            raise SimulationError(f"{name} {getattr(settings, name)!r} is unknown: it must be '{a}' or '{b}'")
-    return dataclasses.replace(settings, dt=check_dt(settings.dt))
+    return settings
 
 
 def plan_of(scene: Scene, integrator: str, self_collision: bool, draggable: bool) -> Plan:
@@ -100,19 +92,11 @@ def check_count(name: str, value) -> int:
     return int(value)
 
 
-def _check_name(name: str, value, known: tuple[str, ...]) -> None:
+def _check_name(name: str, value: str, known: tuple[str, ...]) -> None:
     if value not in known:
-        near = difflib.get_close_matches(str(value), known, 1)
+        near = difflib.get_close_matches(value, known, 1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise SimulationError(f"{name} {value!r} is unknown{hint}: it must be one of {', '.join(known)}")
-
-
-def _check_tolerance(name: str, value) -> None:
-    if value is None:
-        return
-    below = MAX_TOLERANCE.get(name, 1.0)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < below:
-        raise SimulationError(f"{name} = {value!r}: it must lie between 0 and {below:g}, or be None for an adaptive one")
 
 
 def _check_contact_solver(settings: Settings, touching: bool) -> None:

@@ -51,7 +51,7 @@ LONG = {
         "contacts[linearly_",
         "another_process[100]",
     ),
-    "test_ccd_limits": ("[symplectic_euler-",),
+    "test_contact_measures": ("[symplectic_euler-",),
     "test_bench_collision": ("test_films_and_broad_phases",),
     "test_bench_peers": ("test_peers_fall_alike", "test_newtons_explicit_steps", "test_explicit_steps_come_to_the_exact_path"),
     "test_bench_scaling": (

@@ -13,8 +13,10 @@ from oracle_elements import mesh_nodes
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime
+from taisoft.dynamics.dynamics import Dynamics
 from taisoft.fem.model import Layout, Model, build_model
 from taisoft.scene.plan import make_plan
+from taisoft.settings import check_settings, plan_of
 
 SVK, COR, SNH = "st_venant_kirchhoff", "corotational", "stable_neo_hookean"
 
@@ -35,6 +37,18 @@ def rows_of(sim: ts.Simulator, name: str) -> slice:
     k = [body.name for body in bodies].index(name)
     first = sum(body.n_nodes for body in bodies[:k])
     return slice(first, first + bodies[k].n_nodes)
+
+
+@contextmanager
+def dynamics(scene: ts.Scene, **settings) -> Iterator[Dynamics]:
+    """What a Simulator of these settings would step, without a Simulator."""
+    checked = check_settings(scene, **settings)
+    plan = plan_of(scene, checked.integrator, checked.self_collision, checked.draggable)
+    made = Dynamics(scene.snapshot(), checked, plan)
+    try:
+        yield made
+    finally:
+        made.release()
 
 
 def element(order: int, quadrature_degree: int | None = None) -> dict:

@@ -38,8 +38,8 @@ from benchmarks.report_parts.page import (
 from benchmarks.runner import REST
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError
+from taisoft.machine import summarise
 from taisoft.mesh.sdf import SdfGrid
-from taisoft.timing import summarise
 
 SPREAD = (0.98, 1.0, 1.02)  # of rounds about their median
 

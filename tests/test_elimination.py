@@ -20,9 +20,8 @@ from taisoft.dynamics import contact_newton
 from taisoft.dynamics.contact_terms import NO_CONTACTS
 from taisoft.dynamics.elimination import FEW, choose_nodes, eliminate, solve_on
 from taisoft.dynamics.no_contacts import NoContacts
-from taisoft.dynamics.stage import ELASTIC_STAGE, STAY, form_residual, move
+from taisoft.dynamics.stage import ELASTIC_STAGE, STAY, SubsetLists, entries_of, form_residual, move
 from taisoft.dynamics.stage_system import Stage, StageSystem
-from taisoft.dynamics.subset_lists import SubsetLists, entries_of
 from taisoft.fem.node_graph import BLOCKS, EDGES, NODES
 from taisoft.linear import block_csr, pcg
 

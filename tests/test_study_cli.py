@@ -23,8 +23,8 @@ from taisoft.cli import main
 from taisoft.cli import study as study_command
 from taisoft.cli.study import check_device
 from taisoft.errors import SceneError
+from taisoft.machine import usable_cores
 from taisoft.study import workers
-from taisoft.timing import usable_cores
 
 
 def study(*arguments) -> int:

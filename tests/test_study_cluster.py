@@ -18,8 +18,8 @@ from study_places import is_running
 pytest.importorskip("distributed")
 
 from taisoft.cli import main
+from taisoft.machine import usable_cores
 from taisoft.study.workers import BUDGET_SPENT, CUT_BY_BUDGET, carry_out, cluster_places, connect
-from taisoft.timing import usable_cores
 
 SLOW = "import os, time\n\n\ndef build():\n    open({file!r}, 'a').write(f'{{os.getpid()}}\\n')\n    time.sleep(300)\n"
 

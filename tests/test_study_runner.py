@@ -16,12 +16,12 @@ import pytest
 from study_places import Pendulum
 
 from taisoft.errors import OutputError
+from taisoft.machine import versions
 from taisoft.study import Request, Setting, output
 from taisoft.study.accuracy import pack, unpack
 from taisoft.study.output import NoStore, Store, check_scene, write
 from taisoft.study.results import csv_of, text_of
 from taisoft.study.runner import Runner
-from taisoft.timing import versions
 
 DTS = (0.2, 0.1, 0.05)
 ASK = Request("pendulum", repeats=3)

@@ -15,11 +15,11 @@ from command import write
 from study_places import InProcess
 
 from taisoft.errors import SceneError
+from taisoft.machine import usable_cores
 from taisoft.simulator import Simulator
 from taisoft.study import Request, measure
 from taisoft.study.runner import Runner, tasks_of
 from taisoft.study.workers import LocalPlace, carry_out, local_places
-from taisoft.timing import usable_cores
 
 SCENE = '''"""A bar that swings: held at one end, or free and thrown."""
 import taisoft as ts

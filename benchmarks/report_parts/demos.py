@@ -12,9 +12,9 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.cli.scene_file import load_module, shipped_files, shipped_folder
+from taisoft.machine import Timing, summarise
 from taisoft.output.tables import percent, spread_of
 from taisoft.records import RunReport
-from taisoft.timing import Timing, summarise
 
 from ..document import table
 from .page import Claim, Extent, Part, small_png

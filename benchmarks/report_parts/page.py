@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from taisoft.machine import Timing
 from taisoft.output.tables import log_ticks, require_matplotlib
-from taisoft.timing import Timing
 
 from ..document import plain, table
 

@@ -10,9 +10,9 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.cli.scene_file import load_scene
+from taisoft.machine import summarise
 from taisoft.output.tables import percent, spread_of
 from taisoft.stability import stable_dt
-from taisoft.timing import summarise
 
 from ..collision_runs import PHASES
 from ..contact_runs import PARTS, SETTINGS, explicit_places, to_impulses

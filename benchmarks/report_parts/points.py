@@ -17,8 +17,8 @@ from taisoft.backend.runtime import open_runtime, threads
 from taisoft.collision.colliders import body_grid
 from taisoft.collision.surface import SERIAL_BELOW
 from taisoft.errors import SimulationError
+from taisoft.machine import summarise, usable_cores
 from taisoft.mesh.sdf import SdfGrid
-from taisoft.timing import summarise, usable_cores
 
 from ..collision_cases import Setup, cubes_setup, pile_setup
 from ..collision_runs import Rig

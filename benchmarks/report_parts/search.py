@@ -10,7 +10,7 @@ import numpy as np
 
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import SimulationError
-from taisoft.timing import summarise
+from taisoft.machine import summarise
 
 from ..collision import REPORTS_BEST, best_cell, broad_table, by_scene, cell_table, crossover_text, reduction_table
 from ..collision_cases import CUBES, FRAMES, PILES, RATIOS, SWEPT, cubes_setup, pile_setup

@@ -11,7 +11,7 @@ import numpy as np
 
 from taisoft.backend.runtime import open_runtime
 from taisoft.contact.colouring import groups
-from taisoft.timing import summarise
+from taisoft.machine import summarise
 from taisoft.view.offscreen import Offscreen
 
 from ..contact import CONTACTS, count_table, solver_table

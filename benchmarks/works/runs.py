@@ -9,8 +9,8 @@ from types import ModuleType
 import numpy as np
 
 from taisoft.errors import TaisoftError
+from taisoft.machine import Timing, summarise
 from taisoft.study.results import cheapest
-from taisoft.timing import Timing, summarise
 
 from ..elasticity_runs import TAISOFT as OWN
 from ..elasticity_runs import repeat_short

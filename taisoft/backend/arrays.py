@@ -22,7 +22,7 @@ import taichi as ti
 
 from taisoft.backend.private import impl
 from taisoft.errors import SimulationError
-from taisoft.memory import available_memory, format_bytes
+from taisoft.machine import available_memory, format_bytes
 
 DTYPES = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u8: np.uint8}
 SMALL = 2**20  # bytes up to which available memory is not checked

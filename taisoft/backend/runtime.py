@@ -23,8 +23,7 @@ from taisoft.backend.launching import Kernels
 from taisoft.backend.private import impl
 from taisoft.errors import SimulationError
 from taisoft.files import cache_folders
-from taisoft.memory import address_space, format_bytes
-from taisoft.timing import usable_cores
+from taisoft.machine import address_space, format_bytes, usable_cores
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}

@@ -20,10 +20,18 @@ from taisoft.contact.build import (
     upload_pair_numbers,
 )
 from taisoft.contact.problem import build_node_problem, index_nodes
-from taisoft.dynamics.ccd_limits import CLOSING_RATIO, DEPTH, RELATIVE_PENETRATION, find_displacement
-from taisoft.dynamics.contact_measures import DEEP_PENETRATION, NOTICEABLE_PENETRATION, ContactMeasures, Crossing
+from taisoft.dynamics.contact_measures import (
+    CLOSING_RATIO,
+    DEEP_PENETRATION,
+    DEPTH,
+    NOTICEABLE_PENETRATION,
+    RELATIVE_PENETRATION,
+    ContactMeasures,
+    Crossing,
+    find_displacement,
+)
 from taisoft.dynamics.contact_record import read_rows, record_contacts, sum_impulses, write_rows
-from taisoft.dynamics.rebounds import Rebounds
+from taisoft.dynamics.impact import Rebounds
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 

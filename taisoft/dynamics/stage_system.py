@@ -35,13 +35,13 @@ from taisoft.dynamics.stage import (
     LINEARISED,
     STAY,
     StageWork,
+    SubsetLists,
     begin_stage,
     form_residual,
     move,
     negate_direction,
     set_direction_to_rest,
 )
-from taisoft.dynamics.subset_lists import SubsetLists
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import EVERYTHING
 from taisoft.fem.state import END_SLOPE, START_SLOPE, STEP_LENGTH

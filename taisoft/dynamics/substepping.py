@@ -2,7 +2,7 @@
 
 A step that does not converge is repeated in equal substeps. With contacts, each is also short enough to miss no collision.
 
-Before a substep: while contacts close fast, its length is limited by `ccd_limits`. After it: it is undone and halved if the
+Before a substep: while contacts close fast, its length is limited by `contact_measures`. After it: it is undone and halved if the
 motion was much faster than known when it was cut, if searches along its path kept finding new contacts, if it left a new deep
 penetration or crossing, or, if it was short, when it did not converge. A short event, such as an impact or a snap, therefore
 takes short substeps only while it lasts.
@@ -14,8 +14,7 @@ length, or after MAX_UNDONE others were undone, is kept and reported even if dee
 from enum import Enum, auto
 from typing import TYPE_CHECKING
 
-from taisoft.dynamics.ccd_limits import next_length
-from taisoft.dynamics.contact_measures import DEEP_CROSSING, DEEP_PENETRATION
+from taisoft.dynamics.contact_measures import DEEP_CROSSING, DEEP_PENETRATION, next_length
 from taisoft.dynamics.results import StageResult, count_all, merge
 from taisoft.errors import SimulationError
 

@@ -19,9 +19,9 @@ from typing import TextIO
 import numpy as np
 
 from taisoft.files import write_bytes
+from taisoft.machine import processor
+from taisoft.machine import versions as installed
 from taisoft.records import RunReport, StepReport
-from taisoft.timing import processor
-from taisoft.timing import versions as installed
 
 PACKAGES = ("taichi", "numpy", "scipy", "usd-core")
 LINE_EVERY = 5.0  # time between lines of progress if the stream is not a terminal [s]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
-from taisoft.timing import Timing
+from taisoft.machine import Timing
 
 
 def markdown(headings: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = ()) -> str:

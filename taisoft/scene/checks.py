@@ -192,7 +192,7 @@ def _positive(value, what: str) -> None:
 def _tolerance(value, what: str) -> None:
     limit = MAX_TOLERANCE.get(what.rpartition(".")[2], 1.0)
     if value is not None and number(value, what, above=0.0) >= limit:
-        raise SceneError(f"{what} must be below {limit:g}, not {value!r}")
+        raise SceneError(f"{what} must be below {limit:g}, or None for the default, not {value!r}")
 
 
 SOLVER_CHECKS = {  # key of the `solver` dict -> check

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from taisoft.errors import SimulationError
+from taisoft.machine import Timing, summarise
 from taisoft.study import mesh_name
-from taisoft.timing import Timing, summarise
 
 COINCIDENCE = 1e-9  # distance over the body's size below which two nodes coincide
 RICHARDSON = 3.0  # 2^2 - 1

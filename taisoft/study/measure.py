@@ -12,13 +12,13 @@ import numpy as np
 from taisoft.backend import runtime
 from taisoft.errors import SimulationError, TaisoftError
 from taisoft.fem.reference import gravity_mass, lumped_mass, traction_forces
+from taisoft.machine import load_average, usable_cores
 from taisoft.mesh.tet_mesh import edge_lengths
 from taisoft.output.report import extremes, machine, peak_memory, versions
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
 from taisoft.study import simulator_arguments
 from taisoft.study.accuracy import pack
-from taisoft.timing import load_average, usable_cores
 
 WARM_STEPS = 3  # enough for a multistep integrator to compile all its kernels
 MAX_REPEATED_SECONDS = 20.0  # a run with a longer wall time is not repeated: the recorded run gives its time

@@ -19,12 +19,12 @@ import numpy as np
 from taisoft import __version__
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
+from taisoft.machine import versions
 from taisoft.output.files import make_folder
 from taisoft.output.report import json_text
 from taisoft.output.tables import require_matplotlib, save, ticks
 from taisoft.study.accuracy import Row
 from taisoft.study.results import Study, csv_of, plain_of, text_of
-from taisoft.timing import versions
 
 RUNS = "runs"
 KIND, FORMAT = "taisoft study run", 1

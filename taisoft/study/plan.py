@@ -229,8 +229,7 @@ class Planner:
         return "velocity_verlet" if not kind and limit > 2.0 * target / EXPLICIT_DT_RATIO else "implicit_midpoint"
 
     def _check(self, scene: Scene, setting: Setting) -> None:
-        defaults = {"self_collision": False, "allow_unstable": False, "draggable": False} | self.fixed
-        check_settings(scene, **setting.simulator(), **defaults)
+        check_settings(scene, **setting.simulator(), **self.fixed)
 
     def _touches(self, scene: Scene) -> bool:
         return scene.pushes(self.fixed.get("self_collision", False))

@@ -22,8 +22,8 @@ from contextlib import contextmanager, suppress
 from typing import Protocol
 
 from taisoft.errors import SceneError
+from taisoft.machine import usable_cores
 from taisoft.output.report import json_text, machine
-from taisoft.timing import usable_cores
 
 CHILD = (sys.executable, "-m", "taisoft.cli.study")
 POLL_INTERVAL = 0.05  # [s]

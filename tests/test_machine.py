@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from taisoft.timing import machine, summarise, time_repeats, versions
+from taisoft.machine import machine, summarise, time_repeats, versions
 
 
 def test_timing_of_repeats():

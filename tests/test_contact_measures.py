@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.dynamics.ccd_limits import next_length
+from taisoft.dynamics.contact_measures import next_length
 
 THICK = 0.01  # [m] of the sheet
 DT = {"implicit_euler": 1 / 60, "symplectic_euler": 2e-4}  # [s]
