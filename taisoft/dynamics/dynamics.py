@@ -15,11 +15,12 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.drag_spring import DragSpring
 from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.schemes import IMPLICIT
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.fem.measure import NO_TET, measure
-from taisoft.fem.model import build_model
+from taisoft.fem.model import Model, build_model
 from taisoft.fem.state import FIRST_SOFTENED, LOADS
 from taisoft.records import Energies, StepReport
 from taisoft.scene.plan import Plan
@@ -74,7 +75,7 @@ class Dynamics:
         self.reset()
 
     @property
-    def model(self):
+    def model(self) -> Model:
         """The `Model` of the scene."""
         return self.state.model
 
@@ -112,7 +113,7 @@ class Dynamics:
             return SimulationError(f"{step}{nonfinite} at its start")
         return error if str(error).startswith("step ") else SimulationError(f"{step}{error}")
 
-    def _report(self, result) -> StepReport:
+    def _report(self, result: StepResult) -> StepReport:
         """Return the report of a step: of its `StepResult`, and of the state and the contacts at its end."""
         measure(self.model)
         elastic, lowest, inverted, kinetic, gravity, _, loads = self.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
