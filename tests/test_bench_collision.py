@@ -165,7 +165,7 @@ def made_sweep(tets: int, hashed: float, tree: float) -> Sweep:
     return Sweep("tets", f"cubes {tets}", tets, tets, 10, dict.fromkeys(rounds, 5), rounds)
 
 
-def test_crossovers():
+def test_crossovers_lie_between_two_sizes():
     tets = [100, 1000, 10000]
     assert crossovers(tets, [2.0, 2.0, 2.0], [1.0, 1.0, 1.0]) == []
     assert crossovers(tets, [2.0, 1.0, 1.0], [1.0, 2.0, 4.0]) == [pytest.approx(10**2.5)]
@@ -182,7 +182,7 @@ def test_the_best_cell_is_the_fastest():
     assert "* cubes 5, 1,250 tets: best at 2, within 5 % of it from 2 to 3; the report: 2.2" in cell_table(cells)
 
 
-def test_limits():
+def test_limits_are_met_or_not():
     rows = [made_row(pile_setup(n).name, geometry, ms) for n, ms in ((6, 7.9), (LARGE_PILE, 81.0)) for geometry in GEOMETRIES]
     rows += [made_row(SHEET.name, "proximity", 2.3), made_row(SHEET.name, "distance_field", 2.5)]
     film = Film("cubes 5", "proximity", 1250)

@@ -14,7 +14,7 @@ import contact_oracle as oracle
 import numpy as np
 import pytest
 
-from benchmarks import contact, contact_colouring, contact_runs, contact_versions, runner
+from benchmarks import contact, contact_colouring, contact_runs, runner
 from benchmarks.contact import CONTACTS, PILE, STEP_SCENE, count_table, find_limits
 from benchmarks.contact_colouring import (
     REPORT,
@@ -142,15 +142,15 @@ def test_colourings_are_proper(sim):
     p = next_problem(sim)
     contacts = to_numpy(p)
     graph = node_graph(contacts.node, contacts.arity, contacts.inverse_mass)
-    made, colours = colour_all(SCENE, p, 4)
-    assert [c.way for c in made] == list(colours) == ["greedy", "random", "parallel"]
+    colourings, colours = colour_all(SCENE, p, 4)
+    assert [c.way for c in colourings] == list(colours) == ["greedy", "random", "parallel"]
     free = (contacts.inverse_mass > 0).any(axis=1)
     at = [i for c, n in enumerate(contacts.arity) for i in contacts.node[c, :n] if free[i]]
-    for c in made:
+    for c in colourings:
         assert proper(graph, colours[c.way]) and c.contacts == len(contacts.arity)
         assert c.least == np.bincount(at).max() <= min(c.numbers) and max(c.largest) * min(c.numbers) >= c.contacts / 2
-    assert len(made[1].numbers) == 4 and not proper(graph, 0 * colours["greedy"])
-    table = colour_table([replace(made[0], scene="two_cubes_two_boxes")])
+    assert len(colourings[1].numbers) == 4 and not proper(graph, 0 * colours["greedy"])
+    table = colour_table([replace(colourings[0], scene="two_cubes_two_boxes")])
     assert "the report" in table and "125" in table and " 95 " in table and REPORT["two_cubes_two_boxes"][0] == 286
     snapshot = take_snapshot(SCENE, sim, colours)
     assert snapshot.touched.sum() == contacts.arity.sum() and snapshot.image.shape[2] == 3
@@ -272,7 +272,9 @@ def made_film(scene: str, residual: float = 1e-5) -> Film:
     return film
 
 
-def made(scenes=(SCENE, "two_cubes_two_boxes"), ms=1.9, wall=2.9, status="ok", residual=1e-5, verdict="best: pass") -> dict:
+def measurements(
+    scenes=(SCENE, "two_cubes_two_boxes"), ms=1.9, wall=2.9, status="ok", residual=1e-5, verdict="best: pass"
+) -> dict:
     cost = StepCost(SCENE, SERIAL, [1e-3 * ms] * 3, {part: [1e-4] for part in (*PARTS, REST)}, [20], [5], 9e-5, [])
     runs = [Run(scene, "implicit_euler", status, [], 2.0, 2 * wall, [0.02], [20], [3], [5], [30]) for scene in (SCENE, PILE)]
     colourings = [Colouring(scene, "greedy", 4, 2, [2], [2], [0.001]) for scene in scenes]
@@ -291,9 +293,9 @@ def made(scenes=(SCENE, "two_cubes_two_boxes"), ms=1.9, wall=2.9, status="ok", r
     }
 
 
-def test_limits():
-    assert [limit.met for limit in find_limits(made())] == [True] * 6
-    bad = find_limits(made(ms=2.1, wall=3.1, status="degraded", residual=2e-4, verdict="best: FAIL"))
+def test_limits_are_met_or_not():
+    assert [limit.met for limit in find_limits(measurements())] == [True] * 6
+    bad = find_limits(measurements(ms=2.1, wall=3.1, status="degraded", residual=2e-4, verdict="best: FAIL"))
     assert [limit.met for limit in bad] == [False, True, False, False, False, False]
     assert bad[4].value == 8 and STEP_SCENE in bad[0].what
     nothing = {"films": [], "steps": [], "runs": [], "problems": []}
@@ -303,14 +305,14 @@ def test_limits():
 def test_tables_of_contact_counts_and_crossover():
     assert CONTACTS == {SCENE: 198, "two_cubes_two_boxes": 286}
     assert "21 (20 to 22)" in count_table([made_film(SCENE)]) and "89%" in count_table([made_film(SCENE)])
-    points = made()["crossover"]
+    points = measurements()["crossover"]
     assert "crossover at 1,000 contacts" in crossover_text(points, "cpu").splitlines()[0]
     assert "no crossover up to 100 contacts, serial" in crossover_text(points[:1], "cpu")
 
 
 @pytest.fixture
 def faked(monkeypatch):
-    found = [made()]
+    found = [measurements()]
     monkeypatch.setattr(contact, "measure", lambda quick, arch, document: found[0])
     return found
 
@@ -325,7 +327,7 @@ def test_command_writes_what_it_prints(faked, tmp_path, capsys):
 
 
 def test_an_unmet_limit_sets_the_exit_status(faked, capsys):
-    faked[0] = made(wall=3.5)
+    faked[0] = measurements(wall=3.5)
     assert contact.main([]) == 1
     assert "NOT met" in capsys.readouterr().out
     assert contact.main(["--quick"]) == 0
@@ -336,61 +338,3 @@ def test_missing_problems_are_reported(monkeypatch, capsys):
     monkeypatch.setattr(contact.contact_problems, "missing", lambda names: "they are gone")
     assert contact._problems(True, contact.Document()) == []
     assert "Left out: they are gone." in capsys.readouterr().out
-
-
-def test_captured_states_are_replayed(tmp_path, capsys):
-    """Two small scenes."""
-    scenes = ["gripper", "cloth on sphere"]
-    only = [word for name in scenes for word in ("--only", name)]
-    assert contact.main(["--capture", str(tmp_path), "--quick", *only]) == 0
-    assert {file.stem for file in tmp_path.glob("*.pkl")} == set(scenes)
-    out = tmp_path / "replay.json"
-    status = contact.main(["--replay", str(tmp_path), "--only", "gripper", "--out", str(out)])
-    numbers = json.loads(out.read_text())
-    assert status == (0 if all(limit["met"] for limit in numbers["limits"]) else 1)
-    for precision in ("f32", "f64"):
-        rows = numbers["rows"][f"this version, {precision}"]
-        assert [row["step"] for row in rows] == [20, 21, 22] and all(row["converged"] for row in rows)
-        assert all(row["residual"] <= 1e-4 and row["contact residual"] <= 1e-4 for row in rows)
-        assert all(0 < row["newton"] <= row["linear"] and 0.0 < row["error"] < 0.1 and row["launches"] > 5 for row in rows)
-    assert "## Limits" in capsys.readouterr().out
-
-
-def test_drops(tmp_path, capsys):
-    """The first steps of a cube at rest; this version compared with itself takes the same iterations."""
-    out = tmp_path / "drops.json"
-    here = str(contact_versions.HERE)
-    assert contact.main(["--drops", "--quick", "--only", "cube at rest", "--baseline", here, "--out", str(out)]) == 0
-    runs = json.loads(out.read_text())["runs"]
-    this, older = (runs[label]["cube at rest"] for label in ("this", "older"))
-    assert this["newton"] == older["newton"] and len(this["newton"]) == 5 and this["tets"] == 384 and this["unconverged"] == 0
-    assert capsys.readouterr().out.count("| cube at rest |") == 2
-    whole = {
-        label: {name: own["cube at rest"] | {"seconds": [times] * 5} for name in ("bunny", "cloth")}
-        for label, own, times in (("this", runs["this"], 1.0), ("older", runs["older"], 4.0))
-    }
-    met = {limit.what: limit.met for limit in contact_versions.drop_limits(whole)}
-    assert met["bunny: time of the older version over this one's"] and not met["cloth: time of the older version over this one's"]
-    assert len(met) == 6 and sum(met.values()) == 4
-
-
-def test_steps_without_contacts(tmp_path, capsys):
-    """A few steps and static solves, this version compared with itself. Steps that only one version converges in do not count."""
-    out, here = tmp_path / "free.json", str(contact_versions.HERE)
-    names = ["beam, BDF2", "static beams"]
-    only = [word for name in names for word in ("--only", name)]
-    assert contact.main(["--free", "--quick", *only, "--baseline", here, "--out", str(out)]) == 0
-    runs = json.loads(out.read_text())["runs"]
-    for name in names:
-        (this,), (older,) = (runs[name][label] for label in ("this", "older"))
-        assert this["newton"] == older["newton"] and this["linear"] == older["linear"] and min(this["newton"]) > 0
-        assert this["converged"] == [True] * 3
-    assert capsys.readouterr().out.count("| beam, BDF2") == 2
-    older |= {"converged": [True, False, True], "newton": [1, 1, 1]}
-    own = {"this": [this], "older": [older]}
-    assert contact_versions.total(own, "this", "newton")[0] == this["newton"][0] + this["newton"][2]
-    limits = {limit.what: limit for limit in contact_versions.free_limits({"static beams": own})}
-    ratio = limits["static beams: Newton iterations over the older version's"]
-    assert ratio.value == (this["newton"][0] + this["newton"][2]) / 2 and not ratio.met
-    inverted = contact_versions.free_limits({"inverted beam, BDF2": {"this": [this]}})
-    assert [limit.value for limit in inverted] == [sum(this["newton"]) / 3]

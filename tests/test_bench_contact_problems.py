@@ -40,7 +40,7 @@ def test_rows_of_all_solvers(shared):
     assert sum("best" in row.verdict for row in rows) == 1
 
 
-def test_verdicts():
+def test_verdicts_follow_from_residuals_and_costs():
     verdicts = {row.solver: row.verdict for row in bench.judged(ROWS)}
     assert verdicts == {bench.PLAIN: "yardstick: pass", "jacobi": "", "hybrid": "best: pass"}
     slow = [replace(row, residuals=(1.0, 1.0, 1.0), time=5.0 + row.time) for row in ROWS]
@@ -54,7 +54,7 @@ def test_verdicts():
     assert unconverged[0].cells[6] == "-"
 
 
-def test_summary():
+def test_summary_counts_solved_problems():
     lines = bench.summary(ROWS).splitlines()
     assert lines[1].startswith("* jacobi:") and "0 of 1" in lines[1]
     assert "1 of 1" in lines[2] and "operations 0.20, time 0.30" in lines[2]

@@ -159,7 +159,7 @@ def test_the_worst_end_counts():
 
 
 @pytest.mark.filterwarnings("ignore:.*nearly flat")
-def test_meshes_and_shape_errors():
+def test_meshes_and_shape_errors_agree_with_formulas():
     ball = time_step.ball()
     assert ball.n_tets == 6 * round(ball.volumes.sum() / 0.004**3) and ball.n_tets == 3312
     assert geometry.sliver_mesh(1e-4).volumes.min() == pytest.approx(1e-4 * geometry.sliver_mesh(1.0).volumes.mean(), rel=1e-6)

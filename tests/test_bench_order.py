@@ -114,7 +114,7 @@ def test_bounds_of_a_ratio(slow, fast, bound):
     assert found.bound == bound and (found.ratio is None) == (bound == "?")
 
 
-def test_limits():
+def test_limits_are_met_or_not():
     def limits(seconds, elastica):
         rows = [row(error=0.04, rounds=(seconds,)), row(error=0.0025, rounds=(4 * seconds,))]
         rows += [row(QUADRATIC, error=0.04), row(QUADRATIC, error=0.0025, rounds=(4.0,))]

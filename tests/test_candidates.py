@@ -41,7 +41,7 @@ def used_buffer(arena, needs: list[int], capacity: int, limit: int | None) -> Bu
     return buffer
 
 
-def test_active_triangles(rig):
+def test_active_triangles_are_those_whose_boxes_overlap(rig):
     rng = np.random.default_rng(2)
     partly_active = 0
     for kind in range(20):

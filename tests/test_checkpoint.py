@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from checkpoint_scenes import CUBES, LOW, cubes, follow, press
+from checkpoint_scenes import CUBES, OVERLAP, cubes, follow, press
 from command import ROOT
 from scenes import RELEASE, driven_scene
 
@@ -138,7 +138,7 @@ def test_continuing_with_contacts(tmp_path, integrator, precision, settings):
     dt, before, after = (2e-4, 60, 60) if integrator in EXPLICIT else (2e-3, 15, 15)
     scene, path = press(1.5 * before * dt), tmp_path / "checkpoint.npz"
     with ts.Simulator(scene, dt=dt, integrator=integrator, precision=precision, **settings) as sim:
-        sim.set_state(positions=sim.positions("plate") + (0, LOW, 0), body="plate")
+        sim.set_state(positions=sim.positions("plate") + (0, OVERLAP, 0), body="plate")
         follow(sim, before)
         sim.set_contact("cube", "floor", friction=0.1)
         sim.save_checkpoint(path)
@@ -238,9 +238,13 @@ def test_a_changed_byte_is_found(saved, tmp_path):
             assert str(path) in str(error) and "\n" not in str(error)
             continue
         harmless += 1
-        whole = read_checkpoint(saved)
-        assert (content.settings, content.numbers, content.fingerprint) == (whole.settings, whole.numbers, whole.fingerprint)
-        assert np.array_equal(content.state["simulation"]["x"], whole.state["simulation"]["x"])
+        original = read_checkpoint(saved)
+        assert (content.settings, content.numbers, content.fingerprint) == (
+            original.settings,
+            original.numbers,
+            original.fingerprint,
+        )
+        assert np.array_equal(content.state["simulation"]["x"], original.state["simulation"]["x"])
     assert harmless < 100
 
 
@@ -258,13 +262,14 @@ def test_a_changed_number_is_found(saved, tmp_path):
     assert "is damaged: its checksum" in refusal(path)
 
 
-def test_newer_files_are_refused_with_their_version(saved, tmp_path):
-    def newer(text):
-        header = json.loads(text.tobytes()) | {"format": 99, "taisoft": "9.1"}
+@pytest.mark.parametrize("version, format_version", [("0.0", 6), ("9.1", 99)])
+def test_other_formats_are_refused_with_their_version(saved, tmp_path, version, format_version):
+    def change(text):
+        header = json.loads(text.tobytes()) | {"format": format_version, "taisoft": version}
         return np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
 
-    text = refusal(changed(saved, tmp_path / "newer.npz", "header", newer))
-    assert "written by taisoft 9.1 in format 99, and taisoft" in text and "reads format 7" in text
+    text = refusal(changed(saved, tmp_path / "changed.npz", "header", change))
+    assert f"written by taisoft {version} in format {format_version}, and taisoft" in text and "reads format 7" in text
 
 
 def renamed(scene):
@@ -282,11 +287,11 @@ def with_other_mesh(scene):
     vars(scene.body("flyer"))["mesh"] = ts.TetMesh(vertices, mesh.tets)
 
 
-def held(scene):
+def with_constraint(scene):
     scene.body("flyer").fix([0])
 
 
-def loaded(scene):
+def with_load(scene):
     scene.body("flyer").add_force([0], (1, 0, 0))
 
 
@@ -299,7 +304,7 @@ def with_other_law(scene):
     body.material = dataclasses.replace(body.material, law="corotational")
 
 
-def damped(scene):
+def with_damping(scene):
     body = scene.body("flyer")
     body.material = dataclasses.replace(body.material, mass_damping=0.1)
 
@@ -310,11 +315,11 @@ def damped(scene):
         (renamed, 'its bodies are ["beam", "flyer"], those here ["beam", "fly"]'),
         (reordered, 'those here ["flyer", "beam"]'),
         (with_other_mesh, "in body 'flyer': mesh"),
-        (held, "in body 'flyer': constraints"),
-        (loaded, "in body 'flyer': loads"),
+        (with_constraint, "in body 'flyer': constraints"),
+        (with_load, "in body 'flyer': loads"),
         (with_obstacle, 'its obstacles are [], those here ["floor"]'),
         (with_other_law, "in body 'flyer': order, quadrature, law"),
-        (damped, "body 'flyer': mass_damping is 0.1 in this scene and was 0.0 at the start"),
+        (with_damping, "body 'flyer': mass_damping is 0.1 in this scene and was 0.0 at the start"),
     ],
 )
 def test_another_scene_is_refused(saved, change, message):

@@ -98,14 +98,6 @@ def test_numbers_are_compared_with_the_initial_ones(tmp_path, name):
         assert str(path) in str(caught.value) and (other is present or message in str(caught.value))
 
 
-def test_older_formats_are_refused(saved, monkeypatch):
-    monkeypatch.setattr(checkpoint, "FORMAT", 5)
-    checkpoint.write_checkpoint(saved, {}, scene(1.0), {}, {"x": np.zeros(3)}, {})
-    monkeypatch.undo()
-    with pytest.raises(ts.SimulationError, match="in format 5, and taisoft .* reads format 7"):
-        checkpoint.read_checkpoint(saved)
-
-
 class Canary:
     def __init__(self, path):
         self.path = path
