@@ -1,10 +1,10 @@
-"""What must hold on every arch, marked `cuda` where it needs a GPU. On the CPU one variant of each runs, which tests the tests:
+"""Results on every arch; the marker `cuda` needs a GPU, and one variant of each test runs on the CPU:
 
-* energies, forces and the assembled stiffness are the NumPy oracle's, in both precisions;
-* steps follow the oracle; steps with contacts in f32 follow those of the CPU in f64, and converge;
-* the search finds the contacts that the CPU finds, by trees and by hashing;
-* serial and coloured Gauss-Seidel solve the same problem, as judged in NumPy;
-* a checkpoint written by the CPU goes on.
+* energies, forces and the assembled stiffness agree with the NumPy oracle, in both precisions;
+* steps agree with the oracle; steps with contacts in f32 converge, and agree with those of the CPU in f64;
+* contact detection agrees with that of the CPU, by BVH and by spatial hash;
+* serial and coloured Gauss-Seidel solve the same problem, by a residual in NumPy;
+* a checkpoint written on the CPU can be continued.
 """
 
 import numpy as np
@@ -28,12 +28,12 @@ STEPS = 20
 
 
 def on(*values: str) -> list:
-    """Parameters (arch, value): the first value on the CPU, all of them on a GPU."""
+    """Return parameters (arch, value): the first value on the CPU, all values on a GPU."""
     return [("cpu", values[0]), *(pytest.param("cuda", value, marks=GPU) for value in values)]
 
 
 @pytest.mark.parametrize(("arch", "precision"), on("f32", "f64"))
-def test_operator(arch, precision):
+def test_energy_force_and_stiffness_agree_with_the_oracle(arch, precision):
     scene = mixed_scene((SNH, SVK, SNH, SVK), order="both")
     with built(scene, precision, arch=arch) as rig:
         rng = np.random.default_rng(11)
@@ -59,7 +59,7 @@ def test_operator(arch, precision):
 @pytest.mark.parametrize(
     ("arch", "method"), on("symplectic_euler", "velocity_verlet", "implicit_euler", "implicit_midpoint", "bdf2")
 )
-def test_steps_follow_the_oracle(arch, method):
+def test_steps_agree_with_the_oracle(arch, method):
     scene = driven_scene(mass_damping=3.0, stiffness_damping=0.004)
     implicit = method not in ("symplectic_euler", "velocity_verlet")
     tight = {"newton_tolerance": 1e-13, "linear_tolerance": 1e-13} if implicit else {}
@@ -68,7 +68,7 @@ def test_steps_follow_the_oracle(arch, method):
 
 
 def stacked() -> ts.Scene:
-    """A cube on the ground, and one turned a little that falls onto it."""
+    """A cube on the ground, and another one that falls onto it."""
     scene = ts.Scene()
     rubber = ts.Material(young=2e5, friction=0.5)
     scene.add_body(ts.box_mesh((2, 2, 2), (1, 1, 1)), rubber, name="below", position=(0, 0.501, 0))
@@ -82,29 +82,29 @@ def stacked() -> ts.Scene:
     ("arch", "method"),
     on("implicit_euler auto", "symplectic_euler gauss_seidel", "symplectic_euler coloured_gauss_seidel", "bdf2 auto"),
 )
-def test_contacts_follow_the_cpu(arch, method):
+def test_steps_with_contacts_agree_with_the_cpu(arch, method):
     integrator, solver = method.split()
     dt = 0.005 if solver == "auto" else 1e-3
-    ends, touched = [], 0
-    for where, precision in (("cpu", "f64"), (arch, "f32")):
-        settings = {"contact_solver": solver, "precision": precision, "arch": where}
+    ends, n_contacts = [], 0
+    for run_on, precision in (("cpu", "f64"), (arch, "f32")):
+        settings = {"contact_solver": solver, "precision": precision, "arch": run_on}
         with ts.Simulator(stacked(), dt=dt, integrator=integrator, **settings) as sim:
             for _ in range(STEPS):
                 report = sim.step()
                 assert report.converged and report.problems == []
-                touched = max(touched, report.n_contacts)
+                n_contacts = max(n_contacts, report.n_contacts)
             ends.append(sim.positions())
-    assert touched >= 8
+    assert n_contacts >= 8
     assert np.abs(ends[1] - ends[0]).max() < 1e-4  # [m] of 0.1 that the upper cube falls
 
 
 @pytest.mark.parametrize(("arch", "broad_phase"), on("spatial_hash", "bvh"))
-def test_the_search_finds_what_the_cpu_finds(arch, broad_phase):
+def test_detection_agrees_with_the_cpu(arch, broad_phase):
     found = []
-    for where in ("cpu", arch):
+    for run_on in ("cpu", arch):
         scene = stacked()
         scene.collision = ts.CollisionSettings(broad_phase=broad_phase)
-        with ts.Simulator(scene, dt=0.01, precision="f64", arch=where) as sim:
+        with ts.Simulator(scene, dt=0.01, precision="f64", arch=run_on) as sim:
             contacts = sim.detect_contacts()
             order = np.lexsort(contacts.point.T.round(9))
             found.append((contacts.point[order], contacts.normal[order], contacts.gap[order]))
@@ -114,18 +114,18 @@ def test_the_search_finds_what_the_cpu_finds(arch, broad_phase):
 
 
 @pytest.mark.parametrize("arch", ARCHS)
-def test_serial_and_coloured_sweeps(arch):
+def test_serial_and_coloured_sweeps_converge(arch):
     runtime = open_runtime(arch, "f32", "a test")
     try:
         (point,) = measure_crossover((4,), runtime)
     finally:
         runtime.close()
     assert point.contacts > 30 and point.colours > 1
-    assert max(point.serial.residual, point.coloured.residual) <= 2 * GOAL  # the solvers' own residual is in f32
+    assert max(point.serial.residual, point.coloured.residual) <= 2 * GOAL  # the solvers stop by their f32 residual
 
 
 @pytest.mark.parametrize("arch", ARCHS)
-def test_a_checkpoint_of_the_cpu_goes_on(arch, tmp_path):
+def test_a_checkpoint_of_the_cpu_continues(arch, tmp_path):
     with simulator(driven_scene(), "velocity_verlet") as sim:
         sim.advance(3)
         sim.save_checkpoint(tmp_path / "c.npz")

@@ -1,10 +1,9 @@
-"""What may be assigned to before a Simulator takes a scene:
+"""Assignments to a scene before it is simulated:
 
-* a mesh, a surface and nodes never change, nor do their copies and pickles; the message says how to make another one;
-* a body's material, position, velocity and collision can be set, by the rules and with the sentences of `add_body`; what all else
-  of it rests on cannot;
-* items can be taken out of the lists of a scene and a body, and are added by calls only; contact pairs by `set_contact` only;
-* what is written into an array is checked when the scene is taken.
+* meshes, surfaces and nodes are immutable, and so are their copies and pickles; the message says how to make another one;
+* a body's material, position, velocity and collision can be set, with the checks and messages of `add_body`; nothing else can;
+* items can be removed from the lists of a scene and a body, and are added by methods only; contact pairs by `set_contact` only;
+* values written into arrays are checked when the scene is used.
 """
 
 import copy
@@ -17,10 +16,6 @@ from scenes import cube, rubber
 
 import taisoft as ts
 from taisoft.errors import MeshError, SceneError
-
-
-def still(t):
-    return (0, 0, 0)
 
 
 def block() -> ts.Scene:
@@ -46,7 +41,7 @@ def copies(one) -> tuple:
 
 # --- meshes -----------------------------------------------------------------------------------------------------------
 
-OF_A_MESH = (
+MESH_NAMES = (
     "vertices",
     "tets",
     "volumes",
@@ -64,12 +59,12 @@ OF_A_MESH = (
 @pytest.mark.parametrize(
     "make, names, instead",
     [
-        (cube, OF_A_MESH, "make a new mesh, such as ts.TetMesh[(]0.9 [*] mesh.vertices, mesh.tets[)]"),
+        (cube, MESH_NAMES, "make a new mesh, such as ts.TetMesh[(]0.9 [*] mesh.vertices, mesh.tets[)]"),
         (surface, ("vertices", "triangles", "warnings", "volume"), "make a new one, such as ts.SurfaceMesh"),
         (lambda: block().bodies[0].nodes, ("positions", "elements"), "they follow from the mesh and the order; add another body"),
     ],
 )
-def test_meshes_never_change(make, names, instead):
+def test_meshes_are_immutable(make, names, instead):
     for one in copies(make()):
         for name in names:
             before = getattr(one, name)
@@ -85,7 +80,7 @@ def test_meshes_never_change(make, names, instead):
             one.foo = 1
 
 
-def test_lists_of_a_mesh_and_another_mesh():
+def test_lists_of_a_mesh_are_immutable():
     mesh = cube()
     for change in (lambda: mesh.warnings.append("x"), lambda: mesh.recipe.update(shape="ball")):
         with pytest.raises(MeshError, match="cannot change: make a new mesh"):
@@ -96,7 +91,7 @@ def test_lists_of_a_mesh_and_another_mesh():
     class Coloured(ts.TetMesh):
         def __init__(self, *arrays):
             super().__init__(*arrays)
-            self.colour = "red"  # a subclass may have more
+            self.colour = "red"  # a subclass may have attributes of its own
 
     coloured = Coloured(mesh.vertices, mesh.tets)
     with pytest.raises(MeshError, match="vertices cannot change"):
@@ -106,7 +101,7 @@ def test_lists_of_a_mesh_and_another_mesh():
 # --- bodies -----------------------------------------------------------------------------------------------------------
 
 ANOTHER = "add another body by scene.add_body"
-OF_A_BODY = dict.fromkeys(("name", "mesh", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes"), ANOTHER) | {
+READ_ONLY = dict.fromkeys(("name", "mesh", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes"), ANOTHER) | {
     "constraints": "call body.fix or body.move",
     "forces": "call body.add_force",
     "tractions": "call body.add_traction",
@@ -114,10 +109,10 @@ OF_A_BODY = dict.fromkeys(("name", "mesh", "order", "quadrature_degree", "nodes"
 }
 
 
-@pytest.mark.parametrize("name", OF_A_BODY)
-def test_what_cannot_be_set_of_a_body(name):
+@pytest.mark.parametrize("name", READ_ONLY)
+def test_read_only_attributes_of_a_body(name):
     for scene in (*copies(block()), block().snapshot()):
-        with pytest.raises(SceneError, match=f"^body 'block': {name} cannot be set: {OF_A_BODY[name]}$") as caught:
+        with pytest.raises(SceneError, match=f"^body 'block': {name} cannot be set: {READ_ONLY[name]}$") as caught:
             setattr(scene.bodies[0], name, [])
         assert isinstance(caught.value, AttributeError)
 
@@ -136,7 +131,7 @@ def test_what_cannot_be_set_of_a_body(name):
         ("collision", "sdf"),
     ],
 )
-def test_what_is_set_is_checked_as_it_is_added(name, value):
+def test_assignments_are_checked_as_by_add_body(name, value):
     body = block().bodies[0]
     given, before = {"material": rubber(), name: value}, getattr(body, name)
     with pytest.raises(SceneError) as added:
@@ -146,13 +141,13 @@ def test_what_is_set_is_checked_as_it_is_added(name, value):
     assert str(set_later.value) == str(added.value) and getattr(body, name) is before
 
 
-def test_what_can_be_set_of_a_body():
+def test_attributes_of_a_body_can_be_set():
     body = block().bodies[0]
     body.position, body.velocity, body.collision = [1, 2, 3], np.ones((8, 3)), "distance_field"
     assert body.position.tolist() == [1, 2, 3] and body.position.dtype == float and body.velocity.shape == (8, 3)
-    with pytest.warns(UserWarning, match="body 'block': poisson = 0.495 is above 0.49") as told:
+    with pytest.warns(UserWarning, match="body 'block': poisson = 0.495 is above 0.49") as caught:
         body.material = rubber(poisson=0.495)
-    assert told[0].filename == __file__ and body.material.poisson == 0.495
+    assert caught[0].filename == __file__ and body.material.poisson == 0.495
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         copy.deepcopy(body)
@@ -171,7 +166,7 @@ def test_what_can_be_set_of_a_body():
         ("body 'block'", "tractions", "body.add_traction"),
     ],
 )
-def test_lists_are_added_to_by_calls(owner, name, call):
+def test_lists_grow_by_methods_only(owner, name, call):
     for scene in (block(), block().snapshot(), copy.deepcopy(block())):
         one = scene if owner == "scene" else scene.bodies[0]
         items = getattr(one, name)
@@ -186,17 +181,17 @@ def test_lists_are_added_to_by_calls(owner, name, call):
         assert items.pop() is before[-1] and getattr(one, name) == before[:-1]
 
 
-def test_what_is_taken_out_is_free_again(tmp_path):
+def test_items_can_be_removed(tmp_path):
     scene = block()
     body = scene.bodies[0]
     with pytest.raises(SceneError, match="move: node 0 is already fixed along x"):
-        body.move([0], still)
-    held = body.constraints
-    held.clear()
-    body.move([0], still)
-    assert len(held) == 1 and held is body.constraints
-    held.clear()
-    scene.obstacles.clear()  # a contact pair of which is left
+        body.move([0], lambda t: (0, 0, 0))
+    constraints = body.constraints
+    constraints.clear()
+    body.move([0], lambda t: (0, 0, 0))
+    assert len(constraints) == 1 and constraints is body.constraints
+    constraints.clear()
+    scene.obstacles.clear()  # leaves a contact pair of an obstacle
     ts.write_scene(tmp_path / "a.toml", scene)
     assert "friction = 0.3" not in (tmp_path / "a.toml").read_text()
 
@@ -212,7 +207,7 @@ def test_what_is_taken_out_is_free_again(tmp_path):
         lambda s: setattr(s, "contact_pairs", {}),
     ],
 )
-def test_contact_pairs_are_set_by_their_call(change):
+def test_contact_pairs_are_set_by_set_contact_only(change):
     for scene in (*copies(block()), block().snapshot()):
         with pytest.raises(SceneError, match="^scene: contact_pairs cannot be .*: call scene.set_contact"):
             change(scene)
@@ -233,7 +228,7 @@ def test_contact_pairs_are_set_by_their_call(change):
         lambda: block().bodies[0].forces[0],
     ],
 )
-def test_arrays_of_records_and_of_their_copies(make):
+def test_arrays_of_records_and_their_copies_are_read_only(make):
     for one in copies(make()):
         arrays = [value for value in vars(one).values() if isinstance(value, np.ndarray)]
         assert arrays and not any(array.flags.writeable for array in arrays)
@@ -247,7 +242,7 @@ def test_arrays_of_records_and_of_their_copies(make):
         (lambda s: s.bodies[1].velocity[None], "^body 'other': velocity: entry .0. is nan"),
     ],
 )
-def test_what_was_written_into_arrays_is_checked_when_they_are_used(array, words):
+def test_values_written_into_arrays_are_checked(array, words):
     scene = block()
     array(scene)[..., 0] = np.nan
     with pytest.raises(SceneError, match=words):

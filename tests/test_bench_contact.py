@@ -1,10 +1,10 @@
-"""The benchmark of contacts; no test here asks how fast anything is:
+"""The contact benchmark. No test here checks speed:
 
-* the problem that a frame's solvers get is the same for all, is left as it was, and each residual told is right by an oracle;
-* colourings are proper and need no fewer colours than contacts meet at a node;
-* a step is told in parts, each call's time counted once; steps of a run with their iterations;
-* the plates of the crossover lie on each other as they say; both solvers solve them;
-* limits are met or not; the whole prints and writes, and a limit that is not met is the exit status.
+* all solvers of a frame get the same problem, leave it unchanged, and report residuals that agree with an oracle;
+* colourings are proper, with at least as many colours as contacts at one node;
+* a step is timed by parts, each call once; a run lists the iterations of its steps;
+* the plates of the crossover lie on each other, and both solvers solve them;
+* limits are evaluated; the benchmark prints and writes its results, and an unmet limit sets the exit status.
 """
 
 import json
@@ -14,7 +14,7 @@ import contact_oracle as oracle
 import numpy as np
 import pytest
 
-from benchmarks import contact, contact_colouring, contact_runs, contact_versions, runner
+from benchmarks import contact, contact_colouring, contact_runs, runner
 from benchmarks.contact import CONTACTS, PILE, STEP_SCENE, count_table, find_limits
 from benchmarks.contact_colouring import (
     REPORT,
@@ -59,13 +59,11 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import open_runtime
 from taisoft.contact import SOLVERS
 from taisoft.contact.colouring import node_graph
-from taisoft.errors import OutputError
 
 SCENE = "cube_on_box"
 
 
-def read(p) -> oracle.NodeContacts:
-    """The problem in NumPy."""
+def to_numpy(p) -> oracle.NodeContacts:
     k = int(p.count[0])
     rows = {name: getattr(p, name).to_numpy()[:k] for name in ("node", "arity", "weight", "normal", "tangent", "friction")}
     return oracle.NodeContacts(**rows, inverse_mass=p.inverse_mass.to_numpy(), b=p.b.to_numpy()[:k].ravel())
@@ -77,22 +75,30 @@ def sim():
         yield made
 
 
-def test_every_solver_gets_the_same_problem_and_is_judged_rightly(sim, monkeypatch):
-    judged, plain = [], contact_runs.make_judge
+def next_problem(sim):
+    """Take a step, and return its solved contact problem."""
+    problems = []
+    with shown(problems.append):
+        sim.step()
+    return problems[-1]
 
-    def logged(p):
-        judge, contacts, W = plain(p), read(p), None
 
-        def judge_too(r):
+def test_residuals_of_all_solvers_agree_with_the_oracle(sim, monkeypatch):
+    residuals, make_judge = [], contact_runs.make_judge
+
+    def make_logged(p):
+        judge, contacts, W = make_judge(p), to_numpy(p), None
+
+        def logged(r):
             nonlocal W
             W = contacts.W if W is None else W
             value = judge(r)
-            judged.append((value, oracle.residual(W, contacts.b, contacts.friction, r), np.abs(r).max()))
+            residuals.append((value, oracle.residual(W, contacts.b, contacts.friction, r), np.abs(r).max()))
             return value
 
-        return judge_too
+        return logged
 
-    monkeypatch.setattr(contact_runs, "make_judge", logged)
+    monkeypatch.setattr(contact_runs, "make_judge", make_logged)
     film = measure_film(SCENE, sim, 6, Solvers(threads=False))
     assert film.tets == 215 and 0 < film.dt < film.stable_dt and film.solvers == list(SOLVERS)
     assert 2 <= len(film.time) == len(film.contacts) <= 6 and np.all(np.diff(film.time) > 0)
@@ -104,66 +110,64 @@ def test_every_solver_gets_the_same_problem_and_is_judged_rightly(sim, monkeypat
     assert film.missed(film.solvers) == 0
     assert all(o.sweeps > 0 for name in film.solvers for o in film.of(name, COLD))
     assert sum(min(o.colouring) > 0.01 * min(o.seconds) for o in film.of(COLOURED)) == len(film.time)
-    values, wanted, size = np.array(judged).T
-    assert np.allclose(values, wanted, rtol=1e-6, atol=1e-12) and (size > 0).sum() > 3 * len(SOLVERS)
+    values, expected, size = np.array(residuals).T
+    assert np.allclose(values, expected, rtol=1e-6, atol=1e-12) and (size > 0).sum() > 3 * len(SOLVERS)
 
 
-def test_a_problem_is_left_as_it_was_and_solvers_agree(sim):
-    solvers, pushes = Solvers(threads=False), {}
+def test_solvers_leave_the_problem_unchanged_and_agree(sim):
+    solvers, checked = Solvers(threads=False), []
     to_impulses(sim)
 
-    def look(p):
+    def check(p):
         k = int(p.count[0])
         before = {name: getattr(p, name).to_numpy() for name in ("r", "order", "b", "factor", "friction")}
         found = solvers.outcomes(p, np.zeros((p.capacity, 3)), 2)
         assert set(found) == set(SOLVERS) and all(len(o.seconds) == 2 for o in found.values())
         assert all(np.array_equal(getattr(p, name).to_numpy(), old) for name, old in before.items())
-        contacts = read(p)
+        contacts = to_numpy(p)
         assert np.allclose(contact_jacobian(p).toarray(), contacts.jacobian)
         exact = oracle.gauss_seidel(contacts.W, contacts.b, contacts.friction, 2000)
         assert oracle.residual(contacts.W, contacts.b, contacts.friction, exact) < 1e-8
-        pushes.update(wanted=exact[:, 0].sum(), contacts=k)
+        checked.append((p, k, exact[:, 0].sum()))
 
-    with shown(look):
-        report = sim.step()
-    # what follows is the simulator's own solve of that problem
-    assert report.n_contacts == pushes["contacts"] and report.contact_residual <= GOAL
-    assert sim._dynamics.contact.problem.r.to_numpy()[: pushes["contacts"], 0].sum() == pytest.approx(
-        pushes["wanted"], rel=1e-2, abs=1e-3
-    )
+    with shown(check):
+        report = sim.step()  # solves the problem itself after `check`
+    p, n_contacts, normal_impulse = checked[-1]
+    assert report.n_contacts == n_contacts and report.contact_residual <= GOAL
+    assert p.r.to_numpy()[:n_contacts, 0].sum() == pytest.approx(normal_impulse, rel=1e-2, abs=1e-3)
 
 
-def test_colourings(sim):
+def test_colourings_are_proper(sim):
     to_impulses(sim)
-    p = sim._dynamics.contact.problem
-    contacts = read(p)
+    p = next_problem(sim)
+    contacts = to_numpy(p)
     graph = node_graph(contacts.node, contacts.arity, contacts.inverse_mass)
-    made, colours = colour_all(SCENE, p, 4)
-    assert [c.way for c in made] == list(colours) == ["greedy", "random", "parallel"]
+    colourings, colours = colour_all(SCENE, p, 4)
+    assert [c.way for c in colourings] == list(colours) == ["greedy", "random", "parallel"]
     free = (contacts.inverse_mass > 0).any(axis=1)
     at = [i for c, n in enumerate(contacts.arity) for i in contacts.node[c, :n] if free[i]]
-    for c in made:
+    for c in colourings:
         assert proper(graph, colours[c.way]) and c.contacts == len(contacts.arity)
         assert c.least == np.bincount(at).max() <= min(c.numbers) and max(c.largest) * min(c.numbers) >= c.contacts / 2
-    assert len(made[1].numbers) == 4 and not proper(graph, 0 * colours["greedy"])
-    table = colour_table([replace(made[0], scene="two_cubes_two_boxes")])
+    assert len(colourings[1].numbers) == 4 and not proper(graph, 0 * colours["greedy"])
+    table = colour_table([replace(colourings[0], scene="two_cubes_two_boxes")])
     assert "the report" in table and "125" in table and " 95 " in table and REPORT["two_cubes_two_boxes"][0] == 286
     snapshot = take_snapshot(SCENE, sim, colours)
     assert snapshot.touched.sum() == contacts.arity.sum() and snapshot.image.shape[2] == 3
 
 
-def test_a_step_in_parts(sim):
+def test_a_step_is_timed_by_parts(sim):
     cost = measure_step(SCENE, sim, 5)
     assert cost.solver == SERIAL and len(cost.whole) == 5 and cost.problems == []
     assert min(cost.contacts) > 0 and max(cost.sweeps) > 0 and cost.residual <= GOAL
     assert set(cost.parts) == {*PARTS, REST} and all(len(x) == 5 and min(x) > 0 for x in cost.parts.values())
     watch = Stopwatch()
-    with phases.watched(watch, sim):  # of the report: those of the search apart
+    with phases.watched(watch, sim):  # the report's phases, which split the search
         sim.step()
     assert {*PARTS, *phases.CALLS} <= set(watch.spent) and min(watch.spent.values()) >= 0.0
 
 
-def test_a_call_inside_another_counts_once(monkeypatch):
+def test_nested_calls_are_counted_once(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(runner, "clock", lambda: now[0])
     watch = Stopwatch()
@@ -182,7 +186,7 @@ def test_a_call_inside_another_counts_once(monkeypatch):
     assert watch.spent == {"inner": 6.0, "outer": 1.0} and watch.calls == {"wait": 2, "outer": 1}
 
 
-def test_what_is_patched_comes_back():
+def test_patched_attributes_are_restored():
     class Owner:
         def call(self):
             return 1
@@ -202,11 +206,11 @@ def test_plates_lie_on_each_other():
     assert len(find_under(grid(4), 4)[0]) == 25
 
 
-def test_both_solve_the_plates(sim):
+def test_both_solvers_solve_the_plates(sim):
     runtime, arena = open_runtime("cpu", "f32", "a test of the benchmark"), FieldArena()
     try:
         p = build_plates(4, runtime, arena)
-        contacts, first = read(p), 25
+        contacts, first = to_numpy(p), 25
         assert (contacts.arity == 4).all() and np.allclose(contacts.weight.sum(axis=1), 0)
         above = np.where(contacts.weight > 0, contacts.node, first)[:, :4]
         below = np.where(contacts.weight < 0, contacts.node, 0)[:, :4]
@@ -225,8 +229,8 @@ def test_both_solve_the_plates(sim):
     assert oracle.residual(contacts.W, contacts.b, contacts.friction, exact) < GOAL
 
 
-def test_a_run_is_told_with_its_iterations(sim, monkeypatch):
-    """Explicit steps, with iterations made up: implicit ones take longer to compile than the rest of this file."""
+def test_a_run_lists_iterations(sim):
+    """Explicit steps with made-up iterations: implicit steps would take longer to compile than the rest of this file."""
     sim.reset()
     plain, reports = sim.advance, []
 
@@ -258,7 +262,7 @@ def test_scenes_are_opened_with_their_own_settings(monkeypatch):
     assert tets == [215, 240]
 
 
-# --- what is told -------------------------------------------------------------------------------------------------------
+# --- output -------------------------------------------------------------------------------------------------------
 
 
 def made_film(scene: str, residual: float = 1e-5) -> Film:
@@ -268,7 +272,9 @@ def made_film(scene: str, residual: float = 1e-5) -> Film:
     return film
 
 
-def made(scenes=(SCENE, "two_cubes_two_boxes"), ms=1.9, wall=2.9, status="ok", residual=1e-5, verdict="best: pass") -> dict:
+def measurements(
+    scenes=(SCENE, "two_cubes_two_boxes"), ms=1.9, wall=2.9, status="ok", residual=1e-5, verdict="best: pass"
+) -> dict:
     cost = StepCost(SCENE, SERIAL, [1e-3 * ms] * 3, {part: [1e-4] for part in (*PARTS, REST)}, [20], [5], 9e-5, [])
     runs = [Run(scene, "implicit_euler", status, [], 2.0, 2 * wall, [0.02], [20], [3], [5], [30]) for scene in (SCENE, PILE)]
     colourings = [Colouring(scene, "greedy", 4, 2, [2], [2], [0.001]) for scene in scenes]
@@ -287,31 +293,31 @@ def made(scenes=(SCENE, "two_cubes_two_boxes"), ms=1.9, wall=2.9, status="ok", r
     }
 
 
-def test_limits():
-    assert [limit.met for limit in find_limits(made())] == [True] * 6
-    bad = find_limits(made(ms=2.1, wall=3.1, status="degraded", residual=2e-4, verdict="best: FAIL"))
+def test_limits_are_met_or_not():
+    assert [limit.met for limit in find_limits(measurements())] == [True] * 6
+    bad = find_limits(measurements(ms=2.1, wall=3.1, status="degraded", residual=2e-4, verdict="best: FAIL"))
     assert [limit.met for limit in bad] == [False, True, False, False, False, False]
     assert bad[4].value == 8 and STEP_SCENE in bad[0].what
     nothing = {"films": [], "steps": [], "runs": [], "problems": []}
     assert not any(limit.met for limit in find_limits(nothing))
 
 
-def test_counts_beside_the_report_and_the_crossover():
+def test_tables_of_contact_counts_and_crossover():
     assert CONTACTS == {SCENE: 198, "two_cubes_two_boxes": 286}
     assert "21 (20 to 22)" in count_table([made_film(SCENE)]) and "89%" in count_table([made_film(SCENE)])
-    points = made()["crossover"]
+    points = measurements()["crossover"]
     assert "crossover at 1,000 contacts" in crossover_text(points, "cpu").splitlines()[0]
     assert "no crossover up to 100 contacts, serial" in crossover_text(points[:1], "cpu")
 
 
 @pytest.fixture
 def faked(monkeypatch):
-    found = [made()]
+    found = [measurements()]
     monkeypatch.setattr(contact, "measure", lambda quick, arch, document: found[0])
     return found
 
 
-def test_the_whole_writes_what_it_prints(faked, tmp_path, capsys):
+def test_command_writes_what_it_prints(faked, tmp_path, capsys):
     out = tmp_path / "new" / "a.json"
     assert contact.main(["--out", str(out)]) == 0
     printed, numbers = capsys.readouterr().out, json.loads(out.read_text())
@@ -320,79 +326,15 @@ def test_the_whole_writes_what_it_prints(faked, tmp_path, capsys):
     assert "## Limits" in printed and "NOT met" not in printed
 
 
-def test_a_limit_that_is_not_met_is_the_exit_status(faked, capsys):
-    faked[0] = made(wall=3.5)
+def test_an_unmet_limit_sets_the_exit_status(faked, capsys):
+    faked[0] = measurements(wall=3.5)
     assert contact.main([]) == 1
     assert "NOT met" in capsys.readouterr().out
     assert contact.main(["--quick"]) == 0
     assert "## Limits" not in capsys.readouterr().out
 
 
-def test_absent_problems_are_told(monkeypatch, capsys):
+def test_missing_problems_are_reported(monkeypatch, capsys):
     monkeypatch.setattr(contact.contact_problems, "missing", lambda names: "they are gone")
     assert contact._problems(True, contact.Document()) == []
     assert "Left out: they are gone." in capsys.readouterr().out
-
-
-def test_files_that_cannot_be_written_are_refused_first(monkeypatch, tmp_path):
-    monkeypatch.setattr(contact, "measure", lambda *arguments: pytest.fail("measured"))
-    with pytest.raises(OutputError, match=r"the name must end in \.json"):
-        contact.main(["--out", str(tmp_path / "a.txt")])
-
-
-def test_captured_states_are_solved_again(tmp_path, capsys):
-    """Two small scenes; the version beside itself takes the same iterations."""
-    scenes = ["gripper", "cloth on sphere"]
-    only = [word for name in scenes for word in ("--only", name)]
-    assert contact.main(["--capture", str(tmp_path), "--quick", *only]) == 0
-    assert {file.stem for file in tmp_path.glob("*.pkl")} == set(scenes)
-    out = tmp_path / "replay.json"
-    status = contact.main(["--replay", str(tmp_path), "--only", "gripper", "--out", str(out)])
-    numbers = json.loads(out.read_text())
-    assert status == (0 if all(limit["met"] for limit in numbers["limits"]) else 1)
-    for precision in ("f32", "f64"):
-        rows = numbers["rows"][f"this version, {precision}"]
-        assert [row["step"] for row in rows] == [20, 21, 22] and all(row["converged"] for row in rows)
-        assert all(row["residual"] <= 1e-4 and row["contact residual"] <= 1e-4 for row in rows)
-        assert all(0 < row["newton"] <= row["linear"] and 0.0 < row["error"] < 0.1 and row["launches"] > 5 for row in rows)
-    assert "## Limits" in capsys.readouterr().out
-
-
-def test_bodies_that_fall(tmp_path, capsys):
-    """The first steps of a cube at rest, this version beside itself: the same iterations."""
-    out = tmp_path / "drops.json"
-    here = str(contact_versions.HERE)
-    assert contact.main(["--drops", "--quick", "--only", "cube at rest", "--baseline", here, "--out", str(out)]) == 0
-    runs = json.loads(out.read_text())["runs"]
-    this, older = (runs[label]["cube at rest"] for label in ("this", "older"))
-    assert this["newton"] == older["newton"] and len(this["newton"]) == 5 and this["tets"] == 384 and this["unconverged"] == 0
-    assert capsys.readouterr().out.count("| cube at rest |") == 2
-    whole = {
-        label: {name: own["cube at rest"] | {"seconds": [times] * 5} for name in ("bunny", "cloth")}
-        for label, own, times in (("this", runs["this"], 1.0), ("older", runs["older"], 4.0))
-    }
-    met = {limit.what: limit.met for limit in contact_versions.drop_limits(whole)}
-    assert met["bunny: time of the older version over this one's"] and not met["cloth: time of the older version over this one's"]
-    assert len(met) == 6 and sum(met.values()) == 4
-
-
-def test_steps_without_contacts(tmp_path, capsys):
-    """A few steps and static solves, this version beside itself; what one version alone converges in is not told."""
-    out, here = tmp_path / "free.json", str(contact_versions.HERE)
-    names = ["beam, BDF2", "static beams"]
-    only = [word for name in names for word in ("--only", name)]
-    assert contact.main(["--free", "--quick", *only, "--baseline", here, "--out", str(out)]) == 0
-    runs = json.loads(out.read_text())["runs"]
-    for name in names:
-        (this,), (older,) = (runs[name][label] for label in ("this", "older"))
-        assert this["newton"] == older["newton"] and this["linear"] == older["linear"] and min(this["newton"]) > 0
-        assert this["converged"] == [True] * 3
-    assert capsys.readouterr().out.count("| beam, BDF2") == 2
-    older |= {"converged": [True, False, True], "newton": [1, 1, 1]}
-    own = {"this": [this], "older": [older]}
-    assert contact_versions.total(own, "this", "newton")[0] == this["newton"][0] + this["newton"][2]
-    limits = {limit.what: limit for limit in contact_versions.free_limits({"static beams": own})}
-    more = limits["static beams: Newton iterations over the older version's"]
-    assert more.value == (this["newton"][0] + this["newton"][2]) / 2 and not more.met
-    inverted = contact_versions.free_limits({"inverted beam, BDF2": {"this": [this]}})
-    assert [limit.value for limit in inverted] == [sum(this["newton"]) / 3]

@@ -1,13 +1,11 @@
-"""The benchmark of hard cases:
+"""The benchmark of hard cases (for the scoreboard see test_bench_hard_score.py):
 
-* the data are whole: all cases of the catalogue, every criterion asked of some variant, every variant asked something;
-* every variant says how it must end, and why; a run is judged by its end and its numbers; what is absent or not finite never
-  passes;
-* the meshes are what the catalogue says, and shapes are compared up to rigid motions, reflections excluded;
-* a run that fails was refused or stopped, and a degraded one says by what;
-* cheap variants are solved, and a path is held against its reference;
-* the page and the exit status tell what is not solved or not run; finished runs are kept and taken again. The scoreboard itself:
-  test_bench_hard_score.py.
+* the data are complete: all cases of the catalogue; every criterion applies to a variant, and every case has criteria;
+* every variant states its required end and the reason; missing and non-finite numbers never pass a criterion;
+* meshes agree with the catalogue, and shapes are compared up to rigid motions, without reflections;
+* a failed run was refused or stopped, and a degraded one has causes;
+* cheap variants are solved, and a path is compared with its reference;
+* the page and the exit status show what is not solved or not run; finished runs are stored and reused.
 """
 
 import json
@@ -66,37 +64,37 @@ def test_every_case_of_the_catalogue_is_there():
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.id)
-def test_data(case):
+def test_data_are_complete(case):
     names = [variant.name for variant in case.variants]
     assert len(set(names)) == len(names) and set(case.quick) <= set(names) and case.size > 0.0
-    asked = [case.criteria_of(variant) for variant in case.variants]
-    assert any(asked) and {c for some in asked for c in map(id, some)} == set(map(id, case.criteria))
-    for some in asked:
-        assert len({c.quantity for c in some}) == len(some)
+    criteria = [case.criteria_of(variant) for variant in case.variants]
+    assert any(criteria) and {c for own in criteria for c in map(id, own)} == set(map(id, case.criteria))
+    for own in criteria:
+        assert len({c.quantity for c in own}) == len(own)
     assert all(c.note for c in case.criteria if c.asked is not None)
-    explained = [case.shortfalls_of(variant) for variant in case.variants]
-    assert {s for some in explained for s in map(id, some)} == set(map(id, case.shortfalls))
-    assert all(s.cause and s.next_idea for s in case.shortfalls) and all(len(some) <= 1 for some in explained)
+    shortfalls = [case.shortfalls_of(variant) for variant in case.variants]
+    assert {s for own in shortfalls for s in map(id, own)} == set(map(id, case.shortfalls))
+    assert all(s.cause and s.next_idea for s in case.shortfalls) and all(len(own) <= 1 for own in shortfalls)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.id)
-def test_every_variant_has_an_expectation_and_a_reason(case):
+def test_every_variant_has_a_required_end_and_a_reason(case):
     for must in {variant.must for variant in case.variants}:
         assert must.end in (OK, DEGRADED, REFUSED, STOPPED) and set(must.causes) <= CAUSES
         assert len(must.reason) > 20 and not must.reason.endswith(".") and "\n" not in must.reason
-        assert must.causes or must.end != DEGRADED  # degraded by what?
+        assert must.causes or must.end != DEGRADED
 
 
 @pytest.mark.parametrize(
     "numbers, status, passed",
     [
-        ({"small": 1.0, "large": 2.0, "told": 9.0}, OK, [True, True, True, None]),
+        ({"small": 1.0, "large": 2.0, "other": 9.0}, OK, [True, True, True, None]),
         ({"small": 1.1, "large": 1.9}, OK, [True, False, False]),
         ({"small": None}, DEGRADED, [False, False, False]),
         ({"small": math.inf, "large": math.nan}, STOPPED, [False, False, False]),
     ],
 )
-def test_judgement(numbers, status, passed):
+def test_criteria_pass_or_fail(numbers, status, passed):
     case, variant = one_case(None)
     record = {"status": status, "causes": [], "numbers": numbers}
     row = Row(case, variant, record)
@@ -104,7 +102,7 @@ def test_judgement(numbers, status, passed):
     assert [verdict.passed for verdict in row.verdicts] == passed and len(row.faults) == passed.count(False)
 
 
-def test_a_run_that_cannot_be_made():
+def test_an_error_before_the_first_step_is_a_refusal():
     def run(session):
         raise SimulationError("lost")
 
@@ -134,7 +132,7 @@ DEEP = SimpleNamespace(depth=2.0, name_a="a", name_b="b")
         (RunReport("degraded"), 2, [DEEP], DEGRADED, [OVERLAP]),
     ],
 )
-def test_how_a_run_ended(result, done, overlaps, status, causes):
+def test_end_and_causes_of_a_run(result, done, overlaps, status, causes):
     sim = SimpleNamespace(
         dt=0.1,
         step_count=done,
@@ -161,7 +159,7 @@ def test_the_worst_end_counts():
 
 
 @pytest.mark.filterwarnings("ignore:.*nearly flat")
-def test_shapes():
+def test_meshes_and_shape_errors_agree_with_formulas():
     ball = time_step.ball()
     assert ball.n_tets == 6 * round(ball.volumes.sum() / 0.004**3) and ball.n_tets == 3312
     assert geometry.sliver_mesh(1e-4).volumes.min() == pytest.approx(1e-4 * geometry.sliver_mesh(1.0).volumes.mean(), rel=1e-6)
@@ -184,7 +182,7 @@ def test_quick_variants_are_solved(case, name):
     assert not row.faults and record["peak_memory_bytes"] > 0 and (record["steps"] > 0) == (record["step_seconds"] is not None)
 
 
-def test_a_reference_is_finer():
+def test_a_reference_has_smaller_steps_and_double_precision():
     case, variant = find("T1", "corotational, dt 0.002 s")
     steps = []
 
@@ -197,14 +195,14 @@ def test_a_reference_is_finer():
 
     short = Case("Z2", "", follow, (variant,), (), size=0.5)
     small = replace(variant, name="small", settings=variant.settings | {"dt": 2e-4})
-    own, finer = (hard_runs.run(short, small, "cpu", share) for share in (1, 8))
+    own, finer = (hard_runs.run(short, small, "cpu", n) for n in (1, 8))
     assert steps == [(40, 2e-4, "f32", 5), (320, 2.5e-5, "f64", 5)]
-    row, lost = Row(short, small, own, finer), Row(short, small, own, finer | {"status": STOPPED})
-    row.compare(), lost.compare()
-    assert 1e-9 < row.error < 1e-2 and lost.error is None
+    row, without = Row(short, small, own, finer), Row(short, small, own, finer | {"status": STOPPED})
+    row.compare(), without.compare()
+    assert 1e-9 < row.error < 1e-2 and without.error is None
 
 
-def test_the_page_tells_what_is_not_solved(monkeypatch, capsys):
+def test_the_page_shows_what_is_not_solved(monkeypatch, capsys):
     case, variant = one_case(None)
     monkeypatch.setattr(hard, "CASES", (case,))
 
@@ -229,7 +227,7 @@ def test_the_page_tells_what_is_not_solved(monkeypatch, capsys):
     assert "the budget was spent" in text and "* first: not run." in text and "the next idea" not in text
 
 
-def test_finished_runs_are_kept(tmp_path, monkeypatch, capsys):
+def test_finished_runs_are_reused(tmp_path, monkeypatch, capsys):
     out = tmp_path / "hard.json"
     command = ["--case", "G1", "--quick", "--keep", str(tmp_path / "kept"), "--out", str(out)]
     assert hard.main(command) == 0
@@ -238,7 +236,7 @@ def test_finished_runs_are_kept(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "hard.md").read_text().startswith("# Hard cases")
 
     def start(*_):
-        raise AssertionError("a run that was kept is run again")
+        raise AssertionError("a stored run was repeated")
 
     monkeypatch.setattr(hard_runs.LocalPlace, "start", start)
     assert hard.main(command) == 0 and json.loads(out.read_text())["rows"] == first

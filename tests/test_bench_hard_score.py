@@ -1,9 +1,9 @@
 """The scoreboard of the hard cases:
 
-* solved is what ended as it must with all limits kept; a refusal, a stop or a degraded end where there is an answer is not;
-* wrong is an ok end that must not be one, that hides something, or that misses a limit on its answer, not on its cost;
-* the headline is the sum over the groups and over the cases; what was not run is asked, and not solved;
-* stored results are judged by what is asked today: verdicts, page and the manual's table; what is not solved has a cause.
+* a variant is solved if it ended as required and kept all limits;
+* it is wrong if it ended ok although it must not, hid a cause, or missed a limit on its answer (not only on its cost);
+* the headline is the sum over groups and over cases; variants that were not run count as unsolved;
+* stored results are evaluated by the present criteria: verdicts, page and the manual's table; every unsolved variant has a cause.
 """
 
 import json
@@ -46,10 +46,10 @@ def row_of(must: Must, status: str | None, causes=(), numbers=KEPT) -> Row:
 
 
 @pytest.mark.parametrize(
-    "must, status, causes, numbers, where, why",
+    "must, status, causes, numbers, column, faults",
     [
         (PLAIN, OK, [], KEPT, OK, []),
-        (PLAIN, DEGRADED, [UNCONVERGED], KEPT, DEGRADED, [UNCONVERGED]),  # though all its limits are kept
+        (PLAIN, DEGRADED, [UNCONVERGED], KEPT, DEGRADED, [UNCONVERGED]),  # although all limits are kept
         (PLAIN, DEGRADED, [INVERTED], KEPT, DEGRADED, [INVERTED]),
         (PLAIN, DEGRADED, [], KEPT, DEGRADED, ["degraded, must be ok"]),
         (PLAIN, REFUSED, [], KEPT, REFUSED, ["refused, must be ok"]),
@@ -58,13 +58,13 @@ def row_of(must: Must, status: str | None, causes=(), numbers=KEPT) -> Row:
         (PLAIN, None, [], {}, NOT_RUN, [NOT_RUN]),
         (PLAIN, OK, [], OFF, WRONG, ["off by"]),
         (PLAIN, OK, [], {}, WRONG, ["off by", "seconds"]),
-        (PLAIN, OK, [], SLOW, OK, ["seconds"]),  # its answer stands
-        (PLAIN, OK, [UNCONVERGED], KEPT, WRONG, [UNCONVERGED]),  # it hides that
+        (PLAIN, OK, [], SLOW, OK, ["seconds"]),  # its answer is right
+        (PLAIN, OK, [UNCONVERGED], KEPT, WRONG, [UNCONVERGED]),  # hidden
         (INSIDE_OUT, OK, [], KEPT, OK, []),
         (INSIDE_OUT, OK, [INVERTED], KEPT, WRONG, ["ok, must be ok, or degraded by inverted tets"]),
         (INSIDE_OUT, DEGRADED, [INVERTED], KEPT, DEGRADED, []),
         (INSIDE_OUT, DEGRADED, [INVERTED], OFF, DEGRADED, ["off by"]),
-        (INSIDE_OUT, DEGRADED, BOTH, KEPT, DEGRADED, [UNCONVERGED]),  # the start does not explain that
+        (INSIDE_OUT, DEGRADED, BOTH, KEPT, DEGRADED, [UNCONVERGED]),  # not explained by the start
         (INSIDE_OUT, STOPPED, [INVERTED], KEPT, STOPPED, ["stopped, must be ok, or degraded by inverted tets"]),
         (ALWAYS, DEGRADED, [INVERTED], KEPT, DEGRADED, []),
         (ALWAYS, OK, [], KEPT, WRONG, ["ok, must be degraded by inverted tets"]),
@@ -78,16 +78,16 @@ def row_of(must: Must, status: str | None, causes=(), numbers=KEPT) -> Row:
         (STOPS, OK, [], KEPT, WRONG, ["ok, must be stopped"]),
     ],
 )
-def test_solved_or_not(must, status, causes, numbers, where, why):
+def test_columns_and_faults(must, status, causes, numbers, column, faults):
     row = row_of(must, status, causes, numbers)
-    assert (row.column, row.faults) == (where, why)
-    assert row.data()["solved"] == (not why) and row.data()["column"] == where
+    assert (row.column, row.faults) == (column, faults)
+    assert row.data()["solved"] == (not faults) and row.data()["column"] == column
 
 
-def table_numbers(text: str, wanted: str) -> list[int]:
-    """A column of the only Markdown table in a text."""
+def table_numbers(text: str, heading: str) -> list[int]:
+    """Return a column of the only Markdown table in a text."""
     lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
-    place = lines[0].index(wanted)
+    place = lines[0].index(heading)
     return [int(line[place] or 0) for line in lines[2:]]
 
 
@@ -110,7 +110,7 @@ def test_the_headline_is_the_sum(results):
             assert sum(lines) == last == counts[name]
 
 
-def test_what_was_not_run_is_asked_and_not_solved(results):
+def test_variants_not_run_count_as_unsolved(results):
     before = tally(stored(results))
     dropped = next(row for row in results["rows"] if row["solved"])
     rows = stored(results | {"rows": [row for row in results["rows"] if row is not dropped]})
@@ -118,22 +118,22 @@ def test_what_was_not_run_is_asked_and_not_solved(results):
     assert NOT_RUN in scoreboard(rows)
 
 
-def test_every_stored_variant_that_is_not_solved_has_a_cause(results):
+def test_every_unsolved_variant_has_a_cause(results):
     unexplained = [row for row in stored(results) if row.faults and row.record and not row.case.shortfalls_of(row.variant)]
     assert [(row.case.id, row.variant.name) for row in unexplained] == []
 
 
-def test_stored_results_are_judged_anew(results, tmp_path, capsys):
+def test_stored_results_are_evaluated_again(results, tmp_path, capsys):
     page = next(path for path in RESULTS.glob("hard-*.md") if results["date"] in path.read_text(encoding="utf-8"))
     again = tmp_path / "hard.json"
     again.write_text(json.dumps(results | {"rows": [row | {"solved": None} for row in results["rows"]]}))
     solved = all(not row.faults for row in stored(results))
     assert hard.main(["--judge", str(again)]) == (0 if solved else 1)
-    why = f"`taisoft bench hard --judge {page.with_suffix('.json')}` writes it anew"
-    same = json.loads(again.read_text())["rows"] == results["rows"]
-    assert same, why
-    same = again.with_suffix(".md").read_text(encoding="utf-8") == page.read_text(encoding="utf-8")
-    assert same, why
+    hint = f"`taisoft bench hard --judge {page.with_suffix('.json')}` updates it"
+    same_rows = json.loads(again.read_text())["rows"] == results["rows"]
+    assert same_rows, hint
+    same_page = again.with_suffix(".md").read_text(encoding="utf-8") == page.read_text(encoding="utf-8")
+    assert same_page, hint
     capsys.readouterr()
     again.write_text("{")
     with pytest.raises(OutputError, match="hard.json cannot be read"):

@@ -1,8 +1,8 @@
 """The manual's measured tables:
 
-* they are what the results in benchmarks/results say, to the letter, and each is on one page;
-* a number changed in the results or on a page is seen, and written anew;
-* the newest whole results count, and what is missing, unknown or unpaired is told in a sentence.
+* they agree exactly with benchmarks/results, and each is on one page;
+* a number changed in the results or on a page is noticed, and updated;
+* the newest full results are used; missing, unknown and unpaired tables are refused.
 """
 
 import json
@@ -19,7 +19,7 @@ TEXT = "before\n<!-- begin fake -->\nold\n<!-- end fake -->\nafter\n"
 
 @pytest.fixture
 def fake(monkeypatch):
-    """A table of its own."""
+    """A table that exists only here."""
     monkeypatch.setitem(TABLES, "fake", lambda results: f"made of {results}")
 
 
@@ -27,17 +27,17 @@ def texts() -> list[str]:
     return [page.read_text(encoding="utf-8") for page in pages()]
 
 
-def test_the_manual_is_what_the_results_say():
+def test_the_manual_agrees_with_the_results():
     for text in texts():
         assert {name for _, name, _ in BLOCK.findall(text)} <= set(TABLES) and BLOCK.search(text)
-        assert filled(text) == text, "`taisoft bench manual` writes it anew"
+        assert filled(text) == text, "`taisoft bench manual` updates it"
 
 
 def test_every_table_is_in_the_manual():
     assert sorted(name for text in texts() for _, name, _ in BLOCK.findall(text)) == sorted(TABLES)
 
 
-def test_a_changed_number_is_seen(tmp_path):
+def test_a_changed_number_is_noticed(tmp_path):
     shutil.copytree(RESULTS, tmp_path / "results")
     path = next((tmp_path / "results").glob("order-*.json"))
     numbers = json.loads(path.read_text())
@@ -47,7 +47,7 @@ def test_a_changed_number_is_seen(tmp_path):
     assert [filled(text, tmp_path / "results") != text for text in texts()].count(True) == 1
 
 
-def test_marked_parts_are_made_anew_and_the_rest_stays(fake):
+def test_marked_parts_are_replaced_and_the_rest_stays(fake):
     made = filled(TEXT, "here")
     assert made == "before\n<!-- begin fake -->\n\nmade of here\n\n<!-- end fake -->\nafter\n" and filled(made, "here") == made
 
@@ -66,7 +66,7 @@ def test_wrong_markers_are_refused(text, words, fake):
         filled(text)
 
 
-def test_the_newest_whole_results_count(tmp_path):
+def test_the_newest_full_results_are_used(tmp_path):
     with pytest.raises(OutputError, match="no results of `taisoft bench order`"):
         newest(tmp_path, "order")
     for name, date, quick in (("a", "2026-01-02", False), ("b", "2026-01-01", False), ("c", "2026-01-03", True)):
@@ -77,7 +77,7 @@ def test_the_newest_whole_results_count(tmp_path):
         newest(tmp_path, "order")
 
 
-def test_writes_or_tells(fake, monkeypatch, tmp_path, capsys):
+def test_command_updates_or_checks_the_pages(fake, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(manual, "DOCS", tmp_path)
     page = tmp_path / "page.md"
     page.write_text("no table")

@@ -1,11 +1,11 @@
-"""The works on which programs are held against each other:
+"""The comparison with other programs:
 
-* the laws in NumPy are those of small strains, those that taisoft has too give its stress, and no rotation stresses any;
-* a verdict flips where a body falls, leans, hangs in the air, turns inside out or sinks in;
-* errors are distances over what the work says;
-* the comparison takes the fastest that is good enough, and says where nothing is;
-* taisoft's adapter gives the positions of its simulator; the others', where they are installed, start where the work does;
-* every program is given its implicit and its explicit methods, and its own laws; what was tried besides is on the page.
+* laws in NumPy reduce to linear elasticity at small strains, are frame-indifferent, and agree with taisoft's stresses;
+* verdicts detect bodies that fall, lean, float, invert or penetrate;
+* errors are relative to the length that each work defines;
+* limits compare the fastest accurate settings of each program, and show where there are none;
+* adapters give the positions of taisoft and of the installed programs, starting from those of the work;
+* every program runs with implicit and explicit methods and its own laws; the page lists further settings that were tried.
 """
 
 import importlib
@@ -34,7 +34,7 @@ def rotation(angle: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_laws_are_linear_elasticity_at_small_strain_and_blind_to_rotations(law):
+def test_laws_are_linear_at_small_strain_and_frame_indifferent(law):
     grad = 1e-6 * np.random.default_rng(3).standard_normal((3, 3, 5))
     strain = 0.5 * (grad + grad.transpose(1, 0, 2))
     linear = 2 * MU * strain + LAM * np.trace(strain) * np.eye(3)[:, :, None]
@@ -42,12 +42,12 @@ def test_laws_are_linear_elasticity_at_small_strain_and_blind_to_rotations(law):
     assert np.abs(stress - linear).max() < 1e-5 * np.abs(linear).max()
     F = np.eye(3)[:, :, None] + 0.2 * np.random.default_rng(4).standard_normal((3, 3, 5))
     R = rotation(0.8)
-    turned = LAWS[law](np.einsum("ij,jkm->ikm", R, F), MU, LAM)
-    assert np.allclose(turned, np.einsum("ij,jkm->ikm", R, LAWS[law](F, MU, LAM)), rtol=0, atol=1e-9 * np.abs(turned).max())
+    rotated = LAWS[law](np.einsum("ij,jkm->ikm", R, F), MU, LAM)
+    assert np.allclose(rotated, np.einsum("ij,jkm->ikm", R, LAWS[law](F, MU, LAM)), rtol=0, atol=1e-9 * np.abs(rotated).max())
 
 
 @pytest.mark.parametrize("law", own.LAWS)
-def test_stresses_are_those_of_taisoft(law):
+def test_stresses_agree_with_taisoft(law):
     F = np.eye(3) + 0.3 * np.random.default_rng(5).standard_normal((6, 3, 3))
     young = MU * (3 * LAM + 2 * MU) / (LAM + MU)
     _, found = ts.evaluate_law(own.LAWS[law], F, young=young, poisson=LAM / (2 * (LAM + MU)))
@@ -55,7 +55,7 @@ def test_stresses_are_those_of_taisoft(law):
     assert np.abs(found - expected).max() < 1e-9 * np.abs(expected).max()
 
 
-def test_equal_masses_share_the_total():
+def test_equal_masses_have_the_same_total():
     work = scenes.dropped_cube()
     lumped, equal = references.masses(work, TAISOFT), references.masses(work, PYBULLET)
     assert lumped.sum() == pytest.approx(1000.0) and equal.sum() == pytest.approx(1000.0)
@@ -76,12 +76,12 @@ def test_every_reference_is_stored_and_converged(work, model):
     assert reference.error(moved) == pytest.approx(expected)
 
 
-def test_what_is_not_stored_is_refused():
+def test_a_missing_reference_is_refused():
     with pytest.raises(ts.SimulationError, match="no reference is stored for W1 2x1x1 with SNH"):
         references.load(scenes.hanging_beam((2, 1, 1)), TAISOFT)
 
 
-def test_a_fall_is_a_parabola_and_ends_on_the_ground():
+def test_a_fall_is_parabolic_until_the_ground():
     mesh = ts.box_mesh((2, 2, 2), (1, 1, 1))
     mesh = ts.TetMesh(mesh.vertices + [0, 0.6, 0], mesh.tets)
     free = np.ones(mesh.n_verts, bool)
@@ -93,37 +93,37 @@ def test_a_fall_is_a_parabola_and_ends_on_the_ground():
     assert 0.3 < heights.min() < 0.499
 
 
-def still(work: scenes.Work, samples: int = 3) -> np.ndarray:
+def at_rest(work: scenes.Work, samples: int = 3) -> np.ndarray:
     return np.repeat(work.start[None], samples, axis=0)
 
 
-def test_verdicts_flip():
+def test_verdicts_detect_failures():
     work = scenes.stack()
     nodes = work.slices()
-    assert judge.judge(work, TAISOFT, still(work)).stands
-    for change, told in (
-        ([0.2, 0, 0], lambda v: v.fell == 0.01),  # leans off its axis
+    assert judge.judge(work, TAISOFT, at_rest(work)).stands
+    for change, is_detected in (
+        ([0.2, 0, 0], lambda v: v.fell == 0.01),  # leans
         ([0, -0.9, 0], lambda v: v.fell == 0.01 and v.penetration > 0.01),  # falls through
-        ([0, -0.05, 0], lambda v: v.fell is None and v.penetration == pytest.approx(0.049, abs=1e-3)),  # sinks in
+        ([0, -0.05, 0], lambda v: v.fell is None and v.penetration == pytest.approx(0.049, abs=1e-3)),  # penetrates
     ):
-        moved = still(work)
+        moved = at_rest(work)
         moved[1, nodes["cube 1"]] += change
         verdict = judge.judge(work, TAISOFT, moved)
-        assert told(verdict) and not verdict.stands
-    mirrored = still(work)
+        assert is_detected(verdict) and not verdict.stands
+    mirrored = at_rest(work)
     mirrored[2, nodes["cube 2"], 0] *= -1
     verdict = judge.judge(work, TAISOFT, mirrored)
     assert verdict.inverted == work.bodies[2].mesh.n_tets and not verdict.stands
 
 
 @pytest.mark.parametrize("work", [work for work in scenes.WORKS if work.kind == "stand"], ids=lambda work: work.key)
-def test_what_hangs_in_the_air_does_not_stand(work):
+def test_floating_bodies_do_not_stand(work):
     last = list(work.slices().values())[-1]
-    falling = still(work, 21)
+    falling = at_rest(work, 21)
     t = np.arange(21) * 0.01
     falling[:, last, 1] -= 0.5 * work.gravity * t[:, None] ** 2
     assert judge.free_fall(work, falling) == pytest.approx(1.0)
-    assert judge.free_fall(work, still(work, 21)) == 0.0 and judge.free_fall(work, still(work)) is None
+    assert judge.free_fall(work, at_rest(work, 21)) == 0.0 and judge.free_fall(work, at_rest(work)) is None
     verdict = judge.Verdict(0, free_fall=1.1)
     assert verdict.stands and not replace(verdict, free_fall=0.7).stands and not replace(verdict, free_fall=1.3).stands
 
@@ -136,7 +136,7 @@ def made_row(work: scenes.Work, program: str, seconds: float, error: float | Non
     return row
 
 
-def test_the_fastest_that_is_good_enough_is_compared():
+def test_the_fastest_accurate_rows_are_compared():
     work = scenes.hanging_beam((12, 3, 3))
     rows = [
         made_row(work, "taisoft", 0.1, 5e-3),
@@ -148,14 +148,14 @@ def test_the_fastest_that_is_good_enough_is_compared():
     limits = limits_of(rows)
     assert [round(limit.value, 6) for limit in limits] == [1.0, 10.0, 1.0, 2.0, 1.0, 2.0, 0.0]
     assert [limit.met for limit in limits] == [True, True, True, False, True, False, False]
-    told = compare_table(comparisons([rows]))
-    assert "| error <= 0.01 " in told and told.count("MuJoCo explicit") == 3 and "| explicit, SNH, 5 ms" in told
-    rows[0].verdict.error = 1e-8  # below what the reference is good to
+    table = compare_table(comparisons([rows]))
+    assert "| error <= 0.01 " in table and table.count("MuJoCo explicit") == 3 and "| explicit, SNH, 5 ms" in table
+    rows[0].verdict.error = 1e-8  # below the uncertainty of the reference
     assert rows[0].claimed == 1e-6
     assert "5e-05" not in run_table(rows) and "0.005 %" in run_table(rows)
 
 
-def test_what_does_not_stand_is_not_compared():
+def test_rows_that_do_not_stand_are_not_compared():
     work = scenes.stack()
     rows = [made_row(work, "taisoft", 0.5), made_row(work, "taisoft", 0.1, inverted=3)]
     rows.append(made_row(work, "Newton", 0.01, inverted=1))
@@ -166,7 +166,7 @@ def test_what_does_not_stand_is_not_compared():
     assert not rows[0].stood
 
 
-def test_a_drop_has_limits_of_its_own():
+def test_limits_of_a_drop():
     work = scenes.dropped_cube()
     met = [made_row(work, "taisoft", 0.2, 4e-3)]
     assert limits_of(met)[0].met and not limits_of([made_row(work, "taisoft", 0.2, 6e-3)])[0].met
@@ -179,7 +179,7 @@ def small_drop() -> scenes.Work:
     return replace(scenes.dropped_cube(), key="small", kind="stand", bodies=(cube,), seconds=0.1)
 
 
-def test_rows_are_measured_and_judged(capsys):
+def test_rows_are_measured_with_verdicts(capsys):
     work = small_drop()
 
     class Broken:
@@ -200,7 +200,7 @@ def test_rows_are_measured_and_judged(capsys):
 
 
 @pytest.mark.parametrize("seconds, build_seconds, rounds", [(9.0, 19.0, 3), (11.0, 1.0, 1), (1.0, 21.0, 1)])
-def test_what_takes_long_is_measured_in_one_round(seconds, build_seconds, rounds, monkeypatch):
+def test_slow_runs_are_measured_once(seconds, build_seconds, rounds, monkeypatch):
     monkeypatch.setattr(runs, "judge", lambda work, model, positions: judge.Verdict(0))
 
     class Slow:
@@ -212,7 +212,7 @@ def test_what_takes_long_is_measured_in_one_round(seconds, build_seconds, rounds
             self.build_seconds, self.unconverged = self.build_time, 0
 
         def run(self, follow):
-            return (still(small_drop()) if follow else None), seconds
+            return (at_rest(small_drop()) if follow else None), seconds
 
         def close(self):
             pass
@@ -222,11 +222,11 @@ def test_what_takes_long_is_measured_in_one_round(seconds, build_seconds, rounds
     assert len(row.rounds) == rounds and all(one[0] == seconds for one in row.rounds)
 
 
-def test_works_that_are_not_measured_again_are_kept(tmp_path, monkeypatch, capsys):
+def test_stored_rows_of_other_works_are_kept(tmp_path, monkeypatch, capsys):
     first, second = small_drop(), replace(small_drop(), key="second")
     seconds = {"small": 1.0, "second": 1.0}
 
-    class Still:
+    class AtRest:
         NAME = "taisoft"
         problem = staticmethod(lambda: "")
         settings = staticmethod(lambda work, arch: [Setting("taisoft", TAISOFT, "still", 1, {"precision": "f64"})])
@@ -237,14 +237,14 @@ def test_works_that_are_not_measured_again_are_kept(tmp_path, monkeypatch, capsy
         Run = classmethod(lambda cls, work, setting: cls(work))
 
         def run(self, follow):
-            return (still(self.work) if follow else None), seconds[self.work.key] * self.work.seconds
+            return (at_rest(self.work) if follow else None), seconds[self.work.key] * self.work.seconds
 
         def close(self):
             pass
 
     monkeypatch.setattr(peers, "WORKS", (first, second))
-    monkeypatch.setattr(peers, "PROGRAMS", (Still,))
-    monkeypatch.setattr(peers, "own", Still)
+    monkeypatch.setattr(peers, "PROGRAMS", (AtRest,))
+    monkeypatch.setattr(peers, "own", AtRest)
     out = tmp_path / "peers.json"
     assert peers.main(["--out", str(out)]) == 0
     seconds.update(small=3.0, second=3.0)
@@ -259,7 +259,7 @@ def test_works_that_are_not_measured_again_are_kept(tmp_path, monkeypatch, capsy
     assert json.loads((tmp_path / "new.json").read_text())["quick"] and not (tmp_path / "new.png").exists()
 
 
-def test_explicit_steps_come_to_the_exact_path():
+def test_explicit_steps_converge_to_the_exact_path():
     work = scenes.dropped_cube()
     setting = Setting("taisoft", TAISOFT, "velocity_verlet", 16, {"precision": "f64"})
     session = own.Run(work, setting)
@@ -269,7 +269,7 @@ def test_explicit_steps_come_to_the_exact_path():
     assert references.load(work, TAISOFT).error(path) < 5e-4
 
 
-def test_taisoft_does_a_work():
+def test_adapter_of_taisoft():
     work = small_drop()
     session = own.Run(work, Setting("taisoft", TAISOFT, "velocity_verlet", 4, {"precision": "f64"}))
     positions, seconds = session.run(follow=True)
@@ -288,7 +288,7 @@ def adapter(name: str):
     return program
 
 
-def test_mujoco_has_both_contacts_and_both_laws_at_several_steps():
+def test_mujoco_runs_with_both_contact_models_and_laws():
     from benchmarks.programs import mujoco_flex
 
     for work in scenes.WORKS:
@@ -297,13 +297,13 @@ def test_mujoco_has_both_contacts_and_both_laws_at_several_steps():
         assert {one.model for one in implicit} == {mujoco_flex.MODEL, mujoco_flex.NEO_HOOKEAN}
         assert any(one.method == "euler_staggered" for one in found)
         for contact in ("passive", "solref") if work.touches else ():
-            alike = [one for one in implicit if one.model == mujoco_flex.NEO_HOOKEAN and contact in one.options]
-            assert len({one.dt for one in alike}) >= 2
+            similar = [one for one in implicit if one.model == mujoco_flex.NEO_HOOKEAN and contact in one.options]
+            assert len({one.dt for one in similar}) >= 2
         assert len({str(one) + str(one.model) + str(one.dt) for one in found}) == len(found)
 
 
 @pytest.mark.parametrize("neo_hookean", [False, True])
-def test_mujocos_forces_are_those_of_its_law(neo_hookean):
+def test_forces_of_mujoco_agree_with_its_law(neo_hookean):
     program = adapter("mujoco_flex")
     mujoco = program.import_mujoco()
     work, model = small_drop(), program.NEO_HOOKEAN if neo_hookean else program.MODEL
@@ -320,7 +320,7 @@ def test_mujocos_forces_are_those_of_its_law(neo_hookean):
     assert session.model.flex_passive[0] == 1 and session.model.opt.solver == mujoco.mjtSolver.mjSOL_CG
 
 
-def test_mujoco_refuses_implicit_elasticity_elsewhere_than_in_discrete_steps():
+def test_mujoco_refuses_implicit_elasticity_except_in_discrete_steps():
     program = adapter("mujoco_flex")
     work = scenes.hanging_beam((12, 3, 3))
     (setting,) = (one for one in program.settings(work) if one.method == "implicitfast")
@@ -331,7 +331,7 @@ def test_mujoco_refuses_implicit_elasticity_elsewhere_than_in_discrete_steps():
 @pytest.mark.parametrize(
     "name, model", [("pybullet_soft", PYBULLET), ("newton_works", NEWTON), ("mujoco_flex", references.MUJOCO)]
 )
-def test_peers_fall_alike(name, model):
+def test_peers_start_and_fall_as_taisoft(name, model):
     program, work = adapter(name), small_drop()
     kinds = {(one.method, one.model, "passive" in one.options): one for one in program.settings(work) if "ipc" not in one.options}
     assert program.MODEL == model and model in {one.model for one in kinds.values()}
@@ -345,7 +345,7 @@ def test_peers_fall_alike(name, model):
         assert positions[3, :, 1].mean() == pytest.approx(fallen, abs=1.6e-3)  # half a step of 10 ms of the fall
 
 
-def test_newtons_explicit_steps_are_of_second_order():
+def test_explicit_steps_of_newton_are_second_order():
     program = adapter("newton_works")
     work = replace(scenes.hanging_beam((12, 3, 3)), seconds=0.3)
     reference, mass = references.load(work, program.EXPLICIT_MODEL), references.masses(work, program.EXPLICIT_MODEL)

@@ -1,10 +1,10 @@
-"""The report measured again; no test here asks how fast anything is:
+"""The reproduction of the report. No test here checks speed:
 
-* a verdict follows from its claims, and each experiment's claims flip with the numbers that they are about;
-* exponents are those of made-up laws; what runs show of the stable step is that law, on cubes that are really run;
-* the interpreted loop finds the deepest point of a triangle in a known distance, and on a scene that of the compiled search;
-* the page holds what was measured, with its pictures; what cannot be measured is said, and is the exit status;
-* a second run tells which times have not come again, and a run that is no whole one writes nothing unasked.
+* a verdict follows from its claims, and the claims of each experiment depend on its numbers;
+* exponents are those of made-up laws, and the law of the stable step follows from real runs;
+* the interpreted loop finds the deepest point of a triangle in a known distance, and that of the compiled search in a scene;
+* the page has the results and pictures; what cannot be measured is reported, and sets the exit status;
+* a second run is compared with the first, and a partial run writes only to a given folder.
 """
 
 import json
@@ -68,16 +68,16 @@ def test_exponents_are_those_of_the_law():
     assert 1.9 < p < 2.1 and 0.05 < off < 0.1
 
 
-def test_less_is_clear_only_beyond_the_spread():
+def test_differences_within_the_spread_are_unclear():
     assert clearly_less(rounds(1.0), rounds(1.1)) and not clearly_less(rounds(1.0), rounds(1.005))
     assert not clearly_less(rounds(1.1), rounds(1.0))
 
 
-# --- the claims of each experiment --------------------------------------------------------------------------------------
+# --- claims --------------------------------------------------------------------------------------
 
 
 def limits(power: float) -> tuple[list[bound.Limit], ...]:
-    """Of a law dt ~ h^power (density / E)^1/2, as `claims_of` takes them."""
+    """Limits of a law dt ~ h^power (density / E)^1/2, as arguments of `claims_of`."""
 
     def made(cells=3, young=1e6, density=1e3) -> bound.Limit:
         dt = (1.0 / cells) ** power * (density / young) ** 0.5
@@ -87,20 +87,20 @@ def limits(power: float) -> tuple[list[bound.Limit], ...]:
     return youngs, [made(cells=n) for n in (2, 4, 8)], [made(density=d) for d in (1e2, 1e4)]
 
 
-def test_the_bound():
+def test_claims_on_the_stable_step():
     runs = [bound.Long("symplectic_euler", 1e6, f, 1.0 if f < 1 else np.inf, "ok" if f < 1 else "failed") for f in (0.5, 2.0)]
     runs += [bound.Long("implicit_euler", 1e6, f, 1.0, "ok") for f in (1.0, 100.0)]
     claims = bound.claims_of(*limits(1.0), runs)
     assert holds(claims) == [True, True, False, True, True] and "h^1.00" in claims[2].found and "1.0%" in claims[0].found
     assert holds(bound.claims_of(*limits(2.0), runs))[2]
     youngs, sizes, densities = limits(1.0)
-    stuck = [replace(x, measured=1.0) for x in youngs]
-    assert not bound.claims_of(stuck, sizes, densities, runs)[0].holds
-    wild = [*runs[:3], replace(runs[3], reach=40.0)]
-    assert holds(bound.claims_of(*limits(1.0), wild)) == [True, True, False, True, False]
-    assert "E = 1e+06 Pa at 100: reach 40" in bound.claims_of(*limits(1.0), wild)[4].found
-    tame = [runs[0], replace(runs[1], reach=1.0), *runs[2:]]
-    assert not bound.claims_of(*limits(1.0), tame)[3].holds
+    constant = [replace(x, measured=1.0) for x in youngs]
+    assert not bound.claims_of(constant, sizes, densities, runs)[0].holds
+    large = [*runs[:3], replace(runs[3], reach=40.0)]
+    assert holds(bound.claims_of(*limits(1.0), large)) == [True, True, False, True, False]
+    assert "E = 1e+06 Pa at 100: reach 40" in bound.claims_of(*limits(1.0), large)[4].found
+    stable = [runs[0], replace(runs[1], reach=1.0), *runs[2:]]
+    assert not bound.claims_of(*limits(1.0), stable)[3].holds
 
 
 def sweep(tets: int, hashed: float, tree: float) -> Sweep:
@@ -112,7 +112,7 @@ def film_of(**numbers) -> SearchFilm:
     return SearchFilm("cubes", "proximity", 1250, True, {name: list(values) for name, values in numbers.items()})
 
 
-def test_broad_phases():
+def test_claims_on_broad_phases():
     before = film_of(**{HASH: (1.0, 1.1), TREES[-1]: (2.0, 2.1)})
     crossing = [sweep(1000, 2.0, 1.0), sweep(5000, 1.5, 1.2), sweep(12000, 2.0, 2.6), sweep(80000, 3.0, 9.0)]
     assert holds(search.broad_claims(before, crossing)) == [True, True, True]
@@ -123,7 +123,7 @@ def test_broad_phases():
     assert holds(search.broad_claims(before, early)) == [True, False, False]
 
 
-def test_cells():
+def test_claims_on_cell_sizes():
     def cells(best: float) -> list[Sweep]:
         return [replace(sweep(1250, 1.0 + abs(np.log(r / best)), 1.0), at=r, setup="cubes 5") for r in (0.5, 2.2, 6.0)]
 
@@ -131,7 +131,7 @@ def test_cells():
     assert holds(search.cell_claims(cells(0.5))) == [False, False]
 
 
-def test_reductions():
+def test_claims_on_reductions():
     def row(found: int, fast: float, slow: float) -> Row:
         phases_ = dict.fromkeys(PHASES, rounds(1.0)) | {"reduction": rounds(fast)}
         return Row("pile", "proximity", 10 * found, found=found, phases=phases_, quadratic=rounds(slow), same=True)
@@ -155,7 +155,7 @@ def measured(where: str, per_tet: float, plain_seconds: float, first: float = 9.
     return points.Measured(where, [rounds(per_tet)] * 3, sizes, [rounds(plain_seconds)] * 3)
 
 
-def test_contact_points():
+def test_claims_on_contact_points():
     many, one = measured("2 threads", 1e-7, 1e-3), measured("1 thread", 2e-7, 1e-3)
     claims = points.claims_of(many, one)
     assert holds(claims) == [True, False, True, False] and "tets^1.00" in claims[3].found and "2.00" in claims[1].found
@@ -167,21 +167,21 @@ def test_contact_points():
     assert points.claims_of(measured("2 threads", 1e-7, 2e-3), measured("1 thread", 1e-3, 2e-3))[1].holds
 
 
-def shares(search: float, points_: float, reduced: float) -> list[phases.Shares]:
+def fractions(search: float, points_: float, reduced: float) -> list[phases.Shares]:
     parts = dict.fromkeys((*PHASES, phases.OTHER, *PARTS, REST), [0.01])
     parts.pop(phases.SEARCH)
     parts |= {phases.POINTS: [search * points_], "reduction": [reduced], "candidates": [reduced], REST: [1.0 - search]}
     return [phases.Shares(*phases.REPORTS_WAY, 1e-3, parts)]
 
 
-def test_phases():
-    assert holds(phases.claims_of(shares(0.8, 0.9, 0.4))) == [True, False, True]
-    assert holds(phases.claims_of(shares(0.8, 0.9, 0.01))) == [True, True, False]
-    assert holds(phases.claims_of(shares(0.2, 0.9, 0.01))) == [False, True, False]
-    assert shares(0.8, 0.9, 0.1)[0].search == pytest.approx(0.94 / 1.17)  # medians of 0.72, 0.2, two and three of 0.01
+def test_claims_on_phases():
+    assert holds(phases.claims_of(fractions(0.8, 0.9, 0.4))) == [True, False, True]
+    assert holds(phases.claims_of(fractions(0.8, 0.9, 0.01))) == [True, True, False]
+    assert holds(phases.claims_of(fractions(0.2, 0.9, 0.01))) == [False, True, False]
+    assert fractions(0.8, 0.9, 0.1)[0].search == pytest.approx(0.94 / 1.17)  # medians of 0.72, 0.2, two and three of 0.01
 
 
-def test_colours():
+def test_claims_on_colours():
     def made(contacts: int, greedy: int, random: tuple) -> list[Colouring]:
         numbers = {"greedy": [greedy], "random": list(random), "parallel": [greedy]}
         return [Colouring("two", way, contacts, 9, n, [1], [1.0]) for way, n in numbers.items()]
@@ -190,7 +190,7 @@ def test_colours():
     assert holds(solvers.colour_claims(made(72, 10, (10, 10)))) == [False, False, False, False]
 
 
-def test_solvers():
+def test_claims_on_solvers():
     def film(contacts: int, **of) -> Film:
         made = Film("cube_on_box", 215, 1e-3, 1e-2, [0.1, 0.2], [contacts] * 2, [contacts] * 2)
         for name, (sweeps, seconds) in of.items():
@@ -216,13 +216,13 @@ def test_solvers():
     assert holds(claims) == [False, False, False, False, False, False]
 
 
-def test_hours():
+def test_claim_on_hours():
     assert demos.hours_claim(5 * 3600.0, 4.0).holds
     claim = demos.hours_claim(36.0, 4.0)
     assert not claim.holds and "1,000 times less" in claim.found
 
 
-# --- the interpreted loop -------------------------------------------------------------------------------------------------
+# --- interpreted loop -------------------------------------------------------------------------------------------------
 
 
 def grid_of(phi) -> SdfGrid:
@@ -239,14 +239,14 @@ def test_the_interpreted_loop_finds_the_deepest_point():
     w, phi = points.deepest_point(flat, corners)
     assert np.array_equal(w, (0, 0, 1)) and phi == pytest.approx((corners @ slope - 0.1).min())
     ball = grid_of(lambda X: np.linalg.norm(X, axis=-1) - 0.5)
-    around = np.array([(0.4, 0.3, 0.0), (-0.4, 0.3, 0.1), (0.0, 0.3, -0.5)])
-    w, phi = points.deepest_point(ball, around)
-    rng = np.random.default_rng(0).dirichlet((1, 1, 1), 4000)
-    least = min(points.sample(ball, X)[0] for X in rng @ around)
-    assert least - 1e-9 <= phi <= least + 0.01 and w.min() >= 0 and w.sum() == pytest.approx(1.0)
+    corners = np.array([(0.4, 0.3, 0.0), (-0.4, 0.3, 0.1), (0.0, 0.3, -0.5)])
+    w, phi = points.deepest_point(ball, corners)
+    samples = np.random.default_rng(0).dirichlet((1, 1, 1), 4000) @ corners
+    lowest = min(points.sample(ball, X)[0] for X in samples)
+    assert lowest - 1e-9 <= phi <= lowest + 0.01 and w.min() >= 0 and w.sum() == pytest.approx(1.0)
 
 
-def test_the_interpreted_loop_does_what_the_search_does():
+def test_the_interpreted_loop_agrees_with_the_search():
     runtime = open_runtime("cpu", "f32", "a test of the report")
     try:
         with Rig(cubes_setup(2), points.CONTACT_MODES, runtime) as rig:
@@ -260,17 +260,17 @@ def test_the_interpreted_loop_does_what_the_search_does():
     assert len(made.seconds) == 2 and made.plain and made.tets == 80
 
 
-def test_one_thread_is_one_thread():
+def test_one_thread_is_measured_in_a_child():
     assert points.measure_on_one_thread(quick=True).where == "1 thread"
 
 
-def test_a_child_that_fails_is_told(monkeypatch):
+def test_the_error_of_a_child_is_reported(monkeypatch):
     monkeypatch.setattr(points, "CHILD", "raise SystemExit('no thread for {!r}')")
     with pytest.raises(SimulationError, match="no thread for True"):
         points.measure_on_one_thread(quick=True)
 
 
-# --- the page ---------------------------------------------------------------------------------------------------------------
+# --- page ---------------------------------------------------------------------------------------------------------------
 
 
 def fake(seconds: float) -> Part:
@@ -287,7 +287,7 @@ def faked(monkeypatch):
     return made
 
 
-def test_the_page_holds_what_was_measured(faked, tmp_path):
+def test_the_page_has_the_results(faked, tmp_path):
     assert report.main(["--out", str(tmp_path / "page")]) == 0
     text = (tmp_path / "page" / "README.md").read_text()
     assert "## A bound" in text and f"**{PARTLY}**" in text and "![b](b.png)" in text and "1 of 2" in text
@@ -297,23 +297,23 @@ def test_the_page_holds_what_was_measured(faked, tmp_path):
     assert numbers["parts"][0]["verdict"] == PARTLY and numbers["parts"][0]["times"]["a step"]["median"] == 1.0
 
 
-def test_a_second_run_is_held_against_the_first(faked, tmp_path):
-    for seconds, told in ((1.0, "no earlier run"), (1.01, "1 of 1 times agree"), (2.0, "0 of 1 times agree")):
+def test_a_second_run_is_compared_with_the_first(faked, tmp_path):
+    for seconds, text in ((1.0, "no earlier run"), (1.01, "1 of 1 times agree"), (2.0, "0 of 1 times agree")):
         faked["seconds"] = seconds
         assert report.main(["--out", str(tmp_path)]) == 0
-        assert told in (tmp_path / "README.md").read_text()
+        assert text in (tmp_path / "README.md").read_text()
     assert "1.98" in (tmp_path / "README.md").read_text()  # 2 over 1.01
     assert report.main(["--quick", "--out", str(tmp_path)]) == 0
     assert "another quick" in (tmp_path / "README.md").read_text()
 
 
-def test_agreement_is_within_both_spreads():
+def test_times_agree_within_both_spreads():
     one, two = ({"median": m, "spread": s} for m, s in ((1.0, 0.1), (1.25, 0.1)))
     assert not agrees(one, two) and agrees(one, two | {"spread": 0.2})
     assert "no earlier run" in again_text(None, {}, {})
 
 
-def test_what_cannot_be_measured_is_said(monkeypatch, tmp_path):
+def test_a_failed_part_is_reported(monkeypatch, tmp_path):
     def broken(extent):
         raise SimulationError("no such thing")
 
@@ -324,7 +324,7 @@ def test_what_cannot_be_measured_is_said(monkeypatch, tmp_path):
     assert "Nothing" in short_text([]) and MISSING in part_text(Part("a", "A", "", "", failure="gone"))
 
 
-def test_a_part_of_a_run_writes_nothing_unasked(faked, tmp_path, monkeypatch, capsys):
+def test_partial_runs_write_only_to_a_given_folder(faked, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(document, "RESULTS", tmp_path)
     assert report.main(["--quick"]) == 0 and report.main(["--only", "bound"]) == 0
     assert not list(tmp_path.iterdir()) and "A bound" in capsys.readouterr().out
@@ -334,8 +334,8 @@ def test_a_part_of_a_run_writes_nothing_unasked(faked, tmp_path, monkeypatch, ca
         report.main(["--out", str(tmp_path / "file")])
 
 
-def test_the_bound_is_run_and_written(monkeypatch, tmp_path):
-    """A real experiment, smaller than any other: the law comes out of steps that are run."""
+def test_the_stable_step_is_measured(monkeypatch, tmp_path):
+    """A real experiment, smaller than any other."""
     for name, value in (("YOUNGS", ((), (1e5, 1e7))), ("CELLS", ((), (2, 3))), ("AROUND", (0.5, 1.2)), ("FACTORS", (1.0, 100.0))):
         monkeypatch.setattr(bound, name, value)
     assert report.main(["--quick", "--only", "bound", "--out", str(tmp_path)]) == 0

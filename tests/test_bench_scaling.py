@@ -1,10 +1,10 @@
-"""The benchmark of scaling, on tiny meshes and on numbers made up; no test here asks how fast anything is:
+"""The scaling benchmark, on tiny meshes and made-up numbers. No test here checks speed:
 
-* exponents are those of power laws, and unknown from one mesh;
-* the bytes that a step moves at least are what a count by hand gives, of fields that every kind of step has;
-* groups of fields add up to all fields, and a copy on fewer threads does not stand against work on more;
-* a row of each kind has times, phases that make up a step, counts and memory;
-* children answer or their last line says why not; the whole prints, writes and draws, and a failure is the exit status.
+* exponents are those of power laws, and NaN from one mesh;
+* the least bytes moved by a step agree with a count by hand, and every kind of step has the fields counted;
+* groups of fields add up to all fields, and a copy is compared only with work on as many threads;
+* a row of each kind has times, phases that add up to a step, counts and memory;
+* child processes return numbers or an error; the benchmark prints, writes and plots, and a failure sets the exit status.
 """
 
 import json
@@ -26,14 +26,14 @@ from taisoft.errors import OutputError
 
 
 def row(kind="implicit", tets=1000, seconds=1.0, **more) -> Row:
-    """A row with times."""
+    """A row with made-up times."""
     found = {"samples": [seconds] * 3, "phases": {"a": 0.75 * seconds, "b": 0.25 * seconds}, "counts": {"newton": 2.5}}
     found |= {"moved": 8.0 * tets, "field_bytes": {"matrix": 100 * tets}, "setup_seconds": 1e-6 * tets, "base": 10, "peak": 50}
     return Row(kind, "cpu", tets, 300, **found | more)
 
 
 def hashed(collision: str) -> ts.Scene:
-    """The smallest pile, searched by a spatial hash, as on CUDA."""
+    """The smallest pile, with a spatial hash, as on CUDA."""
     scene = pile(1, collision)
     scene.collision = ts.CollisionSettings(broad_phase="spatial_hash")
     return scene
@@ -44,8 +44,8 @@ def hashed(collision: str) -> ts.Scene:
 
 def test_exponents_are_those_of_power_laws():
     tets = [1000, 4000, 64_000]
-    some = [row(tets=n, seconds=1e-9 * n**1.25) for n in tets]
-    found = growths([*some, row("search"), row("search", samples=[], failure="no")])
+    rows = [row(tets=n, seconds=1e-9 * n**1.25) for n in tets]
+    found = growths([*rows, row("search"), row("search", samples=[], failure="no")])
     assert [g.kind for g in found] == ["implicit", "search"] and found[0].meshes == 3
     assert (found[0].step, found[0].step_at_last, found[0].setup, found[0].memory) == pytest.approx((1.25, 1.25, 1, 1))
     assert math.isnan(found[1].step) and math.isnan(exponent([1, 2], [0.0, 1.0])[0])
@@ -53,17 +53,17 @@ def test_exponents_are_those_of_power_laws():
     assert bent.step_at_last == pytest.approx(2) and 1 < bent.step < 2
 
 
-def test_bytes_of_an_explicit_step_are_those_counted_by_hand():
+def test_bytes_of_an_explicit_step_agree_with_a_count_by_hand():
     with ts.Simulator(beam(20), dt=1e-4, integrator="velocity_verlet") as sim:  # 4 x 1 x 1 cells
-        n, t, sizes = sim._dynamics.state.model.n_nodes, 20, sim.field_bytes
-        elements = 24 * n + t * (16 + 36 + 4 + 1) + 48 * t  # x; nodes, Dm_inv, volume, a body for four tets; corner
+        n, t, sizes = sim.scene.bodies[0].n_nodes, 20, sim.field_bytes
+        elements = 24 * n + t * (16 + 36 + 4 + 1) + 48 * t  # x; nodes, Dm_inv, volume, one body per four tets; element_force
         assert floor_bytes(["elements"], sizes) == elements
         drift, nodes = n * (24 + 12 + 12 + 24 + 12), 48 * t + 4 * (n + 1) + 16 * t + n * (4 + 12 + 12 + 12 + 12)
         assert floor_bytes(["drift", "elements", "nodes"], sizes) == drift + elements + nodes
         assert group_bytes(sim) == dict.fromkeys(GROUPS, 0) | {GROUPS[0]: sum(sizes.values())}
 
 
-def test_every_field_that_is_counted_is_there():
+def test_every_counted_field_exists():
     known: set[str] = set()
     for scene, integrator in ((beam(20), "bdf2"), (cubes_on_ground(10), "symplectic_euler"), (beam(20), "velocity_verlet")):
         with ts.Simulator(scene, dt=1e-5, integrator=integrator) as sim:
@@ -81,7 +81,7 @@ def test_every_field_that_is_counted_is_there():
     assert {name for loop in LOOPS.values() for names in loop for name in names} <= known
 
 
-def test_copies():
+def test_copy_rate_is_the_best_on_at_most_as_many_threads():
     copies = measure_copy("cpu", 2**20)
     assert {copy.by for copy in copies} == {"NumPy", "Taichi"} and all(copy.rate > 0 for copy in copies)
     made_up = [Copy("a", 1, 5.0), Copy("b", 1, 7.0), Copy("a", 4, 20.0)]
@@ -108,39 +108,39 @@ def test_a_row_of_each_kind(kind):
     assert Row(**json.loads(json.dumps(found.record()))) == found
 
 
-def test_tables_say_what_failed():
+def test_table_shows_failures():
     table = time_table([row(), row("search", tets=5, samples=[], failure="no luck")]).splitlines()
     cells = [cell.strip() for cell in table[2].split("|")[1:-1]]
     assert cells[:7] == ["implicit", "1,000", "1", "1000", "0.0%", "1e+06", "2.5 newton"]
     assert table[-1] == "* search, 5 tets: no luck"
 
 
-# --- the whole --------------------------------------------------------------------------------------------------------
+# --- command --------------------------------------------------------------------------------------------------------
 
 
-def test_a_child_answers_or_its_last_line_says_why_not():
+def test_a_child_answers_with_a_row_or_an_error():
     found = scaling.ask(f"{EXPLICIT}:20", "cpu")
     assert Row(**found).tets == 20 and found["samples"]
     assert "nonsense" in scaling.ask("nonsense:20", "cpu")
 
 
-def test_one_thread_is_measured_where_several_were_taken(monkeypatch):
-    asked = []
+def test_one_thread_is_measured_where_several_were_used(monkeypatch):
+    jobs = []
 
     def ask(job, arch):
-        asked.append(job)
+        jobs.append(job)
         kind, _, size = job.rpartition(":")
         return row(kind, int(size), threads=2 if int(size) > 50 and kind != ON_ONE else 1).record()
 
     monkeypatch.setattr(scaling, "ask", ask)
     rows = list(scaling.measure_all(list(KINDS), [10, 100], "cpu"))
-    assert [job for job in asked if job.startswith(ON_ONE)] == [f"{ON_ONE}:100"] and len(rows) == len(asked) == 2 * len(KINDS) - 1
-    asked.clear()
+    assert [job for job in jobs if job.startswith(ON_ONE)] == [f"{ON_ONE}:100"] and len(rows) == len(jobs) == 2 * len(KINDS) - 1
+    jobs.clear()
     list(scaling.measure_all(list(KINDS), [10, 100], "cuda"))
-    assert not [job for job in asked if job.startswith(ON_ONE)]
+    assert not [job for job in jobs if job.startswith(ON_ONE)]
 
 
-def test_prints_writes_draws_and_tells(monkeypatch, tmp_path, capsys):
+def test_command_prints_writes_and_plots(monkeypatch, tmp_path, capsys):
     copies = [{"by": "NumPy", "threads": 1, "rate": 2e10}]
 
     def ask(job, arch):
@@ -169,7 +169,7 @@ def test_prints_writes_draws_and_tells(monkeypatch, tmp_path, capsys):
         scaling.main(["--arch", "cuda"])
 
 
-def test_sizes_are_near_those_asked_for():
+def test_meshes_have_about_the_requested_size():
     sizes = np.array([1000, 16_000, 64_000])
     beams = np.array([beam(n).bodies[0].mesh.n_tets for n in sizes])
     cubes = np.array([sum(b.mesh.n_tets for b in cubes_on_ground(n).bodies) for n in sizes])

@@ -1,10 +1,9 @@
-"""`taisoft bench startup`, and what it measures:
+"""`taisoft bench startup`:
 
-* a first simulator compiles, a second one and one of another size compile nothing, nor does a process with another mesh size;
-* so does a larger surface, unless another form of the search takes over; memory is measured over as many simulators as asked for;
-* versions take turns, at another mesh size each round; what is timed has the names of the limits;
-* the page tells waiting, counts and limits; a child that fails is named;
-* a first run on a machine says so once; `taisoft warm` leaves kernels in the cache.
+* the first simulator compiles; another one, of any size and also in another process, compiles nothing;
+* a larger surface compiles nothing, unless detection switches to parallel kernels; memory is measured over many simulators;
+* versions are measured alternately, at another mesh size each round; timed calls have the names of the limits;
+* the page has times, counts and limits; a child process that fails is named.
 """
 
 import json
@@ -25,7 +24,7 @@ def version(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name, cells, other", [("beam", 1, 2), ("cube", 1, 2)])
-def test_nothing_compiles_twice(version, name, cells, other):
+def test_only_the_first_simulator_compiles(version, name, cells, other):
     found, times = startup.ask(version, "again", name, cells, other)
     assert found["first"]["compiled"] > 0 and found["second"]["compiled"] == found["other size"]["compiled"] == 0
     assert times["wall"] > found["first"]["wall"] > found["second"]["wall"]
@@ -34,34 +33,35 @@ def test_nothing_compiles_twice(version, name, cells, other):
     assert before and version.files() == before
 
 
-@pytest.mark.filterwarnings("ignore:body")  # too few tets through the thickness, on purpose
-def test_a_step_is_a_step():
+@pytest.mark.filterwarnings("ignore:body")  # few tets through the thickness
+def test_walk_takes_the_given_steps():
     with startup_child.ts.Simulator(startup_child.cube(1), **startup_child.SCENES["cube"][1]) as sim:
         startup_child.walk(sim, 3)
         assert sim.step_count == 3
 
 
-def test_a_larger_surface(version):
-    few, again, many, more = startup.ask(version, "surfaces", *startup.TASKS["surfaces"][0])[0].items()
-    assert (few[0], many[0]) == ("224 triangles", startup.CROSSING) and few[1] > many[1] > 0 == again[1] == more[1]
+def test_a_larger_surface_compiles_only_parallel_detection(version):
+    first, second, crossing, last = startup.ask(version, "surfaces", *startup.TASKS["surfaces"][0])[0].items()
+    assert (first[0], crossing[0]) == ("224 triangles", startup.CROSSING)
+    assert first[1] > crossing[1] > 0 == second[1] == last[1]
 
 
-def test_memory_of_simulators(version):
+def test_memory_of_simulators_is_measured(version):
     for task in (("grow", "cube", 1, 1), ("keep", 1, 1)):
         found = startup.ask(version, *task)[0]
         assert found["times"] == 1 and 0 < found["start"] < 2 * found["end"]
 
 
-def test_speed(version, monkeypatch):
+def test_speed_has_the_names_of_the_limits(version, monkeypatch):
     monkeypatch.setattr(startup, "SPEED_SHEETS", (2, 3))
     labels = {f"{what}, {startup_child.triangles(n)}" for what in ("search", "contact step") for n in (2, 3)}
-    wanted = {name for name in startup.SLOWER if "triangles" not in name} | labels
-    monkeypatch.setattr(startup, "SLOWER", wanted)
+    names = {name for name in startup.SLOWER if "triangles" not in name} | labels
+    monkeypatch.setattr(startup, "SLOWER", names)
     (found,) = startup.measure_speed([version], quick=True)
-    assert found.keys() == wanted and all(len(seconds) == 1 and seconds[0] > 0 for seconds in found.values())
+    assert found.keys() == names and all(len(seconds) == 1 and seconds[0] > 0 for seconds in found.values())
 
 
-@pytest.mark.filterwarnings("ignore:body")  # too few tets through the thickness, on purpose
+@pytest.mark.filterwarnings("ignore:body")  # few tets through the thickness
 def test_sheets_have_the_sizes_of_the_limits():
     for cells in startup.SPEED_SHEETS:
         assert f"search, {startup_child.triangles(cells)}" in startup.SLOWER
@@ -70,7 +70,7 @@ def test_sheets_have_the_sizes_of_the_limits():
 
 
 class Recorded:
-    """A version that notes its tasks, of seconds that double from task to task."""
+    """A version that records its tasks; each takes twice the time of the one before."""
 
     def __init__(self, name: str, tasks: list):
         self.name, self.tasks = name, tasks
@@ -83,7 +83,7 @@ class Recorded:
         return {len(self.tasks)} if self.name == "old" else set()
 
 
-def test_versions_take_turns(monkeypatch):
+def test_versions_are_measured_alternately(monkeypatch):
     tasks: list = []
     monkeypatch.setattr(startup, "ask", lambda version, *task: version.ask(*task))
     new, old = startup.measure_waiting([Recorded("new", tasks), Recorded("old", tasks)], "cube", quick=False)
@@ -93,7 +93,7 @@ def test_versions_take_turns(monkeypatch):
     assert startup.ratio(*(one[startup.OTHER]["walls"] for one in (new, old))) == 0.5
 
 
-def test_a_child_that_fails(version):
+def test_a_failing_child_is_named(version):
     with pytest.raises(SimulationError, match="task first nobody 1 ended with status 1: KeyError: 'nobody'"):
         startup.ask(version, "first", "nobody", 1)
 
@@ -121,7 +121,7 @@ def numbers(seconds: float, compiled: int) -> dict:
     }
 
 
-def test_the_page(monkeypatch, tmp_path, capsys):
+def test_page_and_exit_status(monkeypatch, tmp_path, capsys):
     found = {ROOT: numbers(0.5, 0), tmp_path: numbers(10.0, 3)}
     monkeypatch.setattr(startup, "measure", lambda versions, quick: [found[version.folder] for version in versions])
     out = tmp_path / "page.json"

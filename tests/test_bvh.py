@@ -1,12 +1,13 @@
-"""Candidates by trees, over 200 scenes of random triangles (large, needles, points, shared vertices), sheets, a mesh that nothing
-soft can lie in, a collider without faces, moved at random, swept, flown off and with NaN in them:
+"""Candidate pairs by bounding volume hierarchies, over 200 random scenes.
 
-* each triangle is in one leaf, children are within their parent, trees are balanced, chunks cover them once;
-* with k = 6 the candidates are the brute-force set, and the spatial hash's, serial with f64 and parallel with f32
-  as the precision of the rest;
-* with k = 14 and 18 they are some of these, fewer, and hold every pair that comes within the margin;
-* the size of the chunks does not change them;
-* small buffers grow to the same result, and stop with both numbers where they may not.
+Colliders are random triangles (large, needles, points, shared vertices), sheets, and a collider without faces; they are moved at
+random, swept, sent far away and made not finite.
+
+* each triangle is in one leaf, children lie within their parent, trees are balanced, and chunks cover each triangle once;
+* with k = 6 the candidates are those by brute force and by spatial hash, serial in f64 and parallel in f32;
+* with k = 14 and 18 they are a proper subset that contains every pair within the margin;
+* the chunk size does not change them;
+* small buffers grow to the same result, or raise an error with the size needed and the limit.
 """
 
 import numpy as np
@@ -22,14 +23,14 @@ SINGLE = (np.array([[0.4, 0.5, 0.5], [0.6, 0.5, 0.5], [0.5, 0.6, 0.7]]), np.arra
 
 
 def colliders(rng) -> dict:
-    """Soft: two soups, of which one hits itself, a sheet, one triangle, and no faces at all. Obstacles: two sheets, none."""
+    """Soft bodies: two triangle soups, a sheet, an empty mesh, one triangle. Obstacles: two sheets, an empty mesh."""
     parts = [soup(rng, 110), soup(rng, 70, 0.1), sheet(4), EMPTY, SINGLE, sheet(3), sheet(2), EMPTY]
     soft = np.arange(8) < 5
     return {"parts": parts, "soft": soft, "self_on": [True, False, True, True, False, False, False, False]}
 
 
 def scatter(rng, made, kind: int) -> None:
-    """Place the vertices anew: shaken, turned upside down, swept, flown far off, not finite."""
+    """Move the vertices: at random, permuted, swept, far away, or not finite."""
     x = made.x0 + 0.1 * rng.standard_normal(made.x0.shape)
     if kind % 5 == 1:
         x = rng.permutation(x)
@@ -63,7 +64,7 @@ def rig(request):
 
 
 def _arena(made):
-    """Fields of another broad phase: each has its own names."""
+    """Fields of another broad phase, since names are unique in an arena."""
     made.others = [*getattr(made, "others", []), type(made.arena)()]
     return made.others[-1]
 
@@ -73,7 +74,7 @@ def found(made, k: int) -> np.ndarray:
     return pairs_of(made.trees[k].find())
 
 
-def test_candidates_are_the_brute_force_set(rig):
+def test_candidates_agree_with_brute_force(rig):
     rng = np.random.default_rng(2)
     total = 0
     scenes = 200 if rig.surface.serial else 30
@@ -87,7 +88,7 @@ def test_candidates_are_the_brute_force_set(rig):
     assert total > scenes * 500
 
 
-def test_more_slabs_drop_only_what_is_apart(rig):
+def test_more_slabs_drop_only_separated_pairs(rig):
     rng = np.random.default_rng(3)
     w = np.concatenate([np.eye(3), (np.eye(3) + np.roll(np.eye(3), 1, axis=1)) / 2, rng.dirichlet(np.ones(3), 6)])
     t, counts = rig.topology.triangle, dict.fromkeys((6, 14, 18, "near"), 0)
@@ -96,7 +97,7 @@ def test_more_slabs_drop_only_what_is_apart(rig):
         pairs = {k: found(rig, k) for k in DIRECTIONS}
         near = np.zeros(len(pairs[6]), dtype=bool)
         for x in (rig.x, rig.x + rig.move):
-            points = np.einsum("pc,tcd->tpd", w, x[t])  # of a pair in these, the distance is at most theirs
+            points = np.einsum("pc,tcd->tpd", w, x[t])  # their distance bounds that of the pair
             with np.errstate(over="ignore"):
                 apart = np.linalg.norm(points[pairs[6][:, 0], :, None] - points[pairs[6][:, 1], None], axis=3)
             near |= apart.min(axis=(1, 2)) < rig.margin * (1 - 1e-12)
@@ -109,7 +110,7 @@ def test_more_slabs_drop_only_what_is_apart(rig):
     assert max(counts[14], counts[18]) < 0.95 * counts[6] and counts["near"] > 1000
 
 
-def test_refit_encloses(rig):
+def test_refitted_boxes_enclose_their_children(rig):
     rng = np.random.default_rng(4)
     for kind in (0, 2):
         scatter(rng, rig, kind)
@@ -134,8 +135,8 @@ def test_chunk_size_does_not_change_the_candidates(rig):
         tree.release()
 
 
-def test_levels_refitted_in_parallel(rig):
-    """As on CUDA, where a loop over the nodes above the chunks, one after the other, would take long."""
+def test_refit_by_levels(rig):
+    """As on CUDA, where a serial loop over the nodes above the chunks would be slow."""
     scatter(np.random.default_rng(6), rig, 0)
     tree = Bvh(rig.surface, rig.topology, rig.x0, rig.margin, rig.machine, _arena(rig), leaves=2)
     first = tree.tables.top_first
@@ -147,7 +148,7 @@ def test_levels_refitted_in_parallel(rig):
     tree.release()
 
 
-def test_buffers_grow_or_stop(rig):
+def test_buffers_grow_up_to_the_limit(rig):
     scatter(np.random.default_rng(7), rig, 0)
     expected = brute_pairs(rig)
     tree = Bvh(rig.surface, rig.topology, rig.x0, rig.margin, rig.machine, _arena(rig), capacity=64)
@@ -165,7 +166,7 @@ def test_trees_hold_every_triangle_once(leaves):
     counts = np.array([0, 1, 2, 3, 100, 0, 257, 64, 5])
     first = np.concatenate([[0], np.cumsum(counts)])
     centroid = rng.standard_normal((first[-1], 3))
-    centroid[10:40] = centroid[10]  # equal ones
+    centroid[10:40] = centroid[10]
     centroid[50] = np.nan
     t = build_trees(centroid, first, leaves)
     assert len(t.link) == sum(2 * n - 1 for n in counts if n)
@@ -181,19 +182,19 @@ def test_trees_hold_every_triangle_once(leaves):
     for k, n in enumerate(counts):
         assert (t.root[k] < 0) == (n == 0)
         if n:
-            inside, depth = triangles(t.root[k])
-            assert sorted(inside) == list(range(first[k], first[k + 1])) and depth == np.ceil(np.log2(n))
+            found, depth = triangles(t.root[k])
+            assert sorted(found) == list(range(first[k], first[k + 1])) and depth == np.ceil(np.log2(n))
     covered = []
     for node in t.chunk:
-        inside, _ = triangles(node)
-        body = np.searchsorted(first, min(inside), side="right") - 1
-        assert len(inside) <= leaves and max(inside) < first[body + 1]
-        covered += inside
+        found, _ = triangles(node)
+        body = np.searchsorted(first, min(found), side="right") - 1
+        assert len(found) <= leaves and max(found) < first[body + 1]
+        covered += found
     assert sorted(covered) == list(range(first[-1]))
     above = {i for i in np.flatnonzero(t.link > 0) if (t.link[i] + 1) // 2 > leaves}
     assert set(t.top) == above and len(t.top) == len(above) == t.top_first[-1]
     place_of = {node: i for i, node in enumerate(t.top)}
-    for node in t.top:  # a parent comes in a later level than its children
+    for node in t.top:  # a parent is in a later level than its children
         for child in (node + 1, node + 2 * ((t.link[node] + 3) // 4)):
             if child in place_of:
                 level = np.searchsorted(t.top_first, [place_of[child], place_of[node]], side="right")

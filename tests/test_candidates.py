@@ -1,8 +1,8 @@
-"""What broad phases share, serial and parallel, f32 and f64 as the precision of the rest:
+"""The common parts of the broad phases, serial and parallel, in f32 and f64:
 
-* the list of active triangles is that of those whose box meets the box of another collider that they may touch, in order;
-* a buffer counts what its largest part and all parts need; one that was too small has grown to hold it, and never beyond its
-  limit; where it may not grow so far it says what is needed, in how many parts, and what is allowed.
+* active triangles, in order, are those whose box overlaps the box of another collider that they may touch;
+* a buffer counts the entries needed by its largest part and by all parts, grows to hold them, and never exceeds its limit;
+* beyond the limit, the error gives the entries needed, the number of parts and the limit.
 """
 
 import numpy as np
@@ -33,17 +33,17 @@ def arena(rig):
     fields.release()
 
 
-def used_buffer(arena, needs: list[int], capacity: int, most: int | None) -> Buffer:
-    """A buffer of a part for each need."""
-    buffer = Buffer("things", entries, capacity, most, len(needs), arena)
+def used_buffer(arena, needs: list[int], capacity: int, limit: int | None) -> Buffer:
+    """A buffer with one part per need."""
+    buffer = Buffer("things", entries, capacity, limit, len(needs), arena)
     buffer.used.from_numpy(np.array(needs, dtype=np.int32))
     buffer.count.from_numpy(np.array([max(needs), sum(needs)]))
     return buffer
 
 
-def test_active_triangles(rig):
+def test_active_triangles_are_those_whose_boxes_overlap(rig):
     rng = np.random.default_rng(2)
-    parts = 0
+    partly_active = 0
     for kind in range(20):
         scatter(rng, rig, kind)
         apart = np.repeat(0.6 * rng.standard_normal((rig.surface.n_bodies, 3)), np.diff(rig.topology.vertex_first), axis=0)
@@ -51,16 +51,16 @@ def test_active_triangles(rig):
         lo, hi = rig.surface.lo.to_numpy(), rig.surface.hi.to_numpy()
         body, soft, n = rig.topology.body, rig.soft, rig.surface.n_bodies
         own = body[:, None] == np.arange(n)
-        body_lo = np.array([lo[of].min(axis=0, initial=np.inf) for of in own.T])
-        body_hi = np.array([hi[of].max(axis=0, initial=-np.inf) for of in own.T])
-        meets = (lo[:, None] <= body_hi).all(axis=2) & (body_lo <= hi[:, None]).all(axis=2) & (lo <= hi).all(axis=1)[:, None]
-        counts = ~own & (soft[body][:, None] | soft)
-        expected = np.flatnonzero((meets & counts).any(axis=1) | (meets & own & rig.self_on[body][:, None]).any(axis=1))
+        body_lo = np.array([lo[rows].min(axis=0, initial=np.inf) for rows in own.T])
+        body_hi = np.array([hi[rows].max(axis=0, initial=-np.inf) for rows in own.T])
+        overlaps = (lo[:, None] <= body_hi).all(axis=2) & (body_lo <= hi[:, None]).all(axis=2) & (lo <= hi).all(axis=1)[:, None]
+        may_touch = ~own & (soft[body][:, None] | soft)
+        expected = np.flatnonzero((overlaps & may_touch).any(axis=1) | (overlaps & own & rig.self_on[body][:, None]).any(axis=1))
         active = rig.surface.active.to_numpy()[: rig.surface.count[ACTIVE]]
         assert np.array_equal(active, expected)
         assert np.isin(brute_pairs(rig), active).all()
-        parts += 0 < len(active) < rig.surface.n_triangles
-    assert parts > 10
+        partly_active += 0 < len(active) < rig.surface.n_triangles
+    assert partly_active > 10
 
 
 def test_a_buffer_that_is_large_enough_stays(rig, arena):
@@ -72,7 +72,7 @@ def test_a_buffer_that_is_large_enough_stays(rig, arena):
     buffer.release()
 
 
-def test_a_buffer_grows_to_what_was_needed(rig, arena):
+def test_a_buffer_grows_to_the_need(rig, arena):
     buffer = used_buffer(arena, [6, 0, 40], 15, None)
     assert buffer.grow_if_full()
     assert (buffer.part, buffer.capacity, buffer.growths) == (60, 180, 1) and SLACK == 1.5
@@ -92,16 +92,16 @@ def test_a_buffer_stops_at_its_limit(rig, arena):
     buffer.release()
 
 
-@pytest.mark.parametrize("capacity, need, most", [(15, 40, 130), (16, 5, 16), (100, 1, 100)])
-def test_a_buffer_is_never_larger_than_its_limit(rig, arena, capacity, need, most):
-    """Parts of equal length: what is left over is not used."""
-    buffer = used_buffer(arena, [need, 0, 1], capacity, most)
+@pytest.mark.parametrize("capacity, need, limit", [(15, 40, 130), (16, 5, 16), (100, 1, 100)])
+def test_a_buffer_never_exceeds_its_limit(rig, arena, capacity, need, limit):
+    """Parts have equal length; the remainder is not used."""
+    buffer = used_buffer(arena, [need, 0, 1], capacity, limit)
     buffer.grow_if_full()
-    assert buffer.part >= need and buffer.capacity <= most
+    assert buffer.part >= need and buffer.capacity <= limit
     buffer.release()
 
 
-def test_what_is_asked_for_at_first_holds(rig, arena):
+def test_the_initial_capacity_is_at_least_the_requested_one(rig, arena):
     for capacity, chunks in ((0, 1), (64, 64), (64, 4096), (100, 64)):
         buffer = Buffer(f"things_{capacity}_{chunks}", pairs, capacity, None, chunks, arena)
         assert buffer.capacity >= max(capacity, chunks) and buffer.data.dtype == ti.i32 and buffer.data.n == 2
