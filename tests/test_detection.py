@@ -151,15 +151,12 @@ def test_states_that_are_not_finite_are_refused(precision):
 def small():
     """The contacts of the zoo at a thousandth of its size."""
     with simulator(zoo(1e-3)[0]) as sim:
-        return sim.detect_contacts()
+        found = sim.detect_contacts()
+    assert len(found) >= 12 and np.abs(found.point).max() < 2e-3
+    return found
 
 
-def test_a_thousandth_of_the_size(small):
-    """A test of its own, so that the kernels of the next tests are those compiled here."""
-    assert len(small) >= 12 and np.abs(small.point).max() < 2e-3
-
-
-def test_a_thousand_times_the_size(small):
+def test_contacts_scale_with_the_scene(small):
     with simulator(zoo(1e3)[0]) as sim:
         compare(small, sim.detect_contacts(), scale=1e6, size=1e3)
 
