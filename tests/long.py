@@ -8,16 +8,8 @@ LONG = {
     "test_arch": ("[cpu-",),
     "test_fuzz": ("[10000-",),
     "test_determinism": ("[cube_implicit]", "[cubes_"),
-    "test_faults": (
-        "test_failing_calls[others]",
-        "test_kills_while_files_are_replaced[100]",
-        "test_kills_during_runs[20]",
-        "[300000000",
-        "[body-implicit_euler]",
-        "[ground-",
-        "[nothing-implicit_euler]",
-        "test_growing_buffers",
-    ),
+    "test_faults": ("test_failing_calls[others]", "test_kills_while_files_are_replaced[100]", "test_kills_during_runs[20]"),
+    "test_faults_memory": ("[300000000", "[body-implicit_euler]", "[ground-", "[nothing-implicit_euler]", "test_growing_buffers"),
     "test_references": (
         "patch_test-",
         "column_self_weight-",
