@@ -8,16 +8,8 @@ LONG = {
     "test_arch": ("[cpu-",),
     "test_fuzz": ("[10000-",),
     "test_determinism": ("[cube_implicit]", "[cubes_"),
-    "test_faults": (
-        "test_a_disk_that_fails[others]",
-        "test_killed_while_files_are_replaced[100]",
-        "test_a_run_that_is_killed[20]",
-        "[300000000",
-        "[body-implicit_euler]",
-        "[ground-",
-        "[nothing-implicit_euler]",
-        "test_a_buffer_that_grows",
-    ),
+    "test_faults": ("test_failing_calls[others]", "test_kills_while_files_are_replaced[100]", "test_kills_during_runs[20]"),
+    "test_faults_memory": ("[300000000", "[body-implicit_euler]", "[ground-", "[nothing-implicit_euler]", "test_growing_buffers"),
     "test_references": (
         "patch_test-",
         "column_self_weight-",
@@ -38,7 +30,9 @@ LONG = {
         "test_parallel_kernels[velocity_verlet]",
         "test_explicit_steps_are_the_oracles[velocity_verlet]",
     ),
-    "test_contact_stepping": ("test_rest[bdf2-", "test_rest[velocity_verlet-"),
+    "test_contact_stepping": tuple(
+        f"test_contact_forces_balance_weight_at_rest[{name}" for name in ("implicit", "linearly", "bdf2", "velocity_verlet")
+    ),
     "test_simulator": ("[symplectic_euler-2]",),
     "test_restitution": ("test_ten_seconds", "test_single_precision", "test_explicit_steps"),
     "test_rebuild": ("test_another_contact_solver",),
@@ -72,11 +66,11 @@ LONG = {
     "test_collision_memory": ("test_nothing_is_out_of_bounds",),
     "test_single_precision": ("test_single_precision_follows[symplectic_euler]",),
     "test_prescribed_nodes": ("test_rigid_flight[bdf2]", "test_second_order_with_a_led_end[bdf2-implicit_midpoint]"),
-    "test_drag_spring": ("test_pulled_to_rest_and_back[bdf2-2]",),
+    "test_drag_spring": ("test_rests_at_the_static_equilibrium_and_returns[bdf2-2]",),
     "test_detection_runs": ("test_sweeps",),
     "test_stability": ("test_the_limit_is_where_steps_explode[velocity_verlet-",),
     "test_newton": ("[1]",),
-    "test_detection": ("test_a_thousandth_of_the_size", "TestZoo::test_all_kinds_are_there[f32]"),
+    "test_detection": ("TestZoo::test_all_kinds_of_contacts_are_found[f32]",),
     "test_bvh": ("[('f32', False)]",),
     "test_spatial_hash": ("[('f32', False)]",),
     "test_queries": ("[('f32', False)",),
@@ -93,7 +87,7 @@ LONG = {
         "test_refinement",
         "test_a_run_that_fails",
     ),
-    "test_crossings": ("test_all_pairs_by_separating_axes[f32-spatial_hash-False]",),
+    "test_crossings": ("test_crossings_equal_those_of_all_pairs[f32-spatial_hash-False]",),
     "test_self_collision": ("test_folded_sheets_against_ipctk[f32]",),
 }
 

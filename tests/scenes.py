@@ -51,6 +51,13 @@ def dynamics(scene: ts.Scene, **settings) -> Iterator[Dynamics]:
         made.release()
 
 
+def set_state(made: Dynamics, x: np.ndarray | None = None, v: np.ndarray | None = None) -> None:
+    """Set positions [m] or velocities [m/s] of all nodes, as `Simulator.set_state` does."""
+    now = made.state.state()
+    made.state.set_state(now[0] if x is None else x, now[1] if v is None else v)
+    made.state_changed()
+
+
 def element(order: int, quadrature_degree: int | None = None) -> dict:
     """Arguments of `add_body`; the degree counts for order 2 only."""
     return {"order": order, "quadrature_degree": quadrature_degree if order == 2 else None}

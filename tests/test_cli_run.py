@@ -1,10 +1,10 @@
 """`taisoft run`, from its first step on:
 
-* a run: exit status 0, and a report with every setting as resolved; 1 where the run failed;
-* output that cannot be written: exit status 3, and what was computed is still reported;
-* signals: the first saves and leaves with 130 or 143, one before the run or a second one leaves at once;
-* the README: its scene runs, from the command line and from Python, and so do the contacts of the manual;
-* a machine without display, home or working folder: a run, or one sentence.
+* runs: exit status 0, and a report with every resolved setting; 1 if the run failed;
+* output that cannot be written: exit status 3, and the results are still reported;
+* signals: the first one saves and exits with 130 or 143; one before the run, or a second one, exits immediately;
+* README: its scene runs from the command line and from Python, and so does the contact example of the manual;
+* a machine without display, home or working folder: a run, or one message.
 """
 
 import os
@@ -22,7 +22,7 @@ from taisoft.errors import OutputError
 # --- runs -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_run_writes_its_results_and_tells_them(beam, tmp_path, capsys):
+def test_a_run_writes_and_prints_its_results(beam, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(beam, "--out", out, "--set", "solver.dt=0.004") == 0
     record = report(out)
@@ -32,7 +32,7 @@ def test_a_run_writes_its_results_and_tells_them(beam, tmp_path, capsys):
     assert record["dt_requested"] == 0.004 and record["dt"] == pytest.approx(1 / 270)
     expected = {"integrator": "symplectic_euler", "fps": 30, "seconds": 0.1, "allow_unstable": False}
     assert expected.items() <= record["settings"].items()
-    assert record["settings"]["dt"] == pytest.approx(1 / 270)  # the dt that was used, not the one asked for
+    assert record["settings"]["dt"] == pytest.approx(1 / 270)  # the dt in use, not the requested one
     assert record["plan"]
     assert sorted(path.name for path in (out / "frames").iterdir()) == [f"{i:05d}.png" for i in range(4)]
     assert len((out / "steps.csv").read_text().splitlines()) == 4 and (out / "scene.usdc").stat().st_size > 0
@@ -52,7 +52,7 @@ def test_results_are_replaced_only_on_request(beam, tmp_path, capsys):
     assert (out / "report.json").read_bytes() == before
     assert run(beam, "--out", out, "--overwrite", *SHORT_OUTPUT) == 0
     assert (out / "report.json").read_bytes() != before
-    assert not (out / "scene.usdc").exists()  # it told of the earlier run
+    assert not (out / "scene.usdc").exists()  # it was of the earlier run
 
 
 def test_without_out_nothing_is_written(beam, tmp_path, monkeypatch):
@@ -71,7 +71,7 @@ def test_a_failed_run_is_reported(tmp_path, capsys):
     assert record["problems"] and record["problems"][0] in capsys.readouterr().out.replace("\n         ", " ")
 
 
-def test_warnings_are_told_once_and_reported(tmp_path, capsys):
+def test_warnings_are_printed_once_and_reported(tmp_path, capsys):
     path = write(tmp_path / "stiff.py", BEAM.replace("young=1e5", "young=1e5, poisson=0.495"))
     out = tmp_path / "out"
     assert run(path, "--out", out, *SHORT_OUTPUT) == 0
@@ -104,17 +104,22 @@ def test_a_picture_that_cannot_be_written_ends_the_run(beam, tmp_path, monkeypat
     assert (out / "scene.usdc").exists() and len(list((out / "frames").iterdir())) == 2
 
 
+def refuse(file: str):
+    """A function that raises because the disk is full."""
+
+    def raise_error(*_, **__):
+        raise OutputError(f"cannot write {file}: No space left on device")
+
+    return raise_error
+
+
 def test_a_report_that_cannot_be_written(beam, tmp_path, monkeypatch, capsys):
-    """Of a run that goes on, or of one in the place of an earlier run: the earlier report does not stay to tell of it."""
-
-    def refuse(*_, **__):
-        raise OutputError("cannot write report.json (9 bytes): No space left on device")
-
+    """Of a resumed run, and of one that replaces an earlier run: the earlier report is removed."""
     out = tmp_path / "out"
     assert run(beam, "--out", out, *SHORT_OUTPUT) == 0 and report(out)["status"] == "ok"
     before = (out / "report.json").read_bytes()
     capsys.readouterr()
-    monkeypatch.setattr(recording, "write_report", refuse)
+    monkeypatch.setattr(recording, "write_report", refuse("report.json"))
     assert run(beam, "--out", out, "--resume", out / "checkpoint.npz", "--seconds", "0.2", *SHORT_OUTPUT) == 3
     assert_degraded(capsys.readouterr(), "cannot write report.json")
     assert not (out / "report.json").exists() and (out / "steps.csv").exists()
@@ -125,13 +130,9 @@ def test_a_report_that_cannot_be_written(beam, tmp_path, monkeypatch, capsys):
 
 
 def test_a_video_that_cannot_be_written(beam, tmp_path, monkeypatch, capsys):
-    """The report, written before it, tells of it too."""
-
-    def refuse(*_):
-        raise OutputError("cannot write video.mp4: No space left on device")
-
+    """The report, written before, is updated."""
     out = tmp_path / "out"
-    monkeypatch.setattr(recording, "write_video", refuse)
+    monkeypatch.setattr(recording, "write_video", refuse("video.mp4"))
     monkeypatch.setattr(recording, "find_ffmpeg", lambda: "ffmpeg")
     assert run(beam, "--out", out, "--video", "--no-usd", "--seconds", "0.03") == 3
     assert_degraded(capsys.readouterr(), "cannot write video.mp4")
@@ -139,13 +140,13 @@ def test_a_video_that_cannot_be_written(beam, tmp_path, monkeypatch, capsys):
 
 
 def assert_degraded(captured, *errors):
-    """The summary says so, and stderr has a line for each output that failed."""
+    """Check for a degraded status in the summary, and a line on stderr for each output that failed."""
     assert "status   degraded" in captured.out and not re.search(r"\bok\b", captured.out)
-    told = captured.err.splitlines()
-    assert len(told) == len(errors) and all(line.startswith(f"taisoft: {error}") for line, error in zip(told, errors)), told
+    lines = captured.err.splitlines()
+    assert len(lines) == len(errors) and all(line.startswith(f"taisoft: {error}") for line, error in zip(lines, errors)), lines
 
 
-def test_no_display_means_no_window(beam, monkeypatch, capsys):
+def test_without_display_there_is_no_window(beam, monkeypatch, capsys):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert main(["run", str(beam)]) == 0
@@ -153,14 +154,14 @@ def test_no_display_means_no_window(beam, monkeypatch, capsys):
     assert "taisoft: running without a window: there is no display" in captured.err and "status   ok" in captured.out
 
 
-def test_the_scene_of_the_readme_runs(tmp_path):
+def test_examples_of_readme_and_manual_run(tmp_path):
     scene, script = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     contacts = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "contacts.md").read_text(), re.DOTALL)[1]
     path = write(tmp_path / "script.py", scene + script.replace("seconds=2.0", "seconds=0.1"))
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, path], env=environment, capture_output=True, text=True, check=True)
     assert re.search(r"^ok \[-2\. ", done.stdout, re.MULTILINE)
-    assert run(write(tmp_path / "my_scene.py", scene), "--seconds", "0.1") == 0  # its kernels are there already
+    assert run(write(tmp_path / "my_scene.py", scene), "--seconds", "0.1") == 0  # kernels are already compiled
     path = write(tmp_path / "contacts.py", contacts)
     done = subprocess.run([sys.executable, path], env=environment, capture_output=True, text=True, check=True)
     assert re.search(r"^52 0\.0 \[ *\S+ -\S+ +\S+\]$", done.stdout, re.MULTILINE)  # the ground is pressed down
@@ -170,7 +171,7 @@ def test_the_scene_of_the_readme_runs(tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_first_signal_saves_what_there_is(tmp_path, number, capfd):
+def test_first_signal_saves_the_results(tmp_path, number, capfd):
     raising = f"import signal; signal.raise_signal({int(number)}) if 0.05 < t < 0.0542 else None\n    return (0, 0, 0)"
     path = write(tmp_path / "led.py", LED.replace("{body}", raising))
     before = signal.getsignal(number)
@@ -190,8 +191,8 @@ def test_signal_before_the_run_writes_nothing(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_second_signal_leaves_at_once(tmp_path):
-    """The scene hangs inside a step after the first signal, so that only the second can end the process."""
+def test_second_signal_exits_immediately(tmp_path):
+    """The scene hangs inside a step after the first signal, so that only the second one can end the process."""
     hanging = "import signal, time; t > 0.05 and (signal.raise_signal(2), time.sleep(60))\n    return (0, 0, 0)"
     path = write(tmp_path / "led.py", LED.replace("{body}", hanging))
     process = child("run", path, "--headless", "--out", tmp_path / "out", *SHORT_OUTPUT)
@@ -207,10 +208,10 @@ def test_second_signal_leaves_at_once(tmp_path):
     assert not (tmp_path / "out" / "report.json").exists()
 
 
-# --- a poor machine ---------------------------------------------------------------------------------------------------
+# --- environment ------------------------------------------------------------------------------------------------------
 
 
-def test_a_working_folder_that_is_gone(beam, tmp_path):
+def test_deleted_working_folder(beam, tmp_path):
     (tmp_path / "gone").mkdir()
     text = "import os, sys; os.rmdir(os.getcwd()); from taisoft.cli import main; sys.exit(main(sys.argv[1:]))"
     done = subprocess.run(
@@ -225,7 +226,7 @@ def test_a_working_folder_that_is_gone(beam, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_home_that_is_not_set(beam):
+def test_home_is_not_set(beam):
     environment = {name: value for name, value in os.environ.items() if name != "HOME"} | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "taisoft", "run", str(beam), "--headless"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)

@@ -1,9 +1,9 @@
-"""`taisoft warm`: scenes of every kind step, a line each; their like, of any size, need no other kernel.
+"""`taisoft warm` compiles the kernels of scenes of every kind, so that similar scenes of any size compile none:
 
-* after it, demos of the structures that it compiled add no kernel to the cache on disk and say nothing of compiling;
-* each demo's structure is in its table, so a new demo is covered or fails here;
-* each scene of the table has what its structure says;
-* simulations and statics are in the precision that was asked for, without one each in its own default.
+* afterwards, demos of the compiled structures add no kernel to the cache on disk and print nothing about compiling;
+* the table has the structure of every demo;
+* each scene of the table has the features of its structure;
+* simulations and statics use the requested precision, or else their own defaults.
 """
 
 import os
@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command import ROOT
+from scenes import dynamics
 
 import taisoft as ts
 from taisoft.backend.runtime import n_compiled
@@ -35,7 +36,7 @@ DEMOS = {
 
 
 def key(scene: ts.Scene, integrator: str, **solver) -> tuple:
-    """What kernels are compiled for, as far as scenes differ in it."""
+    """The properties of a scene that kernels are compiled for."""
     on = {name for name, is_on in plan_of(scene, integrator, solver.get("self_collision", False), False).on.items() if is_on}
     if integrator not in EXPLICIT:
         on.discard("fixed_nodes")  # a mask of numbers there
@@ -73,7 +74,7 @@ def test_every_demo_is_in_the_table(name, covered):
     assert key(scene, **{"integrator": "implicit_euler"} | solver) in covered, "add its Structure to warm.structures"
 
 
-def test_demos_compile_nothing_afterwards(tmp_path):
+def test_demos_compile_nothing_after_warming(tmp_path):
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
     code = (
         "import test_cli_warm as t\nfrom taisoft.cli import main, warm\n"
@@ -91,23 +92,25 @@ def test_demos_compile_nothing_afterwards(tmp_path):
         assert "compiling" not in done.stderr
 
 
-def test_scenes_of_other_sizes_need_no_other_kernel():
+def test_scenes_of_other_sizes_compile_nothing():
     warm.simulate(Structure("implicit_euler", obstacles=("half-space",)), "f32")
     before = n_compiled()
-    made = ts.Scene()
+    scene = ts.Scene()
     rubber = ts.Material(law="stable_neo_hookean", young=2e5, poisson=0.2, density=900.0)
-    made.add_body(ts.box_mesh((4, 3, 2), (0.3, 0.2, 0.1)), rubber, position=(0, 0.0501, 0))
-    made.add_obstacle(ts.HalfSpace((0, -0.05, 0), (0, 1, 0)))
-    with ts.Simulator(made, dt=2e-3, integrator="implicit_euler") as sim:
+    scene.add_body(ts.box_mesh((4, 3, 2), (0.3, 0.2, 0.1)), rubber, position=(0, 0.0501, 0))
+    scene.add_obstacle(ts.HalfSpace((0, -0.05, 0), (0, 1, 0)))
+    with ts.Simulator(scene, dt=2e-3, integrator="implicit_euler") as sim:
         sim.advance(2)
         assert np.isfinite(sim.positions()).all() and n_compiled() == before
-        solver, x = sim._dynamics.stepper.solver, sim.positions()
+    with dynamics(scene, dt=2e-3, integrator="implicit_euler") as made:
+        made.advance(1)
+        solver, x = made.stepper.solver, made.state.state()[0]
         solved = solve_on(solver, replace(solver.stage, tolerance=0.0), np.arange(20, 40), 0.0)  # as hard steps do
-        assert solved.linear > 0.0 and not np.array_equal(sim.positions(), x) and n_compiled() == before
+        assert solved.linear > 0.0 and not np.array_equal(made.state.state()[0], x) and n_compiled() == before
 
 
 @pytest.mark.parametrize("structure", dict.fromkeys([*structures(), *static_structures()]), ids=str)
-def test_scenes_have_what_they_say(structure):
+def test_scenes_have_the_features_of_their_structure(structure):
     scene = build(structure)
     on = plan_of(scene, structure.integrator or "implicit_euler", False, False).on
     for name, feature in (

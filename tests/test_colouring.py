@@ -1,9 +1,9 @@
 """Bodies coloured by stress, stretch or speed:
 
-* a bar stretched by s has the stretch s at every node, linear and quadratic, and turning it changes nothing;
-* the scale ends at 1, 2 or 5 times a power of ten, rises at once, does not flicker, and falls where it is much too high;
+* a bar stretched by s has stretch s at every node, linear and quadratic, in any orientation;
+* the scale ends at 1, 2 or 5 times a power of ten, rises immediately, does not flicker, and falls when it is far too high;
 * markers and obstacles keep their colours, unknown names are refused;
-* a picture by stress is not one in the bodies' own colours, and `taisoft run --colour` makes it.
+* pictures by stress differ from those in the bodies' colours; `taisoft run --colour` makes them.
 """
 
 import numpy as np
@@ -45,7 +45,7 @@ def test_the_scale_does_not_flicker():
     assert [round_up(v) for v in (1.0, 1.1, 2.3, 0.07, 5e4)] == [1.0, 2.0, 5.0, 0.1, 5e4]
 
 
-def test_what_keeps_its_colour():
+def test_markers_and_obstacles_keep_their_colours():
     scene = beam_scene()
     scene.add_obstacle(ts.HalfSpace((0, -3, 0), (0, 1, 0)))
     surfaces, sim = Surfaces(scene), FakeSimulator(scene)
@@ -69,10 +69,10 @@ def test_pictures_by_stress():
     differs = np.abs(own - stress).max(axis=2) > 30
     assert 0.03 < differs.mean() < 0.4, "bodies only"
     red = stress[..., 0] - stress[..., 2] > 60
-    assert red[:, 80:].any() and not red[:, :60].any(), "the stand-in's stress grows along x"
+    assert red[:, 80:].any() and not red[:, :60].any(), "the stress of FakeSimulator grows along x"
 
 
-def test_the_option_of_the_command(tmp_path):
+def test_colour_option(tmp_path):
     scene = write(tmp_path / "beam.py", BEAM)
     pictures = []
     for colour in ("body", "stress"):

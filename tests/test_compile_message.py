@@ -1,9 +1,9 @@
-"""The message that kernels are being compiled, on stderr:
+"""The message on stderr that kernels are being compiled:
 
-* a first run says so once, on a line of its own, on a terminal (where a progress bar follows) and elsewhere, and a second run
-  does not; kernels of another version in the cache change nothing;
-* a kernel that is loaded, however slowly, is not told; long compiling is told again every few seconds;
-* without stderr, or with one that is closed, nothing happens.
+* a first run prints it once, on its own line, on a terminal (before the progress bar) and elsewhere; a second run does not;
+  kernels of another version in the cache change nothing;
+* loading a kernel prints nothing, however slow; long compiling prints a line every few seconds;
+* without stderr, or with a closed one, nothing happens.
 """
 
 import io
@@ -31,7 +31,7 @@ def stderr_of_run(terminal: bool, environment: dict) -> str:
     try:
         while part := os.read(ours, 4096):
             parts.append(part)
-    except OSError:  # Linux's end of a terminal
+    except OSError:  # end of a terminal on Linux
         pass
     finally:
         os.close(ours)
@@ -40,10 +40,10 @@ def stderr_of_run(terminal: bool, environment: dict) -> str:
 
 
 @pytest.mark.parametrize("terminal", [False, True])
-def test_a_first_run_says_so(terminal, tmp_path):
+def test_only_the_first_run_prints_the_message(terminal, tmp_path):
     kernels = tmp_path / "taisoft" / "kernels"
     kernels.mkdir(parents=True)
-    (kernels / "Told.tic").touch()
+    (kernels / "Other.tic").touch()
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
     first, second = (stderr_of_run(terminal, environment) for _ in range(2))
     assert [line for line in first.splitlines() if "compiling" in line] == [MESSAGE]
@@ -53,11 +53,11 @@ def test_a_first_run_says_so(terminal, tmp_path):
 
 @pytest.fixture
 def fresh(monkeypatch) -> None:
-    """As in a process that has told nothing yet."""
+    """As in a process that has not printed the message yet."""
     monkeypatch.setattr(compile_message, "_last_line", None)
 
 
-def test_what_is_told_when(fresh, monkeypatch, capsys):
+def test_when_lines_are_printed(fresh, monkeypatch, capsys):
     clock = [0.0]
     monkeypatch.setattr(compile_message.time, "perf_counter", lambda: clock[0])
     compile_message.show(compiler=0.02, launch=0.1, n_compiled=1)  # loaded
@@ -77,9 +77,9 @@ def test_silenced(fresh, capsys):
     assert capsys.readouterr().err == f"{MESSAGE}\n"
 
 
-@pytest.mark.parametrize("there", [True, False])
-def test_no_stderr(there, fresh, monkeypatch):
+@pytest.mark.parametrize("is_closed", [True, False])
+def test_no_stderr(is_closed, fresh, monkeypatch):
     closed = io.StringIO()
     closed.close()
-    monkeypatch.setattr(sys, "stderr", closed if there else None)
+    monkeypatch.setattr(sys, "stderr", closed if is_closed else None)
     compile_message.show(compiler=0.5, launch=0.6, n_compiled=1)

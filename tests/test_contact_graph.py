@@ -1,10 +1,9 @@
-"""The contact graph and its colours:
+"""The contact graph and its colouring:
 
-* contacts over nodes are joined where they share a node that can move along some axis, by brute force; fully led nodes join none;
-* contacts of a matrix are joined by a block off the diagonal, either way round; blocks of zeros join none;
-* every colouring gives no two joined contacts the same colour, numbers its colours without gaps and needs at most degree + 1;
-* random colours depend on the seed alone; the kernels' colours are first-fit in the order of their priorities, whatever the
-  threads do;
+* contacts over nodes are adjacent if they share a node that is free along some axis, by brute force;
+* contacts of a matrix are adjacent if either block between them is not zero;
+* colourings give adjacent contacts different colours, number them without gaps and use at most degree + 1;
+* random colourings depend on the seed alone; the kernels colour first-fit in the order of priorities, on any number of threads;
 * groups hold every contact once, by colour.
 """
 
@@ -24,7 +23,7 @@ N_NODES, CAPACITY = 120, 700
 
 @pytest.fixture(scope="module")
 def problems():
-    """Room on one thread and on all."""
+    """Contact problems on one thread and on all."""
     runtime, arenas = open_runtime("cpu", "f32"), [FieldArena(), FieldArena()]
     yield [problem.build_node_problem(arena, CAPACITY, N_NODES, serial) for arena, serial in zip(arenas, (True, False))]
     for arena in arenas:
@@ -32,14 +31,14 @@ def problems():
     runtime.close()
 
 
-def put(p: problem.ContactProblem, made: oracle.NodeContacts) -> None:
+def fill(p: problem.ContactProblem, made: oracle.NodeContacts) -> None:
     for field, values in ((p.node, made.node), (p.arity, made.arity), (p.inverse_mass, made.inverse_mass)):
         problem.fill_field(field, values)
     p.count[0] = len(made.arity)
 
 
-def joined(made: oracle.NodeContacts) -> np.ndarray:
-    """Adjacency by brute force."""
+def adjacency(made: oracle.NodeContacts) -> np.ndarray:
+    """By brute force."""
     sets = [{i for i in made.node[c, :n] if made.inverse_mass[i].any()} for c, n in enumerate(made.arity)]
     return np.array([[bool(a & b) and i != j for j, b in enumerate(sets)] for i, a in enumerate(sets)])
 
@@ -49,15 +48,16 @@ def is_colouring(graph: sp.csr_matrix, colour: np.ndarray) -> bool:
     return not (colour[edges.row] == colour[edges.col]).any() and set(colour) == set(range(colour.max() + 1))
 
 
-@pytest.mark.parametrize("led", [False, True])
-def test_graph_of_nodes(problems, led):
-    made = oracle.random_contacts(0, 60, N_NODES, led=led)
+@pytest.mark.parametrize("prescribed", [False, True])
+def test_graph_of_nodes(problems, prescribed):
+    made = oracle.random_contacts(0, 60, N_NODES, led=prescribed)
     graph = node_graph(made.node, made.arity, made.inverse_mass)
-    assert np.array_equal(graph.toarray(), joined(made))
-    put(problems[0], made)
-    assert np.array_equal(colouring.graph_of(problems[0]).toarray(), joined(made))
+    assert np.array_equal(graph.toarray(), adjacency(made))
+    assert np.array_equal(matrix_graph(sp.csr_matrix(made.W)).toarray(), adjacency(made))
+    fill(problems[0], made)
+    assert np.array_equal(colouring.graph_of(problems[0]).toarray(), adjacency(made))
     free = oracle.random_contacts(0, 60, N_NODES, led=False)
-    assert (joined(made).sum() < joined(free).sum()) == led
+    assert (adjacency(made).sum() < adjacency(free).sum()) == prescribed
 
 
 def test_graph_of_a_matrix():
@@ -70,31 +70,26 @@ def test_graph_of_a_matrix():
     assert matrix_graph(stored).nnz == 0
 
 
-def test_both_forms_have_one_graph():
-    made = oracle.random_contacts(1, 50, N_NODES, led=True)
-    assert np.array_equal(matrix_graph(sp.csr_matrix(made.W)).toarray(), joined(made))
-
-
 @pytest.mark.parametrize("k", [1, 2, 30, 200])
-@pytest.mark.parametrize("way", ["largest_first", "smallest_last", "random"])
-def test_colours_on_the_host(way, k):
-    graph = node_graph(*_of(oracle.random_contacts(2, k, N_NODES, led=True)))
-    colour = colour_random(graph, seed=3) if way == "random" else colour_greedy(graph, way)
+@pytest.mark.parametrize("method", ["largest_first", "smallest_last", "random"])
+def test_colouring_on_the_host(method, k):
+    graph = node_graph(*_arrays(oracle.random_contacts(2, k, N_NODES, led=True)))
+    colour = colour_random(graph, seed=3) if method == "random" else colour_greedy(graph, method)
     assert is_colouring(graph, colour) and colour.max() <= np.diff(graph.indptr).max()
 
 
-def _of(made: oracle.NodeContacts):
+def _arrays(made: oracle.NodeContacts):
     return made.node, made.arity, made.inverse_mass
 
 
-def test_random_colours_follow_the_seed():
-    graph = node_graph(*_of(oracle.random_contacts(3, 150, N_NODES)))
+def test_random_colours_depend_on_the_seed():
+    graph = node_graph(*_arrays(oracle.random_contacts(3, 150, N_NODES)))
     one, same, other = (colour_random(graph, seed) for seed in (1, 1, 2))
     assert np.array_equal(one, same) and not np.array_equal(one, other)
 
 
 def test_random_colours_of_a_clique():
-    """Palettes start with a third of the colours that are needed: they must grow."""
+    """Palettes start with a third of the required colours, and must grow."""
     graph = sp.csr_matrix(~np.eye(12, dtype=bool))
     assert sorted(colour_random(graph, 5)) == list(range(12))
 
@@ -113,14 +108,14 @@ def priority(c: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("k", [1, 60, 700])
-def test_colours_of_the_kernels(problems, k):
+def test_kernels_colour_first_fit_by_priority(problems, k):
     made = oracle.random_contacts(4, k, N_NODES, led=True)
-    graph = node_graph(*_of(made))
-    names = priority(np.arange(k))
-    assert len(set(names)) == k
-    expected = nx.greedy_color(nx.from_scipy_sparse_array(graph), lambda g, _: sorted(g, key=lambda c: -names[c]))
+    graph = node_graph(*_arrays(made))
+    priorities = priority(np.arange(k))
+    assert len(set(priorities)) == k
+    expected = nx.greedy_color(nx.from_scipy_sparse_array(graph), lambda g, _: sorted(g, key=lambda c: -priorities[c]))
     for p in (*problems, problems[1]):
-        put(p, made)
+        fill(p, made)
         colouring.colour_contacts(p)
         colour = p.colour.to_numpy()[:k]
         assert colour.tolist() == [expected[c] for c in range(k)]
@@ -129,18 +124,18 @@ def test_colours_of_the_kernels(problems, k):
         assert np.array_equal(p.order.to_numpy()[:k], order)
         assert np.array_equal(p.colour_start.to_numpy()[: len(start)], start)
     if k == 700:
-        assert colour.max() > colouring.BITS  # more colours than one look holds
+        assert colour.max() > colouring.BITS  # more colours than one bit mask holds
 
 
-@pytest.mark.parametrize("way", ["greedy", "random"])
-def test_colours_of_the_host_in_a_problem(problems, way):
+@pytest.mark.parametrize("method", ["greedy", "random"])
+def test_colours_of_the_host_are_stored_in_a_problem(problems, method):
     made = oracle.random_contacts(5, 80, N_NODES)
-    put(problems[0], made)
+    fill(problems[0], made)
     graph = colouring.graph_of(problems[0])
-    stored = colour_greedy(graph) if way == "greedy" else colour_random(graph, 4)
+    stored = colour_greedy(graph) if method == "greedy" else colour_random(graph, 4)
     colouring.store(problems[0], stored)
     colour = problems[0].colour.to_numpy()[:80]
-    assert is_colouring(node_graph(*_of(made)), colour) and np.array_equal(colour, stored)
+    assert is_colouring(node_graph(*_arrays(made)), colour) and np.array_equal(colour, stored)
     order, start = groups(colour)
     assert np.array_equal(problems[0].order.to_numpy()[:80], order) and problems[0].count[1] == len(start) - 1
 

@@ -1,10 +1,10 @@
-"""Steps with contacts that are done again, and paths that end:
+"""Retries of steps with contacts, and paths that end:
 
-* a step that ended too deep starts again from its own start in twice as many parts, led nodes that it had let go included; the
-  result is that of so many steps, its iterations are those of all tries;
-* an implicit part that ended in something is looked at along its way, and edges that come to cross within a step are met;
-* where a try fails, the state is that before the step;
-* a run whose paths end with it ends as any other, and its end is judged.
+* a step that ends too deep is retried from its start with twice as many substeps, and prescribed nodes that it released are
+  prescribed again; the result equals that many steps, and the report counts the iterations of all attempts;
+* an implicit substep that penetrates is searched again along its path; edges that come to cross within a step are found;
+* where an attempt fails, the state is that before the step;
+* a run may end at the end of a path; its final state is checked for overlaps.
 """
 
 import numpy as np
@@ -12,17 +12,18 @@ import pytest
 from retries import assert_is_before_first_step, assert_steps_as_new, state_of
 
 import taisoft as ts
+from taisoft.dynamics.contact import ContactStep
 
 DT, RELEASE, END = 0.02, 0.015, 0.08  # [s]
 
 
 def sink(t: float):
-    """Of the led nodes [m]."""
+    """Displacement of the prescribed nodes [m]."""
     return (0.0, -0.1 * t, 0.0) if t < RELEASE else None
 
 
 def circle(t: float):
-    """Of an obstacle that nothing meets [m]."""
+    """Pose of an obstacle out of reach [m]."""
     if t > END + 1e-9:
         raise ValueError("the path has ended")
     return (np.sin(t), 0.0, 0.0), np.eye(3)
@@ -46,48 +47,48 @@ def sim(shared_sim):
     return shared_sim
 
 
-def patch_end(sim, monkeypatch, events: dict, tells: str = "relative_penetration") -> list:
-    """events: by the number of the call of the step's look at its end, an exception or how deep it tells, in edges."""
-    calls, end = [], sim._dynamics.contact.end
+def patch_end(monkeypatch, events: dict, measure: str = "relative_penetration") -> list:
+    """Patch the measurement at the end of a substep. events: by number of the call, an exception, or a value of the measure."""
+    calls, end = [], ContactStep.end
 
-    def told(time, dt):
-        depth = end(time, dt)
+    def patched(contact, time, dt):
+        depth = end(contact, time, dt)
         calls.append((time, dt))
         event = events.get(len(calls))
         if isinstance(event, Exception):
             raise event
         if event is not None:
-            setattr(sim._dynamics.contact, tells, event)
+            setattr(contact, measure, event)
         return depth
 
-    monkeypatch.setattr(sim._dynamics.contact, "end", told)
+    monkeypatch.setattr(ContactStep, "end", patched)
     return calls
 
 
-@pytest.mark.parametrize("tells, depth", [("relative_penetration", 1.0), ("crossing", 3e-3)])
-def test_a_step_that_ended_too_deep_is_done_again(sim, monkeypatch, tells, depth):
+@pytest.mark.parametrize("measure, depth", [("relative_penetration", 1.0), ("crossing", 3e-3)])
+def test_a_step_that_ends_too_deep_is_retried(sim, monkeypatch, measure, depth):
     sim.dt = DT / 2
     halves = [sim.step() for _ in range(2)]
-    wanted = sim.positions(), sim.velocities(), sim.contact_force("ground")
-    assert np.abs(wanted[0] - sim.scene.body("cube").rest_positions).max() > 1e-4 and wanted[2][1] < -1.0  # it moves and presses
+    x, v, force = sim.positions(), sim.velocities(), sim.contact_force("ground")
+    assert np.abs(x - sim.scene.body("cube").rest_positions).max() > 1e-4 and force[1] < -1.0  # it moves and presses
     sim.dt = DT
     sim.reset()
     whole = sim.step()
     coarse = sim.positions()
-    assert np.abs(coarse - wanted[0]).max() > 1e-6  # [m]
+    assert np.abs(coarse - x).max() > 1e-6  # [m]
     sim.reset()
-    calls = patch_end(sim, monkeypatch, {1: depth}, tells)
+    calls = patch_end(monkeypatch, {1: depth}, measure)
     report = sim.step()
     assert calls == [(DT, DT), (DT / 2, DT / 2), (DT, DT)] and report.max_penetration < 1e-9
-    assert np.abs(sim.positions() - wanted[0]).max() < 1e-8 and np.abs(sim.velocities() - wanted[1]).max() < 1e-6
+    assert np.abs(sim.positions() - x).max() < 1e-8 and np.abs(sim.velocities() - v).max() < 1e-6
     work = [r.newton_iterations for r in (report, whole, *halves)]
     assert whole.newton_iterations < report.newton_iterations and work[0] > max(work[1:])
     assert report.converged and report.substeps == 2 and sim.step_count == 1 and sim.time == DT
 
 
-def test_a_try_that_fails_leaves_the_state_before_the_step(sim, monkeypatch):
+def test_a_failed_retry_leaves_the_state_before_the_step(sim, monkeypatch):
     before = state_of(sim)
-    patch_end(sim, monkeypatch, {1: 1.0, 3: ts.SimulationError("no room")})
+    patch_end(monkeypatch, {1: 1.0, 3: ts.SimulationError("no room")})
     with pytest.raises(ts.SimulationError, match="no room"):
         sim.step()
     assert_is_before_first_step(sim, before)
@@ -95,20 +96,20 @@ def test_a_try_that_fails_leaves_the_state_before_the_step(sim, monkeypatch):
     assert_steps_as_new(sim, 1e-9)
 
 
-def test_a_part_that_sank_is_looked_at_along_its_way(sim, monkeypatch):
-    """Nothing is there that was not known: the part stays what it was."""
+def test_a_penetrating_substep_is_searched_along_its_path(sim, monkeypatch):
+    """The search finds no other contacts, so the substep is kept."""
     first = sim.step()
-    wanted, searched, search = sim.positions(), [], sim._dynamics.contact.search_along_path
+    expected, searched, search = sim.positions(), [], ContactStep.search_along_path
     sim.reset()
-    monkeypatch.setattr(sim._dynamics.contact, "penetrates_deeper", lambda time, dt, before: True)
-    monkeypatch.setattr(sim._dynamics.contact, "search_along_path", lambda *at: searched.append((at, search(*at))))
+    monkeypatch.setattr(ContactStep, "penetrates_deeper", lambda contact, time, dt, before: True)
+    monkeypatch.setattr(ContactStep, "search_along_path", lambda contact, *at: searched.append((at, search(contact, *at))))
     report = sim.step()
     assert searched == [((0.0, DT), False)] and report.newton_iterations == first.newton_iterations
-    assert np.array_equal(sim.positions(), wanted) and report.max_penetration == first.max_penetration
+    assert np.array_equal(sim.positions(), expected) and report.max_penetration == first.max_penetration
 
 
-def test_edges_that_come_to_cross_are_met():
-    """An edge falls past the end of a ridge's cross-section, over which it does not lie at the start of the step."""
+def test_edges_that_come_to_cross_are_found():
+    """A falling edge moves over the end of a ridge within the step; at its start it does not lie over the ridge."""
     mesh, r = ts.box_mesh((1, 1, 1), (0.1, 0.1, 0.1)), np.sqrt(0.5)
     scene = ts.Scene(gravity=(0, 0, 0))
     for name, turn, at, v in (
@@ -130,17 +131,17 @@ def test_a_path_that_ends_with_the_run(sim):
     assert (result.status, result.problems, result.steps) == ("ok", [], 4)
     assert sim.deepest_overlap() is None and sim.intersecting_triangles() == []
     with pytest.raises(ts.SimulationError, match="the path has ended"):
-        sim.detect_contacts()  # of a step beyond the path
+        sim.detect_contacts()  # swept by a step beyond the path
 
 
-def test_the_end_of_a_run_is_judged(sim):
-    """What the search for contacts does not reach any more."""
+def test_the_final_state_of_a_run_is_checked_for_overlaps(sim):
+    """Also for those deeper than contact detection reaches."""
     x = sim.positions()
 
-    def throw(sim, frame, report):
+    def move_down(sim, frame, report):
         if frame == 1:
             sim.set_state(positions=x - (0, 0.5, 0), velocities=np.zeros_like(x))
 
-    result = sim.run(DT, throw, fps=50)
+    result = sim.run(DT, move_down, fps=50)
     assert result.status == "degraded"
     assert any("at the end 'cube' and 'ground' overlap by 0.499 m" in text for text in result.problems)

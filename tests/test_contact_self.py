@@ -1,8 +1,8 @@
-"""A body touches itself:
+"""Self-contact:
 
-* the end of a folded strip is thrown at the strip's own beginning and does not pass through it;
-* a thin strip that is folded flat, through itself about the fold, snaps open: its speed, which no step begins with, cuts the
-  steps, and none is refused.
+* the end of a folded strip is thrown at its beginning and does not pass through it;
+* a thin strip that is folded flat, and penetrates itself at the fold, snaps open: its speed, which builds up within a step,
+  leads to substeps, and no step is refused.
 """
 
 import numpy as np
@@ -33,34 +33,34 @@ def sim(shared_sim):
 
 
 def test_a_folded_strip_does_not_pass_through_itself(sim):
-    """At 3 m/s, 0.03 m a step, to a strip 0.02 m thick; it bears an impulse, loses its speed, and no triangles intersect."""
+    """At 3 m/s, 0.03 m a step, and 0.02 m thick; contact impulses stop it, and no triangles intersect."""
     x, beyond = folded(sim.positions("strip"), 0.05)
     v = np.where(beyond[:, None], [0.0, -3.0, 0.0], 0.0)
     sim.set_state(x, v, body="strip")
     assert sim.intersecting_triangles() == [] and beyond.sum() >= 9
-    borne = 0.0
+    impulse = 0.0
     for _ in range(12):
         report = sim.step()
         assert sim.intersecting_triangles() == [], report
         c = sim.contacts()
-        borne += np.linalg.norm(c.impulse, axis=1).sum()
+        impulse += np.linalg.norm(c.impulse, axis=1).sum()
         assert report.n_inverted == 0 and (c.body_a == c.body_b).all()
-    assert borne > 1.0  # [N s]; the fold's own stiffness takes the rest of the 17 N s that were thrown
+    assert impulse > 1.0  # [N s]; of 17 N s, the fold's stiffness takes the rest
     end = np.flatnonzero(beyond)
     assert sim.positions("strip")[end, 1].min() > -0.01 and sim.velocities("strip")[end, 1].mean() > -1.0
 
 
 def test_a_strip_folded_flat_snaps_open(sim):
-    """Folded sharply by 178 degrees: the layers lie in each other about the fold. After two steps it is clear of itself."""
+    """Folded by 178 degrees, the layers penetrate each other at the fold; after two steps they are apart."""
     x, turn = sim.positions("thin"), np.radians(178.0)
     half = x[:, 0] > 1e-9
     x[half, :2] = x[half, :2] @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
     sim.set_state(x, np.zeros_like(x), body="thin")
-    energy, worst = sim.energies().total, 0.0
+    energy, speed = sim.energies().total, 0.0
     assert len(sim.intersecting_triangles()) > 20
     reports = [sim.step() for _ in range(4)]
     assert max(report.substeps for report in reports[:2]) > 2
     for report in reports[2:]:
         assert report.crossings == 0 and report.n_inverted == 0 and report.max_penetration < 1e-6
-        worst = max(worst, np.linalg.norm(sim.velocities("thin"), axis=1).max())
-    assert sim.energies().total < energy and worst > 5.0  # [m/s]
+        speed = max(speed, np.linalg.norm(sim.velocities("thin"), axis=1).max())
+    assert sim.energies().total < energy and speed > 5.0  # [m/s]

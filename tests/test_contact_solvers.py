@@ -1,13 +1,14 @@
-"""The contact solvers, judged by NumPy (contact_oracle.py):
+"""The contact solvers, compared with NumPy (contact_oracle.py):
 
-* random problems: impulses push, lie in their cones and obey Signorini and Coulomb, by every method;
-* the reference problems: residual 1e-8, the reference's velocities where they are unique; all methods agree in them;
-* the problems of rigid scenes: Gauss-Seidel, plain and with momentum, is no worse than twice the yardstick, "auto" reaches 1e-8;
-* over nodes and as a matrix: W, r-factors, velocities, residuals and sweeps are the same to rounding, and those of NumPy;
-* coloured Gauss-Seidel is serial Gauss-Seidel in the order of its colours; parallel loops give what one thread gives;
-* other units, other frames of the tangents and another order of the contacts leave the solution as it is;
-* whatever is asked, the best impulses of the history are those left; numbers that are not finite are no convergence;
-* the augmented Lagrangian copes with redundant and slightly unsymmetric W, dense or sparse.
+* random problems: impulses are compressive, lie in their cones and obey Signorini and Coulomb, with every method;
+* reference problems: residual 1e-8, and the reference velocities where they are unique; all methods agree in velocities;
+* problems of rigid scenes: residuals of Gauss-Seidel, plain and with momentum, are at most twice the yardstick; "auto" reaches
+  1e-8;
+* over nodes and as a matrix, r-factors, velocities, residuals and sweeps agree to rounding, and with NumPy;
+* coloured Gauss-Seidel equals serial Gauss-Seidel in the order of its colours; parallel loops give the result of one thread;
+* units, frames of the tangents and the order of contacts do not change the solution;
+* the best impulses of the history are returned; problems that are not finite do not converge;
+* the augmented Lagrangian solves problems with redundant and slightly unsymmetric W, dense or sparse.
 """
 
 import json
@@ -63,12 +64,12 @@ def reference(shared, name: str):
     return *oracle.load(path), json.loads(path.read_text(encoding="utf-8"))
 
 
-# --- what is solved ---------------------------------------------------------------------------------------------------
+# --- solutions --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("seed, k, friction", [(0, 1, 0.5), (1, 6, 0.0), (2, 20, 0.3), (3, 40, 1.0)])
-def test_laws(method, seed, k, friction):
+def test_solutions_obey_the_contact_laws(method, seed, k, friction):
     made = oracle.random_contacts(seed, k, N_NODES, friction)
     W, b, mu = made.W, made.b, made.friction
     found = ts.solve_contact_problem(W, b, mu, method, tolerance=1e-9, max_iterations=3000)
@@ -77,12 +78,12 @@ def test_laws(method, seed, k, friction):
     broken = oracle.breaks(W, b, mu, found.impulse)
     assert broken["pulls"] == 0.0 and broken["outside its cone"] < 1e-15
     assert max(broken.values()) < 1e-7, broken
-    assert np.abs(found.impulse).max() > 0.1  # something does touch
+    assert np.abs(found.impulse).max() > 0.1  # some contacts are closed
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("name", REFERENCES)
-def test_references(name, method, shared):
+def test_reference_problems(name, method, shared):
     W, b, mu, data = reference(shared, name)
     found = ts.solve_contact_problem(W, b, mu, method, tolerance=1e-10, max_iterations=20000)
     assert found.converged and oracle.residual(W, b, mu, found.impulse) <= 1e-8
@@ -92,7 +93,7 @@ def test_references(name, method, shared):
 
 
 @pytest.mark.parametrize("name", YARDSTICK)
-def test_yardstick(rig, name, shared):
+def test_gauss_seidel_is_as_good_as_the_yardstick(rig, name, shared):
     W, b, mu = oracle.load(shared / "contact_problems" / f"{name}.npz")
     p = rig.matrix(W, b, mu)
     for momentum in (False, True):
@@ -119,12 +120,12 @@ def test_methods_agree_in_the_velocities(method):
     assert u[1] == pytest.approx(u[0], abs=1e-8)
 
 
-# --- the two forms, the order, the threads ----------------------------------------------------------------------------
+# --- forms, order and threads -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("led", [False, True])
-def test_forms_agree(rig, led):
-    made = oracle.random_contacts(5, 30, N_NODES, led=led)
+@pytest.mark.parametrize("prescribed", [False, True])
+def test_forms_agree(rig, prescribed):
+    made = oracle.random_contacts(5, 30, N_NODES, led=prescribed)
     W, b, mu = made.W, made.b, made.friction
     p, q = rig.nodes(made), rig.matrix(W, b, mu)
     for form in (p, q):
@@ -140,23 +141,25 @@ def test_forms_agree(rig, led):
     assert w == pytest.approx(made.inverse_mass * (made.jacobian.T @ impulses(p).ravel()).reshape(-1, 3), abs=1e-13)
 
 
-@pytest.mark.parametrize("led", [False, True])
-def test_forms_agree_with_momentum(rig, led):
-    made = oracle.random_contacts(6, 30, N_NODES, led=led)
+@pytest.mark.parametrize("prescribed", [False, True])
+def test_forms_agree_with_momentum(rig, prescribed):
+    made = oracle.random_contacts(6, 30, N_NODES, led=prescribed)
     p, q = rig.nodes(made), rig.matrix(made.W, made.b, made.friction)
     for form in (p, q):
         solve(form, "gauss_seidel", 0.0, 12)
     assert p.relaxation.to_numpy()[:30] == pytest.approx(q.relaxation.to_numpy()[:30], rel=1e-12)
-    assert (p.relaxation.to_numpy()[:30] < 0.999).any() == led  # one axis held: the block is no multiple of the identity
+    assert (
+        p.relaxation.to_numpy()[:30] < 0.999
+    ).any() == prescribed  # with one axis prescribed, blocks are no multiples of the identity
     assert impulses(p) == pytest.approx(impulses(q), rel=1e-9, abs=1e-12)
 
 
 @pytest.mark.parametrize("matrix", [False, True])
 @pytest.mark.parametrize("momentum", [False, True])
-def test_coloured_is_serial_in_the_order_of_the_colours(rig, matrix, momentum):
+def test_coloured_equals_serial_in_the_order_of_the_colours(rig, matrix, momentum):
     made = oracle.random_contacts(7, 40, N_NODES, led=True)
     W, b, mu = made.W, made.b, made.friction
-    left = []
+    found = []
     for serial in (True, False):
         p = rig.matrix(W, b, mu, serial) if matrix else rig.nodes(made, serial)
         store(p, colour_greedy(matrix_graph(sp.csr_matrix(W)))) if matrix else colour_contacts(p)
@@ -164,33 +167,33 @@ def test_coloured_is_serial_in_the_order_of_the_colours(rig, matrix, momentum):
         order = p.order.to_numpy()[:40]
         assert sorted(order) == list(range(40)) and (np.diff(order) < 0).any()
         solve(p, "coloured_gauss_seidel", 0.0, 6, momentum=momentum)
-        left.append(impulses(p))
+        found.append(impulses(p))
         p.r.fill(0.0)
         solve(p, "gauss_seidel", 0.0, 6, momentum=momentum)  # in p.order too
-        left.append(impulses(p))
-    for other in left[1:]:
-        assert other == pytest.approx(left[0], rel=1e-11, abs=1e-13)
+        found.append(impulses(p))
+    for other in found[1:]:
+        assert other == pytest.approx(found[0], rel=1e-11, abs=1e-13)
     if not momentum:
-        assert left[0] == pytest.approx(oracle.gauss_seidel(W, b, mu, 6, order), rel=1e-11, abs=1e-13)
+        assert found[0] == pytest.approx(oracle.gauss_seidel(W, b, mu, 6, order), rel=1e-11, abs=1e-13)
 
 
 @pytest.mark.parametrize("matrix", [False, True])
 @pytest.mark.parametrize("method", ["jacobi", "hybrid"])
 def test_threads_do_not_matter(rig, method, matrix):
     made = oracle.random_contacts(8, 60, N_NODES, led=True)
-    left, told = [], []
+    found, results = [], []
     for serial in (True, False, False):
         p = rig.matrix(made.W, made.b, made.friction, serial) if matrix else rig.nodes(made, serial)
-        told.append(solve(p, method, 1e-6, 1000, history=True))
-        left.append(impulses(p))
-    assert told[0].converged and told[0].iterations == told[1].iterations
-    assert told[1].history == pytest.approx(told[0].history, rel=1e-6)
-    assert left[1] == pytest.approx(left[0], rel=1e-6, abs=1e-9)
-    assert np.array_equal(left[1], left[2]) and told[1].history == told[2].history  # reruns are the same bit for bit
+        results.append(solve(p, method, 1e-6, 1000, history=True))
+        found.append(impulses(p))
+    assert results[0].converged and results[0].iterations == results[1].iterations
+    assert results[1].history == pytest.approx(results[0].history, rel=1e-6)
+    assert found[1] == pytest.approx(found[0], rel=1e-6, abs=1e-9)
+    assert np.array_equal(found[1], found[2]) and results[1].history == results[2].history  # reruns give the same bits
 
 
-def test_hybrid_takes_the_new_disk(rig):
-    """One contact pressed and pushed along: after a sweep from 0 Jacobi has no friction yet, the hybrid all of it."""
+def test_hybrid_uses_the_new_normal_impulse_for_friction(rig):
+    """One contact pressed and pushed sideways: after a sweep from 0 Jacobi has no friction yet, the hybrid all of it."""
     W, b, mu = np.eye(3), np.array([-1.0, 5.0, 0.0]), np.array([0.5])
     for method, tangential in (("jacobi", 0.0), ("hybrid", -0.5)):
         p = rig.matrix(W, b, mu)
@@ -220,7 +223,7 @@ def test_random_problems(seed, k, friction, method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_units_do_not_matter(method):
-    """Masses times 2^20, velocities times 2^-10: impulses times 2^10, to the bit where arithmetic allows it."""
+    """Masses times 2^20, velocities times 2^-10: impulses times 2^10."""
     made = oracle.random_contacts(9, 20, N_NODES)
     W, b, mu = made.W, made.b, made.friction
     one = ts.solve_contact_problem(W, b, mu, method, 1e-9, 2000)
@@ -231,7 +234,7 @@ def test_units_do_not_matter(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_frames_and_order_do_not_matter(method):
-    """Tangents turned about the normals, contacts in another order: the same velocities in space."""
+    """Tangents rotated about the normals, contacts permuted: the same velocities in space."""
     made = oracle.random_contacts(10, 20, N_NODES)
     W, b, mu = made.W, made.b, np.linspace(0.1, 0.9, 20)
     rng = np.random.default_rng(0)
@@ -246,25 +249,25 @@ def test_frames_and_order_do_not_matter(method):
     assert T.T @ (T @ W @ T.T @ other.impulse + T @ b) == pytest.approx(W @ one.impulse + b, abs=1e-7)
 
 
-# --- what can go wrong ------------------------------------------------------------------------------------------------
+# --- limits -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", sorted(SOLVERS))
-def test_the_best_is_left(rig, method):
-    """Large friction and normals all about: no method gets there, and residuals go up and down."""
+def test_the_best_impulses_are_returned(rig, method):
+    """With large friction and scattered normals no method converges, and residuals oscillate."""
     made = oracle.random_contacts(17, 60, N_NODES, friction=4.0, spread=1.5)
     p = rig.nodes(made)
     colour_contacts(p)
     found = solve(p, method, 1e-14, 400, every=1, history=True)
-    left = oracle.residual(made.W, made.b, made.friction, impulses(p))
+    residual = oracle.residual(made.W, made.b, made.friction, impulses(p))
     assert not found.converged and max(np.diff(found.history)) > 0.0
-    assert found.residual == min(found.history[1:]) and left == pytest.approx(found.residual, rel=1e-6)
+    assert found.residual == min(found.history[1:]) and residual == pytest.approx(found.residual, rel=1e-6)
     assert p.w.to_numpy() == pytest.approx(made.inverse_mass * (made.jacobian.T @ impulses(p).ravel()).reshape(-1, 3), abs=1e-9)
 
 
 @pytest.mark.parametrize("serial", [True, False])
 @pytest.mark.parametrize("method", sorted(SOLVERS))
-def test_what_is_not_finite_does_not_converge(rig, method, serial):
+def test_nan_does_not_converge(rig, method, serial):
     made = oracle.random_contacts(15, 10, N_NODES)
     made.b[4] = np.nan
     p = rig.nodes(made, serial)
@@ -273,8 +276,7 @@ def test_what_is_not_finite_does_not_converge(rig, method, serial):
     assert not found.converged and found.iterations == 20
 
 
-def test_nothing_to_solve(rig):
-    """Contacts that part need no sweep."""
+def test_separating_contacts_need_no_sweep(rig):
     made = oracle.random_contacts(16, 10, N_NODES)
     made.b[0::3] = np.abs(made.b[0::3]) + 0.1
     p = rig.nodes(made)
@@ -282,8 +284,7 @@ def test_nothing_to_solve(rig):
     assert found.converged and found.iterations == 0 and found.residual == 0.0 and not impulses(p).any()
 
 
-def test_warm_start(rig):
-    """From the solution no sweep is needed; the impulses stay as they are."""
+def test_the_solution_as_start_needs_no_sweep(rig):
     made = oracle.random_contacts(17, 30, N_NODES)
     p = rig.nodes(made)
     solve(p, "gauss_seidel", 1e-9, 2000)
@@ -294,8 +295,8 @@ def test_warm_start(rig):
 
 @pytest.mark.parametrize("dense", [0, 90])
 @pytest.mark.parametrize("skew", [0.0, 1e-3])
-def test_augmented_lagrangian_of_a_poor_matrix(monkeypatch, dense, skew):
-    """Every contact twice, so that half of W's eigenvalues are 0, and W a little unsymmetric."""
+def test_augmented_lagrangian_of_a_singular_matrix(monkeypatch, dense, skew):
+    """Every contact twice, so that half of W's eigenvalues are 0, and W slightly unsymmetric."""
     monkeypatch.setattr(augmented_lagrangian, "DENSE", dense)
     made = oracle.random_contacts(18, 15, N_NODES)
     double = np.kron(np.ones((2, 1)), np.eye(45))

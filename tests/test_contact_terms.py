@@ -1,11 +1,11 @@
-"""What contacts add to an implicit stage, judged by NumPy, on contacts of all states between the nodes of two bodies and against
-obstacles, in f64 and f32:
+"""Contact terms of an implicit stage, compared with NumPy, for contacts of all states between two bodies and with obstacles, in
+f64 and f32:
 
-* impulses, velocities and the residual of their laws are those of the formulas;
+* impulses, velocities and the residual of the contact laws follow their formulas;
 * the derivative of the impulses is minus the blocks of the matrix;
-* J^T D J in factors is the dense one: above the diagonal, below it, on both sides, and its diagonal;
+* the factored J^T D J equals the dense one: above the diagonal, below it, whole, and on the diagonal;
 * conjugate gradients with it, serial and parallel, find the solution of a dense solver;
-* the r-factors rest on the matrix's diagonal; impulses leave the residual as J^T p; a linearised stage is linear.
+* the r-factors follow from the matrix's diagonal; the residual contains -J^T p; a linearised stage is linear.
 """
 
 from types import SimpleNamespace
@@ -31,7 +31,7 @@ from taisoft.linear.block_csr import to_scipy, unpacked
 from taisoft.linear.coupling import add_products, clear_products, form_product, gather_products, prepare_terms
 
 K, BETA, DT = 24, 0.002, 0.003  # contacts; [s]
-GOAL = 1e-3, 0.2, 0.02, 0.05  # contact offset [m], shares that a step mends, speed of that at most [m/s]
+GAP_TARGETS = 1e-3, 0.2, 0.02, 0.05  # contact offset [m], fractions corrected in a step, maximum speed of that [m/s]
 STIFFNESS = 5.0
 FIXED = [0, 7]  # nodes
 
@@ -46,7 +46,7 @@ def couple(
     both: ti.template(),
     d: ti.template(),
 ):
-    """(J^T D J x)_i of the nodes above, of those below, and whole; d: the matrix's diagonal blocks."""
+    """(J^T D J x)_i: parts above and below the diagonal, and whole; d: the matrix's diagonal blocks."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         for i in range(m.n_nodes):
@@ -77,7 +77,7 @@ def rig(request):
         free = np.ones((m.n_nodes, 3))
         free[FIXED] = 0.0
         m.free.from_numpy(free.astype(made.machine.np_real))
-        contacts = oracle.random_contacts(5, K, m.n_nodes - 4)  # the last nodes have none
+        contacts = oracle.random_contacts(5, K, m.n_nodes - 4)  # none at the last nodes
         arity = contacts.arity.copy()
         arity[::5] = (contacts.weight[::5] > 0).sum(axis=1)  # against an obstacle
         p = build_node_problem(arena, K + 3, m.n_nodes, True)
@@ -87,8 +87,8 @@ def rig(request):
             fill_field(getattr(p, name), getattr(contacts, name))
         obstacle_displacement = np.where((np.arange(K) % 5 == 0)[:, None], 1e-3 * rng.standard_normal((K, 3)), 0.0)
         friction = np.where(np.arange(K) % 7 == 0, 0.0, 0.5)
-        gap = rng.uniform(-2, 3, K) * GOAL[0]
-        apart = np.tile([0, 1], (K, 1))  # contacts of a body with itself have other goals
+        gap = rng.uniform(-2, 3, K) * GAP_TARGETS[0]
+        apart = np.tile([0, 1], (K, 1))  # self-contacts have other targets
         fields = (p.arity, p.friction, p.gap, p.obstacle_displacement, p.body)
         for field, values in zip(fields, (arity, friction, gap, obstacle_displacement, apart)):
             fill_field(field, values)
@@ -114,7 +114,7 @@ def rig(request):
         x = start + 1e-3 * rng.standard_normal(start.shape)
         k.x_start.from_numpy(start)
         solver.work.x_hat.from_numpy(x_hat)
-        contact_terms.begin_contacts(solver.work, k, False, BETA, DT, np.array(GOAL))
+        contact_terms.begin_contacts(solver.work, k, False, BETA, DT, np.array(GAP_TARGETS))
         J = found.jacobian
         W = J @ np.diag(free.ravel() / np.diag(A)) @ J.T
         yield SimpleNamespace(
@@ -141,8 +141,8 @@ def rig(request):
         )
 
 
-def press(rig, x: np.ndarray) -> np.ndarray:
-    """The impulses (K,3) at x (n,3); what they were before must not count."""
+def impulses_at(rig, x: np.ndarray) -> np.ndarray:
+    """The impulses (K,3) at x (n,3), independent of earlier ones."""
     rig.m.state.x.from_numpy(x)
     rig.p.r.fill(np.nan)
     evaluate(rig)
@@ -150,12 +150,12 @@ def press(rig, x: np.ndarray) -> np.ndarray:
 
 
 def evaluate(
-    rig, how: int | None = STAY, term_weight: float = 1.0, multiply: bool = False, kind: int = ELASTIC_STAGE, m=None
+    rig, mode: int | None = STAY, term_weight: float = 1.0, multiply: bool = False, kind: int = ELASTIC_STAGE, m=None
 ) -> np.ndarray:
-    """The norms of the residual. how: None to stay without asking for the forces. m: the model, by default that on one thread."""
+    """The norms of the residual. mode: None keeps the state and the forces. m: the model, by default the one on one thread."""
     norms, s, m = np.zeros(5), rig.solver, m or rig.m
-    if how is not None:
-        move(m, rig.work, rig.k, kind, how, term_weight, 1.0, BETA)
+    if mode is not None:
+        move(m, rig.work, rig.k, kind, mode, term_weight, 1.0, BETA)
     contact_terms.update_impulses(m, rig.k, int(multiply), BETA, STIFFNESS)
     form_residual(m, rig.work, s.matrix, rig.k, kind, BETA, norms)
     return norms
@@ -163,18 +163,18 @@ def evaluate(
 
 @pytest.fixture
 def pressed(rig):
-    """Multipliers of which some open, some stick and some slip at rig.x; z (K,3), radii (K,), u (K,3)."""
+    """Set multipliers with open, sticking and slipping contacts at rig.x. Returns z (K,3), radii (K,), u (K,3)."""
     rng = np.random.default_rng(11)
     factor = oracle.factors(rig.W)
-    way = (rig.x - rig.start).ravel()
-    contact_offset, fast, slow, fastest = GOAL
+    displacement = (rig.x - rig.start).ravel()
+    contact_offset, fast, slow, fastest = GAP_TARGETS
     above = np.maximum(rig.gap, 0)
     opening = np.minimum(slow * (contact_offset - above) + fast * (above - rig.gap), fastest * DT)
-    gap_targets = np.where(rig.gap >= contact_offset, contact_offset, rig.gap + opening)
+    target_gap = np.where(rig.gap >= contact_offset, contact_offset, rig.gap + opening)
     assert 0 < (opening == fastest * DT).sum() < (rig.gap < contact_offset).sum()
     obstacle_displacement_at = np.einsum("kij,kj->ki", rig.frame, rig.obstacle_displacement)
     u = (rig.J @ (rig.x - rig.x_hat).ravel() / BETA).reshape(K, 3) - obstacle_displacement_at / DT
-    u[:, 0] = (rig.gap - gap_targets + (rig.J @ way).reshape(K, 3)[:, 0] - obstacle_displacement_at[:, 0]) / BETA
+    u[:, 0] = (rig.gap - target_gap + (rig.J @ displacement).reshape(K, 3)[:, 0] - obstacle_displacement_at[:, 0]) / BETA
     size = STIFFNESS * factor[:, 0] * np.abs(u).max()
     multiplier = size[:, None] * rng.uniform([-1, -1, -1], [3, 1, 1], (K, 3))
     multiplier[:, 0] = np.maximum(multiplier[:, 0], 0.0)
@@ -184,31 +184,31 @@ def pressed(rig):
     assert np.array_equal(rig.k.work.multiplier.to_numpy()[:K], multiplier)
     assert np.allclose(radius, rig.friction * multiplier[:, 0], rtol=1e-15)
     z = multiplier - STIFFNESS * factor * u
-    across = np.linalg.norm(z[:, 1:], axis=1)
-    states = [(z[:, 0] < 0).sum(), (across < radius).sum(), ((across > radius) & (radius > 0)).sum(), (radius == 0).sum()]
-    assert min(states) >= 3 and np.abs(across / np.maximum(radius, 1e-300) - 1).min() > 1e-3
+    tangential = np.linalg.norm(z[:, 1:], axis=1)
+    states = [(z[:, 0] < 0).sum(), (tangential < radius).sum(), ((tangential > radius) & (radius > 0)).sum(), (radius == 0).sum()]
+    assert min(states) >= 3 and np.abs(tangential / np.maximum(radius, 1e-300) - 1).min() > 1e-3
     assert np.abs(z[:, 0]).min() > 1e-3 * size.min()
     return z, radius, u
 
 
-def test_impulses_and_their_residual(rig, pressed):
+def test_impulses_and_residual_of_the_contact_laws(rig, pressed):
     z, radius, u = pressed
-    r = press(rig, rig.x)
-    across = np.linalg.norm(z[:, 1:], axis=1)
-    expected = np.where(np.arange(3) == 0, np.maximum(z, 0), z * np.minimum(1, radius / across)[:, None])
+    r = impulses_at(rig, rig.x)
+    tangential = np.linalg.norm(z[:, 1:], axis=1)
+    expected = np.where(np.arange(3) == 0, np.maximum(z, 0), z * np.minimum(1, radius / tangential)[:, None])
     assert np.abs(r - expected).max() < 10 * rig.close * np.abs(expected).max()
     fixed_point = np.array([oracle.project(row, mu) for row, mu in zip(r - oracle.factors(rig.W) * u, rig.friction)])
-    wanted = np.linalg.norm(r - fixed_point) / np.linalg.norm(r)
-    assert rig.p.state[RESIDUAL] == pytest.approx(wanted, rel=10 * rig.close) and wanted > 0.01
+    residual = np.linalg.norm(r - fixed_point) / np.linalg.norm(r)
+    assert rig.p.state[RESIDUAL] == pytest.approx(residual, rel=10 * rig.close) and residual > 0.01
 
 
-def test_blocks_are_the_slope_of_the_impulses(rig, pressed):
-    press(rig, rig.x)
+def test_blocks_are_minus_the_derivative_of_the_impulses(rig, pressed):
+    impulses_at(rig, rig.x)
     blocks, active = unpacked(rig.k.work.block.to_numpy()[:K]), rig.k.work.active.to_numpy()[:K]
     assert np.abs(blocks - blocks.swapaxes(1, 2)).max() <= rig.close * np.abs(blocks).max()
     assert np.array_equal(active == 1, np.abs(blocks).max(axis=(1, 2)) > 0) and 0 < active.sum() < K
     dv, h = np.random.default_rng(1).standard_normal(rig.x.shape), 1e-7
-    dr = (press(rig, rig.x + h * BETA * dv) - press(rig, rig.x - h * BETA * dv)) / (2 * h)
+    dr = (impulses_at(rig, rig.x + h * BETA * dv) - impulses_at(rig, rig.x - h * BETA * dv)) / (2 * h)
     du = np.einsum("kij,ki->kj", rig.frame, (rig.J @ dv.ravel()).reshape(K, 3))
     dp = np.einsum("kij,ki->kj", rig.frame, dr)
     assert np.abs(np.einsum("kij,kj->ki", blocks, du) + dp).max() < max(1e-6, rig.close) * np.abs(dp).max()
@@ -216,14 +216,14 @@ def test_blocks_are_the_slope_of_the_impulses(rig, pressed):
 
 @pytest.fixture
 def dense(rig, pressed):
-    """J^T D J (3n,3n), with the blocks that are there."""
-    press(rig, rig.x)
+    """J^T D J (3n,3n) of the present blocks."""
+    impulses_at(rig, rig.x)
     D, J = unpacked(rig.k.work.block.to_numpy()[:K]), rig.J.reshape(K, 3, -1)
-    J = np.einsum("kij,kim->kjm", rig.frame, J)  # of the world's axes
+    J = np.einsum("kij,kim->kjm", rig.frame, J)  # in world axes
     return np.einsum("kim,kij,kjn->mn", J, D, J, optimize=True)
 
 
-def test_the_coupling_is_the_dense_matrix(rig, dense):
+def test_the_coupling_equals_the_dense_matrix(rig, dense):
     m, n, real = rig.m, rig.m.n_nodes, rig.made.machine.np_real
     x = np.random.default_rng(2).standard_normal((n, 3)).astype(real)
     rig.vectors[0].from_numpy(x)
@@ -249,9 +249,9 @@ def test_conjugate_gradients(rig, dense, method):
     result = pcg.solve(m, matrix, work, tolerance, 2000, rig.k.coupling)
     assert result.converged and np.abs(work.y.to_numpy().ravel() - y).max() < 1e3 * tolerance * np.abs(y).max()
     without = np.linalg.solve(rig.A[np.ix_(on, on)], rhs.ravel()[on].astype(float))
-    assert np.abs(without - y[on]).max() > 0.1 * np.abs(y).max()  # contacts do count
+    assert np.abs(without - y[on]).max() > 0.1 * np.abs(y).max()  # contacts matter
     blocks = rig.k.work.block.to_numpy()
-    try:  # other blocks of the same contacts beside the same matrix: rows without contacts are prepared already
+    try:  # other blocks of the same contacts with the same matrix: rows without contacts are already prepared
         rig.k.work.block.from_numpy((3.0 * blocks).astype(blocks.dtype))
         y[on] = np.linalg.solve((rig.A + 3.0 * dense)[np.ix_(on, on)], rhs.ravel()[on].astype(float))
         fresh = pcg.solve(m, matrix, work, tolerance, 2000, rig.k.coupling), work.y.to_numpy()
@@ -262,14 +262,14 @@ def test_conjugate_gradients(rig, dense, method):
         rig.k.work.block.from_numpy(blocks)
 
 
-def test_factors_rest_on_the_diagonal(rig):
+def test_r_factors_follow_from_the_diagonal(rig):
     factor = oracle.factors(rig.W)[:, :2]
     assert np.abs(rig.p.factor.to_numpy()[:K] / factor - 1).max() < 10 * rig.close
 
 
 @pytest.mark.parametrize("threads", ["one", "all"])
 def test_residual_of_a_stage(rig, pressed, threads):
-    """That without contacts less J^T p, after a step, a part of it, and where only the multipliers change."""
+    """The residual without contacts minus J^T p, after a full step, part of one, and a change of the multipliers only."""
     m = rig.m if threads == "one" else rig.made.parallel
     work, cg, real = rig.work, rig.solver.work.pcg, rig.made.machine.np_real
     rng = np.random.default_rng(6)
@@ -278,13 +278,13 @@ def test_residual_of_a_stage(rig, pressed, threads):
     cg.y.from_numpy(y)
     work.residual.from_numpy(before)
     m.state.x.from_numpy(rig.x)
-    for how, term_weight in ((STEP, 1.0), (AGAIN, 0.4), (None, 0.4)):
-        norms = evaluate(rig, how, term_weight, multiply=how is None, m=m)
+    for mode, term_weight in ((STEP, 1.0), (AGAIN, 0.4), (None, 0.4)):
+        norms = evaluate(rig, mode, term_weight, multiply=mode is None, m=m)
         got, rhs, r = work.residual.to_numpy(), cg.rhs.to_numpy(), rig.p.r.to_numpy()[:K]
         assert np.abs(m.state.x.to_numpy() - rig.x - term_weight * BETA * y.astype(float)).max() < 1e-15
         v = m.state.v.to_numpy()
         assert np.abs(v - (m.state.x.to_numpy() - rig.x_hat) / BETA).max() < 10 * rig.close * np.abs(v).max()
-        if how == STEP:
+        if mode == STEP:
             slope = (rig.free * before * y).sum()
             size = np.linalg.norm(before.astype(float)) * np.linalg.norm(y.astype(float))
             assert m.state.scalars[START_SLOPE] == pytest.approx(slope, abs=10 * rig.close * size)
@@ -292,18 +292,18 @@ def test_residual_of_a_stage(rig, pressed, threads):
         move(m, work, NO_CONTACTS, ELASTIC_STAGE, STAY, 0.0, 1.0, BETA)
         form_residual(m, work, rig.solver.matrix, NO_CONTACTS, ELASTIC_STAGE, BETA, without)
         expected = work.residual.to_numpy() - (rig.J.T @ r.ravel()).reshape(-1, 3)
-        assert np.abs(expected - work.residual.to_numpy()).max() > 0.1 * np.abs(expected).max()  # the impulses do count
+        assert np.abs(expected - work.residual.to_numpy()).max() > 0.1 * np.abs(expected).max()  # impulses matter
         close = 10 * rig.close * np.abs(expected).max()
         assert np.abs(got - expected).max() < close and np.abs(rhs + rig.free * expected).max() < close
-        wanted = [((rig.free * expected) ** 2).sum(), *without[1:4], (((1 - rig.free) * expected) ** 2).sum()]
-        assert norms == pytest.approx(wanted, rel=100 * rig.close) and norms[4] > 0
+        squares = [((rig.free * expected) ** 2).sum(), *without[1:4], (((1 - rig.free) * expected) ** 2).sum()]
+        assert norms == pytest.approx(squares, rel=100 * rig.close) and norms[4] > 0
         slope, size = (rig.free * expected * y).sum(), np.linalg.norm(expected) * np.linalg.norm(y.astype(float))
         assert end == pytest.approx(slope, abs=100 * rig.close * size)
 
 
 @pytest.mark.parametrize("threads", ["one", "all"])
 def test_a_linearised_stage_is_linear(rig, threads):
-    """It goes along y to where the slope vanishes; the impulses of where it was linearised do not stay in it."""
+    """It moves along y to where the slope vanishes; its impulses replace those of the linearisation point."""
     m = rig.m if threads == "one" else rig.made.parallel
     rng, work, cg = np.random.default_rng(7), rig.work, rig.solver.work.pcg
     m.state.x.from_numpy(rig.start)
@@ -318,8 +318,9 @@ def test_a_linearised_stage_is_linear(rig, threads):
     linearised.advance(m, work, rig.solver.matrix, rig.k, BETA, STIFFNESS, norms)
     r, length = rig.p.r.to_numpy()[:K], m.state.scalars[STEP_LENGTH]
     assert length > 0.0 and np.abs(r - there).max() > 0.01 * np.abs(r).max()
-    way = length * BETA * y
-    assert np.abs(m.state.x.to_numpy() - rig.start - way).max() < rig.close * np.abs(way).max() + 1e-15  # of x's own rounding
+    displacement = length * BETA * y
+    error = np.abs(m.state.x.to_numpy() - rig.start - displacement).max()
+    assert error < rig.close * np.abs(displacement).max() + 1e-15  # rounding of x
     expected = before + (length * rig.A @ y.ravel() - rig.J.T @ r.ravel()).reshape(-1, 3)
     size = np.abs(rig.A @ y.ravel()).max() * length + np.abs(expected).max()
     assert np.abs(work.residual.to_numpy() - expected).max() < 100 * rig.close * size
@@ -333,8 +334,8 @@ def test_a_linearised_stage_is_linear(rig, threads):
     assert np.array_equal(rig.p.r.to_numpy()[:K], there)
 
 
-def test_without_friction_nothing_resists_along_the_surface(rig):
-    """Also at the kink of the energy, where nothing moves along it yet."""
+def test_frictionless_blocks_act_only_along_the_normal(rig):
+    """Also at the kink of the friction energy, without tangential motion."""
     rig.work.x_hat.from_numpy(rig.x)
     multiplier = np.zeros((K, 3))
     multiplier[:, 0] = 1e3

@@ -1,26 +1,28 @@
-"""How deep surfaces have passed through each other:
+"""Depth of crossing surface triangles:
 
-* triangles of crumpled bodies, of one and of several, cross as deep as NumPy says of all pairs, by separating axes: from trees
-  and from the spatial hash, in one thread and in many; rotation, translation and scale do not change it, nor the order of bodies;
-* what only touches does not cross, nor does a body that is not tested against itself;
-* steps tell it: of bodies that have passed each other by more than contacts see, one that ends so is not ok.
+* in crumpled bodies it equals that of NumPy over all pairs, by separating axes: with the BVH and the spatial hash, in one thread
+  and in many; rotation, translation, scale and the order of bodies do not change it;
+* surfaces that only touch do not cross, nor does a body without self-collision cross itself;
+* steps report crossings deeper than contact detection reaches, and a run that ends with them is degraded.
 """
 
 import itertools
 
 import numpy as np
 import pytest
+from scenes import dynamics, set_state
 from scipy.spatial.transform import Rotation
 
 import taisoft as ts
 from taisoft.collision.detector import Detection
 from taisoft.collision.intersections import CROSSED
+from taisoft.dynamics.dynamics import Dynamics
 
 RUBBER = ts.Material(young=1e5)
 
 
 def sat_depth(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """How far (k,) [m] triangles a and b (k,3,3) must part along the best of eleven axes; 0 where they are clear."""
+    """Separation (k,) [m] of triangles a and b (k,3,3) along the best of eleven axes; 0 where they do not cross."""
     ea, eb = np.roll(a, -1, axis=1) - a, np.roll(b, -1, axis=1) - b
     across = np.cross(ea[:, :, None], eb[:, None]).reshape(-1, 9, 3)
     axes = np.concatenate([np.cross(ea[:, :1], ea[:, 1:2]), np.cross(eb[:, :1], eb[:, 1:2]), across], axis=1)
@@ -30,8 +32,8 @@ def sat_depth(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.maximum(width.min(axis=1), 0.0)
 
 
-def brute(d: Detection, self_collision: bool) -> tuple[float, float, int]:
-    """The deepest [m], the deepest over the edge, and how many: of all pairs without a common vertex."""
+def brute_force(d: Detection, self_collision: bool) -> tuple[float, float, int]:
+    """Largest depth [m], largest depth over the edge, and number of crossings among all pairs without a common vertex."""
     x, t, owner = d.surface.x.to_numpy(), d.topology.triangle, d.topology.body
     shared = (t[:, None, :, None] == t[None, :, None, :]).any(axis=(2, 3))
     same = owner[:, None] == owner[None]
@@ -42,7 +44,7 @@ def brute(d: Detection, self_collision: bool) -> tuple[float, float, int]:
 
 
 def boxes(order=(0, 1, 2), size: float = 1.0, **settings) -> ts.Scene:
-    """Three boxes above each other, in an order, of a size."""
+    """Three boxes above each other; the size scales them."""
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.collision = ts.CollisionSettings(**settings)
     mesh = ts.box_mesh((4, 3, 4), (0.4 * size, 0.3 * size, 0.4 * size))
@@ -52,67 +54,67 @@ def boxes(order=(0, 1, 2), size: float = 1.0, **settings) -> ts.Scene:
 
 
 def crumpled(scene: ts.Scene, seed: int) -> dict[str, np.ndarray]:
-    """Nodes of each body (n,3) [m], moved by waves that fold it into itself, and each node a little."""
+    """Positions of each body (n,3) [m], folded into itself by waves, plus noise."""
     rng, found = np.random.default_rng(seed), {}
-    k, way = rng.uniform(-12.0, 12.0, (3, 4)), rng.standard_normal((4, 3))
+    k, amplitude = rng.uniform(-12.0, 12.0, (3, 4)), rng.standard_normal((4, 3))
     for name in sorted(body.name for body in scene.bodies):
         x = scene.body(name).mesh.vertices + scene.body(name).position
-        found[name] = x + 0.2 * np.sin(x @ k) @ way + 0.01 * rng.standard_normal(x.shape)
+        found[name] = x + 0.2 * np.sin(x @ k) @ amplitude + 0.01 * rng.standard_normal(x.shape)
     return found
 
 
-def put(sim: ts.Simulator, x: dict[str, np.ndarray]) -> Detection:
-    """The search's result where the bodies are there."""
-    sim.set_state(np.concatenate([x[body.name] for body in sim.scene.bodies]))
-    return sim._dynamics.find_contacts(0.0)
+def detect(made: Dynamics, x: dict[str, np.ndarray]) -> Detection:
+    """Contact detection with the bodies at x."""
+    set_state(made, np.concatenate([x[body.name] for body in made.scene.bodies]))
+    return made.find_contacts(0.0)
 
 
 @pytest.mark.parametrize("precision, broad_phase, self_collision", [("f64", "bvh", True), ("f32", "spatial_hash", False)])
-def test_all_pairs_by_separating_axes(precision, broad_phase, self_collision):
+def test_crossings_equal_those_of_all_pairs(precision, broad_phase, self_collision):
     scene = boxes(broad_phase=broad_phase)
-    with ts.Simulator(scene, dt=0.01, precision=precision, self_collision=self_collision) as sim:
-        d = put(sim, crumpled(scene, 0))
-        parallel = Detection(scene, d.model, d.layout, sim._dynamics.runtime, self_collision, serial=False)
+    with dynamics(scene, dt=0.01, precision=precision, self_collision=self_collision) as made:
+        d = detect(made, crumpled(scene, 0))
+        parallel = Detection(scene, d.model, d.layout, made.runtime, self_collision, serial=False)
         for seed in range(5):
-            d = put(sim, crumpled(scene, seed))
-            depth, over, pairs = brute(d, self_collision)
-            told = d.crossings()
-            assert told[:2] == pytest.approx((depth, over), rel=1e-12) and told[2] == pairs > 20
+            d = detect(made, crumpled(scene, seed))
+            depth, over, pairs = brute_force(d, self_collision)
+            found = d.crossings()
+            assert found[:2] == pytest.approx((depth, over), rel=1e-12) and found[2] == pairs > 20
             parallel.find(0.0, 0.0)
-            assert np.array_equal(parallel.crossings(), told)
+            assert np.array_equal(parallel.crossings(), found)
         parallel.release()
 
 
-def test_rotation_translation_scale_and_order():
-    with ts.Simulator(boxes(), dt=0.01, precision="f64", self_collision=True) as sim:
-        wanted = [put(sim, crumpled(sim.scene, seed)).crossings() for seed in range(4)]
+def test_rotation_translation_scale_and_order_do_not_matter():
+    settings = {"dt": 0.01, "precision": "f64", "self_collision": True}
+    with dynamics(boxes(), **settings) as made:
+        expected = [detect(made, crumpled(made.scene, seed)).crossings() for seed in range(4)]
         turn = Rotation.from_rotvec((0.3, -0.7, 0.2))
-        for seed, told in enumerate(wanted):
-            x = {name: turn.apply(nodes) + (1.0, -2.0, 0.5) for name, nodes in crumpled(sim.scene, seed).items()}
-            assert put(sim, x).crossings() == pytest.approx(told, rel=1e-9)
-    with ts.Simulator(boxes((2, 0, 1), 1e3), dt=0.01, precision="f64", self_collision=True) as sim:
-        for seed, told in enumerate(wanted):
+        for seed, crossings in enumerate(expected):
+            x = {name: turn.apply(nodes) + (1.0, -2.0, 0.5) for name, nodes in crumpled(made.scene, seed).items()}
+            assert detect(made, x).crossings() == pytest.approx(crossings, rel=1e-9)
+    with dynamics(boxes((2, 0, 1), 1e3), **settings) as made:
+        for seed, crossings in enumerate(expected):
             x = {name: 1e3 * nodes for name, nodes in crumpled(boxes(), seed).items()}
-            assert put(sim, x).crossings() == pytest.approx(told * (1e3, 1.0, 1.0), rel=1e-9)
+            assert detect(made, x).crossings() == pytest.approx(crossings * (1e3, 1.0, 1.0), rel=1e-9)
 
 
-def test_what_touches_does_not_cross():
+def test_touching_surfaces_do_not_cross():
     """Flush boxes, aligned and shifted by half a cell, share planes and edges."""
     scene = ts.Scene()
-    scene.allow_initial_overlap = True
     mesh = ts.box_mesh((4, 4, 4), (0.4, 0.4, 0.4))
     for k in range(2):
         scene.add_body(mesh, RUBBER, name=f"box {k}", position=(0.0, 0.4 * k, 0.0))
-    with ts.Simulator(scene, dt=0.01, precision="f64") as sim:
+    with dynamics(scene, dt=0.01, precision="f64") as made:
         for off, shift in itertools.product((0.0, 1e-12), (0.0, 0.05)):
-            sim.set_state(np.concatenate([mesh.vertices, mesh.vertices + (shift, 0.4 - off, 0.0)]))
-            depth, over, pairs = sim._dynamics.find_contacts(0.0).crossings()
+            x = {"box 0": mesh.vertices, "box 1": mesh.vertices + (shift, 0.4 - off, 0.0)}
+            depth, over, pairs = detect(made, x).crossings()
             assert depth <= 1.01 * off and over <= 1e-10 and pairs == 0
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "symplectic_euler"])
-def test_steps_tell_what_contacts_do_not_see(integrator):
-    """Two plates, each in the middle of the other, cross by far more than the search for contacts reaches."""
+def test_steps_report_deep_crossings(integrator):
+    """Two plates cross in their middle, far deeper than contact detection reaches."""
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.allow_initial_overlap = True
     mesh = ts.box_mesh((8, 1, 8), (0.4, 0.02, 0.4))

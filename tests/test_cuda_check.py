@@ -1,9 +1,9 @@
-"""The check of a GPU, on a machine without one:
+"""The GPU check, on a machine without one:
 
-* a part that fails, one that hangs, and one that finds nothing leave what the others found, and the next one starts;
-* the whole keeps to its time, and the page tells what was not run;
-* every table shows what its part finds, failures included; tests are read from pytest's output;
-* the script goes on past a wheel that cannot be installed, and hands on arguments and exit status.
+* parts that fail, hang or find nothing leave the results of the others, and the next part starts;
+* the time limits hold, and the page names the parts that were not run;
+* every table shows the results of its part, failures included; test results are parsed from pytest's output;
+* the script continues if a wheel cannot be installed, and passes on arguments and exit status.
 """
 
 import json
@@ -76,7 +76,7 @@ def fake(name: str, code: str, seconds: float = 20.0) -> Part:
     return Part(name, f"Part {name}", (sys.executable, "-c", f"import time\n{code}"), seconds)
 
 
-def test_parts_that_fail_leave_the_others(tmp_path):
+def test_failing_parts_leave_the_results_of_others(tmp_path):
     found = f"print({(RESULT + json.dumps(RERUN))!r}, flush=True)"
     parts = [
         fake("reruns", f"{found}\nraise ValueError('the kernel broke')"),
@@ -95,13 +95,13 @@ def test_parts_that_fail_leave_the_others(tmp_path):
     assert [part["ended"] for part in numbers["parts"]] == [outcome.ended for outcome in outcomes]
 
 
-def test_what_no_time_is_left_for_is_told(tmp_path):
+def test_parts_without_time_left_are_reported(tmp_path):
     outcomes = check([fake("sizes", "time.sleep(600)", 1.5), fake("reruns", "pass", 0.0)], 1.6, tmp_path, "cpu")
     assert [outcome.ended for outcome in outcomes] == ["out of time"] * 2
     assert "no time was left to start it" in (tmp_path / "cuda-check.md").read_text()
 
 
-def test_the_page_is_there_after_every_part(tmp_path, monkeypatch):
+def test_the_page_is_written_after_every_part(tmp_path, monkeypatch):
     pages = []
     plain = cuda_check.write_page
 
@@ -125,7 +125,7 @@ def test_tables(name):
     assert shown[name] in text and "Ended: ok, 3 s." in text
 
 
-def test_lines_of_pytest():
+def test_lines_of_pytest_are_parsed():
     line = "tests/test_arch.py::test_operator[cuda-f32] PASSED                  [ 10%]"
     assert parse_test(line) == {"test": "test_operator[cuda-f32]", "result": "passed"}
     assert parse_test("tests/test_arch.py::test_a[cuda-b c] FAILED") == {"test": "test_a[cuda-b c]", "result": "failed"}
@@ -139,15 +139,15 @@ def test_every_part_has_a_job_and_a_table():
 def test_a_job_prints_what_it_finds(capsys):
     run_job("reruns", "cpu", True)
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith(RESULT)]
-    assert json.loads(line.removeprefix(RESULT))["spread"] == 0.0  # the CPU repeats itself to the last bit
+    assert json.loads(line.removeprefix(RESULT))["spread"] == 0.0  # reruns on the CPU give the same bits
 
 
-def test_a_part_that_fails_makes_the_status_1(tmp_path, monkeypatch):
+def test_exit_status_after_a_failing_part(tmp_path, monkeypatch):
     monkeypatch.setattr(cuda_check, "make_parts", lambda arch, quick: [fake("reruns", "raise SystemExit(3)")])
     assert main(["--arch", "cpu", "--out", str(tmp_path)]) == 1
 
 
-def test_the_script_goes_on(tmp_path):
+def test_the_script_continues_after_a_failed_install(tmp_path):
     python, wheels, out = tmp_path / "python", tmp_path / "wheels", tmp_path / "out"
     lines = ["#!/bin/sh", f'echo "$@" >> "{tmp_path}/called"', '[ "$2" = pip ] && exit 1', "exit 7"]
     python.write_text("\n".join(lines) + "\n")

@@ -1,11 +1,9 @@
-"""Every demo runs as `taisoft run` runs it, ends with status ok, and passes its own check of the physics.
+"""Every demo in the folder runs with status ok and passes its own check of the physics:
 
-* demos are found in the folder, so a new one is tested without a line here;
-* the check fails where the material is 1 % stiffer than the demo says, or another number off by as much, so it would notice
-  wrong physics;
-* of sheets in contact no triangle meets one of what they touch in any frame, by the judgement of ipctk;
-* its USD file holds the positions of every frame, and no validator objects to it;
-* a demo says what it is in one line.
+* the check fails if the material is 1 % stiffer than in the demo, or another number is off by as much;
+* sheets in contact intersect nothing in any frame, according to ipctk;
+* the USD file has the positions of every frame and is valid;
+* the first line of a demo describes it in one sentence.
 """
 
 from itertools import combinations
@@ -22,9 +20,7 @@ from taisoft.output.usd import UsdWriter
 from taisoft.simulator import Simulator
 
 DEMOS = shipped_files("demos")
-LINE = 100  # characters that `taisoft list` has for a demo's sentence
-
-
+LINE = 100  # maximum number of characters, for `taisoft list`
 NEVER_CROSS = ("sheet_and_cube", "sheet_on_box")
 
 
@@ -35,12 +31,12 @@ def stiffer(sim: Simulator) -> None:
 
 
 def rougher(sim: Simulator) -> None:
-    """The slope, by 1 %: the cube that slides is accelerated half as much."""
+    """The slope, by 1 %: the sliding cube accelerates half as much."""
     sim.set_contact("slides", "slope", friction=1.01 * 0.49)
 
 
 def heavier(sim: Simulator) -> None:
-    """All bodies by 1 %: where a pile comes to rest is chance, but what it weighs is not."""
+    """All bodies by 1 %: the shape of a pile at rest is chaotic, but its weight is not."""
     sim.set_gravity((0.0, -1.01 * 9.81, 0.0))
 
 
@@ -77,23 +73,23 @@ def test_there_are_demos():
 def test_demo(name, tmp_path):
     demo = load_module(DEMOS[name])
     sim, run = opened(demo)
-    crossed, seen = [], []
+    crossed, frames = [], []
     writer = UsdWriter(tmp_path, sim.scene, fps=run["fps"])
 
-    def look(sim, frame, report):
+    def observe(sim, frame, report):
         if name in NEVER_CROSS and crossing(sim):
             crossed.append(frame)
-        seen.append({body.name: sim.positions(body.name) for body in sim.scene.bodies})
+        frames.append({body.name: sim.positions(body.name) for body in sim.scene.bodies})
         writer.frame(sim, frame)
 
     with sim:
-        result = sim.run(on_frame=look, **run)
+        result = sim.run(on_frame=observe, **run)
         assert result.status == "ok" and result.problems == []
         assert crossed == []
         assert abs(sim.time - run["seconds"]) < 1e-9
         demo.check(sim, result)
         writer.close()
-        assert check_frames(tmp_path / "scene.usdc", seen) == len(seen) > 1
+        assert check_frames(tmp_path / "scene.usdc", frames) == len(frames) > 1
         assert faults(Usd.Stage.Open(str(tmp_path / "scene.usdc"))) == []
 
         WRONG.get(name, stiffer)(sim)
@@ -104,6 +100,6 @@ def test_demo(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", DEMOS)
-def test_demo_says_what_it_is(name):
+def test_first_line_describes_the_demo(name):
     line = first_line(DEMOS[name])
     assert line.endswith(".") and len(line) <= LINE

@@ -1,16 +1,16 @@
-"""The whole detection, from a simulator's state to its list of contacts, on a scene with contacts of every kind:
+"""Contact detection, from the state to the list of contacts, on a scene with contacts of every kind:
 
-* turning, shifting and scaling the scene turns, shifts and scales its contacts; the order of the bodies only swaps sides;
-* one thread and many give the same contacts to the last bit, and so does every repetition; features stay while bodies slide;
+* contacts rotate, translate and scale with the scene; the order of the bodies only swaps sides;
+* one thread and many find the same contacts to the last bit, repeatably; features persist while bodies slide;
 * nodes and weights give the two surface points of a contact, its point lies midway, its gap is their distance along the normal;
-* what is not finite is refused by name; lists without a contact have their shapes.
+* states that are not finite are refused; empty lists have the right shapes.
 """
 
 import numpy as np
 import pytest
 from detection_scenes import DT, compare, identical, keys, pairs_of, simulator, zoo
 from rotations import rotation
-from scenes import rows_of
+from scenes import dynamics, rows_of, set_state
 
 from taisoft.collision import surface
 from taisoft.collision.contacts import KINDS
@@ -27,7 +27,7 @@ def made(request):
 
 @pytest.fixture
 def still(made):
-    """The simulator with all bodies where they start, the place of the obstacles, how close two lists must be."""
+    """The simulator with all bodies at their start, the place of the obstacles, start positions, and tolerance of two lists."""
     sim, place, start, close = made
     place.Q, place.T = np.eye(3), np.zeros(3)
     sim.set_state(positions=start, velocities=np.zeros_like(start))
@@ -35,9 +35,9 @@ def still(made):
 
 
 class TestZoo:
-    """All in one simulator for each precision."""
+    """One simulator for each precision."""
 
-    def test_all_kinds_are_there(self, still):
+    def test_all_kinds_of_contacts_are_found(self, still):
         c = still[0].detect_contacts()
         touching = [("block", "ball"), ("block", "brick"), ("ball", "egg"), ("block", "ground"), ("block", "sphere")]
         touching += [("brick", "capsule"), ("ball", "box"), ("egg", "sheet")]
@@ -46,7 +46,7 @@ class TestZoo:
         assert (c.gap < 0).any() and (c.gap > 0).any() and c.gap.max() <= 0.02 and c.gap.min() > -0.05
         assert np.abs(np.linalg.norm(c.normal, axis=1) - 1).max() < 1e-12 and (c.impulse == 0).all()
 
-    def test_turned_and_shifted(self, still):
+    def test_contacts_rotate_and_translate_with_the_scene(self, still):
         sim, place, start, close = still
         c, rng = sim.detect_contacts(), np.random.default_rng(0)
         for far in (0.0, 1.0, 1e3, 1e3):
@@ -54,7 +54,7 @@ class TestZoo:
             sim.set_state(positions=start @ place.Q.T + place.T)
             compare(c, sim.detect_contacts(), place.Q, place.T, close=close)
 
-    def test_points_of_the_nodes(self, still):
+    def test_weighted_nodes_give_the_contact_points(self, still):
         sim, _, x, _ = still
         c, start = sim.detect_contacts(), {}
         for body in sim.scene.bodies:
@@ -73,7 +73,7 @@ class TestZoo:
         a, b = (np.einsum("kn,knx->kx", c.weights[:, s], x[c.nodes[:, s]]) for s in (slice(0, 3), slice(3, 6)))
         half = 0.5 * c.gap[:, None] * c.normal
         names = [one.name for one in sim.scene.colliders]
-        # a field's body, the second id, has its point where a ray meets its triangles, as near as its grid's cells are small
+        # the point on a field's body, the second id, is where a ray meets its triangles: as exact as its grid is fine
         with_field = np.where(np.char.endswith(c.kind.astype(str), "_field"), c.feature[:, 1], -1)
         for points, sign, owner in ((a, -1, c.body_a), (b, 1, c.body_b)):
             off = np.abs(points + sign * half - c.point).max(axis=1)
@@ -82,7 +82,7 @@ class TestZoo:
             assert (soft & exact).sum() > 5 and (soft & ~exact).any()
             assert off[soft & exact].max() < 1e-9 and off[soft].max() < 5e-3
 
-    def test_features_stay_while_a_body_slides(self, still):
+    def test_features_persist_while_a_body_slides(self, still):
         sim, _, start, _ = still
         c = sim.detect_contacts()
         ball = sim.positions("ball")
@@ -94,45 +94,7 @@ class TestZoo:
             at_vertices = c.kind != "face_field"  # the deepest point between two balls runs ahead
             assert np.abs(other.point - c.point)[at_vertices].max() < 3e-5 * k
 
-    @pytest.mark.parametrize("serial_cheap", [False, True])
-    def test_the_same_on_one_thread_and_on_many(self, still, monkeypatch, serial_cheap):
-        """light: loops that do little at a turn on one thread, the others on many, as of surfaces of middling size."""
-        sim, _, start, close = still
-        if close > 1e-9:
-            return  # once is enough
-        one, simulation = sim.detect_contacts(), sim._dynamics.state
-        monkeypatch.setattr(surface, "SERIAL_BELOW", 0)
-        many = Detection(
-            sim.scene, simulation.model, simulation.layout, sim._dynamics.runtime, serial=None if serial_cheap else False
-        )
-        assert many.surface.serial_cheap == serial_cheap
-        many.find(0.0, DT)
-        first = many.contacts()
-        compare(one, first, close=0.0)  # the parts of the work lie in another order
-        assert sim._dynamics.detection.surface.serial and not many.surface.serial and many.surface.chunks > 1
-        for _ in range(5):
-            many.find(0.0, DT)
-            assert identical(first, many.contacts())
-            assert identical(one, sim.detect_contacts())
-        many.release()
-
-    def test_what_is_not_finite_is_refused(self, still):
-        sim, _, start, _ = still
-        for field, where in ((sim._dynamics.state.model.state.x, "brick"), (sim._dynamics.state.model.state.v, "egg")):
-            for value in (np.nan, np.inf):
-                before = field.to_numpy()
-                whole, rows = before.copy(), rows_of(sim, where)
-                node = sim.scene.body(where).nodes.surface[0, 1]
-                whole[rows.start + node, 2] = value
-                field.from_numpy(whole)
-                sim._dynamics.contact.forget()
-                with pytest.raises(SimulationError, match=f"body '{where}', node {node}: position or velocity is not finite"):
-                    sim.detect_contacts()
-                field.from_numpy(before)
-                sim._dynamics.contact.forget()
-        assert len(sim.detect_contacts())
-
-    def test_bodies_apart(self, still):
+    def test_lists_without_contacts_have_their_shapes(self, still):
         sim, place, start, _ = still
         place.T = np.array([0.0, -10.0, 0.0])
         for k, body in enumerate(sim.scene.bodies):
@@ -144,25 +106,63 @@ class TestZoo:
         assert [array.shape for array in arrays] == shapes
 
 
+def open_zoo(precision: str = "f64"):
+    """The dynamics of the zoo."""
+    return dynamics(zoo()[0], dt=DT, integrator="symplectic_euler", precision=precision)
+
+
+@pytest.mark.parametrize("serial_cheap", [False, True])
+def test_one_thread_and_many_find_the_same(monkeypatch, serial_cheap):
+    """serial_cheap: cheap loops run on one thread and the others on many, as for surfaces of medium size."""
+    with open_zoo() as made:
+        one = made.find_contacts(DT)
+        contacts = one.contacts()
+        monkeypatch.setattr(surface, "SERIAL_BELOW", 0)
+        many = Detection(made.scene, made.model, made.state.layout, made.runtime, serial=None if serial_cheap else False)
+        assert many.surface.serial_cheap == serial_cheap
+        many.find(0.0, DT)
+        first = many.contacts()
+        compare(contacts, first, close=0.0)  # in another order
+        assert one.surface.serial and not many.surface.serial and many.surface.chunks > 1
+        for _ in range(5):
+            many.find(0.0, DT)
+            one.find(0.0, DT)
+            assert identical(first, many.contacts()) and identical(contacts, one.contacts())
+        many.release()
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_states_that_are_not_finite_are_refused(precision):
+    with open_zoo(precision) as made:
+        start = made.state.state()
+        for k, where in enumerate(("brick", "egg")):  # a position, a velocity
+            node = made.scene.body(where).nodes.surface[0, 1]
+            for value in (np.nan, np.inf):
+                state = [array.copy() for array in start]
+                state[k][rows_of(made, where).start + node, 2] = value
+                set_state(made, *state)
+                with pytest.raises(SimulationError, match=f"body '{where}', node {node}: position or velocity is not finite"):
+                    made.find_contacts(DT)
+        set_state(made, *start)
+        assert len(made.find_contacts(DT).contacts())
+
+
 @pytest.fixture(scope="module")
 def small():
     """The contacts of the zoo at a thousandth of its size."""
     with simulator(zoo(1e-3)[0]) as sim:
-        return sim.detect_contacts()
+        found = sim.detect_contacts()
+    assert len(found) >= 12 and np.abs(found.point).max() < 2e-3
+    return found
 
 
-def test_a_thousandth_of_the_size(small):
-    """On its own, so that kernels of the next tests have the same keys as these and are not compiled again."""
-    assert len(small) >= 12 and np.abs(small.point).max() < 2e-3
-
-
-def test_a_thousand_times_the_size(small):
+def test_contacts_scale_with_the_scene(small):
     with simulator(zoo(1e3)[0]) as sim:
         compare(small, sim.detect_contacts(), scale=1e6, size=1e3)
 
 
-def test_the_order_of_bodies(small):
-    """Sides are swapped between two bodies; an obstacle stays b."""
+def test_order_of_bodies_swaps_sides(small):
+    """Between two bodies; an obstacle stays b."""
     with simulator(zoo(1.0, swapped=True)[0]) as sim:
         c = sim.detect_contacts()
     assert len(c) == len(small)

@@ -1,7 +1,7 @@
-"""On the CPU the same run gives the same bits: in three processes, with the same number of threads.
+"""On the CPU, three processes with the same number of threads give the same bits after every step.
 
-What is compared after every step is what each layer makes: positions and velocities, every contact found with its gap, the
-impulses, the energies; of a scene with elasticity, both kinds of collision geometry, obstacles and friction.
+Compared are positions and velocities, contacts with gaps and impulses, and energies, in scenes with elasticity, both kinds of
+collision geometry, obstacles and friction.
 """
 
 import hashlib
@@ -20,18 +20,18 @@ STEPS = {"cube_implicit": 4, "cube_explicit": 40, "cubes_implicit": 4, "cubes_ex
 
 
 def scene(name: str) -> ts.Scene:
-    """One cube on the floor; or cubes that fall on it and on one another, two hit by distance fields, one by proximity."""
+    """One cube on the floor, or falling cubes, two of them with distance fields."""
     made = cubes()
     if name == "cube":
         del made.bodies[1:]
         return made
-    for body, way in zip(made.bodies, ("proximity", "distance_field", "distance_field")):
-        body.collision = way
+    for body, method in zip(made.bodies, ("proximity", "distance_field", "distance_field")):
+        body.collision = method
     return made
 
 
 def digests(case: str) -> list[str]:
-    """After every step, of all that it made."""
+    """A hash of all results after every step."""
     (name, kind), found = case.split("_"), []
     dt, integrator = (0.005, "implicit_euler") if kind == "implicit" else (0.0005, "symplectic_euler")
     with ts.Simulator(scene(name), dt, integrator, precision="f32") as sim:
@@ -47,17 +47,17 @@ def digests(case: str) -> list[str]:
 
 
 @pytest.mark.parametrize("case", STEPS)
-def test_three_runs(case):
+def test_three_processes_agree(case):
     command = [sys.executable, __file__, case]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
     others = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]
     try:
         own = digests(case)
-        told = [other.communicate(timeout=300)[0] for other in others]
+        outputs = [other.communicate(timeout=300)[0] for other in others]
     finally:
         for other in others:
             other.kill()
-    assert [json.loads(text.splitlines()[-1]) for text in told] == [own, own]
+    assert [json.loads(text.splitlines()[-1]) for text in outputs] == [own, own]
     assert len(set(own)) == STEPS[case] and int(own[-1].split()[0]) >= 9
 
 

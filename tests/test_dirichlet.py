@@ -1,9 +1,9 @@
-"""Constraints as the steps see them, of linear and quadratic bodies:
+"""Dirichlet conditions of linear and quadratic bodies:
 
-* fixed and led axes are constrained, a released group's are not, a reset takes it up again;
-* targets are the placed rest positions plus the path's displacement, one for all nodes or one for each;
-* targets end before the first release; asked again at that time, they let go and go on;
-* a path that fails or gives anything else is refused with the body's name and the time.
+* fixed and prescribed axes are constrained, those of a released group are not; a reset prescribes it again;
+* targets are the rest positions plus the path's displacement, one for all nodes or one for each;
+* targets end before the first release; the next call, at that time, releases the group and continues;
+* paths that fail or give invalid values are refused with the body's name and the time.
 """
 
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ both_orders = pytest.mark.parametrize("order, n", [(1, 8), (2, 26)])  # of the s
 
 
 def made(*paths, order: int = 1):
-    """Two cubes; the second, a metre up, is led by the paths (nodes, axes, path) and fixed at node 7 along x, y."""
+    """Two cubes; the second, 1 m higher, is moved by paths (nodes, axes, path) and fixed at node 7 along x, y."""
     scene = ts.Scene()
     scene.add_body(cube(), rubber(), name="still").fix([2], axes="z")
     second = scene.add_body(cube(), rubber(), name="prescribed", position=(0, 1, 0), **element(order))
@@ -31,13 +31,13 @@ def made(*paths, order: int = 1):
     return DirichletConditions(scene, layout), rest
 
 
-def until(end, way):
-    return lambda t: None if t > end else way(t)
+def until(end, path):
+    return lambda t: None if t > end else path(t)
 
 
 @both_orders
 def test_masks(order, n):
-    """The last led node is the middle of an edge if the body is quadratic."""
+    """The last prescribed node is at the middle of an edge if the body is quadratic."""
     dirichlet, _ = made(([0, 1], "xz", lambda t: (t, 0, 0)), ([1, n - 2], "y", lambda t: (0, t, 0)), order=order)
     expected = np.zeros((8 + n, 3), dtype=bool)
     expected[2, 2] = expected[15, :2] = True
@@ -50,19 +50,19 @@ def test_masks(order, n):
 
 @both_orders
 def test_targets(order, n):
-    way = np.array([[1.0, 2, 3], [4, 5, 6]])
-    dirichlet, rest = made(([n - 3, 2], "xyz", lambda t: t * way), ([3], "y", lambda t: (0, -t, 0)), order=order)
+    displacement = np.array([[1.0, 2, 3], [4, 5, 6]])
+    dirichlet, rest = made(([n - 3, 2], "xyz", lambda t: t * displacement), ([3], "y", lambda t: (0, -t, 0)), order=order)
     rows, releasing = dirichlet.targets(np.array([0.5, 2.0]))
     assert rows.shape == (2, 3, 3) and not releasing
     for row, t in zip(rows, (0.5, 2.0)):
-        assert row == pytest.approx(np.concatenate([rest[[5 + n, 10]] + t * way, rest[[11]] + [[0, -t, 0]]]))
+        assert row == pytest.approx(np.concatenate([rest[[5 + n, 10]] + t * displacement, rest[[11]] + [[0, -t, 0]]]))
 
 
 def test_release():
     dirichlet, rest = made(([0, 1], "xyz", until(1.0, lambda t: (t, 0, 0))), ([3], "y", until(2.0, lambda t: (0, t, 0))))
     times = np.array([0.5, 1.0, 1.5, 1.75, 2.5])
     rows, releasing = dirichlet.targets(times)
-    assert len(rows) == 2 and releasing and dirichlet.constrained()[8].all()  # not before its time has come
+    assert len(rows) == 2 and releasing and dirichlet.constrained()[8].all()  # not released before its time
     rows, releasing = dirichlet.targets(times[2:])
     assert len(rows) == 0 and releasing and not dirichlet.constrained()[[8, 9]].any() and dirichlet.constrained()[11, 1]
     assert dirichlet.prescribed_axes().tolist() == [[0, 0, 0], [0, 0, 0], [0, 1, 0]]
@@ -75,16 +75,16 @@ def test_release():
     assert dirichlet.constrained()[8].all() and len(dirichlet.targets(times)[0]) == 2
 
 
-@pytest.mark.parametrize("way", [(1, 2), np.zeros((3, 3)), np.zeros((2, 2)), (0, np.nan, 0), np.full((2, 3), np.inf), 1.0])
-def test_what_a_path_may_give(way):
-    dirichlet, _ = made(([0, 1], "xyz", lambda t: (0, 0, 0) if t < 1 else way))
-    dirichlet.targets(np.array([0.5]))
-    with pytest.raises(ts.SimulationError, match=r"body 'prescribed': the path of its moved nodes gave .* at t = 1.5 s"):
-        dirichlet.targets(np.array([1.5]))
+INVALID = [(1, 2), np.zeros((3, 3)), np.zeros((2, 2)), (0, np.nan, 0), np.full((2, 3), np.inf), 1.0]
 
 
-@pytest.mark.parametrize("late, words", [(lambda t: 1 / 0, "ZeroDivisionError: "), (lambda t: "up", "ValueError: ")])
-def test_a_path_that_fails(late, words):
+@pytest.mark.parametrize(
+    "late, words",
+    [(lambda t, value=value: value, "gave .* at t = 1.5 s") for value in INVALID]
+    + [(lambda t: 1 / 0, "failed at t = 1.5 s: ZeroDivisionError: "), (lambda t: "up", "failed at t = 1.5 s: ValueError: ")],
+)
+def test_invalid_paths_are_refused(late, words):
     dirichlet, _ = made(([0, 1], "xyz", lambda t: (0, 0, 0) if t < 1 else late(t)))
-    with pytest.raises(ts.SimulationError, match=f"body 'prescribed': the path of its moved nodes failed at t = 1.5 s: {words}"):
+    dirichlet.targets(np.array([0.5]))
+    with pytest.raises(ts.SimulationError, match=f"body 'prescribed': the path of its moved nodes {words}"):
         dirichlet.targets(np.array([1.5]))

@@ -1,9 +1,9 @@
-"""A body pulled at a point:
+"""Dragging a body at a point:
 
-* pulled sideways it comes to lie where statics with the force of the same spring says, and released it comes back;
-* the stiffest pull stays bounded, and so does a mad one: no tet turns over, and the force keeps its limit;
-* where pulling is not wanted nothing is allocated for it, and it is refused; a released pull leaves no trace;
-* pulling compiles nothing.
+* a dragged beam comes to rest at the static equilibrium under the same force, and returns after the release;
+* the stiffest spring and a far target stay stable: no tet inverts, and the force keeps its limit;
+* without `draggable` nothing is allocated, and drag is refused; a drag that has ended leaves no trace;
+* a drag compiles nothing.
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ CASES = [("implicit_euler", 1), ("bdf2", 2), ("velocity_verlet", 1)]
 
 
 @pytest.mark.parametrize("integrator, order", CASES)
-def test_pulled_to_rest_and_back(integrator, order):
+def test_rests_at_the_static_equilibrium_and_returns(integrator, order):
     scene, tip = beam(order)
     rest = scene.bodies[0].rest_positions
     start = rest[tip].mean(axis=0)
@@ -41,19 +41,19 @@ def test_pulled_to_rest_and_back(integrator, order):
         sim.run(2.0, fps=20)
         drag, dragged = sim.dragged, sim.positions()
         assert np.allclose(drag.force, 15000.0 * (target - dragged[tip].mean(axis=0)), rtol=0.01, atol=0.5)
-        way, wanted = dragged[tip].mean(axis=0) - start, target - start
-        assert 0.2 < way @ wanted / (wanted @ wanted) < 0.95
+        moved, pull = dragged[tip].mean(axis=0) - start, target - start
+        assert 0.2 < moved @ pull / (pull @ pull) < 0.95
         sim.release()
         sim.run(2.0, fps=20)
         assert np.abs(sim.positions() - rest).max() < 0.003
     still, _ = beam(order)
     still.bodies[0].add_force(tip, np.outer(np.full(len(tip), 1 / len(tip)), drag.force))
     static = ts.solve_static(still, precision="f32", tolerance=1e-4)
-    assert np.abs(static.positions("beam") - dragged).max() < 0.02 * np.linalg.norm(way)
+    assert np.abs(static.positions("beam") - dragged).max() < 0.02 * np.linalg.norm(moved)
 
 
 @pytest.mark.parametrize("integrator", SETTINGS)
-def test_the_stiffest_pull_stays_bounded(integrator):
+def test_the_stiffest_spring_is_stable(integrator):
     scene, tip = beam()
     corner = tip[:1]
     with ts.Simulator(scene, dt=SETTINGS[integrator], integrator=integrator, draggable=True) as sim:
@@ -66,14 +66,14 @@ def test_the_stiffest_pull_stays_bounded(integrator):
             assert sim.run(0.05, fps=20).status == "ok"
             assert np.linalg.norm(sim.dragged.force) <= 1.0001 * sim.dragged.max_force
             energies.append(sim.energies().kinetic + sim.energies().elastic)
-        drag, held = sim.dragged, sim.dt * sim._dynamics.stepper.held_steps(sim.dt)
-        assert max(energies) < 0.5 * SOFT * drag.mass / held**2 * 0.1**2, "no more than the spring held at the start"
         assert sim.energies().kinetic < 0.05 * sim.energies().elastic, "it comes to rest"
         assert np.linalg.norm(sim.positions()[corner[0]] - target) < 0.09
+        drag, held = sim.dragged, sim.dt * sim.advance(1000).steps  # [s] over which the force is held: steps of one launch
+        assert max(energies) < 0.5 * SOFT * drag.mass / held**2 * 0.1**2, "at most the initial energy of the spring"
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "symplectic_euler"])
-def test_a_mad_pull_is_held_back(integrator):
+def test_a_far_target_inverts_no_tet(integrator):
     scene, tip = beam()
     with ts.Simulator(scene, dt=SETTINGS[integrator], integrator=integrator, draggable=True) as sim:
         if sim.settings.explicit:
@@ -90,8 +90,8 @@ def test_a_mad_pull_is_held_back(integrator):
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "velocity_verlet"])
-def test_a_pull_compiles_nothing_and_leaves_nothing(integrator):
-    ways = []
+def test_a_drag_compiles_nothing_and_leaves_no_trace(integrator):
+    ends = []
     for dragged in (False, True):
         scene, tip = beam()
         scene.gravity = (0, -1, 0)
@@ -105,11 +105,11 @@ def test_a_pull_compiles_nothing_and_leaves_nothing(integrator):
                 sim.reset()
                 assert sim.dragged is None
                 sim.advance(4)
-            ways.append(sim.positions())
-    assert np.array_equal(*ways)
+            ends.append(sim.positions())
+    assert np.array_equal(*ends)
 
 
-def test_pulling_is_refused_unless_wanted():
+def test_drag_is_refused_unless_draggable():
     scene, tip = beam()
     with ts.Simulator(scene, dt=0.01) as sim:
         assert not sim.plan.on["loads"] and "loads" not in sim.field_bytes
@@ -127,5 +127,5 @@ def test_pulling_is_refused_unless_wanted():
         ):
             with pytest.raises(SceneError, match=message):
                 sim.drag("beam", nodes, weights, target, 1.0)
-    with pytest.raises(SimulationError, match="draggable = 1"):
+    with pytest.raises(SimulationError, match="draggable must be True or False, not 1"):
         ts.Simulator(scene, draggable=1)

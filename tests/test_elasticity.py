@@ -1,13 +1,14 @@
-"""The elastic operator of four bodies, two linear and two quadratic, none of whose tets fill the last lanes: the serial
-kernels in f64, with two laws and the finer quadrature, the parallel ones in f32 with one law and the coarser one.
+"""The elastic operator of four bodies, two linear and two quadratic, whose tets do not fill the last lanes.
+
+In f64 serial kernels, with two laws and the finer quadrature; in f32 parallel kernels, with one law and the coarser quadrature.
 
 * energies, volume ratios, forces and their differential are the oracle's;
 * forces are minus the gradient of the energy; a tet inverted at a single quadrature point counts as inverted;
-* a body at rest has no force, wherever it stands and however it is turned;
-* the assembled stiffness is the oracle's, the matrix-free differential's and that of finite differences of the forces;
-  it is symmetric, translations are its null space, and its pattern is the node graph;
-* the projected one is the oracle's and has no negative eigenvalue; with mass and damping it makes the system;
-* parallel kernels give the same numbers in every run.
+* a body at rest has no force, at any position and orientation;
+* the assembled stiffness is that of the oracle, of the matrix-free differential and of finite differences of the forces;
+  it is symmetric, translations are in its null space, and its pattern is the node graph;
+* the projected stiffness is the oracle's and has no negative eigenvalue; the system adds mass and damping;
+* parallel kernels give the same bits in every run.
 """
 
 import numpy as np
@@ -25,13 +26,13 @@ SQUEEZE = np.array([[0.6, 0.1, 0.0], [-0.15, 1.2, 0.05], [0.0, 0.1, 0.7]])
 
 @pytest.fixture(scope="module", params=["f64", "f32"])
 def rig(request):
-    # compiling an assembly takes seconds a law and quadrature; the laws have tests of their own
+    # compiling an assembly takes seconds per law and quadrature; the laws have tests of their own
     double = request.param == "f64"
     laws, degree = ((SNH, SVK, SNH, SVK), 4) if double else ((SNH,) * 4, 2)
     scene = mixed_scene(laws, mass_damping=0.4, stiffness_damping=3e-3, order="both", degrees=(degree, degree))
     with built(scene, request.param) as made:
         made.model = made.model if double else made.parallel
-        made.force, made.way, made.product = made.vectors("force"), made.vectors("way"), made.vectors("product")
+        made.force, made.dx, made.product = made.vectors("force"), made.vectors("dx"), made.vectors("product")
         made.matrix = block_csr.build_block_csr(made.model, made.arena)
         made.damper = block_csr.sibling(made.matrix, made.model, made.arena, "damper")
         yield made
@@ -48,20 +49,20 @@ def squeezed(rig):
 
 
 def elastic_force(rig, x) -> np.ndarray:
-    """As float64."""
+    """Elastic forces at x, as float64."""
     rig.model.state.x.from_numpy(x)
     elasticity.elastic_forces(rig.model)
     elasticity.gather_forces(rig.model, rig.force)
     return rig.force.to_numpy().astype(np.float64)
 
 
-def close(rig, value, expected, roundings: float) -> None:
-    """Equal up to so many roundings of the largest expected number."""
+def assert_close(rig, value, expected, roundings: float) -> None:
+    """Check equality up to that many roundings of the largest expected number."""
     assert np.abs(expected).max() > 0.0
     assert np.abs(value - expected).max() < roundings * rig.eps * np.abs(expected).max()
 
 
-def test_the_squeezed_state_is_a_hard_one(rig, squeezed):
+def test_the_squeezed_state_is_inverted_and_indefinite(rig, squeezed):
     assert 1 <= rig.oracle.volume_ratios(squeezed)[1] < 26  # tets
     assert np.linalg.eigvalsh(rig.oracle.stiffness(squeezed)).min() < -1e3  # N/m
 
@@ -77,8 +78,8 @@ def test_energies_and_volume_ratios(rig, squeezed):
 
 
 def test_forces(rig, squeezed):
-    rig.model.state.element_force.fill(np.nan)  # what is read must have been written
-    close(rig, elastic_force(rig, squeezed), rig.oracle.force(squeezed), 30)
+    rig.model.state.element_force.fill(np.nan)  # entries that are read but not written give nan
+    assert_close(rig, elastic_force(rig, squeezed), rig.oracle.force(squeezed), 30)
 
 
 @pytest.mark.parametrize("where", ["here", "far", "turned"])
@@ -99,20 +100,20 @@ def test_no_force_at_rest(rig, where):
 
 
 def test_forces_are_minus_the_gradient_of_the_energy(rig, squeezed):
-    """Of the package's own energy, which is summed in f64."""
-    way, h, energies = np.random.default_rng(4).standard_normal(squeezed.shape), 1e-5, []
+    """By finite differences of taisoft's own energy, which is summed in f64."""
+    direction, h, energies = np.random.default_rng(4).standard_normal(squeezed.shape), 1e-5, []
     elastic_force(rig, squeezed)
     for step in (h, -h):
-        rig.model.state.x.from_numpy(squeezed + step * way)
+        rig.model.state.x.from_numpy(squeezed + step * direction)
         measure(rig.model)
         energies.append(rig.model.state.scalars[ELASTIC])
     slope = (energies[0] - energies[1]) / (2 * h)
     assert abs(slope) > 1e4  # [N]
-    assert -np.sum(elastic_force(rig, squeezed) * way) == pytest.approx(slope, rel=1e-7 + 30 * rig.eps)
+    assert -np.sum(elastic_force(rig, squeezed) * direction) == pytest.approx(slope, rel=1e-7 + 30 * rig.eps)
 
 
 def test_a_tet_inverted_at_one_point_is_inverted(rig):
-    """The middle of an edge is moved along it, towards one end of which the element is then turned inside out."""
+    """Moving the middle of an edge along it inverts the element near one end."""
     x, part = rig.oracle.rest.copy(), rig.oracle.parts[0]
     tet = part.nodes[0]
     x[tet[4]] += 0.6 * (x[tet[1]] - x[tet[0]])
@@ -125,44 +126,43 @@ def test_a_tet_inverted_at_one_point_is_inverted(rig):
 
 
 def test_force_differential(rig, squeezed):
-    way = np.random.default_rng(5).standard_normal(squeezed.shape).astype(rig.machine.np_real)
-    expected = -(rig.oracle.stiffness(squeezed) @ way.astype(np.float64).reshape(-1)).reshape(-1, 3)
-    rig.way.from_numpy(way)
-    elasticity.force_differential(rig.model, rig.way, rig.product)
-    close(rig, rig.product.to_numpy(), expected, 100)
+    dx = np.random.default_rng(5).standard_normal(squeezed.shape).astype(rig.machine.np_real)
+    expected = -(rig.oracle.stiffness(squeezed) @ dx.astype(np.float64).reshape(-1)).reshape(-1, 3)
+    rig.dx.from_numpy(dx)
+    elasticity.force_differential(rig.model, rig.dx, rig.product)
+    assert_close(rig, rig.product.to_numpy(), expected, 100)
 
 
 def test_assembled_stiffness(rig, squeezed):
-    way = np.random.default_rng(6).standard_normal(squeezed.shape).astype(rig.machine.np_real)
-    rig.way.from_numpy(way)
-    elasticity.force_differential(rig.model, rig.way, rig.product)
+    dx = np.random.default_rng(6).standard_normal(squeezed.shape).astype(rig.machine.np_real)
+    rig.dx.from_numpy(dx)
+    elasticity.force_differential(rig.model, rig.dx, rig.product)
     free = rig.product.to_numpy()
-    exactly = rig.oracle.stiffness(squeezed)
     rig.matrix.value.fill(np.nan)
     rig.matrix.diagonal.fill(np.nan)
     block_csr.assemble(rig.model, rig.matrix, EVERYTHING, False)
     K = block_csr.to_scipy(rig.model, rig.matrix).toarray()
-    close(rig, K, exactly, 100)
-    close(rig, K, K.T, 20)
-    block_csr.multiply(rig.model, rig.matrix, rig.way, rig.product)
-    close(rig, rig.product.to_numpy(), -free, 100)
-    close(rig, rig.product.to_numpy().reshape(-1), K @ way.astype(np.float64).reshape(-1), 30)
+    assert_close(rig, K, rig.oracle.stiffness(squeezed), 100)
+    assert_close(rig, K, K.T, 20)
+    block_csr.multiply(rig.model, rig.matrix, rig.dx, rig.product)
+    assert_close(rig, rig.product.to_numpy(), -free, 100)
+    assert_close(rig, rig.product.to_numpy().reshape(-1), K @ dx.astype(np.float64).reshape(-1), 30)
     for axis in np.eye(3):
         assert np.abs(K @ np.tile(axis, rig.model.n_nodes)).max() < 30 * rig.eps * np.abs(K).max()
 
 
 def test_stiffness_by_finite_differences_of_the_forces(rig, squeezed):
-    """Of the package's own forces: h^2 of the third derivative of the energy, and the rounding of the forces over h."""
+    """Of taisoft's own forces: errors are h^2 times the third derivative of the energy, and rounding of the forces over h."""
     block_csr.assemble(rig.model, rig.matrix, EVERYTHING, False)
     K = block_csr.to_scipy(rig.model, rig.matrix)
-    way, h = np.random.default_rng(7).standard_normal(squeezed.shape), {"f64": 1e-6, "f32": 1e-3}[rig.machine.precision]
-    forces = [elastic_force(rig, squeezed + step * way) for step in (h, -h)]
+    direction, h = np.random.default_rng(7).standard_normal(squeezed.shape), {"f64": 1e-6, "f32": 1e-3}[rig.machine.precision]
+    forces = [elastic_force(rig, squeezed + step * direction) for step in (h, -h)]
     change = (forces[0] - forces[1]).reshape(-1) / (2 * h)
-    assert np.abs(K @ way.reshape(-1) + change).max() < (1e-8 + 30 * rig.eps / h) * np.abs(change).max()
+    assert np.abs(K @ direction.reshape(-1) + change).max() < (1e-8 + 30 * rig.eps / h) * np.abs(change).max()
 
 
 def test_pattern_is_the_node_graph(rig):
-    """Rows of ascending columns without the diagonal, one for each pair of a tet's nodes; both halves find their blocks."""
+    """Ascending columns without the diagonal, a block for each pair of a tet's nodes."""
     edges = set()
     for tets, *_ in rig.oracle.parts:
         for tet in tets:
@@ -176,15 +176,15 @@ def test_pattern_is_the_node_graph(rig):
 @pytest.mark.parametrize("rig", ["f32"], indirect=True)  # each law's own projection is tested in f64 with the laws
 def test_projected_stiffness(rig, squeezed):
     expected = rig.oracle.stiffness(squeezed, projected=True)
-    assert np.abs(expected - rig.oracle.stiffness(squeezed)).max() > 1e4  # [N/m] there is something to project
+    assert np.abs(expected - rig.oracle.stiffness(squeezed)).max() > 1e4  # [N/m] so that projection matters
     block_csr.assemble(rig.model, rig.matrix, EVERYTHING, True)
     K = block_csr.to_scipy(rig.model, rig.matrix).toarray()
-    close(rig, K, expected, 100)
+    assert_close(rig, K, expected, 100)
     assert np.linalg.eigvalsh((K + K.T) / 2).min() > -20 * rig.eps * np.abs(K).max()
 
 
 def test_system(rig):
-    """(c + beta a) M + beta^2 K + beta b K_d with each row's own damping a and b, which are 0 in two of the bodies."""
+    """(c + beta a) M + beta^2 K + beta b K_d with each row's damping rates a and b, 0 in two bodies."""
     c, beta, rng = 0.7, 30.0, np.random.default_rng(9)
     fields = (rig.matrix.value, rig.matrix.diagonal, rig.damper.value, rig.damper.diagonal)
     numbers = [block_csr.packed(rng.standard_normal((*field.shape, 3, 3))).astype(rig.machine.np_real) for field in fields]
@@ -196,7 +196,7 @@ def test_system(rig):
     K, K_d = (block_csr.to_scipy(rig.model, A).toarray() for A in (rig.matrix, rig.damper))
     block_csr.to_system(rig.model, rig.matrix, rig.damper, EVERYTHING, c, beta)
     expected = (c + beta * a) * M + beta**2 * K + beta * b * K_d
-    close(rig, block_csr.to_scipy(rig.model, rig.matrix).toarray(), expected, 10)
+    assert_close(rig, block_csr.to_scipy(rig.model, rig.matrix).toarray(), expected, 10)
 
 
 @pytest.mark.parametrize("rig", ["f32"], indirect=True)

@@ -1,10 +1,10 @@
 """Linear and quadratic tetrahedra on the host:
 
 * nodes are vertices, then middles of edges by sorted vertex pairs, and so are an element's;
-* shape functions add up to 1, are 1 at their own node alone, and reproduce polynomials of their order and their gradients;
-* quadrature rules have positive weights, points inside, and are exact for the degree they promise;
-* masses are the oracle's: they add up, the lumped one is positive, the consistent one integrates squares and weight;
-* a uniform traction has the force and the moment of its resultant at the faces' centroids.
+* shape functions sum to 1, are 1 at their own node and 0 at the others, and reproduce polynomials of their order;
+* quadrature rules have positive weights, points inside, and integrate polynomials of their degree exactly;
+* masses are the oracle's and sum to the total; lumped masses are positive, consistent ones integrate squares and weight;
+* a uniform traction has the same total force and moment as area times traction at the faces' centroids.
 """
 
 from itertools import product
@@ -54,7 +54,7 @@ def test_nodes(order):
 def test_shape_functions(order):
     N, s = reference.shape_functions(order, POINTS), reference.shape_derivatives(order, POINTS)
     assert N.shape == (20, (4, 10)[order - 1]) and np.abs(N.sum(axis=1) - 1).max() < 1e-15
-    # a gradient is s_ak grad l_k, and the grad l_k add up to 0: those of N_a do where their sums over a are alike
+    # grad N_a = s_ak grad l_k, and the grad l_k sum to 0: the grad N_a sum to 0 if the sums over a are equal for all k
     assert np.ptp(s.sum(axis=1), axis=1).max() < 1e-14
     at_nodes = np.concatenate([np.eye(4), [(np.eye(4)[a] + np.eye(4)[b]) / 2 for a, b in reference.EDGES]])
     at_nodes = at_nodes[: N.shape[1]]
@@ -79,7 +79,7 @@ def test_gradients_reproduce_polynomials(order, degree):
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_the_order_of_vertices_does_not_matter(order):
+def test_order_of_vertices_does_not_matter(order):
     plain = body(order)
     turned = body(order, mesh=ts.TetMesh(plain.mesh.vertices, plain.mesh.tets[:, [2, 0, 1, 3]]))
     assert np.array_equal(turned.rest_positions, plain.rest_positions)
@@ -117,7 +117,7 @@ def test_quadrature(degree, exact, count):
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_masses_are_the_oracles(order):
+def test_masses_equal_those_of_the_oracle(order):
     made = body(order)
     expected = Elements(made.mesh, order)
     M, lumped = reference.consistent_mass(made).toarray(), reference.lumped_mass(made)
@@ -128,22 +128,22 @@ def test_masses_are_the_oracles(order):
     assert reference.gravity_mass(made) == pytest.approx(M.sum(axis=1))
 
 
-@pytest.mark.parametrize("order, shares, weights", [(1, [1 / 4], [1 / 4]), (2, [1 / 36, 4 / 27], [-1 / 20, 1 / 5])])
-def test_a_tet_gives_its_nodes_their_shares(order, shares, weights):
-    """Of the lumped mass, and of weight."""
+@pytest.mark.parametrize("order, masses, weights", [(1, [1 / 4], [1 / 4]), (2, [1 / 36, 4 / 27], [-1 / 20, 1 / 5])])
+def test_fractions_of_a_tet_at_its_nodes(order, masses, weights):
+    """Of lumped mass and of weight."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], dtype=float)
     tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])  # of 200 kg and 400 kg
     made = body(order, mesh=ts.TetMesh(vertices, tets))
-    for found, share in ((reference.lumped_mass(made), shares), (reference.gravity_mass(made), weights)):
-        assert found[:5] == pytest.approx(share[0] * np.array([200, 600, 600, 600, 400]))
+    for found, fraction in ((reference.lumped_mass(made), masses), (reference.gravity_mass(made), weights)):
+        assert found[:5] == pytest.approx(fraction[0] * np.array([200, 600, 600, 600, 400]))
         # by sorted pairs: 01 02 03 of the first tet, 12 13 of both, 14 of the second, 23 of both, 24 34 of the second
-        middles = share[1] * np.array([200, 200, 200, 600, 600, 400, 600, 400, 400]) if order == 2 else []
+        middles = fraction[1] * np.array([200, 200, 200, 600, 600, 400, 600, 400, 400]) if order == 2 else []
         assert found[5:] == pytest.approx(middles)
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_the_consistent_mass_integrates_squares(order):
-    """Of a polynomial of the elements' own order, by an accurate rule."""
+def test_consistent_mass_integrates_squares(order):
+    """Of polynomials of the element's order, by an accurate rule."""
     made, (field, _) = body(order), polynomial(order)
     rule = reference.quadrature(4)
     values = field(rule.points @ made.mesh.vertices[made.mesh.tets])
@@ -172,12 +172,12 @@ def test_traction_on_two_triangles(order):
     f = reference.traction_forces(made, np.array([3, 8]), (0.0, 10.0, -1.0))
     expected = body_loads(made, made.rest_positions, reference.lumped_mass(made))
     assert np.abs(f - expected).max() < 1e-15 * np.abs(expected).max()
-    assert (f[:, 1] > 0).sum() == (5, 6)[order - 1]  # the triangles have a vertex in common, but no edge
+    assert (f[:, 1] > 0).sum() == (5, 6)[order - 1]  # the triangles share a vertex, but no edge
 
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_work_of_a_traction(order):
-    """Against a displacement of the elements' own order: the integral over a face, by a rule of degree 3."""
+    """On a displacement of the element's order: the integral over a face, by a rule of degree 3."""
     made, (field, _), t = body(order), polynomial(order), np.array([1.0, -2.0, 0.5])
     face = np.arange(4)
     f = reference.traction_forces(made, face, t)

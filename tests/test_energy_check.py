@@ -1,9 +1,10 @@
-"""Runs that create energy are not ok, and all others are:
+"""The energy check: runs that create energy are degraded, others are ok:
 
-* told by a stand-in whose energies are given: a rise above a tenth of what the motion can hold counts, what gravity and loads
-  give does not; driven nodes, changes from outside and overlaps that are mended set the start anew; explicit steps may exchange;
-* steps near `stable_dt` in a strained state, and linearly implicit ones of St. Venant-Kirchhoff's law under strong compression;
-* bodies that fall, bounce, swing, vibrate or are loaded keep their energy, explicit bounces with restitution 1, too.
+* with given energies: a rise above a tenth of the energy of the motion counts, work of gravity and loads does not; prescribed
+  motion, changes by the user and corrected overlaps restart the check; explicit steps may oscillate about the energy;
+* energy is created by steps near `stable_dt` in a strained state, and by linearly implicit steps of St. Venant-Kirchhoff bodies
+  under strong compression;
+* bodies that fall, bounce, swing, vibrate or are loaded create none, also in explicit bounces with restitution 1.
 """
 
 from types import SimpleNamespace
@@ -18,7 +19,7 @@ from taisoft.records import Energies, RunReport, StepReport
 
 
 class StandIn:
-    """A cube of 1 m that holds 100 J of kinetic energy."""
+    """Simulator and Dynamics of a 1 m cube with 100 J of kinetic energy."""
 
     def __init__(self, integrator: str = "implicit_euler"):
         self.settings = SimpleNamespace(explicit=integrator in ("symplectic_euler", "velocity_verlet"), integrator=integrator)
@@ -34,16 +35,16 @@ class StandIn:
         return Energies(100.0, 0.0, 0.0)
 
 
-def told(sim: StandIn, *reports: StepReport | None) -> RunReport:
-    """What comes of steps with these energies; None: something changes the state from outside."""
-    check, run = EnergyCheck(sim), RunReport()
+def check(sim: StandIn, *reports: StepReport | None) -> RunReport:
+    """The report of a run of steps with these energies; None: the user changes the state."""
+    energy, run = EnergyCheck(sim), RunReport()
     for report in reports:
         if report is None:
             sim.changes += 1
             continue
-        check.before_step()
-        check.after_step(report)
-    check.add_problem(run)
+        energy.before_step()
+        energy.after_step(report)
+    energy.add_problem(run)
     return run
 
 
@@ -67,67 +68,67 @@ def step(kinetic: float, elastic: float = 0.0, gravity: float = 0.0, loads: floa
         ([step(np.nan)], "ok"),  # the run has failed
     ],
 )
-def test_what_counts(steps, status):
-    run = told(StandIn(), *steps)
+def test_rises_of_energy(steps, status):
+    run = check(StandIn(), *steps)
     assert run.status == status and len(run.problems) == (status == "degraded")
     assert all("energy was created: it rose by" in text and "halve dt" in text for text in run.problems)
 
 
-def test_how_much_is_said():
-    (text,) = told(StandIn(), step(1000.0), step(400.0)).problems
+def test_messages_give_the_rise():
+    (text,) = check(StandIn(), step(1000.0), step(400.0)).problems
     assert "rose by 900 J from t = 0 s to 1 s, 9 times the energy of the motion" in text
-    assert "rose by 30 J from t = 0 s to 1 s, 30 % of" in told(StandIn(), step(130.0)).problems[0]
+    assert "rose by 30 J from t = 0 s to 1 s, 30 % of" in check(StandIn(), step(130.0)).problems[0]
 
 
 @pytest.mark.parametrize(
-    "integrator, quiet, loud",
+    "integrator, allowed, too_large",
     [("velocity_verlet", (90.0, 25.0), (105.0, 25.0)), ("symplectic_euler", (90.0, 60.0), (180.0, 60.0))],
 )
-def test_explicit_steps_exchange(integrator, quiet, loud):
-    assert told(StandIn(integrator), step(*quiet)).status == "ok"
-    assert told(StandIn(integrator), step(*loud)).status == "degraded"
-    assert told(StandIn(), step(*quiet)).status == "degraded"
+def test_explicit_steps_may_oscillate_about_the_energy(integrator, allowed, too_large):
+    assert check(StandIn(integrator), step(*allowed)).status == "ok"
+    assert check(StandIn(integrator), step(*too_large)).status == "degraded"
+    assert check(StandIn(), step(*allowed)).status == "degraded"
 
 
-def test_what_is_fed():
+def test_driven_motion_and_corrected_overlaps_may_add_energy():
     sim = StandIn()
     sim.is_driven = True
-    assert told(sim, step(500.0)).status == "ok"
+    assert check(sim, step(500.0)).status == "ok"
     sim.is_driven, sim.scene.allow_initial_overlap = False, True
-    assert told(sim, step(500.0, max_penetration=0.1), step(505.0)).status == "ok"
-    assert told(sim, step(500.0, max_penetration=0.1), step(600.0)).status == "degraded"
+    assert check(sim, step(500.0, max_penetration=0.1), step(505.0)).status == "ok"
+    assert check(sim, step(500.0, max_penetration=0.1), step(600.0)).status == "degraded"
 
 
-def test_contacts_of_the_start_open():
-    """To their contact offset, which takes energy; later ones have none to take."""
-    assert told(StandIn(), step(130.0, n_contacts=4)).status == "ok"
-    assert told(StandIn(), step(100.0), step(130.0, n_contacts=4)).status == "degraded"
+def test_initial_contacts_may_open_to_their_offset():
+    """Which adds energy; later contacts may not."""
+    assert check(StandIn(), step(130.0, n_contacts=4)).status == "ok"
+    assert check(StandIn(), step(100.0), step(130.0, n_contacts=4)).status == "degraded"
 
 
-def strained(law: str, integrator: str, share: float, dt: float | None, steps: int) -> RunReport:
+def strained(law: str, integrator: str, stretch: float, dt: float | None, steps: int) -> RunReport:
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.add_body(ts.box_mesh((4, 2, 2), (2, 1, 1)), ts.Material(law=law, young=1e6, poisson=0.3, density=1000.0), name="box")
     with ts.Simulator(scene, 1e-4, integrator, precision="f64") as sim:
         sim.dt = dt or 0.9 * sim.stable_dt
         x = sim.positions()
-        x[:, 0] *= share
+        x[:, 0] *= stretch
         sim.set_state(positions=x)
         return sim.run(steps * sim.dt, fps=None)
 
 
 @pytest.mark.filterwarnings("ignore:step")
 @pytest.mark.parametrize(
-    "law, integrator, share, dt, steps",
+    "law, integrator, stretch, dt, steps",
     [(COR, "symplectic_euler", 0.95, None, 200), (SVK, "linearly_implicit_euler", 0.6, 0.08, 3)],
 )
-def test_strained_bodies(law, integrator, share, dt, steps):
-    run = strained(law, integrator, share, dt, steps)
+def test_unstable_steps_create_energy(law, integrator, stretch, dt, steps):
+    run = strained(law, integrator, stretch, dt, steps)
     assert run.status == "degraded" and "energy was created" in run.problems[-1]
 
 
 @pytest.mark.parametrize("integrator", ["symplectic_euler", "velocity_verlet", "implicit_midpoint", "bdf2", "implicit_euler"])
-def test_swings_and_loads(integrator):
-    """A beam that falls about its fixed end, pulled on by a traction, and a block that vibrates as it flies far away."""
+def test_swinging_and_vibrating_bodies_create_no_energy(integrator):
+    """A beam that falls about its fixed end under a traction, and a vibrating block that flies far away."""
     scene = ts.Scene()
     scene.contact_forces = False
     beam = scene.add_body(cube(cells=(3, 1, 1), size=(2, 0.5, 0.5)), rubber(SNH), name="beam")
@@ -145,8 +146,8 @@ def test_swings_and_loads(integrator):
 @pytest.mark.parametrize(
     "integrator, restitution", [("symplectic_euler", 1.0), ("symplectic_euler", 0.5), ("velocity_verlet", 1.0), ("bdf2", 1.0)]
 )
-def test_falls_and_bounces(integrator, restitution):
-    """Explicit steps at 0.7 of `stable_dt` once made 50 times the energy of the fall."""
+def test_bounces_create_no_energy(integrator, restitution):
+    """Explicit steps at 0.7 of `stable_dt` once created 50 times the energy of the fall."""
     scene, side = ts.Scene(), 0.1
     material = ts.Material(law=SNH, young=1e6, poisson=0.3, density=1000.0, friction=0.0)
     scene.add_body(ts.box_mesh((2, 2, 2), (side,) * 3), material, name="cube", position=(0, side, 0))
@@ -162,8 +163,8 @@ def test_falls_and_bounces(integrator, restitution):
     assert energy[-1] < 1.3 * weight * side / 2
 
 
-def test_a_body_that_just_fits():
-    """Between two planes that it touches: contacts squeeze it by their contact offset."""
+def test_a_body_squeezed_by_the_contact_offset_is_ok():
+    """It touches a plane on either side."""
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.add_body(cube(size=(1, 1, 1)), rubber(), name="cube")
     for k, y in enumerate((-0.5, 0.5)):

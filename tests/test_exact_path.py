@@ -1,9 +1,9 @@
-"""The exact path of the falling beam, against which solvers and peers are measured:
+"""The exact path of the falling beam, the reference for errors of solvers and peers:
 
-* the force is minus the gradient of the St. Venant-Kirchhoff energy, and no rigid motion raises one;
-* the masses add up to the body's, and exactly the end face is fixed;
-* the integration gives the independent reference path of the coarse beam, where that is at hand;
-* the stored paths are those of the present code, converged, and the error they give is a distance over the excursion.
+* the force is minus the gradient of the St. Venant-Kirchhoff energy, and 0 under rigid motion;
+* the masses sum to the total, and exactly the end face is fixed;
+* integration gives the independent reference path of the coarse beam;
+* the stored paths are those of the present code, and converged; errors are distances over the excursion.
 """
 
 import json
@@ -29,7 +29,7 @@ def beam():
     return FallingBeam((4, 2, 1))
 
 
-def test_the_force_is_minus_the_gradient_of_the_energy(beam):
+def test_force_is_minus_the_gradient_of_the_energy(beam):
     rng = np.random.default_rng(1)
     u = 0.05 * rng.standard_normal(beam.vertices.shape)
     direction = rng.standard_normal(u.shape)
@@ -41,11 +41,11 @@ def test_the_force_is_minus_the_gradient_of_the_energy(beam):
     assert power == pytest.approx(slope, rel=1e-7)
 
 
-def test_a_rigid_motion_raises_no_force(beam):
+def test_rigid_motion_causes_no_force(beam):
     angle = 1.1
     R = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     u = beam.vertices @ R.T + [0.3, -2, 5] - beam.vertices
-    assert np.abs(beam.elastic_force(u.T)).max() < 1e-8  # N; a strain of 1 would raise 1e6
+    assert np.abs(beam.elastic_force(u.T)).max() < 1e-8  # N; a strain of 1 causes 1e6
 
 
 def test_mass_and_fixed_nodes(beam):
@@ -56,7 +56,7 @@ def test_mass_and_fixed_nodes(beam):
     assert np.allclose(a[:, beam.free].T, [0, -9.8, 0]) and np.all(a[:, ~beam.free] == 0)
 
 
-def test_the_integration_gives_the_reference_path(shared):
+def test_integration_gives_the_reference_path(shared):
     value = json.loads((shared / "references" / "beam_fall_semidiscrete.json").read_text())["value"]["SVK_lumped"]
     beam = FallingBeam((11, 2, 2))
     node = np.flatnonzero(np.all(np.isclose(beam.vertices, [2, 0, 0]), axis=1))
@@ -69,7 +69,7 @@ def test_the_integration_gives_the_reference_path(shared):
 def test_stored_paths_are_complete_and_converged(cells):
     exact = load_exact(cells)
     assert exact.path.shape == (101, 3) and exact.convergence.shape == (101,)
-    assert exact.convergence.max() < 1e-5  # what the errors quoted against it need
+    assert exact.convergence.max() < 1e-5  # accurate enough for the errors quoted against it
     assert 4.1 < exact.excursion < 4.3  # m, about the length of the beam
 
 
@@ -89,7 +89,7 @@ def test_error_is_the_largest_distance_over_the_excursion():
     assert exact.error(exact.t[90:91], moved[90:91]) == pytest.approx(0.5 / exact.excursion)
 
 
-def test_what_is_not_stored_is_refused():
+def test_other_meshes_and_times_are_refused():
     with pytest.raises(ValueError, match="no exact path is stored for the mesh 5x5x5"):
         load_exact((5, 5, 5))
     with pytest.raises(ValueError, match=r"time 1, 0.005 s, is not a multiple"):
