@@ -67,7 +67,7 @@ LONG = {
     "test_bench_report": ("test_one_thread_is_one_thread", "does_what_the_search_does"),
     "test_collision_memory": ("test_nothing_is_out_of_bounds",),
     "test_single_precision": ("test_single_precision_follows[symplectic_euler]",),
-    "test_prescribed_nodes": ("test_rigid_flight[bdf2]", "test_second_order_with_a_led_end[bdf2-implicit_midpoint]"),
+    "test_prescribed_nodes": ("prescribed_ends[bdf2]", "prescribed_end[implicit_midpoint]"),
     "test_drag_spring": ("test_pulled_to_rest_and_back[bdf2-2]",),
     "test_detection_runs": ("test_sweeps",),
     "test_stability": ("test_the_limit_is_where_steps_explode[velocity_verlet-",),
