@@ -1,4 +1,4 @@
-"""Conjugate gradients, serial and parallel, in f32 and f64, on the stiffness of compressed linear and quadratic bodies plus inertia:
+"""Conjugate gradients, serial and parallel, in both precisions, on stiffness plus inertia of compressed bodies of either order:
 
 * the solution is SciPy's on the free axes and exactly 0 on the others, whatever the right-hand side there;
 * a looser tolerance stops earlier, the iteration limit holds, and a zero right-hand side takes no iteration;
