@@ -6,7 +6,7 @@
 """
 
 import pytest
-from scenes import cube, driven_scene, mixed_scene, rubber
+from scenes import block_scene, cube, driven_scene, mixed_scene, rubber
 
 import taisoft as ts
 from taisoft.backend import runtime
@@ -17,12 +17,6 @@ from taisoft.scene.plan import make_plan
 LOADS, DAMPING = {"loads"}, {"damping", "node_body"}
 PRESCRIBED = {"prescribed_nodes", "prescribed_axes", "targets", "position_before"}
 HELD, VERLET, DAMPED_VERLET = {"held", "held_velocity", "reaction"}, {"acceleration"}, {"half_velocity"}
-
-
-def bare() -> ts.Scene:
-    scene = ts.Scene()
-    scene.add_body(cube(), rubber(), name="block")
-    return scene
 
 
 def test_reasons():
@@ -53,7 +47,7 @@ def test_reasons():
 
 
 def test_every_feature_can_be_on_and_off():
-    off = make_plan(bare(), explicit=True, multistep=False).on
+    off = make_plan(block_scene(), explicit=True, multistep=False).on
     full = driven_scene(order=2, mass_damping=1.0, stiffness_damping=1.0)
     full.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
     full.body("beam").collision, full.contact_forces = "distance_field", True
@@ -64,13 +58,13 @@ def test_every_feature_can_be_on_and_off():
 
 def test_quadratic_bodies_get_a_consistent_mass_in_implicit_steps_only():
     scene = mixed_scene(order="both")
-    names = [b.name for b in scene.bodies if b.order == 2]
+    names = ", ".join(b.name for b in scene.bodies if b.order == 2)
     for explicit in (True, False):
         plan = make_plan(scene, explicit=explicit, multistep=False)
         entries = {e["feature"]: (e["on"], e["why"]) for e in plan.entries}
-        assert entries["quadratic_tets"] == (True, f"bodies of order 2: {', '.join(names)}")
+        assert entries["quadratic_tets"] == (True, f"bodies of order 2: {names}")
         assert entries["consistent_mass"][0] is entries["consistent_weight"][0] is (not explicit)
-    assert entries["consistent_mass"][1] == f"quadratic tets of {', '.join(names)} in implicit steps"
+    assert entries["consistent_mass"][1] == f"quadratic tets of {names} in implicit steps"
 
 
 def test_long_lists_of_names_are_shortened():
@@ -124,7 +118,7 @@ def test_mesh_obstacles_and_self_collision_need_proximity():
 
 @pytest.mark.parametrize("integrator", [*EXPLICIT, "implicit_euler", "bdf2"])
 def test_features_that_are_off_allocate_nothing(integrator):
-    with ts.Simulator(bare(), dt=1e-3, integrator=integrator) as sim:
+    with ts.Simulator(block_scene(), dt=1e-3, integrator=integrator) as sim:
         fields = set(sim.field_bytes)
         assert all(size > 0 for size in sim.field_bytes.values())
     assert not fields & (LOADS | DAMPING | PRESCRIBED | HELD | DAMPED_VERLET) and not any(f.startswith("damping") for f in fields)
@@ -149,12 +143,12 @@ def launched(sim, steps: int) -> dict[str, int]:
 
 
 def test_an_explicit_step_is_one_launch_besides_its_report():
-    with ts.Simulator(bare(), dt=1e-3, integrator="symplectic_euler") as sim:
+    with ts.Simulator(block_scene(), dt=1e-3, integrator="symplectic_euler") as sim:
         assert launched(sim, 3) == {"advance_serial": 3, "measure": 3}
 
 
 def test_an_implicit_step_launches_only_the_kernels_it_needs():
-    with ts.Simulator(bare(), dt=1e-3, integrator="implicit_euler") as sim:
+    with ts.Simulator(block_scene(), dt=1e-3, integrator="implicit_euler") as sim:
         sim.set_gravity((0, 0, 0))
         at_rest = launched(sim, 2)
         # the residual at rest is zero, so nothing is solved

@@ -38,9 +38,8 @@ class Reducer:
             used[c] += min(rng.integers(1, 2 + k // 3), self.part - used[c], k - used.sum())
         places = np.concatenate([c * self.part + np.arange(n) for c, n in enumerate(used)])
         for field, values in zip((self.out.point, self.out.normal, self.out.body), contacts):
-            whole = np.full(
-                (CAPACITY, values.shape[1]), 7, dtype=values.dtype
-            )  # entries beyond the ends of the parts are no contacts
+            # entries beyond the ends of the parts are no contacts
+            whole = np.full((CAPACITY, values.shape[1]), 7, dtype=values.dtype)
             whole[places] = values
             field.from_numpy(whole)
         self.used.from_numpy(used)

@@ -24,7 +24,7 @@ from taisoft.scene.toml_writer import toml_of
 
 
 @pytest.mark.parametrize(
-    "nodes, chosen",
+    "nodes, expected",
     [
         ('"all"', list(range(12))),
         ("[9, 3]", [9, 3]),
@@ -33,33 +33,33 @@ from taisoft.scene.toml_writer import toml_of
         ("{ half_space = { point = [0.5, 0, 0], normal = [-7, 0, 0] } }", [8, 9, 10, 11]),
     ],
 )
-def test_selectors(tmp_path, nodes, chosen):
+def test_selectors_include_their_boundary(tmp_path, nodes, expected):
     text = TEXT.replace('nodes = "all"', f"nodes = {nodes}")
     body = read(tmp_path, text)[0].body("beam")
-    assert body.forces[0].nodes.tolist() == chosen
+    assert body.forces[0].nodes.tolist() == expected
     assert body.constraints[0].nodes.tolist() == [0, 1, 2, 3] and body.constraints[0].axes.tolist() == [True, False, True]
     below = body.mesh.vertices[body.mesh.surface].mean(axis=1)[:, 1] <= -0.49
     assert body.tractions[0].triangles.tolist() == np.flatnonzero(below).tolist()
 
 
-def test_what_is_left_out_is_as_in_python(tmp_path):
+def test_omitted_entries_have_the_defaults_of_python(tmp_path):
     text = '[bodies.a]\nmaterial = {}\nmesh = { shape = "ball", radius = 1, cells = 4 }\n[obstacles.o]\nshape = "sphere"\n'
     scene, solver = read(tmp_path, text + "center = [0, 5, 0]\nradius = 1\n")
-    wanted = ts.Scene()
-    wanted.add_body(ts.ball_mesh(1, 4), ts.Material(), name="a")
-    wanted.add_obstacle(ts.Sphere((0, 5, 0), 1), name="o")
-    assert data(scene) == data(wanted) and solver == {}
+    expected = ts.Scene()
+    expected.add_body(ts.ball_mesh(1, 4), ts.Material(), name="a")
+    expected.add_obstacle(ts.Sphere((0, 5, 0), 1), name="o")
+    assert data(scene) == data(expected) and solver == {}
 
 
-def test_each_table_is_looked_at_once(tmp_path, monkeypatch):
-    """So that a file of many materials is read in time that grows as the file does."""
+def test_each_table_is_built_once(tmp_path, monkeypatch):
+    """So the time to read a file grows linearly with its number of materials."""
     count, built = 2000, []
 
-    def counted(table, file, place, *more):
+    def counted(table, file, place, *arguments):
         built.append(place)
-        made(table, file, place, *more)
+        init(table, file, place, *arguments)
 
-    made = Table.__init__
+    init = Table.__init__
     monkeypatch.setattr(Table, "__init__", counted)
     text = "".join(f"[materials.m{i}]\nyoung = {i + 1}\n" for i in range(count))
     text += "".join(f'[obstacles.o{i}]\nshape = "sphere"\ncenter = [0, {i}, 9]\nradius = 1\n' for i in range(50))
@@ -82,7 +82,7 @@ def test_mesh_files_are_found_beside_the_scene_file(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name, told",
+    "name, message",
     [
         ("gone.msh", "gone.msh: there is no such file"),
         ("", "must be a file's name, not ''"),
@@ -99,7 +99,7 @@ def test_mesh_files_are_found_beside_the_scene_file(tmp_path, monkeypatch):
         ("secret.msh", "not a supported mesh"),
     ],
 )
-def test_mesh_files_stay_inside(tmp_path, name, told):
+def test_mesh_files_must_lie_in_the_folder_of_the_scene_file(tmp_path, name, message):
     outside, inside = tmp_path / "out", tmp_path / "in"
     outside.mkdir()
     inside.mkdir()
@@ -108,13 +108,13 @@ def test_mesh_files_stay_inside(tmp_path, name, told):
     (outside / "pair.node").write_text("secret")
     (inside / "pair.ele").write_text("1 4 0\n1 1 2 3 4\n")
     links = {"link.msh": outside / "out.msh", "folder": outside, "pair.node": outside / "pair.node", "circle.msh": "circle.msh"}
-    for link, to in links.items():
-        os.symlink(to, inside / link)
+    for link, target in links.items():
+        os.symlink(target, inside / link)
     write(inside / "secret.msh", "passphrase")
     text = MESH.format(name.replace("OUT", str(outside)))
     with pytest.raises((ts.SceneError, ts.MeshError)) as caught:
         read(inside, text)
-    assert told in str(caught.value) and str(caught.value).startswith(f"{inside / 'scene.toml'}: bodies.a.mesh")
+    assert message in str(caught.value) and str(caught.value).startswith(f"{inside / 'scene.toml'}: bodies.a.mesh")
     assert "passphrase" not in str(caught.value) and "secret" not in str(caught.value).replace("secret.msh", "")
     if "out.msh" in name or name == "link.msh":
         name = name.replace("../out.msh", "../out/out.msh")
@@ -126,15 +126,15 @@ def test_mesh_files_stay_inside(tmp_path, name, told):
 
 
 def places(values, at=()):
-    """The ways to all values of nested dicts and lists."""
+    """Paths of keys to all values of nested dicts and lists."""
     yield at
     items = values.items() if isinstance(values, dict) else enumerate(values) if isinstance(values, list) else ()
     for key, value in items:
         yield from places(value, (*at, key))
 
 
-WAYS = [way for way in places(tomllib.loads(TEXT)) if way]
-# No number that makes a large but possible mesh.
+PLACES = [place for place in places(tomllib.loads(TEXT)) if place]
+# no number that gives a large but valid mesh
 scalars = st.integers(-3, 3) | st.integers(2**40) | floats() | st.text(max_size=5) | st.booleans()
 scalars |= st.sampled_from(["1e5 Pa", "beam", "box", "all", "none", "rubber", "../a.msh", "__import__('os')"])
 junk = scalars | st.lists(scalars, max_size=4) | st.lists(st.lists(scalars, max_size=3), max_size=3)
@@ -156,28 +156,28 @@ def read_or_refused(tmp_path: Path, data: bytes) -> None:
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.sampled_from(WAYS), st.sampled_from(["replace", "remove", "rename"]), junk, st.text(max_size=8))
-def test_random_edits_are_read_or_refused(tmp_path, way, act, value, name):
+@given(st.sampled_from(PLACES), st.sampled_from(["replace", "remove", "rename"]), junk, st.text(max_size=8))
+def test_random_edits_are_read_or_refused(tmp_path, place, action, value, name):
     tables = tomllib.loads(TEXT)
-    within = tables
-    for key in way[:-1]:
-        within = within[key]
-    if act == "replace":
-        within[way[-1]] = value
-    elif act == "remove" or isinstance(within, list):
-        del within[way[-1]]
+    parent = tables
+    for key in place[:-1]:
+        parent = parent[key]
+    if action == "replace":
+        parent[place[-1]] = value
+    elif action == "remove" or isinstance(parent, list):
+        del parent[place[-1]]
     else:
-        within[name] = within.pop(way[-1])
+        parent[name] = parent.pop(place[-1])
     try:
         text = toml_of(tables)
-    except (AttributeError, KeyError, TypeError):  # a table in a list of others: the writer has no words for it
+    except (AttributeError, KeyError, TypeError):  # the writer cannot write a table in a list of other values
         return
     read_or_refused(tmp_path, text.encode())
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(0, len(TEXT)), st.integers(0, 12), st.text('[]{}=".\n#,\x00é-', max_size=5).map(str.encode) | st.binary())
-def test_random_text_is_read_or_refused(tmp_path, start, length, more):
-    more = bytes(byte for byte in more if not 48 <= byte <= 57)  # digits could ask for a huge mesh
+def test_random_text_is_read_or_refused(tmp_path, start, length, inserted):
+    inserted = bytes(byte for byte in inserted if not 48 <= byte <= 57)  # digits could give a huge mesh
     data = TEXT.encode()
-    read_or_refused(tmp_path, data[:start] + more + data[start + length :])
+    read_or_refused(tmp_path, data[:start] + inserted + data[start + length :])

@@ -24,13 +24,13 @@ DEMOS = shipped_files("demos")
 
 
 @pytest.mark.parametrize("name", DEMOS)
-def test_demos_come_back(tmp_path, name):
+def test_demos_are_read_back(tmp_path, name):
     demo = load_module(DEMOS[name])
     there_and_back(tmp_path / f"{name}.toml", demo.build(), demo.solver)
 
 
 def everything() -> ts.Scene:
-    """A scene that says everything a scene can say."""
+    """A scene with one of everything that a file can hold."""
     scene = ts.Scene(gravity=(0.1, -9.81, -0.0))
     scene.collision = ts.CollisionSettings("bvh", margin=1e-3, k_dop=14, field_cells=40, max_capacity=1000)
     scene.allow_initial_overlap, scene.contact_forces = True, False
@@ -77,7 +77,7 @@ EVERY_SETTING = {
 }
 
 
-def test_everything_comes_back(tmp_path):
+def test_a_scene_with_everything_is_read_back(tmp_path):
     assert set(EVERY_SETTING) == set(SOLVER_CHECKS)
     there_and_back(tmp_path / "all.toml", everything(), EVERY_SETTING)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["all.toml", "all_mesh0.msh"]  # shared by two bodies
@@ -87,12 +87,12 @@ def test_everything_comes_back(tmp_path):
     assert (tmp_path / "all.toml").read_text() == text
 
 
-def test_settings_are_those_of_the_simulator():
+def test_solver_settings_are_those_of_simulator_and_run():
     names = set(inspect.signature(ts.Simulator).parameters) - {"scene"}
     assert set(SOLVER_CHECKS) == names | set(RUN_KEYS)
 
 
-def test_numbers_of_numpy_are_written_as_plain_ones(tmp_path):
+def test_numpy_numbers_are_written_as_plain_numbers(tmp_path):
     scene = ts.Scene()
     scene.add_body(TURNED, ts.Material())
     solver = {"dt": np.float64(1 / 3), "seconds": np.int64(2), "self_collision": np.bool_(True), "fps": Fraction(1, 3)}
@@ -100,16 +100,16 @@ def test_numbers_of_numpy_are_written_as_plain_ones(tmp_path):
     assert ts.read_scene(tmp_path / "a.toml")[1] == {"dt": 1 / 3, "seconds": 2, "self_collision": True, "fps": 1 / 3}
 
 
-MOST = float(np.finfo(np.float32).max)
-numbers = floats(-MOST, MOST)
+LARGEST = float(np.finfo(np.float32).max)
+numbers = floats(-LARGEST, LARGEST)
 vectors = st.tuples(*[floats(-1e30, 1e30)] * 3)
-positive = floats(min_value=float(np.finfo(np.float32).tiny), max_value=MOST)
+positive = floats(min_value=float(np.finfo(np.float32).tiny), max_value=LARGEST)
 names = st.text(min_size=1, max_size=8).filter(str.strip)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_random_numbers_come_back(tmp_path, values):
+def test_random_numbers_and_names_are_read_back(tmp_path, values):
     draw = values.draw
     scene = ts.Scene(gravity=draw(st.tuples(numbers, numbers, numbers)))
     scene.collision = ts.CollisionSettings(cell_ratio=draw(positive), margin=draw(st.none() | floats(0, 1e9)))
@@ -142,7 +142,7 @@ def test_random_numbers_come_back(tmp_path, values):
 # --- refusals ----------------------------------------------------------------------------------------------------------
 
 
-def test_what_no_file_can_hold(tmp_path):
+def test_scenes_that_a_file_cannot_store_are_refused(tmp_path):
     scene = ts.Scene()
     path = tmp_path / "a.toml"
     with pytest.raises(ts.SceneError, match="the scene holds no body"):
@@ -172,10 +172,10 @@ def test_what_no_file_can_hold(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_what_exists_is_replaced_only_on_request(tmp_path):
+def test_existing_files_are_replaced_only_on_request(tmp_path):
     scene = ts.Scene()
     scene.add_body(TURNED, ts.Material(), name="a")
-    write(tmp_path / "a_mesh0.msh", "precious")
+    write(tmp_path / "a_mesh0.msh", "old")
     with pytest.raises(ts.OutputError, match="a_mesh0.msh: the file exists"):
         ts.write_scene(tmp_path / "a.toml", scene)
     assert [path.name for path in tmp_path.iterdir()] == ["a_mesh0.msh"]
@@ -185,20 +185,21 @@ def test_what_exists_is_replaced_only_on_request(tmp_path):
 
 
 FRAMES = {"times": (0, 1), "translations": [(0, 0, 0), (0, 1, 0)]}
-TURNS = FRAMES | {"rotations": [(0, 0, 0), (0, 0, 1)]}
+ROTATIONS = FRAMES | {"rotations": [(0, 0, 0), (0, 0, 1)]}
 PIVOT = {"pivot": (1, 0, 0)}
 
 
-@pytest.mark.parametrize("frames, lost", [(FRAMES, False), (FRAMES | PIVOT, False), (TURNS, False), (TURNS | PIVOT, True)])
-def test_the_path_of_another_obstacle(tmp_path, frames, lost):
-    """It comes back as the same motion, or not at all."""
+@pytest.mark.parametrize(
+    "frames, refused", [(FRAMES, False), (FRAMES | PIVOT, False), (ROTATIONS, False), (ROTATIONS | PIVOT, True)]
+)
+def test_a_path_shared_by_obstacles_keeps_its_motion_or_is_refused(tmp_path, frames, refused):
     scene = ts.Scene()
     scene.add_body(TURNED, ts.Material(), name="a")
     first = scene.add_obstacle(ts.Box((9, 9, 9), (1, 1, 1)), path=ts.KeyFrames(**frames))
     second = scene.add_obstacle(ts.Box((5, 9, 9), (1, 1, 1)), name="second", path=first.path)
-    if lost:
-        told = "obstacle 'second': rotates along a path made for a shape with another center, which a file cannot store"
-        with pytest.raises(ts.SceneError, match=told):
+    if refused:
+        message = "obstacle 'second': rotates along a path made for a shape with another center, which a file cannot store"
+        with pytest.raises(ts.SceneError, match=message):
             ts.write_scene(tmp_path / "a.toml", scene)
         assert not list(tmp_path.iterdir())
         return
@@ -208,13 +209,13 @@ def test_the_path_of_another_obstacle(tmp_path, frames, lost):
         assert all(np.array_equal(*pair) for pair in zip(again.path(t), second.path(t)))
 
 
-@pytest.mark.parametrize("frames, lost", [(FRAMES, False), (TURNS, True)])
-def test_the_path_of_other_nodes(tmp_path, frames, lost):
+@pytest.mark.parametrize("frames, refused", [(FRAMES, False), (ROTATIONS, True)])
+def test_a_path_shared_by_nodes_keeps_its_motion_or_is_refused(tmp_path, frames, refused):
     scene = ts.Scene()
     body = scene.add_body(TURNED, ts.Material(), name="a")
     path = body.move([0, 1], ts.KeyFrames(**frames)).path
     body.move([2, 3], path)
-    if lost:
+    if refused:
         with pytest.raises(ts.SceneError, match="body 'a': rotates along a path made for nodes that start elsewhere, which a"):
             ts.write_scene(tmp_path / "a.toml", scene)
         assert not list(tmp_path.iterdir())

@@ -7,20 +7,14 @@ from itertools import zip_longest
 
 import numpy as np
 import pytest
-from scenes import SNH, cube, rubber
+from scenes import SNH, block_scene, rubber
 
 import taisoft as ts
 from taisoft.backend import runtime
 
 
-def block() -> ts.Scene:
-    scene = ts.Scene()
-    scene.add_body(cube(), rubber(), name="block")
-    return scene
-
-
 def test_a_deleted_simulator_closes_its_runtime():
-    made = ts.Simulator(block(), 1e-3, "symplectic_euler", precision="f64")
+    made = ts.Simulator(block_scene(), 1e-3, "symplectic_euler", precision="f64")
     assert runtime.open_kind() == ("cpu", "f64")
     del made
     gc.collect()
@@ -28,7 +22,7 @@ def test_a_deleted_simulator_closes_its_runtime():
 
 
 def test_a_closed_simulator_refuses_calls():
-    sim = ts.Simulator(block(), 1e-3, "symplectic_euler", precision="f64")
+    sim = ts.Simulator(block_scene(), 1e-3, "symplectic_euler", precision="f64")
     sim.close()
     sim.close()
     calls = (
