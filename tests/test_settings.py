@@ -1,12 +1,15 @@
 """Every argument of a Simulator is checked before a runtime is opened; the message names the argument and the rule."""
 
+import dataclasses
+import inspect
+
 import numpy as np
 import pytest
 from scenes import block_scene, dynamics
 
 import taisoft as ts
 from taisoft.backend import runtime
-from taisoft.settings import check_dt
+from taisoft.settings import NAMES, Settings, check_dt
 
 
 @pytest.mark.parametrize(
@@ -53,6 +56,13 @@ def test_bad_scenes_are_refused(bad, message):
     with pytest.raises(ts.SceneError, match=message):
         ts.Simulator(bad)
     assert runtime.open_kind() is None
+
+
+def test_the_defaults_are_those_of_the_signature():
+    parameters = inspect.signature(ts.Simulator).parameters
+    assert {name: parameters[name].default for name in NAMES} == dataclasses.asdict(Settings()) and len(parameters) == len(
+        NAMES
+    ) + 1
 
 
 def test_dt_becomes_a_float():
