@@ -13,6 +13,7 @@ import pytest
 
 from taisoft.errors import SceneError
 from taisoft.records import Energies, StepReport
+from taisoft.scene.plan import Plan
 from taisoft.view.annotations import MAX_SEGMENTS, cells, drawing, write
 from taisoft.view.plots import CAPACITY, GRID_LINES, PLOTS, QUANTITIES, Plots, curves_of
 
@@ -21,9 +22,9 @@ class Stub:
     """The part of a simulator that plots use."""
 
     def __init__(self, explicit=False, touching=True):
-        on = {"contact_forces": touching}
         self.settings = SimpleNamespace(explicit=explicit, integrator="velocity_verlet" if explicit else "bdf2")
-        self.plan = SimpleNamespace(on=on, why=lambda feature: "one body")
+        self.plan = Plan()
+        self.plan.add("contact_forces", touching, "two bodies", "one body")
         self.time = 0.0
 
     def energies(self):
@@ -131,7 +132,7 @@ def test_the_key_hides_and_shows_again():
     assert plots.visible() == []
     plots.toggle()
     assert plots.visible() == visible
-    sim.plan.on["contact_forces"] = False
+    sim.plan = Stub(touching=False).plan
     assert "contacts" not in plots.visible()
 
 
