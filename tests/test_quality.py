@@ -1,14 +1,14 @@
 """Shape quality of tets:
 
 * the mean ratio is 1 for a regular tet, falls to 0 as the tet is flattened, and does not depend on size;
-* a mesh warns of nearly flat tets with their number and the worst; grids, balls and meshes from meshers give no warning.
+* a mesh warns of nearly flat tets with their number and the worst; grids and meshes from meshers give no warning.
 """
 
 import numpy as np
 import pytest
 
 from taisoft.mesh.files import read_mesh
-from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
+from taisoft.mesh.shapes import box_mesh, sheet_mesh
 from taisoft.mesh.tet_mesh import TetMesh, edge_lengths, mean_ratio
 
 REGULAR = np.array([(1.0, 1, 1), (-1, 1, -1), (1, -1, -1), (-1, -1, 1)])
@@ -48,10 +48,6 @@ def test_cells_are_warned_of_at_an_aspect_ratio_of_1000_but_not_of_200(pattern):
     assert sheet_mesh((3, 3), (0.3, 0.1 / 200, 0.3), pattern=pattern).warnings == []
     with pytest.warns(UserWarning, match="nearly flat"):
         sheet_mesh((3, 3), (0.3, 0.1 / 1000, 0.3), pattern=pattern)
-
-
-def test_balls_give_no_warning():
-    assert all(ball_mesh(1.0, cells).warnings == [] for cells in (2, 4, 12))
 
 
 @pytest.mark.parametrize("name", ["Armadillo13K", "bar-2523", "bunny", "mat20x20", "octocat", "sphere1K"])

@@ -108,23 +108,23 @@ def test_a_ball_is_symmetric():
     assert (mesh.volumes[:, None] * mesh.vertices[mesh.tets].mean(axis=1)).sum(axis=0) == pytest.approx([0, 0, 0], abs=1e-12)
 
 
-@pytest.mark.parametrize("cells", [(0, 1, 1), (1, -2, 1), (1, 1), (1.5, 1, 1), 3, "abc", (True, 1, 1), (1, 1, 1, 1), None])
-def test_invalid_cells_of_a_box_are_refused(cells):
-    with pytest.raises(MeshError, match="box_mesh: cells must be three positive integers"):
-        box_mesh(cells, (1, 1, 1))
-
-
-@pytest.mark.parametrize("size", [(0, 1, 1), (1, -1, 1), (1, 1), (1, np.nan, 1), (1, np.inf, 1), "abc", ((1, 2), 3)])
-def test_invalid_sizes_of_a_box_are_refused(size):
-    with pytest.raises(MeshError, match="box_mesh: size must be"):
-        box_mesh((1, 1, 1), size)
-
-
-def test_invalid_patterns_and_centers_of_a_box_are_refused():
-    with pytest.raises(MeshError, match="pattern must be 'five' or 'six', not 'four'"):
-        box_mesh((1, 1, 1), (1, 1, 1), pattern="four")
-    with pytest.raises(MeshError, match="center must be three finite numbers"):
-        box_mesh((1, 1, 1), (1, 1, 1), center=(0, 0, np.nan))
+@pytest.mark.parametrize(
+    "name, values, rule",
+    [
+        (
+            "cells",
+            [(0, 1, 1), (1, -2, 1), (1, 1), (1.5, 1, 1), 3, "abc", (True, 1, 1), (1, 1, 1, 1), None],
+            "three positive integers",
+        ),
+        ("size", [(0, 1, 1), (1, -1, 1), (1, 1), (1, np.nan, 1), (1, np.inf, 1), "abc", ((1, 2), 3)], ""),
+        ("pattern", ["four"], "'five' or 'six', not 'four'"),
+        ("center", [(0, 0, np.nan)], "three finite numbers"),
+    ],
+)
+def test_invalid_arguments_of_a_box_are_refused(name, values, rule):
+    for value in values:
+        with pytest.raises(MeshError, match=f"box_mesh: {name} must be {rule}"):
+            box_mesh(**({"cells": (1, 1, 1), "size": (1, 1, 1)} | {name: value}))
 
 
 @pytest.mark.parametrize(
