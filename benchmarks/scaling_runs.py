@@ -191,7 +191,7 @@ def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
         *(("matrix", block_csr, name) for name in ("assemble", "to_system")),
         ("matrix", stage_system, "save_diagonal"),
         ("linear solve", pcg, "solve"),
-        ("report", simulator, "measure"),
+        ("report", dynamics, "measure"),
     ]
     contact = sim._dynamics.contact
     if contact is not None:

@@ -68,6 +68,15 @@ def spin(mesh: ts.TetMesh, order: int) -> np.ndarray:
     return np.random.default_rng(8).standard_normal(mesh_nodes(mesh, order)[0].shape)
 
 
+def block_scene(ground: bool = False) -> ts.Scene:
+    """One cube, far above a ground if there is one."""
+    scene = ts.Scene()
+    scene.add_body(cube(), rubber(), name="block")
+    if ground:
+        scene.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
+    return scene
+
+
 def mixed_scene(
     laws=(SNH, SVK, COR, SVK),
     mass_damping: float = 0.0,

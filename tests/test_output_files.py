@@ -1,8 +1,8 @@
-"""Files are whole or absent, and a folder has one writer:
+"""Output files are complete or absent, and an output folder has one writer:
 
-* a file appears under its name complete, or not at all, whatever fails: writing, fsync, rename, a full disk;
-* an older file stays as it was until its successor is complete, and no temporary file is left;
-* an output folder is created, taken when it holds no results, refused otherwise; one that cannot be written is refused;
+* a file appears under its name when it is complete, or not at all, whatever fails: writing, fsync, rename, a full disk;
+* an older file stays until its successor is complete, and no temporary file is left;
+* an output folder is created, or accepted if it holds no results; one that cannot be written is refused;
 * a second writer is refused with the first one's process id; the lock of a dead process is taken over.
 """
 
@@ -30,21 +30,21 @@ def names(folder):
 
 @pytest.fixture
 def small_disk():
-    """No file may grow past 50,000 bytes, as if the disk were full (Python ignores the signal that comes with it)."""
+    """Limits files to 50,000 bytes, as a full disk would (Python ignores the signal of that limit)."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))
     yield 50_000
     resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_written_file_is_complete_and_alone(tmp_path):
+def test_writing_replaces_a_file_and_leaves_no_other(tmp_path):
     write_bytes(tmp_path / "a.bin", b"first")
     write_bytes(tmp_path / "a.bin", b"second")
     assert (tmp_path / "a.bin").read_bytes() == b"second"
     assert names(tmp_path) == ["a.bin"]
 
 
-def test_a_full_disk_leaves_the_old_file(tmp_path, small_disk):
+def test_a_full_disk_keeps_the_old_file(tmp_path, small_disk):
     write_bytes(tmp_path / "a.bin", b"old")
     with pytest.raises(OutputError, match=r"a\.bin \(60000 bytes\): File too large"):
         write_bytes(tmp_path / "a.bin", b"x" * 60_000)
@@ -55,7 +55,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path, small_disk):
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_an_input_output_error_is_told(tmp_path, monkeypatch, call):
+def test_an_input_output_error_keeps_the_old_file(tmp_path, monkeypatch, call):
     write_bytes(tmp_path / "a.bin", b"old")
 
     def fail(*_):
@@ -69,51 +69,48 @@ def test_an_input_output_error_is_told(tmp_path, monkeypatch, call):
     assert (tmp_path / "a.bin").read_bytes() == b"old"
 
 
-def test_any_failure_while_filling_leaves_nothing(tmp_path):
+def test_a_failure_while_writing_leaves_nothing(tmp_path):
     with pytest.raises(KeyboardInterrupt), replacing(tmp_path / "a.bin") as part:
         part.write_bytes(b"half")
         raise KeyboardInterrupt
     assert names(tmp_path) == []
 
 
-def test_order_of_writing(tmp_path, monkeypatch):
-    """The data is on disk before the name changes, and the new name after: fsync, rename, fsync of the folder."""
-    seen = []
+def test_data_are_on_disk_before_the_rename(tmp_path, monkeypatch):
+    """And the new name after it: fsync, rename, fsync of the folder."""
+    calls = []
     fsync, replace = os.fsync, os.replace
 
     def watched_fsync(descriptor):
-        seen.append("folder" if os.path.isdir(f"/proc/self/fd/{descriptor}") else "file")
+        calls.append("folder" if os.path.isdir(f"/proc/self/fd/{descriptor}") else "file")
         fsync(descriptor)
 
     def watched_replace(source, target):
-        seen.append("rename")
+        calls.append("rename")
         replace(source, target)
 
     monkeypatch.setattr(os, "fsync", watched_fsync)
     monkeypatch.setattr(os, "replace", watched_replace)
     write_bytes(tmp_path / "a.bin", b"data")
-    assert "file" in seen[: seen.index("rename")]
-    assert seen[seen.index("rename") + 1 :] == ["folder"]
+    assert "file" in calls[: calls.index("rename")]
+    assert calls[calls.index("rename") + 1 :] == ["folder"]
 
 
-def test_folder_is_created_and_unlocked(tmp_path):
+def test_a_folder_is_created_and_unlocked(tmp_path):
     with OutputFolder(tmp_path / "a" / "b") as folder:
         assert (folder.path / LOCK_NAME).read_text().strip() == str(os.getpid())
     assert names(tmp_path / "a" / "b") == []
 
 
-def test_folder_without_results_is_accepted(tmp_path):
+def test_a_folder_without_results_is_accepted(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "frames").mkdir()
     OutputFolder(tmp_path).close()
     assert names(tmp_path) == ["frames", "notes.txt"]
 
 
-RESULTS = ("report.json", "steps.csv", "scene.usdc", "frames/00000.png", "chunks/points_00000.usdc")
-
-
-@pytest.mark.parametrize("result", RESULTS)
-def test_folder_with_results_is_refused(tmp_path, result):
+@pytest.mark.parametrize("result", ["report.json", "steps.csv", "scene.usdc", "frames/00000.png", "chunks/points_00000.usdc"])
+def test_a_folder_with_results_is_refused(tmp_path, result):
     (tmp_path / result).parent.mkdir(exist_ok=True)
     (tmp_path / result).write_text("old")
     with pytest.raises(OutputError, match="already holds results"):
@@ -123,13 +120,13 @@ def test_folder_with_results_is_refused(tmp_path, result):
     OutputFolder(tmp_path, overwrite=True).close()
 
 
-def test_overwriting_removes_what_the_new_run_does_not_replace(tmp_path):
+def test_overwriting_removes_old_results_only(tmp_path):
     (tmp_path / "frames").mkdir()
     (tmp_path / "chunks").mkdir()
-    mine = ("notes.txt", "report.json.2026-11-22.bak", "frames/mine.png")
-    left_over = ("frames/00007.png", "scene.usdc.1-0.part")
-    left_over += ("chunks/points_00000.usdc.123-7.part", "chunks/points_00010.usdc.123-8.jtZrXE")  # USD's own
-    for name in ("report.json", "scene.usdc", *mine, *left_over):
+    kept = ("notes.txt", "report.json.2026-11-22.bak", "frames/mine.png")
+    removed = ("frames/00007.png", "scene.usdc.1-0.part")
+    removed += ("chunks/points_00000.usdc.123-7.part", "chunks/points_00010.usdc.123-8.jtZrXE")  # USD's own
+    for name in ("report.json", "scene.usdc", *kept, *removed):
         (tmp_path / name).write_text("old")
     with OutputFolder(tmp_path, overwrite=True):
         assert names(tmp_path / "frames") == ["mine.png"] and names(tmp_path / "chunks") == []
@@ -147,7 +144,7 @@ def test_a_failed_overwrite_keeps_the_old_files(tmp_path):
     assert names(tmp_path) == ["scene.usdc"]
 
 
-def test_folder_that_is_a_file_is_refused(tmp_path):
+def test_a_folder_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "out").write_text("mine")
     with pytest.raises(OutputError, match="a file has that name"):
         OutputFolder(tmp_path / "out")
@@ -158,14 +155,14 @@ def test_folder_that_is_a_file_is_refused(tmp_path):
     assert (tmp_path / "out").read_text() == "mine"
 
 
-def test_result_name_taken_by_a_folder_is_refused(tmp_path):
+def test_a_folder_with_the_name_of_a_result_is_refused(tmp_path):
     (tmp_path / "scene.usdc").mkdir()
     with pytest.raises(OutputError, match=r"scene\.usdc: a folder has that name"):
         OutputFolder(tmp_path, overwrite=True)
 
 
-def test_folder_without_permission_is_refused():
-    """As an ordinary user, since the superuser may write anywhere."""
+def test_a_folder_without_write_permission_is_refused():
+    """Run as an ordinary user, since the superuser may write anywhere."""
     folder = Path(tempfile.mkdtemp())
     code = """
 import os, sys
@@ -197,7 +194,7 @@ def run_python(code, *arguments):
     )
 
 
-def test_second_writer_is_refused_and_a_dead_one_replaced(tmp_path):
+def test_a_second_writer_is_refused_until_the_first_is_dead(tmp_path):
     code = """
 import sys, time
 from taisoft.output.files import OutputFolder

@@ -1,7 +1,7 @@
-"""Pictures as files, and the progress of a run:
+"""Image files, and the progress of a run:
 
-* a PNG decodes to the picture that went in, and a frame is numbered with five digits;
-* on a terminal a bar, elsewhere lines, both with steps/s and the time left.
+* a PNG decodes to the same image, and frames are numbered with five digits;
+* progress is a bar on a terminal and lines elsewhere, both with steps/s and the time left.
 """
 
 import io
@@ -18,7 +18,7 @@ from taisoft.output.report import Progress
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (7, 5, 3), (48, 64, 3)])
-def test_png_decodes_to_the_picture(shape):
+def test_a_png_decodes_to_the_same_image(shape):
     image = np.random.default_rng(3).integers(0, 256, shape, dtype=np.uint8)
     assert np.array_equal(decode(png_bytes(image)), image)
 
@@ -30,7 +30,7 @@ def test_png_refuses_other_arrays(image):
 
 
 class GreyRenderer:
-    """Draws sim.step_count as a shade of grey."""
+    """Draws images of one grey value: sim.step_count."""
 
     closed = False
 
@@ -61,9 +61,9 @@ class Terminal(io.StringIO):
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Wall time that moves by 2 s a look."""
-    looks = iter(range(0, 1000, 2))
-    monkeypatch.setattr(report.time, "perf_counter", lambda: float(next(looks)))
+    """Wall time that advances by 2 s per call."""
+    times = iter(range(0, 1000, 2))
+    monkeypatch.setattr(report.time, "perf_counter", lambda: float(next(times)))
 
 
 def advance(bar):
@@ -75,14 +75,14 @@ def advance(bar):
     bar.close()
 
 
-def test_progress_in_lines(clock):
+def test_progress_is_lines_in_a_file(clock):
     stream = io.StringIO()
     advance(Progress(10.0, "beam", stream))
-    # looks at 0, 2, 4, 6, 8, 10 s; a line where 5 s have gone by; 20 steps and 0.5 s simulated in 2 s
+    # frames at 0, 2, ..., 10 s, each of 20 steps and 0.5 s simulated; a line at the first one after 5 s
     assert stream.getvalue() == "beam: 1.500 of 10 s, 10 steps/s, 0:34 left\n"
 
 
-def test_progress_on_a_terminal(clock):
+def test_progress_is_a_bar_on_a_terminal(clock):
     stream = Terminal()
     advance(Progress(10.0, "beam", stream))
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue())

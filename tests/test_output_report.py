@@ -1,7 +1,7 @@
 """report.json and steps.csv, read back:
 
-* report.json is JSON without NaN, holds the run's figures, extremes over its steps, settings, plan, versions, machine;
-* steps.csv gives every field of every StepReport back, problems with commas, quotes and line breaks too.
+* report.json is JSON without NaN and holds the run's results, extremes over its steps, settings, plan, versions and machine;
+* steps.csv holds every field of every StepReport, also problems with commas, quotes and line breaks.
 """
 
 import csv
@@ -54,7 +54,7 @@ def written(tmp_path):
     return tmp_path, result, record
 
 
-def test_report_holds_the_run(written):
+def test_the_report_holds_the_run(written):
     _, result, record = written
     for field in dataclasses.fields(RunReport):
         if field.name != "step_reports":
@@ -65,7 +65,7 @@ def test_report_holds_the_run(written):
     assert record["plan"] == [{"feature": "contact", "on": False, "why": "no obstacles"}]
 
 
-def test_extremes(written):
+def test_the_report_holds_extremes_over_the_steps(written):
     extremes = written[2]["extremes"]
     keys = ("not_finite", "min", "max", "time_of_min", "time_of_max")
     assert extremes["newton_iterations"] == dict(zip(keys, (0, 3, 7, 0.1, 0.2)))
@@ -77,7 +77,7 @@ def test_extremes(written):
     assert numeric <= set(extremes)
 
 
-def test_report_names_versions_and_machine(written):
+def test_the_report_names_versions_and_machine(written):
     record = written[2]
     assert record["versions"]["python"] == platform.python_version()
     for package in ("taisoft", "taichi", "numpy", "scipy", "usd-core"):
@@ -87,7 +87,7 @@ def test_report_names_versions_and_machine(written):
     assert 10e6 < record["peak_memory_bytes"] < 1e12  # a Python with NumPy: tens of megabytes at least
 
 
-def test_steps_read_back(written):
+def test_the_step_table_holds_every_field_of_every_step(written):
     folder, result, _ = written
     with open(folder / "steps.csv", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -103,7 +103,7 @@ def test_steps_read_back(written):
                 assert float(row[field.name]) == value or (math.isnan(value) and row[field.name] == "nan")
 
 
-def test_a_run_without_steps(tmp_path):
+def test_a_run_without_steps_has_no_extremes(tmp_path):
     write_report(tmp_path, RunReport(), arch="cpu", precision="f64", settings={}, plan=[])
     assert json.loads((tmp_path / "report.json").read_text())["extremes"] == {}
     assert (tmp_path / "steps.csv").read_text().count("\n") == 1

@@ -1,15 +1,15 @@
 """The USD export, read back with USD:
 
-* scene.usdc passes every validator of pxr.UsdValidation and holds the float32 positions of every frame, body and node,
-  for elements of first and second order;
-* metres, y up, default prim, frame rate, frame range, extents, materials, tetrahedra that USD itself finds upright;
-* at every point of every frame von Mises' stress and, where there can be contacts, the impulse of contacts, whose sums over a
-  body are those of its contacts;
-* a camera that sees what the pictures' camera sees, in every frame, and lights, which are no part of the default prim;
-* body names become legal, distinct prim names, with the own name beside them;
-* killed at any time, every file under a final name opens, at most the chunk in the making is lost, an older scene.usdc
-  is whole; the chunks join to the file that the run would have written;
-* a full disk is an OutputError with the path, and leaves no partial file.
+* scene.usdc passes every validator of pxr.UsdValidation and holds the float32 positions of every frame, body and node, for linear
+  and quadratic elements;
+* metres, y up, default prim, frame rate, frame range, extents, materials, and tetrahedra that USD finds not inverted;
+* von Mises stress at every point of every frame and, if contacts are possible, contact impulses, whose sums over a body are those
+  of its contacts;
+* a camera that projects like the images' camera in every frame, and lights, both outside the default prim;
+* body names become valid, distinct prim names and are stored beside them;
+* after a kill at any time every file with a final name opens, at most the current chunk is lost, and an older scene.usdc is
+  intact; the chunks join to the file that the run would have written;
+* a full disk raises OutputError with the path and leaves no partial file.
 """
 
 import random
@@ -36,34 +36,34 @@ NAMES = ("1 cube", "1_cube", "ü", "x" * 300, "material")
 
 
 def export(folder, scene, n_frames, chunk_frames=10, close=True):
-    """Write n_frames of a fake run; returns the positions given, per frame and body."""
-    sim, given = FakeSimulator(scene), []
+    """Write n_frames of a fake run; returns the positions per frame and body."""
+    sim, positions = FakeSimulator(scene), []
     writer = UsdWriter(folder, scene, fps=30.0, chunk_frames=chunk_frames)
     for index in range(n_frames):
         sim.time = index / 30
-        given.append({body.name: sim.positions(body.name) for body in scene.bodies})
+        positions.append({body.name: sim.positions(body.name) for body in scene.bodies})
         writer.frame(sim, index)
     if close:
         writer.close()
-    return given
+    return positions
 
 
 @pytest.fixture(scope="module", params=[1, 2], ids=["order1", "order2"])
 def exported(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("usd")
     scene = beam_scene(NAMES, order=request.param)
-    given = export(folder, scene, 23)
-    return folder, scene, given, Usd.Stage.Open(str(folder / "scene.usdc"))
+    positions = export(folder, scene, 23)
+    return folder, scene, positions, Usd.Stage.Open(str(folder / "scene.usdc"))
 
 
-def test_no_validator_objects(exported):
+def test_all_validators_pass(exported):
     assert faults(exported[3]) == []
 
 
 def test_one_file_with_every_frame(exported):
-    folder, _, given, _ = exported
+    folder, _, positions, _ = exported
     assert [path.name for path in folder.iterdir()] == ["scene.usdc"]
-    assert check_frames(folder / "scene.usdc", given) == 23
+    assert check_frames(folder / "scene.usdc", positions) == 23
 
 
 def test_stage_units_and_range(exported):
@@ -75,7 +75,7 @@ def test_stage_units_and_range(exported):
     assert stage.GetFramesPerSecond() == 30.0
 
 
-def test_surface_has_no_inner_vertex_and_a_colour(exported):
+def test_the_surface_has_no_inner_vertex_and_a_colour(exported):
     _, scene, _, stage = exported
     surface = UsdGeom.Mesh(stage.GetPrimAtPath("/World/_1_cube/surface"))
     triangles = scene.bodies[0].nodes.surface
@@ -89,13 +89,13 @@ def test_surface_has_no_inner_vertex_and_a_colour(exported):
 
 
 def primvar(stage, path, name, index):
-    """The numbers at the points of a prim in a frame."""
-    found = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(path)).GetPrimvar(name)
-    assert found.GetInterpolation() == UsdGeom.Tokens.vertex
-    return np.array(found.Get(index))
+    """Values at the points of a prim in a frame."""
+    values = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(path)).GetPrimvar(name)
+    assert values.GetInterpolation() == UsdGeom.Tokens.vertex
+    return np.array(values.Get(index))
 
 
-def test_stress_and_impulses_at_the_points(exported):
+def test_points_have_stress_and_contact_impulses(exported):
     _, scene, _, stage = exported
     sim, mean = FakeSimulator(scene), NodalMean(scene.bodies)
     first = np.cumsum([0] + [body.n_nodes for body in scene.bodies])
@@ -104,20 +104,20 @@ def test_stress_and_impulses_at_the_points(exported):
         contacts = sim.contacts()
         stress, impulses = von_mises(mean(sim.stress())), contact_impulses(contacts, first[-1])
         assert stress.min() >= 0 and np.ptp(stress) > 1e3 and impulses.any()
-        for k, (body, legal) in enumerate(zip(scene.bodies, prim_names(list(NAMES)))):
-            own, path = slice(first[k], first[k + 1]), f"/World/{legal}"
+        for k, (body, prim_name) in enumerate(zip(scene.bodies, prim_names(list(NAMES)))):
+            own, path = slice(first[k], first[k + 1]), f"/World/{prim_name}"
             nodes = np.unique(body.nodes.surface)
             assert np.array_equal(primvar(stage, f"{path}/tets", "vonMisesStress", index), stress[own].astype(np.float32))
             on_surface = primvar(stage, f"{path}/surface", "vonMisesStress", index)
             assert np.array_equal(on_surface, stress[own][nodes].astype(np.float32))
-            pushed = primvar(stage, f"{path}/surface", "contactImpulse", index)
-            assert np.array_equal(pushed, impulses[own][nodes].astype(np.float32))
+            on_surface = primvar(stage, f"{path}/surface", "contactImpulse", index)
+            assert np.array_equal(on_surface, impulses[own][nodes].astype(np.float32))
             total = contacts.impulse[contacts.body_a == body.name].sum(axis=0)
             total = total - contacts.impulse[contacts.body_b == body.name].sum(axis=0)
-            assert np.abs(total).max() > 0.5 and np.allclose(pushed.sum(axis=0), total, atol=1e-5)
+            assert np.abs(total).max() > 0.5 and np.allclose(on_surface.sum(axis=0), total, atol=1e-5)
 
 
-def test_impulses_only_where_there_can_be_contacts(tmp_path):
+def test_impulses_are_written_only_if_contacts_are_possible(tmp_path):
     scenes = {"alone": beam_scene(), "off": beam_scene(("one", "two")), "two": beam_scene(("one", "two")), "itself": beam_scene()}
     scenes["off"].contact_forces = False
     has = {}
@@ -131,8 +131,8 @@ def test_impulses_only_where_there_can_be_contacts(tmp_path):
     assert has == {"alone": {False}, "off": {False}, "two": {True}, "itself": {True}}
 
 
-def test_camera(tmp_path):
-    """What falls out of the picture makes it move back; pixels are those of the pictures' camera."""
+def test_the_camera_projects_like_that_of_the_images(tmp_path):
+    """It moves back for bodies that leave the image."""
     scene = beam_scene()
     sim, writer, size = FakeSimulator(scene), UsdWriter(tmp_path, scene), (1600, 900)
     camera, expected = Camera.framing(start_positions(scene), size), []
@@ -147,35 +147,35 @@ def test_camera(tmp_path):
     assert not prim.GetPath().HasPrefix(stage.GetDefaultPrim().GetPath())
     assert expected[3][0].distance > 1.2 * expected[0][0].distance
     for index, (camera, x) in enumerate(expected):
-        seen = UsdGeom.Camera(prim).GetCamera(index)
-        frustum = seen.frustum
-        across = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
-        clip = np.column_stack([x, np.ones(len(x))]) @ np.array(across)
+        usd_camera = UsdGeom.Camera(prim).GetCamera(index)
+        frustum = usd_camera.frustum
+        projection = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
+        clip = np.column_stack([x, np.ones(len(x))]) @ np.array(projection)
         pixels = (clip[:, :2] / clip[:, 3:] * (1, -1) + 1) / 2 * size
         assert np.abs(pixels - camera.project(x, size)[:, :2]).max() < 0.05
         assert (np.abs(clip[:, :3]) < clip[:, 3:]).all()  # between the clipping planes too
-    # film of 36 mm and a lens of 38 mm, told in tenths of a metre
-    assert [100 * seen.horizontalAperture, 100 * seen.focalLength] == pytest.approx([36, 37.8], abs=0.1)
+    # 36 mm of film and a 38 mm lens, in tenths of a metre
+    assert [100 * usd_camera.horizontalAperture, 100 * usd_camera.focalLength] == pytest.approx([36, 37.8], abs=0.1)
 
 
-def test_lights(exported):
+def test_lights_are_outside_the_default_prim_and_behind_the_camera(exported):
     stage = exported[3]
     lights = [prim for prim in stage.Traverse() if prim.HasAPI(UsdLux.LightAPI)]
     assert [prim.GetTypeName() for prim in lights] == ["DistantLight", "DomeLight"]
     assert not any(prim.GetPath().HasPrefix(stage.GetDefaultPrim().GetPath()) for prim in lights)
     lamp, dome = (UsdLux.LightAPI(prim) for prim in lights)
-    # a white diffuse face square to the lamp
+    # brightness of a white diffuse face perpendicular to the lamp's rays
     assert lamp.GetNormalizeAttr().Get() and 0.9 < lamp.GetIntensityAttr().Get() / np.pi + dome.GetIntensityAttr().Get() < 1.2
-    away = UsdGeom.Xformable(lights[0]).ComputeLocalToWorldTransform(0).TransformDir((0, 0, -1))
+    direction = UsdGeom.Xformable(lights[0]).ComputeLocalToWorldTransform(0).TransformDir((0, 0, -1))
     camera = UsdGeom.Camera(stage.GetPrimAtPath("/View/camera")).GetCamera(0).transform
     right, up, backward = (np.array(camera.TransformDir(axis)) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))
-    towards = -np.array(away)
-    # over the viewer's left shoulder, but before the walls that the camera sees, whose normals are along x and z
+    towards = -np.array(direction)
+    # over the viewer's left shoulder, and in front of the visible walls, whose normals are along x and z
     assert towards[0] > 0.05 and towards[2] > 0.05
     assert towards @ right < -0.2 and towards @ up > 0.4 and towards @ backward > 0.4 and towards[1] > 0.7
 
 
-def test_tets_are_upright_and_not_drawn(exported):
+def test_tets_are_not_inverted_and_not_drawn(exported):
     _, scene, _, stage = exported
     tets = UsdGeom.TetMesh(stage.GetPrimAtPath("/World/_1_cube/tets"))
     assert np.array_equal(np.array(tets.GetTetVertexIndicesAttr().Get()), scene.bodies[0].nodes.tets)
@@ -186,32 +186,32 @@ def test_tets_are_upright_and_not_drawn(exported):
 
 
 def canonical(triangle):
-    """The triangle's indices from the smallest on: equal for equal orientation."""
+    """The triangle's indices starting with the smallest: the same for equal orientations."""
     k = int(np.argmin(triangle))
     return tuple(int(i) for i in np.roll(triangle, -k))
 
 
-def test_body_names_are_kept_beside_legal_ones(exported):
+def test_body_names_are_stored_beside_prim_names(exported):
     stage = exported[3]
     prims = stage.GetPrimAtPath("/World").GetChildren()
     assert [prim.GetDisplayName() for prim in prims] == list(NAMES)
     assert [prim.GetCustomDataByKey("taisoft:name") for prim in prims] == list(NAMES)
 
 
-def test_prim_names_are_legal_and_distinct():
+def test_prim_names_are_valid_and_distinct():
     names = ["a/b", "a b", "a_b", "a_b_1", "", "9", "ü", "é", "x" * 300, "x" * 299, "__", "body"]
-    legal = prim_names(names)
-    assert len(set(legal)) == len(names)
-    assert all(Tf.IsValidIdentifier(name) and name.isascii() and len(name) < 80 for name in legal)
+    valid = prim_names(names)
+    assert len(set(valid)) == len(names)
+    assert all(Tf.IsValidIdentifier(name) and name.isascii() and len(name) < 80 for name in valid)
     assert prim_names(["beam", "cube"]) == ["beam", "cube"]
 
 
-def test_chunks_appear_while_the_run_lasts(tmp_path):
-    given = export(tmp_path, beam_scene(), 25, close=False)
+def test_chunks_are_written_during_the_run(tmp_path):
+    positions = export(tmp_path, beam_scene(), 25, close=False)
     chunks = sorted((tmp_path / "chunks").iterdir())
     assert [path.name for path in chunks] == ["points_00000.usdc", "points_00010.usdc"]
     assert not (tmp_path / "scene.usdc").exists()
-    assert [check_frames(path, given, first) for path, first in zip(chunks, (0, 10))] == [10, 10]
+    assert [check_frames(path, positions, first) for path, first in zip(chunks, (0, 10))] == [10, 10]
 
 
 def test_a_run_without_frames_leaves_nothing(tmp_path):
@@ -223,11 +223,11 @@ def test_joined_chunks_equal_the_finished_scene(tmp_path):
     scene = beam_scene(("one", "two"))
     scene.add_body(scene.bodies[0].mesh, scene.bodies[0].material, name="three", position=(0, -1.5, 0), order=2)
     export(tmp_path / "whole", scene, 20)
-    given = export(tmp_path / "killed", scene, 27, close=False)
+    positions = export(tmp_path / "killed", scene, 27, close=False)
     assert join_chunks(tmp_path / "killed") == tmp_path / "killed" / "scene.usdc"
-    assert check_frames(tmp_path / "killed" / "scene.usdc", given) == 20
+    assert check_frames(tmp_path / "killed" / "scene.usdc", positions) == 20
     texts = [Usd.Stage.Open(str(tmp_path / name / "scene.usdc")).ExportToString() for name in ("whole", "killed")]
-    # the composed text starts with where it came from
+    # the text of a stage begins with its path
     assert texts[0].replace("whole", "killed") == texts[1]
     assert not (tmp_path / "killed" / "chunks").exists()
     with pytest.raises(OutputError, match="holds no chunk"):
@@ -254,46 +254,46 @@ N_KILLED_FRAMES = 150
 
 def test_killed_at_any_time_leaves_files_that_open(tmp_path):
     scene = beam_scene(("one", "two"), cells=(16, 4, 4))
-    sim, given = FakeSimulator(scene), []
+    sim, positions = FakeSimulator(scene), []
     for index in range(N_KILLED_FRAMES):
         sim.time = index / 30
-        given.append({body.name: sim.positions(body.name) for body in scene.bodies})
+        positions.append({body.name: sim.positions(body.name) for body in scene.bodies})
     export(tmp_path / "old", scene, 3)
     old = (tmp_path / "old" / "scene.usdc").read_bytes()
-    dice = random.Random(1)
-    stopped = []
+    rng = random.Random(1)
+    n_printed = []
     closing = [N_KILLED_FRAMES + 1] * 2  # with an earlier scene.usdc and without
-    for attempt, told in enumerate([1, *closing, *dice.sample(range(2, N_KILLED_FRAMES), 3)]):
+    for attempt, n_lines in enumerate([1, *closing, *rng.sample(range(2, N_KILLED_FRAMES), 3)]):
         folder = tmp_path / str(attempt)
         folder.mkdir()
-        before = old if attempt % 2 else None  # without an earlier scene.usdc there is the complete one or none
+        before = old if attempt % 2 else None
         if before:
             (folder / "scene.usdc").write_bytes(before)
-        done = run_and_kill(folder, told, dice.uniform(0.0, 0.02))
-        stopped.append(len(done))
+        lines = run_and_kill(folder, n_lines, rng.uniform(0.0, 0.02))
+        n_printed.append(len(lines))
         chunks = sorted((folder / "chunks").glob("*.usdc"))
         found = (folder / "scene.usdc").read_bytes() if (folder / "scene.usdc").exists() else None
         if found != before:
-            assert check_frames(folder / "scene.usdc", given) == N_KILLED_FRAMES
+            assert check_frames(folder / "scene.usdc", positions) == N_KILLED_FRAMES
         else:
             firsts = [int(path.stem[-5:]) for path in chunks]
-            kept = sum(check_frames(path, given, first) for path, first in zip(chunks, firsts))
-            assert kept >= len([line for line in done if line.isdigit()]) - 10
-    assert len(set(stopped)) > 2, "the kills all came at the same place"
+            kept = sum(check_frames(path, positions, first) for path, first in zip(chunks, firsts))
+            assert kept >= len([line for line in lines if line.isdigit()]) - 10
+    assert len(set(n_printed)) > 2, "all kills came at the same place"
 
 
-def run_and_kill(folder, told, delay):
-    """Lines that the child printed before it was killed, delay [s] after so many of them: a frame each, and that it closes."""
+def run_and_kill(folder, n_lines, delay):
+    """Lines printed by the child, one per frame and one before closing; it is killed delay [s] after n_lines of them."""
     child = subprocess.Popen(
         [sys.executable, "-c", CHILD, str(folder), str(N_KILLED_FRAMES)], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
-    lines = [child.stdout.readline().strip() for _ in range(told)]
+    lines = [child.stdout.readline().strip() for _ in range(n_lines)]
     time.sleep(delay)
     child.kill()
     return [*lines, *child.communicate()[0].split()]
 
 
-def test_a_full_disk_is_told_and_leaves_no_part(tmp_path):
+def test_a_full_disk_is_an_error_and_leaves_no_partial_file(tmp_path):
     scene = beam_scene(cells=(16, 4, 4))
     writer = UsdWriter(tmp_path, scene, chunk_frames=5)
     sim = FakeSimulator(scene)
@@ -304,7 +304,7 @@ def test_a_full_disk_is_told_and_leaves_no_part(tmp_path):
             for index in range(50):
                 writer.frame(sim, index)
         n_chunks = len(list((tmp_path / "chunks").glob("*.usdc")))
-        writer.close()  # nothing to complete, nothing to complain of again
+        writer.close()  # does not raise again
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert not (tmp_path / "scene.usdc").exists()
@@ -314,7 +314,7 @@ def test_a_full_disk_is_told_and_leaves_no_part(tmp_path):
         assert Usd.Stage.Open(str(path))
 
 
-def test_settings_out_of_range_are_refused(tmp_path):
+def test_invalid_settings_are_refused(tmp_path):
     with pytest.raises(OutputError, match="fps is 0"):
         UsdWriter(tmp_path, beam_scene(), fps=0)
     with pytest.raises(OutputError, match="chunk_frames is 0"):

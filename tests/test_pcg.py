@@ -1,11 +1,10 @@
-"""Conjugate gradients, serial and parallel, in f32 and f64, on the stiffness of squeezed linear and quadratic
-bodies plus inertia:
+"""Conjugate gradients, serial and parallel, in both precisions, on stiffness plus inertia of compressed bodies of either order:
 
-* the solution is SciPy's on the free axes and exactly 0 on the others, whatever stands on the right side there;
-* a looser tolerance stops earlier, the limit of iterations is kept, no right side needs no iteration;
-* negative curvature is reported, and the iterate before it is finite and goes downhill;
-* diagonal blocks that are nearly singular do not spoil the solution;
-* the parallel solver's result does not depend on the run.
+* the solution is SciPy's on the free axes and exactly 0 on the others, whatever the right-hand side there;
+* a looser tolerance stops earlier, the iteration limit holds, and a zero right-hand side takes no iteration;
+* negative curvature is reported, and the iterate before it is finite and a descent direction;
+* nearly singular diagonal blocks do not spoil the solution;
+* the parallel solver's result is the same in every run.
 """
 
 import numpy as np
@@ -36,7 +35,7 @@ def rig(request):
 
 
 def fill(rig, dense: np.ndarray) -> sp.csr_matrix:
-    """Put a matrix with the node graph's pattern into the machine; returns what is there, rounded."""
+    """Upload a matrix with the node graph's pattern; returns it as stored, rounded."""
     blocks = dense.reshape(rig.model.n_nodes, 3, rig.model.n_nodes, 3).transpose(0, 2, 1, 3)
     start, column = rig.matrix.row_start.to_numpy(), rig.matrix.column.to_numpy()
     row = np.repeat(np.arange(rig.model.n_nodes), np.diff(start))
@@ -46,7 +45,7 @@ def fill(rig, dense: np.ndarray) -> sp.csr_matrix:
     return block_csr.to_scipy(rig.model, rig.matrix)
 
 
-def solved(rig, method: str, tolerance: float, limit: int = 1000):
+def solve(rig, method: str, tolerance: float, limit: int = 1000):
     rig.work.y.fill(np.nan)
     result = pcg.solve(rig.model if method == "serial" else rig.parallel, rig.matrix, rig.work, tolerance, limit)
     return result, rig.work.y.to_numpy().astype(np.float64)
@@ -54,8 +53,8 @@ def solved(rig, method: str, tolerance: float, limit: int = 1000):
 
 @pytest.fixture
 def system(rig):
-    """K plus an inertia of about a hundredth of it, and its exact solution (n,3)."""
-    shift = np.repeat(np.random.default_rng(2).uniform(200.0, 2000.0, rig.model.n_nodes), 3)  # [N/m], a number a node
+    """Exact solution (n,3) of a system of K plus an inertia of about a hundredth of it."""
+    shift = np.repeat(np.random.default_rng(2).uniform(200.0, 2000.0, rig.model.n_nodes), 3)  # [N/m], one per node
     A = fill(rig, rig.stiffness + np.diag(shift))
     free = rig.free.reshape(-1)
     y = np.zeros(free.size)
@@ -66,7 +65,7 @@ def system(rig):
 @pytest.mark.parametrize("method", METHODS)
 def test_the_solution_is_scipys(rig, system, method):
     tolerance = {"f64": 1e-12, "f32": 1e-6}[rig.machine.precision]
-    result, y = solved(rig, method, tolerance)
+    result, y = solve(rig, method, tolerance)
     assert result.converged and not result.negative and 5 < result.iterations < rig.free.sum()
     # the error is at most the tolerance times the root of the condition of the preconditioned matrix, about 30
     assert np.abs(y - system).max() < 100 * tolerance * np.abs(system).max()
@@ -74,24 +73,24 @@ def test_the_solution_is_scipys(rig, system, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_tolerance_and_limit(rig, system, method):
-    counts = [solved(rig, method, tolerance)[0].iterations for tolerance in (0.3, 1e-2, 1e-5)]
+def test_the_tolerance_and_the_iteration_limit_stop_the_solver(rig, system, method):
+    counts = [solve(rig, method, tolerance)[0].iterations for tolerance in (0.3, 1e-2, 1e-5)]
     assert counts == sorted(set(counts))
-    loose = solved(rig, method, 0.3)[1]
+    loose = solve(rig, method, 0.3)[1]
     assert 1e-3 < np.abs(loose - system).max() / np.abs(system).max() < 1.0
-    result, y = solved(rig, method, 1e-5, limit=3)
+    result, y = solve(rig, method, 1e-5, limit=3)
     assert result.iterations == 3 and not result.converged and not result.negative and np.isfinite(y).all()
 
 
-def test_gauss_seidel_needs_fewer_iterations(rig, system):
-    serial, parallel = (solved(rig, method, 1e-5)[0].iterations for method in METHODS)
+def test_gauss_seidel_takes_fewer_iterations(rig, system):
+    serial, parallel = (solve(rig, method, 1e-5)[0].iterations for method in METHODS)
     assert serial < 0.8 * parallel
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_nothing_to_do(rig, system, method):
+def test_a_zero_right_hand_side_takes_no_iteration(rig, system, method):
     rig.work.rhs.from_numpy(np.where(rig.free, 0.0, 1.0).astype(rig.machine.np_real))
-    result, y = solved(rig, method, 1e-6)
+    result, y = solve(rig, method, 1e-6)
     rig.work.rhs.from_numpy(rig.rhs)
     assert result.converged and result.iterations == 0 and not y.any()
 
@@ -99,18 +98,18 @@ def test_nothing_to_do(rig, system, method):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("shift", [-1e3, -1e5])
 def test_negative_curvature_is_reported(rig, method, shift):
-    """A little indefinite, and negative altogether, which the diagonal blocks already show."""
+    """Slightly indefinite, and negative definite, which already shows in the diagonal blocks."""
     A = fill(rig, rig.stiffness + shift * np.eye(len(rig.stiffness)))
     free = rig.free.reshape(-1)
     assert np.linalg.eigvalsh(A[free][:, free].toarray()).min() < -500
-    result, y = solved(rig, method, 1e-6)
+    result, y = solve(rig, method, 1e-6)
     assert result.negative and not result.converged
     assert np.isfinite(y).all() and np.sum(y * rig.rhs) >= 0.0
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_blocks_that_are_nearly_singular(rig, method):
-    """Nodes ten thousand times as stiff along one oblique axis: their blocks have a determinant of nearly 0."""
+def test_nearly_singular_blocks_do_not_spoil_the_solution(rig, method):
+    """Nodes ten thousand times as stiff along one oblique axis: the determinants of their blocks are nearly 0."""
     u = np.array([1.0, 2.0, -2.0]) / 3.0
     blocks = {i: 3e6 * np.outer(u, u) for i in range(4, 20, 3)}
     A = rig.stiffness + 300.0 * np.eye(len(rig.stiffness))
@@ -124,13 +123,13 @@ def test_blocks_that_are_nearly_singular(rig, method):
     assert np.linalg.eigvalsh(A[free][:, free].toarray()).min() > 10.0
     exact = np.zeros(free.size)
     exact[free] = spl.spsolve(A[free][:, free].tocsc(), rig.rhs.reshape(-1)[free].astype(np.float64))
-    result, y = solved(rig, method, 1e-6)
+    result, y = solve(rig, method, 1e-6)
     assert result.converged and not result.negative
     assert np.abs(y.reshape(-1) - exact).max() < 1e-2 * np.abs(exact).max()
 
 
 def test_the_parallel_solver_is_reproducible(rig, system):
-    first = solved(rig, "parallel", 1e-5)
+    first = solve(rig, "parallel", 1e-5)
     for _ in range(5):
-        again = solved(rig, "parallel", 1e-5)
+        again = solve(rig, "parallel", 1e-5)
         assert again[0] == first[0] and np.array_equal(again[1], first[1])

@@ -1,9 +1,9 @@
-"""MuJoCo as a peer: the comparison is fair only if it solves the same equations.
+"""The comparison with MuJoCo is fair: it solves the same equations.
 
-* Its masses, its elastic force on a deformed mesh and its fixed nodes are those of the exact path's beam;
-* its path is near the exact one, of first order (Euler, discrete) or better (staggered start, RK4);
-* step sizes and names outside the rules are refused, and a run that diverges is an error, not a result;
-* the stored step sizes are the largest stable ones (shown on the smallest mesh).
+* Its masses, elastic forces and fixed nodes are those of the exact path's beam;
+* its path converges to the exact one, with first order (Euler, discrete) or better (staggered start, RK4);
+* invalid step sizes and names are refused, and a diverged run is an error;
+* the stored step sizes are the largest stable ones (checked on the smallest mesh).
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ def test_masses_and_elastic_forces_are_those_of_the_beam():
     assert model.nv == 3 * beam.free.sum()
     assert np.allclose(model.body_mass[1:], beam.mass[beam.free], rtol=1e-14)
     expected = beam.elastic_force(u.T).T[beam.free].ravel()
-    assert np.abs(expected).max() > 1e3  # N: something is active
+    assert np.abs(expected).max() > 1e3  # [N]: the elements are deformed
     assert np.abs(data.qfrc_passive - expected).max() < 1e-10 * np.abs(expected).max()
     expected_acceleration = beam.acceleration(u.T).T[beam.free].ravel()
     assert np.abs(data.qacc - expected_acceleration).max() < 1e-10 * np.abs(expected_acceleration).max()
@@ -42,20 +42,20 @@ def test_masses_and_elastic_forces_are_those_of_the_beam():
     "integrator, dt, order, largest",
     [("euler", 2.5e-3, 1, 2e-3), ("euler_staggered", 2.5e-3, 2, 5e-5), ("discrete", 2.5e-3, 1, 5e-3), ("rk4", 5e-3, 4, 1e-5)],
 )
-def test_error_falls_with_the_order_of_the_integrator(integrator, dt, order, largest):
+def test_the_error_converges_with_the_order_of_the_integrator(integrator, dt, order, largest):
     coarse, fine = (run_mujoco(CELLS, integrator, h, seconds=0.7)["error"] for h in (dt, dt / 2))
     assert coarse < largest
     assert np.log2(coarse / fine) == pytest.approx(order, abs=0.25)
 
 
-def test_result_holds_path_and_times():
+def test_a_result_holds_path_and_times():
     r = run_mujoco(CELLS, "discrete", 0.01, seconds=0.2)
     assert r["path"].shape == (21, 3) and np.allclose(r["t"], np.arange(21) * 0.01)
     assert np.allclose(r["path"][0], [2, 0, 0])
     assert r["seconds_per_simulated_second"] > 0.0 and r["compile_seconds"] > 0.0
 
 
-def test_what_breaks_the_rules_is_refused():
+def test_invalid_arguments_are_refused():
     with pytest.raises(SceneError, match="dt must divide the 0.01 s between two samples, not 0.003 s"):
         run_mujoco(CELLS, "euler", 0.003)
     with pytest.raises(SceneError, match="integrator must be one of .*, not 'implicitfast'"):
@@ -70,4 +70,4 @@ def test_the_stored_steps_are_the_largest_stable_ones(integrator, steps, tmp_pat
     assert run_mujoco(CELLS, integrator, 0.01 / steps)["error"] < 0.01
     with pytest.raises(SimulationError, match=f"MuJoCo's {integrator} with dt = .* diverges on the mesh"):
         run_mujoco(CELLS, integrator, 0.01 / (steps - 1))
-    assert list(tmp_path.iterdir()) == []  # MuJoCo's log of warnings is kept away
+    assert list(tmp_path.iterdir()) == []  # MuJoCo writes no log of warnings

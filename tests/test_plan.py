@@ -1,26 +1,22 @@
-"""What a scene does not need is not there:
+"""A simulator allocates and launches only what its scene needs:
 
-* the plan names each feature, whether it is on and why, with the bodies that ask for it;
-* what is off allocates no field and launches no kernel, counted by name; what is on does;
-* a simulator takes less than 1 kB a tet.
+* the plan lists each feature, whether it is on and why, with the bodies that need it;
+* features that are off allocate no field and launch no kernel; features that are on do;
+* a simulator takes less than 1 kB per tet.
 """
 
 import pytest
-from scenes import cube, driven_scene, mixed_scene, rubber
+from scenes import block_scene, cube, driven_scene, mixed_scene, rubber
 
 import taisoft as ts
 from taisoft.backend import runtime
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.scene.plan import make_plan
 
-LOADS, DAMPING, LED = {"loads"}, {"damping", "node_body"}, {"prescribed_nodes", "prescribed_axes", "targets", "position_before"}
-HELD, VERLET, BOTH = {"held", "held_velocity", "reaction"}, {"acceleration"}, {"half_velocity"}
-
-
-def bare() -> ts.Scene:
-    scene = ts.Scene()
-    scene.add_body(cube(), rubber(), name="block")
-    return scene
+# field names of each feature
+LOADS, DAMPING = {"loads"}, {"damping", "node_body"}
+PRESCRIBED = {"prescribed_nodes", "prescribed_axes", "targets", "position_before"}
+HELD, VERLET, DAMPED_VERLET = {"held", "held_velocity", "reaction"}, {"acceleration"}, {"half_velocity"}
 
 
 def test_reasons():
@@ -51,7 +47,7 @@ def test_reasons():
 
 
 def test_every_feature_can_be_on_and_off():
-    off = make_plan(bare(), explicit=True, multistep=False).on
+    off = make_plan(block_scene(), explicit=True, multistep=False).on
     full = driven_scene(order=2, mass_damping=1.0, stiffness_damping=1.0)
     full.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
     full.body("beam").collision, full.contact_forces = "distance_field", True
@@ -62,16 +58,16 @@ def test_every_feature_can_be_on_and_off():
 
 def test_quadratic_bodies_get_a_consistent_mass_in_implicit_steps_only():
     scene = mixed_scene(order="both")
-    names = [b.name for b in scene.bodies if b.order == 2]
+    names = ", ".join(b.name for b in scene.bodies if b.order == 2)
     for explicit in (True, False):
         plan = make_plan(scene, explicit=explicit, multistep=False)
         entries = {e["feature"]: (e["on"], e["why"]) for e in plan.entries}
-        assert entries["quadratic_tets"] == (True, f"bodies of order 2: {', '.join(names)}")
+        assert entries["quadratic_tets"] == (True, f"bodies of order 2: {names}")
         assert entries["consistent_mass"][0] is entries["consistent_weight"][0] is (not explicit)
-    assert entries["consistent_mass"][1] == f"quadratic tets of {', '.join(names)} in implicit steps"
+    assert entries["consistent_mass"][1] == f"quadratic tets of {names} in implicit steps"
 
 
-def test_many_names_are_cut_short():
+def test_long_lists_of_names_are_shortened():
     scene = ts.Scene()
     for _ in range(6):
         scene.add_body(cube(), rubber())
@@ -80,7 +76,7 @@ def test_many_names_are_cut_short():
 
 
 def contact_plan(bodies=(), obstacles=(), self_collision=False) -> dict[str, tuple[bool, str]]:
-    """feature -> (on, why) of what finds contacts; bodies: pairs of a name and what they ask to be hit by."""
+    """feature -> (on, why) of the contact features; bodies: pairs of a name and a `collision` mode."""
     scene = ts.Scene()
     for name, collision in bodies:
         scene.add_body(ts.ball_mesh(1.0, 8), rubber(), name=name, collision=collision)
@@ -90,7 +86,7 @@ def contact_plan(bodies=(), obstacles=(), self_collision=False) -> dict[str, tup
     return {e["feature"]: (e["on"], e["why"]) for e in entries[-5:]}
 
 
-def test_contact_geometry_is_there_where_something_can_touch():
+def test_contact_features_are_on_if_something_can_touch():
     plane, box = ts.HalfSpace((0, 0, 0), (0, 1, 0)), ts.Box((0, 0, 0), (1, 1, 1))
     ball = ("ball", "distance_field")
     alone = contact_plan([ball])
@@ -105,12 +101,12 @@ def test_contact_geometry_is_there_where_something_can_touch():
     boxed = contact_plan([ball], [plane, box])
     assert boxed["distance_fields"] == (True, "hits ball (requested)")
     assert boxed["proximity"] == (True, "hits obstacle1 (edges)")
-    two = contact_plan([ball, ("told", "proximity"), ("free", "auto")])
+    two = contact_plan([ball, ("block", "proximity"), ("sheet", "auto")])
     assert two["distance_fields"] == (True, "hits ball (requested)")
-    assert two["proximity"] == (True, "hits told (requested), free")
+    assert two["proximity"] == (True, "hits block (requested), sheet")
 
 
-def test_meshes_and_bodies_themselves_are_hit_by_proximity():
+def test_mesh_obstacles_and_self_collision_need_proximity():
     vertices, triangles = ts.Box((0, 0, 0), (1, 1, 1)).surface()
     meshed = contact_plan([("ball", "distance_field")], [ts.MeshObstacle(vertices, triangles)])
     assert meshed["proximity"] == (True, "hits obstacle0 (triangles)") and meshed["distance_fields"][0]
@@ -121,57 +117,57 @@ def test_meshes_and_bodies_themselves_are_hit_by_proximity():
 
 
 @pytest.mark.parametrize("integrator", [*EXPLICIT, "implicit_euler", "bdf2"])
-def test_what_is_off_allocates_nothing(integrator):
-    with ts.Simulator(bare(), dt=1e-3, integrator=integrator) as sim:
+def test_features_that_are_off_allocate_nothing(integrator):
+    with ts.Simulator(block_scene(), dt=1e-3, integrator=integrator) as sim:
         fields = set(sim.field_bytes)
         assert all(size > 0 for size in sim.field_bytes.values())
-    assert not fields & (LOADS | DAMPING | LED | HELD | BOTH) and not any(f.startswith("damping") for f in fields)
+    assert not fields & (LOADS | DAMPING | PRESCRIBED | HELD | DAMPED_VERLET) and not any(f.startswith("damping") for f in fields)
     assert bool(fields & VERLET) == (integrator == "velocity_verlet")
     assert any(f.startswith("stiffness") for f in fields) == any(f.startswith("pcg") for f in fields)
     assert any(f.startswith("stiffness") for f in fields) == (integrator not in EXPLICIT)
     assert ("x_before" in fields) == (integrator == "bdf2")
 
 
-def test_what_is_on_is_allocated():
+def test_features_that_are_on_allocate_their_fields():
     scene = driven_scene(mass_damping=1.0, stiffness_damping=1e-3)
     with ts.Simulator(scene, dt=1e-4, integrator="velocity_verlet") as sim:
-        assert LOADS | DAMPING | LED | HELD | VERLET | BOTH <= set(sim.field_bytes)
+        assert LOADS | DAMPING | PRESCRIBED | HELD | VERLET | DAMPED_VERLET <= set(sim.field_bytes)
 
 
 def launched(sim, steps: int) -> dict[str, int]:
-    """kernel -> launches of so many steps."""
+    """kernel -> launches in a number of steps."""
     before = dict(runtime.launches)
     for _ in range(steps):
         sim.step()
     return {k: n - before.get(k, 0) for k, n in runtime.launches.items() if n > before.get(k, 0)}
 
 
-def test_an_explicit_step_is_one_launch():
-    """Beside the report's own."""
-    with ts.Simulator(bare(), dt=1e-3, integrator="symplectic_euler") as sim:
+def test_an_explicit_step_is_one_launch_besides_its_report():
+    with ts.Simulator(block_scene(), dt=1e-3, integrator="symplectic_euler") as sim:
         assert launched(sim, 3) == {"advance_serial": 3, "measure": 3}
 
 
-def test_an_implicit_step_assembles_what_it_needs():
-    with ts.Simulator(bare(), dt=1e-3, integrator="implicit_euler") as sim:
+def test_an_implicit_step_launches_only_the_kernels_it_needs():
+    with ts.Simulator(block_scene(), dt=1e-3, integrator="implicit_euler") as sim:
         sim.set_gravity((0, 0, 0))
-        still = launched(sim, 2)
-        # at rest there is nothing to solve: a residual says so
-        assert still.keys() == {"begin_step", "begin_stage", "move", "form_residual", "measure"} and set(still.values()) == {2}
+        at_rest = launched(sim, 2)
+        # the residual at rest is zero, so nothing is solved
+        assert at_rest.keys() == {"begin_step", "begin_stage", "move", "form_residual", "measure"}
+        assert set(at_rest.values()) == {2}
         sim.set_gravity((0, -9.81, 0))
         sim.set_state(velocities=0.1 * sim.positions())
         falling = launched(sim, 2)
         assert falling["assemble"] >= 1 and falling["iterate_kernel"] >= 1
-        # no damping: no second matrix; a lower residual: no backtracking; nothing to touch: no kernels of contacts
+        # no second matrix without damping, no backtracking with a falling residual, no contact kernels without contacts
         assert falling["assemble"] <= falling["form_residual"] == falling["move"]
         assert not {"update_impulses", "advance", "begin_linearised", "save_diagonal"} & falling.keys()
         assert falling["measure"] == 2 and "finish_midpoint" not in falling and "elastic_forces" not in falling
 
 
-def test_memory():
+def test_a_simulator_takes_less_than_1_kilobyte_per_tet():
     scene = ts.Scene()
     body = scene.add_body(ts.box_mesh((24, 6, 6), (4, 1, 1)), rubber())
     body.fix(lambda X: X[:, 0] < -1.99)
     with ts.Simulator(scene, integrator="implicit_euler", precision="f32") as sim:
         size = sum(sim.field_bytes.values()) / body.mesh.n_tets
-    assert 300 < size < 1000  # [bytes a tet]
+    assert 300 < size < 1000  # [bytes per tet]

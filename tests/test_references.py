@@ -1,8 +1,8 @@
-"""The reference problems, by the cases of `benchmarks/references.py` on their cheap meshes:
+"""The reference problems of `benchmarks/references.py` on coarse meshes:
 
-* every check with a limit passes, and every case has one;
-* a wrong number, or one that is not a number, fails its check;
-* the benchmark's table, file and exit status tell what failed, what could not be computed and what is absent.
+* every case has checks with a limit, and all pass;
+* a wrong number or NaN fails its check;
+* the benchmark's table, file and exit status show what failed, what could not be computed and what is missing.
 """
 
 import json
@@ -31,13 +31,13 @@ def test_reference(case, shared):
     assert not [check for check in checks if not check.passed]
 
 
-def test_every_problem_has_a_cheap_case_or_is_told_apart():
-    cheap = {case.problem for case in CASES if not case.fine}
-    assert set(PROBLEMS) - cheap == {"beam_fall_converged"}
+def test_every_problem_but_one_has_a_coarse_case():
+    coarse = {case.problem for case in CASES if not case.fine}
+    assert set(PROBLEMS) - coarse == {"beam_fall_converged"}
     assert len({case.name for case in CASES}) == len(CASES)
 
 
-def test_checks_tell_right_from_wrong():
+def test_checks_fail_for_wrong_values_and_nan():
     assert near("a", 1.001, 1.0, 0.01).passed and not near("a", 1.02, 1.0, 0.01).passed
     assert near("a", 5.0, 0.0, 0.1, scale=100.0).passed
     assert not small("a", -2.0, 1.0).passed and not small("a", math.nan, 1.0).passed
@@ -46,7 +46,7 @@ def test_checks_tell_right_from_wrong():
     assert not order("a", 0.0, 0.0, 2, 0.1).passed
 
 
-def test_worst_finds_the_largest_error_and_what_is_no_number():
+def test_worst_finds_the_largest_error_and_nan():
     checks = [Check("a", 1, 1, 0.1, 1.0), Check("b", 2, 1, 0.7, 1.0)]
     assert worst(checks, "what").error == 0.7 and "b" in worst(checks, "what").quantity
     assert not worst([*checks, Check("c", 0, 1, math.nan, 1.0)], "what").passed
@@ -54,14 +54,14 @@ def test_worst_finds_the_largest_error_and_what_is_no_number():
 
 @pytest.fixture
 def tables(shared, tmp_path, monkeypatch):
-    """A folder with a copy of the law table, which the benchmark takes for the references."""
+    """A folder with a copy of the law table, used by the benchmark as its references."""
     text = (shared / "references" / "stress_table.json").read_text(encoding="utf-8")
     monkeypatch.setattr(references, "REFERENCES", tmp_path)
     (tmp_path / "stress_table.json").write_text(text, encoding="utf-8")
     return tmp_path
 
 
-def test_benchmark_prints_and_writes_what_it_found(tables, capsys):
+def test_the_benchmark_prints_and_writes_its_results(tables, capsys):
     out = tables / "rows.json"
     assert references.main(["--problem", "stress_table", "--out", str(out)]) == 0
     printed = capsys.readouterr().out.splitlines()
@@ -72,7 +72,7 @@ def test_benchmark_prints_and_writes_what_it_found(tables, capsys):
     assert printed[-1].startswith("6 checks passed, 0 failed")
 
 
-def test_benchmark_fails_where_a_value_is_off(tables, capsys):
+def test_the_benchmark_fails_for_a_wrong_value(tables, capsys):
     path = tables / "stress_table.json"
     table = json.loads(path.read_text(encoding="utf-8"))
     table["value"][2]["SVK"]["P"][0][0] *= 1 + 1e-8
@@ -82,34 +82,34 @@ def test_benchmark_fails_where_a_value_is_off(tables, capsys):
     assert len(failed) == 1 and "SVK" in failed[0] and "P11" in failed[0]
 
 
-def test_benchmark_says_what_is_absent(tmp_path, capsys, monkeypatch):
+def test_the_benchmark_names_missing_references(tmp_path, capsys, monkeypatch):
     (tmp_path / "stress_table.json").write_text("{}", encoding="utf-8")
     for folder, name in ((tmp_path, "uniaxial_stress"), (tmp_path / "nowhere", "nowhere")):
         monkeypatch.setattr(references, "REFERENCES", folder)
         assert references.main([]) == 2
-        told = capsys.readouterr()
-        assert told.out == "" and told.err.count("\n") == 1 and "absent" in told.err
-        assert name in told.err and "stress_table" not in told.err
+        printed = capsys.readouterr()
+        assert printed.out == "" and printed.err.count("\n") == 1 and "absent" in printed.err
+        assert name in printed.err and "stress_table" not in printed.err
 
 
 def test_a_case_that_cannot_be_computed_is_a_failed_row(tmp_path):
     def broken(reference, arch):
-        raise SimulationError("no such luck")
+        raise SimulationError("no solution")
         yield
 
     rows = references.run(replace(CASES[0], compute=broken), {}, "cpu")
-    assert [row.verdict for row in rows] == ["FAIL"] and "no such luck" in rows[0].check.quantity
+    assert [row.verdict for row in rows] == ["FAIL"] and "no solution" in rows[0].check.quantity
     references._write(tmp_path / "rows.json", "cpu", rows)
     assert json.loads((tmp_path / "rows.json").read_text(encoding="utf-8"))["rows"][0]["measured"] is None
 
 
-def test_a_file_that_cannot_be_written_is_told_before_the_run(tables, capsys):
+def test_a_file_that_cannot_be_written_is_refused_before_the_run(tables, capsys):
     with pytest.raises(OutputError, match="folder does not exist"):
         references.main(["--problem", "stress_table", "--out", str(tables / "no" / "rows.json")])
     assert capsys.readouterr().out == ""
 
 
-def test_benchmark_runs_from_the_command_line(shared):
+def test_the_benchmark_runs_from_the_command_line(shared):
     root = Path(references.__file__).resolve().parents[1]
     command = [sys.executable, "-m", "taisoft", "bench", "references", "--problem", "stress_table"]
     environment = {**os.environ, "PYTHONPATH": str(root)}

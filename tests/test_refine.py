@@ -1,8 +1,8 @@
 """A scene on a finer mesh or with another order, `taisoft.scene.refine`:
 
-* cells of eight, each an eighth of the volume, old nodes first, new ones in the middle between two old ones;
-* what a function chose is what it chooses there; ids choose faces as wholes, and what cannot be told is refused;
-* the load of a traction and of a total force, and the mean velocity, stay the same; paths lead the new nodes too.
+* every tet becomes eight of an eighth of its volume; old nodes come first, new ones halve an edge;
+* selection functions are applied again; ids select whole faces, and ambiguous ids are refused;
+* total tractions, total forces and velocities are kept; paths apply to the new nodes, too.
 """
 
 import numpy as np
@@ -33,7 +33,7 @@ def test_every_tet_becomes_eight(order):
     assert len(np.unique(new.rest_positions.round(9), axis=0)) == new.n_nodes
 
 
-def test_orders_there_and_back():
+def test_changing_the_order_twice_gives_the_same_body():
     scene, old = one_body()
     old.fix(lambda X: X[:, 0] < -0.99)
     quadratic = with_order(scene, 2)
@@ -45,7 +45,7 @@ def test_orders_there_and_back():
 
 @pytest.mark.parametrize("change", [refined, lambda scene: with_order(scene, 2)])
 @pytest.mark.parametrize("by_ids", [False, True])
-def test_a_held_face_is_held_everywhere(change, by_ids):
+def test_a_fixed_face_is_fixed_at_all_its_nodes(change, by_ids):
     scene, old = one_body()
     left = old.rest_positions[:, 0] < -0.99
     old.fix(np.flatnonzero(left) if by_ids else lambda X: X[:, 0] < -0.99, axes="xz")
@@ -54,10 +54,10 @@ def test_a_held_face_is_held_everywhere(change, by_ids):
     assert new.constraints[0].axes.tolist() == [True, False, True]
 
 
-def test_two_faces_held_by_ids_leave_what_is_between_them_untold():
+def test_ids_fix_nodes_between_them_or_are_ambiguous():
     scene, old = one_body(cells=(1, 1, 1))
-    old.fix(np.flatnonzero(np.abs(old.rest_positions[:, 0]) > 0.99))  # both ends of a bar that is one cell long
-    new = refined(scene).bodies[0]  # every tet has its nodes there: the bar is held as a whole
+    old.fix(np.flatnonzero(np.abs(old.rest_positions[:, 0]) > 0.99))  # both ends of a bar of one cell: all its nodes
+    new = refined(scene).bodies[0]
     assert len(new.constraints[0].nodes) == new.n_nodes
     scene, old = one_body(cells=(1, 1, 1))
     corners = np.flatnonzero((old.rest_positions[:, 1] > 0) & (old.rest_positions[:, 2] > 0))
@@ -66,7 +66,7 @@ def test_two_faces_held_by_ids_leave_what_is_between_them_untold():
         refined(scene)
 
 
-def test_loads_stay_what_they_are():
+def test_total_loads_are_kept():
     scene, old = one_body()
     top = old.mesh.vertices[old.mesh.surface].mean(axis=1)[:, 1] > 0.49
     old.add_traction(top, (1.0, -5.0, 2.0))
@@ -89,22 +89,22 @@ def test_nodal_velocities_are_interpolated():
     assert np.allclose(new.velocity, np.cross((0.0, 0.0, 3.0), new.rest_positions), atol=1e-12)
 
 
-def test_paths_lead_new_nodes():
+def test_key_frames_apply_to_new_nodes():
     scene, old = one_body()
 
-    def chooses(X):  # more than a face, so that the mean of the old nodes and that of the new ones differ
+    def selected(X):  # not only a face, so that old and new nodes have different means
         return X[:, 0] + X[:, 1] > 0.4
 
-    where = chooses(old.rest_positions)
-    old.move(chooses, ts.KeyFrames([0.0, 1.0], rotations=[(0, 0, 0), (0.5, 0, 0)]))
+    where = selected(old.rest_positions)
+    old.move(selected, ts.KeyFrames([0.0, 1.0], rotations=[(0, 0, 0), (0.5, 0, 0)]))
     new = refined(scene).bodies[0]
-    ours = new.constraints[0]
-    places = [np.flatnonzero(ours.nodes == node)[0] for node in np.flatnonzero(where)]
-    assert np.allclose(ours.path(0.7)[places], old.constraints[0].path(0.7), atol=1e-12)
-    assert where.sum() < len(ours.nodes)
+    constraint = new.constraints[0]
+    rows = [np.flatnonzero(constraint.nodes == node)[0] for node in np.flatnonzero(where)]
+    assert np.allclose(constraint.path(0.7)[rows], old.constraints[0].path(0.7), atol=1e-12)
+    assert where.sum() < len(constraint.nodes)
 
 
-def test_a_path_of_single_nodes_cannot_be_carried_over():
+def test_a_path_with_a_displacement_per_node_is_refused():
     scene, old = one_body()
     where = old.rest_positions[:, 0] > 0.99
     n = int(where.sum())
@@ -116,7 +116,7 @@ def test_a_path_of_single_nodes_cannot_be_carried_over():
     assert refined(scene).bodies[0].constraints[0].path(2.0) == (2.0, 0.0, 0.0)
 
 
-def test_what_is_held_on_middles_alone_has_no_place_on_linear_tets():
+def test_selected_mid_edge_nodes_are_refused_for_linear_tets():
     scene, old = one_body(order=2)
     old.fix([old.n_nodes - 1])
     with pytest.raises(SceneError, match="mid-edge nodes are chosen, which linear tets do not have"):

@@ -1,12 +1,12 @@
-"""A run, told by a stand-in whose steps cost nothing, and by two real simulators:
+"""`run` with a stand-in whose steps cost nothing, and with two real simulators:
 
 * frames come at fps or after every step, frame 0 first, and the run ends at `seconds` to the nearest step;
-* dt is lowered once, to the next divisor of the frame time, or rounded to one that is within 1e-6, and that is reported; a dt
-  that divides it stays;
-* whoever asks is told of every implicit step and every batch, as it was, with its time but not that of compiling;
-* explicit batches give a report a frame with the extremes of their sub-steps, implicit steps a report each;
-* stop and Ctrl-C end it as interrupted, at the last whole step; a failure ends it as failed; neither raises;
-* status: inverted tets and steps that did not converge make it degraded, and the problems say how many and when.
+* dt is lowered once, to the next divisor of the frame time, or rounded to one within 1e-6 of it, and that is reported; a dt that
+  divides the frame time stays;
+* on_step gets the report of every implicit step and every explicit batch, with its wall time without compilation;
+* explicit batches are merged into one report per frame, with the extremes of their sub-steps; implicit steps have one each;
+* stop and Ctrl-C end a run as interrupted, at the last whole step; a failure ends it as failed; neither raises;
+* inverted tets and steps that did not converge make the status degraded; the problems say how many and when.
 """
 
 from types import SimpleNamespace
@@ -16,12 +16,14 @@ import pytest
 from scenes import cube, element, rubber
 
 import taisoft as ts
+from taisoft.dynamics.explicit_stepper import ExplicitStepper
+from taisoft.dynamics.stage_system import StageSystem
 from taisoft.records import Energies, StepReport
 from taisoft.running import first_frame, run
 
 
 class StandIn:
-    """Counts steps; `events` maps a step to what happens in it: an exception, or fields of its report."""
+    """A simulator that only counts steps; `events` maps a step to an exception or to fields of its report."""
 
     def __init__(self, explicit: bool, dt: float = 0.01, events=None, largest_batch: int = 4):
         self.settings, self.touches = SimpleNamespace(explicit=explicit, integrator="symplectic_euler"), False
@@ -68,9 +70,9 @@ def frames(sim, seconds, fps=60, **arguments):
 
 
 @pytest.mark.parametrize("explicit", [True, False])
-def test_frames_at_fps(explicit):
+def test_frames_come_at_fps(explicit):
     result, seen = frames(StandIn(explicit, dt=0.01), 0.3, fps=10)
-    steps = 10 if explicit else 1  # an explicit frame is one report, an implicit one that of its last step
+    steps = 10 if explicit else 1  # per report: of an explicit frame, or of an implicit frame's last step
     assert seen == [(0, 0.0, None), (1, 0.1, steps), (2, 0.2, steps), (3, 0.3, steps)]
     assert result.status == "ok" and result.problems == [] and not result.interrupted
     assert result.steps == 30 and result.sim_seconds == pytest.approx(0.3)
@@ -78,7 +80,7 @@ def test_frames_at_fps(explicit):
 
 
 @pytest.mark.parametrize("explicit", [True, False])
-def test_a_frame_a_step(explicit):
+def test_without_fps_every_step_is_a_frame(explicit):
     sim = StandIn(explicit, dt=0.03)
     result, seen = frames(sim, 0.1, fps=None)
     assert sim.dt == 0.03 and [time for _, time, _ in seen] == [0.0, 0.03, 0.06, 0.09]
@@ -86,11 +88,11 @@ def test_a_frame_a_step(explicit):
 
 
 @pytest.mark.parametrize("seconds, steps", [(0.104, 10), (0.106, 11), (0.001, 1)])
-def test_the_end_is_the_nearest_step(seconds, steps):
+def test_a_run_ends_at_the_nearest_step(seconds, steps):
     result, seen = frames(StandIn(True, dt=0.01), seconds, fps=20)
     assert result.steps == steps and seen[-1][1] == pytest.approx(steps * 0.01)
-    longer = ["note: 0.001 s are less than half a step: one step of 0.01 s is taken"] if seconds < 0.005 else []
-    assert result.problems == longer
+    note = ["note: 0.001 s are less than half a step: one step of 0.01 s is taken"] if seconds < 0.005 else []
+    assert result.problems == note
 
 
 @pytest.mark.parametrize(
@@ -103,11 +105,11 @@ def test_dt_is_lowered_to_a_divisor_of_the_frame(dt, lowered, per_frame):
     assert [steps for *_, steps in seen[1:]] == [per_frame] * 6
     expected = [] if dt == lowered else [f"note: dt lowered from {dt:g} s to {lowered:.6g} s, so that "]
     assert len(result.problems) == len(expected) and result.status == "ok"
-    assert all(problem.startswith(words) for problem, words in zip(result.problems, expected))
+    assert all(problem.startswith(start) for problem, start in zip(result.problems, expected))
 
 
 @pytest.mark.parametrize(
-    "dt, per_frame, words",
+    "dt, per_frame, change",
     [
         (0.00833333, 2, "rounded from 0.00833333 s to 0.00833333333 s"),
         (0.0083332, 3, "lowered from 0.0083332 s to 0.00555556 s"),
@@ -119,17 +121,17 @@ def test_dt_is_lowered_to_a_divisor_of_the_frame(dt, lowered, per_frame):
     ],
 )
 @pytest.mark.parametrize("explicit", [False, True])
-def test_a_dt_that_was_written_with_few_digits(dt, per_frame, words, explicit):
+def test_a_dt_of_few_digits_is_rounded_to_a_divisor_of_the_frame(dt, per_frame, change, explicit):
     sim = StandIn(explicit, dt=dt)
     sim.settings.allow_unstable, sim.stable_dt = False, 1.0
     result, seen = frames(sim, 0.1)
     assert sim.dt == result.dt == pytest.approx(1 / 60 / per_frame, rel=1e-15) and len(seen) == 7 and result.status == "ok"
-    assert result.dt_requested == (None if words is None else dt)
-    assert result.problems == ([] if words is None else [f"note: dt {words}, so that {per_frame} steps make a frame of 1/60 s"])
+    assert result.dt_requested == (None if change is None else dt)
+    assert result.problems == ([] if change is None else [f"note: dt {change}, so that {per_frame} steps make a frame of 1/60 s"])
 
 
 def test_rounding_does_not_make_a_step_unstable():
-    """Up to a dt that an explicit integrator would refuse; where that only warns, it is rounded."""
+    """A dt that an explicit integrator would refuse is lowered instead; with allow_unstable it is rounded."""
     for allowed, per_frame in ((False, 3), (True, 2)):
         sim = StandIn(True, dt=0.00833333)
         sim.settings.allow_unstable, sim.stable_dt = allowed, 0.00833333
@@ -138,15 +140,15 @@ def test_rounding_does_not_make_a_step_unstable():
         assert first_frame(sim, 60) == 6
 
 
-def test_a_second_run_goes_on():
+def test_a_second_run_continues():
     sim = StandIn(True, dt=0.01)
     frames(sim, 0.2, fps=10)
     result, seen = frames(sim, 0.1, fps=10)
     assert seen == [(0, 0.2, None), (1, 0.3, 10)] and result.steps == 10 and result.sim_seconds == pytest.approx(0.1)
 
 
-def test_batches_are_merged():
-    """Ten sub-steps in batches of four: the extremes of the first batch are in the frame's report."""
+def test_explicit_batches_are_merged():
+    """Ten sub-steps in batches of four: the frame's report has the extremes of all."""
     events = {2: {"n_inverted": 3, "min_volume_ratio": -0.5}, 6: {"n_inverted": 1, "min_volume_ratio": 0.1}}
     result, _ = frames(StandIn(True, events=events), 0.2, fps=10)
     first, second = result.step_reports
@@ -158,8 +160,8 @@ def test_batches_are_merged():
 
 
 @pytest.mark.parametrize("explicit", [True, False])
-def test_steps_are_told(explicit, monkeypatch):
-    sim, now, told = StandIn(explicit, dt=0.01), [0.0], []
+def test_on_step_gets_every_report_and_its_time(explicit, monkeypatch):
+    sim, now, calls = StandIn(explicit, dt=0.01), [0.0], []
     advance = sim.advance
 
     def slow(n):
@@ -169,14 +171,14 @@ def test_steps_are_told(explicit, monkeypatch):
 
     sim.advance = slow
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    result = run(sim, 0.3, fps=10, on_step=lambda report, seconds: told.append((report.time, report.steps, seconds)))
+    result = run(sim, 0.3, fps=10, on_step=lambda report, seconds: calls.append((report.time, report.steps, seconds)))
     steps = [4, 4, 2] * 3 if explicit else [1] * 30
-    assert [(n, seconds) for _, n, seconds in told] == [(n, 2.0) for n in steps]
-    assert [time for time, _, _ in told] == pytest.approx(0.01 * np.cumsum(steps))
+    assert [(n, seconds) for _, n, seconds in calls] == [(n, 2.0) for n in steps]
+    assert [time for time, _, _ in calls] == pytest.approx(0.01 * np.cumsum(steps))
     assert result.wall_seconds == pytest.approx(2.0 * len(steps))
 
 
-def test_steps_that_did_not_converge():
+def test_steps_that_did_not_converge_degrade_a_run():
     events = {3: {"converged": False, "residual": 1e-3}, 5: {"converged": False, "residual": 2e-2}}
     result, _ = frames(StandIn(False, events=events), 0.1, fps=None)
     assert result.status == "degraded"
@@ -186,7 +188,7 @@ def test_steps_that_did_not_converge():
 
 
 @pytest.mark.parametrize("explicit", [True, False])
-def test_stop(explicit):
+def test_stop_interrupts_a_run(explicit):
     sim = StandIn(explicit)
     result, seen = frames(sim, 1.0, fps=10, stop=lambda: sim.step_count >= 23)
     assert (result.status, result.interrupted) == ("degraded", True)
@@ -201,7 +203,7 @@ def test_stop_before_the_first_step():
 
 
 @pytest.mark.parametrize("where", ["step", "frame"])
-def test_ctrl_c(where):
+def test_ctrl_c_interrupts_a_run(where):
     sim = StandIn(False, events={8: KeyboardInterrupt()} if where == "step" else {})
 
     def on_frame(s, index, report):
@@ -214,16 +216,14 @@ def test_ctrl_c(where):
 
 
 @pytest.mark.parametrize("explicit", [True, False])
-def test_failure(explicit):
+def test_a_failed_step_ends_a_run(explicit):
     sim = StandIn(explicit, events={8: ts.SimulationError("step 8: body 'beam', vertex 3: gone")}, largest_batch=1)
     result, seen = frames(sim, 1.0, fps=20)
     assert result.status == "failed" and result.problems == ["step 8: body 'beam', vertex 3: gone"]
     assert result.steps == 7 and [index for index, *_ in seen] == [0, 1]
 
 
-def test_other_errors_are_not_swallowed():
-    """An observer that cannot write is no failure of the run."""
-
+def test_errors_of_on_frame_are_raised():
     def on_frame(s, index, report):
         if index == 1:
             raise ts.OutputError("the disk is full")
@@ -233,7 +233,7 @@ def test_other_errors_are_not_swallowed():
 
 
 @pytest.mark.parametrize(
-    "arguments, words",
+    "arguments, message",
     [
         ((0.0,), "seconds must be greater than 0 s, not 0.0"),
         ((-1,), "seconds must be greater than 0 s, not -1"),
@@ -243,9 +243,9 @@ def test_other_errors_are_not_swallowed():
         ((1.0, None, np.nan), "fps must be finite, not nan"),
     ],
 )
-def test_bad_arguments(arguments, words):
+def test_bad_arguments_are_refused(arguments, message):
     sim = StandIn(True)
-    with pytest.raises(ts.SimulationError, match=words):
+    with pytest.raises(ts.SimulationError, match=message):
         run(sim, *arguments)
     assert sim.step_count == 0
 
@@ -259,7 +259,7 @@ def block(request):
         yield sim
 
 
-def test_a_real_run(block):
+def test_a_run_takes_the_same_steps_as_step_by_step(block):
     block.reset()
     block.dt = 0.004
     result, seen = frames(block, 0.1, fps=20)
@@ -272,7 +272,7 @@ def test_a_real_run(block):
     assert np.array_equal(block.positions(), x)
 
 
-def test_a_real_failure(block):
+def test_a_diverged_step_fails_a_run_and_leaves_the_last_good_state(block):
     block.reset()
     block.dt = 0.004
     if not block.settings.explicit:
@@ -288,22 +288,20 @@ def test_a_real_failure(block):
     assert result.sim_seconds == pytest.approx(0.004 * result.steps) and block.step_count == result.steps
 
 
-def test_real_ctrl_c(block, monkeypatch):
-    """In the middle of a step: the step is abandoned, and the next one starts from the last good state."""
+def test_ctrl_c_within_a_step_abandons_it(block, monkeypatch):
+    """The next step starts from the last good state."""
     block.reset()
     block.dt = 0.004
     block.advance(1)
     before = block.positions(), block.velocities()
-    worker, name = (
-        (block._dynamics.stepper, "_launch") if block.settings.explicit else (block._dynamics.stepper.solver, "form_matrix")
-    )
-    working = getattr(worker, name)
+    owner, name = (ExplicitStepper, "_launch") if block.settings.explicit else (StageSystem, "form_matrix")
+    original = getattr(owner, name)
 
-    def interrupted(*arguments):
-        working(*arguments)
+    def interrupted(*arguments, **named):
+        original(*arguments, **named)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(worker, name, interrupted)
+    monkeypatch.setattr(owner, name, interrupted)
     result = block.run(0.4, fps=None)
     assert (result.status, result.interrupted, result.steps, block.step_count) == ("degraded", True, 0, 1)
     assert np.array_equal(block.positions(), before[0]) and np.array_equal(block.velocities(), before[1])
@@ -327,8 +325,8 @@ def test_real_ctrl_c(block, monkeypatch):
         (MemoryError("lost"), "failed"),
     ],
 )
-def test_the_end_is_judged(end, status):
-    """By the deepest overlap [m], or what asking for it raises."""
+def test_the_final_overlap_sets_the_status(end, status):
+    """end: the deepest overlap [m], or an exception of the overlap check."""
     sim = StandIn(True)
     sim.touches, sim.contact_limit = True, lambda a, b: 0.01 if a == "left" else 1.0
 
@@ -341,13 +339,13 @@ def test_the_end_is_judged(end, status):
     sim.overlaps = overlaps
     result = run(sim, 0.1)
     assert result.status == status and result.interrupted == isinstance(end, KeyboardInterrupt)
-    told = {"ok": "", "degraded": "the run was interrupted" if result.interrupted else "'left' and 'right' overlap by 0.02 m"}
-    assert told.get(status, "lost") in " ".join(result.problems)
+    problem = {"ok": "", "degraded": "the run was interrupted" if result.interrupted else "'left' and 'right' overlap by 0.02 m"}
+    assert problem.get(status, "lost") in " ".join(result.problems)
 
 
 @pytest.mark.parametrize("change", ["dt", "steps"])
-def test_a_run_that_ends_elsewhere_is_not_ok(change):
-    """What on_frame does to dt, or by steps of its own, may end a run early: it says so."""
+def test_a_run_that_on_frame_ends_at_another_time_is_degraded(change):
+    """on_frame changes dt or takes steps itself."""
 
     def on_frame(sim, index, report):
         if change == "dt" and index == 2:

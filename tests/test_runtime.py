@@ -1,9 +1,9 @@
-"""The process's Taichi runtime:
+"""The Taichi runtime of a process:
 
-* it holds one arch and precision at a time; a second kind is refused while one is open, by the name of who holds it;
-* after the last one closed any kind may follow, and the same kind is not initialised again;
-* a machine without CUDA refuses it with a sentence and goes on with the CPU;
-* kernels are counted by name, and their first launch is compile time; a faulty one is told with its file and line.
+* it has one arch and precision at a time; others are refused while it is open, with the name of its user;
+* after the last close any kind can be opened, and the same kind is not initialised again;
+* without CUDA, arch 'cuda' is refused, and the CPU still works;
+* launches are counted by kernel name, and a first launch counts as compile time; errors of a kernel name its file and line.
 """
 
 import numpy as np
@@ -24,16 +24,16 @@ def add_one(x: ti.template()):
         x[i] = x[i] + 1.0
 
 
-def test_one_kind_at_a_time():
+def test_only_one_kind_is_open_at_a_time():
     first = open_runtime("cpu", "f32", "the first one")
     second = open_runtime("cpu", "f32", "the second one")
-    words = "is open with arch 'cpu' and precision 'f32', .*close it before requesting 'cpu' and 'f64'"
+    message = "is open with arch 'cpu' and precision 'f32', .*close it before requesting 'cpu' and 'f64'"
     for holder, claim in (("the first one", first), ("the second one", second)):
-        with pytest.raises(SimulationError, match=f"{holder} {words}"):
+        with pytest.raises(SimulationError, match=f"{holder} {message}"):
             open_runtime("cpu", "f64")
         assert runtime.open_kind() == ("cpu", "f32") and ti.cfg.default_fp == ti.f32
         claim.close()
-        claim.close()  # twice does no harm
+        claim.close()  # closing twice is allowed
     assert runtime.open_kind() is None
     with opened("f64") as machine:
         assert runtime.open_kind() == ("cpu", "f64") and ti.cfg.default_fp == ti.f64
@@ -48,8 +48,8 @@ def test_the_same_kind_is_not_initialised_again(monkeypatch):
         pass
 
 
-def test_a_foreign_initialisation_is_replaced():
-    """Somebody else's ti.init, with the optimisation that miscompiles, does not stay."""
+def test_an_initialisation_from_outside_is_replaced():
+    """By ti.init, with the optimisation that miscompiles."""
     with opened("f32"):
         pass
     ti.init(arch=ti.cpu, default_fp=ti.f64, log_level=ti.ERROR)
@@ -58,7 +58,7 @@ def test_a_foreign_initialisation_is_replaced():
 
 
 @pytest.mark.skipif(core.with_cuda(), reason="this machine has CUDA")
-def test_cuda_where_there_is_none(capfd):
+def test_cuda_is_refused_on_a_machine_without_it():
     with pytest.raises(SimulationError, match="^arch 'cuda' is not available on this machine"):
         open_runtime("cuda", "f32")
     assert runtime.open_kind() is None
@@ -66,9 +66,9 @@ def test_cuda_where_there_is_none(capfd):
         assert ti.cfg.arch == ti.x64 or ti.cfg.arch == ti.arm64
 
 
-@pytest.mark.parametrize("kind, words", [(("opencl", "f32"), "arch 'opencl' is unknown"), (("cpu", "f16"), "'f16' is unknown")])
-def test_unknown_names(kind, words):
-    with pytest.raises(SimulationError, match=words):
+@pytest.mark.parametrize("kind, message", [(("opencl", "f32"), "arch 'opencl' is unknown"), (("cpu", "f16"), "'f16' is unknown")])
+def test_unknown_kinds_are_refused(kind, message):
+    with pytest.raises(SimulationError, match=message):
         open_runtime(*kind)
 
 
@@ -84,7 +84,7 @@ def test_launches_and_compile_time_are_counted():
             add_one(x)
         assert runtime.compile_clock() == first and runtime.launches["add_one"] == before + 4
         compiled = runtime.n_compiled()
-        add_one(y)  # the same code
+        add_one(y)  # a field of the same type
         assert runtime.compile_clock() == first and runtime.n_compiled() == compiled
         assert x.to_numpy().tolist() == [4.0, 4.0] and y.to_numpy().tolist() == [1.0, 1.0]
         arena.release()
@@ -102,12 +102,12 @@ def sums(x: ti.template(), out: ti.types.ndarray()):
         out[i] = (x[i] + 1.0) * (x[i] + 1.0)
 
 
-def test_without_common_subexpressions(monkeypatch):
+def test_a_kernel_without_cse_is_compiled_at_level_0(monkeypatch):
     with opened("f64"):
         arena, config, levels = FieldArena(), ti.lang.impl.get_runtime().prog.config(), []
         x, out = arena.field("x", ti.f64, 3, np.arange(3.0)), np.zeros(3)
-        compile_one = launching.Compiled
-        monkeypatch.setattr(launching, "Compiled", lambda *a: levels.append(config.opt_level) or compile_one(*a))
+        compiled = launching.Compiled
+        monkeypatch.setattr(launching, "Compiled", lambda *a: levels.append(config.opt_level) or compiled(*a))
         for _ in range(2):
             sums(x, out)
             assert np.array_equal(out, [1.0, 4.0, 9.0]) and config.opt_level == 1
@@ -115,8 +115,8 @@ def test_without_common_subexpressions(monkeypatch):
         arena.release()
 
 
-def test_a_faulty_kernel_is_told_with_file_and_line():
-    """Taichi's excerpt of the source is left out, the place is not."""
+def test_errors_of_a_kernel_name_its_file_and_line():
+    """Taichi's excerpt of the source is left out."""
     with opened("f64"):
         arena = FieldArena()
         x = arena.field("x", ti.f64, 2)

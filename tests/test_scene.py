@@ -1,11 +1,10 @@
-"""What a scene promises:
+"""Scenes, bodies and materials:
 
-* Lamé's parameters follow from Young's modulus and Poisson's ratio; a material's numbers outside the rules are refused,
-  near incompressibility is told, a misspelt law gets the nearest name;
-* gravity, positions, velocities, loads and paths are finite numbers of the right shape, names are unique;
-* nodes and triangles are chosen by ids, masks or functions; nothing chosen, ids that do not exist and answers of
-  another kind are refused;
-* two fixes of a node agree, a move shares its node and axis with nothing.
+* Lamé's parameters follow from Young's modulus and Poisson's ratio; invalid material numbers are refused, near
+  incompressibility is warned of, and a misspelt law gets a suggestion;
+* gravity, positions, velocities, loads and paths are finite numbers of the right shape; names are unique;
+* nodes and triangles are selected by ids, masks or functions; empty selections, unknown ids and other results are refused;
+* a node can be fixed twice, but a moved axis of a node has no other constraint.
 """
 
 import warnings
@@ -36,15 +35,15 @@ def still(t):
 
 
 @pytest.mark.parametrize("poisson", [-0.5, 0.0, 0.3, 0.49])
-def test_lame_parameters_are_hookes(poisson):
+def test_lame_parameters_satisfy_hookes_law(poisson):
     rubber = Material(young=2e6, poisson=poisson)
-    # Uniaxial stress: strain (1, -nu, -nu) e must give the stress young e along the axis and none across it.
+    # uniaxial stress: a strain of (1, -nu, -nu) e gives a stress of young e along the axis and none across it
     trace = 1.0 - 2.0 * poisson
     assert 2 * rubber.mu + rubber.lam * trace == pytest.approx(2e6)
     assert -2 * rubber.mu * poisson + rubber.lam * trace == pytest.approx(0.0, abs=1e-6)
 
 
-def test_material_is_frozen_and_keeps_floats():
+def test_a_material_is_frozen_and_holds_floats():
     rubber = Material(young=1000000, density=np.float32(900.0))
     assert type(rubber.young) is float and rubber.density == 900.0
     with pytest.raises(AttributeError):
@@ -53,12 +52,12 @@ def test_material_is_frozen_and_keeps_floats():
 
 
 @pytest.mark.parametrize("poisson", [0.5, 0.7, -1, -1.5, 0.5000001])
-def test_poissons_ratio_lies_in_the_open_interval(poisson):
+def test_poissons_ratio_must_lie_in_the_open_interval(poisson):
     with pytest.raises(SceneError, match=r"poisson must lie in the open interval \(-1, 0.5\), not"):
         Material(poisson=poisson)
 
 
-def test_near_incompressibility_is_told():
+def test_near_incompressibility_is_warned_of_for_linear_tets():
     soft = Material(poisson=0.495)
     with pytest.warns(UserWarning, match="body 'locks': poisson = 0.495 is above 0.49, where linear tets lock"):
         Scene().add_body(box_mesh((1, 1, 1), (1, 1, 1)), soft, name="locks")
@@ -79,17 +78,17 @@ def test_near_incompressibility_is_told():
         ("poisson", [np.nan, "0.3", None]),
     ],
 )
-def test_material_numbers_outside_the_rules(field, values):
+def test_invalid_material_numbers_are_refused(field, values):
     for value in values:
         with pytest.raises(SceneError, match=f"^material: {field} must be"):
             Material(**{field: value})
 
 
 @pytest.mark.parametrize(
-    "law, near", [("corotated", "corotational"), ("Neo_Hookean", "stable_neo_hookean"), ("stvenantkirchhoff", LAWS[0])]
+    "law, suggestion", [("corotated", "corotational"), ("Neo_Hookean", "stable_neo_hookean"), ("stvenantkirchhoff", LAWS[0])]
 )
-def test_a_misspelt_law_gets_the_nearest_name(law, near):
-    with pytest.raises(SceneError, match=f"law must be one of .*did you mean '{near}'"):
+def test_a_misspelt_law_gets_a_suggestion(law, suggestion):
+    with pytest.raises(SceneError, match=f"law must be one of .*did you mean '{suggestion}'"):
         Material(law=law)
 
 
@@ -102,7 +101,7 @@ def test_an_unknown_law_lists_the_known_ones(law):
 @pytest.mark.parametrize(
     "gravity", [(0, -9.81), "down", (0, np.nan, 0), (0, np.inf, 0), 9.81, None, ("0", "1", "2"), [[0, 1, 2]]]
 )
-def test_gravity_is_three_finite_numbers(gravity, scene):
+def test_gravity_must_be_three_finite_numbers(gravity, scene):
     with pytest.raises(SceneError, match="^scene: gravity"):
         Scene(gravity=gravity)
     with pytest.raises(SceneError, match="^scene: gravity"):
@@ -114,14 +113,14 @@ def test_bodies_are_found_by_name(scene, body):
     other = scene.add_body(MESH, Material(), position=(1, 2, 3), velocity=np.ones((27, 3)))
     assert scene.body("beam") is body and scene.body(other.name) is other and scene.bodies == [body, other]
     assert other.name == "body0" and other.velocity.shape == (27, 3) and other.position.tolist() == [1, 2, 3]
-    assert np.array_equal(other.rest_positions, MESH.vertices)  # position shifts the start only
+    assert np.array_equal(other.rest_positions, MESH.vertices)  # position shifts the initial state only
     with pytest.raises(SceneError, match="no body is called 'bean'; did you mean 'beam'"):
         scene.body("bean")
     with pytest.raises(SceneError, match="no body is called 7"):
         scene.body(7)
 
 
-def test_a_free_default_name_is_found(scene):
+def test_default_names_skip_used_ones(scene):
     scene.add_body(MESH, Material(), name="body1")
     assert [scene.add_body(MESH, Material()).name for _ in range(3)] == ["body0", "body2", "body3"]
 
@@ -149,13 +148,13 @@ def test_a_free_default_name_is_found(scene):
         ({"collision": None}, "'b': collision must be one of"),
     ],
 )
-def test_bodies_outside_the_rules(scene, body, options, rule):
+def test_invalid_bodies_are_refused(scene, body, options, rule):
     with pytest.raises(SceneError, match=rule):
         scene.add_body(**({"mesh": MESH, "material": Material(), "name": "b"} | options))
     assert scene.bodies == [body]
 
 
-def test_nodes_are_chosen_by_ids_masks_and_functions(body):
+def test_nodes_are_selected_by_ids_masks_and_functions(body):
     left = MESH.vertices[:, 0] < -0.4
     expected = np.flatnonzero(left).tolist()
     for where in (expected, np.flatnonzero(left), left, lambda X: X[:, 0] < -0.4):
@@ -192,7 +191,7 @@ def test_a_selector_cannot_change_the_mesh(body):
         (lambda X: X.missing, "the selection function failed: AttributeError"),
     ],
 )
-def test_selections_outside_the_rules(body, where, rule):
+def test_invalid_selections_are_refused(body, where, rule):
     for call in (body.fix, lambda where: body.move(where, still), lambda where: body.add_force(where, (0, 0, 1))):
         with pytest.raises(SceneError, match=f"^body 'beam': .*{rule}"):
             call(where)
@@ -200,22 +199,22 @@ def test_selections_outside_the_rules(body, where, rule):
 
 
 @pytest.mark.parametrize("axes", ["", "xx", "w", "xyzz", "XY", None, 1, ["x"], "x y"])
-def test_axes_outside_the_rules(body, axes):
+def test_invalid_axes_are_refused(body, axes):
     with pytest.raises(SceneError, match="axes must be some of 'x', 'y', 'z'"):
         body.fix([0], axes=axes)
     with pytest.raises(SceneError, match="axes must be some of 'x', 'y', 'z'"):
         body.move([0], still, axes=axes)
 
 
-def test_paths_are_asked_once_at_the_start(body):
-    asked = []
+def test_paths_are_evaluated_once_at_time_0(body):
+    times = []
 
     def path(t):
-        asked.append(t)
+        times.append(t)
         return np.zeros((2, 3))
 
     constraint = body.move([9, 4], path, axes="y")
-    assert asked == [0.0] and constraint.nodes.tolist() == [9, 4] and constraint.path is path
+    assert times == [0.0] and constraint.nodes.tolist() == [9, 4] and constraint.path is path
 
 
 @pytest.mark.parametrize(
@@ -231,20 +230,20 @@ def test_paths_are_asked_once_at_the_start(body):
         (None, "path must be a function of time"),
     ],
 )
-def test_paths_outside_the_rules(body, path, rule):
+def test_invalid_paths_are_refused(body, path, rule):
     with pytest.raises(SceneError, match=f"^body 'beam': move: .*{rule}"):
         body.move([1, 2], path)
     assert not body.constraints
 
 
-def test_a_moved_node_is_chosen_once(body):
+def test_a_node_moved_twice_is_refused(body):
     with pytest.raises(SceneError, match="move: node 4 is chosen twice"):
         body.move([4, 3, 4], still)
 
 
-def test_constraints_that_contradict_each_other(body):
+def test_contradicting_constraints_are_refused(body):
     body.fix([0, 1])
-    body.fix([1, 2], "y")  # two fixes agree
+    body.fix([1, 2], "y")  # node 1 again
     body.move([2], still, "x")  # another axis of a fixed node
     with pytest.raises(SceneError, match="move: node 1 is already fixed along x"):
         body.move([5, 1], still)
@@ -252,11 +251,11 @@ def test_constraints_that_contradict_each_other(body):
         body.fix([0, 2])
     with pytest.raises(SceneError, match="move: node 2 is already moved along x"):
         body.move([2], still, "zx")
-    body.move([5], still)  # what was refused above left no trace
+    body.move([5], still)  # refused above for node 1
     assert len(body.constraints) == 4
 
 
-def test_tractions_choose_triangles_by_their_centroids(body):
+def test_tractions_select_triangles_by_their_centroids(body):
     load = body.add_traction(lambda c: c[:, 1] > 0.49, (0, 2000, 0))
     x = MESH.vertices[MESH.surface[load.triangles]]
     areas = 0.5 * np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1)
@@ -265,13 +264,13 @@ def test_tractions_choose_triangles_by_their_centroids(body):
 
 
 @pytest.mark.parametrize("where, rule", [([48], "surface triangle 48 does not exist"), ([], "no surface triangle is chosen")])
-def test_tractions_outside_the_rules(body, where, rule):
+def test_invalid_traction_selections_are_refused(body, where, rule):
     with pytest.raises(SceneError, match=rule):
         body.add_traction(where, (0, 1, 0))
 
 
 @pytest.mark.parametrize("value", [(0, 1), 5.0, (0, np.nan, 0), "up", None])
-def test_loads_are_three_finite_numbers(body, value):
+def test_loads_must_be_three_finite_numbers(body, value):
     with pytest.raises(SceneError, match="add_traction: traction"):
         body.add_traction([0], value)
     with pytest.raises(SceneError, match="add_force: force"):

@@ -1,9 +1,9 @@
-"""What a scene promises about what touches:
+"""Contacts in a scene:
 
-* bodies and obstacles share one set of names, and what is refused leaves no trace;
-* a pair's contact numbers are as set or follow from the two, and a snapshot keeps what was there;
-* the settings of the search for contacts are checked;
-* a body is hit by what fits its shape unless it says otherwise, which is decided once.
+* names of bodies and obstacles are unique together, and a refused obstacle leaves no trace;
+* friction and restitution of a pair are those set, or follow from the two; a snapshot does not follow later changes;
+* collision settings are checked;
+* a body's contact mode follows from its `collision`, and its sharp edges from its mesh.
 """
 
 import numpy as np
@@ -46,7 +46,7 @@ def test_obstacles_are_found_by_name(scene, body):
     assert "obstacles=['ground', 'obstacle0']" in repr(scene) and "obstacles" not in repr(Scene())
 
 
-def test_bodies_and_obstacles_share_their_names(scene, body):
+def test_names_are_unique_among_bodies_and_obstacles(scene, body):
     with pytest.raises(SceneError, match="obstacle name 'beam' is taken"):
         scene.add_obstacle(GROUND, name="beam")
     scene.add_obstacle(GROUND, name="body0")
@@ -66,8 +66,8 @@ def test_a_refused_obstacle_leaves_no_trace(scene):
     assert not scene.obstacles
 
 
-def touching() -> Scene:
-    """Two bodies and two obstacles, all of other frictions and restitutions."""
+def contact_scene() -> Scene:
+    """Two bodies and two obstacles with different friction and restitution."""
     scene = Scene()
     scene.add_body(MESH, Material(friction=0.4, restitution=0.1), name="a")
     scene.add_body(MESH, Material(friction=0.9, restitution=0.3), name="b")
@@ -76,8 +76,8 @@ def touching() -> Scene:
     return scene
 
 
-def test_contact_numbers_follow_from_the_two():
-    scene = touching()
+def test_contact_numbers_follow_from_both_colliders():
+    scene = contact_scene()
     assert scene.contact_numbers("a", "b") == pytest.approx((0.6, 0.3))
     assert scene.contact_numbers("ground", "a") == pytest.approx((0.2, 0.2))
     assert scene.contact_numbers("b", "ice") == (0.0, 0.3)
@@ -87,7 +87,7 @@ def test_contact_numbers_follow_from_the_two():
 
 
 def test_contact_numbers_are_set_by_pairs():
-    scene = touching()
+    scene = contact_scene()
     scene.set_contact("a", "ground", friction=0.7)
     assert scene.contact_numbers("a", "ground") == scene.contact_numbers("ground", "a") == (0.7, 0.2)
     scene.set_contact("ground", "a", restitution=1)
@@ -110,8 +110,8 @@ def test_contact_numbers_are_set_by_pairs():
         (("a", None), {"friction": 1}, "no body or obstacle is called None"),
     ],
 )
-def test_pairs_outside_the_rules(names, numbers, rule):
-    scene = touching()
+def test_invalid_pairs_are_refused(names, numbers, rule):
+    scene = contact_scene()
     with pytest.raises(SceneError, match=f"^scene: .*{rule}"):
         scene.set_contact(*names, **numbers)
     assert not scene.contact_pairs
@@ -120,8 +120,8 @@ def test_pairs_outside_the_rules(names, numbers, rule):
             scene.contact_numbers(*names)
 
 
-def test_a_snapshot_keeps_what_was_there():
-    scene = touching()
+def test_a_snapshot_does_not_follow_later_changes():
+    scene = contact_scene()
     scene.set_contact("a", "b", friction=0.7)
     scene.collision = CollisionSettings(k_dop=14)
     twin = scene.snapshot()
@@ -150,12 +150,12 @@ def test_a_snapshot_keeps_what_was_there():
         ({"initial_capacity": 200, "max_capacity": 100}, "initial_capacity 200 must not exceed max_capacity 100"),
     ],
 )
-def test_collision_settings_outside_the_rules(options, rule):
+def test_invalid_collision_settings_are_refused(options, rule):
     with pytest.raises(SceneError, match=f"^collision settings: {rule}"):
         CollisionSettings(**options)
 
 
-def test_collision_settings_are_clean(scene):
+def test_collision_settings_are_frozen_and_hold_plain_numbers(scene):
     assert scene.collision == CollisionSettings() and scene.collision.margin is None
     settings = CollisionSettings("bvh", 3, np.float32(0.5), np.int64(18), 8, 64, 64)
     assert (type(settings.cell_ratio), type(settings.margin), type(settings.k_dop)) == (float, float, int)
@@ -168,7 +168,7 @@ def test_collision_settings_are_clean(scene):
 
 
 def prism(sides: int, height: float = 1.0) -> TetMesh:
-    """A regular prism of so many sides round the y axis, its normals turning by 360/sides degrees."""
+    """A regular prism about the y axis; the angle between neighbouring sides is 360/sides degrees."""
     angle = 2 * np.pi * np.arange(sides) / sides
     ring = np.stack([np.cos(angle), np.zeros(sides), -np.sin(angle)], axis=1)
     vertices = np.concatenate([[(0, 0, 0), (0, height, 0)], ring, ring + (0, height, 0)])
@@ -179,12 +179,12 @@ def prism(sides: int, height: float = 1.0) -> TetMesh:
     return TetMesh(vertices, np.concatenate([np.stack(t, axis=1) for t in tets]), fix_orientation=True)
 
 
-def test_which_bodies_have_sharp_edges(scene):
+def test_boxes_sheets_and_prisms_have_sharp_edges_and_balls_do_not(scene):
     ball = ball_mesh(1.0, 8)
-    turned = TetMesh(ball.vertices @ np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0].T, ball.tets)
+    rotated = TetMesh(ball.vertices @ np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0].T, ball.tets)
     rows = {
         "ball": (ball, False),
-        "turned": (turned, False),
+        "rotated": (rotated, False),
         "sheet": (sheet_mesh((8, 8), (4, 0.05, 4)), True),
         "box": (box_mesh((4, 4, 4), (1, 1, 1)), True),
         "coarse": (prism(4), True),
@@ -195,12 +195,12 @@ def test_which_bodies_have_sharp_edges(scene):
 
 
 def test_only_convex_edges_are_sharp():
-    for sides in (3, 5, 6, 7):  # a tube: with the caps left out, only the sides' edges turn
+    for sides in (3, 5, 6, 7):  # a tube: a prism without its caps
         mesh = prism(sides)
         x = mesh.vertices[mesh.surface]
         walls = mesh.surface[np.abs(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])[:, 1]) < 1e-9]
-        turn = _largest_convex_angle(mesh.vertices, walls, opposite_half_edges(walls))
-        assert turn == pytest.approx(360 / sides, abs=1e-6)
+        angle = _largest_convex_angle(mesh.vertices, walls, opposite_half_edges(walls))
+        assert angle == pytest.approx(360 / sides, abs=1e-6)
         hollow = walls[:, ::-1]
         assert _largest_convex_angle(mesh.vertices, hollow, opposite_half_edges(hollow)) == pytest.approx(0, abs=1e-5)
 
@@ -212,10 +212,10 @@ def test_parts_joined_at_an_edge_count_as_sharp(scene):
     assert has_sharp_edges(scene.add_body(mesh, Material()).nodes)
 
 
-def test_a_body_may_say_by_what_it_is_hit(scene, body):
+def test_the_contact_mode_follows_from_collision(scene, body):
     assert body.collision == "auto" and body.contact_mode == scene.snapshot().body("beam").contact_mode == "proximity"
-    told = scene.add_body(MESH, Material(), collision="distance_field")
-    assert told.contact_mode == "distance_field"
+    other = scene.add_body(MESH, Material(), collision="distance_field")
+    assert other.contact_mode == "distance_field"
     body.collision = "distance_field"
     assert body.contact_mode == "distance_field"
     with pytest.raises(SceneError, match="^body 'beam': collision must be one of auto, distance_field, proximity"):

@@ -1,7 +1,8 @@
-"""From scenes to files and back:
+"""Writing scene files:
 
-* every demo, and a scene with one of everything, comes back from its file with the same numbers, bit for bit;
-* so do random numbers and names.
+* every demo, a scene with one of everything, and random numbers and names are read back bit for bit;
+* scenes that a file cannot store are refused, such as functions of time and rotations made for another start;
+* existing files are replaced only with overwrite=True.
 """
 
 import inspect
@@ -9,6 +10,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from command import write
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from toml_scenes import TURNED, floats, there_and_back
@@ -22,13 +24,13 @@ DEMOS = shipped_files("demos")
 
 
 @pytest.mark.parametrize("name", DEMOS)
-def test_demos_come_back(tmp_path, name):
+def test_demos_are_read_back(tmp_path, name):
     demo = load_module(DEMOS[name])
     there_and_back(tmp_path / f"{name}.toml", demo.build(), demo.solver)
 
 
 def everything() -> ts.Scene:
-    """A scene that says everything a scene can say."""
+    """A scene with one of everything that a file can hold."""
     scene = ts.Scene(gravity=(0.1, -9.81, -0.0))
     scene.collision = ts.CollisionSettings("bvh", margin=1e-3, k_dop=14, field_cells=40, max_capacity=1000)
     scene.allow_initial_overlap, scene.contact_forces = True, False
@@ -75,7 +77,7 @@ EVERY_SETTING = {
 }
 
 
-def test_everything_comes_back(tmp_path):
+def test_a_scene_with_everything_is_read_back(tmp_path):
     assert set(EVERY_SETTING) == set(SOLVER_CHECKS)
     there_and_back(tmp_path / "all.toml", everything(), EVERY_SETTING)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["all.toml", "all_mesh0.msh"]  # shared by two bodies
@@ -85,12 +87,12 @@ def test_everything_comes_back(tmp_path):
     assert (tmp_path / "all.toml").read_text() == text
 
 
-def test_settings_are_those_of_the_simulator():
+def test_solver_settings_are_those_of_simulator_and_run():
     names = set(inspect.signature(ts.Simulator).parameters) - {"scene"}
     assert set(SOLVER_CHECKS) == names | set(RUN_KEYS)
 
 
-def test_numbers_of_numpy_are_written_as_plain_ones(tmp_path):
+def test_numpy_numbers_are_written_as_plain_numbers(tmp_path):
     scene = ts.Scene()
     scene.add_body(TURNED, ts.Material())
     solver = {"dt": np.float64(1 / 3), "seconds": np.int64(2), "self_collision": np.bool_(True), "fps": Fraction(1, 3)}
@@ -98,16 +100,16 @@ def test_numbers_of_numpy_are_written_as_plain_ones(tmp_path):
     assert ts.read_scene(tmp_path / "a.toml")[1] == {"dt": 1 / 3, "seconds": 2, "self_collision": True, "fps": 1 / 3}
 
 
-MOST = float(np.finfo(np.float32).max)
-numbers = floats(-MOST, MOST)
+LARGEST = float(np.finfo(np.float32).max)
+numbers = floats(-LARGEST, LARGEST)
 vectors = st.tuples(*[floats(-1e30, 1e30)] * 3)
-positive = floats(min_value=float(np.finfo(np.float32).tiny), max_value=MOST)
+positive = floats(min_value=float(np.finfo(np.float32).tiny), max_value=LARGEST)
 names = st.text(min_size=1, max_size=8).filter(str.strip)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_random_numbers_come_back(tmp_path, values):
+def test_random_numbers_and_names_are_read_back(tmp_path, values):
     draw = values.draw
     scene = ts.Scene(gravity=draw(st.tuples(numbers, numbers, numbers)))
     scene.collision = ts.CollisionSettings(cell_ratio=draw(positive), margin=draw(st.none() | floats(0, 1e9)))
@@ -135,3 +137,89 @@ def test_random_numbers_come_back(tmp_path, values):
     scene.add_obstacle(ts.HalfSpace(draw(vectors), normal), name=other)
     scene.set_contact(name, other, friction=loss)
     there_and_back(tmp_path / "random.toml", scene, {"dt": draw(positive), "fps": draw(st.none() | positive)})
+
+
+# --- refusals ----------------------------------------------------------------------------------------------------------
+
+
+def test_scenes_that_a_file_cannot_store_are_refused(tmp_path):
+    scene = ts.Scene()
+    path = tmp_path / "a.toml"
+    with pytest.raises(ts.SceneError, match="the scene holds no body"):
+        ts.write_scene(path, scene)
+    body = scene.add_body(TURNED, ts.Material(), name="a")
+    with pytest.raises(ts.SceneError, match=r"solver: no setting is called 'dtt' \(did you mean dt\?\)"):
+        ts.write_scene(path, scene, {"dtt": 1})
+    with pytest.raises(ts.SceneError, match="solver: dt must be a number, not '1'"):
+        ts.write_scene(path, scene, {"dt": "1"})
+    with pytest.raises(ts.SceneError, match=r"end in \.toml"):
+        ts.write_scene(tmp_path / "a.tml", scene)
+    with pytest.raises(ts.SceneError, match="needs a Scene, not dict"):
+        ts.write_scene(path, {})
+    with pytest.raises(ts.OutputError, match="cannot write .*: No such file"):
+        ts.write_scene(tmp_path / "gone" / "a.toml", scene)
+    obstacle = scene.add_obstacle(ts.Sphere((9, 9, 9), 1), name="s", path=lambda t: ((0, 0, 0), np.eye(3)))
+    with pytest.raises(ts.SceneError, match="obstacle 's': moves along a function, which a file cannot store: use ts.KeyFrames"):
+        ts.write_scene(path, scene)
+    scene.obstacles.remove(obstacle)
+    body.move([0], lambda t: (0, 0, 0))
+    with pytest.raises(ts.SceneError, match="body 'a': moves along a function, which a file cannot store: use ts.KeyFrames"):
+        ts.write_scene(path, scene)
+    body.constraints.clear()
+    scene.add_body(TURNED, ts.Material(), name="\ud800")
+    with pytest.raises(ts.SceneError, match="not a character of Unicode"):
+        ts.write_scene(path, scene)
+    assert not list(tmp_path.iterdir())
+
+
+def test_existing_files_are_replaced_only_on_request(tmp_path):
+    scene = ts.Scene()
+    scene.add_body(TURNED, ts.Material(), name="a")
+    write(tmp_path / "a_mesh0.msh", "old")
+    with pytest.raises(ts.OutputError, match="a_mesh0.msh: the file exists"):
+        ts.write_scene(tmp_path / "a.toml", scene)
+    assert [path.name for path in tmp_path.iterdir()] == ["a_mesh0.msh"]
+    assert ts.write_scene(tmp_path / "a.toml", scene, overwrite=True) == [tmp_path / "a.toml", tmp_path / "a_mesh0.msh"]
+    with pytest.raises(ts.OutputError, match="a.toml: the file exists"):
+        ts.write_scene(tmp_path / "a.toml", scene)
+
+
+FRAMES = {"times": (0, 1), "translations": [(0, 0, 0), (0, 1, 0)]}
+ROTATIONS = FRAMES | {"rotations": [(0, 0, 0), (0, 0, 1)]}
+PIVOT = {"pivot": (1, 0, 0)}
+
+
+@pytest.mark.parametrize(
+    "frames, refused", [(FRAMES, False), (FRAMES | PIVOT, False), (ROTATIONS, False), (ROTATIONS | PIVOT, True)]
+)
+def test_a_path_shared_by_obstacles_keeps_its_motion_or_is_refused(tmp_path, frames, refused):
+    scene = ts.Scene()
+    scene.add_body(TURNED, ts.Material(), name="a")
+    first = scene.add_obstacle(ts.Box((9, 9, 9), (1, 1, 1)), path=ts.KeyFrames(**frames))
+    second = scene.add_obstacle(ts.Box((5, 9, 9), (1, 1, 1)), name="second", path=first.path)
+    if refused:
+        message = "obstacle 'second': rotates along a path made for a shape with another center, which a file cannot store"
+        with pytest.raises(ts.SceneError, match=message):
+            ts.write_scene(tmp_path / "a.toml", scene)
+        assert not list(tmp_path.iterdir())
+        return
+    ts.write_scene(tmp_path / "a.toml", scene)
+    again = ts.read_scene(tmp_path / "a.toml")[0].obstacle("second")
+    for t in (0, 0.3, 1):
+        assert all(np.array_equal(*pair) for pair in zip(again.path(t), second.path(t)))
+
+
+@pytest.mark.parametrize("frames, refused", [(FRAMES, False), (ROTATIONS, True)])
+def test_a_path_shared_by_nodes_keeps_its_motion_or_is_refused(tmp_path, frames, refused):
+    scene = ts.Scene()
+    body = scene.add_body(TURNED, ts.Material(), name="a")
+    path = body.move([0, 1], ts.KeyFrames(**frames)).path
+    body.move([2, 3], path)
+    if refused:
+        with pytest.raises(ts.SceneError, match="body 'a': rotates along a path made for nodes that start elsewhere, which a"):
+            ts.write_scene(tmp_path / "a.toml", scene)
+        assert not list(tmp_path.iterdir())
+        return
+    ts.write_scene(tmp_path / "a.toml", scene)
+    again = ts.read_scene(tmp_path / "a.toml")[0].body("a").constraints[1].path
+    assert all(np.array_equal(again(t), path(t)) for t in (0, 0.3, 1))

@@ -1,11 +1,11 @@
-"""What a distance grid promises:
+"""Signed distance grids:
 
-* at every point the exact signed distance to the triangles, negative inside: a box against its formula, others against all
-  triangles one by one and against winding numbers, and never NaN;
-* cells follow each axis's extent, at least eight across the thinnest side and two beyond the surface;
-* moving, turning and scaling the surface moves, turns and scales the distances;
-* a surface that is open, turned round or without area is refused with the edge or triangle, a grid too large with its size;
-* a kept grid is the same grid; a damaged file is made again; a folder that cannot be written is no error.
+* at every point the exact signed distance to the triangles, negative inside: compared with a box's formula, with a brute-force
+  distance to all triangles, and with winding numbers; never NaN;
+* cells follow the extent along each axis, at least eight across the thinnest side and two beyond the surface;
+* translating, rotating and scaling the surface does the same to the distances;
+* open, inconsistently oriented and degenerate surfaces are refused with the edge or triangle, too large grids with their size;
+* a cached grid is the same grid; a damaged cache file is replaced; a cache folder that cannot be written is no error.
 """
 
 import numpy as np
@@ -25,17 +25,17 @@ def points_of(grid) -> np.ndarray:
 
 
 def box_distance(p, half) -> np.ndarray:
-    """Signed distance of a box round the origin."""
+    """Signed distance to a box about the origin."""
     q = np.abs(p) - half
     return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
 
 
 def brute_distance(vertices, triangles, p) -> np.ndarray:
-    """(n,) unsigned distances of points (n,3) from all triangles: by regions of the plane (Ericson 2005, 5.1.5)."""
+    """(n,) unsigned distances of points (n,3) to the triangles, by Voronoi regions (Ericson 2005, 5.1.5)."""
     best = np.full(len(p), np.inf)
     for a, b, c in vertices[triangles]:
         ab, ac, normal = b - a, c - a, np.cross(b - a, c - a)
-        # barycentric coordinates of the foot in the plane, by least squares
+        # barycentric coordinates of the projection onto the plane, by least squares
         uv = np.linalg.lstsq(np.stack([ab, ac], axis=1), (p - a).T, rcond=None)[0]
         inside = (uv >= 0).all(axis=0) & (uv.sum(axis=0) <= 1)
         d = np.where(inside, np.abs((p - a) @ normal) / np.linalg.norm(normal), np.inf)
@@ -47,7 +47,7 @@ def brute_distance(vertices, triangles, p) -> np.ndarray:
 
 
 def assert_distances(grid, vertices, triangles) -> None:
-    """Two thousand random points of a grid against all triangles."""
+    """Two thousand random points of a grid against brute force."""
     some = np.random.default_rng(1).choice(grid.phi.size, 2000, replace=False)
     exact = brute_distance(vertices, triangles, points_of(grid).reshape(-1, 3)[some])
     assert np.abs(np.abs(grid.phi.reshape(-1)[some]) - exact).max() < 1e-13
@@ -63,7 +63,7 @@ def winding_number(vertices, triangles, p) -> np.ndarray:
 
 
 def assert_signs(vertices, triangles, cells: int) -> None:
-    """All points of a grid that do not lie on the surface against winding numbers."""
+    """All points of a grid off the surface against winding numbers."""
     grid = sdf_grid(vertices, triangles, cells)
     phi = grid.phi.reshape(-1)
     away = np.abs(phi) > 1e-9
@@ -72,15 +72,15 @@ def assert_signs(vertices, triangles, cells: int) -> None:
 
 
 def carved() -> TetMesh:
-    """A block with a step, a notch and a hole through it: what is left of a grid of cells, all vertices shaken."""
+    """A block with a step, a notch and a through hole, its vertices randomly displaced."""
     mesh = box_mesh((5, 4, 4), (1.0, 0.8, 1.2), pattern="six")
     x = mesh.vertices[mesh.tets].mean(axis=1)
     hole = (np.abs(x[:, 0]) < 0.1) & (np.abs(x[:, 2]) < 0.3)
     step = (x[:, 0] > 0.3) & (x[:, 1] > 0.2)
     notch = (x[:, 0] < -0.3) & (np.abs(x[:, 2]) < 0.3) & (x[:, 1] > 0)
     used, tets = np.unique(mesh.tets[~(hole | step | notch)], return_inverse=True)
-    shaken = mesh.vertices[used] + np.random.default_rng(3).uniform(-0.03, 0.03, (len(used), 3))
-    return TetMesh(shaken, tets.reshape(-1, 4))
+    displaced = mesh.vertices[used] + np.random.default_rng(3).uniform(-0.03, 0.03, (len(used), 3))
+    return TetMesh(displaced, tets.reshape(-1, 4))
 
 
 @pytest.fixture(scope="module")
@@ -94,23 +94,23 @@ def carved_grid(carved_mesh):
 
 
 @pytest.mark.parametrize("size", [(4.0, 1.0, 1.0), (1.0, 2.0, 0.7), (3.0, 0.05, 3.0)])
-def test_a_box_has_its_formulas_distance(size):
+def test_distances_to_a_box_are_those_of_the_formula(size):
     mesh = box_mesh((4, 3, 2), size)
     grid = sdf_grid(mesh.vertices, mesh.surface, cells=16)
     assert np.isfinite(grid.phi).all() and grid.phi.dtype == np.float64
-    assert np.abs(grid.phi - box_distance(points_of(grid), np.array(size) / 2)).max() < 1e-14 * 10
+    assert np.abs(grid.phi - box_distance(points_of(grid), np.array(size) / 2)).max() < 1e-13
 
 
-def test_a_ball_has_its_radius():
+def test_distances_to_a_ball_lie_between_inscribed_and_circumscribed_sphere():
     mesh = ball_mesh(0.5, 10)
     grid = sdf_grid(mesh.vertices, mesh.surface, cells=32)
     exact = np.linalg.norm(points_of(grid), axis=-1) - 0.5
     inner = brute_distance(mesh.vertices, mesh.surface, np.zeros((1, 3)))[0]
-    error = grid.phi - exact  # the triangles lie between the ball and the one that they hold
+    error = grid.phi - exact  # the triangles lie between the ball and its inscribed sphere
     assert error.min() > -1e-15 and 0.9 * (0.5 - inner) < error.max() < (0.5 - inner) + 1e-15
 
 
-def test_distances_are_those_of_all_triangles(carved_mesh, carved_grid):
+def test_distances_are_those_by_brute_force(carved_mesh, carved_grid):
     assert_distances(carved_grid, carved_mesh.vertices, carved_mesh.surface)
 
 
@@ -122,8 +122,8 @@ def test_signs_are_those_of_winding_numbers(carved_mesh, carved_grid):
     assert np.array_equal(phi < 0, np.round(inside) == 1) and 300 < (phi < 0).sum() < 2200
 
 
-def test_triangles_of_very_different_size():
-    """The nearest centroid is then a poor first guess."""
+def test_distances_to_triangles_of_very_different_size():
+    """The triangle with the nearest centroid is then a poor first guess."""
     fine = ball_mesh(0.1, 6, center=(0.0, 0.35, 0.0))
     coarse = box_mesh((1, 1, 1), (2.0, 0.4, 1.0), pattern="six")
     vertices = np.concatenate([fine.vertices, coarse.vertices])
@@ -132,8 +132,8 @@ def test_triangles_of_very_different_size():
     assert_distances(grid, vertices, triangles)
 
 
-def test_parts_that_touch_at_a_vertex():
-    """Two spikes tip to tip, one of them slanted: each has its own pseudonormal there."""
+def test_signs_near_a_vertex_shared_by_two_parts():
+    """Two pyramids tip to tip, one of them slanted: each has its own pseudonormal there."""
     base = np.array([(1, 1, 1), (-1, 1, 1), (-1, 1, -1), (1, 1, -1)], dtype=float)
     vertices = np.concatenate([[(0, 0, 0)], base, -base + (1.5, 0, 0)])
     tets = np.array([(0, 1, 2, 3), (0, 1, 3, 4), (0, 5, 6, 7), (0, 5, 7, 8)])
@@ -142,8 +142,8 @@ def test_parts_that_touch_at_a_vertex():
     assert_signs(mesh.vertices, mesh.surface, cells=15)
 
 
-def test_a_hollow_that_touches_the_surface_at_a_vertex():
-    """Seen from outside, the hollow's own pseudonormal there would say inside; its triangles have the nearest centroids."""
+def test_signs_near_a_cavity_that_touches_the_surface_at_a_vertex():
+    """The cavity's triangles have the nearest centroids, but its pseudonormal would give points outside the wrong sign."""
     apex, ring = (0, 1, 0), [(1, 0, 0), (0, 0, -1), (-1, 0, 0), (0, 0, 1)]
     vertices = np.array([apex, *ring, (0, -1, 0), (0.05, 0.8, 0), (-0.05, 0.8, 0.05), (-0.05, 0.8, -0.05)], dtype=float)
     octahedron = [(0, 1 + k, 1 + (k + 1) % 4) for k in range(4)] + [(5, 1 + (k + 1) % 4, 1 + k) for k in range(4)]
@@ -151,17 +151,17 @@ def test_a_hollow_that_touches_the_surface_at_a_vertex():
 
 
 @pytest.mark.parametrize("cells", [8, 32])
-def test_cells_follow_each_axis(cells):
+def test_cells_follow_the_extent_along_each_axis(cells):
     mesh = sheet_mesh((8, 8), (4.0, 0.05, 3.0))
     grid = sdf_grid(mesh.vertices, mesh.surface, cells)
     inside = np.array([cells, 8, max(8, 3 * cells / 4)])
     assert np.allclose(grid.spacing, [4.0, 0.05, 3.0] / inside) and grid.phi.shape == tuple((inside + 5).astype(int))
     assert np.allclose(grid.origin, [-2.0, -0.025, -1.5] - 2 * grid.spacing)
-    # the middle of the sheet is seen
+    # there are points on the middle plane of the sheet
     assert grid.phi.min() == pytest.approx(-0.025)
 
 
-def test_a_margin_widens_the_grid():
+def test_a_margin_extends_the_grid():
     mesh = sheet_mesh((4, 4), (4.0, 0.05, 4.0))
     grid = sdf_grid(mesh.vertices, mesh.surface, 16, margin=0.1)
     far = grid.origin + grid.spacing * (np.array(grid.phi.shape) - 1)
@@ -169,42 +169,42 @@ def test_a_margin_widens_the_grid():
     assert np.abs(grid.phi - box_distance(points_of(grid), np.array([2.0, 0.025, 2.0]))).max() < 1e-13
 
 
-def test_unused_vertices_do_not_count():
+def test_unused_vertices_are_ignored():
     mesh = box_mesh((2, 2, 2), (1, 1, 1))
     grid = sdf_grid(np.concatenate([mesh.vertices, [(50.0, 0, 0)]]), mesh.surface, 8)
     assert np.array_equal(grid.phi, sdf_grid(mesh.vertices, mesh.surface, 8).phi)
 
 
 @pytest.mark.parametrize("scale, shift", [(1.0, (3.0, -2.0, 7.0)), (1e-3, (0, 0, 0)), (1e4, (2e4, 0, 0))])
-def test_distances_move_and_scale_with_the_surface(carved_mesh, carved_grid, scale, shift):
+def test_distances_translate_and_scale_with_the_surface(carved_mesh, carved_grid, scale, shift):
     moved = sdf_grid(scale * carved_mesh.vertices + shift, carved_mesh.surface, cells=14)
     assert np.allclose(moved.phi, scale * carved_grid.phi, rtol=0, atol=1e-12 * scale)
     assert np.allclose(moved.origin, scale * carved_grid.origin + shift)
     assert np.allclose(moved.spacing, scale * carved_grid.spacing)
 
 
-def test_distances_turn_with_the_surface(carved_mesh, carved_grid):
-    turned = sdf_grid(carved_mesh.vertices[:, [1, 2, 0]], carved_mesh.surface, cells=14)
-    assert np.allclose(turned.phi, carved_grid.phi.transpose(1, 2, 0), rtol=0, atol=1e-13)
+def test_distances_rotate_with_the_surface(carved_mesh, carved_grid):
+    rotated = sdf_grid(carved_mesh.vertices[:, [1, 2, 0]], carved_mesh.surface, cells=14)
+    assert np.allclose(rotated.phi, carved_grid.phi.transpose(1, 2, 0), rtol=0, atol=1e-13)
 
 
-def test_what_has_no_inside_is_refused():
+def test_surfaces_without_an_inside_are_refused():
     mesh = box_mesh((1, 1, 1), (1, 1, 1), pattern="six")
     vertices, triangles = mesh.vertices, mesh.surface
     a, b, c = sorted(triangles[4].tolist())
     border = rf"\(({a}, {b}|{a}, {c}|{b}, {c})\)"
     with pytest.raises(MeshError, match=rf"closed surface: edge {border} belongs to triangle \d+ alone \(3 such edges"):
         sdf_grid(vertices, np.delete(triangles, 4, axis=0))
-    turned = triangles.copy()
-    turned[4] = turned[4][::-1]
+    flipped = triangles.copy()
+    flipped[4] = flipped[4][::-1]
     with pytest.raises(MeshError, match="triangles .*4.* traverse their edge .* in the same direction"):
-        sdf_grid(vertices, turned)
+        sdf_grid(vertices, flipped)
     with pytest.raises(MeshError, match="belongs to 4 triangles"):
         sdf_grid(vertices, np.concatenate([triangles, triangles]))
-    squashed = vertices.copy()
-    squashed[triangles[3, 0]] = squashed[triangles[3, 1]]
+    degenerate = vertices.copy()
+    degenerate[triangles[3, 0]] = degenerate[triangles[3, 1]]
     with pytest.raises(MeshError, match="triangle [0-9]+ has none"):
-        sdf_grid(squashed, triangles)
+        sdf_grid(degenerate, triangles)
     with pytest.raises(MeshError, match="flat and has no inside"):
         sdf_grid(vertices * (1, 0, 1), triangles)
 
@@ -217,20 +217,20 @@ def test_a_grid_that_is_too_large_is_refused():
 
 
 @pytest.fixture
-def kept(tmp_path, monkeypatch):
-    """(mesh, a counter of the grids made) with an empty folder of kept grids."""
+def cache(tmp_path, monkeypatch):
+    """(mesh, the calls of `sdf_grid`) with an empty cache folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    made = []
+    calls = []
 
     def counted(*args):
-        made.append(args)
+        calls.append(args)
         return sdf_grid(*args)
 
     monkeypatch.setattr(module, "sdf_grid", counted)
-    return ball_mesh(1.0, 4), made
+    return ball_mesh(1.0, 4), calls
 
 
-def ask(mesh, cells=10, **options):
+def cached_grid(mesh, cells=10, **options):
     return cached_sdf_grid(mesh.vertices, mesh.surface, cells, **options)
 
 
@@ -238,52 +238,52 @@ def equal(a, b) -> bool:
     return all(np.array_equal(getattr(a, f), getattr(b, f)) for f in ("origin", "spacing", "phi"))
 
 
-def test_a_kept_grid_is_the_same(kept):
-    mesh, made = kept
-    first, second = ask(mesh), ask(mesh)
-    assert len(made) == 1 and equal(first, second) and not second.phi.flags.writeable
+def test_a_cached_grid_is_the_same(cache):
+    mesh, calls = cache
+    first, second = cached_grid(mesh), cached_grid(mesh)
+    assert len(calls) == 1 and equal(first, second) and not second.phi.flags.writeable
     assert [path.suffix for path in cache_folder().iterdir()] == [".npz"]
 
 
-def test_other_content_is_another_grid(kept):
-    mesh, made = kept
-    ask(mesh)
-    ask(mesh, cells=11)
-    ask(mesh, margin=0.7)
+def test_other_arguments_give_another_grid(cache):
+    mesh, calls = cache
+    cached_grid(mesh)
+    cached_grid(mesh, cells=11)
+    cached_grid(mesh, margin=0.7)
     cached_sdf_grid(mesh.vertices * 1.0000000001, mesh.surface, 10)
     cached_sdf_grid(mesh.vertices, np.roll(mesh.surface, 1, axis=0), 10)
-    assert len(made) == 5 == len(list(cache_folder().iterdir()))
+    assert len(calls) == 5 == len(list(cache_folder().iterdir()))
     with pytest.raises(MeshError, match="at most 100"):
-        ask(mesh, max_points=100)
+        cached_grid(mesh, max_points=100)
 
 
-@pytest.mark.parametrize("harm", ["cut", "empty", "text", "bit", "other", "folder"])
-def test_a_damaged_file_is_made_again(kept, harm):
-    mesh, made = kept
-    first = ask(mesh)
+@pytest.mark.parametrize("damage", ["cut", "empty", "text", "bit", "other", "folder"])
+def test_a_damaged_cache_file_is_replaced(cache, damage):
+    mesh, calls = cache
+    first = cached_grid(mesh)
     (path,) = cache_folder().iterdir()
     whole = path.read_bytes()
-    if harm == "cut":
+    if damage == "cut":
         path.write_bytes(whole[: len(whole) // 2])
-    elif harm == "empty":
+    elif damage == "empty":
         path.write_bytes(b"")
-    elif harm == "text":
+    elif damage == "text":
         path.write_bytes(b"not an archive")
-    elif harm == "bit":
+    elif damage == "bit":
         path.write_bytes(whole[: len(whole) // 2] + bytes([whole[len(whole) // 2] ^ 1]) + whole[len(whole) // 2 + 1 :])
-    elif harm == "other":
+    elif damage == "other":
         np.savez(path, origin=first.origin, spacing=first.spacing, phi=first.phi[1:])
     else:
         path.unlink()
         path.mkdir()
-    assert equal(ask(mesh), first) and len(made) == 2
-    if harm != "folder":
-        assert equal(ask(mesh), first) and len(made) == 2
+    assert equal(cached_grid(mesh), first) and len(calls) == 2
+    if damage != "folder":
+        assert equal(cached_grid(mesh), first) and len(calls) == 2
     assert not list(cache_folder().glob("*.tmp"))
 
 
-def test_a_folder_that_cannot_be_written_is_no_error(kept, tmp_path, monkeypatch):
-    mesh, made = kept
+def test_a_cache_folder_that_cannot_be_written_is_no_error(cache, tmp_path, monkeypatch):
+    mesh, calls = cache
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert equal(ask(mesh), ask(mesh)) and len(made) == 2
+    assert equal(cached_grid(mesh), cached_grid(mesh)) and len(calls) == 2

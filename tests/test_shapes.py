@@ -1,9 +1,9 @@
-"""What the shapes promise:
+"""Generated meshes:
 
-* a box has its vertices in the agreed order and its size, fills its volume with positive tets and has its six sides as
-  surface, for both patterns and any numbers of cells; pattern five is the agreed checkerboard;
-* a ball has all its surface vertices on the sphere, converges to the ball's volume and has no bad tets;
-* arguments outside the rules are refused, and so is a mesh too large, before any memory is taken.
+* a box has its vertices in the documented order, its size and volume, and its six sides as surface, for both patterns and any
+  numbers of cells; pattern "five" alternates like a checkerboard;
+* a ball has all its surface vertices on the sphere, converges to the ball's volume and has no badly shaped tets;
+* invalid arguments are refused, and so is too large a mesh, before memory is allocated.
 """
 
 import time
@@ -15,27 +15,21 @@ from hypothesis import strategies as st
 
 from taisoft.errors import MeshError
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
+from taisoft.mesh.tet_mesh import edge_lengths, mean_ratio
 
 PATTERNS = {"five": 5, "six": 6}
 EVEN_MIDDLE = {(0, 0, 0), (1, 1, 0), (1, 0, 1), (0, 1, 1)}
 
 
-def mean_ratio(mesh) -> np.ndarray:
-    """12 (3 V)^(2/3) / sum of squared edge lengths of every tet: 1 if regular, 0 if flat."""
-    x = mesh.vertices[mesh.tets]
-    squares = sum(((x[:, a] - x[:, b]) ** 2).sum(axis=1) for a in range(4) for b in range(a))
-    return 12.0 * (3.0 * mesh.volumes) ** (2.0 / 3.0) / squares
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.tuples(*[st.integers(1, 4)] * 3), st.tuples(*[st.floats(0.1, 10.0)] * 3), st.sampled_from(sorted(PATTERNS)))
 @pytest.mark.filterwarnings("ignore:.*nearly flat")
-def test_box_is_the_whole_box(cells, size, pattern):
+def test_a_box_fills_its_volume(cells, size, pattern):
     center = np.array([0.5, -1.0, 2.0])
     mesh = box_mesh(cells, size, center, pattern)
     nx, ny, nz = cells
     assert mesh.n_tets == PATTERNS[pattern] * nx * ny * nz
-    assert all("nearly flat or needles" in told for told in mesh.warnings)  # where cells are long or thin
+    assert all("nearly flat or needles" in message for message in mesh.warnings)  # of long or thin cells
     assert mesh.n_components == 1 and len(mesh.flipped) == 0
     assert mesh.volumes.sum() == pytest.approx(np.prod(size))
     for i, j, k in ((0, 0, 0), (nx, 0, 0), (0, ny, nz), (nx, ny, nz), (nx // 2, ny - 1, 1)):
@@ -54,7 +48,7 @@ def test_known_counts(cells, pattern, count):
 
 
 def cell_tets(mesh, cells):
-    """For every cell (i,j,k), its tets as sets of corners relative to the cell, e.g. (1,0,1)."""
+    """For every cell (i,j,k), its tets as sets of corners relative to the cell, such as (1,0,1)."""
     found: dict[tuple, list] = {}
     grid = np.stack(np.unravel_index(mesh.tets, np.array(cells) + 1), axis=-1)
     for tet in grid:
@@ -63,7 +57,7 @@ def cell_tets(mesh, cells):
     return found
 
 
-def test_five_is_the_agreed_checkerboard():
+def test_pattern_five_alternates_like_a_checkerboard():
     cells = (3, 2, 2)
     found = cell_tets(box_mesh(cells, (3, 2, 2)), cells)
     assert len(found) == 12
@@ -76,13 +70,13 @@ def test_five_is_the_agreed_checkerboard():
             assert {corner} | near in tets
 
 
-def test_six_stands_around_the_diagonal():
+def test_pattern_six_shares_the_diagonal():
     cells = (2, 2, 1)
     for tets in cell_tets(box_mesh(cells, (2, 2, 1), pattern="six"), cells).values():
         assert len(tets) == 6 and all({(0, 0, 0), (1, 1, 1)} <= tet for tet in tets)
 
 
-def test_sheet_lies_flat():
+def test_a_sheet_has_its_size_and_thickness_along_y():
     mesh = sheet_mesh((4, 3), (2.0, 0.05, 1.5), pattern="six")
     assert mesh.n_tets == 72
     assert np.ptp(mesh.vertices, axis=0) == pytest.approx([2.0, 0.05, 1.5])
@@ -92,7 +86,7 @@ def test_sheet_lies_flat():
 
 
 @pytest.mark.parametrize("cells", [2, 4, 8, 16])
-def test_ball_is_round_and_well_shaped(cells):
+def test_a_ball_is_round_and_well_shaped(cells):
     center = np.array([1.0, 2.0, -3.0])
     mesh = ball_mesh(0.7, cells, center)
     assert mesh.n_tets == 6 * cells**3 and mesh.warnings == []
@@ -100,11 +94,11 @@ def test_ball_is_round_and_well_shaped(cells):
     assert radii[np.unique(mesh.surface)] == pytest.approx(0.7)
     assert radii.max() <= 0.7 * (1 + 1e-12)
     missing = 1.0 - mesh.volumes.sum() / (4.0 / 3.0 * np.pi * 0.7**3)
-    assert 0 < missing < 1.2 / cells**2  # a surface of chords of length h loses volume as h^2
-    assert mean_ratio(mesh).min() > 0.68
+    assert 0 < missing < 1.2 / cells**2  # the volume between chords of length h and the sphere scales with h^2
+    assert mean_ratio(edge_lengths(mesh.vertices, mesh.tets), mesh.volumes).min() > 0.68
 
 
-def test_ball_is_symmetric():
+def test_a_ball_is_symmetric():
     mesh = ball_mesh(1.0, 4)
     points = {tuple(p) for p in np.round(mesh.vertices, 12) + 0.0}
     for axis in range(3):
@@ -114,35 +108,35 @@ def test_ball_is_symmetric():
     assert (mesh.volumes[:, None] * mesh.vertices[mesh.tets].mean(axis=1)).sum(axis=0) == pytest.approx([0, 0, 0], abs=1e-12)
 
 
-@pytest.mark.parametrize("cells", [(0, 1, 1), (1, -2, 1), (1, 1), (1.5, 1, 1), 3, "abc", (True, 1, 1), (1, 1, 1, 1), None])
-def test_box_refuses_cells(cells):
-    with pytest.raises(MeshError, match="box_mesh: cells must be three positive integers"):
-        box_mesh(cells, (1, 1, 1))
-
-
-@pytest.mark.parametrize("size", [(0, 1, 1), (1, -1, 1), (1, 1), (1, np.nan, 1), (1, np.inf, 1), "abc", ((1, 2), 3)])
-def test_box_refuses_sizes(size):
-    with pytest.raises(MeshError, match="box_mesh: size must be"):
-        box_mesh((1, 1, 1), size)
-
-
-def test_box_refuses_other_arguments():
-    with pytest.raises(MeshError, match="pattern must be 'five' or 'six', not 'four'"):
-        box_mesh((1, 1, 1), (1, 1, 1), pattern="four")
-    with pytest.raises(MeshError, match="center must be three finite numbers"):
-        box_mesh((1, 1, 1), (1, 1, 1), center=(0, 0, np.nan))
+@pytest.mark.parametrize(
+    "name, values, rule",
+    [
+        (
+            "cells",
+            [(0, 1, 1), (1, -2, 1), (1, 1), (1.5, 1, 1), 3, "abc", (True, 1, 1), (1, 1, 1, 1), None],
+            "three positive integers",
+        ),
+        ("size", [(0, 1, 1), (1, -1, 1), (1, 1), (1, np.nan, 1), (1, np.inf, 1), "abc", ((1, 2), 3)], ""),
+        ("pattern", ["four"], "'five' or 'six', not 'four'"),
+        ("center", [(0, 0, np.nan)], "three finite numbers"),
+    ],
+)
+def test_invalid_arguments_of_a_box_are_refused(name, values, rule):
+    for value in values:
+        with pytest.raises(MeshError, match=f"box_mesh: {name} must be {rule}"):
+            box_mesh(**({"cells": (1, 1, 1), "size": (1, 1, 1)} | {name: value}))
 
 
 @pytest.mark.parametrize(
     "radius, cells, rule", [(0, 4, "radius"), (-1, 4, "radius"), (1, 3, "even"), (1, 0, "even"), (1, 2.0, "even")]
 )
-def test_ball_refuses(radius, cells, rule):
+def test_invalid_arguments_of_a_ball_are_refused(radius, cells, rule):
     with pytest.raises(MeshError, match=rule):
         ball_mesh(radius, cells)
 
 
 @pytest.mark.parametrize("cells", [(1000, 1000, 1000), (10**9, 1, 1), (10**9, 10**9, 10**9), (10**30, 1, 1)])
-def test_a_mesh_too_large_is_refused_at_once(cells):
+def test_a_too_large_mesh_is_refused_at_once(cells):
     start = time.process_time()
     with pytest.raises(MeshError, match="tets"):
         box_mesh(cells, (1, 1, 1))

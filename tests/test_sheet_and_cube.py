@@ -1,9 +1,9 @@
-"""A cube on a thin sheet that sags under it, flat and tilted, apart and pushed into it by less than the sheet is thick:
+"""A cube on a thin sheet, flat or sagging, with gaps and with penetrations below the sheet's thickness:
 
-* every vertex of the cube near the sheet's upper side has its contact there, and no contact is with the lower side;
-* gaps are those of the two surfaces to a millimetre (to rounding by proximity), normals the sheet's to a few degrees;
-  a distance field rounds the cube's edges off, and is allowed more where the sheet's triangles meet those;
-* two thin sheets on each other meet by the sides that face each other.
+* every vertex of the cube near the sheet's upper side has a contact there, and the lower side has none;
+* gaps are those of the two surfaces to a millimetre (by proximity: to rounding), normals those of the sheet to a few degrees; a
+  distance field rounds the cube's edges, so contacts of the sheet's triangles with it have larger tolerances;
+* two thin sheets on each other touch with the sides that face each other.
 """
 
 from itertools import product
@@ -17,7 +17,7 @@ import taisoft as ts
 THICKNESS, MARGIN = 0.05, 0.02  # [m]
 COLUMNS = np.linspace(-2.0, 2.0, 21)  # x of the sheet's vertices [m]
 TILTS = {"flat": np.eye(3), "tilted": rotation((0.4, 0.1, 1.0), np.radians(8.0))}
-GAPS = (0.002, -0.001, -0.005)  # [m] of the cube's lowest vertices
+GAPS = (0.002, -0.001, -0.005)  # of the cube's lowest vertices [m]
 
 
 def top(x: np.ndarray, sag: float) -> np.ndarray:
@@ -28,18 +28,18 @@ def top(x: np.ndarray, sag: float) -> np.ndarray:
 def from_sheet(p: np.ndarray, sag: float) -> tuple[np.ndarray, np.ndarray]:
     """Signed distances (k,) [m] of points (k,3) to the upper side, and its normals there (k,3)."""
     a = np.stack([COLUMNS, top(COLUMNS, sag)], axis=1)
-    way = np.diff(a, axis=0)
-    length = np.linalg.norm(way, axis=1)
-    share = np.clip(np.einsum("ksx,sx->ks", p[:, None, :2] - a[:-1], way) / length**2, 0, 1)
-    off = p[:, None, :2] - a[:-1] - share[:, :, None] * way
-    k = np.argmin(np.linalg.norm(off, axis=2), axis=1)
-    normal = np.stack([-way[:, 1], way[:, 0], 0 * length], axis=1)[k] / length[k, None]
-    distance = np.linalg.norm(off, axis=2).min(axis=1)
+    edge = np.diff(a, axis=0)
+    length = np.linalg.norm(edge, axis=1)
+    fraction = np.clip(np.einsum("ksx,sx->ks", p[:, None, :2] - a[:-1], edge) / length**2, 0, 1)
+    distances = np.linalg.norm(p[:, None, :2] - a[:-1] - fraction[:, :, None] * edge, axis=2)
+    k = np.argmin(distances, axis=1)
+    normal = np.stack([-edge[:, 1], edge[:, 0], 0 * length], axis=1)[k] / length[k, None]
+    distance = distances.min(axis=1)
     return np.where(p[:, 1] > top(p[:, 0], sag), distance, -distance), normal
 
 
 class Pair:
-    """The two in a simulator, the sheet first, so that it is side a."""
+    """Sheet and cube in a simulator, the sheet first, so that it is side a of contacts."""
 
     def __init__(self, collision: str):
         scene = ts.Scene(gravity=(0, 0, 0))
@@ -73,37 +73,37 @@ class Pair:
 @pytest.fixture(scope="module", params=["auto", "distance_field"])
 def pair(request):
     made = Pair(request.param)
-    yield made, 1e-9 if request.param == "auto" else 1e-3
+    yield made, 1e-9 if request.param == "auto" else 1e-3  # and the tolerance of its gaps [m]
     made.sim.close()
 
 
 @pytest.mark.parametrize("sag, tilt, gap", list(product((0.0, 0.3), TILTS, GAPS)))
-def test_the_cube_stands_on_the_upper_side(pair, sag, tilt, gap):
-    made, close = pair
+def test_the_cube_touches_the_upper_side(pair, sag, tilt, gap):
+    made, tolerance = pair
     x = made.place(sag, TILTS[tilt], gap)
     c = made.sim.detect_contacts()
     assert set(c.body_a) == {"sheet"} and set(c.body_b) == {"cube"}
     assert c.unmapped == 0
-    of_sheet, normal = from_sheet(c.point, sag)
+    to_sheet, normal = from_sheet(c.point, sag)
     local = (c.point - x.mean(axis=0)) @ TILTS[tilt]
-    of_cube = -local[:, 1] - 0.5  # from its lower side
+    to_cube = -local[:, 1] - 0.5  # from its lower side
     rounded = c.kind == "face_field"
-    assert (np.abs(of_sheet + of_cube - c.gap) < np.where(rounded, 2e-3, 1e-3)).all()
-    # of the sheet, or of the cube's lower side or edge
-    turned = np.degrees(np.arccos(np.clip(-np.einsum("kx,kx->k", c.normal, normal), -1, 1)))
-    assert (turned < np.where(rounded, 35.0, 5.0 if tilt == "flat" else 15.0)).all()
-    assert c.gap.min() == pytest.approx(gap, abs=close) and c.gap.max() <= MARGIN + 1e-9
-    # the contact of each vertex of the cube near the sheet
+    assert (np.abs(to_sheet + to_cube - c.gap) < np.where(rounded, 2e-3, 1e-3)).all()
+    # normals are those of the sheet, or of the cube's lower side or edge
+    deviation = np.degrees(np.arccos(np.clip(-np.einsum("kx,kx->k", c.normal, normal), -1, 1)))
+    assert (deviation < np.where(rounded, 35.0, 5.0 if tilt == "flat" else 15.0)).all()
+    assert c.gap.min() == pytest.approx(gap, abs=tolerance) and c.gap.max() <= MARGIN + 1e-9
+    # each vertex of the cube near the sheet has a contact
     distance, normal = from_sheet(x, sag)
     near = np.flatnonzero(distance < 0.9 * MARGIN)
     for i in near:
-        mine = np.linalg.norm(c.point - (x[i] - 0.5 * distance[i] * normal[i]), axis=1) < 2e-3
-        assert mine.any(), f"vertex at {x[i]}, {distance[i]} m from the sheet, has no contact"
-        assert np.abs(c.gap[mine] - distance[i]).min() < close
+        own = np.linalg.norm(c.point - (x[i] - 0.5 * distance[i] * normal[i]), axis=1) < 2e-3
+        assert own.any(), f"vertex at {x[i]}, {distance[i]} m from the sheet, has no contact"
+        assert np.abs(c.gap[own] - distance[i]).min() < tolerance
 
 
-def test_thin_sheets_on_each_other():
-    """With a margin above their thickness: only the sides that face each other meet."""
+def test_thin_sheets_touch_with_the_sides_that_face_each_other():
+    """With a margin above their thickness."""
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.contact_forces = False
     scene.collision = ts.CollisionSettings(margin=0.03)

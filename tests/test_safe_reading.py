@@ -1,7 +1,7 @@
-"""Messages of broken mesh files, whatever the terminal and the folder:
+"""Messages about broken mesh files, with a narrow terminal and a long folder name:
 
-* they start with the file's true name, and end with what the reader says, in one line, without the name again;
-* what a reader would print as markup is no error.
+* they start with the file's exact name and end with the reader's message, in one line, without repeating the name;
+* text that a reader prints as markup is no error.
 """
 
 import re
@@ -13,12 +13,12 @@ from test_mesh_files import MESH, same, write_by_meshio
 
 import taisoft as ts
 
-LONG = "a folder with a [bold]long[/bold] name " * 5  # of 195 characters; what is in brackets is markup to rich
+LONG = "a folder with a [bold]long[/bold] name " * 5  # of 195 characters; brackets are markup in rich
 
 
 @pytest.fixture
 def narrow(tmp_path, monkeypatch):
-    """A folder whose name is longer than a terminal is wide."""
+    """A folder whose name is longer than a line of the terminal."""
     monkeypatch.setenv("COLUMNS", "20")
     folder = tmp_path / LONG
     folder.mkdir(parents=True)
@@ -26,7 +26,7 @@ def narrow(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name, said",
+    "name, message",
     [
         ("a b.vtk", "not a supported mesh (Illegal VTK header)"),
         ("[red]a[/blue] b.mesh", "not a supported mesh (Unknown keyword ....)"),
@@ -37,33 +37,32 @@ def narrow(tmp_path, monkeypatch):
         ("a.mdpa", "no tetrahedra; no elements found"),
     ],
 )
-def test_messages_give_the_true_name_and_one_cause(narrow, name, said):
+def test_messages_give_the_exact_name_and_one_cause(narrow, name, message):
     path = narrow / name
     path.parent.mkdir(exist_ok=True)
     path.write_text("passphrase\nof three lines\n\n")
-    with pytest.raises(ts.MeshError, match=f"^{re.escape(f'{path}: {said}')}$"):
+    with pytest.raises(ts.MeshError, match=f"^{re.escape(f'{path}: {message}')}$"):
         ts.read_mesh(path)
 
 
-def test_messages_of_surfaces(narrow):
+def test_messages_about_surfaces(narrow):
     (narrow / "a b.ply").write_text("passphrase")
     with pytest.raises(ts.MeshError, match=f"^{re.escape(f'{narrow}/a b.ply: not a supported surface (Expected ply)')}$"):
         ts.read_surface(narrow / "a b.ply")
 
 
-def test_messages_of_scene_files(narrow):
-    """They are cut off where they repeat what a file holds, but not for a long folder."""
+def test_messages_about_scene_files_are_not_cut_by_a_long_folder_name(narrow):
     folder = narrow / LONG
     folder.mkdir(parents=True)
     (folder / "a b.vtk").write_text("passphrase")
     (folder / "scene.toml").write_text("[bodies.a]\nmaterial = {}\nmesh = { file = 'a b.vtk' }\n")
     with pytest.raises(ts.MeshError) as caught:
         ts.read_scene(folder / "scene.toml")
-    said = "not a supported mesh (Illegal VTK header)"
-    assert str(caught.value) == f"{folder}/scene.toml: bodies.a.mesh: {folder}/a b.vtk: {said}"
+    message = "not a supported mesh (Illegal VTK header)"
+    assert str(caught.value) == f"{folder}/scene.toml: bodies.a.mesh: {folder}/a b.vtk: {message}"
 
 
-def test_markup_in_what_a_reader_prints_is_no_error(tmp_path, capfd):
+def test_markup_in_output_of_a_reader_is_no_error(tmp_path, capfd):
     path = write_by_meshio(tmp_path / "part.su2", [("tetra", MESH.tets)])
     path.write_text(path.read_text() + "[/red] :smile:\n")
     capfd.readouterr()
