@@ -7,7 +7,7 @@ from time import perf_counter
 import numpy as np
 
 import taisoft as ts
-from taisoft import simulator
+from taisoft import changes
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import TaisoftError
 from taisoft.scene.scene import Scene

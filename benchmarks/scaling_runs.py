@@ -22,9 +22,8 @@ import numpy as np
 import taichi as ti
 
 import taisoft as ts
-from taisoft import simulator
 from taisoft.backend.runtime import compile_clock, kernel, open_runtime, threads
-from taisoft.dynamics import stage_system
+from taisoft.dynamics import dynamics, stage_system
 from taisoft.fem import model
 from taisoft.fem.lanes import broadcast
 from taisoft.fem.state import LOWEST_J
