@@ -1,10 +1,11 @@
-"""Where Newton's method starts: at the motion carried on, or at v = 0 where |r| is less there.
+"""The start of Newton's method: the extrapolated motion, or v = 0 if |r| is smaller there.
 
-* a calm step and one in fast flight keep their first iterate;
-* a wild one starts at v = 0, and the direction that is left leads back;
-* with contacts too, where that direction comes first: the step is the one that another start comes to, in fewer iterations
-  where it leads somewhere.
+* calm steps and fast flight keep the extrapolated motion;
+* a step with wild velocities starts at v = 0, and the stored direction leads back to the extrapolated motion;
+* with contacts, where that direction is searched first, the solution is the same as from the other start, in fewer iterations.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -21,6 +22,21 @@ from taisoft.fem.state import STEP_LENGTH
 ADVANCE = StageSystem.advance
 
 
+@dataclass
+class Start:
+    """|r|, its scale and positions before and after `choose_start`, and after stepping back along the stored direction."""
+
+    r: float
+    scale: float
+    r_after: float
+    moved: bool
+    x: np.ndarray
+    x_after: np.ndarray
+    r_back: float = np.nan
+    x_back: np.ndarray | None = None
+    n_contacts: int = 0
+
+
 def beam(fixed: bool = True, ground: bool = False) -> ts.Simulator:
     scene = ts.Scene()
     body = scene.add_body(cube(cells=(3, 3, 3)), rubber(friction=0.5), name="beam", position=(0.0, 0.501, 0.0))
@@ -32,88 +48,93 @@ def beam(fixed: bool = True, ground: bool = False) -> ts.Simulator:
 
 
 @pytest.fixture
-def seen(monkeypatch):
-    """What each start did: |r| and scale of before, of after, whether it moved, and positions before, after and back."""
-    starts = []
+def starts(monkeypatch):
+    """A record of each call of `choose_start`."""
+    records = []
 
     def spy(system, r, scale):
         x = system.model.state.x.to_numpy()
-        found = choose_start(system, r, scale)
-        after = system.model.state.x.to_numpy()
-        back = None
-        if found[2]:
-            r_back, _ = system.evaluate(STEP)
-            back = system.model.state.x.to_numpy(), r_back
+        result = choose_start(system, r, scale)
+        record = Start(
+            r,
+            scale,
+            r_after=result[0],
+            moved=result[2],
+            x=x,
+            x_after=system.model.state.x.to_numpy(),
+            n_contacts=system.n_contacts,
+        )
+        if record.moved:
+            record.r_back, _ = system.evaluate(STEP)
+            record.x_back = system.model.state.x.to_numpy()
             system.evaluate(AGAIN, 0.0)
-        starts.append(((r, scale), found, x, after, back, system.n_contacts))
-        return found
+        records.append(record)
+        return result
 
     monkeypatch.setattr(contact_newton, "choose_start", spy)
-    return starts
+    return records
 
 
-def wild(sim, size: float = 100.0) -> np.ndarray:
+def wild_velocities(sim, size: float = 100.0) -> np.ndarray:
     """Velocities [m/s] that turn tets inside out in a step."""
     return size * np.random.default_rng(3).standard_normal(sim.positions().shape)
 
 
-def test_calm_steps_keep_their_start(seen):
+def test_calm_steps_keep_the_extrapolated_motion(starts):
     with beam() as sim:
         for _ in range(4):
             assert sim.step().converged
-    for _, (_, _, moved), x, after, *_ in seen:
-        assert not moved and np.array_equal(x, after)
-    r, scale = seen[-1][0]
-    assert r <= FAR * scale  # not even looked at
+    assert starts and not any(s.moved for s in starts)
+    assert all(np.array_equal(s.x, s.x_after) for s in starts)
+    assert starts[-1].r <= FAR * starts[-1].scale  # so v = 0 was not evaluated
 
 
-def test_flight_keeps_its_start(seen):
+def test_fast_flight_keeps_the_extrapolated_motion(starts):
     with beam(fixed=False) as sim:
         sim.set_state(velocities=np.tile((30.0, 0.0, 0.0), (len(sim.positions()), 1)))
         assert sim.step().converged
-    (r, scale), (r_after, _, moved), x, after, *_ = seen[0]
-    assert r > FAR * scale and not moved and r_after == pytest.approx(r, rel=1e-12)  # it was looked at
-    assert np.array_equal(x, after)
+    s = starts[0]
+    assert s.r > FAR * s.scale  # so v = 0 was evaluated
+    assert not s.moved and s.r_after == pytest.approx(s.r, rel=1e-12) and np.array_equal(s.x, s.x_after)
 
 
 @pytest.mark.parametrize("ground", [False, True])
-def test_a_wild_step_starts_at_rest(seen, ground):
+def test_a_step_with_wild_velocities_starts_at_rest(starts, ground):
     with beam(ground=ground) as sim:
-        start, velocities = sim.positions(), wild(sim)
-        sim.set_state(velocities=velocities)
+        rest = sim.positions()
+        sim.set_state(velocities=wild_velocities(sim))
         sim.step()
-        fixed = start[:, 0] < -0.49
-    (r, scale), (r_after, _, moved), x, after, (back, r_back), n_contacts = seen[0]
-    assert (n_contacts > 0) == ground
-    assert moved and r > FAR * scale and r_after < r
-    assert np.abs(after - start).max() < 1e-12 and np.array_equal(after[fixed], start[fixed])
-    assert np.abs(x - start)[~fixed].max() > 0.1
-    assert np.abs(back - x).max() < 1e-10 and r_back == pytest.approx(r, rel=1e-6)
+    s, fixed = starts[0], rest[:, 0] < -0.49
+    assert (s.n_contacts > 0) == ground
+    assert s.moved and s.r > FAR * s.scale and s.r_after < s.r
+    assert np.abs(s.x_after - rest).max() < 1e-12 and np.array_equal(s.x_after[fixed], rest[fixed])
+    assert np.abs(s.x - rest)[~fixed].max() > 0.1
+    assert np.abs(s.x_back - s.x).max() < 1e-10 and s.r_back == pytest.approx(s.r, rel=1e-6)
 
 
 @pytest.mark.parametrize("root", [True, False])
-def test_contacts_end_where_another_start_does(seen, monkeypatch, root):
-    """root: whether the direction back has one; else it is dropped."""
-    advanced = []
+def test_both_starts_lead_to_the_same_solution_with_contacts(starts, monkeypatch, root):
+    """root: whether the search along the stored direction finds a root; without one the direction is dropped."""
+    searches = []
 
     def advance(system):
-        advanced.append(ADVANCE(system))
+        searches.append(ADVANCE(system))
         if not root:
             system.model.state.scalars[STEP_LENGTH] = LONGEST
-        return advanced[-1]
+        return searches[-1]
 
     monkeypatch.setattr(StageSystem, "advance", advance)
-    found, iterations, starts = [], [], []
+    elastic, iterations, moved = [], [], []
     for far in (FAR, np.inf):
         monkeypatch.setattr(newton, "FAR", far)
-        seen.clear()
+        starts.clear()
         with beam(fixed=False, ground=True) as sim:
-            sim.set_state(velocities=wild(sim, 20.0) - (0.0, 3.0, 0.0))
+            sim.set_state(velocities=wild_velocities(sim, 20.0) - (0.0, 3.0, 0.0))
             reports = [sim.step() for _ in range(2)]
         assert all(report.converged for report in reports) and reports[-1].n_contacts > 0
-        found.append(reports[-1].elastic)
-        iterations.append(reports[0].newton_iterations)  # the second step has no wild velocities to leave behind
-        starts.append(sum(one[1][2] and one[-1] > 0 for one in seen))
-    assert starts[0] > 0 and starts[1] == 0 and len(advanced) == starts[0]
-    assert found[0] == pytest.approx(found[1], rel=1e-6)
+        elastic.append(reports[-1].elastic)
+        iterations.append(reports[0].newton_iterations)  # of the step that begins with wild velocities
+        moved.append(sum(s.moved and s.n_contacts > 0 for s in starts))
+    assert moved[0] > 0 and moved[1] == 0 and len(searches) == moved[0]
+    assert elastic[0] == pytest.approx(elastic[1], rel=1e-6)
     assert iterations[0] < iterations[1] or not root
