@@ -46,7 +46,6 @@ PIECES = (
     b"\xff\xff\xff\x7f",
     b"\0\0\0@",
 )
-BINARY_HEAD = b"$MeshFormat\n4.1 1 8\n\1\0\0\0\n$EndMeshFormat\n$Nodes\n"
 SIZES = (0, -1, 10**5, 10**6, 10**7, 10**9, 2**31, 2**32 - 1, 2**63, 10**30)
 BASE_MEMORY, MEMORY_PER_BYTE = 5_000_000, 400  # bytes that a reader may allocate: for any file, and per byte of the file
 SECONDS = 20  # time limit of a reader
@@ -88,10 +87,10 @@ def read(path) -> None:
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:
-    """Random bytes, half of them after a binary head, or the data truncated, with a number replaced or pieces overwritten."""
+    """Random bytes, or the data truncated, with one number replaced, or with pieces overwritten."""
     mutation, content = rng.random(), bytearray(data)
     if mutation < 0.1:
-        return rng.choice((b"", BINARY_HEAD)) + rng.randbytes(rng.randint(1, 400))
+        return rng.randbytes(rng.randint(1, 400))
     if mutation < 0.25:
         return data[: rng.randint(0, len(data))]
     if mutation < 0.6:
@@ -131,7 +130,7 @@ def time_out(*_):
     raise ReaderTimeoutError(f"a reader took more than {SECONDS} s")
 
 
-@pytest.mark.parametrize("n, seed", [(500, 1), (10_000, 2)])
+@pytest.mark.parametrize("n, seed", [(600, 1), (10_000, 2)])
 def test_readers_survive_mutated_files(tmp_path, samples, n, seed):
     """After a failure tmp_path holds the file."""
     rng, names = random.Random(seed), sorted(samples)

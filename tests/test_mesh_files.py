@@ -291,6 +291,15 @@ def test_absurd_counts_are_refused_quickly(tmp_path, ending, count):
     assert time.process_time() - start < 2.0
 
 
+@pytest.mark.parametrize("head", [b"", b"$MeshFormat\n4.1 1 8\n\1\0\0\0\n$EndMeshFormat\n$Nodes\n"])
+def test_random_bytes_are_refused(tmp_path, head):
+    path, rng = tmp_path / "mesh.msh", np.random.default_rng(4)
+    for _ in range(50):
+        path.write_bytes(head + rng.bytes(rng.integers(1, 400)))
+        with pytest.raises(MeshError):
+            read_mesh(path)
+
+
 @pytest.mark.parametrize("version, binary", [("gmsh", False), ("gmsh", True), ("gmsh22", False)])
 def test_truncated_gmsh_files_never_give_a_partial_mesh(tmp_path, version, binary):
     path = write_by_meshio(tmp_path / "part.msh", [("tetra", MESH.tets)], file_format=version, binary=binary)
