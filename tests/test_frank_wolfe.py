@@ -1,9 +1,9 @@
-"""The deepest point of a triangle in a signed distance, by Frank-Wolfe, f32 and f64 as the precision of the rest:
+"""The deepest point of a triangle in a signed distance, by Frank-Wolfe. The precision is that of the runtime; phi is f64 in both.
 
-* the reference's triangles against plane, sphere, box, capsule and torus: phi of a listed minimum to 1e-6 m, and its gradient;
-* random triangles, needles and points too: weights are convex, phi is that of their point, and no corner lies deeper;
-* where phi is convex and smooth the point is the deepest of a dense sampling, to 1e-6 of the triangle's size;
-* the size of everything, and the order of the corners, change nothing but rounding.
+* Reference triangles against plane, sphere, box, capsule and torus: phi and its gradient are those of a listed minimum.
+* Random triangles, needles and points too: the weights are convex, phi belongs to their point, and no corner lies deeper.
+* Where phi is convex and smooth, the point is the deepest one of a dense sampling, to 1e-6 of the triangle's size.
+* A uniform scale and the order of the corners change nothing but rounding.
 """
 
 import json
@@ -22,14 +22,14 @@ from taisoft.collision.deepest_point import deepest_point
 from taisoft.collision.surface import dvec
 
 array = ti.types.ndarray(dtype=ti.f64)
-NAMES = ("plane", "sphere", "box", "capsule", "torus")  # of the reference; the first four by their numbers as obstacles
+NAMES = ("plane", "sphere", "box", "capsule", "torus")  # as in the reference; the first four in the order of the obstacle kinds
 TORUS = 4
-SIZE = np.array([(0, 0, 0), (1, 0, 0), (1, 0.5, 0.75), (1, 0.3, 0), (1, 0.25, 0)])  # of the torus, round y: radii
+SIZE = np.array([(0, 0, 0), (1, 0, 0), (1, 0.5, 0.75), (1, 0.3, 0), (1, 0.25, 0)])  # of the torus about y: its two radii
 
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """The five distances, by their places in NAMES."""
+    """The five distances, indexed as NAMES."""
 
     size: Any  # (5) 3-vectors f64
 
@@ -38,8 +38,8 @@ class Distances:
         phi, g = analytic.distance(k, self.size[k], p)
         if k == TORUS:
             ring = dvec(p[0], 0.0, p[2])
-            away = p - self.size[k][0] * ring / ring.norm()
-            phi, g = away.norm() - self.size[k][1], away / away.norm()
+            offset = p - self.size[k][0] * ring / ring.norm()
+            phi, g = offset.norm() - self.size[k][1], offset / offset.norm()
         return phi, g
 
 
@@ -75,8 +75,15 @@ def field(request):
         arena.release()
 
 
-def found(field: Distances, kind: np.ndarray, X: np.ndarray, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (k,3) and phi (k,) of the deepest points of triangles X (k,3,3), all `scale` times as large; phi at scale 1."""
+def sampled(field: Distances, kind: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """phi (k,) and gradients (k,3) at X (k,3)."""
+    out = np.full((len(X), 4), np.nan)
+    sample(field, kind.astype(np.int32), np.ascontiguousarray(X), out)
+    return out[:, 0], out[:, 1:]
+
+
+def deepest_points(field: Distances, kind: np.ndarray, X: np.ndarray, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (k,3) and phi (k,) of the deepest points of triangles X (k,3,3), computed at `scale`; phi is scaled back to 1."""
     field.size.from_numpy(scale * SIZE)
     out = np.full((len(X), 4), np.nan)
     deepest(field, kind.astype(np.int32), np.ascontiguousarray(scale * X), out)
@@ -88,35 +95,28 @@ def found(field: Distances, kind: np.ndarray, X: np.ndarray, scale: float = 1.0)
     return w, phi
 
 
-def sampled(field: Distances, kind: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """phi (k,) and gradients (k,3) at X (k,3)."""
-    out = np.full((len(X), 4), np.nan)
-    sample(field, kind.astype(np.int32), np.ascontiguousarray(X), out)
-    return out[:, 0], out[:, 1:]
-
-
-def test_reference(field, shared):
+def test_reference_minima(field, shared):
     cases = json.loads((shared / "references" / "sdf_triangle_minimum.json").read_text(encoding="utf-8"))["value"]
     kind = np.array([NAMES.index(case["sdf"]) for case in cases])
     X = np.array([case["triangle"] for case in cases])
     assert set(kind) == set(range(5)) and len(cases) == 8
     for order in ((0, 1, 2), (2, 0, 1), (1, 0, 2)):
-        w, phi = found(field, kind, X[:, order])
+        w, phi = deepest_points(field, kind, X[:, order])
         point = np.einsum("ik,ikd->id", w, X[:, order])
         _, gradient = sampled(field, kind, point)
         for i, case in enumerate(cases):
-            off = [max(abs(m["phi"] - phi[i]), 1e-3 * np.abs(m["gradient"] - gradient[i]).max()) for m in case["minima"]]
-            near = case["minima"][int(np.argmin(off))]
-            assert abs(phi[i] - near["phi"]) < 1e-6
-            assert np.abs(point[i] - near["point"]).max() < 1e-3  # phi is flat there
-            if case["sdf"] == "box" and phi[i] < 0:  # as far from two faces, and the reference gives their mean
-                assert gradient[i] @ near["gradient"] > 0.4
+            error = [max(abs(m["phi"] - phi[i]), 1e-3 * np.abs(m["gradient"] - gradient[i]).max()) for m in case["minima"]]
+            nearest = case["minima"][int(np.argmin(error))]
+            assert abs(phi[i] - nearest["phi"]) < 1e-6
+            assert np.abs(point[i] - nearest["point"]).max() < 1e-3  # phi is flat there
+            if case["sdf"] == "box" and phi[i] < 0:  # equally far from two faces; the reference gives the mean gradient
+                assert gradient[i] @ nearest["gradient"] > 0.4
             else:
-                assert np.abs(gradient[i] - near["gradient"]).max() < 1e-3
+                assert np.abs(gradient[i] - nearest["gradient"]).max() < 1e-3
 
 
 def triangles(seed: int, n: int = 1000) -> tuple[np.ndarray, np.ndarray]:
-    """n triangles for each distance, large and small, needles and points among them."""
+    """n triangles per distance, large and small, including needles and points."""
     rng = np.random.default_rng(seed)
     kind = np.repeat(np.arange(5), n)
     X = 10.0 ** rng.uniform(-3, 0, (len(kind), 1, 1)) * rng.standard_normal((len(kind), 3, 3))
@@ -127,8 +127,8 @@ def triangles(seed: int, n: int = 1000) -> tuple[np.ndarray, np.ndarray]:
     return kind, X
 
 
-def least(field: Distances, kind: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """Least phi (k,) of dense samplings: of the triangles, then twice more closely round the deepest point so far."""
+def sampled_minimum(field: Distances, kind: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """Least phi (k,) of a dense sampling of each triangle, refined twice about the deepest sample."""
     i, j = np.triu_indices(41)
     w = np.broadcast_to(np.stack([i, j - i, 40 - j], axis=1) / 40, (len(X), len(i), 3))
     u = np.linspace(-1.5, 1.5, 31)
@@ -145,24 +145,24 @@ def least(field: Distances, kind: np.ndarray, X: np.ndarray) -> np.ndarray:
 
 def test_random_triangles(field):
     kind, X = triangles(1)
-    w, phi = found(field, kind, X)
+    w, phi = deepest_points(field, kind, X)
     corners = np.stack([sampled(field, kind, X[:, k])[0] for k in range(3)], axis=1)
     assert (phi <= corners.min(axis=1)).all()
     size = np.linalg.norm(X - np.roll(X, 1, axis=1), axis=2).max(axis=1)
-    above = (phi - least(field, kind, X)) / np.maximum(size, 1e-9)
-    misses = {name: np.mean(above[kind == k] > 1e-6) for k, name in enumerate(NAMES)}
-    assert misses["plane"] == 0 and above[kind == 1].max() < 1e-5 and misses["sphere"] < 2e-3
-    # kinks within, where it may stop early, and of the torus two minima
+    excess = (phi - sampled_minimum(field, kind, X)) / np.maximum(size, 1e-9)
+    misses = {name: np.mean(excess[kind == k] > 1e-6) for k, name in enumerate(NAMES)}
+    assert misses["plane"] == 0 and excess[kind == 1].max() < 1e-5 and misses["sphere"] < 2e-3
+    # phi has kinks, where the search may stop early, and that of the torus may have two minima on a triangle
     assert max(misses.values()) < 0.05
-    between = w.max(axis=1) < 1 - 1e-6
-    assert all((between & (kind == k)).sum() > 100 for k in range(1, 5))
+    inner = w.max(axis=1) < 1 - 1e-6
+    assert all((inner & (kind == k)).sum() > 100 for k in range(1, 5))
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_size_changes_nothing(field, scale):
+def test_scale_invariance(field, scale):
     kind, X = triangles(2, 200)
-    w, phi = found(field, kind, X)
-    w_scaled, phi_scaled = found(field, kind, X, scale)
+    w, phi = deepest_points(field, kind, X)
+    w_scaled, phi_scaled = deepest_points(field, kind, X, scale)
     same = np.abs(phi_scaled - phi) < 1e-9
-    assert same.mean() > 0.99  # in flat valleys rounding decides where the search ends
+    assert same.mean() > 0.99  # where phi is flat, rounding decides where the search ends
     assert np.abs(w_scaled - w)[same].max() < 1e-2

@@ -1,10 +1,10 @@
-"""What may be assigned to, and when:
+"""Which attributes may be assigned, and when:
 
-* an unknown attribute of a scene, a body, a material, a shape, an obstacle, settings or a simulator is refused with the nearest
-  one that there is, and a read-only one with the call to use; reading, copies and replaced methods are as everywhere;
-* a Simulator that takes a scene freezes it: every later change of it, or of its bodies, is refused with the call to use, in the
-  simulator's own copy too; a construction that fails, statics and modes freeze nothing, and a second Simulator can be made;
-* a snapshot, a copy and a pickle of a frozen scene can change; what a simulator changes itself still works.
+* assigning an unknown attribute of a scene, body, material, shape, obstacle, settings or simulator raises an error that suggests
+  the nearest name; assigning a read-only one raises an error with the call to use; reading and copying work as in plain classes;
+* a Simulator freezes its scene and its own copy: later changes to either, or to their bodies, are refused with the call to use;
+  a failed construction, statics and modes do not freeze the scene, and a second Simulator can be made from it;
+* snapshots, copies and pickles of a frozen scene can change, and the simulator's own set_ methods still work.
 """
 
 import copy
@@ -23,9 +23,9 @@ DT = 1e-4
 
 
 def loaded() -> ts.Scene:
-    """A body with all that a body can have, a second one, and an obstacle."""
+    """A body with velocities, constraints and loads, a second body and an obstacle."""
     scene = ts.Scene()
-    scene.contact_forces = False  # they would take long to compile
+    scene.contact_forces = False  # for shorter compilation
     body = scene.add_body(cube(), rubber(), name="block", velocity=np.zeros((8, 3)))
     body.fix([0])
     body.move([1], lambda t: (0, 0, 0))
@@ -41,7 +41,7 @@ def loaded() -> ts.Scene:
 
 
 @pytest.mark.parametrize(
-    "what, name, words",
+    "select, name, message",
     [
         (lambda s: s, "gravty", "^scene has no attribute 'gravty'; did you mean 'gravity'[?]$"),
         (lambda s: s, "zzz", "^scene has no attribute 'zzz'$"),
@@ -59,15 +59,15 @@ def loaded() -> ts.Scene:
         (lambda s: s.body("block").tractions[0], "value", "^traction: value cannot change: call sim.set_traction"),
     ],
 )
-def test_attributes_of_scenes(what, name, words):
-    one = what(loaded())
-    before = dict(one.__dict__)
-    with pytest.raises(SceneError, match=words) as caught:
-        setattr(one, name, 1.0)
-    assert isinstance(caught.value, AttributeError) and one.__dict__ == before
+def test_unknown_and_read_only_attributes_of_a_scene_are_refused(select, name, message):
+    target = select(loaded())
+    before = dict(target.__dict__)
+    with pytest.raises(SceneError, match=message) as caught:
+        setattr(target, name, 1.0)
+    assert isinstance(caught.value, AttributeError) and target.__dict__ == before
 
 
-def test_every_shape_refuses():
+def test_shapes_and_key_frames_refuse_unknown_attributes():
     shapes = [
         ts.HalfSpace((0, 0, 0), (0, 1, 0)),
         ts.Sphere((0, 0, 0), 1),
@@ -81,7 +81,7 @@ def test_every_shape_refuses():
             shape.colour = 1
 
 
-def test_reading_is_as_everywhere():
+def test_reading_an_unknown_attribute_is_a_plain_attribute_error():
     scene = loaded()
     assert not hasattr(scene, "gravty") and getattr(scene, "gravty", 7) == 7 and hasattr(scene.bodies[0], "material")
     with pytest.raises(AttributeError, match="object has no attribute 'gravty'"):
@@ -90,7 +90,7 @@ def test_reading_is_as_everywhere():
     class Mine(ts.Scene):
         def __init__(self):
             super().__init__()
-            self.colours = {}  # a subclass may have more
+            self.colours = {}  # a subclass may add attributes
 
     assert Mine().colours == {}
 
@@ -99,15 +99,15 @@ def test_reading_is_as_everywhere():
 
 
 @pytest.fixture(scope="module")
-def taken():
-    """A scene, the simulator that took it, and an unchanged copy."""
+def frozen():
+    """A frozen scene, its simulator, and a copy from before."""
     scene = loaded()
     before = copy.deepcopy(scene)
     with ts.Simulator(scene, DT, "symplectic_euler", precision="f64") as sim:
         yield scene, sim, before
 
 
-LATE = {
+CHANGES = {
     "gravity": (lambda s: setattr(s, "gravity", (0, 0, 0)), "call sim.set_gravity"),
     "collision": (lambda s: setattr(s, "collision", ts.CollisionSettings()), "scene.snapshot"),
     "allow_initial_overlap": (lambda s: setattr(s, "allow_initial_overlap", True), "make a new Simulator"),
@@ -131,29 +131,29 @@ LATE = {
     "constraints": (lambda s: s.body("block").constraints.clear(), "scene.snapshot"),
     "mesh": (lambda s: delattr(s.body("block"), "mesh"), "scene.snapshot"),
 }
-NEVER = {"obstacles", "contact_pairs", "name", "forces", "tractions", "mesh"}  # as they are changed there, refused before, too
+ALWAYS_REFUSED = {"obstacles", "contact_pairs", "name", "forces", "tractions", "mesh"}  # not assignable before freezing either
 
 
-@pytest.mark.parametrize("name", LATE)
-def test_late_changes(taken, name):
-    scene, sim, before = taken
-    change, instead = LATE[name]
-    words = f"^(scene|body 'block'): {name} cannot (change|be called) any more, since a Simulator has .*{instead}"
-    for one in (scene, sim.scene):
-        with pytest.raises(SceneError, match=words):
-            change(one)
-        assert one.gravity.tolist() == before.gravity.tolist() and one.contact_pairs == before.contact_pairs
-        assert [b.name for b in one.bodies] == ["block", "other"] and len(one.body("block").forces) == 1
-    for copied in (before.snapshot(), scene.snapshot()):  # which were not taken
-        if name in NEVER:
+@pytest.mark.parametrize("name", CHANGES)
+def test_changes_to_a_frozen_scene_are_refused(frozen, name):
+    scene, sim, before = frozen
+    change, instead = CHANGES[name]
+    message = f"^(scene|body 'block'): {name} cannot (change|be called) any more, since a Simulator has .*{instead}"
+    for target in (scene, sim.scene):
+        with pytest.raises(SceneError, match=message):
+            change(target)
+        assert target.gravity.tolist() == before.gravity.tolist() and target.contact_pairs == before.contact_pairs
+        assert [b.name for b in target.bodies] == ["block", "other"] and len(target.body("block").forces) == 1
+    for copied in (before.snapshot(), scene.snapshot()):
+        if name in ALWAYS_REFUSED:
             with pytest.raises(SceneError, match=f"{name} cannot be (set|changed by hand|deleted): (call|add)"):
                 change(copied)
         else:
             change(copied)
 
 
-def test_arrays_of_a_frozen_scene(taken):
-    scene, _, before = taken
+def test_arrays_of_a_frozen_scene_are_read_only(frozen):
+    scene, _, before = frozen
     body = scene.body("block")
     arrays = scene.gravity, body.position, body.velocity, body.forces[0].value, body.tractions[0].value, body.constraints[0].nodes
     for array in (*arrays, body.rest_positions, body.mesh.vertices):
@@ -162,30 +162,29 @@ def test_arrays_of_a_frozen_scene(taken):
     before.snapshot().gravity[1] = 0.0
 
 
-def test_an_unknown_attribute_is_unknown_late_too(taken):
+def test_unknown_attributes_of_a_frozen_scene_are_still_reported_as_unknown(frozen):
     with pytest.raises(SceneError, match="^scene has no attribute 'gravty'"):
-        taken[0].gravty = 1
+        frozen[0].gravty = 1
 
 
-def test_copies_can_change(taken):
-    scene = taken[0]
-    straight = scene.snapshot()
-    del straight.body("block").constraints[1:]  # a pickle takes no lambda
-    for twin in (scene.snapshot(), copy.copy(scene), copy.deepcopy(scene), pickle.loads(pickle.dumps(straight))):
-        twin.gravity = (0, -1, 0)
-        twin.add_obstacle(ts.Sphere((0, -20, 0), 1))
-        twin.set_contact("block", "ball", friction=0.9)
-        twin.bodies.pop()
-    for twin in (scene.snapshot(), copy.deepcopy(scene)):
-        twin.body("block").add_force([3], (0, 0, 0))
-        twin.body("block").velocity[0] = 1.0
+def test_copies_of_a_frozen_scene_can_change(frozen):
+    scene = frozen[0]
+    picklable = scene.snapshot()
+    del picklable.body("block").constraints[1:]  # its path is a lambda
+    for copied in (scene.snapshot(), copy.copy(scene), copy.deepcopy(scene), pickle.loads(pickle.dumps(picklable))):
+        copied.gravity = (0, -1, 0)
+        copied.add_obstacle(ts.Sphere((0, -20, 0), 1))
+        copied.set_contact("block", "ball", friction=0.9)
+        copied.bodies.pop()
+    for copied in (scene.snapshot(), copy.deepcopy(scene)):
+        copied.body("block").add_force([3], (0, 0, 0))
+        copied.body("block").velocity[0] = 1.0
     assert scene.gravity[1] == -9.81 and len(scene.bodies) == 2 and len(scene.body("block").forces) == 1
-    same = with_order(scene, 1)
-    same.bodies[0].add_force([3], (0, 0, 0))
+    with_order(scene, 1).bodies[0].add_force([3], (0, 0, 0))
 
 
-def test_what_the_simulator_changes(taken):
-    scene, sim, _ = taken
+def test_set_methods_change_the_simulators_copy_alone(frozen):
+    scene, sim, _ = frozen
     sim.set_gravity((0, -1, 0))
     sim.set_material("block", young=2e4)
     sim.set_contact("block", "ball", friction=0.1)
@@ -196,7 +195,7 @@ def test_what_the_simulator_changes(taken):
     for call in (
         lambda: sim.set_gravity("down"),
         lambda: sim.set_contact("block", "ball", friction=-1),
-        lambda: sim.set_material("block", young=1e13),  # not stable
+        lambda: sim.set_material("block", young=1e13),  # unstable at this dt
     ):
         with pytest.raises((SceneError, SimulationError)):
             call()
@@ -207,36 +206,36 @@ def test_what_the_simulator_changes(taken):
         sim.scene.gravity[1] = 0.0
 
 
-def test_only_a_simulator_that_was_made_freezes(taken, tmp_path, monkeypatch):
+def test_only_a_successful_construction_freezes(frozen, tmp_path, monkeypatch):
     def fail(*_):
-        raise RuntimeError("late")
+        raise RuntimeError("construction failed")
 
     scene = loaded()
     for settings in ({"integrator": "nope"}, {"dt": 1.0, "integrator": "symplectic_euler", "precision": "f64"}):
         with pytest.raises(SimulationError):
             ts.Simulator(scene, **settings)
-    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="late"):
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="construction failed"):
         patch.setattr(dynamics, "make_stepper", fail)
         ts.Simulator(scene, DT, "symplectic_euler", precision="f64")
     held = ts.Scene()
     held.add_body(cube(), rubber()).fix(lambda X: X[:, 0] < 0)
     ts.solve_static(held)
     ts.modes(held, 1)
-    for one in (scene, held):
-        one.gravity[1] = -1.0
-        one.bodies[0].fix([5])
-    saved, first = tmp_path / "c.npz", taken[1]
+    for target in (scene, held):
+        target.gravity[1] = -1.0
+        target.bodies[0].fix([5])
+    saved, first = tmp_path / "c.npz", frozen[1]
     first.save_checkpoint(saved)
-    with ts.Simulator(taken[0], DT, "symplectic_euler", precision="f64") as second:  # of a frozen scene
+    with ts.Simulator(frozen[0], DT, "symplectic_euler", precision="f64") as second:  # from a frozen scene
         assert second.scene.gravity[1] == -9.81
     again = loaded()
-    with ts.Simulator.load_checkpoint(saved, again) as loaded_one, pytest.raises(SceneError, match="sim.set_gravity"):
-        assert loaded_one.scene.gravity[1] == first.scene.gravity[1]
+    with ts.Simulator.load_checkpoint(saved, again) as restored, pytest.raises(SceneError, match="sim.set_gravity"):
+        assert restored.scene.gravity[1] == first.scene.gravity[1]
         again.gravity = (0, 0, 0)
 
 
 @pytest.mark.parametrize(
-    "name, words",
+    "name, message",
     [
         ("dtt", "^simulator has no attribute 'dtt'; did you mean 'dt'[?]$"),
         ("gravity", "^simulator has no attribute 'gravity': call sim.set_gravity.gravity.$"),
@@ -254,9 +253,9 @@ def test_only_a_simulator_that_was_made_freezes(taken, tmp_path, monkeypatch):
         ("plan", "^simulator: plan cannot be set: it follows"),
     ],
 )
-def test_attributes_of_a_simulator(taken, name, words):
-    sim = taken[1]
-    with pytest.raises(SimulationError, match=words) as caught:
+def test_unknown_and_read_only_attributes_of_a_simulator_are_refused(frozen, name, message):
+    sim = frozen[1]
+    with pytest.raises(SimulationError, match=message) as caught:
         setattr(sim, name, 1.0)
     assert isinstance(caught.value, AttributeError)
     sim.dt = sim.dt
@@ -264,8 +263,8 @@ def test_attributes_of_a_simulator(taken, name, words):
         sim.settings.dt = 1.0
 
 
-def test_a_method_may_be_replaced(taken, monkeypatch):
-    sim = taken[1]
+def test_a_method_may_be_replaced(frozen, monkeypatch):
+    sim = frozen[1]
     with monkeypatch.context() as patch:
         patch.setattr(sim, "step", lambda: "stepped")
         assert sim.step() == "stepped"

@@ -1,8 +1,8 @@
-"""What steps told over time, in a memory of fixed size:
+"""The history of step reports that plots show, in memory of a fixed size:
 
-* runs of steps follow one another without a gap, each is as long as the others but the last, and holds their lows and highs;
-* at least half of the memory is used, and none beyond it, however many steps there were;
-* energies are told as their change; what is not modelled, or not finite, is unknown, and hides no neighbour.
+* entries cover consecutive runs of steps, of equal length but for the last, and hold the lowest and highest value of each;
+* the capacity is never exceeded, and at least half of it is used;
+* energies are stored as changes since the start; quantities that are not modelled or not finite are NaN and hide no neighbour.
 """
 
 import math
@@ -19,7 +19,7 @@ from taisoft.view.plots import QUANTITIES, History
 COLUMN = {name: k for k, name in enumerate(QUANTITIES)}
 
 
-def begun(capacity: int = 8, time: float = 0.0, kinetic: float = 0.0) -> History:
+def started(capacity: int = 8, time: float = 0.0, kinetic: float = 0.0) -> History:
     history = History(capacity)
     history.start(SimpleNamespace(time=time, energies=lambda: Energies(kinetic, 1.0, 2.0)))
     return history
@@ -29,39 +29,39 @@ def begun(capacity: int = 8, time: float = 0.0, kinetic: float = 0.0) -> History
 @given(
     st.lists(st.floats(-1e6, 1e6, allow_subnormal=False) | st.just(float("nan")), max_size=200), st.sampled_from([2, 4, 8, 10])
 )
-def test_runs_are_what_they_are_of(values, capacity):
-    history = begun(capacity)
+def test_entries_hold_the_extremes_of_their_steps(values, capacity):
+    history = started(capacity)
     for k, value in enumerate(values):
         history.take(StepReport(time=k + 1.0, kinetic=value, elastic=1.0, gravity=2.0, n_contacts=k), 0.001, False, True)
-    told, steps = np.array([0.0, *values]), np.arange(len(values) + 1.0)
+    kinetic, steps = np.array([0.0, *values]), np.arange(len(values) + 1.0)
     n = len(history.times)
-    length = 2 ** math.ceil(math.log2(len(told) / n))
+    length = 2 ** math.ceil(math.log2(len(kinetic) / n))
     assert n <= capacity and (length == 1 or 2 * n > capacity)
     for j in range(n):
-        part = told[j * length : (j + 1) * length]
-        known = part[np.isfinite(part)]
+        covered = slice(j * length, (j + 1) * length)
+        finite = kinetic[covered][np.isfinite(kinetic[covered])]
         low, high = history.low[j, 0], history.high[j, 0]
-        if len(known):
-            assert (low, high) == (known.min(), known.max())
+        if len(finite):
+            assert (low, high) == (finite.min(), finite.max())
         else:
             assert np.isnan(low) and np.isnan(high)
-        assert history.times[j] == steps[j * length : (j + 1) * length][-1]
+        assert history.times[j] == steps[covered][-1]
     assert history.times[-1] == len(values)
 
 
-def test_no_peak_is_lost_and_memory_stays():
-    history = begun(256)
-    arrays = history._times, history._low, history._high
+def test_peaks_are_kept_and_memory_does_not_grow():
+    history = started(256)
+    memory = history.times.base, history.low.base, history.high.base
     for k in range(20_000):
         report = StepReport(time=5e-3 * (k + 1), n_contacts=7777 if k == 6_234 else 3, elastic=1.0, gravity=2.0)
         history.take(report, 0.001, True, True)
     assert history.high[:, COLUMN["n_contacts"]].max() == 7777 and 128 <= len(history.times) <= 256
     assert (np.diff(history.times) > 0).all() and history.times[-1] == pytest.approx(100.0)
-    assert all(a is b for a, b in zip(arrays, (history._times, history._low, history._high)))
+    assert all(a is b for a, b in zip(memory, (history.times.base, history.low.base, history.high.base)))
 
 
-def test_change_of_energy_and_what_is_not_known():
-    history = begun(kinetic=10.0, time=3.0)
+def test_energies_are_changes_and_unmodelled_quantities_are_nan():
+    history = started(kinetic=10.0, time=3.0)
     report = StepReport(
         time=3.1,
         steps=4,
@@ -80,8 +80,8 @@ def test_change_of_energy_and_what_is_not_known():
     contact = {"contact_iterations": 2.0, "n_contacts": 5}
     for explicit, touching in ((False, True), (True, True), (True, False), (False, False)):
         history.take(report, 0.02, explicit, touching)
-        known = expected | (implicit if not explicit else {}) | (contact if touching else {})
-        assert {name: value for name, value in zip(QUANTITIES, history.last) if np.isfinite(value)} == pytest.approx(known)
+        modelled = expected | (implicit if not explicit else {}) | (contact if touching else {})
+        assert {name: value for name, value in zip(QUANTITIES, history.last) if np.isfinite(value)} == pytest.approx(modelled)
     assert history.begin == 3.0
     history.start(SimpleNamespace(time=0.0, energies=lambda: Energies(0.0, 0.0, 0.0)))
     assert len(history.times) == 1 and history.begin == 0.0

@@ -1,9 +1,9 @@
-"""Key frames promise:
+"""Key frames:
 
-* between keys translations are linear, or start and stop gently; before the first and after the last they stay;
-* rotations turn evenly: about one axis by the difference of the angles, full turns too, else by the shortest turn;
-* they lead nodes and obstacles alike, about a pivot in space or their own middle, and let nodes go at the last time;
-* what is no sequence of keys is refused in one sentence.
+* translations between keys are linear, or smooth with zero velocity at the keys; outside the keys they are constant;
+* rotations have a constant rate: about one axis by the difference of the angles, full turns included, else by the shortest one;
+* they move nodes and obstacles about a fixed pivot or their own center, and can release nodes at the last time;
+* invalid keys are refused.
 """
 
 import numpy as np
@@ -16,66 +16,60 @@ UP = [(0, 0, 0), (0, 2, 0), (0, 2, 4)]
 MESH = ts.box_mesh((1, 1, 1), (1, 1, 1))
 
 
-def turned(*vector) -> np.ndarray:
+def rotation_of(*vector) -> np.ndarray:
+    """(3,3) of a rotation vector [rad]."""
     return Rotation.from_rotvec(vector).as_matrix()
 
 
-@pytest.mark.parametrize("t, there", [(-1, UP[0]), (1, UP[0]), (2, (0, 1, 0)), (3, UP[1]), (3.25, (0, 2, 1)), (9, UP[2])])
-def test_translations_are_linear_and_the_ends_stay(t, there):
+@pytest.mark.parametrize("t, expected", [(-1, UP[0]), (1, UP[0]), (2, (0, 1, 0)), (3, UP[1]), (3.25, (0, 2, 1)), (9, UP[2])])
+def test_translations_are_linear_between_keys_and_constant_outside(t, expected):
     translation, rotation = ts.KeyFrames((1, 3, 4), UP)(t)
-    assert np.allclose(translation, there, rtol=0, atol=1e-15) and np.array_equal(rotation, np.eye(3))
+    assert np.allclose(translation, expected, rtol=0, atol=1e-15) and np.array_equal(rotation, np.eye(3))
 
 
-def test_one_key_stays():
+def test_a_single_key_is_constant():
     frames = ts.KeyFrames((1,), [(1, 2, 3)], [(0, 0, np.pi / 2)])
     for t in (0.0, 1.0, 2.0):
         translation, rotation = frames(t)
-        assert translation.tolist() == [1, 2, 3] and np.allclose(rotation, turned(0, 0, np.pi / 2), atol=1e-15)
+        assert translation.tolist() == [1, 2, 3] and np.allclose(rotation, rotation_of(0, 0, np.pi / 2), atol=1e-15)
 
 
-def test_smooth_ones_rest_at_every_key():
+def test_smooth_key_frames_have_zero_velocity_at_keys():
     frames, h = ts.KeyFrames((1, 3, 4), UP, smooth=True), 1e-6
     for t in (1, 3, 4):
         assert np.abs(frames(t + h)[0] - frames(t - h)[0]).max() < 1e-10
     assert np.allclose(frames(2)[0], (0, 1, 0)) and np.allclose(frames(1.5)[0], (0, 2 * (3 / 16 - 2 / 64), 0))
 
 
-def test_full_turns_about_one_axis_count():
+def test_full_turns_about_one_axis_are_kept():
     frames = ts.KeyFrames((0, 1, 2), rotations=[(0, 0, 0), (6 * np.pi, 0, 0), (-1, 0, 0)])
     for t, angle in ((1 / 6, np.pi), (0.5, 3 * np.pi), (0.75, 4.5 * np.pi), (1.5, 3 * np.pi - 0.5), (2, -1)):
-        assert np.allclose(frames(t)[1], turned(angle, 0, 0), rtol=0, atol=1e-14)
+        assert np.allclose(frames(t)[1], rotation_of(angle, 0, 0), rtol=0, atol=1e-14)
 
 
-def test_other_turns_take_the_shortest_way():
+def test_rotations_about_different_axes_take_the_shortest_path():
     a, b = (0.1, 2.0, -0.3), (1.0, 0.2, 3.0)
     frames = ts.KeyFrames((0, 1), rotations=[a, b])
-    way = Rotation.from_matrix(turned(*a).T @ turned(*b)).as_rotvec()
-    assert 1.0 < np.linalg.norm(way) < np.pi
+    relative = Rotation.from_matrix(rotation_of(*a).T @ rotation_of(*b)).as_rotvec()
+    assert 1.0 < np.linalg.norm(relative) < np.pi
     for t in (0, 0.3, 1):
-        assert np.allclose(frames(t)[1], turned(*a) @ turned(*(t * way)), rtol=0, atol=1e-14)
+        assert np.allclose(frames(t)[1], rotation_of(*a) @ rotation_of(*(t * relative)), rtol=0, atol=1e-14)
 
 
-def test_nodes_turn_about_the_pivot_in_space():
-    position = np.array([1.0, 0, 0])
-    for pivot, center in (((0.0, 0, 0), (0.0, 0, 0)), (None, (1.5, 0, 0))):
-        body = ts.Scene().add_body(MESH, ts.Material(), position=position)
-        ids = [7, 5, 6, 4]  # those at x = 0.5
-        body.move(ids, ts.KeyFrames((0, 1), [(0, 0, 0), (0, 0, 1)], [(0, 0, 0), (0, 0, np.pi)], pivot))
-        start = MESH.vertices[ids] + position
-        there = start + body.constraints[0].path(1.0)
-        assert np.allclose(there, (start - center) * (-1, -1, 1) + center + (0, 0, 1), rtol=0, atol=1e-14)
+@pytest.mark.parametrize("pivot, center", [((0.0, 0, 0), (0.0, 0, 0)), (None, (1.5, 0, 0))])
+def test_nodes_and_obstacles_rotate_about_the_pivot(pivot, center):
+    """pivot None: the center of the nodes or the obstacle."""
+    frames = ts.KeyFrames((0, 1), [(0, 0, 0), (0, 0, 1)], [(0, 0, 0), (0, 0, np.pi)], pivot)
+    body = ts.Scene().add_body(MESH, ts.Material(), position=(1.0, 0, 0))
+    ids = [7, 5, 6, 4]  # vertices at x = 0.5
+    body.move(ids, frames)
+    nodes, ends = MESH.vertices[ids] + (1.0, 0, 0), np.array([(1.0, 0, 0), (2.0, 0, 0)])
+    obstacle = ts.Scene().add_obstacle(ts.Capsule(*ends, 0.1), path=frames)
+    for start, end in ((nodes, nodes + body.constraints[0].path(1.0)), (ends, obstacle.points_at(1.0, ends))):
+        assert np.allclose(end, (start - center) * (-1, -1, 1) + center + (0, 0, 1), rtol=0, atol=1e-14)
 
 
-def test_obstacles_turn_about_the_pivot_in_space():
-    corners = np.array([(1.0, 0, 0), (2.0, 0, 0)])
-    for pivot, center in (((0.0, 0, 0), (0.0, 0, 0)), (None, (1.5, 0, 0))):
-        frames = ts.KeyFrames((0, 1), [(0, 0, 0), (0, 0, 1)], [(0, 0, 0), (0, 0, np.pi)], pivot)
-        obstacle = ts.Scene().add_obstacle(ts.Capsule(*corners, 0.1), path=frames)
-        there = obstacle.points_at(1.0, corners)
-        assert np.allclose(there, (corners - center) * (-1, -1, 1) + center + (0, 0, 1), rtol=0, atol=1e-14)
-
-
-def test_nodes_go_free_at_the_last_time():
+def test_nodes_are_released_at_the_last_time():
     body = ts.Scene().add_body(MESH, ts.Material(), name="a")
     body.move([0], ts.KeyFrames((0, 1), [(0, 0, 0), (0, 1, 0)], release=True))
     path = body.constraints[0].path
@@ -87,7 +81,7 @@ def test_nodes_go_free_at_the_last_time():
 
 
 @pytest.mark.parametrize(
-    "arguments, rule",
+    "arguments, message",
     [
         ({"times": ()}, r"times must have shape \(1,\), not \(0,\)"),
         ({"times": 1.0}, r"times must have shape \(1,\), not \(\)"),
@@ -104,12 +98,12 @@ def test_nodes_go_free_at_the_last_time():
         ({"release": None}, "release must be True or False"),
     ],
 )
-def test_key_frames_outside_the_rules(arguments, rule):
-    with pytest.raises(ts.SceneError, match=f"^key frames: {rule}"):
+def test_invalid_key_frames_are_refused(arguments, message):
+    with pytest.raises(ts.SceneError, match=f"^key frames: {message}"):
         ts.KeyFrames(**({"times": (0, 1, 2), "translations": UP} | arguments))
 
 
-def test_key_frames_are_frozen():
+def test_key_frames_cannot_be_changed():
     times = np.array([0.0, 1.0])
     frames = ts.KeyFrames(times, UP[:2])
     times[0] = 5.0

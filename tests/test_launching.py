@@ -1,10 +1,10 @@
 """Kernels over records of arrays:
 
-* one compiled kernel serves every record of one structure, whatever its sizes; what the code depends on brings other code: types,
-  extents but the first, flags, which optional arrays there are, numbers that are not counts, modules;
-* a kernel sees records as they are: nested, in tuples, with properties and methods, in arrays of several dimensions;
-* what is left of a record is nothing: neither it nor its arrays outlive it;
-* Taichi's own way of launching gives the same; what it refuses is refused; after a new ti.init nothing old is launched.
+* one compiled kernel serves all records of one structure, whatever their sizes; it is compiled anew for other types, extents but
+  the first, flags, optional arrays, constants that are not counts, and modules;
+* kernels can use nested records, tuples, properties, methods and arrays of several dimensions;
+* neither a record nor its arrays are kept alive by a launch;
+* the fast launch gives the same results and errors as Taichi's public one; after a new ti.init nothing old is launched.
 """
 
 import gc
@@ -18,17 +18,18 @@ import taichi as ti
 from lanes import opened
 
 from taisoft.backend import launching, runtime
-from taisoft.backend.arrays import Count, FieldArena
+from taisoft.backend.arrays import Count, FieldArena, index_mask
 from taisoft.backend.runtime import kernel
 from taisoft.fem.laws import corotational, stable_neo_hookean
 
 
-@pytest.fixture(params=[False, True], ids=["quick", "public"])
+@pytest.fixture(params=[False, True], ids=["fast", "public"])
 def machine(request, monkeypatch):
+    """A runtime with the fast launch or Taichi's public one."""
     monkeypatch.setattr(launching, "PUBLIC", request.param)
-    runtime._kind = None  # what was compiled the other way goes
-    with opened("f64") as made:
-        yield made
+    runtime._kind = None  # forget kernels compiled for the other launch
+    with opened("f64") as machine:
+        yield machine
     runtime._kind = None
 
 
@@ -38,12 +39,12 @@ class Part:
 
     first: Count
     weight: Any  # f64
-    power: int  # known to the compiler
+    power: int  # a compile-time constant
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What kernels take."""
+    """An argument of kernels."""
 
     n: Count
     x: Any  # 3-vectors
@@ -55,12 +56,12 @@ class Record:
 
     @property
     def has_extra(self) -> bool:
-        """Whether there is more."""
+        """Whether the optional array is there."""
         return self.extra is not None
 
     @ti.func
     def length(self, i):
-        """Of an entry."""
+        """Length of vector i."""
         return self.x[i].norm()
 
 
@@ -68,14 +69,14 @@ def make(arena: FieldArena, n: int, flag: bool = True, extra: bool = False, powe
     tag = len(arena.bytes)
     x, table = np.arange(3.0 * n).reshape(n, 3), np.arange(6.0 * n).reshape(n, 2, 3)
     parts = tuple(Part(k, arena.field(f"weight {k} {tag}", ti.f64, n, np.full(n, k + 1.0)), power) for k in range(2))
-    more = arena.field(f"extra {tag}", ti.f64, n, np.full(n, 0.5)) if extra else None
+    optional = arena.field(f"extra {tag}", ti.f64, n, np.full(n, 0.5)) if extra else None
     x, table = arena.vectors(f"x {tag}", ti.f64, n, x), arena.field(f"table {tag}", ti.f64, (n, 2, 3), table)
-    return Record(n, x, table, more, parts, flag, unused)
+    return Record(n, x, table, optional, parts, flag, unused)
 
 
 @ti.func
 def weighted(p: ti.template(), i):
-    """Of a part."""
+    """The value of a part at i."""
     return p.weight[i] ** p.power + p.first
 
 
@@ -97,7 +98,8 @@ def evaluate(r: ti.template(), scale: ti.f64, out: ti.types.ndarray()) -> ti.f64
     return last
 
 
-def wanted(r: Record, scale: float) -> np.ndarray:
+def expected(r: Record, scale: float) -> np.ndarray:
+    """What `evaluate` should give."""
     x, table = r.x.to_numpy(), r.table.to_numpy()
     value = np.linalg.norm(x, axis=1) + table[:, 1, 2]
     value += sum(p.weight.to_numpy() ** p.power + p.first for p in r.parts)
@@ -105,25 +107,25 @@ def wanted(r: Record, scale: float) -> np.ndarray:
 
 
 def check(r: Record, scale: float = 3.0) -> None:
-    out, right, x = np.zeros(r.n), wanted(r, scale), r.x.to_numpy()
+    out, values, x = np.zeros(r.n), expected(r, scale), r.x.to_numpy()
     last = evaluate(r, scale, out)
-    assert out == pytest.approx(right, rel=1e-14) and last == out[-1]
+    assert out == pytest.approx(values, rel=1e-14) and last == out[-1]
     assert np.array_equal(r.x.to_numpy(), x + (0.0, 0.0, 1.0))
 
 
-def test_sizes_and_records_share_code(machine):
+def test_records_of_all_sizes_share_one_kernel(machine):
     arena, before = FieldArena(), runtime.n_compiled()
     for n in (3, 1, 50):
         record = make(arena, n)
         check(record)
         check(record, 0.5)
     assert runtime.n_compiled() == before + 1
-    check(make(arena, 4, unused=("nobody", "names this")))
+    check(make(arena, 4, unused=("not used", "in the kernel")))
     assert runtime.n_compiled() == before + 1
     arena.release()
 
 
-def test_structure_brings_other_code(machine):
+def test_another_structure_is_compiled_anew(machine):
     arena, before = FieldArena(), runtime.n_compiled()
     for k, changes in enumerate(({}, {"flag": False}, {"extra": True}, {"power": 3}, {"extra": True, "power": 3})):
         check(make(arena, 5, **changes))
@@ -137,7 +139,7 @@ def combine(x: ti.template(), law: ti.template(), n: ti.template(), a: ti.f64, k
         out[i] = a * x[i] + k + n + ti.static(law.SOFTENS_BELOW)
 
 
-def test_arrays_modules_and_constants(machine):
+def test_types_modules_and_constants_are_compiled_anew(machine):
     arena, before = FieldArena(), runtime.n_compiled()
     arrays = [arena.field(f"x{k}", ti.f64, 3 + k, np.arange(3.0 + k)) for k in range(2)]
     single = arena.field("y", ti.f32, 4, np.arange(4.0))
@@ -153,7 +155,7 @@ def test_arrays_modules_and_constants(machine):
     arena.release()
 
 
-def test_what_is_refused(machine):
+def test_wrong_arguments_are_refused(machine):
     arena = FieldArena()
     x, out = arena.field("x", ti.f64, 5), np.zeros(4)
     for _ in range(2):
@@ -170,21 +172,21 @@ def test_what_is_refused(machine):
     arena.release()
 
 
-def test_nothing_of_a_record_is_kept(machine):
+def test_launches_keep_no_reference_to_a_record(machine):
     arena = FieldArena()
     record = make(arena, 4)
     check(record)
-    gone = [weakref.ref(one) for one in (record, record.x, record.parts[0].weight)]
+    references = [weakref.ref(thing) for thing in (record, record.x, record.parts[0].weight)]
     ready = sum(len(known._ready) for known in runtime._all_kernels)
     arena.release()
     del record
     gc.collect()
-    assert not any(ref() for ref in gone)
+    assert not any(reference() for reference in references)
     if not launching.PUBLIC:
         assert sum(len(known._ready) for known in runtime._all_kernels) < ready
 
 
-def test_a_new_taichi_has_nothing_old():
+def test_a_new_taichi_compiles_anew():
     for _ in range(2):
         with opened("f64"):
             arena, before = FieldArena(), runtime.n_compiled()
@@ -192,13 +194,10 @@ def test_a_new_taichi_has_nothing_old():
                 check(make(arena, 4))
             assert runtime.n_compiled() == before + 1
             arena.release()
-        runtime._kind = None  # the next one initialises
+        runtime._kind = None  # the next runtime initialises Taichi
 
 
-def test_masks_do_not_change_indices(machine):
-    """The largest index that 31 bits can count is not changed, and the next array size is refused."""
-    from taisoft.backend.arrays import index_mask
-
+def test_index_masks_are_the_largest_that_31_bits_can_address():
     for n, extents in ((0, ()), (2, ()), (3, ()), (12, ()), (0, (9, 4)), (3, (3,))):
         numbers, mask = max(n, 1) * int(np.prod(extents, initial=1)), index_mask(n, extents)
         assert (mask + 1) & mask == 0 and (mask + 1) * numbers <= 2**31 < 2 * (mask + 1) * numbers * 2

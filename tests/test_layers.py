@@ -1,11 +1,11 @@
-"""The package's shape, read from its source without running it:
+"""The package's structure, read from its source without running it:
 
-* what stands left in ORDER imports nothing of what stands right of it, and collision and contact never meet;
-* only backend/runtime.py starts Taichi, only backend/private.py touches its private parts; records, meshes, scenes and reports
-  know nothing of Taichi;
-* nothing evaluates text, unpickles or starts a shell, and Taichi's faulty 3x3 decompositions stay unused;
-* no kernel file postpones its annotations, which Taichi cannot compile;
-* a public name is never the name of a module too, since importing the module would replace it.
+* imports go one way, from right to left in ORDER, and collision and contact do not import each other;
+* only backend/runtime.py initialises Taichi, only backend/private.py imports its private modules, and meshes, scenes and records
+  do not import Taichi at all;
+* nothing evaluates text, unpickles or starts a shell, and Taichi's faulty 3x3 decompositions are not used;
+* no file with kernels postpones its annotations, since Taichi cannot compile them;
+* no public name is also a module's name, since importing the module would replace it.
 """
 
 import ast
@@ -18,7 +18,7 @@ import taisoft
 PACKAGE = Path(taisoft.__file__).parent
 FILES = sorted(path for path in PACKAGE.rglob("*.py"))
 
-# Modules and packages under taisoft/, left to right; those of one group may import one another unless FOREIGN says otherwise.
+# Modules and packages under taisoft/, left to right; those of one group may import one another, except the pairs in FORBIDDEN.
 ORDER = (
     ("errors", "records", "files", "machine", "compile_message"),
     ("attributes",),
@@ -45,8 +45,8 @@ ORDER = (
     ("__main__",),
 )
 LEVEL = {name: level for level, group in enumerate(ORDER) for name in group}
-OWN_TEXT = {(file, call) for file in ("structure.py", "tracing.py") for call in ("compile", "exec")}  # of functions' own source
-FOREIGN = {("mesh", "scene"), ("collision", "contact"), ("contact", "collision")}  # (importer, imported) of one group
+ALLOWED_CALLS = {(file, call) for file in ("structure.py", "tracing.py") for call in ("compile", "exec")}  # of functions' source
+FORBIDDEN = {("mesh", "scene"), ("collision", "contact"), ("contact", "collision")}  # (importer, imported) within a group
 
 WITHOUT_TAICHI = {"errors", "records", "files", "machine", "compile_message", "attributes", "mesh", "scene"}
 FAULTY = {"ti.svd", "ti.sym_eig", "ti.polar_decompose"}
@@ -94,22 +94,21 @@ def each_file(test):
 
 
 @each_file
-def test_left_imports_nothing_of_right(path):
+def test_imports_go_one_way(path):
     if parts_of(path) in ((), ("backend",), ("fem",)):
-        return  # taisoft/__init__.py imports nothing until a name is asked for, see below
+        return  # taisoft/__init__.py imports lazily, see below
     own = place_of(parts_of(path))
-    assert own, f"taisoft/{'/'.join(parts_of(path))} has no place in ORDER yet: give it one"
+    assert own, f"taisoft/{'/'.join(parts_of(path))} is missing in ORDER"
     for name in imports(path):
         package, *parts = name.split(".")
         other = place_of(tuple(parts)) if package == "taisoft" else None
         if other is None or other == own:
             continue
-        assert LEVEL[other] <= LEVEL[own], f"{path.name} imports taisoft.{other}, which stands right of it"
-        assert (own, other) not in FOREIGN, f"{path.name} imports taisoft.{other}"
+        assert LEVEL[other] <= LEVEL[own], f"{path.name} imports taisoft.{other}, which is right of it in ORDER"
+        assert (own, other) not in FORBIDDEN, f"{path.name} imports taisoft.{other}"
 
 
-def test_import_scan_sees_every_form(tmp_path, monkeypatch):
-    """The scan behind the layer test finds absolute, relative and nested imports."""
+def test_the_import_scan_finds_absolute_relative_and_nested_imports(tmp_path, monkeypatch):
     (tmp_path / "mesh").mkdir()
     path = tmp_path / "mesh" / "a.py"
     path.write_text("import taisoft.cli.run\nfrom . import b\nfrom ..scene import plan\ndef f():\n    from taisoft import view\n")
@@ -118,35 +117,35 @@ def test_import_scan_sees_every_form(tmp_path, monkeypatch):
 
 
 @each_file
-def test_taichi_stays_where_it_belongs(path):
+def test_taichi_is_used_only_where_allowed(path):
     if parts_of(path)[:1] and parts_of(path)[0] in WITHOUT_TAICHI:
         assert not [name for name in imports(path) if name.split(".")[0] == "taichi"]
     if path != PACKAGE / "backend" / "private.py":
-        assert not [name for name in imports(path) if name.startswith("taichi.")], "Taichi's private parts: by backend/private.py"
+        assert not [name for name in imports(path) if name.startswith("taichi.")], "use backend/private.py"
     if path != PACKAGE / "backend" / "runtime.py":
         assert not [line for name, line, _ in calls(path) if name == "ti.init"]
 
 
 @each_file
-def test_nothing_runs_text_or_starts_a_shell(path):
+def test_nothing_evaluates_text_unpickles_or_starts_a_shell(path):
     modules = {name.split(".")[0] for name in imports(path)}
     assert not modules & FORBIDDEN_MODULES
     for name, line, node in calls(path):
-        assert name not in FORBIDDEN_CALLS or (path.name, name) in OWN_TEXT, f"line {line} calls {name}"
+        assert name not in FORBIDDEN_CALLS or (path.name, name) in ALLOWED_CALLS, f"line {line} calls {name}"
         for keyword in node.keywords:
             is_false = isinstance(keyword.value, ast.Constant) and keyword.value.value is False
             assert keyword.arg not in ("shell", "allow_pickle") or is_false, f"line {line}: {keyword.arg} is not False"
-        if name.startswith(("np.load", "numpy.load")):  # the default, said
+        if name.startswith(("np.load", "numpy.load")):  # explicitly False
             assert "allow_pickle" in [keyword.arg for keyword in node.keywords], f"line {line}: {name} without allow_pickle"
 
 
 @each_file
-def test_kernel_files_keep_their_annotations(path):
+def test_kernel_files_do_not_postpone_annotations(path):
     names = imports(path)
     assert not ("taichi" in names and "__future__.annotations" in names)
 
 
-def test_importing_the_package_loads_nothing_heavy():
+def test_the_package_imports_lazily():
     assert imports(PACKAGE / "__init__.py") == ["os", "importlib", "importlib.import_module"]
 
 

@@ -1,4 +1,4 @@
-"""Timing: the median, minimum and spread are those of the repeats; machine and versions are named."""
+"""Statistics of repeated timings, and the description of machine and package versions."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from taisoft.machine import machine, summarise, time_repeats, versions
 
 
-def test_timing_of_repeats():
+def test_statistics_of_repeated_timings():
     t = summarise([4.0, 1.0, 2.0, 3.0, 5.0])
     assert (t.median, t.minimum, t.maximum, t.repeats) == (3.0, 1.0, 5.0, 5)
     assert t.spread == pytest.approx(2 / 3)
@@ -15,7 +15,7 @@ def test_timing_of_repeats():
     assert time_repeats(lambda: sum(range(1000)), 3).minimum > 0
 
 
-def test_machine_and_versions_are_named():
+def test_processor_cores_and_package_versions():
     assert machine()["processor"] and machine()["cores"] >= 1
     found = versions("numpy", "no-such-package")
     assert found["numpy"] == np.__version__ and found["no-such-package"] is None

@@ -1,10 +1,10 @@
-"""What the manual and the README promise:
+"""The manual and the README:
 
-* every example is a block of a kind that `make docs` runs, compiles, and names options that exist;
-* every public name, every argument of a Simulator and every value that it may have is in the API reference;
-* every command, option and key of the window is on the page of the command line, and no other;
-* every integrator and law has its row where one chooses;
-* links between files lead somewhere, the README is short, and pictures are small.
+* every example is of a kind that `make docs` runs, compiles, and uses only options that exist;
+* the API reference lists every public name, every argument of a Simulator and all its values;
+* the page of the command line lists exactly the commands, options and keys that exist;
+* every integrator and law has a row in the tables for choosing one;
+* links and file names exist, the README is short, and images are small.
 """
 
 import argparse
@@ -27,11 +27,13 @@ from taisoft.settings import IMPLICIT_CONTACT, Settings
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted(path for path in DOCS.rglob("*.md") if "results" not in path.relative_to(DOCS).parts)
-RUN = {"python", "toml", "sh", "console"}  # kinds of blocks that docs/conftest.py runs or reads
-SHOWN = {"text", "{toctree}", "{literalinclude}", "{eval-rst}"}  # that are no examples
-EXAMPLES = {"my_scene.py", "drop.py", "taisoft/fem/laws/modified_svk.py"}  # files that a reader writes
-KEYS = {" ": "Space", "Escape": "Escape", "Right": "right arrow"}  # as the page calls them
+TESTED = {"python", "toml", "sh", "console"}  # kinds of blocks that docs/conftest.py runs or checks
+UNTESTED = {"text", "{toctree}", "{literalinclude}", "{eval-rst}"}  # kinds of blocks that are not examples
+READERS_FILES = {"my_scene.py", "drop.py", "taisoft/fem/laws/modified_svk.py"}  # written by the reader
+KEYS = {" ": "Space", "Escape": "Escape", "Right": "right arrow"}  # names on the page
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(DOCS)))
+DOCUMENTS = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+each_document = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
 
 
 def text(name: str) -> str:
@@ -53,28 +55,26 @@ def runner():
 
 
 @each_page
-def test_examples(page, runner):
-    """All blocks are of known kinds, and what the runner finds is all of those it must run."""
+def test_all_examples_are_tested_and_compile(page, runner):
     content = page.read_text(encoding="utf-8")
     kinds = re.findall(r"^ *```(\S+)", content, re.MULTILINE)
-    assert set(kinds) <= RUN | SHOWN
-    found = list(runner.SYBIL.parse(page).examples())
-    assert len(found) == sum(kind in RUN for kind in kinds)
+    assert set(kinds) <= TESTED | UNTESTED
+    assert len(list(runner.SYBIL.parse(page).examples())) == sum(kind in TESTED for kind in kinds)
     for code in re.findall(r"^```python\n(.*?)^```", content, re.DOTALL | re.MULTILINE):
         compile(code, str(page), "exec")
 
 
-@pytest.mark.parametrize("path", [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=lambda path: path.name)
-def test_commands_name_options_that_exist(path, runner):
+@each_document
+def test_commands_use_options_that_exist(path, runner):
     for block in re.findall(r"^```(?:console|sh)?\n(.*?)^```", path.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE):
         runner.check_commands(block)
 
 
-@pytest.mark.parametrize("path", [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=lambda path: path.name)
-def test_links_lead_somewhere(path):
+@each_document
+def test_link_targets_exist(path):
     links = re.findall(r"\]\(([^)#\s]+)", path.read_text(encoding="utf-8"))
     for link in links:
-        if "://" not in link and not re.fullmatch(r"[a-z-]+", link):  # a label is checked by Sphinx
+        if "://" not in link and not re.fullmatch(r"[a-z-]+", link):  # Sphinx checks labels
             assert (path.parent / link).exists(), link
 
 
@@ -82,7 +82,7 @@ def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
 
 
-def test_pictures_are_small():
+def test_images_are_small():
     sizes = [path.stat().st_size for path in DOCS.rglob("*.png") if "results" not in path.relative_to(DOCS).parts]
     assert sizes and max(sizes) <= 60_000 and sum(sizes) <= 500_000
 
@@ -92,7 +92,7 @@ def test_every_public_name_is_in_the_reference():
     assert sorted(listed) == sorted(set(ts.__all__) - {"__version__"})
 
 
-def test_arguments_of_a_simulator():
+def test_the_reference_lists_the_arguments_of_a_simulator():
     rows = re.findall(r"^\| `(\w+)` \| (.*) \|(.*)\|$", section("api.md", "Simulator"), re.MULTILINE)
     parameters = inspect.signature(ts.Simulator).parameters
     assert [name for name, _, _ in rows] == list(parameters)
@@ -104,37 +104,37 @@ def test_arguments_of_a_simulator():
     assert set(Settings.__dataclass_fields__) == set(parameters) - {"scene"}
 
 
-def test_help_lists_the_allowed_values():
+def test_the_docstring_of_a_simulator_lists_the_allowed_values():
     names = set(re.findall(r'"(\w+)"', ts.Simulator.__doc__))
     assert names == {"auto", "f32", "f64", "cpu", "cuda", *INTEGRATORS, *SOLVERS, *IMPLICIT_CONTACT}
     assert dir(ts) == sorted(ts.__all__)
 
 
-def test_methods_of_a_simulator():
+def test_the_reference_lists_the_methods_of_a_simulator():
     listed = re.search(r"autoclass:: taisoft\.Simulator\n +:members: (.*)", text("api.md"))[1].split(", ")
     own = {name for name in dir(ts.Simulator) if not name.startswith("_")}
     assert set(listed) <= own and own - set(listed) <= {"from_checkpoint", "draggable", "dragged"}
 
 
 @pytest.mark.skipif(not (DOCS.parent / ".git").exists() or shutil.which("git") is None, reason="needs a git checkout")
-def test_the_cylinder_applies():
+def test_the_cylinder_patch_applies():
     command = ["git", "apply", "--check", "docs/examples/cylinder.diff"]
     done = subprocess.run(command, cwd=DOCS.parent, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
-def test_files_that_are_named_exist():
+def test_named_files_exist():
     folders = ("taisoft", "benchmarks", "tests", "demos", "docs", "assets")
     own = {path.name for folder in folders for path in (ROOT / folder).rglob("*.py")}
     for page in PAGES:
         named = re.findall(r"`([\w./]+)`", page.read_text(encoding="utf-8"))
         missing = {name for name in named if name.split("/")[0] in folders and "/" in name and not (ROOT / name).exists()}
         missing |= {name for name in named if name.endswith(".py") and name != ".py" and Path(name).name not in own}
-        missing = {name for name in missing - EXAMPLES if "NAME" not in name}  # which stands for the reader's own
+        missing = {name for name in missing - READERS_FILES if "NAME" not in name}  # a placeholder
         assert not missing, f"{page.name}: {missing}"
 
 
-def test_where_one_chooses():
+def test_integrators_and_laws_have_rows_in_the_choosing_tables():
     for heading, names in (("Integrators", INTEGRATORS), ("Material law", LAWS)):
         rows = re.findall(r"^\| `(\w+)` \|", section("choosing.md", heading), re.MULTILINE)
         assert sorted(rows) == sorted(names)
@@ -145,7 +145,7 @@ def commands() -> dict[str, argparse.ArgumentParser]:
     return action.choices
 
 
-def test_options_of_the_command():
+def test_the_page_lists_the_options_of_the_command():
     page = text("cli.md")
     for name in commands():
         assert f"`taisoft {name}`" in page or f"taisoft {name} " in page or f"`{name}`" in page, name
@@ -158,7 +158,7 @@ def test_options_of_the_command():
     assert set(re.findall(r"`(--[\w-]+)", page)) <= known | {"--version"}
 
 
-def test_keys_of_the_window():
+def test_the_page_lists_the_keys_of_the_window():
     from taisoft.view.window import KEYS as keys
 
     rows = re.findall(r"^\| (.*?) \|", section("cli.md", "The live window"), re.MULTILINE)[2:]

@@ -1,9 +1,9 @@
-"""3x3 matrices over lanes, in f32 and f64, with one lane and with four:
+"""3x3 matrices over SIMD lanes, in f32 and f64, with one lane and with four:
 
-* products, cofactor and its differential, determinant and double contraction are NumPy's;
-* the signed SVD gives F back from two rotations and sorted values, all to a few roundings, and the last value is
-  negative exactly for inverted F: random, repeated, rank-deficient, zero, tiny, huge and extremely stretched F;
-* the clamped symmetric matrix is the one with NumPy's negative eigenvalues set to 0.
+* products, cofactor and its differential, determinant and double contraction equal NumPy's;
+* the signed SVD reproduces F from two rotations and sorted values to a few roundings, and the last value is negative exactly
+  for inverted F; F is random, rank-deficient, zero, tiny, huge, extremely stretched, or has repeated values;
+* the clamped symmetric matrix is that of NumPy with negative eigenvalues set to 0.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ from matrices import MATRICES
 from taisoft.backend.runtime import kernel
 from taisoft.fem import math3
 
-SWEEPS = 5  # as many as the laws use
+SWEEPS = 5  # as in the laws
 
 
 @kernel
@@ -44,26 +44,26 @@ def machine(request):
         yield runtime
 
 
-def test_products_are_numpys(machine):
+def test_products_equal_those_of_numpy(machine):
     rng = np.random.default_rng(1)
     F, D = rng.standard_normal((2, 102, 3, 3))
     F, D = (A.astype(machine.np_real).astype(np.float64) for A in (F, D))
     G, h = oracle.cofactor(F), 1e-30
     dG = oracle.cofactor(F + 1j * h * D).imag / h
-    parts = [F @ D, F @ oracle.transposed(D), oracle.transposed(F) @ D, G, dG]
+    matrices = [F @ D, F @ oracle.transposed(D), oracle.transposed(F) @ D, G, dG]
     scalars = [np.linalg.det(F), np.sum(F * D, axis=(1, 2))]
-    expected = np.concatenate([p.reshape(-1, 9) for p in parts] + [s[:, None] for s in scalars], axis=1)
+    expected = np.concatenate([M.reshape(-1, 9) for M in matrices] + [s[:, None] for s in scalars], axis=1)
     for lanes in (4, 1):
         A, B = packed(F, lanes, machine.np_real), packed(D, lanes, machine.np_real)
         out = np.zeros((len(A), expected.shape[1], lanes), machine.np_real)
         products(lanes, A, B, out)
-        # sums of at most 18 products of numbers up to 4 in size
+        # sums of at most 18 products of numbers of size up to 4
         assert np.abs(unpacked(out, len(F)) - expected).max() < 50 * machine.eps
 
 
 @pytest.fixture(scope="module")
 def decomposed(machine):
-    """kind -> (F, U, s, V, S, clamped S) with four lanes, and the same with one; S is F's symmetric part."""
+    """(kind, lanes) -> F, U, s, V, S, clamped S, where S is the symmetric part of F."""
     results = {}
     for lanes in (4, 1):
         for kind, F in MATRICES.items():
@@ -79,7 +79,7 @@ def decomposed(machine):
 
 
 def largest(A) -> np.ndarray:
-    """Largest entry of each matrix, by which its errors are measured; 1 for a zero matrix."""
+    """Largest entry of each matrix, the scale of its errors; 1 for a zero matrix."""
     size = np.abs(A).max(axis=(1, 2))
     return np.where(size > 0, size, 1.0)
 
@@ -88,7 +88,7 @@ def largest(A) -> np.ndarray:
 def test_signed_svd(machine, decomposed, kind):
     for lanes in (4, 1):
         F, U, s, V, _, _ = decomposed[kind, lanes]
-        size, eps = largest(F), 25 * machine.eps  # five sweeps of rotations, a few roundings each; 14 was the most seen
+        size, eps = largest(F), 25 * machine.eps  # five sweeps of rotations, a few roundings each; 14 eps was observed
         for Q in (U, V):
             assert np.abs(oracle.transposed(Q) @ Q - np.eye(3)).max() < eps
             assert np.abs(np.linalg.det(Q) - 1).max() < eps
@@ -99,8 +99,7 @@ def test_signed_svd(machine, decomposed, kind):
         assert np.array_equal(s[clear, 2] < 0, np.linalg.det(F / size[:, None, None])[clear] < 0)
 
 
-def test_the_matrices_hold_what_they_should():
-    """The cases above are active: some inverted, some flat, some with alike stretches, some a million times as long."""
+def test_the_matrices_include_inverted_flat_isotropic_and_extremely_stretched_ones():
     F = np.concatenate([A / largest(A)[:, None, None] for A in MATRICES.values()])
     s = oracle.signed_svd(F)[1]
     assert (s[:, 2] < -1e-3).sum() > 1000 and (np.abs(s[:, 2]) < 1e-14).sum() > 1000

@@ -1,8 +1,8 @@
-"""How a text file is encoded changes nothing:
+"""Encodings of mesh, surface and scene files:
 
-* a byte-order mark and Windows' line ends give the same mesh, surface and scene, with the same warnings;
-* of UTF-16 text a sentence says what to do, unless it is XML, whose readers know it;
-* what only looks like a mark, in a binary file, is data.
+* a byte-order mark and Windows line ends give the same mesh, surface and scene, with the same warnings;
+* UTF-16 text is refused with advice, except XML, whose readers support it;
+* bytes of a binary file that look like a byte-order mark are data.
 """
 
 import warnings
@@ -40,20 +40,20 @@ MARK = b"\xef\xbb\xbf"
 
 
 def outcome(read, path) -> tuple:
-    """What a reader makes of a file: arrays, or a message; and its warnings."""
-    with warnings.catch_warnings(record=True) as told:
+    """The arrays or the error message of a reader, and its warnings."""
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             mesh = read(path)
         except ts.TaisoftError as error:
-            made = str(error)
+            result = str(error)
         else:
-            made = (mesh.vertices.tolist(), mesh.tets.tolist() if read is ts.read_mesh else mesh.triangles.tolist())
-    return made, [str(one.message) for one in told]
+            result = (mesh.vertices.tolist(), mesh.tets.tolist() if read is ts.read_mesh else mesh.triangles.tolist())
+    return result, [str(warning.message) for warning in caught]
 
 
 def written(folder: Path, ending: str) -> Path:
-    """A file of that ending as meshio writes it, with triangles of the surface next to tets where the format has both."""
+    """A file as meshio writes it; some formats with surface triangles beside the tets."""
     if ending in SURFACES:
         return write_by_meshio(folder / f"part{ending}", [("triangle", MESH.surface)], **SURFACES[ending])
     both = [("triangle", MESH.surface)] if ending in (".vtk", "2.msh") else []
@@ -61,10 +61,10 @@ def written(folder: Path, ending: str) -> Path:
 
 
 @pytest.mark.parametrize("ending", [*MESHES, *SURFACES])
-def test_marks_and_line_ends_change_nothing(tmp_path, ending):
+def test_byte_order_marks_and_line_ends_change_nothing(tmp_path, ending):
     path = written(tmp_path, ending)
     read = ts.read_surface if ending in SURFACES else ts.read_mesh
-    files = {file: file.read_bytes().replace(b"\r\n", b"\n") for file in tmp_path.iterdir()}  # TetGen's are two
+    files = {file: file.read_bytes().replace(b"\r\n", b"\n") for file in tmp_path.iterdir()}  # two files of TetGen
     for file, data in files.items():
         file.write_bytes(data)
     plain = outcome(read, path)
@@ -74,12 +74,12 @@ def test_marks_and_line_ends_change_nothing(tmp_path, ending):
             for file, data in files.items():
                 file.write_bytes(mark + data.replace(b"\n", ends))
             assert outcome(read, path) == plain
-    if read is ts.read_surface:  # and the triangles of no tets are counted
+    if read is ts.read_surface:
         with pytest.raises(ts.MeshError, match=f"no tetrahedra; {len(MESH.surface)} (triangles|faces) found"):
             ts.read_mesh(path)
 
 
-def test_a_marked_file_that_is_broken_is_told_alike(tmp_path):
+def test_a_byte_order_mark_does_not_change_errors(tmp_path):
     broken = {"a.vtk": b"nonsense", "a.msh": b"$MeshFormat\n4.1 0 8\n", "a.obj": b"v 0 0\n", "a.off": b"OFF\n1\n"}
     for name, content in broken.items():
         read = ts.read_surface if name in ("a.obj", "a.off") else ts.read_mesh
@@ -93,16 +93,16 @@ def test_a_marked_file_that_is_broken_is_told_alike(tmp_path):
 
 
 @pytest.mark.parametrize("codec", ["utf-16", "utf-16-le", "utf-16-be"])
-def test_utf16_is_refused_with_what_to_do(tmp_path, codec):
-    said = "part.*: the file is UTF-16 text; save it as UTF-8$"
+def test_utf16_text_is_refused_with_advice(tmp_path, codec):
+    message = "part.*: the file is UTF-16 text; save it as UTF-8$"
     for ending in (".msh", ".vtk", ".mesh", ".obj", ".stl", ".ply", ".off"):
         path = written(tmp_path, ending)
         path.write_bytes(path.read_bytes().decode("latin-1").encode(codec))
-        with pytest.raises(ts.MeshError, match=said):
+        with pytest.raises(ts.MeshError, match=message):
             (ts.read_surface if ending in SURFACES else ts.read_mesh)(path)
     for file in (tmp_path / "part.node", written(tmp_path, ".ele")):
         file.write_text(file.read_text(), encoding=codec)
-        with pytest.raises(ts.MeshError, match=said):
+        with pytest.raises(ts.MeshError, match=message):
             ts.read_mesh(tmp_path / "part.node")
     (tmp_path / "scene.toml").write_text(SCENE.format("a.msh"), encoding=codec)
     with pytest.raises(ts.SceneError, match="scene.toml: the file is UTF-16 text; save it as UTF-8$"):
@@ -116,7 +116,7 @@ def test_utf16_xml_is_read(tmp_path):
     assert outcome(ts.read_mesh, path) == plain
 
 
-def test_scene_files(tmp_path):
+def test_scene_files_may_have_byte_order_marks_and_windows_line_ends(tmp_path):
     text = '[bodies."µ"]\nmaterial = {}\nmesh = { file = "a.msh" }\n'
     ts.write_mesh(tmp_path / "a.msh", MESH)
     for data in (text.encode(), MARK + text.encode(), MARK + text.replace("\n", "\r\n").encode()):
@@ -125,7 +125,7 @@ def test_scene_files(tmp_path):
         assert body.name == "µ" and np.array_equal(body.rest_positions, MESH.vertices)
 
 
-def test_what_only_looks_like_a_mark_is_data(tmp_path):
+def test_byte_order_marks_in_binary_data_are_data(tmp_path):
     path = write_by_meshio(tmp_path / "a.stl", [("triangle", MESH.surface)], binary=True)
     plain = outcome(ts.read_surface, path)
     for mark in (MARK, b"\xff\xfe"):

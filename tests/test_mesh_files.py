@@ -1,10 +1,9 @@
-"""What reading and writing meshes promises:
+"""Reading and writing of meshes (test_fuzz.py: random and mutated files):
 
-* what is written is read back bit for bit; a writing that fails leaves no file and no part of one;
-* Gmsh's versions and formats, TetGen's pairs and meshio's formats give the same mesh;
-* a file cut off, changed, random, empty or of another kind gives a MeshError that starts with its name, with the line
-  where it can be had, whatever the reader behind it does: it never ends the program, prints, hangs or takes memory;
-* other elements are refused by name and number, boundary elements and loose vertices are told, welding merges.
+* written meshes are read back bitwise; a failed write leaves no file;
+* Gmsh's versions, TetGen's pairs and meshio's formats give the same mesh;
+* a truncated, inconsistent, empty or unsupported file gives a MeshError that starts with its name and gives the line if known;
+* other elements are refused by name and number; boundary elements and unused vertices cause warnings; welding merges vertices.
 """
 
 import contextlib
@@ -18,8 +17,6 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from taisoft.errors import MeshError, OutputError
 from taisoft.mesh.files import WRITERS, read_mesh, write_mesh
@@ -28,35 +25,19 @@ from taisoft.mesh.tet_mesh import TetMesh
 
 MESH = box_mesh((2, 1, 1), (0.3, 0.1, 1.0 / 3.0), center=(0.1, 0.2, 0.3))
 
-# Endings that are read without further packages.
-FORMATS = (
-    ".msh",
-    ".vtk",
-    ".vtu",
-    ".mesh",
-    ".meshb",
-    ".inp",
-    ".avs",
-    ".xml",
-    ".vol",
-    ".su2",
-    ".dat",
-    ".mdpa",
-    ".f3grid",
-    ".post",
-    ".ele",
-)
+# endings that need no further packages
+FORMATS = ".msh .vtk .vtu .mesh .meshb .inp .avs .xml .vol .su2 .dat .mdpa .f3grid .post .ele".split()
 
 
 def write_by_meshio(path: Path, cells, points=MESH.vertices, **options) -> Path:
-    """A file as meshio writes it. cells: list of (type, (k,nodes) indices)."""
+    """A file written by meshio. cells: list of (type, (k,nodes) indices)."""
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         meshio.write(path, meshio.Mesh(points, cells), **options)
     return path
 
 
 def gmsh_text(tmp_path: Path, mesh: TetMesh = MESH) -> tuple[Path, str]:
-    """A good text file, and its content."""
+    """A valid text file, and its content."""
     path = tmp_path / "part.msh"
     write_mesh(path, mesh)
     return path, path.read_text()
@@ -67,16 +48,16 @@ def same(mesh: TetMesh) -> bool:
 
 
 @pytest.mark.parametrize("ending", sorted(WRITERS))
-def test_written_meshes_come_back_bit_for_bit(tmp_path, ending):
+def test_written_meshes_are_read_back_bitwise(tmp_path, ending):
     path = tmp_path / f"part{ending}"
-    write_mesh(path, ball_mesh(1.0, 2))  # to be replaced
+    write_mesh(path, ball_mesh(1.0, 2))  # replaced below
     write_mesh(str(path), MESH)
     mesh = read_mesh(path)
     assert same(mesh) and mesh.warnings == [] and mesh.source == str(path)
     assert os.listdir(tmp_path) == [path.name]
 
 
-def test_writing_that_fails_leaves_nothing(tmp_path, monkeypatch):
+def test_a_failed_write_leaves_no_file(tmp_path, monkeypatch):
     with pytest.raises(OutputError, match="cannot write .*absent/part.msh: No such file"):
         write_mesh(tmp_path / "absent" / "part.msh", MESH)
 
@@ -89,7 +70,7 @@ def test_writing_that_fails_leaves_nothing(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == []
 
 
-def test_writing_refuses_other_endings_and_things(tmp_path):
+def test_writing_refuses_unknown_endings_and_objects(tmp_path):
     with pytest.raises(MeshError, match="can be written as .msh, .vtk, .vtu, .mesh, not with the ending '.stl'"):
         write_mesh(tmp_path / "part.stl", MESH)
     with pytest.raises(MeshError, match="needs a TetMesh, not tuple"):
@@ -108,7 +89,7 @@ def test_formats_give_the_same_mesh(tmp_path, ending, capfd):
 
 @pytest.mark.parametrize("version", ["gmsh22", "gmsh", "ansys"])
 @pytest.mark.parametrize("binary", [False, True])
-def test_msh_versions_and_kinds_give_the_same_mesh(tmp_path, version, binary):
+def test_msh_versions_give_the_same_mesh(tmp_path, version, binary):
     path = write_by_meshio(tmp_path / "part.msh", [("tetra", MESH.tets)], file_format=version, binary=binary)
     assert same(read_mesh(path))
 
@@ -139,8 +120,8 @@ def test_big_endian_binary(tmp_path):
     assert same(read_mesh(path))
 
 
-def test_tetgen_counts_from_zero_or_one(tmp_path):
-    (tmp_path / "t.node").write_text("# made by hand\n4 3 1 0 # head\n\n1 0 0 0 9\n2 1 0 0 9\n3 0 1 0 9 # far\n4 0 0 1 9\n")
+def test_tetgen_files_count_from_one_and_must_be_consistent(tmp_path):
+    (tmp_path / "t.node").write_text("# comment\n4 3 1 0 # head\n\n1 0 0 0 9\n2 1 0 0 9\n3 0 1 0 9 # third\n4 0 0 1 9\n")
     (tmp_path / "t.ele").write_text("1 4 0\n1 1 2 3 4\n")
     assert read_mesh(tmp_path / "t.node").tets.tolist() == [[0, 1, 2, 3]]
     (tmp_path / "t.ele").write_text("1 4 0\n1 1 2 3\n")
@@ -155,53 +136,48 @@ def test_tetgen_counts_from_zero_or_one(tmp_path):
 
 
 @pytest.mark.parametrize("ending, other", [(".node", ".ele"), (".ele", ".node")])
-def test_the_other_of_tetgens_pair_is_a_pipe(tmp_path, ending, other):
-    """Nobody writes into it: to open it would be to wait for ever."""
+def test_a_pipe_in_place_of_tetgens_other_file_is_refused(tmp_path, ending, other):
+    """Nothing writes to the pipe, so that opening it would block."""
     pipe = tmp_path / f"t{other}"
     os.mkfifo(pipe)
     (tmp_path / f"t{ending}").write_text("4 3\n0 0 0 0\n1 1 0 0\n2 0 1 0\n3 0 0 1\n" if ending == ".node" else "1 4\n0 0 1 2 3\n")
-    end = threading.Timer(5.0, lambda: os.close(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)))
-    end.start()
+    unblock = threading.Timer(5.0, lambda: os.close(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)))
+    unblock.start()
     try:
         with pytest.raises(MeshError, match=f"t{other}: this is not a file; TetGen's files come in pairs"):
             read_mesh(tmp_path / f"t{ending}")
     finally:
-        end.cancel()
+        unblock.cancel()
 
 
-# Files that hold no good mesh
+# invalid files
 
 
-def test_surfaces_are_counted(tmp_path):
+def test_surfaces_without_tets_are_refused_with_their_triangle_count(tmp_path):
+    """Text formats of surfaces: test_mesh_content.py."""
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1/1 3/2 2/3\n")
     with pytest.raises(MeshError, match="a.obj: no tetrahedra; 2 triangles found; make a volume mesh first"):
         read_mesh(tmp_path / "a.obj")
-    for ending, binary in ((".stl", True), (".stl", False), (".ply", True), (".ply", False)):
-        write_by_meshio(tmp_path / f"a{ending}", [("triangle", MESH.surface)], binary=binary)
-        with pytest.raises(MeshError, match=rf"no tetrahedra; {len(MESH.surface)} (triangles|faces) found"):
-            read_mesh(tmp_path / f"a{ending}")
-    write_by_meshio(tmp_path / "a.off", [("triangle", MESH.surface)])
-    with pytest.raises(MeshError, match=f"no tetrahedra; {len(MESH.surface)} faces found"):
-        read_mesh(tmp_path / "a.off")
-    for ending in (".vtk", ".vtu", ".mesh", ".inp"):
-        write_by_meshio(tmp_path / f"a{ending}", [("triangle", MESH.surface)])
-        with pytest.raises(MeshError, match=f"no tetrahedra; {len(MESH.surface)} triangles found; make a volume mesh"):
-            read_mesh(tmp_path / f"a{ending}")
+    for ending in (".stl", ".ply", ".vtk", ".vtu", ".mesh", ".inp"):
+        options = {"binary": True} if ending in (".stl", ".ply") else {}
+        path = write_by_meshio(tmp_path / f"a{ending}", [("triangle", MESH.surface)], **options)
+        with pytest.raises(MeshError, match=f"no tetrahedra; {len(MESH.surface)} (triangles|faces) found; make a volume mesh"):
+            read_mesh(path)
 
 
 @pytest.mark.parametrize(
-    "kind, nodes, said", [("quad", 4, "2 quads"), ("hexahedron", 8, "2 hexahedra"), ("pyramid", 5, "2 pyramid elements")]
+    "kind, nodes, named", [("quad", 4, "2 quads"), ("hexahedron", 8, "2 hexahedra"), ("pyramid", 5, "2 pyramid elements")]
 )
 @pytest.mark.parametrize("ending", [".vtk", ".msh"])
-def test_other_elements_are_refused_by_name_and_number(tmp_path, kind, nodes, said, ending):
+def test_other_elements_are_refused_by_name_and_number(tmp_path, kind, nodes, named, ending):
     cells = [(kind, np.arange(2 * nodes).reshape(2, nodes) % 12), ("tetra", MESH.tets)]
     options = {"file_format": "gmsh22", "binary": False} if ending == ".msh" else {}
     path = write_by_meshio(tmp_path / f"part{ending}", cells, **options)
-    with pytest.raises(MeshError, match=f"only tetrahedra with four or ten nodes can be used, but the file holds {said}$"):
+    with pytest.raises(MeshError, match=f"only tetrahedra with four or ten nodes can be used, but the file holds {named}$"):
         read_mesh(path)
 
 
-def test_boundary_elements_and_loose_vertices_are_told(tmp_path):
+def test_boundary_elements_and_unused_vertices_cause_warnings(tmp_path):
     points = np.vstack([[(9.0, 9, 9)], MESH.vertices, [(8.0, 8, 8)]])
     cells = [("line", [[1, 2], [2, 3]]), ("triangle", MESH.surface + 1), ("tetra", MESH.tets + 1)]
     path = write_by_meshio(tmp_path / "part.vtk", cells, points)
@@ -214,7 +190,7 @@ def test_boundary_elements_and_loose_vertices_are_told(tmp_path):
     ]
 
 
-def test_welding_joins_doubled_vertices(tmp_path):
+def test_welding_merges_close_vertices(tmp_path):
     box = box_mesh((1, 1, 1), (1.0, 1.0, 1.0), pattern="six")
     gap = 1e-4
     points = np.vstack([box.vertices, box.vertices + (1.0 + gap, 0, 0)])
@@ -230,7 +206,7 @@ def test_welding_joins_doubled_vertices(tmp_path):
             read_mesh(path, weld=weld)
 
 
-def test_orientation_is_handed_on(tmp_path):
+def test_inverted_tets_are_refused_or_fixed(tmp_path):
     tets = MESH.tets.copy()
     tets[3] = tets[3, [1, 0, 2, 3]]
     path = write_by_meshio(tmp_path / "part.vtk", [("tetra", tets)])
@@ -240,7 +216,7 @@ def test_orientation_is_handed_on(tmp_path):
         assert read_mesh(path, fix_orientation=True).flipped.tolist() == [3]
 
 
-def test_rules_of_the_mesh_name_the_file(tmp_path):
+def test_errors_of_the_mesh_name_the_file(tmp_path):
     points = MESH.vertices.copy()
     points[7, 2] = np.nan
     path = write_by_meshio(tmp_path / "part.vtk", [("tetra", MESH.tets)], points)
@@ -252,13 +228,13 @@ def test_rules_of_the_mesh_name_the_file(tmp_path):
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    for path, rule in (
+    for path, message in (
         (tmp_path / "absent.msh", "there is no such file"),
         (tmp_path, "this is not a file"),
         (tmp_path / "\0.msh", "."),
         (3, "must be a file's name"),
     ):
-        with pytest.raises(MeshError, match=rule):
+        with pytest.raises(MeshError, match=message):
             read_mesh(path)
     for content in (b"", b"\n \n"):
         (tmp_path / "empty.msh").write_bytes(content)
@@ -269,14 +245,14 @@ def test_files_that_cannot_be_read(tmp_path):
         read_mesh(tmp_path / "notes.txt")
 
 
-def test_a_cut_off_gmsh_file_is_told_with_its_line(tmp_path):
+def test_errors_of_gmsh_files_give_the_line(tmp_path):
     path, text = gmsh_text(tmp_path)
     lines = text.splitlines(keepends=True)
     inside = lines.index("$Elements\n") + 5
     path.write_text("".join(lines[:inside]))
     with pytest.raises(MeshError, match=rf"part.msh: line {inside}: the file ends inside \$Elements, before \$EndElements"):
         read_mesh(path)
-    path.write_text("".join(lines[: inside - 1] + lines[inside:]))  # one element lost
+    path.write_text("".join(lines[: inside - 1] + lines[inside:]))  # without one element
     with pytest.raises(MeshError, match=r"part.msh: line \d+ \(\$Elements\): 50 numbers should follow"):
         read_mesh(path)
     path.write_text("".join(lines[:inside] + ["11 1 x 3 4\n"] + lines[inside + 1 :]))
@@ -287,7 +263,7 @@ def test_a_cut_off_gmsh_file_is_told_with_its_line(tmp_path):
         read_mesh(path)
 
 
-def test_gmsh_nodes_that_do_not_exist_or_come_twice(tmp_path):
+def test_missing_or_repeated_gmsh_nodes_are_refused(tmp_path):
     path, text = gmsh_text(tmp_path)
     lines = text.splitlines(keepends=True)
     first = lines.index("$Elements\n") + 3
@@ -303,99 +279,31 @@ def test_gmsh_nodes_that_do_not_exist_or_come_twice(tmp_path):
 
 @pytest.mark.parametrize("count", [10**9, 10**15, 10**30])
 @pytest.mark.parametrize("ending", [".msh", ".vtk", ".mesh", ".vol", ".su2", ".xml", ".ele", ".dat"])
-def test_absurd_counts_are_refused_at_once(tmp_path, ending, count):
+def test_absurd_counts_are_refused_quickly(tmp_path, ending, count):
     options = {"file_format": "gmsh", "binary": False} if ending == ".msh" else {}
     path = write_by_meshio(tmp_path / f"part{ending}", [("tetra", MESH.tets)], **options)
     data = path.read_bytes()
     assert re.search(rb"\b1[02]\b", data)  # 12 vertices, 10 tets
     path.write_bytes(re.sub(rb"\b1[02]\b", str(count).encode(), data, count=2))
-    start = time.process_time()  # of this process alone, however busy the machine is
+    start = time.process_time()  # does not depend on the load of the machine
     with pytest.raises(MeshError, match="^" + re.escape(str(path))):
         read_mesh(path)
     assert time.process_time() - start < 2.0
 
 
-def check_survives(path: Path) -> None:
-    """A broken file gives a mesh that satisfies the rules, or a MeshError in one line that names the file."""
-    start = time.process_time()
-    try:
-        with contextlib.redirect_stdout(io.StringIO()) as printed:
-            mesh = read_mesh(path)
-    except MeshError as error:
-        assert str(path.with_suffix("")) in str(error) and "\n" not in str(error)
-    else:
-        assert (mesh.volumes > 0).all() and np.isfinite(mesh.vertices).all()
-    assert printed.getvalue() == ""
-    assert time.process_time() - start < 5.0
+@pytest.mark.parametrize("head", [b"", b"$MeshFormat\n4.1 1 8\n\1\0\0\0\n$EndMeshFormat\n$Nodes\n"])
+def test_random_bytes_are_refused(tmp_path, head):
+    path, rng = tmp_path / "mesh.msh", np.random.default_rng(4)
+    for _ in range(50):
+        path.write_bytes(head + rng.bytes(rng.integers(1, 400)))
+        with pytest.raises(MeshError):
+            read_mesh(path)
 
 
-MANY = settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-@MANY
-@given(st.binary(min_size=1, max_size=400), st.sampled_from([b"", b"$MeshFormat\n4.1 1 8\n\1\0\0\0\n$EndMeshFormat\n$Nodes\n"]))
-@pytest.mark.filterwarnings("ignore")
-def test_random_bytes(tmp_path, content, head):
-    path = tmp_path / "mesh.msh"
-    path.write_bytes(head + content)
-    with pytest.raises(MeshError):
-        read_mesh(path)
-
-
-@pytest.fixture(scope="module")
-def samples(tmp_path_factory) -> dict[str, bytes]:
-    """Good files by ending, as bytes; three kinds of .msh."""
-    folder = tmp_path_factory.mktemp("samples")
-    found = {}
-    for ending in FORMATS:
-        options = {"file_format": "gmsh"} if ending == ".msh" else {}
-        found[ending] = write_by_meshio(folder / f"part{ending}", [("tetra", MESH.tets)], **options).read_bytes()
-    for kind in ("gmsh22", "gmsh", "ansys"):
-        path = write_by_meshio(folder / "part.msh", [("tetra", MESH.tets)], file_format=kind, binary=False)
-        found[f"{kind}.msh"] = path.read_bytes()
-    found[".node"] = (folder / "part.node").read_bytes()
-    return found
-
-
-def sample_path(tmp_path: Path, samples: dict[str, bytes], kind: str) -> Path:
-    path = tmp_path / f"part.{kind.rsplit('.', 1)[1]}"
-    for other in (".ele", ".node"):  # TetGen's files are read in pairs
-        path.with_suffix(other).write_bytes(samples[other])
-    return path
-
-
-KINDS = [*FORMATS, "gmsh22.msh", "gmsh.msh", "ansys.msh", ".node"]
-
-
-@MANY
-@given(st.sampled_from(KINDS), st.floats(0.0, 1.0))
-@pytest.mark.filterwarnings("ignore")
-def test_files_cut_off(tmp_path, samples, kind, share):
-    path = sample_path(tmp_path, samples, kind)
-    data = samples[kind]
-    path.write_bytes(data[: int(share * len(data))])
-    check_survives(path)
-
-
-@MANY
-@given(st.sampled_from(KINDS), st.data())
-@pytest.mark.filterwarnings("ignore")
-def test_files_changed_here_and_there(tmp_path, samples, kind, data):
-    path = sample_path(tmp_path, samples, kind)
-    content = bytearray(samples[kind])
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(content) - 1))
-        piece = data.draw(
-            st.sampled_from([b"-1", b"9", b"nan", b"1e400", b" ", b"\n", b"$End", b"\0", b"\xff\xfe", b"999999999"])
-        )
-        content[at : at + data.draw(st.integers(0, 3))] = piece
-    path.write_bytes(content)
-    check_survives(path)
-
-
-@pytest.mark.parametrize("kind", ["gmsh.msh", ".msh", "gmsh22.msh"])
-def test_no_cut_of_a_gmsh_file_gives_a_partial_mesh(tmp_path, samples, kind):
-    path, data = tmp_path / "part.msh", samples[kind].rstrip()
+@pytest.mark.parametrize("version, binary", [("gmsh", False), ("gmsh", True), ("gmsh22", False)])
+def test_truncated_gmsh_files_never_give_a_partial_mesh(tmp_path, version, binary):
+    path = write_by_meshio(tmp_path / "part.msh", [("tetra", MESH.tets)], file_format=version, binary=binary)
+    data = path.read_bytes().rstrip()
     for length in range(0, len(data) - 1, max(1, len(data) // 150)):
         path.write_bytes(data[:length])
         with pytest.raises(MeshError):
@@ -406,9 +314,9 @@ def test_no_cut_of_a_gmsh_file_gives_a_partial_mesh(tmp_path, samples, kind):
     "name, counts",
     [("bar-2523.msh", (886, 2523)), ("bunny.msh", (4670, 19379)), ("sphere1K.msh", (1760, 6851)), ("mat20x20.msh", (800, 2166))],
 )
-def test_meshes_of_others(shared, name, counts):
+def test_meshes_from_other_programs(shared, name, counts):
     mesh = read_mesh(shared / "meshes" / name)
     assert (mesh.n_verts, mesh.n_tets) == counts and mesh.n_components == 1 and mesh.warnings == []
     x = mesh.vertices[mesh.surface]
-    inside = np.einsum("ij,ij->", x[:, 0], np.cross(x[:, 1], x[:, 2])) / 6.0
-    assert inside == pytest.approx(mesh.volumes.sum())
+    enclosed = np.einsum("ij,ij->", x[:, 0], np.cross(x[:, 1], x[:, 2])) / 6.0
+    assert enclosed == pytest.approx(mesh.volumes.sum())

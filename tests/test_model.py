@@ -1,10 +1,10 @@
-"""The arrays of a scene, of linear bodies alone and of linear and quadratic ones:
+"""The device arrays of a scene, with linear bodies alone and with linear and quadratic ones:
 
-* nodes keep the order of the bodies, tets are grouped by kind, no block holds two bodies, padding has no volume;
+* nodes keep the order of the bodies, tets are grouped by kind, no block holds tets of two bodies, padding has no volume;
 * every node of every tet is gathered once;
-* loads are those of the oracle and add up to what was asked for;
-* one lane, as on CUDA, gives the same forces as four;
-* what cannot change while it runs is refused, and nothing is changed then.
+* loads are those of the oracle and add up to the given totals;
+* one lane per block, as on CUDA, gives the same forces as four;
+* material numbers that cannot change at run time are refused, and nothing changes.
 """
 
 import numpy as np
@@ -22,8 +22,8 @@ from taisoft.scene.plan import change_material, make_plan
 
 @pytest.fixture(scope="module", params=[1, "both"])
 def rig(request):
-    with built(mixed_scene(order=request.param), "f64") as made:
-        yield made
+    with built(mixed_scene(order=request.param), "f64") as rig:
+        yield rig
 
 
 def quadratic(rig) -> bool:
@@ -31,7 +31,7 @@ def quadratic(rig) -> bool:
 
 
 def elements(rig, group) -> np.ndarray:
-    """(blocks, lanes, nodes of an element) of a group, from the model's flat array."""
+    """Nodes (blocks, lanes, nodes per element) of a group, from the model's flat array."""
     count = (group.last - group.first) * group.n_nodes * rig.model.lanes
     flat = rig.model.nodes.to_numpy()[group.nodes_at : group.nodes_at + count]
     return flat.reshape(-1, group.n_nodes, rig.model.lanes).transpose(0, 2, 1)
@@ -41,7 +41,7 @@ def test_nodes_and_masses(rig):
     counts = [43, 8, 27, 8] if quadratic(rig) else [12, 8, 8, 8]
     assert list(rig.layout.node_start) == list(np.cumsum([0, *counts])) and rig.model.n_nodes == sum(counts)
     assert [len(rig.layout.rest[rig.layout.nodes(k)]) for k in range(4)] == counts
-    assert np.array_equal(rig.layout.rest, rig.oracle.rest) and rig.layout.rest[0, 0] == 0.0  # placed half a metre on
+    assert np.array_equal(rig.layout.rest, rig.oracle.rest) and rig.layout.rest[0, 0] == 0.0  # position of the body included
     lumped, M = rig.oracle.lumped[:, 0], rig.oracle.mass
     assert rig.model.mass.to_numpy() == pytest.approx(lumped) and lumped_masses(rig.scene) == pytest.approx(lumped)
     assert np.abs(mass_matrix(rig.scene).toarray() - M).max() < 1e-13 * M.max()
@@ -51,7 +51,7 @@ def test_nodes_and_masses(rig):
     assert (rig.model.mass_matrix is not None) == rig.model.consistent == quadratic(rig)
 
 
-def test_the_mass_matrix_on_the_device(rig):
+def test_the_device_mass_matrix_is_consistent(rig):
     if not quadratic(rig):
         assert rig.model.mass_matrix is None
         return
@@ -62,26 +62,25 @@ def test_the_mass_matrix_on_the_device(rig):
     assert np.abs(M - rig.oracle.mass).max() < 1e-13 * M.max()
 
 
-def test_blocks(rig):
-    """Tets of one kind are neighbours; a body's last lanes are copies of its last tet without volume."""
+def test_tets_are_grouped_in_blocks_by_kind_and_body(rig):
+    """A body's last block is padded with tets of no volume."""
     lanes, volume = rig.model.lanes, rig.model.volume.to_numpy()
     body = rig.model.block_body.to_numpy()
     assert lanes == 4 and list(rig.layout.n_tets) == [10, 5, 6, 5] and rig.model.n_blocks == 9
-    found = [(g.order, g.n_points, g.law.NAME, g.first, g.last) for g in rig.model.groups]
+    groups = [(g.order, g.n_points, g.law.NAME, g.first, g.last) for g in rig.model.groups]
     if quadratic(rig):
-        assert found == [(1, 1, SVK, 0, 4), (2, 4, SNH, 4, 7), (2, 14, COR, 7, 9)]
+        assert groups == [(1, 1, SVK, 0, 4), (2, 4, SNH, 4, 7), (2, 14, COR, 7, 9)]
         assert list(body) == [1, 1, 3, 3, 0, 0, 0, 2, 2]
     else:
-        assert found == [(1, 1, SVK, 0, 4), (1, 1, COR, 4, 6), (1, 1, SNH, 6, 9)]
+        assert groups == [(1, 1, SVK, 0, 4), (1, 1, COR, 4, 6), (1, 1, SNH, 6, 9)]
         assert list(body) == [1, 1, 3, 3, 2, 2, 0, 0, 0]
     for g in rig.model.groups:
         for k in set(body[g.first : g.last]):
-            made, blocks = rig.scene.bodies[k], body[g.first : g.last] == k
-            inside = elements(rig, g)[blocks].reshape(-1, g.n_nodes) - rig.layout.node_start[k]
-            here = {tuple(tet) for tet in np.sort(made.nodes.elements, axis=1)}
-            assert {tuple(tet) for tet in np.sort(inside, axis=1)} == here
-            assert (volume[body == k] > 0).sum() == made.mesh.n_tets
-            assert volume[body == k].sum() == pytest.approx(made.mesh.volumes.sum())
+            nodes, mesh, own = rig.scene.bodies[k].nodes, rig.scene.bodies[k].mesh, body[g.first : g.last] == k
+            tets = elements(rig, g)[own].reshape(-1, g.n_nodes) - rig.layout.node_start[k]
+            assert {tuple(tet) for tet in np.sort(tets, axis=1)} == {tuple(tet) for tet in np.sort(nodes.elements, axis=1)}
+            assert (volume[body == k] > 0).sum() == mesh.n_tets
+            assert volume[body == k].sum() == pytest.approx(mesh.volumes.sum())
 
 
 def test_every_node_of_a_tet_is_gathered_once(rig):
@@ -93,11 +92,11 @@ def test_every_node_of_a_tet_is_gathered_once(rig):
             if volume[g.first + block, lane] > 0:
                 place = g.force_at + ((block * g.n_nodes + node) * 3) * lanes + lane
                 expected[place] = elements(rig, g)[at]
-    found = {e: node for node in range(rig.model.n_nodes) for e in entry[start[node] : start[node + 1]]}
-    assert found == expected and len(entry) == len(expected)
+    gathered = {e: node for node in range(rig.model.n_nodes) for e in entry[start[node] : start[node + 1]]}
+    assert gathered == expected and len(entry) == len(expected)
 
 
-def test_loads(rig):
+def test_loads_equal_the_oracle_and_add_up(rig):
     total, start = body_loads(rig.scene), rig.layout.node_start
     assert total == pytest.approx(rig.oracle.loads)
     assert total[: start[1]].sum(axis=0) == pytest.approx(0.9 * 1.1 * np.array([300, 2000, -500]))
@@ -106,7 +105,7 @@ def test_loads(rig):
     assert not total[start[2] :].any() and body_loads(driven) == pytest.approx(Oracle(driven).loads)
 
 
-def test_a_force_for_each_node(rig):
+def test_a_force_may_have_one_value_per_node(rig):
     scene, forces = rig.scene.snapshot(), np.random.default_rng(0).standard_normal((3, 3))
     scene.body("tower").add_force([4, 2, 7], forces)
     added = body_loads(scene) - body_loads(rig.scene)
@@ -133,7 +132,7 @@ def test_one_lane_gives_the_same_forces(rig):
 
 
 @pytest.mark.parametrize(
-    "numbers, words",
+    "numbers, message",
     [
         ({"law": SVK}, "body 'beam': law cannot change while it runs"),
         ({"young": 1e4, "colour": 1}, "body 'beam': colour cannot change"),
@@ -141,8 +140,8 @@ def test_one_lane_gives_the_same_forces(rig):
         ({"young": -1.0}, "young must be greater than 0"),
     ],
 )
-def test_changes_that_are_refused(rig, numbers, words):
+def test_invalid_changes_of_a_material_are_refused(rig, numbers, message):
     body, before = rig.scene.body("beam"), rig.scene.body("beam").material
-    with pytest.raises(ts.SceneError, match=words):
+    with pytest.raises(ts.SceneError, match=message):
         change_material(body, numbers, make_plan(rig.scene, False, False).on)
     assert body.material is before

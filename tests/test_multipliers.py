@@ -1,10 +1,10 @@
-"""Renewals of multipliers, judged by NumPy, on the impulses of 40 contacts:
+"""Anderson extrapolation of multipliers, against NumPy, on the impulses of 40 contacts:
 
-* without a past the impulses are taken, and disks open as far as they say;
-* with one or two renewals known the new multipliers are those of least squares, also beside contacts that nothing can move;
-  a change that says nothing new is left out, and an extrapolation that goes too far is not taken;
-* an affine iteration with two slow modes ends after three renewals;
-* R follows the laws' residual.
+* without a history the impulses become the multipliers, and the radii of the friction disks follow from them;
+* with one or two previous updates the new multipliers are those of least squares, also beside contacts that cannot move;
+  linearly dependent changes are ignored, and an extrapolation that is too long is rejected;
+* an affine iteration with two slow modes converges after three updates;
+* the scale of R follows the residual of the contact laws.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import taichi as ti
-from scenes import opened
+from lanes import opened
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.contact.problem import build_node_problem, fill_field
@@ -50,7 +50,7 @@ def rig():
             arena.vectors("past_change", ti.f64, PAST * (K + 2)),
         )
         factor, friction = 10.0 ** rng.uniform(-1, 1, (K, 2)), rng.uniform(0.1, 1.0, K)
-        factor[::9] = 0.0  # nothing can move these
+        factor[::9] = 0.0  # contacts that cannot move
         for field, values in ((p.factor, factor), (p.friction, friction)):
             fill_field(field, values)
         p.count[0] = K
@@ -58,22 +58,22 @@ def rig():
         arena.release()
 
 
-def renew(rig, impulses: np.ndarray, known: int) -> np.ndarray:
-    """The multipliers (K,3) after impulses (K,3)."""
+def update(rig, impulses: np.ndarray, history: int) -> np.ndarray:
+    """The new multipliers (K,3) after impulses (K,3); history: number of previous updates to use."""
     fill_field(rig.p.r, impulses)
-    extrapolate_multipliers(rig.terms, known)
+    extrapolate_multipliers(rig.terms, history)
     return rig.work.multiplier.to_numpy()[:K]
 
 
-def begin(rig, multipliers: np.ndarray) -> None:
-    """A past that says nothing, and multipliers (K,3)."""
+def restart(rig, multipliers: np.ndarray) -> None:
+    """Discard the history, and set multipliers (K,3)."""
     rig.work.past_impulse.fill(np.nan)
     rig.work.past_change.fill(np.nan)
     fill_field(rig.work.multiplier, multipliers)
 
 
 def least_squares(rig, multipliers: list[np.ndarray], impulses: list[np.ndarray]) -> np.ndarray:
-    """The next multipliers from those so far and what they led to, by NumPy."""
+    """The next multipliers from all previous ones and the impulses that they gave, by NumPy."""
     weight = np.where(rig.factor > 0.0, 1.0 / np.sqrt(np.where(rig.factor > 0.0, rig.factor, 1.0)), 0.0)
     change = [p - x for x, p in zip(multipliers, impulses)]
     steps = np.stack([(weight * (b - a)).ravel() for a, b in zip(change, change[1:])], axis=1)
@@ -83,32 +83,32 @@ def least_squares(rig, multipliers: list[np.ndarray], impulses: list[np.ndarray]
     return new
 
 
-def test_without_a_past_impulses_are_taken(rig):
+def test_without_a_history_impulses_become_the_multipliers(rig):
     rng = np.random.default_rng(0)
-    begin(rig, rng.standard_normal((K, 3)))
+    restart(rig, rng.standard_normal((K, 3)))
     impulses = np.abs(rng.standard_normal((K, 3)))
-    assert np.array_equal(renew(rig, impulses, 0), impulses)
+    assert np.array_equal(update(rig, impulses, 0), impulses)
     assert np.array_equal(rig.work.radius.to_numpy()[:K], rig.friction * impulses[:, 0])
 
 
-@pytest.mark.parametrize("known", [1, 2])
-def test_renewals_are_those_of_least_squares(rig, known):
-    rng = np.random.default_rng(known)
+@pytest.mark.parametrize("max_history", [1, 2])
+def test_updates_are_those_of_least_squares(rig, max_history):
+    rng = np.random.default_rng(max_history)
     multipliers, impulses = [rng.standard_normal((K, 3))], []
-    begin(rig, multipliers[0])
+    restart(rig, multipliers[0])
     for n in range(5):
         impulses.append(rng.standard_normal((K, 3)))
-        at_hand = min(n, known)
-        multipliers.append(renew(rig, impulses[-1], at_hand))
-        if at_hand:
-            wanted = least_squares(rig, multipliers[-2 - at_hand : -1], impulses[-1 - at_hand :])
-            assert np.allclose(multipliers[-1], wanted, rtol=1e-10, atol=1e-10)
+        history = min(n, max_history)
+        multipliers.append(update(rig, impulses[-1], history))
+        if history:
+            expected = least_squares(rig, multipliers[-2 - history : -1], impulses[-1 - history :])
+            assert np.allclose(multipliers[-1], expected, rtol=1e-10, atol=1e-10)
             assert (multipliers[-1][:, 0] == 0.0).any()  # some were clipped
             assert np.allclose(rig.work.radius.to_numpy()[:K], rig.friction * multipliers[-1][:, 0], rtol=1e-14)
 
 
-def slow(rig, rates: list[float], seed: int):
-    """lambda -> p, affine, with so many modes at these rates and its fixed point (K,3), of normal parts well above 0."""
+def affine_iteration(rates: list[float], seed: int):
+    """An affine map of multipliers (K,3) with modes of these rates, its fixed point, and a start; normal parts are large."""
     rng = np.random.default_rng(seed)
     modes = np.linalg.qr(rng.standard_normal((3 * K, len(rates))))[0]
     fixed = rng.standard_normal((K, 3)) + (10.0, 0.0, 0.0)
@@ -119,59 +119,59 @@ def slow(rig, rates: list[float], seed: int):
     return step, fixed, fixed + (modes @ np.ones(len(rates))).reshape(K, 3)
 
 
-def test_two_slow_modes_are_gone_after_three_renewals(rig):
-    step, fixed, x = slow(rig, [0.9, 0.6], 7)
-    begin(rig, x)
-    for known in range(3):
-        x = renew(rig, step(x), known)
+def test_two_slow_modes_converge_after_three_updates(rig):
+    step, fixed, x = affine_iteration([0.9, 0.6], 7)
+    restart(rig, x)
+    for history in range(3):
+        x = update(rig, step(x), history)
     assert np.abs(x - fixed).max() < 1e-9
 
 
-def test_a_change_that_says_nothing_new_is_left_out(rig):
-    """One mode alone: the second change is parallel to the first."""
-    step, fixed, x = slow(rig, [0.9], 8)
-    begin(rig, x)
-    x = renew(rig, step(x), 0)
-    for known in (1, 2):
-        fill_field(rig.work.multiplier, x)  # as if it had not been extrapolated
+def test_linearly_dependent_changes_are_ignored(rig):
+    """With one mode the second change is parallel to the first."""
+    step, fixed, x = affine_iteration([0.9], 8)
+    restart(rig, x)
+    x = update(rig, step(x), 0)
+    for history in (1, 2):
+        fill_field(rig.work.multiplier, x)  # undo the extrapolation
         last, x = x, step(x)
-        renewed = renew(rig, x, known)
-    assert np.abs(renewed - fixed).max() < 1e-6 < np.abs(x - last).max()
+        updated = update(rig, x, history)
+    assert np.abs(updated - fixed).max() < 1e-6 < np.abs(x - last).max()
 
 
-@pytest.mark.parametrize("steps, taken", [(2.0 * MAX_EXTRAPOLATION, False), (0.9 * MAX_EXTRAPOLATION, True)])
-def test_an_extrapolation_that_goes_too_far_is_not_taken(rig, steps, taken):
-    """A mode so slow that its end lies so many steps away."""
-    step, fixed, x = slow(rig, [1.0 - 1.0 / steps], 9)
-    begin(rig, x)
-    x = renew(rig, step(x), 0)
+@pytest.mark.parametrize("steps, accepted", [(2.0 * MAX_EXTRAPOLATION, False), (0.9 * MAX_EXTRAPOLATION, True)])
+def test_an_extrapolation_that_is_too_long_is_rejected(rig, steps, accepted):
+    """The fixed point of the slow mode lies `steps` changes away."""
+    step, fixed, x = affine_iteration([1.0 - 1.0 / steps], 9)
+    restart(rig, x)
+    x = update(rig, step(x), 0)
     impulses = step(x)
-    renewed = renew(rig, impulses, 1)
-    assert np.abs(renewed - fixed).max() < 1e-6 if taken else np.array_equal(renewed, impulses)
+    updated = update(rig, impulses, 1)
+    assert np.abs(updated - fixed).max() < 1e-6 if accepted else np.array_equal(updated, impulses)
 
 
-def test_neither_is_one_whose_second_part_does(rig):
-    """Two modes, the slower one so slow that the change before the last one takes it too far."""
-    step, _, x = slow(rig, [1.0 - 0.2 / MAX_EXTRAPOLATION, 0.5], 10)
-    begin(rig, x)
-    for known in (0, 1):
-        x = renew(rig, step(x), known)
+def test_an_extrapolation_whose_second_term_is_too_long_is_rejected(rig):
+    """The slower of two modes makes the coefficient of the change before the last one too large."""
+    step, _, x = affine_iteration([1.0 - 0.2 / MAX_EXTRAPOLATION, 0.5], 10)
+    restart(rig, x)
+    for history in (0, 1):
+        x = update(rig, step(x), history)
     impulses = step(x)
-    assert np.array_equal(renew(rig, impulses, 2), impulses)
+    assert np.array_equal(update(rig, impulses, 2), impulses)
 
 
 @pytest.mark.parametrize(
-    "scale, law, before, taken, wanted",
+    "scale, residual, before, n_steps, expected",
     [
-        (8.0, 1.3, 1.0, 1, 4.0),  # risen: softer,
+        (8.0, 1.3, 1.0, 1, 4.0),  # increased: softer,
         (4.0, 1.3, 1.0, 1, 8.0),  # but not below STEADY
-        (8.0, 0.9, 1.0, 1, 16.0),  # hardly fallen after one step: stiffer,
+        (8.0, 0.9, 1.0, 1, 16.0),  # hardly decreased after one step: stiffer,
         (MAX_R_SCALE, 0.9, 1.0, 1, MAX_R_SCALE),
-        (8.0, 0.9, 1.0, 3, 8.0),  # after some: as it is,
+        (8.0, 0.9, 1.0, 3, 8.0),  # after some: unchanged,
         (2.0, 0.9, 1.0, 5, 1.0),  # after many: softer
         (MIN_R_SCALE, 0.9, 1.0, 5, MIN_R_SCALE),
-        (8.0, 0.7, 1.0, 1, 8.0),  # fallen: as it is
+        (8.0, 0.7, 1.0, 1, 8.0),  # decreased: unchanged
     ],
 )
-def test_r_follows_the_laws(scale, law, before, taken, wanted):
-    assert next_scale(scale, law, before, taken) == wanted
+def test_the_scale_of_r_follows_the_residual_of_the_contact_laws(scale, residual, before, n_steps, expected):
+    assert next_scale(scale, residual, before, n_steps) == expected

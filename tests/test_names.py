@@ -1,6 +1,6 @@
-"""Names stay the field's: what the code was once called does not come back.
+"""Former names do not return: the code uses the standard terms of the field.
 
-Identifiers are read from the source by Python's tokenizer, so comments and sentences may use the words.
+Only identifiers are checked, as Python's tokenizer finds them; comments and strings may use the words.
 """
 
 import io
@@ -12,13 +12,13 @@ import pytest
 import taisoft
 
 PACKAGE = Path(taisoft.__file__).parent
-FORMER = {  # former name: the one to use
+FORMER = {  # former name: the standard term
     "led": "prescribed",
     "led_nodes": "prescribed_nodes",
     "leads": "has_prescribed",
     "let_go": "release",
     "letting_go": "releasing",
-    "told": "what it is: a message, a report, a list of warnings",
+    "told": "message, report or warnings",
     "told_warnings": "printed_warnings",
     "tell_locking": "warn_locking",
     "World": "SimulationState",
@@ -59,18 +59,18 @@ FORMER = {  # former name: the one to use
 
 
 def identifiers(path: Path) -> set[str]:
-    """All names in a file's code, and the file's own."""
+    """All names in a file's code, and the name of the file."""
     tokens = tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline)
     return {token.string for token in tokens if token.type == tokenize.NAME} | {path.stem}
 
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_no_former_name(path):
+def test_no_former_names(path):
     found = identifiers(path) & set(FORMER)
     assert not found, "; ".join(f"{name}: use {FORMER[name]}" for name in sorted(found))
 
 
-def test_the_scan_sees_names_and_no_words(tmp_path):
+def test_the_scan_finds_identifiers_only(tmp_path):
     path = tmp_path / "fence.py"
     path.write_text('def told(standoff):  # of a carry\n    """The goal is told."""\n    return f"{standoff} survey"\n')
     assert {"told", "standoff", "fence"} <= identifiers(path) and not {"carry", "goal", "survey"} & identifiers(path)

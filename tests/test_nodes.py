@@ -1,11 +1,11 @@
-"""What the nodes of a body promise:
+"""Nodes of a body:
 
-* first order is the mesh itself;
-* second order: vertices first, then the middle of every edge once, by sorted pairs; elements name them in order;
-* the linear tets fill each element, all upright, the octahedron cut along its shortest diagonal;
-* the linear triangles are the boundary of the linear tets, outward, each a face of the tet behind it, at its place;
-* the cut does not depend on the order in which a tet lists its corners;
-* arrays are read-only, other orders are refused.
+* first order: the vertices of the mesh;
+* second order: the vertices, then the edge midpoints sorted by vertex pairs, and elements in the documented node order;
+* the linear tets of an element are positive and fill it; its octahedron is split along the shortest diagonal;
+* the linear triangles are the outward boundary of the linear tets, each a face of its tet, in the order of the mesh surface;
+* the split does not depend on the order of a tet's corners;
+* arrays are read-only, and other orders are refused.
 """
 
 import itertools
@@ -27,7 +27,7 @@ EVEN = [p for p in itertools.permutations(range(4)) if np.linalg.det(np.eye(4)[l
 
 
 def random_mesh(seed: int, n: int = 30) -> TetMesh:
-    """Delaunay tets of random points without the flattest, each with its corners in a random positive order."""
+    """Delaunay tets of random points except the flattest, each with its corners in a random positive order."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, (n, 3))
     tets = Delaunay(points).simplices
@@ -37,7 +37,7 @@ def random_mesh(seed: int, n: int = 30) -> TetMesh:
     tets = np.array([tet[list(EVEN[k])] for tet, k in zip(tets, rng.integers(0, 12, len(tets)))])
     used, local = np.unique(tets, return_inverse=True)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # parts that touch at an edge only
+        warnings.simplefilter("ignore")  # components that share only an edge
         return TetMesh(points[used], local.reshape(-1, 4))
 
 
@@ -60,7 +60,7 @@ def test_first_order_is_the_mesh(mesh):
 
 
 @each_mesh
-def test_middles_are_numbered_by_sorted_vertex_pairs(mesh):
+def test_edge_midpoints_are_numbered_by_sorted_vertex_pairs(mesh):
     pairs = sorted({tuple(sorted((int(tet[a]), int(tet[b])))) for tet in mesh.tets for a, b in EDGES})
     number = {pair: mesh.n_verts + k for k, pair in enumerate(pairs)}
     nodes = make_nodes(mesh, 2)
@@ -75,44 +75,43 @@ def test_middles_are_numbered_by_sorted_vertex_pairs(mesh):
 @each_mesh
 def test_linear_tets_fill_their_element(mesh):
     nodes = make_nodes(mesh, 2)
-    parts = volumes(nodes.positions, nodes.tets).reshape(-1, 8)
-    assert (parts > 0).all()
-    assert np.allclose(parts, mesh.volumes[:, None] / 8, rtol=1e-9)  # each an eighth, so they fill it
-    inside = (nodes.tets.reshape(-1, 32)[:, :, None] == nodes.elements[:, None, :]).any(axis=2)
-    assert inside.all()
+    linear = volumes(nodes.positions, nodes.tets).reshape(-1, 8)
+    assert (linear > 0).all()
+    assert np.allclose(linear, mesh.volumes[:, None] / 8, rtol=1e-9)
+    assert (nodes.tets.reshape(-1, 32)[:, :, None] == nodes.elements[:, None, :]).any(axis=2).all()
 
 
 @each_mesh
-def test_the_octahedron_is_cut_along_its_shortest_diagonal(mesh):
+def test_the_octahedron_is_split_along_its_shortest_diagonal(mesh):
     nodes = make_nodes(mesh, 2)
     x = nodes.positions
     for element, tets in zip(nodes.elements, nodes.tets.reshape(-1, 8, 4)):
         diagonals = [(element[4 + k], element[9 - k]) for k in range(3)]
         lengths = [np.linalg.norm(x[a] - x[b]) for a, b in diagonals]
-        (cut,) = [k for k in range(3) if all({*diagonals[k]} <= {*tet} for tet in tets[4:])]
-        assert lengths[cut] <= min(lengths) * (1 + 1e-9)
+        (chosen,) = [k for k in range(3) if all({*diagonals[k]} <= {*tet} for tet in tets[4:])]
+        assert lengths[chosen] <= min(lengths) * (1 + 1e-9)
 
 
 @each_mesh
-def test_linear_triangles_bound_the_linear_tets_at_their_place(mesh):
+def test_linear_triangles_are_the_boundary_of_the_linear_tets(mesh):
     nodes = make_nodes(mesh, 2)
     faces = Faces(nodes.tets)
-    assert faces.counts.max() <= 2  # neighbours agree on the four triangles between them
+    assert faces.counts.max() <= 2  # neighbours share their four triangles
     boundary = faces.triangles[faces.surface()]
     assert sorted(map(canonical, boundary)) == sorted(map(canonical, nodes.surface))
-    middle = {
+    midpoint = {
         tuple(sorted((int(tet[a]), int(tet[b])))): int(e[4 + k])
         for tet, e in zip(mesh.tets, nodes.elements)
         for k, (a, b) in enumerate(EDGES)
     }
     for (a, b, c), four in zip(mesh.surface.tolist(), nodes.surface.reshape(-1, 4, 3).tolist()):
-        ab, bc, ca = (middle[tuple(sorted(pair))] for pair in ((a, b), (b, c), (c, a)))
+        ab, bc, ca = (midpoint[tuple(sorted(pair))] for pair in ((a, b), (b, c), (c, a)))
         assert four == [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
 
 
 @pytest.mark.parametrize("order", [1, 2])
 @each_mesh
-def test_each_triangle_is_an_outward_face_of_the_tet_behind_it(mesh, order):
+def test_each_triangle_is_an_outward_face_of_its_tet(mesh, order):
     nodes = make_nodes(mesh, order)
     assert (volumes(nodes.positions, nodes.surface_tets) > 0).all()
     all_tets = {tuple(sorted(tet)) for tet in nodes.tets.tolist()}
@@ -127,7 +126,7 @@ def test_each_triangle_is_an_outward_face_of_the_tet_behind_it(mesh, order):
 
 
 def canonical(triangle) -> tuple[int, ...]:
-    """The triangle's indices from the smallest on: equal for equal orientation."""
+    """The triangle's indices, rotated so that the smallest is first."""
     return tuple(np.roll(triangle, -int(np.argmin(triangle))).tolist())
 
 
@@ -138,12 +137,12 @@ def as_sets(nodes: Nodes) -> set[tuple[int, ...]]:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32), st.sampled_from([0, 1, 2, 4]))
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_the_cut_does_not_depend_on_the_order_of_corners(seed, which):
-    """Grids too, whose octahedra have equal diagonals."""
+def test_the_split_does_not_depend_on_the_order_of_corners(seed, which):
+    """Also in grids, whose octahedra have equal diagonals."""
     mesh, rng = MESHES[which], np.random.default_rng(seed)
     order = np.array(EVEN)[rng.integers(0, 12, mesh.n_tets)]
-    turned = TetMesh(mesh.vertices, np.take_along_axis(mesh.tets, order, axis=1))
-    a, b = make_nodes(mesh, 2), make_nodes(turned, 2)
+    reordered = TetMesh(mesh.vertices, np.take_along_axis(mesh.tets, order, axis=1))
+    a, b = make_nodes(mesh, 2), make_nodes(reordered, 2)
     assert np.array_equal(a.positions, b.positions) and as_sets(a) == as_sets(b)
     key = lambda n: {(canonical(f), tuple(sorted(t))) for f, t in zip(n.surface, n.surface_tets.tolist())}  # noqa: E731
     assert key(a) == key(b)

@@ -1,9 +1,9 @@
-"""Contacts with obstacles are those of closed forms, in stations that stand far apart in one scene:
+"""Contacts with obstacles equal closed forms. The cases stand far apart in one scene:
 
-* the corner of a cube on a half-space, a sphere, a capsule, a box (its faces and an edge) and an open mesh;
-* a large triangle on a sphere (inside it, and on an edge of it), on a capsule's end, on the corner of a box and of a closed mesh;
-* all turns and shifts with the obstacles and bodies, and obstacles are where their paths lead them;
-* a moving obstacle is met before it arrives, and one that leaves is not.
+* the corner of a cube on a half-space, sphere, capsule, box (face and edge) and open mesh;
+* a large triangle on a sphere (in its interior and on its edge), a capsule's end, and the corner of a box and of a closed mesh;
+* contacts rotate and translate with everything, and obstacles follow their paths;
+* contacts with an approaching obstacle are found before it arrives; a receding one has none.
 """
 
 from dataclasses import dataclass
@@ -20,57 +20,52 @@ UP = np.array([0.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True)
-class Station:
-    """A body over an obstacle, at the station's origin, and the one contact expected there."""
+class Case:
+    """A body and an obstacle near the origin, and their only contact."""
 
     shape: object
     mesh: ts.TetMesh
-    point: np.ndarray  # (3,) [m] of the body: the contact's is half a gap off it, towards the obstacle
+    point: np.ndarray  # (3,) [m] of the body; the contact point is half a gap away, towards the obstacle
     normal: np.ndarray  # (3,)
     gap: float  # [m]
     kind: str
-    turned: np.ndarray | None = None  # (3,3) by which the obstacle's path turns it
+    R: np.ndarray | None = None  # (3,3) rotation of the obstacle by its path
 
 
-def standing(normal: np.ndarray) -> np.ndarray:
-    """(3,3) rotation that turns a cube's diagonal (1,1,1) along a unit normal (3,)."""
+def align_diagonal(normal: np.ndarray) -> np.ndarray:
+    """(3,3) rotation of a cube's diagonal (1,1,1) to a unit normal (3,)."""
     axis = np.cross([1.0, 1.0, 1.0], normal)
     return rotation(axis, np.arctan2(np.linalg.norm(axis), normal.sum()))
 
 
-def corner(point: np.ndarray, normal: np.ndarray) -> ts.TetMesh:
-    """A cube of 0.5 m that stands on its corner, nearly: there is nothing else of it near a point (3,) [m]."""
-    mesh = ts.box_mesh((1, 1, 1), (0.5, 0.5, 0.5), (0.25, 0.25, 0.25), "six")
-    return ts.TetMesh(mesh.vertices @ (rotation((0.3, 0.1, 0.9), 0.2) @ standing(normal)).T + point, mesh.tets)
-
-
-def on_corner(shape, foot, normal, gap: float, kind: str = "vertex_field") -> Station:
-    """A corner over a point (3,) [m] of the obstacle's surface with its normal (3,)."""
+def vertex_case(shape, foot, normal, gap: float, kind: str = "vertex_field") -> Case:
+    """The corner of a cube over a point (3,) [m] of the obstacle's surface with its normal (3,). The cube is tilted a little."""
     normal = np.asarray(normal) / np.linalg.norm(normal)
-    point = foot + gap * normal
-    return Station(shape, corner(point, normal), point, normal, gap, kind)
+    point, cube = foot + gap * normal, ts.box_mesh((1, 1, 1), (0.5, 0.5, 0.5), (0.25, 0.25, 0.25), "six")
+    R = rotation((0.3, 0.1, 0.9), 0.2) @ align_diagonal(normal)
+    return Case(shape, ts.TetMesh(cube.vertices @ R.T + point, cube.tets), point, normal, gap, kind)
 
 
-def under_face(shape, depth: float, where, kind: str = "face_field", turned=None) -> Station:
-    """A slab whose lower face, y = 0, is two triangles that meet in a diagonal of the square; it is pierced at (3,) [m]."""
+def face_case(shape, depth: float, point, kind: str = "face_field", R=None) -> Case:
+    """A slab with the obstacle below a point (3,) [m] of its lower face y = 0, which is two triangles."""
     mesh = ts.box_mesh((1, 1, 1), (2.0, 0.5, 2.0), (0.0, 0.25, 0.0), "six")
-    return Station(shape, mesh, np.array(where, dtype=float), UP, -depth, kind, turned)
+    return Case(shape, mesh, np.array(point, dtype=float), UP, -depth, kind, R)
 
 
 def octahedron(below: float) -> ts.MeshObstacle:
-    """A closed mesh whose upper corner is at (0.2, -below, -0.5) [m]."""
+    """A closed mesh whose top is at (0.2, -below, -0.5) [m]."""
     vertices = 0.3 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
     faces = [(0, 2, 4), (2, 1, 4), (1, 3, 4), (3, 0, 4), (2, 0, 5), (1, 2, 5), (3, 1, 5), (0, 3, 5)]
     return ts.MeshObstacle(vertices + (0.2, -0.3 - below, -0.5), faces)
 
 
-def pole(height: float) -> ts.Box:
-    """A cube of 0.4 m whose corner is at (0.2, height, -0.4) [m] once it stands upright."""
+def cube_on_corner(height: float) -> ts.Box:
+    """A cube of 0.4 m whose top corner is at (0.2, height, -0.4) [m] after the rotation `upright` below."""
     return ts.Box((0.2, height - 0.2 * np.sqrt(3), -0.4), (0.2, 0.2, 0.2))
 
 
-def stations() -> dict[str, Station]:
-    """By name; a half-space fills one side of the world, so that it comes first."""
+def make_cases() -> dict[str, Case]:
+    """The half-space comes first, since it fills the space on one side."""
     tilted, slope = np.array([1.0, 0.2, -0.1]), np.array([0.2, 1.0, 0.1])
     square = [(-1, 0, -1), (-1, 0, 1), (1, 0, 1), (1, 0, -1)]
     slope = slope / np.linalg.norm(slope)
@@ -78,90 +73,97 @@ def stations() -> dict[str, Station]:
     on_diagonal = np.array([0.3, -0.4 + 0.02, 0.3])
     across = np.array([0.3, -0.4 + 0.02, -0.3])
     end = np.array([0.4, -0.1, 0.2])
-    upright = standing(UP)  # a box's corner (1,1,1) to the top
-    flat = np.cross([0.3, 0.0, 1.0], [1.0, -0.4, 0.0])  # of an open mesh through the origin
-    flat /= np.linalg.norm(flat)
-    sheet = np.array(square) @ np.stack([[1.0, -0.4, 0.0], flat, [0.3, 0.0, 1.0]])
+    upright = align_diagonal(UP)
+    sheet_normal = np.cross([0.3, 0.0, 1.0], [1.0, -0.4, 0.0])  # of an open mesh through the origin
+    sheet_normal /= np.linalg.norm(sheet_normal)
+    sheet = np.array(square) @ np.stack([[1.0, -0.4, 0.0], sheet_normal, [0.3, 0.0, 1.0]])
     return {
-        "half_space": on_corner(ts.HalfSpace((0, 0, 0), tilted), np.zeros(3), tilted, -0.003),
-        "sphere": on_corner(ts.Sphere((0, 0, 0), 0.4), 0.4 * slope, slope, 0.004),
-        "capsule": on_corner(ts.Capsule((-1, 0, 0), (1, 0, 0), 0.2), (0.3, 0.2, 0.0), UP, -0.005),
-        "capsule_end": on_corner(ts.Capsule((-1, -1, 0), (0, 0, 0), 0.2), 0.2 * slope, slope, 0.006),
-        "box_face": on_corner(ts.Box((0, -0.5, 0), (0.5, 0.5, 0.5)), (0.1, 0.0, 0.2), UP, -0.004),
-        "box_edge": on_corner(ts.Box((-0.5, -0.5, 0), (0.5, 0.5, 0.5)), (0.0, 0.0, 0.2), (0.5, 1.0, 0.0), 0.007),
-        "mesh_open": on_corner(
-            ts.MeshObstacle(sheet, [(0, 1, 2), (0, 2, 3)]), 0.3 * sheet[0] + 0.1 * sheet[1], flat, -0.004, "vertex_face"
+        "half_space": vertex_case(ts.HalfSpace((0, 0, 0), tilted), np.zeros(3), tilted, -0.003),
+        "sphere": vertex_case(ts.Sphere((0, 0, 0), 0.4), 0.4 * slope, slope, 0.004),
+        "capsule": vertex_case(ts.Capsule((-1, 0, 0), (1, 0, 0), 0.2), (0.3, 0.2, 0.0), UP, -0.005),
+        "capsule_end": vertex_case(ts.Capsule((-1, -1, 0), (0, 0, 0), 0.2), 0.2 * slope, slope, 0.006),
+        "box_face": vertex_case(ts.Box((0, -0.5, 0), (0.5, 0.5, 0.5)), (0.1, 0.0, 0.2), UP, -0.004),
+        "box_edge": vertex_case(ts.Box((-0.5, -0.5, 0), (0.5, 0.5, 0.5)), (0.0, 0.0, 0.2), (0.5, 1.0, 0.0), 0.007),
+        "mesh_open": vertex_case(
+            ts.MeshObstacle(sheet, [(0, 1, 2), (0, 2, 3)]), 0.3 * sheet[0] + 0.1 * sheet[1], sheet_normal, -0.004, "vertex_face"
         ),
-        "ball_in_triangle": under_face(ts.Sphere(below, 0.4), 0.02, (0.3, 0, -0.5)),
-        "ball_on_diagonal": under_face(ts.Sphere(on_diagonal, 0.4), 0.02, (0.3, 0, 0.3)),
-        "ball_across_diagonal": under_face(ts.Sphere(across, 0.4), 0.02, (0.3, 0, -0.3)),
-        "capsule_in_triangle": under_face(ts.Capsule(end - (1, 0.3, 0.1), end, 0.105), 0.005, (0.4, 0, 0.2)),
-        "mesh_corner": under_face(octahedron(0.004), -0.004, (0.2, 0, -0.5), "vertex_face"),
-        "mesh_corner_inside": under_face(octahedron(-0.01), 0.01, (0.2, 0, -0.5), "vertex_face"),
-        "box_corner": under_face(pole(0.03), 0.03, (0.2, 0, -0.4), "vertex_face", upright),
-        "box_corner_near": under_face(pole(-0.005), -0.005, (0.2, 0, -0.4), "vertex_face", upright),
+        "ball_in_triangle": face_case(ts.Sphere(below, 0.4), 0.02, (0.3, 0, -0.5)),
+        "ball_on_diagonal": face_case(ts.Sphere(on_diagonal, 0.4), 0.02, (0.3, 0, 0.3)),
+        "ball_across_diagonal": face_case(ts.Sphere(across, 0.4), 0.02, (0.3, 0, -0.3)),
+        "capsule_in_triangle": face_case(ts.Capsule(end - (1, 0.3, 0.1), end, 0.105), 0.005, (0.4, 0, 0.2)),
+        "mesh_corner": face_case(octahedron(0.004), -0.004, (0.2, 0, -0.5), "vertex_face"),
+        "mesh_corner_inside": face_case(octahedron(-0.01), 0.01, (0.2, 0, -0.5), "vertex_face"),
+        "box_corner": face_case(cube_on_corner(0.03), 0.03, (0.2, 0, -0.4), "vertex_face", upright),
+        "box_corner_near": face_case(cube_on_corner(-0.005), -0.005, (0.2, 0, -0.4), "vertex_face", upright),
     }
 
 
-ALL = stations()
+CASES = make_cases()
 
 
-class SimulationState:
-    """All stations in one simulator. Q (3,3), T (3,) [m]: where everything is; back: [m] how far each obstacle has gone off its
-    contact; speed: of all obstacles along their normals [m/s]."""
+class CaseScene:
+    """All cases in one simulator.
+
+    Q (3,3), T (3,) [m]: rotation and translation of everything. retreat: distance of each obstacle from its contact position
+    along the negative normal [m]. speed: of all obstacles along their normals [m/s].
+    """
 
     def __init__(self):
-        self.Q, self.T, self.back, self.speed = np.eye(3), np.zeros(3), 0.0, 0.0
+        self.restore()
         scene = ts.Scene(gravity=(0, 0, 0))
         scene.contact_forces = False
         scene.collision = ts.CollisionSettings(margin=MARGIN)
-        for k, (name, station) in enumerate(ALL.items()):
-            place = np.array([10.0 * k, 0.0, 0.0])
-            scene.add_body(station.mesh, ts.Material(young=1e3), name=name, position=place, collision="proximity")
-        for k, (name, station) in enumerate(ALL.items()):
-            place = np.array([10.0 * k, 0.0, 0.0])
-            scene.add_obstacle(moved(station.shape, place), name=f"{name} obstacle", path=self.path(station, place))
+        origins = dict(zip(CASES, 10.0 * np.arange(len(CASES))[:, None] * (1.0, 0.0, 0.0)))
+        for name, case in CASES.items():
+            scene.add_body(case.mesh, ts.Material(young=1e3), name=name, position=origins[name], collision="proximity")
+        for name, case in CASES.items():
+            shape = translated(case.shape, origins[name])
+            scene.add_obstacle(shape, name=f"{name} obstacle", path=self.path(case, shape.pivot))
         self.sim = ts.Simulator(scene, dt=DT, integrator="symplectic_euler", precision="f64", allow_unstable=True)
         self.start = self.sim.positions()
 
-    def path(self, station: Station, place: np.ndarray):
-        """The obstacle's path: what is set here."""
-        pivot = moved(station.shape, place).pivot
-        turned = np.eye(3) if station.turned is None else station.turned
+    def restore(self) -> None:
+        """Set the initial placement of everything."""
+        self.Q, self.T, self.retreat, self.speed = np.eye(3), np.zeros(3), 0.0, 0.0
+
+    def path(self, case: Case, pivot: np.ndarray):
+        """The path of an obstacle with the present values of Q, T, retreat and speed."""
+        R = np.eye(3) if case.R is None else case.R
 
         def pose(t: float):
-            way = (self.speed * t - self.back) * station.normal
-            return self.Q @ (pivot + way) + self.T - pivot, self.Q @ turned
+            displacement = (self.speed * t - self.retreat) * case.normal
+            return self.Q @ (pivot + displacement) + self.T - pivot, self.Q @ R
 
         return pose
 
-    def check(self, seen: bool = True) -> None:
-        """Whether each station has the contact expected of it, and no other; seen False: none has any."""
+    def check(self, touching: bool = True) -> None:
+        """Check that each case has exactly its expected contact, or none if not touching."""
         self.sim.set_state(positions=self.start @ self.Q.T + self.T)
         c = self.sim.detect_contacts()
         assert (np.array([a + " obstacle" for a in c.body_a]) == c.body_b).all()
         wrong = []
-        for k, (name, station) in enumerate(ALL.items()):
-            mine = np.flatnonzero(c.body_a == name)
-            if len(mine) != seen:
-                wrong.append(f"{name}: {len(mine)} contacts, gaps {c.gap[mine]}, kinds {c.kind[mine]}, normals {c.normal[mine]}")
-            if not seen or not len(mine):
+        for k, (name, case) in enumerate(CASES.items()):
+            own = np.flatnonzero(c.body_a == name)
+            if len(own) != touching:
+                wrong.append(f"{name}: {len(own)} contacts, gaps {c.gap[own]}, kinds {c.kind[own]}, normals {c.normal[own]}")
+            if not touching or not len(own):
                 continue
-            gap = station.gap + self.back
-            point = self.Q @ (station.point + (10.0 * k, 0, 0) - 0.5 * gap * station.normal) + self.T
+            gap = case.gap + self.retreat
+            point = self.Q @ (case.point + (10.0 * k, 0, 0) - 0.5 * gap * case.normal) + self.T
             errors = (
-                np.abs(c.point[mine] - point).max(),
-                np.abs(c.normal[mine] - self.Q @ station.normal).max(),
-                np.abs(c.gap[mine] - gap).max(),
+                np.abs(c.point[own] - point).max(),
+                np.abs(c.normal[own] - self.Q @ case.normal).max(),
+                np.abs(c.gap[own] - gap).max(),
             )
-            close = 2e-4 if station.kind == "face_field" else 1e-9  # a search: phi to 1e-8, where it is least to its root
-            if max(errors[:2]) > close or errors[2] > 1e-8 or set(c.kind[mine]) != {station.kind}:
-                wrong.append(f"{name}: {c.kind[mine]} off by {errors}: {c.point[mine]}, {c.normal[mine]}, {c.gap[mine]}")
+            # a face search finds phi to 1e-8, and the place of its minimum to the root of that
+            tolerance = 2e-4 if case.kind == "face_field" else 1e-9
+            if max(errors[:2]) > tolerance or errors[2] > 1e-8 or set(c.kind[own]) != {case.kind}:
+                wrong.append(f"{name}: {c.kind[own]}, errors {errors}: {c.point[own]}, {c.normal[own]}, {c.gap[own]}")
         assert not wrong, "\n".join(wrong)
 
 
-def moved(shape, by: np.ndarray):
-    """A shape, moved (3,) [m]."""
+def translated(shape, by: np.ndarray):
+    """A shape, translated by (3,) [m]."""
     if isinstance(shape, ts.MeshObstacle):
         return ts.MeshObstacle(shape.vertices + by, shape.triangles)
     if isinstance(shape, ts.Capsule):
@@ -172,38 +174,38 @@ def moved(shape, by: np.ndarray):
 
 
 @pytest.fixture(scope="module")
-def whole():
-    simulation = SimulationState()
-    yield simulation
-    simulation.sim.close()
+def shared_scene():
+    scene = CaseScene()
+    yield scene
+    scene.sim.close()
 
 
 @pytest.fixture
-def simulation(whole):
-    whole.Q, whole.T, whole.back, whole.speed = np.eye(3), np.zeros(3), 0.0, 0.0
-    return whole
+def cases(shared_scene):
+    shared_scene.restore()
+    return shared_scene
 
 
-def test_closed_forms(simulation):
-    simulation.check()
+def test_contacts_equal_closed_forms(cases):
+    cases.check()
 
 
-def test_all_turned_and_shifted(simulation):
+def test_contacts_rotate_and_translate_with_everything(cases):
     rng = np.random.default_rng(3)
     for _ in range(4):
-        simulation.Q, simulation.T = rotation(rng.standard_normal(3), rng.uniform(0, np.pi)), 10.0 * rng.standard_normal(3)
-        simulation.check()
+        cases.Q, cases.T = rotation(rng.standard_normal(3), rng.uniform(0, np.pi)), 10.0 * rng.standard_normal(3)
+        cases.check()
 
 
-def test_obstacles_are_where_their_paths_lead_them(simulation):
-    simulation.back = 0.0025
-    simulation.check()
+def test_obstacles_follow_their_paths(cases):
+    cases.retreat = 0.0025
+    cases.check()
 
 
-def test_a_moving_obstacle_is_met_before_it_arrives(simulation):
-    simulation.back = MARGIN + 0.031  # all gaps are above the margin now: the deepest was -0.03
-    simulation.check(seen=False)
-    simulation.speed = 0.05 / DT  # and at the end of the step none is
-    simulation.check()
-    simulation.speed = -simulation.speed
-    simulation.check(seen=False)
+def test_contacts_with_approaching_obstacles_are_found_before_they_arrive(cases):
+    cases.retreat = MARGIN + 0.031  # all gaps are above the margin now: the deepest was -0.03
+    cases.check(touching=False)
+    cases.speed = 0.05 / DT  # all gaps are below the margin at the end of the step
+    cases.check()
+    cases.speed = -cases.speed
+    cases.check(touching=False)

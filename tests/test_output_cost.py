@@ -1,7 +1,7 @@
-"""What output costs a run:
+"""The cost of output:
 
-* pictures compile no kernel of their own, so a run of another mesh adds none to the cache on disk;
-* compiling inside an observer counts as compile time, and not as time for output, which is part of the run's wall time.
+* rendering compiles no kernels, so that a run of another mesh adds none to the cache on disk;
+* compilation within an observer counts as compile time, not as output time, which is part of the run's wall time.
 """
 
 from types import SimpleNamespace
@@ -24,9 +24,9 @@ from taisoft.view.ggui import Canvas
 from taisoft.view.scene_view import Surfaces
 camera, surfaces = Camera.framing(sim.positions()), Surfaces(scene)
 canvas = Canvas(surfaces, (64, 36), visible=False, n_segments=3)
-one = np.ones((2, 3))
-canvas.draw(surfaces.of_bodies(sim)[0], surfaces.colours, camera, (1.0, 1.0, 1.0), (sim.positions()[:2], one))
-canvas.draw_over(np.array([[0.1, 0.1, 0.3, 0.2]]), one[:, :2], one, (2, 5), (0.9, 0.9, 0.9))
+ones = np.ones((2, 3))
+canvas.draw(surfaces.of_bodies(sim)[0], surfaces.colours, camera, (1.0, 1.0, 1.0), (sim.positions()[:2], ones))
+canvas.draw_over(np.array([[0.1, 0.1, 0.3, 0.2]]), ones[:, :2], ones, (2, 5), (0.9, 0.9, 0.9))
 print(canvas.pixels(0, 0, 64, 36).std() > 5)
 canvas.close()
 """
@@ -39,33 +39,33 @@ def kernels(cache) -> set[str]:
 
 
 @needs_vulkan
-def test_pictures_of_another_mesh_add_no_kernels(tmp_path, monkeypatch):
+def test_images_of_another_mesh_add_no_kernels_to_the_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    found = []
+    cached = []
     for cells in ("(4, 1, 1)", "(5, 1, 1)", "(9, 3, 2)"):
-        scene = write(tmp_path / f"scene{len(found)}.py", BEAM.replace("(4, 1, 1)", cells))
+        scene = write(tmp_path / f"scene{len(cached)}.py", BEAM.replace("(4, 1, 1)", cells))
         process = child("run", scene, "--headless", "--no-usd", "--layers", "wires", "--out", tmp_path / scene.stem)
         _, error = process.communicate(timeout=120)
         assert process.returncode == 0, error
         assert (tmp_path / scene.stem / "frames/00003.png").is_file() and "in software" not in error
-        found.append(kernels(tmp_path / "cache"))
-    assert found[0] and found[1] == found[2] == found[0]
+        cached.append(kernels(tmp_path / "cache"))
+    assert cached[0] and cached[1] == cached[2] == cached[0]
 
 
 @needs_vulkan
 def test_drawing_compiles_nothing(tmp_path):
-    """Surfaces, lines, and boxes and lines over the picture."""
+    """Surfaces, lines, and boxes and lines in the overlay."""
     out, _ = run_child(DRAW, XDG_CACHE_HOME=str(tmp_path))
-    assert out.split()[-1] == "True", "it has drawn"
+    assert out.split()[-1] == "True", "nothing was drawn"
     assert (tmp_path / "taisoft/kernels").is_dir() and kernels(tmp_path) == set()
 
 
-def test_compiling_in_an_observer_is_no_output(monkeypatch, capsys):
+def test_compilation_in_an_observer_does_not_count_as_output_time(monkeypatch, capsys):
     sim, now, observers = StandIn(explicit=False, dt=0.01), [0.0], Observers()
 
     def frame(sim, index):
         now[0] += 2.5
-        if index == 0:  # as a kernel that is launched for the first time there
+        if index == 0:  # as if a kernel were launched for the first time
             now[0] += 10.0
             sim.compile_seconds += 10.0
 
