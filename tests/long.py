@@ -34,9 +34,9 @@ LONG = {
     ),
     "test_demos": ("test_demo[incline]", "[two_cubes_two_boxes]", "[hanging_beam_fine]"),
     "test_stepping": (
-        "test_implicit_steps_are_the_oracles[1-linearly",
-        "test_parallel_kernels[velocity_verlet]",
-        "test_explicit_steps_are_the_oracles[velocity_verlet]",
+        "test_implicit_steps_match_the_oracle[1-linearly",
+        "test_parallel_kernels_match_the_oracle[velocity_verlet]",
+        "test_explicit_steps_match_the_oracle[velocity_verlet]",
     ),
     "test_contact_stepping": ("test_rest[bdf2-", "test_rest[velocity_verlet-"),
     "test_simulator": ("[symplectic_euler-2]",),
