@@ -24,10 +24,10 @@ from taisoft.stability import highest_frequency, hooke_differential, hooke_stiff
 KINDS = ((1, None), (2, 2), (2, 4))  # order, degree of the quadrature
 
 
-def one_body(material=None, cells=(2, 1, 1), held: bool = False, order: int = 1, degree: int | None = None) -> ts.Scene:
+def one_body(material=None, cells=(2, 1, 1), constrained: bool = False, order: int = 1, degree: int | None = None) -> ts.Scene:
     scene = ts.Scene(gravity=(0, 0, 0))
     body = scene.add_body(cube(cells=cells), material or rubber(), name="block", **element(order, degree))
-    if held:
+    if constrained:
         body.fix(lambda X: X[:, 0] < -0.49)
         body.fix([10], axes="y")
     return scene
@@ -52,10 +52,10 @@ def test_stiffness_at_rest_is_hookes(law, order, degree):
 
 
 @pytest.mark.parametrize("order, cells", [(1, (2, 1, 1)), (1, (4, 3, 3)), (2, (1, 1, 1)), (2, (3, 2, 2))])
-@pytest.mark.parametrize("held", [False, True])
-def test_highest_frequency_matches_dense_algebra(order, cells, held):
+@pytest.mark.parametrize("constrained", [False, True])
+def test_highest_frequency_matches_dense_algebra(order, cells, constrained):
     """By dense algebra for a small body, by Lanczos for a larger one; overestimated by at most 1 %."""
-    scene = one_body(cells=cells, held=held, order=order)
+    scene = one_body(cells=cells, constrained=constrained, order=order)
     K, M, free = dense(scene)
     exact = np.sqrt(la.eigh(K[np.ix_(free, free)], M[np.ix_(free, free)], eigvals_only=True)[-1])
     assert exact < highest_frequency(scene.bodies[0]) < 1.01 * exact
@@ -69,7 +69,7 @@ def test_highest_frequency_matches_dense_algebra(order, cells, held):
 )
 def test_modes_match_dense_algebra(mass, order, degree, cells):
     """Dense for a small body, by shift-invert Lanczos for a larger one."""
-    scene = one_body(rubber(density=700.0), cells, held=True, order=order, degree=degree)
+    scene = one_body(rubber(density=700.0), cells, constrained=True, order=order, degree=degree)
     K, M, free = dense(scene, mass)
     assert M.sum() == pytest.approx(3 * 700 * 0.99)
     expected = np.sqrt(la.eigh(K[np.ix_(free, free)], M[np.ix_(free, free)], eigvals_only=True)[:5]) / (2 * np.pi)
@@ -102,7 +102,7 @@ def test_free_bodies_have_six_rigid_motions_each(order, degree, cells):
 )
 def test_invalid_arguments_of_modes_are_rejected(k, mass, message):
     with pytest.raises(ts.SceneError, match=message):
-        ts.modes(one_body(held=True), k, mass=mass)
+        ts.modes(one_body(constrained=True), k, mass=mass)
 
 
 def test_modes_of_an_empty_scene_are_rejected():
@@ -190,9 +190,9 @@ def test_limit_is_the_smallest_of_all_bodies():
     assert quadratic < linear
     scene.add_body(cube((18, 0, 0)), rubber(young=4e5), **element(2))
     assert stable_dt(scene, False) == pytest.approx(quadratic / 2, rel=1e-3)
-    held = one_body(cells=(1, 1, 1))
-    held.bodies[0].fix(lambda X: X[:, 0] < 9)
-    assert stable_dt(held, False) == np.inf
+    constrained = one_body(cells=(1, 1, 1))
+    constrained.bodies[0].fix(lambda X: X[:, 0] < 9)
+    assert stable_dt(constrained, False) == np.inf
 
 
 @pytest.mark.filterwarnings("ignore:dt = .* is above the estimated stability limit")

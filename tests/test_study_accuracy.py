@@ -26,9 +26,9 @@ def test_nodes_are_paired_by_position_within_their_body():
     start = np.concatenate([COARSE.vertices, COARSE.vertices])  # two coincident bodies
     other = np.concatenate([FINE[shuffled], FINE])
     n, m = COARSE.n_verts, len(FINE)
-    own, theirs = shared_nodes(start, [["a", n], ["b", n]], other, [["a", m], ["b", m]])
-    assert np.array_equal(own, np.arange(2 * n)) and np.array_equal(start[own], other[theirs])
-    assert (theirs[:n] < m).all() and (theirs[n:] >= m).all()
+    first, second = shared_nodes(start, [["a", n], ["b", n]], other, [["a", m], ["b", m]])
+    assert np.array_equal(first, np.arange(2 * n)) and np.array_equal(start[first], other[second])
+    assert (second[:n] < m).all() and (second[n:] >= m).all()
 
 
 def test_meshes_without_shared_nodes_are_rejected():
@@ -67,7 +67,7 @@ def test_distance_is_relative_to_the_scale():
 
 @pytest.mark.parametrize("start, change, scale", [(100.0, 2.0, 2.0), (100.0, 1e-12, 100.0), (0.0, 2.0, 2.0)])
 def test_momentum_error_is_relative_to_the_largest_change(start, change, scale):
-    known = reference(FINE, [["a", len(FINE)]], shift=1.0)
-    known.momentum = np.array([[start, 0, 0], [start + change, 0, 0]])
-    inexact = known.momentum + [[0, 0, 0], [0, 0.5, 0]]
-    assert _momentum_error({"momentum_rate": None}, inexact, known) == pytest.approx(0.5 / scale)
+    exact = reference(FINE, [["a", len(FINE)]], shift=1.0)
+    exact.momentum = np.array([[start, 0, 0], [start + change, 0, 0]])
+    inexact = exact.momentum + [[0, 0, 0], [0, 0.5, 0]]
+    assert _momentum_error({"momentum_rate": None}, inexact, exact) == pytest.approx(0.5 / scale)

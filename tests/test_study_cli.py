@@ -17,7 +17,7 @@ from types import SimpleNamespace
 
 import pytest
 from command import BEAM, ROOT, child, write
-from study_places import is_running
+from study_places import wait_until_ended
 
 from taisoft.cli import main
 from taisoft.cli import study as study_command
@@ -138,10 +138,7 @@ def test_interrupted_and_killed_studies_are_continued(tmp_path, capsys):
     running = children_of(process.pid)
     process.kill()
     process.communicate()
-    deadline = time.monotonic() + 120
-    while any(map(is_running, running)):
-        assert time.monotonic() < deadline, "a run outlives its study"
-        time.sleep(0.05)
+    wait_until_ended(running)
     second = records(out)
 
     process = child("study", *arguments)

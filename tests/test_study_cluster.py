@@ -13,7 +13,7 @@ from contextlib import ExitStack
 
 import pytest
 from command import BEAM, ROOT, write
-from study_places import is_running
+from study_places import wait_until_ended
 
 pytest.importorskip("distributed")
 
@@ -99,7 +99,4 @@ def test_workers_use_separate_cores_and_may_be_lost(cluster, tmp_path):
             seconds_left=lambda: deadline - time.monotonic(),
         )
         assert sorted(unfinished.values()) == [BUDGET_SPENT, CUT_BY_BUDGET] and len(pids_at_kill) == 2
-    deadline = time.monotonic() + 60
-    while any(map(is_running, started())):
-        assert time.monotonic() < deadline, "a run outlives the study"
-        time.sleep(0.1)
+    wait_until_ended(started())

@@ -21,7 +21,7 @@ from taisoft.study import Request, measure
 from taisoft.study.runner import Runner, tasks_of
 from taisoft.study.workers import LocalPlace, carry_out, local_places
 
-SCENE = '''"""A bar that swings: held at one end, or free and thrown."""
+SCENE = '''"""A bar: fixed at one end, or in free flight."""
 import taisoft as ts
 
 solver = {"dt": 0.01, "integrator": "INTEGRATOR", "seconds": 0.4, "fps": 50}
@@ -33,7 +33,7 @@ def build():
     HOLD
     return scene
 '''
-HELD, FREE = "bar.fix(lambda X: X[:, 0] < -0.99)", "bar.velocity[:] = (1.0, 5.0, 0.0)"
+FIXED, FREE = "bar.fix(lambda X: X[:, 0] < -0.99)", "bar.velocity[:] = (1.0, 5.0, 0.0)"
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def reused_simulators(monkeypatch):
         sim.close()
 
 
-def study_of(tmp_path, hold: str = HELD, **request):
+def study_of(tmp_path, hold: str = FIXED, **request):
     path = write(tmp_path / "bar.py", SCENE.replace("HOLD", hold))
     place = InProcess()
     return run(place, Request(str(path), repeats=1, **request))
@@ -111,7 +111,7 @@ def test_failed_run_is_recorded_with_the_reason(tmp_path):
     ],
 )
 def test_invalid_solver_dict_is_rejected(tmp_path, solver, message):
-    path = write(tmp_path / "bar.py", SCENE.replace("HOLD", HELD) + f"\n\nsolver = {solver}\n")
+    path = write(tmp_path / "bar.py", SCENE.replace("HOLD", FIXED) + f"\n\nsolver = {solver}\n")
     with pytest.raises(SceneError) as error:
         run(InProcess(), Request(str(path)))
     assert message in str(error.value)
@@ -119,11 +119,11 @@ def test_invalid_solver_dict_is_rejected(tmp_path, solver, message):
 
 def test_changed_import_or_refined_mesh_makes_another_run(tmp_path):
     write(tmp_path / "module_of_a_study.py", "YOUNG = 1e5")
-    text = SCENE.replace("def build():", "def build(refine=0):\n    import module_of_a_study as own")
-    text = text.replace("1e5", "own.YOUNG")
+    text = SCENE.replace("def build():", "def build(refine=0):\n    import module_of_a_study as numbers")
+    text = text.replace("1e5", "numbers.YOUNG")
     length = write(tmp_path / "length.txt", "2")
     text = text.replace("(2, 1, 1), (2.0", "(2, 1, 1), (float(open(LENGTH).read()) if refine else 2.0")
-    path = write(tmp_path / "bar.py", text.replace("HOLD", HELD).replace("LENGTH", repr(str(length))))
+    path = write(tmp_path / "bar.py", text.replace("HOLD", FIXED).replace("LENGTH", repr(str(length))))
     axes = {"dt": [0.01], "integrator": ["velocity_verlet"], "refine": [0, 1]}
     place = InProcess()
     runner = Runner(Request(str(path), axes), [place], [{"name": "here"}], bool, lambda: 1.0, str, planner=place)

@@ -85,11 +85,9 @@ OFF_POINTS = "0 0 0\n1 0 0\n0 1 0\n"
     [
         ("# comment\n", "the file is empty"),
         ("3 1 0\n" + OFF_POINTS, "line 1: not a supported surface: expected OFF, not '3'"),
-        ("4OFF 3 1 0\n" + OFF_POINTS, "line 1: not a supported surface"),
         ("OFF\n", "line 1: expected the counts of vertices and faces"),
         ("OFF BINARY\n", "line 1: expected the counts of vertices and faces"),
         ("OFF\n3 -1 0\n", "line 2: expected the counts"),
-        ("OFF\n3\n", "line 2: expected the counts"),
         ("OFF\n1000000000 1 0\n" + OFF_POINTS, "line 2 declares 1000000000 vertices and 1 faces, but 3 lines follow"),
         ("OFF 3 1000000000 0\n" + OFF_POINTS, "line 1 declares 3 vertices and 1000000000 faces, but 3 lines follow"),
         (f"OFF 3 {'9' * 5000} 0\n", "line 1: expected the counts"),
@@ -124,9 +122,9 @@ def test_welding(tmp_path):
         assert len(surface.vertices) == len(X) and not surface.faults()
         if apart:
             assert "hole" in read_surface(path).faults()[0]
-    for wrong in (-1.0, np.nan, "1", True, 1j):
+    for invalid in (-1.0, np.nan, "1", True, 1j):
         with pytest.raises(MeshError, match="ball.obj: weld must be a distance of at least 0 m"):
-            read_surface(path, weld=wrong)
+            read_surface(path, weld=invalid)
 
 
 def test_dropped_triangles_cause_warnings(tmp_path):

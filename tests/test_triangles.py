@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import taichi as ti
 from lanes import opened
+from rotations import rotation
 from surfaces import separation
 
 from taisoft.backend.runtime import kernel
@@ -146,18 +147,13 @@ def integer_cases() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return X, apart, ~(apart > 0)  # NaN for two coincident points, which have no axis
 
 
-def random_rotation(rng: np.random.Generator) -> np.ndarray:
-    Q, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-    return Q
-
-
 def test_intersection_is_exact_on_the_integer_grid():
     X, apart, expected = integer_cases()
     assert 0.2 < expected.mean() < 0.8 and (apart[expected] == 0).sum() > 2500  # many only touch
     assert np.array_equal(run(intersections, X, 1)[:, 0] == 1, expected)
     rng = np.random.default_rng(4)
     for size, shift in ((1.0, 0.0), (1e-5, 1e-2), (1e-5, 0.0), (1e6, 1e6)):
-        moved = size * X @ random_rotation(rng).T + shift * rng.standard_normal(3)
+        moved = size * X @ rotation(rng.standard_normal(3), rng.uniform(0, np.pi)).T + shift * rng.standard_normal(3)
         assert np.array_equal(run(intersections, moved, 1)[:, 0] == 1, expected)
     some = slice(None, None, 7)
     for order in itertools.permutations(range(3)):
