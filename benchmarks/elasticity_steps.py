@@ -189,7 +189,7 @@ def _steps_alone(sim: ts.Simulator, steps: int) -> None:
     stepper, done = sim._dynamics.stepper, 0
     while done < steps:
         if sim.settings.explicit:
-            done += stepper.advance(steps - done, sim.dt).done
+            done += stepper.advance(steps - done, sim.dt).steps
         else:
             stepper.step(sim.dt)
             done += 1

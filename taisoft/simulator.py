@@ -58,13 +58,16 @@ class Simulator(Guarded):
         for text in scale_warnings(scene):
             warnings.warn(text, UserWarning, stacklevel=2)
         self.plan = plan_of(scene, integrator, self_collision, draggable)
-        self._may_soften = any(LAWS[b.material.law].SOFTENS_BELOW for b in scene.bodies)  # until `_warn_softened` has warned
+        self._may_soften = any(LAWS[b.material.law].SOFTENS_BELOW for b in scene.bodies)  # until a warning says so
         self._compiled_before = self._compile_reported = runtime.compile_clock()
         try:
             self._dynamics = Dynamics(scene, self.settings, self.plan)
             self._refuse_overlap()
-        except MemoryError as error:
-            raise no_memory("this scene", error) from None
+        except BaseException as error:
+            self.close()
+            if isinstance(error, MemoryError):
+                raise no_memory("this scene", error) from None
+            raise
         for one in (self._start_scene, scene):
             one.freeze()
         self._seal(Simulator.__init__)
@@ -72,7 +75,6 @@ class Simulator(Guarded):
     def _refuse_overlap(self) -> None:
         found = None if self.scene.allow_initial_overlap or not self.touches else self.deepest_overlap()
         if found is not None:
-            self._dynamics.release()
             raise SceneError(
                 f"'{found.name_a}' and '{found.name_b}' overlap at the start, {found.depth:.3g} m deep: move them apart, or set "
                 "scene.allow_initial_overlap = True"
@@ -90,24 +92,10 @@ class Simulator(Guarded):
         Raises SimulationError as `step` does, and unless n is an integer of at least 1.
         """
         report = self._open().advance(check_count("n", n))
-        if self._may_soften:
-            self._warn_softened()
+        if self._may_soften and (text := self._dynamics.describe_softening()):
+            self._may_soften = False
+            warnings.warn(text, UserWarning, stacklevel=2)
         return report
-
-    def _warn_softened(self) -> None:
-        """Warn once, of the first tet compressed so far that its material law softens."""
-        found = self._dynamics.first_softened()
-        if found is None:
-            return
-        self._may_soften = False
-        body = self.scene.bodies[found[0]]
-        law = LAWS[body.material.law]
-        warnings.warn(
-            f"step {self.step_count}: tet {found[1]} of body '{body.name}' is compressed below {law.SOFTENS_BELOW} of its "
-            f"length, where {law.NAME} softens: tets may collapse or invert, and stay so",
-            UserWarning,
-            stacklevel=3,
-        )
 
     run = running.run
 

@@ -101,7 +101,7 @@ def test_the_life_of_a_simulator(earlier, time):
     assert {"find_proximity", "update_surface", "find_analytic", "begin_reduction"} <= kernels
     with simulator(two_bodies()) as sim:
         before, fields = runtime.launches.copy(), set(sim.field_bytes)
-        assert {"contacts", "found_gap", "problem_normal"} <= fields
+        assert {"contacts", "problem_gap", "problem_normal"} <= fields
         sim.step()
         launched = runtime.launches - before
         assert set(launched) & kernels >= {"find_proximity", "update_surface", "begin_reduction"}

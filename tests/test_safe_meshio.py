@@ -6,6 +6,8 @@
 
 import re
 
+import meshio
+import numpy as np
 import pytest
 from test_mesh_files import MESH, same, write_by_meshio
 
@@ -66,3 +68,12 @@ def test_markup_in_what_a_reader_prints_is_no_error(tmp_path, capfd):
     path.write_text(path.read_text() + "[/red] :smile:\n")
     capfd.readouterr()
     assert same(ts.read_mesh(path)) and capfd.readouterr() == ("", "")
+
+
+def test_more_data_than_the_file_can_hold(tmp_path):
+    """A small compressed file that would fill the memory of its reader."""
+    path = tmp_path / "zeros.vtu"
+    meshio.write(path, meshio.Mesh(np.zeros((2_000_000, 3)), [("tetra", np.array([[0, 1, 2, 3]]))]), compression="zlib")
+    assert path.stat().st_size < 1e6
+    with pytest.raises(ts.MeshError, match="it declares more data than it can hold"):
+        ts.read_mesh(path)

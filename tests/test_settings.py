@@ -1,12 +1,15 @@
 """Every argument of a Simulator is checked before anything is opened: one sentence that names the argument and the rule."""
 
+import dataclasses
+import inspect
+
 import numpy as np
 import pytest
 from scenes import cube, rubber
 
 import taisoft as ts
 from taisoft.backend import runtime
-from taisoft.settings import check_dt
+from taisoft.settings import NAMES, Settings, check_dt
 
 
 def scene() -> ts.Scene:
@@ -63,6 +66,12 @@ def test_bad_scenes(what, words):
     with pytest.raises(ts.SceneError, match=words):
         ts.Simulator(what)
     assert runtime.open_kind() is None
+
+
+def test_the_defaults_are_those_of_the_signature():
+    parameters = inspect.signature(ts.Simulator).parameters
+    assert {name: parameters[name].default for name in NAMES} == dataclasses.asdict(Settings())
+    assert list(parameters) == ["scene", *NAMES]
 
 
 def test_dt_becomes_a_float():

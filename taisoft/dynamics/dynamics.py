@@ -15,11 +15,13 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.drag_spring import DragSpring
 from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.schemes import IMPLICIT
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
+from taisoft.fem.laws import LAWS
 from taisoft.fem.measure import NO_TET, measure
-from taisoft.fem.model import build_model
+from taisoft.fem.model import Model, build_model
 from taisoft.fem.state import FIRST_SOFTENED, LOADS
 from taisoft.records import Energies, StepReport
 from taisoft.scene.plan import Plan
@@ -74,7 +76,7 @@ class Dynamics:
         self.reset()
 
     @property
-    def model(self):
+    def model(self) -> Model:
         """The `Model` of the scene."""
         return self.state.model
 
@@ -112,7 +114,7 @@ class Dynamics:
             return SimulationError(f"{step}{nonfinite} at its start")
         return error if str(error).startswith("step ") else SimulationError(f"{step}{error}")
 
-    def _report(self, result) -> StepReport:
+    def _report(self, result: StepResult) -> StepReport:
         """Return the report of a step: of its `StepResult`, and of the state and the contacts at its end."""
         measure(self.model)
         elastic, lowest, inverted, kinetic, gravity, _, loads = self.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
@@ -207,14 +209,19 @@ class Dynamics:
         elastic, _, _, kinetic, gravity, _, loads = self.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
         return Energies(kinetic, elastic, gravity, loads)
 
-    def first_softened(self) -> tuple[int, int] | None:
-        """Return the body and the tet first compressed so far that its material law softens; None if there is none."""
+    def describe_softening(self) -> str | None:
+        """Name the tet that was first compressed so far that its material law softens; None if there is none."""
         layout, first = self.state.layout, int(self.model.state.scalars[FIRST_SOFTENED])
         if first == NO_TET:
             return None
-        place = first - layout.block_start * self.runtime.lanes
-        k = int(np.flatnonzero((place >= 0) & (place < layout.n_tets))[0])
-        return k, int(place[k])
+        tets = first - layout.block_start * self.runtime.lanes  # its number in each body
+        k = int(np.flatnonzero((tets >= 0) & (tets < layout.n_tets))[0])
+        body = self.scene.bodies[k]
+        law = LAWS[body.material.law]
+        return (
+            f"step {self.state.step_count}: tet {tets[k]} of body '{body.name}' is compressed below {law.SOFTENS_BELOW} of its "
+            f"length, where {law.NAME} softens: tets may collapse or invert, and stay so"
+        )
 
     def find_contacts(self, dt: float) -> "Detection":
         """Detect the contacts of the present state swept by dt [s]; with 0, paths are evaluated at the present time only."""

@@ -24,6 +24,7 @@ UTF16 = "the file is UTF-16 text; save it as UTF-8"
 HEAD = 64  # characters inspected to detect UTF-16 text
 SECONDS, SECONDS_PER_BYTE = 15.0, 1e-5  # time limit of a reader; the slowest reads 1 MB/s
 MEMORY, MEMORY_PER_BYTE = 2 << 30, 200  # limit of a reader's address space [bytes]; text becomes Python objects
+MAX_ENTRIES_PER_BYTE = 16  # of a file, in the arrays read from it: more can only come from counts that it declares
 MAX_READS_PAST_END = 100  # allowed reads past the end of a file, where some of meshio's readers loop forever
 QUALITY = 10.0  # fTetWild's target upper bound of the tets' AMIPS energy: 3 for a regular tet
 MAX_ITERATIONS = 80  # its maximum number of optimisation iterations
@@ -154,6 +155,8 @@ def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
             arrays = [np.asarray(mesh.points), *(np.asarray(block.data) for block in mesh.cells)]
         if any(array.dtype.hasobject for array in arrays):
             raise meshio.ReadError("rows of different lengths")
+        if sum(array.size for array in arrays) > MAX_ENTRIES_PER_BYTE * len(data):
+            raise MemoryError
     except ImportError as error:
         sys.exit(f"its format needs the Python package {error.name or error}")
     except MemoryError:

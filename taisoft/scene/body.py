@@ -133,7 +133,17 @@ class Body(Guarded):
         "tractions": _SET_TRACTION,
     }
 
-    def __init__(self, name: str, mesh, material, position, velocity, order, quadrature_degree, collision):
+    def __init__(
+        self,
+        name: str,
+        mesh: TetMesh,
+        material: Material,
+        position,
+        velocity,
+        order: int,
+        quadrature_degree: int | None,
+        collision: str,
+    ):
         what = f"body {name!r}"
         if not isinstance(mesh, TetMesh):
             raise SceneError(f"{what}: mesh must be a TetMesh, not {type(mesh).__name__}")

@@ -32,6 +32,10 @@ class Plan:
         """Map each feature to whether it is modelled."""
         return {e["feature"]: e["on"] for e in self.entries}
 
+    def why(self, feature: str) -> str:
+        """Return why a feature is or is not modelled."""
+        return next(e["why"] for e in self.entries if e["feature"] == feature)
+
     def add(self, feature: str, on: bool, why: str, why_not: str) -> None:
         """Add a feature with the reason for its state."""
         self.entries.append({"feature": feature, "on": bool(on), "why": why if on else why_not})
