@@ -1,6 +1,7 @@
-"""Places of a study that start no process: runs in this one, or of a program made up."""
+"""Places of a study without child processes: runs in this process, or of a fake program; and helpers for child processes."""
 
 import json
+import time
 from pathlib import Path
 
 import numpy as np
@@ -31,9 +32,9 @@ class InProcess:
 
 
 class Pendulum(InProcess):
-    """Answers as if a mass on a spring, x'' = -x, had been run by implicit Euler, or by trapezes under other names.
+    """Records of an oscillator, x'' = -x, solved by implicit Euler, or by the trapezoidal rule for any other integrator.
 
-    failing: sentences by dt, of runs that fail; crashing: by dt, of processes that end without an answer.
+    failing: dt -> problem of a run that fails; crashing: dt -> message about a process that ended without an answer.
     """
 
     def __init__(self, plan: dict, failing=(), crashing=()):
@@ -60,16 +61,16 @@ class Pendulum(InProcess):
         x, v = np.array(states).T
         path = np.zeros((len(x), 2, 3))
         path[:, 1, 0] = x
-        why = self.failing.get(h)
+        problem = self.failing.get(h)
         energies = np.stack([v**2 / 2, x**2 / 2, 0 * x], axis=1).tolist()
         momentum = np.stack([v, 0 * v, 0 * v], axis=1).tolist()
         extremes = {name: {"max": 0.0} for name in ("n_inverted", "contact_residual", "max_penetration")}
         return {
             "task": task,
-            "status": "failed" if why else "ok",
-            "problems": [why] if why else [],
+            "status": "failed" if problem else "ok",
+            "problems": [problem] if problem else [],
             "warnings": [],
-            "seconds": [] if why else [0.1 / h * (1.0 + 0.1 * k) for k in range(task["repeats"])],
+            "seconds": [] if problem else [0.1 / h * (1.0 + 0.1 * k) for k in range(task["repeats"])],
             "compile_seconds": 1.0,
             "threads": 1,
             "cores": [0],
@@ -87,12 +88,19 @@ class Pendulum(InProcess):
             "bodies": [["mass", 2]],
             "energies": energies,
             "momentum": momentum,
-            "path": None if why else pack(path),
+            "path": None if problem else pack(path),
         }
 
 
-def is_running(pid: int) -> bool:
-    """Whether the process is there and no zombie."""
+def wait_until_ended(pids: list[int], seconds: float = 120.0) -> None:
+    """Wait until no process of these is running; fail after so many seconds."""
+    deadline = time.monotonic() + seconds
+    while any(map(_is_running, pids)):
+        assert time.monotonic() < deadline, "a run outlives its study"
+        time.sleep(0.05)
+
+
+def _is_running(pid: int) -> bool:
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):

@@ -1,12 +1,11 @@
-"""Solids whose surfaces coincide, wholly or in part, wherever they are and however they are turned:
+"""Overlap of solids whose surfaces coincide, wholly or in part:
 
-* doubles, with the same and other tets, shifted by less than what is allowed and by more; shifted along themselves, so that four
-  sides stay flush; one that fills half of another or lies in its corner; in a wall, and round a cavity: the depth does not depend
-  on a rigid motion, nor on the order of the two; an obstacle, which has no tets, in place of either is found too;
-* stacked flush, along an edge, at a corner, in a cavity: no overlap;
-* solids that hang together by an edge alone have an inside, and open surfaces have none, but cut;
-* cuts of triangles into tets are how far they must part, by linear programming; winding numbers and distances of points, rays
-  and segments are those of samples; inner points lie inside their own part.
+* identical solids with the same or other tets, shifted by less and by more than the tolerance; shifted along themselves so that
+  four sides stay flush; half of another, its corner, its wall, its cavity: the depth is invariant under rigid motions and under
+  exchange of the two; a surface without tets (an obstacle) in place of either is found too;
+* flush faces, edges and corners, and a solid in a cavity, do not overlap;
+* solids joined at an edge only, and open surfaces;
+* depths of triangle-tet cuts agree with linear programming; distances of points, rays and segments agree with sampling.
 """
 
 import numpy as np
@@ -37,19 +36,19 @@ def box(n: int, size=(1, 1, 1), pattern="five") -> ts.TetMesh:
     return ts.box_mesh((n, n, n), size, pattern=pattern)
 
 
-def turned(mesh: ts.TetMesh, rotvec) -> ts.TetMesh:
+def rotated(mesh: ts.TetMesh, rotvec) -> ts.TetMesh:
     return ts.TetMesh(Rotation.from_rotvec(rotvec).apply(mesh.vertices.copy()), mesh.tets)
 
 
-def part_of(mesh: ts.TetMesh, kept: np.ndarray) -> ts.TetMesh:
+def subset(mesh: ts.TetMesh, kept: np.ndarray) -> ts.TetMesh:
     used, tets = np.unique(mesh.tets[kept], return_inverse=True)
     return ts.TetMesh(mesh.vertices[used], tets.reshape(-1, 4))
 
 
 def hollow() -> ts.TetMesh:
     """A cube of side 3 with a cubic cavity of side 1."""
-    whole = box(3, (3, 3, 3))
-    return part_of(whole, (np.abs(whole.vertices[whole.tets].mean(axis=1)) > 0.5).any(axis=1))
+    full = box(3, (3, 3, 3))
+    return subset(full, (np.abs(full.vertices[full.tets].mean(axis=1)) > 0.5).any(axis=1))
 
 
 MESHES = {
@@ -61,15 +60,15 @@ MESHES = {
     "eighth": box(1, (0.5, 0.5, 0.5)),
     "wide": box(2, (1.1, 1, 1)),
     "hollow": hollow(),
-    "tilted": turned(box(1), (0, 0, np.pi / 4)),
-    "turned": turned(box(2), (0, np.pi / 2, 0)),
+    "tilted": rotated(box(1), (0, 0, np.pi / 4)),
+    "rotated": rotated(box(2), (0, np.pi / 2, 0)),
 }
-STILL = Rotation.identity(), np.zeros(3)
-MOTIONS = [STILL, (Rotation.from_rotvec((0, 0, np.pi / 2)), np.array([0.0, 0.1, 0.0]))]
+NO_MOTION = Rotation.identity(), np.zeros(3)
+MOTIONS = [NO_MOTION, (Rotation.from_rotvec((0, 0, np.pi / 2)), np.array([0.0, 0.1, 0.0]))]
 MOTIONS += [(Rotation.random(random_state=1), np.array([30.0, -60.0, 10.0]))]
 
 
-def solid(name: str, shift=(0, 0, 0), motion=STILL, filled: bool = True) -> Solid:
+def solid(name: str, shift=(0, 0, 0), motion=NO_MOTION, filled: bool = True) -> Solid:
     mesh = MESHES[name]
     nodes = motion[0].apply(mesh.vertices + np.array(shift, dtype=float)) + motion[1]
     used, triangles = np.unique(mesh.surface, return_inverse=True)
@@ -78,7 +77,7 @@ def solid(name: str, shift=(0, 0, 0), motion=STILL, filled: bool = True) -> Soli
 
 
 def depths(a: str, b: str, shift) -> np.ndarray:
-    """(motions, 6) [m]: of both orders, of both filled, only the first, only the second."""
+    """(motions, 6) [m]: both orders, with tets in both, in the first only, in the second only."""
     found = []
     for motion in MOTIONS:
         row = []
@@ -89,9 +88,9 @@ def depths(a: str, b: str, shift) -> np.ndarray:
     return np.array(found)
 
 
-DOUBLES = ("cube", "coarse", "fine", "six", "turned")
-OVERLAPPING = [  # mesh, mesh, shift of the first [m], bounds of the depth [m]
-    *(("cube", other, (0, 0, 0), 0.5, 0.5) for other in DOUBLES),
+SAME_CUBE = ("cube", "coarse", "fine", "six", "rotated")
+OVERLAPPING = [  # meshes, shift of the first [m], bounds of the depth [m]
+    *(("cube", other, (0, 0, 0), 0.5, 0.5) for other in SAME_CUBE),
     ("coarse", "coarse", (0, 0, 0), 0.4, 0.5),
     *(("cube", "cube", shift, 0.4999, 0.5) for shift in ((1e-9, 2e-9, -1e-9), (1e-5, 2e-5, -1e-5), (1e-5, 0, 0))),
     *(("cube", other, (0.1, 0, 0), 0.4, 0.5) for other in ("cube", "fine")),
@@ -127,46 +126,44 @@ TOUCHING = [
 ]
 
 
-@pytest.mark.parametrize("a, b, shift, least, most", OVERLAPPING)
-def test_what_overlaps(a, b, shift, least, most):
+@pytest.mark.parametrize("a, b, shift, lower, upper", OVERLAPPING)
+def test_depth_of_overlapping_solids(a, b, shift, lower, upper):
     found = depths(a, b, shift)
-    assert found[:, 0].min() > least - 1e-9 and found[:, 0].max() < most + 1e-9
-    assert found[:, 2:].min() > 9e-6 and found[:, 2:].max() < found[:, 0].max() + 1e-9  # fewer tets tell less of the depth
+    assert found[:, 0].min() > lower - 1e-9 and found[:, 0].max() < upper + 1e-9
+    assert found[:, 2:].min() > 9e-6 and found[:, 2:].max() < found[:, 0].max() + 1e-9  # without tets a lower bound
     assert np.ptp(found, axis=0).max() < 1e-11 and np.abs(found[:, ::2] - found[:, 1::2]).max() < 1e-11
 
 
 @pytest.mark.parametrize("a, b, shift", TOUCHING)
-def test_what_only_touches(a, b, shift):
+def test_touching_solids_do_not_overlap(a, b, shift):
     assert depths(a, b, shift).max() < 0.6 * ALLOWED
 
 
-def test_solids_that_hang_together_by_an_edge():
-    """Their edge has four triangles; nothing of the other is inside where the vertices' normals tell."""
-    whole = box(2)
+def test_solid_joined_at_an_edge_only(monkeypatch):
+    """Four surface triangles share that edge, where vertex normals cannot decide what is inside."""
+    full = box(2)
+    middle = full.vertices[full.tets].mean(axis=1)
     with pytest.warns(UserWarning, match="edge"):
-        middle = whole.vertices[whole.tets].mean(axis=1)
-        MESHES["joined"] = part_of(whole, middle[:, 0] * middle[:, 1] > 0.0)
-    try:
-        for motion in MOTIONS:
-            inside, beside = solid("eighth", (0.25, 0.25, 0), motion), solid("eighth", (0.25, -0.25, 0), motion)
-            assert overlap_depth(solid("joined", motion=motion), inside) == pytest.approx(0.25, abs=1e-9)
-            assert overlap_depth(solid("joined", motion=motion), beside) < 1e-12
-    finally:
-        del MESHES["joined"]
-
-
-def test_an_open_surface_cuts():
-    sheet = np.array([[-2.0, 0.1, -2], [2, 0.1, -2], [0, 0.1, 3]])
-    nothing = np.zeros((0, 3)), np.zeros((0, 4), dtype=np.int64)
+        monkeypatch.setitem(MESHES, "joined", subset(full, middle[:, 0] * middle[:, 1] > 0.0))
     for motion in MOTIONS:
-        cut, beside = (Solid(motion[0].apply(sheet + (0, y, 0)) + motion[1], np.array([[0, 1, 2]]), *nothing) for y in (0.0, 0.4))
-        assert overlap_depth(solid("coarse", motion=motion), cut) == pytest.approx(0.4, abs=0.15)
-        assert overlap_depth(cut, solid("coarse", motion=motion)) == overlap_depth(solid("coarse", motion=motion), cut)
-        assert overlap_depth(solid("coarse", motion=motion), beside) < 1e-12
+        joined = solid("joined", motion=motion)
+        inside, beside = solid("eighth", (0.25, 0.25, 0), motion), solid("eighth", (0.25, -0.25, 0), motion)
+        assert overlap_depth(joined, inside) == pytest.approx(0.25, abs=1e-9)
+        assert overlap_depth(joined, beside) < 1e-12
 
 
-def test_cuts_by_linear_programming():
-    """They are clear exactly where they have no point in common, and the depth is the least width over all directions."""
+def test_an_open_surface_cuts_a_solid():
+    sheet = np.array([[-2.0, 0.1, -2], [2, 0.1, -2], [0, 0.1, 3]])
+    no_tets = np.zeros((0, 3)), np.zeros((0, 4), dtype=np.int64)
+    for motion in MOTIONS:
+        cut, beside = (Solid(motion[0].apply(sheet + (0, y, 0)) + motion[1], np.array([[0, 1, 2]]), *no_tets) for y in (0.0, 0.4))
+        cube = solid("coarse", motion=motion)
+        assert overlap_depth(cube, cut) == overlap_depth(cut, cube) == pytest.approx(0.4, abs=0.15)
+        assert overlap_depth(cube, beside) < 1e-12
+
+
+def test_cut_depths_agree_with_linear_programming():
+    """The depth is 0 exactly where the two have no point in common; otherwise it is the least width over all directions."""
     rng = np.random.default_rng(0)
     triangles, tets = rng.random((40, 3, 3)), rng.random((40, 4, 3))
     pairs, depth = cut_depths(triangles, tets, 0.0)
@@ -174,18 +171,18 @@ def test_cuts_by_linear_programming():
     directions = rng.normal(size=(4000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     for (t, m), d in list(zip(pairs, depth))[:120]:
-        # weights of corners of both that make one point
+        # weights of both sets of corners that give the same point
         points = np.concatenate([triangles[t], -tets[m]])
         equal = np.vstack([points.T, [1, 1, 1, 0, 0, 0, 0], [0, 0, 0, 1, 1, 1, 1]])
-        meet = linprog(np.zeros(7), A_eq=equal, b_eq=[0, 0, 0, 1, 1]).status == 0
-        assert meet == (d > 0.0)
+        intersect = linprog(np.zeros(7), A_eq=equal, b_eq=[0, 0, 0, 1, 1]).status == 0
+        assert intersect == (d > 0.0)
         width = (triangles[t] @ directions.T).max(axis=0) - (tets[m] @ directions.T).min(axis=0)
-        assert d <= max(width.min(), 0.0) + 1e-12 and (not meet or width.min() < d + 0.05)
+        assert d <= max(width.min(), 0.0) + 1e-12 and (not intersect or width.min() < d + 0.05)
     above, below = triangles.max(axis=1)[:, None] >= tets.min(axis=1), triangles.min(axis=1)[:, None] <= tets.max(axis=1)
     assert np.array_equal(np.argwhere((above & below).all(axis=2)), pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))])
 
 
-def test_points_rays_and_segments():
+def test_distances_of_points_rays_and_segments():
     rng, mesh = np.random.default_rng(1), MESHES["hollow"]
     corners, points = mesh.vertices[mesh.surface], rng.uniform(-2, 2, (300, 3))
     exact = signed_distances_at(mesh.vertices, mesh.surface, points)
@@ -193,7 +190,7 @@ def test_points_rays_and_segments():
     assert np.array_equal(are_inside(corners, points), exact < 0.0) and 50 < (exact < 0.0).sum() < 250
     assert np.abs(solid_depths(corners, points) - np.maximum(-exact, 0.0)).max() < 1e-12
     assert greatest_depth(mesh.vertices, mesh.surface, points) == pytest.approx(-exact.min(), rel=1e-12)
-    assert np.array_equal(are_inside(corners[:, ::-1], points), exact > 0.0)  # inside out: all but a hollow
+    assert np.array_equal(are_inside(corners[:, ::-1], points), exact > 0.0)  # inside out
     assert is_closed(mesh.surface) and not is_closed(mesh.surface[1:])
     assert nearest_hit(corners, np.zeros(3), np.array([1.0, 0, 0])) == pytest.approx(0.5)
     assert nearest_hit(corners, np.array([0, 2.0, 0]), np.array([0, 1.0, 0])) == np.inf
@@ -204,8 +201,8 @@ def test_points_rays_and_segments():
     assert segment_distance(corners, np.array([-5.0, 2, 0]), np.array([5.0, 2, 0])) == pytest.approx(0.5)  # along a face
 
 
-def test_inner_points():
-    one, two = box(2), turned(box(3, (0.3, 0.2, 0.4)), (0.3, 0.2, 0.1))
+def test_inner_points_lie_inside_their_own_component():
+    one, two = box(2), rotated(box(3, (0.3, 0.2, 0.4)), (0.3, 0.2, 0.1))
     vertices = np.concatenate([one.vertices, two.vertices + (0, 3, 0)])
     tets = np.concatenate([one.tets, two.tets + one.n_verts])
     part = connected_parts(tets)
@@ -227,4 +224,4 @@ def test_inner_points():
             deep = solid_depths(both.vertices[own], points)
             assert deep[k] >= distance[k] - 1e-12 > 0.01 and deep[1 - k] == 0.0
     _, behind, clear = inner_depths(both.vertices, both.surface[:1], np.zeros(1, dtype=np.int64))
-    assert behind[0] == clear[0] == 0.0  # there is nothing behind it
+    assert behind[0] == clear[0] == 0.0  # nothing lies behind a single triangle

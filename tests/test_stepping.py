@@ -1,38 +1,34 @@
-"""Steps against the oracle's, on a driven scene (fixed, led, released, loaded, damped) and on a mixture of three laws. The
-driven bodies are quadratic, for Verlet linear, for implicit steps both, since the linear mass is lumped there; the mixture has
-both kinds:
+"""Steps of every integrator, in f64.
 
-* every integrator's positions, velocities and reactions, step by step, in f64; symplectic Euler also of the mixture;
-* so do those of the parallel kernels, whose result does not depend on the run;
-* a batch of explicit steps is bitwise so many single steps, and two runs from the start are bitwise alike;
-* loads, weight and reactions make the rate of momentum; a free body falls exactly, and keeps its momentum without gravity;
-* the implicit residual is the gradient of inertia, energies and dissipation;
-* the integrators' names mean the schemes they should.
+The driven scene has fixed, prescribed and released nodes, loads and damping. Its bodies are quadratic for symplectic Euler,
+linear for Verlet, and both for implicit steps, where the mass of linear tets is lumped.
+
+* positions, velocities and reactions match the oracle step by step, also with three laws mixed and with parallel kernels;
+* a batch of explicit steps equals single steps bitwise, and so do two runs from the start;
+* loads, weight and reactions equal the rate of momentum; a free body falls exactly, and keeps its momentum without gravity;
+* the implicit residual is the gradient of inertia, energies and dissipation.
 """
 
 from contextlib import contextmanager
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
 from following import DT, follow, simulator
 from oracle import Oracle
-from scenes import driven_scene, mixed_scene, rows_of
+from scenes import driven_scene, dynamics, mixed_scene, rows_of
 from scipy.linalg import block_diag
 
 import taisoft as ts
-from taisoft.dynamics.dynamics import make_stepper
-from taisoft.dynamics.no_contacts import NoContacts
-from taisoft.dynamics.schemes import IMPLICIT, INTEGRATORS, SCHEMES
+from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT
 from taisoft.fem import reference
 from taisoft.fem.model import damping_table
+from taisoft.fem.state import N_COLUMNS
 from taisoft.linear.block_csr import to_scipy
-from taisoft.settings import Settings
 
 DAMPED = {"mass_damping": 3.0, "stiffness_damping": 0.004}
-EXPLICIT = ("symplectic_euler", "velocity_verlet")
-FALL = {  # after n steps from rest, in units of g dt^2; BDF2's first step is one of implicit Euler, whose error goes on
+TIGHT = {"newton_tolerance": 1e-13, "linear_tolerance": 1e-13}
+FALL = {  # after n steps from rest, in units of g dt^2; BDF2 keeps the error of its first step, which is implicit Euler's
     "symplectic_euler": lambda n: n * (n + 1) / 2,
     "implicit_euler": lambda n: n * (n + 1) / 2,
     "linearly_implicit_euler": lambda n: n * (n + 1) / 2,
@@ -40,7 +36,7 @@ FALL = {  # after n steps from rest, in units of g dt^2; BDF2's first step is on
     "implicit_midpoint": lambda n: n * n / 2,
     "bdf2": lambda n: n * n / 2 + 0.75 * (1 - 3.0**-n),
 }
-ANGULAR = ("symplectic_euler", "velocity_verlet", "implicit_midpoint")  # conserve the angular momentum
+CONSERVE_ANGULAR_MOMENTUM = ("symplectic_euler", "velocity_verlet", "implicit_midpoint")
 
 
 @pytest.fixture(scope="module", params=EXPLICIT)
@@ -52,29 +48,38 @@ def explicit(request):
 
 @pytest.fixture(scope="module")
 def mixture():
-    """Three laws and either quadrature, for one integrator: they take long to compile."""
+    """Three laws and both quadratures, with one integrator only because they take long to compile."""
     with simulator(mixed_scene(mass_damping=3.0, order="both"), "symplectic_euler") as sim:
         yield sim
 
 
-@pytest.fixture(scope="module", params=[1, 2])
+@pytest.fixture(scope="module", params=[f"{order}-{integrator}" for order in (1, 2) for integrator in IMPLICIT])
 def implicit(request):
-    """One simulator whose kernels serve every implicit scheme: they differ in numbers only."""
-    scene = driven_scene(**DAMPED, order=request.param)
-    with simulator(scene, "bdf2", newton_tolerance=1e-13, linear_tolerance=1e-13) as sim:
+    order, integrator = request.param.split("-")
+    with simulator(driven_scene(**DAMPED, order=int(order)), integrator, **TIGHT) as sim:
         yield sim
 
 
-def test_explicit_steps_are_the_oracles(explicit):
+def only(integrator: str):
+    """Run a test with this integrator of the fixture `implicit` only."""
+    return pytest.mark.parametrize("implicit", [f"{order}-{integrator}" for order in (1, 2)], indirect=True)
+
+
+def test_explicit_steps_match_the_oracle(explicit):
     oracle = follow(explicit, explicit.settings.integrator, 9, 1e-10)
-    assert len(oracle.prescribed) == 1  # two of the three led nodes have been released
+    assert len(oracle.prescribed) == 1  # two of the three prescribed nodes have been released
 
 
-def test_explicit_steps_of_a_mixture_are_the_oracles(mixture):
+def test_implicit_steps_match_the_oracle(implicit):
+    oracle = follow(implicit, implicit.settings.integrator, 9, 1e-8)
+    assert len(oracle.prescribed) == 1  # two of the three prescribed nodes have been released
+
+
+def test_explicit_steps_of_mixed_laws_match_the_oracle(mixture):
     follow(mixture, mixture.settings.integrator, 9, 1e-10)
 
 
-def test_batches_are_single_steps(mixture):
+def test_batches_equal_single_steps(mixture):
     mixture.reset()
     for _ in range(40):
         mixture.step()
@@ -86,7 +91,7 @@ def test_batches_are_single_steps(mixture):
     assert all(np.array_equal(a, b) for a, b in zip(single, batched))
 
 
-def test_batches_end_where_nodes_are_released(explicit):
+def test_batches_end_when_nodes_are_released(explicit):
     follow(explicit, explicit.settings.integrator, 9, 1e-10)
     single = explicit.positions(), explicit.velocities()
     explicit.reset()
@@ -96,16 +101,10 @@ def test_batches_end_where_nodes_are_released(explicit):
     assert np.abs(explicit.velocities() - single[1]).max() < 1e-11
 
 
-@pytest.mark.parametrize("method", IMPLICIT)
-def test_implicit_steps_are_the_oracles(implicit, method, monkeypatch):
-    monkeypatch.setattr(implicit._dynamics.stepper, "scheme", SCHEMES[method])
-    oracle = follow(implicit, method, 9, 1e-8)
-    assert len(oracle.prescribed) == 1  # two of the three led nodes have been released
-
-
+@only("bdf2")
 @pytest.mark.parametrize("change", ["dt", "state", "gravity"])
-def test_a_change_makes_bdf2_start_anew(implicit, change):
-    """Where the past does not fit any more, the next step is one of implicit Euler; another gravity leaves it as it is."""
+def test_bdf2_restarts_after_a_change_of_dt_or_state(implicit, change):
+    """The next step is implicit Euler's, since the history is no longer valid; a change of gravity keeps it."""
     oracle = follow(implicit, "bdf2", 2, 1e-8)
     dt = DT
     try:
@@ -129,27 +128,27 @@ def test_a_change_makes_bdf2_start_anew(implicit, change):
 
 
 @pytest.mark.parametrize("integrator", [*EXPLICIT, "implicit_euler"])
-def test_parallel_kernels(integrator, monkeypatch):
+def test_parallel_kernels_match_the_oracle(integrator, monkeypatch):
     monkeypatch.setattr("taisoft.fem.model.PARALLEL_FROM", 0)
     monkeypatch.setattr("taisoft.fem.model.PARALLEL_THREADS", 0)
-    settings = {"newton_tolerance": 1e-13, "linear_tolerance": 1e-13} if integrator == "implicit_euler" else {}
+    settings = TIGHT if integrator == "implicit_euler" else {}
     with simulator(driven_scene(mass_damping=3.0, order=2), integrator, **settings) as sim:
-        assert not sim._dynamics.state.model.serial
+        assert sim.field_bytes["partial"] > 8 * N_COLUMNS  # several threads add up partial sums
         follow(sim, integrator, 9, 1e-8 if settings else 1e-10)
         first = sim.positions(), sim.velocities(), sim.reactions()
         for _ in range(3):
             sim.reset()
             while sim.step_count < 9:
                 sim.advance(9 - sim.step_count)
-            assert np.abs(sim.positions() - first[0]).max() < 1e-13  # [m] a batch's times are rounded differently
+            assert np.abs(sim.positions() - first[0]).max() < 1e-13  # [m]; times of a batch are rounded differently
         sim.reset()
         for _ in range(9):
             sim.step()
         assert all(np.array_equal(a, b) for a, b in zip(first, (sim.positions(), sim.velocities(), sim.reactions())))
-        if sim.settings.explicit:  # a failing sub-step is found, and the last good one is where it ends
-            speeds = np.zeros_like(sim.positions())  # of the beam alone, and along itself: nothing comes near the flyer
-            speeds[rows_of(sim, "beam"), 0] = 1e33 * np.sin(sim.positions("beam")[:, 0])
-            sim.set_state(velocities=speeds)
+        if sim.settings.explicit:  # a failing step within a batch is named, and the state is that of the last good one
+            v = np.zeros_like(sim.positions())  # along the beam only, so that it stays away from the flyer
+            v[rows_of(sim, "beam"), 0] = 1e33 * np.sin(sim.positions("beam")[:, 0])
+            sim.set_state(velocities=v)
             with pytest.raises(ts.SimulationError, match=r"step 1\d: body 'beam', node"):
                 sim.advance(5)
             failed, x = sim.step_count, sim.positions()
@@ -159,50 +158,50 @@ def test_parallel_kernels(integrator, monkeypatch):
             assert np.array_equal(sim.positions(), x)
 
 
-def test_the_residual_is_a_gradient(implicit, monkeypatch):
-    """Of inertia, energies and both kinds of damping; inertia and damping are NumPy's."""
-    monkeypatch.setattr(implicit._dynamics.stepper, "scheme", SCHEMES["implicit_euler"])
-    implicit.reset()
-    implicit.step()
-    model, solver, beta = implicit._dynamics.state.model, implicit._dynamics.stepper.solver, implicit._dynamics.stepper._beta
-    bodies, v_hat = implicit.scene.bodies, solver.work.v_hat.to_numpy()
-    mass = [reference.consistent_mass(b) if model.consistent else np.diag(reference.lumped_mass(b)) for b in bodies]
-    mass = block_diag(*[np.asarray(m.todense()) if sp.issparse(m) else m for m in mass])
-    damping = np.repeat(damping_table(implicit.scene), [b.n_nodes for b in bodies], axis=0)
-    damper = to_scipy(model, solver.damper)
+@pytest.mark.parametrize("order", [1, 2])
+def test_residual_is_the_gradient_of_its_objective(order):
+    """The objective consists of inertia, energies and both kinds of damping; inertia and damping are computed by NumPy."""
+    with dynamics(driven_scene(**DAMPED, order=order), dt=DT, integrator="implicit_euler", precision="f64", **TIGHT) as system:
+        system.advance(1)
+        model, solver, beta = system.model, system.stepper.solver, DT
+        bodies, v_hat = system.scene.bodies, solver.work.v_hat.to_numpy()
+        mass = [reference.consistent_mass(b) if model.consistent else np.diag(reference.lumped_mass(b)) for b in bodies]
+        mass = block_diag(*[np.asarray(m.todense()) if sp.issparse(m) else m for m in mass])
+        damping = np.repeat(damping_table(system.scene), [b.n_nodes for b in bodies], axis=0)
+        damper = to_scipy(model, solver.damper)
 
-    def objective(v) -> float:
-        now, change = implicit.energies(), v - v_hat
-        inertia = 0.5 * np.sum(change * (mass @ change))
-        drag = np.sum(damping[:, :1] * v * (mass @ v)) + np.sum(damping[:, 1:] * v * (damper @ v.ravel()).reshape(-1, 3))
-        return inertia + now.elastic + now.gravity + now.loads + 0.5 * beta * drag
+        def objective(v) -> float:
+            now, change = system.energies(), v - v_hat
+            inertia = 0.5 * np.sum(change * (mass @ change))
+            drag = np.sum(damping[:, :1] * v * (mass @ v)) + np.sum(damping[:, 1:] * v * (damper @ v.ravel()).reshape(-1, 3))
+            return inertia + now.elastic + now.gravity + now.loads + 0.5 * beta * drag
 
-    free, x_hat = model.free.to_numpy(), solver.work.x_hat.to_numpy()
-    rng = np.random.default_rng(4)
-    base = model.state.v.to_numpy() + 5.0 * free * rng.standard_normal(x_hat.shape)
-    fixed_x = model.state.x.to_numpy()
+        free, x_hat = model.free.to_numpy(), solver.work.x_hat.to_numpy()
+        rng = np.random.default_rng(4)
+        end_x, end_v = system.state.state()
+        start = end_v + 5.0 * free * rng.standard_normal(x_hat.shape)
 
-    def put(v):
-        model.state.v.from_numpy(v)
-        model.state.x.from_numpy(np.where(free > 0, x_hat + beta * v, fixed_x))
+        def set_velocities(v):
+            system.state.set_state(np.where(free > 0, x_hat + beta * v, end_x), v)
 
-    put(base)
-    solver.evaluate()
-    gradient = solver.work.residual.to_numpy()
-    way = free * (rng.standard_normal(x_hat.shape) + gradient / np.abs(gradient * free).max())
-    slope, values, h = np.sum(gradient * way), [], 1e-3  # [m/s]
-    for step in (h, -h):
-        put(base + step * way)
-        values.append(objective(base + step * way))
-    assert abs(slope) > 100.0  # [J s/m]
-    assert (values[0] - values[1]) / (2 * h) == pytest.approx(slope, rel=1e-6)
+        set_velocities(start)
+        solver.evaluate()
+        gradient = solver.work.residual.to_numpy()
+        direction = free * (rng.standard_normal(x_hat.shape) + gradient / np.abs(gradient * free).max())
+        slope, values, h = np.sum(gradient * direction), [], 1e-3  # [m/s]
+        for step in (h, -h):
+            v = start + step * direction
+            set_velocities(v)
+            values.append(objective(v))
+        assert abs(slope) > 100.0  # [J s/m]
+        assert (values[0] - values[1]) / (2 * h) == pytest.approx(slope, rel=1e-6)
 
 
 def check_momentum(sim, drag_at: int) -> None:
-    """Reactions, loads, weight and drag make the rate of momentum; elastic forces and their damping add up to 0.
+    """Check that reactions, loads, weight and drag equal the rate of momentum; elastic and damping forces cancel.
 
-    drag_at: 0 where the drag is that of the step's start, 1 for its end. Where the mass couples nodes, the led ones have
-    the acceleration of their path, and no kick where it starts with a velocity.
+    drag_at: 0 if the drag is that of the step's start, 1 for its end. With a consistent mass, prescribed nodes have the
+    acceleration of their path, without an impulse where it starts with a velocity.
     """
     sim.reset()
     oracle = Oracle(sim.scene)
@@ -222,18 +221,18 @@ def check_momentum(sim, drag_at: int) -> None:
 
 
 @pytest.mark.parametrize("explicit", ["symplectic_euler"], indirect=True)
-def test_momentum_of_explicit_steps(explicit):
+def test_forces_equal_the_rate_of_momentum_in_explicit_steps(explicit):
     check_momentum(explicit, 0)
 
 
-def test_momentum_of_implicit_steps(implicit, monkeypatch):
-    monkeypatch.setattr(implicit._dynamics.stepper, "scheme", SCHEMES["implicit_euler"])
+@only("implicit_euler")
+def test_forces_equal_the_rate_of_momentum_in_implicit_steps(implicit):
     check_momentum(implicit, 1)
 
 
 @contextmanager
 def free_flight(sim, velocities, gravity):
-    """The flyer at its start without damping, with the velocities given."""
+    """The flyer at its start, undamped, with velocities(X)."""
     body = sim.scene.body("flyer")
     damping, before = body.material.mass_damping, sim.scene.gravity
     sim.reset()
@@ -247,21 +246,21 @@ def free_flight(sim, velocities, gravity):
         sim.set_gravity(before)
 
 
-def check_free_fall(sim, method: str) -> None:
-    """Four steps, to rounding; the body does not deform."""
+def check_free_fall(sim) -> None:
+    """Check four steps to rounding; the body does not deform."""
     v, gravity = np.array([0.3, -0.2, 0.5]), np.array([0.7, -9.81, -0.4])
     with free_flight(sim, lambda X: np.broadcast_to(v, X.shape), gravity):
         start = sim.positions("flyer")
         for _ in range(4):
             sim.step()
-        exact = start + 4 * DT * v + FALL[method](4) * DT**2 * gravity
+        exact = start + 4 * DT * v + FALL[sim.settings.integrator](4) * DT**2 * gravity
         assert np.abs(sim.positions("flyer") - exact).max() < 1e-13  # [m]
         assert np.abs(sim.velocities("flyer") - v - 4 * DT * gravity).max() < 1e-10  # [m/s]
         assert np.abs(sim.stress("flyer")).max() < 1e-11 * 1e5  # [Pa], of young
 
 
-def check_momentum_of_a_free_body(sim, method: str) -> None:
-    """Of one that tumbles and vibrates, also about the origin where the integrator conserves that."""
+def check_momentum_of_a_free_body(sim) -> None:
+    """Check a body that tumbles and vibrates; angular momentum only if the integrator conserves it."""
     oracle, rng = Oracle(sim.scene), np.random.default_rng(0)
     own = slice(oracle.starts[1], oracle.starts[2])
     M = oracle.inertia(sim.settings.explicit)[own, own]
@@ -278,36 +277,14 @@ def check_momentum_of_a_free_body(sim, method: str) -> None:
         linear_now, angular_now = momenta()
         assert np.abs(linear_now - linear).max() < 1e-11 * np.abs(linear).max()
         change = np.abs(angular_now - angular).max() / np.abs(angular).max()
-        assert change < 1e-11 if method in ANGULAR else 1e-11 < change < 1e-2
+        assert change < 1e-11 if sim.settings.integrator in CONSERVE_ANGULAR_MOMENTUM else 1e-11 < change < 1e-2
 
 
-def test_a_free_body_in_explicit_steps(explicit):
-    check_free_fall(explicit, explicit.settings.integrator)
-    check_momentum_of_a_free_body(explicit, explicit.settings.integrator)
+def test_free_body_in_explicit_steps(explicit):
+    check_free_fall(explicit)
+    check_momentum_of_a_free_body(explicit)
 
 
-@pytest.mark.parametrize("method", IMPLICIT)
-def test_a_free_body_in_implicit_steps(implicit, method, monkeypatch):
-    monkeypatch.setattr(implicit._dynamics.stepper, "scheme", SCHEMES[method])
-    check_free_fall(implicit, method)
-    check_momentum_of_a_free_body(implicit, method)
-
-
-def test_names_mean_what_they_should(monkeypatch):
-    for module, name in (
-        ("explicit_stepper", "ExplicitStepper"),
-        ("explicit_contact_stepper", "ContactExplicitStepper"),
-        ("implicit", "ImplicitStepper"),
-    ):
-        monkeypatch.setattr(f"taisoft.dynamics.{module}.{name}", lambda *arguments, name=name: (name, *arguments))
-    idle, contact = NoContacts(), SimpleNamespace(idle=False)
-    for integrator in INTEGRATORS:
-        settings = Settings(integrator=integrator)
-        names = ("ImplicitStepper",) * 2 if integrator in IMPLICIT else ("ExplicitStepper", "ContactExplicitStepper")
-        assert make_stepper(None, settings, contact) == (names[1], None, settings, contact)
-        assert make_stepper(None, settings, idle)[0] == names[0]
-    assert set(IMPLICIT) == {"linearly_implicit_euler", "implicit_euler", "bdf2", "implicit_midpoint"}
-
-
-def test_the_explicit_stepper_is_that_of_its_integrator(explicit):
-    assert explicit._dynamics.stepper.work.verlet == (explicit.settings.integrator == "velocity_verlet")
+def test_free_body_in_implicit_steps(implicit):
+    check_free_fall(implicit)
+    check_momentum_of_a_free_body(implicit)

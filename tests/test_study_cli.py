@@ -1,8 +1,8 @@
-"""`taisoft study` as a command:
+"""The command `taisoft study`:
 
-* what cannot be studied is refused with exit status 2 before any run; the command itself loads no Taichi;
-* an interrupted study ends within seconds with 130 and tells what is done; killed or not, the same command goes on with it,
-  and no process outlives the command.
+* invalid input is rejected with exit status 2 before any run; the command itself does not import Taichi;
+* an interrupted study exits within seconds with status 130; the same command continues it, also after a kill, and no child
+  process outlives the command.
 """
 
 import json
@@ -17,7 +17,7 @@ from types import SimpleNamespace
 
 import pytest
 from command import BEAM, ROOT, child, write
-from study_places import is_running
+from study_places import wait_until_ended
 
 from taisoft.cli import main
 from taisoft.cli import study as study_command
@@ -32,7 +32,7 @@ def study(*arguments) -> int:
 
 
 @pytest.mark.parametrize(
-    "arguments, told",
+    "arguments, message",
     [
         (["--workers", len(usable_cores()) + 1], f"it must be between 1 and {len(usable_cores())}, the number of cores"),
         (["--workers", 0], "--workers 0: it must be between 1 and"),
@@ -41,50 +41,48 @@ def study(*arguments) -> int:
         (["--budget", 0], "--budget must be greater than 0"),
         (["--repeats", 0], "--repeats must be 1 or 2"),
         (["--tolerance", "nan"], "--tolerance must be finite"),
+        (
+            ["--dt", "10", "--integrator", "symplectic_euler"],
+            "no combination of the grid can be run: dt = 10 s is above the stab",
+        ),
     ],
 )
-def test_bad_input(beam, tmp_path, capsys, arguments, told):
+def test_invalid_arguments_are_rejected(beam, tmp_path, capsys, arguments, message):
     assert study(beam, "--out", tmp_path / "out", *arguments) == 2
     error = capsys.readouterr().err
-    assert told in error and error.count("\n") == 1
+    assert message in error and error.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
-def test_an_unknown_scene(capsys):
+def test_unknown_scene_is_rejected(capsys):
     assert study("no_such_demo") == 2
     assert "neither a demo nor a .toml or .py file" in capsys.readouterr().err
 
 
-def test_a_folder_with_results_of_a_run_is_left_alone(beam, tmp_path, capsys):
+def test_folder_with_results_of_a_run_is_not_overwritten(beam, tmp_path, capsys):
     (tmp_path / "report.json").write_text("{}")
     assert study(beam, "--out", tmp_path) == 3
     assert "already holds results (report.json)" in capsys.readouterr().err
 
 
-def test_no_scheduler(beam, capsys, monkeypatch):
+def test_unreachable_scheduler_is_rejected(beam, capsys, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(workers, "CONNECT_SECONDS", 0.3)
     assert study(beam, "--scheduler", "tcp://127.0.0.1:9") == 2
     assert "no Dask scheduler answers there" in capsys.readouterr().err
 
 
-def test_the_command_loads_no_taichi():
-    text = "import sys, taisoft.cli.study; sys.exit('taichi' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", text], env=os.environ | {"PYTHONPATH": str(ROOT)}).returncode == 0
+def test_command_does_not_import_taichi():
+    code = "import sys, taisoft.cli.study; sys.exit('taichi' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(ROOT)}).returncode == 0
 
 
-def test_nothing_that_can_be_run_is_bad_input(beam, tmp_path, capsys):
-    assert study(beam, "--dt", "10", "--integrator", "symplectic_euler", "--out", tmp_path / "out") == 2
-    assert not (tmp_path / "out").exists()
-    assert "no combination of the grid can be run: dt = 10 s is above the stability limit" in capsys.readouterr().err
-
-
-def test_workers_do_not_share_a_device():
+def test_workers_cannot_share_a_gpu():
     def plan(refused: str) -> dict:
         return {"cases": [{"setting": {"arch": "cpu"}, "refused": ""}, {"setting": {"arch": "cuda"}, "refused": refused}]}
 
     check_device(plan(""), 1)
-    check_device(plan("there is none"), 2)
+    check_device(plan("no GPU"), 2)
     with pytest.raises(SceneError, match="cannot be used with arch cuda"):
         check_device(plan(""), 2)
 
@@ -107,48 +105,45 @@ def records(out: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in (out / "runs").glob("*.json")} if out.exists() else {}
 
 
-def until(condition, process) -> None:
-    end = time.monotonic() + 120
+def wait_until(condition, process) -> None:
+    deadline = time.monotonic() + 120
     while not condition():
         assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
+        assert time.monotonic() < deadline
         time.sleep(0.05)
 
 
 def children_of(pid: int) -> list[int]:
-    return [int(one) for one in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    return [int(child_pid) for child_pid in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="there is no /proc to find children in")
-def test_interrupted_then_killed_a_study_goes_on(tmp_path, capsys):
+def test_interrupted_and_killed_studies_are_continued(tmp_path, capsys):
     out, path = tmp_path / "out", write(tmp_path / "beam.py", BEAM)
     arguments = (path, "--out", out, "--repeats", "1", "--dt", "0.00625,0.003125", "--integrator", "symplectic_euler")
 
     process = child("study", *arguments)
-    until(lambda: len(records(out)) >= 1, process)
+    wait_until(lambda: len(records(out)) >= 1, process)
     process.send_signal(signal.SIGINT)
-    printed, told = process.communicate(timeout=120)
-    assert process.returncode == 130 and "ending; runs that are finished are kept" in told
+    printed, errors = process.communicate(timeout=120)
+    assert process.returncode == 130 and "ending; runs that are finished are kept" in errors
     assert "Not complete: the study was interrupted. The same command continues it." in printed
     first = records(out)
     assert 1 <= len(first) < 4 and (out / "study.md").exists()
 
     process = child("study", *arguments)
-    until(lambda: len(records(out)) > len(first), process)
-    # between two runs there is no child; the next one comes soon, or the study is over
-    until(lambda: children_of(process.pid) or len(records(out)) == 4, process)
+    wait_until(lambda: len(records(out)) > len(first), process)
+    # there is no child between two runs: wait for the next one or for the end of the study
+    wait_until(lambda: children_of(process.pid) or len(records(out)) == 4, process)
     running = children_of(process.pid)
     process.kill()
     process.communicate()
-    end = time.monotonic() + 120
-    while any(map(is_running, running)):
-        assert time.monotonic() < end, "a run outlives its study"
-        time.sleep(0.05)
+    wait_until_ended(running)
     second = records(out)
 
     process = child("study", *arguments)
-    printed, told = process.communicate(timeout=200)
-    assert process.returncode == 0 and f"{len(second)} of them already done" in told
+    _, errors = process.communicate(timeout=200)
+    assert process.returncode == 0 and f"{len(second)} of them already done" in errors
     last = records(out)
     assert len(last) == 4 and all(last[name] == at for name, at in second.items()) and first.items() <= second.items()
     record = json.loads((out / "study.json").read_text())

@@ -1,7 +1,7 @@
-"""A study on a Dask cluster of two worker processes on this machine, on loopback addresses:
+"""A study on a Dask cluster of two worker processes on loopback addresses of this machine:
 
-* every run is carried out by a worker, in a process of its own on cores of its own, and the answer is that of local runs;
-* a worker that is gone hands its run to another one; without any the study says so; runs are ended when the study ends.
+* workers run in separate processes on separate cores, and give the result of local runs;
+* the run of a lost worker moves to another one; runs end with the study.
 """
 
 import os
@@ -13,7 +13,7 @@ from contextlib import ExitStack
 
 import pytest
 from command import BEAM, ROOT, write
-from study_places import is_running
+from study_places import wait_until_ended
 
 pytest.importorskip("distributed")
 
@@ -53,20 +53,20 @@ def cluster(tmp_path):
         yield address, workers
 
 
-def test_a_study_on_a_cluster(cluster, tmp_path, capsys):
+def test_a_study_on_a_cluster_equals_a_local_one(cluster, tmp_path, capsys):
     address, _ = cluster
     path = write(tmp_path / "beam.py", BEAM)
     arguments = ["--repeats", "1", "--dt", "0.00625,0.003125", "--integrator", "symplectic_euler"]
     assert main(["study", str(path), "--out", str(tmp_path / "a"), "--scheduler", address, *arguments]) == 0
     table = capsys.readouterr().out
     assert "1 thread," in table and table.count("| ok ") == 2
-    errors = re.findall(r"^\|.*\| symplectic_euler \|[^|]*\|[^|]*\| *(\S+) \|", table, re.MULTILINE)
     assert main(["study", str(path), "--out", str(tmp_path / "b"), *arguments]) == 0
-    local = re.findall(r"^\|.*\| symplectic_euler \|[^|]*\|[^|]*\| *(\S+) \|", capsys.readouterr().out, re.MULTILINE)
-    assert errors == local and len(errors) == 2
+    error_column = re.compile(r"^\|.*\| symplectic_euler \|[^|]*\|[^|]*\| *(\S+) \|", re.MULTILINE)
+    errors, local_errors = error_column.findall(table), error_column.findall(capsys.readouterr().out)
+    assert errors == local_errors and len(errors) == 2
 
 
-def test_workers_have_cores_of_their_own_and_can_be_lost(cluster, tmp_path):
+def test_workers_use_separate_cores_and_may_be_lost(cluster, tmp_path):
     address, processes = cluster
     pids = tmp_path / "pids"
     path = write(tmp_path / "slow.py", SLOW.format(file=str(pids)))
@@ -79,27 +79,24 @@ def test_workers_have_cores_of_their_own_and_can_be_lost(cluster, tmp_path):
         def started() -> list[int]:
             return [int(line) for line in pids.read_text().split()] if pids.exists() else []
 
-        seen: list[int] = []
-        end = time.monotonic() + 120
+        pids_at_kill: list[int] = []
+        deadline = time.monotonic() + 120
 
         def stop_requested() -> bool:
-            """Kill a worker when both runs have begun; its run then waits for the other worker, which is busy."""
-            nonlocal end
-            if len(started()) == 2 and not seen:
-                seen.extend(started())
+            """Kill a worker once both runs have started; its run then waits for the other worker, which is busy."""
+            nonlocal deadline
+            if len(started()) == 2 and not pids_at_kill:
+                pids_at_kill.extend(started())
                 processes[0].kill()
-                end = time.monotonic() + 15
+                deadline = time.monotonic() + 15
             return False
 
-        left = carry_out(
+        unfinished = carry_out(
             [("a", request), ("b", request)],
             places,
             lambda key, answer: None,
             stop_requested=stop_requested,
-            seconds_left=lambda: end - time.monotonic(),
+            seconds_left=lambda: deadline - time.monotonic(),
         )
-        assert sorted(left.values()) == [BUDGET_SPENT, CUT_BY_BUDGET] and len(seen) == 2
-    deadline = time.monotonic() + 60
-    while any(map(is_running, started())):
-        assert time.monotonic() < deadline, "a run outlives the study"
-        time.sleep(0.1)
+        assert sorted(unfinished.values()) == [BUDGET_SPENT, CUT_BY_BUDGET] and len(pids_at_kill) == 2
+    wait_until_ended(started())

@@ -1,11 +1,12 @@
-"""What cuts a step in substeps and undoes them, round a plain step that is faked: a point that moves by its time.
+"""Substepping, with a fake stepper: a point whose position is the time.
 
-* a step that converges is one substep; one that does not is tried in 2 and 4, then as it was, and not again before one converges;
-* substeps are as short as what closes asks for, cover the step without a gap, and grow again after an event;
-* one that met contacts which were not known is taken again with them;
-* one that ends deep, is fast where nobody had looked, or whose contacts do not settle, is undone and halved;
-  after MAX_UNDONE of them the step goes on;
-* what closes too fast for the shortest is refused, and an error leaves the state before the step.
+* a step that converges is one substep; one that does not is retried in 2 and 4 substeps and then whole, and later steps are
+  not retried until one converges;
+* substeps are as short as the closing rate requires, cover the step, and grow again after an event;
+* a substep that met unknown contacts is repeated with them;
+* a substep that ends in deep penetration, leaves the searched path, or whose contacts do not settle, is undone and halved, at
+  most MAX_UNDONE times a step;
+* bodies that close too fast for the shortest substep raise an error; after an error the state is that before the step.
 """
 
 import numpy as np
@@ -18,31 +19,31 @@ from taisoft.errors import SimulationError
 DT = 0.1  # [s]
 
 
-class Plain:
-    """A stepper and its contacts at once: x is the time that it has stepped to. Its answers are set by the tests."""
+class FakeStepper:
+    """Stepper, simulation state and contacts at once: x is the time reached. Tests set what its measurements return."""
 
     idle, is_linear, dissipative, had_impact, n_contacts = False, False, True, False, 0
 
     def __init__(self):
         self.contact = self.simulation = self.dirichlet = self.history = self
         self.x_now, self.step_count, self.flight = None, 4, np.zeros(0)
-        self.x, self.marked = 0.0, 0.0
+        self.x, self.saved = 0.0, 0.0
         self.taken: list[tuple[float, float]] = []
         self.kept: list[tuple[float, float]] = []
-        self.starts: list = []  # what retries began with
+        self.retry_starts: list = []
         self.relative_penetration = self.crossing = self.penetration = 0.0
         self.converges = lambda time, dt: True
         self.closing = lambda time, dt: 0.0
         self.depth = lambda time, dt: 0.0
-        self.astray = self.new_on_way = lambda time, dt: False
+        self.left_path = self.has_new_contacts = lambda time, dt: False
 
     # the stepper
 
     def save_start(self):
-        self.marked = self.x
+        self.saved = self.x
 
     def return_to_start(self, already_undone=False):
-        self.x, self.kept = self.marked, []
+        self.x, self.kept = self.saved, []
 
     def forget(self):
         self.forgotten = True
@@ -60,13 +61,13 @@ class Plain:
         self.kept.pop()
 
     def retry_substep(self, time, dt, start):
-        self.starts.append(start)
+        self.retry_starts.append(start)
         return self.take_substep(time, dt)
 
     def undo_substep(self, released, discard_impulses):
         self.restore_start()
 
-    # its world and contacts
+    # the simulation state and its contacts
 
     def state(self):
         return self.x, self.kept[-1]
@@ -85,13 +86,13 @@ class Plain:
         return 0.0
 
     def left_searched_path(self, x_now):
-        return self.astray(*self.kept[-1])
+        return self.left_path(*self.kept[-1])
 
     def penetrates_deeper(self, time, dt, before):
         return False
 
     def search_along_path(self, time, dt):
-        return self.new_on_way(time, dt)
+        return self.has_new_contacts(time, dt)
 
     def closing_ratio_along_path(self):
         return 10.0
@@ -110,120 +111,126 @@ class Plain:
 
 
 @pytest.fixture
-def plain():
-    return Plain()
+def stepper():
+    return FakeStepper()
 
 
-def covers(plain, dt: float = DT) -> bool:
-    """Whether the substeps that count follow each other and make the step."""
-    starts = np.array([time for time, _ in plain.kept])
-    lengths = np.array([length for _, length in plain.kept])
-    return bool(np.allclose(starts, np.cumsum(lengths) - lengths) and np.isclose(lengths.sum(), dt))
+def covers_step(stepper) -> bool:
+    """Whether the substeps that were kept are contiguous and add up to the step."""
+    starts = np.array([time for time, _ in stepper.kept])
+    lengths = np.array([length for _, length in stepper.kept])
+    return bool(np.allclose(starts, np.cumsum(lengths) - lengths) and np.isclose(lengths.sum(), DT))
 
 
-def test_one_that_converges(plain):
-    wrapped = Substepping(plain)
-    result = wrapped.step(0.0, DT)
-    assert plain.taken == [(0.0, DT)] and wrapped.substeps == 1 and result.converged and result.newton_iterations == 3
+def longest_kept(stepper) -> float:
+    return max(dt for _, dt in stepper.kept)
 
 
-def test_one_that_converges_in_two(plain):
-    plain.converges = lambda time, dt: dt <= 0.5 * DT
-    wrapped = Substepping(plain)
-    result = wrapped.step(0.0, DT)
-    assert [dt for _, dt in plain.taken] == pytest.approx([DT, DT / 2, DT / 2]) and covers(plain)
-    assert wrapped.substeps == 2 and result.converged and result.newton_iterations == 9 and wrapped.may_retry
+def test_converged_step_is_one_substep(stepper):
+    substepping = Substepping(stepper)
+    result = substepping.step(0.0, DT)
+    assert stepper.taken == [(0.0, DT)] and substepping.substeps == 1 and result.converged and result.newton_iterations == 3
 
 
-def test_one_that_never_converges(plain):
-    plain.converges = lambda time, dt: False
-    wrapped = Substepping(plain)
-    result = wrapped.step(0.0, DT)
-    assert [dt for _, dt in plain.taken] == pytest.approx([DT, *[DT / 2] * 2, *[DT / 4] * 4, DT])
-    assert wrapped.substeps == 1 and not result.converged and not wrapped.may_retry and plain.kept == [(0.0, DT)]
-    plain.x, plain.taken = 0.0, []
-    wrapped.step(0.0, DT)
-    assert len(plain.taken) == 1  # substeps did not help in the step before
-    plain.x, plain.converges = 0.0, lambda time, dt: True
-    wrapped.step(0.0, DT)
-    assert wrapped.may_retry
+def test_unconverged_step_is_retried_in_two(stepper):
+    stepper.converges = lambda time, dt: dt <= 0.5 * DT
+    substepping = Substepping(stepper)
+    result = substepping.step(0.0, DT)
+    assert [dt for _, dt in stepper.taken] == pytest.approx([DT, DT / 2, DT / 2]) and covers_step(stepper)
+    assert substepping.substeps == 2 and result.converged and result.newton_iterations == 9 and substepping.may_retry
 
 
-def test_linear_steps_are_not_tried_again(plain):
-    plain.is_linear, plain.converges = True, lambda time, dt: False
-    assert not Substepping(plain).step(0.0, DT).converged and len(plain.taken) == 1
+def test_retries_stop_until_a_step_converges(stepper):
+    stepper.converges = lambda time, dt: False
+    substepping = Substepping(stepper)
+    result = substepping.step(0.0, DT)
+    assert [dt for _, dt in stepper.taken] == pytest.approx([DT, *[DT / 2] * 2, *[DT / 4] * 4, DT])
+    assert substepping.substeps == 1 and not result.converged and not substepping.may_retry and stepper.kept == [(0.0, DT)]
+    stepper.x, stepper.taken = 0.0, []
+    substepping.step(0.0, DT)
+    assert len(stepper.taken) == 1
+    stepper.x, stepper.converges = 0.0, lambda time, dt: True
+    substepping.step(0.0, DT)
+    assert substepping.may_retry
 
 
-def test_what_closes_fast_takes_short_substeps(plain):
-    """Fast between 0.04 and 0.06 s; before and after it substeps are longer."""
-    plain.closing = lambda time, dt: 50.0 * dt / DT if time < 0.06 and time + dt > 0.04 else 0.0
-    wrapped = Substepping(plain)
-    wrapped.step(0.0, DT)
-    lengths = np.array([dt for _, dt in plain.kept])
-    assert covers(plain) and wrapped.substeps == len(lengths) > 5
-    fast = [dt for time, dt in plain.kept if 0.04 <= time < 0.06]
+def test_linear_steps_are_not_retried(stepper):
+    stepper.is_linear, stepper.converges = True, lambda time, dt: False
+    assert not Substepping(stepper).step(0.0, DT).converged and len(stepper.taken) == 1
+
+
+def test_substeps_are_short_only_while_bodies_close_fast(stepper):
+    """They close fast between 0.04 and 0.06 s."""
+    stepper.closing = lambda time, dt: 50.0 * dt / DT if time < 0.06 and time + dt > 0.04 else 0.0
+    substepping = Substepping(stepper)
+    substepping.step(0.0, DT)
+    lengths = np.array([dt for _, dt in stepper.kept])
+    assert covers_step(stepper) and substepping.substeps == len(lengths) > 5
+    fast = [dt for time, dt in stepper.kept if 0.04 <= time < 0.06]
     assert max(fast) <= DT / 50 * 1.001 and lengths.max() > 3 * max(fast)
 
 
-def test_what_closes_too_fast_is_refused(plain):
-    plain.closing = lambda time, dt: 2.0 * MAX_SUBSTEPS * dt / DT if time > 0.049 else 1.9 * dt / DT
+def test_closing_too_fast_for_the_shortest_substep_is_an_error(stepper):
+    stepper.closing = lambda time, dt: 2.0 * MAX_SUBSTEPS * dt / DT if time > 0.049 else 1.9 * dt / DT
     with pytest.raises(SimulationError, match="step 5: they close at 1 m/s"):
-        Substepping(plain).step(0.0, DT)
-    assert plain.x == 0.0
+        Substepping(stepper).step(0.0, DT)
+    assert stepper.x == 0.0
 
 
-def test_one_that_ends_deep_is_halved(plain):
-    plain.depth = lambda time, dt: 1.0 if dt > DT / 8 else 0.0
-    wrapped = Substepping(plain)
-    wrapped.step(0.0, DT)
-    assert covers(plain) and max(dt for _, dt in plain.kept) <= DT / 8 * 1.001 and len(plain.taken) > len(plain.kept)
+def test_deep_penetration_halves_a_substep(stepper):
+    stepper.depth = lambda time, dt: 1.0 if dt > DT / 8 else 0.0
+    substepping = Substepping(stepper)
+    substepping.step(0.0, DT)
+    assert covers_step(stepper) and longest_kept(stepper) <= DT / 8 * 1.001 and len(stepper.taken) > len(stepper.kept)
 
 
-def test_after_so_many_undone_it_goes_on(plain):
-    plain.depth = lambda time, dt: 1.0 + time  # deeper and deeper
-    Substepping(plain).step(0.0, DT)
-    assert covers(plain) and 0 < len(plain.taken) - len(plain.kept) <= MAX_UNDONE and plain.relative_penetration > 1.0
+def test_number_of_undone_substeps_is_bounded(stepper):
+    stepper.depth = lambda time, dt: 1.0 + time  # always deeper
+    Substepping(stepper).step(0.0, DT)
+    assert (
+        covers_step(stepper) and 0 < len(stepper.taken) - len(stepper.kept) <= MAX_UNDONE and stepper.relative_penetration > 1.0
+    )
 
 
-def test_one_that_was_faster_than_seen_is_halved(plain):
-    plain.astray = lambda time, dt: dt > DT / 4
-    Substepping(plain).step(0.0, DT)
-    assert covers(plain) and max(dt for _, dt in plain.kept) <= DT / 4 * 1.001
+def test_leaving_the_searched_path_halves_a_substep(stepper):
+    stepper.left_path = lambda time, dt: dt > DT / 4
+    Substepping(stepper).step(0.0, DT)
+    assert covers_step(stepper) and longest_kept(stepper) <= DT / 4 * 1.001
 
 
-def test_one_that_met_what_was_not_known_is_taken_again(plain):
-    plain.astray = lambda time, dt: len(plain.taken) <= 2
-    plain.new_on_way = lambda time, dt: True
-    wrapped = Substepping(plain)
-    result = wrapped.step(0.0, DT)
-    assert plain.taken == [(0.0, DT)] * 3 and plain.kept == [(0.0, DT)]
-    assert plain.starts == [(0.0, DT)] * 2  # each where the last one ended
-    assert wrapped.substeps == 1 and result.newton_iterations == 9
+def test_substep_that_met_new_contacts_is_repeated(stepper):
+    stepper.left_path = lambda time, dt: len(stepper.taken) <= 2
+    stepper.has_new_contacts = lambda time, dt: True
+    substepping = Substepping(stepper)
+    result = substepping.step(0.0, DT)
+    assert stepper.taken == [(0.0, DT)] * 3 and stepper.kept == [(0.0, DT)]
+    assert stepper.retry_starts == [(0.0, DT)] * 2  # each retry starts from the previous result
+    assert substepping.substeps == 1 and result.newton_iterations == 9
 
 
-def test_one_whose_contacts_do_not_settle_is_halved(plain):
-    plain.astray = plain.new_on_way = lambda time, dt: dt > DT / 2
-    Substepping(plain).step(0.0, DT)
-    whole = [dt for _, dt in plain.taken if dt == DT]
-    assert covers(plain) and len(plain.kept) == 2 and len(whole) == MAX_SEARCHES + 1
+def test_contacts_that_do_not_settle_halve_a_substep(stepper):
+    stepper.left_path = stepper.has_new_contacts = lambda time, dt: dt > DT / 2
+    Substepping(stepper).step(0.0, DT)
+    whole = [dt for _, dt in stepper.taken if dt == DT]
+    assert covers_step(stepper) and len(stepper.kept) == 2 and len(whole) == MAX_SEARCHES + 1
 
 
-def test_an_error_leaves_the_state_before(plain):
+def test_error_restores_the_state_before_the_step(stepper):
     def fails(time, dt):
         raise KeyboardInterrupt
 
-    plain.converges = fails
+    stepper.converges = fails
     with pytest.raises(KeyboardInterrupt):
-        Substepping(plain).step(0.0, DT)
-    assert plain.x == 0.0 and plain.forgotten
+        Substepping(stepper).step(0.0, DT)
+    assert stepper.x == 0.0 and stepper.forgotten
 
 
-def test_an_error_in_a_try_is_one_that_does_not_help(plain):
+def test_error_in_a_retry_keeps_the_first_result(stepper):
     def fails(time, dt):
         if dt < DT and time > 0.0:
-            raise SimulationError("spoilt")
+            raise SimulationError("not finite")
         return False
 
-    plain.converges = fails
-    result = Substepping(plain).step(0.0, DT)
-    assert not result.converged and plain.kept == [(0.0, DT)]
+    stepper.converges = fails
+    result = Substepping(stepper).step(0.0, DT)
+    assert not result.converged and stepper.kept == [(0.0, DT)]

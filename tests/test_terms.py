@@ -1,8 +1,8 @@
-"""Every term's force on states at random, of both orders, in f64 on one thread and in parts, against its own energy and laws:
+"""Forces of every term in random states of both orders, in f64, serial and parallel:
 
-* the force is minus the energy's derivative by finite differences, node by node and axis by axis;
-* a body's own forces neither push nor turn it as a whole, and follow a rotation of the state; loads do not depend on the state;
-* dampers take power, never give it, and none where nothing moves.
+* the force is minus the finite difference of the energy;
+* internal forces have no resultant force or moment and rotate with the state; loads do not depend on the state;
+* dampers dissipate, except in rigid translation.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ from taisoft.fem.terms.elasticity import elastic_forces
 from taisoft.linear import block_csr
 from taisoft.linear.block_csr import row_times
 
-ENERGY = {elasticity: ELASTIC, gravity: GRAVITY, dead_loads: LOADS}  # where `measure` leaves it
+ENERGY = {elasticity: ELASTIC, gravity: GRAVITY, dead_loads: LOADS}  # index in State.scalars, written by `measure`
 H = 1e-6  # [m]
 
 
@@ -65,12 +65,12 @@ def energy(rig, term, x: np.ndarray, model=None) -> float:
     return model.state.scalars[ENERGY[term]]
 
 
-def test_a_scene_has_the_terms_it_needs(rig):
+def test_scene_activates_every_term(rig):
     assert set(rig.model.terms) == set(TERMS) and set(ENERGY) == set(TERMS)
 
 
 @pytest.mark.parametrize("term", TERMS, ids=lambda term: term.__name__.rpartition(".")[2])
-def test_the_force_is_the_slope_of_the_energy(rig, term):
+def test_force_is_minus_the_energy_gradient(rig, term):
     f = forces(rig, term, rig.x)
     assert np.abs(f).max() > 1.0  # [N]
     rng = np.random.default_rng(6)
@@ -83,26 +83,27 @@ def test_the_force_is_the_slope_of_the_energy(rig, term):
 
 
 @pytest.mark.parametrize("term", TERMS, ids=lambda term: term.__name__.rpartition(".")[2])
-def test_rigid_motions(rig, term):
+def test_rigid_motions_rotate_internal_forces(rig, term):
     f, R = forces(rig, term, rig.x), rotation((1.0, -2.0, 0.5), 0.7)
     moved = forces(rig, term, rig.x @ R.T + (0.3, -0.2, 0.1))
     if term.LOAD:
         assert np.array_equal(moved, f)
         return
-    close = 1e-10 * np.abs(f).max()
-    assert np.abs(moved - f @ R.T).max() < close
+    tolerance = 1e-10 * np.abs(f).max()
+    assert np.abs(moved - f @ R.T).max() < tolerance
     start = rig.layout.node_start
     for first, last in zip(start[:-1], start[1:]):
-        own, x = f[first:last], rig.x[first:last]
-        assert np.abs(own.sum(axis=0)).max() < 100 * close and np.abs(np.cross(x, own).sum(axis=0)).max() < 100 * close
+        force, x = f[first:last], rig.x[first:last]
+        assert np.abs(force.sum(axis=0)).max() < 100 * tolerance
+        assert np.abs(np.cross(x, force).sum(axis=0)).max() < 100 * tolerance
 
 
-def test_gravity_is_an_acceleration_too(rig):
+def test_gravity_force_is_mass_times_acceleration(rig):
     f, weight = forces(rig, gravity, rig.x), rig.model.gravity_mass.to_numpy()
     assert gravity.ACCELERATION and np.abs(f - weight[:, None] * rig.model.gravity.to_numpy()[0]).max() < 1e-12
 
 
-def test_dampers_take_power(rig):
+def test_dampers_dissipate(rig):
     m, rng = rig.model, np.random.default_rng(7)
     matrix = block_csr.build_block_csr(m, rig.arena, "test_damper")
     rates = np.repeat(damping_table(rig.scene)[:, 0], [body.n_nodes for body in rig.scene.bodies])
@@ -117,5 +118,5 @@ def test_dampers_take_power(rig):
         power = float(np.sum(stiffness * v))
         if np.ptp(v, axis=0).max() > 0.0:
             assert power < -1.0  # [W]
-        else:  # nothing deforms
+        else:  # rigid translation
             assert np.abs(stiffness).max() < 1e-6

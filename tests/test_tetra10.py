@@ -1,9 +1,9 @@
 """Second-order tets in files:
 
-* their corners give the mesh that the same file of first order would give, in every format, without a word where edges
-  are straight, whatever order the format lists the edges in;
-* curved edges are counted and told with the largest deviation; nodes elsewhere than on the edges are refused;
-* tets of both orders, second-order boundary elements, vertices of no tet and welding go together.
+* their corners give the mesh of the same file of first order, in every format and for any order of the edges, without a warning
+  if edges are straight;
+* curved edges are counted in a warning with the largest deviation; nodes off the edges are rejected;
+* they can be combined with first-order tets, second-order boundary elements, unused vertices and welding.
 """
 
 import contextlib
@@ -31,38 +31,34 @@ def write(path: Path, points=NODES.positions, cells=CELLS, others=(), **options)
     return path
 
 
-def same(mesh) -> bool:
+def equals_mesh(mesh) -> bool:
     return np.array_equal(mesh.vertices, MESH.vertices) and np.array_equal(mesh.tets, MESH.tets)
 
 
-@pytest.mark.parametrize("ending", [".vtk", ".vtu", ".inp", ".mdpa", ".vol"])
-def test_corners_make_the_mesh(tmp_path, ending):
-    mesh = read_mesh(write(tmp_path / f"part{ending}"))
-    assert same(mesh) and mesh.warnings == []
+FORMATS = [(ending, {}) for ending in (".vtk", ".vtu", ".inp", ".mdpa", ".vol")]
+FORMATS += [(".msh", {"file_format": version, "binary": binary}) for version in ("gmsh22", "gmsh") for binary in (False, True)]
 
 
-@pytest.mark.parametrize("version", ["gmsh22", "gmsh"])
-@pytest.mark.parametrize("binary", [False, True])
-def test_corners_of_gmsh_files(tmp_path, version, binary):
-    path = write(tmp_path / "part.msh", file_format=version, binary=binary)
-    mesh = read_mesh(path)
-    assert same(mesh) and mesh.warnings == []
+@pytest.mark.parametrize("ending, options", FORMATS)
+def test_corners_make_the_mesh(tmp_path, ending, options):
+    mesh = read_mesh(write(tmp_path / f"part{ending}", **options))
+    assert equals_mesh(mesh) and mesh.warnings == []
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_any_order_of_the_edges_is_understood(tmp_path, seed):
+def test_edges_may_have_any_order(tmp_path, seed):
     cells = np.hstack([CELLS[:, :4], 0 * CELLS[:, 4:]])
     cells[:, 4:] = CELLS[:, 4:][:, np.random.default_rng(seed).permutation(6)]
     mesh = read_mesh(write(tmp_path / "part.vtk", cells=cells))
-    assert same(mesh) and mesh.warnings == []
+    assert equals_mesh(mesh) and mesh.warnings == []
 
 
-def test_tetgen_files_of_second_order(tmp_path):
+def test_second_order_tetgen_files(tmp_path):
     rows = [f"{i} {x:.17g} {y:.17g} {z:.17g}" for i, (x, y, z) in enumerate(NODES.positions, 1)]
     (tmp_path / "t.node").write_text("\n".join([f"{len(rows)} 3 0 0", *rows]))
     rows = [" ".join(map(str, [i, *(nodes + 1)])) for i, nodes in enumerate(NODES.elements, 1)]
     (tmp_path / "t.ele").write_text("\n".join([f"{len(rows)} 10 0", *rows]))
-    assert same(read_mesh(tmp_path / "t.ele"))
+    assert equals_mesh(read_mesh(tmp_path / "t.ele"))
     (tmp_path / "t.ele").write_text("1 5 0\n1 1 2 3 4 5\n")
     with pytest.raises(MeshError, match="t.ele: tets must have 4 or 10 nodes, not 5"):
         read_mesh(tmp_path / "t.ele")
@@ -78,31 +74,31 @@ def curved_ball() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return points, nodes.elements, edges
 
 
-def test_curved_edges_are_counted_and_straightened(tmp_path):
+def test_curved_edges_are_straightened_with_a_warning(tmp_path):
     points, cells, edges = curved_ball()
     a, b = points[edges[:, 0]], points[edges[:, 1]]
-    off = (1 - 0.5 * np.linalg.norm(a + b, axis=1)) / np.linalg.norm(a - b, axis=1)
+    deviation = (1 - 0.5 * np.linalg.norm(a + b, axis=1)) / np.linalg.norm(a - b, axis=1)
     with pytest.warns(UserWarning, match="part.vtu: .* curved"):
         mesh = read_mesh(write(tmp_path / "part.vtu", points, cells))
     assert np.array_equal(mesh.vertices, ball_mesh(1.0, 4).vertices) and len(mesh.warnings) == 1
-    told = mesh.warnings[0]
-    assert told.startswith(f"{len(edges)} edges of second-order tets are curved")
-    assert f"the largest deviation is {off.max():.2g} of the edge's length, between vertices " in told
-    worst = [int(word) for word in told.split("between vertices ")[1].split(" of ")[0].split(" and ")]
-    assert off[(edges == worst).all(axis=1)] == pytest.approx(off.max())
+    message = mesh.warnings[0]
+    assert message.startswith(f"{len(edges)} edges of second-order tets are curved")
+    assert f"the largest deviation is {deviation.max():.2g} of the edge's length, between vertices " in message
+    worst = [int(word) for word in message.split("between vertices ")[1].split(" of ")[0].split(" and ")]
+    assert deviation[(edges == worst).all(axis=1)] == pytest.approx(deviation.max())
 
 
-@pytest.mark.parametrize("shift, told", [(0.9e-6, 0), (1.1e-6, 1)])
-def test_a_millionth_of_the_length_counts_as_straight(tmp_path, shift, told, recwarn):
+@pytest.mark.parametrize("shift, n_warnings", [(0.9e-6, 0), (1.1e-6, 1)])
+def test_deviation_below_a_millionth_counts_as_straight(tmp_path, shift, n_warnings, recwarn):
     points = NODES.positions.copy()
     edge = MESH.n_verts + 4
     a, b = next(c[list(EDGES[k])] for c in CELLS for k in range(6) if NODES.elements[(CELLS == c).all(1)][0, 4 + k] == edge)
     points[edge] += shift * np.linalg.norm(points[a] - points[b]) * np.array([0.6, 0, 0.8])
     mesh = read_mesh(write(tmp_path / "part.vtu", points))
-    assert len(mesh.warnings) == told and all("1 edges of" in text and "1.1e-06" in text for text in mesh.warnings)
+    assert len(mesh.warnings) == n_warnings and all("1 edges of" in text and "1.1e-06" in text for text in mesh.warnings)
 
 
-def test_nodes_that_are_not_on_the_edges_are_refused(tmp_path):
+def test_nodes_off_the_edges_are_rejected(tmp_path):
     points = NODES.positions.copy()
     points[MESH.n_verts :] += 1.0
     mixed = CELLS[:, [0, 4, 1, 5, 2, 3, 6, 7, 8, 9]]
@@ -111,7 +107,7 @@ def test_nodes_that_are_not_on_the_edges_are_refused(tmp_path):
             read_mesh(path)
 
 
-def test_nodes_that_do_not_exist_are_refused(tmp_path):
+def test_node_indices_out_of_range_are_rejected(tmp_path):
     cells = CELLS.copy()
     cells[3, 7] = 99
     with pytest.raises(MeshError, match="part.vtk: second-order tet 3: node 99 does not exist"):
@@ -121,21 +117,21 @@ def test_nodes_that_do_not_exist_are_refused(tmp_path):
         read_mesh(write(tmp_path / "part.vtk", cells=cells))
 
 
-def test_both_orders_boundaries_and_loose_vertices_together(tmp_path):
+def test_both_orders_with_boundary_elements_and_unused_vertices(tmp_path):
     points = np.vstack([[(9.0, 9, 9)], NODES.positions])
     others = [("line3", CELLS[:1, [0, 1, 4]] + 1), ("triangle6", CELLS[:2, [0, 1, 2, 4, 5, 6]] + 1), ("tetra", MESH.tets[:4] + 1)]
     with pytest.warns(UserWarning):
         mesh = read_mesh(write(tmp_path / "part.vtk", points, CELLS[4:] + 1, others))
-    loose = 1 + len(np.setdiff1d(CELLS[:4], [*CELLS[4:].flat, *MESH.tets.flat]))  # middles that no second-order tet has
-    assert same(mesh) and loose > 1
+    n_unused = 1 + len(np.setdiff1d(CELLS[:4], [*CELLS[4:].flat, *MESH.tets.flat]))  # midside nodes of no second-order tet
+    assert equals_mesh(mesh) and n_unused > 1
     assert mesh.warnings == [
         "1 line3, 2 triangle6 elements next to the tets are not used",
-        f"{loose} vertices of no tet are left out, the first is vertex 0 of the file",
+        f"{n_unused} vertices of no tet are left out, the first is vertex 0 of the file",
     ]
 
 
-def test_a_middle_that_is_a_corner_elsewhere_stays(tmp_path):
-    """A tet on half of another one's edge, as after a refinement on one side."""
+def test_midside_node_that_is_a_corner_of_another_tet_stays(tmp_path):
+    """A tet on half of another one's edge, as after one-sided refinement."""
     box = make_nodes(box_mesh((1, 1, 1), (1.0, 1.0, 1.0)), 2)
     points = np.vstack([box.positions, [(-0.5, -2.0, -2.0), (0.0, -2.0, -1.0)]])
     corner, middle = box.elements[1, 0], box.elements[1, 4]
@@ -146,7 +142,7 @@ def test_a_middle_that_is_a_corner_elsewhere_stays(tmp_path):
     assert mesh.n_verts == 8 + 3 and mesh.n_tets == 6
 
 
-def test_welding_goes_by_the_corners(tmp_path):
+def test_welding_merges_corners(tmp_path):
     one = make_nodes(box_mesh((1, 1, 1), (1.0, 1.0, 1.0), pattern="six"), 2)
     points = np.vstack([one.positions, one.positions + (1.0, 0, 0)])
     path = write(tmp_path / "part.vtk", points, np.vstack([one.elements, one.elements + len(one.positions)]))

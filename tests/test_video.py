@@ -1,8 +1,8 @@
-"""Films of a run's pictures:
+"""Videos of a run's pictures:
 
-* every picture is a frame of the film, at the run's frame rate, odd sizes too; the first need not be number 0;
-* without ffmpeg the command is printed, and it is the one that is run elsewhere; a failure of ffmpeg is one sentence, no file;
-* `taisoft run --video` makes it, and is refused without pictures.
+* every picture is a frame at the run's frame rate, for odd sizes and any first number;
+* without ffmpeg its command is printed; a failure of ffmpeg is reported in one sentence and leaves no file;
+* `taisoft run --video` makes a video, and is rejected without pictures.
 """
 
 import shlex
@@ -19,7 +19,7 @@ from taisoft.output.frames import VIDEO_NAME, ffmpeg_command, find_ffmpeg, png_b
 needs_ffmpeg = pytest.mark.skipif(find_ffmpeg() is None, reason="there is no ffmpeg")
 
 
-def pictures(folder, first=0, n=5, size=(48, 64)):
+def write_pictures(folder, first=0, n=5, size=(48, 64)):
     (folder / "frames").mkdir(parents=True)
     for k in range(first, first + n):
         picture = np.full((*size, 3), 40 * (k - first), dtype=np.uint8)
@@ -31,8 +31,8 @@ def pictures(folder, first=0, n=5, size=(48, 64)):
 def test_every_picture_is_a_frame(first, size, name, tmp_path):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     folder = tmp_path / name
-    pictures(folder, first, size=size)
-    (folder / "frames" / "2a.png").write_bytes(b"another's")
+    write_pictures(folder, first, size=size)
+    (folder / "frames" / "2a.png").write_bytes(b"not a picture of the run")
     write_video(folder, 25.0)
     n, seconds = imageio_ffmpeg.count_frames_and_secs(str(folder / VIDEO_NAME))
     assert n == 5 and seconds == pytest.approx(0.2, abs=0.01)
@@ -40,33 +40,34 @@ def test_every_picture_is_a_frame(first, size, name, tmp_path):
 
 
 @needs_ffmpeg
-def test_a_failure_is_told(tmp_path):
-    pictures(tmp_path)
-    (tmp_path / "frames" / "00000.png").write_bytes(b"no picture")
+def test_failure_of_ffmpeg_is_reported(tmp_path):
+    write_pictures(tmp_path)
+    (tmp_path / "frames" / "00000.png").write_bytes(b"not a PNG")
     with pytest.raises(OutputError, match="video.mp4 cannot be made: ffmpeg says: "):
         write_video(tmp_path, 25.0)
     assert not [path for path in tmp_path.iterdir() if path.is_file()]
 
 
-def test_without_ffmpeg(tmp_path, monkeypatch, capsys):
+def test_command_is_printed_without_ffmpeg(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(frames, "find_spec", lambda name: None)
     monkeypatch.setattr(frames.shutil, "which", lambda name: None)
     assert find_ffmpeg() is None
     out = tmp_path / "out"
     recording = Recording(str(out), overwrite=False)
     recording.video(30.0)
-    assert not capsys.readouterr().err  # no pictures, nothing to tell
-    pictures(out)
+    assert not capsys.readouterr().err  # no pictures
+    write_pictures(out)
     recording.video(30.0)
     recording.close()
-    said = capsys.readouterr().err
-    assert "pip install 'taisoft[video]'" in said and shlex.join(ffmpeg_command(out, 30.0)) in said and "-framerate 30 " in said
+    errors = capsys.readouterr().err
+    command = shlex.join(ffmpeg_command(out, 30.0))
+    assert "pip install 'taisoft[video]'" in errors and command in errors and "-framerate 30 " in command
     with pytest.raises(OutputError, match="cannot be made without ffmpeg"):
         write_video(out, 30.0)
 
 
 @needs_ffmpeg
-def test_a_run_with_a_film(beam, tmp_path):
+def test_run_writes_a_video(beam, tmp_path):
     out = tmp_path / "out"
     assert run(beam, "--video") == 2 and run(beam, "--video", "--out", out, "--no-frames") == 2 and not out.exists()
     assert run(beam, "--video", "--out", out, "--no-usd") == 0

@@ -1,13 +1,11 @@
-"""Pictures and the live window:
+"""Pictures of scenes and what they need:
 
-* the camera frames a scene whichever way it turns, and projects as a pinhole does;
-* surfaces are split at sharp edges only, their normals point outward, and nodes in the middle of edges are drawn;
+* surfaces are split at sharp edges only, normals point outward, and midside nodes are drawn;
 * the NumPy renderer covers, orders and colours pixels as a plain loop over pixels does;
-* Taichi's renderer and the NumPy one draw the same picture, upright; a body that moves, moves in the picture;
-* without a Vulkan driver pictures are drawn in software, and one line says which package is missing;
-* without a display or a driver a window is refused with a sentence, and the process lives on;
-* a window leaves no file behind, and a file of the name it would have used stays as it is;
-* a process holds one window, and an open one keeps the runtime from being initialised anew.
+* the Vulkan renderer and the NumPy one draw the same picture, and bodies move in it;
+* without a Vulkan driver pictures are drawn in software, with one note on the missing package; without a display or a driver a
+  window is rejected with an error;
+* windows leave no files behind; a process holds one window, which keeps the runtime from being initialised again.
 """
 
 import os
@@ -22,9 +20,9 @@ from fake_simulator import RUBBER, FakeSimulator, beam_scene
 import taisoft as ts
 from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, SimulationError
-from taisoft.output.camera import BORDER, FILL, Camera
+from taisoft.output.camera import Camera
 from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
-from taisoft.view.offscreen import MAX_COORDINATE, Offscreen, rasterise
+from taisoft.view.offscreen import Offscreen, rasterise
 from taisoft.view.scene_view import MARKER_COLOUR, Surfaces, smoothing_groups, vertex_normals
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -32,92 +30,20 @@ SIZE = (320, 180)
 needs_vulkan = pytest.mark.skipif(bool(vulkan_missing()), reason="no Vulkan driver: Debian package mesa-vulkan-drivers")
 
 
-# --- camera ---
-
-
-@pytest.mark.parametrize("azimuth, elevation", [(0, 0), (32, 20), (140, -60), (270, 89)])
-def test_framing_shows_everything(azimuth, elevation):
-    points = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * (4, 1, 1) + (10, 20, 30)
-    camera = Camera.framing(points, azimuth=azimuth, elevation=elevation)
-    seen = camera.project(points, SIZE)
-    assert (seen[:, 2] > 0).all()
-    shares = np.abs(2 * seen[:, :2] / SIZE - 1).max(axis=0)  # of the picture's width and height
-    assert shares.max() == pytest.approx(FILL)
-    assert np.allclose(camera.project(camera.target[None], SIZE), [[160, 90, camera.distance]])
-
-
-def test_projection_is_a_pinhole():
-    camera = Camera(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0, fov=90.0)
-    seen = camera.project(np.array([[1.0, 0, 0], [0, 2.0, 0], [0, 0, 5.0], [1.0, 0, 5.0]]), (200, 100))
-    # at 10 m the half height of 50 pixels is 10 m: 5 pixels a metre, 10 at 5 m; x right, y up, z towards the eye
-    assert np.allclose(seen, [[105, 50, 10], [100, 40, 10], [100, 50, 5], [110, 50, 5]])
-
-
-def test_moving_the_camera():
-    camera = Camera(target=np.zeros(3), distance=10.0, azimuth=350.0, elevation=80.0)
-    turned = camera.orbit(20.0, 50.0)
-    assert turned.azimuth == pytest.approx(10.0) and turned.elevation == 89.0
-    assert np.linalg.norm(turned.position - turned.target) == pytest.approx(10.0)
-    assert camera.zoom(0.5).distance == 5.0
-    shifted = camera.pan(0.0, 0.25)  # a quarter of the picture's height up
-    assert shifted.project(np.zeros((1, 3)), SIZE)[0, 1] == pytest.approx(90 + 45, abs=1e-9)
-
-
-def test_the_camera_moves_back_from_moving_bodies():
-    camera = Camera(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0, fov=90.0)
-    near = np.array([[0.0, 1, 0], [2, 0, 0]])
-    border = 1 - BORDER
-    assert camera.widened(near, (200, 100), 100.0) == camera
-    for far in ([0.0, -20 * border, 0], [40 * border, 0, 0], [0, 10 * border, 10], [0, 0, 20]):
-        assert camera.widened(np.array([far, [0, np.nan, 0]]), (200, 100), 100.0).distance == pytest.approx(20.0)
-    assert camera.widened(np.array([[0.0, 900, 0]]), (200, 100), 15.0).distance == 15.0
-
-
-def test_a_floor_that_reaches_behind_the_eye():
-    """Against rays through the middle of every pixel; triangles in front stay as they are, those behind go. Not to be dropped
-    as too large, either, in a picture of many pixels."""
-    half = 30.0
-    floor = [[-half, 0, -half], [half, 0, -half], [half, 0, half], [-half, 0, half]]
-    corners = np.array([*floor, [0, 1, -9], [1, 1, -9], [0, 2, -9], [0, 1, 9], [1, 1, 9], [0, 2, 9]])
-    shades, triangles = (corners + half) / (2 * half), np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [7, 8, 9]])
-    camera = Camera(target=np.array([0.0, 0.5, 0.0]), distance=3.0, azimuth=20.0, elevation=10.0)
-    x, cut, colours = camera.clipped(corners, triangles, shades, SIZE)
-    assert not (cut == 7).any() and np.array_equal(x[: len(corners)], corners) and (cut == [4, 5, 6]).all(axis=1).sum() == 1
-    image, (width, height) = np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8), SIZE
-    below = (cut != [4, 5, 6]).all(axis=1)
-    drawn = rasterise(camera.project(x, SIZE), cut[below], colours, camera.clipping[0], image)
-    focal = height / 2 / np.tan(np.radians(camera.fov) / 2)
-    v, u = np.mgrid[:height, :width] + 0.5
-    ray = np.stack([(u - width / 2) / focal, (height / 2 - v) / focal, np.ones_like(u)], axis=-1) @ camera.axes
-    with np.errstate(divide="ignore"):
-        far = -camera.position[1] / ray[..., 1]
-    hit = camera.position + far[..., None] * ray
-    expected = (far > camera.clipping[0]) & (np.abs(hit[..., [0, 2]]) < half).all(axis=-1)
-    assert (drawn != expected).mean() < 0.005 and 0.4 < expected.mean() < 0.8
-    both = drawn & expected
-    assert np.abs(image[both] / 255 - (hit[both] + half) / (2 * half))[:, [0, 2]].max() < 0.02
-    large = np.abs(camera.project(camera.clipped(corners, triangles, shades, (2560, 1440))[0], (2560, 1440))[len(corners) :, :2])
-    assert 1e4 < large.max() < 0.5 * MAX_COORDINATE
-    for value in (np.nan, np.inf):
-        bad = corners.copy()
-        bad[4] = value
-        assert not (camera.clipped(bad, triangles, shades, SIZE)[1] == 4).any()
-
-
 # --- surfaces ---
 
 
-def test_a_box_keeps_its_edges():
+def test_box_has_sharp_edges():
     mesh = ts.box_mesh((2, 3, 4), (1, 1, 1))
     nodes, corners = smoothing_groups(mesh.vertices, mesh.surface)
     assert np.array_equal(nodes[corners], mesh.surface)
-    assert len(nodes) == 2 * (3 * 4 + 4 * 5 + 3 * 5)  # each side with vertices of its own
+    assert len(nodes) == 2 * (3 * 4 + 4 * 5 + 3 * 5)  # sides share no vertices
     normals = vertex_normals(mesh.vertices[nodes], corners)
     assert np.allclose(np.abs(normals).max(axis=1), 1.0)
     assert (np.einsum("ij,ij->i", normals, mesh.vertices[nodes]) > 0.4).all()
 
 
-def test_a_ball_is_smooth():
+def test_ball_is_smooth():
     mesh = ts.ball_mesh(2.0, 8)
     nodes, corners = smoothing_groups(mesh.vertices, mesh.surface)
     assert np.array_equal(np.sort(nodes), np.unique(mesh.surface))  # no vertex is split
@@ -126,7 +52,7 @@ def test_a_ball_is_smooth():
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_drawn_vertices_follow_the_body_and_mark_fixed_nodes(order):
+def test_drawn_surface_follows_the_body_and_marks_fixed_nodes(order):
     scene = beam_scene(("one", "two"), order=order)
     surfaces, sim = Surfaces(scene), FakeSimulator(scene)
     x, normals = surfaces.of_bodies(sim)
@@ -138,18 +64,18 @@ def test_drawn_vertices_follow_the_body_and_mark_fixed_nodes(order):
     assert (moved[:, 1] <= x[:, 1] + 1e-12).all() and (x[:, 1] - moved[:, 1]).max() > 1.0
     drawn_colours = np.unique(surfaces.colours, axis=0)
     assert len(drawn_colours) == 3  # two bodies and the markers
-    held = len(np.intersect1d(scene.bodies[0].constraints[0].nodes, scene.bodies[0].nodes.surface))
-    assert held == (2 * order + 1) ** 2  # all of the left end
-    assert (surfaces.colours == MARKER_COLOUR).all(axis=1).sum() == 2 * held * 66  # vertices of a ball
-    # every triangle's normals point the way it is wound: outward
+    n_fixed = len(np.intersect1d(scene.bodies[0].constraints[0].nodes, scene.bodies[0].nodes.surface))
+    assert n_fixed == (2 * order + 1) ** 2  # the left end
+    assert (surfaces.colours == MARKER_COLOUR).all(axis=1).sum() == 2 * n_fixed * 66  # vertices of a marker
+    # vertex normals agree with the winding of triangles
     a, b, c = (x[surfaces.triangles[:, k]] for k in range(3))
     winding = np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[surfaces.triangles].sum(axis=1))
     assert (winding > 0).all()
 
 
-def test_a_second_order_body_is_drawn_as_finely_as_a_first_order_one_of_half_the_size():
+def test_second_order_body_is_drawn_like_a_first_order_body_of_half_the_cell_size():
     drawn = []
-    for cells, order in (((4, 2, 2), 2), ((8, 4, 4), 1)):  # every vertex of the fine grid's surface is a node of the coarse
+    for cells, order in (((4, 2, 2), 2), ((8, 4, 4), 1)):  # with the same surface nodes
         scene = beam_scene(cells=cells, order=order)
         surfaces, sim = Surfaces(scene), FakeSimulator(scene)
         sim.time = 1.0
@@ -166,7 +92,7 @@ def test_a_second_order_body_is_drawn_as_finely_as_a_first_order_one_of_half_the
 
 
 def plain_raster(projected, triangles, colours, near, shape):
-    """The same picture, pixel by pixel: the nearest triangle that holds the pixel's centre."""
+    """A picture in which each pixel shows the nearest triangle that contains its centre."""
     image, nearest = np.zeros((*shape, 3)), np.zeros(shape)
     for triangle in triangles:
         p, depth = projected[triangle, :2], projected[triangle, 2]
@@ -186,10 +112,10 @@ def plain_raster(projected, triangles, colours, near, shape):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_raster_equals_a_plain_loop(seed):
+def test_rasterised_picture_equals_a_plain_loop(seed):
     rng = np.random.default_rng(seed)
     shape = (24, 32)
-    projected = rng.uniform((-8, -8, 1), (40, 32, 5), (36, 3))  # some of it outside the picture
+    projected = rng.uniform((-8, -8, 1), (40, 32, 5), (36, 3))  # partly outside the picture
     projected[0, 2], projected[4, 2] = -1.0, np.nan
     colours, triangles = rng.uniform(0, 1, (36, 3)), np.arange(36).reshape(12, 3)
     expected, covered = plain_raster(projected, triangles, colours, 0.5, shape)
@@ -200,7 +126,7 @@ def test_raster_equals_a_plain_loop(seed):
     assert np.abs(image.astype(float) - 255 * expected).max() <= 0.51
 
 
-def test_raster_leaves_no_seam_between_neighbours():
+def test_no_gap_between_adjacent_triangles():
     rng = np.random.default_rng(5)
     projected = np.array([[2.0, 3.0], [58.0, 1.0], [61.0, 37.0], [4.0, 35.0]])
     inner = rng.uniform((10, 8), (50, 30), (1, 2))
@@ -214,9 +140,9 @@ def test_raster_leaves_no_seam_between_neighbours():
 
 
 def body_mask(image):
-    """Pixels that are not grey as the background is: the bodies are coloured."""
-    wide = image.astype(int)
-    return wide.max(axis=2) - wide.min(axis=2) > 20
+    """Coloured pixels: the background is grey."""
+    rgb = image.astype(int)
+    return rgb.max(axis=2) - rgb.min(axis=2) > 20
 
 
 @pytest.fixture(params=["software", pytest.param("vulkan", marks=needs_vulkan)])
@@ -224,7 +150,7 @@ def renderer(request):
     return request.param
 
 
-def test_picture_of_a_beam(renderer):
+def test_bent_beam_moves_down_in_the_picture(renderer):
     scene = beam_scene()
     sim, drawing = FakeSimulator(scene), Offscreen(scene, SIZE, renderer=renderer)
     try:
@@ -238,9 +164,8 @@ def test_picture_of_a_beam(renderer):
     assert np.array_equal(straight, again)
     before, after = body_mask(straight), body_mask(bent)
     assert 0.05 < before.mean() < 0.5
-    lower = np.argwhere(after)[:, 0].mean() - np.argwhere(before)[:, 0].mean()
-    assert lower > 5, "a beam that bends down moves down in the picture"
-    assert (straight[0] > 235).all() and (straight[-1] > 195).all() and (straight[-1] < 215).all()  # lighter above
+    assert np.argwhere(after)[:, 0].mean() > np.argwhere(before)[:, 0].mean() + 5  # rows count downward
+    assert (straight[0] > 235).all() and (straight[-1] > 195).all() and (straight[-1] < 215).all()  # lighter at the top
     assert straight[before].max() > 150, "the body is lit"
 
 
@@ -257,24 +182,24 @@ def test_both_renderers_draw_the_same_picture():
         drawing.close()
     difference = np.abs(images["vulkan"] - images["software"]).max(axis=2)
     assert body_mask(images["software"]).mean() > 0.1
-    assert np.mean(difference > 3) < 0.005  # pixels on an outline may fall either way
+    assert np.mean(difference > 3) < 0.005  # pixels on outlines may differ
 
 
 @needs_vulkan
 @pytest.mark.parametrize("layers", [(), ("wires",)])
-def test_a_picture_that_vulkan_left_empty_is_drawn_in_software(monkeypatch, layers):
-    """Empty, or with nothing on it but lines."""
+def test_empty_vulkan_picture_is_redrawn_in_software(monkeypatch, layers):
+    """Empty, or with lines only."""
     draw, images = Canvas.draw, []
-    for scale in (1.0, 0.0):  # at scale 0 no triangle has an area
-        monkeypatch.setattr(Canvas, "draw", lambda self, x, *more, scale=scale: draw(self, scale * x, *more))
+    for scale in (1.0, 0.0):  # 0: triangles without area
+        monkeypatch.setattr(Canvas, "draw", lambda self, x, *rest, scale=scale: draw(self, scale * x, *rest))
         drawing = Offscreen(beam_scene(), SIZE, renderer="vulkan", layers=layers)
         images.append(drawing.image(FakeSimulator(beam_scene())).astype(int))
         drawing.close()
-    differ = np.mean(np.abs(images[0] - images[1]).max(axis=2) > 3)
-    assert body_mask(images[0]).mean() > 0.05 and differ < (0.02 if layers else 0.005)
+    changed = np.mean(np.abs(images[0] - images[1]).max(axis=2) > 3)
+    assert body_mask(images[0]).mean() > 0.05 and changed < (0.02 if layers else 0.005)
 
 
-def test_a_falling_body_stays_in_the_picture(renderer):
+def test_falling_body_stays_in_the_picture(renderer):
     scene = beam_scene()
     sim, drawing = FakeSimulator(scene), Offscreen(scene, SIZE, renderer=renderer)
     try:
@@ -287,24 +212,24 @@ def test_a_falling_body_stays_in_the_picture(renderer):
         drawing.close()
     assert first < drawing.camera.distance < 4 * first
     rows = np.flatnonzero(mask.any(axis=1))
-    assert 170 <= rows.max() <= 175, "whole, with a border of 3 % below"
+    assert 170 <= rows.max() <= 175, "complete, with a border of 3 % below"
 
 
-def test_a_scene_out_of_sight_is_background():
+def test_scene_out_of_view_shows_the_background():
     scene = beam_scene()
     away = Camera(target=np.array([0.0, 100.0, 0.0]), distance=5.0)
     image = Offscreen(scene, SIZE, away, "software").image(FakeSimulator(scene))
     assert not body_mask(image).any() and image.std(axis=1).max() == 0
 
 
-def test_wrong_settings_are_refused():
+def test_invalid_settings_are_rejected():
     with pytest.raises(OutputError, match="renderer 'povray' is unknown"):
         Offscreen(beam_scene(), SIZE, renderer="povray")
     with pytest.raises(OutputError, match="0 x 10 pixels"):
         Offscreen(beam_scene(), (0, 10))
 
 
-# --- what a machine may lack ---
+# --- missing drivers and displays, and windows ---
 
 PROLOGUE = """
 import sys
@@ -322,14 +247,14 @@ TRY_WINDOW = (
 try:
     show(sim)
 except OutputError as error:
-    print("refused:", error)
+    print("rejected:", error)
 print(Offscreen(scene, (64, 36), renderer="software").image(sim).shape)
 """
 )
 
 
 def run_child(code, **variables):
-    """stdout and stderr of a child with these environment variables (None removes one) that must end well."""
+    """stdout and stderr of a child process that must succeed; variables: of its environment, None removes one."""
     environment = {k: v for k, v in (os.environ | variables).items() if v is not None}
     command = [sys.executable, "-c", code]
     child = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False)
@@ -360,16 +285,16 @@ except OutputError as error:
     assert err.count("mesa-vulkan-drivers") == 1
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="displays are named by DISPLAY on Linux alone")
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="DISPLAY names displays on Linux only")
 @pytest.mark.parametrize("display, reason", [(None, "DISPLAY is not set"), (":4711", "':4711' does not answer")])
-def test_without_a_display_a_window_is_refused(display, reason):
+def test_without_a_display_a_window_is_rejected(display, reason):
     out, _ = run_child(TRY_WINDOW, DISPLAY=display)
-    assert "refused: cannot open a window" in out and reason in out
+    assert "rejected: cannot open a window" in out and reason in out
     assert "(36, 64, 3)" in out
 
 
 @needs_vulkan
-def test_a_window_leaves_no_file_behind(tmp_path, monkeypatch):
+def test_windows_leave_no_files_behind(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scene = beam_scene()
 
@@ -380,13 +305,13 @@ def test_a_window_leaves_no_file_behind(tmp_path, monkeypatch):
         return list(tmp_path.iterdir())
 
     assert draw() == []
-    own = tmp_path / "imgui.ini"
-    own.write_text("[Window][mine]\n")
-    assert draw() == [own]
+    ini = tmp_path / "imgui.ini"
+    ini.write_text("[Window][mine]\n")
+    assert draw() == [ini] and "[Window][mine]" in ini.read_text()
 
 
 @needs_vulkan
-def test_one_window_at_a_time():
+def test_one_window_per_process():
     scene = beam_scene()
     first = Offscreen(scene, SIZE, renderer="vulkan")
     try:
@@ -409,7 +334,7 @@ def test_one_window_at_a_time():
 
 @needs_vulkan
 @pytest.mark.parametrize("precision", ["f32", "f64"])
-def test_pictures_in_either_precision(precision):
+def test_vulkan_pictures_in_both_precisions(precision):
     if open_kind() not in (None, ("cpu", precision)):
         pytest.skip(f"another test holds the runtime as {open_kind()}")
     runtime = open_runtime("cpu", precision)

@@ -1,11 +1,11 @@
-"""The live window, on a virtual display:
+"""The live window, partly on a virtual display:
 
-* a ray through a pixel is what the camera projects there, and picks the nearest surface; a patch round it has weights of sum 1;
-* wires, contacts and arrows are where they belong; pictures do not wait for a solver that is slower than real time;
-* keys pause, step, restart, colour and end it; dragging beside the bodies turns the view, dragging a body moves the body;
-* another integrator is chosen there, and the run goes on with it from where it was; plots are shown beside their numbers;
-* sliders change the run at once and compile nothing; a stiffer body lowers dt where steps are explicit;
-* pictures are recorded; making the window larger, smaller or tiny, and closing it in the middle of a drag, is survived.
+* the cursor picks the nearest surface; the drag patch around it has weights of sum 1;
+* wires, contacts and arrows have the right places; a solver slower than real time does not delay pictures;
+* keys pause, step, restart, colour and quit; dragging beside bodies turns the view, dragging a body moves it;
+* choosing another integrator continues the run with it; plots can be shown;
+* sliders change the run at once without compiling; a stiffer body lowers dt of explicit steps;
+* pictures are recorded; the window can be resized, made tiny, and closed in the middle of a drag.
 """
 
 import struct
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from desktop import ROOT, TOOLS, Desktop
 from fake_simulator import FakeSimulator, beam_scene
-from test_view import SIZE, body_mask, needs_vulkan
+from test_view import body_mask, needs_vulkan
 
 from taisoft.output.camera import Camera
 from taisoft.records import StepReport
@@ -33,7 +33,7 @@ from taisoft.backend.runtime import compile_clock
 from taisoft.view.window import show
 
 
-class Told(ts.Simulator):
+class PrintingSimulator(ts.Simulator):
     def advance(self, n):
         report = super().advance(n)
         x, body = self.positions()[-14], self.scene.bodies[0]
@@ -52,28 +52,20 @@ class Told(ts.Simulator):
         print("reset", flush=True)
 
 
-with Told(beam_scene(), dt={dt}, integrator={integrator!r}, draggable=True) as sim:
+with PrintingSimulator(beam_scene(), dt={dt}, integrator={integrator!r}, draggable=True) as sim:
     show(sim)
     print("ended", sim.settings.integrator, sim.step_count, np.isfinite(sim.energies().total))
 print("closed")
 """
 SLIDERS = {"dt": 228, "gravity": 251, "young": 274}  # pixels from the top, with one body
-SOLVER, INTEGRATOR, USE = 411, 434, 457  # with a legend: the section, its button, and the one that takes what was chosen
-TIP = (965, 350)  # where the beam's end is in the window as it starts
+SOLVER, INTEGRATOR, USE = 411, 434, 457  # with a legend: the solver section, its integrator button, and its apply button
+TIP = (965, 350)  # initial pixel of the beam's end
 
 
 # --- picking ---
 
 
-def test_a_ray_is_the_inverse_of_the_projection():
-    camera = Camera(target=np.array([1.0, 2, 3]), distance=4.0, azimuth=70.0, elevation=-30.0)
-    for point in np.random.default_rng(1).uniform(-1, 1, (20, 3)) + camera.target:
-        across, down, _ = camera.project(point[None], SIZE)[0]
-        ray = camera.ray((across / SIZE[0], 1 - down / SIZE[1]), SIZE)
-        assert np.allclose(np.cross(ray, point - camera.position), 0, atol=1e-12) and ray @ camera.forward > 0
-
-
-def test_the_nearest_triangle_is_hit():
+def test_ray_hits_the_nearest_triangle():
     x = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 2], [1, 0, 2], [0, 1, 2]])
     triangles = np.array([[3, 4, 5], [0, 2, 1]])
     ray = np.array([0.0, 0, 1])
@@ -86,61 +78,61 @@ def test_the_nearest_triangle_is_hit():
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_a_body_is_picked_and_pulled_by_the_cursor(order):
+def test_cursor_picks_and_drags_a_body(order):
     scene = beam_scene(("one", "two"), order=order)
     sim, camera, size = FakeSimulator(scene), Camera.framing(np.array([[-2.0, -1, -1], [2, 2, 1]])), (1600, 900)
     sim.time, calls = 1.0, []
     sim.drag = lambda *arguments: calls.append(arguments)
-    aim = sim.positions("two")[scene.bodies[1].nodes.surface].mean(axis=1)
-    aim = aim[np.argmin(np.linalg.norm(aim - camera.position, axis=1))]  # the nearest triangle is not hidden
-    across, down, _ = camera.project(aim[None], size)[0]
+    centres = sim.positions("two")[scene.bodies[1].nodes.surface].mean(axis=1)
+    point = centres[np.argmin(np.linalg.norm(centres - camera.position, axis=1))]  # of a visible triangle
+    across, down, _ = camera.project(point[None], size)[0]
     cursor = (across / size[0], 1 - down / size[1])
     hit = pick(sim, camera, cursor, size)
-    assert scene.bodies[hit.body].name == "two" and np.allclose(hit.point, aim) and np.allclose(hit.weights, 1 / 3)
+    assert scene.bodies[hit.body].name == "two" and np.allclose(hit.point, point) and np.allclose(hit.weights, 1 / 3)
     drag = MouseDrag(sim, hit)
     assert drag.weights.sum() == pytest.approx(1.0) and len(drag.nodes) >= 3
     drag.drag(sim, camera, cursor, size, 10.0)
     name, nodes, weights, target, stiffness = calls[0]
-    assert name == "two" and np.allclose(target, weights @ sim.positions("two")[nodes]), "no way, no force"
+    assert name == "two" and np.allclose(target, weights @ sim.positions("two")[nodes]), "without motion there is no force"
     assert stiffness == pytest.approx(10 * 4000 * 9.81 / np.sqrt(18))
     drag.drag(sim, camera, (cursor[0], cursor[1] + 0.1), size, 10.0)
     moved = calls[1][3] - target
     assert moved @ camera.axes[0] == pytest.approx(0, abs=1e-9) and moved @ camera.forward == pytest.approx(0, abs=1e-9)
     assert moved @ camera.axes[1] > 0
-    assert np.allclose(drag.line(sim), [aim, aim + moved])
+    assert np.allclose(drag.line(sim), [point, point + moved])
     assert pick(sim, camera, (0.01, 0.99), size) is None
 
 
-# --- what is drawn over the bodies, and when ---
+# --- layers and the loop ---
 
 
-def test_layers():
+def test_lines_of_layers():
     scene = beam_scene()
     scene.bodies[0].add_traction(lambda c: c[:, 0] > 1.99, (0, 0, 50.0))
     sim, layers, camera = FakeSimulator(scene), Layers(scene), Camera.framing(scene.bodies[0].rest_positions)
-    found = sim.contacts()
-    found.point, found.normal = np.array([[0.0, 1, 0]]), np.array([[0.0, 1, 0]])
-    sim.contacts = lambda: found
+    contacts = sim.contacts()
+    contacts.point, contacts.normal = np.array([[0.0, 1, 0]]), np.array([[0.0, 1, 0]])
+    sim.contacts = lambda: contacts
     faces = len(scene.bodies[0].mesh.surface)
-    tips = 2 * 2 * 2
-    counts = {"wires": 3 * faces // 2, "contacts": 2, "tractions": 3 * tips, "fixed_nodes": 0}
+    loaded = 2 * 2 * 2  # triangles of the end
+    counts = {"wires": 3 * faces // 2, "contacts": 2, "tractions": 3 * loaded, "fixed_nodes": 0}
     for name, count in counts.items():
         layers.shown = {other: other == name for other in counts}
         ends, colours = layers.lines(sim, camera)
         assert len(ends) == len(colours) == 2 * count <= 2 * layers.n_segments
         if name == "wires":
             x, size = sim.positions(), (200, 100)
-            seen, drawn = camera.project(x, size), camera.project(ends, size)
-            gaps = np.linalg.norm(drawn[:, None, :2] - seen[None, :, :2], axis=2).min(axis=1)
-            assert gaps.max() < 1e-9, "wires end on nodes"
+            nodes, drawn = camera.project(x, size), camera.project(ends, size)
+            gaps = np.linalg.norm(drawn[:, None, :2] - nodes[None, :, :2], axis=2).min(axis=1)
+            assert gaps.max() < 1e-9, "wires end at nodes"
         if name == "contacts":
             a, b, _, c = (ends - camera.position) / 0.1 + camera.position
-            assert np.allclose(a, found.point) and np.allclose((b - a) / np.linalg.norm(b - a), found.normal)
-            assert np.allclose(np.cross(c - a, found.impulse[0]), 0, atol=1e-12)
+            assert np.allclose(a, contacts.point) and np.allclose((b - a) / np.linalg.norm(b - a), contacts.normal)
+            assert np.allclose(np.cross(c - a, contacts.impulse[0]), 0, atol=1e-12)
 
 
 class Clock:
-    """A simulator whose steps of dt take some wall time, on a clock of its own."""
+    """A simulator whose steps take a given time of its own clock."""
 
     def __init__(self, dt, seconds_per_step):
         self.dt, self.seconds_per_step, self.now, self.step_count, self.calls = dt, seconds_per_step, 0.0, 0, []
@@ -154,7 +146,7 @@ class Clock:
 
 
 @pytest.mark.parametrize(
-    "dt, seconds_per_step, steps, needs",
+    "dt, seconds_per_step, steps_per_picture, slowdown",
     [
         (1 / 60, 0.001, 1.0, 0.0),
         (1 / 600, 0.0001, 10.0, 0.0),
@@ -163,7 +155,7 @@ class Clock:
         (1 / 60, 0.5, 1.0, 30.0),
     ],
 )
-def test_pictures_do_not_wait_for_a_slow_solver(monkeypatch, dt, seconds_per_step, steps, needs):
+def test_slow_solver_does_not_delay_pictures(monkeypatch, dt, seconds_per_step, steps_per_picture, slowdown):
     sim = Clock(dt, seconds_per_step)
     monkeypatch.setattr("time.perf_counter", lambda: sim.now)
     loop = Loop(sim, 60.0, False)
@@ -176,38 +168,37 @@ def test_pictures_do_not_wait_for_a_slow_solver(monkeypatch, dt, seconds_per_ste
         loop.speed()
         if k == 59:
             half = sim.step_count
-    assert (sim.step_count - half) / 60 == pytest.approx(steps, rel=0.1)
-    told = loop.lines()[0]
-    assert told == "running" if needs == 0 else f"needs {needs:.1f} times real time" in told
+    assert (sim.step_count - half) / 60 == pytest.approx(steps_per_picture, rel=0.1)
+    status = loop.lines()[0]
+    assert status == "running" if slowdown == 0 else f"needs {slowdown:.1f} times real time" in status
 
 
-def test_a_simulator_is_built_after_a_picture_has_told_of_it():
+def test_rebuild_starts_after_a_picture_announced_it():
     sim = Clock(1 / 60, 1e-3)
     loop, built = Loop(sim, 60.0, False), []
     for _ in range(5):
         loop.advance()
-    count, refused = sim.step_count, [True, False]
+    count, results = sim.step_count, [False, True]
     assert count > 0 and loop.lines() == ["running"]
 
     def build():
         built.append(sim.step_count)
-        return not refused.pop(0)
+        return results.pop(0)
 
-    for works in (False, True):
+    for succeeds in (False, True):
         loop.request_rebuild(build, "it is built")
         loop.react(set())
         loop.advance()
-        assert loop.lines()[1] == "it is built" and len(built) == int(works) and sim.step_count == count
+        assert loop.lines()[1] == "it is built" and len(built) == int(succeeds) and sim.step_count == count
         loop.react(set())
-        assert len(built) == 1 + int(works)
-        compiled = loop.lines()[0] == "compiling the next step, for some seconds"
-        assert compiled == works
-        if not works:
+        assert len(built) == 1 + int(succeeds)
+        assert (loop.lines()[0] == "compiling the next step, for some seconds") == succeeds
+        if not succeeds:
             loop.advance()
             count = sim.step_count
     for _ in range(2):
         loop.advance()
-        assert sim.step_count == count, "pictures that tell of it come first"
+        assert sim.step_count == count, "pictures that announce the compilation come first"
     loop.advance()
     assert sim.step_count > count and loop.lines()[0] == "running"
 
@@ -243,14 +234,13 @@ def press(desktop, key, condition, what):
     desktop.wait_for(condition, what)
 
 
-def still(desktop):
-    """True once the simulation has stopped running."""
+def is_paused(desktop):
     before = steps(desktop)
     desktop.pause(0.4)
     return steps(desktop) == before
 
 
-def end(desktop):
+def quit_window(desktop):
     desktop.tool("xdotool", "key", "Escape")
     assert desktop.child.wait(timeout=30) == 0
     assert desktop.printed()[-1] == "closed"
@@ -259,45 +249,45 @@ def end(desktop):
 @needs_vulkan
 def test_keys_and_mouse(opened, tmp_path):
     desktop = opened()
-    press(desktop, "space", lambda: still(desktop), "pause")
+    press(desktop, "space", lambda: is_paused(desktop), "pause")
     for k, key in enumerate(("s", "Right")):
         before = steps(desktop)
         press(desktop, key, lambda at=before: steps(desktop) == at + 1, f"single step {k}")
     screen = desktop.picture()
     mask = body_mask(screen[:, 400:])  # right of the panel
-    assert mask.mean() > 0.05, "the beam is on the screen"
-    assert (screen[60:200, 30:300] > 200).any(), "the panel's text is on the screen"
+    assert mask.mean() > 0.05, "the beam is visible"
+    assert (screen[60:200, 30:300] > 200).any(), "the panel's text is visible"
     desktop.tool("xdotool", "key", "v")
-    desktop.wait_for(lambda: np.abs(desktop.picture()[:, 400:].astype(int) - screen[:, 400:]).max() > 60, "other colours")
+    desktop.wait_for(lambda: np.abs(desktop.picture()[:, 400:].astype(int) - screen[:, 400:]).max() > 60, "change of colours")
 
     def turn():
         desktop.drag((900, 650), (-150, 50), 0.3)
         desktop.tool("xdotool", "mouseup", "1")
 
     desktop.repeat(turn, lambda: np.mean(body_mask(desktop.picture()[:, 400:]) != mask) > 0.02, "turned view")
-    assert still(desktop)
-    flat = desktop.picture()
+    assert is_paused(desktop)
+    plain = desktop.picture()
     desktop.tool("xdotool", "key", "w")
-    desktop.wait_for(lambda: np.mean((flat[:, 400:] > desktop.picture()[:, 400:].astype(int) + 40).any(axis=2)) > 0.003, "wires")
+    desktop.wait_for(lambda: np.mean((plain[:, 400:] > desktop.picture()[:, 400:].astype(int) + 40).any(axis=2)) > 0.003, "wires")
     press(desktop, "p", lambda: len(list(tmp_path.glob("out/window-1/*.png"))) > 1, "recorded pictures")
     desktop.tool("xdotool", "key", "p")
     assert struct.unpack(">II", (tmp_path / "out/window-1/00000.png").read_bytes()[16:24]) == (1280, 720)
-    press(desktop, "g", lambda: plotted(desktop) == 4, "plots")
-    press(desktop, "g", lambda: plotted(desktop) == 0, "no plots")
+    press(desktop, "g", lambda: n_plots(desktop) == 4, "plots")
+    press(desktop, "g", lambda: n_plots(desktop) == 0, "no plots")
     press(desktop, "r", lambda: desktop.printed().count("reset") == 1, "restart")
-    press(desktop, "space", lambda: not still(desktop), "running on")
+    press(desktop, "space", lambda: not is_paused(desktop), "resumed run")
     choose_the_next_integrator(desktop)
     for width, height in ((800, 600), (1, 1), (1000, 700)):
         desktop.tool("xdotool", "search", "--name", "taisoft", "windowsize", str(width), str(height))
         before = steps(desktop)
         desktop.wait_for(lambda at=before: steps(desktop) > at + 2, f"steps in a window of {width} x {height}")
     desktop.wait_for(lambda: body_mask(desktop.picture()[:, 400:]).mean() > 0.03, "beam in a resized window")
-    end(desktop)
+    quit_window(desktop)
     assert desktop.last("ended")[1] == "bdf2" and desktop.last("ended")[3] == "True"
 
 
-def plotted(desktop):
-    """How many plots are on the screen at the right: dark windows of text, high enough for three lines, beside light boxes."""
+def n_plots(desktop):
+    """Number of plots at the right: dark text windows at least three lines high, beside light boxes."""
     screen = desktop.picture()[:720]
     dark = np.flatnonzero((screen[:, 1030:1038] < 60).all(axis=(1, 2)))
     tall = [run for run in np.split(dark, np.flatnonzero(np.diff(dark) > 1) + 1) if len(run) > 40]
@@ -305,23 +295,23 @@ def plotted(desktop):
 
 
 def choose_the_next_integrator(desktop):
-    """By the panel: its section is opened, bdf2 comes after implicit_euler, and the run goes on."""
+    """Open the solver section of the panel and choose bdf2, which follows implicit_euler; the run continues."""
     desktop.repeat(lambda: hold(desktop, 32, SOLVER), lambda: bright(desktop, INTEGRATOR), "section of the solver")
     for height in (INTEGRATOR, USE):
         hold(desktop, 60, height)
     desktop.wait_for(lambda: desktop.last("rebuilt"), "other integrator")
     _, name, count, same = desktop.last("rebuilt")
     assert name == "bdf2" and same == "same"
-    desktop.wait_for(lambda: steps(desktop) > int(count) + 2, "steps of it")
+    desktop.wait_for(lambda: steps(desktop) > int(count) + 2, "steps after the rebuild")
 
 
 def bright(desktop, height):
-    """Whether a button is at that height of the panel."""
+    """Whether the panel has a button at that height."""
     return (desktop.picture()[height - 8 : height + 8, 24:140, 2] > 90).mean() > 0.5
 
 
 def hold(desktop, across, down):
-    """A click that a slow picture sees too."""
+    """Click for long enough to be noticed between slow pictures."""
     desktop.tool("xdotool", "mousemove", str(across), str(down), "mousedown", "1")
     desktop.pause(0.4)
     desktop.tool("xdotool", "mouseup", "1")
@@ -338,7 +328,7 @@ def click(desktop, across, down):
 
 
 @needs_vulkan
-def test_pulling_and_sliders(opened):
+def test_dragging_and_sliders(opened):
     desktop = opened(dt=8e-3, integrator="symplectic_euler")
     compiled = numbers(desktop)[-1]
     press(desktop, "r", lambda: desktop.printed().count("reset") == 1, "restart")
@@ -349,13 +339,13 @@ def test_pulling_and_sliders(opened):
         desktop.tool("xdotool", "mouseup", "1")
         desktop.drag(TIP, (0, -250), 0.5)
 
-    desktop.repeat(drag, lambda: numbers(desktop)[1] > before[1] + 0.3, "pulled beam")
+    desktop.repeat(drag, lambda: numbers(desktop)[1] > before[1] + 0.3, "dragged beam")
     desktop.tool("xdotool", "mouseup", "1")
-    desktop.wait_for(lambda: numbers(desktop)[1] < before[1] + 0.2, "beam that comes back")
+    desktop.wait_for(lambda: numbers(desktop)[1] < before[1] + 0.2, "beam that springs back")
     desktop.repeat(lambda: click(desktop, 225, SLIDERS["young"]), lambda: numbers(desktop)[4] > 2e6, "stiffer beam")
     stiff = numbers(desktop)
-    assert stiff[3] < 4e-3, "as an explicit step must be"
+    assert stiff[3] < 4e-3, "below the explicit limit"
     desktop.repeat(lambda: click(desktop, 60, SLIDERS["dt"]), lambda: numbers(desktop)[3] < 0.5 * stiff[3], "shorter steps")
-    assert numbers(desktop)[-1] == compiled, "nothing is compiled anew"
-    desktop.drag((640, 650), (0, -20))  # and closed while a button is pressed
-    end(desktop)
+    assert numbers(desktop)[-1] == compiled, "nothing is compiled"
+    desktop.drag((640, 650), (0, -20))  # closed while a button is pressed
+    quit_window(desktop)

@@ -1,0 +1,88 @@
+"""The camera: framing, projection, motion, rays and clipping."""
+
+import numpy as np
+import pytest
+
+from taisoft.output.camera import BORDER, FILL, Camera
+from taisoft.view.offscreen import MAX_COORDINATE, rasterise
+
+SIZE = (320, 180)
+
+
+@pytest.mark.parametrize("azimuth, elevation", [(0, 0), (32, 20), (140, -60), (270, 89)])
+def test_framing_shows_all_points(azimuth, elevation):
+    points = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * (4, 1, 1) + (10, 20, 30)
+    camera = Camera.framing(points, azimuth=azimuth, elevation=elevation)
+    projected = camera.project(points, SIZE)
+    assert (projected[:, 2] > 0).all()
+    fill = np.abs(2 * projected[:, :2] / SIZE - 1).max(axis=0)  # of the picture's width and height
+    assert fill.max() == pytest.approx(FILL)
+    assert np.allclose(camera.project(camera.target[None], SIZE), [[160, 90, camera.distance]])
+
+
+def test_projection_is_that_of_a_pinhole_camera():
+    camera = Camera(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0, fov=90.0)
+    projected = camera.project(np.array([[1.0, 0, 0], [0, 2.0, 0], [0, 0, 5.0], [1.0, 0, 5.0]]), (200, 100))
+    # half the height, 50 pixels, is 10 m at a depth of 10 m: 5 pixels per metre, 10 at 5 m; x right, y up, z towards the camera
+    assert np.allclose(projected, [[105, 50, 10], [100, 40, 10], [100, 50, 5], [110, 50, 5]])
+
+
+def test_orbit_zoom_and_pan():
+    camera = Camera(target=np.zeros(3), distance=10.0, azimuth=350.0, elevation=80.0)
+    orbited = camera.orbit(20.0, 50.0)
+    assert orbited.azimuth == pytest.approx(10.0) and orbited.elevation == 89.0
+    assert np.linalg.norm(orbited.position - orbited.target) == pytest.approx(10.0)
+    assert camera.zoom(0.5).distance == 5.0
+    panned = camera.pan(0.0, 0.25)  # up by a quarter of the picture's height
+    assert panned.project(np.zeros((1, 3)), SIZE)[0, 1] == pytest.approx(90 + 45, abs=1e-9)
+
+
+def test_camera_moves_back_from_approaching_bodies():
+    camera = Camera(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0, fov=90.0)
+    near = np.array([[0.0, 1, 0], [2, 0, 0]])
+    border = 1 - BORDER
+    assert camera.widened(near, (200, 100), 100.0) == camera
+    for far in ([0.0, -20 * border, 0], [40 * border, 0, 0], [0, 10 * border, 10], [0, 0, 20]):
+        assert camera.widened(np.array([far, [0, np.nan, 0]]), (200, 100), 100.0).distance == pytest.approx(20.0)
+    assert camera.widened(np.array([[0.0, 900, 0]]), (200, 100), 15.0).distance == 15.0
+
+
+def test_floor_that_reaches_behind_the_camera_is_clipped():
+    """Compare with rays through pixel centres.
+
+    Triangles in front are unchanged, those behind are dropped; in a large picture clipped ones stay below MAX_COORDINATE.
+    """
+    half = 30.0
+    floor = [[-half, 0, -half], [half, 0, -half], [half, 0, half], [-half, 0, half]]
+    corners = np.array([*floor, [0, 1, -9], [1, 1, -9], [0, 2, -9], [0, 1, 9], [1, 1, 9], [0, 2, 9]])
+    shades, triangles = (corners + half) / (2 * half), np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [7, 8, 9]])
+    camera = Camera(target=np.array([0.0, 0.5, 0.0]), distance=3.0, azimuth=20.0, elevation=10.0)
+    x, cut, colours = camera.clipped(corners, triangles, shades, SIZE)
+    assert not (cut == 7).any() and np.array_equal(x[: len(corners)], corners) and (cut == [4, 5, 6]).all(axis=1).sum() == 1
+    image, (width, height) = np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8), SIZE
+    below = (cut != [4, 5, 6]).all(axis=1)
+    drawn = rasterise(camera.project(x, SIZE), cut[below], colours, camera.clipping[0], image)
+    focal = height / 2 / np.tan(np.radians(camera.fov) / 2)
+    v, u = np.mgrid[:height, :width] + 0.5
+    ray = np.stack([(u - width / 2) / focal, (height / 2 - v) / focal, np.ones_like(u)], axis=-1) @ camera.axes
+    with np.errstate(divide="ignore"):
+        depth = -camera.position[1] / ray[..., 1]
+    hit = camera.position + depth[..., None] * ray
+    expected = (depth > camera.clipping[0]) & (np.abs(hit[..., [0, 2]]) < half).all(axis=-1)
+    assert (drawn != expected).mean() < 0.005 and 0.4 < expected.mean() < 0.8
+    both = drawn & expected
+    assert np.abs(image[both] / 255 - (hit[both] + half) / (2 * half))[:, [0, 2]].max() < 0.02
+    large = np.abs(camera.project(camera.clipped(corners, triangles, shades, (2560, 1440))[0], (2560, 1440))[len(corners) :, :2])
+    assert 1e4 < large.max() < 0.5 * MAX_COORDINATE
+    for value in (np.nan, np.inf):
+        bad = corners.copy()
+        bad[4] = value
+        assert not (camera.clipped(bad, triangles, shades, SIZE)[1] == 4).any()
+
+
+def test_rays_invert_the_projection():
+    camera = Camera(target=np.array([1.0, 2, 3]), distance=4.0, azimuth=70.0, elevation=-30.0)
+    for point in np.random.default_rng(1).uniform(-1, 1, (20, 3)) + camera.target:
+        across, down, _ = camera.project(point[None], SIZE)[0]
+        ray = camera.ray((across / SIZE[0], 1 - down / SIZE[1]), SIZE)
+        assert np.allclose(np.cross(ray, point - camera.position), 0, atol=1e-12) and ray @ camera.forward > 0
