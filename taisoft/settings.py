@@ -7,7 +7,7 @@ import numpy as np
 
 from taisoft.attributes import guarded_record
 from taisoft.contact import SOLVERS as EXPLICIT_CONTACT
-from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS, is_multistep
+from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS, is_multistep, takes_contacts
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
 from taisoft.scene.plan import Plan, make_plan
@@ -69,7 +69,7 @@ def plan_of(scene: Scene, integrator: str, self_collision: bool, draggable: bool
 
 def contact_solvers(integrator: str) -> tuple[str, ...]:
     """Return the contact solvers that an integrator supports, besides "auto"."""
-    return EXPLICIT_CONTACT if integrator in EXPLICIT else () if integrator == "implicit_midpoint" else IMPLICIT_CONTACT
+    return () if not takes_contacts(integrator) else EXPLICIT_CONTACT if integrator in EXPLICIT else IMPLICIT_CONTACT
 
 
 def check_dt(dt) -> float:

@@ -12,13 +12,12 @@ from functools import partial
 import numpy as np
 
 import taisoft as ts
-from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
+from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS, SECOND_ORDER
 from taisoft.errors import SimulationError
 from taisoft.fem.reference import lumped_masses
 
 from .record import LAWS, Case, Check, face, label, material, near, nearest, order, reported, scene, small
 
-SECOND_ORDER = ("velocity_verlet", "bdf2", "implicit_midpoint")
 ORDER = {name: 2 if name in SECOND_ORDER else 1 for name in INTEGRATORS}
 
 

@@ -41,6 +41,12 @@ SCHEMES = {
 }
 IMPLICIT = tuple(SCHEMES)
 INTEGRATORS = (*EXPLICIT, *IMPLICIT)
+SECOND_ORDER = ("velocity_verlet", "bdf2", "implicit_midpoint")  # in time, of smooth motion; others are of first order
+
+
+def takes_contacts(integrator: str) -> bool:
+    """Whether an integrator supports contacts: a stage in the middle of the step does not, since its end must hold them."""
+    return integrator in EXPLICIT or not SCHEMES[integrator].midpoint
 
 
 def is_multistep(integrator: str) -> bool:

@@ -236,7 +236,7 @@ def _draw_points(panel, study: Study, rows: list[Row]) -> None:
             for status, fill, suffix in (("ok", colour, ""), ("degraded", "white", " (degraded)")):
                 if selected := [row for row in series if row.status == status]:
                     label = ", ".join(filter(None, (integrator, kind))) + suffix
-                    _draw_series(panel, study, selected, color=colour, mfc=fill, marker=MARKERS[integrator], label=label)
+                    _draw_series(panel, study, selected, color=colour, mfc=fill, marker=MARKERS.get(integrator, "X"), label=label)
 
 
 def _draw_series(panel, study: Study, rows: list[Row], **style) -> None:

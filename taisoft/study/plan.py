@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 
-from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
+from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS, SECOND_ORDER
 from taisoft.errors import SceneError, TaisoftError
 from taisoft.scene.scene import Scene
 from taisoft.settings import check_settings
@@ -28,7 +28,6 @@ MAX_DENOMINATOR = 10_000  # of the ratio of two time steps; above it they have n
 DT_RATIO = 8  # the study's smallest dt over the reference's
 STABLE_FRACTION = 0.9  # of the stable step, for a reference's coarser run
 EXPLICIT_DT_RATIO = 16  # explicit references may use steps this many times smaller than requested: they are cheap
-SECOND_ORDER = ("velocity_verlet", "bdf2", "implicit_midpoint")
 
 Variant = Callable[[int, int | None], Scene]  # (refine, order) -> scene
 
