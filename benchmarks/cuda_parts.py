@@ -98,7 +98,7 @@ def _timed_size(scene: Scene, integrator: str, dt: float, arch: str) -> dict:
     start = perf_counter()
     try:
         # the highest frequency of millions of tets takes minutes on the host: the step is scaled from the small beam's
-        with patched(changes, "check_stability", lambda *_: None):
+        with patched(changes, "check_stability", lambda *_, **__: None):
             sim = ts.Simulator(scene, dt=dt, integrator=integrator, arch=arch)
         with sim:
             build = perf_counter() - start - sim.compile_seconds

@@ -1,4 +1,4 @@
-"""Changes of a running simulation by its user: each function is a method of `Simulator`."""
+"""Changes of a running simulation by its user: each function is a method of `Simulator`, whose class body lists them."""
 
 import warnings
 from typing import TYPE_CHECKING
@@ -41,11 +41,11 @@ def set_dt(self: "Simulator", value: float) -> None:
     value = check_dt(value)
     if value == self.dt:
         return
-    check_stability(self.settings, value, self, stacklevel=5)
+    check_stability(self.settings, value, self, stacklevel=4)
     self._host().set_dt(value)
 
 
-def check_stability(settings: Settings, dt: float, sim: "Simulator", stacklevel: int = 4) -> None:
+def check_stability(settings: Settings, dt: float, sim: "Simulator", stacklevel: int = 3) -> None:
     """Refuse a dt [s] above the limit of an explicit integrator, or warn if the settings allow it."""
     if not settings.explicit or dt <= sim.stable_dt:
         return

@@ -1,4 +1,4 @@
-"""Results and other queries of a simulator: each function is a method of `Simulator`."""
+"""Results and other queries of a simulator: each function is a method of `Simulator`, whose class body lists them."""
 
 from typing import TYPE_CHECKING
 
@@ -178,7 +178,7 @@ def draggable(self: "Simulator") -> bool:
 
 def dragged(self: "Simulator") -> Drag | None:
     """The present drag, with its point [m] and force [N] at the start of the last step; None if nothing is dragged."""
-    spring = self._host().drag_spring
+    spring = self._dynamics.drag_spring
     return None if spring is None else spring.drag
 
 
@@ -194,7 +194,7 @@ def field_bytes(self: "Simulator") -> dict[str, int]:
 
 def buffer_growths(self: "Simulator") -> dict[str, int]:
     """How often each buffer of contact detection grew since the start; buffers that never grew are left out."""
-    detection = self._host().detection
+    detection = self._dynamics.detection
     return {name: n for name, n in detection.counts.growths.items() if n} if detection is not None else {}
 
 

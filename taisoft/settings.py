@@ -41,6 +41,7 @@ class Settings:
 
 
 NAMES = tuple(field.name for field in dataclasses.fields(Settings))
+TOLERANCES = ("newton_tolerance", "linear_tolerance", "contact_tolerance")
 FIXED = ("dt", "precision", "arch")  # settings that `Simulator.rebuild` is not for: dt is assigned, the others never change
 
 
@@ -56,6 +57,8 @@ def check_settings(scene: Scene, **given) -> Settings:
         checks.check_solver(**dataclasses.asdict(settings))
     except SceneError as error:
         raise SimulationError(str(error)) from None
+    given = {name: value for name in TOLERANCES if (value := getattr(settings, name)) is not None}
+    settings = dataclasses.replace(settings, **{name: float(value) for name, value in given.items()})
     _check_name("integrator", settings.integrator, INTEGRATORS)
     _check_name("contact_solver", settings.contact_solver, CONTACT_SOLVERS)
     _check_contact_solver(settings, scene.pushes(settings.self_collision))

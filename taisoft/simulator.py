@@ -32,7 +32,6 @@ class Simulator(Guarded):
     _read_only = frozenset(("settings", "scene", "plan"))
     _instead = changes.INSTEAD
     settings: Settings
-    _stable_dt: float | None = None  # None: not computed yet, or outdated
     _dynamics: Dynamics | None = None  # None until it is made
 
     def __init__(
@@ -50,8 +49,9 @@ class Simulator(Guarded):
         contact_tolerance: float | None = None,
         draggable: bool = False,
     ):
-        given = locals()
+        given = locals()  # of the arguments alone, as long as this is the first line
         self.settings = check_settings(scene, **{name: given[name] for name in NAMES})
+        self._stable_dt: float | None = None  # None: not computed yet, or outdated
         self.scene = scene.snapshot()  # run-time changes must not reach the user's scene
         self._start_scene, scene = scene, self.scene
         changes.check_stability(self.settings, self.settings.dt, self)
@@ -157,7 +157,7 @@ class Simulator(Guarded):
             new.scene.allow_initial_overlap = self.scene.allow_initial_overlap
         new._dynamics.continue_from(before)
         kept = {name: self.__dict__[name] for name in ("_start_scene", "_compiled_before", "_compile_reported")}
-        before.release()
+        before.close()
         self.__dict__.update(new.__dict__ | kept)
 
     # --- checkpoints and resources --------------------------------------------------------------------------------------
@@ -169,7 +169,7 @@ class Simulator(Guarded):
     def close(self) -> None:
         """Release memory and runtime; a closed simulator cannot be used."""
         if self._dynamics is not None:
-            self._dynamics.release()
+            self._dynamics.close()
 
     def __enter__(self) -> "Simulator":
         return self
@@ -179,7 +179,7 @@ class Simulator(Guarded):
 
     def _host(self) -> Dynamics:
         """Return the dynamics for data on the host alone. Raises SimulationError after `close`."""
-        if not self._dynamics.release.alive:
+        if not self._dynamics.is_open:
             raise SimulationError("the simulator is closed")
         return self._dynamics
 

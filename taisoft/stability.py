@@ -11,7 +11,6 @@ import scipy.sparse.linalg as spl
 
 from taisoft.errors import SceneError
 from taisoft.fem import reference
-from taisoft.fem.reference import lumped_masses
 from taisoft.scene.scene import Body, Scene
 
 MAX_WEIGHT_STRAIN = 0.5  # strain of a body under its own weight above which its scale is questioned
@@ -167,7 +166,7 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
         raise SceneError(f"k = {k!r}: it must be a whole number from 1 to the {n_free} free axes of the scene")
     K = sp.block_diag([hooke_stiffness(b) for b in scene.bodies], format="csr")[free][:, free]
     if mass == "lumped":
-        M = sp.diags(np.repeat(lumped_masses(scene), 3)[free], format="csc")
+        M = sp.diags(np.repeat(reference.lumped_masses(scene), 3)[free], format="csc")
     else:
         scalar = sp.block_diag([reference.consistent_mass(b) for b in scene.bodies])
         M = sp.kron(scalar, sp.identity(3), format="csr")[free][:, free]

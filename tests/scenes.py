@@ -48,7 +48,7 @@ def dynamics(scene: ts.Scene, **settings) -> Iterator[Dynamics]:
     try:
         yield made
     finally:
-        made.release()
+        made.close()
 
 
 def set_state(made: Dynamics, x: np.ndarray | None = None, v: np.ndarray | None = None) -> None:

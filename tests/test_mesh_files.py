@@ -11,7 +11,6 @@ import io
 import os
 import re
 import threading
-import time
 from pathlib import Path
 
 import meshio
@@ -277,6 +276,12 @@ def test_missing_or_repeated_gmsh_nodes_are_refused(tmp_path):
         read_mesh(path)
 
 
+def processor_seconds() -> float:
+    """Processor time of this process and of the readers that have ended [s]: independent of other work on the machine."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
 @pytest.mark.parametrize("count", [10**9, 10**15, 10**30])
 @pytest.mark.parametrize("ending", [".msh", ".vtk", ".mesh", ".vol", ".su2", ".xml", ".ele", ".dat"])
 def test_absurd_counts_are_refused_quickly(tmp_path, ending, count):
@@ -285,10 +290,10 @@ def test_absurd_counts_are_refused_quickly(tmp_path, ending, count):
     data = path.read_bytes()
     assert re.search(rb"\b1[02]\b", data)  # 12 vertices, 10 tets
     path.write_bytes(re.sub(rb"\b1[02]\b", str(count).encode(), data, count=2))
-    start = time.process_time()  # does not depend on the load of the machine
+    start = processor_seconds()
     with pytest.raises(MeshError, match="^" + re.escape(str(path))):
         read_mesh(path)
-    assert time.process_time() - start < 2.0
+    assert processor_seconds() - start < 5.0
 
 
 @pytest.mark.parametrize("head", [b"", b"$MeshFormat\n4.1 1 8\n\1\0\0\0\n$EndMeshFormat\n$Nodes\n"])

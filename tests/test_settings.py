@@ -83,3 +83,31 @@ def test_valid_contact_settings_are_used(integrator, solver):
         assert sim.settings.contact_solver == solver and sim.settings.contact_tolerance == 1e-3
     with dynamics(block_scene(ground=True), **settings) as made:
         assert made.stepper.contact_tolerance == 1e-3 and getattr(made.stepper, "method", solver) == solver
+
+
+def test_tolerances_become_floats(tmp_path):
+    with ts.Simulator(block_scene(), newton_tolerance=np.float32(1e-3)) as sim:
+        assert type(sim.settings.newton_tolerance) is float
+        sim.save_checkpoint(tmp_path / "c.npz")
+
+
+def test_a_warning_of_an_unstable_dt_names_the_line_of_the_caller():
+    with pytest.warns(UserWarning, match="stability limit") as found:
+        sim = ts.Simulator(block_scene(), 1.0, "symplectic_euler", allow_unstable=True)
+    with sim, pytest.warns(UserWarning, match="stability limit") as later:
+        sim.dt = 0.5
+        sim.set_material("block", young=2e6)
+    assert {warning.filename for warning in (*found, *later) if "stability limit" in str(warning.message)} == {__file__}
+    assert len(later) == 2
+
+
+def test_an_overlap_check_that_fails_leaves_nothing_open(monkeypatch):
+    def fail(_detection):
+        raise ts.MeshError("no distance field")
+
+    monkeypatch.setattr("taisoft.collision.overlap.find_overlaps", fail)
+    touching = block_scene()
+    touching.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
+    with pytest.raises(ts.MeshError, match="no distance field"):
+        ts.Simulator(touching)
+    assert runtime.open_kind() is None

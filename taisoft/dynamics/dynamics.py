@@ -33,13 +33,12 @@ if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep
     from taisoft.dynamics.explicit_stepper import ExplicitStepper
     from taisoft.dynamics.implicit import ImplicitStepper
-    from taisoft.dynamics.no_contacts import NoContacts
 
 
 class Dynamics:
     """A simulated scene. `Simulator` checks arguments, and adds queries, changes and runs.
 
-    Memory and runtime are released by `release`, at the latest with the object. Raises MemoryError, SimulationError or MeshError;
+    Memory and runtime are freed by `close`, at the latest with the object. Raises MemoryError, SimulationError or MeshError;
     nothing is then left allocated.
     """
 
@@ -52,11 +51,11 @@ class Dynamics:
             settings.arch, settings.precision, f"the simulator of {[b.name for b in scene.bodies]}"
         )
         self.arena, self._owned = FieldArena(), []  # the latter have memory of their own
-        self.release = weakref.finalize(self, _release, self.arena, self.runtime, self._owned)
+        self._free = weakref.finalize(self, _free, self.arena, self.runtime, self._owned)
         try:
             self._build(scene, settings, plan)
         except BaseException:
-            self.release()
+            self.close()
             raise
 
     def _build(self, scene: Scene, settings: Settings, plan: Plan) -> None:
@@ -74,6 +73,16 @@ class Dynamics:
         self.stepper = make_stepper(self.state, settings, self.contact or NoContacts())
         self._owned.append(self.stepper)
         self.reset()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it can be used: `close` was not called yet."""
+        return self._free.alive
+
+    def close(self) -> None:
+        """Free all memory and the runtime; dt alone stays readable."""
+        self._free()
+        self.state = self.contact = self.stepper = self.drag_spring = self._idle_detection = self.tangent = None
 
     @property
     def model(self) -> Model:
@@ -279,7 +288,7 @@ class Dynamics:
         self.changes = other.changes + 1
 
 
-def _release(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:
+def _free(arena: FieldArena, claim: runtime.Runtime, owned: list) -> None:
     while owned:
         owned.pop().release()
     arena.release()

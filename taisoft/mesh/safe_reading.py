@@ -22,12 +22,15 @@ from taisoft.errors import MeshError
 
 UTF16 = "the file is UTF-16 text; save it as UTF-8"
 HEAD = 64  # characters inspected to detect UTF-16 text
-SECONDS, SECONDS_PER_BYTE = 15.0, 1e-5  # time limit of a reader; the slowest reads 1 MB/s
+SECONDS, SECONDS_PER_BYTE = 15.0, 1e-5  # processor time limit of a reader; the slowest reads 1 MB/s
+WALL_FACTOR = 4.0  # times that: its wall time limit, on a machine with other work
 MEMORY, MEMORY_PER_BYTE = 2 << 30, 200  # limit of a reader's address space [bytes]; text becomes Python objects
 MAX_ENTRIES_PER_BYTE = 16  # of a file, in the arrays read from it: more can only come from counts that it declares
 MAX_READS_PAST_END = 100  # allowed reads past the end of a file, where some of meshio's readers loop forever
 QUALITY = 10.0  # fTetWild's target upper bound of the tets' AMIPS energy: 3 for a regular tet
 MAX_ITERATIONS = 80  # its maximum number of optimisation iterations
+
+_open = open  # the child replaces the built-in one
 
 Blocks = list[tuple[str, np.ndarray]]  # element blocks: meshio's type name, (k,nodes) indices from 0
 
@@ -87,7 +90,7 @@ def read_by_meshio(file: Path, data: bytes, kind: str) -> tuple[np.ndarray, Bloc
             source = Path(folder, file.name)
             source.write_bytes(data)
         try:
-            found = run_child(folder, "read", str(source), str(seconds), seconds=seconds)
+            found = run_child(folder, "read", str(source), str(seconds), seconds=WALL_FACTOR * seconds)
         except MeshError as error:
             raise MeshError(f"{file}: not a supported {kind} ({error})") from None
     return found["points"], [(str(name), found[f"cells{i}"]) for i, name in enumerate(found["kinds"])]
@@ -107,13 +110,13 @@ def run_child(folder: str, task: str, *arguments: str, seconds: float | None = N
         cwd=folder,
         env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path)), "OPENBLAS_NUM_THREADS": "1"},
     )
-    try:
-        printed = child.communicate(timeout=seconds)[1].decode("utf-8", "replace").strip()
-    except subprocess.TimeoutExpired:
-        raise MeshError(f"not done after {seconds:.0f} s") from None
-    finally:  # do not leave the process running after a signal
-        child.kill()
-        child.wait()
+    with child:
+        try:
+            printed = child.communicate(timeout=seconds)[1].decode("utf-8", "replace").strip()
+        except subprocess.TimeoutExpired:
+            raise MeshError(f"its reader was stopped after {seconds:.0f} s") from None
+        finally:  # do not leave the process running after a signal
+            child.kill()
     result = Path(folder, "result.npz")
     if child.returncode != 0 or not result.is_file():
         raise MeshError(one_line(printed.rsplit("\n", 1)[-1]) or f"exit status {child.returncode}")
@@ -169,11 +172,14 @@ def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
 
 
 def _limit_resources(memory: int, seconds: int) -> None:
-    with contextlib.suppress(ImportError, ValueError):  # other systems than Linux lack the module or the limits
+    with contextlib.suppress(ImportError):  # other systems than Linux lack the module
         import resource
 
-        resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))  # ends an orphan too
+        for kind, limit in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, seconds)):  # the latter ends an orphan too
+            hard = resource.getrlimit(kind)[1]
+            limit = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
+            with contextlib.suppress(ValueError, OSError):  # or refuse the limit
+                resource.setrlimit(kind, (limit, limit))
 
 
 def _first_fitting(path: str, data: bytes):
@@ -223,11 +229,11 @@ class _BoundedFile(io.BufferedReader):
         return self._checked(super().readline(*size))
 
 
-def _open_bounded(file, mode: str = "r", *arguments, **options):
+def _open_bounded(file, mode: str = "r", buffering: int = -1, encoding: str | None = None, **options) -> io.IOBase:
     if not set(mode) <= set("rbt"):
-        return open(file, mode, *arguments, **options)
+        return _open(file, mode, buffering, encoding, **options)
     stream = _BoundedFile(io.FileIO(file))
-    return stream if "b" in mode else io.TextIOWrapper(stream, encoding="utf-8")
+    return stream if "b" in mode else io.TextIOWrapper(stream, encoding=encoding or "utf-8", **options)
 
 
 if __name__ == "__main__":

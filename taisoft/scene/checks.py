@@ -70,7 +70,7 @@ def choice(value, what: str, allowed: tuple[str, ...]) -> str:
     """Return value if it is one of the allowed words; otherwise the message suggests the closest one."""
     if isinstance(value, str) and value in allowed:
         return value
-    near = difflib.get_close_matches(value.lower(), allowed, n=1) if isinstance(value, str) else []
+    near = difflib.get_close_matches(value.lower(), allowed, n=1) if isinstance(value, str) and len(allowed) > 2 else []
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise SceneError(f"{what} must be one of {', '.join(allowed)}, not {value!r}{hint}")
 

@@ -57,10 +57,12 @@ def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
         raise SceneError(f"read_scene: path must be a file's name, not {path!r}") from error
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        scene, solver = _read(Table(file, "", _parsed(file), TOP_KEYS, ["bodies"]), allow_outside)
-    for warning in found:
-        warnings.warn(warning.message, stacklevel=2)
-    return scene, solver
+        try:
+            return _read(Table(file, "", _parsed(file), TOP_KEYS, ["bodies"]), allow_outside)
+        finally:
+            own = [warning.message for warning in found if issubclass(warning.category, UserWarning)]
+    for message in own:
+        warnings.warn(message, stacklevel=2)
 
 
 def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
