@@ -48,8 +48,8 @@ def shaken_cube(cells: int) -> ts.TetMesh:
     mesh = ts.box_mesh((cells,) * 3, (1, 1, 1), pattern="six")
     x = mesh.vertices
     free = np.abs(np.abs(x) - 0.5) > 1e-9
-    way = np.random.default_rng(SEED).uniform(-SHAKEN, SHAKEN, x.shape) / cells
-    return ts.TetMesh(x + free * way, mesh.tets)
+    shift = np.random.default_rng(SEED).uniform(-SHAKEN, SHAKEN, x.shape) / cells
+    return ts.TetMesh(x + free * shift, mesh.tets)
 
 
 def pile(cells: int, collision: str) -> ts.Scene:
@@ -74,14 +74,14 @@ def two_cubes(cells: int, collision: str) -> ts.Scene:
     return scene
 
 
-def turning(scene: ts.Scene, share: float) -> np.ndarray:
+def turning(scene: ts.Scene, fraction: float) -> np.ndarray:
     """The upper of two cubes comes down by a hundredth and turns by a third of a right angle."""
     below, above = (body.rest_positions + body.position for body in scene.bodies)
-    angle = np.radians(30.0) * share
+    angle = np.radians(30.0) * fraction
     c, s = np.cos(angle), np.sin(angle)
     middle = above.mean(axis=0)
     turned = (above - middle) @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) + middle
-    return np.concatenate([below, turned + (0, 0.005 - 0.01 * share, 0)])
+    return np.concatenate([below, turned + (0, 0.005 - 0.01 * fraction, 0)])
 
 
 def sheet_and_cube(collision: str) -> ts.Scene:
@@ -94,10 +94,10 @@ def sheet_and_cube(collision: str) -> ts.Scene:
     return scene
 
 
-def sagging(scene: ts.Scene, share: float) -> np.ndarray:
+def sagging(scene: ts.Scene, fraction: float) -> np.ndarray:
     """The sheet, held at both ends, sags by a quarter of a metre, and the cube goes with it, its edges 0.2 mm deep."""
     sheet, cube = (body.rest_positions + body.position for body in scene.bodies)
-    sag = 0.25 * share
+    sag = 0.25 * fraction
 
     def height(x):
         return -sag * (1 - (x / 2) ** 2)

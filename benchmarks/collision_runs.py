@@ -196,9 +196,9 @@ class Rig:
         self.detection.release()
         self._arena.release()
 
-    def place(self, share: float) -> None:
+    def place(self, fraction: float) -> None:
         """Put the nodes where the motion has them, a fraction of the film done."""
-        x = start(self.scene) if self.setup.motion is None else self.setup.motion(self.scene, share)
+        x = start(self.scene) if self.setup.motion is None else self.setup.motion(self.scene, fraction)
         self.model.state.x.from_numpy(x)
 
     def search(self) -> None:

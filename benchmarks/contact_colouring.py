@@ -59,16 +59,16 @@ def _parallel(p: ContactProblem) -> np.ndarray:
 
 def colour_all(scene: str, p: ContactProblem, seeds: int) -> tuple[list[Colouring], dict[str, np.ndarray]]:
     """Colourings of the contacts that `p` holds, and a colour (k,) of each way."""
-    graph, k, made, colours = graph_of(p), int(p.count[0]), [], {}
+    graph, k, colourings, colours = graph_of(p), int(p.count[0]), [], {}
     start, movable = p.entry_start.to_numpy(), (p.inverse_mass.to_numpy() != 0.0).any(axis=1)
     least = int(np.diff(start)[movable].max())
     _parallel(p)  # compiles
-    ways = {
+    methods = {
         "greedy": lambda _: colour_greedy(graph_of(p)),
         "random": lambda seed: colour_random(graph_of(p), seed),
         "parallel": lambda _: _parallel(p),
     }
-    for name, way in ways.items():
+    for name, way in methods.items():
         numbers, largest, seconds = [], [], []
         for seed in range(seeds if name == "random" else ROUNDS):
             begin = clock()
@@ -80,8 +80,8 @@ def colour_all(scene: str, p: ContactProblem, seeds: int) -> tuple[list[Colourin
             numbers.append(len(sizes))
             largest.append(int(sizes.max()))
             colours.setdefault(name, colour)
-        made.append(Colouring(scene, name, k, least, numbers, largest, seconds))
-    return made, colours
+        colourings.append(Colouring(scene, name, k, least, numbers, largest, seconds))
+    return colourings, colours
 
 
 def colour_table(colourings: list[Colouring]) -> str:

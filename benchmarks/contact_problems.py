@@ -212,7 +212,7 @@ def host_rows(problem: Problem, repeats: int) -> list[Row]:
     return rows
 
 
-def judged(rows: list[Row]) -> list[Row]:
+def with_verdicts(rows: list[Row]) -> list[Row]:
     """The rows of one problem with their verdicts."""
     yardstick = YARDSTICK[rows[0].problem]
     able = [row for row in rows if row.iterations is not None]
@@ -233,7 +233,7 @@ def compute(names: tuple[str, ...] = tuple(YARDSTICK), repeats: int = 5) -> Iter
     """The rows of these problems, of one after the other."""
     for name in names:
         problem = load(name)
-        yield from judged(sweeper_rows(problem, repeats) + host_rows(problem, repeats))
+        yield from with_verdicts(sweeper_rows(problem, repeats) + host_rows(problem, repeats))
 
 
 def missing(names: tuple[str, ...] = tuple(YARDSTICK)) -> str | None:

@@ -66,15 +66,15 @@ class Outcome:
 
 
 @contextmanager
-def shown(look: Callable[[ContactProblem], None]) -> Iterator[None]:
+def observe_problems(observe: Callable[[ContactProblem], None]) -> Iterator[None]:
     """Each contact problem of explicit steps is shown to `look` when its solve would begin; it must leave it as it was."""
     plain = explicit_contact_stepper.solve
 
-    def looked_at(p, *rest):
-        look(p)
+    def observed(p, *rest):
+        observe(p)
         return plain(p, *rest)
 
-    with patched(explicit_contact_stepper, "solve", looked_at):
+    with patched(explicit_contact_stepper, "solve", observed):
         yield
 
 
@@ -91,7 +91,7 @@ def contact_jacobian(p: ContactProblem) -> sp.csr_matrix:
     return sp.csr_matrix((entries.ravel(), (row.ravel(), column.ravel())), shape=(3 * k, 3 * p.n_nodes))
 
 
-def make_judge(p: ContactProblem) -> Callable[[np.ndarray], float]:
+def make_residual(p: ContactProblem) -> Callable[[np.ndarray], float]:
     """The residual of impulses (k,3) in this problem."""
     k = int(p.count[0])
     J, b, mu = contact_jacobian(p), p.b.to_numpy()[:k].ravel(), p.friction.to_numpy()[:k]
@@ -126,7 +126,7 @@ class Solvers:
         """Solve `p` to GOAL from the impulses `start` (capacity, 3) by each solver, in turns; `p` is left as it was."""
         r, order, k = p.r.to_numpy(), p.order.to_numpy(), int(p.count[0])
         names = self.names(p) if names is None else list(names)
-        judge, found = make_judge(p), {name: Outcome() for name in names}
+        judge, found = make_residual(p), {name: Outcome() for name in names}
         for _ in range(rounds):
             for name in names:
                 form, method = self._form(p, name)
@@ -235,11 +235,11 @@ def measure_film(name: str, sim: ts.Simulator, frames: int, solvers: Solvers) ->
     film = Film(name, tets, sim.dt, sim.stable_dt)
     known: list[ContactProblem] = []
 
-    def look(p: ContactProblem) -> None:
+    def observe(p: ContactProblem) -> None:
         if p not in known:  # the first, or one with more room
             known.append(p)
             solvers.outcomes(p, p.r.to_numpy(), 1)  # compiles
-        if make_judge(p)(np.zeros((int(p.count[0]), 3))) == 0.0:
+        if make_residual(p)(np.zeros((int(p.count[0]), 3))) == 0.0:
             return
         for start, rounds, r in ((WARM, ROUNDS, p.r.to_numpy()), (COLD, COLD_ROUNDS, np.zeros((p.capacity, 3)))):
             for solver, outcome in solvers.outcomes(p, r, rounds).items():
@@ -254,7 +254,7 @@ def measure_film(name: str, sim: ts.Simulator, frames: int, solvers: Solvers) ->
     for _ in range(frames):
         for _ in range(per_frame - 1):
             sim.step()
-        with shown(look):
+        with observe_problems(observe):
             sim.step()
     return film
 

@@ -28,7 +28,7 @@ except ImportError:  # version 0.1
 ROOT = Path(ts.__file__).resolve().parents[1]
 MESHES = Path(__file__).resolve().parents[2] / "shared" / "meshes"
 EVERY, SLOWEST, QUICK_STEPS = 5, 10, 3
-MOST_HALVES = 16
+MAX_HALVES = 16
 DOWN, GROUND = (0.0, -9.81, 0.0), ts.HalfSpace((0, 0, 0), (0, 1, 0))
 IMPLICIT = {"integrator": "implicit_euler"}
 
@@ -93,8 +93,8 @@ def gripper() -> ts.Scene:
     scene.add_body(ts.ball_mesh(0.1, 8), soft, name="ball", position=(0, 0.101, 0))
     scene.add_obstacle(GROUND, name="ground", friction=0.5)
     for name, side in (("left", -1.0), ("right", 1.0)):
-        way = [(0, 0, 0), (-side * 0.03, 0, 0), (-side * 0.03, 0.1, 0)]
-        path = ts.KeyFrames([0.0, 0.4, 1.0], way, smooth=True)
+        displacements = [(0, 0, 0), (-side * 0.03, 0, 0), (-side * 0.03, 0.1, 0)]
+        path = ts.KeyFrames([0.0, 0.4, 1.0], displacements, smooth=True)
         scene.add_obstacle(ts.Box((side * 0.115, 0.12, 0), (0.01, 0.06, 0.06)), name=name, friction=0.8, path=path)
     return scene
 
@@ -183,7 +183,7 @@ def replay(file: Path, precision: str, tolerance: float, reference: Path | None)
         stepper = parts_of(sim)[0]
         stepper.tolerance = stepper.contact_tolerance = tolerance
         for k, state in enumerate(data["states"]):
-            row, x = solve(sim, state["kept"], sim.dt, 1 if reference and known is None else MOST_HALVES)
+            row, x = solve(sim, state["kept"], sim.dt, 1 if reference and known is None else MAX_HALVES)
             row |= {"scene": data["scene"], "step": state["step"], "captured": state["captured"]}
             if known is not None and known[k] is not None and row["halves"] == 1:  # a step in halves is another one
                 row["error"] = float(np.abs(x - known[k]).max() / scale)

@@ -67,7 +67,7 @@ def make_parts(arch: str, quick: bool) -> list[Part]:
     ]
 
 
-def carry_out(part: Part, limit: float) -> Outcome:
+def run_part(part: Part, limit: float) -> Outcome:
     """Run a part for at most `limit` seconds; its whole process group ends with it."""
     outcome, start = Outcome(part), time.monotonic()
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
@@ -222,7 +222,7 @@ def check(parts: list[Part], budget: float, folder: Path, arch: str) -> list[Out
             outcomes.append(Outcome(part, "out of time", tail="no time was left to start it"))
         else:
             print(f"{part.name}: at most {limit:.0f} s", file=sys.stderr, flush=True)
-            outcomes.append(carry_out(part, limit))
+            outcomes.append(run_part(part, limit))
         print(f"{part.name}: {outcomes[-1].ended}, {outcomes[-1].seconds:.0f} s", file=sys.stderr, flush=True)
         write_page(folder, text, numbers, outcomes, parts[k + 1 :])
     return outcomes

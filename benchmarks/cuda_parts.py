@@ -17,9 +17,9 @@ from .contact_colouring import measure_crossover
 from .elasticity_runs import MARGIN, beam_scene
 from .programs import own
 from .programs.session import Setting
-from .runner import patched, say
+from .runner import patched, print_result
 from .scaling_runs import cubes_on_ground
-from .works.judge import judge
+from .works.evaluation import evaluate
 from .works.references import MUJOCO, TAISOFT
 from .works.scenes import WORKS, Work
 
@@ -34,7 +34,7 @@ RERUNS = 3
 def run_job(name: str, arch: str, quick: bool) -> None:
     """Print the results of a part."""
     for found in JOBS[name][2](arch, quick):
-        say(found)
+        print_result(found)
 
 
 def works(arch: str, quick: bool) -> Iterator[dict]:
@@ -58,7 +58,7 @@ def _timed(work: Work, setting: Setting) -> dict:
             _, seconds = session.run(follow=False)
         finally:
             session.close()
-        verdict = judge(work, setting.model, positions)
+        verdict = evaluate(work, setting.model, positions)
     except TaisoftError as error:
         return {"failure": str(error)}
     return {

@@ -101,7 +101,7 @@ class Row:
         runs = [seconds for one in self.rounds for seconds in one]
         return summarise(runs) if runs else None
 
-    def judge(self, cells, path: np.ndarray) -> None:
+    def set_errors(self, cells, path: np.ndarray) -> None:
         """Errors of the path (k,3) [m], a point every 10 ms."""
         exact, t = load_exact(cells), np.arange(len(path)) * SAMPLE
         self.error, self.error_unfolded = exact.error(t, path), exact.error(t, path, until=FOLDING_STARTS)
@@ -172,7 +172,7 @@ def _taisoft_round(row: Row, cells, arch: str, seconds: float, first: bool) -> N
         warm_up(sim)
         if first:
             path, row.first_run = follow_tip(sim, row.steps, samples)
-            row.judge(cells, path)
+            row.set_errors(cells, path)
 
         def run() -> float:
             sim.reset()

@@ -24,7 +24,7 @@ SAMPLE_SECONDS = 0.05  # wall time of a sample, about
 GUESSED_SECONDS_PER_TET = 12e-9  # of a step, sizes a sample; 5 to 30 ns were met on the CPU
 GUESSED_LAUNCHES = {"cpu": 0.0, "cuda": 200e-6}  # s a step: on CUDA every sub-step is several launches
 LONGEST_FALL = 0.5  # s: the beam is bent by then, and St. Venant-Kirchhoff does not fold yet
-MOST_STEPS = 10_000
+MAX_STEPS = 10_000
 # What a step may cost on this machine, f32: 7 us at 540 tets, 11 ns per tet at 34,560.
 STEP_LIMIT = {540: 7e-6, 34_560: 34_560 * 11e-9}  # s
 RATIO_LIMIT = {"SVK": 1.0, "COR": 3.0}  # cost over that of stable neo-Hookean
@@ -61,7 +61,7 @@ def measure_costs(cells, precision: str, arch: str, repeats: int, laws=tuple(LAW
     """Costs on one mesh; all simulators are open together and take their samples in turn, `repeats` each."""
     tets = n_tets(cells)
     guess = GUESSED_SECONDS_PER_TET * tets + GUESSED_LAUNCHES[arch]
-    steps = min(MOST_STEPS, max(1, round(SAMPLE_SECONDS / guess)))
+    steps = min(MAX_STEPS, max(1, round(SAMPLE_SECONDS / guess)))
     dt = min(SAMPLE / steps_within_limit(cells), LONGEST_FALL / steps)
     with contextlib.ExitStack() as stack:
         pairs = []

@@ -39,7 +39,7 @@ NO_QUICK = ("references",)
 
 
 @dataclass
-class Ended:
+class Outcome:
     """How a benchmark ended. load: of the machine when it began."""
 
     name: str
@@ -55,7 +55,7 @@ def command(name: str, quick: bool, results: Path) -> list[str]:
     return [sys.executable, "-m", "taisoft", "bench", name, *(["--quick"] if quick and name not in NO_QUICK else []), *files]
 
 
-def make(names: Iterable[str], quick: bool, results: Path, logs: Path) -> list[Ended]:
+def make(names: Iterable[str], quick: bool, results: Path, logs: Path) -> list[Outcome]:
     """Run the benchmarks, telling each as it ends."""
     ended = []
     for name in names:
@@ -64,7 +64,7 @@ def make(names: Iterable[str], quick: bool, results: Path, logs: Path) -> list[E
             done = subprocess.run(
                 command(name, quick, results), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, check=False
             )
-        ended.append(Ended(name, done.returncode, time.monotonic() - start, load))
+        ended.append(Outcome(name, done.returncode, time.monotonic() - start, load))
         progress(f"{name}: status {done.returncode}, {ended[-1].seconds:.0f} s")
     return ended
 
@@ -83,7 +83,7 @@ def main(argv=None) -> int:
     ended = make(options.only or WRITES, options.quick, results, logs)
     if results == RESULTS:
         done = subprocess.run([sys.executable, "-m", "taisoft", "bench", "manual"], stdin=subprocess.DEVNULL, check=False)
-        ended.append(Ended("manual", done.returncode, 0.0, load_average()))
+        ended.append(Outcome("manual", done.returncode, 0.0, load_average()))
     columns = [("<benchmark", "{.name}"), ("exit status", "{.status}"), ("seconds", "{.seconds:.0f}")]
     print(table(ended, [*columns, ("load at its start", lambda one: load_text(one.load))]))
     return 0 if all(one.status == 0 for one in ended) else 1

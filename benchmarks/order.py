@@ -33,7 +33,7 @@ from .runner import make_parser, parse_options
 ROUNDS, QUICK_ROUNDS, QUICK_MESHES = 5, 1, 2
 GOALS = (0.1, 0.03, 0.01)  # errors whose times are compared
 GOAL = GOALS[-1]  # the one that cases are summed up by
-WANTED_RATIO = 20.0  # of the hanging beam's times to that error, order 1 over order 2
+MIN_SPEEDUP = 20.0  # of the hanging beam's times to that error, order 1 over order 2
 ELASTICA_LIMIT = 0.005  # error of order 2 on its finest mesh
 LEAST_ERROR = 1e-12  # what no error at all counts as among logarithms
 DEFAULT_DEGREE = {1: None, 2: 2}  # of the quadrature of the elements that are compared
@@ -182,7 +182,7 @@ def find_limits(comparisons: list[Comparison], rows: list[Row]) -> list[Limit]:
             known = c.ratio is not None and c.bound in "=>"
             what = f"{c.case}: order 1's time to {c.goal:.0%} error / order 2's"
             value, spread = (c.ratio.median, spread_of(c.ratio)) if known else (math.nan, None)
-            limits.append(Limit(what, value, WANTED_RATIO, spread, at_least=True))
+            limits.append(Limit(what, value, MIN_SPEEDUP, spread, at_least=True))
     for name in dict.fromkeys(row.case for row in rows if row.case.startswith("elastica")):
         own = [row for row in rows if row.case == name and (row.order, row.degree) == (2, DEFAULT_DEGREE[2])]
         value = math.nan if not own or own[-1].error is None else 100 * own[-1].error

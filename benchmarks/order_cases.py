@@ -108,8 +108,8 @@ def _turned(body: Body) -> None:
     """The face at x = 2 m turned by 90 degrees about x."""
     end = face(0, 2.0)(body.rest_positions)
     _, y, z = body.rest_positions[end].T
-    way = np.column_stack([np.zeros_like(y), -z - y, y - z])
-    body.move(end, lambda t: way)
+    displacement = np.column_stack([np.zeros_like(y), -z - y, y - z])
+    body.move(end, lambda t: displacement)
 
 
 def _torque(body: Body, state) -> np.ndarray:

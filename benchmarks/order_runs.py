@@ -21,7 +21,7 @@ from taisoft.study.measure import TimedRun, advance
 from .order_cases import Case, Element, Reference
 from .reference_cases.motion import parabola_vertex
 from .reference_cases.record import label, nearest
-from .runner import progress, repeated, timed, unwarned
+from .runner import progress, repeated, timed, without_warnings
 
 TOLERANCE = 1e-6  # of |residual| / |load|
 FALL_SECONDS = 1.2  # the first swing is over
@@ -132,7 +132,7 @@ def measure_case(case: Case, meshes: dict[Element, tuple], rounds: int, runtime:
                 _prepare(case, element, row, runs, runtime)
         reference = case.reference or own_reference(case, rows)
         for row in rows:
-            judge(row, reference)
+            set_error(row, reference)
         _time(runs, rounds)
     finally:
         for run, _ in runs:
@@ -144,7 +144,7 @@ def _prepare(case: Case, element: Element, row: Row, runs: list[tuple], runtime:
     """Build, solve once and write down what was found; the run joins `runs`."""
     compiled = compile_clock()
     try:
-        with unwarned():  # order 1 locks where nu is near 1/2: this is what is measured
+        with without_warnings():  # order 1 locks where nu is near 1/2: this is what is measured
             scene = case.build(row.cells, element)
         row.tets, row.nodes = scene.bodies[0].mesh.n_tets, len(scene.bodies[0].rest_positions)
         run = (Statics if case.dt is None else Fall)(case, scene, runtime)
@@ -162,7 +162,7 @@ def _time(runs: list[tuple], rounds: int) -> None:
     for _ in range(rounds):
         for run, row in runs:
             if not row.failure and sum(row.rounds) < ENOUGH_SECONDS:
-                row.rounds.append(float(np.median(repeated(run.again, ROUND_RUNS, ROUND_SECONDS, least=1))))
+                row.rounds.append(float(np.median(repeated(run.again, ROUND_RUNS, ROUND_SECONDS, min_rounds=1))))
 
 
 def own_reference(case: Case, rows: list[Row]) -> Reference:
@@ -176,7 +176,7 @@ def own_reference(case: Case, rows: list[Row]) -> Reference:
     return Reference(tuple(limit.tolist()), uncertainty, "the three finest order-2 meshes of this run, extrapolated")
 
 
-def judge(row: Row, reference: Reference) -> None:
+def set_error(row: Row, reference: Reference) -> None:
     """Set the error of a row that has numbers, where there are others to compare them with."""
     if row.measured and reference.values:
         exact = np.array(reference.values)

@@ -115,7 +115,7 @@ def beam(law: str = "SNH", cells: tuple = (8, 2, 2), order: int = 1) -> Scene:
     return scene
 
 
-def way(sim: ts.Simulator) -> np.ndarray:
+def mean_displacement(sim: ts.Simulator) -> np.ndarray:
     """How far the last body's nodes went on average (3,) [m]."""
     body = sim.scene.bodies[-1]
     return (sim.positions(body.name) - body.rest_positions - body.position).mean(axis=0)
@@ -127,9 +127,9 @@ def cube_on_slope() -> Scene:
     return on_slope(box((2, 2, 2), (0.1,) * 3), cube, ANGLE, FRICTION)
 
 
-def way_down(sim: ts.Simulator) -> np.ndarray:
+def slide_distance(sim: ts.Simulator) -> np.ndarray:
     """How far the cube slid (1,) [m]."""
-    return np.array([way(sim) @ (np.cos(ANGLE), -np.sin(ANGLE), 0.0)])
+    return np.array([mean_displacement(sim) @ (np.cos(ANGLE), -np.sin(ANGLE), 0.0)])
 
 
 def slid(seconds: float) -> list[float]:
@@ -143,7 +143,7 @@ def demo(name: str, precision: str, seconds: float) -> Case:
 
     own = {key: value for key, value in load_scene(name)[1].items() if key in SETTINGS}
     what = f"mean way of the last body after {seconds:g} s; by steps of an eighth in f64"
-    return motion(f"demo {name}", what, precision, lambda: load_scene(name)[0], seconds, way, **own)
+    return motion(f"demo {name}", what, precision, lambda: load_scene(name)[0], seconds, mean_displacement, **own)
 
 
 # --- the others -------------------------------------------------------------------------------------------------------
@@ -235,19 +235,19 @@ SLOPE = "way down the slope after 0.4 s; by the formula of a rigid cube"
 GAP = "least gap; as built"
 
 CASES: tuple[Case, ...] = (  # those of one precision follow each other: another one starts Taichi anew
-    motion("explicit beam SNH", TIP, "f32", beam, 0.2, way, quick=True, **FALL),
-    motion("explicit beam COR", TIP, "f32", partial(beam, "COR"), 0.2, way, **FALL),
-    motion("explicit beam SVK", TIP, "f32", partial(beam, "SVK"), 0.2, way, **FALL),
-    motion("implicit beam SNH", TIP, "f32", beam, 0.2, way, quick=True, **SWING),
-    motion("explicit slope", SLOPE, "f32", cube_on_slope, 0.4, way_down, slid(0.4), integrator="symplectic_euler", dt=8e-4),
+    motion("explicit beam SNH", TIP, "f32", beam, 0.2, mean_displacement, quick=True, **FALL),
+    motion("explicit beam COR", TIP, "f32", partial(beam, "COR"), 0.2, mean_displacement, **FALL),
+    motion("explicit beam SVK", TIP, "f32", partial(beam, "SVK"), 0.2, mean_displacement, **FALL),
+    motion("implicit beam SNH", TIP, "f32", beam, 0.2, mean_displacement, quick=True, **SWING),
+    motion("explicit slope", SLOPE, "f32", cube_on_slope, 0.4, slide_distance, slid(0.4), integrator="symplectic_euler", dt=8e-4),
     demo("cube_on_box", "f32", 0.5),
     Case("search, two cubes", GAP, "f32", partial(search, cubes_setup(3)), lambda _: [-DEEP_PENETRATION / 3], 1e-6, quick=True),
     Case("search, sheet and cube", GAP, "f32", partial(search, SHEET), lambda arch: [-2e-4], 1e-6),
     Case("self-collision", GAP, "f32", self_collision, lambda arch: [2 * RADIUS - THICK], 1e-9),
-    motion("implicit slope", SLOPE, "f64", cube_on_slope, 0.4, way_down, slid(0.4), integrator="implicit_euler", dt=0.01),
-    motion("implicit beam COR", TIP, "f64", partial(beam, "COR"), 0.2, way, **SWING),
-    motion("implicit beam SVK", TIP, "f64", partial(beam, "SVK"), 0.2, way, **SWING),
-    motion("quadratic beam", TIP, "f64", partial(beam, "SNH", (4, 1, 1), 2), 0.2, way, **SWING),
+    motion("implicit slope", SLOPE, "f64", cube_on_slope, 0.4, slide_distance, slid(0.4), integrator="implicit_euler", dt=0.01),
+    motion("implicit beam COR", TIP, "f64", partial(beam, "COR"), 0.2, mean_displacement, **SWING),
+    motion("implicit beam SVK", TIP, "f64", partial(beam, "SVK"), 0.2, mean_displacement, **SWING),
+    motion("quadratic beam", TIP, "f64", partial(beam, "SNH", (4, 1, 1), 2), 0.2, mean_displacement, **SWING),
     *(
         Case(
             f"static beam, order {order}",

@@ -23,7 +23,7 @@ from taisoft.errors import OutputError, SimulationError
 from taisoft.output.tables import percent, require_matplotlib, save, spread_of, ticks
 
 from .document import again_text, begin, earlier_numbers, exponent, plain, table
-from .runner import make_parser, parse_options, parse_result, progress, run_python, say
+from .runner import make_parser, parse_options, parse_result, print_result, progress, run_python
 from .scaling_bytes import GROUPS, Copy, copy_rate, measure_copy
 from .scaling_runs import EXPLICIT, KINDS, ON_ONE, PRECISION, Row, measure
 
@@ -39,10 +39,10 @@ PANEL = (4.6, 3.6)  # inches
 def answer(job: str, arch: str) -> None:
     """A child's part: measure "copy", or "kind:size", and print what was found."""
     kind, _, size = job.rpartition(":")
-    say(plain(measure_copy(arch) if job == COPY else measure(kind, int(size), arch)))
+    print_result(plain(measure_copy(arch) if job == COPY else measure(kind, int(size), arch)))
 
 
-def ask(job: str, arch: str) -> list | dict | str:
+def run_child(job: str, arch: str) -> list | dict | str:
     """What a child finds, or a sentence about why it found nothing."""
     progress(job)
     try:
@@ -57,7 +57,7 @@ def measure_all(kinds: list[str], sizes: list[int], arch: str) -> Iterator[Row]:
     several: set[int] = set()
     for kind in kinds:
         for size in sizes if kind != ON_ONE else sorted(several):
-            found = ask(f"{kind}:{size}", arch)
+            found = run_child(f"{kind}:{size}", arch)
             row = Row(kind, arch, tets=size, failure=found) if isinstance(found, str) else Row(**found)
             if kind == EXPLICIT and row.threads > 1 and arch == "cpu":
                 several.add(size)
@@ -246,7 +246,7 @@ def main(argv=None) -> int:
         return 0
     sizes = options.sizes or list(QUICK_SIZES if options.quick else (*SIZES, *((CUDA_SIZE,) if options.arch == "cuda" else ())))
     document, numbers = begin("Scaling", options.arch, PRECISION)
-    copies = ask(COPY, options.arch)
+    copies = run_child(COPY, options.arch)
     if isinstance(copies, str):
         raise SimulationError(copies)
     copies = [Copy(**copy) for copy in copies]

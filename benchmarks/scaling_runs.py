@@ -39,13 +39,13 @@ from .collision_cases import pile_setup, two_cubes
 from .collision_runs import Rig
 from .contact_runs import explicit_places
 from .elasticity_runs import MARGIN, beam_scene, n_tets
-from .elasticity_steps import LONGEST_FALL, MOST_STEPS, SAMPLE_SECONDS
+from .elasticity_steps import LONGEST_FALL, MAX_STEPS, SAMPLE_SECONDS
 from .runner import Stopwatch, clock, patched, repeated, timed
 from .scaling_bytes import floor_bytes, group_bytes
 
 DT, TINY_DT = 0.01, 1e-6  # [s] of implicit steps; of explicit ones until their limit is known
 SAMPLES, ROUNDS = 7, 15  # of explicit steps without contacts; of searches
-WARM, ENOUGH_SECONDS, FEWEST, MOST = 3, 3.0, 3, 20  # steps before, and steps that are timed one by one: time and number
+WARM, ENOUGH_SECONDS, MIN_TIMED, MAX_TIMED = 3, 3.0, 3, 20  # steps before, and steps that are timed one by one: time and number
 COUNTS = {"newton": "newton_iterations", "linear": "linear_iterations", "sweeps": "contact_iterations", "contacts": "n_contacts"}
 PRECISION = "f32"
 EXPLICIT, ON_ONE = "explicit", "explicit, one thread"
@@ -137,7 +137,7 @@ def explicit(row: Row, size: int) -> None:
     with _open(row, beam, size, "velocity_verlet", None) as sim:
         warm_up(sim)
         a_few = advance(sim, 10).seconds / 10
-        steps = max(1, min(MOST_STEPS, round(SAMPLE_SECONDS / a_few)))
+        steps = max(1, min(MAX_STEPS, round(SAMPLE_SECONDS / a_few)))
         sim.dt = min(sim.dt, LONGEST_FALL / steps)
         _element_seconds(sim, steps)  # compiles
         fractions = []
@@ -218,7 +218,7 @@ def _one_by_one(row: Row, sim: ts.Simulator, places: list[tuple[str, object, str
     """Time steps one by one, then the same steps by their parts."""
     reports = []
     _warm(sim)
-    while len(row.samples) < FEWEST or (sum(row.samples) < ENOUGH_SECONDS and len(row.samples) < MOST):
+    while len(row.samples) < MIN_TIMED or (sum(row.samples) < ENOUGH_SECONDS and len(row.samples) < MAX_TIMED):
         begin = clock()
         reports.append(sim.step())
         row.samples.append(clock() - begin)

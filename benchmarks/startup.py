@@ -57,7 +57,7 @@ TASKS = {
 }
 
 
-def ask(version: Version, *task: str | int) -> tuple[dict, dict]:
+def run_child(version: Version, *task: str | int) -> tuple[dict, dict]:
     """What a child found, and wall and CPU seconds of its process. Raises SimulationError where it failed."""
     used, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     lines = version.run(CHILD, *task)
@@ -75,7 +75,7 @@ def measure(versions: list[Version], quick: bool) -> list[dict]:
     for what, task in TASKS.items():
         progress(what)
         for own, version in zip(found, versions):
-            own[what] = ask(version, what, *task[quick])[0]
+            own[what] = run_child(version, what, *task[quick])[0]
     for own, speed in zip(found, measure_speed(versions, quick)):
         own["speed"] = speed
     return found
@@ -88,20 +88,22 @@ def measure_waiting(versions: list[Version], name: str, quick: bool) -> list[dic
     """
     cells, *others = SIZES[name]
     progress(f"{name}, cold")
-    found = [{"cold": ask(version, "first", name, cells)[1], "warm": [], OTHER: [], "new files": []} for version in versions]
+    found = [
+        {"cold": run_child(version, "first", name, cells)[1], "warm": [], OTHER: [], "new files": []} for version in versions
+    ]
     for other in others[:1] if quick else others:
         progress(f"{name}, warm, then {other} cells")
         for own, version in zip(found, versions):
-            own["warm"].append(ask(version, "first", name, cells)[1])
+            own["warm"].append(run_child(version, "first", name, cells)[1])
         for own, version in zip(found, versions):
             before = version.files()
-            own[OTHER].append(ask(version, "first", name, other)[1])
+            own[OTHER].append(run_child(version, "first", name, other)[1])
             own["new files"].append(len(version.files() - before))
     progress(f"{name}, one process")
     for own, version in zip(found, versions):
         own |= {what: median(own[what]) for what in ("warm", OTHER)}
-        own["one process"] = ask(version, "again", name, cells, others[0])[0]
-        own["memory"] = ask(version, "grow", name, cells, 2 if quick else TIMES)[0]
+        own["one process"] = run_child(version, "again", name, cells, others[0])[0]
+        own["memory"] = run_child(version, "grow", name, cells, 2 if quick else TIMES)[0]
     return found
 
 
@@ -111,7 +113,7 @@ def measure_speed(versions: list[Version], quick: bool) -> list[dict[str, list[f
     for k in range(1 if quick else SPEED_ROUNDS):
         progress(f"speed, round {k + 1}")
         for version, times in zip(versions, found):
-            for what, seconds in ask(version, "speed", 2 if quick else SPEED_CELLS, *SPEED_SHEETS)[0].items():
+            for what, seconds in run_child(version, "speed", 2 if quick else SPEED_CELLS, *SPEED_SHEETS)[0].items():
                 times[what].append(seconds)
     return found
 

@@ -47,9 +47,9 @@ from benchmarks.contact_runs import (
     measure_film,
     measure_run,
     measure_step,
+    observe_problems,
     open_explicit,
     open_scene,
-    shown,
     to_impulses,
 )
 from benchmarks.report_parts import phases
@@ -78,7 +78,7 @@ def sim():
 
 
 def test_every_solver_gets_the_same_problem_and_is_judged_rightly(sim, monkeypatch):
-    judged, plain = [], contact_runs.make_judge
+    judged, plain = [], contact_runs.make_residual
 
     def logged(p):
         judge, contacts, W = plain(p), read(p), None
@@ -92,7 +92,7 @@ def test_every_solver_gets_the_same_problem_and_is_judged_rightly(sim, monkeypat
 
         return judge_too
 
-    monkeypatch.setattr(contact_runs, "make_judge", logged)
+    monkeypatch.setattr(contact_runs, "make_residual", logged)
     film = measure_film(SCENE, sim, 6, Solvers(threads=False))
     assert film.tets == 215 and 0 < film.dt < film.stable_dt and film.solvers == list(SOLVERS)
     assert 2 <= len(film.time) == len(film.contacts) <= 6 and np.all(np.diff(film.time) > 0)
@@ -124,7 +124,7 @@ def test_a_problem_is_left_as_it_was_and_solvers_agree(sim):
         assert oracle.residual(contacts.W, contacts.b, contacts.friction, exact) < 1e-8
         pushes.update(wanted=exact[:, 0].sum(), contacts=k)
 
-    with shown(look):
+    with observe_problems(look):
         report = sim.step()
     # what follows is the simulator's own solve of that problem
     assert report.n_contacts == pushes["contacts"] and report.contact_residual <= GOAL

@@ -41,16 +41,16 @@ def test_rows(shared):
 
 
 def test_verdicts():
-    told = {row.solver: row.verdict for row in bench.judged(ROWS)}
+    told = {row.solver: row.verdict for row in bench.with_verdicts(ROWS)}
     assert told == {bench.PLAIN: "yardstick: pass", "jacobi": "", "hybrid": "best: pass"}
     slow = [replace(row, residuals=(1.0, 1.0, 1.0), time=5.0 + row.time) for row in ROWS]
-    assert {row.solver: row.verdict for row in bench.judged(slow)} == {
+    assert {row.solver: row.verdict for row in bench.with_verdicts(slow)} == {
         bench.PLAIN: "yardstick: FAIL",
         "jacobi": "",
         "hybrid": "best: FAIL",
     }
     never = [replace(row, iterations=None) for row in ROWS]
-    assert all("FAIL" in row.verdict for row in bench.judged(never))
+    assert all("FAIL" in row.verdict for row in bench.with_verdicts(never))
     assert never[0].cells[6] == "-"
 
 

@@ -19,7 +19,7 @@ import pytest
 from benchmarks import order, order_runs
 from benchmarks.order import Reach, compare, find_limits, row_table, time_to
 from benchmarks.order_cases import CASES, HANGING, HEAVY, LINEAR, QUADRATIC, QUADRATIC_14, STRIP, Reference
-from benchmarks.order_runs import Row, judge, measure_case, own_reference
+from benchmarks.order_runs import Row, measure_case, own_reference, set_error
 from benchmarks.reference_cases.record import GRAVITY
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError
@@ -154,9 +154,9 @@ def test_own_reference_is_the_limit_of_a_geometric_sequence_or_nothing():
 
 def test_errors_are_the_largest_of_the_numbers_that_have_a_reference():
     found = row(measured=[-1.9, 4.4, 99.0], error=None)
-    judge(found, Reference((-2.0, 4.0), 0.0, ""))
+    set_error(found, Reference((-2.0, 4.0), 0.0, ""))
     assert found.error == pytest.approx(0.1)
-    judge(found, Reference((), 0.0, "none"))
+    set_error(found, Reference((), 0.0, "none"))
     assert found.error == pytest.approx(0.1)
 
 

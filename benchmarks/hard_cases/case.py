@@ -215,17 +215,19 @@ class Session:
             settings["precision"] = "f64"
         return ts.Simulator(scene, arch=self.arch, **settings)
 
-    def go(self, sim: ts.Simulator, steps: int, look: Callable | None = None, every: int = 1, follow: bool = True) -> RunReport:
-        """Run so many steps of the variant's length; look(sim, number, report) before them and after every `every` of them.
+    def run_steps(
+        self, sim: ts.Simulator, steps: int, observe: Callable | None = None, every: int = 1, follow: bool = True
+    ) -> RunReport:
+        """Run `steps` steps of the variant's dt; call observe(sim, number, report) first and after each `every` steps.
 
-        follow: keep some of its states for the comparison with the reference. A run that fails says so in the result.
+        follow: keep some states for comparison with the reference. The result reports a failed run.
         """
         dt, total = sim.dt * self.finer, steps // every
         kept = max(1, total // FRAMES)
 
         def frame(sim, number, report):
-            if look is not None:
-                look(sim, number, report)
+            if observe is not None:
+                observe(sim, number, report)
             if follow and (number % kept == 0 or number == total):
                 self.path.append(sim.positions())
 
@@ -242,14 +244,14 @@ class Session:
         return result
 
     def watch(self, sim: ts.Simulator, steps: int, *read: Callable, every: int = 1, follow: bool = True) -> list[list]:
-        """`go` with a list of what each of `read` returned, before the steps and after every `every` of them."""
+        """`run_steps`, returning the values of each of `read`: first and after each `every` steps."""
         found = [[] for _ in read]
 
-        def look(*_):
+        def observe(*_):
             for values, get in zip(found, read):
                 values.append(get())
 
-        self.go(sim, steps, look, every, follow)
+        self.run_steps(sim, steps, observe, every, follow)
         return found
 
     def refuse(self, sentence: str) -> None:
@@ -271,7 +273,7 @@ class Session:
         """Reports of steps that did not converge."""
         return sum(not report.converged for report in self.reports)
 
-    def most(self, name: str) -> float:
+    def largest(self, name: str) -> float:
         """The largest of a number of the StepReports so far."""
         return max((getattr(report, name) for report in self.reports), default=0)
 
@@ -300,7 +302,7 @@ class Session:
             "total_seconds": time.perf_counter() - start,
             "step_seconds": float(np.median(self.step_seconds)) if self.step_seconds else None,
             **{f"{what}_iterations": self.total(f"{what}_iterations") for what in ("newton", "linear", "contact")},
-            "inverted": self.most("n_inverted"),
+            "inverted": self.largest("n_inverted"),
             "unconverged": self.unconverged,
             "peak_memory_bytes": peak_memory(),
             "points": np.concatenate(self.path) if self.path else np.empty((0, 3)),

@@ -42,7 +42,7 @@ def recover(session: Session, law: str, start: str, steps: int) -> dict[str, flo
     scene, body = one_body("cube", cube(4, 1.0), law=law, young=1e5, poisson=0.4, mass_damping=6.0)
     with session.simulator(scene) as sim:
         sim.set_state(start_of(start, body.rest_positions))
-        session.go(sim, steps, every=max(1, steps // 700))
+        session.run_steps(sim, steps, every=max(1, steps // 700))
         return rest_at_last(sim, 1.0) | {FINITE: not_finite(sim.positions(), sim.velocities())}
 
 
@@ -53,12 +53,12 @@ def squeeze(session: Session, law: str) -> dict[str, float]:
     down = [0.0, 0.0, 0.0], [0.0, -0.05, 0.0]
     body.move(face(1, 0.05), KeyFrames([0.0, 1.0, 1.5, 2.5], [down[0], down[1], down[1], down[0]]))
     with session.simulator(scene) as sim:
-        session.go(sim, 350)
+        session.run_steps(sim, 350)
         found = rest_at_last(sim, 0.1)
-        way = np.linalg.norm(sim.positions() - body.rest_positions, axis=1).max()
+        displacement = np.linalg.norm(sim.positions() - body.rest_positions, axis=1).max()
     named = [text for text in session.warnings if "step " in text and "tet " in text and "softens" in text]
     return found | {
-        "largest displacement at the end [m]": way,
+        "largest displacement at the end [m]": displacement,
         "smallest volume ratio of all steps": min(report.min_volume_ratio for report in session.reports),
         "warnings of softening that name step and tet": len(named),
         "run is ok though tets are inverted at the end": session.status == OK and found[INVERTED_LAST] > 0.0,
@@ -74,7 +74,7 @@ def draw_and_twist(session: Session, law: str) -> dict[str, float]:
     path = KeyFrames([0.0, 1.0, 2.0], [WEIGHTLESS, far, far], [WEIGHTLESS, WEIGHTLESS, turn], release=True)
     body.move(face(0, 0.5), path)
     with session.simulator(scene) as sim:
-        session.go(sim, 1000)
+        session.run_steps(sim, 1000)
         return rest_at_last(sim, 0.5) | {"steps that did not converge": session.unconverged}
 
 

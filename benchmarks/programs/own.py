@@ -42,7 +42,7 @@ def make_scene(work: Work, model: Model = TAISOFT) -> Scene:
 def settings(work: Work, arch: str = "cpu") -> list[Setting]:
     """Explicit steps at the largest dt that lasts and finer, implicit ones of 10 ms; W1 with the law that MuJoCo has, too."""
     model = MUJOCO if work.cells is not None else TAISOFT
-    with unwarned():
+    with without_warnings():
         least, _ = lasting_steps(make_scene(work, model), "velocity_verlet", arch, work.seconds)
     f32, f64 = {"precision": "f32", "arch": arch}, {"precision": "f64", "arch": arch}
     finer = FINER if work.cells is not None else FINER[:3] if work.kind == "path" else FINER[:1]
@@ -58,7 +58,7 @@ def settings(work: Work, arch: str = "cpu") -> list[Setting]:
 
 
 @contextlib.contextmanager
-def unwarned():
+def without_warnings():
     """Without the warning that a body is soft for its weight: it shall be."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
@@ -70,7 +70,7 @@ class Run(Session):
 
     def build(self) -> None:
         work, setting = self.work, self.setting
-        with unwarned():
+        with without_warnings():
             self.sim = ts.Simulator(make_scene(work, setting.model), dt=setting.dt, integrator=setting.method, **setting.options)
         warm_up(self.sim)
 

@@ -68,13 +68,13 @@ def incline(integrator: str, reference: dict, arch: str):
             reports = sim.run(0.5, fps=None).step_reports  # a released block shakes at first
             before = sim.velocities().mean(axis=0)
             reports += sim.run(0.5, fps=None).step_reports
-            way = (sim.positions() - start).mean(axis=0)
+            displacement = (sim.positions() - start).mean(axis=0)
             if slips:
                 gain = (sim.velocities().mean(axis=0) - before) / 0.5
                 yield near(f"{what}: acceleration [m/s^2]", gain[0], case["acceleration"], SLIP)
-                yield small(f"{what}: sideways, over slip", way[2] / way[0], STRAIGHT)
+                yield small(f"{what}: sideways, over slip", displacement[2] / displacement[0], STRAIGHT)
             else:
-                yield small(f"{what}: slip in 1 s [m]", np.linalg.norm(way[[0, 2]]), STILL)
+                yield small(f"{what}: slip in 1 s [m]", np.linalg.norm(displacement[[0, 2]]), STILL)
             yield small(f"{what}: penetration [m]", max(report.max_penetration for report in reports), 1e-4)
 
 
@@ -155,8 +155,8 @@ def bar(integrator: str, law: str, reference: dict, arch: str):
     value, dt = reference["value"], 2e-4
     mesh = ts.box_mesh((2, 20, 2), (0.1, 1.0, 0.1))
     s = ts.Scene(gravity=(0.0, 0.0, 0.0))
-    place = (0, 0.5 + CONTACT_OFFSET * mean_surface_edge([(mesh.vertices, mesh.surface)]), 0)
-    body = s.add_body(mesh, material(reference, law), name="bar", position=place, velocity=(0, -0.1, 0))
+    position = (0, 0.5 + CONTACT_OFFSET * mean_surface_edge([(mesh.vertices, mesh.surface)]), 0)
+    body = s.add_body(mesh, material(reference, law), name="bar", position=position, velocity=(0, -0.1, 0))
     add_plane(s, friction=0.0, restitution=0.0)
     with ts.Simulator(s, dt=dt, integrator=integrator, precision="f64", arch=arch) as sim:
         forces = []
@@ -164,11 +164,11 @@ def bar(integrator: str, law: str, reference: dict, arch: str):
             sim.step()
             forces.append(-sim.contact_force("plane")[1])
         forces = np.array(forces)
-        pushed = np.flatnonzero(forces > 0.05 * value["force"])
+        loaded = np.flatnonzero(forces > 0.05 * value["force"])
         v = sim.velocities("bar")
         mass = 0.1 * 0.1 * 1.0 * body.material.density
     impulse = forces.sum() * dt
-    duration = (pushed[-1] + 1) * dt
+    duration = (loaded[-1] + 1) * dt
     yield near("impulse [N s]", impulse, value["impulse"], 0.05)
     yield near("duration [s]", duration, value["duration"], 0.05)
     yield near("mean force [N]", impulse / duration, value["force"], 0.05)
@@ -218,13 +218,13 @@ def hertz(cells: int, limit: float | None, reference: dict, arch: str):
     whole = ts.ball_mesh(radius, cells)
     mesh = submesh(whole, whole.vertices[whole.tets].mean(axis=1)[:, 1] < 0.0)
     rows = [row for row in reference["value"]["SNH"] if row["d_over_R"] > 0.015]
-    way = [0.0] + [row["d"] for row in rows]
+    displacement = [0.0] + [row["d"] for row in rows]
     s = ts.Scene(gravity=(0.0, 0.0, 0.0))
     height = radius + CONTACT_OFFSET * mean_surface_edge([(mesh.vertices, mesh.surface)])
     ball = s.add_body(mesh, material(reference, "SNH"), name="ball", position=(0.0, height, 0.0))
     middle = np.flatnonzero(np.abs(mesh.vertices).max(axis=1) < 1e-9)
     flat = np.flatnonzero(np.abs(mesh.vertices[:, 1]) < 1e-9)
-    ball.move(flat, lambda t: (0.0, -float(np.interp(t, np.arange(len(way)), way)), 0.0), axes="y")
+    ball.move(flat, lambda t: (0.0, -float(np.interp(t, np.arange(len(displacement)), displacement)), 0.0), axes="y")
     ball.fix(middle, axes="xz")
     add_plane(s, friction=0.0, restitution=0.0)
     with ts.Simulator(s, dt=0.5, precision="f64", arch=arch, newton_tolerance=1e-8) as sim:

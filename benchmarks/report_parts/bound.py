@@ -15,7 +15,7 @@ from taisoft.errors import SimulationError
 from taisoft.study.measure import advance
 
 from ..document import exponent, table
-from ..runner import unwarned
+from ..runner import without_warnings
 from .page import COLOURS, Claim, Extent, Part, is_near, new_figure, plot_png
 
 EXPLICIT, IMPLICIT = "symplectic_euler", "implicit_euler"
@@ -46,7 +46,7 @@ class Limit:
 
 
 @dataclass(frozen=True)
-class Long:
+class LongRun:
     """A run from a stretch. factor: its dt over the measured limit; reach: largest displacement over that at the start;
     status: of the run."""
 
@@ -72,7 +72,7 @@ class Cube:
         body.fix(lambda X: X[:, 0] < -0.5 + 1e-9)
         explicit = integrator == EXPLICIT
         self.cells, self.rest, self.young, self.density = cells, body.rest_positions, young, DENSITY
-        with unwarned():
+        with without_warnings():
             self.sim = ts.Simulator(scene, 1e-5, integrator, precision="f64", arch=arch, allow_unstable=explicit)
 
     def __enter__(self) -> "Cube":
@@ -84,16 +84,16 @@ class Cube:
     def set(self, young: float = YOUNG, density: float = DENSITY) -> None:
         """Another material."""
         self.young, self.density = young, density
-        with unwarned():
+        with without_warnings():
             self.sim.set_material("cube", young=young, density=density)
 
     def _begin(self, dt: float, positions: np.ndarray | None = None, velocities: np.ndarray | None = None) -> None:
         self.sim.reset()
-        with unwarned():
+        with without_warnings():
             self.sim.dt = dt
         self.sim.set_state(positions, velocities)
 
-    def moved(self) -> float:
+    def largest_displacement(self) -> float:
         """Largest displacement of a node [m]."""
         return float(np.linalg.norm(self.sim.positions("cube") - self.rest, axis=1).max())
 
@@ -106,7 +106,7 @@ class Cube:
             advance(self.sim, STEPS)
         except SimulationError:
             return False
-        return self.moved() < GROWTH * KICK  # [m]: the cube is 1 m long
+        return self.largest_displacement() < GROWTH * KICK  # [m]: the cube is 1 m long
 
     def limit(self) -> Limit:
         """By halving, from an interval found by doubling."""
@@ -121,27 +121,27 @@ class Cube:
             low, high = (middle, high) if self.is_stable(middle) else (low, middle)
         return Limit(self.cells, self.young, self.density, low, self.sim.stable_dt)
 
-    def long_run(self, factor: float, limit: float) -> Long:
+    def long_run(self, factor: float, limit: float) -> LongRun:
         """Let go from a stretch, in steps of so many times the limit [s]."""
         X = self.rest
         start = X + STRETCH * (X[:, :1] + 0.5) * np.array([1.0, 0.0, 0.0])
         dt = factor * limit
         self._begin(dt, start, np.zeros_like(X))
-        before, reach = self.moved(), 0.0
+        before, reach = self.largest_displacement(), 0.0
 
         def on_frame(_sim, _index, _report) -> None:
             nonlocal reach
-            reach = max(reach, self.moved() / before)
+            reach = max(reach, self.largest_displacement() / before)
 
         done = self.sim.run(LONG * dt, on_frame, fps=None)
         reach = np.inf if done.status == "failed" else reach
-        return Long(self.sim.settings.integrator, self.young, factor, float(reach), done.status)
+        return LongRun(self.sim.settings.integrator, self.young, factor, float(reach), done.status)
 
 
 # --- what it says -----------------------------------------------------------------------------------------------------
 
 
-def claims_of(youngs: list[Limit], sizes: list[Limit], densities: list[Limit], runs: list[Long]) -> list[Claim]:
+def claims_of(youngs: list[Limit], sizes: list[Limit], densities: list[Limit], runs: list[LongRun]) -> list[Claim]:
     """The exponents of the law, and what stays bounded. Each list of limits varies one number."""
     by_young, off = exponent([x.young for x in youngs], [x.measured for x in youngs])
     by_size, _ = exponent([1.0 / x.cells for x in sizes], [x.measured for x in sizes])
@@ -185,7 +185,7 @@ def claims_of(youngs: list[Limit], sizes: list[Limit], densities: list[Limit], r
     ]
 
 
-def _implicit_text(implicit: list[Long], good: list[bool]) -> str:
+def _implicit_text(implicit: list[LongRun], good: list[bool]) -> str:
     """How far the implicit runs went, and those that did not end as they should."""
     factors = ", ".join(f"{f:g}" for f in dict.fromkeys(r.factor for r in implicit))
     bad = [f"E = {r.young:.0e} Pa at {r.factor:g}: reach {r.reach:.3g}, {r.status}" for r, ok in zip(implicit, good) if not ok]
@@ -210,7 +210,7 @@ def limit_table(limits: list[Limit]) -> str:
     return table(limits, columns)
 
 
-def run_table(runs: list[Long]) -> str:
+def run_table(runs: list[LongRun]) -> str:
     """A row a Young's modulus and integrator, the reach at each factor."""
 
     def reaches(kind: tuple[str, float]) -> str:
@@ -221,7 +221,7 @@ def run_table(runs: list[Long]) -> str:
     return table(kinds, (("<steps", "{[0]}"), ("E [Pa]", "{[1]:.0e}"), (heading, reaches)))
 
 
-def draw(youngs: list[Limit], sizes: list[Limit], runs: list[Long]) -> bytes:
+def draw(youngs: list[Limit], sizes: list[Limit], runs: list[LongRun]) -> bytes:
     """The limit over E and over h, and how far runs go."""
     figure, ((over_young, over_size, reach),) = new_figure(3)
     over_young.plot([x.young for x in youngs], [1e3 * x.measured for x in youngs], "o", color=COLOURS[0], label="by runs")

@@ -23,15 +23,15 @@ from taisoft.mesh.sdf import SdfGrid
 from ..collision_cases import Setup, cubes_setup, pile_setup
 from ..collision_runs import Rig
 from ..document import exponent, ms, table, timed_cells
-from ..runner import clock, parse_result, repeated, run_python, say
+from ..runner import clock, parse_result, print_result, repeated, run_python
 from .page import COLOURS, Claim, Extent, Part, clearly_less, new_figure, plot_png
 
 FRANK_WOLFE_STEPS, CLOSED = 32, 1e-4  # at most; gap, in lengths of the triangle, at which it ends
-CONTACT_MODES = "distance_field"  # the report's way
+CONTACT_MODE = "distance_field"  # the report's way
 FILM, FRAMES = ("cubes 9", "cubes 5"), (20, 4)  # of figure 11: a cube turns on another; the first has 1,944 triangles
 SIZES = ("cubes 5", "cubes 9", "cubes 11", "cubes 15", "cubes 20", "pile 6"), ("cubes 2", "cubes 5")  # full, quick
 ROUNDS, PLAIN_ROUNDS = (15, 3), 2
-MOST_PLAIN = 15_000  # pairs above which the interpreted loop is left out
+MAX_INTERPRETED = 15_000  # pairs above which the interpreted loop is left out
 TENFOLD, FLAT = 10.0, 0.1  # what the report gained; exponent of a time that does not grow
 
 
@@ -156,7 +156,7 @@ def measure_size(rig: Rig, rounds: int, plain: PlainPoints | None) -> Points:
     pairs = candidate_pairs(rig)
     found = Points(rig.setup.name, rig.tets, rig.detection.surface.n_triangles, len(pairs), first, contact_seconds(rig, rounds))
     found.deepest = float(rig.detection.contacts().gap.min())
-    if plain is not None and len(pairs) <= MOST_PLAIN:
+    if plain is not None and len(pairs) <= MAX_INTERPRETED:
         contacts: list = []
         found.plain = repeated(lambda: contacts.extend(plain.find(pairs)), PLAIN_ROUNDS)
         found.plain_deepest = min(depth for *_, depth in contacts)
@@ -183,7 +183,7 @@ def measure_here(quick: bool, arch: str, plain: bool) -> Measured:
         n = threads()
         found = Measured("GPU" if arch == "cuda" else f"{n} thread{'s' * (n > 1)}", [], [])
         for name in SIZES[k]:
-            with Rig(setup_of(name), CONTACT_MODES, runtime) as rig:
+            with Rig(setup_of(name), CONTACT_MODE, runtime) as rig:
                 loop = PlainPoints(rig) if plain else None
                 found.sizes.append(measure_size(rig, ROUNDS[k], loop))
                 if name == FILM[k]:
@@ -199,7 +199,7 @@ CHILD = "from taisoft.cli.scene_file import load_shipped; load_shipped('benchmar
 def answer(quick: bool) -> None:
     """In the child: everything on its first core alone."""
     os.sched_setaffinity(0, usable_cores()[:1])
-    say(asdict(measure_here(quick, "cpu", plain=False)))
+    print_result(asdict(measure_here(quick, "cpu", plain=False)))
 
 
 def measure_on_one_thread(quick: bool) -> Measured:
@@ -314,7 +314,7 @@ def measure(extent: Extent) -> Part:
         "section 3.1.2, figures 11 and 12",
         "contact points alone of searches through distance fields (Frank-Wolfe), bodies as in `taisoft bench collision`, in "
         "f32: compiled on all threads, compiled on one (a process that has one core), and an interpreted NumPy loop over the "
-        f"same pairs, which is not run on more than {MOST_PLAIN:,}. The deepest point of both tells that they do the same.",
+        f"same pairs, which is not run on more than {MAX_INTERPRETED:,}. The deepest point of both tells that they do the same.",
         claims_of(many, one),
         [size_table(many, one)],
         {"points.png": draw(many, one)},

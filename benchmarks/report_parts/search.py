@@ -36,7 +36,7 @@ HALF_WAY = 1.5  # between the exponents of what is linear and what is square
 def broad_claims(film: Film, sweeps: list[Sweep]) -> list[Claim]:
     """Each frame at 1,250 tets, small and large scenes, and where the one overtakes the other."""
     hashed, trees = (np.array(film.numbers[name]) for name in (HASH, TREE))
-    share = float((hashed < trees).mean())
+    fraction = float((hashed < trees).mean())
     small = [s for s in sweeps if s.tets < REPORTS_CROSSOVER]
     large = [s for s in sweeps if s.tets > REPORTS_CROSSOVER]
     slower = [clearly_less(s.rounds[TREE], s.rounds[HASH]) for s in small]
@@ -52,10 +52,10 @@ def broad_claims(film: Film, sweeps: list[Sweep]) -> list[Claim]:
     return [
         Claim(
             "at 1,250 tets the spatial hash takes less time than the tree in every frame (figure 17, left).",
-            share == 1.0,
-            f"at {film.tets:,} tets it does in {share:.0%} of {len(hashed)} frames; medians are {1e3 * np.median(hashed):.3g} "
+            fraction == 1.0,
+            f"at {film.tets:,} tets it does in {fraction:.0%} of {len(hashed)} frames; medians are {1e3 * np.median(hashed):.3g} "
             f"and {1e3 * np.median(trees):.3g} ms.",
-            "" if share == 1.0 else why,
+            "" if fraction == 1.0 else why,
         ),
         Claim(
             f"below about {REPORTS_CROSSOVER:,} tets the hash is the slower one (section 3.1.4).",

@@ -41,7 +41,7 @@ JACOBI, HYBRID = "jacobi", "hybrid"
 SPIKE = 5.0  # times the median: a frame that counts as a spike
 MOSTLY = 0.9  # of the frames in which what is by far the fastest is faster
 BANDS = COLOURS[:2]  # of groups in turn
-WAYS = ("random", "greedy")  # of the grouped Jacobians
+COLOURINGS = ("random", "greedy")  # of the grouped Jacobians
 PICTURE = (640, 520)  # pixels of a scene
 NEAR = 0.25  # of a number of the report's, within which ours counts as its
 
@@ -119,7 +119,7 @@ def figure_19(panels, s: Snapshot) -> None:
     panels[0].set_axis_off()
     panels[0].set_title(f"{s.scene} (as fig. 19)")
     _spy(panels[1], s.touched, np.zeros(len(s.touched), dtype=int), f"contact Jacobian: {len(s.touched)} contacts")
-    for panel, way in zip(panels[2:], WAYS):
+    for panel, way in zip(panels[2:], COLOURINGS):
         order, start = groups(s.colours[way])
         band = np.repeat(np.arange(len(start) - 1), np.diff(start))
         _spy(panel, s.touched[order], band % len(BANDS), f"grouped, {way}: {len(start) - 1} colours")
@@ -178,13 +178,13 @@ def solver_claims(film: Film, points: list[Point]) -> list[Claim]:
     contacts = float(np.median(film.contacts))
     sweeps = {name: np.array([o.sweeps for o in film.of(name)]) for name in film.solvers}
     times = {name: [o.median for o in film.of(name)] for name in film.solvers}
-    told = ", ".join(f"{name} {ms(np.median(t))}" for name, t in times.items())
+    times_text = ", ".join(f"{name} {ms(np.median(t))}" for name, t in times.items())
     beaten = float((sweeps[SERIAL] <= sweeps[JACOBI]).mean())
     few = beaten == 1.0 and np.median(sweeps[SERIAL]) < np.median(sweeps[JACOBI])
     fastest = min(times, key=lambda name: np.median(times[name]))
     hybrid = min((name for name in times if name.startswith(HYBRID)), key=lambda name: np.median(times[name]))
-    won = [float(np.less(times[hybrid], t).mean()) for name, t in times.items() if not name.startswith(HYBRID)]
-    clear = min(won) >= MOSTLY
+    wins = [float(np.less(times[hybrid], t).mean()) for name, t in times.items() if not name.startswith(HYBRID)]
+    is_clear = min(wins) >= MOSTLY
     parallel = [name for name in times if name.startswith(COLOURED)]
     slow = all(np.median(times[SERIAL]) <= np.median(times[name]) for name in parallel)
     jacobi = [name for name in times if name.startswith(JACOBI)]
@@ -205,11 +205,11 @@ def solver_claims(film: Film, points: list[Point]) -> list[Claim]:
         ),
         Claim(
             "the parallel hybrid is by far the fastest.",
-            clear,
-            f"{fastest} is the fastest in the median; {hybrid} is faster than each of the others in at least {min(won):.0%} of "
-            f"the frames. Medians, in ms: {told}.",
+            is_clear,
+            f"{fastest} is the fastest in the median; {hybrid} is faster than each of the others in at least {min(wins):.0%} of "
+            f"the frames. Medians, in ms: {times_text}.",
             ""
-            if clear
+            if is_clear
             else "Hybrid sweeps are Jacobi's with the newest normal impulse in the friction bound: they need about "
             "as many. With tens of contacts a compiled serial sweep takes microseconds, less than waking a thread.",
         ),

@@ -15,7 +15,7 @@ from taisoft.study.results import cheapest
 from ..elasticity_runs import TAISOFT as OWN
 from ..elasticity_runs import repeat_short
 from ..programs.session import Setting
-from .judge import Verdict, judge
+from .evaluation import Verdict, evaluate
 from .references import MODELS
 from .scenes import Work
 
@@ -85,16 +85,16 @@ def measure(work: Work, programs: Iterable[ModuleType], rounds: int, arch: str =
     rows = [Row(work, setting, date=date) for setting in settings]
     for number in range(rounds):
         for row in rows:
-            if row.failure or (row.rounds and is_dear(row.rounds[0][0] * work.seconds, row.build_seconds[0])):
+            if row.failure or (row.rounds and is_expensive(row.rounds[0][0] * work.seconds, row.build_seconds[0])):
                 continue
             print(f"{work.key}, round {number + 1} of {rounds}: {row.setting.program} {row.setting}", file=sys.stderr, flush=True)
             positions = _round(row, adapters[row.setting.program])
             if positions is not None:
-                row.verdict = judge(work, row.setting.model, positions)
+                row.verdict = evaluate(work, row.setting.model, positions)
     return rows
 
 
-def is_dear(seconds: float, build_seconds: float) -> bool:
+def is_expensive(seconds: float, build_seconds: float) -> bool:
     """Whether a run of so long [s] is not repeated."""
     return seconds > ENOUGH_SECONDS or build_seconds > ENOUGH_BUILDING
 
@@ -109,7 +109,7 @@ def _round(row: Row, program: ModuleType) -> np.ndarray | None:
             if row.verdict is None:
                 positions, seconds = session.run(follow=True)
                 row.unconverged = session.unconverged
-                if is_dear(seconds, session.build_seconds):
+                if is_expensive(seconds, session.build_seconds):
                     row.rounds.append([seconds / row.work.seconds])
                     return positions
             row.rounds.append(list(repeat_short(lambda: session.run(follow=False)[1] / row.work.seconds)))

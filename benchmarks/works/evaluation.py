@@ -8,7 +8,7 @@ import taisoft as ts
 from taisoft.mesh.tet_mesh import mean_surface_edge
 
 from ..exact_path import SAMPLE
-from ..programs.own import make_scene, unwarned
+from ..programs.own import make_scene, without_warnings
 from . import references
 from .scenes import Work
 from .semi_discrete import inverted
@@ -44,7 +44,7 @@ class Verdict:
         return self.fell is None and self.inverted == 0 and shallow and free
 
 
-def judge(work: Work, model: references.Model, positions: np.ndarray) -> Verdict:
+def evaluate(work: Work, model: references.Model, positions: np.ndarray) -> Verdict:
     """Of the positions (k,n,3) [m] that a program with this model gave."""
     parts = list(zip(work.bodies, work.slices().values()))
     verdict = Verdict(max(sum(inverted(body.mesh, x[nodes]) for body, nodes in parts) for x in positions))
@@ -75,7 +75,7 @@ def deepest(work: Work, positions: np.ndarray) -> float:
 
     In f64: no simulator of another precision may be open.
     """
-    with unwarned():
+    with without_warnings():
         sim = ts.Simulator(make_scene(work), dt=1e-6, integrator="velocity_verlet", precision="f64")
     depth = 0.0
     with sim:
