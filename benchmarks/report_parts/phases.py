@@ -173,8 +173,8 @@ def measure(extent: Extent) -> Part:
         "Where the time goes",
         "section 3.1.1, figure 10",
         f"steps of the demo {SCENE} from the first impulse on, with {EXPLICIT} at {STEP_FRACTION:g} of its largest stable step "
-        "and with the demo's own implicit steps. Contacts come from distance fields by Frank-Wolfe (the report: with explicit steps) or from "
-        "the proximity of surfaces. Parts are timed between synchronisations; fractions are those of the medians.",
+        "and with the demo's own implicit steps. Contacts come from distance fields by Frank-Wolfe (the report: with explicit "
+        "steps) or from the proximity of surfaces. Parts are timed between synchronisations; fractions are those of the medians.",
     )
     kinds = [(integrator, mode) for integrator in (EXPLICIT, IMPLICIT) for mode in CONTACT_MODES]
     profiles = [measure_profile(*kind, extent) for kind in kinds[: extent.of(None, 1)]]
