@@ -1,11 +1,11 @@
-"""Every measured page and figure in one go, then the manual's tables.
+"""All measured pages and figures, then the manual's tables.
 
 taisoft bench figures [--only NAME] [--quick] [--results DIR] [--logs DIR]
 
-Runs the benchmarks one after the other, each in a process of its own, and writes their pages into benchmarks/results, named
-after the machine; what they print goes to DIR/NAME.log. A benchmark that fails or misses a limit does not stop the next one.
-The machine should do nothing else meanwhile: the table shows the load at each start. The whole takes about three hours on two
-cores, and its parts can be made one by one. Exit status: 0, or 1 where a benchmark ended with another status.
+Runs the benchmarks one after the other in separate processes and writes their pages into benchmarks/results, named after the
+machine; their output goes to DIR/NAME.log. A benchmark that fails or misses a limit does not stop the next one. Run nothing else
+meanwhile: the table shows the load at each start. A full run takes about three hours on two cores; --only runs single parts. Exit
+status: 0, or 1 if a benchmark ended with another status.
 """
 
 import subprocess
@@ -21,7 +21,7 @@ from taisoft.output.files import make_folder
 from .document import RESULTS, default_out, load_text, table
 from .runner import make_parser, progress
 
-# name -> what of it is written: a page with numbers (json), a picture beside it (png), or a folder of both (folder)
+# name -> output: a page with numbers (json), a picture (png), or a folder of both (folder)
 WRITES = {
     "references": ("json",),
     "elasticity": ("json",),
@@ -40,7 +40,7 @@ NO_QUICK = ("references",)
 
 @dataclass
 class Outcome:
-    """How a benchmark ended. load: of the machine when it began."""
+    """How a benchmark ended. load: of the machine at its start."""
 
     name: str
     status: int
@@ -49,14 +49,14 @@ class Outcome:
 
 
 def command(name: str, quick: bool, results: Path) -> list[str]:
-    """The command line of a benchmark, its files named after the machine."""
+    """Command line of a benchmark, with files named after the machine."""
     outputs = [(option, default_out("cpu", name, suffix)) for option, suffix in (OPTIONS[kind] for kind in WRITES[name])]
     files = [part for option, path in outputs for part in (option, str(results / path.name))]
     return [sys.executable, "-m", "taisoft", "bench", name, *(["--quick"] if quick and name not in NO_QUICK else []), *files]
 
 
 def make(names: Iterable[str], quick: bool, results: Path, logs: Path) -> list[Outcome]:
-    """Run the benchmarks, telling each as it ends."""
+    """Run the benchmarks, printing each as it ends."""
     ended = []
     for name in names:
         load, start = load_average(), time.monotonic()
@@ -70,7 +70,7 @@ def make(names: Iterable[str], quick: bool, results: Path, logs: Path) -> list[O
 
 
 def main(argv=None) -> int:
-    """Make them. Raises OutputError."""
+    """Run the benchmarks. Raises OutputError."""
     parser = make_parser("figures", __doc__)
     parser.add_argument("--only", action="append", choices=WRITES, metavar="NAME", help=f"one of {', '.join(WRITES)}; repeatable")
     parser.add_argument("--quick", action="store_true", help="small cases; give --results too, the manual takes no quick ones")
