@@ -169,7 +169,7 @@ def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
     rows = []
     for name, (_, momentum) in SWEEPERS.items():
         done = found[name]
-        # a linearise at the residual is a product too, after every fifth sweep; momentum takes about 40 operations a contact
+        # the residual after every fifth sweep is a product too; momentum takes about 40 operations a contact
         cost = problem.sweep_cost * 1.2 + (40 * len(mu) if momentum else 0)
         relative = done.iterations * cost / (SWEEPS[-1] * problem.sweep_cost)
         reached = done.iterations if done.converged else None
