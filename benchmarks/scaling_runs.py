@@ -1,14 +1,14 @@
-"""What `scaling.py` measures: one kind of work on one mesh, in a process that does nothing else.
+"""Measurements of `scaling.py`: one kind of work on one mesh.
 
 explicit:   velocity Verlet of a clamped beam that falls, stable neo-Hookean, at most 0.9 of the largest stable step.
-explicit, one thread: the same where taisoft would take all threads, on one.
+explicit, one thread: the same on one thread, for meshes on which taisoft uses all.
 implicit:   BDF2 of that beam, steps of 10 ms.
 search:     a search for contacts by proximity among 27 cubes at rest that touch, the pile of `collision.py`.
-explicit contact, implicit contact: two cubes on the ground, the upper one aside and sunk into the lower a little: symplectic
+explicit contact, implicit contact: two cubes on the ground, the upper one off centre and slightly penetrating: symplectic
             Euler and Gauss-Seidel at 0.9 of the largest stable step, implicit Euler and the augmented Lagrangian at 10 ms.
 
-All in f32. Steps are timed first as they are, then done again from the same start with a watch on their parts, whose looks at
-the clock cost a little. The first steps, which compile and let buffers grow, are left out.
+All in f32. Steps are timed first as a whole, then repeated from the same start with a stopwatch on their parts, which adds a
+small overhead. The first steps, which compile and grow buffers, are left out.
 """
 
 import math
@@ -53,9 +53,9 @@ EXPLICIT, ON_ONE = "explicit", "explicit, one thread"
 
 @dataclass
 class Row:
-    """A kind of work on one mesh. samples: seconds of a step or a search; phases: seconds of each phase of one, medians; counts:
-    of one, means; moved: bytes that one moves at least; field_bytes: by group; base, peak: resident bytes before the scene was
-    made, and the most; setup_seconds: of making the scene and the simulator, without compiling."""
+    """A kind of work on one mesh. samples: seconds of a step or a search; phases: median seconds per phase; counts: means; moved:
+    lower bound of the bytes moved; field_bytes: by group; base, peak: resident bytes before the scene was built, and at most;
+    setup_seconds: of building scene and simulator, without compilation."""
 
     kind: str
     arch: str
@@ -75,16 +75,16 @@ class Row:
 
     @property
     def timing(self) -> Timing | None:
-        """Of a step or a search [s]; None where there is none."""
+        """Timing of a step or a search [s], or None."""
         return summarise(self.samples) if self.samples else None
 
     def record(self) -> dict:
-        """As plain data, of which Row(**record) makes the row again."""
+        """The row as plain data; Row(**record) restores it."""
         return asdict(self)
 
 
 def measure(kind: str, size: int, arch: str) -> Row:
-    """A kind of work on a mesh of about so many tets. Raises TaisoftError where it cannot be done."""
+    """Measure a kind of work on a mesh of about `size` tets. Raises TaisoftError."""
     row = Row(kind, arch, base=peak_memory())
     before = compile_clock()
     KINDS[kind](row, size)
@@ -111,7 +111,7 @@ def cubes_on_ground(size: int) -> Scene:
 
 
 def _open(row: Row, build: Callable[[int], Scene], size: int, integrator: str, dt: float | None) -> ts.Simulator:
-    """A scene's simulator; its numbers go into the row. dt None: MARGIN of the largest stable one."""
+    """Open a scene's simulator and record its sizes in the row. dt None: MARGIN times the largest stable step."""
     begin = perf_counter()
     sim = ts.Simulator(build(size), dt=dt or TINY_DT, integrator=integrator, precision=PRECISION, arch=row.arch)
     if dt is None:
@@ -127,7 +127,7 @@ def _open(row: Row, build: Callable[[int], Scene], size: int, integrator: str, d
 
 
 def explicit_on_one(row: Row, size: int) -> None:
-    """The same on one thread, however large the mesh is."""
+    """Explicit steps on one thread for any mesh size."""
     with patched(model, "PARALLEL_FROM", math.inf):
         explicit(row, size)
 
@@ -141,7 +141,7 @@ def explicit(row: Row, size: int) -> None:
         sim.dt = min(sim.dt, LONGEST_FALL / steps)
         _element_seconds(sim, steps)  # compiles
         fractions = []
-        for _ in range(SAMPLES):  # in turn, so that a slow moment of the machine falls on both
+        for _ in range(SAMPLES):  # in turn, so that a slow moment of the machine affects both
             sim.reset()
             row.samples.append(advance(sim, steps).seconds / steps)
             fractions.append(min(1.0, _element_seconds(sim, steps) / row.samples[-1]))
@@ -165,7 +165,7 @@ def repeat_elements(m: ti.template(), n: ti.i32):
 
 
 def _element_seconds(sim: ts.Simulator, n: int) -> float:
-    """Seconds of the element loop of a step, done n times."""
+    """Seconds of the element loop of a step, averaged over n runs."""
     m, begin = sim._dynamics.state.model, clock()
     if m.serial:
         repeat_elements(m, n)
@@ -185,7 +185,7 @@ def explicit_contact(row: Row, size: int) -> None:
 
 
 def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
-    """Where the parts of the simulator's implicit steps are called, for `Stopwatch.on`."""
+    """The functions of each part of implicit steps, for `Stopwatch.on`."""
     places = [
         *(("residual", stage_system, name) for name in ("move", "update_impulses", "form_residual")),
         *(("matrix", block_csr, name) for name in ("assemble", "to_system")),
@@ -201,7 +201,7 @@ def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
 
 
 def implicit(build: Callable[[int], Scene], integrator: str, row: Row, size: int) -> None:
-    """Implicit steps, with contacts inside the Newton loop or without. Bytes: without what contacts add."""
+    """Implicit steps with or without contacts; bytes moved exclude those of contacts."""
     with _open(row, build, size, integrator, DT) as sim:
         watch = _one_by_one(row, sim, implicit_places(sim))
         fields, steps = sim.field_bytes, len(row.samples)

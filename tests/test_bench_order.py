@@ -303,7 +303,7 @@ def test_the_whole_writes_and_draws_what_it_prints(faked, tmp_path, capsys, monk
     assert numbers["precision"] == "f64" and numbers["references"]["beam_fall"]["values"] == [-3.774]
     kept = (tmp_path / "new" / "order.md").read_text()
     assert kept.strip() in shown and "* order 2, 3x3x3: no equilibrium beyond 90% of the load" in kept
-    for part in ("## hanging_beam: hanging beam, SNH", "## Time to 1% error", "## Limits", "good to 0.04%"):
+    for part in ("## hanging_beam: hanging beam, SNH", "## Time to 1% error", "## Limits", "uncertainty 0.04%"):
         assert part in kept
     assert plot.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and len(plot.read_bytes()) > 10_000
 

@@ -167,4 +167,4 @@ def summary_table(parts: Sequence[Part]) -> str:
 def short_text(parts: Sequence[Part]) -> str:
     """Differences from the report and omissions, by part."""
     lines = [f"* {part.title}: {text}" for part in parts for text in ([part.failure] if part.failure else part.short)]
-    return "## Differences and omissions\n\n" + ("\n".join(lines) if lines else "None known.")
+    return "## Differences and omissions\n\n" + ("\n".join(lines) if lines else "Nothing known.")

@@ -78,7 +78,7 @@ def colour_claims(found: list[Colouring]) -> list[Claim]:
             ""
             if all(groups)
             else f"A colouring needs at least as many groups as contacts meet at one node, here {_listed(least)}, and greedy "
-            f"needs about as many. With {theirs} greedy colours, some contact of the report has at least {theirs - 1} neighbours.",
+            f"needs about as many. With {theirs} greedy colours, a contact of the report had at least {theirs - 1} neighbours.",
         ),
         Claim(
             "random colouring varies.",
