@@ -1,4 +1,4 @@
-"""Materials at their worst: collapsed, mirrored and random shapes, squeezes, a bar that is drawn, twisted and released."""
+"""Materials under extreme deformation: collapsed, mirrored and random shapes, compression, a bar stretched, twisted, released."""
 
 import numpy as np
 
@@ -31,14 +31,14 @@ SMALLEST = "smallest volume ratio at the end"
 
 
 def start_of(name: str, X: np.ndarray) -> np.ndarray:
-    """Where the vertices X (n,3) [m] are put."""
+    """Initial positions of the vertices X (n,3) [m]."""
     if name == "random":
         return np.random.default_rng(1).uniform(-0.5, 0.5, X.shape)
     return X * {"plane": (1.0, 1.0, 0.0), "mirrored": (-1.0, 1.0, 1.0)}[name]
 
 
 def recover(session: Session, law: str, start: str, steps: int) -> dict[str, float]:
-    """M1, M2: a free cube of 1 m from a start in which tets have no volume or a negative one, for 14 s."""
+    """M1, M2: a free cube of 1 m that starts with flat or inverted tets, for 14 s."""
     scene, body = one_body("cube", cube(4, 1.0), law=law, young=1e5, poisson=0.4, mass_damping=6.0)
     with session.simulator(scene) as sim:
         sim.set_state(start_of(start, body.rest_positions))
@@ -47,7 +47,7 @@ def recover(session: Session, law: str, start: str, steps: int) -> dict[str, flo
 
 
 def squeeze(session: Session, law: str) -> dict[str, float]:
-    """M3: a cube of 0.1 m is squeezed to half its height, held, and drawn back."""
+    """M3: a cube of 0.1 m is compressed to half its height, held, and released slowly."""
     scene, body = one_body("cube", cube(4, 0.1), law=law, young=1e5, poisson=0.3)
     body.fix(face(1, -0.05))
     down = [0.0, 0.0, 0.0], [0.0, -0.05, 0.0]
@@ -66,7 +66,7 @@ def squeeze(session: Session, law: str) -> dict[str, float]:
 
 
 def draw_and_twist(session: Session, law: str) -> dict[str, float]:
-    """M4: a bar's end is drawn to four times its length, turned once and released."""
+    """M4: a bar is stretched to four times its length, twisted once and released."""
     mesh = box((10, 3, 3), (0.5, 0.15, 0.15), (0.25, 0.0, 0.0))
     scene, body = one_body("bar", mesh, law=law, young=3e4, poisson=0.4, mass_damping=2.0)
     body.fix(face(0, 0.0))

@@ -1,8 +1,8 @@
 """Contact: friction on slopes, stacks, impacts, momentum, and a ball pressed on a plane.
 
-Blocks are unit cubes of 2 x 2 x 2 cells. Those that slide are damped within, by their stiffness: a soft block that vibrates on
-its base slides further than a rigid one, as it lets go of the plane here and there. Contacts keep a contact offset; bodies that
-begin on a plane move up to it first, by about a millimetre.
+Blocks are unit cubes of 2 x 2 x 2 cells. Sliding blocks have stiffness damping: a soft block that vibrates loses contact in
+places and slides further than a rigid one. Contacts keep a contact offset; bodies that start on a plane first move up to it, by
+about a millimetre.
 """
 
 from dataclasses import replace
@@ -19,7 +19,7 @@ from .record import GRAVITY, Case, material, near, reported, rotation, small, su
 EXPLICIT, IMPLICIT = "symplectic_euler", "implicit_euler"
 STEP = {EXPLICIT: 1e-3, IMPLICIT: 1e-2}  # [s] of blocks of 1e7 Pa
 CONTACT_OFFSET = 2e-3  # of the mean surface edge
-STICKS = 10.0  # friction of what must not move
+STICKS = 10.0  # friction of blocks that must not move
 STILL, SLIP, STRAIGHT = 1e-5, 5e-3, 1e-4  # limits: [m], of a distance, sideways over distance
 UP = (0.0, 1.0, 0.0)
 
@@ -46,7 +46,7 @@ def add_plane(s: ts.Scene, **contact) -> None:
 
 
 def settled(sim: ts.Simulator, friction: float, angle: float = 0.0, held: bool = False) -> np.ndarray:
-    """Let the block settle on a slope [rad], held by more friction if wanted. Returns where it is (n,3) [m]."""
+    """Let the block settle on a slope [rad], with more friction if `held`. Returns its positions (n,3) [m]."""
     sim.reset()
     sim.set_gravity((GRAVITY * np.sin(angle), -GRAVITY * np.cos(angle), 0.0))
     sim.set_contact("block", "plane", friction=STICKS if held else friction)
@@ -98,7 +98,7 @@ def slide(integrator: str, reference: dict, arch: str):
 
 
 def stack(reference: dict, arch: str):
-    """Five cubes on each other, at rest: what each interface bears.
+    """Five cubes on each other at rest: the force at each interface.
 
     A column so high buckles under its own weight, and so does one of bonded cubes (Greenhill: 4.05 m for this material), at
     a rate of about 1/s. From a symmetric start it stays upright for the first seconds, in which damping brings it to rest.
@@ -173,11 +173,11 @@ def bar(integrator: str, law: str, reference: dict, arch: str):
     yield near("duration [s]", duration, value["duration"], 0.05)
     yield near("mean force [N]", impulse / duration, value["force"], 0.05)
     yield near("rebound velocity [m/s]", impulse / mass - 0.1, value["rebound_velocity"], 0.1)
-    yield reported("of it in vibration, share of the speed", np.abs(v[:, 1] - v[:, 1].mean()).max() / 0.1)
+    yield reported("vibration after the impact, over the speed", np.abs(v[:, 1] - v[:, 1].mean()).max() / 0.1)
 
 
 def momentum(integrator: str, reference: dict, arch: str):
-    """Two cubes that collide in free space: what their momentum does."""
+    """Two cubes that collide in free space: conservation of momentum."""
     s = ts.Scene(gravity=(0.0, 0.0, 0.0))
     soft = replace(material(reference, "SNH"), friction=0.4)
     s.add_body(cube(), soft, name="left", position=(-0.6, 0, 0), velocity=(1.0, 0, 0))
