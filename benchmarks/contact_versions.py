@@ -170,8 +170,8 @@ def drop_limits(found: dict[str, dict[str, dict]]) -> Iterator[Limit]:
             yield Limit(f"{name}: Newton iterations per step", sum(one["newton"]) / len(one["newton"]), DROP_NEWTON)
         if older is not None:
             faster = sum(older[name]["seconds"]) / sum(one["seconds"])
-            wanted = FASTER_OTHERS.get(name, FASTER)
-            yield Limit(f"{name}: time of the older version over this one's", faster, wanted, at_least=True)
+            required = FASTER_OTHERS.get(name, FASTER)
+            yield Limit(f"{name}: time of the older version over this one's", faster, required, at_least=True)
     meshes = [name for name in this if name in contact_drops.MESH]
     if older is not None and meshes:
         faster = sum(with_contacts(older[name]) for name in meshes) / sum(with_contacts(this[name]) for name in meshes)

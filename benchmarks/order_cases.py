@@ -14,7 +14,7 @@ import taisoft as ts
 from taisoft.scene.scene import Body
 
 from .reference_cases.record import GRAVITY, LAWS, face, nearest, scene
-from .reference_cases.statics import cook_panel
+from .reference_cases.statics import cook_panel, turn_end
 
 
 @dataclass(frozen=True)
@@ -100,14 +100,6 @@ def _box(size, starts_at_zero: bool = False) -> Callable[[tuple], ts.TetMesh]:
 def _pulled(x: float, force: float, area: float) -> Callable[[Body], object]:
     """A dead force [N] along y, spread evenly over the face at x [m] of an area [m^2]."""
     return lambda body: body.add_traction(face(0, x), (0.0, force / area, 0.0))
-
-
-def _turned(body: Body) -> None:
-    """The face at x = 2 m turned by 90 degrees about x."""
-    end = face(0, 2.0)(body.rest_positions)
-    _, y, z = body.rest_positions[end].T
-    displacement = np.column_stack([np.zeros_like(y), -z - y, y - z])
-    body.move(end, lambda t: displacement)
 
 
 def _torque(body: Body, state) -> np.ndarray:
@@ -233,7 +225,7 @@ CASES = (
         read=_torque,
         meshes={LINEAR: ((8, 2, 2), (16, 4, 4), (32, 8, 8)), QUADRATIC: ((4, 1, 1), (8, 2, 2), (16, 4, 4))},
         gravity=False,
-        load=_turned,
+        load=turn_end,
     ),
     Case(
         "cantilever",

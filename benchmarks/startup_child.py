@@ -162,10 +162,10 @@ def identify(cells: int) -> dict:
         return ts.solve_static(beam(cells, young)).positions()[:, 1].min()
 
     def search() -> None:
-        wanted, low, high = sag(3e6), 6.0, 7.0
+        target, low, high = sag(3e6), 6.0, 7.0
         for _ in range(8):
             middle = 0.5 * (low + high)
-            low, high = (middle, high) if sag(10.0**middle) < wanted else (low, middle)
+            low, high = (middle, high) if sag(10.0**middle) < target else (low, middle)
         assert abs(middle - np.log10(3e6)) < 0.01
 
     return timed(search)

@@ -8,13 +8,13 @@ from taisoft.study.measure import TimedRun, advance, warm_up
 
 from ..elasticity_runs import lasting_steps
 from ..exact_path import DENSITY, POISSON, SAMPLE
-from ..reference_cases.record import LAWS
 from ..runner import without_warnings
 from ..works.references import MUJOCO, TAISOFT, Model
 from ..works.scenes import Work
 from .session import Session, Setting
 
 NAME, MODEL = "taisoft", TAISOFT
+LAWS = {"SNH": "stable_neo_hookean", "SVK": "st_venant_kirchhoff"}
 IMPLICIT = ("bdf2", "implicit_midpoint", "implicit_euler")
 FINER = (1, 2, 4, 11)  # explicit steps of W1: errors of second order down to 1e-5; the last in f64 too
 

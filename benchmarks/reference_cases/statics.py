@@ -116,6 +116,11 @@ def soft_sheet(sheet: Body, reference: dict) -> None:
 def twisted_bar(bar: Body, reference: dict) -> None:
     """Thick bar, one end face clamped, the other turned by 90 degrees about x."""
     bar.fix(face(0, -2.0))
+    turn_end(bar)
+
+
+def turn_end(bar: Body) -> None:
+    """Turn the face at x = 2 m by 90 degrees about x."""
     end = face(0, 2.0)(bar.rest_positions)
     _, y, z = bar.rest_positions[end].T
     displacement = np.column_stack([np.zeros_like(y), -z - y, y - z])

@@ -122,9 +122,9 @@ def limits_of(rows: list[Row]) -> list[Limit]:
     for at, a, b in pairs_of(rows):
         found.append(Limit(f"{work.key}, {at}: settings of taisoft that do", float(a is not None), 1.0, at_least=True))
         if a and b:
-            ratio, wanted = time_ratio(b, a), FASTER if work.kind == "path" else 1.0
+            ratio, required = time_ratio(b, a), FASTER if work.kind == "path" else 1.0
             what = f"{work.key}, {at}: time of {b.setting.program} / taisoft"
-            found.append(Limit(what, ratio.median, wanted, spread_of(ratio), at_least=True))
+            found.append(Limit(what, ratio.median, required, spread_of(ratio), at_least=True))
     return found
 
 
